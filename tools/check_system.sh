@@ -1,0 +1,64 @@
+#!/bin/sh
+# check_system.sh PYTHON: is there what pip cannot install?
+# Missing system packages are installed when this runs as root, and named otherwise.
+set -u
+
+python=$1
+apt_packages='g++ python3-venv python3-dev make'
+
+fail() {
+    printf '%s\n' "$@" >&2
+    exit 1
+}
+
+apt_line() {
+    echo "    sudo apt update && sudo apt install $apt_packages"
+}
+
+# Prints what is missing, one word each.
+missing() {
+    command -v g++ >/dev/null || echo 'g++'
+    "$python" -c 'import ensurepip, venv' 2>/dev/null || echo 'python3-venv'
+    "$python" -c '
+import os, sys, sysconfig
+sys.exit(not os.path.exists(os.path.join(sysconfig.get_path("include"), "Python.h")))
+' 2>/dev/null || echo 'python3-dev'
+}
+
+# The ROS wheels of PyPI are built for x86_64 Linux with glibc only.
+if [ "$(uname -s)" != Linux ] || [ "$(uname -m)" != x86_64 ]; then
+    fail "This is $(uname -s) on $(uname -m); the ROS packages on PyPI exist for Linux on x86_64 only." \
+         'Install ROS 2 Jazzy from apt and build with colcon: see README.md.'
+fi
+
+if command -v "$python" >/dev/null; then
+    # The pins of constraints.txt have wheels for 3.10 to 3.13; more can be allowed when they have.
+    "$python" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' ||
+        fail "$python is $("$python" --version 2>&1); Python 3.10 to 3.13 is needed." \
+             'Name another one like this: make setup PYTHON=python3.12'
+elif [ "$python" != python3 ]; then
+    fail "There is no $python here."
+fi
+
+lacking=$(echo $(missing))
+[ -n "$lacking" ] || exit 0
+
+if [ "$(id -u)" -ne 0 ] || ! command -v apt-get >/dev/null; then
+    fail "Missing here: $lacking" 'On Debian and Ubuntu, type this and try again:' "$(apt_line)"
+fi
+
+echo "Setting up: installing from apt, as $lacking is missing"
+log=$(mktemp)
+# shellcheck disable=SC2086 # a list of words
+if ! { apt-get update && DEBIAN_FRONTEND=noninteractive apt-get install -y $apt_packages; } \
+        >"$log" 2>&1; then
+    tail -n 20 "$log" >&2
+    rm -f "$log"
+    fail 'apt-get failed; this is what it was to do:' "$(apt_line)"
+fi
+rm -f "$log"
+
+lacking=$(echo $(missing))
+[ -z "$lacking" ] ||
+    fail "Still missing for $python: $lacking" \
+         'It is perhaps not the Python of apt: try make setup PYTHON=/usr/bin/python3'
