@@ -1,0 +1,1 @@
+"""What a sensor must be corrected for, learnt from its own samples."""

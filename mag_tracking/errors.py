@@ -1,0 +1,21 @@
+"""The errors that a caller can act on; each message names the thing, the value and the bound."""
+
+
+class MagTrackingError(Exception):
+    """Base of all errors that this package raises on purpose."""
+
+
+class SettingsError(MagTrackingError):
+    """A setting has an unknown name, a wrong type, or a value out of range."""
+
+
+class NetworkError(MagTrackingError):
+    """The network file does not describe a usable network."""
+
+
+class RecordingError(MagTrackingError):
+    """A recording cannot be read, or does not hold what is needed."""
+
+
+class OutputError(MagTrackingError):
+    """A result cannot be written where it was asked for."""

@@ -1,0 +1,1 @@
+"""Filters and tests: mathematics in arrays, without ROS."""

@@ -1,0 +1,55 @@
+"""Thresholds and probabilities of the chi-square energy test.
+
+Source: T10 section 5.4, eq. (5.14)-(5.19).
+"""
+
+import numpy as np
+from scipy.special import chdtrc, chdtri, chndtr
+
+
+def energy_threshold(false_alarm_probability, degrees_of_freedom):
+    """Threshold h with P(chi2_n > h) = `false_alarm_probability`; T10 eq. (5.18)."""
+    return chdtri(degrees_of_freedom, false_alarm_probability)
+
+
+def false_alarm_probability(threshold, degrees_of_freedom):
+    """P(chi2_n > threshold), the inverse of `energy_threshold`."""
+    return chdtrc(degrees_of_freedom, threshold)
+
+
+def detection_probability(snr, threshold, degrees_of_freedom):
+    """P(chi2_n(snr) > threshold) with non-centrality `snr`; T10 eq. (5.19)."""
+    return 1.0 - chndtr(threshold, degrees_of_freedom, snr)
+
+
+def whitened_energy(y, C):
+    """Energy of a measurement in units of its noise.
+
+    Parameters
+    ----------
+    y : (n, 3)
+        Per sensor; NaN = missing axis.
+    C : (n, 3, 3)
+        Noise covariance, same unit squared; not read where `y` is missing.
+
+    Returns
+    -------
+    energy : (n,)
+        y' C^-1 y over the axes present; 0 where there are none.
+    axes : (n,) int
+        How many were present.
+
+    Raises numpy.linalg.LinAlgError where a covariance is singular.
+    Source: T10 eq. (5.16).
+    """
+    present = ~np.isnan(y)
+    axes = present.sum(axis=1)
+    energy = np.zeros(len(y))
+    full = axes == 3
+    if full.any():
+        z = np.linalg.solve(C[full], y[full][:, :, None])[:, :, 0]
+        energy[full] = np.einsum('ni,ni->n', y[full], z)
+    for j in np.flatnonzero((axes > 0) & ~full):
+        p = present[j]
+        energy[j] = y[j, p] @ np.linalg.solve(C[j][np.ix_(p, p)], y[j, p])
+    return energy, axes

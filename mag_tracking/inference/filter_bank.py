@@ -1,0 +1,145 @@
+"""The bank of filters: hypotheses as arrays, their weights in logarithms.
+
+Source: T10 section 2.6 and Alg. 3; weights live in logarithms because two
+hypotheses may be thousands of nats apart.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+def log_sum_exp(a, axis=None):
+    """log(sum(exp(a))) without overflow; -inf where all are -inf."""
+    a = np.asarray(a, dtype=float)
+    top = np.max(a, axis=axis, keepdims=True)
+    top = np.where(np.isfinite(top), top, 0.0)
+    with np.errstate(divide='ignore'):
+        total = np.log(np.sum(np.exp(a - top), axis=axis, keepdims=True)) + top
+    return total.squeeze() if axis is None else np.squeeze(total, axis=axis)
+
+
+@dataclass
+class FilterBank:
+    """Hypotheses of one target; every array has the hypothesis as first axis."""
+
+    x: np.ndarray
+    """(n_hyp, n_x) states."""
+    P: np.ndarray
+    """(n_hyp, n_x, n_x) covariances."""
+    log_w: np.ndarray
+    """(n_hyp,) normalised log-weights."""
+    label: np.ndarray
+    """(n_hyp,) int: the arrival that each hypothesis assumes."""
+
+    @classmethod
+    def of_targets(cls, x, P, label, n_sensors, background_std):
+        """A bank with equal weights from target states alone.
+
+        `x` (n_hyp, n_t), `P` (n_hyp, n_t, n_t); three background states per
+        sensor are put behind them: zero, with `background_std` [T].
+        """
+        n, n_t = x.shape
+        n_x = n_t + 3 * n_sensors
+        full_x, full_P = np.zeros((n, n_x)), np.zeros((n, n_x, n_x))
+        full_x[:, :n_t], full_P[:, :n_t, :n_t] = x, P
+        background = np.arange(n_t, n_x)
+        full_P[:, background, background] = background_std**2
+        return cls(full_x, full_P, np.full(n, -np.log(n)), label)
+
+    def __len__(self):
+        return len(self.log_w)
+
+    def best(self):
+        """Row of the hypothesis to publish: the heaviest of the heaviest label."""
+        labels = np.unique(self.label)
+        totals = [log_sum_exp(self.log_w[self.label == k]) for k in labels]
+        rows = np.flatnonzero(self.label == labels[int(np.argmax(totals))])
+        return int(rows[np.argmax(self.log_w[rows])])
+
+    def separated_weight(self, i, distance=3.0):
+        """Total weight of the hypotheses whose position is apart from that of row `i`.
+
+        Apart: by more than `distance` deviations of the difference in some
+        direction (both covariances), so neither explains the other.
+        """
+        difference = self.x[:, :3] - self.x[i, :3]
+        S = self.P[:, :3, :3] + self.P[i, :3, :3]
+        z = np.einsum('ni,nij,nj->n', difference, np.linalg.pinv(S, hermitian=True), difference)
+        apart = z > distance**2
+        return float(np.exp(log_sum_exp(self.log_w[apart]))) if apart.any() else 0.0
+
+    def reweight(self, log_likelihood):
+        """Bayes' rule on the weights; returns the log-evidence of the frame.
+
+        A hypothesis whose likelihood is not finite loses all its weight.
+        If none is left the evidence is -inf and the weights stay as they were.
+        """
+        log_likelihood = np.where(np.isfinite(log_likelihood), log_likelihood, -np.inf)
+        joint = self.log_w + log_likelihood
+        evidence = float(log_sum_exp(joint))
+        if np.isfinite(evidence):
+            self.log_w = joint - evidence
+        return evidence
+
+    def keep(self, mask):
+        """Keep the hypotheses of `mask` and normalise; returns how many went."""
+        gone = int(np.count_nonzero(~mask))
+        if gone:
+            self.x = np.ascontiguousarray(self.x[mask])
+            self.P = np.ascontiguousarray(self.P[mask])
+            self.log_w = self.log_w[mask] - log_sum_exp(self.log_w[mask])
+            self.label = self.label[mask]
+        return gone
+
+    def prune(self, log_ratio, most):
+        """Drop what is below the best by more than `log_ratio`, and beyond the `most` best."""
+        mask = self.log_w >= self.log_w.max() - log_ratio
+        if np.count_nonzero(mask) > most:
+            order = np.argsort(-self.log_w, kind='stable')
+            mask = np.zeros(len(self), dtype=bool)
+            mask[order[:most]] = True
+        return self.keep(mask)
+
+    def merge(self, n_target, distance):
+        """Let hypotheses that say the same be one; returns how many went.
+
+        From the heaviest down, each takes up those of its label whose target
+        state is within `distance` of its own standard deviations (Mahalanobis
+        per root of the dimension) and becomes their mean, with the covariance
+        of the mixture. Separated hypotheses are never averaged.
+        """
+        order = np.argsort(-self.log_w, kind='stable')
+        rank = np.empty(len(self), dtype=int)
+        rank[order] = np.arange(len(self))
+        alive = np.ones(len(self), dtype=bool)
+        for i in order:
+            if not alive[i]:
+                continue
+            others = np.flatnonzero(alive & (self.label == self.label[i]) & (rank > rank[i]))
+            if not len(others):
+                continue
+            close = self._distance(i, others, n_target) <= distance**2 * n_target
+            if close.any():
+                self._absorb(i, others[close])
+                alive[others[close]] = False
+        return self.keep(alive)
+
+    def _distance(self, i, others, n_target):
+        """Squared Mahalanobis distances of `others` from row `i`, by the covariance of `i`."""
+        std = np.sqrt(np.diagonal(self.P[i])[:n_target])
+        free = std > 0.0
+        std = std[free]
+        correlation = self.P[i, :n_target, :n_target][np.ix_(free, free)] / np.outer(std, std)
+        z = (self.x[others, :n_target] - self.x[i, :n_target])[:, free] / std
+        return np.einsum('ni,ij,nj->n', z, np.linalg.pinv(correlation, hermitian=True), z)
+
+    def _absorb(self, i, others):
+        """Put rows `others` into row `i`: weight, mean and covariance of the mixture."""
+        rows = np.append(i, others)
+        total = log_sum_exp(self.log_w[rows])
+        w = np.exp(self.log_w[rows] - total)
+        mean = w @ self.x[rows]
+        d = self.x[rows] - mean
+        P = np.einsum('n,nij->ij', w, self.P[rows]) + np.einsum('n,ni,nj->ij', w, d, d)
+        self.x[i], self.P[i], self.log_w[i] = mean, 0.5 * (P + P.T), total

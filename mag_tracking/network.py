@@ -1,0 +1,63 @@
+"""The sensor network: where each sensor is, how it is turned, what it was calibrated to."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mag_tracking.errors import NetworkError
+
+
+@dataclass(frozen=True)
+class SensorNetwork:
+    """Stationary three-axis magnetometers; the order of `names` is that of every array."""
+
+    names: tuple[str, ...]
+    positions: np.ndarray
+    """(n, 3) [m], world."""
+    R_ws: np.ndarray
+    """(n, 3, 3), sensor to world."""
+    topics: tuple[str, ...]
+    frame: str = 'map'
+    earth_field: np.ndarray | None = None
+    """(3,) [T], world; None = unknown."""
+    noise_std: tuple[np.ndarray | None, ...] = ()
+    """Per sensor (3,) [T]; None = to be estimated."""
+    background: tuple[np.ndarray | None, ...] = ()
+    """Per sensor (3,) [T], sensor frame; None = to be learnt."""
+
+    def __post_init__(self):
+        n = len(self.names)
+        if n == 0:
+            raise NetworkError('a network needs at least one sensor')
+        twice = sorted({name for name in self.names if self.names.count(name) > 1})
+        if twice:
+            raise NetworkError(f'sensor {twice[0]} is there twice')
+        shared = sorted({t for t in self.topics if self.topics.count(t) > 1})
+        if shared:
+            raise NetworkError(f'topic {shared[0]} is that of two sensors')
+        if self.positions.shape != (n, 3) or self.R_ws.shape != (n, 3, 3):
+            raise NetworkError(f'{n} sensors need positions ({n}, 3) and orientations ({n}, 3, 3)')
+        for name in ('noise_std', 'background'):
+            if not getattr(self, name):
+                object.__setattr__(self, name, (None,) * n)
+
+    def __len__(self):
+        return len(self.names)
+
+    @property
+    def R_sw(self):
+        """(n, 3, 3), world to sensor."""
+        return np.ascontiguousarray(np.swapaxes(self.R_ws, 1, 2))
+
+    @property
+    def centre(self):
+        """(3,) [m], mean of the sensor positions."""
+        return self.positions.mean(axis=0)
+
+    def index(self, name):
+        """Row of sensor `name`; raises NetworkError if there is none."""
+        try:
+            return self.names.index(name)
+        except ValueError:
+            raise NetworkError(f'unknown sensor {name}; the network has '
+                               f'{", ".join(self.names)}') from None

@@ -1,0 +1,1 @@
+"""Fields, sources and motion: mathematics in arrays, without ROS."""

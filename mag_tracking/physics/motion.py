@@ -1,0 +1,43 @@
+"""Motion models, exactly discretised.
+
+Only the exact form of the process noise is supported: white noise drives the
+highest derivative in continuous time. (T10 eq. (4.2) and ICASSP11 eq. (2)
+hold it constant over a sample, and PHD15 Paper A eq. (18) is misprinted.)
+"""
+
+import numpy as np
+
+
+def integrator_noise(dt, density):
+    """Process noise of a double integrator driven by white noise.
+
+    Parameters
+    ----------
+    dt : float [s]
+    density : (3,) [unit^2/s^3]
+        Spectral density of the second derivative, per axis.
+
+    Returns
+    -------
+    (6, 6)
+        density * [[T^3/3, T^2/2], [T^2/2, T]], first three rows the integral.
+
+    Source: PHD15 Paper A eq. (24), the form that (18) should have.
+    """
+    block = np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
+    return np.kron(block, np.diag(np.asarray(density, dtype=float)))
+
+
+def constant_velocity(dt):
+    """Transition matrix (6, 6) of position and velocity over `dt` seconds."""
+    return np.kron(np.array([[1.0, dt], [0.0, 1.0]]), np.eye(3))
+
+
+def cross_matrix(a):
+    """Matrices [a]x with [a]x b = a x b; `a` (..., 3) gives (..., 3, 3)."""
+    a = np.asarray(a, dtype=float)
+    out = np.zeros(a.shape + (3,))
+    out[..., 0, 1], out[..., 0, 2] = -a[..., 2], a[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = a[..., 2], -a[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -a[..., 1], a[..., 0]
+    return out

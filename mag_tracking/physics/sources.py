@@ -1,0 +1,150 @@
+"""The targets: what a state means, how it moves, and which dipoles it is.
+
+A source model turns a batch of target states into dipoles with derivatives;
+the field at the sensors follows from `dipole.sensor_fields` alone, so that a
+new target is one new class here and nothing elsewhere.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from mag_tracking.physics.dipole import MU0
+from mag_tracking.physics.motion import constant_velocity, cross_matrix, integrator_noise
+
+
+class Dipoles(NamedTuple):
+    """Dipoles of every hypothesis, in the world, with derivatives by the target state."""
+
+    r: np.ndarray
+    """(n_hyp, n_dipoles, 3) [m] positions."""
+    m: np.ndarray
+    """(n_hyp, n_dipoles, 3) [A m^2] moments."""
+    dr_dx: np.ndarray
+    """(n_hyp, n_dipoles, 3, n_t)."""
+    dm_dx: np.ndarray
+    """(n_hyp, n_dipoles, 3, n_t)."""
+
+
+class SourceModel(Protocol):
+    """What the tracker asks of a target. States begin with position and velocity."""
+
+    state_names: tuple[str, ...]
+
+    def dipoles(self, x: np.ndarray) -> Dipoles:
+        """Dipoles of the target states `x` (n_hyp, n_t)."""
+
+    def propagate(self, x: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """States after `dt` seconds, Jacobian (..., n_t, n_t), process noise (..., n_t, n_t)."""
+
+
+@dataclass(frozen=True)
+class PointVehicle:
+    """Point target whose moment depends on its heading: hard iron and soft iron.
+
+    State (10): position r, velocity v, hard iron moment m0 in the vehicle's
+    frame (x forward, z up), soft iron scalar D [m^3]. The heading is that of
+    the velocity; no roll, pitch or slip.
+
+        m = Rz(heading) m0 + D/mu0 B0
+
+    Where the speed is zero the heading is atan2(0, 0) = 0 and its derivative
+    is taken as zero.
+
+    Source: ICASSP11 eq. (4)-(8); (D/mu0) B0 and not T10's (3D/mu0) B0.
+    """
+
+    earth_field: np.ndarray
+    """(3,) [T], world. Zeros: no soft iron can be modelled."""
+    acceleration_density: np.ndarray
+    """(3,) [m^2/s^3], spectral density of the acceleration, per axis."""
+    moment_density: float = 0.0
+    """[(A m^2)^2/s], random walk of m0."""
+
+    state_names = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'm0x', 'm0y', 'm0z', 'D')
+
+    def dipoles(self, x):
+        """One dipole a hypothesis; see `SourceModel.dipoles`."""
+        n = len(x)
+        speed2 = x[:, 3] ** 2 + x[:, 4] ** 2
+        speed = np.sqrt(speed2)
+        moving = speed2 > 0.0
+        c = np.divide(x[:, 3], speed, out=np.ones(n), where=moving)
+        s = np.divide(x[:, 4], speed, out=np.zeros(n), where=moving)
+        hard = np.stack([c * x[:, 6] - s * x[:, 7], s * x[:, 6] + c * x[:, 7], x[:, 8]], axis=1)
+        m = hard + x[:, 9:10] * (self.earth_field / MU0)
+        dr_dx = np.zeros((n, 1, 3, 10))
+        dr_dx[:, 0, [0, 1, 2], [0, 1, 2]] = 1.0
+        dm_dx = np.zeros((n, 1, 3, 10))
+        dm_dx[:, 0, 0, 6], dm_dx[:, 0, 0, 7] = c, -s
+        dm_dx[:, 0, 1, 6], dm_dx[:, 0, 1, 7] = s, c
+        dm_dx[:, 0, 2, 8] = 1.0
+        dm_dx[:, 0, :, 9] = self.earth_field / MU0
+        # d(heading)/dv = [-sin, cos]/|v|, and d(hard)/d(heading) = z x hard.
+        dpsi_dvx = np.divide(-s, speed, out=np.zeros(n), where=moving)
+        dpsi_dvy = np.divide(c, speed, out=np.zeros(n), where=moving)
+        dm_dx[:, 0, 0, 3], dm_dx[:, 0, 0, 4] = -hard[:, 1] * dpsi_dvx, -hard[:, 1] * dpsi_dvy
+        dm_dx[:, 0, 1, 3], dm_dx[:, 0, 1, 4] = hard[:, 0] * dpsi_dvx, hard[:, 0] * dpsi_dvy
+        return Dipoles(x[:, None, :3].copy(), m[:, None, :], dr_dx, dm_dx)
+
+    def propagate(self, x, dt):
+        """Constant velocity; see `SourceModel.propagate`."""
+        F = np.eye(10)
+        F[:6, :6] = constant_velocity(dt)
+        Q = np.zeros((10, 10))
+        Q[:6, :6] = integrator_noise(dt, self.acceleration_density)
+        Q[[6, 7, 8], [6, 7, 8]] = self.moment_density * abs(dt)
+        return x @ F.T, F, Q
+
+
+@dataclass(frozen=True)
+class Magnet:
+    """A small magnet: one dipole that moves and turns, five degrees of freedom.
+
+    State (12): position r, velocity v, moment m (world), angular velocity w
+    (world). The moment turns with w; the roll about m cannot be observed.
+
+    Source: PHD15 Paper A section 3.1 and eq. (19)-(24).
+    """
+
+    acceleration_density: np.ndarray
+    """(3,) [m^2/s^3], spectral density of the acceleration."""
+    angular_density: float
+    """[rad^2/s^3], spectral density of the angular acceleration."""
+
+    state_names = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'mx', 'my', 'mz', 'wx', 'wy', 'wz')
+
+    def dipoles(self, x):
+        """One dipole a hypothesis; see `SourceModel.dipoles`."""
+        dr_dx = np.zeros((len(x), 1, 3, 12))
+        dr_dx[:, 0, [0, 1, 2], [0, 1, 2]] = 1.0
+        dm_dx = np.zeros((len(x), 1, 3, 12))
+        dm_dx[:, 0, [0, 1, 2], [6, 7, 8]] = 1.0
+        return Dipoles(x[:, None, :3].copy(), x[:, None, 6:9].copy(), dr_dx, dm_dx)
+
+    def propagate(self, x, dt):
+        """Constant velocity and angular velocity; see `SourceModel.propagate`.
+
+        m + dt (w x m), as eq. (24) has it: m is held constant over the
+        interval. Its noise is that of the double integrator, mapped by
+        w -> w x m = C(m) w.
+        """
+        n = len(x)
+        C = -cross_matrix(x[:, 6:9])
+        F = np.zeros((n, 12, 12))
+        F[:, :6, :6] = constant_velocity(dt)
+        F[:, 6:9, 6:9] = np.eye(3) + dt * cross_matrix(x[:, 9:12])
+        F[:, 6:9, 9:12] = dt * C
+        F[:, 9:12, 9:12] = np.eye(3)
+        moved = np.einsum('nij,nj->ni', F, x)
+        # F holds both derivatives of the product w x m: do not count it twice.
+        moved[:, 6:9] = x[:, 6:9] + dt * np.einsum('nij,nj->ni', C, x[:, 9:12])
+        G = np.zeros((n, 6, 6))
+        G[:, :3, :3] = C
+        G[:, 3:, 3:] = np.eye(3)
+        Q = np.zeros((n, 12, 12))
+        Q[:, :6, :6] = integrator_noise(dt, self.acceleration_density)
+        Q[:, 6:, 6:] = (G @ integrator_noise(dt, np.full(3, self.angular_density))
+                        @ np.swapaxes(G, 1, 2))
+        return moved, F, Q

@@ -1,0 +1,214 @@
+"""Settings, declared once: defaults, documentation, units and ranges in one place.
+
+ROS parameters, the YAML file of defaults and the parameter reference are all
+made from these declarations.
+"""
+
+import dataclasses
+import difflib
+import math
+import typing
+from collections.abc import Mapping
+
+import yaml
+
+from mag_tracking.errors import SettingsError
+
+
+def param(default, doc, unit='', range=None, live=False, length=None):
+    """Declare one setting of a frozen dataclass.
+
+    Parameters
+    ----------
+    default : float, int, bool, str, or a tuple of float or of str
+    doc : str
+        One sentence, for the reference and the ROS descriptor.
+    unit : str
+    range : (low, high), optional
+        Inclusive, for numbers and for every element of a tuple.
+    live : bool
+        May change while running (a ROS parameter that is not read-only).
+    length : int, optional
+        Required length of a tuple; None = any but zero.
+    """
+    return dataclasses.field(default=default, metadata={
+        'doc': doc, 'unit': unit, 'range': range, 'live': live, 'length': length})
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """One setting, flattened: its dotted name, its value and its declaration."""
+
+    name: str
+    value: object
+    type: type
+    element: type | None
+    doc: str
+    unit: str
+    range: tuple | None
+    live: bool
+    length: int | None
+
+
+def _kind(hint):
+    """(type, element type) of an annotation such as float or tuple[float, ...]."""
+    if typing.get_origin(hint) is tuple:
+        return tuple, typing.get_args(hint)[0]
+    return hint, None
+
+
+def flatten(settings, prefix=''):
+    """All settings below `settings` as a list of `Parameter`, in the order declared."""
+    hints = typing.get_type_hints(type(settings))
+    out = []
+    for f in dataclasses.fields(settings):
+        name, value = prefix + f.name, getattr(settings, f.name)
+        if dataclasses.is_dataclass(value):
+            out += flatten(value, name + '.')
+        else:
+            kind, element = _kind(hints[f.name])
+            out.append(Parameter(name, value, kind, element, **f.metadata))
+    return out
+
+
+def _scalar(name, value, kind):
+    """`value` as `kind`, or a SettingsError that names the setting."""
+    if kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    if kind is int and isinstance(value, int) and not isinstance(value, bool):
+        return value
+    if kind in (bool, str) and isinstance(value, kind):
+        return value
+    raise SettingsError(f'{name}: expected {kind.__name__}, got {value!r}')
+
+
+def _checked(p, value):
+    """`value` in the type of the declaration `p`, within its range and length."""
+    if p.type is tuple:
+        if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
+            raise SettingsError(f'{p.name}: expected a list of {p.element.__name__}, '
+                                f'got {value!r}')
+        value = tuple(_scalar(p.name, v, p.element) for v in value)
+        if p.length is not None and len(value) != p.length:
+            raise SettingsError(f'{p.name}: expected {p.length} values, got {len(value)}')
+        if not value:
+            raise SettingsError(f'{p.name}: expected at least one value, got none')
+    else:
+        value = _scalar(p.name, value, p.type)
+    for v in value if isinstance(value, tuple) else (value,):
+        if isinstance(v, float) and math.isnan(v):
+            raise SettingsError(f'{p.name}: NaN is not a value')
+        if p.range is not None and not p.range[0] <= v <= p.range[1]:
+            raise SettingsError(f'{p.name}: {v} is outside {p.range[0]} .. {p.range[1]}'
+                                f'{" " + p.unit if p.unit else ""}')
+    return value
+
+
+def _dotted(mapping, prefix=''):
+    """Nested mappings as one flat dict with dotted names."""
+    out = {}
+    for key, value in mapping.items():
+        if isinstance(value, Mapping):
+            out.update(_dotted(value, f'{prefix}{key}.'))
+        else:
+            out[f'{prefix}{key}'] = value
+    return out
+
+
+def replace(settings, changes):
+    """A copy of `settings` with `changes`, a mapping of (dotted or nested) names to values.
+
+    Raises SettingsError for an unknown name (with the nearest known one), a
+    wrong type, a wrong length, or a value out of range.
+    """
+    known = {p.name: p for p in flatten(settings)}
+    checked = {}
+    for name, value in _dotted(changes).items():
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f'; did you mean {near[0]}?' if near else ''
+            raise SettingsError(f'unknown setting {name}{hint}')
+        checked[name] = _checked(known[name], value)
+    return _rebuild(settings, checked, '')
+
+
+def _rebuild(settings, checked, prefix):
+    """Copy of the tree with the checked values put in."""
+    changes = {}
+    for f in dataclasses.fields(settings):
+        name, value = prefix + f.name, getattr(settings, f.name)
+        if dataclasses.is_dataclass(value):
+            changes[f.name] = _rebuild(value, checked, name + '.')
+        elif name in checked:
+            changes[f.name] = checked[name]
+    return dataclasses.replace(settings, **changes)
+
+
+def read_parameter_file(path):
+    """The settings in a YAML file, as a flat dict of dotted names.
+
+    Takes a plain mapping, or a ROS parameter file (`node: ros__parameters:`),
+    whose sections of all nodes are joined. Raises SettingsError.
+    """
+    try:
+        with open(path, encoding='utf-8') as stream:
+            content = yaml.safe_load(stream)
+    except OSError as error:
+        raise SettingsError(f'cannot read {path}: {error.strerror}') from error
+    except yaml.YAMLError as error:
+        raise SettingsError(f'{path} is not YAML: {error}') from error
+    if content is None:
+        return {}
+    if not isinstance(content, Mapping):
+        raise SettingsError(f'{path}: expected a mapping of settings, got {content!r}')
+    sections = [v['ros__parameters'] for v in content.values()
+                if isinstance(v, Mapping) and 'ros__parameters' in v]
+    if not sections:
+        return _dotted(content)
+    joined = {}
+    for section in sections:
+        joined.update(_dotted(section or {}))
+    return joined
+
+
+def _yaml_value(value):
+    """One value as YAML that reads back as the same value of the same type."""
+    if isinstance(value, tuple):
+        return '[' + ', '.join(_yaml_value(v) for v in value) + ']'
+    if isinstance(value, bool):
+        return 'true' if value else 'false'
+    if isinstance(value, float):
+        text = repr(value)
+        # YAML 1.1 reads 1e-08 as a string: a mantissa needs its point.
+        return text.replace('e', '.0e') if 'e' in text and '.' not in text else text
+    return str(value) if isinstance(value, int) else f"'{value}'"
+
+
+def to_yaml(settings, node='/**'):
+    """The settings as a ROS parameter file with documentation."""
+    lines = ['# Generated from the settings by `make config`; do not edit.',
+             f'{node}:', '  ros__parameters:']
+    group = None
+    for p in flatten(settings):
+        head, _, leaf = p.name.rpartition('.')
+        if head != group:
+            lines += [''] if group is not None else []
+            lines += [f'    {head}:'] if head else []
+            group = head
+        pad = '      ' if head else '    '
+        notes = [p.unit] if p.unit else []
+        notes += [f'{p.range[0]} .. {p.range[1]}'] if p.range else []
+        notes += ['live'] if p.live else []
+        lines.append(f'{pad}# {p.doc}' + (f' [{"; ".join(notes)}]' if notes else ''))
+        lines.append(f'{pad}{leaf}: {_yaml_value(p.value)}')
+    return '\n'.join(lines) + '\n'
+
+
+def to_reference(settings):
+    """The parameter reference, as a Markdown table."""
+    lines = ['| parameter | default | unit | range | live | what |', '|---|---|---|---|---|---|']
+    for p in flatten(settings):
+        bounds = f'{p.range[0]} .. {p.range[1]}' if p.range else ''
+        lines.append(f'| `{p.name}` | `{_yaml_value(p.value)}` | {p.unit} | {bounds} | '
+                     f'{"yes" if p.live else ""} | {p.doc} |')
+    return '\n'.join(lines) + '\n'
