@@ -1,0 +1,110 @@
+"""The settings tree and the one chain of stages, for nodes and offline alike."""
+
+from dataclasses import dataclass, field
+
+from mag_tracking.errors import SettingsError
+from mag_tracking.records import FieldFrame
+from mag_tracking.settings import replace
+from mag_tracking.stages.align import Align, AlignSettings
+from mag_tracking.stages.calibrate import Calibrate, CalibrateSettings
+from mag_tracking.stages.detect import Detect, DetectSettings
+from mag_tracking.stages.stage import rejected
+from mag_tracking.stages.track import TrackSettings, TrackStage
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All settings, one group a stage."""
+
+    calibrate: CalibrateSettings = field(default_factory=CalibrateSettings)
+    align: AlignSettings = field(default_factory=AlignSettings)
+    detect: DetectSettings = field(default_factory=DetectSettings)
+    track: TrackSettings = field(default_factory=TrackSettings)
+
+
+TARGET_DEFAULTS = {
+    'vehicle': {},
+    'magnet': {
+        'calibrate.max_field': 0.1,
+        'calibrate.relearn_s': 0.0,
+        'align.burst': True,
+        'align.period_s': 0.5,
+        'align.max_wait_s': 2.0,
+        'detect.onset_frames': 1,
+        'detect.background_std': 5e-7,
+        'track.near_field_length': 5e-4,
+        'track.field_error': 0.01,
+        'track.model_error_time_s': 0.0,
+        'track.background_std': 5e-7,
+        'track.background_drift': 1e-8,
+        'track.iterations': 5,
+        'track.lookback_s': 0.0,
+        'track.end_gap_s': 30.0,
+    },
+}
+"""What differs from the defaults for each target."""
+
+
+def settings_for(target, changes=None):
+    """Settings of a target with `changes` ({dotted name: value}) on top; raises SettingsError.
+
+    A `track.target` among the changes has to agree.
+    """
+    if target not in TARGET_DEFAULTS:
+        raise SettingsError(f'target: expected {" or ".join(TARGET_DEFAULTS)}, got {target!r}')
+    changes = dict(changes or {})
+    if changes.setdefault('track.target', target) != target:
+        raise SettingsError(f'track.target: {changes["track.target"]!r} in the parameters, '
+                            f'but {target!r} was asked for')
+    return replace(replace(Settings(), TARGET_DEFAULTS[target]), changes)
+
+
+class Pipeline:
+    """Raw samples in, frames, detections and tracks out; no ROS, no clock."""
+
+    def __init__(self, network, settings):
+        self.network = network
+        self.settings = settings
+        self.calibrate = Calibrate(network, settings.calibrate)
+        self.align = Align(network, settings.align)
+        self.detect = Detect(network, settings.detect)
+        self.track = TrackStage(network, settings.track)
+
+    def feed(self, sample):
+        """A raw `MagSample` gives the `FieldFrame | Detection | Track` records that follow."""
+        return self._chain(1, self.calibrate.feed(sample))
+
+    def flush(self):
+        """The input has ended: what was still held back."""
+        out = []
+        for position, stage in enumerate((self.calibrate, self.align, self.detect, self.track)):
+            out += self._chain(position + 1, stage.flush())
+        return out
+
+    def _chain(self, position, items):
+        """Push `items` through the stages from `position` on; collect what leaves the chain."""
+        if position == 1:
+            items = [f for s in items for f in self.align.feed(s)]
+            position = 2
+        out = []
+        if position == 2:
+            items = [r for f in items for r in self.detect.feed(f)]
+            position = 3
+        for item in items:
+            out.append(item)
+            if position == 3 and isinstance(item, FieldFrame):
+                out += self.track.feed(item)
+        return out
+
+    def counts(self):
+        """{stage: {what: number}}."""
+        return {name: dict(sorted(getattr(self, name).counts.items()))
+                for name in ('calibrate', 'align', 'detect', 'track')}
+
+    def rejections(self):
+        """{cause: number} over all stages."""
+        total = {}
+        for name in ('calibrate', 'align'):
+            for cause, n in rejected(getattr(self, name).counts).items():
+                total[cause] = total.get(cause, 0) + n
+        return total

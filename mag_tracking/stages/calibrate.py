@@ -1,0 +1,147 @@
+"""Calibrate: check a sample, remove the background, attach the noise."""
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from mag_tracking.calibration.background import RunningBackground
+from mag_tracking.records import MagSample
+from mag_tracking.settings import param
+from mag_tracking.stages.stage import NS
+
+
+@dataclass(frozen=True)
+class CalibrateSettings:
+    """Settings of the calibration."""
+
+    learn_s: float = param(
+        3.0, 'Quiet time needed before a sensor is used, unless its calibration is given.',
+        's', (0.1, 3600.0))
+    memory_s: float = param(
+        20.0, 'Length of the quiet stretch that level, drift and noise are fitted to.',
+        's', (1.0, 36000.0))
+    guard_s: float = param(
+        1.5, 'How far the background stays behind, so that a slow approach does not enter it.',
+        's', (0.0, 600.0))
+    block_s: float = param(
+        0.25, 'Samples are judged in blocks of this length.', 's', (0.01, 60.0))
+    freeze_std: float = param(
+        2.0, 'A block whose mean is off by this many noise deviations freezes the background.',
+        '', (0.5, 1000.0))
+    relearn_s: float = param(
+        60.0, 'After so long frozen on a steady level, that level becomes the background '
+        '(a parked car); 0 = never.', 's', (0.0, 86400.0))
+    max_field: float = param(
+        1e-3, 'A reading above this is rejected: gauss or microtesla published as tesla is the '
+        'commonest fault. Near magnets millitesla are legitimate.', 'T', (1e-6, 10.0))
+    jump_back_s: float = param(
+        1.0, 'A stamp that goes back by more than this is a restart (a looped recording): '
+        'what was learnt is forgotten.', 's', (0.0, 3600.0))
+
+
+class Calibrate:
+    """Raw samples to calibrated ones: background removed, covariance known.
+
+    The field stays in the sensor's own frame, where a missing axis is a
+    missing axis. The covariance is the sample's own if it carries one, else
+    the configured one, else the estimated one.
+    """
+
+    def __init__(self, network, settings):
+        self.counts = Counter()
+        self.per_sensor = {name: Counter() for name in network.names}
+        self._network = network
+        self._settings = settings
+        self._first_ns, self._last_ns = {}, {}
+        self._background = {
+            name: RunningBackground(
+                settings.learn_s, settings.memory_s, settings.guard_s, settings.block_s,
+                settings.freeze_std, settings.relearn_s,
+                network.background[i], network.noise_std[i])
+            for i, name in enumerate(network.names)}
+
+    def feed(self, sample):
+        """A raw `MagSample` gives at most one calibrated `MagSample`."""
+        if sample.sensor not in self._background:
+            return self._reject(sample, f'unknown sensor {sample.sensor}')
+        cause = self._fault(sample)
+        if cause:
+            return self._reject(sample, cause)
+        last = self._last_ns.get(sample.sensor)
+        background = self._background[sample.sensor]
+        if last is not None and sample.stamp_ns <= last:
+            if last - sample.stamp_ns <= self._settings.jump_back_s * NS:
+                return self._reject(sample, 'duplicate stamp' if sample.stamp_ns == last
+                                    else 'out of order')
+            background.forget()
+            self.counts['time jumped back'] += 1
+            self._first_ns.pop(sample.sensor)
+        self._last_ns[sample.sensor] = sample.stamp_ns
+        # Counted from the first sample: seconds since 1970 leave a float few digits.
+        time = (sample.stamp_ns - self._first_ns.setdefault(sample.sensor, sample.stamp_ns)) / NS
+        background.add(time, sample.field)
+        self.per_sensor[sample.sensor]['accepted'] += 1
+        if not background.ready:
+            self.counts['held back while learning'] += 1
+            return []
+        self.counts['calibrated'] += 1
+        covariance = sample.covariance
+        return [MagSample(sample.stamp_ns, sample.sensor, sample.field - background.level(time),
+                          background.covariance if covariance is None else covariance)]
+
+    def flush(self):
+        """Nothing is held back for long: []."""
+        return []
+
+    def _fault(self, sample):
+        """Why the sample cannot be used, or None."""
+        if np.isnan(sample.field).all():
+            return 'no axis reported (all NaN)'
+        if np.isinf(sample.field).any():
+            return 'infinite value'
+        if np.nanmax(np.abs(sample.field)) > self._settings.max_field:
+            return f'above {self._settings.max_field:g} T (gauss or microtesla as tesla?)'
+        there = ~np.isnan(sample.field)
+        if sample.covariance is not None and not (
+                sample.covariance.shape == (3, 3)
+                and _is_covariance(sample.covariance[np.ix_(there, there)])):
+            return 'covariance is not positive definite'
+        return None
+
+    def _reject(self, sample, cause):
+        """Count the rejection."""
+        self.counts[f'rejected: {cause}'] += 1
+        if sample.sensor in self.per_sensor:
+            self.per_sensor[sample.sensor]['rejected'] += 1
+        return []
+
+    def forget(self, sensors=()):
+        """Learn the backgrounds of `sensors` (all if empty) anew.
+
+        Raises NetworkError for a sensor that is not in the network.
+        """
+        for name in sensors:
+            self._network.index(name)
+        for name in sensors or self._network.names:
+            self._background[name].forget()
+
+    def last_stamp_ns(self, sensor):
+        """Stamp of the latest accepted sample of `sensor`, or None."""
+        return self._last_ns.get(sensor)
+
+    def background(self, sensor):
+        """(3,) [T] background of `sensor` at its latest sample; ValueError before it is ready."""
+        elapsed = self._last_ns[sensor] - self._first_ns[sensor]
+        return self._background[sensor].level(elapsed / NS)
+
+    def backgrounds(self):
+        """{sensor: RunningBackground}, to look at."""
+        return dict(self._background)
+
+
+def _is_covariance(C):
+    """Whether C is finite, symmetric and positive definite."""
+    if not np.isfinite(C).all() or np.abs(C - C.T).max() > 1e-6 * np.abs(C).max():
+        return False
+    return bool(np.linalg.eigvalsh(C)[0] > 0.0)

@@ -1,0 +1,116 @@
+"""Detect: the chi-square energy test on whitened frames.
+
+Source: T10 section 5.4, eq. (5.14)-(5.19), over all sensors at once.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mag_tracking.inference.detection_theory import energy_threshold, whitened_energy
+from mag_tracking.records import Detection
+from mag_tracking.settings import param
+from mag_tracking.stages.stage import NS
+
+
+@dataclass(frozen=True)
+class DetectSettings:
+    """Settings of the detection."""
+
+    false_alarm_probability: float = param(
+        1e-3, 'Probability that a single frame of noise exceeds the threshold.',
+        '', (1e-12, 0.5))
+    onset_frames: int = param(
+        3, 'So many frames in a row above the threshold are a target.', '', (1, 1000))
+    release_probability: float = param(
+        1e-2, 'A frame is quiet below the threshold that noise exceeds with this probability.',
+        '', (1e-12, 0.5))
+    hold_s: float = param(
+        1.0, 'The target is gone after so long without a frame that is not quiet.',
+        's', (0.0, 3600.0))
+    background_std: float = param(
+        4e-9, 'What the background may be off by (drift while frozen); added to the noise. '
+        '0 = the stated probability is exact for noise alone.', 'T', (0.0, 1e-3))
+
+
+class Detect:
+    """Frames to frames with a verdict, and a `Detection` at onset and release."""
+
+    def __init__(self, network, settings):
+        self.counts = Counter()
+        self._names = network.names
+        self._settings = settings
+        self._allowance = settings.background_std**2 * np.eye(3)
+        self._thresholds = {}
+        self._next_id = 1
+        self._reset()
+
+    def _reset(self):
+        """No target."""
+        self._present = False
+        self._above = 0
+        self._last_ns = self._loud_ns = None
+
+    def threshold(self, probability, degrees_of_freedom):
+        """Threshold of the energy, remembered."""
+        key = probability, degrees_of_freedom
+        if key not in self._thresholds:
+            self._thresholds[key] = float(energy_threshold(probability, degrees_of_freedom))
+        return self._thresholds[key]
+
+    def feed(self, frame):
+        """A `FieldFrame` gives itself with the verdict, after any `Detection`."""
+        out = []
+        if self._last_ns is not None and frame.stamp_ns <= self._last_ns:
+            self.counts['time jumped back'] += 1
+            out = self._release(self._last_ns, float('nan'), 0, '')
+            self._reset()
+        self._last_ns = frame.stamp_ns
+        energy, axes = whitened_energy(frame.field, frame.covariance + self._allowance)
+        statistic, n = float(energy.sum()), int(axes.sum())
+        self.counts['frames'] += 1
+        if n:
+            per_axis = np.divide(energy, axes, out=np.zeros(len(energy)), where=axes > 0)
+            out += self._judge(frame.stamp_ns, statistic, n, self._names[int(per_axis.argmax())])
+        else:
+            self.counts['frames without a measurement'] += 1
+        return [*out, replace(frame, target_present=self._present, statistic=statistic,
+                              degrees_of_freedom=n)]
+
+    def _judge(self, stamp_ns, statistic, n, strongest):
+        """Onset, hold and release; the detections that follow."""
+        s = self._settings
+        if statistic > self.threshold(s.false_alarm_probability, n):
+            self.counts['frames above the threshold'] += 1
+            self._above += 1
+        else:
+            self._above = 0
+        if statistic > self.threshold(s.release_probability, n):
+            self._loud_ns = stamp_ns
+        if not self._present and self._above >= s.onset_frames:
+            self._present = True
+            self.counts['onsets'] += 1
+            return [self._detection(stamp_ns, True, statistic, n, strongest)]
+        if self._present and stamp_ns - self._loud_ns > s.hold_s * NS:
+            return self._release(stamp_ns, statistic, n, strongest)
+        return []
+
+    def _release(self, stamp_ns, statistic, n, strongest):
+        """End the detection, if there is one."""
+        if not self._present:
+            return []
+        self._present = False
+        detection = self._detection(stamp_ns, False, statistic, n, strongest)
+        self._next_id += 1
+        return [detection]
+
+    def _detection(self, stamp_ns, onset, statistic, n, strongest):
+        """The record."""
+        p = self._settings.false_alarm_probability
+        return Detection(stamp_ns, self._next_id, onset, statistic, n,
+                         self.threshold(p, n) if n else float('nan'), p, strongest)
+
+    def flush(self):
+        """Nothing is held back: []."""
+        return []

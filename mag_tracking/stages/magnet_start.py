@@ -1,0 +1,110 @@
+"""Where a magnet's track begins: its settings, its model and the first hypotheses."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.inference.least_squares import project_out_linear, refine
+from mag_tracking.physics.dipole import dipole_jacobians, sensor_fields
+from mag_tracking.physics.sources import Magnet
+from mag_tracking.settings import param
+
+
+@dataclass(frozen=True)
+class MagnetSettings:
+    """The magnet: its motion and where it may appear."""
+
+    reach: float = param(
+        0.15, 'It may first appear so far beyond the box of the sensors.', 'm', (1e-3, 100.0))
+    grid_points: int = param(
+        4000, 'Points of the coarse grid over that box.', '', (8, 1_000_000))
+    starts: int = param(24, 'Best points of the grid that are refined.', '', (1, 1000))
+    speed_std: float = param(0.05, 'Spread of the starting speed, per axis.', 'm/s', (1e-9, 100.0))
+    spin_std: float = param(0.5, 'Spread of the starting angular speed, per axis.',
+                            'rad/s', (1e-9, 1000.0))
+    acceleration: float = param(
+        0.02, 'Root spectral density of the acceleration.', 'm/s^1.5', (0.0, 1000.0))
+    angular_acceleration: float = param(
+        0.2, 'Root spectral density of the angular acceleration.', 'rad/s^1.5', (0.0, 1000.0))
+    axis: tuple[float, ...] = param(
+        (0.0, 0.0, 1.0), 'Direction of the moment in the magnet\'s own frame.',
+        '', (-1.0, 1.0), length=3)
+
+
+def magnet_model(settings):
+    """The `Magnet` of the settings."""
+    return Magnet(np.full(3, settings.acceleration**2), settings.angular_acceleration**2)
+
+
+def start_magnet(settings, network, frame, background_std, relative_std):
+    """Hypotheses of a magnet at its first frame, wherever it is.
+
+    On a coarse grid the moment is projected out; the best points are refined,
+    and every distinct optimum is a hypothesis, weighted by its fit.
+    `relative_std` is the model's error relative to the field.
+
+    Returns a `FilterBank` with all labels 0, or None where the frame has fewer
+    than six axes or nothing fits. Source: PHD15 Paper A eq. (3).
+    """
+    present = ~np.isnan(frame.field)
+    if np.count_nonzero(present) < 6:
+        return None
+    size = np.sqrt(np.nansum(frame.field**2, axis=1))
+    std = np.sqrt(np.einsum('jii->ji', frame.covariance) + background_std**2
+                  + (relative_std * size[:, None]) ** 2)
+    y = (frame.field / std)[present]
+    low, high = network.positions.min(axis=0), network.positions.max(axis=0)
+    extent = high - low + 2.0 * settings.reach
+    step = float((np.prod(extent) / settings.grid_points) ** (1.0 / 3.0))
+    axes = [np.arange(a - settings.reach + step / 2, b + settings.reach, step)
+            for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)
+    # Only the moment's Jacobian is wanted: it does not depend on the moment.
+    dB_dm = dipole_jacobians(network.positions[None] - grid[:, None], np.zeros(3))[1]
+    A = np.einsum('jik,gjkl->gjil', network.R_sw, dB_dm) / std[:, :, None]
+    A = A[:, present]
+    usable = np.isfinite(A).all(axis=(1, 2))
+    moments, cost = project_out_linear(A[usable], y)
+    best = np.argsort(cost, kind='stable')[:settings.starts]
+    start = np.hstack([grid[usable][best], moments[best]])
+    return _distinct_optima(settings, network, start, y, std, present, background_std)
+
+
+def _distinct_optima(settings, network, start, y, std, present, background_std):
+    """Refine the starts and make a bank of the optima that differ."""
+    identity = np.zeros((len(start), 1, 3, 6))
+    dr_dx, dm_dx = identity.copy(), identity.copy()
+    dr_dx[:, 0, :, :3] = np.eye(3)
+    dm_dx[:, 0, :, 3:] = np.eye(3)
+
+    def residual_and_jacobian(x):
+        h, H, _ = sensor_fields(network.positions, network.R_sw,
+                                np.ascontiguousarray(x[:, None, :3]),
+                                np.ascontiguousarray(x[:, None, 3:]), dr_dx, dm_dx)
+        return y - (h / std)[:, present], (H / std[:, :, None])[:, present]
+
+    x, cost, covariance = refine(residual_and_jacobian, start)
+    keep = []
+    for i in np.argsort(cost, kind='stable'):
+        if not np.isfinite(cost[i]) or cost[i] - cost.min() > 60.0:
+            break
+        apart = [np.linalg.norm(x[i, :3] - x[k, :3])
+                 > 3.0 * np.sqrt(np.trace(covariance[k][:3, :3])) for k in keep]
+        if all(apart):
+            keep.append(i)
+    if not keep:
+        return None
+    n = len(keep)
+    state = np.zeros((n, 12))
+    state[:, :3], state[:, 6:9] = x[keep, :3], x[keep, 3:]
+    P = np.zeros((n, 12, 12))
+    rm = np.r_[0:3, 6:9]
+    # What the fit leaves over says how far the model can be trusted.
+    excess = np.maximum(1.0, cost[keep] / max(1, len(y) - 6))
+    P[np.ix_(range(n), rm, rm)] = covariance[keep] * excess[:, None, None]
+    P[:, [3, 4, 5], [3, 4, 5]] = settings.speed_std**2
+    P[:, [9, 10, 11], [9, 10, 11]] = settings.spin_std**2
+    bank = FilterBank.of_targets(state, P, np.zeros(n, dtype=int), len(network), background_std)
+    bank.reweight(-0.5 * cost[keep])
+    return bank

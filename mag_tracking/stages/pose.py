@@ -1,0 +1,101 @@
+"""From a bank to what is published: the best hypothesis, its pose and its honest doubts."""
+
+import numpy as np
+
+from mag_tracking.geometry import quaternion_between, quaternion_from_yaw
+from mag_tracking.inference.filter_bank import log_sum_exp
+from mag_tracking.physics.motion import cross_matrix
+from mag_tracking.records import Hypothesis, Track
+
+UNOBSERVED_VARIANCE = np.pi**2
+"""[rad^2] of an angle that the field does not determine."""
+
+
+def vehicle_orientation(x, P):
+    """Heading of the velocity; roll and pitch are not observed.
+
+    Parameters
+    ----------
+    x : (n_t,), P : (n_t, n_t)
+        A target state that begins with position and velocity.
+
+    Returns
+    -------
+    q : (4,) xyzw
+    T : (3, n_t)
+        Derivative of the small rotation about world axes by the state.
+    unobserved : (3, 3)
+        Variance of what is not observed, to be added.
+    flags : (3,) bool
+        Body x, y, z.
+    """
+    speed2 = x[3] ** 2 + x[4] ** 2
+    T = np.zeros((3, len(x)))
+    if speed2 > 0.0:
+        T[2, 3], T[2, 4] = -x[4] / speed2, x[3] / speed2
+    yaw_known = speed2 > 0.0 and T[2] @ P @ T[2] < UNOBSERVED_VARIANCE
+    if not yaw_known:
+        T[:] = 0.0
+    unobserved = np.diag([1.0, 1.0, 0.0 if yaw_known else 1.0]) * UNOBSERVED_VARIANCE
+    return (quaternion_from_yaw(np.arctan2(x[4], x[3])), T, unobserved,
+            (True, True, not yaw_known))
+
+
+def magnet_orientation(x, P, axis):
+    """Direction of the moment; the roll about it is not observed.
+
+    As `vehicle_orientation`; `axis` (3,) is the moment's direction in the
+    magnet's own frame. The flag goes to the body axis nearest to it.
+    """
+    m = x[6:9]
+    size2 = m @ m
+    T = np.zeros((3, len(x)))
+    # dm = w x m gives the part of w across m: w = m x dm / |m|^2.
+    T[:, 6:9] = cross_matrix(m) / size2
+    along = np.outer(m, m) / size2
+    flags = [False] * 3
+    flags[int(np.argmax(np.abs(axis)))] = True
+    return quaternion_between(axis, m), T, UNOBSERVED_VARIANCE * along, tuple(flags)
+
+
+def published_track(bank, model, orientation, names, **known):
+    """The `Track` of a bank's best hypothesis.
+
+    Parameters
+    ----------
+    bank : FilterBank
+    model : SourceModel
+    orientation : function
+        Takes state and covariance of the target, as `vehicle_orientation`.
+    names : sequence of str
+        The arrival of each label.
+    known : fields of `Track` that the bank does not know
+        stamp_ns, id, ended, existence, nis, degrees_of_freedom, innovation.
+    """
+    n_t = len(model.state_names)
+    best = bank.best()
+    x, P = bank.x[best, :n_t], bank.P[best, :n_t, :n_t]
+    dipoles = model.dipoles(bank.x[:, :n_t])
+    dm_dx = dipoles.dm_dx[best].sum(axis=0)
+    q, T, unobserved, flags = orientation(x, P)
+    weights = np.exp(bank.log_w)
+    moments = dipoles.m.sum(axis=1)
+    order = np.argsort(-bank.log_w, kind='stable')
+    hypotheses = tuple(
+        Hypothesis(names[bank.label[i]], float(weights[i]), bank.x[i, :3].copy(),
+                   bank.x[i, 3:6].copy(), bank.P[i, :6, :6].copy(), moments[i].copy())
+        for i in order)
+    return Track(
+        position=x[:3].copy(), velocity=x[3:6].copy(), covariance=P[:6, :6].copy(),
+        orientation=q, orientation_covariance=T @ P @ T.T + unobserved,
+        position_orientation_covariance=P[:3] @ T.T,
+        moment=moments[best].copy(), moment_covariance=dm_dx @ P @ dm_dx.T,
+        weight=float(weights[best]), arrival=names[bank.label[best]],
+        ambiguous=bank.separated_weight(best) > 0.05,
+        unobservable=(False, False, False, *flags), hypotheses=hypotheses, **known)
+
+
+def arrival_weights(bank, names):
+    """{arrival: total weight} of a bank."""
+    return {name: float(np.exp(log_sum_exp(bank.log_w[bank.label == k])))
+            if (bank.label == k).any() else 0.0 for k, name in enumerate(names)}

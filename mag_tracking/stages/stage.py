@@ -1,0 +1,34 @@
+"""What every step of the way has in common."""
+
+from collections import Counter
+from typing import Protocol, TypeVar
+
+In = TypeVar('In', contravariant=True)
+Out = TypeVar('Out', covariant=True)
+
+
+class Stage(Protocol[In, Out]):
+    """Pushed one record at a time, it hands back what it has to say.
+
+    It never pulls, never sleeps and never reads a clock: time is what the
+    records carry. `counts` tells what was taken, held back and rejected, by
+    cause, so that nothing is lost without a word.
+    """
+
+    counts: Counter
+
+    def feed(self, item: In) -> list[Out]:
+        """Take one record; return the records that follow from it."""
+
+    def flush(self) -> list[Out]:
+        """The input has ended: return what was still held back."""
+
+
+NS = 1_000_000_000
+"""Nanoseconds in a second."""
+
+
+def rejected(counts):
+    """The rejections among `counts`: {cause: number}, without their prefix."""
+    return {k.removeprefix('rejected: '): n for k, n in sorted(counts.items())
+            if k.startswith('rejected: ')}

@@ -1,0 +1,240 @@
+"""Track: a bank of extended Kalman filters, from a detection to its release.
+
+Source: ICASSP11 section 2, T10 Alg. 2 and 3; PHD15 Paper A for the magnet.
+"""
+
+from collections import Counter, deque
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from mag_tracking.errors import SettingsError
+from mag_tracking.inference import kalman
+from mag_tracking.inference.detection_theory import whitened_energy
+from mag_tracking.physics.dipole import sensor_fields
+from mag_tracking.settings import param
+from mag_tracking.stages.magnet_start import MagnetSettings, magnet_model, start_magnet
+from mag_tracking.stages.pose import magnet_orientation, published_track, vehicle_orientation
+from mag_tracking.stages.stage import NS
+from mag_tracking.stages.vehicle_start import VehicleSettings, start_vehicle, vehicle_model
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """Settings of the tracker."""
+
+    target: str = param('vehicle', 'What moves: vehicle or magnet.')
+    near_field_length: float = param(
+        1.0, 'Length of the target: the noise near it grows by the first neglected multipole '
+        'term (ICASSP11 eq. (9), there lambda).', 'm', (0.0, 1000.0), live=True)
+    field_error: float = param(
+        0.07, 'Error of the predicted field relative to its size: mounting angles, gains, shape.',
+        '', (0.0, 10.0), live=True)
+    model_error_time_s: float = param(
+        0.1, 'Model errors stay alike for so long: at a shorter frame period they count once, '
+        'not once a frame (their variance is multiplied by this time over the period).',
+        's', (0.0, 60.0), live=True)
+    background_std: float = param(
+        2e-8, 'What a background may be off by when a track starts.', 'T', (0.0, 1e-3), live=True)
+    background_drift: float = param(
+        1e-8, 'Random walk of a background during a track.', 'T/s^0.5', (0.0, 1e-3), live=True)
+    iterations: int = param(
+        1, 'Linearisations an update: more than one helps when the field says far more than the '
+        'prediction (magnets); for vehicles it locks into the wrong side.', '', (1, 20), live=True)
+    prune_ratio: float = param(
+        1e-12, 'A hypothesis lighter than the heaviest by this ratio is dropped (T10 Alg. 3).',
+        '', (1e-300, 0.5), live=True)
+    most_hypotheses: int = param(
+        600, 'No more than the heaviest so many are kept.', '', (1, 100000), live=True)
+    merge_distance: float = param(
+        0.3, 'Hypotheses of one arrival closer than this (deviations per dimension) become one; '
+        '0 = never.', '', (0.0, 10.0), live=True)
+    lookback_s: float = param(
+        1.0, 'A track begins so long before its detection, with the frames kept since: what is '
+        'too weak to detect still tells where the target came from.', 's', (0.0, 60.0))
+    end_gap_s: float = param(
+        2.0, 'A track ends where the frames have a longer gap than this.', 's', (1e-3, 86400.0))
+    vehicle: VehicleSettings = field(default_factory=VehicleSettings)
+    magnet: MagnetSettings = field(default_factory=MagnetSettings)
+
+
+class TrackStage:
+    """Frames with a verdict to `Track`s, one a frame while a target is present."""
+
+    def __init__(self, network, settings):
+        self.counts = Counter()
+        self._network = network
+        self._positions = np.ascontiguousarray(network.positions, dtype=float)
+        self._R_sw = network.R_sw
+        self._settings = settings
+        if settings.target == 'vehicle':
+            v = settings.vehicle
+            if len(v.arrival_names) != len(v.arrival_headings_deg):
+                raise SettingsError(
+                    f'track.vehicle.arrival_headings_deg: expected {len(v.arrival_names)} values '
+                    f'(one per arrival_names), got {len(v.arrival_headings_deg)}')
+            self._model = vehicle_model(v, network)
+            self._orientation = vehicle_orientation
+            self.arrivals = v.arrival_names
+        elif settings.target == 'magnet':
+            if not any(settings.magnet.axis):
+                raise SettingsError('track.magnet.axis: the zero vector has no direction')
+            self._model = magnet_model(settings.magnet)
+            self._orientation = partial(magnet_orientation, axis=settings.magnet.axis)
+            self.arrivals = ('',)
+        else:
+            raise SettingsError(f'track.target: expected vehicle or magnet, '
+                                f'got {settings.target!r}')
+        self._next_id = 1
+        self._bank = None
+        self._recent = deque()
+        self._last = None
+        self._last_ns = None
+
+    def configure(self, settings):
+        """Take new values of the live settings; the running bank goes on with them."""
+        self._settings = settings
+
+    @property
+    def bank(self):
+        """The running `FilterBank`, or None."""
+        return self._bank
+
+    def feed(self, frame):
+        """A `FieldFrame` gives the `Track`s that follow from it."""
+        out = []
+        if self._last_ns is not None:
+            dt = (frame.stamp_ns - self._last_ns) / NS
+            if dt <= 0.0:
+                self.counts['time jumped back'] += 1
+                out = self._end('time jumped back')
+            elif dt > self._settings.end_gap_s:
+                out = self._end('gap in the frames')
+        previous, self._last_ns = self._last_ns, frame.stamp_ns
+        self.counts['frames'] += 1
+        if frame.target_present and self._bank is not None:
+            return out + self._step(frame, (frame.stamp_ns - previous) / NS)
+        if frame.target_present:
+            return out + self._start(frame)
+        out += self._end('released')
+        self._remember(frame)
+        return out
+
+    def _remember(self, frame):
+        """Keep a frame without a target for a track that may begin soon."""
+        self._recent.append(frame)
+        oldest = frame.stamp_ns - self._settings.lookback_s * NS
+        while self._recent and self._recent[0].stamp_ns < oldest:
+            self._recent.popleft()
+
+    def flush(self):
+        """End the running track."""
+        return self._end('input ended')
+
+    def _start(self, frame):
+        """Make the first hypotheses and run them through the frames before the detection."""
+        s = self._settings
+        if s.target == 'vehicle':
+            self._bank = start_vehicle(s.vehicle, self._network, frame, s.background_std)
+        else:
+            self._bank = start_magnet(s.magnet, self._network, frame, s.background_std,
+                                      s.field_error)
+        recent = [f for f in self._recent if frame.stamp_ns - f.stamp_ns <= s.lookback_s * NS]
+        self._recent.clear()
+        if self._bank is None:
+            self.counts['frames without a start'] += 1
+            return []
+        self.counts['tracks'] += 1
+        self._log_odds = 0.0
+        if recent:
+            self._predict((recent[0].stamp_ns - frame.stamp_ns) / NS)
+        dt = 0.0
+        for before, after in zip(recent, [*recent[1:], frame], strict=True):
+            self._step(before, dt)
+            dt = (after.stamp_ns - before.stamp_ns) / NS
+        return self._step(frame, dt)
+
+    def _predict(self, dt):
+        """Time update of the bank; backwards in time without process noise."""
+        bank, n_t = self._bank, len(self._model.state_names)
+        x_target, F, Q = self._model.propagate(bank.x[:, :n_t], dt)
+        kalman.predict(bank.x, bank.P, x_target, F, Q if dt > 0.0 else 0.0 * Q,
+                       self._settings.background_drift**2 * max(dt, 0.0))
+
+    def _step(self, frame, dt):
+        """Predict, update, weigh, publish."""
+        s, bank = self._settings, self._bank
+        if bank is None:
+            return []
+        if dt > 0.0:
+            self._predict(dt)
+        covariance = np.where(np.isnan(frame.covariance), np.eye(3), frame.covariance)
+        log_likelihood, nis = self._update(frame, covariance, dt)
+        evidence = bank.reweight(log_likelihood)
+        if not np.isfinite(evidence):
+            self.counts['banks lost'] += 1
+            return self._end('no hypothesis explains the field')
+        self._log_odds += evidence - self._log_density_of_noise(frame, covariance)
+        best = bank.best()
+        n_y = int(np.count_nonzero(~np.isnan(frame.field)))
+        innovation = self._innovation(frame, best)
+        best_nis = float(nis[best]) if n_y else float('nan')
+        gone = bank.prune(-np.log(s.prune_ratio), s.most_hypotheses)
+        if s.merge_distance:
+            gone += bank.merge(len(self._model.state_names), s.merge_distance)
+        self.counts['hypotheses dropped'] += gone
+        self._last = published_track(
+            bank, self._model, self._orientation, self.arrivals, stamp_ns=frame.stamp_ns,
+            id=self._next_id, ended=False, nis=best_nis, degrees_of_freedom=n_y,
+            existence=float(1.0 / (1.0 + np.exp(-np.clip(self._log_odds, -700.0, 700.0)))),
+            innovation=innovation)
+        self.counts['poses'] += 1
+        return [self._last]
+
+    def _update(self, frame, covariance, dt):
+        """Measurement update of the bank, relinearised as often as the settings say."""
+        s, bank, n_t = self._settings, self._bank, len(self._model.state_names)
+        x_prior, P_prior, x_lin = bank.x.copy(), bank.P.copy(), bank.x.copy()
+        repeat = max(1.0, s.model_error_time_s / dt) if dt > 0.0 else 1.0
+        for _ in range(s.iterations):
+            bank.x, bank.P = x_prior.copy(), P_prior.copy()
+            h, H, gradient_power = sensor_fields(self._positions, self._R_sw,
+                                                 *self._model.dipoles(x_lin[:, :n_t]))
+            inflation = repeat * (s.near_field_length**2 * gradient_power
+                                  + s.field_error**2 * np.einsum('pji,pji->pj', h, h))
+            # A dipole on a sensor has no field: such a hypothesis is as good as ruled out.
+            lost = ~(np.isfinite(h).all(axis=(1, 2)) & np.isfinite(inflation).all(axis=1))
+            h[lost], H[lost], inflation[lost] = 0.0, 0.0, 0.0
+            log_likelihood, nis = kalman.update(bank.x, bank.P, frame.field, h, H, covariance,
+                                                inflation, x_lin)
+            log_likelihood[lost] = -np.inf
+            x_lin = bank.x.copy()
+        return log_likelihood, nis
+
+    def _innovation(self, frame, row):
+        """(n_sensors, 3) [T] measured minus predicted field of hypothesis `row`, after update."""
+        n_t = len(self._model.state_names)
+        x = self._bank.x[row:row + 1]
+        h = sensor_fields(self._positions, self._R_sw, *self._model.dipoles(x[:, :n_t]))[0][0]
+        return frame.field - h - x[0, n_t:].reshape(-1, 3)
+
+    def _log_density_of_noise(self, frame, covariance):
+        """Log-density of the frame if there were no target."""
+        C = covariance + self._settings.background_std**2 * np.eye(3)
+        energy, axes = whitened_energy(frame.field, C)
+        total = -0.5 * (energy.sum() + axes.sum() * np.log(2.0 * np.pi))
+        for j in np.flatnonzero(axes):
+            there = ~np.isnan(frame.field[j])
+            total -= 0.5 * np.linalg.slogdet(C[j][np.ix_(there, there)])[1]
+        return float(total)
+
+    def _end(self, reason):
+        """Close the running track; its last record goes out once more, marked as ended."""
+        if self._bank is None:
+            return []
+        self._bank = None
+        self.counts[f'tracks ended: {reason}'] += 1
+        self._next_id += 1
+        last, self._last = self._last, None
+        return [] if last is None else [replace(last, ended=True)]
