@@ -1,0 +1,1 @@
+"""The edges: recordings, network files, importers, the simulator."""

@@ -1,0 +1,317 @@
+"""MCAP recordings: a reader that survives damage and says so, and a writer.
+
+The reader goes chunk by chunk and checks each chunk's CRC: a damaged chunk is
+left out and reported, a file that was cut off is read up to the cut, and the
+memory stays at about one chunk.
+"""
+
+import heapq
+import os
+import struct
+import zlib
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+import zstandard
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, Message, Schema
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.writer import CompressionType, Writer
+
+from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.io.schema import definition, encoder
+
+_DAMAGE = (McapError, CRCValidationError, ValueError, KeyError, EOFError, struct.error,
+           zlib.error, zstandard.ZstdError, RuntimeError, UnicodeDecodeError, MemoryError)
+"""What the MCAP library and its decompressors raise on damaged bytes."""
+
+
+class RawMessage(NamedTuple):
+    """One message as it is in the file."""
+
+    topic: str
+    type: str
+    log_time_ns: int
+    data: bytes
+    schema: Schema
+
+
+class Recording:
+    """One MCAP file, or a rosbag2 folder of them.
+
+    Attributes
+    ----------
+    path : Path
+    types : {topic: message type}
+    message_counts : {topic: int}, empty for a file that was cut off
+    start_ns, end_ns : int or None
+        Log times; None where the file does not tell.
+    losses : Counter
+        {what: number}, grows while reading.
+    """
+
+    def __init__(self, path):
+        """Raises RecordingError where there is no readable recording at `path`."""
+        self.path = Path(path)
+        self._files = _files(self.path)
+        self.types, self.message_counts = {}, Counter()
+        self.losses = Counter()
+        self.start_ns = self.end_ns = None
+        self._indexes = [self._inspect(f) for f in self._files]
+
+    @property
+    def size(self):
+        """Bytes of all files."""
+        return sum(f.stat().st_size for f in self._files)
+
+    def _inspect(self, file):
+        """Read topics, counts and times of one file; its chunk index, or None without one."""
+        with open(file, 'rb') as stream:
+            if stream.read(5) != b'\x89MCAP':
+                raise RecordingError(f'{file} is not an MCAP file')
+            stream.seek(0)
+            try:
+                summary = make_reader(stream).get_summary()
+            except _DAMAGE:
+                summary = None
+        if summary is None:
+            self.losses[f'{file.name} has no usable end (cut off?): read up to the damage'] = 1
+            return None
+        for channel in summary.channels.values():
+            schema = summary.schemas.get(channel.schema_id)
+            self.types[channel.topic] = schema.name if schema else ''
+        statistics = summary.statistics
+        if statistics and statistics.message_count:
+            for i, n in statistics.channel_message_counts.items():
+                if i in summary.channels:
+                    self.message_counts[summary.channels[i].topic] += n
+            starts = [t for t in (self.start_ns, statistics.message_start_time) if t is not None]
+            ends = [t for t in (self.end_ns, statistics.message_end_time) if t is not None]
+            self.start_ns, self.end_ns = min(starts), max(ends)
+        return sorted(summary.chunk_indexes, key=lambda c: c.message_start_time)
+
+    def messages(self, topics=None, start_ns=None, progress=None):
+        """Iterate over the `RawMessage`s, in order of log time.
+
+        Parameters
+        ----------
+        topics : collection of str, optional
+            All if left out.
+        start_ns : int, optional
+            Leave out what was logged before.
+        progress : function, optional
+            Called with the bytes done since the last call.
+
+        What could not be read is counted in `losses`.
+        """
+        for file, index in zip(self._files, self._indexes, strict=True):
+            with open(file, 'rb') as stream:
+                if index:
+                    records = self._from_index(stream, index, start_ns, progress)
+                else:
+                    records = self._from_stream(stream, progress)
+                for m in records:
+                    self.types.setdefault(m.topic, m.type)
+                    if (topics is None or m.topic in topics) and (
+                            start_ns is None or m.log_time_ns >= start_ns):
+                        yield m
+
+    def _from_index(self, stream, index, start_ns, progress):
+        """Messages of an intact file, in order of log time across chunks."""
+        heap, schemas, channels = [], {}, {}
+        for k, entry in enumerate(index):
+            if start_ns is not None and entry.message_end_time < start_ns:
+                continue
+            stream.seek(entry.chunk_start_offset)
+            try:
+                chunk = next(iter(StreamReader(stream, skip_magic=True,
+                                               emit_chunks=True).records))
+                if not isinstance(chunk, Chunk):
+                    raise ValueError('no chunk where the index says')
+                found = self._of_chunk(chunk, schemas, channels)
+            except _DAMAGE as error:
+                self._lose_chunk(entry, error)
+                found = []
+            for n, message in enumerate(found):
+                heapq.heappush(heap, (message.log_time_ns, k, n, message))
+            if progress:
+                progress(entry.chunk_length)
+            horizon = index[k + 1].message_start_time if k + 1 < len(index) else None
+            while heap and (horizon is None or heap[0][0] < horizon):
+                yield heapq.heappop(heap)[3]
+
+    def _lose_chunk(self, entry, error):
+        """Report a chunk that cannot be read."""
+        seconds = (entry.message_end_time - entry.message_start_time) / 1e9
+        after = (entry.message_start_time - (self.start_ns or entry.message_start_time)) / 1e9
+        self.losses[f'a damaged stretch of {seconds:.1f} s at {after:.1f} s '
+                    f'({type(error).__name__})'] += 1
+
+    def _from_stream(self, stream, progress):
+        """Messages in the order of the file, up to where it breaks off."""
+        schemas, channels = {}, {}
+        done = 0
+        try:
+            for record in StreamReader(stream, emit_chunks=True).records:
+                if isinstance(record, Chunk):
+                    try:
+                        yield from self._of_chunk(record, schemas, channels)
+                    except _DAMAGE as error:
+                        self.losses[f'a damaged chunk ({type(error).__name__})'] += 1
+                elif isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    channels[record.id] = record
+                elif isinstance(record, Message):
+                    yield _raw(record, schemas, channels)
+                if progress:
+                    here = stream.tell()
+                    progress(here - done)
+                    done = here
+        except _DAMAGE as error:
+            self.losses[f'{os.path.basename(stream.name)}: nothing readable after byte '
+                        f'{stream.tell()} of {os.fstat(stream.fileno()).st_size} '
+                        f'({type(error).__name__})'] += 1
+
+    @staticmethod
+    def _of_chunk(chunk, schemas, channels):
+        """The messages of one chunk, sorted by log time; raises where it is damaged."""
+        messages = []
+        for record in breakup_chunk(chunk, validate_crc=True):
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                messages.append(_raw(record, schemas, channels))
+        return sorted(messages, key=lambda m: m.log_time_ns)
+
+
+def _raw(message, schemas, channels):
+    """The message with its topic and type."""
+    channel = channels[message.channel_id]
+    schema = schemas[channel.schema_id]
+    return RawMessage(channel.topic, schema.name, message.log_time, message.data, schema)
+
+
+def _files(path):
+    """The MCAP files of a recording, in order."""
+    if not path.exists():
+        raise RecordingError(f'there is no {path}')
+    if path.is_file():
+        if path.suffix == '.db3':
+            raise RecordingError(f'{path} is an SQLite bag; convert it with `ros2 bag convert`')
+        if path.stat().st_size == 0:
+            raise RecordingError(f'{path} is empty (0 bytes)')
+        return [path]
+    metadata = path / 'metadata.yaml'
+    files = sorted(path.glob('*.mcap'))
+    if metadata.exists():
+        try:
+            content = yaml.safe_load(metadata.read_text(encoding='utf-8'))
+            listed = content['rosbag2_bagfile_information']['relative_file_paths']
+            files = [path / name for name in listed]
+        except (yaml.YAMLError, KeyError, TypeError) as error:
+            raise RecordingError(f'{metadata} is not rosbag2 metadata: {error}') from error
+    if not files:
+        raise RecordingError(f'{path} holds no .mcap file')
+    for file in files:
+        if not file.exists():
+            raise RecordingError(f'{file}, which metadata.yaml names, is not there')
+        if file.suffix != '.mcap':
+            raise RecordingError(f'{file} is not MCAP; convert it with `ros2 bag convert`')
+    return files
+
+
+class RecordingWriter:
+    """Writes messages to an MCAP file that rosbag2 plays; a context manager.
+
+    Beside the file goes a `metadata.yaml`, so that its folder is a rosbag2
+    recording. Chunks are small, so that a crash loses little.
+    """
+
+    def __init__(self, path):
+        """Raises OutputError where the file cannot be written."""
+        self.path = Path(path)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._stream = open(self.path, 'wb')
+        except OSError as error:
+            raise OutputError(f'cannot write {self.path}: {error.strerror}') from error
+        self._writer = Writer(self._stream, chunk_size=1 << 20, compression=CompressionType.ZSTD)
+        self._writer.start(profile='ros2', library='mag_tracking')
+        self._schemas, self._channels, self._counts = {}, {}, Counter()
+        self._sequence = Counter()
+        self._first = self._last = None
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+    def write(self, topic, type_name, message, time_ns):
+        """Append a message, given as nested dicts, logged at `time_ns`.
+
+        Raises RecordingError for a type that `schema` has no definition of.
+        """
+        if topic not in self._channels:
+            self._open_channel(topic, type_name)
+        self._writer.add_message(
+            self._channels[topic][0], log_time=time_ns, publish_time=time_ns,
+            sequence=self._sequence[topic], data=encoder(type_name)(message))
+        self._sequence[topic] += 1
+        self._counts[topic] += 1
+        self._first = time_ns if self._first is None else min(self._first, time_ns)
+        self._last = time_ns if self._last is None else max(self._last, time_ns)
+
+    def _open_channel(self, topic, type_name):
+        """Register schema and channel."""
+        if type_name not in self._schemas:
+            self._schemas[type_name] = self._writer.register_schema(
+                type_name, 'ros2msg', definition(type_name).encode())
+        channel = self._writer.register_channel(
+            topic, 'cdr', self._schemas[type_name], {'offered_qos_profiles': _QOS})
+        self._channels[topic] = channel, type_name
+
+    def close(self):
+        """Finish the file and write `metadata.yaml`."""
+        if self._stream.closed:
+            return
+        self._writer.finish()
+        self._stream.close()
+        first, last = self._first or 0, self._last or 0
+        metadata = {'rosbag2_bagfile_information': {
+            'version': 9, 'storage_identifier': 'mcap',
+            'duration': {'nanoseconds': last - first},
+            'starting_time': {'nanoseconds_since_epoch': first},
+            'message_count': sum(self._counts.values()),
+            'topics_with_message_count': [
+                {'topic_metadata': {'name': t, 'type': type_name, 'serialization_format': 'cdr',
+                                    'offered_qos_profiles': [], 'type_description_hash': ''},
+                 'message_count': self._counts[t]}
+                for t, (_, type_name) in self._channels.items()],
+            'compression_format': '', 'compression_mode': '',
+            'relative_file_paths': [self.path.name],
+            'files': [{'path': self.path.name,
+                       'starting_time': {'nanoseconds_since_epoch': first},
+                       'duration': {'nanoseconds': last - first},
+                       'message_count': sum(self._counts.values())}],
+            'custom_data': None, 'ros_distro': 'jazzy'}}
+        with open(self.path.parent / 'metadata.yaml', 'w', encoding='utf-8') as stream:
+            yaml.safe_dump(metadata, stream, sort_keys=False)
+
+
+_QOS = '''- history: keep_last
+  depth: 10
+  reliability: reliable
+  durability: volatile
+  deadline: {sec: 9223372036, nsec: 854775807}
+  lifespan: {sec: 9223372036, nsec: 854775807}
+  liveliness: automatic
+  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}
+  avoid_ros_namespace_conventions: false
+'''

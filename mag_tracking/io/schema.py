@@ -1,0 +1,265 @@
+"""Records to and from messages, as nested dicts and CDR bytes, without ROS.
+
+The definitions of this package's own messages stand in `msg_defs/`; the copy
+here is what a recording carries, and a test compares the two.
+"""
+
+import functools
+import struct
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap_ros2 import _dynamic
+from mcap_ros2.decoder import DecoderFactory
+
+from mag_tracking.errors import RecordingError
+from mag_tracking.geometry import rotation_from_quaternion
+from mag_tracking.records import FieldFrame, MagSample
+
+MAGNETIC_FIELD = 'sensor_msgs/msg/MagneticField'
+POSE = 'geometry_msgs/msg/PoseStamped'
+POSE_WITH_COVARIANCE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+TRACK_ARRAY = 'mag_tracking_msgs/msg/TrackArray'
+
+DEFINITIONS = {
+    'builtin_interfaces/msg/Time': ((), 'int32 sec\nuint32 nanosec\n'),
+    'std_msgs/msg/Header': (('builtin_interfaces/msg/Time',),
+                            'builtin_interfaces/Time stamp\nstring frame_id\n'),
+    'geometry_msgs/msg/Vector3': ((), 'float64 x\nfloat64 y\nfloat64 z\n'),
+    'geometry_msgs/msg/Point': ((), 'float64 x\nfloat64 y\nfloat64 z\n'),
+    'geometry_msgs/msg/Quaternion': (
+        (), 'float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n'),
+    'geometry_msgs/msg/Pose': (
+        ('geometry_msgs/msg/Point', 'geometry_msgs/msg/Quaternion'),
+        'geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n'),
+    'geometry_msgs/msg/PoseWithCovariance': (
+        ('geometry_msgs/msg/Pose',), 'geometry_msgs/Pose pose\nfloat64[36] covariance\n'),
+    POSE: (('std_msgs/msg/Header', 'geometry_msgs/msg/Pose'),
+           'std_msgs/Header header\ngeometry_msgs/Pose pose\n'),
+    POSE_WITH_COVARIANCE: (
+        ('std_msgs/msg/Header', 'geometry_msgs/msg/PoseWithCovariance'),
+        'std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose\n'),
+    MAGNETIC_FIELD: (
+        ('std_msgs/msg/Header', 'geometry_msgs/msg/Vector3'),
+        'std_msgs/Header header\ngeometry_msgs/Vector3 magnetic_field\n'
+        'float64[9] magnetic_field_covariance\n'),
+    'mag_tracking_msgs/msg/Track': (
+        ('std_msgs/msg/Header', 'geometry_msgs/msg/PoseWithCovariance',
+         'geometry_msgs/msg/Vector3'),
+        'uint8 ACTIVE=0\nuint8 ENDED=1\nstd_msgs/Header header\nuint32 id\nuint8 status\n'
+        'geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/Vector3 velocity\n'
+        'float64[36] covariance\ngeometry_msgs/Vector3 moment\nfloat64[9] moment_covariance\n'
+        'float64 existence\nfloat64 weight\nfloat64 normalised_innovation\n'
+        'uint32 degrees_of_freedom\nstring arrival\nbool ambiguous\nbool[6] unobservable\n'),
+    TRACK_ARRAY: (('std_msgs/msg/Header', 'mag_tracking_msgs/msg/Track'),
+                  'std_msgs/Header header\nmag_tracking_msgs/Track[] tracks\n'),
+}
+"""{type: (types that it names, text)}; Jazzy's definitions without comments."""
+
+
+def _closure(type_name):
+    """The types below `type_name`, each once, in the order met."""
+    seen = []
+    queue = list(DEFINITIONS[type_name][0])
+    while queue:
+        name = queue.pop(0)
+        if name not in seen:
+            seen.append(name)
+            queue += DEFINITIONS[name][0]
+    return seen
+
+
+def definition(type_name):
+    """The text of a type with all that it needs, as a `ros2msg` schema has it.
+
+    Raises RecordingError for a type that is not defined here.
+    """
+    if type_name not in DEFINITIONS:
+        raise RecordingError(f'no definition of {type_name} to write it with')
+    text = DEFINITIONS[type_name][1]
+    for name in _closure(type_name):
+        package, _, leaf = name.split('/')
+        text += f'{"=" * 80}\nMSG: {package}/{leaf}\n{DEFINITIONS[name][1]}'
+    return text
+
+
+@functools.cache
+def encoder(type_name):
+    """Function from nested dicts to CDR bytes."""
+    # The library offers this function only through its own writer, which cannot
+    # write channel metadata; the version is pinned, so this private name is safe.
+    return _dynamic.serialize_dynamic(type_name, definition(type_name))[type_name]
+
+
+_decoders = {}
+_DECODE_ERRORS = (ValueError, IndexError, KeyError, OverflowError, struct.error, McapError)
+
+
+def decode(message):
+    """A `RawMessage` as an object with the fields of its type.
+
+    Raises RecordingError where the bytes do not fit the type.
+    """
+    key = message.schema.name, message.schema.data
+    if key not in _decoders:
+        _decoders[key] = DecoderFactory().decoder_for('cdr', message.schema)
+    try:
+        return _decoders[key](message.data)
+    except _DECODE_ERRORS as error:
+        raise RecordingError(f'a message on {message.topic} is not a {message.type}: '
+                             f'{error}') from error
+
+
+def stamp_ns(stamp):
+    """Nanoseconds of a builtin_interfaces/Time."""
+    return stamp.sec * 1_000_000_000 + stamp.nanosec
+
+
+def stamp_dict(ns):
+    """A builtin_interfaces/Time of nanoseconds."""
+    return {'sec': ns // 1_000_000_000, 'nanosec': ns % 1_000_000_000}
+
+
+def sample_of(message, sensor):
+    """`MagSample` of a message-shaped sensor_msgs/MagneticField of `sensor`.
+
+    A covariance that is all zero, or begins with -1, is unknown.
+    """
+    f = message.magnetic_field
+    C = np.array(message.magnetic_field_covariance, dtype=float)
+    unknown = C[0] == -1.0 or not C.any()
+    return MagSample(stamp_ns(message.header.stamp), sensor, np.array([f.x, f.y, f.z]),
+                     None if unknown else C.reshape(3, 3))
+
+
+def _xyz(v):
+    """Vector as a dict."""
+    return {'x': float(v[0]), 'y': float(v[1]), 'z': float(v[2])}
+
+
+def header_dict(ns, frame):
+    """A std_msgs/Header."""
+    return {'stamp': stamp_dict(ns), 'frame_id': frame}
+
+
+def sample_dict(sample, frame):
+    """sensor_msgs/MagneticField of a `MagSample`; `frame` is the sensor's."""
+    C = np.zeros(9) if sample.covariance is None else sample.covariance.ravel()
+    return {'header': header_dict(sample.stamp_ns, frame), 'magnetic_field': _xyz(sample.field),
+            'magnetic_field_covariance': C.tolist()}
+
+
+def pose_dict(ns, frame, position, quaternion):
+    """geometry_msgs/PoseStamped."""
+    return {'header': header_dict(ns, frame), 'pose': _pose(position, quaternion)}
+
+
+def _pose(position, quaternion):
+    """geometry_msgs/Pose."""
+    return {'position': _xyz(position),
+            'orientation': {**_xyz(quaternion), 'w': float(quaternion[3])}}
+
+
+def pose_covariance(track):
+    """(6, 6) of position and small rotations about fixed axes, as ROS orders them."""
+    C = np.empty((6, 6))
+    C[:3, :3] = track.covariance[:3, :3]
+    C[:3, 3:] = track.position_orientation_covariance
+    C[3:, :3] = track.position_orientation_covariance.T
+    C[3:, 3:] = track.orientation_covariance
+    return C
+
+
+def pose_with_covariance_dict(track):
+    """geometry_msgs/PoseWithCovariance of a `Track`."""
+    return {'pose': _pose(track.position, track.orientation),
+            'covariance': pose_covariance(track).ravel().tolist()}
+
+
+def track_dict(track, frame):
+    """mag_tracking_msgs/Track of a `Track`."""
+    return {'header': header_dict(track.stamp_ns, frame), 'id': track.id,
+            'status': int(track.ended), 'pose': pose_with_covariance_dict(track),
+            'velocity': _xyz(track.velocity), 'covariance': track.covariance.ravel().tolist(),
+            'moment': _xyz(track.moment),
+            'moment_covariance': track.moment_covariance.ravel().tolist(),
+            'existence': track.existence, 'weight': track.weight,
+            'normalised_innovation': track.nis, 'degrees_of_freedom': track.degrees_of_freedom,
+            'arrival': track.arrival, 'ambiguous': track.ambiguous,
+            'unobservable': list(track.unobservable)}
+
+
+def hypotheses_dict(track, frame):
+    """mag_tracking_msgs/HypothesisArray of a `Track`."""
+    return {'header': header_dict(track.stamp_ns, frame), 'track_id': track.id,
+            'hypotheses': [
+                {'arrival': h.arrival, 'weight': h.weight, 'position': _xyz(h.position),
+                 'velocity': _xyz(h.velocity), 'covariance': h.covariance.ravel().tolist(),
+                 'moment': _xyz(h.moment)} for h in track.hypotheses]}
+
+
+def frame_dict(frame, network):
+    """mag_tracking_msgs/NetworkFrame of a `FieldFrame`."""
+    return {'header': header_dict(frame.stamp_ns, network.frame), 'sensors': list(network.names),
+            'field': frame.field.ravel().tolist(),
+            'covariance': frame.covariance.ravel().tolist(),
+            'n_samples': frame.n_samples.tolist(), 'target_present': frame.target_present,
+            'statistic': frame.statistic, 'degrees_of_freedom': frame.degrees_of_freedom}
+
+
+def frame_of(message, network):
+    """`FieldFrame` of a message-shaped NetworkFrame.
+
+    Raises RecordingError where sensors or lengths are not those of the network.
+    """
+    n = len(network)
+    if tuple(message.sensors) != network.names:
+        raise RecordingError(f'a frame of {", ".join(message.sensors)} does not fit the network '
+                             f'of {", ".join(network.names)}')
+    lengths = len(message.field), len(message.covariance), len(message.n_samples)
+    if lengths != (3 * n, 9 * n, n):
+        raise RecordingError(f'a frame of {n} sensors needs arrays of {3 * n}, {9 * n} and {n}, '
+                             f'got {", ".join(map(str, lengths))}')
+    return FieldFrame(
+        stamp_ns(message.header.stamp), np.array(message.field).reshape(n, 3),
+        np.array(message.covariance).reshape(n, 3, 3), np.array(message.n_samples, dtype=int),
+        bool(message.target_present), float(message.statistic), int(message.degrees_of_freedom))
+
+
+def detection_dict(d, frame):
+    """mag_tracking_msgs/Detection of a `Detection`."""
+    return {'header': header_dict(d.stamp_ns, frame), 'id': d.id, 'kind': int(not d.onset),
+            'statistic': d.statistic, 'degrees_of_freedom': d.degrees_of_freedom,
+            'threshold': d.threshold, 'false_alarm_probability': d.false_alarm_probability,
+            'strongest_sensor': d.strongest_sensor}
+
+
+def odometry_dict(track, frame, child_frame):
+    """nav_msgs/Odometry: the twist is in the child frame, as REP-105 has it.
+
+    The angular velocity is not estimated here: zero, with variance pi^2.
+    """
+    R = rotation_from_quaternion(track.orientation)
+    twist = np.zeros((6, 6))
+    twist[:3, :3] = R.T @ track.covariance[3:, 3:] @ R
+    twist[3:, 3:] = np.pi**2 * np.eye(3)
+    return {'header': header_dict(track.stamp_ns, frame), 'child_frame_id': child_frame,
+            'pose': pose_with_covariance_dict(track),
+            'twist': {'twist': {'linear': _xyz(R.T @ track.velocity), 'angular': _xyz(np.zeros(3))},
+                      'covariance': twist.ravel().tolist()}}
+
+
+def calibration_dict(calibrate, network, ns):
+    """mag_tracking_msgs/CalibrationState of a `Calibrate` stage at time `ns`."""
+    sensors = []
+    for name, background in calibrate.backgrounds().items():
+        last = calibrate.last_stamp_ns(name)
+        ready = background.ready and last is not None
+        counts = calibrate.per_sensor[name]
+        sensors.append({
+            'sensor': name, 'ready': ready, 'frozen': background.frozen,
+            'background': _xyz(calibrate.background(name) if ready else np.full(3, np.nan)),
+            'covariance': (background.covariance if ready
+                           else np.full((3, 3), np.nan)).ravel().tolist(),
+            'n_samples': counts['accepted'], 'n_rejected': counts['rejected']})
+    return {'header': header_dict(ns, network.frame), 'sensors': sensors}

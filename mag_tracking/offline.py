@@ -1,0 +1,136 @@
+"""One recording through the chain, offline: tables, summary, recording and figures."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mag_tracking.io.results import ResultFolder
+from mag_tracking.io.samples import SampleReader
+from mag_tracking.pipeline import Pipeline
+from mag_tracking.records import Detection, FieldFrame
+from mag_tracking.report.metrics import interpolate_truth, magnet_errors, pass_errors
+from mag_tracking.report.track_log import TrackLog
+
+
+@dataclass
+class Run:
+    """What came of a recording."""
+
+    summary: dict
+    logs: dict = field(default_factory=dict)
+    """{track id: TrackLog}."""
+    truth: dict = field(default_factory=dict)
+    """{name: (stamps, positions, quaternions)}."""
+
+
+def replay(recording, network, settings, out, progress=None):
+    """Track everything in a recording and write the results.
+
+    Parameters
+    ----------
+    recording : Recording
+    network : SensorNetwork
+    settings : Settings
+    out : path
+        Folder for the results; made if it is not there.
+    progress : function, optional
+        Called with the bytes done since the last call.
+
+    Returns
+    -------
+    Run
+
+    Raises RecordingError and OutputError. An interruption (KeyboardInterrupt)
+    ends the reading; what was done is written, and the summary says so.
+    """
+    reader = SampleReader(recording, network)
+    pipeline = Pipeline(network, settings)
+    logs, interrupted = {}, False
+    with ResultFolder(out, network.frame) as results:
+        frame = None
+        try:
+            for sample in reader.samples(progress):
+                frame = _take(pipeline.feed(sample), frame, results, logs)
+        except KeyboardInterrupt:
+            interrupted = True
+        _take(pipeline.flush(), frame, results, logs)
+        truth = reader.truth_arrays()
+        summary = _summary(recording, reader, pipeline, logs, truth)
+        summary['interrupted'] = interrupted
+        results.write_summary(summary)
+    return Run(summary, logs, truth)
+
+
+def _take(records, frame, results, logs):
+    """Write what left the pipeline; returns the latest frame."""
+    for record in records:
+        if isinstance(record, FieldFrame):
+            frame = record
+        elif isinstance(record, Detection):
+            results.add_detection(record)
+        else:
+            results.add_track(record)
+            logs.setdefault(record.id, TrackLog(record.id)).add(record, frame)
+    return frame
+
+
+def _summary(recording, reader, pipeline, logs, truth):
+    """The content of `summary.json`."""
+    rejections = dict(reader.rejected)
+    for cause, n in pipeline.rejections().items():
+        rejections[cause] = rejections.get(cause, 0) + n
+    sensors = {}
+    for name, background in pipeline.calibrate.backgrounds().items():
+        counts = pipeline.calibrate.per_sensor[name]
+        sensors[name] = {'accepted': counts['accepted'], 'rejected': counts['rejected'],
+                         'ready': background.ready, 'times_relearnt': background.n_relearnt}
+        if background.ready and counts['accepted']:
+            std = np.sqrt(np.diagonal(background.covariance))
+            sensors[name]['noise_std'] = [None if np.isnan(v) else float(v) for v in std]
+            sensors[name]['background'] = [
+                None if np.isnan(v) else float(v) for v in pipeline.calibrate.background(name)]
+    tracks = []
+    for log in logs.values():
+        entry = log.summary()
+        errors = _against_truth(log, pipeline, truth)
+        if errors:
+            entry['truth'] = errors
+        tracks.append(entry)
+    return {'recording': recording.path.name, 'target': pipeline.settings.track.target,
+            'counts': pipeline.counts(), 'rejected': rejections, 'lost': dict(recording.losses),
+            'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks}
+
+
+def _against_truth(log, pipeline, truth):
+    """Errors against the truth that fits best, or None."""
+    best = None
+    for name, arrays in truth.items():
+        if pipeline.settings.track.target == 'magnet':
+            errors = magnet_errors(log, arrays, pipeline.settings.track.magnet.axis)
+            size = errors and errors['position_mean']
+        else:
+            errors = pass_errors(log, arrays, pipeline.network.centre)
+            size = errors and errors['closest']
+        if errors and (best is None or size < best[0]):
+            best = size, {'name': name, **errors}
+    return best and best[1]
+
+
+def write_figures(run, network, out, most=6):
+    """Draw the figures of the first `most` tracks into folder `out`; returns their paths."""
+    # Drawing needs matplotlib, which a run without figures should not wait for.
+    from mag_tracking.report.figures import field_figure, map_figure, weights_figure
+
+    paths = []
+    for log in list(run.logs.values())[:most]:
+        entry = next(t for t in run.summary['tracks'] if t['id'] == log.id)
+        truth = None
+        if 'truth' in entry:
+            truth = interpolate_truth(run.truth[entry['truth']['name']], log.stamp_ns)
+        for name, figure in (('map', map_figure(log, network, truth)),
+                             ('weights', weights_figure(log)),
+                             ('field', field_figure(log, network))):
+            path = out / f'{name}_track_{log.id}.png'
+            figure.savefig(path, dpi=110)
+            paths.append(path)
+    return paths

@@ -1,0 +1,84 @@
+"""Tracks against truth: errors, and whether the covariance told the truth about them."""
+
+import numpy as np
+
+from mag_tracking.geometry import rotation_from_quaternion
+
+
+def interpolate_truth(truth, stamps_ns):
+    """Positions (n, 3) of `truth` (stamps, positions, quaternions) at `stamps_ns`; NaN outside."""
+    t, position, _ = truth
+    seconds = (t - t[0]) / 1e9
+    at = (np.asarray(stamps_ns, dtype=np.int64) - t[0]) / 1e9
+    return np.stack([np.interp(at, seconds, position[:, k], left=np.nan, right=np.nan)
+                     for k in range(3)], axis=1)
+
+
+def pass_errors(log, truth, centre, radius=5.0):
+    """Errors of a vehicle's track.
+
+    Parameters
+    ----------
+    log : TrackLog
+    truth : (stamps (n,), positions (n, 3), quaternions (n, 4))
+    centre : (3,) [m]
+        The pass is measured about this point.
+    radius : float [m]
+
+    Returns
+    -------
+    dict
+        rms : horizontal RMS error within `radius` of the centre, None if it was
+        never there; closest : error at the closest point; closest_distance;
+        anees : mean of NEES / 2 over the same poses (or the closest one); n.
+        None where the track has no truth.
+    """
+    true = interpolate_truth(truth, log.stamp_ns)[:, :2]
+    known = np.isfinite(true).all(axis=1)
+    if not known.any():
+        return None
+    error = np.array(log.position)[:, :2] - true
+    size = np.hypot(*error.T)
+    distance = np.where(known, np.hypot(*(true - centre[:2]).T), np.inf)
+    closest = int(np.argmin(distance))
+    near = distance < radius
+    rows = np.flatnonzero(near) if near.any() else np.array([closest])
+    nees = [error[k] @ np.linalg.solve(log.covariance[k][:2, :2], error[k]) / 2 for k in rows]
+    return {'rms': float(np.sqrt(np.mean(size[near] ** 2))) if near.any() else None,
+            'closest': float(size[closest]), 'closest_distance': float(distance[closest]),
+            'anees': float(np.mean(nees)), 'n': int(near.sum())}
+
+
+def magnet_errors(log, truth, axis=(0.0, 0.0, 1.0), skip=3):
+    """Errors of a magnet's track, each pose against the truth nearest in time.
+
+    Parameters
+    ----------
+    log : TrackLog
+    truth : (stamps (n,), positions (n, 3), quaternions (n, 4))
+    axis : (3,)
+        Direction of the moment in the magnet's frame.
+    skip : int
+        Poses at the start that do not count.
+
+    Returns
+    -------
+    dict
+        position_mean, position_max [m], axis_median_deg, anees (3 axes), n;
+        None with no pose left.
+    """
+    stamps = np.array(log.stamp_ns, dtype=np.int64)[skip:]
+    if not len(stamps):
+        return None
+    nearest = np.abs(truth[0][None, :] - stamps[:, None]).argmin(axis=1)
+    error = np.array(log.position)[skip:] - truth[1][nearest]
+    true_axis = rotation_from_quaternion(truth[2][nearest]) @ np.asarray(axis, dtype=float)
+    moment = np.array(log.moment)[skip:]
+    cosine = np.einsum('ni,ni->n', moment, true_axis) / (
+        np.linalg.norm(moment, axis=1) * np.linalg.norm(true_axis, axis=1))
+    C = np.array(log.covariance)[skip:, :3, :3]
+    nees = np.einsum('ni,ni->n', error, np.linalg.solve(C, error[:, :, None])[:, :, 0]) / 3
+    size = np.linalg.norm(error, axis=1)
+    return {'position_mean': float(size.mean()), 'position_max': float(size.max()),
+            'axis_median_deg': float(np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1))))),
+            'anees': float(nees.mean()), 'n': len(stamps)}

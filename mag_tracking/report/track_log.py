@@ -1,0 +1,76 @@
+"""What a report remembers of a run: per track the poses, the weights, the fields."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass
+class TrackLog:
+    """One track, frame by frame; lists grow together."""
+
+    id: int
+    stamp_ns: list = field(default_factory=list)
+    position: list = field(default_factory=list)
+    velocity: list = field(default_factory=list)
+    covariance: list = field(default_factory=list)
+    moment: list = field(default_factory=list)
+    orientation: list = field(default_factory=list)
+    nis: list = field(default_factory=list)
+    degrees_of_freedom: list = field(default_factory=list)
+    ambiguous: list = field(default_factory=list)
+    arrivals: list = field(default_factory=list)
+    """Per frame {arrival: (weight, position, covariance (2, 2) of its best hypothesis)}."""
+    measured: list = field(default_factory=list)
+    innovation: list = field(default_factory=list)
+    existence: float = 0.0
+    ended: bool = False
+
+    def add(self, track, frame):
+        """Take a `Track` and the `FieldFrame` that it came from."""
+        if track.ended:
+            self.ended = True
+            return
+        for name in ('stamp_ns', 'position', 'velocity', 'covariance', 'moment', 'orientation',
+                     'nis', 'degrees_of_freedom', 'ambiguous', 'innovation'):
+            getattr(self, name).append(getattr(track, name))
+        self.measured.append(frame.field)
+        self.existence = track.existence
+        best = {}
+        for h in track.hypotheses:
+            weight, position, covariance = best.get(
+                h.arrival, (0.0, h.position, h.covariance[:2, :2]))
+            best[h.arrival] = weight + h.weight, position, covariance
+        self.arrivals.append(best)
+
+    def seconds(self):
+        """(n,) [s] since the first pose."""
+        stamps = np.array(self.stamp_ns, dtype=np.int64)
+        return (stamps - stamps[0]) / 1e9
+
+    def summary(self):
+        """The track in a few JSON-ready numbers.
+
+        Speed and moment are those of the most certain pose.
+        """
+        sd = np.array([np.sqrt(np.trace(C[:2, :2])) for C in self.covariance])
+        sure = int(np.argmin(sd))
+        final = self.arrivals[-1]
+        arrival = max(final, key=lambda name: final[name][0])
+        nis = np.array(self.nis) / np.maximum(1, self.degrees_of_freedom)
+        known = np.isfinite(nis)
+        return {
+            'id': self.id, 'start_ns': self.stamp_ns[0], 'end_ns': self.stamp_ns[-1],
+            'poses': len(self.stamp_ns), 'ended': self.ended, 'arrival': arrival,
+            'arrival_weights': {k: v[0] for k, v in sorted(final.items())},
+            'verdict': 'ambiguous' if self.ambiguous[-1] else 'unique',
+            'ambiguous_share': float(np.mean(self.ambiguous)),
+            'existence': self.existence,
+            'speed': float(np.linalg.norm(self.velocity[sure][:2])),
+            'heading_deg': float(np.degrees(np.arctan2(self.velocity[sure][1],
+                                                       self.velocity[sure][0]))),
+            'moment': [float(v) for v in self.moment[sure]],
+            'moment_size': float(np.linalg.norm(self.moment[sure])),
+            'smallest_sd': float(sd[sure]),
+            'nis_per_axis': float(nis[known].mean()) if known.any() else None,
+        }
