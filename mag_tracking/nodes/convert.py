@@ -1,0 +1,68 @@
+"""The only conversions between records and ROS messages.
+
+What a message holds is said once, in `io.schema`, as nested dicts; here dicts
+become message objects. Messages read as records through the same functions
+that read a recording: both have the same attributes.
+"""
+
+import importlib
+
+import numpy as np
+
+from mag_tracking.io.schema import stamp_ns
+from mag_tracking.records import Hypothesis, Track
+
+
+def message_class(type_name):
+    """The class of a type such as `std_msgs/msg/Header`; None where it is not installed."""
+    package, _, name = type_name.split('/')
+    try:
+        return getattr(importlib.import_module(f'{package}.msg'), name, None)
+    except ModuleNotFoundError:
+        return None
+
+
+def to_message(cls, content):
+    """A message of class `cls` with the `content` of nested dicts.
+
+    Raises AttributeError for a field that the message does not have.
+    """
+    message = cls()
+    fields = cls.get_fields_and_field_types()
+    for name, value in content.items():
+        if isinstance(value, dict):
+            value = to_message(type(getattr(message, name)), value)
+        elif value and isinstance(value, list) and isinstance(value[0], dict):
+            element = fields[name].removeprefix('sequence<').removesuffix('>')
+            package, leaf = element.split('/')
+            element_class = message_class(f'{package}/msg/{leaf}')
+            value = [to_message(element_class, v) for v in value]
+        setattr(message, name, value)
+    return message
+
+
+def _vector(v):
+    """(3,) of anything with x, y, z."""
+    return np.array([v.x, v.y, v.z])
+
+
+def track_of(message, hypotheses=None, innovation=None):
+    """`Track` of a mag_tracking_msgs/Track and, if given, its HypothesisArray.
+
+    `innovation` (n_sensors, 3) [T] does not travel in the message.
+    """
+    pose = np.array(message.pose.covariance).reshape(6, 6)
+    q = message.pose.pose.orientation
+    members = () if hypotheses is None else tuple(
+        Hypothesis(h.arrival, h.weight, _vector(h.position), _vector(h.velocity),
+                   np.array(h.covariance).reshape(6, 6), _vector(h.moment))
+        for h in hypotheses.hypotheses)
+    return Track(
+        stamp_ns(message.header.stamp), message.id, message.status == message.ENDED,
+        _vector(message.pose.pose.position), _vector(message.velocity),
+        np.array(message.covariance).reshape(6, 6), np.array([q.x, q.y, q.z, q.w]),
+        pose[3:, 3:], pose[:3, 3:], _vector(message.moment),
+        np.array(message.moment_covariance).reshape(3, 3), message.existence, message.weight,
+        message.normalised_innovation, message.degrees_of_freedom, message.arrival,
+        message.ambiguous, tuple(message.unobservable),
+        np.empty((0, 3)) if innovation is None else innovation, members)

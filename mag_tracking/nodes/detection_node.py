@@ -1,0 +1,55 @@
+"""detection_node: calibrated fields in, frames of the network and detections out."""
+
+import sys
+from functools import partial
+
+from mag_tracking_msgs.msg import Detection as DetectionMessage
+from mag_tracking_msgs.msg import NetworkFrame
+from sensor_msgs.msg import MagneticField
+
+from mag_tracking.io.schema import detection_dict, frame_dict, sample_of
+from mag_tracking.nodes import stage_node
+from mag_tracking.nodes.convert import to_message
+from mag_tracking.nodes.ros_params import declare_settings
+from mag_tracking.nodes.stage_node import RESULTS, STREAM, StageNode
+from mag_tracking.records import Detection
+from mag_tracking.stages.align import Align
+from mag_tracking.stages.detect import Detect
+
+
+class DetectionNode(StageNode):
+    """Aligns the sensors to frames and tests each for a target."""
+
+    def __init__(self, **node_arguments):
+        super().__init__('detection_node', 'align', **node_arguments)
+        self.settings = declare_settings(self, self.settings, 'detect', self.OWN_PARAMETERS)
+        self._align = Align(self.network, self.settings.align)
+        self._detect = Detect(self.network, self.settings.detect)
+        self._frames = self.publisher(NetworkFrame, '~/frame', STREAM)
+        self._detections = self.publisher(DetectionMessage, '~/detections', RESULTS)
+        for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
+            self.subscription(MagneticField, f'{topic}_calibrated', partial(self._take, sensor),
+                              STREAM)
+
+    def stages(self):
+        return {'align': self._align, 'detect': self._detect}
+
+    def _take(self, sensor, message):
+        """One calibrated reading."""
+        for frame in self._align.feed(sample_of(message, sensor)):
+            for record in self._detect.feed(frame):
+                if isinstance(record, Detection):
+                    self._detections.publish(to_message(
+                        DetectionMessage, detection_dict(record, self.network.frame)))
+                else:
+                    self._frames.publish(to_message(
+                        NetworkFrame, frame_dict(record, self.network)))
+
+
+def main(arguments=None):
+    """Run the node."""
+    sys.exit(stage_node.main(DetectionNode, arguments))
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,158 @@
+"""replay_node: plays a recording over topics, with /clock, pause, resume and seek."""
+
+import sys
+import time
+from collections import Counter
+
+from builtin_interfaces.msg import Time
+from mag_tracking_msgs.srv import Seek
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
+
+from mag_tracking.errors import RecordingError, SettingsError
+from mag_tracking.io.bag import Recording
+from mag_tracking.nodes import stage_node
+from mag_tracking.nodes.convert import message_class
+from mag_tracking.nodes.stage_node import STREAM
+
+TICK_S = 0.005
+"""How often the node looks for messages that are due [s]."""
+
+
+class ReplayNode(Node):
+    """Publishes a recording's messages as they were, at its pace or another."""
+
+    def __init__(self, **node_arguments):
+        """Raises RecordingError or SettingsError where there is nothing to play."""
+        super().__init__('replay_node', **node_arguments)
+        path = self.declare_parameter('recording', '').value
+        if not path:
+            raise SettingsError('replay_node: parameter recording: a path is needed')
+        self._rate = self.declare_parameter('rate', 1.0).value
+        if not self._rate > 0.0:
+            raise SettingsError(f'replay_node: parameter rate: {self._rate} is not above 0')
+        self._loop = self.declare_parameter('loop', False).value
+        offset = self.declare_parameter('start_offset', 0.0).value
+        topics = self.declare_parameter('topics', ['']).value
+        delay = self.declare_parameter('start_delay', 2.0).value
+        self._paused = self.declare_parameter('paused', False).value
+        self._recording = Recording(path)
+        self.counts, self._missing = Counter(), set()
+        self._open(topics)
+        self._clock_publisher = self.create_publisher(Clock, '/clock', STREAM)
+        self.finished = False
+        self._seek(offset)
+        # Discovery takes a moment; what is published before it is lost.
+        self._start = time.monotonic() + delay
+        self.create_service(Trigger, '~/pause', self._pause)
+        self.create_service(Trigger, '~/resume', self._resume)
+        self.create_service(Seek, '~/seek', self._seek_service)
+        self.create_timer(TICK_S, self._tick)
+
+    def _open(self, topics):
+        """Publishers of what is to be played and can be."""
+        recording = self._recording
+        self._begin = recording.start_ns
+        if self._begin is None:
+            # A file without an end does not tell: read on until it does.
+            first = next(recording.messages(), None)
+            if first is None:
+                raise RecordingError(f'{recording.path} holds no message')
+            self._begin = first.log_time_ns
+        wanted = [t for t in topics if t]
+        unknown = [t for t in wanted if t not in recording.types]
+        if unknown and recording.message_counts:
+            raise RecordingError(f'{recording.path} has no topic {unknown[0]}; it has '
+                                 f'{", ".join(sorted(recording.types))}')
+        self._wanted = set(wanted) or None
+        self.publishers_by_topic = {}
+        for topic, kind in recording.types.items():
+            if self._wanted is None or topic in self._wanted:
+                self._publisher_for(topic, kind)
+
+    def _publisher_for(self, topic, kind):
+        """The publisher of a topic; None where its type is not installed."""
+        if topic not in self.publishers_by_topic and topic not in self._missing:
+            cls = message_class(kind)
+            if cls is None:
+                self._missing.add(topic)
+                self.get_logger().warning(f'{topic} is not played: {kind} is not installed')
+            else:
+                self.publishers_by_topic[topic] = self.create_publisher(cls, topic, STREAM)
+        return self.publishers_by_topic.get(topic)
+
+    def _seek(self, offset):
+        """Go on from `offset` seconds after the first message."""
+        self._position = self._begin + int(offset * 1e9)
+        self._messages = self._recording.messages(self._wanted, self._position)
+        self._next = next(self._messages, None)
+        self._wall = None
+
+    def _tick(self):
+        """Publish what is due."""
+        now = time.monotonic()
+        if self._paused or self.finished or now < self._start:
+            return
+        if self._wall is None:
+            self._wall, self._origin = now, self._position
+        self._position = self._origin + int((now - self._wall) * self._rate * 1e9)
+        self._clock_publisher.publish(Clock(clock=Time(sec=self._position // 10**9,
+                                             nanosec=self._position % 10**9)))
+        while self._next is not None and self._next.log_time_ns <= self._position:
+            publisher = self._publisher_for(self._next.topic, self._next.type)
+            if publisher is not None:
+                publisher.publish(self._next.data)
+                self.counts['messages'] += 1
+            self._next = next(self._messages, None)
+        if self._next is None:
+            self._end()
+
+    def _end(self):
+        """The recording is over: begin again, or stay."""
+        for what, n in self._recording.losses.items():
+            self.get_logger().warning(f'{what}: {n}')
+        if self._loop:
+            self._seek(0.0)
+            return
+        self.finished = True
+        self.get_logger().info(f'{self.counts["messages"]} messages played')
+
+    def _pause(self, _request, response):
+        """Stop where it is."""
+        self._paused, self._wall = True, None
+        response.success, response.message = True, 'paused'
+        return response
+
+    def _resume(self, _request, response):
+        """Go on."""
+        self.resume()
+        response.success, response.message = True, 'playing'
+        return response
+
+    def resume(self):
+        """Go on from where it was paused."""
+        self._paused = False
+        self._start = 0.0
+
+    def _seek_service(self, request, response):
+        """Move to another place; a negative or too large offset is refused."""
+        last = self._recording.end_ns
+        if not request.offset >= 0.0 or (
+                last is not None and self._begin + request.offset * 1e9 > last):
+            response.success = False
+            response.message = f'offset {request.offset} s is outside the recording'
+            return response
+        self._seek(request.offset)
+        self.finished = False
+        response.success, response.message = True, f'at {request.offset} s'
+        return response
+
+
+def main(arguments=None):
+    """Run the node."""
+    sys.exit(stage_node.main(ReplayNode, arguments))
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,84 @@
+"""Settings as ROS parameters: descriptors, ranges, checks, live changes."""
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+
+from mag_tracking.errors import SettingsError
+from mag_tracking.settings import flatten, replace
+
+
+def _descriptor(p):
+    """Description, unit and range of one setting."""
+    d = ParameterDescriptor(description=p.doc, read_only=not p.live,
+                            additional_constraints=f'unit: {p.unit}' if p.unit else '')
+    if p.range and p.type is float:
+        d.floating_point_range = [FloatingPointRange(from_value=float(p.range[0]),
+                                                     to_value=float(p.range[1]))]
+    elif p.range and p.type is int:
+        d.integer_range = [IntegerRange(from_value=p.range[0], to_value=p.range[1])]
+    return d
+
+
+def declare_settings(node, settings, group, own=()):
+    """Declare the settings of one group as parameters of `node`; returns the settings in force.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    settings : Settings
+        The whole tree, with the defaults of the target.
+    group : str
+        Only `group.*` become parameters; a parameter file may hold the others.
+    own : collection of str
+        Parameters of the node itself.
+
+    Raises SettingsError for an override that names no setting at all, or with
+    a wrong type, length or range.
+    """
+    known = {p.name: p for p in flatten(settings)}
+    overrides = dict(node._parameter_overrides)  # rclpy has no public way to list them
+    for name in overrides:
+        if name not in known and name not in own and not name.startswith('qos_overrides.'):
+            replace(settings, {name: overrides[name].value})
+    changes = {name: _plain(p.value) for name, p in overrides.items() if name in known}
+    in_force = replace(settings, changes)
+    for p in flatten(in_force):
+        if p.name.startswith(f'{group}.'):
+            value = list(p.value) if p.type is tuple else p.value
+            node.declare_parameter(p.name, value, _descriptor(p))
+    return in_force
+
+
+def _plain(value):
+    """A parameter's value with arrays as lists."""
+    return list(value) if hasattr(value, '__iter__') and not isinstance(value, str) else value
+
+
+def follow_changes(node, settings, apply):
+    """Check live changes of parameters and hand the new settings to `apply`."""
+    state = {'settings': settings}
+
+    def check(parameters):
+        try:
+            replace(state['settings'], _changes(parameters))
+        except SettingsError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def take(parameters):
+        changes = _changes(parameters)
+        if changes:
+            state['settings'] = replace(state['settings'], changes)
+            apply(state['settings'])
+
+    known = {p.name for p in flatten(settings)}
+
+    def _changes(parameters):
+        return {p.name: _plain(p.value) for p in parameters if p.name in known}
+
+    node.add_on_set_parameters_callback(check)
+    node.add_post_set_parameters_callback(take)

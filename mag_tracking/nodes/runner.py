@@ -1,0 +1,146 @@
+"""All nodes in one process: what a launch file does, for those who have none."""
+
+import sys
+import time
+
+import rclpy
+from mag_tracking_msgs.msg import TrackArray
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from mag_tracking.errors import MagTrackingError
+from mag_tracking.nodes.calibration_node import CalibrationNode
+from mag_tracking.nodes.convert import track_of
+from mag_tracking.nodes.detection_node import DetectionNode
+from mag_tracking.nodes.replay_node import ReplayNode
+from mag_tracking.nodes.stage_node import STREAM, make_executor, spin
+from mag_tracking.nodes.tracker_node import TrackerNode
+from mag_tracking.settings import flatten
+
+
+class TrackPrinter(Node):
+    """Prints the track as it grows; subscribes like any other program."""
+
+    def __init__(self, every=1, out=sys.stdout):
+        super().__init__('track_printer')
+        self._every, self._out = every, out
+        self._n = 0
+        self.create_subscription(TrackArray, '/tracker_node/tracks', self._take, STREAM)
+
+    def _take(self, message):
+        """One line a pose."""
+        for track in map(track_of, message.tracks):
+            if track.ended:
+                print(f'track {track.id} has ended', file=self._out, flush=True)
+                self._n = 0
+                continue
+            if self._n % self._every == 0:
+                print(line_of(track), file=self._out, flush=True)
+            self._n += 1
+
+
+def line_of(track):
+    """One pose as a line of text: position with 1-sigma, speed, moment, arrival."""
+    x, y, z = track.position
+    sx, sy, sz = (float(v) ** 0.5 for v in track.covariance.diagonal()[:3])
+    unit, f = ('m', 1.0) if max(sx, sy) > 0.02 or max(abs(x), abs(y)) > 2.0 else ('mm', 1e3)
+    vx, vy, _ = track.velocity
+    size = float((track.moment @ track.moment) ** 0.5)
+    return (f'track {track.id}  {track.stamp_ns / 1e9:.2f}  '
+            f'x {f * x:8.2f} ± {f * sx:5.2f}  y {f * y:8.2f} ± {f * sy:5.2f}  '
+            f'z {f * z:7.2f} ± {f * sz:5.2f} {unit}  {(vx * vx + vy * vy) ** 0.5:5.1f} m/s  '
+            f'{size:7.3g} A m²  {track.arrival}{"  ambiguous" if track.ambiguous else ""}')
+
+
+def parameters(network_path, settings, reliable):
+    """ROS parameters that put `settings` in force in the nodes."""
+    out = [Parameter('network', value=str(network_path)),
+           Parameter('target', value=settings.track.target),
+           Parameter('reliable_input', value=reliable)]
+    return out + [Parameter(p.name, value=list(p.value) if p.type is tuple else p.value)
+                  for p in flatten(settings)]
+
+
+def make_nodes(network_path, settings, recording=None, rate=1.0, loop=False):
+    """(stage nodes, replay node or None), ready to be added to an executor.
+
+    The replay waits, paused, until `all_connected`.
+    """
+    overrides = parameters(network_path, settings, reliable=recording is not None)
+    stages = [cls(parameter_overrides=overrides)
+              for cls in (CalibrationNode, DetectionNode, TrackerNode)]
+    if recording is None:
+        return stages, None
+    replay = ReplayNode(parameter_overrides=[
+        Parameter('recording', value=str(recording)), Parameter('rate', value=float(rate)),
+        Parameter('loop', value=loop), Parameter('paused', value=True)])
+    return stages, replay
+
+
+def all_connected(stages, replay):
+    """Whether every topic of the way has found its subscriber."""
+    network = stages[0].network
+    raw = [replay.publishers_by_topic[t] for t in network.topics
+           if t in replay.publishers_by_topic]
+    calibrated = [p for p in stages[0].publishers if p.topic_name.endswith('_calibrated')]
+    frames = [p for p in stages[1].publishers if p.topic_name.endswith('/frame')]
+    return all(p.get_subscription_count() > 0 for p in raw + calibrated + frames)
+
+
+def run(network_path, settings, recording=None, rate=1.0, loop=False, observers=()):
+    """Run the nodes until Ctrl-C, or until the recording has been played and worked off.
+
+    Parameters
+    ----------
+    network_path : path
+    settings : Settings
+    recording : path, optional
+    rate : float
+    loop : bool
+    observers : nodes to run beside, created after `rclpy.init`, given as functions;
+        a `TrackPrinter` if there are none.
+
+    Returns the exit status.
+    """
+    rclpy.init()
+    executor, nodes = make_executor(), []
+    try:
+        stages, replay = make_nodes(network_path, settings, recording, rate, loop)
+        nodes = stages + [make() for make in observers or (TrackPrinter,)]
+        nodes += [replay] if replay else []
+        for node in nodes:
+            executor.add_node(node)
+        if replay is None:
+            spin(executor)
+            return 0
+        deadline = time.monotonic() + 10.0
+        spin(executor, lambda: all_connected(stages, replay) or time.monotonic() > deadline)
+        if not all_connected(stages, replay):
+            raise MagTrackingError('the nodes did not find each other within 10 s')
+        replay.resume()
+        spin(executor, lambda: replay.finished)
+        _work_off(executor, stages)
+        return 0
+    finally:
+        for node in nodes:
+            executor.remove_node(node)
+            node.destroy_node()
+        executor.shutdown()
+        rclpy.try_shutdown()
+
+
+def _work_off(executor, stages, quiet_s=1.0):
+    """Spin until nothing has moved for `quiet_s` seconds."""
+    def moved():
+        return [sum(s.counts.values()) for node in stages for s in node.stages().values()]
+
+    last, since = moved(), time.monotonic()
+
+    def quiet():
+        nonlocal last, since
+        now = moved()
+        if now != last:
+            last, since = now, time.monotonic()
+        return time.monotonic() - since > quiet_s
+
+    spin(executor, quiet)
