@@ -9,6 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 
+_NEGLIGIBLE = np.log(100.0)
+"""Hypotheses lighter than the heaviest by more than this have no say in which is published."""
+
+
 def log_sum_exp(a, axis=None):
     """log(sum(exp(a))) without overflow; -inf where all are -inf."""
     a = np.asarray(a, dtype=float)
@@ -51,11 +55,25 @@ class FilterBank:
         return len(self.log_w)
 
     def best(self):
-        """Row of the hypothesis to publish: the heaviest of the heaviest label."""
+        """Row of the hypothesis to publish.
+
+        Of the heaviest label, the one at whose position the mixture of that
+        label is densest: near the mode of the posterior. The heaviest alone
+        would be a lottery where many neighbours share the weight.
+        """
         labels = np.unique(self.label)
         totals = [log_sum_exp(self.log_w[self.label == k]) for k in labels]
         rows = np.flatnonzero(self.label == labels[int(np.argmax(totals))])
-        return int(rows[np.argmax(self.log_w[rows])])
+        rows = rows[self.log_w[rows] >= self.log_w[rows].max() - _NEGLIGIBLE]
+        P = self.P[rows, :3, :3]
+        values = np.linalg.eigvalsh(P)
+        if values[:, 0].min() <= 0.0:
+            return int(rows[np.argmax(self.log_w[rows])])
+        # [i, j]: position of i seen from hypothesis j.
+        d = self.x[rows, None, :3] - self.x[None, rows, :3]
+        log_density = self.log_w[rows] - 0.5 * np.log(values).sum(axis=1) \
+            - 0.5 * np.einsum('ijk,jkl,ijl->ij', d, np.linalg.inv(P), d)
+        return int(rows[np.argmax(log_sum_exp(log_density, axis=1))])
 
     def separated_weight(self, i, distance=3.0):
         """Total weight of the hypotheses whose position is apart from that of row `i`.

@@ -291,7 +291,8 @@ class RecordingWriter:
             'message_count': sum(self._counts.values()),
             'topics_with_message_count': [
                 {'topic_metadata': {'name': t, 'type': type_name, 'serialization_format': 'cdr',
-                                    'offered_qos_profiles': [], 'type_description_hash': ''},
+                                    'offered_qos_profiles': yaml.safe_load(_QOS),
+                                    'type_description_hash': ''},
                  'message_count': self._counts[t]}
                 for t, (_, type_name) in self._channels.items()],
             'compression_format': '', 'compression_mode': '',

@@ -6,6 +6,7 @@ Source: ICASSP11 section 2, T10 Alg. 2 and 3; PHD15 Paper A for the magnet.
 from collections import Counter, deque
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
@@ -150,7 +151,7 @@ class TrackStage:
         if recent:
             self._predict((recent[0].stamp_ns - frame.stamp_ns) / NS)
         dt = 0.0
-        for before, after in zip(recent, [*recent[1:], frame], strict=True):
+        for before, after in pairwise([*recent, frame]):
             self._step(before, dt)
             dt = (after.stamp_ns - before.stamp_ns) / NS
         return self._step(frame, dt)

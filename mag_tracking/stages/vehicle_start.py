@@ -48,7 +48,8 @@ class VehicleSettings:
     climb_acceleration: float = param(
         0.1, 'Root spectral density of the vertical acceleration.', 'm/s^1.5', (0.0, 1000.0))
     moment_drift: float = param(
-        10.0, 'Random walk of the hard iron moment.', 'A m^2/s^0.5', (0.0, 1e6))
+        40.0, 'Random walk of the hard iron moment: a long target shows another one from every '
+        'side.', 'A m^2/s^0.5', (0.0, 1e6))
 
 
 def vehicle_model(settings, network):

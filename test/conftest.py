@@ -1,0 +1,73 @@
+"""What the tests share: recordings, networks, a short way through the pipeline."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mag_tracking.io.bag import Recording
+from mag_tracking.io.importers import import_pose_table
+from mag_tracking.io.network_file import read_network
+from mag_tracking.network import SensorNetwork
+from mag_tracking.offline import replay
+from mag_tracking.pipeline import settings_for
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = ROOT / 'test' / 'data'
+VEHICLES = sorted(p.stem for p in (DATA / 'vehicles').glob('*.mcap'))
+NETWORK_FILE = ROOT / 'config' / 'network.yaml'
+
+# Keep the middleware to this machine, and apart from other runs on it.
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
+
+
+@pytest.fixture(scope='session')
+def road_network():
+    return read_network(NETWORK_FILE)
+
+
+@pytest.fixture(scope='session')
+def magnet_runs(tmp_path_factory):
+    """{run: (recording path, network path)} of the imported magnet tables."""
+    folder = tmp_path_factory.mktemp('magnet')
+    source = DATA / 'magnet_16_sensors'
+    return {n: import_pose_table(source / f'lisa_data{n}.csv',
+                                 source / f'lisa_data{n}_background.csv',
+                                 folder / f'run{n}', 1e-6)[:2] for n in (1, 2)}
+
+
+def vehicle_path(name):
+    return DATA / 'vehicles' / f'{name}.mcap'
+
+
+@pytest.fixture(scope='session')
+def vehicle_replays(tmp_path_factory, road_network):
+    """{name: (Run, folder)}: every bundled vehicle recording, replayed once with the defaults."""
+    out = tmp_path_factory.mktemp('replays')
+    return {name: (replay(Recording(vehicle_path(name)), road_network, settings_for('vehicle'),
+                          out / name), out / name) for name in VEHICLES}
+
+
+@pytest.fixture(scope='session')
+def magnet_replays(tmp_path_factory, magnet_runs):
+    """{run: (Run, folder)} of the magnet recordings."""
+    out = tmp_path_factory.mktemp('magnet_replays')
+    return {n: (replay(Recording(recording), read_network(network), settings_for('magnet'),
+                       out / str(n)), out / str(n))
+            for n, (recording, network) in magnet_runs.items()}
+
+
+def line_network(n, spacing=9.0, earth=(2e-6, 1.55e-5, -4.9e-5), noise=1.2e-8, tilt=0.3):
+    """`n` sensors across and along a road, each turned differently."""
+    rng = np.random.default_rng(n)
+    positions = np.zeros((n, 3))
+    positions[:, 0] = spacing * (np.arange(n) // 2)
+    positions[:, 1] = np.where(np.arange(n) % 2, 4.5, -4.5)
+    from mag_tracking.geometry import quaternion_from_rotation_vector, rotation_from_quaternion
+    R = rotation_from_quaternion(
+        quaternion_from_rotation_vector(tilt * rng.standard_normal((n, 3))))
+    names = tuple(f'mag_{i + 1}' for i in range(n))
+    return SensorNetwork(names, positions, R, tuple(f'/{name}/imu/mag' for name in names),
+                         earth_field=np.array(earth), noise_std=(np.full(3, noise),) * n)

@@ -1,0 +1,170 @@
+"""Calibration: what is learnt, when it freezes, and what becomes of bad input."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import line_network
+
+from mag_tracking.calibration.background import RunningBackground
+from mag_tracking.errors import NetworkError
+from mag_tracking.records import MagSample
+from mag_tracking.settings import replace
+from mag_tracking.stages.calibrate import Calibrate, CalibrateSettings
+from mag_tracking.stages.stage import rejected
+
+SIGMA = np.array([1.0e-8, 1.2e-8, 1.5e-8])
+EARTH = np.array([2e-6, 1.5e-5, -4.9e-5])
+
+
+def running(**changes):
+    return RunningBackground(**{'learn': 3.0, 'memory': 20.0, 'guard': 1.5, 'block': 0.25,
+                                'freeze_std': 2.0, 'relearn': 60.0, **changes})
+
+
+def feed(background, t, signal=0.0, seed=0, drift=0.0):
+    rng = np.random.default_rng(seed)
+    for s in t:
+        extra = signal(s) if callable(signal) else signal
+        background.add(s, EARTH + drift * s + extra + SIGMA * rng.standard_normal(3))
+
+
+def test_level_noise_and_drift_are_learnt():
+    b = running()
+    drift = np.array([5e-9, -3e-9, 0.0])
+    feed(b, np.arange(0, 30, 0.01), drift=drift)
+    error = (b.level(30.0) - EARTH - 30.0 * drift) / SIGMA
+    # A line through 2000 samples, carried 1.5 s beyond its end.
+    assert np.abs(error).max() < 4.5 * np.sqrt(1 / 2000 * (1 + 3 * (1 + 2 * 1.75 / 20) ** 2))
+    std = np.sqrt(np.diagonal(b.covariance))
+    np.testing.assert_allclose(std, SIGMA, rtol=5 / np.sqrt(2 * 2000))
+
+
+def test_not_ready_before_it_has_learnt():
+    b = running()
+    feed(b, np.arange(0, 2.0, 0.01))
+    assert not b.ready
+    with pytest.raises(ValueError, match='not been learnt'):
+        b.level(2.0)
+
+
+def test_a_target_freezes_the_background():
+    def target(t):
+        return np.array([3e-6, -2e-6, 1e-6]) / (1 + ((t - 15.0) / 0.8) ** 2) ** 2.5
+    b = running()
+    feed(b, np.arange(0, 15.0, 0.01), signal=target)
+    assert b.frozen
+    assert np.abs((b.level(15.0) - EARTH) / SIGMA).max() < 0.5
+    feed(b, np.arange(15.0, 30.0, 0.01), signal=target, seed=1)
+    assert not b.frozen
+    assert np.abs((b.level(30.0) - EARTH) / SIGMA).max() < 0.5
+
+
+def test_a_parked_car_becomes_background_only_after_its_time():
+    parked = np.array([1e-6, 0.0, 0.0])
+    b = running(relearn=20.0)
+    feed(b, np.arange(0, 10, 0.01))
+    feed(b, np.arange(10, 25, 0.01), signal=parked)
+    assert b.frozen and b.n_relearnt == 0
+    feed(b, np.arange(25, 40, 0.01), signal=parked)
+    assert b.n_relearnt == 1
+    assert np.abs((b.level(40.0) - EARTH - parked) / SIGMA).max() < 0.5
+    never = running(relearn=0.0)
+    feed(never, np.arange(0, 10, 0.01))
+    feed(never, np.arange(10, 60, 0.05), signal=parked)
+    assert never.frozen and never.n_relearnt == 0
+
+
+def test_a_target_in_the_beginning_is_not_learnt():
+    def passing(t):
+        return np.array([2e-6, 1e-6, 0.0]) / (1 + ((t - 1.5) / 0.5) ** 2) ** 2.5
+    b = running()
+    feed(b, np.arange(0, 3.5, 0.01), signal=passing)
+    assert not b.ready
+    feed(b, np.arange(3.5, 12.0, 0.01), signal=passing, seed=1)
+    assert b.ready
+    assert np.abs((b.level(12.0) - EARTH) / SIGMA).max() < 0.6
+
+
+def test_given_background_and_noise_are_ready_at_once():
+    b = running(background=EARTH, noise_std=SIGMA)
+    assert b.ready
+    np.testing.assert_array_equal(b.level(0.0), EARTH)
+    np.testing.assert_allclose(np.diagonal(b.covariance), SIGMA**2)
+
+
+def test_given_background_without_noise_learns_the_noise():
+    b = running(background=EARTH)
+    assert not b.ready
+    feed(b, np.arange(0, 5, 0.01))
+    assert b.ready
+
+
+def stage(n=2, given=True, **changes):
+    network = line_network(n)
+    if given:
+        network = dataclasses.replace(network, background=(EARTH,) * n)
+    return Calibrate(network, replace(CalibrateSettings(), changes))
+
+
+def sample(t, field=EARTH, sensor='mag_1', covariance=None):
+    return MagSample(int(t * 1e9), sensor, np.array(field, dtype=float), covariance)
+
+
+@pytest.mark.parametrize('field, cause', [
+    ([np.nan] * 3, 'all NaN'),
+    ([np.inf, 0, 0], 'infinite'),
+    ([0.02, 0.15, -0.49], 'gauss or microtesla'),
+    ([2.0, 15.0, -49.0], 'gauss or microtesla'),
+])
+def test_unusable_fields_are_counted_and_rejected(field, cause):
+    s = stage()
+    assert s.feed(sample(1.0, field)) == []
+    assert len(rejected(s.counts)) == 1 and cause in next(iter(rejected(s.counts)))
+    assert s.per_sensor['mag_1']['rejected'] == 1
+
+
+def test_millitesla_are_legitimate_where_the_setting_says_so():
+    assert len(stage(max_field=0.1).feed(sample(1.0, [0.01, 0.0, 0.0]))) == 1
+
+
+def test_unknown_sensor_is_counted():
+    s = stage()
+    assert s.feed(sample(1.0, sensor='mag_9')) == []
+    assert rejected(s.counts) == {'unknown sensor mag_9': 1}
+
+
+def test_a_missing_axis_is_kept_missing():
+    out = stage().feed(sample(1.0, [EARTH[0], EARTH[1], np.nan]))
+    np.testing.assert_allclose(out[0].field[:2], 0.0, atol=1e-20)
+    assert np.isnan(out[0].field[2])
+
+
+def test_duplicate_and_late_stamps_are_counted_and_rejected():
+    s = stage()
+    for t in (1.0, 1.0, 0.5, 1.1):
+        s.feed(sample(t))
+    assert rejected(s.counts) == {'duplicate stamp': 1, 'out of order': 1}
+
+
+def test_a_restart_is_taken_and_counted():
+    s = stage()
+    s.feed(sample(100.0))
+    assert len(s.feed(sample(1.0))) == 1
+    assert s.counts['time jumped back'] == 1
+
+
+def test_covariances():
+    own = np.diag([1e-16, 2e-16, 3e-16])
+    s = stage()
+    np.testing.assert_array_equal(s.feed(sample(1.0, covariance=own))[0].covariance, own)
+    # Unknown: the configured one.
+    np.testing.assert_allclose(s.feed(sample(2.0))[0].covariance, 1.44e-16 * np.eye(3))
+    for bad in (-own, np.full((3, 3), np.nan), own + np.triu(np.ones((3, 3)), 1)):
+        assert s.feed(sample(3.0, covariance=bad)) == []
+    assert rejected(s.counts) == {'covariance is not positive definite': 3}
+
+
+def test_forget_names_an_unknown_sensor():
+    with pytest.raises(NetworkError, match='mag_9'):
+        stage().forget(['mag_9'])

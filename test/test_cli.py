@@ -1,0 +1,128 @@
+"""The command line: what it writes, what it says, how it fails."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from conftest import DATA, NETWORK_FILE, vehicle_path
+
+from mag_tracking.cli import main
+from mag_tracking.io.results import DETECTION_COLUMNS, POSE_COLUMNS
+
+NAME = 'junction_left_to_right'
+
+
+def test_replay_writes_all_that_it_promises(tmp_path, capsys):
+    out = tmp_path / 'out'
+    assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE),
+                 '--out', str(out)]) == 0
+    assert {p.name for p in out.iterdir()} == {
+        'poses.csv', 'detections.csv', 'hypotheses.csv', 'summary.json', 'tracks.mcap',
+        'metadata.yaml', 'map_track_1.png', 'weights_track_1.png', 'field_track_1.png'}
+    head = (out / 'poses.csv').read_text().splitlines()[0]
+    assert head == ('stamp_ns,track_id,x,y,z,vx,vy,vz,sd_x,sd_y,sd_z,sd_vx,sd_vy,sd_vz,'
+                    'mx,my,mz,weight,ambiguous') == ','.join(POSE_COLUMNS)
+    assert (out / 'detections.csv').read_text().splitlines()[0] == ','.join(DETECTION_COLUMNS)
+    track = json.loads((out / 'summary.json').read_text())['tracks'][0]
+    assert track['arrival'] == 'left' and track['verdict'] == 'unique'
+    assert {'speed', 'moment', 'poses', 'truth'} <= set(track)
+    assert 'from left' in capsys.readouterr().out
+
+
+def test_several_recordings_get_a_folder_each(tmp_path):
+    names = ['straight_car_right', 'straight_small_left']
+    assert main(['replay', *(str(vehicle_path(n)) for n in names), '--network', str(NETWORK_FILE),
+                 '--out', str(tmp_path), '--no-figures']) == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == names
+
+
+def test_import_and_replay_of_a_magnet(tmp_path, capsys):
+    source = DATA / 'magnet_16_sensors'
+    assert main(['import', str(source / 'lisa_data1.csv'), '--background',
+                 str(source / 'lisa_data1_background.csv'), '--out', str(tmp_path / 'm')]) == 0
+    assert main(['replay', str(tmp_path / 'm'), '--network', str(tmp_path / 'm/network.yaml'),
+                 '--target', 'magnet', '--out', str(tmp_path / 'out')]) == 0
+    assert '63 poses' in capsys.readouterr().out
+
+
+def test_info(capsys):
+    assert main(['info', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE)]) == 0
+    out = capsys.readouterr().out
+    assert '/mag_1/imu/mag  sensor_msgs/msg/MagneticField  2000' in out
+    assert 'sensor mag_2: /mag_2/imu/mag is there' in out
+
+
+def fail(capsys, *arguments):
+    """Run, expect failure, return the one line of the message."""
+    assert main([str(a) for a in arguments]) == 1
+    error = capsys.readouterr().err.strip()
+    assert error.startswith('mag-tracking: ') and '\n' not in error
+    return error
+
+
+def test_failures_are_one_clear_line(tmp_path, capsys):
+    common = ['--network', NETWORK_FILE, '--out', tmp_path / 'out']
+    recording = vehicle_path(NAME)
+    assert 'there is no' in fail(capsys, 'replay', tmp_path / 'x.mcap', *common)
+    typo = tmp_path / 'typo.yaml'
+    typo.write_text('track: {vehicle: {momnet: 3.0}}')
+    assert 'did you mean track.vehicle.moment?' in fail(
+        capsys, 'replay', recording, *common, '--params', typo)
+    blocked = tmp_path / 'blocked'
+    blocked.write_text('a file')
+    assert 'cannot write to' in fail(capsys, 'replay', recording, '--network', NETWORK_FILE,
+                                     '--out', blocked / 'out')
+    network = tmp_path / 'network.yaml'
+    network.write_text('sensors: {mag_7: {position: [0, 0, 0]}}')
+    assert "none of the network's topics" in fail(
+        capsys, 'replay', recording, '--network', network, '--out', tmp_path / 'out')
+    bad = tmp_path / 'bad.csv'
+    bad.write_text('a,b\n1,2\n')
+    assert 'column id is missing' in fail(capsys, 'import', bad, '--background', bad,
+                                          '--out', tmp_path / 'out')
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason='root may write everywhere')
+def test_a_read_only_folder_is_named(tmp_path, capsys):
+    tmp_path.chmod(0o500)
+    assert 'cannot write' in fail(capsys, 'replay', vehicle_path(NAME), '--network', NETWORK_FILE,
+                                  '--out', tmp_path / 'out')
+
+
+def test_a_recording_too_short_to_learn_says_so(tmp_path, capsys):
+    params = tmp_path / 'p.yaml'
+    params.write_text('calibrate: {learn_s: 600.0}')
+    assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--params',
+                 str(params), '--out', str(tmp_path / 'out')]) == 0
+    out = capsys.readouterr().out
+    assert 'no background was learnt for mag_1, mag_2' in out
+    assert json.loads((tmp_path / 'out/summary.json').read_text())['tracks'] == []
+
+
+def test_help_teaches():
+    for command in ('replay', 'run', 'import'):
+        text = subprocess.run([sys.executable, '-m', 'mag_tracking.cli', command, '--help'],
+                              capture_output=True, text=True, check=True).stdout
+        assert 'example' in text
+
+
+def test_an_interrupted_replay_keeps_what_is_done(tmp_path):
+    out = tmp_path / 'out'
+    recordings = [str(vehicle_path(NAME))] * 40
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'mag_tracking.cli', 'replay', *recordings, '--network',
+         str(NETWORK_FILE), '--out', str(out), '--no-figures'],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    table = out / NAME / 'summary.json'
+    deadline = time.monotonic() + 60
+    while not table.exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130, stderr
+    assert 'Traceback' not in stderr
+    assert json.loads(table.read_text())['recording'] == f'{NAME}.mcap'

@@ -1,0 +1,151 @@
+"""The compiled update against the dense filter and filterpy, and its statistics."""
+
+import numpy as np
+import pytest
+from conftest import line_network
+from filterpy.kalman import ExtendedKalmanFilter
+from scipy.stats import chi2, multivariate_normal
+
+from mag_tracking.inference import kalman
+from mag_tracking.io.simulator import Path, point_body, simulate
+from mag_tracking.physics.dipole import sensor_fields
+from mag_tracking.pipeline import Pipeline, settings_for
+
+
+def dense_update(x, P, y, h, H, C, inflation, x_lin):
+    """The textbook, stacked update of one hypothesis: the oracle."""
+    n_sensors, _, n_t = H.shape
+    full = np.zeros((3 * n_sensors, len(x)))
+    full[:, :n_t] = H.reshape(-1, n_t)
+    full[:, n_t:] = np.eye(3 * n_sensors)
+    R = np.zeros((3 * n_sensors, 3 * n_sensors))
+    for j in range(n_sensors):
+        R[3 * j:3 * j + 3, 3 * j:3 * j + 3] = C[j] + inflation[j] * np.eye(3)
+    there = ~np.isnan(y.ravel())
+    full, R = full[there], R[np.ix_(there, there)]
+    predicted = (h.ravel() + x_lin[n_t:])[there] + full @ (x - x_lin)
+    nu = y.ravel()[there] - predicted
+    # Whitened, as the tesla scale would be lost on general-purpose tolerances.
+    W = np.linalg.inv(np.linalg.cholesky(R))
+    A = W @ full
+    S = A @ P @ A.T + np.eye(len(A))
+    K = np.linalg.solve(S, A @ P).T
+    log_likelihood = multivariate_normal(np.zeros(len(A)), S).logpdf(W @ nu) \
+        + np.linalg.slogdet(W)[1]
+    z = W @ nu
+    P_new = P - K @ A @ P
+    return (x + K @ z, 0.5 * (P_new + P_new.T), log_likelihood, z @ np.linalg.solve(S, z),
+            (A, z, S))
+
+
+def tracked(n_sensors, missing=False):
+    """A bank in the middle of a simulated pass, and the ingredients of its next update."""
+    network = line_network(n_sensors)
+    rng = np.random.default_rng(5)
+    samples, *_ = simulate(network, point_body([250.0, -120.0, 90.0], 5.0, 0.5),
+                           Path(np.array([-60.0, -1.0]), 0.0, 10.0), 25.0, 12.0, rng)
+    pipeline = Pipeline(network, settings_for('vehicle', {
+        'align.period_s': 0.04, 'track.vehicle.arrival_names': ['a'],
+        'track.vehicle.arrival_headings_deg': [0.0]}))
+    frame = None
+    for sample in samples:
+        for record in pipeline.feed(sample):
+            if hasattr(record, 'target_present') and record.target_present:
+                frame = record
+        if pipeline.track.counts['poses'] >= 25:
+            break
+    bank = pipeline.track.bank
+    y = frame.field + 1e-8 * rng.standard_normal(frame.field.shape)
+    if missing:
+        y[0, 2] = np.nan
+        y[1] = np.nan
+    x, P = bank.x.copy(), bank.P.copy()
+    model = pipeline.track._model
+    h, H, power = sensor_fields(network.positions, network.R_sw, *model.dipoles(x[:, :10]))
+    C = np.repeat(1.44e-16 * np.array([[1.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 0.8]])[None],
+                  n_sensors, axis=0)
+    return x, P, y, h, H, C, power
+
+
+def compare(n_sensors, missing=False, shift=0.0):
+    """Largest differences in mean [sd] and covariance [sd^2] from both oracles."""
+    x, P, y, h, H, C, inflation = tracked(n_sensors, missing)
+    x_lin = x + shift * np.sqrt(np.einsum('nii->ni', P))
+    new_x, new_P = x.copy(), P.copy()
+    log_likelihood, nis = kalman.update(new_x, new_P, y, h, H, C, inflation, x_lin)
+    worst = np.zeros(4)
+    for p in range(len(x)):
+        ox, oP, oll, onis, (A, z, _) = dense_update(x[p], P[p], y, h[p], H[p], C, inflation[p],
+                                                    x_lin[p])
+        sd = np.sqrt(np.diagonal(oP))
+        worst[0] = max(worst[0], np.abs((new_x[p] - ox) / sd).max())
+        worst[1] = max(worst[1], np.abs((new_P[p] - oP) / np.outer(sd, sd)).max())
+        assert abs(log_likelihood[p] - oll) <= 1e-8 * max(1.0, abs(oll))
+        assert abs(nis[p] - onis) <= 1e-8 * max(1.0, onis)
+        ekf = ExtendedKalmanFilter(len(x[p]), len(z))
+        ekf.x, ekf.P, ekf.R = x[p].copy(), P[p].copy(), np.eye(len(z))
+        ekf.update(z, lambda _, A=A: A, lambda _, n=len(z): np.zeros(n))
+        worst[2] = max(worst[2], np.abs((new_x[p] - ekf.x) / sd).max())
+        worst[3] = max(worst[3], np.abs((new_P[p] - ekf.P) / np.outer(sd, sd)).max())
+    return worst
+
+
+@pytest.mark.parametrize('n_sensors', [2, 8, 32])
+def test_update_equals_dense_oracle_and_filterpy(n_sensors):
+    dense_mean, dense_cov, ekf_mean, ekf_cov = compare(n_sensors)
+    print(f'{n_sensors} sensors: dense {dense_mean:.1e} sd, {dense_cov:.1e}; '
+          f'filterpy {ekf_mean:.1e} sd, {ekf_cov:.1e}')
+    assert max(dense_mean, ekf_mean) <= 1e-8
+    assert max(dense_cov, ekf_cov) <= 1e-9
+
+
+def test_update_with_missing_axes_and_sensors():
+    assert max(compare(3, missing=True)) <= 1e-8
+
+
+def test_update_linearised_elsewhere():
+    assert max(compare(2, shift=0.3)[:2]) <= 1e-8
+
+
+def test_covariance_stays_exactly_symmetric():
+    x, P, y, h, H, C, inflation = tracked(2)
+    kalman.update(x, P, y, h, H, C, inflation)
+    np.testing.assert_array_equal(P, np.swapaxes(P, 1, 2))
+
+
+def test_a_singular_noise_is_refused():
+    x, P, y, h, H, C, inflation = tracked(2)
+    with pytest.raises(ValueError, match='not positive definite'):
+        kalman.update(x, P, y, h, H, 0.0 * C, 0.0 * inflation)
+
+
+def test_nees_of_a_linear_gaussian_case_is_chi_square():
+    """Linear model, true prior and noise: the mean NEES lies in its 95 % band."""
+    rng = np.random.default_rng(11)
+    runs, steps, n_t, n_sensors, dt = 400, 12, 6, 2, 0.1
+    n_x = n_t + 3 * n_sensors
+    F, Q = np.eye(6), 0.02 * np.eye(6)
+    F[:3, 3:] = dt * np.eye(3)
+    P0 = np.diag(np.r_[np.full(3, 2.0), np.full(3, 1.0), np.full(6, 0.3)])
+    truth = rng.multivariate_normal(np.zeros(n_x), P0, runs)
+    x, P = np.zeros((runs, n_x)), np.repeat(P0[None], runs, axis=0)
+    H = np.repeat(rng.standard_normal((n_sensors, 3, n_t))[None], runs, axis=0)
+    C = np.repeat(np.diag([0.5, 1.0, 2.0])[None], n_sensors, axis=0)
+    for k in range(steps):
+        if k:
+            truth[:, :n_t] = truth[:, :n_t] @ F.T + rng.multivariate_normal(np.zeros(6), Q, runs)
+            truth[:, n_t:] += np.sqrt(0.01) * rng.standard_normal((runs, n_x - n_t))
+            kalman.predict(x, P, x[:, :n_t] @ F.T, F, Q, 0.01)
+        noise = rng.standard_normal((runs, n_sensors, 3)) * np.sqrt([0.5, 1.0, 2.0])
+        y = np.einsum('pjic,pc->pji', H, truth[:, :n_t]) \
+            + truth[:, n_t:].reshape(runs, n_sensors, 3) + noise
+        # The measurement differs from run to run, so each is an update of its own.
+        for p in range(runs):
+            h = np.einsum('jic,c->ji', H[p], x[p, :n_t])[None]
+            kalman.update(x[p:p + 1], P[p:p + 1], y[p], h, H[p:p + 1], C,
+                          np.zeros((1, n_sensors)))
+    e = truth - x
+    nees = np.einsum('pi,pij,pj->p', e, np.linalg.inv(P), e)
+    low, high = chi2.ppf([0.025, 0.975], runs * n_x) / runs
+    print(f'linear Gaussian NEES {nees.mean():.3f}, band {low:.3f} .. {high:.3f}')
+    assert low <= nees.mean() <= high

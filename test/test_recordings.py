@@ -1,0 +1,135 @@
+"""The whole way on recordings: errors against truth, covariances, repetition.
+
+The limits are the project's targets; a number that is not reached stands here
+as what it is, strictly expected to fail, so that the day it is reached is seen.
+"""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from conftest import VEHICLES, vehicle_path
+
+from mag_tracking.io.bag import Recording
+from mag_tracking.io.samples import SampleReader
+from mag_tracking.offline import replay
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.records import Track
+
+ARRIVAL = {name: 'right' if '_left' in name and name.startswith('straight') else
+           name.split('_')[1] if name.startswith('junction') else 'left' for name in VEHICLES}
+CARS = [name for name in VEHICLES if 'truck' not in name]
+
+
+def pass_of(replays, name):
+    """The one track of a recording, and its errors."""
+    run, _ = replays[name]
+    assert len(run.summary['tracks']) == 1, name
+    return run.summary['tracks'][0]
+
+
+@pytest.mark.parametrize('name', VEHICLES)
+def test_arrival_direction(vehicle_replays, name):
+    assert len(VEHICLES) == 8
+    track = pass_of(vehicle_replays, name)
+    run, _ = vehicle_replays[name]
+    log = run.logs[track['id']]
+    best = [max(row, key=lambda a: row[a][0]) for row in log.arrivals]
+    assert track['arrival'] == best[-1] == ARRIVAL[name]
+    # And already where it matters: when the position is best known.
+    sd = [np.trace(C[:2, :2]) for C in log.covariance]
+    assert best[int(np.argmin(sd))] == ARRIVAL[name]
+
+
+@pytest.mark.parametrize('name', CARS)
+def test_error_while_near(vehicle_replays, name):
+    errors = pass_of(vehicle_replays, name)['truth']
+    print(f'{name}: rms {errors["rms"]}, closest {errors["closest"]:.2f} '
+          f'at {errors["closest_distance"]:.1f} m, ANEES {errors["anees"]:.1f}')
+    if name == 'junction_rear_turns_right':
+        assert errors['rms'] is None  # it never comes within 5 m
+    else:
+        assert errors['rms'] <= (1.5 if 'fast' in name else 1.0)
+
+
+@pytest.mark.parametrize('name', [
+    pytest.param(name, marks=pytest.mark.xfail(
+        strict=True, reason='0.72 m: sensor 1 is mounted 7.5 degrees off, which is not yet '
+        'calibrated; with the true mountings it is 0.55 m'))
+    if name == 'junction_left_turns_to_rear' else name for name in CARS])
+def test_error_at_the_closest_point(vehicle_replays, name):
+    assert pass_of(vehicle_replays, name)['truth']['closest'] <= (1.0 if 'fast' in name else 0.5)
+
+
+@pytest.mark.parametrize('run', [1, 2])
+def test_magnet(magnet_replays, run):
+    tracks = magnet_replays[run][0].summary['tracks']
+    assert len(tracks) == 1
+    errors = tracks[0]['truth']
+    print(f'run {run}: position {1e3 * errors["position_mean"]:.3f} mm, '
+          f'axis {errors["axis_median_deg"]:.2f} deg, ANEES {errors["anees"]:.2f}')
+    assert errors['n'] >= 60
+    assert errors['position_mean'] <= 0.6e-3
+    assert errors['axis_median_deg'] <= 1.5
+    # Honest: neither far too sure nor far too wide.
+    assert 0.1 <= errors['anees'] <= 3.0
+    assert tracks[0]['moment_size'] == pytest.approx(0.866, rel=0.05)
+
+
+def rows(path):
+    with open(path, newline='') as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_repetition_gives_the_same_bytes(vehicle_replays, road_network, tmp_path):
+    name = 'junction_rear_turns_right'
+    replay(Recording(vehicle_path(name)), road_network, settings_for('vehicle'), tmp_path)
+    for table in ('poses.csv', 'hypotheses.csv', 'detections.csv', 'summary.json'):
+        assert (tmp_path / table).read_bytes() == \
+            (vehicle_replays[name][1] / table).read_bytes(), table
+
+
+def test_the_interleaving_of_the_sensors_does_not_matter(vehicle_replays, road_network):
+    """Sensor by sensor in blocks of 0.3 s instead of in turn."""
+    name = 'straight_small_left'
+    samples = list(SampleReader(Recording(vehicle_path(name)), road_network).samples())
+    samples.sort(key=lambda s: (s.stamp_ns // 300_000_000, s.sensor, s.stamp_ns))
+    pipeline = Pipeline(road_network, settings_for('vehicle'))
+    tracks = [r for s in samples for r in pipeline.feed(s)] + pipeline.flush()
+    ours = [t for t in tracks if isinstance(t, Track) and not t.ended]
+    log = next(iter(vehicle_replays[name][0].logs.values()))
+    assert [t.stamp_ns for t in ours] == log.stamp_ns
+    np.testing.assert_array_equal([t.position for t in ours], log.position)
+
+
+def test_results_agree_with_each_other(vehicle_replays):
+    for name, (_, folder) in vehicle_replays.items():
+        poses, hypotheses = rows(folder / 'poses.csv'), rows(folder / 'hypotheses.csv')
+        summary = json.loads((folder / 'summary.json').read_text())
+        assert len(poses) == summary['tracks'][0]['poses']
+        by_stamp = {}
+        for h in hypotheses:
+            by_stamp.setdefault(h['stamp_ns'], []).append(h)
+        for p in poses:
+            members = by_stamp[p['stamp_ns']]
+            assert sum(float(h['weight']) for h in members) == pytest.approx(1.0)
+            assert any((h['x'], h['y'], h['weight']) == (p['x'], p['y'], p['weight'])
+                       for h in members), name
+        assert [d['event'] for d in rows(folder / 'detections.csv')][0] == 'onset'
+
+
+def test_published_covariances_are_covariances(vehicle_replays, magnet_replays):
+    for run, _ in [*vehicle_replays.values(), *magnet_replays.values()]:
+        for log in run.logs.values():
+            C = np.array(log.covariance)
+            np.testing.assert_allclose(C, np.swapaxes(C, 1, 2))
+            assert np.linalg.eigvalsh(C).min() > -1e-12
+
+
+def test_no_sample_is_lost_without_a_word(vehicle_replays):
+    for run, _ in vehicle_replays.values():
+        c = run.summary['counts']['calibrate']
+        taken = sum(s['accepted'] for s in run.summary['sensors'].values())
+        assert c['calibrated'] + c['held back while learning'] == taken
+        assert run.summary['rejected'] == {}

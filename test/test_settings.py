@@ -1,0 +1,88 @@
+"""Settings: declared once, checked everywhere, and what is generated from them is up to date."""
+
+import importlib.util
+
+import pytest
+import yaml
+from conftest import ROOT
+
+from mag_tracking.errors import SettingsError
+from mag_tracking.pipeline import Settings, settings_for
+from mag_tracking.settings import flatten, read_parameter_file, replace, to_yaml
+
+
+def test_generated_files_are_up_to_date():
+    spec = importlib.util.spec_from_file_location('generate', ROOT / 'tools/generate_config.py')
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    for path, content in module.generated().items():
+        assert path.read_text(encoding='utf-8') == content, f'{path.name}: run `make config`'
+
+
+@pytest.mark.parametrize('target', ['vehicle', 'magnet'])
+def test_yaml_of_the_defaults_reads_back_as_the_defaults(target, tmp_path):
+    path = tmp_path / 'p.yaml'
+    path.write_text(to_yaml(settings_for(target)))
+    changes = read_parameter_file(path)
+    assert set(changes) == {p.name for p in flatten(Settings())}
+    assert settings_for(target, changes) == settings_for(target)
+
+
+def test_every_setting_is_documented_and_its_default_is_in_range():
+    for p in flatten(Settings()):
+        assert len(p.doc) > 10, p.name
+        assert replace(Settings(), {p.name: p.value}) == Settings(), p.name
+
+
+@pytest.mark.parametrize('changes, message', [
+    ({'align': {'perod_s': 0.1}}, 'unknown setting align.perod_s; did you mean align.period_s'),
+    ({'align.period_s': 'long'}, 'align.period_s: expected float'),
+    ({'align.period_s': -1.0}, 'align.period_s: -1.0 is outside'),
+    ({'align.period_s': float('nan')}, 'NaN'),
+    ({'align.burst': 1}, 'align.burst: expected bool'),
+    ({'detect.onset_frames': 2.5}, 'detect.onset_frames: expected int'),
+    ({'detect.onset_frames': True}, 'detect.onset_frames: expected int'),
+    ({'track.magnet.axis': [0.0, 1.0]}, 'track.magnet.axis: expected 3 values, got 2'),
+    ({'track.vehicle.speeds': []}, 'at least one'),
+    ({'track.vehicle.speeds': 5.0}, 'expected a list'),
+    ({'track.vehicle.speeds': [5.0, 1e9]}, 'outside'),
+])
+def test_faults_name_the_setting(changes, message):
+    with pytest.raises(SettingsError, match=message):
+        replace(Settings(), changes)
+
+
+def test_arrivals_need_a_heading_each(road_network):
+    from mag_tracking.pipeline import Pipeline
+    settings = settings_for('vehicle', {'track.vehicle.arrival_headings_deg': [0.0, 90.0]})
+    with pytest.raises(SettingsError, match='arrival_headings_deg: expected 3 values'):
+        Pipeline(road_network, settings)
+
+
+def test_target_of_the_file_and_of_the_caller_have_to_agree():
+    with pytest.raises(SettingsError, match='magnet'):
+        settings_for('vehicle', {'track.target': 'magnet'})
+    with pytest.raises(SettingsError, match='expected vehicle or magnet'):
+        settings_for('submarine')
+
+
+def test_parameter_files(tmp_path):
+    path = tmp_path / 'p.yaml'
+    path.write_text('tracker_node:\n  ros__parameters:\n    track:\n      iterations: 2\n'
+                    'detection_node:\n  ros__parameters:\n    align.period_s: 0.1\n')
+    assert read_parameter_file(path) == {'track.iterations': 2, 'align.period_s': 0.1}
+    path.write_text('track: {vehicle: {moment: 100.0}}')
+    assert read_parameter_file(path) == {'track.vehicle.moment': 100.0}
+    path.write_text('')
+    assert read_parameter_file(path) == {}
+    for content, message in (('- 1', 'expected a mapping'), ('{a: [', 'not YAML')):
+        path.write_text(content)
+        with pytest.raises(SettingsError, match=message):
+            read_parameter_file(path)
+    with pytest.raises(SettingsError, match='cannot read'):
+        read_parameter_file(tmp_path / 'nowhere.yaml')
+
+
+def test_the_default_file_is_plain_yaml_with_floats():
+    content = yaml.safe_load((ROOT / 'config/default.yaml').read_text())
+    assert content['/**']['ros__parameters']['track']['background_std'] == 2e-8
