@@ -40,6 +40,7 @@ TARGET_DEFAULTS = {
         'track.iterations': 5,
         'track.lookback_s': 0.0,
         'track.end_gap_s': 30.0,
+        'track.end_std': 0.2,
     },
 }
 """What differs from the defaults for each target."""

@@ -43,7 +43,11 @@ def predict(x, P, x_target, F, Q, background_variance):
     P[:, background, background] += background_variance
 
 
-@njit('int64(float64[::1], float64[:,::1], float64, int64[::1], float64[:,::1])', cache=True)
+_COMPILE = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}
+"""Fused multiply-add is allowed, nothing else that would change a result."""
+
+
+@njit('int64(float64[::1], float64[:,::1], float64, int64[::1], float64[:,::1])', **_COMPILE)
 def _cholesky_of_present(y, C, inflation, axes, L):
     """Cholesky factor of the noise of the axes that are not NaN; their number, -1 if singular."""
     n = 0
@@ -67,81 +71,144 @@ def _cholesky_of_present(y, C, inflation, axes, L):
     return n
 
 
-@njit('float64(float64[::1], float64[:,::1], float64[::1], int64, int64, float64, '
-      'float64[::1])', cache=True)
-def _scalar_update(x, P, a, n_t, first, residual, Ph):
-    """Update with one whitened row; returns the variance of the innovation `residual`.
+@njit('void(float64[::1], float64[:,::1], float64[:,::1], int64[::1], int64, float64[:,::1], '
+      'float64[:,::1], float64[::1])', **_COMPILE)
+def _whitened_rows(residual, H, L, axes, n, A, A_b, z):
+    """L^-1 [H | I | residual] of the `n` present axes, into A, A_b and z."""
+    n_t = A.shape[1]
+    for i in range(n):
+        a = axes[i]
+        z[i] = residual[a]
+        for c in range(n_t):
+            A[i, c] = H[a, c]
+        for c in range(3):
+            A_b[i, c] = 0.0
+        A_b[i, a] = 1.0
+        for k in range(i):
+            w = L[i, k]
+            z[i] -= w * z[k]
+            for c in range(n_t):
+                A[i, c] -= w * A[k, c]
+            for c in range(3):
+                A_b[i, c] -= w * A_b[k, c]
+        w = 1.0 / L[i, i]
+        z[i] *= w
+        for c in range(n_t):
+            A[i, c] *= w
+        for c in range(3):
+            A_b[i, c] *= w
 
-    `a` covers the target states and one sensor's background. P stays exactly
-    symmetric: both halves are the same products.
-    """
-    n_x = x.shape[0]
-    Ph[:] = 0.0
-    for c in range(n_t + 3):
-        w = a[c]
-        if w != 0.0:
-            row = P[c if c < n_t else first + c - n_t]
+
+@njit('void(float64[:,::1], float64[:,::1], float64[:,::1], int64, int64, float64[:,::1])',
+      **_COMPILE)
+def _gain_rows(P, A, A_b, n, first, T):
+    """T = [A, A_b] P for the columns of the target and of one sensor's background."""
+    n_x, n_t = P.shape[0], A.shape[1]
+    T[:n] = 0.0
+    if n == 3:
+        for c in range(n_t + 3):
+            if c < n_t:
+                row, a0, a1, a2 = P[c], A[0, c], A[1, c], A[2, c]
+            else:
+                b = c - n_t
+                row, a0, a1, a2 = P[first + b], A_b[0, b], A_b[1, b], A_b[2, b]
             for i in range(n_x):
-                Ph[i] += w * row[i]
-    s = 1.0
-    for c in range(n_t + 3):
-        s += a[c] * Ph[c if c < n_t else first + c - n_t]
-    gain = residual / s
-    root = 1.0 / math.sqrt(s)
+                p = row[i]
+                T[0, i] += a0 * p
+                T[1, i] += a1 * p
+                T[2, i] += a2 * p
+        return
+    for k in range(n):
+        for c in range(n_t):
+            for i in range(n_x):
+                T[k, i] += A[k, c] * P[c, i]
+        for b in range(3):
+            for i in range(n_x):
+                T[k, i] += A_b[k, b] * P[first + b, i]
+
+
+@njit('void(float64[:,::1], float64[:,::1], int64)', **_COMPILE)
+def _downdate(P, G, n):
+    """P -= G' G; both halves get the same products, so P stays exactly symmetric."""
+    n_x = P.shape[0]
     for i in range(n_x):
-        x[i] += gain * Ph[i]
-        Ph[i] *= root
-    for i in range(n_x):
-        g = Ph[i]
-        if g != 0.0:
-            row = P[i]
+        row = P[i]
+        if n == 3:
+            g0, g1, g2 = G[0, i], G[1, i], G[2, i]
             for j in range(n_x):
-                row[j] -= g * Ph[j]
-    return s
+                row[j] -= g0 * G[0, j] + g1 * G[1, j] + g2 * G[2, j]
+        else:
+            for k in range(n):
+                for j in range(n_x):
+                    row[j] -= G[k, i] * G[k, j]
+
+
+@njit('float64(float64[:,::1], float64[:,::1], int64, int64, float64[:,::1], float64[::1], '
+      'float64[:,::1])', **_COMPILE)
+def _whiten_innovation(A, A_b, n, first, G, z, S):
+    """Divide innovation z and gain rows G by the Cholesky factor of S; half its log-determinant."""
+    n_t, n_x = A.shape[1], G.shape[1]
+    for i in range(n):
+        for k in range(i + 1):
+            s = 1.0 if i == k else 0.0
+            for c in range(n_t):
+                s += A[i, c] * G[k, c]
+            for b in range(3):
+                s += A_b[i, b] * G[k, first + b]
+            S[i, k] = s
+    half = 0.0
+    for i in range(n):
+        for k in range(i + 1):
+            for m in range(k):
+                S[i, k] -= S[i, m] * S[k, m]
+            if k < i:
+                S[i, k] /= S[k, k]
+        S[i, i] = math.sqrt(S[i, i])
+        half += math.log(S[i, i])
+    for i in range(n):
+        for k in range(i):
+            w = S[i, k]
+            z[i] -= w * z[k]
+            for j in range(n_x):
+                G[i, j] -= w * G[k, j]
+        w = 1.0 / S[i, i]
+        z[i] *= w
+        for j in range(n_x):
+            G[i, j] *= w
+    return half
 
 
 @njit('int64(float64[:,::1], float64[:,:,::1], float64[:,::1], float64[:,::1], '
       'float64[:,:,::1], float64[:,:,::1], float64[:,:,:,::1], float64[:,::1], '
-      'float64[::1], float64[::1])', cache=True)
+      'float64[::1], float64[::1])', **_COMPILE)
 def _update_bank(x, P, x_lin, y, C, h, H, inflation, log_likelihood, nis):
-    """Loop of the update over hypotheses, sensors and axes; -1 where a noise is singular."""
-    n_hyp, n_sensors, n_t = H.shape[0], H.shape[1], H.shape[3]
+    """Loop of the update over hypotheses and sensors; -1 where a noise is singular."""
+    n_hyp, n_sensors, n_t, n_x = H.shape[0], H.shape[1], H.shape[3], x.shape[1]
     axes = np.empty(3, dtype=np.int64)
-    L = np.zeros((3, 3))
-    rows = np.empty((3, n_t + 3))
-    z = np.empty(3)
-    Ph = np.empty(x.shape[1])
+    L, S, A_b = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
+    A, G = np.empty((3, n_t)), np.empty((3, n_x))
+    z, residual = np.empty(3), np.empty(3)
     for p in range(n_hyp):
         for j in range(n_sensors):
             n = _cholesky_of_present(y[j], C[j], inflation[p, j], axes, L)
             if n < 0:
                 return -1
             first = n_t + 3 * j
-            for i in range(n):
-                # Forward substitution: row i of L^-1 [y - h | H | I].
-                a = axes[i]
-                z[i] = y[j, a] - h[p, j, a] - x_lin[p, first + a]
+            for a in range(3):
+                residual[a] = y[j, a] - h[p, j, a] - x[p, first + a]
                 for c in range(n_t):
-                    rows[i, c] = H[p, j, a, c]
-                for c in range(3):
-                    rows[i, n_t + c] = 1.0 if c == a else 0.0
-                for k in range(i):
-                    z[i] -= L[i, k] * z[k]
-                    for c in range(n_t + 3):
-                        rows[i, c] -= L[i, k] * rows[k, c]
-                z[i] /= L[i, i]
-                for c in range(n_t + 3):
-                    rows[i, c] /= L[i, i]
+                    residual[a] -= H[p, j, a, c] * (x[p, c] - x_lin[p, c])
+            _whitened_rows(residual, H[p, j], L, axes, n, A, A_b, z)
+            _gain_rows(P[p], A, A_b, n, first, G)
+            half = _whiten_innovation(A, A_b, n, first, G, z, S)
             for i in range(n):
-                residual = z[i]
-                for c in range(n_t):
-                    residual -= rows[i, c] * (x[p, c] - x_lin[p, c])
-                for c in range(3):
-                    residual -= rows[i, n_t + c] * (x[p, first + c] - x_lin[p, first + c])
-                s = _scalar_update(x[p], P[p], rows[i], n_t, first, residual, Ph)
-                q = residual * residual / s
-                nis[p] += q
-                log_likelihood[p] -= 0.5 * (q + math.log(s) + _LOG_2PI) + math.log(L[i, i])
+                w = z[i]
+                for c in range(n_x):
+                    x[p, c] += w * G[i, c]
+                nis[p] += w * w
+                half += math.log(L[i, i]) + 0.5 * w * w
+            _downdate(P[p], G, n)
+            log_likelihood[p] -= half + 0.5 * n * _LOG_2PI
     return 0
 
 

@@ -18,6 +18,8 @@ from mag_tracking.nodes.stage_node import STREAM
 
 TICK_S = 0.005
 """How often the node looks for messages that are due [s]."""
+LONGEST_STEP_S = 0.02
+"""Time on the wall that one look may make good for [s]."""
 
 
 class ReplayNode(Node):
@@ -94,9 +96,10 @@ class ReplayNode(Node):
         now = time.monotonic()
         if self._paused or self.finished or now < self._start:
             return
-        if self._wall is None:
-            self._wall, self._origin = now, self._position
-        self._position = self._origin + int((now - self._wall) * self._rate * 1e9)
+        # After a stall it goes on at its pace: a burst would overrun the subscribers' queues.
+        elapsed = 0.0 if self._wall is None else min(now - self._wall, LONGEST_STEP_S)
+        self._wall = now
+        self._position += int(elapsed * self._rate * 1e9)
         self._clock_publisher.publish(Clock(clock=Time(sec=self._position // 10**9,
                                              nanosec=self._position % 10**9)))
         while self._next is not None and self._next.log_time_ns <= self._position:

@@ -54,6 +54,9 @@ class TrackSettings:
     lookback_s: float = param(
         1.0, 'A track begins so long before its detection, with the frames kept since: what is '
         'too weak to detect still tells where the target came from.', 's', (0.0, 60.0))
+    end_std: float = param(
+        5.0, 'A track ends when its horizontal position is less certain than this (one standard '
+        'deviation): the target is out of reach.', 'm', (1e-6, 1e6), live=True)
     end_gap_s: float = param(
         2.0, 'A track ends where the frames have a longer gap than this.', 's', (1e-3, 86400.0))
     vehicle: VehicleSettings = field(default_factory=VehicleSettings)
@@ -90,6 +93,8 @@ class TrackStage:
         self._next_id = 1
         self._bank = None
         self._recent = deque()
+        # A target that was lost is not to be started anew in the tail of its own detection.
+        self._out_of_reach = False
         self._last = None
         self._last_ns = None
 
@@ -117,8 +122,9 @@ class TrackStage:
         if frame.target_present and self._bank is not None:
             return out + self._step(frame, (frame.stamp_ns - previous) / NS)
         if frame.target_present:
-            return out + self._start(frame)
+            return out if self._out_of_reach else out + self._start(frame)
         out += self._end('released')
+        self._out_of_reach = False
         self._remember(frame)
         return out
 
@@ -147,7 +153,7 @@ class TrackStage:
             self.counts['frames without a start'] += 1
             return []
         self.counts['tracks'] += 1
-        self._log_odds = 0.0
+        self._log_odds, self._surest = 0.0, np.inf
         if recent:
             self._predict((recent[0].stamp_ns - frame.stamp_ns) / NS)
         dt = 0.0
@@ -191,6 +197,10 @@ class TrackStage:
             existence=float(1.0 / (1.0 + np.exp(-np.clip(self._log_odds, -700.0, 700.0)))),
             innovation=innovation)
         self.counts['poses'] += 1
+        if np.trace(self._last.covariance[:2, :2]) > s.end_std**2 and self._surest < s.end_std:
+            self._out_of_reach = True
+            return [self._last, *self._end('out of reach')]
+        self._surest = min(self._surest, float(np.trace(self._last.covariance[:2, :2])) ** 0.5)
         return [self._last]
 
     def _update(self, frame, covariance, dt):

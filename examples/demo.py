@@ -1,0 +1,134 @@
+"""The main job on a bundled recording, over real ROS topics.
+
+A recorded car turns at a junction between two magnetometers. The replay node
+plays the recording; calibration, detection and tracker nodes work on it; this
+program subscribes to what they publish, prints the track as it grows, and
+draws it.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from mag_tracking_msgs.msg import HypothesisArray, NetworkFrame, TrackArray
+from rclpy.node import Node
+
+from mag_tracking.errors import MagTrackingError, OutputError
+from mag_tracking.io.network_file import read_network
+from mag_tracking.io.schema import frame_of, stamp_ns
+from mag_tracking.nodes.convert import track_of
+from mag_tracking.nodes.runner import line_of, run
+from mag_tracking.nodes.stage_node import STREAM
+from mag_tracking.physics.dipole import dipole_field
+from mag_tracking.pipeline import settings_for
+from mag_tracking.report.figures import field_figure, map_figure, weights_figure
+from mag_tracking.report.metrics import interpolate_truth, pass_errors
+from mag_tracking.report.track_log import TrackLog
+
+ROOT = Path(__file__).resolve().parents[1]
+RECORDING = ROOT / 'test' / 'data' / 'vehicles' / 'junction_left_turns_to_rear.mcap'
+
+
+class Spectator(Node):
+    """Subscribes to the published topics, as any other program would."""
+
+    def __init__(self, network):
+        super().__init__('spectator')
+        self.network = network
+        self.logs, self.truth = {}, []
+        self._frames, self._hypotheses = {}, {}
+        self.create_subscription(NetworkFrame, '/detection_node/frame', self._frame, STREAM)
+        self.create_subscription(HypothesisArray, '/tracker_node/hypotheses', self._bank, STREAM)
+        self.create_subscription(TrackArray, '/tracker_node/tracks', self._track, STREAM)
+        self.create_subscription(PoseStamped, '/ground_truth/vehicle_00/pose', self._true, STREAM)
+
+    def _frame(self, message):
+        frame = frame_of(message, self.network)
+        self._frames[frame.stamp_ns] = frame
+
+    def _bank(self, message):
+        self._hypotheses[stamp_ns(message.header.stamp)] = message
+
+    def _true(self, message):
+        p, q = message.pose.position, message.pose.orientation
+        self.truth.append((stamp_ns(message.header.stamp), p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+
+    def _track(self, message):
+        for m in message.tracks:
+            track = track_of(m)
+            if track.ended:
+                print(f'track {track.id} has ended', flush=True)
+                self.logs.setdefault(track.id, TrackLog(track.id)).ended = True
+                continue
+            print(line_of(track), flush=True)
+            frame = self._frames.get(track.stamp_ns)
+            hypotheses = self._hypotheses.get(track.stamp_ns)
+            if frame is None or hypotheses is None:
+                continue  # it came before this node was connected: printed, but not drawn
+            B = dipole_field(self.network.positions - track.position, track.moment)
+            innovation = frame.field - np.einsum('jik,jk->ji', self.network.R_sw, B)
+            self.logs.setdefault(track.id, TrackLog(track.id)).add(
+                track_of(m, hypotheses, innovation), frame)
+
+
+def draw(spectator, out):
+    """Write the pictures and the errors; returns the paths."""
+    rows = sorted(spectator.truth)
+    truth = (np.array([r[0] for r in rows], dtype=np.int64), np.array([r[1:4] for r in rows]),
+             np.array([r[4:] for r in rows]))
+    paths, network = [], spectator.network
+    for log in spectator.logs.values():
+        if not log.stamp_ns:
+            continue
+        for name, figure in (
+                ('map', map_figure(log, network, interpolate_truth(truth, log.stamp_ns))),
+                ('weights', weights_figure(log)), ('field', field_figure(log, network))):
+            paths.append(out / f'{name}_track_{log.id}.png')
+            figure.savefig(paths[-1], dpi=110)
+        summary = {**log.summary(), 'truth': pass_errors(log, truth, network.centre)}
+        (out / f'track_{log.id}.json').write_text(json.dumps(summary, indent=1) + '\n')
+        print(f'\ntrack {log.id}: from {summary["arrival"]}, '
+              f'{summary["speed"]:.1f} m/s, {summary["moment_size"]:.0f} A m²; '
+              f'error at the closest point {summary["truth"]["closest"]:.2f} m, '
+              f'within 5 m RMS {summary["truth"]["rms"] or float("nan"):.2f} m')
+    return paths
+
+
+def main(argv=None):
+    """Run the demo; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--out', type=Path, default=Path('out/demo'))
+    parser.add_argument('--rate', type=float, default=3.0, help='speed of the replay (default: 3)')
+    args = parser.parse_args(argv)
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f'cannot write to {args.out}: {error.strerror}') from error
+    network_file = ROOT / 'config' / 'network.yaml'
+    spectators = []
+
+    def spectator():
+        spectators.append(Spectator(read_network(network_file)))
+        return spectators[-1]
+
+    print(f'Playing {RECORDING.name} at {args.rate:g} times its speed through replay, calibration, '
+          'detection and tracker nodes.\nThe first seconds are target-free: the background is '
+          'learnt from them.\n', flush=True)
+    status = run(network_file, settings_for('vehicle'), RECORDING, args.rate,
+                 observers=[spectator])
+    paths = draw(spectators[0], args.out)
+    if not paths:
+        print('no track was seen', file=sys.stderr)
+        return 1
+    print('pictures:', *paths, sep='\n  ')
+    return status
+
+
+if __name__ == '__main__':
+    try:
+        sys.exit(main())
+    except MagTrackingError as problem:
+        sys.exit(f'demo: {problem}')

@@ -1,0 +1,192 @@
+"""`make bench`: ratios against named peers, measured alternately in one run, and time to a pose.
+
+One thread everywhere. Each ratio is the median over rounds of (peer / ours).
+"""
+
+import os
+
+for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'NUMBA_NUM_THREADS'):
+    os.environ[_name] = '1'
+
+import shutil  # noqa: E402  (the thread counts have to be set before NumPy is loaded)
+import subprocess  # noqa: E402
+import sys  # noqa: E402
+import tempfile  # noqa: E402
+import time  # noqa: E402
+from pathlib import Path  # noqa: E402
+
+import numpy as np  # noqa: E402
+from filterpy.kalman import ExtendedKalmanFilter  # noqa: E402
+from tqdm import tqdm  # noqa: E402
+
+from mag_tracking.geometry import (  # noqa: E402
+    quaternion_from_rotation_vector,
+    rotation_from_quaternion,
+)
+from mag_tracking.inference import kalman  # noqa: E402
+from mag_tracking.physics.dipole import sensor_fields  # noqa: E402
+from mag_tracking.physics.sources import PointVehicle  # noqa: E402
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parents[1]
+EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
+SIGMA = 4e-9
+
+
+def numpy_dipole(d, m):
+    """Field and Jacobians of one dipole at many points, as one writes them in NumPy."""
+    n2 = np.einsum('ij,ij->i', d, d)
+    k3 = 1e-7 / n2**1.5
+    dm = d @ m
+    B = k3[:, None] * (3 * (dm / n2)[:, None] * d - m)
+    dd = np.einsum('ij,ik->ijk', d, d)
+    J_m = k3[:, None, None] * (3 * dd / n2[:, None, None] - np.eye(3))
+    J_d = 3 * (k3 / n2)[:, None, None] * (
+        dm[:, None, None] * np.eye(3) + np.einsum('ij,k->ijk', d, m)
+        + np.einsum('ij,k->ikj', d, m) - 5 * (dm / n2)[:, None, None] * dd)
+    return B, J_d, J_m
+
+
+class Peer:
+    """A loop of filterpy EKFs with a NumPy measurement model: what one would write first."""
+
+    def __init__(self, model, positions, R_sw, x, P):
+        self.model, self.positions, self.R_sw = model, positions, R_sw
+        self.n = 3 * len(positions)
+        self.filters = []
+        for xi, Pi in zip(x, P, strict=True):
+            f = ExtendedKalmanFilter(x.shape[1], self.n)
+            f.x, f.P, f.R = xi.copy(), Pi.copy(), np.eye(self.n)
+            self.filters.append(f)
+
+    def h(self, x):
+        """Predicted measurement in standard deviations."""
+        d = self.model.dipoles(x[None, :10])
+        B, _, _ = numpy_dipole(self.positions - d.r[0, 0], d.m[0, 0])
+        return (np.einsum('jik,jk->ji', self.R_sw, B).ravel() + x[10:]) / SIGMA
+
+    def H(self, x):
+        """Its Jacobian."""
+        d = self.model.dipoles(x[None, :10])
+        _, J_d, J_m = numpy_dipole(self.positions - d.r[0, 0], d.m[0, 0])
+        world = J_m @ d.dm_dx[0, 0] - J_d @ d.dr_dx[0, 0]
+        out = np.zeros((self.n, len(x)))
+        out[:, :10] = (self.R_sw @ world).reshape(self.n, 10)
+        out[:, 10:] = np.eye(self.n)
+        return out / SIGMA
+
+    def update(self, y):
+        """One measurement for every filter."""
+        z = y.ravel() / SIGMA
+        for f in self.filters:
+            f.update(z, self.H, self.h)
+
+
+def bank_case(n_sensors, n_hyp, rng):
+    """Model, geometry, states and one measurement near the truth."""
+    positions = np.zeros((n_sensors, 3))
+    positions[:, 0] = 9.0 * (np.arange(n_sensors) // 2)
+    positions[:, 1] = np.where(np.arange(n_sensors) % 2, 4.5, -4.5)
+    R_sw = rotation_from_quaternion(quaternion_from_rotation_vector(
+        0.2 * rng.standard_normal((n_sensors, 3))))
+    model = PointVehicle(EARTH, np.ones(3), 1.0)
+    x = np.zeros((n_hyp, 10 + 3 * n_sensors))
+    x[:, :3] = [-6.0, -1.0, 0.5] + 0.3 * rng.standard_normal((n_hyp, 3))
+    x[:, 3:6] = [10.0, 0.0, 0.0] + 0.3 * rng.standard_normal((n_hyp, 3))
+    x[:, 6:9] = 200.0 * rng.standard_normal((n_hyp, 3))
+    x[:, 9] = 5.0
+    P = np.repeat(np.diag(np.r_[1.0, 1.0, 0.1, 4.0, 1.0, 0.01, [1e4] * 3, 4.0,
+                                np.full(3 * n_sensors, 4e-16)])[None], n_hyp, axis=0)
+    y = sensor_fields(positions, R_sw, *model.dipoles(x[:1, :10]))[0][0]
+    return model, positions, R_sw, x, P, y + SIGMA * rng.standard_normal(y.shape)
+
+
+def bank_ratio(n_sensors, n_hyp=64, rounds=12):
+    """(median ratio, lowest, highest, our microseconds, theirs) of a bank's update."""
+    rng = np.random.default_rng(n_sensors)
+    model, positions, R_sw, x, P, y = bank_case(n_sensors, n_hyp, rng)
+    C = np.repeat(SIGMA**2 * np.eye(3)[None], n_sensors, axis=0)
+    zero = np.zeros((n_hyp, n_sensors))
+    ours, theirs = [], []
+    for k in range(rounds + 1):
+        peer = Peer(model, positions, R_sw, x, P)
+        start = time.perf_counter()
+        peer.update(y)
+        t_peer = time.perf_counter() - start
+        copies = [(x.copy(), P.copy()) for _ in range(20)]
+        start = time.perf_counter()
+        for xi, Pi in copies:
+            h, H, _ = sensor_fields(positions, R_sw, *model.dipoles(xi[:, :10]))
+            kalman.update(xi, Pi, y, h, H, C, zero)
+        t_ours = (time.perf_counter() - start) / len(copies)
+        worst = max(np.abs((f.x - a) / np.sqrt(np.diagonal(f.P))).max()
+                    for f, a in zip(peer.filters, copies[0][0], strict=True))
+        assert worst < 1e-6, f'the two do not compute the same: {worst} sd apart'
+        if k:
+            ours.append(t_ours)
+            theirs.append(t_peer)
+    ratio = np.array(theirs) / np.array(ours)
+    return (np.median(ratio), ratio.min(), ratio.max(), 1e6 * np.median(ours),
+            1e6 * np.median(theirs))
+
+
+FIRST_POSE = '''
+import sys, time
+start = float(sys.argv[1])
+from mag_tracking.io.bag import Recording
+from mag_tracking.io.network_file import read_network
+from mag_tracking.io.samples import SampleReader
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.records import Track
+network = read_network(sys.argv[2])
+pipeline = Pipeline(network, settings_for('vehicle'))
+for sample in SampleReader(Recording(sys.argv[3]), network).samples():
+    if any(isinstance(r, Track) for r in pipeline.feed(sample)):
+        print(time.time() - start)
+        break
+'''
+
+
+def first_pose(cache):
+    """Seconds from the start of a process to its first pose, with the compiled cache in `cache`."""
+    environment = {**os.environ, 'NUMBA_CACHE_DIR': str(cache)}
+    out = subprocess.run(
+        [sys.executable, '-c', FIRST_POSE, str(time.time()), str(ROOT / 'config/network.yaml'),
+         str(ROOT / 'test/data/vehicles/straight_car_right.mcap')],
+        env=environment, check=True, capture_output=True, text=True)
+    return float(out.stdout)
+
+
+def first_pose_times(rounds=5):
+    """(cold, warm) lists of seconds, taken alternately."""
+    cold, warm = [], []
+    for _ in tqdm(range(rounds), desc='first pose', disable=None):
+        cache = Path(tempfile.mkdtemp())
+        cold.append(first_pose(cache))
+        warm.append(first_pose(cache))
+        shutil.rmtree(cache)
+    return cold, warm
+
+
+def main():
+    """Print the figures; exit status 1 where a target is missed."""
+    missed = 0
+    print('bank update against a loop of filterpy EKFs, 64 hypotheses, one thread')
+    for n_sensors, target in ((2, 250.0), (8, 60.0)):
+        ratio, low, high, ours, theirs = bank_ratio(n_sensors)
+        missed += ratio < target
+        print(f'  {n_sensors} sensors: {ratio:6.0f}x  ({low:.0f} .. {high:.0f}; '
+              f'{ours:.0f} us against {theirs:.0f} us; target {target:.0f}x)', flush=True)
+    cold, warm = first_pose_times()
+    missed += np.median(warm) >= 1.0
+    missed += np.median(cold) >= 5.0
+    print('first pose after the start of the process (6 s of recording as fast as it goes)')
+    print(f'  compiled cache warm: {np.median(warm):.2f} s  ({min(warm):.2f} .. {max(warm):.2f}; '
+          'target < 1 s)')
+    print(f'  compiled cache cold: {np.median(cold):.2f} s  ({min(cold):.2f} .. {max(cold):.2f}; '
+          'target < 5 s)')
+    return int(missed > 0)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
