@@ -126,3 +126,20 @@ def test_an_interrupted_replay_keeps_what_is_done(tmp_path):
     assert process.returncode == 130, stderr
     assert 'Traceback' not in stderr
     assert json.loads(table.read_text())['recording'] == f'{NAME}.mcap'
+
+
+def test_the_example_runs():
+    from conftest import ROOT
+    out = subprocess.run([sys.executable, str(ROOT / 'examples/offline.py')], check=True,
+                         capture_output=True, text=True).stdout
+    assert 'left' in out and len(out.splitlines()) > 30
+
+
+def test_the_demo_draws_a_track_over_topics(tmp_path):
+    from conftest import ROOT
+    out = subprocess.run([sys.executable, str(ROOT / 'examples/demo.py'), '--rate', '6',
+                          '--out', str(tmp_path)], check=True, capture_output=True,
+                         text=True, timeout=120).stdout
+    assert 'from left' in out
+    assert {'map_track_1.png', 'weights_track_1.png', 'field_track_1.png'} <= {
+        p.name for p in tmp_path.iterdir()}

@@ -84,7 +84,7 @@ def compare(n_sensors, missing=False, shift=0.0):
         assert abs(nis[p] - onis) <= 1e-8 * max(1.0, onis)
         ekf = ExtendedKalmanFilter(len(x[p]), len(z))
         ekf.x, ekf.P, ekf.R = x[p].copy(), P[p].copy(), np.eye(len(z))
-        ekf.update(z, lambda _, A=A: A, lambda _, n=len(z): np.zeros(n))
+        ekf.update(z, lambda _, A=A: A, lambda _, z=z: np.zeros_like(z))
         worst[2] = max(worst[2], np.abs((new_x[p] - ekf.x) / sd).max())
         worst[3] = max(worst[3], np.abs((new_P[p] - ekf.P) / np.outer(sd, sd)).max())
     return worst

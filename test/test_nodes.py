@@ -1,4 +1,4 @@
-"""The nodes over the real middleware: in processes of their own, and equal to the offline replay."""
+"""The nodes over the real middleware: each a process, and equal to the offline replay."""
 
 import csv
 import os
@@ -267,7 +267,8 @@ def test_bad_messages_are_counted_and_survived(ros):
     node.create_subscription(DiagnosticArray, '/diagnostics', diagnostics.append, 10)
     node.create_subscription(MagneticField, '/mag_1/imu/mag_calibrated', calibrated.append, STREAM)
     publisher = node.create_publisher(MagneticField, '/mag_1/imu/mag', STREAM)
-    process = start('calibration_node', '-p', f'network:={NETWORK_FILE}', '-p', 'calibrate.learn_s:=0.5')
+    process = start('calibration_node', '-p', f'network:={NETWORK_FILE}',
+                    '-p', 'calibrate.learn_s:=0.5')
 
     def publish(ms, x, y=1.5e-5, z=-4.9e-5, covariance=0.0):
         publisher.publish(to_message(MagneticField, {
@@ -299,9 +300,9 @@ def test_bad_messages_are_counted_and_survived(ros):
             assert cause in causes
         assert calibrated and np.isnan(calibrated[-1].magnetic_field.z)
         assert calibrated[-1].header.frame_id == 'mag_1'
-        ok = call(ros, Calibrate, '/calibration_node/calibrate', Calibrate.Request(sensors=['mag_1']))
-        assert ok.success
-        no = call(ros, Calibrate, '/calibration_node/calibrate', Calibrate.Request(sensors=['mag_9']))
+        service = '/calibration_node/calibrate'
+        assert call(ros, Calibrate, service, Calibrate.Request(sensors=['mag_1'])).success
+        no = call(ros, Calibrate, service, Calibrate.Request(sensors=['mag_9']))
         assert not no.success and 'mag_9' in no.message
     finally:
         codes, outputs = stop([process])

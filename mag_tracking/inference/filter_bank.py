@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-
 _NEGLIGIBLE = np.log(100.0)
 """Hypotheses lighter than the heaviest by more than this have no say in which is published."""
 
