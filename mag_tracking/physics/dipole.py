@@ -15,9 +15,12 @@ MU0 = 4e-7 * math.pi
 K_DIPOLE = 1e-7
 """mu0 / 4 pi [T m / A]."""
 
+_COMPILE = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}
+"""Fused multiply-add is allowed, nothing else that would change a result."""
+
 
 @njit('void(float64[::1], float64[::1], float64[::1], float64[:,::1], float64[:,::1])',
-      cache=True)
+      **_COMPILE)
 def field_and_jacobians(d, m, B, dB_dd, dB_dm):
     """Write field and both Jacobians of one dipole at one point.
 
@@ -61,20 +64,18 @@ def _field_and_jacobians_rows(d, m, B, dB_dd, dB_dm):
 
 @njit('void(float64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[:,:,::1], '
       'float64[:,:,:,::1], float64[:,:,:,::1], float64[:,:,::1], float64[:,:,:,::1], '
-      'float64[:,::1])', cache=True, error_model='numpy')
+      'float64[:,::1])', **_COMPILE)
 def _sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx, h, H, gradient_power):
     """Loop of `field_and_jacobians` over hypotheses, sensors and dipoles."""
     n_hyp, n_dip, n_t = dr_dx.shape[0], dr_dx.shape[1], dr_dx.shape[3]
     d = np.empty(3)
     b = np.empty(3)
-    B = np.empty(3)
     dB_dd = np.empty((3, 3))
     dB_dm = np.empty((3, 3))
-    dB_dx = np.empty((3, n_t))
     for p in range(n_hyp):
         for j in range(positions.shape[0]):
-            B[:] = 0.0
-            dB_dx[:] = 0.0
+            h[p, j] = 0.0
+            H[p, j] = 0.0
             gradient_power[p, j] = 0.0
             for s in range(n_dip):
                 d2 = 0.0
@@ -85,20 +86,16 @@ def _sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx, h, H, gradient_power):
                     m2 += m[p, s, i] * m[p, s, i]
                 field_and_jacobians(d, m[p, s], b, dB_dd, dB_dm)
                 gradient_power[p, j] += K_DIPOLE * K_DIPOLE * m2 / (d2 * d2 * d2 * d2)
+                # Turned into the sensor's frame first: 3 x 3 products are cheaper than 3 x n_t.
                 for i in range(3):
-                    B[i] += b[i]
                     for k in range(3):
+                        g, q = 0.0, 0.0
+                        for u in range(3):
+                            g += R_sw[j, i, u] * dB_dd[u, k]
+                            q += R_sw[j, i, u] * dB_dm[u, k]
+                        h[p, j, i] += R_sw[j, i, k] * b[k]
                         for c in range(n_t):
-                            dB_dx[i, c] += (dB_dm[i, k] * dm_dx[p, s, k, c]
-                                            - dB_dd[i, k] * dr_dx[p, s, k, c])
-            for i in range(3):
-                h[p, j, i] = 0.0
-                H[p, j, i, :] = 0.0
-                for k in range(3):
-                    w = R_sw[j, i, k]
-                    h[p, j, i] += w * B[k]
-                    for c in range(n_t):
-                        H[p, j, i, c] += w * dB_dx[k, c]
+                            H[p, j, i, c] += q * dm_dx[p, s, k, c] - g * dr_dx[p, s, k, c]
 
 
 def sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx):

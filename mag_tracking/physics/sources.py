@@ -5,10 +5,12 @@ the field at the sensors follows from `dipole.sensor_fields` alone, so that a
 new target is one new class here and nothing elsewhere.
 """
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numba import njit
 
 from mag_tracking.physics.dipole import MU0
 from mag_tracking.physics.motion import constant_velocity, cross_matrix, integrator_noise
@@ -39,6 +41,30 @@ class SourceModel(Protocol):
         """States after `dt` seconds, Jacobian (..., n_t, n_t), process noise (..., n_t, n_t)."""
 
 
+@njit('void(float64[:,::1], float64[::1], float64[:,:,::1], float64[:,:,::1], '
+      'float64[:,:,:,::1], float64[:,:,:,::1])', cache=True)
+def _vehicle_dipoles(x, induction, r, m, dr_dx, dm_dx):
+    """ICASSP11 eq. (8) with derivatives, a row a hypothesis; the derivatives come as zeros."""
+    for p in range(x.shape[0]):
+        speed = math.hypot(x[p, 3], x[p, 4])
+        c, s = (x[p, 3] / speed, x[p, 4] / speed) if speed > 0.0 else (1.0, 0.0)
+        hard_x = c * x[p, 6] - s * x[p, 7]
+        hard_y = s * x[p, 6] + c * x[p, 7]
+        m[p, 0, 0] = hard_x + x[p, 9] * induction[0]
+        m[p, 0, 1] = hard_y + x[p, 9] * induction[1]
+        m[p, 0, 2] = x[p, 8] + x[p, 9] * induction[2]
+        d = dm_dx[p, 0]
+        for k in range(3):
+            r[p, 0, k] = x[p, k]
+            dr_dx[p, 0, k, k] = 1.0
+            d[k, 9] = induction[k]
+        d[0, 6], d[0, 7], d[1, 6], d[1, 7], d[2, 8] = c, -s, s, c, 1.0
+        if speed > 0.0:
+            # d(heading)/dv = [-sin, cos]/|v|, and d(hard)/d(heading) = z x hard.
+            d[0, 3], d[0, 4] = hard_y * s / speed, -hard_y * c / speed
+            d[1, 3], d[1, 4] = -hard_x * s / speed, hard_x * c / speed
+
+
 @dataclass(frozen=True)
 class PointVehicle:
     """Point target whose moment depends on its heading: hard iron and soft iron.
@@ -67,26 +93,11 @@ class PointVehicle:
     def dipoles(self, x):
         """One dipole a hypothesis; see `SourceModel.dipoles`."""
         n = len(x)
-        speed2 = x[:, 3] ** 2 + x[:, 4] ** 2
-        speed = np.sqrt(speed2)
-        moving = speed2 > 0.0
-        c = np.divide(x[:, 3], speed, out=np.ones(n), where=moving)
-        s = np.divide(x[:, 4], speed, out=np.zeros(n), where=moving)
-        hard = np.stack([c * x[:, 6] - s * x[:, 7], s * x[:, 6] + c * x[:, 7], x[:, 8]], axis=1)
-        m = hard + x[:, 9:10] * (self.earth_field / MU0)
-        dr_dx = np.zeros((n, 1, 3, 10))
-        dr_dx[:, 0, [0, 1, 2], [0, 1, 2]] = 1.0
-        dm_dx = np.zeros((n, 1, 3, 10))
-        dm_dx[:, 0, 0, 6], dm_dx[:, 0, 0, 7] = c, -s
-        dm_dx[:, 0, 1, 6], dm_dx[:, 0, 1, 7] = s, c
-        dm_dx[:, 0, 2, 8] = 1.0
-        dm_dx[:, 0, :, 9] = self.earth_field / MU0
-        # d(heading)/dv = [-sin, cos]/|v|, and d(hard)/d(heading) = z x hard.
-        dpsi_dvx = np.divide(-s, speed, out=np.zeros(n), where=moving)
-        dpsi_dvy = np.divide(c, speed, out=np.zeros(n), where=moving)
-        dm_dx[:, 0, 0, 3], dm_dx[:, 0, 0, 4] = -hard[:, 1] * dpsi_dvx, -hard[:, 1] * dpsi_dvy
-        dm_dx[:, 0, 1, 3], dm_dx[:, 0, 1, 4] = hard[:, 0] * dpsi_dvx, hard[:, 0] * dpsi_dvy
-        return Dipoles(x[:, None, :3].copy(), m[:, None, :], dr_dx, dm_dx)
+        r, m = np.empty((n, 1, 3)), np.empty((n, 1, 3))
+        dr_dx, dm_dx = np.zeros((n, 1, 3, 10)), np.zeros((n, 1, 3, 10))
+        _vehicle_dipoles(np.ascontiguousarray(x, dtype=float), self.earth_field / MU0,
+                         r, m, dr_dx, dm_dx)
+        return Dipoles(r, m, dr_dx, dm_dx)
 
     def propagate(self, x, dt):
         """Constant velocity; see `SourceModel.propagate`."""
