@@ -126,30 +126,32 @@ class FilterBank:
         per root of the dimension) and becomes their mean, with the covariance
         of the mixture. Separated hypotheses are never averaged.
         """
-        order = np.argsort(-self.log_w, kind='stable')
-        rank = np.empty(len(self), dtype=int)
-        rank[order] = np.arange(len(self))
         alive = np.ones(len(self), dtype=bool)
-        for i in order:
-            if not alive[i]:
-                continue
-            others = np.flatnonzero(alive & (self.label == self.label[i]) & (rank > rank[i]))
-            if not len(others):
-                continue
-            close = self._distance(i, others, n_target) <= distance**2 * n_target
-            if close.any():
-                self._absorb(i, others[close])
-                alive[others[close]] = False
+        for label in np.unique(self.label):
+            rows = np.flatnonzero(self.label == label)
+            rows = rows[np.argsort(-self.log_w[rows], kind='stable')]
+            close = self._close(rows, n_target, distance)
+            for k, i in enumerate(rows):
+                if not alive[i]:
+                    continue
+                others = rows[k + 1:][close[k, k + 1:]]
+                others = others[alive[others]]
+                if len(others):
+                    self._absorb(i, others)
+                    alive[others] = False
         return self.keep(alive)
 
-    def _distance(self, i, others, n_target):
-        """Squared Mahalanobis distances of `others` from row `i`, by the covariance of `i`."""
-        std = np.sqrt(np.diagonal(self.P[i])[:n_target])
-        free = std > 0.0
-        std = std[free]
-        correlation = self.P[i, :n_target, :n_target][np.ix_(free, free)] / np.outer(std, std)
-        z = (self.x[others, :n_target] - self.x[i, :n_target])[:, free] / std
-        return np.einsum('ni,ij,nj->n', z, np.linalg.pinv(correlation, hermitian=True), z)
+    def _close(self, rows, n_target, distance):
+        """[i, j]: whether row j is within `distance` of row i, by the covariance of i."""
+        P = self.P[rows, :n_target, :n_target]
+        std = np.sqrt(np.einsum('nii->ni', P))
+        free = (std > 0.0).all(axis=0)
+        std = std[:, free]
+        correlation = P[:, free][:, :, free] / (std[:, :, None] * std[:, None, :])
+        x = self.x[rows, :n_target][:, free]
+        z = (x[None] - x[:, None]) / std[:, None]
+        squared = ((z @ np.linalg.pinv(correlation, hermitian=True)) * z).sum(axis=2)
+        return squared <= distance**2 * n_target
 
     def _absorb(self, i, others):
         """Put rows `others` into row `i`: weight, mean and covariance of the mixture."""
