@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from mag_tracking.errors import MagTrackingError
+from mag_tracking.errors import MagTrackingError, OutputError
 from mag_tracking.io.bag import Recording
 from mag_tracking.io.network_file import read_network
 from mag_tracking.offline import replay, write_figures
@@ -112,9 +112,14 @@ def _settings(args):
 def _replay(args):
     """mag-tracking replay."""
     network, settings = read_network(args.network), _settings(args)
-    for path in args.recordings:
+    names = [path.resolve().stem for path in args.recordings]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise OutputError(f'two recordings are named {twice[0]}: their results would overwrite '
+                          'each other; replay them one by one')
+    for path, name in zip(args.recordings, names, strict=True):
         recording = Recording(path)
-        out = args.out / path.stem if len(args.recordings) > 1 else args.out
+        out = args.out / name if len(args.recordings) > 1 else args.out
         with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
                   disable=None) as bar:
             run = replay(recording, network, settings, out, bar.update)
@@ -137,7 +142,11 @@ def _print_summary(path, summary):
         print(f'  warning: nothing on {topic}')
     for what, n in {**summary['rejected'], **summary['lost']}.items():
         print(f'  warning: {what}: {n}')
-    waiting = [name for name, s in summary['sensors'].items() if not s['ready']]
+    stuck = [name for name, s in summary['sensors'].items() if s['stuck']]
+    if stuck:
+        print(f'  warning: {", ".join(stuck)}: an axis does not vary (a stuck sensor, or one with '
+              'coarse steps: give it a noise_std in the network file)')
+    waiting = [name for name, s in summary['sensors'].items() if not s['ready'] and not s['stuck']]
     if waiting:
         print(f'  warning: no background was learnt for {", ".join(waiting)}: the recording needs '
               'a target-free beginning, or the network file a background and a noise_std')
@@ -202,7 +211,8 @@ def main(argv=None):
     command = {'replay': _replay, 'run': _run, 'info': _info, 'import': _import}[args.command]
     try:
         return command(args)
-    except MagTrackingError as error:
+    except (MagTrackingError, OSError) as error:
+        # An OSError here is a full disk or a lost drive; its text names the file.
         print(f'mag-tracking: {error}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mag_tracking.errors import OutputError
 from mag_tracking.io.results import ResultFolder
 from mag_tracking.io.samples import SampleReader
 from mag_tracking.pipeline import Pipeline
@@ -43,6 +44,8 @@ def replay(recording, network, settings, out, progress=None):
     Raises RecordingError and OutputError. An interruption (KeyboardInterrupt)
     ends the reading; what was done is written, and the summary says so.
     """
+    if recording.lies_in(out):
+        raise OutputError(f'{out} is the folder of the recording; the results would overwrite it')
     reader = SampleReader(recording, network)
     pipeline = Pipeline(network, settings)
     logs, interrupted = {}, False
@@ -83,7 +86,8 @@ def _summary(recording, reader, pipeline, logs, truth):
     for name, background in pipeline.calibrate.backgrounds().items():
         counts = pipeline.calibrate.per_sensor[name]
         sensors[name] = {'accepted': counts['accepted'], 'rejected': counts['rejected'],
-                         'ready': background.ready, 'times_relearnt': background.n_relearnt}
+                         'ready': background.ready, 'stuck': background.stuck,
+                         'times_relearnt': background.n_relearnt}
         if background.ready and counts['accepted']:
             std = np.sqrt(np.diagonal(background.covariance))
             sensors[name]['noise_std'] = [None if np.isnan(v) else float(v) for v in std]

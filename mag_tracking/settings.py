@@ -74,7 +74,10 @@ def flatten(settings, prefix=''):
 def _scalar(name, value, kind):
     """`value` as `kind`, or a SettingsError that names the setting."""
     if kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            raise SettingsError(f'{name}: {str(value)[:20]}... is too large') from None
     if kind is int and isinstance(value, int) and not isinstance(value, bool):
         return value
     if kind in (bool, str) and isinstance(value, kind):
@@ -155,7 +158,7 @@ def read_parameter_file(path):
             content = yaml.safe_load(stream)
     except OSError as error:
         raise SettingsError(f'cannot read {path}: {error.strerror}') from error
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise SettingsError(f'{path} is not YAML: {error}') from error
     if content is None:
         return {}

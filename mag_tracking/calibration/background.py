@@ -24,7 +24,15 @@ class Block:
     """(3,) [T]; NaN = axis not reported."""
     scatter: np.ndarray
     """(3, 3) [T^2], sum of squared deviations."""
-    n: int
+    n: np.ndarray
+    """(3,) samples per axis."""
+
+
+LEAST_SAMPLES = 8
+"""A block has at least so many samples, however slow the sensor: fewer tell nothing of noise."""
+
+LEAST_STD = 1e-11
+"""[T] A block that scatters less teaches nothing: the sensor is stuck, or its steps are coarse."""
 
 
 class RunningBackground:
@@ -54,7 +62,6 @@ class RunningBackground:
         self._given = None if background is None else np.asarray(background, dtype=float)
         self._noise = None if noise_std is None else np.diag(np.asarray(noise_std, float) ** 2)
         self._noise_given = self._noise is not None
-        self._line = None if self._given is None else (0.0, self._given, np.zeros(3), np.inf)
         self.n_relearnt = 0
         self.forget()
 
@@ -66,7 +73,8 @@ class RunningBackground:
         self.frozen = False
         if not self._noise_given:
             self._noise = None
-        self._line = None if self._given is None else (0.0, self._given, np.zeros(3), np.inf)
+        self._line = None if self._given is None else (0.0, self._given, np.zeros(3), 0.0)
+        self.stuck = False
 
     @property
     def ready(self):
@@ -81,17 +89,19 @@ class RunningBackground:
     def level(self, time):
         """(3,) [T] background at `time` [s].
 
-        The drift is carried on for at most the length of the memory.
+        The drift is carried on for at most twice the stretch that it was
+        learnt from: what is known of it from three seconds is not good for twenty.
         Raises ValueError before it is ready.
         """
         if self._line is None:
             raise ValueError('the background has not been learnt yet')
-        centre, mean, slope, last = self._line
-        return mean + slope * (min(time, last + self._memory) - centre)
+        centre, mean, slope, horizon = self._line
+        return mean + slope * (min(time, horizon) - centre)
 
     def add(self, time, field):
         """Take a sample: `time` [s], `field` (3,) [T], sensor frame."""
-        if self._start is not None and time >= self._start + self._block:
+        if self._start is not None and time >= self._start + self._block \
+                and len(self._samples) >= LEAST_SAMPLES:
             self._close()
         if self._start is None:
             self._start = time
@@ -101,10 +111,16 @@ class RunningBackground:
         """Turn the collected samples into a block and judge it."""
         times = np.array([t for t, _ in self._samples])
         fields = np.array([f for _, f in self._samples])
-        mean = fields.mean(axis=0)
-        deviation = fields - mean
-        block = Block(float(times.mean()), mean, deviation.T @ deviation, len(times))
+        n = np.count_nonzero(~np.isnan(fields), axis=0)
+        mean = np.where(n > 0, np.nansum(fields, axis=0) / np.maximum(n, 1), np.nan)
+        # An axis that is missing now and then is missing in those products only.
+        deviation = np.nan_to_num(fields - mean)
+        block = Block(float(times.mean()), mean, deviation.T @ deviation, n)
         self._samples, self._start = [], None
+        variance = np.diagonal(block.scatter)[n > 1] / (n[n > 1] - 1)
+        self.stuck = bool((variance < LEAST_STD**2).any())
+        if self.stuck:
+            return
         if self._line is not None and self._noise is not None:
             self._follow(block)
         else:
@@ -113,9 +129,10 @@ class RunningBackground:
     def _begin(self, block):
         """Before it is ready: collect until a quiet stretch is long enough."""
         self._strange.append(block)
-        while self._strange[-1].time - self._strange[0].time > self._learn:
+        while len(self._strange) > 3 and block.time - self._strange[0].time > self._learn:
             self._strange.popleft()
-        if self._strange[-1].time - self._strange[0].time < self._learn - 1.5 * self._block:
+        if len(self._strange) < 3 or block.time - self._strange[0].time \
+                < self._learn - 1.5 * self._block:
             return
         self._adopt_if_steady()
 
@@ -123,6 +140,7 @@ class RunningBackground:
         """Once ready: extend the quiet stretch, or freeze."""
         std = np.sqrt(np.diagonal(self._noise))
         off = np.abs(block.mean - self.level(block.time))
+        # A comparison with NaN is false: an axis that is not reported freezes nothing.
         self.frozen = bool(np.any(off > self._freeze_std * std))
         if self.frozen:
             self._pending.clear()
@@ -149,9 +167,11 @@ class RunningBackground:
         if noise is None and not self._noise_given:
             return False
         std = np.sqrt(np.diagonal(self._noise if self._noise_given else noise))
+        if np.isnan(std).all():
+            return False
         centre, mean, slope = _line_through(blocks)
         off = [np.abs(b.mean - mean - slope * (b.time - centre)) for b in blocks]
-        if np.nanmax(np.array(off) / std) > self._freeze_std:
+        if not np.nanmax(np.array(off) / std) <= self._freeze_std:
             return False
         if not self._noise_given:
             self._noise = noise
@@ -172,25 +192,40 @@ class RunningBackground:
         if self._given is not None and blocks[-1].time - blocks[0].time < self._learn:
             return
         centre, mean, slope = _line_through(blocks)
-        self._line = (centre, mean, slope, blocks[-1].time)
+        span = blocks[-1].time - blocks[0].time
+        self._line = (centre, mean, slope, blocks[-1].time + 2.0 * span)
         noise = _pooled_covariance(blocks)
         if not self._noise_given and noise is not None:
             self._noise = noise
 
 
 def _line_through(blocks):
-    """Weighted least-squares line: centre [s], mean (3,) and slope (3,) there."""
+    """Weighted least-squares line per axis: centre [s], mean (3,) and slope (3,) there.
+
+    NaN for an axis that no block reports.
+    """
     t = np.array([b.time for b in blocks])
     w = np.array([b.n for b in blocks], dtype=float)
-    y = np.array([b.mean for b in blocks])
-    centre = float(w @ t / w.sum())
-    mean = w @ y / w.sum()
-    spread = float(w @ (t - centre) ** 2)
-    slope = (w * (t - centre)) @ (y - mean) / spread if spread > 0.0 else np.zeros(3)
-    return centre, mean, slope
+    y = np.nan_to_num(np.array([b.mean for b in blocks]))
+    total = w.sum(axis=0)
+    some = total > 0.0
+    total = np.where(some, total, np.nan)
+    centre = float(t.mean())
+    mean_t = (w * t[:, None]).sum(axis=0) / total
+    mean_y = (w * y).sum(axis=0) / total
+    d = t[:, None] - mean_t
+    spread = (w * d * d).sum(axis=0)
+    flat = ~(spread > 0.0)
+    slope = np.where(flat, 0.0, (w * d * (y - mean_y)).sum(axis=0) / np.where(flat, 1.0, spread))
+    return centre, mean_y + slope * (centre - mean_t), slope
 
 
 def _pooled_covariance(blocks):
-    """Scatter within blocks, pooled; None where there are too few samples for it."""
-    freedom = sum(b.n - 1 for b in blocks)
-    return sum(b.scatter for b in blocks) / freedom if freedom > 3 else None
+    """Scatter within blocks, pooled; None with too few samples, NaN for an axis not reported."""
+    n = sum(b.n for b in blocks)
+    freedom = n - np.count_nonzero([b.n > 0 for b in blocks], axis=0)
+    if freedom.max() <= 3:
+        return None
+    freedom = np.where(freedom > 3, freedom, np.nan).astype(float)
+    scatter = sum(b.scatter for b in blocks)
+    return scatter / np.sqrt(freedom[:, None] * freedom[None, :])

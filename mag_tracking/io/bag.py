@@ -62,6 +62,10 @@ class Recording:
         self.start_ns = self.end_ns = None
         self._indexes = [self._inspect(f) for f in self._files]
 
+    def lies_in(self, folder):
+        """Whether a file of this recording is in `folder` itself."""
+        return any(f.resolve().parent == Path(folder).resolve() for f in self._files)
+
     @property
     def size(self):
         """Bytes of all files."""
@@ -165,7 +169,7 @@ class Recording:
                     schemas[record.id] = record
                 elif isinstance(record, Channel):
                     channels[record.id] = record
-                elif isinstance(record, Message):
+                elif isinstance(record, Message) and _has_schema(record, channels):
                     yield _raw(record, schemas, channels)
                 if progress:
                     here = stream.tell()
@@ -185,9 +189,14 @@ class Recording:
                 schemas[record.id] = record
             elif isinstance(record, Channel):
                 channels[record.id] = record
-            elif isinstance(record, Message):
+            elif isinstance(record, Message) and _has_schema(record, channels):
                 messages.append(_raw(record, schemas, channels))
         return sorted(messages, key=lambda m: m.log_time_ns)
+
+
+def _has_schema(message, channels):
+    """Whether the message has a type at all; MCAP allows channels without (id 0), ROS does not."""
+    return channels[message.channel_id].schema_id != 0
 
 
 def _raw(message, schemas, channels):
@@ -236,6 +245,11 @@ class RecordingWriter:
     def __init__(self, path):
         """Raises OutputError where the file cannot be written."""
         self.path = Path(path)
+        metadata = self.path.parent / 'metadata.yaml'
+        if metadata.exists() and f'- {self.path.name}\n' not in metadata.read_text(
+                encoding='utf-8', errors='replace'):
+            raise OutputError(f'{self.path.parent} holds another recording (its metadata.yaml does '
+                              f'not name {self.path.name}); choose another folder')
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._stream = open(self.path, 'wb')

@@ -90,6 +90,11 @@ def _read_table(path):
     if not values:
         raise RecordingError(f'{path} has no rows')
     a = np.array(values)
+    if not np.isfinite(a).all():
+        row, column = np.argwhere(~np.isfinite(a))[0]
+        raise RecordingError(f'{path}: row {row + 2}: {_COLUMNS[column]} is not a finite number')
+    if (a[:, 0] != a[:, 0].astype(int)).any():
+        raise RecordingError(f'{path}: column id has numbers that are not whole')
     return {'id': a[:, 0], 'timestamp': a[:, 1], 'field': a[:, 2:5], 'sensor': a[:, 5:8],
             'sensor_rotation': a[:, 8:11], 'magnet': a[:, 11:14], 'magnet_rotation': a[:, 14:17]}
 

@@ -1,6 +1,7 @@
 """`network.yaml`: the geometry and calibration of a sensor network."""
 
-import math
+import re
+from collections.abc import Hashable
 
 import numpy as np
 import yaml
@@ -9,6 +10,7 @@ from mag_tracking.errors import NetworkError, OutputError
 from mag_tracking.geometry import rotation_from_quaternion
 from mag_tracking.network import SensorNetwork
 
+_TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 _TOP = {'frame', 'earth_field', 'sensors'}
 _SENSOR = {'position', 'orientation', 'noise_std', 'background', 'topic'}
 
@@ -20,6 +22,8 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         seen = set()
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, Hashable):
+                raise NetworkError(f'{key!r} is no name (line {key_node.start_mark.line + 1})')
             if key in seen:
                 raise NetworkError(f'{key} is there twice (line {key_node.start_mark.line + 1})')
             seen.add(key)
@@ -35,7 +39,7 @@ def _vector(what, value, lengths):
         # YAML 1.1 reads 1e-8, without a point, as text.
         if isinstance(v, str):
             raise NetworkError(f'{what}: {v!r} is text; write numbers as 1.0e-8')
-        if isinstance(v, bool) or not isinstance(v, (int, float)) or not math.isfinite(v):
+        if isinstance(v, bool) or not isinstance(v, (int, float)) or not abs(v) < 1e300:
             raise NetworkError(f'{what}: {v!r} is not a finite number')
     return np.array(value, dtype=float)
 
@@ -65,15 +69,21 @@ def _sensor(name, entry):
     if noise is not None:
         noise = noise if isinstance(noise, list) else [noise]
         noise = _vector(f'sensor {name}: noise_std', noise, (1, 3)) * np.ones(3)
-        if not (noise > 0.0).all():
-            raise NetworkError(f'sensor {name}: noise_std must be above zero, got '
-                               f'{noise.tolist()}')
+        if not ((noise > 0.0) & (noise < 1e-3)).all():
+            raise NetworkError(f'sensor {name}: noise_std must be above zero and below a '
+                               f'millitesla, got {noise.tolist()} T')
     background = entry.get('background')
     if background is not None:
         background = _vector(f'sensor {name}: background', background, (3,))
+        if np.abs(background).max() > 0.1:
+            raise NetworkError(f'sensor {name}: background: {background.tolist()} T is more than '
+                               '0.1 T; is it in microtesla or gauss?')
     topic = entry.get('topic', f'/{name}/imu/mag')
     if not isinstance(topic, str) or not topic.startswith('/'):
         raise NetworkError(f'sensor {name}: topic must begin with /, got {topic!r}')
+    if not _TOPIC.fullmatch(topic):
+        raise NetworkError(f'sensor {name}: {topic!r} is no ROS topic: letters, digits and _, '
+                           'no part begins with a digit')
     return position, R_ws, noise, background, topic
 
 
@@ -84,7 +94,7 @@ def read_network(path):
             content = yaml.load(stream, Loader=_UniqueKeyLoader)
     except OSError as error:
         raise NetworkError(f'cannot read {path}: {error.strerror}') from error
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise NetworkError(f'{path} is not YAML: {error}') from error
     except NetworkError as error:
         raise NetworkError(f'{path}: {error}') from error
@@ -106,11 +116,14 @@ def _network(content):
         if np.linalg.norm(earth) > 1e-3:
             raise NetworkError(f'earth_field: {earth.tolist()} T is more than a millitesla; '
                                'is it in microtesla or gauss?')
+    frame = content.get('frame', 'map')
+    if not isinstance(frame, str) or not frame:
+        raise NetworkError(f'frame: expected a name, got {frame!r}')
     names = tuple(str(name) for name in sensors)
     parts = [_sensor(n, e) for n, e in zip(names, sensors.values(), strict=True)]
     position, R_ws, noise, background, topics = zip(*parts, strict=True)
     return SensorNetwork(names, np.array(position), np.array(R_ws), topics,
-                         str(content.get('frame', 'map')), earth, noise, background)
+                         frame, earth, noise, background)
 
 
 def _numbers(values):

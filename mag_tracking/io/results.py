@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -94,8 +95,17 @@ class ResultFolder:
     def write_summary(self, summary):
         """`summary.json`."""
         with open(self.folder / 'summary.json', 'w', encoding='utf-8') as stream:
-            json.dump(summary, stream, indent=1, allow_nan=False)
+            json.dump(_without_nan(summary), stream, indent=1, allow_nan=False)
             stream.write('\n')
+
+
+def _without_nan(value):
+    """NaN and infinity are no JSON: null instead."""
+    if isinstance(value, dict):
+        return {k: _without_nan(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _floats(*groups):

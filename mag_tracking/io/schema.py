@@ -101,9 +101,11 @@ def decode(message):
     Raises RecordingError where the bytes do not fit the type.
     """
     key = message.schema.name, message.schema.data
-    if key not in _decoders:
-        _decoders[key] = DecoderFactory().decoder_for('cdr', message.schema)
     try:
+        if key not in _decoders:
+            _decoders[key] = DecoderFactory().decoder_for('cdr', message.schema)
+        if _decoders[key] is None:
+            raise ValueError(f'its schema is in {message.schema.encoding}, not in ros2msg')
         return _decoders[key](message.data)
     except _DECODE_ERRORS as error:
         raise RecordingError(f'a message on {message.topic} is not a {message.type}: '

@@ -20,6 +20,8 @@ TICK_S = 0.005
 """How often the node looks for messages that are due [s]."""
 LONGEST_STEP_S = 0.02
 """Time on the wall that one look may make good for [s]."""
+MOST_AT_ONCE = 200
+"""Messages published at one look; the subscribers' queues hold more than that."""
 
 
 class ReplayNode(Node):
@@ -32,8 +34,9 @@ class ReplayNode(Node):
         if not path:
             raise SettingsError('replay_node: parameter recording: a path is needed')
         self._rate = self.declare_parameter('rate', 1.0).value
-        if not self._rate > 0.0:
-            raise SettingsError(f'replay_node: parameter rate: {self._rate} is not above 0')
+        if not 0.0 < self._rate < float('inf'):
+            raise SettingsError(f'replay_node: parameter rate: {self._rate} is not a number '
+                                'above 0')
         self._loop = self.declare_parameter('loop', False).value
         offset = self.declare_parameter('start_offset', 0.0).value
         topics = self.declare_parameter('topics', ['']).value
@@ -44,6 +47,10 @@ class ReplayNode(Node):
         self._open(topics)
         self._clock_publisher = self.create_publisher(Clock, '/clock', STREAM)
         self.finished = False
+        end = self._recording.end_ns
+        if not offset >= 0.0 or (end is not None and self._begin + offset * 1e9 > end):
+            raise SettingsError(f'replay_node: parameter start_offset: {offset} s is outside the '
+                                'recording')
         self._seek(offset)
         # Discovery takes a moment; what is published before it is lost.
         self._start = time.monotonic() + delay
@@ -102,7 +109,13 @@ class ReplayNode(Node):
         self._position += int(elapsed * self._rate * 1e9)
         self._clock_publisher.publish(Clock(clock=Time(sec=self._position // 10**9,
                                              nanosec=self._position % 10**9)))
+        room = MOST_AT_ONCE
         while self._next is not None and self._next.log_time_ns <= self._position:
+            if room == 0:
+                # Slower than asked for, rather than more than the queues hold.
+                self._position = self._next.log_time_ns
+                return
+            room -= 1
             publisher = self._publisher_for(self._next.topic, self._next.type)
             if publisher is not None:
                 publisher.publish(self._next.data)

@@ -40,6 +40,9 @@ class StageNode(Node):
         self.input_qos = STREAM if reliable else SENSORS
         self.network = read_network(path)
         self.settings = declare_settings(self, settings_for(target), group, self.OWN_PARAMETERS)
+        if self.settings.track.target != target:
+            raise SettingsError(f'{name}: track.target is {self.settings.track.target!r}, but '
+                                f'target is {target!r}')
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RESULTS)
         self._reported = {}
         self.create_timer(1.0, self._publish_diagnostics)

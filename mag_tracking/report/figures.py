@@ -38,6 +38,16 @@ def _scale_of(extent):
     return (1.0, 'm') if extent > 1.0 else (1e3, 'mm')
 
 
+def _without_switches(rows):
+    """Points (n, 2), with NaN where the best of an arrival is suddenly elsewhere: another one."""
+    points = np.array([r[2][:2] for r in rows])
+    certain = np.array([3.0 * np.sqrt(np.trace(r[3])) for r in rows])
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    usual = 4.0 * np.median(steps) if len(steps) else 0.0
+    switch = np.flatnonzero(steps > np.maximum(usual, 0.5 * certain[1:])) + 1
+    return np.insert(points, switch, np.nan, axis=0)
+
+
 def map_figure(log, network, truth=None):
     """The map: trajectories of the hypotheses with 90 % ellipses, sensors and truth.
 
@@ -58,7 +68,7 @@ def map_figure(log, network, truth=None):
     colours = _colours(log)
     for name, colour in colours.items():
         rows = [(k, *row[name]) for k, row in enumerate(log.arrivals) if name in row]
-        points = f * np.array([r[2][:2] for r in rows])
+        points = f * _without_switches(rows)
         weight = rows[-1][1] if rows[-1][0] == len(best) - 1 else 0.0
         axes.plot(*points.T, color=colour, lw=1.8 if weight > 0.5 else 1.0,
                   label=f'{name or "hypothesis"} ({weight:.0%} at the end)')

@@ -6,7 +6,7 @@ frames do not depend on the order in which the sensors' messages arrive.
 """
 
 from collections import Counter, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,6 +42,7 @@ class Align:
     def __init__(self, network, settings):
         self.counts = Counter()
         self._n = len(network)
+        self._noise = network.noise_std
         self._index = {name: i for i, name in enumerate(network.names)}
         self._settings = settings
         self._period = int(round(settings.period_s * NS))
@@ -61,6 +62,14 @@ class Align:
         if i is None:
             self.counts[f'rejected: unknown sensor {sample.sensor}'] += 1
             return []
+        if not np.isfinite(sample.field).any() or np.isinf(sample.field).any():
+            self.counts['rejected: no finite field'] += 1
+            return []
+        if sample.covariance is None:
+            if self._noise[i] is None:
+                self.counts['rejected: covariance unknown, and no noise_std in the network'] += 1
+                return []
+            sample = replace(sample, covariance=np.diag(self._noise[i] ** 2))
         out = []
         last = self._latest[i]
         if last is not None and stamp <= last:

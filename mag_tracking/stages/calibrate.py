@@ -35,6 +35,9 @@ class CalibrateSettings:
     max_field: float = param(
         1e-3, 'A reading above this is rejected: gauss or microtesla published as tesla is the '
         'commonest fault. Near magnets millitesla are legitimate.', 'T', (1e-6, 10.0))
+    jump_ahead_s: float = param(
+        60.0, 'A stamp that is ahead by more than this has to be confirmed by the next one, else '
+        'it is taken for corrupt.', 's', (1e-3, 1e9))
     jump_back_s: float = param(
         1.0, 'A stamp that goes back by more than this is a restart (a looped recording): '
         'what was learnt is forgotten.', 's', (0.0, 3600.0))
@@ -53,7 +56,7 @@ class Calibrate:
         self.per_sensor = {name: Counter() for name in network.names}
         self._network = network
         self._settings = settings
-        self._first_ns, self._last_ns = {}, {}
+        self._first_ns, self._last_ns, self._ahead_ns = {}, {}, {}
         self._background = {
             name: RunningBackground(
                 settings.learn_s, settings.memory_s, settings.guard_s, settings.block_s,
@@ -69,6 +72,8 @@ class Calibrate:
         if cause:
             return self._reject(sample, cause)
         last = self._last_ns.get(sample.sensor)
+        if last is not None and self._is_ahead(sample, last):
+            return self._reject(sample, 'stamp too far ahead')
         background = self._background[sample.sensor]
         if last is not None and sample.stamp_ns <= last:
             if last - sample.stamp_ns <= self._settings.jump_back_s * NS:
@@ -85,14 +90,31 @@ class Calibrate:
         if not background.ready:
             self.counts['held back while learning'] += 1
             return []
+        covariance = background.covariance if sample.covariance is None else sample.covariance
+        field = sample.field - background.level(time)
+        unknown = ~np.isnan(field) & np.isnan(np.diagonal(covariance))
+        if unknown.any() or (np.isnan(field) & ~np.isnan(sample.field)).any():
+            # It has only just begun to report this axis: nothing is known of it yet.
+            field = np.where(unknown, np.nan, field)
+            self.counts['axes held back while learning'] += 1
+        if np.isnan(field).all():
+            return []
         self.counts['calibrated'] += 1
-        covariance = sample.covariance
-        return [MagSample(sample.stamp_ns, sample.sensor, sample.field - background.level(time),
-                          background.covariance if covariance is None else covariance)]
+        return [MagSample(sample.stamp_ns, sample.sensor, field, covariance)]
 
     def flush(self):
         """Nothing is held back for long: []."""
         return []
+
+    def _is_ahead(self, sample, last):
+        """Whether a stamp is far ahead of the `last`, and of the one that was so before it."""
+        limit = self._settings.jump_ahead_s * NS
+        if sample.stamp_ns - last <= limit:
+            self._ahead_ns.pop(sample.sensor, None)
+            return False
+        before = self._ahead_ns.get(sample.sensor)
+        self._ahead_ns[sample.sensor] = sample.stamp_ns
+        return before is None or not 0 < sample.stamp_ns - before <= limit
 
     def _fault(self, sample):
         """Why the sample cannot be used, or None."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mag_tracking.errors import SettingsError
 from mag_tracking.inference.detection_theory import energy_threshold, whitened_energy
 from mag_tracking.records import Detection
 from mag_tracking.settings import param
@@ -29,19 +30,30 @@ class DetectSettings:
     hold_s: float = param(
         1.0, 'The target is gone after so long without a frame that is not quiet.',
         's', (0.0, 3600.0))
+    background_drift: float = param(
+        1e-9, 'How much more the background may be off for every second that a target has kept it '
+        'from being learnt; forgotten a few seconds after the target.', 'T/s', (0.0, 1e-3))
     background_std: float = param(
         4e-9, 'What the background may be off by (drift while frozen); added to the noise. '
-        '0 = the stated probability is exact for noise alone.', 'T', (0.0, 1e-3))
+        '0 = the stated probability is exact where the background is.', 'T', (0.0, 1e-3))
+
+
+RECOVERY_S = 5.0
+"""[s] After a target the calibration needs about this long to learn the background anew."""
 
 
 class Detect:
     """Frames to frames with a verdict, and a `Detection` at onset and release."""
 
     def __init__(self, network, settings):
+        if settings.release_probability < settings.false_alarm_probability:
+            raise SettingsError(
+                f'detect.release_probability: {settings.release_probability:g} is below '
+                f'false_alarm_probability ({settings.false_alarm_probability:g}): what is loud '
+                'enough to begin would be quiet enough to end')
         self.counts = Counter()
         self._names = network.names
         self._settings = settings
-        self._allowance = settings.background_std**2 * np.eye(3)
         self._thresholds = {}
         self._next_id = 1
         self._reset()
@@ -50,7 +62,8 @@ class Detect:
         """No target."""
         self._present = False
         self._above = 0
-        self._last_ns = self._loud_ns = None
+        self._last_ns = self._loud_ns = self._onset_ns = None
+        self._unlearnt_s = 0.0
 
     def threshold(self, probability, degrees_of_freedom):
         """Threshold of the energy, remembered."""
@@ -67,7 +80,8 @@ class Detect:
             out = self._release(self._last_ns, float('nan'), 0, '')
             self._reset()
         self._last_ns = frame.stamp_ns
-        energy, axes = whitened_energy(frame.field, frame.covariance + self._allowance)
+        energy, axes = whitened_energy(
+            frame.field, frame.covariance + self._allowance(frame.stamp_ns) * np.eye(3))
         statistic, n = float(energy.sum()), int(axes.sum())
         self.counts['frames'] += 1
         if n:
@@ -77,6 +91,15 @@ class Detect:
             self.counts['frames without a measurement'] += 1
         return [*out, replace(frame, target_present=self._present, statistic=statistic,
                               degrees_of_freedom=n)]
+
+    def _allowance(self, stamp_ns):
+        """[T^2] Variance of what the background may be off by."""
+        if self._present:
+            self._unlearnt_s = (stamp_ns - self._onset_ns) / NS
+        elif self._loud_ns is not None and stamp_ns - self._loud_ns > RECOVERY_S * NS:
+            self._unlearnt_s = 0.0
+        s = self._settings
+        return (s.background_std + s.background_drift * self._unlearnt_s) ** 2
 
     def _judge(self, stamp_ns, statistic, n, strongest):
         """Onset, hold and release; the detections that follow."""
@@ -89,7 +112,9 @@ class Detect:
         if statistic > self.threshold(s.release_probability, n):
             self._loud_ns = stamp_ns
         if not self._present and self._above >= s.onset_frames:
-            self._present = True
+            self._present, self._loud_ns = True, stamp_ns
+            # What was not learnt for an earlier target is still not learnt.
+            self._onset_ns = stamp_ns - int(self._unlearnt_s * NS)
             self.counts['onsets'] += 1
             return [self._detection(stamp_ns, True, statistic, n, strongest)]
         if self._present and stamp_ns - self._loud_ns > s.hold_s * NS:

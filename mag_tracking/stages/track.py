@@ -12,7 +12,6 @@ import numpy as np
 
 from mag_tracking.errors import SettingsError
 from mag_tracking.inference import kalman
-from mag_tracking.inference.detection_theory import whitened_energy
 from mag_tracking.physics.dipole import sensor_fields
 from mag_tracking.settings import param
 from mag_tracking.stages.magnet_start import MagnetSettings, magnet_model, start_magnet
@@ -114,9 +113,9 @@ class TrackStage:
             dt = (frame.stamp_ns - self._last_ns) / NS
             if dt <= 0.0:
                 self.counts['time jumped back'] += 1
-                out = self._end('time jumped back')
+                out = self._forget('time jumped back')
             elif dt > self._settings.end_gap_s:
-                out = self._end('gap in the frames')
+                out = self._forget('gap in the frames')
         previous, self._last_ns = self._last_ns, frame.stamp_ns
         self.counts['frames'] += 1
         if frame.target_present and self._bank is not None:
@@ -127,6 +126,12 @@ class TrackStage:
         self._out_of_reach = False
         self._remember(frame)
         return out
+
+    def _forget(self, reason):
+        """What came before has nothing to do with what comes."""
+        self._recent.clear()
+        self._out_of_reach = False
+        return self._end(reason)
 
     def _remember(self, frame):
         """Keep a frame without a target for a track that may begin soon."""
@@ -154,11 +159,14 @@ class TrackStage:
             return []
         self.counts['tracks'] += 1
         self._log_odds, self._surest = 0.0, np.inf
+        n_background = 3 * len(self._network)
+        self._noise_x = np.zeros((1, n_background))
+        self._noise_P = s.background_std**2 * np.eye(n_background)[None]
         if recent:
             self._predict((recent[0].stamp_ns - frame.stamp_ns) / NS)
         dt = 0.0
         for before, after in pairwise([*recent, frame]):
-            self._step(before, dt)
+            self._step(before, dt, publish=False)
             dt = (after.stamp_ns - before.stamp_ns) / NS
         return self._step(frame, dt)
 
@@ -169,8 +177,8 @@ class TrackStage:
         kalman.predict(bank.x, bank.P, x_target, F, Q if dt > 0.0 else 0.0 * Q,
                        self._settings.background_drift**2 * max(dt, 0.0))
 
-    def _step(self, frame, dt):
-        """Predict, update, weigh, publish."""
+    def _step(self, frame, dt, publish=True):
+        """Predict, update, weigh, publish; the `Track` of the frame if it is to be published."""
         s, bank = self._settings, self._bank
         if bank is None:
             return []
@@ -182,15 +190,15 @@ class TrackStage:
         if not np.isfinite(evidence):
             self.counts['banks lost'] += 1
             return self._end('no hypothesis explains the field')
-        self._log_odds += evidence - self._log_density_of_noise(frame, covariance)
+        self._log_odds += evidence - self._log_density_of_noise(frame, covariance, dt)
+        if not publish:
+            self._thin_out()
+            return []
         best = bank.best()
         n_y = int(np.count_nonzero(~np.isnan(frame.field)))
         innovation = self._innovation(frame, best)
         best_nis = float(nis[best]) if n_y else float('nan')
-        gone = bank.prune(-np.log(s.prune_ratio), s.most_hypotheses)
-        if s.merge_distance:
-            gone += bank.merge(len(self._model.state_names), s.merge_distance)
-        self.counts['hypotheses dropped'] += gone
+        self._thin_out()
         self._last = published_track(
             bank, self._model, self._orientation, self.arrivals, stamp_ns=frame.stamp_ns,
             id=self._next_id, ended=False, nis=best_nis, degrees_of_freedom=n_y,
@@ -202,6 +210,14 @@ class TrackStage:
             return [self._last, *self._end('out of reach')]
         self._surest = min(self._surest, float(np.trace(self._last.covariance[:2, :2])) ** 0.5)
         return [self._last]
+
+    def _thin_out(self):
+        """Drop and merge hypotheses."""
+        s = self._settings
+        gone = self._bank.prune(-np.log(s.prune_ratio), s.most_hypotheses)
+        if s.merge_distance:
+            gone += self._bank.merge(len(self._model.state_names), s.merge_distance)
+        self.counts['hypotheses dropped'] += gone
 
     def _update(self, frame, covariance, dt):
         """Measurement update of the bank, relinearised as often as the settings say."""
@@ -230,15 +246,15 @@ class TrackStage:
         h = sensor_fields(self._positions, self._R_sw, *self._model.dipoles(x[:, :n_t]))[0][0]
         return frame.field - h - x[0, n_t:].reshape(-1, 3)
 
-    def _log_density_of_noise(self, frame, covariance):
-        """Log-density of the frame if there were no target."""
-        C = covariance + self._settings.background_std**2 * np.eye(3)
-        energy, axes = whitened_energy(frame.field, C)
-        total = -0.5 * (energy.sum() + axes.sum() * np.log(2.0 * np.pi))
-        for j in np.flatnonzero(axes):
-            there = ~np.isnan(frame.field[j])
-            total -= 0.5 * np.linalg.slogdet(C[j][np.ix_(there, there)])[1]
-        return float(total)
+    def _log_density_of_noise(self, frame, covariance, dt):
+        """Log-density of the frame if there is no target, only backgrounds that wander."""
+        n = len(self._network)
+        i = np.arange(3 * n)
+        self._noise_P[0, i, i] += self._settings.background_drift**2 * dt
+        log_likelihood, _ = kalman.update(
+            self._noise_x, self._noise_P, frame.field, np.zeros((1, n, 3)),
+            np.zeros((1, n, 3, 0)), covariance, np.zeros((1, n)))
+        return float(log_likelihood[0])
 
     def _end(self, reason):
         """Close the running track; its last record goes out once more, marked as ended."""
