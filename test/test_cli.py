@@ -112,12 +112,14 @@ def test_help_teaches():
 
 def test_an_interrupted_replay_keeps_what_is_done(tmp_path):
     out = tmp_path / 'out'
-    recordings = [str(vehicle_path(NAME))] * 40
+    recordings = [tmp_path / f'{NAME}_{k}.mcap' for k in range(40)]
+    for path in recordings:
+        path.write_bytes(vehicle_path(NAME).read_bytes())
     process = subprocess.Popen(
-        [sys.executable, '-m', 'mag_tracking.cli', 'replay', *recordings, '--network',
+        [sys.executable, '-m', 'mag_tracking.cli', 'replay', *map(str, recordings), '--network',
          str(NETWORK_FILE), '--out', str(out), '--no-figures'],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    table = out / NAME / 'summary.json'
+    table = out / f'{NAME}_0' / 'summary.json'
     deadline = time.monotonic() + 60
     while not table.exists() and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -125,7 +127,7 @@ def test_an_interrupted_replay_keeps_what_is_done(tmp_path):
     stdout, stderr = process.communicate(timeout=60)
     assert process.returncode == 130, stderr
     assert 'Traceback' not in stderr
-    assert json.loads(table.read_text())['recording'] == f'{NAME}.mcap'
+    assert json.loads(table.read_text())['recording'] == f'{NAME}_0.mcap'
 
 
 def test_the_example_runs():

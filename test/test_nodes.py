@@ -268,7 +268,7 @@ def test_bad_messages_are_counted_and_survived(ros):
     node.create_subscription(MagneticField, '/mag_1/imu/mag_calibrated', calibrated.append, STREAM)
     publisher = node.create_publisher(MagneticField, '/mag_1/imu/mag', STREAM)
     process = start('calibration_node', '-p', f'network:={NETWORK_FILE}',
-                    '-p', 'calibrate.learn_s:=0.5')
+                    '-p', 'calibrate.learn_s:=0.5', '-p', 'reliable_input:=true')
 
     def publish(ms, x, y=1.5e-5, z=-4.9e-5, covariance=0.0):
         publisher.publish(to_message(MagneticField, {
@@ -281,8 +281,8 @@ def test_bad_messages_are_counted_and_survived(ros):
                           and node.count_publishers('/mag_1/imu/mag_calibrated'))
         rng = np.random.default_rng(0)
         for k in range(150):
-            publish(10 * k, 2e-6 + 1e-8 * rng.standard_normal(),
-                    covariance=-1.0 if k % 2 else 0.0)
+            field = np.array([2e-6, 1.5e-5, -4.9e-5]) + 1e-8 * rng.standard_normal(3)
+            publish(10 * k, *field.tolist(), covariance=-1.0 if k % 2 else 0.0)
         nan = float('nan')
         publish(1600, nan, nan, nan)
         publish(1610, float('inf'))
