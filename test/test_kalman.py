@@ -16,7 +16,7 @@ def dense_update(x, P, y, h, H, C, inflation, x_lin):
     """The textbook, stacked update of one hypothesis: the oracle."""
     n_sensors, _, n_t = H.shape
     full = np.zeros((3 * n_sensors, len(x)))
-    full[:, :n_t] = H.reshape(-1, n_t)
+    full[:, :n_t] = H.reshape(3 * n_sensors, n_t)
     full[:, n_t:] = np.eye(3 * n_sensors)
     R = np.zeros((3 * n_sensors, 3 * n_sensors))
     for j in range(n_sensors):
@@ -101,6 +101,32 @@ def test_update_equals_dense_oracle_and_filterpy(n_sensors):
 
 def test_update_with_missing_axes_and_sensors():
     assert max(compare(3, missing=True)) <= 1e-8
+
+
+@pytest.mark.parametrize('n_t', [0, 3, 5, 7, 12])
+def test_update_in_numbers_near_one_with_any_axes_missing(n_t):
+    """In tesla a missing axis that is only given a large noise would look like one left out."""
+    rng = np.random.default_rng(n_t)
+    n_sensors = 8
+    n_x = n_t + 3 * n_sensors
+    x = rng.standard_normal((1, n_x))
+    P, C = (np.stack([a @ a.T + 0.1 * np.eye(k) for a in rng.standard_normal((n, k, k))])
+            for n, k in ((1, n_x), (n_sensors, 3)))
+    h, H = rng.standard_normal((1, n_sensors, 3)), rng.standard_normal((1, n_sensors, 3, n_t))
+    inflation = rng.uniform(0.0, 1.0, (1, n_sensors))
+    x_lin = x + rng.standard_normal(x.shape)
+    y = rng.standard_normal((n_sensors, 3))
+    patterns = np.array([[j >> a & 1 for a in range(3)] for j in range(n_sensors)], dtype=bool)
+    y[patterns] = np.nan
+    C[patterns] = np.nan
+    C[np.broadcast_to(patterns[:, None, :], C.shape)] = np.nan
+    new_x, new_P = x.copy(), P.copy()
+    log_likelihood, nis = kalman.update(new_x, new_P, y, h, H, C, inflation, x_lin)
+    filled = np.where(np.isnan(C), np.eye(3), C)
+    ox, oP, oll, onis, _ = dense_update(x[0], P[0], y, h[0], H[0], filled, inflation[0], x_lin[0])
+    np.testing.assert_allclose(new_x[0], ox, atol=1e-9)
+    np.testing.assert_allclose(new_P[0], oP, atol=1e-9)
+    np.testing.assert_allclose([log_likelihood[0], nis[0]], [oll, onis], rtol=1e-9)
 
 
 def test_update_linearised_elsewhere():

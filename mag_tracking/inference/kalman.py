@@ -44,160 +44,174 @@ def predict(x, P, x_target, F, Q, background_variance):
 
 
 _COMPILE = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}
-"""Fused multiply-add is allowed, nothing else that would change a result."""
+"""Fused multiply-add is allowed, nothing else that would change a result.
+
+The kernels take whole arrays and row numbers, and give back scalars: a slice
+or a small array passed on costs more than the arithmetic it saves writing.
+"""
+
+_INLINE = {'error_model': 'numpy', 'fastmath': {'contract'}, 'forceinline': True}
 
 
-@njit('int64(float64[::1], float64[:,::1], float64, int64[::1], float64[:,::1])', **_COMPILE)
-def _cholesky_of_present(y, C, inflation, axes, L):
-    """Cholesky factor of the noise of the axes that are not NaN; their number, -1 if singular."""
-    n = 0
+@njit(**_INLINE)
+def _residual(y, predicted, H, x, x_lin, p, j, a):
+    """Measured minus predicted field of one axis; zero where it is missing."""
+    if math.isnan(y):
+        return 0.0
+    residual = y - predicted
+    for c in range(H.shape[3]):
+        residual -= H[p, j, a, c] * (x[p, c] - x_lin[p, c])
+    return residual
+
+
+@njit(**_INLINE)
+def _gain_rows(y, P, H, p, j, first, T):
+    """T = [H | I] P, the three rows of sensor j; rows of missing axes are zero.
+
+    Five columns of H at a time, so that each entry of T is touched less often.
+    """
+    n_x, n_t = P.shape[1], H.shape[3]
+    for i in range(n_x):
+        T[0, i] = P[p, first, i]
+        T[1, i] = P[p, first + 1, i]
+        T[2, i] = P[p, first + 2, i]
+    for c in range(0, n_t - 4, 5):
+        a0, a1, a2, a3, a4 = (H[p, j, 0, c], H[p, j, 0, c + 1], H[p, j, 0, c + 2],
+                              H[p, j, 0, c + 3], H[p, j, 0, c + 4])
+        b0, b1, b2, b3, b4 = (H[p, j, 1, c], H[p, j, 1, c + 1], H[p, j, 1, c + 2],
+                              H[p, j, 1, c + 3], H[p, j, 1, c + 4])
+        d0, d1, d2, d3, d4 = (H[p, j, 2, c], H[p, j, 2, c + 1], H[p, j, 2, c + 2],
+                              H[p, j, 2, c + 3], H[p, j, 2, c + 4])
+        for i in range(n_x):
+            p0, p1, p2, p3, p4 = (P[p, c, i], P[p, c + 1, i], P[p, c + 2, i],
+                                  P[p, c + 3, i], P[p, c + 4, i])
+            T[0, i] += a0 * p0 + a1 * p1 + a2 * p2 + a3 * p3 + a4 * p4
+            T[1, i] += b0 * p0 + b1 * p1 + b2 * p2 + b3 * p3 + b4 * p4
+            T[2, i] += d0 * p0 + d1 * p1 + d2 * p2 + d3 * p3 + d4 * p4
+    for c in range(n_t - n_t % 5, n_t):
+        a0, b0, d0 = H[p, j, 0, c], H[p, j, 1, c], H[p, j, 2, c]
+        for i in range(n_x):
+            T[0, i] += a0 * P[p, c, i]
+            T[1, i] += b0 * P[p, c, i]
+            T[2, i] += d0 * P[p, c, i]
     for a in range(3):
-        if not math.isnan(y[a]):
-            axes[n] = a
-            n += 1
-    for i in range(n):
-        for j in range(i + 1):
-            s = C[axes[i], axes[j]]
-            if i == j:
-                s += inflation
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            if j < i:
-                L[i, j] = s / L[j, j]
-            elif s > 0.0:
-                L[i, i] = math.sqrt(s)
-            else:
-                return -1
+        if math.isnan(y[j, a]):
+            for i in range(n_x):
+                T[a, i] = 0.0
+
+
+_LOWER = 'float64, float64, float64, float64, float64, float64'
+"""Lower triangle of a symmetric 3 x 3, row by row."""
+
+
+@njit(**_INLINE)
+def _of_present_axes(y, j, s00, s10, s11, s20, s21, s22):
+    """A covariance of sensor j with the rows and columns of missing axes as in identity."""
+    if math.isnan(y[j, 0]):
+        s00, s10, s20 = 1.0, 0.0, 0.0
+    if math.isnan(y[j, 1]):
+        s10, s11, s21 = 0.0, 1.0, 0.0
+    if math.isnan(y[j, 2]):
+        s20, s21, s22 = 0.0, 0.0, 1.0
+    return s00, s10, s11, s20, s21, s22
+
+
+@njit(**_INLINE)
+def _factor(s00, s10, s11, s20, s21, s22):
+    """Unit lower factor l10, l20, l21 and pivots e0, e1, e2: S = L diag(e) L'."""
+    l10, l20 = s10 / s00, s20 / s00
+    e1 = s11 - l10 * s10
+    e21 = s21 - l20 * s10
+    l21 = e21 / e1
+    return l10, l20, l21, s00, e1, s22 - l20 * s20 - l21 * e21
+
+
+@njit(**_INLINE)
+def _n_present(y, C):
+    """How many axes are not NaN; -1 if the noise of a sensor's is not positive definite."""
+    n = 0
+    for j in range(y.shape[0]):
+        s00, s10, s11, s20, s21, s22 = _of_present_axes(
+            y, j, C[j, 0, 0], C[j, 1, 0], C[j, 1, 1], C[j, 2, 0], C[j, 2, 1], C[j, 2, 2])
+        _, _, _, e0, e1, e2 = _factor(s00, s10, s11, s20, s21, s22)
+        if not (e0 > 0.0 and e1 > 0.0 and e2 > 0.0):
+            return -1
+        for a in range(3):
+            n += not math.isnan(y[j, a])
     return n
 
 
-@njit('float64(float64[::1], float64[:,::1], float64[:,::1], int64[::1], int64, '
-      'float64[:,::1], float64[::1])', **_COMPILE)
-def _whitened_rows(residual, H, L, axes, n, A, z):
-    """L^-1 [H | I] and L^-1 residual of the `n` present axes, into A and z; det L.
-
-    The rows of missing axes are zero: they change nothing further on.
-    """
-    n_t = H.shape[1]
-    det = 1.0
-    A[:] = 0.0
-    z[:] = 0.0
-    for i in range(n):
-        a = axes[i]
-        z[i] = residual[a]
-        for c in range(n_t):
-            A[i, c] = H[a, c]
-        A[i, n_t + a] = 1.0
-        for k in range(i):
-            w = L[i, k]
-            z[i] -= w * z[k]
-            for c in range(n_t + 3):
-                A[i, c] -= w * A[k, c]
-        w = 1.0 / L[i, i]
-        z[i] *= w
-        for c in range(n_t + 3):
-            A[i, c] *= w
-        det *= L[i, i]
-    return det
+@njit(**_INLINE)
+def _innovation_covariance(y, C, inflation, H, p, j, first, T):
+    """T [H | I]' + C + inflation."""
+    s00 = C[j, 0, 0] + inflation + T[0, first]
+    s10, s11 = C[j, 1, 0] + T[1, first], C[j, 1, 1] + inflation + T[1, first + 1]
+    s20, s21 = C[j, 2, 0] + T[2, first], C[j, 2, 1] + T[2, first + 1]
+    s22 = C[j, 2, 2] + inflation + T[2, first + 2]
+    for c in range(H.shape[3]):
+        h0, h1, h2 = H[p, j, 0, c], H[p, j, 1, c], H[p, j, 2, c]
+        t0, t1, t2 = T[0, c], T[1, c], T[2, c]
+        s00 += h0 * t0
+        s10 += h0 * t1
+        s11 += h1 * t1
+        s20 += h0 * t2
+        s21 += h1 * t2
+        s22 += h2 * t2
+    return _of_present_axes(y, j, s00, s10, s11, s20, s21, s22)
 
 
-@njit('void(float64[:,::1], float64[:,::1], int64[::1], float64[:,::1])', **_COMPILE)
-def _gain_rows(P, A, columns, T):
-    """T = A P[columns]; four columns at a time, so that each entry of T is touched less often."""
-    n_x = P.shape[0]
-    T[:] = 0.0
-    for c in range(0, columns.shape[0], 4):
-        r0, r1, r2, r3 = columns[c], columns[c + 1], columns[c + 2], columns[c + 3]
-        a0, a1, a2, a3 = A[0, c], A[0, c + 1], A[0, c + 2], A[0, c + 3]
-        b0, b1, b2, b3 = A[1, c], A[1, c + 1], A[1, c + 2], A[1, c + 3]
-        d0, d1, d2, d3 = A[2, c], A[2, c + 1], A[2, c + 2], A[2, c + 3]
-        for i in range(n_x):
-            p0, p1, p2, p3 = P[r0, i], P[r1, i], P[r2, i], P[r3, i]
-            T[0, i] += a0 * p0 + a1 * p1 + a2 * p2 + a3 * p3
-            T[1, i] += b0 * p0 + b1 * p1 + b2 * p2 + b3 * p3
-            T[2, i] += d0 * p0 + d1 * p1 + d2 * p2 + d3 * p3
-
-
-@njit('float64(float64[:,::1], int64[::1], float64[:,::1], float64[::1])', **_COMPILE)
-def _whiten_innovation(A, columns, G, z):
-    """Divide innovation z and gain rows G by the Cholesky factor of S = I + A G'.
-
-    Returns the root of det S. A row of zeros stays one.
-    """
-    s00, s10, s11, s20, s21, s22 = 1.0, 0.0, 1.0, 0.0, 0.0, 1.0
-    for c in range(columns.shape[0]):
-        g0, g1, g2 = G[0, columns[c]], G[1, columns[c]], G[2, columns[c]]
-        s00 += A[0, c] * g0
-        s10 += A[1, c] * g0
-        s11 += A[1, c] * g1
-        s20 += A[2, c] * g0
-        s21 += A[2, c] * g1
-        s22 += A[2, c] * g2
-    l00 = math.sqrt(s00)
-    l10, l20 = s10 / l00, s20 / l00
-    l11 = math.sqrt(s11 - l10 * l10)
-    l21 = (s21 - l20 * l10) / l11
-    l22 = math.sqrt(s22 - l20 * l20 - l21 * l21)
-    d0, d1, d2 = 1.0 / l00, 1.0 / l11, 1.0 / l22
-    for i in range(G.shape[1]):
-        g0 = G[0, i] * d0
-        g1 = (G[1, i] - l10 * g0) * d1
-        G[2, i] = (G[2, i] - l20 * g0 - l21 * g1) * d2
-        G[0, i] = g0
-        G[1, i] = g1
-    z[0] *= d0
-    z[1] = (z[1] - l10 * z[0]) * d1
-    z[2] = (z[2] - l20 * z[0] - l21 * z[1]) * d2
-    return l00 * l11 * l22
-
-
-@njit('void(float64[::1], float64[:,::1], float64[:,::1], float64[::1])', **_COMPILE)
-def _apply(x, P, G, z):
+@njit(**_INLINE)
+def _apply(x, P, p, G, z0, z1, z2):
     """x += G' z and P -= G' G; both halves get the same products, so P stays symmetric."""
-    n_x = P.shape[0]
+    n_x = x.shape[1]
     for i in range(n_x):
         g0, g1, g2 = G[0, i], G[1, i], G[2, i]
-        x[i] += g0 * z[0] + g1 * z[1] + g2 * z[2]
-        row = P[i]
-        for j in range(n_x):
-            row[j] -= g0 * G[0, j] + g1 * G[1, j] + g2 * G[2, j]
+        x[p, i] += g0 * z0 + g1 * z1 + g2 * z2
+        for k in range(n_x):
+            P[p, i, k] -= g0 * G[0, k] + g1 * G[1, k] + g2 * G[2, k]
+
+
+@njit(**_INLINE)
+def _whiten(T, l10, l20, l21, r0, r1, r2):
+    """Rows of T to diag(r) L^-1 T, where r is one over the root of the pivots."""
+    for i in range(T.shape[1]):
+        t0 = T[0, i]
+        t1 = T[1, i] - l10 * t0
+        T[2, i] = r2 * (T[2, i] - l20 * t0 - l21 * t1)
+        T[1, i] = r1 * t1
+        T[0, i] = r0 * t0
 
 
 @njit('int64(float64[:,::1], float64[:,:,::1], float64[:,::1], float64[:,::1], '
       'float64[:,:,::1], float64[:,:,::1], float64[:,:,:,::1], float64[:,::1], '
       'float64[::1], float64[::1])', **_COMPILE)
 def _update_bank(x, P, x_lin, y, C, h, H, inflation, log_likelihood, nis):
-    """Loop of the update over hypotheses and sensors; -1 where a noise is singular."""
-    n_hyp, n_sensors, n_t, n_x = H.shape[0], H.shape[1], H.shape[3], x.shape[1]
-    axes = np.empty(3, dtype=np.int64)
-    # Columns of P that a sensor sees: the target's and its own background's, and padding.
-    n_columns = 4 * ((n_t + 3 + 3) // 4)
-    columns = np.zeros(n_columns, dtype=np.int64)
-    for c in range(n_t):
-        columns[c] = c
-    L = np.zeros((3, 3))
-    A, G = np.zeros((3, n_columns)), np.empty((3, n_x))
-    z, residual = np.empty(3), np.empty(3)
+    """Loop of the update over hypotheses and sensors; -1 if a noise is not positive definite."""
+    n_hyp, n_sensors, n_t = H.shape[0], H.shape[1], H.shape[3]
+    n = _n_present(y, C)
+    if n < 0:
+        return -1
+    T = np.empty((3, x.shape[1]))
     for p in range(n_hyp):
+        log_likelihood[p] = -0.5 * n * _LOG_2PI
+        nis[p] = 0.0
         for j in range(n_sensors):
-            n = _cholesky_of_present(y[j], C[j], inflation[p, j], axes, L)
-            if n < 0:
-                return -1
-            if n == 0:
-                continue
             first = n_t + 3 * j
-            for a in range(3):
-                columns[n_t + a] = first + a
-                residual[a] = y[j, a] - h[p, j, a] - x[p, first + a]
-                for c in range(n_t):
-                    residual[a] -= H[p, j, a, c] * (x[p, c] - x_lin[p, c])
-            det = _whitened_rows(residual, H[p, j], L, axes, n, A, z)
-            _gain_rows(P[p], A, columns, G)
-            det *= _whiten_innovation(A, columns, G, z)
-            _apply(x[p], P[p], G, z)
-            q = z[0] * z[0] + z[1] * z[1] + z[2] * z[2]
+            u0 = _residual(y[j, 0], h[p, j, 0] + x[p, first], H, x, x_lin, p, j, 0)
+            u1 = _residual(y[j, 1], h[p, j, 1] + x[p, first + 1], H, x, x_lin, p, j, 1)
+            u2 = _residual(y[j, 2], h[p, j, 2] + x[p, first + 2], H, x, x_lin, p, j, 2)
+            _gain_rows(y, P, H, p, j, first, T)
+            s00, s10, s11, s20, s21, s22 = _innovation_covariance(
+                y, C, inflation[p, j], H, p, j, first, T)
+            l10, l20, l21, e0, e1, e2 = _factor(s00, s10, s11, s20, s21, s22)
+            r0, r1, r2 = 1.0 / math.sqrt(e0), 1.0 / math.sqrt(e1), 1.0 / math.sqrt(e2)
+            _whiten(T, l10, l20, l21, r0, r1, r2)
+            u1 -= l10 * u0
+            z0, z1, z2 = r0 * u0, r1 * u1, r2 * (u2 - l20 * u0 - l21 * u1)
+            _apply(x, P, p, T, z0, z1, z2)
+            q = z0 * z0 + z1 * z1 + z2 * z2
             nis[p] += q
-            log_likelihood[p] -= math.log(det) + 0.5 * (q + n * _LOG_2PI)
+            log_likelihood[p] -= 0.5 * (q + math.log(e0 * e1 * e2))
     return 0
 
 
@@ -236,8 +250,7 @@ def update(x, P, y, h, H, C, inflation, x_lin=None):
     Source: T10 Alg. 2, measurement update; ICASSP11 eq. (9) for the inflation.
     """
     x_lin = x.copy() if x_lin is None else x_lin
-    log_likelihood = np.zeros(len(x))
-    nis = np.zeros(len(x))
+    log_likelihood, nis = np.empty(len(x)), np.empty(len(x))
     if _update_bank(x, P, x_lin, y, C, h, H, inflation, log_likelihood, nis) < 0:
         raise ValueError('a sensor\'s noise covariance is not positive definite')
     return log_likelihood, nis

@@ -19,83 +19,83 @@ _COMPILE = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}
 """Fused multiply-add is allowed, nothing else that would change a result."""
 
 
-@njit('void(float64[::1], float64[::1], float64[::1], float64[:,::1], float64[:,::1])',
-      **_COMPILE)
-def field_and_jacobians(d, m, B, dB_dd, dB_dm):
-    """Write field and both Jacobians of one dipole at one point.
+_INLINE = {'error_model': 'numpy', 'fastmath': {'contract'}, 'forceinline': True}
+"""For kernels that pass scalars: small arrays would cost more than the arithmetic."""
 
-    `d` is sensor minus source [m], `m` the moment [A m^2]; `B` (3,) [T],
-    `dB_dd` (3, 3) [T/m] and `dB_dm` (3, 3) [T/(A m^2)] are written.
-    All become NaN where |d| = 0.
 
-    Source: TSP14 eq. (2), (30a), (30b), with the mu0/4pi that (30) leaves out.
+@njit(**_INLINE)
+def field_and_jacobians(d0, d1, d2, m0, m1, m2):
+    """Field and both Jacobians of one dipole at one point, as scalars.
+
+    `d` is sensor minus source [m], `m` the moment [A m^2]. Returns B (3) [T] and
+    the upper triangles, row by row (6 each), of dB/dd [T/m] and dB/dm [T/(A m^2)];
+    all are NaN where |d| = 0.
+
+    Source: TSP14 eq. (2), (30a), (30b), with the factor mu0/4pi.
     """
-    d2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
-    if d2 == 0.0:
-        B[:] = np.nan
-        dB_dd[:] = np.nan
-        dB_dm[:] = np.nan
-        return
-    inv2 = 1.0 / d2
+    inv2 = 1.0 / (d0 * d0 + d1 * d1 + d2 * d2)
     k3 = K_DIPOLE * inv2 * math.sqrt(inv2)
-    dm = d[0] * m[0] + d[1] * m[1] + d[2] * m[2]
-    for i in range(3):
-        B[i] = k3 * (3.0 * dm * inv2 * d[i] - m[i])
-        for j in range(i, 3):
-            dd = d[i] * d[j] * inv2
-            jm = 3.0 * k3 * dd
-            jd = 3.0 * k3 * inv2 * (d[i] * m[j] + m[i] * d[j] - 5.0 * dm * dd)
-            if i == j:
-                jm -= k3
-                jd += 3.0 * k3 * inv2 * dm
-            dB_dm[i, j] = jm
-            dB_dm[j, i] = jm
-            dB_dd[i, j] = jd
-            dB_dd[j, i] = jd
+    a = 3.0 * k3 * inv2
+    e = a * (d0 * m0 + d1 * m1 + d2 * m2)
+    f = 5.0 * e * inv2
+    return ((e * d0 - k3 * m0, e * d1 - k3 * m1, e * d2 - k3 * m2),
+            (2.0 * a * d0 * m0 - f * d0 * d0 + e,
+             a * (d0 * m1 + d1 * m0) - f * d0 * d1,
+             a * (d0 * m2 + d2 * m0) - f * d0 * d2,
+             2.0 * a * d1 * m1 - f * d1 * d1 + e,
+             a * (d1 * m2 + d2 * m1) - f * d1 * d2,
+             2.0 * a * d2 * m2 - f * d2 * d2 + e),
+            (a * d0 * d0 - k3, a * d0 * d1, a * d0 * d2,
+             a * d1 * d1 - k3, a * d1 * d2, a * d2 * d2 - k3))
+
+
+@njit(**_INLINE)
+def _row_times_symmetric(a, b, c, S):
+    """[a b c] S of a symmetric S given as its upper triangle."""
+    s00, s01, s02, s11, s12, s22 = S
+    return a * s00 + b * s01 + c * s02, a * s01 + b * s11 + c * s12, a * s02 + b * s12 + c * s22
 
 
 @njit('void(float64[:,::1], float64[:,::1], float64[:,::1], float64[:,:,::1], '
-      'float64[:,:,::1])', cache=True)
+      'float64[:,:,::1])', **_COMPILE)
 def _field_and_jacobians_rows(d, m, B, dB_dd, dB_dm):
     """Loop of `field_and_jacobians` over rows."""
     for i in range(d.shape[0]):
-        field_and_jacobians(d[i], m[i], B[i], dB_dd[i], dB_dm[i])
+        b, dd, dm = field_and_jacobians(d[i, 0], d[i, 1], d[i, 2], m[i, 0], m[i, 1], m[i, 2])
+        B[i, 0], B[i, 1], B[i, 2] = b
+        for J, (j00, j01, j02, j11, j12, j22) in ((dB_dd, dd), (dB_dm, dm)):
+            J[i, 0, 0], J[i, 0, 1], J[i, 0, 2] = j00, j01, j02
+            J[i, 1, 0], J[i, 1, 1], J[i, 1, 2] = j01, j11, j12
+            J[i, 2, 0], J[i, 2, 1], J[i, 2, 2] = j02, j12, j22
 
 
 @njit('void(float64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[:,:,::1], '
       'float64[:,:,:,::1], float64[:,:,:,::1], float64[:,:,::1], float64[:,:,:,::1], '
       'float64[:,::1])', **_COMPILE)
 def _sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx, h, H, gradient_power):
-    """Loop of `field_and_jacobians` over hypotheses, sensors and dipoles."""
+    """Loop of `field_and_jacobians` over hypotheses, sensors and dipoles; adds to zeros."""
     n_hyp, n_dip, n_t = dr_dx.shape[0], dr_dx.shape[1], dr_dx.shape[3]
-    d = np.empty(3)
-    b = np.empty(3)
-    dB_dd = np.empty((3, 3))
-    dB_dm = np.empty((3, 3))
     for p in range(n_hyp):
         for j in range(positions.shape[0]):
-            h[p, j] = 0.0
-            H[p, j] = 0.0
-            gradient_power[p, j] = 0.0
             for s in range(n_dip):
-                d2 = 0.0
-                m2 = 0.0
-                for i in range(3):
-                    d[i] = positions[j, i] - r[p, s, i]
-                    d2 += d[i] * d[i]
-                    m2 += m[p, s, i] * m[p, s, i]
-                field_and_jacobians(d, m[p, s], b, dB_dd, dB_dm)
-                gradient_power[p, j] += K_DIPOLE * K_DIPOLE * m2 / (d2 * d2 * d2 * d2)
+                d0, d1, d2 = (positions[j, 0] - r[p, s, 0], positions[j, 1] - r[p, s, 1],
+                              positions[j, 2] - r[p, s, 2])
+                m0, m1, m2 = m[p, s, 0], m[p, s, 1], m[p, s, 2]
+                (b0, b1, b2), dB_dd, dB_dm = field_and_jacobians(d0, d1, d2, m0, m1, m2)
+                square = d0 * d0 + d1 * d1 + d2 * d2
+                gradient_power[p, j] += (K_DIPOLE * K_DIPOLE * (m0 * m0 + m1 * m1 + m2 * m2)
+                                         / (square * square * square * square))
                 # Turned into the sensor's frame first: 3 x 3 products are cheaper than 3 x n_t.
                 for i in range(3):
-                    for k in range(3):
-                        g, q = 0.0, 0.0
-                        for u in range(3):
-                            g += R_sw[j, i, u] * dB_dd[u, k]
-                            q += R_sw[j, i, u] * dB_dm[u, k]
-                        h[p, j, i] += R_sw[j, i, k] * b[k]
-                        for c in range(n_t):
-                            H[p, j, i, c] += q * dm_dx[p, s, k, c] - g * dr_dx[p, s, k, c]
+                    u, v, w = R_sw[j, i, 0], R_sw[j, i, 1], R_sw[j, i, 2]
+                    g0, g1, g2 = _row_times_symmetric(u, v, w, dB_dd)
+                    q0, q1, q2 = _row_times_symmetric(u, v, w, dB_dm)
+                    h[p, j, i] += u * b0 + v * b1 + w * b2
+                    for c in range(n_t):
+                        H[p, j, i, c] += (
+                            q0 * dm_dx[p, s, 0, c] + q1 * dm_dx[p, s, 1, c]
+                            + q2 * dm_dx[p, s, 2, c] - g0 * dr_dx[p, s, 0, c]
+                            - g1 * dr_dx[p, s, 1, c] - g2 * dr_dx[p, s, 2, c])
 
 
 def sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx):
@@ -121,9 +121,9 @@ def sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx):
         NaN and infinite where a dipole sits on a sensor.
     """
     n_hyp, n_sensors, n_t = len(r), len(positions), dr_dx.shape[-1]
-    h = np.empty((n_hyp, n_sensors, 3))
-    H = np.empty((n_hyp, n_sensors, 3, n_t))
-    gradient_power = np.empty((n_hyp, n_sensors))
+    h = np.zeros((n_hyp, n_sensors, 3))
+    H = np.zeros((n_hyp, n_sensors, 3, n_t))
+    gradient_power = np.zeros((n_hyp, n_sensors))
     _sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx, h, H, gradient_power)
     return h, H, gradient_power
 

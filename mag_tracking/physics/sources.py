@@ -7,6 +7,7 @@ new target is one new class here and nothing elsewhere.
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -41,28 +42,31 @@ class SourceModel(Protocol):
         """States after `dt` seconds, Jacobian (..., n_t, n_t), process noise (..., n_t, n_t)."""
 
 
-@njit('void(float64[:,::1], float64[::1], float64[:,:,::1], float64[:,:,::1], '
-      'float64[:,:,:,::1], float64[:,:,:,::1])', cache=True)
+@njit('void(float64[:,:], float64[:], float64[:,:,::1], float64[:,:,::1], '
+      'float64[:,:,:,::1], float64[:,:,:,::1])', cache=True, error_model='numpy')
 def _vehicle_dipoles(x, induction, r, m, dr_dx, dm_dx):
     """ICASSP11 eq. (8) with derivatives, a row a hypothesis; the derivatives come as zeros."""
     for p in range(x.shape[0]):
-        speed = math.hypot(x[p, 3], x[p, 4])
-        c, s = (x[p, 3] / speed, x[p, 4] / speed) if speed > 0.0 else (1.0, 0.0)
-        hard_x = c * x[p, 6] - s * x[p, 7]
-        hard_y = s * x[p, 6] + c * x[p, 7]
-        m[p, 0, 0] = hard_x + x[p, 9] * induction[0]
-        m[p, 0, 1] = hard_y + x[p, 9] * induction[1]
-        m[p, 0, 2] = x[p, 8] + x[p, 9] * induction[2]
-        d = dm_dx[p, 0]
+        vx, vy, forward, left, soft = x[p, 3], x[p, 4], x[p, 6], x[p, 7], x[p, 9]
+        speed = math.sqrt(vx * vx + vy * vy)
+        c, s, slowness = 1.0, 0.0, 0.0
+        if speed > 0.0:
+            slowness = 1.0 / speed
+            c, s = vx * slowness, vy * slowness
+        hard_x, hard_y = c * forward - s * left, s * forward + c * left
+        m[p, 0, 0] = hard_x + soft * induction[0]
+        m[p, 0, 1] = hard_y + soft * induction[1]
+        m[p, 0, 2] = x[p, 8] + soft * induction[2]
         for k in range(3):
             r[p, 0, k] = x[p, k]
             dr_dx[p, 0, k, k] = 1.0
-            d[k, 9] = induction[k]
-        d[0, 6], d[0, 7], d[1, 6], d[1, 7], d[2, 8] = c, -s, s, c, 1.0
-        if speed > 0.0:
-            # d(heading)/dv = [-sin, cos]/|v|, and d(hard)/d(heading) = z x hard.
-            d[0, 3], d[0, 4] = hard_y * s / speed, -hard_y * c / speed
-            d[1, 3], d[1, 4] = -hard_x * s / speed, hard_x * c / speed
+            dm_dx[p, 0, k, 9] = induction[k]
+        dm_dx[p, 0, 0, 6], dm_dx[p, 0, 0, 7] = c, -s
+        dm_dx[p, 0, 1, 6], dm_dx[p, 0, 1, 7] = s, c
+        dm_dx[p, 0, 2, 8] = 1.0
+        # d(heading)/dv = [-sin, cos]/|v|, and d(hard)/d(heading) = z x hard.
+        dm_dx[p, 0, 0, 3], dm_dx[p, 0, 0, 4] = hard_y * s * slowness, -hard_y * c * slowness
+        dm_dx[p, 0, 1, 3], dm_dx[p, 0, 1, 4] = -hard_x * s * slowness, hard_x * c * slowness
 
 
 @dataclass(frozen=True)
@@ -90,13 +94,17 @@ class PointVehicle:
 
     state_names = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'm0x', 'm0y', 'm0z', 'D')
 
+    @cached_property
+    def _induction(self):
+        """(3,) [A/m] B0/mu0."""
+        return np.asarray(self.earth_field, dtype=float) / MU0
+
     def dipoles(self, x):
         """One dipole a hypothesis; see `SourceModel.dipoles`."""
         n = len(x)
         r, m = np.empty((n, 1, 3)), np.empty((n, 1, 3))
         dr_dx, dm_dx = np.zeros((n, 1, 3, 10)), np.zeros((n, 1, 3, 10))
-        _vehicle_dipoles(np.ascontiguousarray(x, dtype=float), self.earth_field / MU0,
-                         r, m, dr_dx, dm_dx)
+        _vehicle_dipoles(np.asarray(x, dtype=float), self._induction, r, m, dr_dx, dm_dx)
         return Dipoles(r, m, dr_dx, dm_dx)
 
     def propagate(self, x, dt):
