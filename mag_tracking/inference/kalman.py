@@ -54,17 +54,6 @@ _INLINE = {'error_model': 'numpy', 'fastmath': {'contract'}, 'forceinline': True
 
 
 @njit(**_INLINE)
-def _residual(y, predicted, H, x, x_lin, p, j, a):
-    """Measured minus predicted field of one axis; zero where it is missing."""
-    if math.isnan(y):
-        return 0.0
-    residual = y - predicted
-    for c in range(H.shape[3]):
-        residual -= H[p, j, a, c] * (x[p, c] - x_lin[p, c])
-    return residual
-
-
-@njit(**_INLINE)
 def _gain_rows(y, P, H, p, j, first, T):
     """T = [H | I] P, the three rows of sensor j; rows of missing axes are zero.
 
@@ -142,22 +131,32 @@ def _n_present(y, C):
 
 
 @njit(**_INLINE)
-def _innovation_covariance(y, C, inflation, H, p, j, first, T):
-    """T [H | I]' + C + inflation."""
-    s00 = C[j, 0, 0] + inflation + T[0, first]
-    s10, s11 = C[j, 1, 0] + T[1, first], C[j, 1, 1] + inflation + T[1, first + 1]
+def _innovation(y, C, inflation, h, H, x, x_lin, p, j, first, T):
+    """Innovation u and its covariance T [H | I]' + C + inflation; u is zero on missing axes."""
+    u0 = y[j, 0] - h[p, j, 0] - x[p, first]
+    u1 = y[j, 1] - h[p, j, 1] - x[p, first + 1]
+    u2 = y[j, 2] - h[p, j, 2] - x[p, first + 2]
+    s00 = C[j, 0, 0] + inflation[p, j] + T[0, first]
+    s10, s11 = C[j, 1, 0] + T[1, first], C[j, 1, 1] + inflation[p, j] + T[1, first + 1]
     s20, s21 = C[j, 2, 0] + T[2, first], C[j, 2, 1] + T[2, first + 1]
-    s22 = C[j, 2, 2] + inflation + T[2, first + 2]
+    s22 = C[j, 2, 2] + inflation[p, j] + T[2, first + 2]
     for c in range(H.shape[3]):
         h0, h1, h2 = H[p, j, 0, c], H[p, j, 1, c], H[p, j, 2, c]
         t0, t1, t2 = T[0, c], T[1, c], T[2, c]
+        d = x[p, c] - x_lin[p, c]
+        u0 -= h0 * d
+        u1 -= h1 * d
+        u2 -= h2 * d
         s00 += h0 * t0
         s10 += h0 * t1
         s11 += h1 * t1
         s20 += h0 * t2
         s21 += h1 * t2
         s22 += h2 * t2
-    return _of_present_axes(y, j, s00, s10, s11, s20, s21, s22)
+    u0 = 0.0 if math.isnan(y[j, 0]) else u0
+    u1 = 0.0 if math.isnan(y[j, 1]) else u1
+    u2 = 0.0 if math.isnan(y[j, 2]) else u2
+    return (u0, u1, u2), _of_present_axes(y, j, s00, s10, s11, s20, s21, s22)
 
 
 @njit(**_INLINE)
@@ -197,12 +196,9 @@ def _update_bank(x, P, x_lin, y, C, h, H, inflation, log_likelihood, nis):
         nis[p] = 0.0
         for j in range(n_sensors):
             first = n_t + 3 * j
-            u0 = _residual(y[j, 0], h[p, j, 0] + x[p, first], H, x, x_lin, p, j, 0)
-            u1 = _residual(y[j, 1], h[p, j, 1] + x[p, first + 1], H, x, x_lin, p, j, 1)
-            u2 = _residual(y[j, 2], h[p, j, 2] + x[p, first + 2], H, x, x_lin, p, j, 2)
             _gain_rows(y, P, H, p, j, first, T)
-            s00, s10, s11, s20, s21, s22 = _innovation_covariance(
-                y, C, inflation[p, j], H, p, j, first, T)
+            (u0, u1, u2), (s00, s10, s11, s20, s21, s22) = _innovation(
+                y, C, inflation, h, H, x, x_lin, p, j, first, T)
             l10, l20, l21, e0, e1, e2 = _factor(s00, s10, s11, s20, s21, s22)
             r0, r1, r2 = 1.0 / math.sqrt(e0), 1.0 / math.sqrt(e1), 1.0 / math.sqrt(e2)
             _whiten(T, l10, l20, l21, r0, r1, r2)

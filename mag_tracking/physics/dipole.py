@@ -73,7 +73,7 @@ def _field_and_jacobians_rows(d, m, B, dB_dd, dB_dm):
       'float64[:,:,:,::1], float64[:,:,:,::1], float64[:,:,::1], float64[:,:,:,::1], '
       'float64[:,::1])', **_COMPILE)
 def _sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx, h, H, gradient_power):
-    """Loop of `field_and_jacobians` over hypotheses, sensors and dipoles; adds to zeros."""
+    """Loop of `field_and_jacobians` over hypotheses, sensors, dipoles; adds to zeros but for H."""
     n_hyp, n_dip, n_t = dr_dx.shape[0], dr_dx.shape[1], dr_dx.shape[3]
     for p in range(n_hyp):
         for j in range(positions.shape[0]):
@@ -92,6 +92,8 @@ def _sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx, h, H, gradient_power):
                     q0, q1, q2 = _row_times_symmetric(u, v, w, dB_dm)
                     h[p, j, i] += u * b0 + v * b1 + w * b2
                     for c in range(n_t):
+                        if s == 0:
+                            H[p, j, i, c] = 0.0
                         H[p, j, i, c] += (
                             q0 * dm_dx[p, s, 0, c] + q1 * dm_dx[p, s, 1, c]
                             + q2 * dm_dx[p, s, 2, c] - g0 * dr_dx[p, s, 0, c]
@@ -122,7 +124,7 @@ def sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx):
     """
     n_hyp, n_sensors, n_t = len(r), len(positions), dr_dx.shape[-1]
     h = np.zeros((n_hyp, n_sensors, 3))
-    H = np.zeros((n_hyp, n_sensors, 3, n_t))
+    H = np.empty((n_hyp, n_sensors, 3, n_t))
     gradient_power = np.zeros((n_hyp, n_sensors))
     _sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx, h, H, gradient_power)
     return h, H, gradient_power

@@ -152,14 +152,13 @@ def bank_ratio(peer_class, n_sensors, n_hyp=64, rounds=12, repeats=100):
     model, positions, R_sw, x, P, y = bank_case(n_sensors, n_hyp, rng)
     C = np.repeat(SIGMA**2 * np.eye(3)[None], n_sensors, axis=0)
     zero = np.zeros((n_hyp, n_sensors))
-    xi, Pi = np.empty_like(x), np.empty_like(P)
     ours, theirs = [], []
     for k in range(rounds + 1):
         peer = peer_class(positions, R_sw, x, P)
         start = time.perf_counter()
         peer.update(y)
         t_peer = time.perf_counter() - start
-        t_ours = 0.0
+        xi, Pi, t_ours = np.empty_like(x), np.empty_like(P), 0.0
         for _ in range(repeats):
             # Just written, as by the prediction before an update; so are the peer's.
             xi[:], Pi[:] = x, P
