@@ -34,6 +34,7 @@ TARGET_DEFAULTS = {
         'detect.background_std': 5e-7,
         'track.near_field_length': 5e-4,
         'track.field_error': 0.01,
+        'track.mounting_std_deg': 0.0,
         'track.model_error_time_s': 0.0,
         'track.background_std': 5e-7,
         'track.background_drift': 1e-8,

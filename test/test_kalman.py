@@ -45,7 +45,7 @@ def tracked(n_sensors, missing=False):
     samples, *_ = simulate(network, point_body([250.0, -120.0, 90.0], 5.0, 0.5),
                            Path(np.array([-60.0, -1.0]), 0.0, 10.0), 25.0, 12.0, rng)
     pipeline = Pipeline(network, settings_for('vehicle', {
-        'align.period_s': 0.04, 'track.vehicle.arrival_names': ['a'],
+        'align.period_s': 0.04, 'track.mounting_std_deg': 0.0, 'track.vehicle.arrival_names': ['a'],
         'track.vehicle.arrival_headings_deg': [0.0]}))
     frame = None
     for sample in samples:

@@ -36,18 +36,21 @@ class FilterBank:
     """(n_hyp,) int: the arrival that each hypothesis assumes."""
 
     @classmethod
-    def of_targets(cls, x, P, label, n_sensors, background_std):
+    def of_targets(cls, x, P, label, n_sensors, background_std, mounting_std=0.0):
         """A bank with equal weights from target states alone.
 
-        `x` (n_hyp, n_t), `P` (n_hyp, n_t, n_t); three background states per
-        sensor are put behind them: zero, with `background_std` [T].
+        `x` (n_hyp, n_t), `P` (n_hyp, n_t, n_t). Behind them are put three mounting
+        angles a sensor, where `mounting_std` [rad] is not zero, and three
+        backgrounds a sensor with `background_std` [T]; all are zero.
         """
         n, n_t = x.shape
-        n_x = n_t + 3 * n_sensors
+        std = np.repeat([mounting_std, background_std] if mounting_std else [background_std],
+                        3 * n_sensors)
+        n_x = n_t + len(std)
         full_x, full_P = np.zeros((n, n_x)), np.zeros((n, n_x, n_x))
         full_x[:, :n_t], full_P[:, :n_t, :n_t] = x, P
-        background = np.arange(n_t, n_x)
-        full_P[:, background, background] = background_std**2
+        rest = np.arange(n_t, n_x)
+        full_P[:, rest, rest] = std**2
         return cls(full_x, full_P, np.full(n, -np.log(n)), label)
 
     def __len__(self):

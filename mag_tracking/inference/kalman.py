@@ -1,7 +1,8 @@
 """Kalman prediction and update, batched over hypotheses.
 
-The leading axis is always the hypothesis. A state is the target's n_t states
-followed by three background states per sensor (tesla, sensor frame). The
+The leading axis is always the hypothesis. A state is n_t states that may be
+seen by every sensor, the target's first, followed by three background states
+per sensor (tesla, sensor frame). The
 update takes the sensors one after the other, linearised at one common point,
 which gives the numbers of the stacked update at a fraction of its cost.
 """
@@ -14,7 +15,7 @@ from numba import njit
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
-def predict(x, P, x_target, F, Q, background_variance):
+def predict(x, P, x_target, F, Q, walk_variance):
     """Time update of every hypothesis, in place.
 
     Parameters
@@ -27,8 +28,8 @@ def predict(x, P, x_target, F, Q, background_variance):
         Propagated target states.
     F, Q : (n_hyp, n_t, n_t) or (n_t, n_t)
         Jacobian of the propagation and covariance of the process noise.
-    background_variance : float [T^2]
-        Added to every background state (random walk over the interval).
+    walk_variance : float or (n_x - n_t,)
+        Added to the states behind the target's (random walk over the interval).
 
     Source: T10 Alg. 2, time update.
     """
@@ -39,8 +40,8 @@ def predict(x, P, x_target, F, Q, background_variance):
     P[:, n_t:, :n_t] = np.swapaxes(P_tb, 1, 2)
     P_tt = F @ P[:, :n_t, :n_t] @ np.swapaxes(F, -1, -2) + Q
     P[:, :n_t, :n_t] = 0.5 * (P_tt + np.swapaxes(P_tt, 1, 2))
-    background = np.arange(n_t, x.shape[1])
-    P[:, background, background] += background_variance
+    rest = np.arange(n_t, x.shape[1])
+    P[:, rest, rest] += walk_variance
 
 
 _COMPILE = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}

@@ -37,7 +37,7 @@ def magnet_model(settings):
     return Magnet(np.full(3, settings.acceleration**2), settings.angular_acceleration**2)
 
 
-def start_magnet(settings, network, frame, background_std, relative_std):
+def start_magnet(settings, network, frame, background_std, mounting_std, relative_std):
     """Hypotheses of a magnet at its first frame, wherever it is.
 
     On a coarse grid the moment is projected out; the best points are refined,
@@ -68,11 +68,17 @@ def start_magnet(settings, network, frame, background_std, relative_std):
     moments, cost = project_out_linear(A[usable], y)
     best = np.argsort(cost, kind='stable')[:settings.starts]
     start = np.hstack([grid[usable][best], moments[best]])
-    return _distinct_optima(settings, network, start, y, std, present, background_std)
+    state, P, cost = _distinct_optima(settings, network, start, y, std, present)
+    if not len(cost):
+        return None
+    bank = FilterBank.of_targets(state, P, np.zeros(len(cost), dtype=int), len(network),
+                                 background_std, mounting_std)
+    bank.reweight(-0.5 * cost)
+    return bank
 
 
-def _distinct_optima(settings, network, start, y, std, present, background_std):
-    """Refine the starts and make a bank of the optima that differ."""
+def _distinct_optima(settings, network, start, y, std, present):
+    """Refine the starts; states, covariances and costs of the optima that differ, perhaps none."""
     identity = np.zeros((len(start), 1, 3, 6))
     dr_dx, dm_dx = identity.copy(), identity.copy()
     dr_dx[:, 0, :, :3] = np.eye(3)
@@ -93,8 +99,6 @@ def _distinct_optima(settings, network, start, y, std, present, background_std):
                  > 3.0 * np.sqrt(np.trace(covariance[k][:3, :3])) for k in keep]
         if all(apart):
             keep.append(i)
-    if not keep:
-        return None
     n = len(keep)
     state = np.zeros((n, 12))
     state[:, :3], state[:, 6:9] = x[keep, :3], x[keep, 3:]
@@ -105,6 +109,4 @@ def _distinct_optima(settings, network, start, y, std, present, background_std):
     P[np.ix_(range(n), rm, rm)] = covariance[keep] * excess[:, None, None]
     P[:, [3, 4, 5], [3, 4, 5]] = settings.speed_std**2
     P[:, [9, 10, 11], [9, 10, 11]] = settings.spin_std**2
-    bank = FilterBank.of_targets(state, P, np.zeros(n, dtype=int), len(network), background_std)
-    bank.reweight(-0.5 * cost[keep])
-    return bank
+    return state, P, cost[keep]

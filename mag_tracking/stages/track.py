@@ -13,6 +13,7 @@ import numpy as np
 from mag_tracking.errors import SettingsError
 from mag_tracking.inference import kalman
 from mag_tracking.physics.dipole import sensor_fields
+from mag_tracking.physics.mounting import turned_fields
 from mag_tracking.settings import param
 from mag_tracking.stages.magnet_start import MagnetSettings, magnet_model, start_magnet
 from mag_tracking.stages.pose import magnet_orientation, published_track, vehicle_orientation
@@ -29,7 +30,7 @@ class TrackSettings:
         1.0, 'Length of the target: the noise near it grows by the first neglected multipole '
         'term (ICASSP11 eq. (9), there lambda).', 'm', (0.0, 1000.0), live=True)
     field_error: float = param(
-        0.07, 'Error of the predicted field relative to its size: mounting angles, gains, shape.',
+        0.04, 'Error of the predicted field relative to its size: gains, axes, shape.',
         '', (0.0, 10.0), live=True)
     model_error_time_s: float = param(
         0.1, 'Model errors stay alike for so long: at a shorter frame period they count once, '
@@ -39,6 +40,10 @@ class TrackSettings:
         2e-8, 'What a background may be off by when a track starts.', 'T', (0.0, 1e-3), live=True)
     background_drift: float = param(
         1e-8, 'Random walk of a background during a track.', 'T/s^0.5', (0.0, 1e-3), live=True)
+    mounting_std_deg: float = param(
+        5.0, 'How far a sensor may be turned from its orientation in the network file, about '
+        'each axis; the angles are estimated with each track. 0 = as the file says.',
+        'deg', (0.0, 15.0))
     iterations: int = param(
         1, 'Linearisations an update: more than one helps when the field says far more than the '
         'prediction (magnets); for vehicles it locks into the wrong side.', '', (1, 20), live=True)
@@ -89,6 +94,8 @@ class TrackStage:
         else:
             raise SettingsError(f'track.target: expected vehicle or magnet, '
                                 f'got {settings.target!r}')
+        self._mounting_std = np.deg2rad(settings.mounting_std_deg)
+        self._n_mounting = 3 * len(network) if self._mounting_std else 0
         self._next_id = 1
         self._bank = None
         self._recent = deque()
@@ -148,10 +155,11 @@ class TrackStage:
         """Make the first hypotheses and run them through the frames before the detection."""
         s = self._settings
         if s.target == 'vehicle':
-            self._bank = start_vehicle(s.vehicle, self._network, frame, s.background_std)
+            self._bank = start_vehicle(s.vehicle, self._network, frame, s.background_std,
+                                       self._mounting_std)
         else:
             self._bank = start_magnet(s.magnet, self._network, frame, s.background_std,
-                                      s.field_error)
+                                      self._mounting_std, s.field_error)
         recent = [f for f in self._recent if frame.stamp_ns - f.stamp_ns <= s.lookback_s * NS]
         self._recent.clear()
         if self._bank is None:
@@ -174,8 +182,19 @@ class TrackStage:
         """Time update of the bank; backwards in time without process noise."""
         bank, n_t = self._bank, len(self._model.state_names)
         x_target, F, Q = self._model.propagate(bank.x[:, :n_t], dt)
-        kalman.predict(bank.x, bank.P, x_target, F, Q if dt > 0.0 else 0.0 * Q,
-                       self._settings.background_drift**2 * max(dt, 0.0))
+        walk = np.zeros(bank.x.shape[1] - n_t)
+        walk[self._n_mounting:] = self._settings.background_drift**2 * max(dt, 0.0)
+        kalman.predict(bank.x, bank.P, x_target, F, Q if dt > 0.0 else 0.0 * Q, walk)
+
+    def _fields(self, x):
+        """Fields of the target of states `x` as the sensors see them; see `turned_fields`."""
+        n_t = len(self._model.state_names)
+        h, H, gradient_power = sensor_fields(self._positions, self._R_sw,
+                                             *self._model.dipoles(x[:, :n_t]))
+        if self._n_mounting:
+            angles = x[:, n_t:n_t + self._n_mounting].reshape(len(x), -1, 3)
+            h, H = turned_fields(h, H, angles)
+        return h, H, gradient_power
 
     def _step(self, frame, dt, publish=True):
         """Predict, update, weigh, publish; the `Track` of the frame if it is to be published."""
@@ -221,13 +240,12 @@ class TrackStage:
 
     def _update(self, frame, covariance, dt):
         """Measurement update of the bank, relinearised as often as the settings say."""
-        s, bank, n_t = self._settings, self._bank, len(self._model.state_names)
+        s, bank = self._settings, self._bank
         x_prior, P_prior, x_lin = bank.x.copy(), bank.P.copy(), bank.x.copy()
         repeat = max(1.0, s.model_error_time_s / dt) if dt > 0.0 else 1.0
         for _ in range(s.iterations):
             bank.x, bank.P = x_prior.copy(), P_prior.copy()
-            h, H, gradient_power = sensor_fields(self._positions, self._R_sw,
-                                                 *self._model.dipoles(x_lin[:, :n_t]))
+            h, H, gradient_power = self._fields(x_lin)
             inflation = repeat * (s.near_field_length**2 * gradient_power
                                   + s.field_error**2 * np.einsum('pji,pji->pj', h, h))
             # A dipole on a sensor has no field: such a hypothesis is as good as ruled out.
@@ -241,10 +259,9 @@ class TrackStage:
 
     def _innovation(self, frame, row):
         """(n_sensors, 3) [T] measured minus predicted field of hypothesis `row`, after update."""
-        n_t = len(self._model.state_names)
         x = self._bank.x[row:row + 1]
-        h = sensor_fields(self._positions, self._R_sw, *self._model.dipoles(x[:, :n_t]))[0][0]
-        return frame.field - h - x[0, n_t:].reshape(-1, 3)
+        background = x[0, -3 * len(self._network):].reshape(-1, 3)
+        return frame.field - self._fields(x)[0][0] - background
 
     def _log_density_of_noise(self, frame, covariance, dt):
         """Log-density of the frame if there is no target, only backgrounds that wander."""

@@ -67,7 +67,7 @@ def moment_directions():
     return np.vstack([axes, diagonals / np.sqrt(3.0)])
 
 
-def start_vehicle(settings, network, frame, background_std):
+def start_vehicle(settings, network, frame, background_std, mounting_std):
     """Hypotheses of a vehicle at its first frame.
 
     Arrival lines x moment directions x lateral offsets x speeds, each at the
@@ -93,7 +93,7 @@ def start_vehicle(settings, network, frame, background_std):
                 covariances += [_vehicle_covariance(settings, R, speed)] * len(moments)
                 labels += [label] * len(moments)
     return FilterBank.of_targets(np.vstack(states), np.array(covariances), np.array(labels),
-                                  len(network), background_std)
+                                  len(network), background_std, mounting_std)
 
 
 def _matching_positions(settings, network, frame, R, offset, moments):
