@@ -1,7 +1,10 @@
 """The command `mag-tracking`."""
 
 import argparse
+import signal
 import sys
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 from tqdm import tqdm
@@ -109,6 +112,29 @@ def _settings(args):
     return settings_for(args.target, changes)
 
 
+@contextmanager
+def _interrupts():
+    """A list on which every SIGINT is put before it is raised as KeyboardInterrupt."""
+    seen = []
+
+    def note(signum, _):
+        seen.append(signum)
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield seen
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _count_on(bar, interrupts, n):
+    """Progress; raises an interruption again that a library on the way has swallowed."""
+    bar.update(n)
+    if interrupts:
+        raise KeyboardInterrupt
+
+
 def _replay(args):
     """mag-tracking replay."""
     network, settings = read_network(args.network), _settings(args)
@@ -120,11 +146,11 @@ def _replay(args):
     for path, name in zip(args.recordings, names, strict=True):
         recording = Recording(path)
         out = args.out / name if len(args.recordings) > 1 else args.out
-        with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
-                  disable=None) as bar:
-            run = replay(recording, network, settings, out, bar.update)
+        with _interrupts() as seen, tqdm(total=recording.size, unit='B', unit_scale=True,
+                                         desc=path.name, disable=None) as bar:
+            run = replay(recording, network, settings, out, partial(_count_on, bar, seen))
         _print_summary(path, run.summary)
-        if run.summary['interrupted']:
+        if run.summary['interrupted'] or seen:
             print(f'interrupted; what was done is in {out}')
             return 130
         if not args.no_figures:

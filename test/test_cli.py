@@ -1,5 +1,6 @@
 """The command line: what it writes, what it says, how it fails."""
 
+import contextlib
 import json
 import os
 import signal
@@ -128,6 +129,24 @@ def test_an_interrupted_replay_keeps_what_is_done(tmp_path):
     assert process.returncode == 130, stderr
     assert 'Traceback' not in stderr
     assert json.loads(table.read_text())['recording'] == f'{NAME}_0.mcap'
+
+
+def test_an_interruption_that_a_library_swallows_is_not_lost(tmp_path, monkeypatch):
+    from mag_tracking.pipeline import Pipeline
+    feed, calls = Pipeline.feed, []
+
+    def swallowing(self, sample):
+        calls.append(sample)
+        if len(calls) == 300:
+            with contextlib.suppress(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+        return feed(self, sample)
+
+    monkeypatch.setattr(Pipeline, 'feed', swallowing)
+    before = signal.getsignal(signal.SIGINT)
+    assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--out',
+                     str(tmp_path), '--no-figures']) == 130
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_the_example_runs():
