@@ -48,6 +48,15 @@ def test_not_ready_before_it_has_learnt():
         b.level(2.0)
 
 
+@pytest.mark.parametrize('rate', [1.0, 5.0, 8.0, 10.0, 12.5, 15.0, 25.0, 70.0, 200.0])
+def test_a_sensor_of_any_rate_learns(rate):
+    # Ten and 12.5 Hz once never did: their blocks of eight samples did not fit into the stretch.
+    b = running()
+    feed(b, np.arange(0, 3.0 + 24 / rate, 1 / rate))
+    assert b.ready
+    assert np.abs((b.level(3.0) - EARTH) / SIGMA).max() < 4.5 * (24.0 ** -0.5) * 2.0
+
+
 def test_a_target_freezes_the_background():
     def target(t):
         return np.array([3e-6, -2e-6, 1e-6]) / (1 + ((t - 15.0) / 0.8) ** 2) ** 2.5

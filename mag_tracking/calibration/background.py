@@ -129,12 +129,12 @@ class RunningBackground:
     def _begin(self, block):
         """Before it is ready: collect until a quiet stretch is long enough."""
         self._strange.append(block)
-        while len(self._strange) > 3 and block.time - self._strange[0].time > self._learn:
+        # From centre to centre; the blocks of a slow sensor may be longer than `_block`.
+        enough = self._learn - 1.5 * self._block
+        while len(self._strange) > 3 and block.time - self._strange[1].time >= enough:
             self._strange.popleft()
-        if len(self._strange) < 3 or block.time - self._strange[0].time \
-                < self._learn - 1.5 * self._block:
-            return
-        self._adopt_if_steady()
+        if len(self._strange) >= 3 and block.time - self._strange[0].time >= enough:
+            self._adopt_if_steady()
 
     def _follow(self, block):
         """Once ready: extend the quiet stretch, or freeze."""
