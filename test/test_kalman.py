@@ -12,18 +12,21 @@ from mag_tracking.physics.dipole import sensor_fields
 from mag_tracking.pipeline import Pipeline, settings_for
 
 
-def dense_update(x, P, y, h, H, C, inflation, x_lin):
+def dense_update(x, P, y, h, H, C, inflation, x_lin, n_own=0):
     """The textbook, stacked update of one hypothesis: the oracle."""
-    n_sensors, _, n_t = H.shape
+    n_sensors, n_t = len(H), H.shape[2] - n_own
     full = np.zeros((3 * n_sensors, len(x)))
-    full[:, :n_t] = H.reshape(3 * n_sensors, n_t)
-    full[:, n_t:] = np.eye(3 * n_sensors)
+    full[:, -3 * n_sensors:] = np.eye(3 * n_sensors)
+    for j in range(n_sensors):
+        own = n_t + n_own * j
+        full[3 * j:3 * j + 3, :n_t] = H[j, :, :n_t]
+        full[3 * j:3 * j + 3, own:own + n_own] = H[j, :, n_t:]
     R = np.zeros((3 * n_sensors, 3 * n_sensors))
     for j in range(n_sensors):
         R[3 * j:3 * j + 3, 3 * j:3 * j + 3] = C[j] + inflation[j] * np.eye(3)
     there = ~np.isnan(y.ravel())
     full, R = full[there], R[np.ix_(there, there)]
-    predicted = (h.ravel() + x_lin[n_t:])[there] + full @ (x - x_lin)
+    predicted = (h.ravel() + x_lin[-3 * n_sensors:])[there] + full @ (x - x_lin)
     nu = y.ravel()[there] - predicted
     # Whitened, as the tesla scale would be lost on general-purpose tolerances.
     W = np.linalg.inv(np.linalg.cholesky(R))
@@ -103,16 +106,18 @@ def test_update_with_missing_axes_and_sensors():
     assert max(compare(3, missing=True)) <= 1e-8
 
 
+@pytest.mark.parametrize('n_own', [0, 2, 3])
 @pytest.mark.parametrize('n_t', [0, 3, 5, 7, 12])
-def test_update_in_numbers_near_one_with_any_axes_missing(n_t):
+def test_update_in_numbers_near_one_with_any_axes_missing(n_t, n_own):
     """In tesla a missing axis that is only given a large noise would look like one left out."""
     rng = np.random.default_rng(n_t)
     n_sensors = 8
-    n_x = n_t + 3 * n_sensors
+    n_x = n_t + (n_own + 3) * n_sensors
     x = rng.standard_normal((1, n_x))
     P, C = (np.stack([a @ a.T + 0.1 * np.eye(k) for a in rng.standard_normal((n, k, k))])
             for n, k in ((1, n_x), (n_sensors, 3)))
-    h, H = rng.standard_normal((1, n_sensors, 3)), rng.standard_normal((1, n_sensors, 3, n_t))
+    h = rng.standard_normal((1, n_sensors, 3))
+    H = rng.standard_normal((1, n_sensors, 3, n_t + n_own))
     inflation = rng.uniform(0.0, 1.0, (1, n_sensors))
     x_lin = x + rng.standard_normal(x.shape)
     y = rng.standard_normal((n_sensors, 3))
@@ -121,9 +126,10 @@ def test_update_in_numbers_near_one_with_any_axes_missing(n_t):
     C[patterns] = np.nan
     C[np.broadcast_to(patterns[:, None, :], C.shape)] = np.nan
     new_x, new_P = x.copy(), P.copy()
-    log_likelihood, nis = kalman.update(new_x, new_P, y, h, H, C, inflation, x_lin)
+    log_likelihood, nis = kalman.update(new_x, new_P, y, h, H, C, inflation, x_lin, n_own)
     filled = np.where(np.isnan(C), np.eye(3), C)
-    ox, oP, oll, onis, _ = dense_update(x[0], P[0], y, h[0], H[0], filled, inflation[0], x_lin[0])
+    ox, oP, oll, onis, _ = dense_update(x[0], P[0], y, h[0], H[0], filled, inflation[0], x_lin[0],
+                                        n_own)
     np.testing.assert_allclose(new_x[0], ox, atol=1e-9)
     np.testing.assert_allclose(new_P[0], oP, atol=1e-9)
     np.testing.assert_allclose([log_likelihood[0], nis[0]], [oll, onis], rtol=1e-9)
@@ -139,10 +145,22 @@ def test_covariance_stays_exactly_symmetric():
     np.testing.assert_array_equal(P, np.swapaxes(P, 1, 2))
 
 
-def test_a_singular_noise_is_refused():
+@pytest.mark.parametrize('bad', [np.zeros((3, 3)), np.diag([-1.0, 1.0, 1.0]),
+                                 [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+                                 [[1.0, 0.0, 2.0], [0.0, 1.0, 0.0], [2.0, 0.0, 1.0]]])
+def test_a_noise_that_is_not_positive_definite_is_refused(bad):
     x, P, y, h, H, C, inflation = tracked(2)
+    before = x.copy()
+    C[1] = 1.44e-16 * np.array(bad)
     with pytest.raises(ValueError, match='not positive definite'):
-        kalman.update(x, P, y, h, H, 0.0 * C, 0.0 * inflation)
+        kalman.update(x, P, y, h, H, C, 0.0 * inflation)
+    np.testing.assert_array_equal(x, before)
+
+
+def test_states_that_do_not_fit_the_sensors_are_refused():
+    x, P, y, h, H, C, inflation = tracked(2)
+    with pytest.raises(ValueError, match='expected'):
+        kalman.update(x, P, y, h, H, C, inflation, n_own=3)
 
 
 def test_nees_of_a_linear_gaussian_case_is_chi_square():

@@ -1,10 +1,11 @@
 """Kalman prediction and update, batched over hypotheses.
 
-The leading axis is always the hypothesis. A state is n_t states that may be
-seen by every sensor, the target's first, followed by three background states
-per sensor (tesla, sensor frame). The
-update takes the sensors one after the other, linearised at one common point,
-which gives the numbers of the stacked update at a fraction of its cost.
+The leading axis is always the hypothesis. A state is the n_t states of the
+target, which every sensor sees, then n_own states of each sensor that only it
+sees (its mounting angles; n_own may be 0), then three backgrounds of each
+sensor (tesla, sensor frame): n_x = n_t + (n_own + 3) n_sensors. The update
+takes the sensors one after the other, linearised at one common point, which
+gives the numbers of the stacked update at a fraction of its cost.
 """
 
 import math
@@ -55,12 +56,12 @@ _INLINE = {'error_model': 'numpy', 'fastmath': {'contract'}, 'forceinline': True
 
 
 @njit(**_INLINE)
-def _gain_rows(y, P, H, p, j, first, T):
+def _gain_rows(y, P, H, p, j, n_own, first, T):
     """T = [H | I] P, the three rows of sensor j; rows of missing axes are zero.
 
     Five columns of H at a time, so that each entry of T is touched less often.
     """
-    n_x, n_t = P.shape[1], H.shape[3]
+    n_x, n_t = P.shape[1], H.shape[3] - n_own
     for i in range(n_x):
         T[0, i] = P[p, first, i]
         T[1, i] = P[p, first + 1, i]
@@ -78,12 +79,13 @@ def _gain_rows(y, P, H, p, j, first, T):
             T[0, i] += a0 * p0 + a1 * p1 + a2 * p2 + a3 * p3 + a4 * p4
             T[1, i] += b0 * p0 + b1 * p1 + b2 * p2 + b3 * p3 + b4 * p4
             T[2, i] += d0 * p0 + d1 * p1 + d2 * p2 + d3 * p3 + d4 * p4
-    for c in range(n_t - n_t % 5, n_t):
+    for c in range(n_t - n_t % 5, n_t + n_own):
         a0, b0, d0 = H[p, j, 0, c], H[p, j, 1, c], H[p, j, 2, c]
+        row = c if c < n_t else c + n_own * j
         for i in range(n_x):
-            T[0, i] += a0 * P[p, c, i]
-            T[1, i] += b0 * P[p, c, i]
-            T[2, i] += d0 * P[p, c, i]
+            T[0, i] += a0 * P[p, row, i]
+            T[1, i] += b0 * P[p, row, i]
+            T[2, i] += d0 * P[p, row, i]
     for a in range(3):
         if math.isnan(y[j, a]):
             for i in range(n_x):
@@ -132,7 +134,7 @@ def _n_present(y, C):
 
 
 @njit(**_INLINE)
-def _innovation(y, C, inflation, h, H, x, x_lin, p, j, first, T):
+def _innovation(y, C, inflation, h, H, x, x_lin, p, j, n_own, first, T):
     """Innovation u and its covariance T [H | I]' + C + inflation; u is zero on missing axes."""
     u0 = y[j, 0] - h[p, j, 0] - x[p, first]
     u1 = y[j, 1] - h[p, j, 1] - x[p, first + 1]
@@ -141,10 +143,12 @@ def _innovation(y, C, inflation, h, H, x, x_lin, p, j, first, T):
     s10, s11 = C[j, 1, 0] + T[1, first], C[j, 1, 1] + inflation[p, j] + T[1, first + 1]
     s20, s21 = C[j, 2, 0] + T[2, first], C[j, 2, 1] + T[2, first + 1]
     s22 = C[j, 2, 2] + inflation[p, j] + T[2, first + 2]
-    for c in range(H.shape[3]):
+    n_t = H.shape[3] - n_own
+    for c in range(n_t + n_own):
         h0, h1, h2 = H[p, j, 0, c], H[p, j, 1, c], H[p, j, 2, c]
-        t0, t1, t2 = T[0, c], T[1, c], T[2, c]
-        d = x[p, c] - x_lin[p, c]
+        i = c if c < n_t else c + n_own * j
+        t0, t1, t2 = T[0, i], T[1, i], T[2, i]
+        d = x[p, i] - x_lin[p, i]
         u0 -= h0 * d
         u1 -= h1 * d
         u2 -= h2 * d
@@ -184,10 +188,10 @@ def _whiten(T, l10, l20, l21, r0, r1, r2):
 
 @njit('int64(float64[:,::1], float64[:,:,::1], float64[:,::1], float64[:,::1], '
       'float64[:,:,::1], float64[:,:,::1], float64[:,:,:,::1], float64[:,::1], '
-      'float64[::1], float64[::1])', **_COMPILE)
-def _update_bank(x, P, x_lin, y, C, h, H, inflation, log_likelihood, nis):
+      'int64, float64[::1], float64[::1])', **_COMPILE)
+def _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis):
     """Loop of the update over hypotheses and sensors; -1 if a noise is not positive definite."""
-    n_hyp, n_sensors, n_t = H.shape[0], H.shape[1], H.shape[3]
+    n_hyp, n_sensors = H.shape[0], H.shape[1]
     n = _n_present(y, C)
     if n < 0:
         return -1
@@ -196,10 +200,10 @@ def _update_bank(x, P, x_lin, y, C, h, H, inflation, log_likelihood, nis):
         log_likelihood[p] = -0.5 * n * _LOG_2PI
         nis[p] = 0.0
         for j in range(n_sensors):
-            first = n_t + 3 * j
-            _gain_rows(y, P, H, p, j, first, T)
+            first = x.shape[1] - 3 * (n_sensors - j)
+            _gain_rows(y, P, H, p, j, n_own, first, T)
             (u0, u1, u2), (s00, s10, s11, s20, s21, s22) = _innovation(
-                y, C, inflation, h, H, x, x_lin, p, j, first, T)
+                y, C, inflation, h, H, x, x_lin, p, j, n_own, first, T)
             l10, l20, l21, e0, e1, e2 = _factor(s00, s10, s11, s20, s21, s22)
             r0, r1, r2 = 1.0 / math.sqrt(e0), 1.0 / math.sqrt(e1), 1.0 / math.sqrt(e2)
             _whiten(T, l10, l20, l21, r0, r1, r2)
@@ -212,25 +216,27 @@ def _update_bank(x, P, x_lin, y, C, h, H, inflation, log_likelihood, nis):
     return 0
 
 
-def update(x, P, y, h, H, C, inflation, x_lin=None):
+def update(x, P, y, h, H, C, inflation, x_lin=None, n_own=0):
     """Measurement update of every hypothesis, in place.
 
     Parameters
     ----------
     x : (n_hyp, n_x), P : (n_hyp, n_x, n_x)
-        Predicted states and covariances, C-contiguous; n_x = n_t + 3 n_sensors.
+        Predicted states and covariances, C-contiguous; n_x as on top of this module.
     y : (n_sensors, 3) [T], sensor frame
         Measurement; NaN = axis or sensor missing.
     h : (n_hyp, n_sensors, 3) [T], sensor frame
-        Field of the target alone, at the linearisation point.
-    H : (n_hyp, n_sensors, 3, n_t)
-        Its derivative with respect to the target states.
+        Field without the background, at the linearisation point.
+    H : (n_hyp, n_sensors, 3, n_t + n_own)
+        Its derivative by the target states and by the sensor's own.
     C : (n_sensors, 3, 3) [T^2]
         Noise covariance per sensor.
     inflation : (n_hyp, n_sensors) [T^2]
         Isotropic variance added to C (model error near the target).
     x_lin : (n_hyp, n_x), optional
         Linearisation point; the predicted state if left out.
+    n_own : int
+        States of each sensor between the target's and the backgrounds.
 
     Returns
     -------
@@ -242,12 +248,15 @@ def update(x, P, y, h, H, C, inflation, x_lin=None):
     Raises
     ------
     ValueError
-        A noise covariance is not positive definite.
+        A noise covariance is not positive definite, or the shapes do not fit.
 
     Source: T10 Alg. 2, measurement update; ICASSP11 eq. (9) for the inflation.
     """
     x_lin = x.copy() if x_lin is None else x_lin
+    n_x = H.shape[3] - n_own + (n_own + 3) * H.shape[1]
+    if x.shape[1] != n_x:
+        raise ValueError(f'expected {n_x} states, got {x.shape[1]}')
     log_likelihood, nis = np.empty(len(x)), np.empty(len(x))
-    if _update_bank(x, P, x_lin, y, C, h, H, inflation, log_likelihood, nis) < 0:
+    if _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis) < 0:
         raise ValueError('a sensor\'s noise covariance is not positive definite')
     return log_likelihood, nis

@@ -95,7 +95,7 @@ class TrackStage:
             raise SettingsError(f'track.target: expected vehicle or magnet, '
                                 f'got {settings.target!r}')
         self._mounting_std = np.deg2rad(settings.mounting_std_deg)
-        self._n_mounting = 3 * len(network) if self._mounting_std else 0
+        self._n_own = 3 if self._mounting_std else 0
         self._next_id = 1
         self._bank = None
         self._recent = deque()
@@ -183,7 +183,7 @@ class TrackStage:
         bank, n_t = self._bank, len(self._model.state_names)
         x_target, F, Q = self._model.propagate(bank.x[:, :n_t], dt)
         walk = np.zeros(bank.x.shape[1] - n_t)
-        walk[self._n_mounting:] = self._settings.background_drift**2 * max(dt, 0.0)
+        walk[self._n_own * len(self._network):] = self._settings.background_drift**2 * max(dt, 0.0)
         kalman.predict(bank.x, bank.P, x_target, F, Q if dt > 0.0 else 0.0 * Q, walk)
 
     def _fields(self, x):
@@ -191,10 +191,14 @@ class TrackStage:
         n_t = len(self._model.state_names)
         h, H, gradient_power = sensor_fields(self._positions, self._R_sw,
                                              *self._model.dipoles(x[:, :n_t]))
-        if self._n_mounting:
-            angles = x[:, n_t:n_t + self._n_mounting].reshape(len(x), -1, 3)
-            h, H = turned_fields(h, H, angles)
+        if self._n_own:
+            h, H = turned_fields(h, H, self._angles(x))
         return h, H, gradient_power
+
+    def _angles(self, x):
+        """(n_hyp, n_sensors, 3) [rad] mounting angles among the states `x`."""
+        n_t, n = len(self._model.state_names), len(self._network)
+        return x[:, n_t:n_t + 3 * n].reshape(len(x), n, 3)
 
     def _step(self, frame, dt, publish=True):
         """Predict, update, weigh, publish; the `Track` of the frame if it is to be published."""
@@ -252,7 +256,7 @@ class TrackStage:
             lost = ~(np.isfinite(h).all(axis=(1, 2)) & np.isfinite(inflation).all(axis=1))
             h[lost], H[lost], inflation[lost] = 0.0, 0.0, 0.0
             log_likelihood, nis = kalman.update(bank.x, bank.P, frame.field, h, H, covariance,
-                                                inflation, x_lin)
+                                                inflation, x_lin, self._n_own)
             log_likelihood[lost] = -np.inf
             x_lin = bank.x.copy()
         return log_likelihood, nis
