@@ -22,7 +22,6 @@ from mag_tracking.io.schema import frame_of, stamp_ns
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.runner import line_of, run
 from mag_tracking.nodes.stage_node import STREAM
-from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.pipeline import settings_for
 from mag_tracking.report.figures import field_figure, map_figure, weights_figure
 from mag_tracking.report.metrics import interpolate_truth, pass_errors
@@ -68,10 +67,7 @@ class Spectator(Node):
             hypotheses = self._hypotheses.get(track.stamp_ns)
             if frame is None or hypotheses is None:
                 continue  # it came before this node was connected: printed, but not drawn
-            B = dipole_field(self.network.positions - track.position, track.moment)
-            innovation = frame.field - np.einsum('jik,jk->ji', self.network.R_sw, B)
-            self.logs.setdefault(track.id, TrackLog(track.id)).add(
-                track_of(m, hypotheses, innovation), frame)
+            self.logs.setdefault(track.id, TrackLog(track.id)).add(track_of(m, hypotheses), frame)
 
 
 def draw(spectator, out):

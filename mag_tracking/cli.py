@@ -3,8 +3,8 @@
 import argparse
 import signal
 import sys
+import threading
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 from tqdm import tqdm
@@ -114,25 +114,28 @@ def _settings(args):
 
 @contextmanager
 def _interrupts():
-    """A list on which every SIGINT is put before it is raised as KeyboardInterrupt."""
+    """A list on which every SIGINT is put; the first is raised as KeyboardInterrupt.
+
+    The next ones are only noted: what was done is being written by then. Where
+    SIGINT is ignored (a background job) it stays so, and outside the main
+    thread, where no handler can be set, the list stays empty.
+    """
     seen = []
 
     def note(signum, _):
         seen.append(signum)
-        raise KeyboardInterrupt
+        if len(seen) == 1:
+            raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGINT, note)
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.SIG_IGN or threading.current_thread() is not threading.main_thread():
+        yield seen
+        return
+    signal.signal(signal.SIGINT, note)
     try:
         yield seen
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def _count_on(bar, interrupts, n):
-    """Progress; raises an interruption again that a library on the way has swallowed."""
-    bar.update(n)
-    if interrupts:
-        raise KeyboardInterrupt
 
 
 def _replay(args):
@@ -143,20 +146,32 @@ def _replay(args):
     if twice:
         raise OutputError(f'two recordings are named {twice[0]}: their results would overwrite '
                           'each other; replay them one by one')
-    for path, name in zip(args.recordings, names, strict=True):
-        recording = Recording(path)
-        out = args.out / name if len(args.recordings) > 1 else args.out
-        with _interrupts() as seen, tqdm(total=recording.size, unit='B', unit_scale=True,
-                                         desc=path.name, disable=None) as bar:
-            run = replay(recording, network, settings, out, partial(_count_on, bar, seen))
-        _print_summary(path, run.summary)
-        if run.summary['interrupted'] or seen:
-            print(f'interrupted; what was done is in {out}')
-            return 130
-        if not args.no_figures:
-            write_figures(run, network, out)
-        print(f'results in {out}')
+    with _interrupts() as seen:
+        for path, name in zip(args.recordings, names, strict=True):
+            out = args.out / name if len(args.recordings) > 1 else args.out
+            _replay_one(path, network, settings, out, seen, not args.no_figures)
+            if seen:
+                print(f'interrupted; what was done is in {out}')
+                return 130
     return 0
+
+
+def _replay_one(path, network, settings, out, seen, figures):
+    """Replay one recording into one folder; what was done stays when it is interrupted."""
+    recording = Recording(path)
+    with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
+              disable=None) as bar:
+        # Asked, not only raised: a library on the way may swallow what is raised in it.
+        run = replay(recording, network, settings, out, bar.update, lambda: bool(seen))
+    _print_summary(path, run.summary)
+    if seen:
+        return
+    if figures:
+        try:
+            write_figures(run, network, out)
+        except KeyboardInterrupt:
+            return
+    print(f'results in {out}')
 
 
 def _print_summary(path, summary):
@@ -181,6 +196,11 @@ def _print_summary(path, summary):
               + (f', from {t["arrival"]} ({t["arrival_weights"][t["arrival"]]:.0%})'
                  if t['arrival'] else '')
               + f', {t["speed"]:.2f} m/s, {t["moment_size"]:.3g} A m^2, {t["verdict"]}')
+        for name, m in t['mounting'].items():
+            if m['suspicious']:
+                print(f'    warning: {name} fits best if turned by '
+                      f'{max(m["angles_deg"], key=abs):+.0f} degrees about one axis: its '
+                      'orientation in the network file is wrong, or the target is not as modelled')
         for name, value in t.get('truth', {}).items():
             if isinstance(value, float):
                 print(f'    against truth: {name} {value:.4g}')
@@ -242,6 +262,7 @@ def main(argv=None):
         print(f'mag-tracking: {error}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
+        print('mag-tracking: interrupted', file=sys.stderr)
         return 130
 
 

@@ -12,6 +12,9 @@ from mag_tracking.records import Detection, FieldFrame
 from mag_tracking.report.metrics import interpolate_truth, magnet_errors, pass_errors
 from mag_tracking.report.track_log import TrackLog
 
+SUSPICIOUS = 2.0
+"""A sensor that seems to be turned by more prior deviations than this is reported."""
+
 
 @dataclass
 class Run:
@@ -24,7 +27,7 @@ class Run:
     """{name: (stamps, positions, quaternions)}."""
 
 
-def replay(recording, network, settings, out, progress=None):
+def replay(recording, network, settings, out, progress=None, stopped=None):
     """Track everything in a recording and write the results.
 
     Parameters
@@ -36,13 +39,16 @@ def replay(recording, network, settings, out, progress=None):
         Folder for the results; made if it is not there.
     progress : function, optional
         Called with the bytes done since the last call.
+    stopped : function, optional
+        Asked before every sample; true ends the reading.
 
     Returns
     -------
     Run
 
-    Raises RecordingError and OutputError. An interruption (KeyboardInterrupt)
-    ends the reading; what was done is written, and the summary says so.
+    Raises RecordingError and OutputError. An interruption (KeyboardInterrupt,
+    or `stopped`) ends the reading; what was done is written, and the summary
+    says so.
     """
     if recording.lies_in(out):
         raise OutputError(f'{out} is the folder of the recording; the results would overwrite it')
@@ -53,6 +59,9 @@ def replay(recording, network, settings, out, progress=None):
         frame = None
         try:
             for sample in reader.samples(progress):
+                interrupted = stopped is not None and stopped()
+                if interrupted:
+                    break
                 frame = _take(pipeline.feed(sample), frame, results, logs)
         except KeyboardInterrupt:
             interrupted = True
@@ -96,6 +105,7 @@ def _summary(recording, reader, pipeline, logs, truth):
     tracks = []
     for log in logs.values():
         entry = log.summary()
+        entry['mounting'] = _mounting(log, pipeline)
         errors = _against_truth(log, pipeline, truth)
         if errors:
             entry['truth'] = errors
@@ -103,6 +113,14 @@ def _summary(recording, reader, pipeline, logs, truth):
     return {'recording': recording.path.name, 'target': pipeline.settings.track.target,
             'counts': pipeline.counts(), 'rejected': rejections, 'lost': dict(recording.losses),
             'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks}
+
+
+def _mounting(log, pipeline):
+    """{sensor: how it seems to be turned} of a track; empty where that is not estimated."""
+    allowed = SUSPICIOUS * pipeline.settings.track.mounting_std_deg
+    return {name: {'angles_deg': angles.tolist(), 'std_deg': std.tolist(),
+                   'suspicious': bool(np.abs(angles).max() > allowed)}
+            for name, (angles, std) in log.mounting_of(pipeline.network.names).items()}
 
 
 def _against_truth(log, pipeline, truth):

@@ -101,7 +101,11 @@ class Track:
     ambiguous: bool
     unobservable: tuple[bool, ...]
     """(6): x, y, z, and rotation about the body's x, y, z."""
-    innovation: np.ndarray
-    """(n_sensors, 3) [T] measured minus predicted field, sensor frames, NaN = missing."""
+    predicted: np.ndarray
+    """(n_sensors, 3) [T], sensor frames: the frame's field as the published hypothesis has it."""
+    mounting: np.ndarray
+    """(n_sensors, 3) [rad] angles as in `physics.mounting`; (0, 3) where they are not estimated."""
+    mounting_std: np.ndarray
+    """(n_sensors, 3) [rad], or (0, 3)."""
     hypotheses: tuple[Hypothesis, ...] = field(default=())
     """Heaviest first; the published one is among them."""

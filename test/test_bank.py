@@ -17,7 +17,7 @@ def bank(n=4, spread=10.0, label=None):
     x[:, 0] = spread * np.arange(n)
     P = np.repeat(np.eye(7)[None], n, axis=0)
     return FilterBank(x, P, np.full(n, -np.log(n)),
-                      np.arange(n) if label is None else np.array(label))
+                      np.arange(n) if label is None else np.array(label), np.arange(n) + 0.5)
 
 
 def test_log_sum_exp_equals_scipy_and_survives_extremes():

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
@@ -131,22 +132,89 @@ def test_an_interrupted_replay_keeps_what_is_done(tmp_path):
     assert json.loads(table.read_text())['recording'] == f'{NAME}_0.mcap'
 
 
-def test_an_interruption_that_a_library_swallows_is_not_lost(tmp_path, monkeypatch):
+def interrupt_feed(monkeypatch, at, swallow=False):
+    """Let the pipeline be interrupted at one of its samples; returns the list of samples fed."""
     from mag_tracking.pipeline import Pipeline
     feed, calls = Pipeline.feed, []
 
-    def swallowing(self, sample):
+    def interrupted(self, sample):
         calls.append(sample)
-        if len(calls) == 300:
-            with contextlib.suppress(KeyboardInterrupt):
+        if len(calls) == at:
+            with contextlib.suppress(KeyboardInterrupt) if swallow else contextlib.nullcontext():
                 signal.raise_signal(signal.SIGINT)
         return feed(self, sample)
 
-    monkeypatch.setattr(Pipeline, 'feed', swallowing)
+    monkeypatch.setattr(Pipeline, 'feed', interrupted)
+    return calls
+
+
+def replay_one(out, *options):
+    return main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--out',
+                 str(out), *options])
+
+
+@pytest.mark.parametrize('swallow', [False, True])
+def test_an_interruption_ends_the_reading_even_if_a_library_swallows_it(
+        tmp_path, monkeypatch, swallow):
+    calls = interrupt_feed(monkeypatch, 300, swallow)
     before = signal.getsignal(signal.SIGINT)
-    assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--out',
-                     str(tmp_path), '--no-figures']) == 130
+    assert replay_one(tmp_path, '--no-figures') == 130
     assert signal.getsignal(signal.SIGINT) is before
+    assert 300 <= len(calls) < 2000
+    assert json.loads((tmp_path / 'summary.json').read_text())['interrupted'] is True
+
+
+def test_an_interruption_need_not_wait_for_the_next_sample(tmp_path, monkeypatch):
+    from mag_tracking.io.samples import SampleReader
+    waited = []
+
+    def no_sample_for_long(self, progress):
+        signal.raise_signal(signal.SIGINT)
+        waited.append(True)
+        yield from ()
+
+    monkeypatch.setattr(SampleReader, 'samples', no_sample_for_long)
+    assert replay_one(tmp_path, '--no-figures') == 130
+    assert not waited
+
+
+def test_a_second_interruption_does_not_lose_what_is_being_written(tmp_path, monkeypatch, capsys):
+    from mag_tracking import offline
+    summary = offline._summary
+
+    def impatient(*args):
+        signal.raise_signal(signal.SIGINT)
+        return summary(*args)
+
+    interrupt_feed(monkeypatch, 300)
+    monkeypatch.setattr(offline, '_summary', impatient)
+    assert replay_one(tmp_path, '--no-figures') == 130
+    assert json.loads((tmp_path / 'summary.json').read_text())['interrupted'] is True
+    assert 'interrupted; what was done is in' in capsys.readouterr().out
+
+
+def test_an_interruption_while_drawing_keeps_the_tables(tmp_path, monkeypatch):
+    from mag_tracking import cli
+    monkeypatch.setattr(cli, 'write_figures', lambda *_: signal.raise_signal(signal.SIGINT))
+    assert replay_one(tmp_path) == 130
+    assert (tmp_path / 'summary.json').exists()
+
+
+def test_a_background_job_ignores_interruptions_as_it_was_told(tmp_path, monkeypatch):
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        interrupt_feed(monkeypatch, 300)
+        assert replay_one(tmp_path, '--no-figures') == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_the_command_works_outside_the_main_thread(tmp_path):
+    status = []
+    thread = threading.Thread(target=lambda: status.append(replay_one(tmp_path, '--no-figures')))
+    thread.start()
+    thread.join()
+    assert status == [0]
 
 
 def test_the_example_runs():

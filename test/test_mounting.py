@@ -1,13 +1,18 @@
 """Sensors turned from what the network says: derivatives, and what it does to a track."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import line_network
-from test_track import drive
+from test_track import NOISE, drive
 
 from mag_tracking.geometry import quaternion_from_rotation_vector, rotation_from_quaternion
-from mag_tracking.io.simulator import Imperfections, Path, point_body
+from mag_tracking.io.simulator import Imperfections, Path, point_body, simulate
+from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.physics.mounting import turned_fields
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.records import FieldFrame, Track
 
 
 def case():
@@ -54,6 +59,65 @@ def test_derivatives_by_state_and_angle():
         j, a = divmod(k - 4, 3)
         np.testing.assert_allclose(derivative[:, j, :, 4 + a], expected[:, j], atol=1e-8)
         assert not np.delete(expected, j, axis=1).any()
+
+
+ANGLES = np.deg2rad([[4.0, -3.0, 6.0], [-5.0, 2.0, 3.0]])
+
+
+@pytest.fixture(scope='module')
+def turned_pass():
+    """(network, tracks, {stamp: frame}) of a pass by sensors that are turned by `ANGLES`."""
+    network = line_network(2)
+    samples, *_ = simulate(network, point_body([300.0, -150.0, 80.0], 5.0, 0.5),
+                           Path(np.array([-70.0, -1.2]), 0.0, 10.0), 100.0, 12.0,
+                           np.random.default_rng(6))
+    R = rotation_from_quaternion(quaternion_from_rotation_vector(ANGLES))
+    pipeline = Pipeline(network, settings_for('vehicle', {
+        'track.field_error': 0.02, 'track.near_field_length': 0.0}))
+    tracks, frames = [], {}
+    for s in samples:
+        turned = R[network.names.index(s.sensor)] @ s.field
+        for record in pipeline.feed(replace(s, field=turned)):
+            if isinstance(record, FieldFrame):
+                frames[record.stamp_ns] = record
+            elif isinstance(record, Track) and not record.ended:
+                tracks.append(record)
+    return network, tracks, frames
+
+
+def test_the_angles_are_found_within_their_deviations(turned_pass):
+    last = turned_pass[1][-1]
+    z = (last.mounting - ANGLES) / last.mounting_std
+    assert np.abs(z).max() < 3.0
+    # Found, not only doubted: both sensors as a whole are better known than before the pass.
+    assert np.linalg.norm(last.mounting - ANGLES) < 0.5 * np.linalg.norm(ANGLES)
+    assert (last.mounting_std < 0.8 * np.deg2rad(5.0)).all()
+
+
+def test_the_predicted_field_is_that_of_the_published_pose(turned_pass):
+    network, tracks, frames = turned_pass
+    for t in tracks:
+        B_s = np.einsum('jik,jk->ji', network.R_sw,
+                        dipole_field(network.positions - t.position, t.moment))
+        model = B_s + np.cross(t.mounting, B_s)
+        # What is left is the background, which a track starts with knowing to 2e-8 T.
+        assert np.abs(t.predicted - model).max() < 8e-8
+    near = [t for t in tracks if np.hypot(*t.position[:2]) < 6.0]
+    assert len(near) > 5
+    for t in near:
+        field = frames[t.stamp_ns].field
+        assert np.abs(field - t.predicted).max() < 4.0 * NOISE / np.sqrt(8) + 0.1 * np.abs(
+            field).max()
+        assert 0.0 < t.nis < 20.0 and t.degrees_of_freedom == 6
+
+
+def test_a_tracker_without_angles_publishes_none():
+    network = line_network(2)
+    tracks, *_ = drive(network, point_body([300.0, -150.0, 80.0], 5.0, 0.5),
+                       Path(np.array([-70.0, -1.2]), 0.0, 10.0),
+                       changes={'track.mounting_std_deg': 0.0})
+    assert tracks[0].mounting.shape == tracks[0].mounting_std.shape == (0, 3)
+    assert tracks[0].predicted.shape == (2, 3)
 
 
 @pytest.fixture(scope='module')

@@ -174,10 +174,12 @@ def test_a_hypothesis_on_a_sensor_is_dropped_and_the_rest_go_on():
     bank = stage.bank
     bank.x, bank.P = np.vstack([bank.x, bank.x[:1]]), np.concatenate([bank.P, bank.P[:1]])
     bank.log_w, bank.label = np.append(bank.log_w, bank.log_w[0]), np.append(bank.label, 0)
+    bank.nis = np.append(bank.nis, 0.0)
     bank.x[-1, :3] = network.positions[0]
     bank.x[-1, 3:6] = 0.0
     track = stage.feed(frames[1])[-1]
     assert np.isfinite(track.position).all() and not track.ended
+    assert min(np.linalg.norm(h.position - network.positions[0]) for h in track.hypotheses) > 0.01
 
 
 def test_without_an_earth_field_there_is_no_soft_iron():

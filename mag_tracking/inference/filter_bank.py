@@ -34,6 +34,8 @@ class FilterBank:
     """(n_hyp,) normalised log-weights."""
     label: np.ndarray
     """(n_hyp,) int: the arrival that each hypothesis assumes."""
+    nis: np.ndarray
+    """(n_hyp,) normalised innovation squared of the latest measurement; NaN before it."""
 
     @classmethod
     def of_targets(cls, x, P, label, n_sensors, background_std, mounting_std=0.0):
@@ -51,7 +53,8 @@ class FilterBank:
         full_x[:, :n_t], full_P[:, :n_t, :n_t] = x, P
         rest = np.arange(n_t, n_x)
         full_P[:, rest, rest] = std**2
-        return cls(full_x, full_P, np.full(n, -np.log(n)), label)
+        return cls(full_x, full_P, np.full(n, -np.log(n)), label,
+                   np.full(n, np.nan))
 
     def __len__(self):
         return len(self.log_w)
@@ -109,7 +112,7 @@ class FilterBank:
             self.x = np.ascontiguousarray(self.x[mask])
             self.P = np.ascontiguousarray(self.P[mask])
             self.log_w = self.log_w[mask] - log_sum_exp(self.log_w[mask])
-            self.label = self.label[mask]
+            self.label, self.nis = self.label[mask], self.nis[mask]
         return gone
 
     def prune(self, log_ratio, most):

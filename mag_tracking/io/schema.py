@@ -50,7 +50,8 @@ DEFINITIONS = {
         'geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/Vector3 velocity\n'
         'float64[36] covariance\ngeometry_msgs/Vector3 moment\nfloat64[9] moment_covariance\n'
         'float64 existence\nfloat64 weight\nfloat64 normalised_innovation\n'
-        'uint32 degrees_of_freedom\nstring arrival\nbool ambiguous\nbool[6] unobservable\n'),
+        'uint32 degrees_of_freedom\nstring arrival\nbool ambiguous\nbool[6] unobservable\n'
+        'float64[] predicted_field\nfloat64[] mounting\nfloat64[] mounting_std\n'),
     TRACK_ARRAY: (('std_msgs/msg/Header', 'mag_tracking_msgs/msg/Track'),
                   'std_msgs/Header header\nmag_tracking_msgs/Track[] tracks\n'),
 }
@@ -188,7 +189,10 @@ def track_dict(track, frame):
             'existence': track.existence, 'weight': track.weight,
             'normalised_innovation': track.nis, 'degrees_of_freedom': track.degrees_of_freedom,
             'arrival': track.arrival, 'ambiguous': track.ambiguous,
-            'unobservable': list(track.unobservable)}
+            'unobservable': list(track.unobservable),
+            'predicted_field': track.predicted.ravel().tolist(),
+            'mounting': track.mounting.ravel().tolist(),
+            'mounting_std': track.mounting_std.ravel().tolist()}
 
 
 def hypotheses_dict(track, frame):

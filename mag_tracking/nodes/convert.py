@@ -46,11 +46,8 @@ def _vector(v):
     return np.array([v.x, v.y, v.z])
 
 
-def track_of(message, hypotheses=None, innovation=None):
-    """`Track` of a mag_tracking_msgs/Track and, if given, its HypothesisArray.
-
-    `innovation` (n_sensors, 3) [T] does not travel in the message.
-    """
+def track_of(message, hypotheses=None):
+    """`Track` of a mag_tracking_msgs/Track and, if given, its HypothesisArray."""
     pose = np.array(message.pose.covariance).reshape(6, 6)
     q = message.pose.pose.orientation
     members = () if hypotheses is None else tuple(
@@ -65,4 +62,5 @@ def track_of(message, hypotheses=None, innovation=None):
         np.array(message.moment_covariance).reshape(3, 3), message.existence, message.weight,
         message.normalised_innovation, message.degrees_of_freedom, message.arrival,
         message.ambiguous, tuple(message.unobservable),
-        np.empty((0, 3)) if innovation is None else innovation, members)
+        np.array(message.predicted_field).reshape(-1, 3), np.array(message.mounting).reshape(-1, 3),
+        np.array(message.mounting_std).reshape(-1, 3), members)

@@ -129,7 +129,7 @@ def field_figure(log, network, most=8):
     most : int
         Sensors drawn; with more, those with the strongest field (the title says so).
     """
-    measured, innovation = np.array(log.measured), np.array(log.innovation)
+    measured, predicted = np.array(log.measured), np.array(log.predicted)
     strength = np.nan_to_num(np.nanmax(np.abs(np.where(np.isnan(measured), 0.0, measured)),
                                        axis=(0, 2)))
     rows = np.sort(np.argsort(-strength, kind='stable')[:most])
@@ -146,7 +146,7 @@ def field_figure(log, network, most=8):
         for a, colour in enumerate(('tab:red', 'tab:green', 'tab:blue')):
             axes.plot(t, f * measured[:, j, a], '.', ms=4, color=colour,
                       label=f'{"xyz"[a]} measured' if j == rows[0] else None)
-            axes.plot(t, f * (measured - innovation)[:, j, a], '-', lw=1.2, color=colour,
+            axes.plot(t, f * predicted[:, j, a], '-', lw=1.2, color=colour,
                       label=f'{"xyz"[a]} predicted' if j == rows[0] else None)
         axes.set_title(network.names[j], fontsize=9)
         axes.set_ylabel(f'field [{unit}]')

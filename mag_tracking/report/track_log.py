@@ -22,7 +22,9 @@ class TrackLog:
     arrivals: list = field(default_factory=list)
     """Per frame {arrival: (weight, position, covariance (2, 2) of its best hypothesis)}."""
     measured: list = field(default_factory=list)
-    innovation: list = field(default_factory=list)
+    predicted: list = field(default_factory=list)
+    mounting: list = field(default_factory=list)
+    mounting_std: list = field(default_factory=list)
     existence: float = 0.0
     ended: bool = False
 
@@ -32,7 +34,8 @@ class TrackLog:
             self.ended = True
             return
         for name in ('stamp_ns', 'position', 'velocity', 'covariance', 'moment', 'orientation',
-                     'nis', 'degrees_of_freedom', 'ambiguous', 'innovation'):
+                     'nis', 'degrees_of_freedom', 'ambiguous', 'predicted', 'mounting',
+                     'mounting_std'):
             getattr(self, name).append(getattr(track, name))
         self.measured.append(frame.field)
         self.existence = track.existence
@@ -48,13 +51,22 @@ class TrackLog:
         stamps = np.array(self.stamp_ns, dtype=np.int64)
         return (stamps - stamps[0]) / 1e9
 
+    def surest(self):
+        """Index of the pose whose horizontal position is most certain."""
+        return int(np.argmin([np.trace(C[:2, :2]) for C in self.covariance]))
+
+    def mounting_of(self, names):
+        """{sensor: (angles (3,), their deviations (3,)) [deg]} at the surest pose; may be empty."""
+        k = self.surest()
+        return {name: (np.degrees(a), np.degrees(sd)) for name, a, sd in
+                zip(names, self.mounting[k], self.mounting_std[k], strict=False)}
+
     def summary(self):
         """The track in a few JSON-ready numbers.
 
         Speed and moment are those of the most certain pose.
         """
-        sd = np.array([np.sqrt(np.trace(C[:2, :2])) for C in self.covariance])
-        sure = int(np.argmin(sd))
+        sure = self.surest()
         final = self.arrivals[-1]
         arrival = max(final, key=lambda name: final[name][0])
         nis = np.array(self.nis) / np.maximum(1, self.degrees_of_freedom)
@@ -71,6 +83,6 @@ class TrackLog:
                                                        self.velocity[sure][0]))),
             'moment': [float(v) for v in self.moment[sure]],
             'moment_size': float(np.linalg.norm(self.moment[sure])),
-            'smallest_sd': float(sd[sure]),
+            'smallest_sd': float(np.sqrt(np.trace(self.covariance[sure][:2, :2]))),
             'nis_per_axis': float(nis[known].mean()) if known.any() else None,
         }

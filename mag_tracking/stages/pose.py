@@ -58,22 +58,24 @@ def magnet_orientation(x, P, axis):
     return quaternion_between(axis, m), T, UNOBSERVED_VARIANCE * along, tuple(flags)
 
 
-def published_track(bank, model, orientation, names, **known):
-    """The `Track` of a bank's best hypothesis.
+def published_track(bank, best, model, orientation, names, **known):
+    """The `Track` of a bank's hypothesis `best`.
 
     Parameters
     ----------
     bank : FilterBank
+    best : int
+        Row of the hypothesis to publish.
     model : SourceModel
     orientation : function
         Takes state and covariance of the target, as `vehicle_orientation`.
     names : sequence of str
         The arrival of each label.
     known : fields of `Track` that the bank does not know
-        stamp_ns, id, ended, existence, nis, degrees_of_freedom, innovation.
+        stamp_ns, id, ended, existence, degrees_of_freedom, predicted, mounting,
+        mounting_std.
     """
     n_t = len(model.state_names)
-    best = bank.best()
     x, P = bank.x[best, :n_t], bank.P[best, :n_t, :n_t]
     dipoles = model.dipoles(bank.x[:, :n_t])
     dm_dx = dipoles.dm_dx[best].sum(axis=0)
@@ -90,7 +92,7 @@ def published_track(bank, model, orientation, names, **known):
         orientation=q, orientation_covariance=T @ P @ T.T + unobserved,
         position_orientation_covariance=P[:3] @ T.T,
         moment=moments[best].copy(), moment_covariance=dm_dx @ P @ dm_dx.T,
-        weight=float(weights[best]), arrival=names[bank.label[best]],
+        nis=float(bank.nis[best]), weight=float(weights[best]), arrival=names[bank.label[best]],
         ambiguous=bank.separated_weight(best) > 0.05,
         unobservable=(False, False, False, *flags), hypotheses=hypotheses, **known)
 

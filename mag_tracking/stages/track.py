@@ -208,25 +208,16 @@ class TrackStage:
         if dt > 0.0:
             self._predict(dt)
         covariance = np.where(np.isnan(frame.covariance), np.eye(3), frame.covariance)
-        log_likelihood, nis = self._update(frame, covariance, dt)
+        log_likelihood = self._update(frame, covariance, dt)
         evidence = bank.reweight(log_likelihood)
         if not np.isfinite(evidence):
             self.counts['banks lost'] += 1
             return self._end('no hypothesis explains the field')
         self._log_odds += evidence - self._log_density_of_noise(frame, covariance, dt)
-        if not publish:
-            self._thin_out()
-            return []
-        best = bank.best()
-        n_y = int(np.count_nonzero(~np.isnan(frame.field)))
-        innovation = self._innovation(frame, best)
-        best_nis = float(nis[best]) if n_y else float('nan')
         self._thin_out()
-        self._last = published_track(
-            bank, self._model, self._orientation, self.arrivals, stamp_ns=frame.stamp_ns,
-            id=self._next_id, ended=False, nis=best_nis, degrees_of_freedom=n_y,
-            existence=float(1.0 / (1.0 + np.exp(-np.clip(self._log_odds, -700.0, 700.0)))),
-            innovation=innovation)
+        if not publish:
+            return []
+        self._last = self._published(frame)
         self.counts['poses'] += 1
         if np.trace(self._last.covariance[:2, :2]) > s.end_std**2 and self._surest < s.end_std:
             self._out_of_reach = True
@@ -255,17 +246,28 @@ class TrackStage:
             # A dipole on a sensor has no field: such a hypothesis is as good as ruled out.
             lost = ~(np.isfinite(h).all(axis=(1, 2)) & np.isfinite(inflation).all(axis=1))
             h[lost], H[lost], inflation[lost] = 0.0, 0.0, 0.0
-            log_likelihood, nis = kalman.update(bank.x, bank.P, frame.field, h, H, covariance,
+            log_likelihood, bank.nis = kalman.update(bank.x, bank.P, frame.field, h, H, covariance,
                                                 inflation, x_lin, self._n_own)
             log_likelihood[lost] = -np.inf
             x_lin = bank.x.copy()
-        return log_likelihood, nis
+        if np.isnan(frame.field).all():
+            bank.nis[:] = np.nan
+        return log_likelihood
 
-    def _innovation(self, frame, row):
-        """(n_sensors, 3) [T] measured minus predicted field of hypothesis `row`, after update."""
-        x = self._bank.x[row:row + 1]
-        background = x[0, -3 * len(self._network):].reshape(-1, 3)
-        return frame.field - self._fields(x)[0][0] - background
+    def _published(self, frame):
+        """The `Track` of the hypothesis to publish, with what it says of the sensors."""
+        bank, n = self._bank, len(self._network)
+        best = bank.best()
+        x = bank.x[best:best + 1]
+        own = slice(len(self._model.state_names), bank.x.shape[1] - 3 * n)
+        return published_track(
+            bank, best, self._model, self._orientation, self.arrivals, stamp_ns=frame.stamp_ns,
+            id=self._next_id, ended=False,
+            existence=float(1.0 / (1.0 + np.exp(-np.clip(self._log_odds, -700.0, 700.0)))),
+            degrees_of_freedom=int(np.count_nonzero(~np.isnan(frame.field))),
+            predicted=self._fields(x)[0][0] + x[0, -3 * n:].reshape(n, 3),
+            mounting=x[0, own].reshape(-1, 3),
+            mounting_std=np.sqrt(np.diagonal(bank.P[best])[own]).reshape(-1, 3))
 
     def _log_density_of_noise(self, frame, covariance, dt):
         """Log-density of the frame if there is no target, only backgrounds that wander."""

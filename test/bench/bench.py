@@ -161,8 +161,9 @@ def bank_case(n_sensors, n_hyp, rng, turned):
     x[:, 3:6] = [10.0, 0.0, 0.0] + 0.3 * rng.standard_normal((n_hyp, 3))
     x[:, 6:9] = 200.0 * rng.standard_normal((n_hyp, 3))
     x[:, 9] = 5.0
-    P = np.repeat(np.diag(np.r_[1.0, 1.0, 0.1, 4.0, 1.0, 0.01, [1e4] * 3, 4.0, np.full(n_own, 0.0076),
-                                np.full(3 * n_sensors, 4e-16)])[None], n_hyp, axis=0)
+    P = np.repeat(np.diag(np.r_[1.0, 1.0, 0.1, 4.0, 1.0, 0.01, [1e4] * 3, 4.0,
+                                np.full(n_own, 0.0076), np.full(3 * n_sensors, 4e-16)])[None],
+                  n_hyp, axis=0)
     y = sensor_fields(positions, R_sw, *model.dipoles(x[:1, :10]))[0][0]
     return model, positions, R_sw, x, P, y + SIGMA * rng.standard_normal(y.shape)
 
@@ -254,8 +255,8 @@ def main():
             missed += goal is not None and ratio < goal
             state = 'target, backgrounds' + (', mounting' if turned else '')
             kind = 'a model from sensor to sensor' if peer is Peer else 'a vectorised model'
-            print(f'  {n_sensors} sensors; {state}; {kind}: {ratio:.0f}x  ({low:.0f} .. {high:.0f}; '
-                  f'{ours:.0f} us against {theirs:.0f} us'
+            print(f'  {n_sensors} sensors; {state}; {kind}: '
+                  f'{ratio:.0f}x  ({low:.0f} .. {high:.0f}; {ours:.0f} us against {theirs:.0f} us'
                   + (f'; target {goal:.0f}x)' if goal else ')'), flush=True)
     cold, warm = first_pose_times()
     missed += np.median(warm) >= 1.0
