@@ -181,6 +181,8 @@ def _print_summary(path, summary):
           f'{len(summary["tracks"])} tracks')
     for topic in summary['missing_topics']:
         print(f'  warning: nothing on {topic}')
+    if not summary['counts']['detect'].get('onsets', 0):
+        print(f'  nothing was detected with the settings for a {summary["target"]}')
     for what, n in {**summary['rejected'], **summary['lost']}.items():
         print(f'  warning: {what}: {n}')
     stuck = [name for name, s in summary['sensors'].items() if s['stuck']]

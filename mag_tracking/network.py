@@ -37,6 +37,11 @@ class SensorNetwork:
             raise NetworkError(f'topic {shared[0]} is that of two sensors')
         if self.positions.shape != (n, 3) or self.R_ws.shape != (n, 3, 3):
             raise NetworkError(f'{n} sensors need positions ({n}, 3) and orientations ({n}, 3, 3)')
+        places = {}
+        for name, place in zip(self.names, map(tuple, self.positions.tolist()), strict=True):
+            other = places.setdefault(place, name)
+            if other != name:
+                raise NetworkError(f'sensors {other} and {name} are both at {list(place)}')
         for name in ('noise_std', 'background'):
             if not getattr(self, name):
                 object.__setattr__(self, name, (None,) * n)

@@ -37,7 +37,6 @@ TARGET_DEFAULTS = {
         'track.mounting_std_deg': 0.0,
         'track.model_error_time_s': 0.0,
         'track.background_std': 5e-7,
-        'track.background_drift': 1e-8,
         'track.iterations': 5,
         'track.lookback_s': 0.0,
         'track.end_gap_s': 30.0,

@@ -10,9 +10,8 @@ import math
 import typing
 from collections.abc import Mapping
 
-import yaml
-
 from mag_tracking.errors import SettingsError
+from mag_tracking.yaml_file import read_yaml
 
 
 def param(default, doc, unit='', range=None, live=False, length=None):
@@ -112,10 +111,17 @@ def _dotted(mapping, prefix=''):
     out = {}
     for key, value in mapping.items():
         if isinstance(value, Mapping):
-            out.update(_dotted(value, f'{prefix}{key}.'))
+            _join(out, _dotted(value, f'{prefix}{key}.'))
         else:
-            out[f'{prefix}{key}'] = value
+            _join(out, {f'{prefix}{key}': value})
     return out
+
+
+def _join(out, more):
+    """Put `more` into `out`; raises SettingsError where the two disagree."""
+    for name, value in more.items():
+        if out.setdefault(name, value) is not value and out[name] != value:
+            raise SettingsError(f'{name} is there twice, as {out[name]!r} and as {value!r}')
 
 
 def replace(settings, changes):
@@ -153,24 +159,19 @@ def read_parameter_file(path):
     Takes a plain mapping, or a ROS parameter file (`node: ros__parameters:`),
     whose sections of all nodes are joined. Raises SettingsError.
     """
-    try:
-        with open(path, encoding='utf-8') as stream:
-            content = yaml.safe_load(stream)
-    except OSError as error:
-        raise SettingsError(f'cannot read {path}: {error.strerror}') from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise SettingsError(f'{path} is not YAML: {error}') from error
+    content = read_yaml(path, SettingsError)
     if content is None:
         return {}
     if not isinstance(content, Mapping):
         raise SettingsError(f'{path}: expected a mapping of settings, got {content!r}')
     sections = [v['ros__parameters'] for v in content.values()
                 if isinstance(v, Mapping) and 'ros__parameters' in v]
-    if not sections:
-        return _dotted(content)
     joined = {}
-    for section in sections:
-        joined.update(_dotted(section or {}))
+    try:
+        for section in sections or [content]:
+            _join(joined, _dotted(section or {}))
+    except SettingsError as error:
+        raise SettingsError(f'{path}: {error}') from error
     return joined
 
 

@@ -1,6 +1,7 @@
 """What the tests share: recordings, networks, a short way through the pipeline."""
 
 import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -71,3 +72,27 @@ def line_network(n, spacing=9.0, earth=(2e-6, 1.55e-5, -4.9e-5), noise=1.2e-8, t
     names = tuple(f'mag_{i + 1}' for i in range(n))
     return SensorNetwork(names, positions, R, tuple(f'/{name}/imu/mag' for name in names),
                          earth_field=np.array(earth), noise_std=(np.full(3, noise),) * n)
+
+
+@pytest.fixture
+def ros():
+    """A node of the test's own in an executor: (node, spin_until)."""
+    # Only the tests of the nodes need ROS.
+    import rclpy
+    from rclpy.node import Node
+
+    from mag_tracking.nodes.stage_node import make_executor, spin
+    rclpy.init()
+    node, executor = Node('tester'), make_executor()
+    executor.add_node(node)
+
+    def spin_until(condition, seconds=30.0):
+        end = time.monotonic() + seconds
+        spin(executor, lambda: condition() or time.monotonic() > end)
+        return condition()
+
+    yield node, spin_until
+    executor.remove_node(node)
+    node.destroy_node()
+    executor.shutdown()
+    rclpy.try_shutdown()

@@ -9,6 +9,7 @@ from mag_tracking.inference import kalman
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
 from mag_tracking.physics.dipole import MU0, sensor_fields
 from mag_tracking.physics.sources import PointVehicle
+from mag_tracking.stages.pose import published_track, vehicle_orientation
 from mag_tracking.stages.vehicle_start import moment_directions
 
 
@@ -18,6 +19,32 @@ def bank(n=4, spread=10.0, label=None):
     P = np.repeat(np.eye(7)[None], n, axis=0)
     return FilterBank(x, P, np.full(n, -np.log(n)),
                       np.arange(n) if label is None else np.array(label), np.arange(n) + 0.5)
+
+
+def test_the_innovations_stay_with_their_hypotheses():
+    b = bank(6)
+    b.log_w = np.log([0.1, 0.3, 1e-14, 0.2, 0.2, 0.2])
+    b.x[4, 0] = b.x[3, 0]
+    b.label[4] = b.label[3]
+    b.prune(20.0, 100)
+    b.merge(7, 0.5)
+    assert b.nis.tolist() == [0.5, 1.5, 3.5, 5.5]
+
+
+@pytest.mark.parametrize('other, label, ambiguous', [
+    (0.01, 1, False), (0.2, 1, True), (0.2, 0, False)])
+def test_another_arrival_makes_a_track_ambiguous_even_where_the_places_agree(
+        other, label, ambiguous):
+    model = PointVehicle(np.zeros(3), np.ones(3), 1.0)
+    x = np.tile([1.0, 2.0, 0.5, 10.0, 0.0, 0.0, 100.0, 0.0, 0.0, 0.0], (2, 1))
+    b = FilterBank(x, np.repeat(np.eye(10)[None], 2, axis=0), np.log([other, 1.0 - other]),
+                   np.array([label, 0]), np.array([7.0, 3.0]))
+    track = published_track(
+        b, 1, model, vehicle_orientation, ('left', 'right'), stamp_ns=1, id=1, ended=False,
+        existence=1.0, degrees_of_freedom=6, predicted=np.zeros((2, 3)),
+        mounting=np.zeros((0, 3)), mounting_std=np.zeros((0, 3)))
+    assert track.ambiguous == ambiguous
+    assert (track.arrival, track.nis) == ('left', 3.0)
 
 
 def test_log_sum_exp_equals_scipy_and_survives_extremes():

@@ -112,6 +112,24 @@ def test_help_teaches():
         assert 'example' in text
 
 
+def test_a_sensor_on_its_head_is_named(tmp_path, capsys):
+    network = tmp_path / 'turned.yaml'
+    text, upright = NETWORK_FILE.read_text(), 'orientation: [0.0, 0.0, 0.0, 1.0]'
+    assert text.count(upright) == 1
+    network.write_text(text.replace(upright, 'orientation: [1.0, 0.0, 0.0, 0.0]'))
+    assert main(['replay', str(vehicle_path('straight_car_right')), '--network', str(network),
+                 '--out', str(tmp_path / 'out'), '--no-figures']) == 0
+    assert 'orientation in the network file is wrong' in capsys.readouterr().out
+    # And a network that is right raises no alarm.
+    assert replay_one(tmp_path / 'right', '--no-figures') == 0
+    assert 'fits best if turned' not in capsys.readouterr().out
+
+
+def test_a_recording_without_a_target_says_so(tmp_path, capsys):
+    assert replay_one(tmp_path, '--no-figures', '--target', 'magnet') == 0
+    assert 'nothing was detected with the settings for a magnet' in capsys.readouterr().out
+
+
 def test_an_interrupted_replay_keeps_what_is_done(tmp_path):
     out = tmp_path / 'out'
     recordings = [tmp_path / f'{NAME}_{k}.mcap' for k in range(40)]

@@ -68,7 +68,7 @@ ANGLES = np.deg2rad([[4.0, -3.0, 6.0], [-5.0, 2.0, 3.0]])
 def turned_pass():
     """(network, tracks, {stamp: frame}) of a pass by sensors that are turned by `ANGLES`."""
     network = line_network(2)
-    samples, *_ = simulate(network, point_body([300.0, -150.0, 80.0], 5.0, 0.5),
+    samples, *_ = simulate(network, point_body([600.0, -300.0, 160.0], 5.0, 0.5),
                            Path(np.array([-70.0, -1.2]), 0.0, 10.0), 100.0, 12.0,
                            np.random.default_rng(6))
     R = rotation_from_quaternion(quaternion_from_rotation_vector(ANGLES))
@@ -100,8 +100,8 @@ def test_the_predicted_field_is_that_of_the_published_pose(turned_pass):
         B_s = np.einsum('jik,jk->ji', network.R_sw,
                         dipole_field(network.positions - t.position, t.moment))
         model = B_s + np.cross(t.mounting, B_s)
-        # What is left is the background, which a track starts with knowing to 2e-8 T.
-        assert np.abs(t.predicted - model).max() < 8e-8
+        # What is left is the background; the angles move the field by up to 6e-8 T.
+        assert np.abs(t.predicted - model).max() < 2.5e-8
     near = [t for t in tracks if np.hypot(*t.position[:2]) < 6.0]
     assert len(near) > 5
     for t in near:

@@ -1,20 +1,18 @@
 """The nodes over the real middleware: each a process, and equal to the offline replay."""
 
 import csv
+import dataclasses
 import os
-import signal
-import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
-import rclpy
 from conftest import NETWORK_FILE, VEHICLES, vehicle_path
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from mag_tracking_msgs.msg import CalibrationState, HypothesisArray, NetworkFrame, TrackArray
-from mag_tracking_msgs.srv import Calibrate, Seek
+from mag_tracking_msgs.srv import Seek
 from nav_msgs.msg import Odometry
+from node_processes import call, start, stop
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -28,7 +26,7 @@ from mag_tracking.io.network_file import read_network
 from mag_tracking.io.schema import stamp_ns
 from mag_tracking.nodes.convert import to_message, track_of
 from mag_tracking.nodes.runner import run
-from mag_tracking.nodes.stage_node import LATCHED, STREAM, make_executor, spin
+from mag_tracking.nodes.stage_node import LATCHED, STREAM
 from mag_tracking.offline import replay
 from mag_tracking.pipeline import settings_for
 
@@ -101,50 +99,6 @@ def test_nodes_equal_offline_on_magnets(run_number, magnet_runs, tmp_path):
     worst = compare_with_offline(over_topics(network_file, settings, recording, 80.0), tmp_path)
     print(f'magnet run {run_number}: nodes against offline {worst:.1e}')
     assert worst <= 1e-9
-
-
-def start(module, *arguments):
-    """A node in a process of its own."""
-    return subprocess.Popen(
-        [sys.executable, '-m', f'mag_tracking.nodes.{module}', '--ros-args', *arguments],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-
-
-def stop(processes):
-    """End them as Ctrl-C does; (exit codes, outputs)."""
-    for p in processes:
-        p.send_signal(signal.SIGINT)
-    outputs = [p.communicate(timeout=30)[0] for p in processes]
-    return [p.returncode for p in processes], outputs
-
-
-@pytest.fixture
-def ros():
-    """A node of the test's own in an executor: (node, spin_until)."""
-    rclpy.init()
-    node, executor = Node('tester'), make_executor()
-    executor.add_node(node)
-
-    def spin_until(condition, seconds=30.0):
-        end = time.monotonic() + seconds
-        spin(executor, lambda: condition() or time.monotonic() > end)
-        return condition()
-
-    yield node, spin_until
-    executor.remove_node(node)
-    node.destroy_node()
-    executor.shutdown()
-    rclpy.try_shutdown()
-
-
-def call(ros, kind, name, request):
-    """The response of a service."""
-    node, spin_until = ros
-    client = node.create_client(kind, name)
-    assert spin_until(client.service_is_ready)
-    future = client.call_async(request)
-    assert spin_until(future.done)
-    return future.result()
 
 
 def test_four_processes_over_the_middleware(ros, tmp_path, road_network):
@@ -242,92 +196,6 @@ def test_parameters_have_descriptors_and_are_checked(ros):
     assert codes == [0], outputs
 
 
-@pytest.mark.parametrize('arguments, message', [
-    ([], 'network'),
-    (['-p', 'network:=/no/such/file.yaml'], 'cannot read /no/such/file.yaml'),
-    (['-p', f'network:={NETWORK_FILE}', '-p', 'track.vehicle.momnet:=1.0'],
-     'did you mean track.vehicle.moment'),
-    (['-p', f'network:={NETWORK_FILE}', '-p', 'track.prune_ratio:=7.0'], 'prune_ratio'),
-    (['-p', f'network:={NETWORK_FILE}', '-p', 'track.vehicle.arrival_headings_deg:=[0.0]'],
-     'expected 3 values'),
-    (['-p', f'network:={NETWORK_FILE}', '-p', 'target:=submarine'], 'submarine'),
-])
-def test_faulty_parameters_end_the_node_with_a_clear_word(arguments, message):
-    process = start('tracker_node', *arguments)
-    output, _ = process.communicate(timeout=30)
-    assert process.returncode == 1
-    assert message in output and 'Traceback' not in output
-
-
-def test_bad_messages_are_counted_and_survived(ros):
-    """NaN, infinity, gauss, wrong stamps: diagnostics name them, the node lives."""
-    from diagnostic_msgs.msg import DiagnosticArray
-    node, spin_until = ros
-    diagnostics, calibrated = [], []
-    node.create_subscription(DiagnosticArray, '/diagnostics', diagnostics.append, 10)
-    node.create_subscription(MagneticField, '/mag_1/imu/mag_calibrated', calibrated.append, STREAM)
-    publisher = node.create_publisher(MagneticField, '/mag_1/imu/mag', STREAM)
-    process = start('calibration_node', '-p', f'network:={NETWORK_FILE}',
-                    '-p', 'calibrate.learn_s:=0.5', '-p', 'reliable_input:=true')
-
-    def publish(ms, x, y=1.5e-5, z=-4.9e-5, covariance=0.0):
-        publisher.publish(to_message(MagneticField, {
-            'header': {'stamp': {'sec': 10 + ms // 1000, 'nanosec': ms % 1000 * 10**6},
-                       'frame_id': 'mag_1'},
-            'magnetic_field': {'x': x, 'y': y, 'z': z},
-            'magnetic_field_covariance': [covariance] + [0.0] * 8}))
-    try:
-        assert spin_until(lambda: publisher.get_subscription_count() > 0
-                          and node.count_publishers('/mag_1/imu/mag_calibrated'))
-        rng = np.random.default_rng(0)
-        for k in range(150):
-            field = np.array([2e-6, 1.5e-5, -4.9e-5]) + 1e-8 * rng.standard_normal(3)
-            publish(10 * k, *field.tolist(), covariance=-1.0 if k % 2 else 0.0)
-        nan = float('nan')
-        publish(1600, nan, nan, nan)
-        publish(1610, float('inf'))
-        publish(1620, 0.02, 0.15, -0.49)
-        publish(1490, 2e-6)
-        publish(1495 - 100, 2e-6)
-        publish(1700, 2e-6, 1.5e-5, nan)
-
-        def values():
-            return {v.key: int(v.value) for m in diagnostics for s in m.status for v in s.values
-                    if 'calibrate' in s.name}
-        assert spin_until(lambda: sum(k.startswith('rejected') for k in values()) >= 5), values()
-        causes = ' '.join(values())
-        for cause in ('all NaN', 'infinite', 'gauss', 'duplicate stamp', 'out of order'):
-            assert cause in causes
-        assert calibrated and np.isnan(calibrated[-1].magnetic_field.z)
-        assert calibrated[-1].header.frame_id == 'mag_1'
-        service = '/calibration_node/calibrate'
-        assert call(ros, Calibrate, service, Calibrate.Request(sensors=['mag_1'])).success
-        no = call(ros, Calibrate, service, Calibrate.Request(sensors=['mag_9']))
-        assert not no.success and 'mag_9' in no.message
-    finally:
-        codes, outputs = stop([process])
-    assert codes == [0], outputs
-
-
-def test_a_frame_of_another_network_is_counted(ros):
-    from diagnostic_msgs.msg import DiagnosticArray
-    node, spin_until = ros
-    diagnostics = []
-    node.create_subscription(DiagnosticArray, '/diagnostics', diagnostics.append, 10)
-    publisher = node.create_publisher(NetworkFrame, '/detection_node/frame', STREAM)
-    process = start('tracker_node', '-p', f'network:={NETWORK_FILE}')
-    try:
-        assert spin_until(lambda: publisher.get_subscription_count() > 0)
-        publisher.publish(NetworkFrame(sensors=['a', 'b'], field=[0.0] * 6))
-        publisher.publish(NetworkFrame(sensors=['mag_1', 'mag_2'], field=[0.0] * 5))
-        assert spin_until(lambda: any(
-            v.key == 'rejected: frame does not fit the network' and v.value == '2'
-            for m in diagnostics for s in m.status for v in s.values))
-    finally:
-        codes, outputs = stop([process])
-    assert codes == [0], outputs
-
-
 def test_conversion_survives_the_message():
     """A track that went through a message is the same track."""
     from test_track import magnet_frames
@@ -336,7 +204,9 @@ def test_conversion_survives_the_message():
     from mag_tracking.stages.track import TrackStage
     network, frames, _ = magnet_frames(3)
     stage = TrackStage(network, settings_for('magnet').track)
-    track = [t for f in frames for t in stage.feed(f)][-1]
+    track = dataclasses.replace(
+        [t for f in frames for t in stage.feed(f)][-1],
+        mounting=np.arange(27.0).reshape(9, 3), mounting_std=np.arange(27.0).reshape(9, 3) / 7.0)
     from mag_tracking_msgs.msg import Track as TrackMessage
     back = track_of(to_message(TrackMessage, track_dict(track, 'map')),
                     to_message(HypothesisArray, hypotheses_dict(track, 'map')))
@@ -344,7 +214,8 @@ def test_conversion_survives_the_message():
                  'arrival', 'ambiguous', 'unobservable'):
         assert getattr(back, name) == getattr(track, name), name
     for name in ('position', 'velocity', 'covariance', 'orientation', 'orientation_covariance',
-                 'position_orientation_covariance', 'moment', 'moment_covariance'):
+                 'position_orientation_covariance', 'moment', 'moment_covariance', 'predicted',
+                 'mounting', 'mounting_std'):
         np.testing.assert_array_equal(getattr(back, name), getattr(track, name))
     assert len(back.hypotheses) == len(track.hypotheses)
 

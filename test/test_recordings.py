@@ -56,7 +56,8 @@ def test_error_while_near(vehicle_replays, name):
 NOT_REACHED = {
     'junction_left_turns_to_rear': '0.53 m: the clocks of the sensors are 21 ms apart, and the '
                                    'point model leans to one end',
-    'junction_rear_turns_right': '0.53 m at 5.9 m, its nearest: 1.1 standard deviations',
+    'junction_rear_turns_right': '0.53 m at 5.9 m, its nearest: 1.1 standard deviations; the '
+                                 'clocks of the sensors are 24 ms apart',
     'junction_right_turns_to_rear': '0.52 m at 4.8 m, one of its own standard deviations: the '
                                     'car is seen only from 10 m on, in the turn',
 }

@@ -75,7 +75,12 @@ def test_parameter_files(tmp_path):
     assert read_parameter_file(path) == {'track.vehicle.moment': 100.0}
     path.write_text('')
     assert read_parameter_file(path) == {}
-    for content, message in (('- 1', 'expected a mapping'), ('{a: [', 'not YAML')):
+    for content, message in (
+            ('- 1', 'expected a mapping'), ('{a: [', 'not YAML'),
+            ('track: {iterations: 2, iterations: 3}', 'iterations is there twice'),
+            ('track: {iterations: 2}\ntrack.iterations: 3', 'track.iterations is there twice'),
+            ('a:\n  ros__parameters: {track.iterations: 2}\n'
+             'b:\n  ros__parameters: {track.iterations: 3}', 'track.iterations is there twice')):
         path.write_text(content)
         with pytest.raises(SettingsError, match=message):
             read_parameter_file(path)

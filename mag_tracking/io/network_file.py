@@ -1,33 +1,24 @@
 """`network.yaml`: the geometry and calibration of a sensor network."""
 
 import re
-from collections.abc import Hashable
 
 import numpy as np
-import yaml
 
 from mag_tracking.errors import NetworkError, OutputError
 from mag_tracking.geometry import rotation_from_quaternion
 from mag_tracking.network import SensorNetwork
+from mag_tracking.yaml_file import read_yaml
 
 _TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 _TOP = {'frame', 'earth_field', 'sensors'}
 _SENSOR = {'position', 'orientation', 'noise_std', 'background', 'topic'}
 
 
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """YAML lets a key appear twice and keeps the last: a sensor would vanish without a word."""
+_LONGEST = 1e8
+"""[m] No position is farther from the origin: room for any frame of the Earth."""
 
-    def construct_mapping(self, node, deep=False):
-        seen = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if not isinstance(key, Hashable):
-                raise NetworkError(f'{key!r} is no name (line {key_node.start_mark.line + 1})')
-            if key in seen:
-                raise NetworkError(f'{key} is there twice (line {key_node.start_mark.line + 1})')
-            seen.add(key)
-        return super().construct_mapping(node, deep)
+_QUIETEST = 1e-15
+"""[T] No sensor is quieter."""
 
 
 def _vector(what, value, lengths):
@@ -36,9 +27,9 @@ def _vector(what, value, lengths):
         raise NetworkError(f'{what}: expected {" or ".join(map(str, lengths))} numbers, '
                            f'got {value!r}')
     for v in value:
-        # YAML 1.1 reads 1e-8, without a point, as text.
+        # YAML 1.1 reads 1e-8, without a point, as text, and 1.0e8, without a sign, too.
         if isinstance(v, str):
-            raise NetworkError(f'{what}: {v!r} is text; write numbers as 1.0e-8')
+            raise NetworkError(f'{what}: {v!r} is text; write numbers as 1.0e-8 or 1.0e+8')
         if isinstance(v, bool) or not isinstance(v, (int, float)) or not abs(v) < 1e300:
             raise NetworkError(f'{what}: {v!r} is not a finite number')
     return np.array(value, dtype=float)
@@ -60,6 +51,8 @@ def _sensor(name, entry):
     if 'position' not in entry:
         raise NetworkError(f'sensor {name}: position is missing')
     position = _vector(f'sensor {name}: position', entry['position'], (3,))
+    if np.abs(position).max() > _LONGEST:
+        raise NetworkError(f'sensor {name}: position: {position.tolist()} m is nowhere on Earth')
     q = _vector(f'sensor {name}: orientation', entry.get('orientation', [0, 0, 0, 1]), (4,))
     try:
         R_ws = rotation_from_quaternion(q)
@@ -69,8 +62,8 @@ def _sensor(name, entry):
     if noise is not None:
         noise = noise if isinstance(noise, list) else [noise]
         noise = _vector(f'sensor {name}: noise_std', noise, (1, 3)) * np.ones(3)
-        if not ((noise > 0.0) & (noise < 1e-3)).all():
-            raise NetworkError(f'sensor {name}: noise_std must be above zero and below a '
+        if not ((noise >= _QUIETEST) & (noise < 1e-3)).all():
+            raise NetworkError(f'sensor {name}: noise_std must be above a femtotesla and below a '
                                f'millitesla, got {noise.tolist()} T')
     background = entry.get('background')
     if background is not None:
@@ -89,15 +82,7 @@ def _sensor(name, entry):
 
 def read_network(path):
     """The `SensorNetwork` in a file; raises NetworkError, which names file and key."""
-    try:
-        with open(path, encoding='utf-8') as stream:
-            content = yaml.load(stream, Loader=_UniqueKeyLoader)
-    except OSError as error:
-        raise NetworkError(f'cannot read {path}: {error.strerror}') from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise NetworkError(f'{path} is not YAML: {error}') from error
-    except NetworkError as error:
-        raise NetworkError(f'{path}: {error}') from error
+    content = read_yaml(path, NetworkError)
     try:
         return _network(content)
     except NetworkError as error:

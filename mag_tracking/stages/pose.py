@@ -10,6 +10,9 @@ from mag_tracking.records import Hypothesis, Track
 UNOBSERVED_VARIANCE = np.pi**2
 """[rad^2] of an angle that the field does not determine."""
 
+DOUBT = 0.05
+"""Other places, or other arrivals, with more weight than this make a track ambiguous."""
+
 
 def vehicle_orientation(x, P):
     """Heading of the velocity; roll and pitch are not observed.
@@ -93,7 +96,8 @@ def published_track(bank, best, model, orientation, names, **known):
         position_orientation_covariance=P[:3] @ T.T,
         moment=moments[best].copy(), moment_covariance=dm_dx @ P @ dm_dx.T,
         nis=float(bank.nis[best]), weight=float(weights[best]), arrival=names[bank.label[best]],
-        ambiguous=bank.separated_weight(best) > 0.05,
+        ambiguous=(bank.separated_weight(best) > DOUBT
+                   or 1.0 - np.exp(bank.log_w).sum(where=bank.label == bank.label[best]) > DOUBT),
         unobservable=(False, False, False, *flags), hypotheses=hypotheses, **known)
 
 

@@ -1,0 +1,30 @@
+"""Nodes as processes of their own, for the tests."""
+
+import signal
+import subprocess
+import sys
+
+
+def start(module, *arguments):
+    """A node in a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, '-m', f'mag_tracking.nodes.{module}', '--ros-args', *arguments],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def stop(processes):
+    """End them as Ctrl-C does; (exit codes, outputs)."""
+    for p in processes:
+        p.send_signal(signal.SIGINT)
+    outputs = [p.communicate(timeout=30)[0] for p in processes]
+    return [p.returncode for p in processes], outputs
+
+
+def call(ros, kind, name, request):
+    """The response of a service."""
+    node, spin_until = ros
+    client = node.create_client(kind, name)
+    assert spin_until(client.service_is_ready)
+    future = client.call_async(request)
+    assert spin_until(future.done)
+    return future.result()
