@@ -28,6 +28,35 @@ def quaternion_from_rotation_vector(v):
     return np.concatenate([0.5 * v * np.sinc(half / np.pi), np.cos(half)], axis=-1)
 
 
+def cross_matrix(a):
+    """Matrices [a]x with [a]x b = a x b; `a` (..., 3) gives (..., 3, 3)."""
+    a = np.asarray(a, dtype=float)
+    out = np.zeros(a.shape + (3,))
+    out[..., 0, 1], out[..., 0, 2] = -a[..., 2], a[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = a[..., 2], -a[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -a[..., 1], a[..., 0]
+    return out
+
+
+def left_jacobian(v):
+    """How a rotation changes with its rotation vector; `v` (..., 3) [rad] gives (..., 3, 3).
+
+    To first order R(v + d) = R(J d) R(v): a change d of the vector turns what is
+    turned already by J d more. Source: Solà, Deray and Atchuthan, A micro Lie
+    theory for state estimation in robotics (2018), appendix on SO(3).
+    """
+    v = np.asarray(v, dtype=float)
+    square = np.einsum('...i,...i->...', v, v)[..., None, None]
+    angle = np.sqrt(square)
+    K = cross_matrix(v)
+    half = np.sinc(0.5 * angle / np.pi)
+    # (angle - sin(angle)) / angle^3, by its series where the difference would be lost.
+    small = angle < 1e-2
+    third = np.where(small, (1.0 - square / 20.0) / 6.0,
+                     (1.0 - np.sinc(angle / np.pi)) / np.where(small, 1.0, square))
+    return np.eye(3) + 0.5 * half**2 * K + third * K @ K
+
+
 def quaternion_from_yaw(yaw):
     """Quaternion xyzw (4,) of a rotation about z by `yaw` [rad]."""
     return np.array([0.0, 0.0, np.sin(0.5 * yaw), np.cos(0.5 * yaw)])

@@ -31,6 +31,8 @@ class FieldFrame:
     """(n_sensors, 3, 3) [T^2] of `field`; rows of a missing sensor are NaN."""
     n_samples: np.ndarray
     """(n_sensors,) samples averaged; 0 = missing."""
+    time_offset: np.ndarray
+    """(n_sensors,) [s] mean time of a sensor's samples, from `stamp_ns`; 0 where it is missing."""
     target_present: bool = False
     """The detector's verdict; false before detection."""
     statistic: float = float('nan')

@@ -48,6 +48,21 @@ def test_frames_average_and_their_noise_falls():
     np.testing.assert_allclose(frames[0].covariance[0], C / 8)
 
 
+def test_a_frame_says_when_each_sensor_was_read():
+    """Steps of 10 ms, the second sensor 3 ms later; then it reads only every 30 ms."""
+    frames = feed(stage(), stream(2, 800))
+    np.testing.assert_allclose(frames[0].time_offset, [-1.5e-3, 1.5e-3])
+    assert frames[0].stamp_ns == 36_500_000
+    slow = [s for s in stream(2, 800)
+            if s.sensor == 'mag_1' or s.stamp_ns % 30_000_000 == 3_000_000]
+    first = feed(stage(), slow)[0]
+    # 0, 10 .. 70 and 3, 33, 63: the mean is that of all samples.
+    mean = (280 + 99) / 11 * 1e-3
+    np.testing.assert_allclose(first.time_offset, [0.035 - mean, 0.033 - mean], atol=1e-9)
+    alone = feed(stage(), [s for s in stream(2, 800) if s.sensor == 'mag_1'])
+    assert alone[0].time_offset.tolist() == [0.0, 0.0]
+
+
 @given(st.data())
 def test_frames_do_not_depend_on_the_interleaving_of_the_sensors(data):
     """Each sensor's samples in order, the sensors mixed anyhow within the waiting time."""

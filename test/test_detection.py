@@ -23,7 +23,8 @@ SIGMA = 1.2e-8
 def frame(k, field, network, period_ns=80_000_000):
     n = len(network)
     C = np.repeat(SIGMA**2 * np.eye(3)[None], n, axis=0)
-    return FieldFrame(k * period_ns, np.asarray(field, dtype=float), C, np.ones(n, dtype=int))
+    return FieldFrame(k * period_ns, np.asarray(field, dtype=float), C, np.ones(n, dtype=int),
+                      np.zeros(n))
 
 
 def detector(network, **changes):

@@ -198,7 +198,8 @@ def test_existence_falls_on_noise():
     tracks = []
     for k in range(40):
         y = 1.2e-8 / np.sqrt(8) * rng.standard_normal((2, 3))
-        tracks += stage_.feed(FieldFrame(k * 80_000_000, y, C, np.full(2, 8), True, 6.0, 6))
+        tracks += stage_.feed(FieldFrame(k * 80_000_000, y, C, np.full(2, 8), np.zeros(2),
+                                          True, 6.0, 6))
     assert tracks[-1].existence < 0.5
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from mag_tracking.geometry import cross_matrix, left_jacobian
 from mag_tracking.physics import sources
 from mag_tracking.physics.dipole import MU0
 from mag_tracking.physics.motion import constant_velocity, integrator_noise
@@ -51,16 +52,17 @@ def test_dipole_derivatives(name):
                                        atol=1e-7 * max(1.0, np.abs(numeric).max()))
 
 
+@pytest.mark.parametrize('dt', [-0.5, 0.003, 0.3, 4.0])
 @pytest.mark.parametrize('name', found())
-def test_propagation_derivatives(name):
+def test_propagation_derivatives(name, dt):
     model = EXAMPLES[name]
     x = states(model)
-    _, F, _ = model.propagate(x, 0.3)
+    _, F, _ = model.propagate(x, dt)
     F = np.broadcast_to(F, (len(x),) + F.shape[-2:])
     for k in range(x.shape[1]):
         h = 1e-6 * np.eye(x.shape[1])[k]
-        numeric = (model.propagate(x + h, 0.3)[0] - model.propagate(x - h, 0.3)[0]) / 2e-6
-        np.testing.assert_allclose(F[:, :, k], numeric, rtol=0, atol=1e-7)
+        numeric = (model.propagate(x + h, dt)[0] - model.propagate(x - h, dt)[0]) / 2e-6
+        np.testing.assert_allclose(F[:, :, k], numeric, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize('name', found())
@@ -97,9 +99,71 @@ def test_standing_vehicle_has_a_finite_model():
     assert all(np.isfinite(a).all() for a in d)
 
 
-def test_magnet_keeps_its_size_while_it_turns_a_little():
-    x = np.zeros((1, 12))
-    x[0, 6:9], x[0, 9:12] = [0.0, 0.0, 2.0], [0.3, 0.0, 0.0]
-    moved, _, _ = EXAMPLES['Magnet'].propagate(x, 0.1)
-    # About x by 0.03 rad: z goes towards -y.
-    np.testing.assert_allclose(moved[0, 6:9], [0.0, -0.06, 2.0], atol=1e-3)
+@pytest.mark.parametrize('angle', [0.0, 1e-9, 0.0099, 0.0101, 0.5, 3.0])
+def test_left_jacobian_is_the_mean_of_the_rotations_on_the_way(angle):
+    v = angle * np.array([0.6, -0.48, 0.64])
+    K, term, series = cross_matrix(v), np.eye(3), np.zeros((3, 3))
+    for n in range(1, 40):
+        series += term / n
+        term = term @ K / n
+    np.testing.assert_allclose(left_jacobian(v), series, rtol=0, atol=2e-15)
+
+
+def magnet_state(m, w):
+    return np.r_[0.1, 0.2, 0.3, 0.0, 0.0, 0.0, m, w][None]
+
+
+def test_a_magnet_turns_by_its_whole_angle_and_keeps_its_size():
+    model = EXAMPLES['Magnet']
+    # About x by a right angle: z goes to -y.
+    moved, _, _ = model.propagate(magnet_state([0.0, 0.0, 2.0], [0.5 * np.pi, 0.0, 0.0]), 1.0)
+    np.testing.assert_allclose(moved[0, 6:9], [0.0, -2.0, 0.0], atol=1e-12)
+    x = states(model)
+    for dt in (0.01, 0.3, 5.0, -2.0):
+        there, _, _ = model.propagate(x, dt)
+        np.testing.assert_allclose(np.linalg.norm(there[:, 6:9], axis=1),
+                                   np.linalg.norm(x[:, 6:9], axis=1), rtol=1e-12)
+        back, _, _ = model.propagate(there, -dt)
+        np.testing.assert_allclose(back, x, atol=1e-9)
+
+
+def test_a_magnet_that_turns_a_little_follows_the_source():
+    """PHD15 Paper A eq. (24), which is the first order of it."""
+    dt, x = 1e-4, states(EXAMPLES['Magnet'])
+    moved, F, Q = EXAMPLES['Magnet'].propagate(x, dt)
+    m, w = x[:, 6:9], x[:, 9:12]
+    np.testing.assert_allclose(moved[:, 6:9], m + dt * np.cross(w, m), atol=1e-7)
+    for p in range(len(x)):
+        C = np.array([np.cross(e, m[p]) for e in np.eye(3)]).T  # w x m = C w
+        np.testing.assert_allclose(F[p, 6:9, 9:12], dt * C, atol=1e-7)
+        np.testing.assert_allclose(Q[p, 6:9, 9:12], 0.5 * dt**2 / 2.0 * C, atol=1e-11)
+
+
+def test_the_second_order_of_an_uncertain_turn_is_in_its_noise():
+    """By sampling: how far turned moments end from the plane that the Jacobian moves them in."""
+    model = Magnet(np.zeros(3), 0.0)
+    rng = np.random.default_rng(8)
+    m, w, dt = np.array([0.3, -0.4, 1.2]), np.array([0.2, 0.1, 0.0]), 0.5
+    std_w = np.array([0.10, 0.25, 0.15])
+    P = np.zeros((1, 12, 12))
+    P[0, 9:, 9:] = np.diag(std_w**2)
+    x = magnet_state(m, w)
+    moved, F, without = model.propagate(x, dt)
+    _, _, Q = model.propagate(x, dt, P)
+    samples = np.repeat(x, 200_000, axis=0)
+    samples[:, 9:] += std_w * rng.standard_normal((len(samples), 3))
+    left = model.propagate(samples, dt)[0][:, 6:9] - moved[0, 6:9] \
+        - (samples - x) @ F[0, 6:9].T
+    u = moved[0, 6:9] / np.linalg.norm(m)
+    expected = np.mean((left @ u) ** 2)
+    extra = (Q - without)[0, 6:9, 6:9]
+    assert u @ extra @ u == pytest.approx(expected, rel=0.05)
+    np.testing.assert_allclose(extra, (u @ extra @ u) * np.outer(u, u), atol=1e-12)
+    # However little is known of the turn, a moment is never shorter than nothing.
+    _, _, Q = model.propagate(x, dt, 1e6 * P)
+    assert u @ Q[0, 6:9, 6:9] @ u == pytest.approx(m @ m)
+
+
+def test_a_magnet_of_no_moment_has_a_finite_noise():
+    _, F, Q = EXAMPLES['Magnet'].propagate(np.zeros((1, 12)), 0.1, np.eye(12)[None])
+    assert np.isfinite(F).all() and np.isfinite(Q).all() and not Q[0, 6:9, 6:9].any()

@@ -40,7 +40,7 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
     """Hard and soft iron together: what the settings call the moment."""
     vehicle = settings_for('vehicle').track.vehicle
     frame = FieldFrame(0, np.full((2, 3), 1e-7), np.repeat(1e-16 * np.eye(3)[None], 2, axis=0),
-                       np.full(2, 8))
+                       np.full(2, 8), np.zeros(2))
     bank = start_vehicle(vehicle, road_network, frame, 2e-8, 0.0)
     m = vehicle_model(vehicle, road_network).dipoles(bank.x[:, :10]).m[:, 0]
     np.testing.assert_allclose(np.linalg.norm(m, axis=1), vehicle.moment, rtol=1e-9)
@@ -103,7 +103,8 @@ def test_backgrounds_that_wander_are_no_target(road_network):
     for k in range(100):
         level += drift * np.sqrt(dt) * rng.standard_normal((2, 3))
         y = level + noise * rng.standard_normal((2, 3))
-        tracks += stage.feed(FieldFrame(round(k * dt * 1e9), y, C, np.full(2, 8), True, 1e3, 6))
+        tracks += stage.feed(FieldFrame(round(k * dt * 1e9), y, C, np.full(2, 8), np.zeros(2),
+                                        True, 1e3, 6))
     existence = np.array([t.existence for t in tracks])
     assert len(existence) and existence[-1] < 0.5
 
@@ -113,7 +114,7 @@ def test_backgrounds_wander_between_frames_and_angles_do_not(road_network):
     stage = TrackStage(road_network, settings_for(
         'vehicle', {'track.background_drift': drift}).track)
     C = np.repeat(1e-16 * np.eye(3)[None], 2, axis=0)
-    stage.feed(FieldFrame(0, np.full((2, 3), 1e-7), C, np.full(2, 8), True, 1e3, 6))
+    stage.feed(FieldFrame(0, np.full((2, 3), 1e-7), C, np.full(2, 8), np.zeros(2), True, 1e3, 6))
     before = np.diagonal(stage.bank.P, axis1=1, axis2=2).copy()
     stage._predict(dt)
     grown = np.diagonal(stage.bank.P, axis1=1, axis2=2) - before

@@ -85,7 +85,7 @@ def magnet_frames(n=40, dt=0.1, lost=None):
         if lost is not None:
             y[lost] = np.nan
         frames.append(FieldFrame(int(k * dt * 1e9), y, np.repeat(1e-14 * np.eye(3)[None], 9, 0),
-                                 np.ones(9, dtype=int), True, 1e6, 27))
+                                 np.ones(9, dtype=int), np.zeros(9), True, 1e6, 27))
         truth.append(np.r_[r, m])
     return network, frames, np.array(truth)
 

@@ -209,7 +209,8 @@ def frame_dict(frame, network):
     return {'header': header_dict(frame.stamp_ns, network.frame), 'sensors': list(network.names),
             'field': frame.field.ravel().tolist(),
             'covariance': frame.covariance.ravel().tolist(),
-            'n_samples': frame.n_samples.tolist(), 'target_present': frame.target_present,
+            'n_samples': frame.n_samples.tolist(), 'time_offset': frame.time_offset.tolist(),
+            'target_present': frame.target_present,
             'statistic': frame.statistic, 'degrees_of_freedom': frame.degrees_of_freedom}
 
 
@@ -222,14 +223,17 @@ def frame_of(message, network):
     if tuple(message.sensors) != network.names:
         raise RecordingError(f'a frame of {", ".join(message.sensors)} does not fit the network '
                              f'of {", ".join(network.names)}')
-    lengths = len(message.field), len(message.covariance), len(message.n_samples)
-    if lengths != (3 * n, 9 * n, n):
-        raise RecordingError(f'a frame of {n} sensors needs arrays of {3 * n}, {9 * n} and {n}, '
-                             f'got {", ".join(map(str, lengths))}')
+    lengths = {name: len(getattr(message, name)) for name in (
+        'field', 'covariance', 'n_samples', 'time_offset')}
+    expected = dict(zip(lengths, (3 * n, 9 * n, n, n), strict=True))
+    if lengths != expected:
+        raise RecordingError(f'a frame of {n} sensors needs arrays of lengths {expected}, '
+                             f'got {lengths}')
     return FieldFrame(
         stamp_ns(message.header.stamp), np.array(message.field).reshape(n, 3),
         np.array(message.covariance).reshape(n, 3, 3), np.array(message.n_samples, dtype=int),
-        bool(message.target_present), float(message.statistic), int(message.degrees_of_freedom))
+        np.array(message.time_offset, dtype=float), bool(message.target_present),
+        float(message.statistic), int(message.degrees_of_freedom))
 
 
 def detection_dict(d, frame):

@@ -31,13 +31,3 @@ def integrator_noise(dt, density):
 def constant_velocity(dt):
     """Transition matrix (6, 6) of position and velocity over `dt` seconds."""
     return np.kron(np.array([[1.0, dt], [0.0, 1.0]]), np.eye(3))
-
-
-def cross_matrix(a):
-    """Matrices [a]x with [a]x b = a x b; `a` (..., 3) gives (..., 3, 3)."""
-    a = np.asarray(a, dtype=float)
-    out = np.zeros(a.shape + (3,))
-    out[..., 0, 1], out[..., 0, 2] = -a[..., 2], a[..., 1]
-    out[..., 1, 0], out[..., 1, 2] = a[..., 2], -a[..., 0]
-    out[..., 2, 0], out[..., 2, 1] = -a[..., 1], a[..., 0]
-    return out

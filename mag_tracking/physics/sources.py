@@ -13,8 +13,14 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numba import njit
 
+from mag_tracking.geometry import (
+    cross_matrix,
+    left_jacobian,
+    quaternion_from_rotation_vector,
+    rotation_from_quaternion,
+)
 from mag_tracking.physics.dipole import MU0
-from mag_tracking.physics.motion import constant_velocity, cross_matrix, integrator_noise
+from mag_tracking.physics.motion import constant_velocity, integrator_noise
 
 
 class Dipoles(NamedTuple):
@@ -38,8 +44,13 @@ class SourceModel(Protocol):
     def dipoles(self, x: np.ndarray) -> Dipoles:
         """Dipoles of the target states `x` (n_hyp, n_t)."""
 
-    def propagate(self, x: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """States after `dt` seconds, Jacobian (..., n_t, n_t), process noise (..., n_t, n_t)."""
+    def propagate(self, x: np.ndarray, dt: float, P: np.ndarray | None = None
+                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """States after `dt` seconds, Jacobian (..., n_t, n_t), process noise (..., n_t, n_t).
+
+        With the states' covariances `P` (n_hyp, n_t, n_t) the noise holds what the
+        Jacobian leaves out, too.
+        """
 
 
 @njit('void(float64[:,:], float64[:], float64[:,:,::1], float64[:,:,::1], '
@@ -107,8 +118,8 @@ class PointVehicle:
         _vehicle_dipoles(np.asarray(x, dtype=float), self._induction, r, m, dr_dx, dm_dx)
         return Dipoles(r, m, dr_dx, dm_dx)
 
-    def propagate(self, x, dt):
-        """Constant velocity; see `SourceModel.propagate`."""
+    def propagate(self, x, dt, P=None):
+        """Constant velocity, which is linear; see `SourceModel.propagate`."""
         F = np.eye(10)
         F[:6, :6] = constant_velocity(dt)
         Q = np.zeros((10, 10))
@@ -142,23 +153,26 @@ class Magnet:
         dm_dx[:, 0, [0, 1, 2], [6, 7, 8]] = 1.0
         return Dipoles(x[:, None, :3].copy(), x[:, None, 6:9].copy(), dr_dx, dm_dx)
 
-    def propagate(self, x, dt):
+    def propagate(self, x, dt, P=None):
         """Constant velocity and angular velocity; see `SourceModel.propagate`.
 
-        m + dt (w x m), as eq. (24) has it: m is held constant over the
-        interval. Its noise is that of the double integrator, mapped by
-        w -> w x m = C(m) w.
+        The moment is turned by the whole angle w dt. Eq. (24) holds it constant
+        over the interval, m + dt (w x m): each step makes it longer by half the
+        square of the angle, and a filter that knows the size of its magnet
+        then moves the magnet away to make up for it.
+        Its noise is that of the double integrator, mapped by w -> w x m, and with
+        `P` that of the second order (`_shortening`).
         """
-        n = len(x)
-        C = -cross_matrix(x[:, 6:9])
-        F = np.zeros((n, 12, 12))
+        n, angle = len(x), dt * x[:, 9:12]
+        R = rotation_from_quaternion(quaternion_from_rotation_vector(angle))
+        moved = x.copy()
+        moved[:, :3] += dt * x[:, 3:6]
+        moved[:, 6:9] = np.einsum('nij,nj->ni', R, x[:, 6:9])
+        C = -cross_matrix(moved[:, 6:9])
+        F = np.tile(np.eye(12), (n, 1, 1))
         F[:, :6, :6] = constant_velocity(dt)
-        F[:, 6:9, 6:9] = np.eye(3) + dt * cross_matrix(x[:, 9:12])
-        F[:, 6:9, 9:12] = dt * C
-        F[:, 9:12, 9:12] = np.eye(3)
-        moved = np.einsum('nij,nj->ni', F, x)
-        # F holds both derivatives of the product w x m: do not count it twice.
-        moved[:, 6:9] = x[:, 6:9] + dt * np.einsum('nij,nj->ni', C, x[:, 9:12])
+        F[:, 6:9, 6:9] = R
+        F[:, 6:9, 9:12] = dt * C @ left_jacobian(angle)
         G = np.zeros((n, 6, 6))
         G[:, :3, :3] = C
         G[:, 3:, 3:] = np.eye(3)
@@ -166,4 +180,28 @@ class Magnet:
         Q[:, :6, :6] = integrator_noise(dt, self.acceleration_density)
         Q[:, 6:, 6:] = (G @ integrator_noise(dt, np.full(3, self.angular_density))
                         @ np.swapaxes(G, 1, 2))
+        if P is not None:
+            Q[:, 6:9, 6:9] += self._shortening(moved[:, 6:9], F[:, 6:9] @ P @ np.swapaxes(
+                F[:, 6:9], 1, 2) + Q[:, 6:9, 6:9])
         return moved, F, Q
+
+    @staticmethod
+    def _shortening(m, P):
+        """Second moment (n, 3, 3) of what a turn by an uncertain angle takes from m along m.
+
+        A moment `m` (n, 3) that is turned by a small (a, b) across itself ends
+        (a^2 + b^2)/2 |m| short of the plane in which the Jacobian moves it. With
+        the variances p, q of a, b that has the second moment
+        (3 p^2 + 3 q^2 + 2 p q)/4 |m|^2; it is never more than |m|^2.
+        `P` (n, 3, 3) is the covariance of the turned moment.
+        """
+        size2 = np.einsum('ni,ni->n', m, m)
+        along = np.einsum('ni,nj->nij', m, m)
+        # A moment of zero cannot be turned: `along` is zero, and so is the result.
+        size2 = np.where(size2 > 0.0, size2, 1.0)
+        across = np.eye(3) - along / size2[:, None, None]
+        S = across @ P @ across / size2[:, None, None]
+        # Of the two variances only their sum and the sum of their squares are needed.
+        total = np.trace(S, axis1=1, axis2=2)
+        squares = np.einsum('nij,nji->n', S, S)
+        return np.minimum(1.0, 0.25 * (2.0 * squares + total**2))[:, None, None] * along

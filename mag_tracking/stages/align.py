@@ -154,7 +154,7 @@ class Align:
         field = np.full((self._n, 3), np.nan)
         covariance = np.full((self._n, 3, 3), np.nan)
         n_samples = np.zeros(self._n, dtype=int)
-        stamps = []
+        stamps = [[] for _ in range(self._n)]
         for i, queue in enumerate(self._pending):
             taken = []
             while queue and queue[0].stamp_ns < end:
@@ -164,7 +164,7 @@ class Align:
             if not taken:
                 continue
             self._taken[i] = taken[-1].stamp_ns
-            stamps += [s.stamp_ns for s in taken]
+            stamps[i] = [s.stamp_ns for s in taken]
             n_samples[i] = len(taken)
             values = np.array([s.field for s in taken])
             there = np.count_nonzero(~np.isnan(values), axis=0)
@@ -172,10 +172,12 @@ class Align:
             # The fewest per axis counts for all: never better than it is.
             n = there[there > 0].min() if there.any() else 1
             covariance[i] = np.mean([s.covariance for s in taken], axis=0) / n
-        self._end = max(stamps) + 1 if self._settings.burst else end
+        every = [t for row in stamps for t in row]
+        self._end = max(every) + 1 if self._settings.burst else end
         self.counts['frames'] += 1
         if (n_samples == 0).any():
             self.counts['frames with a sensor missing'] += 1
-        first = min(stamps)
-        stamp = first + round(sum(t - first for t in stamps) / len(stamps))
-        return FieldFrame(stamp, field, covariance, n_samples)
+        first = min(every)
+        stamp = first + round(sum(t - first for t in every) / len(every))
+        offset = [sum(t - stamp for t in row) / len(row) / NS if row else 0.0 for row in stamps]
+        return FieldFrame(stamp, field, covariance, n_samples, np.array(offset))

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from mag_tracking.geometry import quaternion_between, quaternion_from_yaw
+from mag_tracking.geometry import cross_matrix, quaternion_between, quaternion_from_yaw
 from mag_tracking.inference.filter_bank import log_sum_exp
-from mag_tracking.physics.motion import cross_matrix
 from mag_tracking.records import Hypothesis, Track
 
 UNOBSERVED_VARIANCE = np.pi**2

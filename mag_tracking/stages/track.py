@@ -20,6 +20,14 @@ from mag_tracking.stages.pose import magnet_orientation, published_track, vehicl
 from mag_tracking.stages.stage import NS
 from mag_tracking.stages.vehicle_start import VehicleSettings, start_vehicle, vehicle_model
 
+SAME_TIME_S = 1e-3
+"""[s] Samples closer than this are taken together: at 20 m/s a target moves two centimetres."""
+
+
+ONE_TIME = 0.05
+"""A frame that is shorter than this share of the time since the frame before is one time, and so
+is the first of a track: velocities are better learnt from frame to frame than within one."""
+
 
 @dataclass(frozen=True)
 class TrackSettings:
@@ -186,16 +194,26 @@ class TrackStage:
     def _predict(self, dt):
         """Time update of the bank; backwards in time without process noise."""
         bank, n_t = self._bank, len(self._model.state_names)
-        x_target, F, Q = self._model.propagate(bank.x[:, :n_t], dt)
+        x_target, F, Q = self._model.propagate(bank.x[:, :n_t], dt, bank.P[:, :n_t, :n_t])
         walk = np.zeros(bank.x.shape[1] - n_t)
         walk[self._n_own * len(self._network):] = self._settings.background_drift**2 * max(dt, 0.0)
         kalman.predict(bank.x, bank.P, x_target, F, Q if dt > 0.0 else 0.0 * Q, walk)
 
-    def _fields(self, x):
-        """Fields of the target of states `x` as the sensors see them; see `turned_fields`."""
-        n_t = len(self._model.state_names)
-        h, H, gradient_power = sensor_fields(self._positions, self._R_sw,
-                                             *self._model.dipoles(x[:, :n_t]))
+    def _fields(self, x, time_offset):
+        """Fields of the target of states `x` as the sensors see them; see `turned_fields`.
+
+        Each sensor sees the target where it is at the sensor's own time.
+        """
+        n_hyp, n, n_t = len(x), len(self._network), len(self._model.state_names)
+        h, H = np.empty((n_hyp, n, 3)), np.empty((n_hyp, n, 3, n_t))
+        gradient_power = np.empty((n_hyp, n))
+        steps = np.round(time_offset / SAME_TIME_S)
+        for step in np.unique(steps):
+            j = np.flatnonzero(steps == step)
+            moved, F, _ = self._model.propagate(x[:, :n_t], step * SAME_TIME_S)
+            h[:, j], H_moved, gradient_power[:, j] = sensor_fields(
+                self._positions[j], self._R_sw[j], *self._model.dipoles(moved))
+            H[:, j] = H_moved @ (F if F.ndim == 2 else F[:, None])
         if self._n_own:
             h, H = turned_fields(h, H, self._angles(x))
         return h, H, gradient_power
@@ -212,6 +230,8 @@ class TrackStage:
             return []
         if dt > 0.0:
             self._predict(dt)
+        if np.ptp(frame.time_offset) < ONE_TIME * dt or dt <= 0.0:
+            frame = replace(frame, time_offset=np.zeros(len(self._network)))
         covariance = np.where(np.isnan(frame.covariance), np.eye(3), frame.covariance)
         log_likelihood = self._update(frame, covariance, dt)
         evidence = bank.reweight(log_likelihood)
@@ -245,7 +265,7 @@ class TrackStage:
         repeat = max(1.0, s.model_error_time_s / dt) if dt > 0.0 else 1.0
         for _ in range(s.iterations):
             bank.x, bank.P = x_prior.copy(), P_prior.copy()
-            h, H, gradient_power = self._fields(x_lin)
+            h, H, gradient_power = self._fields(x_lin, frame.time_offset)
             inflation = repeat * (s.near_field_length**2 * gradient_power
                                   + s.field_error**2 * np.einsum('pji,pji->pj', h, h))
             # A dipole on a sensor has no field: such a hypothesis is as good as ruled out.
@@ -270,7 +290,7 @@ class TrackStage:
             id=self._next_id, ended=False,
             existence=float(1.0 / (1.0 + np.exp(-np.clip(self._log_odds, -700.0, 700.0)))),
             degrees_of_freedom=int(np.count_nonzero(~np.isnan(frame.field))),
-            predicted=self._fields(x)[0][0] + x[0, -3 * n:].reshape(n, 3),
+            predicted=self._fields(x, frame.time_offset)[0][0] + x[0, -3 * n:].reshape(n, 3),
             mounting=x[0, own].reshape(-1, 3),
             mounting_std=np.sqrt(np.diagonal(bank.P[best])[own]).reshape(-1, 3))
 

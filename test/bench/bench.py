@@ -20,12 +20,12 @@ from filterpy.kalman import ExtendedKalmanFilter  # noqa: E402
 from tqdm import tqdm  # noqa: E402
 
 from mag_tracking.geometry import (  # noqa: E402
+    cross_matrix,
     quaternion_from_rotation_vector,
     rotation_from_quaternion,
 )
 from mag_tracking.inference import kalman  # noqa: E402
 from mag_tracking.physics.dipole import MU0, sensor_fields  # noqa: E402
-from mag_tracking.physics.motion import cross_matrix  # noqa: E402
 from mag_tracking.physics.mounting import turned_fields  # noqa: E402
 from mag_tracking.physics.sources import PointVehicle  # noqa: E402
 
