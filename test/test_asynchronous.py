@@ -118,3 +118,36 @@ def test_a_magnet_over_sensors_that_are_read_in_turn():
     assert np.median(error) < 0.3e-3
     assert nees.mean() < 1.5
     assert np.median(error) < 0.2 * np.median(as_one)
+
+
+@pytest.mark.parametrize('gap_s', [2.0, 5.0, 15.0])
+def test_a_magnet_that_was_not_seen_for_long_is_found_again(gap_s):
+    """Flagged, or ended, while it is wrong; right again by the third frame."""
+    network, frames, truth = turning_magnet(np.zeros(9), n=40 + round(gap_s / 0.1), dt=0.1)
+    keep = np.r_[0:20, -20:0]
+    frames, truth = [frames[k] for k in keep], truth[keep]
+    stage = TrackStage(network, settings_for('magnet').track)
+    for k, (frame, r) in enumerate(zip(frames, truth, strict=True)):
+        tracks = stage.feed(frame)
+        live = [t for t in tracks if not t.ended]
+        wrong = [t for t in live if np.linalg.norm(t.position - r) > max(
+            1e-3, 5.0 * np.sqrt(np.trace(t.covariance[:3, :3])))]
+        assert all(t.ambiguous for t in wrong)
+        if k > 22:
+            assert len(live) == 1 and not wrong and not live[0].ambiguous
+    assert stage.counts['frames'] == 40
+
+
+def test_a_vehicle_that_the_field_contradicts_is_lost_and_not_started_anew():
+    network = line_network(2)
+    stage = TrackStage(network, settings_for('vehicle').track)
+    C = np.repeat(1e-16 * np.eye(3)[None], 2, axis=0)
+    rng = np.random.default_rng(1)
+    tracks = []
+    for k in range(30):
+        y = 1e-7 * np.ones((2, 3)) if k < 10 else 1e-4 * rng.standard_normal((2, 3))
+        tracks += stage.feed(FieldFrame(80_000_000 * k, y, C, np.full(2, 8), np.zeros(2), True,
+                                        1e3, 6))
+    assert stage.counts['tracks ended: lost its target'] == 1
+    assert tracks[-1].ended and tracks[-2].ambiguous
+    assert stage.counts['tracks'] == 1 and stage.bank is None

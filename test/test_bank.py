@@ -40,7 +40,7 @@ def test_another_arrival_makes_a_track_ambiguous_even_where_the_places_agree(
     b = FilterBank(x, np.repeat(np.eye(10)[None], 2, axis=0), np.log([other, 1.0 - other]),
                    np.array([label, 0]), np.array([7.0, 3.0]))
     track = published_track(
-        b, 1, model, vehicle_orientation, ('left', 'right'), stamp_ns=1, id=1, ended=False,
+        b, 1, model, vehicle_orientation, ('left', 'right'), False, stamp_ns=1, id=1, ended=False,
         existence=1.0, degrees_of_freedom=6, predicted=np.zeros((2, 3)),
         mounting=np.zeros((0, 3)), mounting_std=np.zeros((0, 3)))
     assert track.ambiguous == ambiguous

@@ -139,29 +139,41 @@ def test_a_magnet_that_turns_a_little_follows_the_source():
         np.testing.assert_allclose(Q[p, 6:9, 9:12], 0.5 * dt**2 / 2.0 * C, atol=1e-11)
 
 
+def turned_noise(std_w, std_m, dt, density=0.0):
+    """(second moment along the turned m by sampling, that of the model's extra noise, extra)."""
+    model = Magnet(np.zeros(3), density)
+    rng = np.random.default_rng(8)
+    x = magnet_state(np.array([0.3, -0.4, 1.2]), np.array([0.2, 0.1, 0.0]))
+    P = np.zeros((1, 12, 12))
+    P[0, 6:9, 6:9], P[0, 9:, 9:] = np.diag(std_m**2), np.diag(std_w**2)
+    moved, F, without = model.propagate(x, dt)
+    extra = (model.propagate(x, dt, P)[2] - without)[0, 6:9, 6:9]
+    samples = np.repeat(x, 400_000, axis=0)
+    samples[:, 6:9] += std_m * rng.standard_normal((len(samples), 3))
+    samples[:, 9:] += std_w * rng.standard_normal((len(samples), 3))
+    left = model.propagate(samples, dt)[0][:, 6:9] - moved[0, 6:9] - np.einsum(
+        'ij,nj->ni', F[0, 6:9], samples - x)
+    u = moved[0, 6:9] / np.linalg.norm(moved[0, 6:9])
+    np.testing.assert_allclose(extra, (u @ extra @ u) * np.outer(u, u), atol=1e-12)
+    return np.mean((left @ u) ** 2), u @ extra @ u
+
+
 def test_the_second_order_of_an_uncertain_turn_is_in_its_noise():
     """By sampling: how far turned moments end from the plane that the Jacobian moves them in."""
-    model = Magnet(np.zeros(3), 0.0)
-    rng = np.random.default_rng(8)
-    m, w, dt = np.array([0.3, -0.4, 1.2]), np.array([0.2, 0.1, 0.0]), 0.5
     std_w = np.array([0.10, 0.25, 0.15])
-    P = np.zeros((1, 12, 12))
-    P[0, 9:, 9:] = np.diag(std_w**2)
-    x = magnet_state(m, w)
-    moved, F, without = model.propagate(x, dt)
-    _, _, Q = model.propagate(x, dt, P)
-    samples = np.repeat(x, 200_000, axis=0)
-    samples[:, 9:] += std_w * rng.standard_normal((len(samples), 3))
-    left = model.propagate(samples, dt)[0][:, 6:9] - moved[0, 6:9] \
-        - (samples - x) @ F[0, 6:9].T
-    u = moved[0, 6:9] / np.linalg.norm(m)
-    expected = np.mean((left @ u) ** 2)
-    extra = (Q - without)[0, 6:9, 6:9]
-    assert u @ extra @ u == pytest.approx(expected, rel=0.05)
-    np.testing.assert_allclose(extra, (u @ extra @ u) * np.outer(u, u), atol=1e-12)
+    expected, extra = turned_noise(std_w, np.zeros(3), 0.5)
+    assert extra == pytest.approx(expected, rel=0.05)
     # However little is known of the turn, a moment is never shorter than nothing.
-    _, _, Q = model.propagate(x, dt, 1e6 * P)
-    assert u @ Q[0, 6:9, 6:9] @ u == pytest.approx(m @ m)
+    assert turned_noise(1e3 * std_w, np.zeros(3), 0.5)[1] == pytest.approx(1.69)
+
+
+def test_a_turn_that_is_known_costs_nothing_however_uncertain_the_moment():
+    """Else each of many short steps would count the same doubt again."""
+    expected, extra = turned_noise(np.zeros(3), np.full(3, 0.2), 0.5)
+    assert expected < 1e-20 and extra < 1e-20
+    # Unknown spin is a density, too: its angles grow with the third power of the time.
+    assert turned_noise(np.zeros(3), np.zeros(3), 1.0, 0.04)[1] == pytest.approx(
+        2.0 * (0.04 / 3.0) ** 2 * 1.69)
 
 
 def test_a_magnet_of_no_moment_has_a_finite_noise():

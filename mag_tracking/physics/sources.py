@@ -181,27 +181,32 @@ class Magnet:
         Q[:, 6:, 6:] = (G @ integrator_noise(dt, np.full(3, self.angular_density))
                         @ np.swapaxes(G, 1, 2))
         if P is not None:
-            Q[:, 6:9, 6:9] += self._shortening(moved[:, 6:9], F[:, 6:9] @ P @ np.swapaxes(
-                F[:, 6:9], 1, 2) + Q[:, 6:9, 6:9])
+            # What is not known of the moment itself is turned exactly: the turn's share counts.
+            before = R @ P[:, 6:9, 6:9] @ np.swapaxes(R, 1, 2)
+            after = F[:, 6:9] @ P @ np.swapaxes(F[:, 6:9], 1, 2) + Q[:, 6:9, 6:9]
+            Q[:, 6:9, 6:9] += _shortening(moved[:, 6:9], before, after)
         return moved, F, Q
 
-    @staticmethod
-    def _shortening(m, P):
-        """Second moment (n, 3, 3) of what a turn by an uncertain angle takes from m along m.
 
-        A moment `m` (n, 3) that is turned by a small (a, b) across itself ends
-        (a^2 + b^2)/2 |m| short of the plane in which the Jacobian moves it. With
-        the variances p, q of a, b that has the second moment
-        (3 p^2 + 3 q^2 + 2 p q)/4 |m|^2; it is never more than |m|^2.
-        `P` (n, 3, 3) is the covariance of the turned moment.
-        """
-        size2 = np.einsum('ni,ni->n', m, m)
-        along = np.einsum('ni,nj->nij', m, m)
-        # A moment of zero cannot be turned: `along` is zero, and so is the result.
-        size2 = np.where(size2 > 0.0, size2, 1.0)
-        across = np.eye(3) - along / size2[:, None, None]
+def _shortening(m, before, after):
+    """Second moment (n, 3, 3), along m, of what a turn by an uncertain angle takes from m.
+
+    A moment `m` (n, 3) that is turned by a small (a, b) across itself ends
+    (a^2 + b^2)/2 |m| short of the plane in which the Jacobian moves it. With the
+    variances p, q of a, b that has the second moment (3 p^2 + 3 q^2 + 2 p q)/4
+    |m|^2. Counted is what the covariance `after` (n, 3, 3) of the turned moment has
+    more of it than the one `before`, and never more than |m|^2.
+    """
+    size2 = np.einsum('ni,ni->n', m, m)
+    along = np.einsum('ni,nj->nij', m, m)
+    # A moment of zero cannot be turned: `along` is zero, and so is the result.
+    size2 = np.where(size2 > 0.0, size2, 1.0)
+    across = np.eye(3) - along / size2[:, None, None]
+
+    def second_moment(P):
         S = across @ P @ across / size2[:, None, None]
         # Of the two variances only their sum and the sum of their squares are needed.
-        total = np.trace(S, axis1=1, axis2=2)
-        squares = np.einsum('nij,nji->n', S, S)
-        return np.minimum(1.0, 0.25 * (2.0 * squares + total**2))[:, None, None] * along
+        return 0.25 * (2.0 * np.einsum('nij,nji->n', S, S) + np.trace(S, axis1=1, axis2=2) ** 2)
+
+    more = second_moment(after) - second_moment(before)
+    return np.clip(more, 0.0, 1.0)[:, None, None] * along

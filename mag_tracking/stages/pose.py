@@ -60,7 +60,7 @@ def magnet_orientation(x, P, axis):
     return quaternion_between(axis, m), T, UNOBSERVED_VARIANCE * along, tuple(flags)
 
 
-def published_track(bank, best, model, orientation, names, **known):
+def published_track(bank, best, model, orientation, names, strange, **known):
     """The `Track` of a bank's hypothesis `best`.
 
     Parameters
@@ -73,6 +73,8 @@ def published_track(bank, best, model, orientation, names, **known):
         Takes state and covariance of the target, as `vehicle_orientation`.
     names : sequence of str
         The arrival of each label.
+    strange : bool
+        The measurement does not fit even the best hypothesis: ambiguous, too.
     known : fields of `Track` that the bank does not know
         stamp_ns, id, ended, existence, degrees_of_freedom, predicted, mounting,
         mounting_std.
@@ -95,7 +97,7 @@ def published_track(bank, best, model, orientation, names, **known):
         position_orientation_covariance=P[:3] @ T.T,
         moment=moments[best].copy(), moment_covariance=dm_dx @ P @ dm_dx.T,
         nis=float(bank.nis[best]), weight=float(weights[best]), arrival=names[bank.label[best]],
-        ambiguous=(bank.separated_weight(best) > DOUBT
+        ambiguous=bool(strange or bank.separated_weight(best) > DOUBT
                    or 1.0 - np.exp(bank.log_w).sum(where=bank.label == bank.label[best]) > DOUBT),
         unobservable=(False, False, False, *flags), hypotheses=hypotheses, **known)
 

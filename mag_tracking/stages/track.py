@@ -71,6 +71,9 @@ class TrackSettings:
     end_std: float = param(
         5.0, 'A track ends when its horizontal position is less certain than this (one standard '
         'deviation): the target is out of reach.', 'm', (1e-6, 1e6), live=True)
+    end_nis: float = param(
+        25.0, 'A track ends when its normalised innovation is larger than this per axis, twice '
+        'running: it has lost its target. Once makes it ambiguous.', '', (1.0, 1e12), live=True)
     end_gap_s: float = param(
         2.0, 'A track ends where the frames have a longer gap than this.', 's', (1e-3, 86400.0))
     vehicle: VehicleSettings = field(default_factory=VehicleSettings)
@@ -94,6 +97,8 @@ class TrackStage:
                     f'(one per arrival_names), got {len(v.arrival_headings_deg)}')
             self._model = vehicle_model(v, network)
             self._orientation = vehicle_orientation
+            # A vehicle starts on an arrival line; a magnet that was lost is found anywhere.
+            self._starts_anywhere = False
             self.arrivals = v.arrival_names
         elif settings.target == 'magnet':
             if not any(settings.magnet.axis):
@@ -101,6 +106,7 @@ class TrackStage:
             self._model = magnet_model(settings.magnet)
             self._orientation = partial(magnet_orientation, axis=settings.magnet.axis)
             self.arrivals = ('',)
+            self._starts_anywhere = True
         else:
             raise SettingsError(f'track.target: expected vehicle or magnet, '
                                 f'got {settings.target!r}')
@@ -109,7 +115,7 @@ class TrackStage:
         self._next_id = 1
         self._bank = None
         # Evidence for a target against backgrounds that wander, and the filter of the latter.
-        self._log_odds, self._surest = 0.0, np.inf
+        self._log_odds, self._surest, self._strange = 0.0, np.inf, 0
         self._noise_x = self._noise_P = None
         self._recent = deque()
         # A target that was lost is not to be started anew in the tail of its own detection.
@@ -179,7 +185,7 @@ class TrackStage:
             self.counts['frames without a start'] += 1
             return []
         self.counts['tracks'] += 1
-        self._log_odds, self._surest = 0.0, np.inf
+        self._log_odds, self._surest, self._strange = 0.0, np.inf, 0
         n_background = 3 * len(self._network)
         self._noise_x = np.zeros((1, n_background))
         self._noise_P = s.background_std**2 * np.eye(n_background)[None]
@@ -225,7 +231,7 @@ class TrackStage:
 
     def _step(self, frame, dt, publish=True):
         """Predict, update, weigh, publish; the `Track` of the frame if it is to be published."""
-        s, bank = self._settings, self._bank
+        bank = self._bank
         if bank is None:
             return []
         if dt > 0.0:
@@ -244,11 +250,24 @@ class TrackStage:
             return []
         self._last = self._published(frame)
         self.counts['poses'] += 1
-        if np.trace(self._last.covariance[:2, :2]) > s.end_std**2 and self._surest < s.end_std:
-            self._out_of_reach = True
-            return [self._last, *self._end('out of reach')]
-        self._surest = min(self._surest, float(np.trace(self._last.covariance[:2, :2])) ** 0.5)
+        reason = self._reason_to_end(self._last)
+        if reason:
+            # In the tail of its own detection a vehicle would be started on the wrong line.
+            self._out_of_reach = not self._starts_anywhere
+            return [self._last, *self._end(reason)]
         return [self._last]
+
+    def _reason_to_end(self, track):
+        """Why the running track is over after its pose `track`; None while it goes on."""
+        s, spread = self._settings, float(np.trace(track.covariance[:2, :2])) ** 0.5
+        strange = track.nis > s.end_nis * track.degrees_of_freedom
+        self._strange = self._strange + 1 if strange else 0
+        if self._strange > 1:
+            return 'lost its target'
+        if spread > s.end_std > self._surest:
+            return 'out of reach'
+        self._surest = min(self._surest, spread)
+        return None
 
     def _thin_out(self):
         """Drop and merge hypotheses."""
@@ -285,11 +304,12 @@ class TrackStage:
         best = bank.best()
         x = bank.x[best:best + 1]
         own = slice(len(self._model.state_names), bank.x.shape[1] - 3 * n)
+        n_y = int(np.count_nonzero(~np.isnan(frame.field)))
         return published_track(
             bank, best, self._model, self._orientation, self.arrivals, stamp_ns=frame.stamp_ns,
             id=self._next_id, ended=False,
             existence=float(1.0 / (1.0 + np.exp(-np.clip(self._log_odds, -700.0, 700.0)))),
-            degrees_of_freedom=int(np.count_nonzero(~np.isnan(frame.field))),
+            degrees_of_freedom=n_y, strange=bank.nis[best] > self._settings.end_nis * n_y,
             predicted=self._fields(x, frame.time_offset)[0][0] + x[0, -3 * n:].reshape(n, 3),
             mounting=x[0, own].reshape(-1, 3),
             mounting_std=np.sqrt(np.diagonal(bank.P[best])[own]).reshape(-1, 3))
