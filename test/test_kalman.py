@@ -159,8 +159,13 @@ def test_a_noise_that_is_not_positive_definite_is_refused(bad):
 
 def test_states_that_do_not_fit_the_sensors_are_refused():
     x, P, y, h, H, C, inflation = tracked(2)
-    with pytest.raises(ValueError, match='expected'):
+    with pytest.raises(ValueError, match='x: expected'):
         kalman.update(x, P, y, h, H, C, inflation, n_own=3)
+    arguments = {'P': P, 'y': y, 'h': h, 'C': C, 'inflation': inflation, 'x_lin': x.copy()}
+    for name, array in arguments.items():
+        for bad in (array[..., :-1], np.asfortranarray(array), array[:-1]):
+            with pytest.raises(ValueError, match=f'{name}: expected'):
+                kalman.update(x, H=H, **{**arguments, name: bad})
 
 
 def test_nees_of_a_linear_gaussian_case_is_chi_square():

@@ -86,7 +86,7 @@ def test_bad_messages_are_counted_and_survived(ros):
     assert codes == [0], outputs
 
 
-def test_a_frame_of_another_network_is_counted(ros):
+def test_frames_that_cannot_be_are_counted(ros):
     node, spin_until = ros
     diagnostics = []
     node.create_subscription(DiagnosticArray, '/diagnostics', diagnostics.append, 10)
@@ -96,8 +96,16 @@ def test_a_frame_of_another_network_is_counted(ros):
         assert spin_until(lambda: publisher.get_subscription_count() > 0)
         publisher.publish(NetworkFrame(sensors=['a', 'b'], field=[0.0] * 6))
         publisher.publish(NetworkFrame(sensors=['mag_1', 'mag_2'], field=[0.0] * 5))
+        good = {'sensors': ['mag_1', 'mag_2'], 'field': [0.0] * 6, 'time_offset': [0.0] * 2,
+                'covariance': (1e-16 * np.eye(3)).ravel().tolist() * 2, 'n_samples': [8] * 2,
+                'target_present': True}
+        for bad in ({'time_offset': [float('nan'), 0.0]}, {'time_offset': [0.0, 1e9]},
+                    {'field': [float('inf')] + [0.0] * 5}, {'covariance': [0.0] * 18},
+                    {'covariance': (1e-16 * np.ones((3, 3))).ravel().tolist() * 2}):
+            publisher.publish(NetworkFrame(**{**good, **bad}))
+        publisher.publish(NetworkFrame(**good))
         assert spin_until(lambda: any(
-            v.key == 'rejected: frame does not fit the network' and v.value == '2'
+            v.key == 'rejected: bad frame' and v.value == '7'
             for m in diagnostics for s in m.status for v in s.values))
     finally:
         codes, outputs = stop([process])

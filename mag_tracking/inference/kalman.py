@@ -216,6 +216,20 @@ def _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis)
     return 0
 
 
+def _check_shapes(x, P, x_lin, y, C, h, H, inflation, n_own):
+    """Raise ValueError where the kernel would read beyond an array."""
+    n_hyp, n_sensors, _, n_columns = H.shape
+    n_x = n_columns - n_own + (n_own + 3) * n_sensors
+    for name, array, shape in (
+            ('x', x, (n_hyp, n_x)), ('P', P, (n_hyp, n_x, n_x)), ('x_lin', x_lin, (n_hyp, n_x)),
+            ('y', y, (n_sensors, 3)), ('C', C, (n_sensors, 3, 3)), ('h', h, (n_hyp, n_sensors, 3)),
+            ('H', H, (n_hyp, n_sensors, 3, n_columns)), ('inflation', inflation,
+                                                         (n_hyp, n_sensors))):
+        if array.shape != shape or not array.flags.c_contiguous:
+            raise ValueError(f'{name}: expected a C-contiguous array of {shape}, '
+                             f'got {array.shape}')
+
+
 def update(x, P, y, h, H, C, inflation, x_lin=None, n_own=0):
     """Measurement update of every hypothesis, in place.
 
@@ -253,9 +267,7 @@ def update(x, P, y, h, H, C, inflation, x_lin=None, n_own=0):
     Source: T10 Alg. 2, measurement update; ICASSP11 eq. (9) for the inflation.
     """
     x_lin = x.copy() if x_lin is None else x_lin
-    n_x = H.shape[3] - n_own + (n_own + 3) * H.shape[1]
-    if x.shape[1] != n_x:
-        raise ValueError(f'expected {n_x} states, got {x.shape[1]}')
+    _check_shapes(x, P, x_lin, y, C, h, H, inflation, n_own)
     log_likelihood, nis = np.empty(len(x)), np.empty(len(x))
     if _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis) < 0:
         raise ValueError('a sensor\'s noise covariance is not positive definite')

@@ -21,6 +21,9 @@ POSE = 'geometry_msgs/msg/PoseStamped'
 POSE_WITH_COVARIANCE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 TRACK_ARRAY = 'mag_tracking_msgs/msg/TrackArray'
 
+LONGEST_OFFSET_S = 60.0
+"""[s] The longest frame there can be (`align.period_s`)."""
+
 DEFINITIONS = {
     'builtin_interfaces/msg/Time': ((), 'int32 sec\nuint32 nanosec\n'),
     'std_msgs/msg/Header': (('builtin_interfaces/msg/Time',),
@@ -229,11 +232,29 @@ def frame_of(message, network):
     if lengths != expected:
         raise RecordingError(f'a frame of {n} sensors needs arrays of lengths {expected}, '
                              f'got {lengths}')
-    return FieldFrame(
+    frame = FieldFrame(
         stamp_ns(message.header.stamp), np.array(message.field).reshape(n, 3),
         np.array(message.covariance).reshape(n, 3, 3), np.array(message.n_samples, dtype=int),
         np.array(message.time_offset, dtype=float), bool(message.target_present),
         float(message.statistic), int(message.degrees_of_freedom))
+    _check_numbers(frame)
+    return frame
+
+
+def _check_numbers(frame):
+    """Raise RecordingError where a frame holds what no alignment gives."""
+    if np.isinf(frame.field).any():
+        raise RecordingError('a frame with an infinite field')
+    if not (np.abs(frame.time_offset) <= LONGEST_OFFSET_S).all():
+        raise RecordingError(f'a frame with time offsets of {frame.time_offset.tolist()} s')
+    there = ~np.isnan(frame.field)
+    C = np.where(there[:, :, None] & there[:, None, :], frame.covariance, np.eye(3))
+    variance = np.einsum('jii->ji', C)
+    # Scaled to one: in tesla squared every eigenvalue looks like zero.
+    std = np.sqrt(np.where(variance > 0.0, variance, np.nan))
+    scaled = C / (std[:, :, None] * std[:, None, :])
+    if not np.isfinite(scaled).all() or np.linalg.eigvalsh(scaled).min() <= 1e-12:
+        raise RecordingError('a frame with a covariance that is not positive definite')
 
 
 def detection_dict(d, frame):

@@ -52,7 +52,7 @@ class TrackerNode(StageNode):
         try:
             frame = frame_of(message, self.network)
         except RecordingError as error:
-            self._stage.counts['rejected: frame does not fit the network'] += 1
+            self._stage.counts['rejected: bad frame'] += 1
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return
         for track in self._stage.feed(frame):
