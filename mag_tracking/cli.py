@@ -114,17 +114,18 @@ def _settings(args):
 
 @contextmanager
 def _interrupts():
-    """A list on which every SIGINT is put; the first is raised as KeyboardInterrupt.
+    """A list on which every SIGINT is put, to be asked where it is safe to stop.
 
-    The next ones are only noted: what was done is being written by then. Where
-    SIGINT is ignored (a background job) it stays so, and outside the main
-    thread, where no handler can be set, the list stays empty.
+    Raised in the middle of an update or of a line of a table, it would leave half
+    of it, and a library on the way might swallow it. The third is raised all the
+    same. Where SIGINT is ignored (a background job) it stays so, and outside the
+    main thread, where no handler can be set, the list stays empty.
     """
     seen = []
 
     def note(signum, _):
         seen.append(signum)
-        if len(seen) == 1:
+        if len(seen) > 2:
             raise KeyboardInterrupt
 
     before = signal.getsignal(signal.SIGINT)
@@ -161,17 +162,12 @@ def _replay_one(path, network, settings, out, seen, figures):
     recording = Recording(path)
     with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
               disable=None) as bar:
-        # Asked, not only raised: a library on the way may swallow what is raised in it.
         run = replay(recording, network, settings, out, bar.update, lambda: bool(seen))
     _print_summary(path, run.summary)
-    if seen:
-        return
     if figures:
-        try:
-            write_figures(run, network, out)
-        except KeyboardInterrupt:
-            return
-    print(f'results in {out}')
+        write_figures(run, network, out, stopped=lambda: bool(seen))
+    if not seen:
+        print(f'results in {out}')
 
 
 def _print_summary(path, summary):

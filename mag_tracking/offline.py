@@ -27,6 +27,10 @@ class Run:
     """{name: (stamps, positions, quaternions)}."""
 
 
+class _Stopped(Exception):
+    """The reading is to end here."""
+
+
 def replay(recording, network, settings, out, progress=None, stopped=None):
     """Track everything in a recording and write the results.
 
@@ -40,30 +44,35 @@ def replay(recording, network, settings, out, progress=None, stopped=None):
     progress : function, optional
         Called with the bytes done since the last call.
     stopped : function, optional
-        Asked before every sample; true ends the reading.
+        Asked before every sample and whenever the reading has got on. When it is
+        true the reading ends, what was done is written, and the summary says so.
 
     Returns
     -------
     Run
 
-    Raises RecordingError and OutputError. An interruption (KeyboardInterrupt,
-    or `stopped`) ends the reading; what was done is written, and the summary
-    says so.
+    Raises RecordingError and OutputError.
     """
     if recording.lies_in(out):
         raise OutputError(f'{out} is the folder of the recording; the results would overwrite it')
     reader = SampleReader(recording, network)
     pipeline = Pipeline(network, settings)
     logs, interrupted = {}, False
+
+    def advance(n):
+        if progress is not None:
+            progress(n)
+        if stopped is not None and stopped():
+            raise _Stopped
+
     with ResultFolder(out, network.frame) as results:
         frame = None
         try:
-            for sample in reader.samples(progress):
-                interrupted = stopped is not None and stopped()
-                if interrupted:
-                    break
+            for sample in reader.samples(advance):
+                if stopped is not None and stopped():
+                    raise _Stopped
                 frame = _take(pipeline.feed(sample), frame, results, logs)
-        except KeyboardInterrupt:
+        except _Stopped:
             interrupted = True
         _take(pipeline.flush(), frame, results, logs)
         truth = reader.truth_arrays()
@@ -138,13 +147,18 @@ def _against_truth(log, pipeline, truth):
     return best and best[1]
 
 
-def write_figures(run, network, out, most=6):
-    """Draw the figures of the first `most` tracks into folder `out`; returns their paths."""
+def write_figures(run, network, out, most=6, stopped=None):
+    """Draw the figures of the first `most` tracks into folder `out`; returns their paths.
+
+    `stopped` is asked before each track; when it is true no more are drawn.
+    """
     # Drawing needs matplotlib, which a run without figures should not wait for.
     from mag_tracking.report.figures import field_figure, map_figure, weights_figure
 
     paths = []
     for log in list(run.logs.values())[:most]:
+        if stopped is not None and stopped():
+            break
         entry = next(t for t in run.summary['tracks'] if t['id'] == log.id)
         truth = None
         if 'truth' in entry:

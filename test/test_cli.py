@@ -1,6 +1,5 @@
 """The command line: what it writes, what it says, how it fails."""
 
-import contextlib
 import json
 import os
 import signal
@@ -150,16 +149,15 @@ def test_an_interrupted_replay_keeps_what_is_done(tmp_path):
     assert json.loads(table.read_text())['recording'] == f'{NAME}_0.mcap'
 
 
-def interrupt_feed(monkeypatch, at, swallow=False):
-    """Let the pipeline be interrupted at one of its samples; returns the list of samples fed."""
+def interrupt_feed(monkeypatch, at):
+    """Let a signal come at one of the pipeline's samples; returns the list of samples fed."""
     from mag_tracking.pipeline import Pipeline
     feed, calls = Pipeline.feed, []
 
     def interrupted(self, sample):
         calls.append(sample)
         if len(calls) == at:
-            with contextlib.suppress(KeyboardInterrupt) if swallow else contextlib.nullcontext():
-                signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
         return feed(self, sample)
 
     monkeypatch.setattr(Pipeline, 'feed', interrupted)
@@ -171,15 +169,17 @@ def replay_one(out, *options):
                  str(out), *options])
 
 
-@pytest.mark.parametrize('swallow', [False, True])
-def test_an_interruption_ends_the_reading_even_if_a_library_swallows_it(
-        tmp_path, monkeypatch, swallow):
-    calls = interrupt_feed(monkeypatch, 300, swallow)
+def summary_of(out):
+    return json.loads((out / 'summary.json').read_text())
+
+
+def test_an_interruption_ends_the_reading_after_the_sample(tmp_path, monkeypatch):
+    calls = interrupt_feed(monkeypatch, 300)
     before = signal.getsignal(signal.SIGINT)
     assert replay_one(tmp_path, '--no-figures') == 130
     assert signal.getsignal(signal.SIGINT) is before
-    assert 300 <= len(calls) < 2000
-    assert json.loads((tmp_path / 'summary.json').read_text())['interrupted'] is True
+    assert len(calls) == 300
+    assert summary_of(tmp_path)['interrupted'] is True
 
 
 def test_an_interruption_need_not_wait_for_the_next_sample(tmp_path, monkeypatch):
@@ -188,34 +188,45 @@ def test_an_interruption_need_not_wait_for_the_next_sample(tmp_path, monkeypatch
 
     def no_sample_for_long(self, progress):
         signal.raise_signal(signal.SIGINT)
+        progress(1)
         waited.append(True)
         yield from ()
 
     monkeypatch.setattr(SampleReader, 'samples', no_sample_for_long)
     assert replay_one(tmp_path, '--no-figures') == 130
-    assert not waited
+    assert not waited and summary_of(tmp_path)['interrupted'] is True
 
 
-def test_a_second_interruption_does_not_lose_what_is_being_written(tmp_path, monkeypatch, capsys):
-    from mag_tracking import offline
-    summary = offline._summary
+@pytest.mark.parametrize('step', ['_summary', '_take', '_against_truth', 'write_figures'])
+def test_an_interruption_while_writing_loses_nothing(tmp_path, monkeypatch, capsys, step):
+    """First or second, in the middle of an update or of what is written at the end."""
+    from mag_tracking import cli, offline
+    module = cli if step == 'write_figures' else offline
+    whole, count = getattr(module, step), []
 
-    def impatient(*args):
-        signal.raise_signal(signal.SIGINT)
-        return summary(*args)
+    def impatient(*args, **named):
+        count.append(step)
+        if len(count) in (1, 2):
+            signal.raise_signal(signal.SIGINT)
+        return whole(*args, **named)
 
-    interrupt_feed(monkeypatch, 300)
-    monkeypatch.setattr(offline, '_summary', impatient)
-    assert replay_one(tmp_path, '--no-figures') == 130
-    assert json.loads((tmp_path / 'summary.json').read_text())['interrupted'] is True
-    assert 'interrupted; what was done is in' in capsys.readouterr().out
-
-
-def test_an_interruption_while_drawing_keeps_the_tables(tmp_path, monkeypatch):
-    from mag_tracking import cli
-    monkeypatch.setattr(cli, 'write_figures', lambda *_: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(module, step, impatient)
     assert replay_one(tmp_path) == 130
-    assert (tmp_path / 'summary.json').exists()
+    assert summary_of(tmp_path)['interrupted'] is (step == '_take')
+    assert 'interrupted; what was done is in' in capsys.readouterr().out
+    assert not list(tmp_path.glob('*.png'))
+
+
+def test_who_insists_is_obeyed(tmp_path, monkeypatch):
+    from mag_tracking import offline
+
+    def hanging(*_):
+        for _ in range(3):
+            signal.raise_signal(signal.SIGINT)
+        raise AssertionError('not reached')
+
+    monkeypatch.setattr(offline, '_summary', hanging)
+    assert replay_one(tmp_path, '--no-figures') == 130
 
 
 def test_a_background_job_ignores_interruptions_as_it_was_told(tmp_path, monkeypatch):
