@@ -164,14 +164,26 @@ def read_parameter_file(path):
         return {}
     if not isinstance(content, Mapping):
         raise SettingsError(f'{path}: expected a mapping of settings, got {content!r}')
-    sections = [v['ros__parameters'] for v in content.values()
-                if isinstance(v, Mapping) and 'ros__parameters' in v]
-    joined = {}
     try:
-        for section in sections or [content]:
-            _join(joined, _dotted(section or {}))
+        return _joined_sections(content)
     except SettingsError as error:
         raise SettingsError(f'{path}: {error}') from error
+    except RecursionError as error:
+        raise SettingsError(f'{path}: a mapping that holds itself') from error
+
+
+def _joined_sections(content):
+    """The settings of a plain mapping, or of all the nodes of a ROS parameter file."""
+    nodes = [k for k, v in content.items() if isinstance(v, Mapping) and 'ros__parameters' in v]
+    if not nodes:
+        return _dotted(content)
+    joined = {}
+    for name, node in content.items():
+        section = node.get('ros__parameters') if isinstance(node, Mapping) else None
+        if name not in nodes or len(node) > 1 or not isinstance(section, Mapping | None):
+            raise SettingsError(f'{name}: expected nothing but a mapping under ros__parameters, as '
+                                f'for {nodes[0]}, got {node!r}')
+        _join(joined, _dotted(section or {}))
     return joined
 
 

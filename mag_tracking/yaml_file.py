@@ -11,6 +11,8 @@ class _UniqueKeyLoader(yaml.SafeLoader):
     def construct_mapping(self, node, deep=False):
         seen = set()
         for key_node, _ in node.value:
+            if key_node.tag == 'tag:yaml.org,2002:merge':
+                continue
             key = self.construct_object(key_node, deep=True)
             line = key_node.start_mark.line + 1
             if not isinstance(key, Hashable):
@@ -32,5 +34,8 @@ def read_yaml(path, error):
             return yaml.load(stream, Loader=_UniqueKeyLoader)
     except OSError as problem:
         raise error(f'cannot read {path}: {problem.strerror}') from problem
-    except (yaml.YAMLError, UnicodeDecodeError) as problem:
+    # ValueError: a date or a number that is none (2001-13-45); also bytes that are no text.
+    except (yaml.YAMLError, ValueError) as problem:
         raise error(f'{path} is not YAML as it should be: {problem}') from problem
+    except RecursionError as problem:
+        raise error(f'{path} is nested too deeply') from problem

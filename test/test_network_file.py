@@ -76,6 +76,11 @@ def test_what_is_written_reads_back(tmp_path):
     ('[2.0e-6, 1.55e-5, -4.9e-5]', '[0.02, 0.155, -0.49]', 'microtesla or gauss'),
     ('frame: map', 'fram: map', 'unknown key'),
     ('frame: map', 'frame: [', 'not YAML'),
+    ('frame: map', 'frame: "a b"', 'frame: expected a name'),
+    ('  b:', '  b/c:', "'b/c' is no name for a sensor"),
+    ('background: [1.0e-6', 'background: [0.2', 'background: .* is it in microtesla'),
+    ('[2.0e-6, 1.55e-5, -4.9e-5]', '[2.0e-3, 0.0, 0.0]', 'more than a millitesla'),
+    ('position: [0, -4.5, 0]', 'position: [0, 2.0e+8, 0]', 'nowhere on Earth'),
 ])
 def test_faults_are_named(tmp_path, old, new, message):
     assert old in GOOD

@@ -73,10 +73,18 @@ def test_parameter_files(tmp_path):
     assert read_parameter_file(path) == {'track.iterations': 2, 'align.period_s': 0.1}
     path.write_text('track: {vehicle: {moment: 100.0}}')
     assert read_parameter_file(path) == {'track.vehicle.moment': 100.0}
+    path.write_text('base: &b {iterations: 2, prune_ratio: 0.1}\n'
+                    'track: {<<: *b, iterations: 3}\n')
+    assert read_parameter_file(path)['track.iterations'] == 3
     path.write_text('')
     assert read_parameter_file(path) == {}
     for content, message in (
             ('- 1', 'expected a mapping'), ('{a: [', 'not YAML'),
+            ('track: 2001-13-45', 'not YAML'), ('{? [1] : 2}', 'is no name'),
+            ('[' * 3000, 'nested too deeply'), ('track: &t {a: *t}', 'holds itself'),
+            ('n: {ros__parameters: 5}', 'expected nothing but a mapping'),
+            ('n: {ros__parameters: {track.iterations: 2}}\ntrack: {iterations: 3}',
+             'track: expected nothing but'),
             ('track: {iterations: 2, iterations: 3}', 'iterations is there twice'),
             ('track: {iterations: 2}\ntrack.iterations: 3', 'track.iterations is there twice'),
             ('a:\n  ros__parameters: {track.iterations: 2}\n'

@@ -10,6 +10,8 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.yaml_file import read_yaml
 
 _TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
+_NAME = re.compile(r'[A-Za-z0-9_.-]+')
+_FRAME = re.compile(r'[A-Za-z0-9_./-]+')
 _TOP = {'frame', 'earth_field', 'sensors'}
 _SENSOR = {'position', 'orientation', 'noise_std', 'background', 'topic'}
 
@@ -102,9 +104,12 @@ def _network(content):
             raise NetworkError(f'earth_field: {earth.tolist()} T is more than a millitesla; '
                                'is it in microtesla or gauss?')
     frame = content.get('frame', 'map')
-    if not isinstance(frame, str) or not frame:
+    if not isinstance(frame, str) or not _FRAME.fullmatch(frame):
         raise NetworkError(f'frame: expected a name, got {frame!r}')
     names = tuple(str(name) for name in sensors)
+    for name in names:
+        if not _NAME.fullmatch(name):
+            raise NetworkError(f'{name!r} is no name for a sensor: letters, digits, _ . and -')
     parts = [_sensor(n, e) for n, e in zip(names, sensors.values(), strict=True)]
     position, R_ws, noise, background, topics = zip(*parts, strict=True)
     return SensorNetwork(names, np.array(position), np.array(R_ws), topics,
