@@ -157,3 +157,21 @@ def test_burst_mode_does_not_mix_rounds_after_a_lost_sample():
 def test_every_sample_is_used_exactly_once(period):
     frames = feed(stage(2, period_s=period), stream(2, 3000))
     assert sum(f.n_samples.sum() for f in frames) == 600
+
+
+@given(st.integers(0, 10_000))
+def test_stamps_of_frames_always_increase_and_offsets_keep_the_true_times(seed):
+    rng = np.random.default_rng(seed)
+    samples = []
+    for j in range(3):
+        times = np.cumsum(rng.uniform(2.0, 60.0) * rng.uniform(0.9, 1.1, 60))
+        samples += [sample(round(t, 3), j) for t in times if t < 900.0]
+    samples.sort(key=lambda s: s.stamp_ns)
+    for burst in (False, True):
+        frames = feed(stage(3, burst=burst, period_s=0.08), samples)
+        assert (np.diff([f.stamp_ns for f in frames]) > 0).all()
+        for f in frames:
+            assert (f.time_offset[f.n_samples == 0] == 0.0).all()
+        times = sum((f.n_samples * (f.stamp_ns / 1e9 + f.time_offset)).sum() for f in frames)
+        assert sum(f.n_samples.sum() for f in frames) == len(samples)
+        assert times == pytest.approx(sum(s.stamp_ns for s in samples) / 1e9)

@@ -118,6 +118,11 @@ def test_a_magnet_over_sensors_that_are_read_in_turn():
     assert np.median(error) < 0.3e-3
     assert nees.mean() < 1.5
     assert np.median(error) < 0.2 * np.median(as_one)
+    stage = TrackStage(network, settings_for('magnet').track)
+    for frame in frames:
+        track = stage.feed(frame)[-1]
+    # Each sensor's field is predicted at its own time.
+    assert np.abs(track.predicted - frame.field).max() < 0.02 * np.abs(frame.field).max()
 
 
 @pytest.mark.parametrize('gap_s', [2.0, 5.0, 15.0])

@@ -57,6 +57,19 @@ def test_a_sensor_of_any_rate_learns(rate):
     assert np.abs((b.level(3.0) - EARTH) / SIGMA).max() < 4.5 * (24.0 ** -0.5) * 2.0
 
 
+@pytest.mark.parametrize('rate, at', [(1.0, 20.0), (1.0, 8.0), (2.0, 12.0), (2.0, 6.0)])
+def test_a_target_that_passes_while_it_learns_is_no_noise(rate, at):
+    """A block of a slow sensor is long enough for a whole pass: its mean hardly tells."""
+    def target(t):
+        return np.array([3e-6, -2e-6, 1e-6]) / (1 + ((t - at) / 0.8) ** 2) ** 2.5
+    b = running()
+    end = at + 10.0 + 60 / rate
+    feed(b, np.arange(0, end, 1 / rate), signal=target)
+    assert b.ready
+    assert np.sqrt(np.diagonal(b.covariance)).max() < 2.5 * SIGMA.max()
+    assert np.abs((b.level(end) - EARTH) / SIGMA).max() < 3.0
+
+
 def test_a_target_freezes_the_background():
     def target(t):
         return np.array([3e-6, -2e-6, 1e-6]) / (1 + ((t - 15.0) / 0.8) ** 2) ** 2.5

@@ -125,7 +125,8 @@ def test_four_processes_over_the_middleware(ros, tmp_path, road_network):
                           and node.count_subscribers('/detection_node/frame') > 1
                           and node.count_subscribers('/mag_1/imu/mag_calibrated'))
         processes.append(start('replay_node', '-p', f'recording:={vehicle_path(name)}',
-                               '-p', 'rate:=5.0', '-p', 'start_delay:=3.0'))
+                               '-p', 'rate:=5.0', '-p', 'start_delay:=3.0',
+                               '-p', 'wait_for_subscribers:=30.0'))
         assert spin_until(lambda: any(t.status == t.ENDED for m in received[TrackArray]
                                       for t in m.tracks), 60.0)
     finally:
@@ -134,10 +135,11 @@ def test_four_processes_over_the_middleware(ros, tmp_path, road_network):
     assert not any('Traceback' in text for text in outputs), outputs
     replay(Recording(vehicle_path(name)), road_network, settings_for('vehicle', PATIENT), tmp_path)
     with open(tmp_path / 'poses.csv', newline='') as stream:
-        offline = [[int(r['stamp_ns']), float(r['x']), float(r['y'])]
-                   for r in csv.DictReader(stream)]
+        offline = {int(r['stamp_ns']): [float(r['x']), float(r['y'])]
+                   for r in csv.DictReader(stream)}
     live = [t for m in received[TrackArray] for t in map(track_of, m.tracks) if not t.ended]
-    np.testing.assert_allclose([[t.stamp_ns, *t.position[:2]] for t in live], offline, rtol=1e-9)
+    assert [t.stamp_ns for t in live] == list(offline)
+    np.testing.assert_allclose([t.position[:2] for t in live], list(offline.values()), rtol=1e-9)
     assert received[Clock] and len(received[Odometry]) == len(live)
     assert received[Odometry][0].child_frame_id == 'track_1'
     # DELETE at the end of the track.

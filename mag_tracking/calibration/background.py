@@ -31,6 +31,10 @@ class Block:
 LEAST_SAMPLES = 8
 """A block has at least so many samples, however slow the sensor: fewer tell nothing of noise."""
 
+LOUDEST = 100.0
+"""A block whose variance is so many times that of the quietest is no noise: a target passed within
+it, as it can within the long blocks of a slow sensor. Noise and coarse steps stay well below."""
+
 LEAST_STD = 1e-11
 """[T] A block that scatters less teaches nothing: the sensor is stuck, or its steps are coarse."""
 
@@ -163,6 +167,8 @@ class RunningBackground:
     def _adopt_if_steady(self):
         """Take the collected blocks as the background if they lie on one line."""
         blocks = list(self._strange)
+        if _one_is_loud(blocks):
+            return False
         noise = _pooled_covariance(blocks)
         if noise is None and not self._noise_given:
             return False
@@ -218,6 +224,14 @@ def _line_through(blocks):
     flat = ~(spread > 0.0)
     slope = np.where(flat, 0.0, (w * d * (y - mean_y)).sum(axis=0) / np.where(flat, 1.0, spread))
     return centre, mean_y + slope * (centre - mean_t), slope
+
+
+def _one_is_loud(blocks):
+    """Whether a block scatters far more than the others, on any axis."""
+    variance = np.array([np.where(b.n > 1, np.diagonal(b.scatter) / np.maximum(b.n - 1, 1), np.nan)
+                         for b in blocks])
+    known = variance[:, ~np.isnan(variance).all(axis=0)]
+    return bool((np.nanmax(known, axis=0) > LOUDEST * np.nanmin(known, axis=0)).any())
 
 
 def _pooled_covariance(blocks):

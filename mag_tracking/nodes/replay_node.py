@@ -12,6 +12,7 @@ from std_srvs.srv import Trigger
 
 from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.io.bag import Recording
+from mag_tracking.io.schema import MAGNETIC_FIELD
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import message_class
 from mag_tracking.nodes.stage_node import STREAM
@@ -54,6 +55,7 @@ class ReplayNode(Node):
         self._seek(offset)
         # Discovery takes a moment; what is published before it is lost.
         self._start = time.monotonic() + delay
+        self._patience = self.declare_parameter('wait_for_subscribers', 0.0).value
         self.create_service(Trigger, '~/pause', self._pause)
         self.create_service(Trigger, '~/resume', self._resume)
         self.create_service(Seek, '~/seek', self._seek_service)
@@ -101,7 +103,7 @@ class ReplayNode(Node):
     def _tick(self):
         """Publish what is due."""
         now = time.monotonic()
-        if self._paused or self.finished or now < self._start:
+        if self._paused or self.finished or now < self._start or not self._heard(now):
             return
         # After a stall it goes on at its pace: a burst would overrun the subscribers' queues.
         elapsed = 0.0 if self._wall is None else min(now - self._wall, LONGEST_STEP_S)
@@ -123,6 +125,13 @@ class ReplayNode(Node):
             self._next = next(self._messages, None)
         if self._next is None:
             self._end()
+
+    def _heard(self, now):
+        """Whether somebody listens to every magnetic field, or has been waited for long enough."""
+        if now < self._start + self._patience:
+            return all(p.get_subscription_count() for topic, p in self.publishers_by_topic.items()
+                       if self._recording.types.get(topic) == MAGNETIC_FIELD)
+        return True
 
     def _end(self):
         """The recording is over: begin again, or stay."""

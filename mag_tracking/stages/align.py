@@ -53,7 +53,7 @@ class Align:
         """As new."""
         self._pending = [deque() for _ in range(self._n)]
         self._latest = [None] * self._n
-        self._first = self._newest = self._end = None
+        self._first = self._newest = self._end = self._stamp = None
         self._taken = [None] * self._n
 
     def feed(self, sample):
@@ -179,5 +179,9 @@ class Align:
             self.counts['frames with a sensor missing'] += 1
         first = min(every)
         stamp = first + round(sum(t - first for t in every) / len(every))
+        if self._stamp is not None:
+            # Rounds of sensors with different rates overlap; the offsets keep their true times.
+            stamp = max(stamp, self._stamp + 1)
+        self._stamp = stamp
         offset = [sum(t - stamp for t in row) / len(row) / NS if row else 0.0 for row in stamps]
         return FieldFrame(stamp, field, covariance, n_samples, np.array(offset))

@@ -86,9 +86,10 @@ def grids(network, n=8, period=0.08):
         begin, closest = samples[0].stamp_ns, []
         for k in tqdm(range(n), desc=path.stem, disable=None, leave=False):
             late = [s for s in samples if s.stamp_ns - begin >= k * period / n * 1e9]
-            closest.append(pass_errors(longest_track(late, network), truth,
-                                       network.centre)['closest'])
-        print(f'  {path.stem}: mean {np.mean(closest):.2f} m, '
+            log = longest_track(late, network)
+            if log is not None:
+                closest.append(pass_errors(log, truth, network.centre)['closest'])
+        print(f'  {path.stem}: {len(closest)} of {n} tracked; mean {np.mean(closest):.2f} m, '
               f'{min(closest):.2f} .. {max(closest):.2f} m', flush=True)
 
 
