@@ -159,13 +159,17 @@ def test_a_noise_that_is_not_positive_definite_is_refused(bad):
 
 def test_states_that_do_not_fit_the_sensors_are_refused():
     x, P, y, h, H, C, inflation = tracked(2)
-    with pytest.raises(ValueError, match='x: expected'):
+    with pytest.raises(ValueError, match='shapes that do not fit'):
         kalman.update(x, P, y, h, H, C, inflation, n_own=3)
     arguments = {'P': P, 'y': y, 'h': h, 'C': C, 'inflation': inflation, 'x_lin': x.copy()}
     for name, array in arguments.items():
-        for bad in (array[..., :-1], np.asfortranarray(array), array[:-1]):
-            with pytest.raises(ValueError, match=f'{name}: expected'):
-                kalman.update(x, H=H, **{**arguments, name: bad})
+        for bad in (array[..., :-1], array[:-1]):
+            with pytest.raises(ValueError, match='shapes that do not fit'):
+                kalman.update(x, H=H, **{**arguments, name: bad.copy()})
+        with pytest.raises(ValueError, match='C-contiguous'):
+            kalman.update(x, H=H, **{**arguments, name: np.asfortranarray(array)})
+    with pytest.raises(ValueError, match='shapes that do not fit'):
+        kalman.update(x, H=H[:, :, :2].copy(), **arguments)
 
 
 def test_nees_of_a_linear_gaussian_case_is_chi_square():

@@ -190,8 +190,20 @@ def _whiten(T, l10, l20, l21, r0, r1, r2):
       'float64[:,:,::1], float64[:,:,::1], float64[:,:,:,::1], float64[:,::1], '
       'int64, float64[::1], float64[::1])', **_COMPILE)
 def _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis):
-    """Loop of the update over hypotheses and sensors; -1 if a noise is not positive definite."""
-    n_hyp, n_sensors = H.shape[0], H.shape[1]
+    """Loop of the update over hypotheses and sensors; nothing is changed where it is not 0.
+
+    -1: a noise is not positive definite; -2: shapes do not fit, it would read beyond an array.
+    """
+    n_hyp, n_sensors, n_columns = H.shape[0], H.shape[1], H.shape[3]
+    n_x = n_columns - n_own + (n_own + 3) * n_sensors
+    # Sizes one by one: numba takes half a second to compile comparisons of tuples.
+    if (len(x) != n_hyp or len(P) != n_hyp or len(x_lin) != n_hyp or len(h) != n_hyp
+            or len(inflation) != n_hyp or x.shape[1] != n_x or x_lin.shape[1] != n_x
+            or P.shape[1] != n_x or P.shape[2] != n_x or len(y) != n_sensors
+            or len(C) != n_sensors or h.shape[1] != n_sensors or inflation.shape[1] != n_sensors
+            or y.shape[1] != 3 or C.shape[1] != 3 or C.shape[2] != 3 or h.shape[2] != 3
+            or H.shape[2] != 3):
+        return -2
     n = _n_present(y, C)
     if n < 0:
         return -1
@@ -214,20 +226,6 @@ def _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis)
             nis[p] += q
             log_likelihood[p] -= 0.5 * (q + math.log(e0 * e1 * e2))
     return 0
-
-
-def _check_shapes(x, P, x_lin, y, C, h, H, inflation, n_own):
-    """Raise ValueError where the kernel would read beyond an array."""
-    n_hyp, n_sensors, _, n_columns = H.shape
-    n_x = n_columns - n_own + (n_own + 3) * n_sensors
-    for name, array, shape in (
-            ('x', x, (n_hyp, n_x)), ('P', P, (n_hyp, n_x, n_x)), ('x_lin', x_lin, (n_hyp, n_x)),
-            ('y', y, (n_sensors, 3)), ('C', C, (n_sensors, 3, 3)), ('h', h, (n_hyp, n_sensors, 3)),
-            ('H', H, (n_hyp, n_sensors, 3, n_columns)), ('inflation', inflation,
-                                                         (n_hyp, n_sensors))):
-        if array.shape != shape or not array.flags.c_contiguous:
-            raise ValueError(f'{name}: expected a C-contiguous array of {shape}, '
-                             f'got {array.shape}')
 
 
 def update(x, P, y, h, H, C, inflation, x_lin=None, n_own=0):
@@ -267,8 +265,16 @@ def update(x, P, y, h, H, C, inflation, x_lin=None, n_own=0):
     Source: T10 Alg. 2, measurement update; ICASSP11 eq. (9) for the inflation.
     """
     x_lin = x.copy() if x_lin is None else x_lin
-    _check_shapes(x, P, x_lin, y, C, h, H, inflation, n_own)
     log_likelihood, nis = np.empty(len(x)), np.empty(len(x))
-    if _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis) < 0:
+    try:
+        status = _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis)
+    except TypeError as error:
+        raise ValueError(f'arrays have to be C-contiguous and of float64: {error}') from error
+    if status == -2:
+        raise ValueError('shapes that do not fit: ' + ', '.join(
+            f'{name} {a.shape}' for name, a in (
+                ('x', x), ('P', P), ('x_lin', x_lin), ('y', y), ('h', h), ('H', H), ('C', C),
+                ('inflation', inflation))) + f' with n_own {n_own}')
+    if status < 0:
         raise ValueError('a sensor\'s noise covariance is not positive definite')
     return log_likelihood, nis

@@ -114,7 +114,7 @@ class PointVehicle:
         """One dipole a hypothesis; see `SourceModel.dipoles`."""
         n = len(x)
         r, m = np.empty((n, 1, 3)), np.empty((n, 1, 3))
-        dr_dx, dm_dx = np.zeros((n, 1, 3, 10)), np.zeros((n, 1, 3, 10))
+        dr_dx, dm_dx = np.zeros((2, n, 1, 3, 10))
         _vehicle_dipoles(np.asarray(x, dtype=float), self._induction, r, m, dr_dx, dm_dx)
         return Dipoles(r, m, dr_dx, dm_dx)
 
