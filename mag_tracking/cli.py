@@ -3,13 +3,12 @@
 import argparse
 import signal
 import sys
-import threading
-from contextlib import contextmanager
 from pathlib import Path
 
 from tqdm import tqdm
 
 from mag_tracking.errors import MagTrackingError, OutputError
+from mag_tracking.interrupts import noted_signals
 from mag_tracking.io.bag import Recording
 from mag_tracking.io.network_file import read_network
 from mag_tracking.offline import replay, write_figures
@@ -112,33 +111,6 @@ def _settings(args):
     return settings_for(args.target, changes)
 
 
-@contextmanager
-def _interrupts():
-    """A list on which every SIGINT is put, to be asked where it is safe to stop.
-
-    Raised in the middle of an update or of a line of a table, it would leave half
-    of it, and a library on the way might swallow it. The third is raised all the
-    same. Where SIGINT is ignored (a background job) it stays so, and outside the
-    main thread, where no handler can be set, the list stays empty.
-    """
-    seen = []
-
-    def note(signum, _):
-        seen.append(signum)
-        if len(seen) > 2:
-            raise KeyboardInterrupt
-
-    before = signal.getsignal(signal.SIGINT)
-    if before is signal.SIG_IGN or threading.current_thread() is not threading.main_thread():
-        yield seen
-        return
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield seen
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 def _replay(args):
     """mag-tracking replay."""
     network, settings = read_network(args.network), _settings(args)
@@ -147,7 +119,7 @@ def _replay(args):
     if twice:
         raise OutputError(f'two recordings are named {twice[0]}: their results would overwrite '
                           'each other; replay them one by one')
-    with _interrupts() as seen:
+    with noted_signals(signal.SIGINT) as seen:
         for path, name in zip(args.recordings, names, strict=True):
             out = args.out / name if len(args.recordings) > 1 else args.out
             _replay_one(path, network, settings, out, seen, not args.no_figures)

@@ -1,5 +1,6 @@
 """All nodes in one process: what a launch file does, for those who have none."""
 
+import signal
 import sys
 import time
 
@@ -7,8 +8,10 @@ import rclpy
 from mag_tracking_msgs.msg import TrackArray
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
 
 from mag_tracking.errors import MagTrackingError
+from mag_tracking.interrupts import noted_signals
 from mag_tracking.nodes.calibration_node import CalibrationNode
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.detection_node import DetectionNode
@@ -102,7 +105,14 @@ def run(network_path, settings, recording=None, rate=1.0, loop=False, observers=
 
     Returns the exit status.
     """
-    rclpy.init()
+    with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
+        return _run_until(lambda: bool(seen), network_path, settings, recording, rate, loop,
+                          observers)
+
+
+def _run_until(stopped, network_path, settings, recording, rate, loop, observers):
+    """As `run`, until `stopped()`."""
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     executor, nodes = make_executor(), []
     try:
         stages, replay = make_nodes(network_path, settings, recording, rate, loop)
@@ -111,15 +121,16 @@ def run(network_path, settings, recording=None, rate=1.0, loop=False, observers=
         for node in nodes:
             executor.add_node(node)
         if replay is None:
-            spin(executor)
+            spin(executor, stopped)
             return 0
         deadline = time.monotonic() + 10.0
-        spin(executor, lambda: all_connected(stages, replay) or time.monotonic() > deadline)
-        if not all_connected(stages, replay):
+        spin(executor, lambda: all_connected(stages, replay) or stopped()
+             or time.monotonic() > deadline)
+        if not all_connected(stages, replay) and not stopped():
             raise MagTrackingError('the nodes did not find each other within 10 s')
         replay.resume()
-        spin(executor, lambda: replay.finished)
-        _work_off(executor, stages)
+        spin(executor, lambda: replay.finished or stopped())
+        _work_off(executor, stages, stopped)
         return 0
     finally:
         for node in nodes:
@@ -129,8 +140,8 @@ def run(network_path, settings, recording=None, rate=1.0, loop=False, observers=
         rclpy.try_shutdown()
 
 
-def _work_off(executor, stages, quiet_s=1.0):
-    """Spin until nothing has moved for `quiet_s` seconds."""
+def _work_off(executor, stages, stopped, quiet_s=1.0):
+    """Spin until nothing has moved for `quiet_s` seconds, or until `stopped()`."""
     def moved():
         return [sum(s.counts.values()) for node in stages for s in node.stages().values()]
 
@@ -141,6 +152,6 @@ def _work_off(executor, stages, quiet_s=1.0):
         now = moved()
         if now != last:
             last, since = now, time.monotonic()
-        return time.monotonic() - since > quiet_s
+        return stopped() or time.monotonic() - since > quiet_s
 
     spin(executor, quiet)

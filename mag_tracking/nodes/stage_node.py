@@ -1,5 +1,7 @@
 """The generic node: parameters, network, diagnostics and the main loop."""
 
+import signal
+
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -7,9 +9,11 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from mag_tracking.errors import MagTrackingError, SettingsError
+from mag_tracking.interrupts import noted_signals
 from mag_tracking.io.network_file import read_network
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.pipeline import settings_for
@@ -105,13 +109,20 @@ def spin(executor, until=lambda: False):
 
 
 def main(node_class, arguments=None):
-    """Run one node as a process; returns the exit status."""
-    rclpy.init(args=arguments)
+    """Run one node as a process until SIGINT or SIGTERM; returns the exit status."""
+    with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
+        return _run_until(seen, node_class, arguments)
+
+
+def _run_until(seen, node_class, arguments):
+    """Run one node until there is something in `seen`."""
+    # Its own handlers raise KeyboardInterrupt wherever Python is, in its C++ too.
+    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     executor, node = make_executor(), None
     try:
         node = node_class()
         executor.add_node(node)
-        spin(executor)
+        spin(executor, lambda: bool(seen))
     except (MagTrackingError, ParameterException) as error:
         rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
         return 1
