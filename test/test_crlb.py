@@ -1,0 +1,349 @@
+"""Information, observability and bounds: the source's check values, laws and oracles."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from mag_tracking.inference.crlb import (
+    bound,
+    cpa_information,
+    information,
+    marginal,
+    observability,
+    path_bound,
+    snr,
+    snr_at_distance,
+    snr_range,
+)
+from mag_tracking.inference.detection_theory import whitened_energy
+from mag_tracking.physics.dipole import K_DIPOLE, dipole_field, dipole_jacobians
+
+NAMES = [f'{state}_{axis}' for state in ('r0', 'v0', 'm') for axis in 'xyz']
+R0, V0, ONES, UP = ([-3.0, 1.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.0, 0.0, 1.0])
+ONE, TWO = [[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]]
+CAR, ROAD = [-20.0, 5.0, 0.4, 10.0, 0.3, 0.0, 200.0, -150.0, 250.0], [[0.0] * 3, [0.0, 9.0, 0.0]]
+NOISE = 1.3e-16
+"""[T^2], TSP14 section VI.B."""
+
+
+def jacobian(m, positions, r0=R0, v0=V0, n_t=60):
+    """(n_t, n_sensors, 3, 9) by [r0, v0, m], tesla; the source moves, hence the minus."""
+    t = 0.1 * np.arange(n_t)[:, None, None]
+    d = np.asarray(positions) - (np.asarray(r0) + t * np.asarray(v0))
+    dB_dd, dB_dm = dipole_jacobians(d, np.asarray(m))
+    return np.concatenate([-dB_dd, -t[..., None] * dB_dd, dB_dm], axis=-1)
+
+
+def unitless(m, positions):
+    """Information of the sources' example: R = I and the field without mu0/4pi."""
+    return information(jacobian(m, positions) / K_DIPOLE, np.eye(3))
+
+
+def car(positions):
+    """Jacobian by [r0, v0, m, b] of a car, b each sensor's background, 40 samples in tesla."""
+    H, n = jacobian(CAR[6:], positions, CAR[:3], CAR[3:6], n_t=40), len(positions)
+    H_b = np.broadcast_to(np.eye(3 * n).reshape(n, 3, 3 * n), (40, n, 3, 3 * n))
+    return np.concatenate([H, H_b], axis=-1)
+
+
+CAR_SCALE = np.repeat([5.0, 5.0, 300.0, 1e-8], [3, 3, 3, 6])
+CORRELATED = NOISE * np.array([[2.0, 0.5, 0.0], [0.5, 1.0, -0.3], [0.0, -0.3, 1.5]])
+
+
+# The field of a moment across the plane of motion shows distances only.
+TURNING = [*np.cross(UP, R0), *np.cross(UP, V0), 0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize('m, sensors, kernel, smallest, condition, unobservable', [
+    (ONES, ONE, [[*R0, *V0, 3, 3, 3]], (0.2305, 5e-5), (np.inf, 0), 'r0_x r0_y v0_x m_x m_y m_z'),
+    (UP, ONE, [[*R0, *V0, 0, 0, 3], TURNING], (0.714, 5e-4), (np.inf, 0),
+     'r0_x r0_y v0_x v0_y m_z'),
+    (ONES, TWO, np.empty((0, 9)), (3.956, 5e-4), (2571, 0.5), ''),
+])
+def test_observability_of_the_sources_example(m, sensors, kernel, smallest, condition,
+                                              unobservable):
+    """Check values of seeds.md item 12, to the digits given there; TSP14 Proposition 1."""
+    o, k = observability(unitless(m, sensors), NAMES), len(kernel)
+    print(f'{len(sensors)} sensors, m = {m}:', o.eigenvalues, o.condition_number)
+    assert np.all(np.abs(o.eigenvalues[:k]) < 1e-12 * o.eigenvalues[-1])
+    assert o.eigenvalues[k] == pytest.approx(smallest[0], abs=smallest[1])
+    assert o.condition_number == pytest.approx(condition[0], abs=condition[1])
+    assert o.kernel_dimension == k and o.unobservable == tuple(unobservable.split())
+    np.testing.assert_allclose(o.kernel @ o.kernel.T @ np.transpose(kernel), np.transpose(kernel),
+                               atol=1e-10)
+
+
+def test_scaled_observability_does_not_depend_on_units():
+    """Metres or millimetres, tesla or nanotesla: with the scale told, the same numbers."""
+    J = information(car(ROAD), NOISE * np.eye(3))
+    unit = np.repeat([1e3, 1e3, 1.0, 1e9], [3, 3, 3, 6])
+    names = NAMES + list('abcdef')
+    ours = observability(J, names, CAR_SCALE)
+    theirs = observability(J / np.outer(unit, unit), names, CAR_SCALE * unit)
+    assert ours.kernel_dimension == 0
+    np.testing.assert_allclose(ours.eigenvalues, theirs.eigenvalues, rtol=1e-6)
+    # Unscaled, a tesla of background drowns all the rest.
+    assert observability(J, names).kernel_dimension > 0
+    # The kernel comes back in metres: [r0, v0, 3 m, 0].
+    one = information(car(ROAD[:1]), NOISE * np.eye(3))
+    kernel = observability(one, names[:12], CAR_SCALE[:12]).kernel
+    x = np.concatenate([CAR[:6], 3.0 * np.array(CAR[6:]), np.zeros(3)])
+    assert kernel.shape == (12, 1)
+    np.testing.assert_allclose(kernel[:, 0] * (x[0] / kernel[0, 0]), x, rtol=1e-6, atol=1e-7)
+
+
+def test_known_cpa_range_makes_one_sensor_observable():
+    J, prior = unitless(ONES, ONE), cpa_information(R0, V0, 0.1)
+    assert observability(J + prior, NAMES).kernel_dimension == 0
+    # Nothing but the prior tells the range, so its bound is the prior's own.
+    gradient = np.array([0.0, 1.0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0, 0.0])
+    assert gradient @ bound(J, prior) @ gradient == pytest.approx(0.1**2, rel=1e-9)
+    # Not so where the kernel is larger: the heading remains.
+    assert observability(unitless(UP, ONE) + prior, NAMES).kernel_dimension == 1
+
+
+def test_cpa_gradient_is_that_of_the_range():
+    """Against central differences: the minus sign that TSP14 does not print."""
+    def cpa_range(x):
+        return np.linalg.norm(np.cross(x[:3], x[3:6])) / np.linalg.norm(x[3:6])
+
+    x, step = np.array([-4.0, 2.0, 0.7, 3.0, 0.5, -0.2, *ONES]), 1e-5
+    gradient = np.array([(cpa_range(x + e) - cpa_range(x - e)) / (2 * step)
+                         for e in step * np.eye(9)])
+    np.testing.assert_allclose(cpa_information(x[:3], x[3:6], 0.3),
+                               np.outer(gradient, gradient) / 0.3**2, rtol=1e-7, atol=1e-8)
+
+
+def test_estimate_of_a_linear_model_reaches_the_bound():
+    rng, n, H = np.random.default_rng(3), 4000, car(ROAD)
+    P = bound(information(H, CORRELATED), np.diag(1.0 / CAR_SCALE**2))
+    L = np.linalg.cholesky(CORRELATED)
+    x = CAR_SCALE * rng.standard_normal((n, 15))
+    y = np.einsum('tsai,ni->ntsa', H, x)
+    y += np.einsum('ab,ntsb->ntsa', L, rng.standard_normal(y.shape))
+    # The estimate by another road: least squares of x / scale on rows whitened by Cholesky.
+    A = np.vstack([np.linalg.solve(L, H).reshape(-1, 15) * CAR_SCALE, np.eye(15)])
+    z = np.hstack([np.linalg.solve(L, y[..., None]).reshape(n, -1), np.zeros((n, 15))])
+    e = CAR_SCALE * np.linalg.lstsq(A, z.T, rcond=None)[0].T - x
+    nees = np.einsum('ni,ij,nj->', e, np.linalg.inv(P), e)
+    low, high = chi2.ppf([0.005, 0.995], 15 * n) / (15 * n)
+    print(f'NEES per state {nees / (15 * n):.4f}, limits {low:.4f} .. {high:.4f}')
+    assert low <= nees / (15 * n) <= high
+    # Each variance by itself, at one chance in a hundred over all fifteen.
+    low, high = chi2.ppf([0.005 / 15, 1.0 - 0.005 / 15], n) / n
+    ratio = (e**2).mean(axis=0) / np.diag(P)
+    assert np.all((low <= ratio) & (ratio <= high)), ratio
+
+
+@pytest.mark.parametrize('m', [ONES, UP])
+def test_unobservable_states_have_infinite_variance_and_the_others_the_limit(m):
+    J = unitless(m, ONE)
+    P = bound(J)
+    lost = np.isin(NAMES, observability(J, NAMES).unobservable)
+    assert np.array_equal(np.isinf(np.diag(P)), lost)
+    assert np.all(np.isnan(P[lost][:, ~lost])) and np.all(np.isfinite(P[np.ix_(~lost, ~lost)]))
+    for weak in (1e-6 * np.eye(9), 1e-6 * np.diag(1.0 + np.arange(9.0))):
+        limit = np.linalg.inv(J + weak)[np.ix_(~lost, ~lost)]
+        np.testing.assert_allclose(P[np.ix_(~lost, ~lost)], limit, rtol=1e-4, atol=1e-5)
+
+
+def test_a_state_with_a_small_part_in_what_is_lost_is_lost():
+    """Its part is so small that the others by themselves look unobservable."""
+    A = np.random.default_rng(4).standard_normal((20, 6))
+    n = np.array([1e-5, 1.0, -2.0, 1.0, 0.0, 3.0])
+    A -= np.outer(A @ n, n) / (n @ n)
+    J = A.T @ A
+    lost = n != 0.0
+    assert np.array_equal(np.isinf(np.diag(bound(J))), lost)
+    for i in range(6):
+        assert np.isinf(bound(marginal(J, [i]))[0, 0]) == lost[i]
+    # And one of which nothing at all is known, beside units of many decades.
+    np.testing.assert_allclose(bound(np.diag([4.0, 0.0, 1e16])), [
+        [0.25, np.nan, 0.0], [np.nan, np.inf, np.nan], [0.0, np.nan, 1e-16]], rtol=1e-12)
+
+
+def test_bound_of_an_observable_case_is_the_inverse_in_any_units():
+    J, unit = unitless(ONES, TWO), 10.0 ** np.arange(-12, 15, 3)
+    expected = np.linalg.inv(J)
+    P = bound(J * np.outer(unit, unit)) * np.outer(unit, unit)
+    np.testing.assert_allclose(P, expected, rtol=1e-9, atol=1e-9 * expected.max())
+
+
+def test_prior_bounds_the_bound():
+    """MITRE12 figure 5: far away the bounds approach the prior's, and never exceed them."""
+    std = np.array([30.0, 5.0, 1.0, 4.5, 1.0, 0.1, 100.0, 100.0, 100.0])
+    near, far = (np.sqrt(np.diag(bound(information(
+        jacobian(CAR[6:], ONE, [-20.0, y, 0.0], [11.0, 0.0, 0.0]), NOISE * np.eye(3)),
+        np.diag(std**-2)))) for y in (5.0, 300.0))
+    assert np.all(near <= std) and near[0] < 0.1 * std[0]
+    np.testing.assert_allclose(far, std, rtol=1e-3)
+
+
+def test_states_known_exactly_are_as_if_they_were_not_estimated():
+    """MITRE12 section 4.3: variance zero."""
+    J, free = unitless(ONES, ONE), np.ix_([1, 2, 3, 5, 6, 7, 8], [1, 2, 3, 5, 6, 7, 8])
+    expected = np.zeros((9, 9))
+    expected[free] = np.linalg.inv(J[free])
+    prior = np.diag([np.inf, 0.0, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(bound(J, prior), expected, rtol=1e-8, atol=1e-10)
+
+
+def test_marginal_information_is_the_schur_complement():
+    J, keep = information(car(ROAD), CORRELATED) * np.outer(CAR_SCALE, CAR_SCALE), [5, 0, 1]
+    ours, rest = marginal(J, keep), np.setdiff1d(np.arange(15), keep)
+    block = np.linalg.inv(J)[np.ix_(keep, keep)]
+    np.testing.assert_allclose(ours @ block, np.eye(3), atol=1e-8)
+    mixed = J[np.ix_(keep, rest)]
+    schur = J[np.ix_(keep, keep)] - mixed @ np.linalg.inv(J[np.ix_(rest, rest)]) @ mixed.T
+    np.testing.assert_allclose(ours, schur, rtol=1e-6)
+    np.testing.assert_array_equal(marginal(J, np.arange(15) < 6), marginal(J, range(6)))
+
+
+@pytest.mark.parametrize('keep', [[0], [2], [2, 0], [0, 1, 2], [3, 4, 5], [6, 7, 8], range(9)])
+@pytest.mark.parametrize('m', [ONES, UP])
+def test_marginal_information_of_what_is_lost_is_lost(m, keep):
+    """What rounding leaves of it must not come back as an enormous but finite bound."""
+    J, keep = unitless(m, ONE), np.array(keep)
+    whole, part = bound(J)[np.ix_(keep, keep)], bound(marginal(J, keep))
+    assert np.array_equal(np.isinf(np.diag(part)), np.isinf(np.diag(whole)))
+    np.testing.assert_allclose(part, whole, rtol=1e-6, atol=1e-9)
+
+
+def plain_kalman(F, Q, H, C, P):
+    """The textbook recursion, each sensor's rows stacked: the oracle."""
+    out = []
+    for F_k, Q_k, H_k in zip(F, Q, H, strict=True):
+        P = F_k @ P @ F_k.T + Q_k
+        there = ~np.isnan(H_k).any(axis=-1).ravel()
+        A = H_k.reshape(-1, H_k.shape[-1])[there]
+        R = np.kron(np.eye(len(H_k)), C)[np.ix_(there, there)]
+        K = P @ A.T @ np.linalg.inv(A @ P @ A.T + R)
+        P = P - K @ A @ P
+        out.append(P)
+    return np.array(out)
+
+
+def filter_problem():
+    """A car as [r, v, m, b]: Jacobians along its path, with sensors and axes missing."""
+    dt, n = 0.1, 40
+    F, Q, H = np.eye(15), np.zeros((15, 15)), car(ROAD)
+    F[:3, 3:6] = dt * np.eye(3)
+    Q[:6, :6] = 0.25 * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(3))
+    H[..., 3:6] = 0.0
+    H[7:9, 1] = H[20, 0, 2] = np.nan
+    P0 = np.diag(np.repeat([25.0, 25.0, 9e4, 1e-16], [3, 3, 3, 6]))
+    return np.repeat(F[None], n, 0), np.repeat(Q[None], n, 0), H, P0
+
+
+def relative(P, expected):
+    """Difference in units of the standard deviations."""
+    std = np.sqrt(np.einsum('...ii->...i', expected))
+    return np.abs((P - expected) / (std[..., :, None] * std[..., None, :])).max()
+
+
+def test_path_bound_is_the_kalman_filters_covariance():
+    F, Q, H, P0 = filter_problem()
+    expected = plain_kalman(F, Q, H, CORRELATED, P0)
+    P = path_bound(F, Q, H, CORRELATED, P0)
+    print('path bound against the filter:', relative(P, expected))
+    assert relative(P, expected) < 1e-7
+    assert P[-1][0, 0] < 0.02 * P0[0, 0]
+    # Whitened beforehand, and one F and Q for all steps.
+    white = np.linalg.solve(np.linalg.cholesky(CORRELATED), H[:7])
+    assert relative(path_bound(F[0], Q[0], white, None, P0), expected[:7]) < 1e-7
+
+
+def test_path_bound_accepts_what_is_known_exactly():
+    """A start without variance, and heights that never change."""
+    (F, Q, H, P0), known = filter_problem(), [2, 5, 8]
+    Q[:, known] = Q[:, :, known] = P0[known, known] = 0.0
+    P = path_bound(F, Q, H, CORRELATED, P0)
+    assert np.all(P[:, known] == 0.0)
+    free = np.setdiff1d(np.arange(15), known)
+    few = np.ix_(range(40), free, free)
+    expected = plain_kalman(F[few], Q[few], H[..., free], CORRELATED, P0[np.ix_(free, free)])
+    assert relative(P[few], expected) < 1e-7
+
+
+def test_path_bound_without_process_noise_ends_at_the_batch_bound():
+    F, Q, H, P0 = filter_problem()
+    F[0] = np.eye(15)
+    P = path_bound(F, 0.0 * Q, H, CORRELATED, P0)
+    # The batch is about the start, the filter's last step 39 samples later.
+    H_batch = H.copy()
+    H_batch[..., 3:6] = 0.1 * np.arange(40)[:, None, None, None] * H[..., :3]
+    shift = np.eye(15) + 3.9 * np.eye(15, k=3) * (np.arange(15) < 6)
+    batch = shift @ bound(information(H_batch, CORRELATED), np.linalg.inv(P0)) @ shift.T
+    assert relative(P[-1], batch) < 1e-7
+
+
+def test_missing_axes_and_sensors_count_for_nothing():
+    H = car(ROAD)[:5]
+    H[1, 0] = H[2, 1, 1] = np.nan
+    C = np.repeat(CORRELATED[None], 2, axis=0) * np.array([1.0, 3.0])[:, None, None]
+    J = np.zeros((15, 15))
+    for t, j in np.ndindex(5, 2):
+        p = np.flatnonzero(~np.isnan(H[t, j, :, 0]))
+        J += H[t, j, p].T @ np.linalg.inv(C[j][np.ix_(p, p)]) @ H[t, j, p]
+    ours, size = information(H, C), np.outer(CAR_SCALE, CAR_SCALE)
+    np.testing.assert_allclose(ours * size, J * size, rtol=1e-12, atol=1e-12 * (J * size).max())
+    # The noise of what is missing is not read.
+    C = np.broadcast_to(C, (5, 2, 3, 3)).copy()
+    C[1, 0], C[2, 1, 1], C[2, 1, :, 1] = np.nan, np.nan, np.nan
+    np.testing.assert_array_equal(information(H, C), ours)
+    assert np.all(information(np.full((4, 3, 9), np.nan), np.eye(3)) == 0.0)
+
+
+def test_snr_is_the_energy_of_the_field_and_least_abeam():
+    """T10 (5.21) is the least over all directions; four times as much along the axis."""
+    h = 1e-8 * np.array([[1.0, -2.0, 0.5], [1.0, np.nan, 2.0], [np.nan] * 3])
+    expected, _ = whitened_energy(h, np.repeat(CORRELATED[None], 3, axis=0))
+    np.testing.assert_allclose(snr(h, CORRELATED), expected, rtol=1e-12)
+    r = np.random.default_rng(1).standard_normal((1000, 3))
+    r *= 12.0 / np.linalg.norm(r, axis=1, keepdims=True)
+    r[0] = [12.0, 0.0, 0.0]
+    exact = snr(dipole_field(r, [0.0, 0.0, 450.0]), NOISE * np.eye(3))
+    exact /= snr_at_distance(450.0, np.sqrt(NOISE), 12.0)
+    assert exact[0] == pytest.approx(1.0, rel=1e-12)
+    assert exact.min() > 1.0 - 1e-12 and 3.9 < exact.max() <= 4.0
+
+
+def test_range_of_a_magnetometer_is_about_ten_metres():
+    """T10 (5.22)-(5.24), (6.1), and the same at TSP14's scale, which is the right one."""
+    t10 = snr_range(1.0, np.sqrt(1e-21), 9.2)
+    cars = snr_range(np.array([300.0, 600.0, 1800.0]), np.sqrt(NOISE), 9.2)
+    print(f'range: {t10:.2f} m; cars and truck {cars}')
+    assert t10 == pytest.approx((1e7 / 9.2) ** (1 / 6), rel=1e-12)
+    assert cars == pytest.approx([9.54, 12.02, 17.33], abs=0.01)
+    assert snr_at_distance(1.0, np.sqrt(1e-21), 4.5) == pytest.approx(1200, abs=10)
+    assert snr_at_distance(300.0, np.sqrt(NOISE), cars[0]) == pytest.approx(9.2, rel=1e-12)
+
+
+H9, I9, SKEW = np.ones((4, 3, 9)), np.eye(9), np.eye(3) + 0.5 * np.eye(3, k=1)
+
+
+@pytest.mark.parametrize('call, named', [
+    (lambda: information(H9, np.ones((1, 3))), r'C has shape \(1, 3\), needed is \(4, 3, 3\)'),
+    (lambda: information(H9, np.ones((5, 3, 3))), r'C has shape \(5, 3, 3\)'),
+    (lambda: information(H9, 1e-16 * np.ones((3, 3))), r'C\[0\] is not positive definite.*1e-16'),
+    (lambda: information(H9, -1e-16 * np.eye(3)), r'C\[0\] is not positive semidefinite.*-1e-16'),
+    (lambda: information(H9, np.nan * np.eye(3)), r'C\[0\] is not finite'),
+    (lambda: information(H9, 1e-16 * SKEW), r'C\[0\] is not symmetric'),
+    (lambda: information(np.where(np.arange(9) == 4, np.nan, H9)), r'row of H \[0, 0\] is not fin'),
+    (lambda: observability(np.ones((9, 8)), NAMES), r'information has to be square.*\(9, 8\)'),
+    (lambda: observability(I9, NAMES[:8]), '9 states need as many names'),
+    (lambda: observability(I9, NAMES, np.zeros(9)), 'positive scales.*0.0'),
+    (lambda: bound(I9, -2.0 * I9), 'prior is not positive semidefinite.*-2.0'),
+    (lambda: marginal(I9, [9]), 'keep does not fit 9 states.*9'),
+    (lambda: marginal(I9, [1, 1]), r'twice: \[1, 1\]'),
+    (lambda: cpa_information(R0, V0, 0.0), 'std has to be positive.*0.0'),
+    (lambda: cpa_information(R0, [0.0, 0.0, 0.0], 1.0), 'v0 not zero'),
+    (lambda: cpa_information(R0[:2], V0, 1.0), r'shape \(3,\), got \(2,\)'),
+    (lambda: cpa_information([-6.0, 2.0, 0.4], [3.0, -1.0, -0.2], 1.0), r'\[-6.0, .* is parallel'),
+    (lambda: path_bound(I9, 0 * I9, H9[0], None, I9), r'leading axis of steps, got \(3, 9\)'),
+    (lambda: path_bound(I9, -I9, H9, None, I9), r'Q\[0\] is not positive semidefinite'),
+    (lambda: path_bound(I9, 0 * I9, H9, None, -I9), 'P0 is not positive semidefinite'),
+])
+def test_bad_input_is_refused_with_its_value(call, named):
+    with pytest.raises(ValueError, match=named):
+        call()
