@@ -86,7 +86,7 @@ def draw(spectator, out):
             figure.savefig(paths[-1], dpi=110)
         summary = {**log.summary(), 'truth': pass_errors(log, truth, network.centre)}
         (out / f'track_{log.id}.json').write_text(json.dumps(summary, indent=1) + '\n')
-        print(f'\ntrack {log.id}: from {summary["arrival"]}, '
+        print(f'\ntrack {log.id}: a {summary["kind"]} from {summary["arrival"]}, '
               f'{summary["speed"]:.1f} m/s, {summary["moment_size"]:.0f} A m²; '
               f'error at the closest point {summary["truth"]["closest"]:.2f} m, '
               f'within 5 m RMS {summary["truth"]["rms"] or float("nan"):.2f} m')

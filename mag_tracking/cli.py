@@ -165,6 +165,7 @@ def _print_summary(path, summary):
         print(f'  track {t["id"]}: {t["poses"]} poses'
               + (f', from {t["arrival"]} ({t["arrival_weights"][t["arrival"]]:.0%})'
                  if t['arrival'] else '')
+              + (f', a {t["kind"]} ({t["kind_weight"]:.0%})' if t['kind'] else '')
               + f', {t["speed"]:.2f} m/s, {t["moment_size"]:.3g} A m^2, {t["verdict"]}')
         for name, m in t['mounting'].items():
             if m['suspicious']:

@@ -8,9 +8,9 @@ from mag_tracking.errors import OutputError
 from mag_tracking.io.results import ResultFolder
 from mag_tracking.io.samples import SampleReader
 from mag_tracking.pipeline import Pipeline
-from mag_tracking.records import Detection, FieldFrame
+from mag_tracking.records import Detection, FieldFrame, SmoothedPose
 from mag_tracking.report.metrics import interpolate_truth, magnet_errors, pass_errors
-from mag_tracking.report.track_log import TrackLog
+from mag_tracking.report.track_log import SmoothedLog, TrackLog
 
 SUSPICIOUS = 2.0
 """A sensor that seems to be turned by more prior deviations than this is reported."""
@@ -23,6 +23,8 @@ class Run:
     summary: dict
     logs: dict = field(default_factory=dict)
     """{track id: TrackLog}."""
+    smoothed: dict = field(default_factory=dict)
+    """{track id: SmoothedLog}, of the tracks that were smoothed."""
     truth: dict = field(default_factory=dict)
     """{name: (stamps, positions, quaternions)}."""
 
@@ -57,7 +59,7 @@ def replay(recording, network, settings, out, progress=None, stopped=None):
         raise OutputError(f'{out} is the folder of the recording; the results would overwrite it')
     reader = SampleReader(recording, network)
     pipeline = Pipeline(network, settings)
-    logs, interrupted = {}, False
+    interrupted = False
 
     def advance(n):
         if progress is not None:
@@ -66,36 +68,47 @@ def replay(recording, network, settings, out, progress=None, stopped=None):
             raise _Stopped
 
     with ResultFolder(out, network.frame) as results:
-        frame = None
+        taker = _Taker(results)
         try:
             for sample in reader.samples(advance):
                 if stopped is not None and stopped():
                     raise _Stopped
-                frame = _take(pipeline.feed(sample), frame, results, logs)
+                taker.take(pipeline.feed(sample))
         except _Stopped:
             interrupted = True
-        _take(pipeline.flush(), frame, results, logs)
+        taker.take(pipeline.flush())
         truth = reader.truth_arrays()
-        summary = _summary(recording, reader, pipeline, logs, truth)
+        summary = _summary(recording, reader, pipeline, taker, truth)
         summary['interrupted'] = interrupted
         results.write_summary(summary)
-    return Run(summary, logs, truth)
+    return Run(summary, taker.logs, taker.smoothed, truth)
 
 
-def _take(records, frame, results, logs):
-    """Write what left the pipeline; returns the latest frame."""
-    for record in records:
-        if isinstance(record, FieldFrame):
-            frame = record
-        elif isinstance(record, Detection):
-            results.add_detection(record)
-        else:
-            results.add_track(record)
-            logs.setdefault(record.id, TrackLog(record.id)).add(record, frame)
-    return frame
+class _Taker:
+    """Writes what leaves the pipeline, and remembers it for the summary and the figures."""
+
+    def __init__(self, results):
+        self._results = results
+        self._frame = None
+        self.logs, self.smoothed = {}, {}
+
+    def take(self, records):
+        """Take what one sample led to."""
+        for record in records:
+            if isinstance(record, FieldFrame):
+                self._frame = record
+            elif isinstance(record, Detection):
+                self._results.add_detection(record)
+            elif isinstance(record, SmoothedPose):
+                self._results.add_smoothed(record)
+                if record.complete:
+                    self.smoothed.setdefault(record.id, SmoothedLog(record.id)).add(record)
+            else:
+                self._results.add_track(record)
+                self.logs.setdefault(record.id, TrackLog(record.id)).add(record, self._frame)
 
 
-def _summary(recording, reader, pipeline, logs, truth):
+def _summary(recording, reader, pipeline, taker, truth):
     """The content of `summary.json`."""
     rejections = dict(reader.rejected)
     for cause, n in pipeline.rejections().items():
@@ -111,17 +124,26 @@ def _summary(recording, reader, pipeline, logs, truth):
             sensors[name]['noise_std'] = [None if np.isnan(v) else float(v) for v in std]
             sensors[name]['background'] = [
                 None if np.isnan(v) else float(v) for v in pipeline.calibrate.background(name)]
-    tracks = []
-    for log in logs.values():
-        entry = log.summary()
-        entry['mounting'] = _mounting(log, pipeline)
-        errors = _against_truth(log, pipeline, truth)
-        if errors:
-            entry['truth'] = errors
-        tracks.append(entry)
+    tracks = [_track_entry(log, taker.smoothed.get(log.id), pipeline, truth)
+              for log in taker.logs.values()]
     return {'recording': recording.path.name, 'target': pipeline.settings.track.target,
             'counts': pipeline.counts(), 'rejected': rejections, 'lost': dict(recording.losses),
             'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks}
+
+
+def _track_entry(log, smoothed, pipeline, truth):
+    """One track in the summary; `smoothed` is its `SmoothedLog` or None."""
+    entry = log.summary()
+    entry['mounting'] = _mounting(log, pipeline)
+    errors = _against_truth(log, pipeline, truth)
+    if errors:
+        entry['truth'] = errors
+    if smoothed is not None:
+        entry['smoothed'] = smoothed.summary()
+        errors = _against_truth(smoothed, pipeline, truth)
+        if errors:
+            entry['smoothed']['truth'] = errors
+    return entry
 
 
 def _mounting(log, pipeline):
@@ -163,7 +185,8 @@ def write_figures(run, network, out, most=6, stopped=None):
         truth = None
         if 'truth' in entry:
             truth = interpolate_truth(run.truth[entry['truth']['name']], log.stamp_ns)
-        for name, figure in (('map', map_figure(log, network, truth)),
+        for name, figure in (('map', map_figure(
+                log, network, truth, run.smoothed.get(log.id))),
                              ('weights', weights_figure(log)),
                              ('field', field_figure(log, network))):
             path = out / f'{name}_track_{log.id}.png'

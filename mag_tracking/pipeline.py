@@ -32,7 +32,6 @@ TARGET_DEFAULTS = {
         'align.max_wait_s': 2.0,
         'detect.onset_frames': 1,
         'detect.background_std': 5e-7,
-        'track.near_field_length': 5e-4,
         'track.field_error': 0.01,
         'track.mounting_std_deg': 0.0,
         'track.model_error_time_s': 0.0,

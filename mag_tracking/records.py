@@ -68,6 +68,42 @@ class Hypothesis:
     """(6, 6) of position and velocity."""
     moment: np.ndarray
     """(3,) [A m^2], world."""
+    kind: str
+    """The kind of target that it assumed; empty where there is only one."""
+
+
+@dataclass(frozen=True, slots=True)
+class SmoothedPose:
+    """A target at one time, by what came before it and after."""
+
+    stamp_ns: int
+    id: int
+    """Of the track."""
+    position: np.ndarray
+    """(3,) [m], world."""
+    velocity: np.ndarray
+    """(3,) [m/s], world."""
+    covariance: np.ndarray
+    """(6, 6) of position and velocity, world."""
+    orientation: np.ndarray
+    """(4,) quaternion xyzw, body to world."""
+    orientation_covariance: np.ndarray
+    """(3, 3) [rad^2], small rotations about the fixed world axes."""
+    position_orientation_covariance: np.ndarray
+    """(3, 3) [m rad]."""
+    moment: np.ndarray
+    """(3,) [A m^2], world."""
+    moment_covariance: np.ndarray
+    """(3, 3)."""
+    kind: str
+    length: float
+    """[m] of the row of dipoles that the target is taken for; 0 for a point."""
+    length_std: float
+    """[m]; 0 for a point."""
+    ambiguous: bool
+    """Something else was still possible when it was smoothed."""
+    complete: bool
+    """All of the track was used; else what came within a fixed lag."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +136,14 @@ class Track:
     """Normalised innovation squared of the published hypothesis; NaN without a measurement."""
     degrees_of_freedom: int
     arrival: str
+    kind: str
+    """Of target, that of the published hypothesis; empty where there is only one."""
+    kind_weight: float
+    """Of all hypotheses of that kind, 0..1."""
+    length: float
+    """[m] of the row of dipoles that the target is taken for; 0 for a point."""
+    length_std: float
+    """[m]; 0 for a point."""
     ambiguous: bool
     unobservable: tuple[bool, ...]
     """(6): x, y, z, and rotation about the body's x, y, z."""

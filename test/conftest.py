@@ -19,6 +19,12 @@ DATA = ROOT / 'test' / 'data'
 VEHICLES = sorted(p.stem for p in (DATA / 'vehicles').glob('*.mcap'))
 NETWORK_FILE = ROOT / 'config' / 'network.yaml'
 
+POINT = {f'track.vehicle.{name}': [value] for name, value in {
+    'kinds': 'car', 'lengths': 0.0, 'length_stds': 0.0, 'moments': 400.0, 'moment_stds': 150.0,
+    'difference_stds': 0.0, 'heights': 0.5, 'height_stds': 0.2,
+    'near_field_lengths': 1.0}.items()}
+"""Settings of a tracker that knows point targets only."""
+
 # Keep the middleware to this machine, and apart from other runs on it.
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)

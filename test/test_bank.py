@@ -8,7 +8,7 @@ from scipy.special import logsumexp
 from mag_tracking.inference import kalman
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
 from mag_tracking.physics.dipole import MU0, sensor_fields
-from mag_tracking.physics.sources import PointVehicle
+from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.stages.pose import published_track, vehicle_orientation
 from mag_tracking.stages.vehicle_start import moment_directions
 
@@ -18,33 +18,37 @@ def bank(n=4, spread=10.0, label=None):
     x[:, 0] = spread * np.arange(n)
     P = np.repeat(np.eye(7)[None], n, axis=0)
     return FilterBank(x, P, np.full(n, -np.log(n)),
-                      np.arange(n) if label is None else np.array(label), np.arange(n) + 0.5)
+                      np.arange(n) if label is None else np.array(label),
+                      np.zeros(n, dtype=int), np.arange(n), np.arange(n) + 0.5)
 
 
 def test_the_innovations_stay_with_their_hypotheses():
     b = bank(6)
     b.log_w = np.log([0.1, 0.3, 1e-14, 0.2, 0.2, 0.2])
-    b.x[4, 0] = b.x[3, 0]
-    b.label[4] = b.label[3]
+    b.kind = 10 * np.arange(6)
     b.prune(20.0, 100)
-    b.merge(7, 0.5)
-    assert b.nis.tolist() == [0.5, 1.5, 3.5, 5.5]
+    assert b.nis.tolist() == [0.5, 1.5, 3.5, 4.5, 5.5]
+    assert b.kind.tolist() == [0, 10, 30, 40, 50]
+    assert b.origin.tolist() == b.label.tolist() == [0, 1, 3, 4, 5]
 
 
 @pytest.mark.parametrize('other, label, ambiguous', [
     (0.01, 1, False), (0.2, 1, True), (0.2, 0, False)])
 def test_another_arrival_makes_a_track_ambiguous_even_where_the_places_agree(
         other, label, ambiguous):
-    model = PointVehicle(np.zeros(3), np.ones(3), 1.0)
+    model = RowVehicle(np.zeros(3), np.ones(3), n_dipoles=1)
     x = np.tile([1.0, 2.0, 0.5, 10.0, 0.0, 0.0, 100.0, 0.0, 0.0, 0.0], (2, 1))
     b = FilterBank(x, np.repeat(np.eye(10)[None], 2, axis=0), np.log([other, 1.0 - other]),
-                   np.array([label, 0]), np.array([7.0, 3.0]))
+                   np.array([label, 0]), np.array([0, 1]), np.arange(2), np.array([7.0, 3.0]))
     track = published_track(
-        b, 1, model, vehicle_orientation, ('left', 'right'), False, stamp_ns=1, id=1, ended=False,
+        b, 1, model, vehicle_orientation, ('left', 'right'), ('car', 'truck'),
+        False, stamp_ns=1, id=1, ended=False,
         existence=1.0, degrees_of_freedom=6, predicted=np.zeros((2, 3)),
         mounting=np.zeros((0, 3)), mounting_std=np.zeros((0, 3)))
     assert track.ambiguous == ambiguous
-    assert (track.arrival, track.nis) == ('left', 3.0)
+    assert (track.arrival, track.nis, track.kind) == ('left', 3.0, 'truck')
+    assert track.kind_weight == pytest.approx(1.0 - other)
+    assert [h.kind for h in track.hypotheses] == ['truck', 'car']
 
 
 def test_log_sum_exp_equals_scipy_and_survives_extremes():
@@ -88,31 +92,17 @@ def test_prune_by_ratio_and_by_number():
     assert len(b) == len(b.x) == len(b.P) == len(b.label) == 2
 
 
-def test_merge_joins_what_is_close_and_keeps_mean_and_covariance():
-    b = bank(3, spread=0.2, label=[0, 0, 0])
-    b.x[2, 0] = 50.0
-    b.log_w = np.log([0.5, 0.3, 0.2])
-    w, x, P = np.exp(b.log_w[:2]) / 0.8, b.x[:2].copy(), b.P[:2].copy()
-    assert b.merge(6, 0.5) == 1
-    mean = w @ x
-    np.testing.assert_allclose(b.x[0], mean)
-    spread = np.einsum('n,ni,nj->ij', w, x - mean, x - mean)
-    np.testing.assert_allclose(b.P[0], w[0] * P[0] + w[1] * P[1] + spread)
-    np.testing.assert_allclose(np.exp(b.log_w), [0.8, 0.2])
-    np.testing.assert_allclose(b.x[1, 0], 50.0)
-
-
-def test_merge_never_joins_separated_or_differently_labelled_ones():
-    apart = bank(2, spread=10.0, label=[0, 0])
-    assert apart.merge(6, 0.5) == 0
-    other = bank(2, spread=0.0, label=[0, 1])
-    assert other.merge(6, 0.5) == 0
-
-
 def test_the_best_is_the_heaviest_of_the_heaviest_label():
     b = bank(3, label=[0, 1, 1])
     b.log_w = np.log([0.4, 0.35, 0.25])
     assert b.best() == 1
+
+
+def test_the_best_is_of_the_heaviest_kind_of_the_heaviest_arrival():
+    b = bank(4, label=[0, 1, 1, 1])
+    b.kind = np.array([0, 0, 1, 1])
+    b.log_w = np.log([0.35, 0.25, 0.22, 0.18])
+    assert b.best() == 2
 
 
 def test_separated_weight_counts_only_what_is_apart():
@@ -148,7 +138,7 @@ def matched_run(rng, network, model, sigma):
     for k in range(22):
         if k:
             moved, F, Q = model.propagate(truth[None, :10], dt)
-            truth[:10] = moved[0] + rng.multivariate_normal(np.zeros(10), Q)
+            truth[:10] = moved[0] + rng.multivariate_normal(np.zeros(10), Q[0])
             truth[10:] += 1e-9 * np.sqrt(dt) * rng.standard_normal(n_x - 10)
             x_target, F, Q = model.propagate(bank.x[:, :10], dt)
             kalman.predict(bank.x, bank.P, x_target, F, Q, 1e-18 * dt)
@@ -168,7 +158,7 @@ def test_anees_of_the_matched_case():
     """200 runs, two sensors, 12.5 Hz, tight prior, 126 starts: position and velocity."""
     earth = np.array([2e-6, 1.55e-5, -4.9e-5])
     network = line_network(2, tilt=0.0)
-    model = PointVehicle(earth, np.array([0.1, 0.1, 1e-4]), 1.0)
+    model = RowVehicle(earth, np.array([0.1, 0.1, 1e-4]), 0.003, n_dipoles=1)
     rng = np.random.default_rng(42)
     nees = np.array([matched_run(rng, network, model, 1.2e-8 / np.sqrt(8.0))
                      for _ in range(200)])

@@ -12,7 +12,7 @@ import pytest
 from conftest import DATA, NETWORK_FILE, vehicle_path
 
 from mag_tracking.cli import main
-from mag_tracking.io.results import DETECTION_COLUMNS, POSE_COLUMNS
+from mag_tracking.io.results import DETECTION_COLUMNS, POSE_COLUMNS, SMOOTHED_COLUMNS
 
 NAME = 'junction_left_to_right'
 
@@ -22,16 +22,19 @@ def test_replay_writes_all_that_it_promises(tmp_path, capsys):
     assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE),
                  '--out', str(out)]) == 0
     assert {p.name for p in out.iterdir()} == {
-        'poses.csv', 'detections.csv', 'hypotheses.csv', 'summary.json', 'tracks.mcap',
-        'metadata.yaml', 'map_track_1.png', 'weights_track_1.png', 'field_track_1.png'}
+        'poses.csv', 'poses_smoothed.csv', 'detections.csv', 'hypotheses.csv', 'summary.json',
+        'tracks.mcap', 'metadata.yaml', 'map_track_1.png', 'weights_track_1.png',
+        'field_track_1.png'}
     head = (out / 'poses.csv').read_text().splitlines()[0]
     assert head == ('stamp_ns,track_id,x,y,z,vx,vy,vz,sd_x,sd_y,sd_z,sd_vx,sd_vy,sd_vz,'
-                    'mx,my,mz,weight,ambiguous') == ','.join(POSE_COLUMNS)
+                    'mx,my,mz,weight,ambiguous,kind,kind_weight,length,sd_length'
+                    ) == ','.join(POSE_COLUMNS)
+    assert (out / 'poses_smoothed.csv').read_text().splitlines()[0] == ','.join(SMOOTHED_COLUMNS)
     assert (out / 'detections.csv').read_text().splitlines()[0] == ','.join(DETECTION_COLUMNS)
     track = json.loads((out / 'summary.json').read_text())['tracks'][0]
     assert track['arrival'] == 'left' and track['verdict'] == 'unique'
-    assert {'speed', 'moment', 'poses', 'truth'} <= set(track)
-    assert 'from left' in capsys.readouterr().out
+    assert {'speed', 'moment', 'poses', 'truth', 'smoothed', 'kind'} <= set(track)
+    assert 'from left (100%), a car (100%)' in capsys.readouterr().out
 
 
 def test_several_recordings_get_a_folder_each(tmp_path):
@@ -71,7 +74,7 @@ def test_failures_are_one_clear_line(tmp_path, capsys):
     assert 'there is no' in fail(capsys, 'replay', tmp_path / 'x.mcap', *common)
     typo = tmp_path / 'typo.yaml'
     typo.write_text('track: {vehicle: {momnet: 3.0}}')
-    assert 'did you mean track.vehicle.moment?' in fail(
+    assert 'did you mean track.vehicle.moments?' in fail(
         capsys, 'replay', recording, *common, '--params', typo)
     blocked = tmp_path / 'blocked'
     blocked.write_text('a file')
@@ -197,11 +200,11 @@ def test_an_interruption_need_not_wait_for_the_next_sample(tmp_path, monkeypatch
     assert not waited and summary_of(tmp_path)['interrupted'] is True
 
 
-@pytest.mark.parametrize('step', ['_summary', '_take', '_against_truth', 'write_figures'])
+@pytest.mark.parametrize('step', ['_summary', 'take', '_against_truth', 'write_figures'])
 def test_an_interruption_while_writing_loses_nothing(tmp_path, monkeypatch, capsys, step):
     """First or second, in the middle of an update or of what is written at the end."""
     from mag_tracking import cli, offline
-    module = cli if step == 'write_figures' else offline
+    module = {'write_figures': cli, 'take': offline._Taker}.get(step, offline)
     whole, count = getattr(module, step), []
 
     def impatient(*args, **named):
@@ -212,7 +215,7 @@ def test_an_interruption_while_writing_loses_nothing(tmp_path, monkeypatch, caps
 
     monkeypatch.setattr(module, step, impatient)
     assert replay_one(tmp_path) == 130
-    assert summary_of(tmp_path)['interrupted'] is (step == '_take')
+    assert summary_of(tmp_path)['interrupted'] is (step == 'take')
     assert 'interrupted; what was done is in' in capsys.readouterr().out
     assert not list(tmp_path.glob('*.png'))
 

@@ -79,12 +79,19 @@ def test_a_wrong_last_axis_is_named():
         dipole_field(np.zeros((4, 2)), np.zeros(2))
 
 
+def test_arrays_that_may_not_be_written_are_taken():
+    r, m = np.ones((4, 3)), np.ones((4, 3))
+    expected = dipole_field(r, m)
+    r.flags.writeable = m.flags.writeable = False
+    np.testing.assert_array_equal(dipole_field(r, m), expected)
+
+
 def test_sensor_fields_add_dipoles_and_turn_into_the_sensors_frame():
     rng = np.random.default_rng(1)
     positions, R_sw = rng.uniform(-5, 5, (3, 3)), Rotation.random(3, random_state=2).as_matrix()
     r, m = rng.uniform(-1, 1, (4, 2, 3)), rng.standard_normal((4, 2, 3))
     dr, dm = rng.standard_normal((4, 2, 3, 5)), rng.standard_normal((4, 2, 3, 5))
-    h, H, power = sensor_fields(positions, R_sw, r, m, dr, dm)
+    h, H, gradient = sensor_fields(positions, R_sw, r, m, dr, dm)
     d = positions[None, :, None] - r[:, None]
     world = dipole_field(d, m[:, None])
     np.testing.assert_allclose(h, np.einsum('jik,pjk->pji', R_sw, world.sum(axis=2)), rtol=1e-12)
@@ -93,4 +100,4 @@ def test_sensor_fields_add_dipoles_and_turn_into_the_sensors_frame():
         - np.einsum('jik,pjskl,pslc->pjic', R_sw, J_r, dr)
     np.testing.assert_allclose(H, expected, rtol=1e-9, atol=1e-12 * np.abs(H).max())
     size = 1e-7 * np.linalg.norm(m, axis=2)[:, None] / np.linalg.norm(d, axis=3) ** 4
-    np.testing.assert_allclose(power, (size**2).sum(axis=2), rtol=1e-10)
+    np.testing.assert_allclose(gradient, size.sum(axis=2), rtol=1e-10)

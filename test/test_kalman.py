@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import line_network
+from conftest import POINT, line_network
 from filterpy.kalman import ExtendedKalmanFilter
 from scipy.stats import chi2, multivariate_normal
 
@@ -48,7 +48,8 @@ def tracked(n_sensors, missing=False):
     samples, *_ = simulate(network, point_body([250.0, -120.0, 90.0], 5.0, 0.5),
                            Path(np.array([-60.0, -1.0]), 0.0, 10.0), 25.0, 12.0, rng)
     pipeline = Pipeline(network, settings_for('vehicle', {
-        'align.period_s': 0.04, 'track.mounting_std_deg': 0.0, 'track.vehicle.arrival_names': ['a'],
+        **POINT, 'align.period_s': 0.04, 'track.mounting_std_deg': 0.0,
+        'track.model_error_time_s': 0.0, 'track.vehicle.arrival_names': ['a'],
         'track.vehicle.arrival_headings_deg': [0.0]}))
     frame = None
     for sample in samples:
@@ -64,10 +65,10 @@ def tracked(n_sensors, missing=False):
         y[1] = np.nan
     x, P = bank.x.copy(), bank.P.copy()
     model = pipeline.track._model
-    h, H, power = sensor_fields(network.positions, network.R_sw, *model.dipoles(x[:, :10]))
+    h, H, gradient = sensor_fields(network.positions, network.R_sw, *model.dipoles(x[:, :10]))
     C = np.repeat(1.44e-16 * np.array([[1.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 0.8]])[None],
                   n_sensors, axis=0)
-    return x, P, y, h, H, C, power
+    return x, P, y, h, H, C, gradient**2
 
 
 def compare(n_sensors, missing=False, shift=0.0):

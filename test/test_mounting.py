@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import line_network
+from conftest import POINT, line_network
 from test_track import NOISE, drive
 
 from mag_tracking.geometry import quaternion_from_rotation_vector, rotation_from_quaternion
@@ -73,7 +73,7 @@ def turned_pass():
                            np.random.default_rng(6))
     R = rotation_from_quaternion(quaternion_from_rotation_vector(ANGLES))
     pipeline = Pipeline(network, settings_for('vehicle', {
-        'track.field_error': 0.02, 'track.near_field_length': 0.0}))
+        **POINT, 'track.field_error': 0.02, 'track.vehicle.near_field_lengths': [0.0]}))
     tracks, frames = [], {}
     for s in samples:
         turned = R[network.names.index(s.sensor)] @ s.field
@@ -132,8 +132,8 @@ def passes():
             tracks, _, truth = drive(
                 network, point_body([300.0, -150.0, 80.0], 5.0, 0.5),
                 Path(np.array([-70.0, side]), 0.0, 10.0), seed=seed,
-                changes={'track.mounting_std_deg': mounting, 'track.field_error': 0.02,
-                         'track.near_field_length': 0.0},
+                changes={**POINT, 'track.mounting_std_deg': mounting, 'track.field_error': 0.02,
+                         'track.vehicle.near_field_lengths': [0.0]},
                 flaws=Imperfections(bias_std=1e-6, tilt_std=np.deg2rad(5.0)))
             live = [t for t in tracks if not t.ended]
             for t, q in zip(live, truth, strict=True):

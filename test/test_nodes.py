@@ -181,17 +181,17 @@ def test_parameters_have_descriptors_and_are_checked(ros):
     try:
         described = call(ros, DescribeParameters, '/tracker_node/describe_parameters',
                          DescribeParameters.Request(names=[
-                             'track.near_field_length', 'track.vehicle.moment'])).descriptors
+                             'track.field_error', 'track.vehicle.soft_iron'])).descriptors
         assert all(d.description for d in described)
-        assert described[0].floating_point_range[0].to_value == 1000.0
+        assert described[0].floating_point_range[0].to_value == 10.0
         assert [d.read_only for d in described] == [False, True]
 
         def set_parameter(name, value):
             return call(ros, SetParameters, '/tracker_node/set_parameters',
                         SetParameters.Request(parameters=[
                             Parameter(name, value=value).to_parameter_msg()])).results[0]
-        assert set_parameter('track.near_field_length', 2.0).successful
-        for name, value in (('track.near_field_length', -1.0), ('track.vehicle.moment', 1.0),
+        assert set_parameter('track.field_error', 0.03).successful
+        for name, value in (('track.field_error', -1.0), ('track.vehicle.soft_iron', 1.0),
                             ('track.nonsense', 1.0)):
             assert not set_parameter(name, value).successful
     finally:

@@ -42,32 +42,99 @@ def test_arrival_direction(vehicle_replays, name):
     assert best[int(np.argmin(sd))] == ARRIVAL[name]
 
 
-@pytest.mark.parametrize('name', CARS)
+def expected_to_fail(names, reasons):
+    """The parameters `names`, of which those with a reason are known not to be reached."""
+    return [pytest.param(n, marks=pytest.mark.xfail(strict=True, reason=reasons[n]))
+            if n in reasons else n for n in names]
+
+
+RMS_NOT_REACHED = {
+    'junction_left_to_right': '0.65 m: with 260 A m^2 it is between a small vehicle and a car, and '
+                              'is taken for a larger one that is faster and farther ahead',
+    'straight_truck_right': '1.8 m: until its middle has passed, its front is like a car',
+}
+
+
+@pytest.mark.parametrize('name', expected_to_fail(VEHICLES, RMS_NOT_REACHED))
 def test_error_while_near(vehicle_replays, name):
-    errors = pass_of(vehicle_replays, name)['truth']
-    print(f'{name}: rms {errors["rms"]}, closest {errors["closest"]:.2f} '
+    track = pass_of(vehicle_replays, name)
+    errors = track['truth']
+    print(f'{name}: a {track["kind"]}, rms {errors["rms"]}, closest {errors["closest"]:.2f} '
           f'at {errors["closest_distance"]:.1f} m, ANEES {errors["anees"]:.1f}')
     if name == 'junction_rear_turns_right':
         assert errors['rms'] is None  # it never comes within 5 m
     else:
-        assert errors['rms'] <= (1.5 if 'fast' in name else 1.0)
+        assert errors['rms'] <= (1.2 if 'fast' in name or 'truck' in name else 0.6)
 
 
-NOT_REACHED = {
-    'junction_left_turns_to_rear': '0.53 m: the clocks of the sensors are 21 ms apart, and the '
-                                   'point model leans to one end',
-    'junction_rear_turns_right': '0.53 m at 5.9 m, its nearest: 1.1 standard deviations; the '
-                                 'clocks of the sensors are 24 ms apart',
-    'junction_right_turns_to_rear': '0.52 m at 4.8 m, one of its own standard deviations: the '
-                                    'car is seen only from 10 m on, in the turn',
+@pytest.mark.parametrize('name', CARS)
+def test_cars_are_no_surer_than_they_are_right(vehicle_replays, name):
+    assert pass_of(vehicle_replays, name)['truth']['anees'] <= 3.0
+
+
+CLOSEST_NOT_REACHED = {
+    'junction_left_to_right': '0.61 m: as above',
+    'junction_left_turns_to_rear': '0.61 m, twice what its covariance says: the clocks of the '
+                                   'sensors are 21 ms apart',
 }
 
 
-@pytest.mark.parametrize('name', [
-    pytest.param(n, marks=pytest.mark.xfail(strict=True, reason=NOT_REACHED[n]))
-    if n in NOT_REACHED else n for n in CARS])
+@pytest.mark.parametrize('name', expected_to_fail(CARS, CLOSEST_NOT_REACHED))
 def test_error_at_the_closest_point(vehicle_replays, name):
     assert pass_of(vehicle_replays, name)['truth']['closest'] <= (1.0 if 'fast' in name else 0.5)
+
+
+def speed_error(vehicle_replays, name):
+    """Relative error of the speed where the position is most certain."""
+    run, _ = vehicle_replays[name]
+    log = run.logs[pass_of(vehicle_replays, name)['id']]
+    stamps, positions, _ = next(iter(run.truth.values()))
+    sure = log.surest()
+    i = int(np.abs(stamps - log.stamp_ns[sure]).argmin())
+    i = min(max(i, 2), len(stamps) - 3)
+    true = np.hypot(*(positions[i + 2] - positions[i - 2])[:2]) / (
+        (stamps[i + 2] - stamps[i - 2]) / 1e9)
+    return np.hypot(*log.velocity[sure][:2]) / true - 1.0
+
+
+SPEED_NOT_REACHED = {
+    'junction_left_to_right': '+12 %: as above',
+    'junction_right_turns_to_rear': '+13 %, in the turn',
+    'straight_car_right': '+10.2 %',
+}
+
+
+@pytest.mark.parametrize('name', expected_to_fail(VEHICLES, SPEED_NOT_REACHED))
+def test_speed(vehicle_replays, name):
+    error = speed_error(vehicle_replays, name)
+    print(f'{name}: speed {error:+.1%}')
+    assert abs(error) <= 0.10
+
+
+@pytest.mark.parametrize('name', VEHICLES)
+def test_smoothed(vehicle_replays, name):
+    """The limits are those asked of the filter; by what came after, all of them are kept."""
+    run, folder = vehicle_replays[name]
+    track = pass_of(vehicle_replays, name)
+    smoothed = track['smoothed']
+    errors = smoothed['truth']
+    print(f'{name}: smoothed rms {errors["rms"]}, closest {errors["closest"]:.2f}, '
+          f'ANEES {errors["anees"]:.1f}')
+    slack = 'fast' in name or 'truck' in name
+    assert (errors['rms'] or 0.0) <= (1.2 if slack else 0.6)
+    assert errors['closest'] <= (1.0 if slack else 0.5)
+    table = rows(folder / 'poses_smoothed.csv')
+    assert [int(r['stamp_ns']) for r in table] == run.logs[track['id']].stamp_ns
+
+
+KINDS = {name: 'truck' if 'truck' in name else 'car' for name in VEHICLES}
+
+
+@pytest.mark.parametrize('name', VEHICLES)
+def test_kind(vehicle_replays, name):
+    track = pass_of(vehicle_replays, name)
+    print(f'{name}: {track["kind"]} {track["kind_weight"]:.3f}, {track["length"]:.1f} m')
+    assert track['kind'] == KINDS[name]
 
 
 @pytest.mark.parametrize('run', [1, 2])
@@ -93,7 +160,8 @@ def rows(path):
 def test_repetition_gives_the_same_bytes(vehicle_replays, road_network, tmp_path):
     name = 'junction_rear_turns_right'
     replay(Recording(vehicle_path(name)), road_network, settings_for('vehicle'), tmp_path)
-    for table in ('poses.csv', 'hypotheses.csv', 'detections.csv', 'summary.json'):
+    for table in ('poses.csv', 'poses_smoothed.csv', 'hypotheses.csv', 'detections.csv',
+                  'summary.json'):
         assert (tmp_path / table).read_bytes() == \
             (vehicle_replays[name][1] / table).read_bytes(), table
 

@@ -7,21 +7,25 @@ import pytest
 from scipy.linalg import expm
 
 from mag_tracking.geometry import cross_matrix, left_jacobian
-from mag_tracking.physics import sources
-from mag_tracking.physics.dipole import MU0
+from mag_tracking.physics import sources, vehicles
+from mag_tracking.physics.dipole import MU0, sensor_fields
 from mag_tracking.physics.motion import constant_velocity, integrator_noise
-from mag_tracking.physics.sources import Magnet, PointVehicle
+from mag_tracking.physics.sources import Magnet
+from mag_tracking.physics.vehicles import RowVehicle
 
+EARTH, ACCELERATION = np.array([2e-6, 1.5e-5, -4.9e-5]), np.array([1.0, 1.0, 0.1])
 EXAMPLES = {
-    'PointVehicle': PointVehicle(np.array([2e-6, 1.5e-5, -4.9e-5]), np.array([1.0, 1.0, 0.1]),
-                                 4.0),
+    'RowVehicle': RowVehicle(EARTH, ACCELERATION, 0.1, 0.02),
+    'RowVehicle of one': RowVehicle(EARTH, ACCELERATION, 0.1, n_dipoles=1),
+    'RowVehicle of four': RowVehicle(EARTH, ACCELERATION, 0.1, 0.02, 4),
     'Magnet': Magnet(np.array([0.1, 0.2, 0.3]), 0.5),
 }
 
 
 def found():
     """The classes that behave as a SourceModel."""
-    return sorted(name for name, c in inspect.getmembers(sources, inspect.isclass)
+    return sorted(name for module in (sources, vehicles)
+                  for name, c in inspect.getmembers(module, inspect.isclass)
                   if hasattr(c, 'dipoles') and hasattr(c, 'propagate')
                   and c.__name__ != 'SourceModel')
 
@@ -34,10 +38,10 @@ def states(model, n=6):
 
 
 def test_every_model_has_an_example():
-    assert found() == sorted(EXAMPLES)
+    assert found() == sorted({name.split()[0] for name in EXAMPLES})
 
 
-@pytest.mark.parametrize('name', found())
+@pytest.mark.parametrize('name', EXAMPLES)
 def test_dipole_derivatives(name):
     model = EXAMPLES[name]
     x = states(model)
@@ -53,7 +57,7 @@ def test_dipole_derivatives(name):
 
 
 @pytest.mark.parametrize('dt', [-0.5, 0.003, 0.3, 4.0])
-@pytest.mark.parametrize('name', found())
+@pytest.mark.parametrize('name', EXAMPLES)
 def test_propagation_derivatives(name, dt):
     model = EXAMPLES[name]
     x = states(model)
@@ -65,7 +69,7 @@ def test_propagation_derivatives(name, dt):
         np.testing.assert_allclose(F[:, :, k], numeric, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize('name', found())
+@pytest.mark.parametrize('name', EXAMPLES)
 def test_process_noise_is_symmetric_and_not_negative(name):
     model = EXAMPLES[name]
     _, _, Q = model.propagate(states(model), 0.2)
@@ -87,16 +91,91 @@ def test_constant_velocity_noise_is_the_exact_integral():
 
 
 def test_vehicle_moment_is_hard_iron_turned_plus_soft_iron():
-    model = EXAMPLES['PointVehicle']
+    model = EXAMPLES['RowVehicle of one']
     x = np.zeros((1, 10))
     x[0, 3:6], x[0, 6:9], x[0, 9] = [0.0, 7.0, 0.0], [100.0, 20.0, 5.0], 6.0
     expected = np.array([-20.0, 100.0, 5.0]) + 6.0 / MU0 * model.earth_field
     np.testing.assert_allclose(model.dipoles(x).m[0, 0], expected, rtol=1e-12)
 
 
-def test_standing_vehicle_has_a_finite_model():
-    d = EXAMPLES['PointVehicle'].dipoles(np.zeros((1, 10)))
-    assert all(np.isfinite(a).all() for a in d)
+@pytest.mark.parametrize('name', ['RowVehicle', 'RowVehicle of one'])
+def test_standing_vehicle_has_a_finite_model(name):
+    model = EXAMPLES[name]
+    x = np.zeros((1, len(model.state_names)))
+    assert all(np.isfinite(a).all() for a in (*model.dipoles(x), *model.propagate(x, 0.1)))
+
+
+def test_states_of_another_model_are_refused():
+    with pytest.raises(ValueError, match=r'3 dipoles need 17 states, got an array \(2, 10\)'):
+        EXAMPLES['RowVehicle'].dipoles(np.zeros((2, 10)))
+
+
+def row_state(d, length, heading=0.6):
+    """A state of a row of `d` dipoles whose whole moment does not depend on `d`."""
+    x = np.zeros((1, 6 + 3 * d + (2 if d > 1 else 1)))
+    x[0, :6] = [3.0, -1.0, 0.5, 8.0 * np.cos(heading), 8.0 * np.sin(heading), 0.2]
+    x[0, 6:6 + 3 * d] = np.tile(np.array([250.0, -90.0, 60.0]) / d, d)
+    x[0, 6 + 3 * d] = 4.0
+    x[0, 7 + 3 * d:] = length
+    return x
+
+
+def field_of(model, x, places):
+    """(n, 3) [T] at `places` (n, 3)."""
+    return sensor_fields(places, np.tile(np.eye(3), (len(places), 1, 1)), *model.dipoles(x))[0][0]
+
+
+def test_a_row_lies_along_the_heading_with_its_middle_at_the_position():
+    """TSP14 eq. (10b), written out for four dipoles."""
+    x = row_state(4, 3.6)
+    r = EXAMPLES['RowVehicle of four'].dipoles(x).r[0]
+    heading = np.array([np.cos(0.6), np.sin(0.6), 0.0])
+    for i in (1, 2, 3, 4):
+        np.testing.assert_allclose(r[i - 1], x[0, :3] + (i - 2.5) * 3.6 / 3 * heading, atol=1e-12)
+
+
+def test_a_row_without_length_is_a_point():
+    places = np.random.default_rng(0).uniform(-8.0, 8.0, (20, 3))
+    point = field_of(EXAMPLES['RowVehicle of one'], row_state(1, 0.0), places)
+    for name, d in (('RowVehicle', 3), ('RowVehicle of four', 4)):
+        np.testing.assert_allclose(field_of(EXAMPLES[name], row_state(d, 0.0), places), point,
+                                   rtol=1e-11, atol=1e-11 * np.abs(point).max())
+
+
+def test_a_row_turned_end_for_end_is_the_same_row():
+    x = row_state(3, 3.0)
+    x[0, 6:15] = [100.0, 20.0, 3.0, 80.0, -9.0, 1.0, 10.0, 70.0, 5.0]
+    y = x.copy()
+    y[0, 6:15] = x[0, 6:15].reshape(3, 3)[::-1].ravel()
+    y[0, -1] = -3.0
+    places = np.random.default_rng(0).uniform(-8.0, 8.0, (20, 3))
+    B = field_of(EXAMPLES['RowVehicle'], x, places)
+    np.testing.assert_allclose(field_of(EXAMPLES['RowVehicle'], y, places), B, rtol=1e-12,
+                               atol=1e-12 * np.abs(B).max())
+
+
+def test_far_away_an_even_row_becomes_its_dipole_with_the_square_of_the_distance():
+    """Without a quadrupole the first term that is left is two orders of distance smaller."""
+    direction = np.array([[0.3, 0.9, 0.1]])
+    errors = []
+    for distance in (40.0, 80.0, 160.0):
+        x1, x3 = row_state(1, 0.0), row_state(3, 3.0)
+        places = x1[:, :3] + distance * direction / np.linalg.norm(direction)
+        B = field_of(EXAMPLES['RowVehicle of one'], x1, places)
+        errors.append(np.linalg.norm(field_of(EXAMPLES['RowVehicle'], x3, places) - B)
+                      / np.linalg.norm(B))
+    assert errors[0] < 0.02
+    np.testing.assert_allclose(np.array(errors[:-1]) / errors[1:], 4.0, rtol=0.02)
+
+
+def test_the_whole_moment_drifts_as_stated_and_the_differences_apart_from_it():
+    model = EXAMPLES['RowVehicle']
+    x = row_state(3, 3.0)
+    Q = model.propagate(x, 0.5)[2][0, 6:15, 6:15].reshape(3, 3, 3, 3)
+    size2 = 250.0**2 + 90.0**2 + 60.0**2 + (4.0 / MU0) ** 2 * (EARTH @ EARTH)
+    np.testing.assert_allclose(Q.sum(axis=(0, 2)), 0.1**2 * size2 * 0.5 * np.eye(3), rtol=1e-12)
+    between = Q[0, :, 0] - Q[0, :, 1]
+    np.testing.assert_allclose(between, 0.02**2 * size2 * 0.5 * np.eye(3), rtol=1e-9)
 
 
 @pytest.mark.parametrize('angle', [0.0, 1e-9, 0.0099, 0.0101, 0.5, 3.0])

@@ -15,8 +15,8 @@ from mag_tracking.stages.vehicle_start import start_vehicle, vehicle_model
 SETTINGS = settings_for('magnet').track.magnet
 
 
-def start(frame, network, relative_std=0.0, mounting_std=0.0):
-    return start_magnet(SETTINGS, network, frame, 1e-12, mounting_std, relative_std)
+def start(frame, network, relative_std=0.0, own_std=()):
+    return start_magnet(SETTINGS, network, frame, 1e-12, own_std, relative_std)
 
 
 def test_the_side_that_fits_better_is_the_heavier():
@@ -41,13 +41,20 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
     vehicle = settings_for('vehicle').track.vehicle
     frame = FieldFrame(0, np.full((2, 3), 1e-7), np.repeat(1e-16 * np.eye(3)[None], 2, axis=0),
                        np.full(2, 8), np.zeros(2))
-    bank = start_vehicle(vehicle, road_network, frame, 2e-8, 0.0)
-    m = vehicle_model(vehicle, road_network).dipoles(bank.x[:, :10]).m[:, 0]
-    np.testing.assert_allclose(np.linalg.norm(m, axis=1), vehicle.moment, rtol=1e-9)
+    bank = start_vehicle(vehicle, road_network, frame, 2e-8, ())
+    m = vehicle_model(vehicle, road_network).dipoles(bank.x[:, :17]).m.sum(axis=1)
+    np.testing.assert_allclose(np.linalg.norm(m, axis=1), np.take(vehicle.moments, bank.kind),
+                               rtol=1e-9)
+    np.testing.assert_array_equal(bank.x[:, 16], np.take(vehicle.lengths, bank.kind))
+    assert len(bank) == 3 * 3 * 14 * 3 * 3
+    # What is called a point is one: neither a length nor differences.
+    points = bank.P[bank.kind == 0]
+    assert not points[:, 16, 16].any()
+    np.testing.assert_allclose(points[:, 6, 6], points[:, 6, 9], rtol=1e-12)
     for label, heading in enumerate(np.deg2rad(vehicle.arrival_headings_deg)):
         rows = bank.label == label
         along = bank.x[rows, :2] @ [np.cos(heading), np.sin(heading)]
-        assert (along < 0.0).all()  # all are before the sensors
+        assert (along <= 0.0).all()  # all are before the sensors
         speed = np.hypot(*bank.x[rows, 3:5].T)
         np.testing.assert_allclose(bank.x[rows, 3], speed * np.cos(heading), atol=1e-9)
         assert set(np.round(speed, 6)) == set(vehicle.speeds)
@@ -116,7 +123,12 @@ def test_backgrounds_wander_between_frames_and_angles_do_not(road_network):
     C = np.repeat(1e-16 * np.eye(3)[None], 2, axis=0)
     stage.feed(FieldFrame(0, np.full((2, 3), 1e-7), C, np.full(2, 8), np.zeros(2), True, 1e3, 6))
     before = np.diagonal(stage.bank.P, axis1=1, axis2=2).copy()
-    stage._predict(dt)
-    grown = np.diagonal(stage.bank.P, axis1=1, axis2=2) - before
-    np.testing.assert_array_equal(grown[:, 10:16], 0.0)
-    np.testing.assert_allclose(grown[:, 16:], drift**2 * dt, rtol=1e-6)
+    stage._filter.predict(stage.bank, dt)
+    after = np.diagonal(stage.bank.P, axis1=1, axis2=2)
+    own, grown = before[:, 17:29].reshape(-1, 2, 6), after[:, 17:29].reshape(-1, 2, 6)
+    np.testing.assert_array_equal(grown[:, :, :3], own[:, :, :3])
+    # A model error forgets what was learnt of it, with its time of 0.3 s, and stays of size one.
+    np.testing.assert_allclose(1.0 - grown[:, :, 3:],
+                               np.exp(-2.0 * dt / 0.3) * (1.0 - own[:, :, 3:]), atol=1e-12)
+    assert (own[:, :, 3:] < 1.0 - 1e-6).any()
+    np.testing.assert_allclose(after[:, 29:] - before[:, 29:], drift**2 * dt, rtol=1e-6)

@@ -4,7 +4,7 @@ Source: T10 section 2.6 and Alg. 3; weights live in logarithms because two
 hypotheses may be thousands of nats apart.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -34,26 +34,30 @@ class FilterBank:
     """(n_hyp,) normalised log-weights."""
     label: np.ndarray
     """(n_hyp,) int: the arrival that each hypothesis assumes."""
+    kind: np.ndarray
+    """(n_hyp,) int: the kind of target that each hypothesis assumes."""
+    origin: np.ndarray
+    """(n_hyp,) int: the row that each hypothesis had when the bank was made."""
     nis: np.ndarray
     """(n_hyp,) normalised innovation squared of the latest measurement; NaN before it."""
 
     @classmethod
-    def of_targets(cls, x, P, label, n_sensors, background_std, mounting_std=0.0):
+    def of_targets(cls, x, P, label, n_sensors, background_std, own_std=(), kind=None):
         """A bank with equal weights from target states alone.
 
-        `x` (n_hyp, n_t), `P` (n_hyp, n_t, n_t). Behind them are put three mounting
-        angles a sensor, where `mounting_std` [rad] is not zero, and three
-        backgrounds a sensor with `background_std` [T]; all are zero.
+        `x` (n_hyp, n_t), `P` (n_hyp, n_t, n_t). Behind them are put each sensor's own
+        states with the deviations `own_std` (n_own,), and three backgrounds a sensor
+        with `background_std` [T]; all are zero. `kind` (n_hyp,) is 0 if left out.
         """
         n, n_t = x.shape
-        std = np.repeat([mounting_std, background_std] if mounting_std else [background_std],
-                        3 * n_sensors)
+        std = np.append(np.tile(own_std, n_sensors), np.full(3 * n_sensors, background_std))
         n_x = n_t + len(std)
         full_x, full_P = np.zeros((n, n_x)), np.zeros((n, n_x, n_x))
         full_x[:, :n_t], full_P[:, :n_t, :n_t] = x, P
         rest = np.arange(n_t, n_x)
         full_P[:, rest, rest] = std**2
         return cls(full_x, full_P, np.full(n, -np.log(n)), label,
+                   np.zeros(n, dtype=int) if kind is None else kind, np.arange(n),
                    np.full(n, np.nan))
 
     def __len__(self):
@@ -62,13 +66,12 @@ class FilterBank:
     def best(self):
         """Row of the hypothesis to publish.
 
-        Of the heaviest label, the one at whose position the mixture of that
-        label is densest: near the mode of the posterior. The heaviest alone
+        Of the heaviest label, and in it of the heaviest kind, the one at whose position
+        their mixture is densest: near the mode of the posterior. The heaviest alone
         would be a lottery where many neighbours share the weight.
         """
-        labels = np.unique(self.label)
-        totals = [log_sum_exp(self.log_w[self.label == k]) for k in labels]
-        rows = np.flatnonzero(self.label == labels[int(np.argmax(totals))])
+        rows = self._heaviest(self.label, np.arange(len(self)))
+        rows = self._heaviest(self.kind, rows)
         rows = rows[self.log_w[rows] >= self.log_w[rows].max() - _NEGLIGIBLE]
         P = self.P[rows, :3, :3]
         values = np.linalg.eigvalsh(P)
@@ -79,6 +82,17 @@ class FilterBank:
         log_density = self.log_w[rows] - 0.5 * np.log(values).sum(axis=1) \
             - 0.5 * np.einsum('ijk,jkl,ijl->ij', d, np.linalg.inv(P), d)
         return int(rows[np.argmax(log_sum_exp(log_density, axis=1))])
+
+    def alone(self, i):
+        """A bank of the hypothesis `i` alone; its arrays are its own."""
+        rows = {f.name: getattr(self, f.name)[i:i + 1].copy() for f in fields(self)}
+        return FilterBank(**{**rows, 'log_w': np.zeros(1)})
+
+    def _heaviest(self, kind, rows):
+        """Those of `rows` that are of the kind (n_hyp,) which weighs most."""
+        kinds = np.unique(kind[rows])
+        totals = [log_sum_exp(self.log_w[rows[kind[rows] == k]]) for k in kinds]
+        return rows[kind[rows] == kinds[int(np.argmax(totals))]]
 
     def separated_weight(self, i, distance=3.0):
         """Total weight of the hypotheses whose position is apart from that of row `i`.
@@ -112,7 +126,8 @@ class FilterBank:
             self.x = np.ascontiguousarray(self.x[mask])
             self.P = np.ascontiguousarray(self.P[mask])
             self.log_w = self.log_w[mask] - log_sum_exp(self.log_w[mask])
-            self.label, self.nis = self.label[mask], self.nis[mask]
+            for name in ('label', 'kind', 'origin', 'nis'):
+                setattr(self, name, getattr(self, name)[mask])
         return gone
 
     def prune(self, log_ratio, most):
@@ -123,48 +138,3 @@ class FilterBank:
             mask = np.zeros(len(self), dtype=bool)
             mask[order[:most]] = True
         return self.keep(mask)
-
-    def merge(self, n_target, distance):
-        """Let hypotheses that say the same be one; returns how many went.
-
-        From the heaviest down, each takes up those of its label whose target
-        state is within `distance` of its own standard deviations (Mahalanobis
-        per root of the dimension) and becomes their mean, with the covariance
-        of the mixture. Separated hypotheses are never averaged.
-        """
-        alive = np.ones(len(self), dtype=bool)
-        for label in np.unique(self.label):
-            rows = np.flatnonzero(self.label == label)
-            rows = rows[np.argsort(-self.log_w[rows], kind='stable')]
-            close = self._close(rows, n_target, distance)
-            for k, i in enumerate(rows):
-                if not alive[i]:
-                    continue
-                others = rows[k + 1:][close[k, k + 1:]]
-                others = others[alive[others]]
-                if len(others):
-                    self._absorb(i, others)
-                    alive[others] = False
-        return self.keep(alive)
-
-    def _close(self, rows, n_target, distance):
-        """[i, j]: whether row j is within `distance` of row i, by the covariance of i."""
-        P = self.P[rows, :n_target, :n_target]
-        std = np.sqrt(np.einsum('nii->ni', P))
-        free = (std > 0.0).all(axis=0)
-        std = std[:, free]
-        correlation = P[:, free][:, :, free] / (std[:, :, None] * std[:, None, :])
-        x = self.x[rows, :n_target][:, free]
-        z = (x[None] - x[:, None]) / std[:, None]
-        squared = ((z @ np.linalg.pinv(correlation, hermitian=True)) * z).sum(axis=2)
-        return squared <= distance**2 * n_target
-
-    def _absorb(self, i, others):
-        """Put rows `others` into row `i`: weight, mean and covariance of the mixture."""
-        rows = np.append(i, others)
-        total = log_sum_exp(self.log_w[rows])
-        w = np.exp(self.log_w[rows] - total)
-        mean = w @ self.x[rows]
-        d = self.x[rows] - mean
-        P = np.einsum('n,nij->ij', w, self.P[rows]) + np.einsum('n,ni,nj->ij', w, d, d)
-        self.x[i], self.P[i], self.log_w[i] = mean, 0.5 * (P + P.T), total

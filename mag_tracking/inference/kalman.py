@@ -16,7 +16,7 @@ from numba import njit
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
-def predict(x, P, x_target, F, Q, walk_variance):
+def predict(x, P, x_target, F, Q, variance, decay=None):
     """Time update of every hypothesis, in place.
 
     Parameters
@@ -29,20 +29,26 @@ def predict(x, P, x_target, F, Q, walk_variance):
         Propagated target states.
     F, Q : (n_hyp, n_t, n_t) or (n_t, n_t)
         Jacobian of the propagation and covariance of the process noise.
-    walk_variance : float or (n_x - n_t,)
-        Added to the states behind the target's (random walk over the interval).
+    variance : float or (n_x - n_t,)
+        Added to the states behind the target's.
+    decay : (n_x - n_t,), optional
+        Before that they are multiplied by this.
 
     Source: T10 Alg. 2, time update.
     """
     n_t = x_target.shape[1]
     x[:, :n_t] = x_target
+    if decay is not None:
+        x[:, n_t:] *= decay
+        P[:, n_t:] *= decay[:, None]
+        P[:, :, n_t:] *= decay
     P_tb = F @ P[:, :n_t, n_t:]
     P[:, :n_t, n_t:] = P_tb
     P[:, n_t:, :n_t] = np.swapaxes(P_tb, 1, 2)
     P_tt = F @ P[:, :n_t, :n_t] @ np.swapaxes(F, -1, -2) + Q
     P[:, :n_t, :n_t] = 0.5 * (P_tt + np.swapaxes(P_tt, 1, 2))
     rest = np.arange(n_t, x.shape[1])
-    P[:, rest, rest] += walk_variance
+    P[:, rest, rest] += variance
 
 
 _COMPILE = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}

@@ -18,11 +18,14 @@ from mag_tracking.io.schema import (
 )
 
 POSE_COLUMNS = ('stamp_ns', 'track_id', 'x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z',
-                'sd_vx', 'sd_vy', 'sd_vz', 'mx', 'my', 'mz', 'weight', 'ambiguous')
+                'sd_vx', 'sd_vy', 'sd_vz', 'mx', 'my', 'mz', 'weight', 'ambiguous',
+                'kind', 'kind_weight', 'length', 'sd_length')
+SMOOTHED_COLUMNS = (*POSE_COLUMNS[:17], 'ambiguous', 'kind', 'length', 'sd_length')
 DETECTION_COLUMNS = ('stamp_ns', 'id', 'event', 'statistic', 'degrees_of_freedom', 'threshold',
                      'false_alarm_probability', 'strongest_sensor')
-HYPOTHESIS_COLUMNS = ('stamp_ns', 'track_id', 'arrival', 'weight', 'x', 'y', 'z', 'vx', 'vy',
-                      'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz', 'mx', 'my', 'mz')
+HYPOTHESIS_COLUMNS = ('stamp_ns', 'track_id', 'arrival', 'kind', 'weight', 'x', 'y', 'z', 'vx',
+                      'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz', 'mx', 'my',
+                      'mz')
 
 
 class ResultFolder:
@@ -39,6 +42,7 @@ class ResultFolder:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._poses = self._table('poses.csv', POSE_COLUMNS)
+            self._smoothed = self._table('poses_smoothed.csv', SMOOTHED_COLUMNS)
             self._detections = self._table('detections.csv', DETECTION_COLUMNS)
             self._hypotheses = self._table('hypotheses.csv', HYPOTHESIS_COLUMNS)
         except OSError as error:
@@ -86,11 +90,20 @@ class ResultFolder:
         sd = np.sqrt(np.diagonal(track.covariance))
         self._poses.writerow([track.stamp_ns, track.id, *_floats(
             track.position, track.velocity, sd, track.moment, [track.weight]),
-            int(track.ambiguous)])
+            int(track.ambiguous), track.kind, *_floats(
+                [track.kind_weight, track.length, track.length_std])])
         for h in track.hypotheses:
             sd = np.sqrt(np.diagonal(h.covariance))
-            self._hypotheses.writerow([track.stamp_ns, track.id, h.arrival, *_floats(
+            self._hypotheses.writerow([track.stamp_ns, track.id, h.arrival, h.kind, *_floats(
                 [h.weight], h.position, h.velocity, sd, h.moment)])
+
+    def add_smoothed(self, pose):
+        """One row for a `SmoothedPose` of a whole track; those of a fixed lag have none."""
+        if pose.complete:
+            sd = np.sqrt(np.diagonal(pose.covariance))
+            self._smoothed.writerow([
+                pose.stamp_ns, pose.id, *_floats(pose.position, pose.velocity, sd, pose.moment),
+                int(pose.ambiguous), pose.kind, *_floats([pose.length, pose.length_std])])
 
     def write_summary(self, summary):
         """`summary.json`."""

@@ -53,7 +53,9 @@ DEFINITIONS = {
         'geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/Vector3 velocity\n'
         'float64[36] covariance\ngeometry_msgs/Vector3 moment\nfloat64[9] moment_covariance\n'
         'float64 existence\nfloat64 weight\nfloat64 normalised_innovation\n'
-        'uint32 degrees_of_freedom\nstring arrival\nbool ambiguous\nbool[6] unobservable\n'
+        'uint32 degrees_of_freedom\nstring arrival\nstring kind\n'
+        'float64 kind_weight\nfloat64 length\nfloat64 length_std\nbool ambiguous\n'
+        'bool[6] unobservable\n'
         'float64[] predicted_field\nfloat64[] mounting\nfloat64[] mounting_std\n'),
     TRACK_ARRAY: (('std_msgs/msg/Header', 'mag_tracking_msgs/msg/Track'),
                   'std_msgs/Header header\nmag_tracking_msgs/Track[] tracks\n'),
@@ -191,7 +193,8 @@ def track_dict(track, frame):
             'moment_covariance': track.moment_covariance.ravel().tolist(),
             'existence': track.existence, 'weight': track.weight,
             'normalised_innovation': track.nis, 'degrees_of_freedom': track.degrees_of_freedom,
-            'arrival': track.arrival, 'ambiguous': track.ambiguous,
+            'arrival': track.arrival, 'kind': track.kind, 'kind_weight': track.kind_weight,
+            'length': track.length, 'length_std': track.length_std, 'ambiguous': track.ambiguous,
             'unobservable': list(track.unobservable),
             'predicted_field': track.predicted.ravel().tolist(),
             'mounting': track.mounting.ravel().tolist(),
@@ -202,9 +205,10 @@ def hypotheses_dict(track, frame):
     """mag_tracking_msgs/HypothesisArray of a `Track`."""
     return {'header': header_dict(track.stamp_ns, frame), 'track_id': track.id,
             'hypotheses': [
-                {'arrival': h.arrival, 'weight': h.weight, 'position': _xyz(h.position),
-                 'velocity': _xyz(h.velocity), 'covariance': h.covariance.ravel().tolist(),
-                 'moment': _xyz(h.moment)} for h in track.hypotheses]}
+                {'arrival': h.arrival, 'kind': h.kind, 'weight': h.weight,
+                 'position': _xyz(h.position), 'velocity': _xyz(h.velocity),
+                 'covariance': h.covariance.ravel().tolist(), 'moment': _xyz(h.moment)}
+                for h in track.hypotheses]}
 
 
 def frame_dict(frame, network):

@@ -52,7 +52,7 @@ def track_of(message, hypotheses=None):
     q = message.pose.pose.orientation
     members = () if hypotheses is None else tuple(
         Hypothesis(h.arrival, h.weight, _vector(h.position), _vector(h.velocity),
-                   np.array(h.covariance).reshape(6, 6), _vector(h.moment))
+                   np.array(h.covariance).reshape(6, 6), _vector(h.moment), h.kind)
         for h in hypotheses.hypotheses)
     return Track(
         stamp_ns(message.header.stamp), message.id, message.status == message.ENDED,
@@ -61,6 +61,7 @@ def track_of(message, hypotheses=None):
         pose[3:, 3:], pose[:3, 3:], _vector(message.moment),
         np.array(message.moment_covariance).reshape(3, 3), message.existence, message.weight,
         message.normalised_innovation, message.degrees_of_freedom, message.arrival,
-        message.ambiguous, tuple(message.unobservable),
+        message.kind, message.kind_weight, message.length, message.length_std, message.ambiguous,
+        tuple(message.unobservable),
         np.array(message.predicted_field).reshape(-1, 3), np.array(message.mounting).reshape(-1, 3),
         np.array(message.mounting_std).reshape(-1, 3), members)

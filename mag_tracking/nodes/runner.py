@@ -43,7 +43,7 @@ class TrackPrinter(Node):
 
 
 def line_of(track):
-    """One pose as a line of text: position with 1-sigma, speed, moment, arrival."""
+    """One pose as a line of text: position with 1-sigma, speed, moment, arrival, kind."""
     x, y, z = track.position
     sx, sy, sz = (float(v) ** 0.5 for v in track.covariance.diagonal()[:3])
     unit, f = ('m', 1.0) if max(sx, sy) > 0.02 or max(abs(x), abs(y)) > 2.0 else ('mm', 1e3)
@@ -52,7 +52,8 @@ def line_of(track):
     return (f'track {track.id}  {track.stamp_ns / 1e9:.2f}  '
             f'x {f * x:8.2f} ± {f * sx:5.2f}  y {f * y:8.2f} ± {f * sy:5.2f}  '
             f'z {f * z:7.2f} ± {f * sz:5.2f} {unit}  {(vx * vx + vy * vy) ** 0.5:5.1f} m/s  '
-            f'{size:7.3g} A m²  {track.arrival}{"  ambiguous" if track.ambiguous else ""}')
+            f'{size:7.3g} A m²  {track.arrival:6s} {track.kind}'
+            f'{"  ambiguous" if track.ambiguous else ""}')
 
 
 def parameters(network_path, settings, reliable):

@@ -22,6 +22,7 @@ from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.markers import delete_markers, track_markers
 from mag_tracking.nodes.ros_params import follow_changes
 from mag_tracking.nodes.stage_node import RESULTS, STREAM, StageNode
+from mag_tracking.records import SmoothedPose
 from mag_tracking.stages.track import TrackStage
 
 LONGEST_PATH = 2000
@@ -40,6 +41,9 @@ class TrackerNode(StageNode):
         self._tracks = self.publisher(TrackArray, '~/tracks', STREAM)
         self._hypotheses = self.publisher(HypothesisArray, '~/hypotheses', STREAM)
         self._path_publisher = self.publisher(Path, '~/path', RESULTS)
+        self._smoothed_pose = self.publisher(
+            PoseWithCovarianceStamped, '~/pose_smoothed', STREAM)
+        self._smoothed_path = self.publisher(Path, '~/path_smoothed', RESULTS)
         self._markers = self.publisher(MarkerArray, '~/markers', RESULTS)
         self._path = Path()
         self.subscription(NetworkFrame, '/detection_node/frame', self._take, STREAM)
@@ -55,8 +59,24 @@ class TrackerNode(StageNode):
             self._stage.counts['rejected: bad frame'] += 1
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return
-        for track in self._stage.feed(frame):
-            self._publish(track)
+        whole = []
+        for record in self._stage.feed(frame):
+            if not isinstance(record, SmoothedPose):
+                self._publish(record)
+            elif record.complete:
+                whole.append(record)
+            else:
+                self._smoothed_pose.publish(to_message(PoseWithCovarianceStamped, {
+                    'header': header_dict(record.stamp_ns, self.network.frame),
+                    'pose': pose_with_covariance_dict(record)}))
+        if whole:
+            self._smoothed_path.publish(self._path_of(whole))
+
+    def _path_of(self, poses):
+        """nav_msgs/Path of `SmoothedPose`s, with the header of the latest."""
+        steps = [to_message(PoseStamped, pose_dict(p.stamp_ns, self.network.frame, p.position,
+                                                   p.orientation)) for p in poses]
+        return Path(header=steps[-1].header, poses=steps)
 
     def _publish(self, track):
         """Everything about one track at one time."""

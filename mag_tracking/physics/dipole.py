@@ -72,7 +72,7 @@ def _field_and_jacobians_rows(d, m, B, dB_dd, dB_dm):
 @njit('void(float64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[:,:,::1], '
       'float64[:,:,:,::1], float64[:,:,:,::1], float64[:,:,::1], float64[:,:,:,::1], '
       'float64[:,::1])', **_COMPILE)
-def _sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx, h, H, gradient_power):
+def _sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx, h, H, gradient):
     """Loop of `field_and_jacobians` over hypotheses, sensors, dipoles; adds to zeros but for H."""
     n_hyp, n_dip, n_t = dr_dx.shape[0], dr_dx.shape[1], dr_dx.shape[3]
     for p in range(n_hyp):
@@ -83,8 +83,8 @@ def _sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx, h, H, gradient_power):
                 m0, m1, m2 = m[p, s, 0], m[p, s, 1], m[p, s, 2]
                 (b0, b1, b2), dB_dd, dB_dm = field_and_jacobians(d0, d1, d2, m0, m1, m2)
                 square = d0 * d0 + d1 * d1 + d2 * d2
-                gradient_power[p, j] += (K_DIPOLE * K_DIPOLE * (m0 * m0 + m1 * m1 + m2 * m2)
-                                         / (square * square * square * square))
+                gradient[p, j] += (K_DIPOLE * math.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
+                                   / (square * square))
                 # Turned into the sensor's frame first: 3 x 3 products are cheaper than 3 x n_t.
                 for i in range(3):
                     u, v, w = R_sw[j, i, 0], R_sw[j, i, 1], R_sw[j, i, 2]
@@ -117,17 +117,18 @@ def sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx):
     -------
     h : (n_hyp, n_sensors, 3) [T], sensor frame
     H : (n_hyp, n_sensors, 3, n_t)
-    gradient_power : (n_hyp, n_sensors) [T^2/m^2]
-        Sum of (mu0/4pi |m|)^2 / |d|^8: the first neglected multipole term for
-        a target of one metre (ICASSP11 eq. (9)).
+    gradient : (n_hyp, n_sensors) [T/m]
+        Sum of mu0/4pi |m| / |d|^4: the size of the first neglected multipole term
+        for dipoles that stand for one metre each (ICASSP11 eq. (9)). Neighbours in a
+        body err alike, so sizes are added and not squares.
         NaN and infinite where a dipole sits on a sensor.
     """
     n_hyp, n_sensors, n_t = len(r), len(positions), dr_dx.shape[-1]
     h = np.zeros((n_hyp, n_sensors, 3))
     H = np.empty((n_hyp, n_sensors, 3, n_t))
-    gradient_power = np.zeros((n_hyp, n_sensors))
-    _sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx, h, H, gradient_power)
-    return h, H, gradient_power
+    gradient = np.zeros((n_hyp, n_sensors))
+    _sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx, h, H, gradient)
+    return h, H, gradient
 
 
 def _evaluate(r, m):
@@ -136,8 +137,8 @@ def _evaluate(r, m):
     if r.shape[-1:] != (3,):
         raise ValueError(f'r and m need a last axis of length 3, got {r.shape}')
     shape = r.shape
-    r = np.ascontiguousarray(r).reshape(-1, 3)
-    m = np.ascontiguousarray(m).reshape(-1, 3)
+    # Copied: the kernels refuse arrays that may not be written.
+    r, m = r.reshape(-1, 3).copy(), m.reshape(-1, 3).copy()
     B = np.empty_like(r)
     dB_dd = np.empty((len(r), 3, 3))
     dB_dm = np.empty((len(r), 3, 3))

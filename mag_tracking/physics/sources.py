@@ -2,16 +2,13 @@
 
 A source model turns a batch of target states into dipoles with derivatives;
 the field at the sensors follows from `dipole.sensor_fields` alone, so that a
-new target is one new class here and nothing elsewhere.
+new target is one new class (here; vehicles in `vehicles.py`) and nothing elsewhere.
 """
 
-import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numba import njit
 
 from mag_tracking.geometry import (
     cross_matrix,
@@ -19,7 +16,6 @@ from mag_tracking.geometry import (
     quaternion_from_rotation_vector,
     rotation_from_quaternion,
 )
-from mag_tracking.physics.dipole import MU0
 from mag_tracking.physics.motion import constant_velocity, integrator_noise
 
 
@@ -51,81 +47,6 @@ class SourceModel(Protocol):
         With the states' covariances `P` (n_hyp, n_t, n_t) the noise holds what the
         Jacobian leaves out, too.
         """
-
-
-@njit('void(float64[:,:], float64[:], float64[:,:,::1], float64[:,:,::1], '
-      'float64[:,:,:,::1], float64[:,:,:,::1])', cache=True, error_model='numpy')
-def _vehicle_dipoles(x, induction, r, m, dr_dx, dm_dx):
-    """ICASSP11 eq. (8) with derivatives, a row a hypothesis; the derivatives come as zeros."""
-    for p in range(x.shape[0]):
-        vx, vy, forward, left, soft = x[p, 3], x[p, 4], x[p, 6], x[p, 7], x[p, 9]
-        speed = math.sqrt(vx * vx + vy * vy)
-        c, s, slowness = 1.0, 0.0, 0.0
-        if speed > 0.0:
-            slowness = 1.0 / speed
-            c, s = vx * slowness, vy * slowness
-        hard_x, hard_y = c * forward - s * left, s * forward + c * left
-        m[p, 0, 0] = hard_x + soft * induction[0]
-        m[p, 0, 1] = hard_y + soft * induction[1]
-        m[p, 0, 2] = x[p, 8] + soft * induction[2]
-        for k in range(3):
-            r[p, 0, k] = x[p, k]
-            dr_dx[p, 0, k, k] = 1.0
-            dm_dx[p, 0, k, 9] = induction[k]
-        dm_dx[p, 0, 0, 6], dm_dx[p, 0, 0, 7] = c, -s
-        dm_dx[p, 0, 1, 6], dm_dx[p, 0, 1, 7] = s, c
-        dm_dx[p, 0, 2, 8] = 1.0
-        # d(heading)/dv = [-sin, cos]/|v|, and d(hard)/d(heading) = z x hard.
-        dm_dx[p, 0, 0, 3], dm_dx[p, 0, 0, 4] = hard_y * s * slowness, -hard_y * c * slowness
-        dm_dx[p, 0, 1, 3], dm_dx[p, 0, 1, 4] = -hard_x * s * slowness, hard_x * c * slowness
-
-
-@dataclass(frozen=True)
-class PointVehicle:
-    """Point target whose moment depends on its heading: hard iron and soft iron.
-
-    State (10): position r, velocity v, hard iron moment m0 in the vehicle's
-    frame (x forward, z up), soft iron scalar D [m^3]. The heading is that of
-    the velocity; no roll, pitch or slip.
-
-        m = Rz(heading) m0 + D/mu0 B0
-
-    Where the speed is zero the heading is atan2(0, 0) = 0 and its derivative
-    is taken as zero.
-
-    Source: ICASSP11 eq. (4)-(8); (D/mu0) B0 and not T10's (3D/mu0) B0.
-    """
-
-    earth_field: np.ndarray
-    """(3,) [T], world. Zeros: no soft iron can be modelled."""
-    acceleration_density: np.ndarray
-    """(3,) [m^2/s^3], spectral density of the acceleration, per axis."""
-    moment_density: float = 0.0
-    """[(A m^2)^2/s], random walk of m0."""
-
-    state_names = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'm0x', 'm0y', 'm0z', 'D')
-
-    @cached_property
-    def _induction(self):
-        """(3,) [A/m] B0/mu0."""
-        return np.asarray(self.earth_field, dtype=float) / MU0
-
-    def dipoles(self, x):
-        """One dipole a hypothesis; see `SourceModel.dipoles`."""
-        n = len(x)
-        r, m = np.empty((n, 1, 3)), np.empty((n, 1, 3))
-        dr_dx, dm_dx = np.zeros((2, n, 1, 3, 10))
-        _vehicle_dipoles(np.asarray(x, dtype=float), self._induction, r, m, dr_dx, dm_dx)
-        return Dipoles(r, m, dr_dx, dm_dx)
-
-    def propagate(self, x, dt, P=None):
-        """Constant velocity, which is linear; see `SourceModel.propagate`."""
-        F = np.eye(10)
-        F[:6, :6] = constant_velocity(dt)
-        Q = np.zeros((10, 10))
-        Q[:6, :6] = integrator_noise(dt, self.acceleration_density)
-        Q[[6, 7, 8], [6, 7, 8]] = self.moment_density * abs(dt)
-        return x @ F.T, F, Q
 
 
 @dataclass(frozen=True)

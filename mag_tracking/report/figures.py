@@ -48,7 +48,7 @@ def _without_switches(rows):
     return np.insert(points, switch, np.nan, axis=0)
 
 
-def map_figure(log, network, truth=None):
+def map_figure(log, network, truth=None, smoothed=None):
     """The map: trajectories of the hypotheses with 90 % ellipses, sensors and truth.
 
     Parameters
@@ -56,6 +56,7 @@ def map_figure(log, network, truth=None):
     log : TrackLog
     network : SensorNetwork
     truth : (n, 3) [m], optional
+    smoothed : SmoothedLog, optional
     """
     figure = Figure(figsize=(7.5, 6.5), layout='constrained')
     axes = figure.add_subplot()
@@ -78,6 +79,9 @@ def map_figure(log, network, truth=None):
                           alpha=0.10 if weight > 0.5 else 0.04, lw=0)
     if truth is not None and np.isfinite(truth).any():
         axes.plot(f * truth[:, 0], f * truth[:, 1], 'k--', lw=1.2, label='truth')
+    if smoothed is not None:
+        axes.plot(*(f * np.array(smoothed.position)[:, :2]).T, color='tab:red', lw=1.4,
+                  label='smoothed')
     axes.plot(f * network.positions[:, 0], f * network.positions[:, 1], 'k^', ms=8,
               label='magnetometers')
     axes.plot(*(f * best[0, :2]), 'o', mfc='w', mec='k', ms=6, label='first pose')

@@ -6,6 +6,30 @@ import numpy as np
 
 
 @dataclass
+class SmoothedLog:
+    """One smoothed track; lists grow together."""
+
+    id: int
+    stamp_ns: list = field(default_factory=list)
+    position: list = field(default_factory=list)
+    velocity: list = field(default_factory=list)
+    covariance: list = field(default_factory=list)
+    moment: list = field(default_factory=list)
+
+    def add(self, pose):
+        """Take a `SmoothedPose`."""
+        for name in ('stamp_ns', 'position', 'velocity', 'covariance', 'moment'):
+            getattr(self, name).append(getattr(pose, name))
+
+    def summary(self):
+        """Speed and moment where the position is most certain, JSON-ready."""
+        sure = int(np.argmin([np.trace(C[:2, :2]) for C in self.covariance]))
+        return {'speed': float(np.hypot(*self.velocity[sure][:2])),
+                'moment_size': float(np.linalg.norm(self.moment[sure])),
+                'smallest_sd': float(np.sqrt(np.trace(self.covariance[sure][:2, :2])))}
+
+
+@dataclass
 class TrackLog:
     """One track, frame by frame; lists grow together."""
 
@@ -21,6 +45,9 @@ class TrackLog:
     ambiguous: list = field(default_factory=list)
     arrivals: list = field(default_factory=list)
     """Per frame {arrival: (weight, position, covariance (2, 2) of its best hypothesis)}."""
+    kind: list = field(default_factory=list)
+    kind_weight: list = field(default_factory=list)
+    length: list = field(default_factory=list)
     measured: list = field(default_factory=list)
     predicted: list = field(default_factory=list)
     mounting: list = field(default_factory=list)
@@ -35,7 +62,7 @@ class TrackLog:
             return
         for name in ('stamp_ns', 'position', 'velocity', 'covariance', 'moment', 'orientation',
                      'nis', 'degrees_of_freedom', 'ambiguous', 'predicted', 'mounting',
-                     'mounting_std'):
+                     'mounting_std', 'kind', 'kind_weight', 'length'):
             getattr(self, name).append(getattr(track, name))
         self.measured.append(frame.field)
         self.existence = track.existence
@@ -75,6 +102,8 @@ class TrackLog:
             'id': self.id, 'start_ns': self.stamp_ns[0], 'end_ns': self.stamp_ns[-1],
             'poses': len(self.stamp_ns), 'ended': self.ended, 'arrival': arrival,
             'arrival_weights': {k: v[0] for k, v in sorted(final.items())},
+            'kind': self.kind[-1], 'kind_weight': self.kind_weight[-1],
+            'length': self.length[sure],
             'verdict': 'ambiguous' if self.ambiguous[-1] else 'unique',
             'ambiguous_share': float(np.mean(self.ambiguous)),
             'existence': self.existence,

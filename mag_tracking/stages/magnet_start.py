@@ -27,6 +27,9 @@ class MagnetSettings:
         0.02, 'Root spectral density of the acceleration.', 'm/s^1.5', (0.0, 1000.0))
     angular_acceleration: float = param(
         0.2, 'Root spectral density of the angular acceleration.', 'rad/s^1.5', (0.0, 1000.0))
+    near_field_length: float = param(
+        5e-4, 'How far the magnet is from a point: near it the model errs by the first neglected '
+        'multipole term (ICASSP11 eq. (9), there lambda).', 'm', (0.0, 1000.0), live=True)
     axis: tuple[float, ...] = param(
         (0.0, 0.0, 1.0), 'Direction of the moment in the magnet\'s own frame.',
         '', (-1.0, 1.0), length=3)
@@ -37,7 +40,7 @@ def magnet_model(settings):
     return Magnet(np.full(3, settings.acceleration**2), settings.angular_acceleration**2)
 
 
-def start_magnet(settings, network, frame, background_std, mounting_std, relative_std):
+def start_magnet(settings, network, frame, background_std, own_std, relative_std):
     """Hypotheses of a magnet at its first frame, wherever it is.
 
     On a coarse grid the moment is projected out; the best points are refined,
@@ -72,7 +75,7 @@ def start_magnet(settings, network, frame, background_std, mounting_std, relativ
     if not len(cost):
         return None
     bank = FilterBank.of_targets(state, P, np.zeros(len(cost), dtype=int), len(network),
-                                 background_std, mounting_std)
+                                 background_std, own_std)
     bank.reweight(-0.5 * cost)
     return bank
 

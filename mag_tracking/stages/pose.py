@@ -3,8 +3,7 @@
 import numpy as np
 
 from mag_tracking.geometry import cross_matrix, quaternion_between, quaternion_from_yaw
-from mag_tracking.inference.filter_bank import log_sum_exp
-from mag_tracking.records import Hypothesis, Track
+from mag_tracking.records import Hypothesis, SmoothedPose, Track
 
 UNOBSERVED_VARIANCE = np.pi**2
 """[rad^2] of an angle that the field does not determine."""
@@ -60,7 +59,7 @@ def magnet_orientation(x, P, axis):
     return quaternion_between(axis, m), T, UNOBSERVED_VARIANCE * along, tuple(flags)
 
 
-def published_track(bank, best, model, orientation, names, strange, **known):
+def published_track(bank, best, model, orientation, names, kinds, strange, **known):
     """The `Track` of a bank's hypothesis `best`.
 
     Parameters
@@ -73,6 +72,8 @@ def published_track(bank, best, model, orientation, names, strange, **known):
         Takes state and covariance of the target, as `vehicle_orientation`.
     names : sequence of str
         The arrival of each label.
+    kinds : sequence of str
+        The name of each kind.
     strange : bool
         The measurement does not fit even the best hypothesis: ambiguous, too.
     known : fields of `Track` that the bank does not know
@@ -80,29 +81,48 @@ def published_track(bank, best, model, orientation, names, strange, **known):
         mounting_std.
     """
     n_t = len(model.state_names)
-    x, P = bank.x[best, :n_t], bank.P[best, :n_t, :n_t]
-    dipoles = model.dipoles(bank.x[:, :n_t])
-    dm_dx = dipoles.dm_dx[best].sum(axis=0)
-    q, T, unobserved, flags = orientation(x, P)
+    said, flags = _said_of(model, orientation, bank.x[best, :n_t], bank.P[best, :n_t, :n_t])
     weights = np.exp(bank.log_w)
-    moments = dipoles.m.sum(axis=1)
+    moments = model.dipoles(bank.x[:, :n_t]).m.sum(axis=1)
     order = np.argsort(-bank.log_w, kind='stable')
     hypotheses = tuple(
         Hypothesis(names[bank.label[i]], float(weights[i]), bank.x[i, :3].copy(),
-                   bank.x[i, 3:6].copy(), bank.P[i, :6, :6].copy(), moments[i].copy())
+                   bank.x[i, 3:6].copy(), bank.P[i, :6, :6].copy(), moments[i].copy(),
+                   kinds[bank.kind[i]])
         for i in order)
     return Track(
-        position=x[:3].copy(), velocity=x[3:6].copy(), covariance=P[:6, :6].copy(),
-        orientation=q, orientation_covariance=T @ P @ T.T + unobserved,
-        position_orientation_covariance=P[:3] @ T.T,
-        moment=moments[best].copy(), moment_covariance=dm_dx @ P @ dm_dx.T,
         nis=float(bank.nis[best]), weight=float(weights[best]), arrival=names[bank.label[best]],
-        ambiguous=bool(strange or bank.separated_weight(best) > DOUBT
-                   or 1.0 - np.exp(bank.log_w).sum(where=bank.label == bank.label[best]) > DOUBT),
-        unobservable=(False, False, False, *flags), hypotheses=hypotheses, **known)
+        kind=kinds[bank.kind[best]],
+        kind_weight=float(weights.sum(where=bank.kind == bank.kind[best])),
+        ambiguous=bool(strange or is_ambiguous(bank, best)),
+        unobservable=(False, False, False, *flags), hypotheses=hypotheses, **said, **known)
 
 
-def arrival_weights(bank, names):
-    """{arrival: total weight} of a bank."""
-    return {name: float(np.exp(log_sum_exp(bank.log_w[bank.label == k])))
-            if (bank.label == k).any() else 0.0 for k, name in enumerate(names)}
+def is_ambiguous(bank, best):
+    """Whether another place, or another arrival, than that of hypothesis `best` is possible."""
+    same_arrival = np.exp(bank.log_w).sum(where=bank.label == bank.label[best])
+    return bool(bank.separated_weight(best) > DOUBT or 1.0 - same_arrival > DOUBT)
+
+
+def smoothed_pose(model, orientation, x, P, **known):
+    """The `SmoothedPose` of a state `x` (n_x,) with covariance `P`.
+
+    `known` are its stamp_ns, id, kind, ambiguous, complete; the others as for `published_track`.
+    """
+    n_t = len(model.state_names)
+    return SmoothedPose(**_said_of(model, orientation, x[:n_t], P[:n_t, :n_t])[0], **known)
+
+
+def _said_of(model, orientation, x, P):
+    """What a target state says, as fields of a record, and which rotations it does not."""
+    dipoles = model.dipoles(x[None])
+    dm_dx = dipoles.dm_dx[0].sum(axis=0)
+    q, T, unobserved, flags = orientation(x, P)
+    # A row has a length, as its last state; from its other end it is the same row.
+    row = model.state_names[-1] == 'L'
+    return {'position': x[:3].copy(), 'velocity': x[3:6].copy(), 'covariance': P[:6, :6].copy(),
+            'orientation': q, 'orientation_covariance': T @ P @ T.T + unobserved,
+            'position_orientation_covariance': P[:3] @ T.T,
+            'moment': dipoles.m[0].sum(axis=0), 'moment_covariance': dm_dx @ P @ dm_dx.T,
+            'length': abs(float(x[-1])) if row else 0.0,
+            'length_std': float(np.sqrt(max(P[-1, -1], 0.0))) if row else 0.0}, flags

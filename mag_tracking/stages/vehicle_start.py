@@ -4,16 +4,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mag_tracking.errors import SettingsError
 from mag_tracking.inference.detection_theory import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.physics.dipole import MU0, dipole_field
-from mag_tracking.physics.sources import PointVehicle
+from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.settings import param
 
 
 @dataclass(frozen=True)
 class VehicleSettings:
-    """The point vehicle: its motion, its magnetism and where it may come from."""
+    """Vehicles: their motion, their magnetism and where they may come from."""
 
     arrival_names: tuple[str, ...] = param(
         ('left', 'right', 'rear'), 'Names of the arrival directions.')
@@ -27,18 +28,38 @@ class VehicleSettings:
     along_std: float = param(3.0, 'Spread of the starting distance.', 'm', (1e-3, 1000.0))
     farthest: float = param(
         30.0, 'Largest starting distance from the outermost sensor.', 'm', (0.1, 10000.0))
-    height: float = param(0.5, 'Height of the magnetic centre above the sensors\' plane z = 0.',
-                          'm', (-100.0, 100.0))
-    height_std: float = param(0.2, 'Spread of the height.', 'm', (1e-6, 100.0))
     speeds: tuple[float, ...] = param((5.0, 10.0, 20.0), 'Starting speeds.', 'm/s', (0.01, 200.0))
     speed_std: float = param(0.3, 'Spread of a starting speed, relative to it.', '', (1e-3, 10.0))
     cross_speed_std: float = param(
         0.1, 'Spread of the speed across the heading, relative to it.', '', (1e-3, 10.0))
     climb_std: float = param(0.1, 'Spread of the vertical speed.', 'm/s', (1e-9, 100.0))
-    moment: float = param(400.0, 'Starting size of the moment (a car: 300 to 600; TSP14).',
-                          'A m^2', (1e-6, 1e6))
-    moment_std: float = param(150.0, 'Spread of the hard iron moment, per axis.',
-                              'A m^2', (1e-6, 1e6))
+    kinds: tuple[str, ...] = param(
+        ('small', 'car', 'truck'), 'Names of the kinds of vehicle; the evidence picks one per '
+        'track. The settings down to near_field_lengths have one value per kind.')
+    lengths: tuple[float, ...] = param(
+        (0.0, 3.0, 9.0), 'Starting length of the row of three dipoles that a vehicle is taken '
+        'for (TSP14 eq. (10)); somewhat shorter than the vehicle. 0 = a point. If all are points '
+        'the filter is several times faster.', 'm', (0.0, 1000.0))
+    length_stds: tuple[float, ...] = param(
+        (0.0, 1.0, 3.0), 'Spread of the length; 0 for points.', 'm', (0.0, 1000.0))
+    moments: tuple[float, ...] = param(
+        (120.0, 400.0, 1600.0), 'Starting size of the moment (a car: 300 to 600, a truck: 1800; '
+        'TSP14).', 'A m^2', (1e-6, 1e6))
+    moment_stds: tuple[float, ...] = param(
+        (45.0, 150.0, 600.0), 'Spread of the whole hard iron moment, per axis.',
+        'A m^2', (1e-6, 1e6))
+    difference_stds: tuple[float, ...] = param(
+        (0.0, 30.0, 120.0), 'Spread of what each dipole of a row differs from their mean, per '
+        'axis: iron that is not spread evenly.', 'A m^2', (0.0, 1e6))
+    heights: tuple[float, ...] = param(
+        (0.5, 0.5, 1.0), 'Height of the magnetic centre above the sensors\' plane z = 0.',
+        'm', (-100.0, 100.0))
+    height_stds: tuple[float, ...] = param(
+        (0.2, 0.2, 0.4), 'Spread of the height.', 'm', (1e-6, 100.0))
+    near_field_lengths: tuple[float, ...] = param(
+        (0.8, 0.3, 0.3), 'How far the iron reaches from where the model has it: near a vehicle '
+        'the model errs by the first neglected multipole term (ICASSP11 eq. (9), there lambda).',
+        'm', (0.0, 1000.0), live=True)
     soft_iron: float = param(4.0, 'Starting soft iron scalar D; m = Rz m0 + D/mu0 B0.',
                              'm^3', (0.0, 1e4))
     soft_iron_std: float = param(4.0, 'Spread of D; without an earth field it has no effect.',
@@ -48,16 +69,42 @@ class VehicleSettings:
     climb_acceleration: float = param(
         0.1, 'Root spectral density of the vertical acceleration.', 'm/s^1.5', (0.0, 1000.0))
     moment_drift: float = param(
-        40.0, 'Random walk of the hard iron moment: a long target shows another one from every '
-        'side.', 'A m^2/s^0.5', (0.0, 1e6))
+        0.1, 'Random walk of the hard iron moment relative to the size of the iron: a vehicle '
+        'shows another moment from every side.', '1/s^0.5', (0.0, 1e3))
+    difference_drift: float = param(
+        0.0125, 'The same of what each dipole of a row differs from their mean.',
+        '1/s^0.5', (0.0, 1e3))
+
+
+PER_KIND = ('lengths', 'length_stds', 'moments', 'moment_stds', 'difference_stds', 'heights',
+            'height_stds', 'near_field_lengths')
 
 
 def vehicle_model(settings, network):
-    """The `PointVehicle` of the settings; without an earth field there is no soft iron."""
-    earth = np.zeros(3) if network.earth_field is None else network.earth_field
+    """The `RowVehicle` of the settings; without an earth field there is no soft iron.
+
+    Raises SettingsError where lists that belong together differ in length.
+    """
+    for names, lists in (('arrival_names', ('arrival_headings_deg',)), ('kinds', PER_KIND)):
+        n = len(getattr(settings, names))
+        for name in lists:
+            if len(getattr(settings, name)) != n:
+                raise SettingsError(f'track.vehicle.{name}: expected {n} values (one per {names}), '
+                                    f'got {len(getattr(settings, name))}')
+    for kind, length, spread in zip(settings.kinds, settings.lengths, settings.length_stds,
+                                    strict=True):
+        if spread and not length:
+            raise SettingsError(f'track.vehicle.length_stds: {spread:g} m for {kind}, which is a '
+                                'point (its length is 0)')
     horizontal, vertical = settings.acceleration**2, settings.climb_acceleration**2
-    return PointVehicle(earth, np.array([horizontal, horizontal, vertical]),
-                        settings.moment_drift**2)
+    return RowVehicle(_earth_field(network), np.array([horizontal, horizontal, vertical]),
+                      settings.moment_drift, settings.difference_drift,
+                      3 if any(settings.lengths) else 1)
+
+
+def _earth_field(network):
+    """(3,) [T], zeros where it is not known."""
+    return np.zeros(3) if network.earth_field is None else network.earth_field
 
 
 def moment_directions():
@@ -67,40 +114,39 @@ def moment_directions():
     return np.vstack([axes, diagonals / np.sqrt(3.0)])
 
 
-def start_vehicle(settings, network, frame, background_std, mounting_std):
+def start_vehicle(settings, network, frame, background_std, own_std):
     """Hypotheses of a vehicle at its first frame.
 
-    Arrival lines x moment directions x lateral offsets x speeds, each at the
+    Kinds x arrival lines x moment directions x lateral offsets x speeds, each at the
     distance at which its field, coming nearer, first has the measured energy.
 
-    Returns a `FilterBank` whose labels index `settings.arrival_names`.
+    Returns a `FilterBank` whose labels index `settings.arrival_names`, its kinds `settings.kinds`.
     Source: ICASSP11 section 2.2, T10 Alg. 3 (there one hypothesis an arrival).
     """
-    earth = np.zeros(3) if network.earth_field is None else network.earth_field
-    moments = settings.moment * moment_directions()
-    states, covariances, labels = [], [], []
-    for label, heading in enumerate(np.deg2rad(settings.arrival_headings_deg)):
-        c, s = np.cos(heading), np.sin(heading)
-        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        for offset in settings.lateral_offsets:
-            starts = _matching_positions(settings, network, frame, R, offset, moments)
-            hard = (moments - settings.soft_iron * earth / MU0) @ R
-            for speed in settings.speeds:
-                x = np.zeros((len(moments), 10))
-                x[:, :3], x[:, 3:6], x[:, 6:9] = starts, R @ [speed, 0.0, 0.0], hard
-                x[:, 9] = settings.soft_iron
-                states.append(x)
-                covariances += [_vehicle_covariance(settings, R, speed)] * len(moments)
-                labels += [label] * len(moments)
+    states, covariances, labels, kinds = [], [], [], []
+    for kind in range(len(settings.kinds)):
+        moments = settings.moments[kind] * moment_directions()
+        for label, heading in enumerate(np.deg2rad(settings.arrival_headings_deg)):
+            c, s = np.cos(heading), np.sin(heading)
+            R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+            hard = (moments - settings.soft_iron * _earth_field(network) / MU0) @ R
+            for offset in settings.lateral_offsets:
+                starts = _matching_positions(settings, network, frame, R, offset, moments,
+                                             settings.heights[kind])
+                for speed in settings.speeds:
+                    states.append(_states(settings, kind, starts, R @ [speed, 0.0, 0.0], hard))
+                    covariances += [_covariance(settings, kind, R, speed)] * len(moments)
+                    labels += [label] * len(moments)
+                    kinds += [kind] * len(moments)
     return FilterBank.of_targets(np.vstack(states), np.array(covariances), np.array(labels),
-                                  len(network), background_std, mounting_std)
+                                 len(network), background_std, own_std, np.array(kinds))
 
 
-def _matching_positions(settings, network, frame, R, offset, moments):
+def _matching_positions(settings, network, frame, R, offset, moments, height):
     """Positions (n, 3) on one line where each moment's field first has the frame's energy."""
     along = (network.positions - network.centre) @ R[:, 0]
     distance = np.linspace(settings.farthest, 0.0, 160) - along.min()
-    line = np.array([network.centre[0], network.centre[1], settings.height])
+    line = np.array([network.centre[0], network.centre[1], height])
     points = line + offset * R[:, 1] - distance[:, None] * R[:, 0]
     r = network.positions[None] - points[:, None]
     B = dipole_field(r[None], moments[:, None, None, :])
@@ -115,14 +161,29 @@ def _matching_positions(settings, network, frame, R, offset, moments):
     return points[first]
 
 
-def _vehicle_covariance(settings, R, speed):
-    """Starting covariance (10, 10) of one hypothesis."""
-    P = np.zeros((10, 10))
+def _states(settings, kind, positions, velocity, hard):
+    """States (n, n_t) of `RowVehicle` with the whole hard iron moments `hard` (n, 3)."""
+    d = 3 if any(settings.lengths) else 1
+    n = len(positions)
+    rest = [settings.soft_iron] + ([settings.lengths[kind]] if d > 1 else [])
+    return np.hstack([positions, np.tile(velocity, (n, 1)), np.tile(hard / d, d),
+                      np.tile(rest, (n, 1))])
+
+
+def _covariance(settings, kind, R, speed):
+    """Starting covariance (n_t, n_t) of one hypothesis."""
+    d = 3 if any(settings.lengths) else 1
+    hard = 6 + 3 * d
+    P = np.zeros((hard + min(d, 2), hard + min(d, 2)))
     P[:3, :3] = R @ np.diag([settings.along_std**2, settings.lateral_std**2,
-                             settings.height_std**2]) @ R.T
+                             settings.height_stds[kind]**2]) @ R.T
     P[3:6, 3:6] = R @ np.diag([(settings.speed_std * speed) ** 2,
                                (settings.cross_speed_std * speed) ** 2,
                                settings.climb_std**2]) @ R.T
-    P[6:9, 6:9] = settings.moment_std**2 * np.eye(3)
-    P[9, 9] = settings.soft_iron_std**2
+    mean = np.full((d, d), 1.0 / d)
+    P[6:hard, 6:hard] = np.kron(settings.moment_stds[kind]**2 / d * mean
+                                + settings.difference_stds[kind]**2 * (np.eye(d) - mean), np.eye(3))
+    P[hard, hard] = settings.soft_iron_std**2
+    if d > 1:
+        P[hard + 1, hard + 1] = settings.length_stds[kind]**2
     return P

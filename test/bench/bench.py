@@ -27,7 +27,7 @@ from mag_tracking.geometry import (  # noqa: E402
 from mag_tracking.inference import kalman  # noqa: E402
 from mag_tracking.physics.dipole import MU0, sensor_fields  # noqa: E402
 from mag_tracking.physics.mounting import turned_fields  # noqa: E402
-from mag_tracking.physics.sources import PointVehicle  # noqa: E402
+from mag_tracking.physics.vehicles import RowVehicle  # noqa: E402
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
@@ -154,7 +154,7 @@ def bank_case(n_sensors, n_hyp, rng, turned):
     positions[:, 1] = np.where(np.arange(n_sensors) % 2, 4.5, -4.5)
     R_sw = rotation_from_quaternion(quaternion_from_rotation_vector(
         0.2 * rng.standard_normal((n_sensors, 3))))
-    model = PointVehicle(EARTH, np.ones(3), 1.0)
+    model = RowVehicle(EARTH, np.ones(3), n_dipoles=1)
     n_own = 3 * n_sensors if turned else 0
     x = np.zeros((n_hyp, 10 + n_own + 3 * n_sensors))
     x[:, :3] = [-6.0, -1.0, 0.5] + 0.3 * rng.standard_normal((n_hyp, 3))

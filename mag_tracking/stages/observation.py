@@ -1,0 +1,108 @@
+"""What the sensors see of a bank's states: where the target's physics meets the filter's states."""
+
+import numpy as np
+
+from mag_tracking.physics.dipole import sensor_fields
+from mag_tracking.physics.mounting import turned_fields
+
+SAME_TIME_S = 1e-3
+"""[s] Samples closer than this are taken together: at 20 m/s a target moves two centimetres."""
+
+
+class Observation:
+    """The field that a network has of hypotheses, and the states that belong to its sensors.
+
+    A state is as on top of `inference.kalman`. Behind the target's states come each sensor's
+    own: three mounting angles [rad] where they are estimated, and three model errors, in units
+    of their size, where those last. They are what the target model leaves out near a
+    vehicle, and stay alike for `error_time` (first-order Gauss-Markov), so that what is counted
+    of them does not depend on the frame period. Without an `error_time` they are new every frame.
+    """
+
+    def __init__(self, network, model, mounting_std, error_time):
+        self._positions = np.ascontiguousarray(network.positions, dtype=float)
+        self._R_sw = network.R_sw
+        self._model = model
+        self._error_time = error_time
+        self._n_angles = 3 if mounting_std else 0
+        self.n_target = len(model.state_names)
+        self.own_std = np.repeat([mounting_std, 1.0], [self._n_angles, 3 if error_time else 0])
+        """(n_own,) deviations of a sensor's own states when a track begins."""
+
+    @property
+    def n_own(self):
+        """States of each sensor between the target's and the backgrounds."""
+        return len(self.own_std)
+
+    def own(self, x):
+        """(..., n_sensors, n_own): the sensors' own states among those on the last axis of `x`."""
+        n = len(self._positions)
+        own = x[..., self.n_target:x.shape[-1] - 3 * n]
+        return own.reshape(*own.shape[:-1], n, self.n_own)
+
+    def angles(self, x):
+        """(..., n_sensors, 3) [rad] mounting angles; (..., 0, 3) where they are not estimated."""
+        return self.own(x)[..., :3] if self._n_angles else np.zeros((*x.shape[:-1], 0, 3))
+
+    def drift(self, dt, background_density):
+        """What becomes of the sensors' states over `dt` seconds.
+
+        Returns
+        -------
+        decay, variance : (n_own + 3) n_sensors
+            They are multiplied by the one, and the other is added.
+        """
+        n = len(self._positions)
+        fading = np.exp(-abs(dt) / self._error_time) if self._error_time else 1.0
+        angles, errors = self._n_angles, self.n_own - self._n_angles
+        decay = np.tile(np.repeat([1.0, fading], [angles, errors]), n)
+        variance = np.tile(np.repeat([0.0, 1.0 - fading**2], [angles, errors]), n)
+        walk = background_density**2 * max(dt, 0.0)
+        return np.append(decay, np.ones(3 * n)), np.append(variance, np.full(3 * n, walk))
+
+    def target_fields(self, x, time_offset):
+        """Field of the target alone, at each sensor's own time; see `sensor_fields`."""
+        n_hyp, n, n_t = len(x), len(self._positions), self.n_target
+        h, H = np.empty((n_hyp, n, 3)), np.empty((n_hyp, n, 3, n_t))
+        gradient = np.empty((n_hyp, n))
+        steps = np.round(time_offset / SAME_TIME_S)
+        for step in np.unique(steps):
+            j = np.flatnonzero(steps == step)
+            moved, F, _ = self._model.propagate(x[:, :n_t], step * SAME_TIME_S)
+            h[:, j], H_moved, gradient[:, j] = sensor_fields(
+                self._positions[j], self._R_sw[j], *self._model.dipoles(moved))
+            H[:, j] = H_moved @ (F if F.ndim == 2 else F[:, None])
+        return h, H, gradient
+
+    def fields(self, x, time_offset, near_field_length, field_error):
+        """Fields as the sensors see them, without the backgrounds.
+
+        Parameters
+        ----------
+        x : (n_hyp, n_x)
+        time_offset : (n_sensors,) [s]
+        near_field_length : (n_hyp,) [m]
+        field_error : float
+            Model error relative to the field.
+
+        Returns
+        -------
+        h : (n_hyp, n_sensors, 3) [T], sensor frame
+        H : (n_hyp, n_sensors, 3, n_target + n_own)
+        inflation : (n_hyp, n_sensors) [T^2]
+            Variance of the model error, where it is new in every frame; else 0.
+
+        Source: ICASSP11 eq. (9) for the size of the model error.
+        """
+        h, H, gradient = self.target_fields(x, time_offset)
+        variance = (np.square(near_field_length)[:, None] * gradient**2
+                    + field_error**2 * np.einsum('pji,pji->pj', h, h))
+        own = self.own(x)
+        if self._n_angles:
+            h, H = turned_fields(h, H, np.ascontiguousarray(own[..., :3]))
+        if not self._error_time:
+            return h, H, variance
+        size = np.sqrt(variance)[:, :, None]
+        h = h + size * own[..., -3:]
+        H = np.concatenate([H, size[..., None] * np.eye(3)], axis=3)
+        return h, H, np.zeros_like(variance)

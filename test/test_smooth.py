@@ -1,0 +1,217 @@
+"""Smoothing: against the stacked least-squares solution, and on tracks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import POINT, line_network
+
+from mag_tracking.inference.smoother import smooth
+from mag_tracking.io.simulator import Path, point_body, random_vehicle, simulate
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.records import SmoothedPose, Track
+from mag_tracking.stages.track import TrackStage
+
+
+def stacked(F, Q, H, R, y, x0, P0):
+    """Means and covariances of all states given all measurements, by one least squares."""
+    n, n_x = len(y), len(x0)
+    A, b = [np.linalg.inv(np.linalg.cholesky(P0)) @ np.eye(n_x, n * n_x)], []
+    b.append(np.linalg.inv(np.linalg.cholesky(P0)) @ x0)
+    L_q, L_r = np.linalg.inv(np.linalg.cholesky(Q)), np.linalg.inv(np.linalg.cholesky(R))
+    for k in range(n):
+        row = np.zeros((len(R), n * n_x))
+        row[:, k * n_x:(k + 1) * n_x] = H[k]
+        A.append(L_r @ row)
+        b.append(L_r @ y[k])
+        if k + 1 < n:
+            row = np.zeros((n_x, n * n_x))
+            row[:, k * n_x:(k + 1) * n_x], row[:, (k + 1) * n_x:(k + 2) * n_x] = -F, np.eye(n_x)
+            A.append(L_q @ row)
+            b.append(np.zeros(n_x))
+    A, b = np.vstack(A), np.concatenate(b)
+    C = np.linalg.inv(A.T @ A)
+    return (C @ A.T @ b).reshape(n, n_x), [C[k * n_x:(k + 1) * n_x, k * n_x:(k + 1) * n_x]
+                                           for k in range(n)]
+
+
+def filtered_chain(F, Q, H, R, y, x0, P0):
+    """A plain Kalman filter: what `smooth` wants."""
+    x, P, filtered, predicted = x0, P0, [], []
+    for k in range(len(y)):
+        if k:
+            x, P = F @ x, F @ P @ F.T + Q
+            predicted.append((x, P))
+        K = P @ H[k].T @ np.linalg.inv(H[k] @ P @ H[k].T + R)
+        x, P = x + K @ (y[k] - H[k] @ x), P - K @ H[k] @ P
+        filtered.append((x, P))
+    return filtered, predicted, [F] * (len(y) - 1)
+
+
+@pytest.mark.parametrize('unit', [1.0, 1e-8])
+def test_the_backward_pass_gives_what_least_squares_over_all_times_gives(unit):
+    """Also where one state is in metres and another of the size of teslas."""
+    rng = np.random.default_rng(1)
+    F = np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.9]])
+    Q, P0 = np.diag([0.01, 0.02, 0.1]), np.diag([4.0, 2.0, 1.0])
+    H, R = rng.standard_normal((12, 2, 3)), np.diag([0.3, 0.5])
+    y, x0 = rng.standard_normal((12, 2)), np.array([1.0, -1.0, 0.5])
+    mean, covariance = stacked(F, Q, H, R, y, x0, P0)
+    T = np.diag([1.0, 1.0, unit])
+    back = np.linalg.inv(T)
+    out = smooth(*filtered_chain(T @ F @ back, T @ Q @ T, H @ back, R, y, T @ x0, T @ P0 @ T))
+    for k, (x, P) in enumerate(out):
+        np.testing.assert_allclose(back @ x, mean[k], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(back @ P @ back, covariance[k], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(P, P.T, rtol=1e-12)
+
+
+def test_what_is_known_exactly_stays_as_it_is():
+    """A state without variance, and two that are one: neither is divided by."""
+    rng = np.random.default_rng(2)
+    F, Q = np.eye(3), np.diag([0.1, 0.1, 0.0])
+    Q[:2, :2] = 0.1
+    P0 = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    H, R, y = np.tile([[1.0, 0.0, 1.0]], (6, 1, 1)), np.array([[0.2]]), rng.standard_normal((6, 1))
+    out = smooth(*filtered_chain(F, Q, H, R, y, np.array([0.0, 0.0, 3.0]), P0))
+    alone = smooth(*filtered_chain(np.eye(1), np.array([[0.1]]), H[:, :, :1], R, y - 3.0,
+                                   np.zeros(1), np.eye(1)))
+    for (x, P), (x1, P1) in zip(out, alone, strict=True):
+        np.testing.assert_allclose(x, [x1[0], x1[0], 3.0], atol=1e-8)
+        np.testing.assert_allclose(P[0, 1], P1[0, 0], atol=1e-8)
+
+
+def run(body, changes, seed=0, speed=10.0):
+    """(records, truth: function of stamps) of one simulated straight pass."""
+    network = line_network(2, tilt=0.0)
+    samples, t, position, _ = simulate(network, body, Path(np.array([-70.0, -1.2]), 0.0, speed),
+                                       100.0, 12.0, np.random.default_rng(seed))
+    pipeline = Pipeline(network, settings_for('vehicle', changes))
+    records = [r for s in samples for r in pipeline.feed(s)] + pipeline.flush()
+
+    def truth(stamps_ns):
+        at = np.array(stamps_ns) / 1e9
+        return np.stack([np.interp(at, t, position[:, k]) for k in (0, 1)], axis=1)
+    return records, truth
+
+
+def errors_of(poses, truth):
+    """(errors (n,) [m], NEES (n,) per axis) in the plane."""
+    e = np.array([p.position[:2] for p in poses]) - truth([p.stamp_ns for p in poses])
+    C = np.array([p.covariance[:2, :2] for p in poses])
+    return np.hypot(*e.T), np.einsum('ni,ni->n', e, np.linalg.solve(C, e[:, :, None])[:, :, 0]) / 2
+
+
+def near(poses, truth):
+    """[bool] which of the poses are within five metres of the middle between the sensors."""
+    return np.hypot(*truth([p.stamp_ns for p in poses]).T) < 5.0
+
+
+def smoothing_study(bodies, changes):
+    """Per pass: RMS error within 5 m, smoothed over filtered, and NEES per axis, smoothed."""
+    ratios, nees = [], []
+    for seed, body in enumerate(bodies):
+        records, truth = run(body, changes, seed, np.random.default_rng(seed).uniform(8.0, 18.0))
+        live = [r for r in records if isinstance(r, Track) and not r.ended]
+        smoothed = [r for r in records if isinstance(r, SmoothedPose)]
+        assert [s.stamp_ns for s in smoothed] == [t.stamp_ns for t in live]
+        there = near(live, truth)
+        before, (after, z) = errors_of(live, truth)[0][there], errors_of(smoothed, truth)
+        ratios.append(np.sqrt(np.mean(after[there] ** 2) / np.mean(before**2)))
+        nees.append(z[there].mean())
+    return np.array(ratios), np.array(nees)
+
+
+def test_smoothing_a_matched_target_takes_a_quarter_of_the_error_away():
+    """Not the 0.6 that is the aim: near the sensors the filter already knows nearly all."""
+    rng = np.random.default_rng(5)
+    bodies = [point_body(rng.uniform(300.0, 500.0) * u / np.linalg.norm(u), 3.0, 0.5)
+              for u in rng.standard_normal((40, 3))]
+    ratios, nees = smoothing_study(bodies, {
+        **POINT, 'track.vehicle.near_field_lengths': [0.0], 'track.field_error': 0.0,
+        'track.mounting_std_deg': 0.0, 'track.model_error_time_s': 0.0})
+    print(f'matched: smoothed over filtered error {np.median(ratios):.2f} (median), '
+          f'ANEES {nees.mean():.2f}')
+    assert np.median(ratios) <= 0.8
+    assert 0.6 <= nees.mean() <= 1.3
+
+
+def test_smoothed_cars_are_nearer_and_no_surer_than_they_are_right():
+    ratios, nees = smoothing_study(
+        [random_vehicle(np.random.default_rng(100 + k), length=4.0) for k in range(40)], {})
+    print(f'clouds of 4 m: smoothed over filtered error {np.median(ratios):.2f} (median), '
+          f'ANEES {nees.mean():.2f}, median {np.median(nees):.2f}')
+    assert np.median(ratios) <= 0.7
+    assert nees.mean() <= 3.0
+
+
+def test_the_last_smoothed_pose_is_the_last_filtered_one_and_none_is_surer_without_reason():
+    """Before it is linearised anew; on a matched point target."""
+    records, _ = run(point_body([250.0, -150.0, 80.0], 4.0, 0.5), POINT)
+    live = [r for r in records if isinstance(r, Track) and not r.ended]
+    smoothed = [r for r in records if isinstance(r, SmoothedPose)]
+    np.testing.assert_allclose(smoothed[-1].position, live[-1].position, atol=0.2)
+    spread = [[np.trace(p.covariance[:2, :2]) for p in poses] for poses in (smoothed, live)]
+    assert (np.array(spread[0])[:-5] < np.array(spread[1])[:-5]).mean() > 0.9
+    assert all(s.complete and s.kind == 'car' and s.length == 0.0 for s in smoothed)
+    for s in smoothed:
+        assert np.linalg.eigvalsh(s.covariance).min() > -1e-9
+
+
+def test_a_fixed_lag_gives_every_pose_once_when_its_time_has_come():
+    lag = 0.5
+    body = point_body([250.0, -150.0, 80.0], 4.0, 0.5)
+    records, truth = run(body, {**POINT, 'track.smoothing_lag_s': lag})
+    now, lagged, live = None, [], []
+    for r in records:
+        if isinstance(r, Track) and not r.ended:
+            now = r.stamp_ns
+            live.append(r)
+        elif isinstance(r, SmoothedPose) and not r.complete:
+            assert 0.0 <= (now - r.stamp_ns) / 1e9 - lag < 0.09
+            lagged.append(r)
+    assert [r.stamp_ns for r in lagged] == [
+        t.stamp_ns for t in live if now - t.stamp_ns >= lag * 1e9]
+    same = live[:len(lagged)]
+    assert np.median(errors_of(lagged, truth)[0]) < np.median(errors_of(same, truth)[0])
+    # What is published now does not depend on what is smoothed.
+    plain = [r for r in run(body, POINT)[0] if isinstance(r, Track) and not r.ended]
+    np.testing.assert_array_equal([t.position for t in live], [t.position for t in plain])
+
+
+def test_smoothing_can_be_left_out_and_what_is_too_long_is_counted():
+    body = point_body([250.0, -150.0, 80.0], 4.0, 0.5)
+    none, _ = run(body, {**POINT, 'track.smooth_longest_s': 0.0})
+    assert not [r for r in none if isinstance(r, SmoothedPose)]
+    network = line_network(2, tilt=0.0)
+    samples, *_ = simulate(network, body, Path(np.array([-70.0, -1.2]), 0.0, 10.0), 100.0, 12.0,
+                           np.random.default_rng(0))
+    pipeline = Pipeline(network, settings_for('vehicle', {
+        **POINT, 'track.smooth_longest_s': 1.0}))
+    records = [r for s in samples for r in pipeline.feed(s)] + pipeline.flush()
+    assert [r for r in records if isinstance(r, Track)]
+    assert not [r for r in records if isinstance(r, SmoothedPose)]
+    assert pipeline.track.counts['tracks too long to smooth'] == 1
+
+
+def test_missing_frames_are_bridged():
+    """Half a second without a measurement in the middle of a pass: smoothed from both sides."""
+    body = point_body([250.0, -150.0, 80.0], 4.0, 0.5)
+    network = line_network(2, tilt=0.0)
+    samples, t, position, _ = simulate(network, body, Path(np.array([-70.0, -1.2]), 0.0, 10.0),
+                                       100.0, 12.0, np.random.default_rng(0))
+    pipeline = Pipeline(network, settings_for('vehicle', POINT))
+    stage = TrackStage(network, settings_for('vehicle', POINT).track)
+    out = []
+    for s in samples:
+        for r in pipeline.feed(s):
+            if hasattr(r, 'target_present'):
+                if 6.8 < r.stamp_ns / 1e9 < 7.3:
+                    r = replace(r, field=np.full((2, 3), np.nan))
+                out += stage.feed(r)
+    out += stage.flush()
+    gap = [r for r in out if isinstance(r, SmoothedPose) and 6.8 < r.stamp_ns / 1e9 < 7.3]
+    assert len(gap) >= 5
+    for r in gap:
+        q = [np.interp(r.stamp_ns / 1e9, t, position[:, k]) for k in (0, 1)]
+        assert np.hypot(*(r.position[:2] - q)) < 0.3
