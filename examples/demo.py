@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from mag_tracking_msgs.msg import HypothesisArray, NetworkFrame, TrackArray
+from nav_msgs.msg import Path as PathMessage
 from rclpy.node import Node
 
 from mag_tracking.errors import MagTrackingError, OutputError
@@ -21,7 +22,7 @@ from mag_tracking.io.network_file import read_network
 from mag_tracking.io.schema import frame_of, stamp_ns
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.runner import line_of, run
-from mag_tracking.nodes.stage_node import STREAM
+from mag_tracking.nodes.stage_node import RESULTS, STREAM
 from mag_tracking.pipeline import settings_for
 from mag_tracking.report.figures import field_figure, map_figure, weights_figure
 from mag_tracking.report.metrics import interpolate_truth, pass_errors
@@ -37,11 +38,12 @@ class Spectator(Node):
     def __init__(self, network):
         super().__init__('spectator')
         self.network = network
-        self.logs, self.truth = {}, []
+        self.logs, self.truth, self.smoothed = {}, [], {}
         self._frames, self._hypotheses = {}, {}
         self.create_subscription(NetworkFrame, '/detection_node/frame', self._frame, STREAM)
         self.create_subscription(HypothesisArray, '/tracker_node/hypotheses', self._bank, STREAM)
         self.create_subscription(TrackArray, '/tracker_node/tracks', self._track, STREAM)
+        self.create_subscription(PathMessage, '/tracker_node/path_smoothed', self._whole, RESULTS)
         self.create_subscription(PoseStamped, '/ground_truth/vehicle_00/pose', self._true, STREAM)
 
     def _frame(self, message):
@@ -50,6 +52,11 @@ class Spectator(Node):
 
     def _bank(self, message):
         self._hypotheses[stamp_ns(message.header.stamp)] = message
+
+    def _whole(self, message):
+        """A track has ended: the latest one that was drawn, once more, by all that was measured."""
+        positions = [pose.pose.position for pose in message.poses]
+        self.smoothed[max(self.logs)] = np.array([[p.x, p.y, p.z] for p in positions])
 
     def _true(self, message):
         p, q = message.pose.position, message.pose.orientation
@@ -80,7 +87,8 @@ def draw(spectator, out):
         if not log.stamp_ns:
             continue
         for name, figure in (
-                ('map', map_figure(log, network, interpolate_truth(truth, log.stamp_ns))),
+                ('map', map_figure(log, network, interpolate_truth(truth, log.stamp_ns),
+                                   spectator.smoothed.get(log.id))),
                 ('weights', weights_figure(log)), ('field', field_figure(log, network))):
             paths.append(out / f'{name}_track_{log.id}.png')
             figure.savefig(paths[-1], dpi=110)

@@ -22,6 +22,7 @@ filters. No ROS has to run: the nodes use the very same code.
 
 Writes to DIR:
   poses.csv        the published pose, one row a frame
+  poses_smoothed.csv  the same by what came before and after, when a track has ended
   detections.csv   onsets and releases
   hypotheses.csv   every member of the bank, every frame
   summary.json     counts, rejected samples by cause, the tracks

@@ -185,8 +185,8 @@ def write_figures(run, network, out, most=6, stopped=None):
         truth = None
         if 'truth' in entry:
             truth = interpolate_truth(run.truth[entry['truth']['name']], log.stamp_ns)
-        for name, figure in (('map', map_figure(
-                log, network, truth, run.smoothed.get(log.id))),
+        smoothed = run.smoothed[log.id].position if log.id in run.smoothed else None
+        for name, figure in (('map', map_figure(log, network, truth, smoothed)),
                              ('weights', weights_figure(log)),
                              ('field', field_figure(log, network))):
             path = out / f'{name}_track_{log.id}.png'

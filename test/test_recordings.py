@@ -9,13 +9,15 @@ import json
 
 import numpy as np
 import pytest
-from conftest import VEHICLES, vehicle_path
+from conftest import DATA, VEHICLES, vehicle_path
 
 from mag_tracking.io.bag import Recording
+from mag_tracking.io.network_file import read_network
 from mag_tracking.io.samples import SampleReader
 from mag_tracking.offline import replay
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
+from mag_tracking.report.metrics import interpolate_truth
 
 ARRIVAL = {name: 'right' if '_left' in name and name.startswith('straight') else
            name.split('_')[1] if name.startswith('junction') else 'left' for name in VEHICLES}
@@ -135,6 +137,27 @@ def test_kind(vehicle_replays, name):
     track = pass_of(vehicle_replays, name)
     print(f'{name}: {track["kind"]} {track["kind_weight"]:.3f}, {track["length"]:.1f} m')
     assert track['kind'] == KINDS[name]
+
+
+def test_a_car_is_followed_along_a_corridor(tmp_path):
+    """Eight sensors along 42 m, an accelerating car: one track, all the way."""
+    folder = DATA / 'corridor'
+    network = read_network(folder / 'network.yaml')
+    run = replay(Recording(folder / 'corridor_8_sensors.mcap'), network, settings_for('vehicle'),
+                 tmp_path)
+    assert len(run.logs) == 1
+    log = next(iter(run.logs.values()))
+    truth = next(iter(run.truth.values()))
+    for name, poses in (('filtered', log), ('smoothed', run.smoothed[log.id])):
+        true = interpolate_truth(truth, poses.stamp_ns)
+        along = (true[:, 0] > 0.0) & (true[:, 0] < 42.0)
+        e = (np.array(poses.position) - true)[along, :2]
+        C = np.array(poses.covariance)[along, :2, :2]
+        rms = np.sqrt((e**2).sum(axis=1).mean())
+        anees = np.einsum('ni,nij,nj->n', e, np.linalg.inv(C), e).mean() / 2
+        print(f'corridor, {name}: {along.sum()} poses, RMS {rms:.2f} m, ANEES {anees:.1f}')
+        assert np.ptp(true[along, 0]) > 41.0
+        assert rms <= 0.6
 
 
 @pytest.mark.parametrize('run', [1, 2])

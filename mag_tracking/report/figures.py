@@ -56,7 +56,7 @@ def map_figure(log, network, truth=None, smoothed=None):
     log : TrackLog
     network : SensorNetwork
     truth : (n, 3) [m], optional
-    smoothed : SmoothedLog, optional
+    smoothed : (n, 3) [m], optional
     """
     figure = Figure(figsize=(7.5, 6.5), layout='constrained')
     axes = figure.add_subplot()
@@ -80,7 +80,7 @@ def map_figure(log, network, truth=None, smoothed=None):
     if truth is not None and np.isfinite(truth).any():
         axes.plot(f * truth[:, 0], f * truth[:, 1], 'k--', lw=1.2, label='truth')
     if smoothed is not None:
-        axes.plot(*(f * np.array(smoothed.position)[:, :2]).T, color='tab:red', lw=1.4,
+        axes.plot(*(f * np.asarray(smoothed)[:, :2]).T, color='tab:red', lw=1.4,
                   label='smoothed')
     axes.plot(f * network.positions[:, 0], f * network.positions[:, 1], 'k^', ms=8,
               label='magnetometers')
