@@ -134,6 +134,7 @@ def _summary(recording, reader, pipeline, taker, truth):
 def _track_entry(log, smoothed, pipeline, truth):
     """One track in the summary; `smoothed` is its `SmoothedLog` or None."""
     entry = log.summary()
+    entry['nis_by_sensor'] = log.nis_of(pipeline.network.names)
     entry['mounting'] = _mounting(log, pipeline)
     errors = _against_truth(log, pipeline, truth)
     if errors:

@@ -134,6 +134,8 @@ class Track:
     """Of the published hypothesis, 0..1."""
     nis: float
     """Normalised innovation squared of the published hypothesis; NaN without a measurement."""
+    nis_by_sensor: np.ndarray
+    """(n_sensors,) its parts, each given the sensors before it; NaN of a missing sensor."""
     degrees_of_freedom: int
     arrival: str
     kind: str

@@ -19,7 +19,7 @@ def bank(n=4, spread=10.0, label=None):
     P = np.repeat(np.eye(7)[None], n, axis=0)
     return FilterBank(x, P, np.full(n, -np.log(n)),
                       np.arange(n) if label is None else np.array(label),
-                      np.zeros(n, dtype=int), np.arange(n), np.arange(n) + 0.5)
+                      np.zeros(n, dtype=int), np.arange(n), np.arange(n)[:, None] + 0.5)
 
 
 def test_the_innovations_stay_with_their_hypotheses():
@@ -27,7 +27,7 @@ def test_the_innovations_stay_with_their_hypotheses():
     b.log_w = np.log([0.1, 0.3, 1e-14, 0.2, 0.2, 0.2])
     b.kind = 10 * np.arange(6)
     b.prune(20.0, 100)
-    assert b.nis.tolist() == [0.5, 1.5, 3.5, 4.5, 5.5]
+    assert b.nis[:, 0].tolist() == [0.5, 1.5, 3.5, 4.5, 5.5]
     assert b.kind.tolist() == [0, 10, 30, 40, 50]
     assert b.origin.tolist() == b.label.tolist() == [0, 1, 3, 4, 5]
 
@@ -39,7 +39,8 @@ def test_another_arrival_makes_a_track_ambiguous_even_where_the_places_agree(
     model = RowVehicle(np.zeros(3), np.ones(3), n_dipoles=1)
     x = np.tile([1.0, 2.0, 0.5, 10.0, 0.0, 0.0, 100.0, 0.0, 0.0, 0.0], (2, 1))
     b = FilterBank(x, np.repeat(np.eye(10)[None], 2, axis=0), np.log([other, 1.0 - other]),
-                   np.array([label, 0]), np.array([0, 1]), np.arange(2), np.array([7.0, 3.0]))
+                   np.array([label, 0]), np.array([0, 1]), np.arange(2),
+                   np.array([[7.0, np.nan], [1.0, 2.0]]))
     track = published_track(
         b, 1, model, vehicle_orientation, ('left', 'right'), ('car', 'truck'),
         False, stamp_ns=1, id=1, ended=False,
@@ -47,6 +48,7 @@ def test_another_arrival_makes_a_track_ambiguous_even_where_the_places_agree(
         mounting=np.zeros((0, 3)), mounting_std=np.zeros((0, 3)))
     assert track.ambiguous == ambiguous
     assert (track.arrival, track.nis, track.kind) == ('left', 3.0, 'truck')
+    assert track.nis_by_sensor.tolist() == [1.0, 2.0]
     assert track.kind_weight == pytest.approx(1.0 - other)
     assert [h.kind for h in track.hypotheses] == ['truck', 'car']
 

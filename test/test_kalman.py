@@ -85,7 +85,7 @@ def compare(n_sensors, missing=False, shift=0.0):
         worst[0] = max(worst[0], np.abs((new_x[p] - ox) / sd).max())
         worst[1] = max(worst[1], np.abs((new_P[p] - oP) / np.outer(sd, sd)).max())
         assert abs(log_likelihood[p] - oll) <= 1e-8 * max(1.0, abs(oll))
-        assert abs(nis[p] - onis) <= 1e-8 * max(1.0, onis)
+        assert abs(nis[p].sum() - onis) <= 1e-8 * max(1.0, onis)
         ekf = ExtendedKalmanFilter(len(x[p]), len(z))
         ekf.x, ekf.P, ekf.R = x[p].copy(), P[p].copy(), np.eye(len(z))
         ekf.update(z, lambda _, A=A: A, lambda _, z=z: np.zeros_like(z))
@@ -133,7 +133,7 @@ def test_update_in_numbers_near_one_with_any_axes_missing(n_t, n_own):
                                         n_own)
     np.testing.assert_allclose(new_x[0], ox, atol=1e-9)
     np.testing.assert_allclose(new_P[0], oP, atol=1e-9)
-    np.testing.assert_allclose([log_likelihood[0], nis[0]], [oll, onis], rtol=1e-9)
+    np.testing.assert_allclose([log_likelihood[0], nis[0].sum()], [oll, onis], rtol=1e-9)
 
 
 def test_update_linearised_elsewhere():
@@ -185,6 +185,7 @@ def test_nees_of_a_linear_gaussian_case_is_chi_square():
     x, P = np.zeros((runs, n_x)), np.repeat(P0[None], runs, axis=0)
     H = np.repeat(rng.standard_normal((n_sensors, 3, n_t))[None], runs, axis=0)
     C = np.repeat(np.diag([0.5, 1.0, 2.0])[None], n_sensors, axis=0)
+    nis = []
     for k in range(steps):
         if k:
             truth[:, :n_t] = truth[:, :n_t] @ F.T + rng.multivariate_normal(np.zeros(6), Q, runs)
@@ -196,10 +197,15 @@ def test_nees_of_a_linear_gaussian_case_is_chi_square():
         # The measurement differs from run to run, so each is an update of its own.
         for p in range(runs):
             h = np.einsum('jic,c->ji', H[p], x[p, :n_t])[None]
-            kalman.update(x[p:p + 1], P[p:p + 1], y[p], h, H[p:p + 1], C,
-                          np.zeros((1, n_sensors)))
+            nis.append(kalman.update(x[p:p + 1], P[p:p + 1], y[p], h, H[p:p + 1], C,
+                                     np.zeros((1, n_sensors)))[1][0])
     e = truth - x
     nees = np.einsum('pi,pij,pj->p', e, np.linalg.inv(P), e)
     low, high = chi2.ppf([0.025, 0.975], runs * n_x) / runs
     print(f'linear Gaussian NEES {nees.mean():.3f}, band {low:.3f} .. {high:.3f}')
     assert low <= nees.mean() <= high
+    # Innovations are white: each sensor's alone has three degrees of freedom, in every step.
+    low, high = chi2.ppf([0.005, 0.995], 3 * len(nis)) / len(nis)
+    by_sensor = np.mean(nis, axis=0)
+    print(f'NIS by sensor {by_sensor.round(3)}, band {low:.3f} .. {high:.3f}')
+    assert (low <= by_sensor).all() and (by_sensor <= high).all()

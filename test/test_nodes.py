@@ -214,11 +214,12 @@ def test_conversion_survives_the_message():
     back = track_of(to_message(TrackMessage, track_dict(track, 'map')),
                     to_message(HypothesisArray, hypotheses_dict(track, 'map')))
     for name in ('stamp_ns', 'id', 'ended', 'existence', 'weight', 'nis', 'degrees_of_freedom',
-                 'arrival', 'ambiguous', 'unobservable'):
+                 'arrival', 'ambiguous', 'unobservable', 'kind', 'kind_weight', 'length',
+                 'length_std'):
         assert getattr(back, name) == getattr(track, name), name
     for name in ('position', 'velocity', 'covariance', 'orientation', 'orientation_covariance',
                  'position_orientation_covariance', 'moment', 'moment_covariance', 'predicted',
-                 'mounting', 'mounting_std'):
+                 'mounting', 'mounting_std', 'nis_by_sensor'):
         np.testing.assert_array_equal(getattr(back, name), getattr(track, name))
     assert len(back.hypotheses) == len(track.hypotheses)
 

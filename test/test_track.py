@@ -176,7 +176,8 @@ def test_a_frame_without_a_measurement_is_coasted_through():
     for f in frames[:5]:
         before = stage.feed(f)[-1]
     after = stage.feed(dataclasses.replace(frames[5], field=np.full((9, 3), np.nan)))[-1]
-    assert np.isnan(after.nis) and after.degrees_of_freedom == 0
+    assert np.isnan(after.nis) and np.isnan(after.nis_by_sensor).all()
+    assert after.degrees_of_freedom == 0
     assert (np.diagonal(after.covariance) > np.diagonal(before.covariance)).all()
 
 
@@ -196,7 +197,7 @@ def test_a_hypothesis_on_a_sensor_is_dropped_and_the_rest_go_on():
     bank = stage.bank
     bank.x, bank.P = np.vstack([bank.x, bank.x[:1]]), np.concatenate([bank.P, bank.P[:1]])
     bank.log_w, bank.label = np.append(bank.log_w, bank.log_w[0]), np.append(bank.label, 0)
-    bank.nis, bank.kind = np.append(bank.nis, 0.0), np.append(bank.kind, 0)
+    bank.nis, bank.kind = np.vstack([bank.nis, bank.nis[:1]]), np.append(bank.kind, 0)
     bank.origin = np.append(bank.origin, len(bank.origin))
     bank.x[-1, :3] = network.positions[0]
     bank.x[-1, 3:6] = 0.0

@@ -39,7 +39,8 @@ class FilterBank:
     origin: np.ndarray
     """(n_hyp,) int: the row that each hypothesis had when the bank was made."""
     nis: np.ndarray
-    """(n_hyp,) normalised innovation squared of the latest measurement; NaN before it."""
+    """(n_hyp, n_sensors) normalised innovation squared of the latest measurement; NaN before it,
+    and of a sensor that is missing."""
 
     @classmethod
     def of_targets(cls, x, P, label, n_sensors, background_std, own_std=(), kind=None):
@@ -58,7 +59,7 @@ class FilterBank:
         full_P[:, rest, rest] = std**2
         return cls(full_x, full_P, np.full(n, -np.log(n)), label,
                    np.zeros(n, dtype=int) if kind is None else kind, np.arange(n),
-                   np.full(n, np.nan))
+                   np.full((n, n_sensors), np.nan))
 
     def __len__(self):
         return len(self.log_w)

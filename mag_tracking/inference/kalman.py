@@ -194,7 +194,7 @@ def _whiten(T, l10, l20, l21, r0, r1, r2):
 
 @njit('int64(float64[:,::1], float64[:,:,::1], float64[:,::1], float64[:,::1], '
       'float64[:,:,::1], float64[:,:,::1], float64[:,:,:,::1], float64[:,::1], '
-      'int64, float64[::1], float64[::1])', **_COMPILE)
+      'int64, float64[::1], float64[:,::1])', **_COMPILE)
 def _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis):
     """Loop of the update over hypotheses and sensors; nothing is changed where it is not 0.
 
@@ -216,7 +216,6 @@ def _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis)
     T = np.empty((3, x.shape[1]))
     for p in range(n_hyp):
         log_likelihood[p] = -0.5 * n * _LOG_2PI
-        nis[p] = 0.0
         for j in range(n_sensors):
             first = x.shape[1] - 3 * (n_sensors - j)
             _gain_rows(y, P, H, p, j, n_own, first, T)
@@ -229,7 +228,7 @@ def _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis)
             z0, z1, z2 = r0 * u0, r1 * u1, r2 * (u2 - l20 * u0 - l21 * u1)
             _apply(x, P, p, T, z0, z1, z2)
             q = z0 * z0 + z1 * z1 + z2 * z2
-            nis[p] += q
+            nis[p, j] = q
             log_likelihood[p] -= 0.5 * (q + math.log(e0 * e1 * e2))
     return 0
 
@@ -260,8 +259,9 @@ def update(x, P, y, h, H, C, inflation, x_lin=None, n_own=0):
     -------
     log_likelihood : (n_hyp,)
         Log-density of the measurement given the past, in tesla^-n.
-    nis : (n_hyp,)
-        Normalised innovation squared; as many degrees of freedom as axes present.
+    nis : (n_hyp, n_sensors)
+        Normalised innovation squared of each sensor, given those before it; as many degrees of
+        freedom as it has axes present. Their sum is that of the stacked update.
 
     Raises
     ------
@@ -271,7 +271,7 @@ def update(x, P, y, h, H, C, inflation, x_lin=None, n_own=0):
     Source: T10 Alg. 2, measurement update; ICASSP11 eq. (9) for the inflation.
     """
     x_lin = x.copy() if x_lin is None else x_lin
-    log_likelihood, nis = np.empty(len(x)), np.empty(len(x))
+    log_likelihood, nis = np.empty(len(x)), np.empty(inflation.shape)
     try:
         status = _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis)
     except TypeError as error:

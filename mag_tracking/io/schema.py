@@ -53,7 +53,7 @@ DEFINITIONS = {
         'geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/Vector3 velocity\n'
         'float64[36] covariance\ngeometry_msgs/Vector3 moment\nfloat64[9] moment_covariance\n'
         'float64 existence\nfloat64 weight\nfloat64 normalised_innovation\n'
-        'uint32 degrees_of_freedom\nstring arrival\nstring kind\n'
+        'float64[] innovation_by_sensor\nuint32 degrees_of_freedom\nstring arrival\nstring kind\n'
         'float64 kind_weight\nfloat64 length\nfloat64 length_std\nbool ambiguous\n'
         'bool[6] unobservable\n'
         'float64[] predicted_field\nfloat64[] mounting\nfloat64[] mounting_std\n'),
@@ -193,6 +193,7 @@ def track_dict(track, frame):
             'moment_covariance': track.moment_covariance.ravel().tolist(),
             'existence': track.existence, 'weight': track.weight,
             'normalised_innovation': track.nis, 'degrees_of_freedom': track.degrees_of_freedom,
+            'innovation_by_sensor': track.nis_by_sensor.tolist(),
             'arrival': track.arrival, 'kind': track.kind, 'kind_weight': track.kind_weight,
             'length': track.length, 'length_std': track.length_std, 'ambiguous': track.ambiguous,
             'unobservable': list(track.unobservable),

@@ -41,6 +41,7 @@ class TrackLog:
     moment: list = field(default_factory=list)
     orientation: list = field(default_factory=list)
     nis: list = field(default_factory=list)
+    nis_by_sensor: list = field(default_factory=list)
     degrees_of_freedom: list = field(default_factory=list)
     ambiguous: list = field(default_factory=list)
     arrivals: list = field(default_factory=list)
@@ -61,8 +62,8 @@ class TrackLog:
             self.ended = True
             return
         for name in ('stamp_ns', 'position', 'velocity', 'covariance', 'moment', 'orientation',
-                     'nis', 'degrees_of_freedom', 'ambiguous', 'predicted', 'mounting',
-                     'mounting_std', 'kind', 'kind_weight', 'length'):
+                     'nis', 'nis_by_sensor', 'degrees_of_freedom', 'ambiguous', 'predicted',
+                     'mounting', 'mounting_std', 'kind', 'kind_weight', 'length'):
             getattr(self, name).append(getattr(track, name))
         self.measured.append(frame.field)
         self.existence = track.existence
@@ -87,6 +88,16 @@ class TrackLog:
         k = self.surest()
         return {name: (np.degrees(a), np.degrees(sd)) for name, a, sd in
                 zip(names, self.mounting[k], self.mounting_std[k], strict=False)}
+
+    def nis_of(self, names):
+        """{sensor: mean normalised innovation squared per axis}; None where it was never there.
+
+        About one or less where the sensor agrees with the model and with the others.
+        """
+        axes = (~np.isnan(np.array(self.measured))).sum(axis=(0, 2))
+        total = np.nansum(np.array(self.nis_by_sensor), axis=0)
+        return {name: float(q / n) if n else None
+                for name, q, n in zip(names, total, axes, strict=True)}
 
     def summary(self):
         """The track in a few JSON-ready numbers.

@@ -81,8 +81,7 @@ class BankFilter:
                 self.observation.n_own)
             log_likelihood[lost] = -np.inf
             x_lin = bank.x.copy()
-        if np.isnan(frame.field).all():
-            bank.nis[:] = np.nan
+        bank.nis[:, np.isnan(frame.field).all(axis=1)] = np.nan
         return log_likelihood
 
 

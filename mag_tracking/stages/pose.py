@@ -90,8 +90,10 @@ def published_track(bank, best, model, orientation, names, kinds, strange, **kno
                    bank.x[i, 3:6].copy(), bank.P[i, :6, :6].copy(), moments[i].copy(),
                    kinds[bank.kind[i]])
         for i in order)
+    nis = bank.nis[best]
     return Track(
-        nis=float(bank.nis[best]), weight=float(weights[best]), arrival=names[bank.label[best]],
+        nis=float('nan') if np.isnan(nis).all() else float(np.nansum(nis)),
+        nis_by_sensor=nis.copy(), weight=float(weights[best]), arrival=names[bank.label[best]],
         kind=kinds[bank.kind[best]],
         kind_weight=float(weights.sum(where=bank.kind == bank.kind[best])),
         ambiguous=bool(strange or is_ambiguous(bank, best)),

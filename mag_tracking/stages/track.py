@@ -255,7 +255,8 @@ class TrackStage:
             stamp_ns=frame.stamp_ns,
             id=self._next_id, ended=False,
             existence=float(1.0 / (1.0 + np.exp(-np.clip(self._log_odds, -700.0, 700.0)))),
-            degrees_of_freedom=n_y, strange=bank.nis[best] > self._settings.end_nis * n_y,
+            degrees_of_freedom=n_y,
+            strange=np.nansum(bank.nis[best]) > self._settings.end_nis * n_y,
             predicted=self._filter.predicted_field(bank, best, frame, dt),
             mounting=observation.angles(bank.x[best]),
             mounting_std=observation.angles(np.sqrt(np.diagonal(bank.P[best]))))

@@ -59,7 +59,7 @@ class VehicleSettings:
     near_field_lengths: tuple[float, ...] = param(
         (0.8, 0.3, 0.3), 'How far the iron reaches from where the model has it: near a vehicle '
         'the model errs by the first neglected multipole term (ICASSP11 eq. (9), there lambda).',
-        'm', (0.0, 1000.0), live=True)
+        'm', (0.0, 1000.0))
     soft_iron: float = param(4.0, 'Starting soft iron scalar D; m = Rz m0 + D/mu0 B0.',
                              'm^3', (0.0, 1e4))
     soft_iron_std: float = param(4.0, 'Spread of D; without an earth field it has no effect.',
