@@ -59,6 +59,7 @@ test: $(STAMP)  ## check style, floors and behaviour
 
 bench: $(STAMP)  ## measure times and accuracies
 	$(BIN)/python test/bench/bench.py
+	$(BIN)/python test/bench/matched.py
 	$(BIN)/python test/bench/extended_target.py
 
 # As a user of a ROS from apt would, but with the generators from PyPI.

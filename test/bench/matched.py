@@ -1,0 +1,119 @@
+"""`make bench`: the tracker's bank on targets that are as it believes, against the path bound.
+
+Truths are drawn from a wide prior, moved with the process noise of the model and measured with
+the noise of the sensors; a point, and a row of three dipoles. The bank starts as the tracker's
+does, from the first frame. The bound is the covariance of a filter that is linearised at the truth
+and starts with the covariance of that prior.
+"""
+
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+
+import numpy as np
+from tqdm import tqdm
+
+from mag_tracking.inference.crlb import path_bound
+from mag_tracking.network import SensorNetwork
+from mag_tracking.physics.dipole import sensor_fields
+from mag_tracking.pipeline import settings_for
+from mag_tracking.records import FieldFrame
+from mag_tracking.stages.bank_filter import BankFilter
+from mag_tracking.stages.vehicle_start import start_vehicle, vehicle_model
+
+PERIOD, SIGMA, STEPS = 0.08, 1.2e-8 / np.sqrt(8.0), 26
+NETWORK = SensorNetwork(
+    ('mag_1', 'mag_2'), np.array([[0.0, -4.5, 0.0], [0.0, 4.5, 0.0]]),
+    np.tile(np.eye(3), (2, 1, 1)), ('/mag_1/imu/mag', '/mag_2/imu/mag'),
+    earth_field=np.array([2e-6, 1.55e-5, -4.9e-5]))
+MATCHED = {'track.mounting_std_deg': 0.0, 'track.model_error_time_s': 0.0,
+           'track.field_error': 0.0, 'track.vehicle.near_field_lengths': [0.0],
+           'track.vehicle.kinds': ['car'], 'track.vehicle.moments': [400.0],
+           'track.vehicle.moment_stds': [150.0], 'track.vehicle.heights': [0.5],
+           'track.vehicle.height_stds': [0.2],
+           'track.vehicle.arrival_names': ['left'], 'track.vehicle.arrival_headings_deg': [0.0],
+           'track.vehicle.speeds': [7.0, 10.0, 14.0], 'track.vehicle.soft_iron': 0.0,
+           'track.vehicle.soft_iron_std': 1.0, 'track.background_std': 1e-8,
+           'track.background_drift': 1e-9, 'track.vehicle.acceleration': 0.3,
+           'track.vehicle.moment_drift': 0.01, 'track.vehicle.difference_drift': 0.005}
+TARGETS = {
+    'point': {**MATCHED, 'track.vehicle.lengths': [0.0], 'track.vehicle.length_stds': [0.0],
+              'track.vehicle.difference_stds': [0.0]},
+    'row of three': {**MATCHED, 'track.vehicle.lengths': [3.0], 'track.vehicle.length_stds': [0.5],
+                     'track.vehicle.difference_stds': [30.0]}}
+
+
+def prior_of(settings, n_t):
+    """Mean and covariance of what the truths are drawn from: it comes along x, from 12 m on."""
+    v = settings.vehicle
+    x, P = np.zeros(n_t + 6), np.zeros((n_t + 6, n_t + 6))
+    hard = n_t - 2 if n_t > 10 else n_t - 1
+    d = (hard - 6) // 3
+    x[[0, 2, 3, hard]] = -12.0, v.heights[0], 10.0, v.soft_iron
+    x[hard + 1:n_t] = v.lengths[0]
+    std = np.r_[2.0, 2.0, v.height_stds[0], 3.0, 0.5, 0.05]
+    P[:6, :6] = np.diag(std**2)
+    mean = np.full((d, d), 1.0 / d)
+    P[6:hard, 6:hard] = np.kron(v.moments[0]**2 / 3.0 / d * mean
+                                + v.difference_stds[0]**2 * (np.eye(d) - mean), np.eye(3))
+    P[hard, hard] = 1.0
+    P[hard + 1:n_t, hard + 1:n_t] = v.length_stds[0]**2
+    P[n_t:, n_t:] = settings.background_std**2 * np.eye(6)
+    return x, P
+
+
+def one_run(target, seed):
+    """(error [m], bound [m]) in the plane at each step."""
+    settings = settings_for('vehicle', TARGETS[target]).track
+    model = vehicle_model(settings.vehicle, NETWORK)
+    filter_, bank, rng = BankFilter(NETWORK, model, settings), None, np.random.default_rng(seed)
+    n_t = len(model.state_names)
+    x0, P0 = prior_of(settings, n_t)
+    truth = rng.multivariate_normal(x0, P0, method='eigh')
+    errors, F, Q, H = [], [], [], []
+    for k in range(STEPS):
+        if k:
+            moved, F_t, Q_t = model.propagate(truth[None, :n_t], PERIOD)
+            walk = settings.background_drift**2 * PERIOD * np.eye(6)
+            F.append(np.block([[F_t, np.zeros((n_t, 6))], [np.zeros((6, n_t)), np.eye(6)]]))
+            Q.append(np.block([[Q_t[0], np.zeros((n_t, 6))], [np.zeros((6, n_t)), walk]]))
+            truth = np.append(moved[0], truth[n_t:]) + rng.multivariate_normal(
+                np.zeros(n_t + 6), Q[-1], method='eigh')
+            filter_.predict(bank, PERIOD)
+        else:
+            F.append(np.eye(n_t + 6))
+            Q.append(np.zeros((n_t + 6, n_t + 6)))
+        h, H_t, _ = sensor_fields(NETWORK.positions, NETWORK.R_sw,
+                                  *model.dipoles(truth[None, :n_t]))
+        H.append(np.hstack([H_t[0].reshape(6, n_t), np.eye(6)]))
+        y = h[0] + truth[n_t:].reshape(2, 3) + SIGMA * rng.standard_normal((2, 3))
+        frame = FieldFrame(k, y, np.tile(SIGMA**2 * np.eye(3), (2, 1, 1)), np.full(2, 8),
+                           np.zeros(2), True)
+        if bank is None:
+            bank = start_vehicle(settings.vehicle, NETWORK, frame, settings.background_std, ())
+        bank.reweight(filter_.update(bank, frame, PERIOD if k else 0.0))
+        bank.prune(-np.log(settings.prune_ratio), settings.most_hypotheses)
+        errors.append(np.linalg.norm((bank.x[bank.best()] - truth)[:2]))
+    bound = path_bound(np.array(F), np.array(Q), np.array(H), SIGMA**2 * np.eye(6), P0)
+    return np.array(errors), np.sqrt(bound[:, 0, 0] + bound[:, 1, 1])
+
+
+def main(n=200, trimmed=0.05):
+    """Print a line for each kind of target."""
+    print(f'{n} matched runs, two sensors, wide prior, the last half of each pass')
+    with ProcessPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
+        for target in TARGETS:
+            jobs = [pool.submit(one_run, target, seed) for seed in range(n)]
+            found = [j.result() for j in tqdm(jobs, desc=target, disable=None, leave=False)]
+            error, bound = (np.array(a)[:, STEPS // 2:] for a in zip(*found, strict=True))
+            size = np.sqrt((error**2).mean(axis=1))
+            kept = np.argsort(size)[:round(n * (1.0 - trimmed))]
+            ratio = np.sqrt((error[kept]**2).mean() / (bound[kept]**2).mean())
+            print(f'  {target}: error over path bound {ratio:.2f} (the worst {trimmed:.0%} '
+                  f'left out); RMS {np.sqrt((error[kept]**2).mean()):.3f} m; failures '
+                  f'(> 2 m at the end) {np.mean(error[:, -1] > 2.0):.1%}', flush=True)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
