@@ -1,0 +1,90 @@
+"""Hard and soft iron from moments at several headings."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from mag_tracking.inference.iron import hard_and_soft_iron
+from mag_tracking.physics.dipole import MU0
+
+INDUCTION = np.array([2e-6, 1.55e-5, -4.9e-5]) / MU0
+HARD, SOFT = np.array([-200.0, 120.0, -270.0]), 4.0
+
+# T10 Table 6.9: yaw [deg], moment and its deviations, in that thesis's own units.
+TABLE = np.array([
+    [94.8, -0.28, -0.28, -0.96, 0.01, 0.01, 0.02], [94.8, -0.28, -0.29, -0.98, 0.01, 0.02, 0.03],
+    [274.8, 0.27, 0.67, -1.06, 0.01, 0.02, 0.03], [274.8, 0.31, 0.69, -1.10, 0.01, 0.02, 0.03],
+    [274.8, 0.25, 0.63, -1.06, 0.02, 0.02, 0.04], [29.9, -0.55, 0.19, -1.04, 0.01, 0.01, 0.02],
+    [29.9, -0.52, 0.12, -1.04, 0.02, 0.01, 0.02], [29.9, -0.50, 0.11, -1.00, 0.02, 0.01, 0.02],
+    [29.9, -0.48, 0.10, -0.96, 0.02, 0.01, 0.02], [209.9, 0.59, 0.13, -1.08, 0.03, 0.01, 0.04],
+    [209.9, 0.58, 0.14, -1.02, 0.03, 0.01, 0.05], [209.9, 0.60, 0.15, -1.10, 0.03, 0.01, 0.05],
+    [209.9, 0.60, 0.13, -1.05, 0.03, 0.02, 0.05]])
+
+
+def moments_at(headings):
+    """(n, 3) [A m^2] of HARD and SOFT."""
+    c, s = np.cos(headings), np.sin(headings)
+    x, y, z = HARD
+    return np.stack([c * x - s * y, s * x + c * y, z + 0.0 * c], axis=1) + SOFT * INDUCTION
+
+
+def test_the_table_of_the_source_is_refitted():
+    """All alike, as (6.16) has it; with T10's 3 B0/mu0. It prints D = 1.23."""
+    B0 = 1.7e-7 * np.array([0.0, 0.31, -0.95])
+    fit = hard_and_soft_iron(TABLE[:, 1:4], np.deg2rad(TABLE[:, 0]), 3.0 * B0 / MU0)
+    print(f'T10 Table 6.9: m0 = {fit.hard.round(3)}, D = {fit.soft:.3f}')
+    np.testing.assert_allclose(fit.hard, [-0.47, 0.29, -0.56], atol=0.005)
+    assert fit.soft == pytest.approx(1.22, abs=0.005)
+
+
+def test_exact_moments_give_exact_iron():
+    headings = np.deg2rad([0.0, 80.0, 200.0])
+    fit = hard_and_soft_iron(moments_at(headings), headings, INDUCTION)
+    np.testing.assert_allclose(fit.hard, HARD, rtol=1e-10)
+    assert fit.soft == pytest.approx(SOFT, rel=1e-10)
+    assert np.abs(fit.residuals).max() < 1e-9
+
+
+@pytest.mark.parametrize('stated', [True, False])
+def test_the_covariance_is_that_of_the_errors(stated):
+    rng = np.random.default_rng(1)
+    headings = np.deg2rad([10.0, 100.0, 190.0, 280.0] * 2)
+    C = np.tile(np.diag([9.0, 16.0, 25.0]) if stated else 16.0 * np.eye(3), (8, 1, 1))
+    nees, costs = [], []
+    for _ in range(400):
+        noise = rng.standard_normal((8, 3)) * np.sqrt(np.diagonal(C[0]))
+        fit = hard_and_soft_iron(moments_at(headings) + noise, headings, INDUCTION,
+                                 C if stated else None)
+        e = np.append(fit.hard - HARD, fit.soft - SOFT)
+        nees.append(e @ np.linalg.solve(fit.covariance, e))
+        costs.append(fit.normalised_cost)
+    if stated:
+        low, high = chi2.ppf([0.005, 0.995], 4 * 400) / 400
+        assert low <= np.mean(nees) <= high
+        assert np.mean(costs) == pytest.approx(1.0, abs=0.05)
+    else:
+        # Four times an F distribution with 4 and 20 degrees of freedom: mean 4 * 20 / 18.
+        assert np.mean(nees) == pytest.approx(4.44, rel=0.12)
+        assert np.isnan(costs).all()
+
+
+@pytest.mark.parametrize('headings, induction', [
+    ([0.3], INDUCTION), ([0.3, 0.3, 0.3 + 2.0 * np.pi], INDUCTION),
+    ([0.3, 1.3, 2.3], [0.0, 0.0, -39.0]), ([0.3, 1.3, 2.3], np.zeros(3))])
+def test_what_cannot_be_told_apart_is_refused(headings, induction):
+    headings = np.array(headings)
+    with pytest.raises(ValueError, match='cannot be told apart'):
+        hard_and_soft_iron(moments_at(headings), headings, induction)
+
+
+def test_bad_input_is_named():
+    headings = np.array([0.0, 1.0, 2.0])
+    m = moments_at(headings)
+    with pytest.raises(ValueError, match=r'expected moments \(n, 3\)'):
+        hard_and_soft_iron(m[:2], headings, INDUCTION)
+    with pytest.raises(ValueError, match='not finite'):
+        hard_and_soft_iron(m * [np.nan, 1.0, 1.0], headings, INDUCTION)
+    with pytest.raises(ValueError, match=r'expected covariances \(3, 3, 3\)'):
+        hard_and_soft_iron(m, headings, INDUCTION, np.eye(3))
+    with pytest.raises(ValueError, match='not positive definite'):
+        hard_and_soft_iron(m, headings, INDUCTION, -np.tile(np.eye(3), (3, 1, 1)))
