@@ -54,9 +54,10 @@ class Spectator(Node):
         self._hypotheses[stamp_ns(message.header.stamp)] = message
 
     def _whole(self, message):
-        """A track has ended: the latest one that was drawn, once more, by all that was measured."""
+        """A track has ended: its path once more, by all that was measured."""
         positions = [pose.pose.position for pose in message.poses]
-        self.smoothed[max(self.logs)] = np.array([[p.x, p.y, p.z] for p in positions])
+        self.smoothed[stamp_ns(message.poses[0].header.stamp)] = np.array(
+            [[p.x, p.y, p.z] for p in positions])
 
     def _true(self, message):
         p, q = message.pose.position, message.pose.orientation
@@ -88,7 +89,7 @@ def draw(spectator, out):
             continue
         for name, figure in (
                 ('map', map_figure(log, network, interpolate_truth(truth, log.stamp_ns),
-                                   spectator.smoothed.get(log.id))),
+                                   spectator.smoothed.get(log.stamp_ns[0]))),
                 ('weights', weights_figure(log)), ('field', field_figure(log, network))):
             paths.append(out / f'{name}_track_{log.id}.png')
             figure.savefig(paths[-1], dpi=110)

@@ -39,6 +39,7 @@ TARGET_DEFAULTS = {
         'track.iterations': 5,
         'track.lookback_s': 0.0,
         'track.end_gap_s': 30.0,
+        'track.smooth_longest_s': 3600.0,
         'track.end_std': 0.2,
     },
 }

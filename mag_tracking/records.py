@@ -69,7 +69,7 @@ class Hypothesis:
     moment: np.ndarray
     """(3,) [A m^2], world."""
     kind: str
-    """The kind of target that it assumed; empty where there is only one."""
+    """The kind of target that it assumed; empty for a magnet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +139,7 @@ class Track:
     degrees_of_freedom: int
     arrival: str
     kind: str
-    """Of target, that of the published hypothesis; empty where there is only one."""
+    """Of target, that of the published hypothesis; empty for a magnet."""
     kind_weight: float
     """Of all hypotheses of that kind, 0..1."""
     length: float

@@ -12,7 +12,7 @@ from conftest import NETWORK_FILE, VEHICLES, vehicle_path
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from mag_tracking_msgs.msg import CalibrationState, HypothesisArray, NetworkFrame, TrackArray
 from mag_tracking_msgs.srv import Seek
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry, Path
 from node_processes import call, start, stop
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.node import Node
@@ -27,7 +27,7 @@ from mag_tracking.io.network_file import read_network
 from mag_tracking.io.schema import stamp_ns
 from mag_tracking.nodes.convert import to_message, track_of
 from mag_tracking.nodes.runner import run
-from mag_tracking.nodes.stage_node import LATCHED, STREAM
+from mag_tracking.nodes.stage_node import LATCHED, RESULTS, STREAM
 from mag_tracking.offline import replay
 from mag_tracking.pipeline import settings_for
 
@@ -42,7 +42,10 @@ class Collector(Node):
 
     def __init__(self):
         super().__init__('collector')
-        self.poses, self.tracks, self.hypotheses = [], [], []
+        self.poses, self.tracks, self.hypotheses, self.paths, self.late = [], [], [], [], []
+        self.create_subscription(Path, '/tracker_node/path_smoothed', self.paths.append, RESULTS)
+        self.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose_smoothed',
+                                 self.late.append, STREAM)
         self.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose',
                                  self.poses.append, STREAM)
         self.create_subscription(TrackArray, '/tracker_node/tracks', self.tracks.append, STREAM)
@@ -74,6 +77,23 @@ def compare_with_offline(collector, folder):
     return worst
 
 
+def compare_smoothed(collector, folder):
+    """The smoothed path equals poses_smoothed.csv; the late poses are there and are others."""
+    with open(folder / 'poses_smoothed.csv', newline='') as stream:
+        offline = list(csv.DictReader(stream))
+    assert len(collector.paths) == 1
+    steps = collector.paths[0].poses
+    assert [stamp_ns(s.header.stamp) for s in steps] == [int(r['stamp_ns']) for r in offline]
+    ours = np.array([[getattr(s.pose.position, a) for a in 'xyz'] for s in steps])
+    theirs = np.array([[float(r[a]) for a in 'xyz'] for r in offline])
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9)
+    late = {stamp_ns(m.header.stamp): m.pose.pose.position for m in collector.late}
+    assert list(late) == [stamp_ns(s.header.stamp) for s in steps]
+    apart = [np.hypot(late[s].x - x, late[s].y - y) for s, (x, y, _) in zip(
+        late, theirs, strict=True)]
+    assert 0.01 < np.median(apart) < 2.0
+
+
 def over_topics(network_file, settings, recording, rate):
     """Play a recording through all the nodes; the collector."""
     holder = []
@@ -84,10 +104,11 @@ def over_topics(network_file, settings, recording, rate):
 
 @pytest.mark.parametrize('name', VEHICLES)
 def test_nodes_equal_offline_on_vehicles(name, tmp_path, road_network):
-    settings = settings_for('vehicle', PATIENT)
+    settings = settings_for('vehicle', {**PATIENT, 'track.smoothing_lag_s': 0.3})
     replay(Recording(vehicle_path(name)), road_network, settings, tmp_path)
-    worst = compare_with_offline(
-        over_topics(NETWORK_FILE, settings, vehicle_path(name), 6.0), tmp_path)
+    collector = over_topics(NETWORK_FILE, settings, vehicle_path(name), 6.0)
+    worst = compare_with_offline(collector, tmp_path)
+    compare_smoothed(collector, tmp_path)
     print(f'{name}: nodes against offline, largest relative difference {worst:.1e}')
     assert worst <= 1e-9
 

@@ -9,6 +9,7 @@ from conftest import ROOT
 from mag_tracking.errors import SettingsError
 from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.settings import flatten, read_parameter_file, replace, to_yaml
+from mag_tracking.stages.track import TrackStage
 
 
 def test_generated_files_are_up_to_date():
@@ -99,3 +100,14 @@ def test_parameter_files(tmp_path):
 def test_the_default_file_is_plain_yaml_with_floats():
     content = yaml.safe_load((ROOT / 'config/default.yaml').read_text())
     assert content['/**']['ros__parameters']['track']['background_std'] == 2e-8
+
+
+@pytest.mark.parametrize('changes, message', [
+    ({'track.vehicle.lengths': [0.0, 3.0]}, r'lengths: expected 3 values \(one per kinds\), got 2'),
+    ({'track.vehicle.arrival_names': ['a']}, 'arrival_headings_deg: expected 1 values'),
+    ({'track.vehicle.kinds': ['car', 'car', 'truck']}, 'kinds: a name is there twice'),
+    ({'track.vehicle.length_stds': [1.0, 1.0, 3.0]}, 'length_stds: 1 for small, which is a point'),
+    ({'track.vehicle.difference_stds': [9.0, 30.0, 120.0]}, 'difference_stds: 9 for small')])
+def test_lists_that_belong_together_are_checked(road_network, changes, message):
+    with pytest.raises(SettingsError, match=message):
+        TrackStage(road_network, settings_for('vehicle', changes).track)

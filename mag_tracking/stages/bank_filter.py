@@ -84,6 +84,11 @@ class BankFilter:
         bank.nis[:, np.isnan(frame.field).all(axis=1)] = np.nan
         return log_likelihood
 
+    def is_strange(self, bank, i, frame):
+        """Whether hypothesis `i`, just updated with the `frame`, is contradicted by it."""
+        n_y = np.count_nonzero(~np.isnan(frame.field))
+        return bool(np.nansum(bank.nis[i]) > self._settings.end_nis * n_y)
+
 
 class NoTarget:
     """The filter of no target at all, only backgrounds that wander: what evidence is against."""

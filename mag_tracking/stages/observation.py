@@ -92,7 +92,9 @@ class Observation:
         inflation : (n_hyp, n_sensors) [T^2]
             Variance of the model error, where it is new in every frame; else 0.
 
-        Source: ICASSP11 eq. (9) for the size of the model error.
+        H leaves out that the size of the model error depends on the state, too: a few parts in
+        a hundred of the derivative where the error is large. ICASSP11 eq. (9) for that size,
+        there as noise.
         """
         h, H, gradient = self.target_fields(x, time_offset)
         variance = (np.square(near_field_length)[:, None] * gradient**2

@@ -1,21 +1,28 @@
 """Smooth: a track once more, by what came before and after each of its poses.
 
-One hypothesis of the bank, the one that stands at the end, is run through the frames again
-and then back. Hypotheses do not touch each other, so this is what it did in the bank.
+One hypothesis of the bank, the one that stands at the end, is run through the frames again and
+then back. Hypotheses do not touch each other, so this is what it did in the bank, but for frames
+that contradict it: those are left out, as one of them would bend the whole track.
 """
 
 from collections import deque
+from copy import copy
 
 import numpy as np
 
 from mag_tracking.inference.smoother import smooth
+from mag_tracking.stages.stage import NS
 
 RELINEARISATIONS = 1
-"""How often the whole is linearised anew, at what came of it before. Far ahead of the sensors the
-filter did not yet know where to linearise; a second time changes little."""
+"""How often the whole is linearised anew, at what came of it before: far ahead of the sensors the
+filter did not yet know where to linearise."""
+
+MOST_NUMBERS = 10_000_000
+"""Frames times states squared that are smoothed at most: 80 MB, and a few seconds."""
 
 
-def smoothed_states(bank_filter, bank, frames, intervals, updated):
+def smoothed_states(bank_filter, bank, frames, intervals, updated=False,
+                    relinearisations=RELINEARISATIONS):
     """States of a hypothesis at each frame, given all of them.
 
     Parameters
@@ -28,38 +35,43 @@ def smoothed_states(bank_filter, bank, frames, intervals, updated):
         Time from the frame before.
     updated : bool
         The bank has been updated with the first frame.
+    relinearisations : int
 
     Returns
     -------
-    list of n (x (n_x,), P (n_x, n_x))
+    states : list of n (x (n_x,), P (n_x, n_x))
+    left_out : int
+        Frames that the hypothesis contradicted; it coasted through them.
     """
     x_lin = [None] * len(frames)
-    for _ in range(RELINEARISATIONS + 1):
-        states = _forth_and_back(bank_filter, bank.alone(0), frames, intervals, updated, x_lin)
+    for _ in range(relinearisations + 1):
+        states, left_out = _forth_and_back(bank_filter, bank.alone(0), frames, intervals, updated,
+                                           x_lin)
         x_lin = [x[None] for x, _ in states]
-    return states
+    return states, left_out
 
 
 def _forth_and_back(bank_filter, bank, frames, intervals, updated, x_lin):
     """One pass of filter and smoother, linearised at `x_lin`; None = at the predictions."""
-    filtered, predicted, jacobians = [], [], []
+    filtered, predicted, jacobians, left_out = [], [], [], 0
     for k, (frame, dt) in enumerate(zip(frames, intervals, strict=True)):
         if k:
             F, decay = bank_filter.predict(bank, dt)
             predicted.append((bank.x[0].copy(), bank.P[0].copy()))
-            jacobians.append(_whole(F, decay))
+            jacobians.append((F if F.ndim == 2 else F[0], decay))
         if k or not updated:
+            before = bank.x.copy(), bank.P.copy()
             bank_filter.update(bank, frame, dt, x_lin[k])
+            if bank_filter.is_strange(bank, 0, frame):
+                bank.x, bank.P = before
+                left_out += 1
         filtered.append((bank.x[0].copy(), bank.P[0].copy()))
-    return smooth(filtered, predicted, jacobians)
+    return smooth(filtered, predicted, jacobians), left_out
 
 
-def _whole(F, decay):
-    """(n_x, n_x) from the target's Jacobian and the factors of the other states."""
-    n_t = F.shape[-1]
-    A = np.diag(np.append(np.ones(n_t), decay))
-    A[:n_t, :n_t] = F if F.ndim == 2 else F[0]
-    return A
+def _rows_of(origins, wanted):
+    """[bool] which of `origins` (n,) are among `wanted`."""
+    return np.isin(origins, wanted)
 
 
 class WholeTrack:
@@ -67,37 +79,50 @@ class WholeTrack:
 
     def __init__(self, longest_s):
         self._longest_s = longest_s
+        self.clear()
 
-    def begin(self, bank):
-        """A track begins with `bank`, before its first frame."""
-        self._x, self._P = bank.x.copy(), bank.P.copy()
+    def clear(self):
+        """Nothing is kept."""
+        self._filter = self._x = self._P = self._origin = None
         self._frames, self._intervals, self._published = [], [], []
-        self._length_s = 0.0
+        self._length_s, self.too_long = 0.0, False
 
-    @property
-    def too_long(self):
-        """The track is longer than is kept."""
-        return self._length_s > self._longest_s
+    def begin(self, bank, bank_filter):
+        """A track begins with `bank`, before its first frame; its settings stay those of now."""
+        self.clear()
+        if self._longest_s:
+            self._filter = copy(bank_filter)
+            self._x, self._P, self._origin = bank.x.copy(), bank.P.copy(), bank.origin
 
-    def add(self, frame, dt, published):
+    def add(self, bank, frame, dt, published):
         """A frame was used, `dt` [s] after the one before."""
+        if self._filter is None:
+            return
         self._length_s += dt
-        if self.too_long:
-            self._frames, self._intervals, self._published = [], [], []
+        n_numbers = (len(self._frames) + 1) * bank.x.shape[1]**2
+        if self._length_s > self._longest_s or n_numbers > MOST_NUMBERS:
+            self.clear()
+            self.too_long = True
             return
         self._frames.append(frame)
         self._intervals.append(dt)
         self._published.append(published)
+        if len(bank) < len(self._origin) // 2:
+            rows = _rows_of(self._origin, bank.origin)
+            self._x, self._P, self._origin = self._x[rows], self._P[rows], self._origin[rows]
 
-    def smoothed(self, bank_filter, bank, best):
-        """[(stamp_ns, x, P)] of the published frames, by the hypothesis `best` of the `bank`."""
+    def smoothed(self, bank, best):
+        """[(stamp_ns, x, P)] of the published frames, and how many frames did not fit.
+
+        By the hypothesis `best` of the `bank`.
+        """
         if not self._frames:
-            return []
-        one, row = bank.alone(best), bank.origin[best]
-        one.x, one.P = self._x[row:row + 1].copy(), self._P[row:row + 1].copy()
-        states = smoothed_states(bank_filter, one, self._frames, self._intervals, False)
+            return [], 0
+        one, row = bank.alone(best), np.flatnonzero(self._origin == bank.origin[best])
+        one.x, one.P = self._x[row].copy(), self._P[row].copy()
+        states, left_out = smoothed_states(self._filter, one, self._frames, self._intervals)
         return [(frame.stamp_ns, x, P) for frame, (x, P), published in zip(
-            self._frames, states, self._published, strict=True) if published]
+            self._frames, states, self._published, strict=True) if published], left_out
 
 
 class FixedLag:
@@ -107,8 +132,8 @@ class FixedLag:
         self._lag_s = lag_s
         self._kept = deque()
 
-    def begin(self):
-        """A track begins."""
+    def clear(self):
+        """Nothing is kept: a track has ended."""
         self._kept.clear()
 
     def smoothed(self, bank_filter, bank, best, frame, dt, published):
@@ -117,15 +142,27 @@ class FixedLag:
         `bank` after the update with `frame`, which came `dt` [s] after the one before.
         """
         self._kept.append((frame, dt, published, bank.origin, bank.x.copy(), bank.P.copy()))
+        if len(bank) < len(self._kept[0][3]) // 2:
+            self._kept = deque((f, d, p, origin[rows], x[rows], P[rows]) for f, d, p, origin, x, P
+                               in self._kept for rows in [_rows_of(origin, bank.origin)])
         out = []
-        while (frame.stamp_ns - self._kept[0][0].stamp_ns) / 1e9 >= self._lag_s:
-            first, _, was_published, origin, x, P = self._kept[0]
-            if was_published:
-                row = int(np.flatnonzero(origin == bank.origin[best])[0])
-                one = bank.alone(best)
-                one.x, one.P = x[row:row + 1].copy(), P[row:row + 1].copy()
-                state = smoothed_states(bank_filter, one, [k[0] for k in self._kept],
-                                        [k[1] for k in self._kept], True)[0]
-                out.append((first.stamp_ns, *state))
+        while (frame.stamp_ns - self._kept[0][0].stamp_ns) / NS >= self._lag_s:
+            if self._kept[0][2]:
+                out.append((self._kept[0][0].stamp_ns, *self._states(bank_filter, bank, best)[0]))
             self._kept.popleft()
         return out
+
+    def rest(self, bank_filter, bank, best):
+        """[(stamp_ns, x, P)] of all frames that are left: the track ends."""
+        if not self._kept:
+            return []
+        return [(kept[0].stamp_ns, *state) for kept, state in zip(
+            self._kept, self._states(bank_filter, bank, best), strict=True) if kept[2]]
+
+    def _states(self, bank_filter, bank, best):
+        """Smoothed states of the frames that are kept, linearised once: it is done every frame."""
+        _, _, _, origin, x, P = self._kept[0]
+        one, row = bank.alone(best), np.flatnonzero(origin == bank.origin[best])
+        one.x, one.P = x[row].copy(), P[row].copy()
+        return smoothed_states(bank_filter, one, [k[0] for k in self._kept],
+                               [k[1] for k in self._kept], updated=True, relinearisations=0)[0]

@@ -69,11 +69,13 @@ class TrackSettings:
     end_gap_s: float = param(
         2.0, 'A track ends where the frames have a longer gap than this.', 's', (1e-3, 86400.0))
     smooth_longest_s: float = param(
-        300.0, 'A track that is no longer than this is smoothed when it ends, over all of its '
-        'frames; 0 = never.', 's', (0.0, 86400.0))
+        60.0, 'A track that is no longer than this is smoothed when it ends, over all of its '
+        'frames, which takes about two milliseconds a frame (more with many sensors); 0 = never.',
+        's', (0.0, 86400.0))
     smoothing_lag_s: float = param(
         0.0, 'While a track runs, each pose is given once more when so much time has passed, by '
-        'what came since; 0 = no.', 's', (0.0, 60.0))
+        'what came since; every frame then costs about a millisecond for each frame of the lag. '
+        '0 = no.', 's', (0.0, 10.0))
     vehicle: VehicleSettings = field(default_factory=VehicleSettings)
     magnet: MagnetSettings = field(default_factory=MagnetSettings)
 
@@ -186,9 +188,7 @@ class TrackStage:
         self._no_target = NoTarget(len(self._network), s.background_std)
         if recent:
             self._filter.predict(self._bank, (recent[0].stamp_ns - frame.stamp_ns) / NS)
-        self._whole.begin(self._bank)
-        if self._lag is not None:
-            self._lag.begin()
+        self._whole.begin(self._bank, self._filter)
         dt = 0.0
         for before, after in pairwise([*recent, frame]):
             self._step(before, dt, publish=False)
@@ -212,10 +212,9 @@ class TrackStage:
         self.counts['hypotheses dropped'] += bank.prune(
             -np.log(self._settings.prune_ratio), self._settings.most_hypotheses)
         best = bank.best()
-        self._whole.add(frame, dt, publish)
-        late = [] if self._lag is None else [
-            self._smoothed(stamp_ns, x, P, best, complete=False) for stamp_ns, x, P in
-            self._lag.smoothed(self._filter, bank, best, frame, dt, publish)]
+        self._whole.add(bank, frame, dt, publish)
+        late = [] if self._lag is None else self._smoothed(best, False, self._lag.smoothed(
+            self._filter, bank, best, frame, dt, publish))
         if not publish:
             return []
         self._last = self._published(frame, dt, best)
@@ -239,12 +238,25 @@ class TrackStage:
         self._surest = min(self._surest, spread)
         return None
 
-    def _smoothed(self, stamp_ns, x, P, best, complete):
-        """The `SmoothedPose` of a state of the hypothesis `best`."""
+    def _smoothed(self, best, complete, states, doubtful=False):
+        """The `SmoothedPose`s of states (stamp_ns, x, P) of the hypothesis `best`."""
         bank = self._bank
-        return smoothed_pose(
+        ambiguous = doubtful or is_ambiguous(bank, best)
+        return [smoothed_pose(
             self._model, self._orientation, x, P, stamp_ns=stamp_ns, id=self._next_id,
-            kind=self.kinds[bank.kind[best]], complete=complete, ambiguous=is_ambiguous(bank, best))
+            kind=self.kinds[bank.kind[best]], complete=complete, ambiguous=ambiguous)
+            for stamp_ns, x, P in states]
+
+    def _smoothed_at_the_end(self):
+        """What is left of a fixed lag, and the whole track."""
+        best = self._bank.best()
+        out = [] if self._lag is None else self._smoothed(best, False, self._lag.rest(
+            self._filter, self._bank, best), self._strange > 0)
+        states, left_out = self._whole.smoothed(self._bank, best)
+        self.counts['frames left out of smoothing'] += left_out
+        self.counts['tracks too long to smooth'] += self._whole.too_long
+        # A track that ended because the field contradicted it may have been something else.
+        return out + self._smoothed(best, True, states, self._strange > 0)
 
     def _published(self, frame, dt, best):
         """The `Track` of the hypothesis `best`, with what it says of the sensors."""
@@ -256,7 +268,7 @@ class TrackStage:
             id=self._next_id, ended=False,
             existence=float(1.0 / (1.0 + np.exp(-np.clip(self._log_odds, -700.0, 700.0)))),
             degrees_of_freedom=n_y,
-            strange=np.nansum(bank.nis[best]) > self._settings.end_nis * n_y,
+            strange=self._filter.is_strange(bank, best, frame),
             predicted=self._filter.predicted_field(bank, best, frame, dt),
             mounting=observation.angles(bank.x[best]),
             mounting_std=observation.angles(np.sqrt(np.diagonal(bank.P[best]))))
@@ -265,13 +277,11 @@ class TrackStage:
         """Close the running track: its last record once more, marked as ended, then it smoothed."""
         if self._bank is None:
             return []
-        last, self._last, smoothed = self._last, None, []
-        if last is not None and self._settings.smooth_longest_s:
-            if self._whole.too_long:
-                self.counts['tracks too long to smooth'] += 1
-            best = self._bank.best()
-            smoothed = [self._smoothed(stamp_ns, x, P, best, complete=True) for stamp_ns, x, P in
-                        self._whole.smoothed(self._filter, self._bank, best)]
+        last, self._last = self._last, None
+        smoothed = [] if last is None else self._smoothed_at_the_end()
+        self._whole.clear()
+        if self._lag is not None:
+            self._lag.clear()
         self._bank = None
         self.counts[f'tracks ended: {reason}'] += 1
         self._next_id += 1

@@ -91,15 +91,23 @@ def vehicle_model(settings, network):
             if len(getattr(settings, name)) != n:
                 raise SettingsError(f'track.vehicle.{name}: expected {n} values (one per {names}), '
                                     f'got {len(getattr(settings, name))}')
-    for kind, length, spread in zip(settings.kinds, settings.lengths, settings.length_stds,
-                                    strict=True):
-        if spread and not length:
-            raise SettingsError(f'track.vehicle.length_stds: {spread:g} m for {kind}, which is a '
-                                'point (its length is 0)')
+    if len(set(settings.kinds)) < len(settings.kinds):
+        raise SettingsError(f'track.vehicle.kinds: a name is there twice in {settings.kinds}')
+    for name in ('length_stds', 'difference_stds'):
+        for kind, length, spread in zip(settings.kinds, settings.lengths, getattr(settings, name),
+                                        strict=True):
+            if spread and not length:
+                raise SettingsError(f'track.vehicle.{name}: {spread:g} for {kind}, which is a '
+                                    'point (its length is 0)')
     horizontal, vertical = settings.acceleration**2, settings.climb_acceleration**2
     return RowVehicle(_earth_field(network), np.array([horizontal, horizontal, vertical]),
                       settings.moment_drift, settings.difference_drift,
-                      3 if any(settings.lengths) else 1)
+                      _n_dipoles(settings))
+
+
+def _n_dipoles(settings):
+    """Three, of which those of a point coincide; one where all kinds are points."""
+    return 3 if any(settings.lengths) else 1
 
 
 def _earth_field(network):
@@ -163,7 +171,7 @@ def _matching_positions(settings, network, frame, R, offset, moments, height):
 
 def _states(settings, kind, positions, velocity, hard):
     """States (n, n_t) of `RowVehicle` with the whole hard iron moments `hard` (n, 3)."""
-    d = 3 if any(settings.lengths) else 1
+    d = _n_dipoles(settings)
     n = len(positions)
     rest = [settings.soft_iron] + ([settings.lengths[kind]] if d > 1 else [])
     return np.hstack([positions, np.tile(velocity, (n, 1)), np.tile(hard / d, d),
@@ -172,7 +180,7 @@ def _states(settings, kind, positions, velocity, hard):
 
 def _covariance(settings, kind, R, speed):
     """Starting covariance (n_t, n_t) of one hypothesis."""
-    d = 3 if any(settings.lengths) else 1
+    d = _n_dipoles(settings)
     hard = 6 + 3 * d
     P = np.zeros((hard + min(d, 2), hard + min(d, 2)))
     P[:3, :3] = R @ np.diag([settings.along_std**2, settings.lateral_std**2,
