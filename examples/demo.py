@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
-from mag_tracking_msgs.msg import HypothesisArray, NetworkFrame, TrackArray
-from nav_msgs.msg import Path as PathMessage
+from mag_tracking_msgs.msg import HypothesisArray, NetworkFrame, SmoothedTrack, TrackArray
 from rclpy.node import Node
 
 from mag_tracking.errors import MagTrackingError, OutputError
@@ -43,7 +42,7 @@ class Spectator(Node):
         self.create_subscription(NetworkFrame, '/detection_node/frame', self._frame, STREAM)
         self.create_subscription(HypothesisArray, '/tracker_node/hypotheses', self._bank, STREAM)
         self.create_subscription(TrackArray, '/tracker_node/tracks', self._track, STREAM)
-        self.create_subscription(PathMessage, '/tracker_node/path_smoothed', self._whole, RESULTS)
+        self.create_subscription(SmoothedTrack, '/tracker_node/smoothed', self._whole, RESULTS)
         self.create_subscription(PoseStamped, '/ground_truth/vehicle_00/pose', self._true, STREAM)
 
     def _frame(self, message):
@@ -55,9 +54,8 @@ class Spectator(Node):
 
     def _whole(self, message):
         """A track has ended: its path once more, by all that was measured."""
-        positions = [pose.pose.position for pose in message.poses]
-        self.smoothed[stamp_ns(message.poses[0].header.stamp)] = np.array(
-            [[p.x, p.y, p.z] for p in positions])
+        positions = [p.pose.pose.position for p in message.poses]
+        self.smoothed[message.track_id] = np.array([[p.x, p.y, p.z] for p in positions])
 
     def _true(self, message):
         p, q = message.pose.position, message.pose.orientation
@@ -89,7 +87,7 @@ def draw(spectator, out):
             continue
         for name, figure in (
                 ('map', map_figure(log, network, interpolate_truth(truth, log.stamp_ns),
-                                   spectator.smoothed.get(log.stamp_ns[0]))),
+                                   spectator.smoothed.get(log.id))),
                 ('weights', weights_figure(log)), ('field', field_figure(log, network))):
             paths.append(out / f'{name}_track_{log.id}.png')
             figure.savefig(paths[-1], dpi=110)

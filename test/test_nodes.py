@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 from conftest import NETWORK_FILE, VEHICLES, vehicle_path
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from mag_tracking_msgs.msg import CalibrationState, HypothesisArray, NetworkFrame, TrackArray
+from mag_tracking_msgs.msg import (
+    CalibrationState,
+    HypothesisArray,
+    NetworkFrame,
+    SmoothedTrack,
+    TrackArray,
+)
 from mag_tracking_msgs.srv import Seek
 from nav_msgs.msg import Odometry, Path
 from node_processes import call, start, stop
@@ -42,7 +48,10 @@ class Collector(Node):
 
     def __init__(self):
         super().__init__('collector')
-        self.poses, self.tracks, self.hypotheses, self.paths, self.late = [], [], [], [], []
+        self.poses, self.tracks, self.hypotheses, self.paths = [], [], [], []
+        self.late, self.smoothed = [], []
+        self.create_subscription(SmoothedTrack, '/tracker_node/smoothed', self.smoothed.append,
+                                 RESULTS)
         self.create_subscription(Path, '/tracker_node/path_smoothed', self.paths.append, RESULTS)
         self.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose_smoothed',
                                  self.late.append, STREAM)
@@ -87,6 +96,15 @@ def compare_smoothed(collector, folder):
     ours = np.array([[getattr(s.pose.position, a) for a in 'xyz'] for s in steps])
     theirs = np.array([[float(r[a]) for a in 'xyz'] for r in offline])
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9)
+    whole = collector.smoothed[0]
+    assert len(collector.smoothed) == 1 and whole.track_id == int(offline[0]['track_id'])
+    assert (whole.kind, whole.ambiguous) == (offline[-1]['kind'], offline[-1]['ambiguous'] == '1')
+    assert whole.length == float(offline[-1]['length'])
+    for p, v, row in zip(whole.poses, whole.velocities, offline, strict=True):
+        C = np.array(p.pose.covariance).reshape(6, 6)
+        said = [p.pose.pose.position.x, p.pose.pose.position.y, v.x, v.y, C[0, 0]**0.5]
+        np.testing.assert_allclose(
+            said, [float(row[c]) for c in ('x', 'y', 'vx', 'vy', 'sd_x')], rtol=0, atol=1e-9)
     late = {stamp_ns(m.header.stamp): m.pose.pose.position for m in collector.late}
     assert list(late) == [stamp_ns(s.header.stamp) for s in steps]
     apart = [np.hypot(late[s].x - x, late[s].y - y) for s, (x, y, _) in zip(

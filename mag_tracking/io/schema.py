@@ -212,6 +212,20 @@ def hypotheses_dict(track, frame):
                 for h in track.hypotheses]}
 
 
+def smoothed_pose_dict(pose, frame):
+    """geometry_msgs/PoseWithCovarianceStamped of a `SmoothedPose`."""
+    return {'header': header_dict(pose.stamp_ns, frame), 'pose': pose_with_covariance_dict(pose)}
+
+
+def smoothed_track_dict(poses, frame):
+    """mag_tracking_msgs/SmoothedTrack of the `SmoothedPose`s of one track."""
+    last = poses[-1]
+    return {'header': header_dict(last.stamp_ns, frame), 'track_id': last.id, 'kind': last.kind,
+            'length': last.length, 'length_std': last.length_std, 'ambiguous': last.ambiguous,
+            'poses': [smoothed_pose_dict(p, frame) for p in poses],
+            'velocities': [_xyz(p.velocity) for p in poses]}
+
+
 def frame_dict(frame, network):
     """mag_tracking_msgs/NetworkFrame of a `FieldFrame`."""
     return {'header': header_dict(frame.stamp_ns, network.frame), 'sensors': list(network.names),

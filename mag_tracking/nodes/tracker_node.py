@@ -3,7 +3,7 @@
 import sys
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from mag_tracking_msgs.msg import HypothesisArray, NetworkFrame, TrackArray
+from mag_tracking_msgs.msg import HypothesisArray, NetworkFrame, SmoothedTrack, TrackArray
 from nav_msgs.msg import Odometry, Path
 from visualization_msgs.msg import MarkerArray
 
@@ -15,6 +15,8 @@ from mag_tracking.io.schema import (
     odometry_dict,
     pose_dict,
     pose_with_covariance_dict,
+    smoothed_pose_dict,
+    smoothed_track_dict,
     track_dict,
 )
 from mag_tracking.nodes import stage_node
@@ -43,6 +45,7 @@ class TrackerNode(StageNode):
         self._path_publisher = self.publisher(Path, '~/path', RESULTS)
         self._smoothed_pose = self.publisher(
             PoseWithCovarianceStamped, '~/pose_smoothed', STREAM)
+        self._smoothed = self.publisher(SmoothedTrack, '~/smoothed', RESULTS)
         self._smoothed_path = self.publisher(Path, '~/path_smoothed', RESULTS)
         self._markers = self.publisher(MarkerArray, '~/markers', RESULTS)
         self._path = Path()
@@ -66,10 +69,11 @@ class TrackerNode(StageNode):
             elif record.complete:
                 whole.append(record)
             else:
-                self._smoothed_pose.publish(to_message(PoseWithCovarianceStamped, {
-                    'header': header_dict(record.stamp_ns, self.network.frame),
-                    'pose': pose_with_covariance_dict(record)}))
+                self._smoothed_pose.publish(to_message(
+                    PoseWithCovarianceStamped, smoothed_pose_dict(record, self.network.frame)))
         if whole:
+            self._smoothed.publish(to_message(
+                SmoothedTrack, smoothed_track_dict(whole, self.network.frame)))
             self._smoothed_path.publish(self._path_of(whole))
 
     def _path_of(self, poses):
