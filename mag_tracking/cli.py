@@ -162,6 +162,10 @@ def _print_summary(path, summary):
     if waiting:
         print(f'  warning: no background was learnt for {", ".join(waiting)}: the recording needs '
               'a target-free beginning, or the network file a background and a noise_std')
+    too_long = summary['counts']['track'].get('tracks too long to smooth', 0)
+    if too_long:
+        print(f'  warning: {too_long} tracks were too long to smooth (track.smooth_longest_s, or '
+              'too many frames for so many sensors)')
     for t in summary['tracks']:
         print(f'  track {t["id"]}: {t["poses"]} poses'
               + (f', from {t["arrival"]} ({t["arrival_weights"][t["arrival"]]:.0%})'

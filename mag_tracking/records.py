@@ -150,7 +150,8 @@ class Track:
     unobservable: tuple[bool, ...]
     """(6): x, y, z, and rotation about the body's x, y, z."""
     predicted: np.ndarray
-    """(n_sensors, 3) [T], sensor frames: the frame's field as the published hypothesis has it."""
+    """(n_sensors, 3) [T], sensor frames: the frame's field as the published hypothesis has it,
+    without what it takes for errors of its model."""
     mounting: np.ndarray
     """(n_sensors, 3) [rad] angles as in `physics.mounting`; (0, 3) where they are not estimated."""
     mounting_std: np.ndarray

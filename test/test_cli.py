@@ -37,6 +37,15 @@ def test_replay_writes_all_that_it_promises(tmp_path, capsys):
     assert 'from left (100%), a car (100%)' in capsys.readouterr().out
 
 
+def test_a_track_that_is_too_long_to_smooth_is_said(tmp_path, capsys):
+    params = tmp_path / 'short.yaml'
+    params.write_text('track: {smooth_longest_s: 1.0}')
+    assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--params',
+                 str(params), '--no-figures', '--out', str(tmp_path / 'out')]) == 0
+    assert 'warning: 1 tracks were too long to smooth' in capsys.readouterr().out
+    assert len((tmp_path / 'out' / 'poses_smoothed.csv').read_text().splitlines()) == 1
+
+
 def test_several_recordings_get_a_folder_each(tmp_path):
     names = ['straight_car_right', 'straight_small_left']
     assert main(['replay', *(str(vehicle_path(n)) for n in names), '--network', str(NETWORK_FILE),

@@ -211,3 +211,23 @@ def test_without_an_earth_field_there_is_no_soft_iron():
     network = dataclasses.replace(line_network(2), earth_field=None)
     stage = TrackStage(network, settings_for('vehicle').track)
     assert not stage._model.earth_field.any()
+
+
+def test_the_predicted_field_is_without_the_errors_of_the_model():
+    """With them anything would seem to fit: a car that may only be a point shows what is left."""
+    left = {}
+    for name, changes in (('point', {**POINT, 'track.vehicle.near_field_lengths': [2.0]}),
+                          ('row', {})):
+        network = line_network(2, tilt=0.0)
+        tracks, pipeline, _ = drive(network, random_vehicle(np.random.default_rng(3), **CAR),
+                                    Path(np.array([-80.0, -1.2]), 0.0, 12.0), changes)
+        samples, *_ = simulate(network, random_vehicle(np.random.default_rng(3), **CAR),
+                               Path(np.array([-80.0, -1.2]), 0.0, 12.0), 100.0, 12.0,
+                               np.random.default_rng(0))
+        again = Pipeline(network, settings_for('vehicle', changes))
+        fields = {r.stamp_ns: r.field for s in samples for r in again.feed(s)
+                  if hasattr(r, 'target_present')}
+        left[name] = max(np.abs(t.predicted - fields[t.stamp_ns]).max()
+                         for t in tracks if not t.ended)
+    assert left['point'] > 2.0 * left['row']
+    assert left['point'] > 5e-8

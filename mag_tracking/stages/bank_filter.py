@@ -55,9 +55,13 @@ class BankFilter:
                                        self._settings.field_error)
 
     def predicted_field(self, bank, i, frame, dt):
-        """(n_sensors, 3) [T] the field of the frame as hypothesis `i` has it, with backgrounds."""
-        h, _, _ = self.fields(bank.x[i:i + 1], bank.kind[i:i + 1], frame, dt)
-        return h[0] + bank.x[i, -3 * self._n_sensors:].reshape(-1, 3)
+        """(n_sensors, 3) [T] the field of the frame as hypothesis `i` has it, with backgrounds.
+
+        Without what it takes for errors of its model: with them anything would seem to fit.
+        """
+        x = self.observation.without_errors(bank.x[i:i + 1])
+        h, _, _ = self.fields(x, bank.kind[i:i + 1], frame, dt)
+        return h[0] + x[0, -3 * self._n_sensors:].reshape(-1, 3)
 
     def update(self, bank, frame, dt, x_lin=None):
         """Measurement update in place.

@@ -44,6 +44,12 @@ class Observation:
         """(..., n_sensors, 3) [rad] mounting angles; (..., 0, 3) where they are not estimated."""
         return self.own(x)[..., :3] if self._n_angles else np.zeros((*x.shape[:-1], 0, 3))
 
+    def without_errors(self, x):
+        """The states `x` (n_hyp, n_x), copied, with model errors of zero."""
+        x = x.copy()
+        self.own(x)[..., self._n_angles:] = 0.0
+        return x
+
     def drift(self, dt, background_density):
         """What becomes of the sensors' states over `dt` seconds.
 

@@ -69,11 +69,6 @@ def _forth_and_back(bank_filter, bank, frames, intervals, updated, x_lin):
     return smooth(filtered, predicted, jacobians), left_out
 
 
-def _rows_of(origins, wanted):
-    """[bool] which of `origins` (n,) are among `wanted`."""
-    return np.isin(origins, wanted)
-
-
 class WholeTrack:
     """The frames of a running track, to smooth it when it ends."""
 
@@ -108,7 +103,7 @@ class WholeTrack:
         self._intervals.append(dt)
         self._published.append(published)
         if len(bank) < len(self._origin) // 2:
-            rows = _rows_of(self._origin, bank.origin)
+            rows = np.isin(self._origin, bank.origin)
             self._x, self._P, self._origin = self._x[rows], self._P[rows], self._origin[rows]
 
     def smoothed(self, bank, best):
@@ -144,7 +139,7 @@ class FixedLag:
         self._kept.append((frame, dt, published, bank.origin, bank.x.copy(), bank.P.copy()))
         if len(bank) < len(self._kept[0][3]) // 2:
             self._kept = deque((f, d, p, origin[rows], x[rows], P[rows]) for f, d, p, origin, x, P
-                               in self._kept for rows in [_rows_of(origin, bank.origin)])
+                               in self._kept for rows in [np.isin(origin, bank.origin)])
         out = []
         while (frame.stamp_ns - self._kept[0][0].stamp_ns) / NS >= self._lag_s:
             if self._kept[0][2]:
