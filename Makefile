@@ -61,6 +61,7 @@ bench: $(STAMP)  ## measure times and accuracies
 	$(BIN)/python test/bench/bench.py
 	$(BIN)/python test/bench/matched.py
 	$(BIN)/python test/bench/extended_target.py
+	$(BIN)/python test/bench/pass_search.py
 
 # As a user of a ROS from apt would, but with the generators from PyPI.
 colcon: $(STAMP)  ## build and test both packages with colcon

@@ -12,6 +12,7 @@ import pytest
 from conftest import DATA, NETWORK_FILE, vehicle_path
 
 from mag_tracking.cli import main
+from mag_tracking.io.fit_results import FIT_COLUMNS
 from mag_tracking.io.results import DETECTION_COLUMNS, POSE_COLUMNS, SMOOTHED_COLUMNS
 
 NAME = 'junction_left_to_right'
@@ -212,8 +213,10 @@ def test_an_interruption_need_not_wait_for_the_next_sample(tmp_path, monkeypatch
 @pytest.mark.parametrize('step', ['_summary', 'take', '_against_truth', 'write_figures'])
 def test_an_interruption_while_writing_loses_nothing(tmp_path, monkeypatch, capsys, step):
     """First or second, in the middle of an update or of what is written at the end."""
-    from mag_tracking import cli, offline
-    module = {'write_figures': cli, 'take': offline._Taker}.get(step, offline)
+    from mag_tracking import offline
+    from mag_tracking.cli import replay
+
+    module = {'write_figures': replay, 'take': offline._Taker}.get(step, offline)
     whole, count = getattr(module, step), []
 
     def impatient(*args, **named):
@@ -273,3 +276,42 @@ def test_the_demo_draws_a_track_over_topics(tmp_path):
     assert 'from left' in out
     assert {'map_track_1.png', 'weights_track_1.png', 'field_track_1.png'} <= {
         p.name for p in tmp_path.iterdir()}
+
+
+def test_fit_writes_all_that_it_promises(tmp_path, capsys):
+    out = tmp_path / 'out'
+    names = ['straight_car_fast_left', 'junction_right_turns_to_rear']
+    assert main(['fit', *(str(vehicle_path(n)) for n in names), '--network', str(NETWORK_FILE),
+                 '--orders', '1', '3', '--out', str(out)]) == 0
+    assert {p.name for p in out.iterdir()} == {'fits.csv', 'fits.json', 'orders.png',
+                                               *(f'{n}_pass_1.png' for n in names)}
+    lines = (out / 'fits.csv').read_text().splitlines()
+    assert lines[0] == ','.join(FIT_COLUMNS) and len(lines) == 5
+    content = json.loads((out / 'fits.json').read_text())
+    assert content['iron'] is None and not content['interrupted']
+    car, turn = content['fits'][1], content['fits'][3]
+    assert car['chosen'] == 1 and abs(car['speed'] - 20.0) < 1.6 and not car['reason']
+    assert turn['reason'].startswith('not at constant velocity') and turn['speed'] is None
+    text = capsys.readouterr().out
+    assert 'a turn, braking' in text and 'closest to the middle of the sensors' in text
+
+
+def test_fit_of_one_vehicle_tells_its_iron(tmp_path, capsys):
+    """Two passes of the same heading cannot; the file says so with a null."""
+    name = str(vehicle_path('straight_car_right'))
+    assert main(['fit', name, '--network', str(NETWORK_FILE), '--orders', '3', '--same-vehicle',
+                 '--no-figures', '--out', str(tmp_path)]) == 0
+    assert 'cannot be told apart' in capsys.readouterr().out
+    assert json.loads((tmp_path / 'fits.json').read_text())['iron'] is None
+
+
+@pytest.mark.parametrize('options, text', [
+    (['--orders', '0'], '--orders: expected different numbers from 1 to 8'),
+    (['--orders', '2', '2'], '--orders'),
+    (['--cpa-range', '4', '1'], 'for one sensor; the network has 2'),
+])
+def test_fit_refuses_options_that_make_no_sense(tmp_path, capsys, options, text):
+    assert main(['fit', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), *options,
+                 '--out', str(tmp_path / 'out')]) == 1
+    assert text in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()

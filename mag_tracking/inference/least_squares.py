@@ -1,12 +1,15 @@
 """Non-linear least squares from many starts at once.
 
-The model comes in as a function, so that this file is mathematics only.
+The model comes in as a function or an object, so that this file is mathematics only.
 """
+
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 
-def refine(residual_and_jacobian, x, n_iterations=40):
+def refine(residual_and_jacobian, x, n_iterations=40, tolerance=0.0):
     """Levenberg-Marquardt on many starts at once, each with its own damping.
 
     Parameters
@@ -17,6 +20,8 @@ def refine(residual_and_jacobian, x, n_iterations=40):
     x : (n, n_x)
         Starts.
     n_iterations : int
+    tolerance : float
+        A start is done, too, when a step makes its cost smaller by less than this share of it.
 
     Returns
     -------
@@ -25,44 +30,69 @@ def refine(residual_and_jacobian, x, n_iterations=40):
         Sum of squared whitened residuals; infinite where a start is unusable.
     covariance : (n, n_x, n_x)
         Pseudo-inverse of the information at x.
+    converged : (n,) bool
+        Done before the iterations were used up, and not because no damping helped.
 
     Source: T10 section 2.3, Alg. 1.
     """
     x = np.array(x, dtype=float)
     residual, J, cost = _evaluate(residual_and_jacobian, x)
     damping = np.full(len(x), 1e-3)
+    converged = np.zeros(len(x), dtype=bool)
+    busy = np.flatnonzero(np.isfinite(cost))
     for _ in range(n_iterations):
-        information = np.einsum('nyi,nyj->nij', J, J)
-        # Marquardt's scaling: damping is relative to each parameter's own information.
-        diagonal = np.einsum('nii->ni', information)
-        A = information + (damping[:, None] * diagonal)[:, :, None] * np.eye(x.shape[1])
-        step = np.einsum('nij,nj->ni', _inverse(A), np.einsum('nyi,ny->ni', J, residual))
-        trial = x + step
-        trial_residual, trial_J, trial_cost = _evaluate(residual_and_jacobian, trial)
-        better = trial_cost < cost
-        x[better], cost[better] = trial[better], trial_cost[better]
-        residual[better], J[better] = trial_residual[better], trial_J[better]
-        damping = np.where(better, damping * 0.2, damping * 5.0)
-        if np.all(np.abs(step) <= 1e-10 * np.abs(x)):
+        if not len(busy):
             break
-    return x, cost, _inverse(np.einsum('nyi,nyj->nij', J, J))
+        step = _damped_step(J[busy], residual[busy], damping[busy])
+        trial = x[busy] + step
+        trial_residual, trial_J, trial_cost = _evaluate(residual_and_jacobian, trial)
+        better = trial_cost < cost[busy]
+        gain = cost[busy] - trial_cost
+        done = (np.abs(step) <= 1e-10 * np.abs(x[busy])).all(axis=1)
+        done |= better & (gain <= tolerance * cost[busy])
+        moved = busy[better]
+        x[moved], cost[moved] = trial[better], trial_cost[better]
+        residual[moved], J[moved] = trial_residual[better], trial_J[better]
+        damping[busy] *= np.where(better, 0.2, 5.0)
+        converged[busy[done]] = True
+        busy = busy[~done & (damping[busy] < MOST_DAMPING)]
+    return x, cost, _inverse(np.einsum('nyi,nyj->nij', J, J)), converged
+
+
+MOST_DAMPING = 1e12
+"""Steps that are so small and still lead uphill lead nowhere."""
+
+
+def _damped_step(J, residual, damping):
+    """Steps (n, n_x) of Levenberg and Marquardt."""
+    Jt = np.swapaxes(J, 1, 2)
+    information = Jt @ J
+    # Marquardt's scaling: damping is relative to each parameter's own information.
+    diagonal = np.einsum('nii->ni', information)
+    A = information + (damping[:, None] * diagonal)[:, :, None] * np.eye(J.shape[2])
+    return np.einsum('nij,nj->ni', _inverse(A), np.einsum('nij,nj->ni', Jt, residual))
 
 
 def _evaluate(residual_and_jacobian, x):
     """Residuals, Jacobians and costs; an unusable point costs infinity."""
     residual, J = residual_and_jacobian(x)
     cost = np.einsum('ni,ni->n', residual, residual)
-    bad = ~np.isfinite(cost)
+    bad = ~(np.isfinite(cost) & np.isfinite(J).all(axis=(1, 2)))
     residual[bad], J[bad], cost[bad] = 0.0, 0.0, np.inf
     return residual, J, cost
 
 
-def _inverse(A):
-    """Pseudo-inverses (n, k, k), scaled to unit diagonal first: units differ by decades."""
+def _inverse(A, rank=1e-15):
+    """Pseudo-inverses (n, k, k), scaled to unit diagonal first: units differ by decades.
+
+    Directions whose eigenvalue is then below the share `rank` of the largest are left out.
+    """
     scale = np.sqrt(np.einsum('nii->ni', A))
     scale = np.where(scale > 0.0, scale, 1.0)
-    outer = scale[:, :, None] * scale[:, None, :]
-    return np.linalg.pinv(A / outer, hermitian=True) / outer
+    w, V = np.linalg.eigh(A / (scale[:, :, None] * scale[:, None, :]))
+    w = np.where(w > rank * w[:, -1:], w, np.inf)
+    V = V / scale[:, :, None]
+    return (V / w[:, None, :]) @ np.swapaxes(V, 1, 2)
 
 
 def project_out_linear(A, y):
@@ -76,10 +106,141 @@ def project_out_linear(A, y):
     Returns
     -------
     p : (n, k)
-    cost : (n,)
-        Remaining sum of squares.
+        Zero in directions that A hardly has (`LINEAR_RANK`).
+    residual : (n, n_y)
+        y - A p.
+    inverse : (n, k, k)
+        Pseudo-inverse of A'A.
     """
-    normal = np.einsum('nyi,nyj->nij', A, A)
-    p = np.einsum('nij,nj->ni', _inverse(normal), np.einsum('nyi,y->ni', A, y))
-    residual = y - np.einsum('nyi,ni->ny', A, p)
-    return p, np.einsum('ny,ny->n', residual, residual)
+    At = np.swapaxes(A, 1, 2)
+    inverse = _inverse(At @ A, LINEAR_RANK)
+    p = np.einsum('nij,nj->ni', inverse, At @ y)
+    return p, y - np.einsum('nyi,ni->ny', A, p), inverse
+
+
+LINEAR_RANK = 1e-11
+"""Dipoles that are almost at one place would cancel each other with moments without bounds."""
+
+
+class SeparableModel(Protocol):
+    """Whitened measurements basis(theta) p: linear in p, not in the few theta."""
+
+    def basis(self, theta: np.ndarray) -> np.ndarray:
+        """(n, n_y, k) for theta (n, n_theta)."""
+
+    def derivative(self, theta: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """d(basis(theta) p)/d(theta), (n, n_y, n_theta)."""
+
+
+class SeparableProblem:
+    """A separable model and what it is to fit; p is eliminated for every theta.
+
+    Parameters
+    ----------
+    model : SeparableModel
+    y : (n_y,)
+        Whitened.
+    nuisance : (n_y, q), optional
+        Further linear terms that do not depend on theta (backgrounds), whitened.
+
+    Source: variable projection with the Jacobian of Kaufman (1975); TSP14 eq. (46).
+    """
+
+    def __init__(self, model, y, nuisance=None):
+        self._model = model
+        # The nuisance is projected out of everything, once.
+        self._Q = np.zeros((len(y), 0)) if nuisance is None else np.linalg.qr(nuisance)[0]
+        self._y = y - self._Q @ (self._Q.T @ y)
+        self.energy = float(self._y @ self._y)
+        """Sum of squares of what the nuisance alone does not explain."""
+
+    def _without_nuisance(self, A):
+        """A (n, n_y, k) without what the nuisance explains."""
+        return A - self._Q @ (self._Q.T @ A)
+
+    def cost(self, theta):
+        """(n,) least sum of squares for theta (n, n_theta); infinite where it is no number."""
+        A = self._without_nuisance(self._model.basis(theta))
+        p, _, _ = project_out_linear(A, self._y)
+        # Not from the residuals: a grid of starts has many, and digits enough.
+        cost = self.energy - np.einsum('ni,ni->n', p, self._y @ A)
+        return np.where(np.isfinite(cost), cost, np.inf)
+
+    def residual_and_jacobian(self, theta):
+        """Residuals (n, n_y) and the Jacobians (n, n_y, n_theta) of what is predicted."""
+        A = self._without_nuisance(self._model.basis(theta))
+        p, residual, inverse = project_out_linear(A, self._y)
+        D = self._without_nuisance(self._model.derivative(theta, p))
+        return residual, D - A @ (inverse @ (np.swapaxes(A, 1, 2) @ D))
+
+    def linear(self, theta):
+        """p (k,) at theta (n_theta,)."""
+        return project_out_linear(
+            self._without_nuisance(self._model.basis(theta[None])), self._y)[0][0]
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """The lowest minimum that a search found."""
+
+    theta: np.ndarray
+    """(n_theta,)."""
+    cost: float
+    """Sum of squared whitened residuals; infinite where no start was usable."""
+    converged: bool
+    rivals: tuple = ()
+    """(theta, cost) of other minima that it ended in, best first."""
+
+
+def search(smooth, coarse, fine, starts, apart, companions=None, n_refined=60, n_steps=4,
+           n_distinct=8, n_best=4):
+    """The lowest minimum of a separable problem, from many starts.
+
+    Parameters
+    ----------
+    smooth, coarse : SeparableProblem
+        Smaller problems with nearly the same minima, the first one smoother. By it all `starts`
+        are judged, and the best `n_refined` get `n_steps` steps of Levenberg and Marquardt. The
+        best `n_distinct` of those that differ go to their minima of the second.
+    fine : SeparableProblem
+        The one to solve, from the best `n_best` of these minima.
+    starts : (n, n_theta)
+    apart : (n_theta,)
+        Points differ that are farther from each other than this in any of the numbers.
+    companions : function, optional
+        Takes the best point (n_theta,) of the coarse problem, gives others (n, n_theta) whose
+        minima are often mistaken for its own; the search goes on from them, too.
+
+    Returns
+    -------
+    Minimum
+    """
+    theta, cost = starts, smooth.cost(starts)
+    theta = theta[np.argsort(cost, kind='stable')[:n_refined]]
+    theta, cost, _, _ = refine(smooth.residual_and_jacobian, theta, n_steps)
+    theta = _distinct(theta, cost, apart, n_distinct)
+    theta, cost, _, _ = refine(coarse.residual_and_jacobian, theta, 40, 1e-6)
+    if companions is not None:
+        more, more_cost, _, _ = refine(coarse.residual_and_jacobian,
+                                       companions(theta[np.argmin(cost)]), 40, 1e-6)
+        theta, cost = np.vstack([theta, more]), np.append(cost, more_cost)
+    theta = _distinct(theta, cost, apart, n_best)
+    theta, cost, _, converged = refine(fine.residual_and_jacobian, theta, 100, 1e-8)
+    order = np.argsort(cost, kind='stable')
+    best, rivals = order[0], []
+    for k in order[1:]:
+        if all((np.abs(theta[k] - x) > apart).any()
+               for x in (theta[best], *(x for x, _ in rivals))):
+            rivals.append((theta[k], float(cost[k])))
+    return Minimum(theta[best], float(cost[best]), bool(converged[best]), tuple(rivals))
+
+
+def _distinct(theta, cost, apart, most):
+    """The best `most` of theta (n, n_theta) of which no two are the same point."""
+    kept = []
+    for x in theta[np.argsort(cost, kind='stable')]:
+        if all((np.abs(x - other) > apart).any() for other in kept):
+            kept.append(x)
+            if len(kept) == most:
+                break
+    return np.array(kept)

@@ -38,6 +38,11 @@ def _scale_of(extent):
     return (1.0, 'm') if extent > 1.0 else (1e3, 'mm')
 
 
+def field_unit(strongest):
+    """(factor, unit) that makes fields up to `strongest` [T] readable."""
+    return (1e9, 'nT') if strongest < 1e-5 else (1e6, 'µT') if strongest < 1e-2 else (1e3, 'mT')
+
+
 def _without_switches(rows):
     """Points (n, 2), with NaN where the best of an arrival is suddenly elsewhere: another one."""
     points = np.array([r[2][:2] for r in rows])
@@ -141,8 +146,7 @@ def field_figure(log, network, most=8):
     lines = -(-len(rows) // columns)
     figure = Figure(figsize=(9.5, 1.2 + 2.4 * lines), layout='constrained')
     grid = figure.subplots(lines, columns, squeeze=False, sharex=True)
-    f, unit = (1e9, 'nT') if strength.max() < 1e-5 else (1e6, 'µT') if strength.max() < 1e-2 \
-        else (1e3, 'mT')
+    f, unit = field_unit(strength.max())
     t = log.seconds()
     for axes in grid.flat[len(rows):]:
         axes.set_visible(False)

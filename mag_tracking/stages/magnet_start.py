@@ -68,7 +68,8 @@ def start_magnet(settings, network, frame, background_std, own_std, relative_std
     A = np.einsum('jik,gjkl->gjil', network.R_sw, dB_dm) / std[:, :, None]
     A = A[:, present]
     usable = np.isfinite(A).all(axis=(1, 2))
-    moments, cost = project_out_linear(A[usable], y)
+    moments, residual, _ = project_out_linear(A[usable], y)
+    cost = np.einsum('gy,gy->g', residual, residual)
     best = np.argsort(cost, kind='stable')[:settings.starts]
     start = np.hstack([grid[usable][best], moments[best]])
     state, P, cost = _distinct_optima(settings, network, start, y, std, present)
@@ -90,10 +91,11 @@ def _distinct_optima(settings, network, start, y, std, present):
     def residual_and_jacobian(x):
         h, H, _ = sensor_fields(network.positions, network.R_sw,
                                 np.ascontiguousarray(x[:, None, :3]),
-                                np.ascontiguousarray(x[:, None, 3:]), dr_dx, dm_dx)
+                                np.ascontiguousarray(x[:, None, 3:]), dr_dx[:len(x)],
+                                dm_dx[:len(x)])
         return y - (h / std)[:, present], (H / std[:, :, None])[:, present]
 
-    x, cost, covariance = refine(residual_and_jacobian, start)
+    x, cost, covariance, _ = refine(residual_and_jacobian, start)
     keep = []
     for i in np.argsort(cost, kind='stable'):
         if not np.isfinite(cost[i]) or cost[i] - cost.min() > 60.0:

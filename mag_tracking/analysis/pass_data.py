@@ -1,0 +1,124 @@
+"""What a network measured while something passed, as arrays that can be fitted."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from mag_tracking.inference.least_squares import SeparableProblem
+from mag_tracking.network import SensorNetwork
+
+
+@dataclass(frozen=True)
+class PassData:
+    """Samples of some sensors over one stretch of time; a sensor's samples are neighbours."""
+
+    network: SensorNetwork
+    stamp_ns: int
+    """Where `t` is zero."""
+    t: np.ndarray
+    """(n,) [s], ascending for each sensor."""
+    sensor: np.ndarray
+    """(n,) int, rows of the network, ascending."""
+    field: np.ndarray
+    """(n, 3) [T], sensor frame; NaN = axis not measured."""
+    covariance: np.ndarray
+    """(n_sensors, 3, 3) [T^2] of one sample; not read where the axis is missing."""
+    count: np.ndarray | None = None
+    """(n,) of how many samples each is the mean; None = of one."""
+
+    @property
+    def n_values(self):
+        """How many numbers were measured."""
+        return int(np.count_nonzero(~np.isnan(self.field)))
+
+    @property
+    def sensors(self):
+        """(k,) rows of the network of which there are measurements."""
+        return np.unique(self.sensor[~np.isnan(self.field).all(axis=1)])
+
+    @property
+    def positions(self):
+        """(n, 3) [m], world, of each sample's sensor."""
+        return self.network.positions[self.sensor]
+
+    def shifted(self, seconds):
+        """The same with time zero `seconds` later."""
+        return replace(self, stamp_ns=self.stamp_ns + int(round(1e9 * seconds)),
+                       t=self.t - seconds)
+
+    @cached_property
+    def whitening(self):
+        """(n, 3, 3) W with W C W' = I over the axes measured; the other rows are zero."""
+        W = np.zeros((len(self.t), 3, 3))
+        present = ~np.isnan(self.field)
+        for j in np.unique(self.sensor):
+            mine = self.sensor == j
+            for axes in np.unique(present[mine], axis=0):
+                if axes.any():
+                    block = np.ix_(axes, axes)
+                    one = np.zeros((3, 3))
+                    one[block] = np.linalg.inv(np.linalg.cholesky(self.covariance[j][block]))
+                    W[mine & (present == axes).all(axis=1)] = one
+        return W if self.count is None else W * np.sqrt(self.count)[:, None, None]
+
+    def averaged(self, most):
+        """The same with at most `most` means of neighbours for each sensor, of fewer where the
+        field is strong."""
+        size = np.sqrt(np.linalg.norm(self.departure, axis=1))
+        rows = []
+        for j in np.unique(self.sensor):
+            mine = np.flatnonzero(self.sensor == j)
+            share = 1.0 / len(mine) + size[mine] / max(size[mine].sum(), 1e-300)
+            part = np.floor(np.cumsum(share) / share.sum() * most * (1.0 - 1e-9)).astype(int)
+            first = np.flatnonzero(np.diff(part, prepend=-1))
+            n = np.diff(first, append=len(mine))
+            # The mean of an axis that is missing in part would belong to another time: NaN.
+            rows.append((np.add.reduceat(self.t[mine], first) / n, np.full(len(n), j),
+                         np.add.reduceat(self.field[mine], first) / n[:, None], n))
+        t, sensor, field, n = (np.concatenate(c) for c in zip(*rows, strict=True))
+        return replace(self, t=t, sensor=sensor, field=field, count=n)
+
+    @cached_property
+    def departure(self):
+        """(n, 3) [T], what departs from each sensor's median: the target, more or less."""
+        out = np.zeros_like(self.field)
+        for j in self.sensors:
+            mine = self.sensor == j
+            seen = ~np.isnan(self.field[mine]).all(axis=0)
+            level = np.zeros(3)
+            level[seen] = np.nanmedian(self.field[mine][:, seen], axis=0)
+            out[mine] = np.nan_to_num(self.field[mine] - level)
+        return out
+
+
+def separable_problem(data, model_of, relative_error=0.0):
+    """The fit of a pass as a `SeparableProblem`, the sensors' backgrounds being unknown.
+
+    Parameters
+    ----------
+    data : PassData
+    model_of : function
+        Takes t (n,), positions (n, 3) and M (n, 3, 3) (world to sensor, and whitening), gives a
+        `SeparableModel`.
+    relative_error : float
+        Each sample counts as if its field were wrong by this share of itself, too.
+
+    Returns a `SeparableProblem`.
+    """
+    W = data.whitening
+    if relative_error > 0.0:
+        signal = np.einsum('nij,nj->ni', W, data.departure)
+        size2 = np.einsum('ni,ni->n', signal, signal)
+        W = W / np.sqrt(1.0 + relative_error**2 * size2)[:, None, None]
+    model = model_of(data.t, data.positions, W @ data.network.R_sw[data.sensor])
+    y = np.einsum('nij,nj->ni', W, np.nan_to_num(data.field)).ravel()
+    return SeparableProblem(model, y, background_columns(data, W))
+
+
+def background_columns(data, W):
+    """(3 n, q): the constant field of each axis of each sensor that was measured, whitened."""
+    columns = np.zeros((len(data.t), 3, len(data.network), 3))
+    columns[np.arange(len(data.t)), :, data.sensor] = W
+    columns = columns.reshape(3 * len(data.t), -1)
+    return columns[:, (columns != 0.0).any(axis=0)]

@@ -1,0 +1,169 @@
+"""What a batch fit of a pass has to say."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mag_tracking.analysis.pass_data import PassData
+from mag_tracking.physics.anderson import closest_approach
+
+RIVAL = 9.2
+"""Chi-square that a rival may be behind: one in a hundred."""
+
+FAR = 22.5
+"""Squared deviations, of six numbers, at which another path is another: one in a thousand."""
+
+
+@dataclass(frozen=True)
+class Bearing:
+    """What one sensor alone tells: everything but the scale.
+
+    Seen from the sensor; target and motion may both be reversed, which gives the same field.
+    """
+
+    cpa_direction: np.ndarray
+    """(3,) unit vector, world, to the target at its closest; the end that is not below."""
+    motion_direction: np.ndarray
+    """(3,) unit vector, world."""
+    moment_direction: np.ndarray
+    """(3,) unit vector, world, of the whole."""
+    direction_std: np.ndarray
+    """(3,) [rad], of the three: the largest deviation across each."""
+    cpa_time: float
+    """[s] after time zero."""
+    cpa_time_std: float
+    rate: float
+    """[1/s] speed over CPA range."""
+    rate_std: float
+
+
+@dataclass(frozen=True)
+class PassFit:
+    """A pass at constant velocity, as weighted least squares has it.
+
+    Where `reason` is not empty there is no answer: the numbers that it concerns are NaN.
+    """
+
+    n_dipoles: int
+    data: PassData
+    reason: str = ''
+    converged: bool = False
+    names: tuple[str, ...] = ()
+    """Of the unknowns: path, moments, backgrounds."""
+    x: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """(n_x,) their values: [m], [m/s], [A m^2], [T]."""
+    covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    """(n_x, n_x) TSP14 eq. (47), which takes model and noise for right; infinite variance = not
+    observable."""
+    cost: float = np.nan
+    """Sum of squared whitened residuals, TSP14 eq. (46b)."""
+    explained: float = np.nan
+    """Share of the whitened energy beyond the backgrounds and the noise that the fit explains."""
+    velocity_change: float = np.nan
+    """Share of itself by which the velocity seems to change while the target is seen."""
+    velocity_change_std: float = np.nan
+    """By noise alone."""
+    bearing: Bearing | None = None
+    """With one sensor."""
+    rivals: tuple[tuple[float, np.ndarray], ...] = ()
+    """(d, path) of other minima, a likelihood ratio of exp(-d/2) behind this one: the covariance
+    knows nothing of them. A row with an empty end is one, a shorter one further on."""
+    predicted: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    """(n, 3) [T], sensor frame, with the background."""
+    predicted_std: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    """(n, 3) [T], by the covariance, without noise."""
+
+    @property
+    def degrees_of_freedom(self):
+        """Measurements less unknowns."""
+        return self.data.n_values - len(self.x)
+
+    @property
+    def normalised_cost(self):
+        """About one where the model is right; TSP14 eq. (50)."""
+        return self.cost / self.degrees_of_freedom
+
+    @property
+    def determined(self):
+        """Whether the measurements fix all unknowns, right or not."""
+        if not (len(self.x) and self.converged and np.isfinite(np.diagonal(self.covariance)).all()):
+            return False
+        length, length_std = self.length
+        return bool(length_std <= max(length, 1.0))
+
+    @property
+    def ambiguous(self):
+        """Whether another path, elsewhere by its deviations, is possible at 1 %."""
+        P = self.scaled_covariance[:6, :6]
+        for d, path in self.rivals:
+            e = path[:6] - self.x[:6]
+            if d < RIVAL and e @ np.linalg.pinv(P, hermitian=True) @ e > FAR:
+                return True
+        return False
+
+    @property
+    def scaled_covariance(self):
+        """(n_x, n_x) larger where the model is not right, as if its errors were more noise."""
+        return self.covariance * max(1.0, self.normalised_cost)
+
+    @property
+    def position(self):
+        """(3,) [m], world, of the middle at time zero."""
+        return self.x[:3]
+
+    @property
+    def velocity(self):
+        """(3,) [m/s], world."""
+        return self.x[3:6]
+
+    @property
+    def speed(self):
+        """[m/s] and its deviation (scaled)."""
+        speed = np.linalg.norm(self.velocity)
+        u = self.velocity / speed
+        return speed, np.sqrt(u @ self.scaled_covariance[3:6, 3:6] @ u)
+
+    @property
+    def heading(self):
+        """[rad] anticlockwise from x, and its deviation (scaled)."""
+        vx, vy, _ = self.velocity
+        g = np.array([-vy, vx]) / (vx * vx + vy * vy)
+        return np.arctan2(vy, vx), np.sqrt(g @ self.scaled_covariance[3:5, 3:5] @ g)
+
+    @property
+    def length(self):
+        """[m] of the row and its deviation (scaled); zeros for a point."""
+        if self.n_dipoles == 1:
+            return 0.0, 0.0
+        return self.x[6], np.sqrt(self.scaled_covariance[6, 6])
+
+    @property
+    def moment(self):
+        """(3,) [A m^2], world, of the whole, and its covariance (3, 3) (scaled); TSP14 (9)."""
+        S = np.zeros((3, len(self.x)))
+        first = 6 + int(self.n_dipoles > 1)
+        for i in range(self.n_dipoles):
+            S[:, first + 3 * i:first + 3 * i + 3] = np.eye(3)
+        return S @ self.x, S @ self.scaled_covariance @ S.T
+
+    def closest_approach(self, point):
+        """CPA of the row's middle to a point.
+
+        Parameters
+        ----------
+        point : (3,) [m], world
+
+        Returns
+        -------
+        time, time_std : float [s], after time zero
+        range, range_std : float [m]
+
+        Source: TSP14 eq. (24); deviations by its derivatives, scaled.
+        """
+        r, v = self.position - point, self.velocity
+        time, distance, r_cpa = closest_approach(r, v)
+        u = r_cpa / distance if distance > 0.0 else np.zeros(3)
+        P = self.scaled_covariance[:6, :6]
+        g_time = -np.concatenate([v, r + 2.0 * time * v]) / (v @ v)
+        g_range = np.concatenate([u, time * u])
+        return (time, np.sqrt(g_time @ P @ g_time), distance, np.sqrt(g_range @ P @ g_range))

@@ -1,0 +1,201 @@
+"""mag-tracking fit."""
+
+import signal
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from mag_tracking.cli.options import add_command, add_network, add_settings, settings_of
+from mag_tracking.errors import OutputError, SettingsError
+from mag_tracking.fitting import RecordingFit
+from mag_tracking.inference.iron import hard_and_soft_iron
+from mag_tracking.interrupts import noted_signals
+from mag_tracking.io.bag import Recording
+from mag_tracking.io.fit_results import FitFolder
+from mag_tracking.io.network_file import read_network
+from mag_tracking.physics.dipole import MU0
+
+_FIT = '''
+Cuts the passes out of a recording (from before a detection until its end) and fits
+each as a whole: a row of 1, 2, 3, 4 dipoles at constant velocity (TSP14). For a
+vehicle on a straight road this is the most accurate that there is, and the normalised
+cost says whether to believe it: 1 = the model is right.
+
+A pass that this cannot describe (a turn, two vehicles at once, nothing but noise, one
+sensor alone, ...) gets a reason instead of numbers.
+
+Writes to DIR:
+  fits.csv, fits.json   a row a pass and order
+  *_pass_N.png          measured against fitted field, with 90 % bands
+  orders.png            normalised cost over the order
+
+examples:
+  mag-tracking fit road.mcap --network network.yaml --out fits
+  mag-tracking fit north.mcap south.mcap east.mcap --same-vehicle --network network.yaml --out fits
+  mag-tracking fit alone.mcap --network one_sensor.yaml --cpa-range 4.5 0.3 --out fits
+'''
+
+
+def add(commands):
+    """Register the command."""
+    p = add_command(commands, 'fit', _fit, 'Fit whole passes at constant velocity, offline.', _FIT)
+    p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
+                   help='an .mcap file or a rosbag2 folder')
+    add_network(p)
+    p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder for the results')
+    p.add_argument('--orders', nargs='+', type=int, default=[1, 2, 3, 4], metavar='N',
+                   help='numbers of dipoles to try (default: 1 2 3 4)')
+    p.add_argument('--cpa-range', nargs=2, type=float, metavar=('RANGE', 'STD'),
+                   help='for one sensor, which cannot tell the scale: the range of the closest '
+                   'point and its deviation [m]')
+    p.add_argument('--same-vehicle', action='store_true',
+                   help='all passes are of one vehicle: tell its hard and soft iron')
+    add_settings(p)
+    p.add_argument('--no-figures', action='store_true', help='leave the pictures out')
+
+
+def _fit(args):
+    """mag-tracking fit."""
+    network, settings = read_network(args.network), settings_of(args)
+    _check(args, network)
+    passes, figures = [], 0
+    with noted_signals(signal.SIGINT) as seen, FitFolder(args.out) as folder:
+        for path in args.recordings:
+            recording = Recording(path)
+            if recording.lies_in(args.out):
+                raise OutputError(f'{args.out} is the folder of a recording')
+            job = RecordingFit(recording, network, settings, args.orders, args.cpa_range)
+            with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
+                      disable=None) as bar:
+                for one in job.passes(bar.update, lambda: bool(seen)):
+                    folder.add(one)
+                    passes.append(one)
+                    bar.clear()
+                    _print_pass(one)
+                    figures += 0 if args.no_figures else _draw(one, args.out)
+            for line in job.warnings():
+                print(f'  warning: {path.name}: {line}')
+            if seen:
+                break
+        iron = _iron(passes, network) if args.same_vehicle else None
+        folder.write_summary({'iron': iron, 'interrupted': bool(seen)})
+    if not passes:
+        print('no pass: nothing was detected')
+    elif not args.no_figures:
+        _draw_orders(passes, args.out)
+    print(f'{"interrupted; what was done is" if seen else "results"} in {args.out}')
+    return 130 if seen else 0
+
+
+def _check(args, network):
+    """Raise SettingsError for options that make no sense."""
+    if min(args.orders) < 1 or max(args.orders) > 8 or len(set(args.orders)) < len(args.orders):
+        raise SettingsError(f'--orders: expected different numbers from 1 to 8, got {args.orders}')
+    if args.cpa_range is not None:
+        if len(network) > 1:
+            raise SettingsError(f'--cpa-range is for one sensor; the network has {len(network)}, '
+                                'which tell the scale themselves')
+        if not (np.isfinite(args.cpa_range).all() and min(args.cpa_range) > 0.0):
+            raise SettingsError('--cpa-range: expected two positive numbers, got '
+                                f'{args.cpa_range}')
+    if args.same_vehicle and not (network.earth_field is not None and network.earth_field.any()):
+        raise SettingsError('--same-vehicle: the network file has no earth_field, without which '
+                            'hard and soft iron cannot be told apart')
+
+
+def _print_pass(one):
+    """A table of the orders of one pass."""
+    print(f'{one.recording}, pass {one.number}: {one.fits[0].data.n_values} measurements, '
+          f'{len(one.fits[0].data.sensors)} sensors')
+    for note in one.notes:
+        print(f'  note: {note}')
+    if any(not f.reason for f in one.fits):
+        print('  dipoles  cost       x        y       z      speed        heading      length   '
+              '   moment')
+    for fit in one.fits:
+        mark = '*' if fit is one.chosen else ' '
+        cost = f'{fit.normalised_cost:8.2f}' if len(fit.x) else ' ' * 8
+        print(f' {mark}   {fit.n_dipoles}  {cost}  {fit.reason or _numbers(fit)}')
+        if fit.bearing is not None:
+            _print_bearing(fit.bearing)
+        if not fit.reason and fit.ambiguous:
+            behind, path = min(fit.rivals, key=lambda rival: rival[0])
+            print(f'        ambiguous: {np.exp(-0.5 * behind):.2f} times as likely is '
+                  f'({", ".join(f"{v:.2f}" for v in path[:3])}) m'
+                  + (f' with a length of {abs(path[6]):.1f} m' if len(path) > 6 else ''))
+    if one.chosen is not None:
+        centre = one.chosen.data.network.positions[one.chosen.data.sensors].mean(axis=0)
+        time, std, distance, distance_std = one.chosen.closest_approach(centre)
+        print(f'  closest to the middle of the sensors {time:+.2f} ({std:.2f}) s after the '
+              f'strongest field, {distance:.2f} ({distance_std:.2f}) m away')
+        far, fast = one.disagreement
+        if np.isfinite(far):
+            print(f'  orders with nearly this cost differ by up to {far:.2f} m and {fast:.2f} m/s, '
+                  'more than the deviations (of noise, in brackets) where the model is not right')
+
+
+def _numbers(fit):
+    """Position, speed, heading, length and moment, with deviations in brackets."""
+    sd = np.sqrt(np.diagonal(fit.scaled_covariance))[:3]
+    place = ' '.join(f'{v:6.2f}({s:.2f})' for v, s in zip(fit.position, sd, strict=True))
+    moment, P = fit.moment
+    size = np.linalg.norm(moment)
+    size_std = np.sqrt(moment @ P @ moment) / size
+    heading, heading_std = np.degrees(fit.heading)
+    return (f'{place} m  {fit.speed[0]:.2f}({fit.speed[1]:.2f}) m/s  {heading:.1f}'
+            f'({heading_std:.1f}) deg  {fit.length[0]:.1f}({fit.length[1]:.1f}) m  '
+            f'{size:.0f}({size_std:.0f}) A m^2')
+
+
+def _print_bearing(b):
+    """What one sensor tells."""
+    def text(direction):
+        return ' '.join(f'{v:.2f}' for v in direction)
+
+    print(f'        to the closest point ({text(b.cpa_direction)}), moving '
+          f'({text(b.motion_direction)}), or both reversed; moment along '
+          f'({text(b.moment_direction)})')
+    print(f'        closest {b.cpa_time:+.3f} ({b.cpa_time_std:.3f}) s after the strongest field; '
+          f'speed over range {b.rate:.3f} ({b.rate_std:.3f}) 1/s')
+
+
+def _iron(passes, network):
+    """Hard and soft iron from the chosen fits, JSON-ready, or None with a line that says why."""
+    fits = [one.chosen for one in passes if one.chosen is not None]
+    try:
+        if not fits:
+            raise ValueError('no pass has an answer')
+        moments, covariances = zip(*(f.moment for f in fits), strict=True)
+        iron = hard_and_soft_iron(moments, [f.heading[0] for f in fits],
+                                  network.earth_field / MU0, covariances)
+    except ValueError as error:
+        print(f'hard and soft iron: {error}')
+        return None
+    std = np.sqrt(np.diagonal(iron.covariance)) * np.sqrt(max(1.0, iron.normalised_cost))
+    hard = ', '.join(f'{v:.1f} ({s:.1f})' for v, s in zip(iron.hard, std[:3], strict=True))
+    print(f'hard iron m0 = {hard} A m^2 (forward, left, up); soft iron D = {iron.soft:.3f} '
+          f'({std[3]:.3f}) m^3; {len(fits)} passes, normalised cost {iron.normalised_cost:.1f}')
+    return {'hard': iron.hard.tolist(), 'soft': iron.soft, 'std': std.tolist(),
+            'normalised_cost': iron.normalised_cost, 'passes': len(fits)}
+
+
+def _draw(one, out):
+    """The figure of the order chosen, or of the richest that there is; how many were drawn."""
+    fit = one.chosen or next((f for f in reversed(one.fits) if len(f.x)), None)
+    if fit is None:
+        return 0
+    # Drawing needs matplotlib, which a run without figures should not wait for.
+    from mag_tracking.report.fit_figures import pass_figure
+
+    title = f'{one.recording}, pass {one.number}, {fit.n_dipoles} dipole{"s" * (fit.n_dipoles > 1)}'
+    pass_figure(fit, title + (' (no answer)' if fit.reason else '')).savefig(
+        out / f'{one.recording}_pass_{one.number}.png', dpi=110)
+    return 1
+
+
+def _draw_orders(passes, out):
+    """The figure of all orders."""
+    from mag_tracking.report.fit_figures import order_figure
+
+    order_figure(passes).savefig(out / 'orders.png', dpi=110)

@@ -1,0 +1,34 @@
+"""What several commands share: options and settings."""
+
+import argparse
+from pathlib import Path
+
+from mag_tracking.pipeline import TARGET_DEFAULTS, settings_for
+from mag_tracking.settings import read_parameter_file
+
+
+def add_command(commands, name, run, short, text=''):
+    """A command's parser; `run` takes the parsed arguments and returns the exit status."""
+    parser = commands.add_parser(name, help=short, description=short, epilog=text,
+                                 formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.set_defaults(run_command=run)
+    return parser
+
+
+def add_network(parser, required=True, text='positions and orientations of the sensors '
+                '(network.yaml)'):
+    """--network."""
+    parser.add_argument('--network', required=required, type=Path, metavar='FILE', help=text)
+
+
+def add_settings(parser):
+    """--target and --params."""
+    parser.add_argument('--params', type=Path, metavar='FILE', help='settings that differ')
+    parser.add_argument('--target', choices=list(TARGET_DEFAULTS), default='vehicle',
+                        help='what moves (default: vehicle)')
+
+
+def settings_of(args):
+    """Settings of the command line's target and parameter file."""
+    changes = read_parameter_file(args.params) if args.params else {}
+    return settings_for(args.target, changes)

@@ -1,0 +1,122 @@
+"""mag-tracking replay."""
+
+import signal
+from pathlib import Path
+
+from tqdm import tqdm
+
+from mag_tracking.cli.options import add_command, add_network, add_settings, settings_of
+from mag_tracking.errors import OutputError
+from mag_tracking.interrupts import noted_signals
+from mag_tracking.io.bag import Recording
+from mag_tracking.io.network_file import read_network
+from mag_tracking.offline import replay, write_figures
+
+_REPLAY = '''
+Reads the magnetic fields of the network's topics, learns each sensor's
+background from the target-free beginning, detects, and tracks with a bank of
+filters. No ROS has to run: the nodes use the very same code.
+
+Writes to DIR:
+  poses.csv        the published pose, one row a frame
+  poses_smoothed.csv  the same by what came before and after, when a track has ended
+  detections.csv   onsets and releases
+  hypotheses.csv   every member of the bank, every frame
+  summary.json     counts, rejected samples by cause, the tracks
+  tracks.mcap      poses and tracks as ROS messages (with metadata.yaml)
+  *_track_N.png    the map, the weights, measured against predicted field
+With several recordings, each gets a folder of its own in DIR.
+
+examples:
+  mag-tracking replay junction.mcap --network config/network.yaml --out out
+  mag-tracking replay magnet/ --network magnet/network.yaml --target magnet --out out
+  mag-tracking replay night.mcap --network site.yaml --params mine.yaml --out out
+
+A parameter file holds only what differs from the defaults (config/default.yaml
+has them all, with their meaning):
+  track:
+    vehicle:
+      arrival_names: ['east', 'west']
+      arrival_headings_deg: [180.0, 0.0]
+'''
+
+
+def add(commands):
+    """Register the command."""
+    p = add_command(commands, 'replay', _replay, 'Track what is in recordings, offline.', _REPLAY)
+    p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
+                   help='an .mcap file or a rosbag2 folder')
+    add_network(p)
+    p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder for the results')
+    add_settings(p)
+    p.add_argument('--no-figures', action='store_true', help='leave the pictures out')
+
+
+def _replay(args):
+    """mag-tracking replay."""
+    network, settings = read_network(args.network), settings_of(args)
+    names = [path.resolve().stem for path in args.recordings]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise OutputError(f'two recordings are named {twice[0]}: their results would overwrite '
+                          'each other; replay them one by one')
+    with noted_signals(signal.SIGINT) as seen:
+        for path, name in zip(args.recordings, names, strict=True):
+            out = args.out / name if len(args.recordings) > 1 else args.out
+            _replay_one(path, network, settings, out, seen, not args.no_figures)
+            if seen:
+                print(f'interrupted; what was done is in {out}')
+                return 130
+    return 0
+
+
+def _replay_one(path, network, settings, out, seen, figures):
+    """Replay one recording into one folder; what was done stays when it is interrupted."""
+    recording = Recording(path)
+    with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
+              disable=None) as bar:
+        run = replay(recording, network, settings, out, bar.update, lambda: bool(seen))
+    _print_summary(path, run.summary)
+    if figures:
+        write_figures(run, network, out, stopped=lambda: bool(seen))
+    if not seen:
+        print(f'results in {out}')
+
+
+def _print_summary(path, summary):
+    """The run in a few lines."""
+    print(f'{path.name}: {summary["counts"]["align"].get("frames", 0)} frames, '
+          f'{summary["counts"]["detect"].get("onsets", 0)} detections, '
+          f'{len(summary["tracks"])} tracks')
+    for topic in summary['missing_topics']:
+        print(f'  warning: nothing on {topic}')
+    if not summary['counts']['detect'].get('onsets', 0):
+        print(f'  nothing was detected with the settings for a {summary["target"]}')
+    for what, n in {**summary['rejected'], **summary['lost']}.items():
+        print(f'  warning: {what}: {n}')
+    stuck = [name for name, s in summary['sensors'].items() if s['stuck']]
+    if stuck:
+        print(f'  warning: {", ".join(stuck)}: an axis does not vary (a stuck sensor, or one with '
+              'coarse steps: give it a noise_std in the network file)')
+    waiting = [name for name, s in summary['sensors'].items() if not s['ready'] and not s['stuck']]
+    if waiting:
+        print(f'  warning: no background was learnt for {", ".join(waiting)}: the recording needs '
+              'a target-free beginning, or the network file a background and a noise_std')
+    too_long = summary['counts']['track'].get('tracks too long to smooth', 0)
+    if too_long:
+        print(f'  warning: {too_long} tracks were too long to smooth (track.smooth_longest_s, or '
+              'too many frames for so many sensors)')
+    for t in summary['tracks']:
+        print(f'  track {t["id"]}: {t["poses"]} poses'
+              + (f', from {t["arrival"]} ({t["arrival_weights"][t["arrival"]]:.0%})'
+                 if t['arrival'] else '')
+              + (f', a {t["kind"]} ({t["kind_weight"]:.0%})' if t['kind'] else '')
+              + f', {t["speed"]:.2f} m/s, {t["moment_size"]:.3g} A m^2, {t["verdict"]}')
+        for name, m in t['mounting'].items():
+            if m['suspicious']:
+                print(f'    warning: {name} fits best if turned by '
+                      f'{max(m["angles_deg"], key=abs):+.0f} degrees about one axis: its '
+                      'orientation in the network file is wrong, or the target is not as modelled')
+        for name, value in t.get('truth', {}).items():
+            if isinstance(value, float):
+                print(f'    against truth: {name} {value:.4g}')

@@ -1,0 +1,97 @@
+"""Figures of fitted passes: one function a figure, each returns the figure."""
+
+import matplotlib
+import numpy as np
+
+matplotlib.use('Agg')
+from matplotlib.figure import Figure  # noqa: E402  (the backend has to be chosen first)
+
+from mag_tracking.report.figures import SCALE_1D, field_unit  # noqa: E402
+
+_AXES = ('tab:red', 'tab:green', 'tab:blue')
+
+
+def pass_figure(fit, title, most=6):
+    """Measured and fitted field with the band that 90 % of the measurements should lie in.
+
+    Where the normalised cost is above one the band is wider by its root, as if what the model does
+    not describe were more noise.
+
+    Parameters
+    ----------
+    fit : PassFit
+    title : str
+    most : int
+        Sensors drawn; with more, those with the strongest field.
+
+    Source: TSP14 Fig. 6.
+    """
+    data = fit.data
+    level = fit.predicted - _target_alone(fit)
+    strength = {j: np.nanmax(np.abs(data.field - level)[data.sensor == j]) for j in data.sensors}
+    shown = sorted(sorted(strength, key=lambda j: -strength[j])[:most])
+    f, unit = field_unit(max(strength.values()))
+    scale = f * SCALE_1D * np.sqrt(max(1.0, fit.normalised_cost))
+    figure = Figure(figsize=(10.0, 1.0 + 2.6 * len(shown)), layout='constrained')
+    for axes, j in zip(figure.subplots(len(shown), 1, squeeze=False, sharex=True).flat, shown,
+                       strict=True):
+        mine = data.sensor == j
+        t = data.t[mine]
+        noise = np.diagonal(data.covariance[j])
+        for a, colour in enumerate(_AXES):
+            if np.isnan(data.field[mine, a]).all():
+                continue
+            middle = f * (fit.predicted - level)[mine, a]
+            half = scale * np.sqrt(fit.predicted_std[mine, a]**2 + noise[a])
+            axes.fill_between(t, middle - half, middle + half, color=colour, alpha=0.25, lw=0)
+            axes.plot(t, f * (data.field - level)[mine, a], '.', ms=2.5, color=colour,
+                      label=f'{"xyz"[a]}')
+            axes.plot(t, middle, '-', lw=0.9, color='k')
+        axes.set_title(data.network.names[j], fontsize=9)
+        axes.set_ylabel(f'field [{unit}]')
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8, ncol=3, loc='upper right')
+    axes.set_xlabel('time from the strongest field [s]')
+    figure.suptitle(f'{title}: measured (dots), fitted (lines), 90 % bands', fontsize=11)
+    return figure
+
+
+def _target_alone(fit):
+    """(n, 3) [T] the fitted field without the backgrounds, which are the last unknowns."""
+    out = fit.predicted.copy()
+    for name, value in zip(fit.names, fit.x, strict=True):
+        if name.startswith('B '):
+            sensor, axis = name[2:].rsplit(' ', 1)
+            out[fit.data.sensor == fit.data.network.index(sensor), 'xyz'.index(axis)] -= value
+    return out
+
+
+def order_figure(passes):
+    """Normalised cost over the number of dipoles, a line a pass; filled = the order chosen.
+
+    Parameters
+    ----------
+    passes : sequence of FittedPass
+
+    Source: TSP14 Fig. 7.
+    """
+    figure = Figure(figsize=(7.5, 5.0), layout='constrained')
+    axes = figure.add_subplot()
+    for k, one in enumerate(passes):
+        fits = [f for f in one.fits if len(f.x)]
+        if not fits:
+            continue
+        colour = f'C{k % 10}'
+        axes.semilogy([f.n_dipoles for f in fits], [f.normalised_cost for f in fits], 'o-',
+                      mfc='w', color=colour, label=f'{one.recording}, pass {one.number}')
+        if one.chosen is not None:
+            axes.semilogy([one.chosen.n_dipoles], [one.chosen.normalised_cost], 'o', ms=8,
+                          color=colour)
+    axes.axhline(1.0, color='k', lw=0.8, ls='--')
+    axes.set_xticks(sorted({f.n_dipoles for one in passes for f in one.fits}))
+    axes.set_xlabel('number of dipoles')
+    axes.set_ylabel('normalised cost (1 = the model is right)')
+    axes.grid(alpha=0.3, which='both')
+    axes.legend(fontsize=8)
+    axes.set_title('How well a row of dipoles describes each pass (filled: the order chosen)')
+    return figure
