@@ -33,7 +33,7 @@ def _colours(log):
     return {name: _COLOURS[i % len(_COLOURS)] for i, name in enumerate(names)}
 
 
-def _scale_of(extent):
+def scale_of(extent):
     """(factor, unit) that makes a length of `extent` metres readable."""
     return (1.0, 'm') if extent > 1.0 else (1e3, 'mm')
 
@@ -68,7 +68,7 @@ def map_figure(log, network, truth=None, smoothed=None):
     best = np.array(log.position)
     reach = np.vstack([best[:, :2], network.positions[:, :2]])
     low, high = reach.min(axis=0), reach.max(axis=0)
-    f, unit = _scale_of((high - low).max())
+    f, unit = scale_of((high - low).max())
     span = max((high - low).max(), 1e-6)
     every = max(1, len(best) // 14)
     colours = _colours(log)

@@ -1,0 +1,121 @@
+"""Figures of a plan: one function a figure, each returns the figure."""
+
+import matplotlib
+import numpy as np
+
+matplotlib.use('Agg')
+from matplotlib.colors import LogNorm  # noqa: E402  (the backend has to be chosen first)
+from matplotlib.figure import Figure  # noqa: E402
+
+from mag_tracking.report.figures import scale_of  # noqa: E402
+
+
+def _map(plan, title):
+    """(figure, axes, factor, unit) with the sensors and the lanes."""
+    f, unit = scale_of(np.ptp(plan.x))
+    figure = Figure(figsize=(8.0, 6.8), layout='constrained')
+    axes = figure.add_subplot()
+    axes.set_aspect('equal')
+    axes.set_xlabel(f'x [{unit}]')
+    axes.set_ylabel(f'y [{unit}]')
+    axes.set_title(title, fontsize=11)
+    for lane in plan.lanes:
+        low, high = (plan.x[0], plan.y[0]), (plan.x[-1], plan.y[-1])
+        inside = f * lane.points[((lane.points >= low) & (lane.points <= high)).all(axis=1)]
+        axes.plot(*inside.T, '--', color='0.25', lw=0.8)
+        if len(inside) > 3:
+            axes.annotate('', inside[-1], inside[-4],
+                          arrowprops={'arrowstyle': '-|>', 'color': '0.25'})
+    axes.plot(*(f * plan.network.positions[:, :2]).T, 'k^', ms=8, mec='w', zorder=5)
+    axes.set_xlim(f * plan.x[0], f * plan.x[-1])
+    axes.set_ylim(f * plan.y[0], f * plan.y[-1])
+    return figure, axes, f, unit
+
+
+def _levels(values, factor):
+    """Round contour levels, 1-2-5, within the values."""
+    tens = 10.0 ** np.arange(-6, 7)
+    levels = np.sort(np.concatenate([tens, 2.0 * tens, 5.0 * tens]))
+    low, high = factor * np.nanmin(values), factor * np.nanmax(values)
+    inside = levels[(levels > low) & (levels < high)]
+    return inside if len(inside) else np.array([np.sqrt(low * high)])
+
+
+def position_figure(plan):
+    """Map of the position's bound by a whole pass through each point."""
+    figure, axes, f, unit = _map(
+        plan, 'How well a position can be known by a whole pass through it (standard deviation)')
+    z = f * np.clip(plan.position_std, None, np.ptp(plan.x))
+    mesh = axes.pcolormesh(f * plan.x, f * plan.y, z, norm=LogNorm(), cmap='viridis',
+                           shading='nearest', rasterized=True)
+    lines = axes.contour(f * plan.x, f * plan.y, z, levels=_levels(z, 1.0), colors='w',
+                         linewidths=0.8)
+    axes.clabel(lines, fmt=f'%g {unit}', fontsize=8)
+    figure.colorbar(mesh, ax=axes, label=f'standard deviation in the plane [{unit}]')
+    return figure
+
+
+def detection_figure(plan):
+    """Map of the probability that one frame detects the target."""
+    figure, axes, f, _ = _map(plan, 'Probability that one frame detects the target there')
+    mesh = axes.pcolormesh(f * plan.x, f * plan.y, plan.detection, vmin=0.0, vmax=1.0,
+                           cmap='magma', shading='nearest', rasterized=True)
+    levels = [p for p in (0.1, 0.5, 0.9, 0.99) if plan.detection.min() < p < plan.detection.max()]
+    if levels:
+        lines = axes.contour(f * plan.x, f * plan.y, plan.detection, levels=levels, colors='c',
+                             linewidths=0.9)
+        axes.clabel(lines, fmt=lambda p: f'{100 * p:g} %', fontsize=8)
+    figure.colorbar(mesh, ax=axes, label='probability of detection')
+    return figure
+
+
+def sensor_figure(plan):
+    """Map of what one more sensor would bring; left white where none may stand."""
+    gain = 1.0 - plan.with_one_more / plan.without
+    figure, axes, f, unit = _map(
+        plan, f'Where one more sensor helps: the median bound near the sensors is now '
+        f'{f_text(plan.without)}')
+    ny, nx = gain.shape
+    x, y = np.linspace(plan.x[0], plan.x[-1], nx), np.linspace(plan.y[0], plan.y[-1], ny)
+    mesh = axes.pcolormesh(f * x, f * y, 100.0 * gain, cmap='cividis', shading='nearest',
+                           rasterized=True)
+    best = plan.best_place
+    axes.plot(f * best[0], f * best[1], 'r*', ms=15, mec='w',
+              label=f'best: ({f * best[0]:.3g}, {f * best[1]:.3g}) {unit}, then '
+              f'{f_text(np.nanmin(plan.with_one_more))}')
+    axes.legend(fontsize=9, loc='upper right')
+    figure.colorbar(mesh, ax=axes, label='smaller by [%]')
+    return figure
+
+
+def f_text(metres):
+    """A length in a readable unit."""
+    return f'{metres:.3g} m' if metres >= 0.01 else f'{1e3 * metres:.2g} mm'
+
+
+def lane_figure(plan):
+    """Bounds and detection along the lanes, and how many passes are missed by their distance."""
+    figure = Figure(figsize=(8.5, 9.0), layout='constrained')
+    top, middle, bottom = figure.subplots(3, 1)
+    f, unit = scale_of(np.ptp(plan.x))
+    for k, lane in enumerate(plan.lanes):
+        colour = f'C{k % 10}'
+        top.semilogy(f * lane.along, f * lane.filter_std, '-', color=colour,
+                     label=f'{lane.name}: filter so far')
+        top.semilogy(f * lane.along, f * lane.pass_std[:, 0], '--', color=colour,
+                     label=f'{lane.name}: whole pass')
+        middle.plot(f * lane.along, lane.detection, color=colour, label=lane.name)
+    top.set_ylabel(f'position bound [{unit}]')
+    top.set_ylim(top=min(top.get_ylim()[1], f * np.ptp(plan.x)))
+    top.legend(fontsize=8)
+    top.set_title('Along the lanes (in the direction of travel, 0 = nearest to the middle)')
+    middle.set_ylabel('P(one frame detects it)')
+    middle.set_xlabel(f'distance along the lane [{unit}]')
+    middle.legend(fontsize=8)
+    bottom.semilogy(f * plan.missed[:, 0], np.maximum(plan.missed[:, 1], 1e-6), 'k.-')
+    bottom.set_ylim(1e-6, 1.5)
+    bottom.set_xlabel(f'lateral distance of a pass from the middle of the sensors [{unit}]')
+    bottom.set_ylabel('P(a pass is missed)')
+    for axes in (top, middle, bottom):
+        axes.grid(alpha=0.3)
+    return figure
