@@ -4,12 +4,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mag_tracking.analysis.consistency import error_over_bound
 from mag_tracking.errors import OutputError
 from mag_tracking.io.results import ResultFolder
 from mag_tracking.io.samples import SampleReader
 from mag_tracking.pipeline import Pipeline
 from mag_tracking.records import Detection, FieldFrame, SmoothedPose
-from mag_tracking.report.metrics import interpolate_truth, magnet_errors, pass_errors
+from mag_tracking.report.metrics import (
+    MAGNET_SKIP,
+    interpolate_truth,
+    magnet_errors,
+    near_poses,
+    pass_errors,
+)
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
 
 SUSPICIOUS = 2.0
@@ -139,6 +146,7 @@ def _track_entry(log, smoothed, pipeline, truth):
     errors = _against_truth(log, pipeline, truth)
     if errors:
         entry['truth'] = errors
+        entry['truth']['error_over_bound'] = _bound_ratio(log, pipeline, truth[errors['name']])
     if smoothed is not None:
         entry['smoothed'] = smoothed.summary()
         errors = _against_truth(smoothed, pipeline, truth)
@@ -168,6 +176,23 @@ def _against_truth(log, pipeline, truth):
         if errors and (best is None or size < best[0]):
             best = size, {'name': name, **errors}
     return best and best[1]
+
+
+def _bound_ratio(log, pipeline, truth):
+    """Error over the path bound of a track, over the poses that its errors are of, or None."""
+    track = pipeline.settings.track
+    if track.target == 'magnet':
+        m = track.magnet
+        # Between two poses it may have turned anywhere.
+        return error_over_bound(pipeline.network, log, truth, np.full(3, m.acceleration), 1.0,
+                                track.field_error, track.background_std,
+                                np.arange(MAGNET_SKIP, len(log.stamp_ns)), 3)
+    v = track.vehicle
+    rows = near_poses(log, truth, pipeline.network.centre)
+    return error_over_bound(
+        pipeline.network, log, truth,
+        np.array([v.acceleration, v.acceleration, v.climb_acceleration]), v.moment_drift,
+        track.field_error, track.background_std, rows, 2)
 
 
 def write_figures(run, network, out, most=6, stopped=None):

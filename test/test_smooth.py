@@ -110,39 +110,43 @@ def near(poses, truth):
 
 
 def smoothing_study(bodies, changes):
-    """Per pass: RMS error within 5 m, smoothed over filtered, and NEES per axis, smoothed."""
-    ratios, nees = [], []
+    """Per pass: RMS errors, smoothed over filtered, of the whole track and of what is within 5 m of
+    the middle, and there NEES per axis, smoothed."""
+    ratios, whole, nees = [], [], []
     for seed, body in enumerate(bodies):
         records, truth = run(body, changes, seed, np.random.default_rng(seed).uniform(8.0, 18.0))
         live = [r for r in records if isinstance(r, Track) and not r.ended]
         smoothed = [r for r in records if isinstance(r, SmoothedPose)]
         assert [s.stamp_ns for s in smoothed] == [t.stamp_ns for t in live]
         there = near(live, truth)
-        before, (after, z) = errors_of(live, truth)[0][there], errors_of(smoothed, truth)
-        ratios.append(np.sqrt(np.mean(after[there] ** 2) / np.mean(before**2)))
+        before, (after, z) = errors_of(live, truth)[0], errors_of(smoothed, truth)
+        whole.append(np.sqrt(np.mean(after**2) / np.mean(before**2)))
+        ratios.append(np.sqrt(np.mean(after[there] ** 2) / np.mean(before[there] ** 2)))
         nees.append(z[there].mean())
-    return np.array(ratios), np.array(nees)
+    return np.array(whole), np.array(ratios), np.array(nees)
 
 
-def test_smoothing_a_matched_target_takes_a_quarter_of_the_error_away():
-    """Not the 0.6 that is the aim: near the sensors the filter already knows nearly all."""
+def test_smoothing_a_matched_target_takes_half_of_the_error_away():
+    """Of the whole track; near the sensors, where the filter already knows nearly all, less."""
     rng = np.random.default_rng(5)
     bodies = [point_body(rng.uniform(300.0, 500.0) * u / np.linalg.norm(u), 3.0, 0.5)
               for u in rng.standard_normal((40, 3))]
-    ratios, nees = smoothing_study(bodies, {
+    whole, ratios, nees = smoothing_study(bodies, {
         **POINT, 'track.vehicle.near_field_lengths': [0.0], 'track.field_error': 0.0,
         'track.mounting_std_deg': 0.0, 'track.model_error_time_s': 0.0})
-    print(f'matched: smoothed over filtered error {np.median(ratios):.2f} (median), '
-          f'ANEES {nees.mean():.2f}')
+    print(f'matched: smoothed over filtered error {np.median(whole):.2f} (median), within 5 m '
+          f'{np.median(ratios):.2f}, ANEES {nees.mean():.2f}')
+    assert np.median(whole) <= 0.6
     assert np.median(ratios) <= 0.8
     assert 0.6 <= nees.mean() <= 1.3
 
 
 def test_smoothed_cars_are_nearer_and_no_surer_than_they_are_right():
-    ratios, nees = smoothing_study(
+    whole, ratios, nees = smoothing_study(
         [random_vehicle(np.random.default_rng(100 + k), length=4.0) for k in range(40)], {})
-    print(f'clouds of 4 m: smoothed over filtered error {np.median(ratios):.2f} (median), '
-          f'ANEES {nees.mean():.2f}, median {np.median(nees):.2f}')
+    print(f'clouds of 4 m: smoothed over filtered error {np.median(whole):.2f} (median), within '
+          f'5 m {np.median(ratios):.2f}, ANEES {nees.mean():.2f}, median {np.median(nees):.2f}')
+    assert np.median(whole) <= 0.6
     assert np.median(ratios) <= 0.7
     assert nees.mean() <= 3.0
 

@@ -34,22 +34,39 @@ def pass_errors(log, truth, centre, radius=5.0):
         None where the track has no truth.
     """
     true = interpolate_truth(truth, log.stamp_ns)[:, :2]
-    known = np.isfinite(true).all(axis=1)
-    if not known.any():
+    rows = near_poses(log, truth, centre, radius)
+    if not len(rows):
         return None
     error = np.array(log.position)[:, :2] - true
     size = np.hypot(*error.T)
-    distance = np.where(known, np.hypot(*(true - centre[:2]).T), np.inf)
-    closest = int(np.argmin(distance))
-    near = distance < radius
-    rows = np.flatnonzero(near) if near.any() else np.array([closest])
+    distance = np.hypot(*(true - centre[:2]).T)
+    closest = int(np.nanargmin(distance))
+    near = distance[rows] < radius
     nees = [error[k] @ np.linalg.solve(log.covariance[k][:2, :2], error[k]) / 2 for k in rows]
-    return {'rms': float(np.sqrt(np.mean(size[near] ** 2))) if near.any() else None,
+    return {'rms': float(np.sqrt(np.mean(size[rows] ** 2))) if near.all() else None,
             'closest': float(size[closest]), 'closest_distance': float(distance[closest]),
             'anees': float(np.mean(nees)), 'n': int(near.sum())}
 
 
-def magnet_errors(log, truth, axis=(0.0, 0.0, 1.0), skip=3):
+def near_poses(log, truth, centre, radius=5.0):
+    """Indices (k,) of the poses whose truth is within `radius` [m] of `centre`.
+
+    The closest one where it was never there; none without truth.
+    """
+    true = interpolate_truth(truth, log.stamp_ns)[:, :2]
+    known = np.isfinite(true).all(axis=1)
+    if not known.any():
+        return np.zeros(0, dtype=int)
+    distance = np.where(known, np.hypot(*(true - centre[:2]).T), np.inf)
+    near = np.flatnonzero(distance < radius)
+    return near if len(near) else np.array([np.argmin(distance)])
+
+
+MAGNET_SKIP = 3
+"""Poses at the start of a magnet's track that do not count."""
+
+
+def magnet_errors(log, truth, axis=(0.0, 0.0, 1.0), skip=MAGNET_SKIP):
     """Errors of a magnet's track, each pose against the truth nearest in time.
 
     Parameters

@@ -50,6 +50,8 @@ class TrackLog:
     kind_weight: list = field(default_factory=list)
     length: list = field(default_factory=list)
     measured: list = field(default_factory=list)
+    noise: list = field(default_factory=list)
+    """Per frame (n_sensors, 3, 3) [T^2] covariance of what was measured."""
     predicted: list = field(default_factory=list)
     mounting: list = field(default_factory=list)
     mounting_std: list = field(default_factory=list)
@@ -66,6 +68,7 @@ class TrackLog:
                      'mounting', 'mounting_std', 'kind', 'kind_weight', 'length'):
             getattr(self, name).append(getattr(track, name))
         self.measured.append(frame.field)
+        self.noise.append(frame.covariance)
         self.existence = track.existence
         best = {}
         for h in track.hypotheses:
