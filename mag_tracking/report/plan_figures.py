@@ -80,7 +80,7 @@ def sensor_figure(plan):
     mesh = axes.pcolormesh(f * x, f * y, 100.0 * gain, cmap='cividis', shading='nearest',
                            rasterized=True)
     best = plan.best_place
-    axes.plot(f * best[0], f * best[1], 'r*', ms=15, mec='w',
+    axes.plot(f * best[0], f * best[1], 'r*', ms=15, mec='w', clip_on=False, zorder=6,
               label=f'best: ({f * best[0]:.3g}, {f * best[1]:.3g}) {unit}, then '
               f'{f_text(np.nanmin(plan.with_one_more))}')
     axes.legend(fontsize=9, loc='upper right')
