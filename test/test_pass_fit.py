@@ -46,16 +46,6 @@ def test_a_row_is_the_sum_of_its_dipoles(n_dipoles):
     np.testing.assert_allclose(field, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize('n_dipoles', [1, 2, 3, 4])
-def test_derivatives_of_a_row(n_dipoles):
-    model, theta, p = rows(n_dipoles)
-    D = model.derivative(theta, p)
-    for k in range(theta.shape[1]):
-        h = 1e-6 * np.eye(theta.shape[1])[k]
-        numeric = np.einsum('nyi,ni->ny', model.basis(theta + h) - model.basis(theta - h), p) / 2e-6
-        np.testing.assert_allclose(D[:, :, k], numeric, rtol=0, atol=1e-6 * np.abs(numeric).max())
-
-
 @pytest.mark.parametrize('road', [True, False], ids=['road', 'any heading'])
 @pytest.mark.parametrize('n_dipoles', ORDERS)
 def test_the_search_finds_the_global_optimum(n_dipoles, road):
