@@ -14,11 +14,10 @@ from mag_tracking.analysis.placement import (
     pass_fields,
     pass_information,
 )
-from mag_tracking.inference.crlb import observability, path_bound
+from mag_tracking.inference.crlb import observability, path_bound, snr_range
 from mag_tracking.inference.detection_theory import energy_threshold
 from mag_tracking.inference.matched_filter import any_detects
 from mag_tracking.network import SensorNetwork
-from mag_tracking.physics.dipole import K_DIPOLE
 from mag_tracking.physics.motion import constant_velocity, integrator_noise
 
 GOOD_PD = 0.9
@@ -74,9 +73,12 @@ class Plan:
 
 
 def detection_range(target, noise_std, n_axes, false_alarm):
-    """[m] where a frame of one sensor detects half of such targets, about."""
-    return float(np.cbrt(K_DIPOLE * target.moment * np.sqrt(2.0)
-                         / (noise_std * np.sqrt(energy_threshold(false_alarm, n_axes)))))
+    """[m] where a frame of one sensor detects half of such targets, about; T10 eq. (5.20).
+
+    Over all directions of the moment the energy is twice that of a dipole abeam.
+    """
+    return float(snr_range(np.sqrt(2.0) * target.moment, noise_std,
+                           energy_threshold(false_alarm, n_axes)))
 
 
 def plan(network, target, sampling, lanes, area, settings, clearance=0.0, n_grid=41,
