@@ -133,20 +133,25 @@ def plan(network, target, sampling, lanes, area, settings, clearance=0.0, n_grid
     without, more[free] = _one_more(network, target, sampling, near, places[free])
     step(1)
     best = int(np.nanargmin(more)) if free.any() else 0
-    first = done[0]
-    closest = first.points[np.argmin(np.abs(first.along))][None]
-    J = pass_information(*place, target, sampling, closest, first.heading)[0].sum(axis=1)
-    scale = np.repeat([max(reach, 1e-3), target.speed, target.moment], 3)
+    known, blocks = _at_closest(network, target, sampling, done[0], reach)
     shape = len(coarse_y), len(coarse_x)
     return Plan(
         network, target, sampling, x, y,
         np.median(np.concatenate(std, axis=1), axis=1).reshape(len(y), len(x)),
         seen.mean(axis=1).reshape(len(y), len(x)), done, more.reshape(shape), without,
         (float(coarse_x[best % shape[1]]), float(coarse_y[best // shape[1]])),
-        observability(J[3], STATES, scale),
-        {'with prior': np.median(bounds_of(J, prior), axis=0),
-         'without prior': np.median(bounds_of(J, np.zeros((9, 9))), axis=0)},
-        _missed(network, target, sampling, first, area, settings))
+        known, blocks, _missed(network, target, sampling, done[0], area, settings))
+
+
+def _at_closest(network, target, sampling, lane, reach):
+    """`Plan.observability` and `Plan.blocks`; `reach` [m] is a typical distance."""
+    closest = lane.points[np.argmin(np.abs(lane.along))][None]
+    J = pass_information(network.positions, network.R_sw, target, sampling, closest,
+                         lane.heading)[0].sum(axis=1)
+    scale = np.repeat([max(reach, 1e-3), target.speed, target.moment], 3)
+    return (observability(J[3], STATES, scale),
+            {'with prior': np.median(bounds_of(J, target.prior()), axis=0),
+             'without prior': np.median(bounds_of(J, np.zeros((9, 9))), axis=0)})
 
 
 def _distance(lane, places):
