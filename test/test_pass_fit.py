@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from conftest import VEHICLES, vehicle_path
 from passes import EARTH, NOISE, ROAD, measured, network_of, random_path, together, unknowns_at
+from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from mag_tracking.analysis.model_order import choose_order, order_criteria
@@ -13,7 +14,7 @@ from mag_tracking.analysis.pass_data import separable_problem
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.fitting import RecordingFit
 from mag_tracking.inference.iron import hard_and_soft_iron
-from mag_tracking.inference.least_squares import refine
+from mag_tracking.inference.least_squares import correlated_scores, refine
 from mag_tracking.io.bag import Recording
 from mag_tracking.physics.dipole import MU0, dipole_field
 from mag_tracking.physics.passes import RowPass
@@ -83,6 +84,37 @@ def test_errors_are_as_large_as_the_covariance_says(n_dipoles):
     assert low < sum(nees) < high
     low, high = chi2.ppf([0.0005, 0.9995], fit.degrees_of_freedom * n)
     assert low < sum(costs) < high
+
+
+def test_correlated_residuals_count_for_less():
+    """Newey and West's covariance of a straight line's parameters in noise of 0.1 s."""
+    rng, n, keep = np.random.default_rng(3), 3000, np.exp(-0.1)
+    H = np.column_stack([np.ones(n), np.linspace(-1.0, 1.0, n)])
+    P = np.linalg.inv(H.T @ H)
+    found, errors = np.zeros((2, 2)), []
+    for _ in range(300):
+        e = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(n))
+        x = P @ (H.T @ e)
+        errors.append(x)
+        found += P @ correlated_scores(H * (e - H @ x)[:, None], 60) @ P / 300.0
+    true = np.cov(np.transpose(errors))
+    # White, it would be said to be a twentieth of that.
+    assert (np.diagonal(P) < 0.1 * np.diagonal(true)).all()
+    assert (np.diagonal(found) > 0.7 * np.diagonal(true)).all()
+    assert (np.diagonal(found) < 1.2 * np.diagonal(true)).all()
+
+
+@pytest.mark.parametrize('n_dipoles', ORDERS)
+def test_the_honest_covariance_is_never_smaller_and_no_larger_where_all_is_right(n_dipoles):
+    ratios = []
+    for seed in range(6):
+        rng = np.random.default_rng([seed, n_dipoles, 9])
+        fit = fit_pass(measured(ROAD, *random_path(rng, n_dipoles, True), rng), n_dipoles)
+        excess = fit.honest_covariance - fit.covariance
+        scale = np.sqrt(np.diagonal(fit.covariance))
+        assert np.linalg.eigvalsh(excess / np.outer(scale, scale)).min() > -1e-6
+        ratios.append(np.sqrt(np.diagonal(fit.honest_covariance)) / scale)
+    assert 1.0 <= np.median(ratios) < 1.4
 
 
 def test_hard_and_soft_iron_from_four_headings():
@@ -250,6 +282,9 @@ def test_order_three_describes_vehicles(recorded_passes, name):
     assert not fit.reason
     assert fit.normalised_cost < (8.0 if 'truck' in name else 2.0)
     assert fit.speed[0] == pytest.approx(STRAIGHT[name], rel=0.08)
+    # A truck is no row of three: its deviations are several times those of noise alone.
+    honest = np.sqrt(np.diagonal(fit.honest_covariance) / np.diagonal(fit.covariance))[:6]
+    assert np.median(honest) > (5.0 if 'truck' in name else 1.0)
     assert recorded_passes[name].chosen is not None
 
 

@@ -10,7 +10,7 @@ from mag_tracking.analysis.pass_data import background_columns, separable_proble
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.inference.crlb import bound, cpa_information, information
 from mag_tracking.inference.detection_theory import energy_threshold
-from mag_tracking.inference.least_squares import search
+from mag_tracking.inference.least_squares import correlated_scores, search
 from mag_tracking.physics.passes import RowPass
 
 N_COARSE = 24
@@ -32,6 +32,9 @@ dipoles explain 99 % of vehicles and more, of two vehicles in one window mostly 
 MOST_CHANGE = 0.3
 """Share of itself by which the velocity may seem to change while the target is seen: 17 degrees of
 a turn. Vehicles that are no rows of dipoles seem to change it by up to 0.2."""
+
+CORRELATED_S = 0.2
+"""[s] What the model leaves out is alike for so long: a car's length at 20 m/s."""
 
 EXACT = 1e-4
 """[m] Deviation of a CPA range that is only a unit of length."""
@@ -165,19 +168,42 @@ def _described(data, n_dipoles, theta, p, found, explained, cpa_range):
         J[:6, :6] += cpa_information(theta[:3] - place, theta[3:6],
                                      cpa_range[1] if cpa_range else EXACT)[:6, :6]
     covariance = bound(J)
-    spread = np.sqrt(np.einsum('yi,ij,yj->y', H, covariance, H)).reshape(-1, 3)
     x = T @ np.concatenate([theta, p, background])
+    change, change_std = _velocity_change(data, H, theta, predicted)
     # An unobservable state has an infinite variance; what it is combined to has none.
     with np.errstate(invalid='ignore'):
-        covariance = T @ covariance @ T.T
-    change, change_std = _velocity_change(data, H, theta, predicted)
-    fit = PassFit(n_dipoles, data, '', found.converged, names, x, covariance, found.cost,
+        honest = covariance + _unmodelled(data, H, predicted, covariance)
+        spread = np.sqrt(np.einsum('yi,ij,yj->y', H, honest, H)).reshape(-1, 3)
+        covariance, honest = (T @ P @ T.T for P in (covariance, honest))
+    fit = PassFit(n_dipoles, data, '', found.converged, names, x, covariance, honest, found.cost,
                   explained, change, change_std, predicted=predicted, predicted_std=spread)
     if not one:
         fit = replace(fit, rivals=_rivals(fit, found.rivals))
     if one and cpa_range is None:
         fit = replace(fit, bearing=bearing_of(fit, place))
     return replace(fit, reason=_doubt(fit))
+
+
+def _unmodelled(data, H, predicted, covariance):
+    """What must be added to a covariance (n_x, n_x) for what the model leaves out.
+
+    The residuals then are no noise: they are alike for a while, and count for less than their
+    number. Nothing is taken away where chance made them look less than noise.
+    """
+    W, scale = data.whitening, np.sqrt(np.diagonal(covariance))
+    columns = (W @ (H * scale).reshape(len(W), 3, -1))
+    left = np.einsum('nij,nj->ni', W, np.nan_to_num(data.field - predicted))
+    excess = -np.einsum('nai,naj->ij', columns, columns)
+    for j in data.sensors:
+        mine = data.sensor == j
+        step = np.median(np.diff(data.t[mine])) if mine.sum() > 1 else CORRELATED_S
+        excess += correlated_scores(np.einsum('nai,na->ni', columns[mine], left[mine]),
+                                    int(CORRELATED_S / max(step, 1e-9)))
+    if not np.isfinite(excess).all():
+        return np.full_like(covariance, np.nan)
+    w, V = np.linalg.eigh(excess)
+    root = (covariance / np.outer(scale, scale)) @ (V * np.sqrt(np.maximum(w, 0.0)))
+    return np.outer(scale, scale) * (root @ root.T)
 
 
 def _rivals(fit, minima):
@@ -264,7 +290,7 @@ def _doubt(fit):
         length, length_std = fit.length
         return (f'not determined: a length of {length:.1f} m, known to {length_std:.1f} m only; '
                 'take fewer dipoles')
-    std = np.sqrt(np.trace(fit.scaled_covariance[:3, :3]))
+    std = np.sqrt(np.trace(fit.honest_covariance[:3, :3]))
     nearest = min(fit.closest_approach(place)[2]
                   for place in fit.data.network.positions[fit.data.sensors])
     if std > nearest:

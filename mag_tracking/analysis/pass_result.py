@@ -55,6 +55,9 @@ class PassFit:
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     """(n_x, n_x) TSP14 eq. (47), which takes model and noise for right; infinite variance = not
     observable."""
+    honest_covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    """(n_x, n_x) the same and what the model leaves out: residuals that are alike for a while
+    instead of noise. All deviations are of this one."""
     cost: float = np.nan
     """Sum of squared whitened residuals, TSP14 eq. (46b)."""
     explained: float = np.nan
@@ -71,7 +74,7 @@ class PassFit:
     predicted: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     """(n, 3) [T], sensor frame, with the background."""
     predicted_std: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    """(n, 3) [T], by the covariance, without noise."""
+    """(n, 3) [T], by the honest covariance, without noise."""
 
     @property
     def degrees_of_freedom(self):
@@ -94,17 +97,12 @@ class PassFit:
     @property
     def ambiguous(self):
         """Whether another path, elsewhere by its deviations, is possible at 1 %."""
-        P = self.scaled_covariance[:6, :6]
+        P = self.honest_covariance[:6, :6]
         for d, path in self.rivals:
             e = path[:6] - self.x[:6]
             if d < RIVAL and e @ np.linalg.pinv(P, hermitian=True) @ e > FAR:
                 return True
         return False
-
-    @property
-    def scaled_covariance(self):
-        """(n_x, n_x) larger where the model is not right, as if its errors were more noise."""
-        return self.covariance * max(1.0, self.normalised_cost)
 
     @property
     def position(self):
@@ -118,33 +116,33 @@ class PassFit:
 
     @property
     def speed(self):
-        """[m/s] and its deviation (scaled)."""
+        """[m/s] and its deviation."""
         speed = np.linalg.norm(self.velocity)
         u = self.velocity / speed
-        return speed, np.sqrt(u @ self.scaled_covariance[3:6, 3:6] @ u)
+        return speed, np.sqrt(u @ self.honest_covariance[3:6, 3:6] @ u)
 
     @property
     def heading(self):
-        """[rad] anticlockwise from x, and its deviation (scaled)."""
+        """[rad] anticlockwise from x, and its deviation."""
         vx, vy, _ = self.velocity
         g = np.array([-vy, vx]) / (vx * vx + vy * vy)
-        return np.arctan2(vy, vx), np.sqrt(g @ self.scaled_covariance[3:5, 3:5] @ g)
+        return np.arctan2(vy, vx), np.sqrt(g @ self.honest_covariance[3:5, 3:5] @ g)
 
     @property
     def length(self):
-        """[m] of the row and its deviation (scaled); zeros for a point."""
+        """[m] of the row and its deviation; zeros for a point."""
         if self.n_dipoles == 1:
             return 0.0, 0.0
-        return self.x[6], np.sqrt(self.scaled_covariance[6, 6])
+        return self.x[6], np.sqrt(self.honest_covariance[6, 6])
 
     @property
     def moment(self):
-        """(3,) [A m^2], world, of the whole, and its covariance (3, 3) (scaled); TSP14 (9)."""
+        """(3,) [A m^2], world, of the whole, and its covariance (3, 3); TSP14 (9)."""
         S = np.zeros((3, len(self.x)))
         first = 6 + int(self.n_dipoles > 1)
         for i in range(self.n_dipoles):
             S[:, first + 3 * i:first + 3 * i + 3] = np.eye(3)
-        return S @ self.x, S @ self.scaled_covariance @ S.T
+        return S @ self.x, S @ self.honest_covariance @ S.T
 
     def closest_approach(self, point):
         """CPA of the row's middle to a point.
@@ -158,12 +156,12 @@ class PassFit:
         time, time_std : float [s], after time zero
         range, range_std : float [m]
 
-        Source: TSP14 eq. (24); deviations by its derivatives, scaled.
+        Source: TSP14 eq. (24); deviations by its derivatives.
         """
         r, v = self.position - point, self.velocity
         time, distance, r_cpa = closest_approach(r, v)
         u = r_cpa / distance if distance > 0.0 else np.zeros(3)
-        P = self.scaled_covariance[:6, :6]
+        P = self.honest_covariance[:6, :6]
         g_time = -np.concatenate([v, r + 2.0 * time * v]) / (v @ v)
         g_range = np.concatenate([u, time * u])
         return (time, np.sqrt(g_time @ P @ g_time), distance, np.sqrt(g_range @ P @ g_range))

@@ -132,12 +132,12 @@ def _print_pass(one):
         far, fast = one.disagreement
         if np.isfinite(far):
             print(f'  orders with nearly this cost differ by up to {far:.2f} m and {fast:.2f} m/s, '
-                  'more than the deviations (of noise, in brackets) where the model is not right')
+                  'which the deviations (in brackets) do not know of')
 
 
 def _numbers(fit):
     """Position, speed, heading, length and moment, with deviations in brackets."""
-    sd = np.sqrt(np.diagonal(fit.scaled_covariance))[:3]
+    sd = np.sqrt(np.diagonal(fit.honest_covariance))[:3]
     place = ' '.join(f'{v:6.2f}({s:.2f})' for v, s in zip(fit.position, sd, strict=True))
     moment, P = fit.moment
     size = np.linalg.norm(moment)

@@ -122,6 +122,30 @@ LINEAR_RANK = 1e-11
 """Dipoles that are almost at one place would cancel each other with moments without bounds."""
 
 
+def correlated_scores(scores, lag):
+    """Covariance of the sum of scores that are correlated over some neighbours.
+
+    Parameters
+    ----------
+    scores : (n, n_x)
+        Gradient of each sample's cost at the minimum, in order of time.
+    lag : int
+        Samples that are further apart are taken for independent.
+
+    Returns
+    -------
+    (n_x, n_x)
+        Positive semidefinite. Where model and noise are right it is the information, about.
+
+    Source: Newey and West 1987, with Bartlett's weights.
+    """
+    S = scores.T @ scores
+    for k in range(1, min(lag, len(scores) - 1) + 1):
+        pairs = scores[k:].T @ scores[:-k]
+        S += (1.0 - k / (lag + 1.0)) * (pairs + pairs.T)
+    return S
+
+
 class SeparableModel(Protocol):
     """Whitened measurements basis(theta) p: linear in p, not in the few theta."""
 

@@ -15,8 +15,8 @@ FIT_COLUMNS = (
     'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz', 'speed', 'sd_speed', 'heading_deg',
     'sd_heading_deg', 'length', 'sd_length', 'mx', 'my', 'mz', 'sd_mx', 'sd_my', 'sd_mz',
     'cpa_time', 'sd_cpa_time', 'cpa_range', 'sd_cpa_range')
-"""Deviations are scaled by the root of the normalised cost where that is above one; the CPA is to
-the middle of the sensors, its time in seconds after `stamp_ns`."""
+"""Deviations are of `PassFit.honest_covariance`; the CPA is to the middle of the sensors, its time
+in seconds after `stamp_ns`."""
 
 
 def fit_row(fit):
@@ -33,7 +33,7 @@ def fit_row(fit):
     if fit.reason:
         return row
     row['ambiguous'] = int(fit.ambiguous)
-    sd = np.sqrt(np.diagonal(fit.scaled_covariance))
+    sd = np.sqrt(np.diagonal(fit.honest_covariance))
     moment, P = fit.moment
     heading = [math.degrees(v) for v in fit.heading]
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)

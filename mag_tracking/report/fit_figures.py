@@ -14,8 +14,8 @@ _AXES = ('tab:red', 'tab:green', 'tab:blue')
 def pass_figure(fit, title, most=6):
     """Measured and fitted field with the band that 90 % of the measurements should lie in.
 
-    Where the normalised cost is above one the band is wider by its root, as if what the model does
-    not describe were more noise.
+    By noise and `PassFit.honest_covariance`; where the normalised cost is above one, what the model
+    does not describe counts as more noise.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def pass_figure(fit, title, most=6):
     strength = {j: np.nanmax(np.abs(data.field - level)[data.sensor == j]) for j in data.sensors}
     shown = sorted(sorted(strength, key=lambda j: -strength[j])[:most])
     f, unit = field_unit(max(strength.values()))
-    scale = f * SCALE_1D * np.sqrt(max(1.0, fit.normalised_cost))
+    more = max(1.0, fit.normalised_cost)
     figure = Figure(figsize=(10.0, 1.0 + 2.6 * len(shown)), layout='constrained')
     for axes, j in zip(figure.subplots(len(shown), 1, squeeze=False, sharex=True).flat, shown,
                        strict=True):
@@ -42,7 +42,7 @@ def pass_figure(fit, title, most=6):
             if np.isnan(data.field[mine, a]).all():
                 continue
             middle = f * (fit.predicted - level)[mine, a]
-            half = scale * np.sqrt(fit.predicted_std[mine, a]**2 + noise[a])
+            half = f * SCALE_1D * np.sqrt(fit.predicted_std[mine, a]**2 + more * noise[a])
             axes.fill_between(t, middle - half, middle + half, color=colour, alpha=0.25, lw=0)
             axes.plot(t, f * (data.field - level)[mine, a], '.', ms=2.5, color=colour,
                       label=f'{"xyz"[a]}')
