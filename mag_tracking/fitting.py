@@ -10,6 +10,7 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.calibration.saturation import cut_off
+from mag_tracking.inference.detection_theory import energy_threshold
 from mag_tracking.io.samples import SampleReader
 from mag_tracking.records import Detection
 from mag_tracking.stages.align import Align
@@ -48,12 +49,13 @@ class FittedPass:
     def disagreement(self):
         """Largest difference [m], [m/s] to the chosen fit of those with nearly its cost.
 
-        That is what the model leaves open: the deviations only know of noise. NaN where there is
-        no other fit.
+        That is what the model leaves open. NaN where there is no other fit, and where the chosen
+        one describes the measurements to the noise: then richer ones only fit noise.
         """
-        best = self.chosen
-        others = [f for f in self.fits if best is not None and f is not best and not f.reason
-                  and f.normalised_cost <= NEARLY * best.normalised_cost]
+        best, others = self.chosen, []
+        if best is not None and best.cost > energy_threshold(1e-3, best.degrees_of_freedom):
+            others = [f for f in self.fits if f is not best and not f.reason
+                      and f.normalised_cost <= NEARLY * best.normalised_cost]
         if not others:
             return np.nan, np.nan
         return (max(float(np.linalg.norm(f.position - best.position)) for f in others),
@@ -112,8 +114,8 @@ class PassCollector:
             elif self._onset_ns is not None:
                 out.append(self._cut(record.stamp_ns))
         if self._onset_ns is not None and frame.stamp_ns - self._onset_ns > LONGEST_S * NS:
-            out.append(self._cut(frame.stamp_ns, f'it is seen for more than {LONGEST_S:.0f} s; '
-                                 'cut here'))
+            out.append(self._cut(frame.stamp_ns, f'it is seen for more than {LONGEST_S:.0f} s: '
+                                 'what comes after, until it is gone, is left out'))
         self._last_ns = frame.stamp_ns
         begin = (frame.stamp_ns if self._onset_ns is None else self._onset_ns) - PAD_S * NS
         while self._kept and self._kept[0][0].stamp_ns < begin:
@@ -178,15 +180,19 @@ class RecordingFit:
         for sample in self._reader.samples(progress):
             if stopped is not None and stopped():
                 return
-            yield from self._fitted(self._collector.feed(sample))
-        yield from self._fitted(self._collector.flush())
+            yield from self._fitted(self._collector.feed(sample), stopped)
+        yield from self._fitted(self._collector.flush(), stopped)
 
-    def _fitted(self, passes):
-        """The fits of what the collector gave."""
+    def _fitted(self, passes, stopped):
+        """The fits of what the collector gave; a pass that is stopped in the middle is left out."""
         for data, notes in passes:
+            fits = []
+            for n_dipoles in self._orders:
+                if stopped is not None and stopped():
+                    return
+                fits.append(fit_pass(data, n_dipoles, self._cpa_range))
             self._n += 1
-            yield FittedPass(self._name, self._n, tuple(
-                fit_pass(data, d, self._cpa_range) for d in self._orders), notes)
+            yield FittedPass(self._name, self._n, tuple(fits), notes)
 
     def warnings(self):
         """What was lost or rejected, and which sensors were never heard; a list of lines."""

@@ -15,10 +15,12 @@ from mag_tracking.analysis.placement import (
     pass_information,
 )
 from mag_tracking.inference.crlb import observability, path_bound, snr_range
-from mag_tracking.inference.detection_theory import energy_threshold
-from mag_tracking.inference.matched_filter import any_detects
+from mag_tracking.inference.detection_theory import energy_threshold, missed_probability
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.motion import constant_velocity, integrator_noise
+
+MOST_FRAMES = 1000
+"""Of a pass, when it is asked whether it is missed: slower ones are not missed more."""
 
 GOOD_PD = 0.9
 """A target is counted as seen where a frame detects it with this probability."""
@@ -90,8 +92,8 @@ def plan(network, target, sampling, lanes, area, settings, clearance=0.0, n_grid
     network : SensorNetwork
     target : PlannedTarget
     sampling : Sampling
-    lanes : {name: (heading [rad], lateral offset [m])}
-        To the left of the line through the middle of the sensors.
+    lanes : sequence of (name, heading [rad], lateral offset [m])
+        The offset is to the left of the line through the middle of the sensors.
     area : (x0, y0, x1, y1) [m]
     settings : Settings
         Of detection and tracking.
@@ -112,7 +114,7 @@ def plan(network, target, sampling, lanes, area, settings, clearance=0.0, n_grid
     place = network.positions, network.R_sw
     prior = target.prior()
     std = []
-    for heading in sorted({heading % np.pi for heading, _ in lanes.values()}):
+    for heading in sorted({heading % np.pi for _, heading, _ in lanes}):
         J = pass_information(*place, target, sampling, points, heading).sum(axis=2)
         std.append(bounds_of(J, prior)[..., 0])
         step(1)
@@ -120,8 +122,7 @@ def plan(network, target, sampling, lanes, area, settings, clearance=0.0, n_grid
     seen = detection_probabilities(*place, target, sampling, points,
                                    detect.false_alarm_probability, detect.background_std)
     step(1)
-    done = tuple(_lane(network, target, sampling, name, *lane, area, settings)
-                 for name, lane in lanes.items())
+    done = tuple(_lane(network, target, sampling, *lane, area, settings) for lane in lanes)
     step(1)
     # One more sensor: where the lanes are near the network, as that is where it is to be good.
     reach = 0.5 * max(np.ptp(network.positions[:, :2], axis=0).max(), 8.0 * target.height)
@@ -130,7 +131,8 @@ def plan(network, target, sampling, lanes, area, settings, clearance=0.0, n_grid
     places = np.stack(np.meshgrid(coarse_x, coarse_y), axis=-1).reshape(-1, 2)
     free = np.all([_distance(lane, places) >= clearance for lane in done], axis=0)
     more = np.full(len(places), np.nan)
-    without, more[free] = _one_more(network, target, sampling, near, places[free])
+    without, found = _one_more(network, target, sampling, near, places[free])
+    more[free] = found
     step(1)
     best = int(np.nanargmin(more)) if free.any() else 0
     known, blocks = _at_closest(network, target, sampling, done[0], reach)
@@ -163,7 +165,7 @@ def _distance(lane, places):
 
 def n_parts(lanes):
     """How often `plan` calls its `progress`."""
-    return len({heading % np.pi for heading, _ in lanes.values()}) + 3
+    return len({heading % np.pi for _, heading, _ in lanes}) + 3
 
 
 def _grid(area, n):
@@ -203,9 +205,7 @@ def _filter_bound(network, target, sampling, points, heading, settings):
     n_x = 9 + 3 * n_sensors
     F, Q, P0 = np.eye(n_x), np.zeros((n_x, n_x)), np.zeros((n_x, n_x))
     F[:6, :6] = constant_velocity(dt)
-    v = settings.track.vehicle
-    Q[:6, :6] = integrator_noise(dt, np.square([v.acceleration, v.acceleration,
-                                                v.climb_acceleration]))
+    Q[:6, :6] = integrator_noise(dt, np.square(_acceleration(settings.track)))
     known = np.diagonal(target.prior())[[2, 5]]
     wide = np.array([1.0, 1.0, 1.0, target.speed, target.speed, target.speed])
     wide[:3] *= np.hypot(*(points[-1] - points[0]))
@@ -226,6 +226,14 @@ def _filter_bound(network, target, sampling, points, heading, settings):
     return np.median(std, axis=1)
 
 
+def _acceleration(track):
+    """(3,) root spectral density [m/s^1.5] of the tracker's motion."""
+    if track.target == 'magnet':
+        return np.full(3, track.magnet.acceleration)
+    v = track.vehicle
+    return np.array([v.acceleration, v.acceleration, v.climb_acceleration])
+
+
 def _one_more(network, target, sampling, near, places):
     """(median bound as it is, (n_places,) with one more sensor at each of the places)."""
     height = network.positions[:, 2].mean()
@@ -235,29 +243,30 @@ def _one_more(network, target, sampling, near, places):
     prior = target.prior()
     base, more = [], []
     for heading, points in near:
+        if not len(places):
+            continue
         J = pass_information(network.positions, network.R_sw, target, sampling, points,
                              heading).sum(axis=2)
         base.append(bounds_of(J, prior)[..., 0].ravel())
         extra = pass_information(candidates, upright, target, alike, points, heading)
         more.append(bounds_of(J[:, :, None] + extra, prior)[..., 0].reshape(-1, len(places)))
+    if not base:
+        return float('nan'), np.zeros(0)
     return float(np.median(np.concatenate(base))), np.median(np.concatenate(more), axis=0)
 
 
 def _missed(network, target, sampling, lane, area, settings):
-    """`Plan.missed`: looks half a second apart count as independent; MITRE12 eq. (6).
-
-    A look sees the target when so many frames in a row detect it as an onset needs.
-    """
+    """`Plan.missed`: no so many frames in a row detect the target as an onset needs."""
     half = 0.5 * max(area[2] - area[0], area[3] - area[1])
     offsets = np.linspace(0.0, 2.0 * half, 25)
     u = np.array([np.cos(lane.heading), np.sin(lane.heading)])
-    along = np.arange(-2.0 * half, 2.0 * half, target.speed * max(sampling.period, 0.5))[:, None]
-    out = []
+    n = int(np.clip(4.0 * half / (target.speed * sampling.period), 1, MOST_FRAMES))
+    along = np.linspace(-2.0 * half, 2.0 * half, n)[:, None]
+    detect, out = settings.detect, []
     for offset in offsets:
         points = network.centre[:2] + offset * np.array([-u[1], u[0]]) + along * u
         seen = detection_probabilities(
             network.positions, network.R_sw, target, sampling, points,
-            settings.detect.false_alarm_probability, settings.detect.background_std)
-        looks = seen**settings.detect.onset_frames
-        out.append((offset, 1.0 - float(np.mean(any_detects(looks, axis=0)))))
+            detect.false_alarm_probability, detect.background_std)
+        out.append((offset, float(np.mean(missed_probability(seen, detect.onset_frames)))))
     return np.array(out)

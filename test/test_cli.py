@@ -305,6 +305,28 @@ def test_fit_of_one_vehicle_tells_its_iron(tmp_path, capsys):
     assert json.loads((tmp_path / 'fits.json').read_text())['iron'] is None
 
 
+def test_fit_of_one_sensor_keeps_what_it_knows(tmp_path, capsys):
+    network = tmp_path / 'one.yaml'
+    network.write_text('sensors:\n  mag_1:\n    position: [0.0, -4.5, 0.0]\n')
+    assert main(['fit', str(vehicle_path('straight_car_right')), '--network', str(network),
+                 '--orders', '2', '--no-figures', '--out', str(tmp_path / 'out')]) == 0
+    row, = json.loads((tmp_path / 'out' / 'fits.json').read_text())['fits']
+    assert row['x'] is None and row['rate'] > 0.0 and row['sd_cpa_time'] > 0.0
+    assert len(row['bearing']['motion']) == 3 and 'reversed' in row['bearing']['or_reversed']
+    assert 'or both reversed' in capsys.readouterr().out
+
+
+def test_fit_opens_everything_before_it_writes(tmp_path, capsys):
+    out = tmp_path / 'out'
+    out.mkdir()
+    (out / 'fits.csv').write_text('old')
+    for names in (['nosuch'], [NAME, 'nosuch'], [NAME, NAME]):
+        assert main(['fit', *(str(vehicle_path(n)) for n in names), '--network',
+                     str(NETWORK_FILE), '--out', str(out)]) == 1
+        assert (out / 'fits.csv').read_text() == 'old'
+    assert f'two recordings are named {NAME}' in capsys.readouterr().err
+
+
 @pytest.mark.parametrize('options, text', [
     (['--orders', '0'], '--orders: expected different numbers from 1 to 8'),
     (['--orders', '2', '2'], '--orders'),

@@ -19,6 +19,7 @@ from mag_tracking.analysis.placement import (
 )
 from mag_tracking.cli import main
 from mag_tracking.inference.crlb import bound, information
+from mag_tracking.inference.detection_theory import missed_probability
 from mag_tracking.physics.dipole import dipole_field, dipole_jacobians
 from mag_tracking.pipeline import settings_for
 from mag_tracking.planning import plan
@@ -129,7 +130,7 @@ def test_detection_is_that_of_the_energy_test():
 @pytest.fixture(scope='module')
 def road_plan():
     return plan(ROAD, PlannedTarget(400.0, 0.5, 10.0, 0.2, 0.1), Sampling(0.08, 4e-9, 0.04, 1e-8),
-                {'right': (0.0, 0.0)}, (-12.0, -12.0, 12.0, 12.0), settings_for('vehicle'),
+                [('right', 0.0, 0.0)], (-12.0, -12.0, 12.0, 12.0), settings_for('vehicle'),
                 clearance=2.0, n_grid=13)
 
 
@@ -163,11 +164,11 @@ def test_plan_writes_all_that_it_promises(tmp_path, capsys):
 
 
 @pytest.mark.parametrize('options, text', [
-    (['--target', 'tank'], '--target: expected one of small, car, truck'),
+    (['--target', 'tank'], '--target: expected one of small, car, truck, magnet'),
     (['--target', 'car', '--moment', '3'], 'give one of them'),
     (['--moment', '3'], '--height: needed with --moment'),
-    (['--moment', '-3', '--height', '1'], '--moment: expected a positive number'),
-    (['--speed', '0'], '--speed: expected a positive number'),
+    (['--moment', '-3', '--height', '1'], '--moment: expected 1e-06 to 1e+06, got -3'),
+    (['--speed', '0'], '--speed: expected 0.0001 to 1000, got 0'),
     (['--rate', 'nan'], '--rate'),
     (['--noise-std', '0'], '--noise-std'),
     (['--heading', '0', '--offset', '1', '2'], '--offset: expected 1 numbers'),
@@ -175,9 +176,50 @@ def test_plan_writes_all_that_it_promises(tmp_path, capsys):
     (['--field-error', '2'], '--field-error'),
     (['--clearance', '-1'], '--clearance'),
     (['--grid', '2'], '--grid'),
+    (['--height', 'nan'], '--height'),
+    (['--area', '0', '0', '1e9', '1e9'], '--area: a side'),
+    (['--area', '0', '0', '1', '1000'], '--area: its longer side'),
+    (['--heading', '0', '0'], 'a lane is there twice'),
+    (['--target', 'magnet'], '--moment and --height: needed for a magnet'),
 ])
 def test_plan_refuses_what_makes_no_sense(tmp_path, capsys, options, text):
     assert main(['plan', '--network', str(NETWORK_FILE), *options,
                  '--out', str(tmp_path / 'out')]) == 1
     assert text in capsys.readouterr().err
     assert not (tmp_path / 'out').exists()
+
+
+@pytest.mark.parametrize('options', [
+    # Points of the map and of a lane on the very sensor; no free place; two lanes of one heading.
+    ['--height', '0', '--heading', '0', '--offset', '4.5', '--area', '-10', '-10', '10', '10'],
+    ['--height', '0', '--heading', '90', '--area', '-9', '-9', '9', '9', '--clearance', '1e6'],
+    ['--heading', '0', '0', '--offset', '2', '-2', '--rate', '1'],
+])
+def test_plan_bears_what_is_odd(tmp_path, capsys, options):
+    out = tmp_path / 'out'
+    assert main(['plan', '--network', str(NETWORK_FILE), '--grid', '9', *options,
+                 '--out', str(out)]) == 0
+    content = json.loads((out / 'plan.json').read_text())
+    assert len(content['lanes']) == (2 if '--rate' in options else 1)
+    assert len(list(out.glob('*.png'))) == 4
+    if '1e6' in options:
+        assert 'nowhere in the area is it clear' in capsys.readouterr().out
+
+
+def test_lanes_keep_a_further_sensor_away_from_each_of_them():
+    p = plan(ROAD, CAR, Sampling(0.08, 4e-9, 0.04, 1e-8), [('a', 0.0, 2.0), ('b', 0.0, -3.0)],
+             (-12.0, -12.0, 12.0, 12.0), settings_for('vehicle'), clearance=1.5, n_grid=13)
+    y = np.linspace(-12.0, 12.0, p.with_one_more.shape[0])
+    free = (np.abs(y - 2.0) >= 1.5) & (np.abs(y + 3.0) >= 1.5)
+    assert np.array_equal(np.isfinite(p.with_one_more).all(axis=1), free)
+
+
+def test_a_pass_is_missed_as_often_as_no_run_of_frames_detects():
+    rng = np.random.default_rng(2)
+    p = rng.uniform(0.0, 0.6, (12, 2))
+    found = missed_probability(p, 3)
+    hits = rng.random((40000, 12, 2)) < p
+    runs = hits[:, :-2] & hits[:, 1:-1] & hits[:, 2:]
+    rate = 1.0 - runs.any(axis=1).mean(axis=0)
+    assert (np.abs(rate - found) < 4.0 * np.sqrt(found * (1.0 - found) / 40000)).all()
+    np.testing.assert_allclose(missed_probability(p, 1), np.prod(1.0 - p, axis=0))

@@ -30,6 +30,11 @@ def test_coarse_steps_are_no_limit(step):
     assert not cut_off(np.round(curve() / step) * step).any()
 
 
+def test_short_stretches():
+    assert cut_off([0.0, 1.0, 5.0, 5.0, 5.0, 1.0, 0.0]).all()
+    assert not cut_off([0.0, 1.0, 5.0, 5.0, 1.0]).any() and not cut_off([]).any()
+
+
 def test_what_is_missing_or_stuck_is_no_limit():
     cut = np.minimum(curve() + np.random.default_rng(1).standard_normal(200), 300.0)
     cut[::7] = np.nan

@@ -16,6 +16,7 @@ def scaled_to_range(theta, p, place, distance):
     """A path and its moments, seen alike by the one sensor at `place`, with that CPA range.
 
     (r, v, L, m) and (u r, u v, u L, u^3 m) give the same field; TSP14 eq. (34).
+    So do (r, v) and (-r, -v), of which it gives the one that passes above the sensor.
     Returns (None, None) where the path goes through the sensor.
     """
     r, v = theta[:3] - place, theta[3:6]
@@ -23,8 +24,10 @@ def scaled_to_range(theta, p, place, distance):
     if at <= THROUGH * np.linalg.norm(r - time * v):
         return None, None
     u = distance / at
-    scaled = theta * u
-    scaled[:3] = place + u * r
+    # Target and motion may both be reversed: taken is the end that is not below the sensor.
+    side = 1.0 if (r + time * v)[2] >= 0.0 else -1.0
+    scaled = u * np.concatenate([side * r, side * v, theta[6:]])
+    scaled[:3] += place
     return scaled, p * u**3
 
 

@@ -29,6 +29,13 @@ LEAST_EXPLAINED = 0.98
 """Share of the field's energy that has to be that of one target on a straight line. Rows of three
 dipoles explain 99 % of vehicles and more, of two vehicles in one window mostly less than 97 %."""
 
+MOST_COST = 100.0
+"""A normalised cost beyond is no pass of a row of dipoles; trucks come to ten, and with a single
+dipole to a hundred."""
+
+LEAST_WAY = 0.3
+"""Share of the distance of the nearest sensor that a target has to move while it is seen."""
+
 MOST_CHANGE = 0.3
 """Share of itself by which the velocity may seem to change while the target is seen: 17 degrees of
 a turn. Vehicles that are no rows of dipoles seem to change it by up to 0.2."""
@@ -169,15 +176,21 @@ def _described(data, n_dipoles, theta, p, found, explained, cpa_range):
                                      cpa_range[1] if cpa_range else EXACT)[:6, :6]
     covariance = bound(J)
     x = T @ np.concatenate([theta, p, background])
-    change, change_std = _velocity_change(data, H, theta, predicted)
+    seen_s = _seen_s(data)
+    change, change_std = _velocity_change(data, H, theta, predicted, seen_s)
     # An unobservable state has an infinite variance; what it is combined to has none.
     with np.errstate(invalid='ignore'):
         honest = covariance + _unmodelled(data, H, predicted, covariance)
         spread = np.sqrt(np.einsum('yi,ij,yj->y', H, honest, H)).reshape(-1, 3)
         covariance, honest = (T @ P @ T.T for P in (covariance, honest))
     fit = PassFit(n_dipoles, data, '', found.converged, names, x, covariance, honest, found.cost,
-                  explained, change, change_std, predicted=predicted, predicted_std=spread)
-    if not one:
+                  explained, seen_s, change, change_std, predicted=predicted,
+                  predicted_std=spread)
+    if one:
+        # Seen from the other end of space everything looks the same.
+        mirrored = np.concatenate([2.0 * place - theta[:3], -theta[3:6], theta[6:]])
+        fit = replace(fit, rivals=((0.0, mirrored),))
+    else:
         fit = replace(fit, rivals=_rivals(fit, found.rivals))
     if one and cpa_range is None:
         fit = replace(fit, bearing=bearing_of(fit, place))
@@ -216,7 +229,16 @@ def _rivals(fit, minima):
     return tuple(rivals)
 
 
-def _velocity_change(data, H, theta, predicted):
+def _seen_s(data):
+    """[s] in which nearly all of the target's energy came."""
+    energy = np.square(np.linalg.norm(data.departure, axis=1))
+    order = np.argsort(data.t)
+    part = np.cumsum(energy[order]) / energy.sum()
+    first, last = data.t[order][np.searchsorted(part, (0.02, 0.98))]
+    return float(last - first)
+
+
+def _velocity_change(data, H, theta, predicted, seen_s):
     """Share of itself by which the velocity would like to change while the target is seen.
 
     One step of Gauss and Newton from the minimum, with a constant horizontal acceleration more
@@ -230,11 +252,7 @@ def _velocity_change(data, H, theta, predicted):
     size = np.linalg.norm(wider, axis=0)
     inverse = np.linalg.pinv(wider / size, rcond=1e-8) / size[:, None]
     step, spread = inverse @ left, np.linalg.norm(inverse, axis=1)
-    energy = np.square(np.linalg.norm(data.departure, axis=1))
-    order = np.argsort(data.t)
-    part = np.cumsum(energy[order]) / energy.sum()
-    first, last = data.t[order][np.searchsorted(part, (0.02, 0.98))]
-    scale = (last - first) / np.linalg.norm(theta[3:6])
+    scale = seen_s / np.linalg.norm(theta[3:6])
     return float(np.linalg.norm(step[-2:]) * scale), float(np.linalg.norm(spread[-2:]) * scale)
 
 
@@ -279,6 +297,13 @@ def _doubt(fit):
     if fit.velocity_change - doubtful > MOST_CHANGE:
         return ('not at constant velocity: while it was seen it changed by '
                 f'{fit.velocity_change:.0%} of itself (a turn, braking)')
+    nearest = min(fit.closest_approach(place)[2]
+                  for place in fit.data.network.positions[fit.data.sensors])
+    if np.linalg.norm(fit.velocity) * fit.seen_s < LEAST_WAY * nearest:
+        return 'no pass: while it was seen it hardly moved'
+    if fit.normalised_cost > MOST_COST:
+        return (f'not what the model describes: the normalised cost is {fit.normalised_cost:.0f} '
+                '(not a vehicle, a wrong network file, or a noise_std that is too small)')
     if fit.bearing is not None:
         return ('one sensor: the scale is not observable, only directions and the time of the '
                 'closest approach are (TSP14 Proposition 1)')
@@ -288,11 +313,9 @@ def _doubt(fit):
         return f'not observable: {", ".join(lost)}'
     if not fit.determined:
         length, length_std = fit.length
-        return (f'not determined: a length of {length:.1f} m, known to {length_std:.1f} m only; '
+        return (f'not determined: a length of {length:.1f} m, known to {length_std:.1f} m; '
                 'take fewer dipoles')
     std = np.sqrt(np.trace(fit.honest_covariance[:3, :3]))
-    nearest = min(fit.closest_approach(place)[2]
-                  for place in fit.data.network.positions[fit.data.sensors])
     if std > nearest:
         return (f'out of range: the position is known to {std:.1f} m only, and no sensor is nearer '
                 f'than {nearest:.1f} m')

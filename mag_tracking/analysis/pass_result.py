@@ -14,6 +14,11 @@ FAR = 22.5
 """Squared deviations, of six numbers, at which another path is another: one in a thousand."""
 
 
+SHORTEST = 1e-2
+"""A row that is shorter than this share of the way on which it was seen is a point; one that is
+longer than that way is none."""
+
+
 @dataclass(frozen=True)
 class Bearing:
     """What one sensor alone tells: everything but the scale.
@@ -62,6 +67,8 @@ class PassFit:
     """Sum of squared whitened residuals, TSP14 eq. (46b)."""
     explained: float = np.nan
     """Share of the whitened energy beyond the backgrounds and the noise that the fit explains."""
+    seen_s: float = np.nan
+    """[s] in which nearly all of the target's energy came."""
     velocity_change: float = np.nan
     """Share of itself by which the velocity seems to change while the target is seen."""
     velocity_change_std: float = np.nan
@@ -89,10 +96,16 @@ class PassFit:
     @property
     def determined(self):
         """Whether the measurements fix all unknowns, right or not."""
-        if not (len(self.x) and self.converged and np.isfinite(np.diagonal(self.covariance)).all()):
+        if not (len(self.x) and self.converged):
             return False
+        variance = np.diagonal(self.honest_covariance)
+        if not (np.isfinite(variance).all() and (variance > 0.0).all()):
+            return False
+        if self.n_dipoles == 1:
+            return True
         length, length_std = self.length
-        return bool(length_std <= max(length, 1.0))
+        way = np.linalg.norm(self.velocity) * self.seen_s
+        return bool(length_std <= max(length, 1.0) and SHORTEST * way <= length <= way)
 
     @property
     def ambiguous(self):

@@ -57,7 +57,8 @@ class Sampling:
     noise_std: np.ndarray | float
     """(n_sensors,) [T] of one axis of one frame, or one for all."""
     field_error: float = 0.0
-    """Relative error of the field, by clocks, mountings and the model; as noise, frame by frame."""
+    """Relative error of the field, by clocks, mountings and the model, as noise frame by frame; of
+    an error that lasts, the root of the number of frames that it lasts times as much."""
     background_std: float = np.inf
     """[T] how well the backgrounds are known; inf = not at all."""
     half_window: float = 3.0
@@ -103,10 +104,14 @@ def pass_fields(positions, R_sw, target, sampling, points, heading):
         r = np.broadcast_to(r0[:, None, None] + t[:, None] * v, (n, *shape, 3))
 
         def repeated(a, n=n):
+            """The same for each of the points."""
             return np.tile(a.reshape(size, 1, *a.shape[2:]), (n, *[1] * (a.ndim - 1)))
 
-        h, H, _ = sensor_fields(positions, R_sw, r.reshape(n * size, 1, 3), repeated(m),
+        h, H, _ = sensor_fields(positions, R_sw, r.reshape(n * size, 1, 3).copy(), repeated(m),
                                 repeated(dr_dx), repeated(dm_dx))
+        # On the very sensor there is no field; that look tells nothing.
+        on_it = ~(np.isfinite(h).all(axis=-1) & np.isfinite(H).all(axis=(-2, -1)))
+        h[on_it], H[on_it] = 0.0, 0.0
         yield (slice(first, first + n), h.reshape(n, *shape, -1, 3),
                H.reshape(n, *shape, len(positions), 3, 9))
 

@@ -43,7 +43,7 @@ def cut_off(values):
         for first, end in edges.reshape(-1, 2):
             sides = [jumps[i] for i in (first - 1, end - 1) if 0 <= i < len(jumps)]
             if end - first >= LEAST_RUN and max(sides) >= LEAST_JUMP * step:
-                near = np.convolve(at, np.ones(2 * MARGIN + 1), 'same') > 0.0
-                out[present[near]] = True
+                near = np.flatnonzero(at)[:, None] + np.arange(-MARGIN, MARGIN + 1)
+                out[present[np.clip(near, 0, len(v) - 1)]] = True
                 break
     return out

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.cli.options import add_command, add_network, add_settings, settings_of
+from mag_tracking.cli.options import add_command, add_network, distinct_names
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.fitting import RecordingFit
 from mag_tracking.inference.iron import hard_and_soft_iron
@@ -15,6 +15,8 @@ from mag_tracking.io.bag import Recording
 from mag_tracking.io.fit_results import FitFolder
 from mag_tracking.io.network_file import read_network
 from mag_tracking.physics.dipole import MU0
+from mag_tracking.pipeline import settings_for
+from mag_tracking.settings import read_parameter_file
 
 _FIT = '''
 Cuts the passes out of a recording (from before a detection until its end) and fits
@@ -37,6 +39,10 @@ examples:
 '''
 
 
+POOR = 2.0
+"""A normalised cost beyond says that the model leaves out more than the noise covers."""
+
+
 def add(commands):
     """Register the command."""
     p = add_command(commands, 'fit', _fit, 'Fit whole passes at constant velocity, offline.', _FIT)
@@ -51,21 +57,23 @@ def add(commands):
                    'point and its deviation [m]')
     p.add_argument('--same-vehicle', action='store_true',
                    help='all passes are of one vehicle: tell its hard and soft iron')
-    add_settings(p)
+    p.add_argument('--params', type=Path, metavar='FILE', help='settings that differ')
     p.add_argument('--no-figures', action='store_true', help='leave the pictures out')
 
 
 def _fit(args):
     """mag-tracking fit."""
-    network, settings = read_network(args.network), settings_of(args)
+    network = read_network(args.network)
+    settings = settings_for('vehicle', read_parameter_file(args.params) if args.params else {})
     _check(args, network)
-    passes, figures = [], 0
+    # All is opened before anything is written.
+    recordings = [Recording(path) for path in args.recordings]
+    if any(recording.lies_in(args.out) for recording in recordings):
+        raise OutputError(f'{args.out} is the folder of a recording; the results would be in it')
+    jobs = [RecordingFit(r, network, settings, args.orders, args.cpa_range) for r in recordings]
+    passes = []
     with noted_signals(signal.SIGINT) as seen, FitFolder(args.out) as folder:
-        for path in args.recordings:
-            recording = Recording(path)
-            if recording.lies_in(args.out):
-                raise OutputError(f'{args.out} is the folder of a recording')
-            job = RecordingFit(recording, network, settings, args.orders, args.cpa_range)
+        for path, recording, job in zip(args.recordings, recordings, jobs, strict=True):
             with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
                       disable=None) as bar:
                 for one in job.passes(bar.update, lambda: bool(seen)):
@@ -73,13 +81,14 @@ def _fit(args):
                     passes.append(one)
                     bar.clear()
                     _print_pass(one)
-                    figures += 0 if args.no_figures else _draw(one, args.out)
+                    if not args.no_figures:
+                        _draw(one, args.out)
             for line in job.warnings():
                 print(f'  warning: {path.name}: {line}')
             if seen:
                 break
         iron = _iron(passes, network) if args.same_vehicle else None
-        folder.write_summary({'iron': iron, 'interrupted': bool(seen)})
+        folder.summary = {'iron': iron, 'interrupted': bool(seen)}
     if not passes:
         print('no pass: nothing was detected')
     elif not args.no_figures:
@@ -89,7 +98,8 @@ def _fit(args):
 
 
 def _check(args, network):
-    """Raise SettingsError for options that make no sense."""
+    """Raise SettingsError or OutputError for options that make no sense."""
+    distinct_names(args.recordings)
     if min(args.orders) < 1 or max(args.orders) > 8 or len(set(args.orders)) < len(args.orders):
         raise SettingsError(f'--orders: expected different numbers from 1 to 8, got {args.orders}')
     if args.cpa_range is not None:
@@ -106,8 +116,9 @@ def _check(args, network):
 
 def _print_pass(one):
     """A table of the orders of one pass."""
-    print(f'{one.recording}, pass {one.number}: {one.fits[0].data.n_values} measurements, '
-          f'{len(one.fits[0].data.sensors)} sensors')
+    data = one.fits[0].data
+    print(f'{one.recording}, pass {one.number}: {data.n_values} measurements, '
+          f'sensors: {", ".join(data.network.names[j] for j in data.sensors)}')
     for note in one.notes:
         print(f'  note: {note}')
     if any(not f.reason for f in one.fits):
@@ -125,6 +136,10 @@ def _print_pass(one):
                   f'({", ".join(f"{v:.2f}" for v in path[:3])}) m'
                   + (f' with a length of {abs(path[6]):.1f} m' if len(path) > 6 else ''))
     if one.chosen is not None:
+        cost = one.chosen.normalised_cost
+        if cost > POOR:
+            print(f'  a row of dipoles describes it poorly (cost {cost:.1f}): '
+                  'speed and position may be off by several of the deviations')
         centre = one.chosen.data.network.positions[one.chosen.data.sensors].mean(axis=0)
         time, std, distance, distance_std = one.chosen.closest_approach(centre)
         print(f'  closest to the middle of the sensors {time:+.2f} ({std:.2f}) s after the '
@@ -150,12 +165,15 @@ def _numbers(fit):
 
 def _print_bearing(b):
     """What one sensor tells."""
-    def text(direction):
-        return ' '.join(f'{v:.2f}' for v in direction)
+    def text(k, direction):
+        if not np.isfinite(direction).all():
+            return 'unknown'
+        return (f'({" ".join(f"{v:.2f}" for v in direction)}) to '
+                f'{np.degrees(b.direction_std[k]):.1f} deg')
 
-    print(f'        to the closest point ({text(b.cpa_direction)}), moving '
-          f'({text(b.motion_direction)}), or both reversed; moment along '
-          f'({text(b.moment_direction)})')
+    print(f'        direction to the closest point {text(0, b.cpa_direction)}, of motion '
+          f'{text(1, b.motion_direction)}, or both reversed; of the moment '
+          f'{text(2, b.moment_direction)}')
     print(f'        closest {b.cpa_time:+.3f} ({b.cpa_time_std:.3f}) s after the strongest field; '
           f'speed over range {b.rate:.3f} ({b.rate_std:.3f}) 1/s')
 
@@ -181,17 +199,16 @@ def _iron(passes, network):
 
 
 def _draw(one, out):
-    """The figure of the order chosen, or of the richest that there is; how many were drawn."""
+    """Draw the order chosen, or the richest that there is."""
     fit = one.chosen or next((f for f in reversed(one.fits) if len(f.x)), None)
     if fit is None:
-        return 0
+        return
     # Drawing needs matplotlib, which a run without figures should not wait for.
     from mag_tracking.report.fit_figures import pass_figure
 
     title = f'{one.recording}, pass {one.number}, {fit.n_dipoles} dipole{"s" * (fit.n_dipoles > 1)}'
     pass_figure(fit, title + (' (no answer)' if fit.reason else '')).savefig(
         out / f'{one.recording}_pass_{one.number}.png', dpi=110)
-    return 1
 
 
 def _draw_orders(passes, out):

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from mag_tracking.errors import OutputError
 from mag_tracking.pipeline import TARGET_DEFAULTS, settings_for
 from mag_tracking.settings import read_parameter_file
 
@@ -26,6 +27,16 @@ def add_settings(parser):
     parser.add_argument('--params', type=Path, metavar='FILE', help='settings that differ')
     parser.add_argument('--target', choices=list(TARGET_DEFAULTS), default='vehicle',
                         help='what moves (default: vehicle)')
+
+
+def distinct_names(paths):
+    """Stems of recordings; raises OutputError where results would overwrite each other."""
+    names = [path.resolve().stem for path in paths]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise OutputError(f'two recordings are named {twice[0]}: their results would overwrite '
+                          'each other; take them one by one')
+    return names
 
 
 def settings_of(args):

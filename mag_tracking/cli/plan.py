@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from mag_tracking.analysis.placement import PlannedTarget, Sampling
 from mag_tracking.cli.options import add_command, add_network
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.io.network_file import read_network
+from mag_tracking.io.results import without_nan
 from mag_tracking.pipeline import settings_for
 from mag_tracking.planning import GOOD_PD, detection_range, n_parts, plan
 from mag_tracking.settings import read_parameter_file
@@ -32,7 +34,7 @@ Writes to DIR:
 examples:
   mag-tracking plan --network network.yaml --target car --out plan
   mag-tracking plan --network network.yaml --target truck --speed 25 --heading 0 180 --out plan
-  mag-tracking plan --network board.yaml --moment 0.87 --height 0.03 --speed 0.05 \\
+  mag-tracking plan --network board.yaml --target magnet --moment 0.87 --height 0.03 --speed 0.05 \\
       --noise-std 1e-6 --out plan
 '''
 
@@ -44,7 +46,7 @@ def add(commands):
     add_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder for the results')
     p.add_argument('--target', metavar='KIND', help='a kind of vehicle of the settings: small, '
-                   'car or truck (default: car); gives moment and height')
+                   'car or truck (default: car), which gives moment and height; or magnet')
     p.add_argument('--moment', type=float, metavar='A_M2', help='size of the moment instead')
     p.add_argument('--height', type=float, metavar='M', help='height of the '
                    'magnetic centre, z in the frame of the network')
@@ -69,25 +71,31 @@ def add(commands):
     p.add_argument('--params', type=Path, metavar='FILE', help='settings that differ')
 
 
-def _positive(name, value):
+def _within(name, value, low, high):
     """`value`, or a SettingsError."""
-    if not (math.isfinite(value) and value > 0.0):
-        raise SettingsError(f'{name}: expected a positive number, got {value:g}')
+    if not low <= value <= high:
+        raise SettingsError(f'{name}: expected {low:g} to {high:g}, got {value:g}')
     return value
 
 
-def _target(args, vehicle):
+def _target(args, track):
     """The `PlannedTarget` of the command line."""
-    speed = _positive('--speed', args.speed)
+    vehicle = track.vehicle
+    speed = _within('--speed', args.speed, 1e-4, 1e3)
+    if args.height is not None:
+        _within('--height', args.height, -1e3, 1e3)
     if args.moment is not None:
-        if args.target is not None:
+        if args.target not in (None, 'magnet'):
             raise SettingsError('--target and --moment: give one of them')
         if args.height is None:
             raise SettingsError('--height: needed with --moment')
-        return PlannedTarget(_positive('--moment', args.moment), args.height, speed)
+        return PlannedTarget(_within('--moment', args.moment, 1e-6, 1e6), args.height, speed)
+    if args.target == 'magnet':
+        raise SettingsError('--moment and --height: needed for a magnet')
     kind = args.target or 'car'
     if kind not in vehicle.kinds:
-        raise SettingsError(f'--target: expected one of {", ".join(vehicle.kinds)}, got {kind!r}')
+        raise SettingsError(f'--target: expected one of {", ".join(vehicle.kinds)}, magnet; got '
+                            f'{kind!r}')
     k = vehicle.kinds.index(kind)
     height = vehicle.heights[k] if args.height is None else args.height
     return PlannedTarget(vehicle.moments[k], height, speed, vehicle.height_stds[k],
@@ -95,54 +103,74 @@ def _target(args, vehicle):
 
 
 def _lanes(args, vehicle):
-    """{name: (heading, offset)} of the command line."""
+    """[(name, heading, offset)] of the command line."""
     if args.heading is None:
-        named = dict(zip(vehicle.arrival_names, vehicle.arrival_headings_deg, strict=True))
+        names, headings = vehicle.arrival_names, vehicle.arrival_headings_deg
     else:
-        named = {f'{heading:g} deg': heading for heading in args.heading}
-    offsets = args.offset or [0.0] * len(named)
-    if len(offsets) != len(named):
-        raise SettingsError(f'--offset: expected {len(named)} numbers, one a lane '
-                            f'({", ".join(named)}), got {len(offsets)}')
-    if not np.isfinite([*named.values(), *offsets]).all():
-        raise SettingsError('--heading, --offset: expected finite numbers')
-    return {name: (math.radians(heading), offset)
-            for (name, heading), offset in zip(named.items(), offsets, strict=True)}
+        names, headings = [f'{heading:g} deg' for heading in args.heading], args.heading
+    offsets = args.offset or [0.0] * len(headings)
+    if len(offsets) != len(headings):
+        raise SettingsError(f'--offset: expected {len(headings)} numbers, one a lane '
+                            f'({", ".join(names)}), got {len(offsets)}')
+    for value in (*headings, *offsets):
+        _within('--heading, --offset', value, -1e5, 1e5)
+    if args.offset:
+        names = [f'{name}, {offset:+g} m' for name, offset in zip(names, offsets, strict=True)]
+    lanes = list(zip(names, map(math.radians, headings), offsets, strict=True))
+    if len(set(lanes)) < len(lanes):
+        raise SettingsError('--heading: a lane is there twice; give each its --offset')
+    return lanes
 
 
-def _sampling(args, network, settings, reach, speed):
-    """The `Sampling` of the command line."""
-    period = settings.align.period_s
-    n = max(1.0, _positive('--rate', args.rate) * period)
-    default = args.noise_std if args.noise_std is not None else 1.2e-8
-    noise = np.array([_positive('--noise-std', default) if std is None or args.noise_std is not None
+def _sampling(args, network, settings):
+    """The `Sampling` of the command line, but for how long the target is followed.
+
+    An error of the field that lasts tells as little in many frames as in one: it counts as so much
+    more noise in each (the architecture page says why the tracker has it as a state).
+    """
+    rate, track = _within('--rate', args.rate, 1e-2, 1e5), settings.track
+    period = max(settings.align.period_s, 1.0 / rate)
+    given = args.noise_std
+    if given is not None:
+        _within('--noise-std', given, 1e-15, 1e-3)
+    noise = np.array([given or 1.2e-8 if std is None or given
                       else float(np.sqrt(np.mean(np.square(std)))) for std in network.noise_std])
-    error = settings.track.field_error if args.field_error is None else args.field_error
-    if not 0.0 <= error < 1.0:
-        raise SettingsError(f'--field-error: expected a share from 0 to 1, got {error:g}')
-    return Sampling(period, noise / math.sqrt(n), error, half_window=1.2 * reach / speed)
+    error = track.field_error if args.field_error is None else args.field_error
+    _within('--field-error', error, 0.0, 0.9)
+    lasting = max(1.0, 2.0 * track.model_error_time_s / period)
+    return Sampling(period, noise / math.sqrt(max(1.0, rate * period)), error * math.sqrt(lasting))
+
+
+def _area(args, network, reach):
+    """(x0, y0, x1, y1) of the maps."""
+    low, high = network.positions[:, :2].min(axis=0), network.positions[:, :2].max(axis=0)
+    x0, y0, x1, y1 = args.area or [*(low - reach), *(high + reach)]
+    if not (x1 > x0 and y1 > y0):
+        raise SettingsError(f'--area: expected X0 < X1 and Y0 < Y1, got {args.area}')
+    for side in (x1 - x0, y1 - y0):
+        _within('--area: a side', side, 1e-3, 1e5)
+    _within('--area: its longer side over the other', max((x1 - x0) / (y1 - y0),
+                                                          (y1 - y0) / (x1 - x0)), 1.0, 50.0)
+    return x0, y0, x1, y1
 
 
 def _plan(args):
     """mag-tracking plan."""
     network = read_network(args.network)
-    settings = settings_for('vehicle', read_parameter_file(args.params) if args.params else {})
-    target, lanes = _target(args, settings.track.vehicle), _lanes(args, settings.track.vehicle)
-    if not 5 <= args.grid <= 400:
-        raise SettingsError(f'--grid: expected 5 to 400 points, got {args.grid}')
-    noise = _sampling(args, network, settings, 1.0, 1.0).noise_std
+    kind = 'magnet' if args.target == 'magnet' else 'vehicle'
+    settings = settings_for(kind, read_parameter_file(args.params) if args.params else {})
+    target, lanes = _target(args, settings.track), _lanes(args, settings.track.vehicle)
+    _within('--grid', args.grid, 5, 200)
+    sampling = _sampling(args, network, settings)
+    noise = sampling.noise_std
     reach = detection_range(target, float(np.median(noise)), 3,
                             settings.detect.false_alarm_probability)
-    sampling = _sampling(args, network, settings, reach, target.speed)
-    low, high = network.positions[:, :2].min(axis=0), network.positions[:, :2].max(axis=0)
-    area = tuple(args.area or [*(low - reach), *(high + reach)])
-    if not (np.isfinite(area).all() and area[2] > area[0] and area[3] > area[1]):
-        raise SettingsError(f'--area: expected X0 < X1 and Y0 < Y1, got {list(area)}')
+    sampling = replace(sampling, half_window=1.2 * reach / target.speed)
+    area = _area(args, network, reach)
     clearance = args.clearance
     if clearance is None:
         clearance = 2.0 if args.moment is None else 0.0
-    if not (math.isfinite(clearance) and clearance >= 0.0):
-        raise SettingsError(f'--clearance: expected metres, got {clearance:g}')
+    _within('--clearance', clearance, 0.0, 1e6)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -180,37 +208,35 @@ def _print(p, noise):
     caught = p.missed[p.missed[:, 1] < 0.01, 0]
     print(f'99 % of passes are detected up to {caught.max():.3g} m from the middle' if len(caught)
           else 'nowhere are 99 % of the passes detected')
+    print('(bounds of a point; real vehicles are followed several times less well)')
     if not np.isfinite(p.with_one_more).any():
         print('one more sensor: nowhere in the area is it clear of the lanes')
-        return
-    print(f'one more sensor helps most at ({p.best_place[0]:.2f}, {p.best_place[1]:.2f}) m: the '
-          f'median bound near the sensors becomes {f_text(np.nanmin(p.with_one_more))}, now '
-          f'{f_text(p.without)}')
-
-
-def _without_nan(a):
-    """Nested lists of an array (n, m), null where it is no number."""
-    return [[v if math.isfinite(v) else None for v in row] for row in a.tolist()]
+    elif np.nanmin(p.with_one_more) > 0.99 * p.without:
+        print('one more sensor helps nowhere in the area')
+    else:
+        x, y = p.best_place
+        edge = ' (on the edge of the area)' if x in p.x[[0, -1]] or y in p.y[[0, -1]] else ''
+        print(f'one more sensor helps most at ({x:.2f}, {y:.2f}) m{edge}: the median bound near '
+              f'the sensors becomes {f_text(np.nanmin(p.with_one_more))}, now {f_text(p.without)}')
 
 
 def _write(p, out):
     """The figures and `plan.json`."""
+    content = {
+        'x': p.x.tolist(), 'y': p.y.tolist(), 'position_std': p.position_std.tolist(),
+        'detection': p.detection.tolist(), 'with_one_more': p.with_one_more.tolist(),
+        'without': p.without, 'best_place': list(p.best_place),
+        'bounds_at_closest': {k: v.tolist() for k, v in p.blocks.items()},
+        'unobservable': list(p.observability.unobservable), 'missed': p.missed.tolist(),
+        'lanes': [{'name': lane.name, 'along': lane.along.tolist(),
+                   'filter_std': lane.filter_std.tolist(), 'pass_std': lane.pass_std.tolist(),
+                   'detection': lane.detection.tolist()} for lane in p.lanes]}
+    with open(out / 'plan.json', 'w', encoding='utf-8') as stream:
+        json.dump(without_nan(content), stream, indent=1, allow_nan=False)
+        stream.write('\n')
     # Drawing needs matplotlib, which the other commands should not wait for.
     from mag_tracking.report import plan_figures
 
     for name in ('position', 'detection', 'sensor', 'lane'):
         figure = getattr(plan_figures, f'{name}_figure')(p)
         figure.savefig(out / f'plan_{name}{"s" * (name == "lane")}.png', dpi=110)
-    finite = {name: [v if math.isfinite(v) else None for v in values.tolist()]
-              for name, values in p.blocks.items()}
-    content = {
-        'x': p.x.tolist(), 'y': p.y.tolist(), 'position_std': p.position_std.tolist(),
-        'detection': p.detection.tolist(), 'with_one_more': _without_nan(p.with_one_more),
-        'without': p.without, 'best_place': p.best_place, 'bounds_at_closest': finite,
-        'unobservable': p.observability.unobservable, 'missed': p.missed.tolist(),
-        'lanes': [{'name': lane.name, 'along': lane.along.tolist(),
-                   'filter_std': lane.filter_std.tolist(), 'pass_std': lane.pass_std.tolist(),
-                   'detection': lane.detection.tolist()} for lane in p.lanes]}
-    with open(out / 'plan.json', 'w', encoding='utf-8') as stream:
-        json.dump(content, stream, indent=1, allow_nan=False)
-        stream.write('\n')

@@ -5,8 +5,13 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from mag_tracking.cli.options import add_command, add_network, add_settings, settings_of
-from mag_tracking.errors import OutputError
+from mag_tracking.cli.options import (
+    add_command,
+    add_network,
+    add_settings,
+    distinct_names,
+    settings_of,
+)
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.io.bag import Recording
 from mag_tracking.io.network_file import read_network
@@ -55,11 +60,7 @@ def add(commands):
 def _replay(args):
     """mag-tracking replay."""
     network, settings = read_network(args.network), settings_of(args)
-    names = [path.resolve().stem for path in args.recordings]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise OutputError(f'two recordings are named {twice[0]}: their results would overwrite '
-                          'each other; replay them one by one')
+    names = distinct_names(args.recordings)
     with noted_signals(signal.SIGINT) as seen:
         for path, name in zip(args.recordings, names, strict=True):
             out = args.out / name if len(args.recordings) > 1 else args.out

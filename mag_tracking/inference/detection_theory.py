@@ -22,6 +22,27 @@ def detection_probability(snr, threshold, degrees_of_freedom):
     return 1.0 - chndtr(threshold, degrees_of_freedom, snr)
 
 
+def missed_probability(probability, run):
+    """Probability that no `run` frames in a row detect.
+
+    Parameters
+    ----------
+    probability : (n, ...)
+        Of each frame's detection, in order of time; the frames are independent.
+    run : int
+
+    Returns (...): exact, by the distribution of how many frames in a row have detected so far.
+    """
+    p = np.asarray(probability, dtype=float)
+    waiting = np.zeros((run, *p.shape[1:]))
+    waiting[0] = 1.0
+    for detected in p:
+        # One more in a row, or none; the last one leaves: the target has been detected.
+        waiting = np.concatenate([((1.0 - detected) * waiting.sum(axis=0))[None],
+                                  detected * waiting[:-1]])
+    return waiting.sum(axis=0)
+
+
 def whitened_energy(y, C):
     """Energy of a measurement in units of its noise.
 

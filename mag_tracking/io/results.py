@@ -108,16 +108,16 @@ class ResultFolder:
     def write_summary(self, summary):
         """`summary.json`."""
         with open(self.folder / 'summary.json', 'w', encoding='utf-8') as stream:
-            json.dump(_without_nan(summary), stream, indent=1, allow_nan=False)
+            json.dump(without_nan(summary), stream, indent=1, allow_nan=False)
             stream.write('\n')
 
 
-def _without_nan(value):
+def without_nan(value):
     """NaN and infinity are no JSON: null instead."""
     if isinstance(value, dict):
-        return {k: _without_nan(v) for k, v in value.items()}
+        return {k: without_nan(v) for k, v in value.items()}
     if isinstance(value, list):
-        return [_without_nan(v) for v in value]
+        return [without_nan(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -1,7 +1,7 @@
 """Straight passes at constant velocity: the field of a whole pass as a function of few numbers.
 
 The moments enter linearly, the path does not: a model gives the matrix of the former and the
-derivatives by the latter (`inference.separable` fits such models).
+derivatives by the latter (`inference.least_squares` fits such models).
 """
 
 from dataclasses import dataclass

@@ -72,6 +72,7 @@ def detection_figure(plan):
 def sensor_figure(plan):
     """Map of what one more sensor would bring; left white where none may stand."""
     gain = 1.0 - plan.with_one_more / plan.without
+    possible = np.isfinite(gain).any()
     figure, axes, f, unit = _map(
         plan, f'Where one more sensor helps: the median bound near the sensors is now '
         f'{f_text(plan.without)}')
@@ -79,6 +80,8 @@ def sensor_figure(plan):
     x, y = np.linspace(plan.x[0], plan.x[-1], nx), np.linspace(plan.y[0], plan.y[-1], ny)
     mesh = axes.pcolormesh(f * x, f * y, 100.0 * gain, cmap='cividis', shading='nearest',
                            rasterized=True)
+    if not possible:
+        return figure
     best = plan.best_place
     axes.plot(f * best[0], f * best[1], 'r*', ms=15, mec='w', clip_on=False, zorder=6,
               label=f'best: ({f * best[0]:.3g}, {f * best[1]:.3g}) {unit}, then '
