@@ -208,7 +208,7 @@ def _print(p, noise):
     caught = p.missed[p.missed[:, 1] < 0.01, 0]
     print(f'99 % of passes are detected up to {caught.max():.3g} m from the middle' if len(caught)
           else 'nowhere are 99 % of the passes detected')
-    print('(bounds of a point at constant speed; real vehicles are followed several times less well)')
+    print('(bounds of a point: real vehicles are followed several times less well)')
     if not np.isfinite(p.with_one_more).any():
         print('one more sensor: nowhere in the area is it clear of the lanes')
     elif np.nanmin(p.with_one_more) > 0.99 * p.without:
