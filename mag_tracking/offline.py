@@ -18,6 +18,7 @@ from mag_tracking.report.metrics import (
     pass_errors,
 )
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
+from mag_tracking.stages.track import acceleration_density
 
 SUSPICIOUS = 2.0
 """A sensor that seems to be turned by more prior deviations than this is reported."""
@@ -182,17 +183,14 @@ def _bound_ratio(log, pipeline, truth):
     """Error over the path bound of a track, over the poses that its errors are of, or None."""
     track = pipeline.settings.track
     if track.target == 'magnet':
-        m = track.magnet
         # Between two poses it may have turned anywhere.
-        return error_over_bound(pipeline.network, log, truth, np.full(3, m.acceleration), 1.0,
+        return error_over_bound(pipeline.network, log, truth, acceleration_density(track), 1.0,
                                 track.field_error, track.background_std,
                                 np.arange(MAGNET_SKIP, len(log.stamp_ns)), 3)
-    v = track.vehicle
     rows = near_poses(log, truth, pipeline.network.centre)
-    return error_over_bound(
-        pipeline.network, log, truth,
-        np.array([v.acceleration, v.acceleration, v.climb_acceleration]), v.moment_drift,
-        track.field_error, track.background_std, rows, 2)
+    return error_over_bound(pipeline.network, log, truth, acceleration_density(track),
+                            track.vehicle.moment_drift, track.field_error, track.background_std,
+                            rows, 2)
 
 
 def write_figures(run, network, out, most=6, stopped=None):

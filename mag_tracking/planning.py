@@ -18,6 +18,7 @@ from mag_tracking.inference.crlb import observability, path_bound, snr_range
 from mag_tracking.inference.detection_theory import energy_threshold, missed_probability
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.motion import constant_velocity, integrator_noise
+from mag_tracking.stages.track import acceleration_density
 
 MOST_FRAMES = 1000
 """Of a pass, when it is asked whether it is missed: slower ones are not missed more."""
@@ -205,7 +206,7 @@ def _filter_bound(network, target, sampling, points, heading, settings):
     n_x = 9 + 3 * n_sensors
     F, Q, P0 = np.eye(n_x), np.zeros((n_x, n_x)), np.zeros((n_x, n_x))
     F[:6, :6] = constant_velocity(dt)
-    Q[:6, :6] = integrator_noise(dt, np.square(_acceleration(settings.track)))
+    Q[:6, :6] = integrator_noise(dt, acceleration_density(settings.track))
     known = np.diagonal(target.prior())[[2, 5]]
     wide = np.array([1.0, 1.0, 1.0, target.speed, target.speed, target.speed])
     wide[:3] *= np.hypot(*(points[-1] - points[0]))
@@ -213,7 +214,9 @@ def _filter_bound(network, target, sampling, points, heading, settings):
     P0[range(6), range(6)] = wide**2
     P0[range(6, 9), range(6, 9)] = target.moment**2 / 3.0
     P0[range(9, n_x), range(9, n_x)] = min(sampling.background_std, 1e-6)**2
-    (_, h, H), = pass_fields(network.positions, network.R_sw, target, still, points, heading)
+    _, h, H = zip(*pass_fields(network.positions, network.R_sw, target, still, points, heading),
+                  strict=True)
+    h, H = np.concatenate(h), np.concatenate(H)
     std = np.empty((len(points), len(DIRECTIONS)))
     backgrounds = np.broadcast_to(np.eye(3 * n_sensors).reshape(n_sensors, 3, -1),
                                   (len(points), n_sensors, 3, 3 * n_sensors))
@@ -224,14 +227,6 @@ def _filter_bound(network, target, sampling, points, heading, settings):
                        variance[..., None, None] * np.eye(3), P0)
         std[:, d] = np.sqrt(P[:, 0, 0] + P[:, 1, 1])
     return np.median(std, axis=1)
-
-
-def _acceleration(track):
-    """(3,) root spectral density [m/s^1.5] of the tracker's motion."""
-    if track.target == 'magnet':
-        return np.full(3, track.magnet.acceleration)
-    v = track.vehicle
-    return np.array([v.acceleration, v.acceleration, v.climb_acceleration])
 
 
 def _one_more(network, target, sampling, near, places):

@@ -26,7 +26,7 @@ def passed(errors, noise=NOISE, missing=False):
 
 
 def ratio(log, truth, rows=range(N), field_error=0.0):
-    return error_over_bound(ROAD, log, truth, np.array([1.0, 1.0, 0.1]), 0.1, field_error, 1e-8,
+    return error_over_bound(ROAD, log, truth, np.array([1.0, 1.0, 0.01]), 0.1, field_error, 1e-8,
                             np.array(rows), 2)
 
 

@@ -223,3 +223,22 @@ def test_a_pass_is_missed_as_often_as_no_run_of_frames_detects():
     rate = 1.0 - runs.any(axis=1).mean(axis=0)
     assert (np.abs(rate - found) < 4.0 * np.sqrt(found * (1.0 - found) / 40000)).all()
     np.testing.assert_allclose(missed_probability(p, 1), np.prod(1.0 - p, axis=0))
+
+
+def test_a_lane_counts_every_frame_once():
+    """A third of the frames with a third of the variance are the same, step by step."""
+    slow = PlannedTarget(400.0, 0.5, 0.8, 0.2, 0.1)
+    lanes = [plan(ROAD, slow, Sampling(0.08 * k, 4e-9 / np.sqrt(k), 0.04 / np.sqrt(k), 1e-8, 20.0),
+                  [('a', 0.0, 1.0)], (-12.0, -12.0, 12.0, 12.0), settings_for('vehicle'),
+                  n_grid=5).lanes[0] for k in (1, 3)]
+    assert len(lanes[0].along) == len(lanes[1].along) == 121
+    np.testing.assert_allclose(lanes[0].filter_std, lanes[1].filter_std, rtol=1e-6)
+
+
+def test_a_lane_is_the_median_over_the_directions(road_plan):
+    lane, = road_plan.lanes
+    J = pass_information(*place_of(ROAD), road_plan.target, road_plan.sampling, lane.points,
+                         lane.heading).sum(axis=2)
+    std = bounds_of(J, road_plan.target.prior())
+    np.testing.assert_allclose(lane.pass_std, np.median(std, axis=1))
+    assert (lane.pass_std[:, 0] < 0.95 * std[..., 0].max(axis=1)).any()

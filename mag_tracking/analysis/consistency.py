@@ -25,7 +25,7 @@ def error_over_bound(network, log, truth, acceleration, moment_walk, field_error
     network : SensorNetwork
     log : TrackLog
     truth : (stamps, positions, quaternions)
-    acceleration : (3,) root spectral density [m/s^1.5]
+    acceleration : (3,) [m^2/s^3] spectral density
     moment_walk : float [1/s^0.5]
         Random walk of the moment relative to its size.
     field_error : float
@@ -79,7 +79,7 @@ def _motion(t, acceleration, moment_walk, log, known, n_x):
     F, Q = np.tile(np.eye(n_x), (len(t), 1, 1)), np.zeros((len(t), n_x, n_x))
     for k, dt in enumerate(np.diff(t), 1):
         F[k, :6, :6] = constant_velocity(dt)
-        Q[k, :6, :6] = integrator_noise(dt, np.square(acceleration))
+        Q[k, :6, :6] = integrator_noise(dt, acceleration)
         walk = moment_walk**2 * dt * np.square(log.moment[known[k]]).sum()
         Q[k, 6:9, 6:9] = walk * np.eye(3)
     return F, Q

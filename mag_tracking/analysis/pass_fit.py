@@ -170,17 +170,19 @@ def _described(data, n_dipoles, theta, p, found, explained, cpa_range):
                            'there is no closest point to scale by')
     H, T, names, predicted, background = _linearised(data, n_dipoles, theta, p)
     W = data.whitening
-    J = information((W @ H.reshape(len(W), 3, -1)).reshape(H.shape))
+    whitened = W @ H.reshape(len(W), 3, -1)
+    left = np.einsum('nij,nj->ni', W, np.nan_to_num(data.field - predicted))
+    J = information(whitened)
     if one:
         J[:6, :6] += cpa_information(theta[:3] - place, theta[3:6],
                                      cpa_range[1] if cpa_range else EXACT)[:6, :6]
     covariance = bound(J)
     x = T @ np.concatenate([theta, p, background])
     seen_s = _seen_s(data)
-    change, change_std = _velocity_change(data, H, theta, predicted, seen_s)
+    change, change_std = _velocity_change(data, whitened, left, theta, seen_s)
     # An unobservable state has an infinite variance; what it is combined to has none.
     with np.errstate(invalid='ignore'):
-        honest = covariance + _unmodelled(data, H, predicted, covariance)
+        honest = covariance + _unmodelled(data, whitened, left, covariance)
         spread = np.sqrt(np.einsum('yi,ij,yj->y', H, honest, H)).reshape(-1, 3)
         covariance, honest = (T @ P @ T.T for P in (covariance, honest))
     fit = PassFit(n_dipoles, data, '', found.converged, names, x, covariance, honest, found.cost,
@@ -197,15 +199,15 @@ def _described(data, n_dipoles, theta, p, found, explained, cpa_range):
     return replace(fit, reason=_doubt(fit))
 
 
-def _unmodelled(data, H, predicted, covariance):
+def _unmodelled(data, whitened, left, covariance):
     """What must be added to a covariance (n_x, n_x) for what the model leaves out.
 
-    The residuals then are no noise: they are alike for a while, and count for less than their
-    number. Nothing is taken away where chance made them look less than noise.
+    The residuals `left` (n, 3) then are no noise: they are alike for a while, and count for less
+    than their number. Nothing is taken away where chance made them look less than noise.
+    `whitened` (n, 3, n_x) are the derivatives.
     """
-    W, scale = data.whitening, np.sqrt(np.diagonal(covariance))
-    columns = (W @ (H * scale).reshape(len(W), 3, -1))
-    left = np.einsum('nij,nj->ni', W, np.nan_to_num(data.field - predicted))
+    scale = np.sqrt(np.diagonal(covariance))
+    columns = whitened * scale
     excess = -np.einsum('nai,naj->ij', columns, columns)
     for j in data.sensors:
         mine = data.sensor == j
@@ -238,20 +240,18 @@ def _seen_s(data):
     return float(last - first)
 
 
-def _velocity_change(data, H, theta, predicted, seen_s):
+def _velocity_change(data, whitened, left, theta, seen_s):
     """Share of itself by which the velocity would like to change while the target is seen.
 
     One step of Gauss and Newton from the minimum, with a constant horizontal acceleration more
     among the unknowns: it moves the target by t^2/2, as its start moves it by 1. Returns the share
     and its deviation (by noise alone).
     """
-    W = data.whitening
-    wider = np.hstack([H, 0.5 * np.repeat(data.t**2, 3)[:, None] * H[:, :2]])
-    wider = (W @ wider.reshape(len(W), 3, -1)).reshape(wider.shape)
-    left = np.einsum('nij,nj->ni', W, np.nan_to_num(data.field - predicted)).ravel()
+    moved = 0.5 * np.square(data.t)[:, None, None] * whitened[:, :, :2]
+    wider = np.concatenate([whitened, moved], axis=2).reshape(left.size, -1)
     size = np.linalg.norm(wider, axis=0)
     inverse = np.linalg.pinv(wider / size, rcond=1e-8) / size[:, None]
-    step, spread = inverse @ left, np.linalg.norm(inverse, axis=1)
+    step, spread = inverse @ left.ravel(), np.linalg.norm(inverse, axis=1)
     scale = seen_s / np.linalg.norm(theta[3:6])
     return float(np.linalg.norm(step[-2:]) * scale), float(np.linalg.norm(spread[-2:]) * scale)
 

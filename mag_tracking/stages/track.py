@@ -80,6 +80,15 @@ class TrackSettings:
     magnet: MagnetSettings = field(default_factory=MagnetSettings)
 
 
+def acceleration_density(settings):
+    """(3,) [m^2/s^3] spectral density of the acceleration that the tracker of these
+    `TrackSettings` assumes."""
+    if settings.target == 'magnet':
+        return np.full(3, settings.magnet.acceleration**2)
+    v = settings.vehicle
+    return np.square([v.acceleration, v.acceleration, v.climb_acceleration])
+
+
 class TrackStage:
     """Frames with a verdict to `Track`s, one a frame while a target is present.
 
