@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import POINT, line_network
+from scipy.linalg import block_diag
 
-from mag_tracking.inference.smoother import smooth
+from mag_tracking.inference import kalman
+from mag_tracking.inference.smoother import Step, smoothed_covariances, smoothed_states
 from mag_tracking.io.simulator import Path, point_body, random_vehicle, simulate
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
@@ -14,17 +16,20 @@ from mag_tracking.stages import smooth as smooth_module
 from mag_tracking.stages.track import TrackStage
 
 
-def stacked(F, Q, H, R, y, x0, P0):
-    """Means and covariances of all states given all measurements, by one least squares."""
+def stacked(F, Q, H, R, y, x0, P0, missing):
+    """Means and covariances of all states given all measurements that are not `missing`, by one
+    least squares."""
     n, n_x = len(y), len(x0)
     A, b = [np.linalg.inv(np.linalg.cholesky(P0)) @ np.eye(n_x, n * n_x)], []
     b.append(np.linalg.inv(np.linalg.cholesky(P0)) @ x0)
-    L_q, L_r = np.linalg.inv(np.linalg.cholesky(Q)), np.linalg.inv(np.linalg.cholesky(R))
+    L_q = np.linalg.inv(np.linalg.cholesky(Q))
     for k in range(n):
-        row = np.zeros((len(R), n * n_x))
-        row[:, k * n_x:(k + 1) * n_x] = H[k]
+        there = ~missing[k]
+        L_r = np.linalg.inv(np.linalg.cholesky(R[np.ix_(there, there)]))
+        row = np.zeros((there.sum(), n * n_x))
+        row[:, k * n_x:(k + 1) * n_x] = H[k][there]
         A.append(L_r @ row)
-        b.append(L_r @ y[k])
+        b.append(L_r @ y[k][there])
         if k + 1 < n:
             row = np.zeros((n_x, n * n_x))
             row[:, k * n_x:(k + 1) * n_x], row[:, (k + 1) * n_x:(k + 2) * n_x] = -F, np.eye(n_x)
@@ -36,51 +41,100 @@ def stacked(F, Q, H, R, y, x0, P0):
                                            for k in range(n)]
 
 
-def filtered_chain(F, Q, H, R, y, x0, P0):
-    """A plain Kalman filter: what `smooth` wants."""
-    x, P, filtered, predicted = x0, P0, [], []
+N_T, N_OWN, N_SENSORS, N_STEPS = 4, 2, 2, 9
+N_X = N_T + (N_OWN + 3) * N_SENSORS
+
+
+def whole_derivative(H):
+    """(3 n_sensors, n_x) of what `kalman.update` takes sensor by sensor."""
+    out = np.zeros((3 * N_SENSORS, N_X))
+    for j in range(N_SENSORS):
+        rows = slice(3 * j, 3 * j + 3)
+        out[rows, :N_T] = H[j, :, :N_T]
+        out[rows, N_T + N_OWN * j:N_T + N_OWN * (j + 1)] = H[j, :, N_T:]
+        out[rows, N_X - 3 * (N_SENSORS - j):N_X - 3 * (N_SENSORS - j) + 3] = np.eye(3)
+    return out
+
+
+def problem(seed):
+    """F, decay, Q (diagonal), C, H and measurements (n_steps, n_sensors, 3), some missing."""
+    rng = np.random.default_rng(seed)
+    F = np.eye(N_T) + 0.2 * rng.standard_normal((N_T, N_T))
+    decay, Q = rng.uniform(0.5, 1.0, N_X - N_T), rng.uniform(0.01, 0.1, N_X)
+    A = rng.standard_normal((N_SENSORS, 3, 3))
+    C = A @ np.swapaxes(A, 1, 2) + np.eye(3)
+    H = rng.standard_normal((N_STEPS, N_SENSORS, 3, N_T + N_OWN))
+    y = rng.standard_normal((N_STEPS, N_SENSORS, 3))
+    y[2, 0, 1] = y[4, 1, 0] = y[4, 1, 2] = np.nan
+    y[5, 0] = y[6] = np.nan
+    return F, decay, Q, C, H, y
+
+
+def steps_of(F, decay, Q, C, H, y, x, P, without=()):
+    """The filter's `Step`s from the states `x` (n_hyp, n_x) on; no update at times `without`."""
+    steps, n_hyp = [], len(x)
     for k in range(len(y)):
         if k:
-            x, P = F @ x, F @ P @ F.T + Q
-            predicted.append((x, P))
-        K = P @ H[k].T @ np.linalg.inv(H[k] @ P @ H[k].T + R)
-        x, P = x + K @ (y[k] - H[k] @ x), P - K @ H[k] @ P
-        filtered.append((x, P))
-    # The last state goes its own way.
-    return filtered, predicted, [(F[:-1, :-1], np.diagonal(F)[-1:])] * (len(y) - 1)
+            kalman.predict(x, P, x[:, :N_T] @ F.T, F, np.diag(Q[:N_T]), Q[N_T:], decay)
+        gains = None
+        if k not in without:
+            H_k = np.ascontiguousarray(np.tile(H[k], (n_hyp, 1, 1, 1)))
+            gains = kalman.Gains.of(H_k, N_OWN, N_X)
+            own = x[:, N_T:N_X - 3 * N_SENSORS].reshape(n_hyp, N_SENSORS, N_OWN)
+            h = np.einsum('jai,pi->pja', H[k][:, :, :N_T], x[:, :N_T]) + np.einsum(
+                'jai,pji->pja', H[k][:, :, N_T:], own)
+            kalman.update(x, P, y[k], h, H_k, C, np.zeros((n_hyp, N_SENSORS)), n_own=N_OWN,
+                          gains=gains)
+        steps.append(Step(x.copy(), P.copy(), gains, *((F, decay) if k else ())))
+    return steps
 
 
 @pytest.mark.parametrize('unit', [1.0, 1e-8])
 def test_the_backward_pass_gives_what_least_squares_over_all_times_gives(unit):
-    """Also where one state is in metres and another of the size of teslas."""
-    rng = np.random.default_rng(1)
-    F = np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.9]])
-    Q, P0 = np.diag([0.01, 0.02, 0.1]), np.diag([4.0, 2.0, 1.0])
-    H, R = rng.standard_normal((12, 2, 3)), np.diag([0.3, 0.5])
-    y, x0 = rng.standard_normal((12, 2)), np.array([1.0, -1.0, 0.5])
-    mean, covariance = stacked(F, Q, H, R, y, x0, P0)
-    T = np.diag([1.0, 1.0, unit])
-    back = np.linalg.inv(T)
-    out = smooth(*filtered_chain(T @ F @ back, T @ Q @ T, H @ back, R, y, T @ x0, T @ P0 @ T))
-    for k, (x, P) in enumerate(out):
-        np.testing.assert_allclose(back @ x, mean[k], rtol=0, atol=1e-9)
-        np.testing.assert_allclose(back @ P @ back, covariance[k], rtol=0, atol=1e-9)
-        np.testing.assert_allclose(P, P.T, rtol=1e-12)
+    """With axes, sensors and a time missing, also where some states are of the size of teslas."""
+    F, decay, Q, C, H, y = problem(1)
+    without = (3,)
+    x0, P0 = np.random.default_rng(2).standard_normal((2, N_X)), np.diag(
+        np.random.default_rng(3).uniform(1.0, 9.0, N_X))
+    missing = np.isnan(y).reshape(N_STEPS, -1)
+    missing[list(without)] = True
+    whole = np.array([whole_derivative(h) for h in H])
+    whole[missing] = 0.0
+    R = block_diag(*C)
+    # What is missing is cut out of the noise, too: least squares by rows that are there.
+    expected = [stacked(block_diag(F, np.diag(decay)), np.diag(Q), whole, R,
+                        np.where(missing, 0.0, y.reshape(N_STEPS, -1)), x, P0, missing)
+                for x in x0]
+    # The other states in another unit, as backgrounds and fields are in teslas.
+    T = np.append(np.ones(N_T), np.full(N_X - N_T, unit))
+    H_unit = H.copy()
+    H_unit[..., :N_T] *= unit
+    steps = steps_of(F, decay, Q * T**2, C * unit**2, H_unit, y * unit, x0 * T,
+                     np.tile(P0 * np.outer(T, T), (2, 1, 1)), without)
+    for k, (x, P) in enumerate(zip(smoothed_states(steps), smoothed_covariances(steps),
+                                   strict=True)):
+        for p, (mean, covariance) in enumerate(expected):
+            np.testing.assert_allclose(x[p] / T, mean[k], rtol=0, atol=1e-9)
+            np.testing.assert_allclose(P[p] / np.outer(T, T), covariance[k], rtol=0, atol=1e-9)
+            np.testing.assert_allclose(P[p], P[p].T, rtol=1e-12)
 
 
 def test_what_is_known_exactly_stays_as_it_is():
     """A state without variance, and two that are one: neither is divided by."""
-    rng = np.random.default_rng(2)
-    F, Q = np.eye(3), np.diag([0.1, 0.1, 0.0])
-    Q[:2, :2] = 0.1
-    P0 = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
-    H, R, y = np.tile([[1.0, 0.0, 1.0]], (6, 1, 1)), np.array([[0.2]]), rng.standard_normal((6, 1))
-    out = smooth(*filtered_chain(F, Q, H, R, y, np.array([0.0, 0.0, 3.0]), P0))
-    mean, covariance = stacked(np.eye(1), np.array([[0.1]]), H[:, :, :1], R, y - 3.0,
-                               np.zeros(1), np.eye(1))
-    for (x, P), x1, P1 in zip(out, mean, covariance, strict=True):
-        np.testing.assert_allclose(x, [x1[0], x1[0], 3.0], atol=1e-8)
-        np.testing.assert_allclose(P[0, 1], P1[0, 0], atol=1e-8)
+    F, decay, Q, C, H, y = problem(4)
+    F, Q, P0 = np.eye(N_T), 0.0 * Q, np.diag(np.r_[1.0, 1.0, 0.0, 2.0, np.ones(N_X - N_T)])
+    P0[0, 1] = P0[1, 0] = 1.0
+    x0 = np.zeros((1, N_X))
+    x0[0, 2] = 3.0
+    steps = steps_of(F, decay, Q, C, H, y, x0, P0[None].copy())
+    for x, P in zip(smoothed_states(steps), smoothed_covariances(steps), strict=True):
+        assert x[0, 2] == 3.0
+        assert not P[0, 2].any()
+        assert x[0, 0] == pytest.approx(x[0, 1], abs=1e-12)
+        np.testing.assert_allclose(P[0, 0], P[0, 1], atol=1e-12)
+        # Nothing moves: what is known of it is the same at all times.
+        np.testing.assert_allclose(x[0, :N_T], steps[-1].x[0, :N_T], atol=1e-10)
+        np.testing.assert_allclose(P[0, :N_T, :N_T], steps[-1].P[0, :N_T, :N_T], atol=1e-10)
 
 
 def run(body, changes, seed=0, speed=10.0):
@@ -153,7 +207,7 @@ def test_smoothed_cars_are_nearer_and_no_surer_than_they_are_right():
 
 def test_the_survivor_does_again_what_it_did_in_the_bank(monkeypatch):
     """Linearised where the filter was, the last smoothed pose is the last filtered one."""
-    monkeypatch.setattr(smooth_module.smoothed_states, '__defaults__', (False, 0))
+    monkeypatch.setattr(smooth_module.smoothed_track, '__defaults__', (False, 0))
     records, _ = run(point_body([250.0, -150.0, 80.0], 4.0, 0.5), {})
     live = [r for r in records if isinstance(r, Track) and not r.ended]
     smoothed = [r for r in records if isinstance(r, SmoothedPose)]

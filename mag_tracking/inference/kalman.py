@@ -9,6 +9,7 @@ gives the numbers of the stacked update at a fraction of its cost.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -192,13 +193,27 @@ def _whiten(T, l10, l20, l21, r0, r1, r2):
         T[0, i] = r0 * t0
 
 
+@njit(**_INLINE)
+def _keep(p, j, T, z0, z1, z2, l10, l20, l21, r0, r1, r2, G, z, W):
+    """Store what `Gains` holds of hypothesis p and sensor j."""
+    for a in range(3):
+        for i in range(T.shape[1]):
+            G[p, j, a, i] = T[a, i]
+    z[p, j, 0], z[p, j, 1], z[p, j, 2] = z0, z1, z2
+    W[p, j, 0] = r0
+    W[p, j, 1], W[p, j, 2] = -r1 * l10, r1
+    W[p, j, 3], W[p, j, 4], W[p, j, 5] = r2 * (l10 * l21 - l20), -r2 * l21, r2
+
+
 @njit('int64(float64[:,::1], float64[:,:,::1], float64[:,::1], float64[:,::1], '
       'float64[:,:,::1], float64[:,:,::1], float64[:,:,:,::1], float64[:,::1], '
-      'int64, float64[::1], float64[:,::1])', **_COMPILE)
-def _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis):
+      'int64, float64[::1], float64[:,::1], '
+      'float64[:,:,:,::1], float64[:,:,::1], float64[:,:,::1])', **_COMPILE)
+def _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis, G, z, W):
     """Loop of the update over hypotheses and sensors; nothing is changed where it is not 0.
 
     -1: a noise is not positive definite; -2: shapes do not fit, it would read beyond an array.
+    What a backward pass wants goes into G, z and W unless they are of length 0.
     """
     n_hyp, n_sensors, n_columns = H.shape[0], H.shape[1], H.shape[3]
     n_x = n_columns - n_own + (n_own + 3) * n_sensors
@@ -209,6 +224,11 @@ def _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis)
             or len(C) != n_sensors or h.shape[1] != n_sensors or inflation.shape[1] != n_sensors
             or y.shape[1] != 3 or C.shape[1] != 3 or C.shape[2] != 3 or h.shape[2] != 3
             or H.shape[2] != 3):
+        return -2
+    keep = len(G) > 0
+    if keep and (len(G) != n_hyp or len(z) != n_hyp or len(W) != n_hyp or G.shape[1] != n_sensors
+                 or z.shape[1] != n_sensors or W.shape[1] != n_sensors or G.shape[2] != 3
+                 or G.shape[3] != n_x or z.shape[2] != 3 or W.shape[2] != 6):
         return -2
     n = _n_present(y, C)
     if n < 0:
@@ -227,13 +247,44 @@ def _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis)
             u1 -= l10 * u0
             z0, z1, z2 = r0 * u0, r1 * u1, r2 * (u2 - l20 * u0 - l21 * u1)
             _apply(x, P, p, T, z0, z1, z2)
+            if keep:
+                _keep(p, j, T, z0, z1, z2, l10, l20, l21, r0, r1, r2, G, z, W)
             q = z0 * z0 + z1 * z1 + z2 * z2
             nis[p, j] = q
             log_likelihood[p] -= 0.5 * (q + math.log(e0 * e1 * e2))
     return 0
 
 
-def update(x, P, y, h, H, C, inflation, x_lin=None, n_own=0):
+@dataclass(frozen=True)
+class Gains:
+    """What an update did, sensor after sensor, as `inference.smoother` wants it.
+
+    Of each sensor given those before it: z = W u whitens its innovation u, and x += G' z,
+    P -= G' G, with G = W [H | I] P.
+    """
+
+    H: np.ndarray
+    """(n_hyp, n_sensors, 3, n_t + n_own) the derivative that was used."""
+    n_own: int
+    G: np.ndarray
+    """(n_hyp, n_sensors, 3, n_x); rows of missing axes are zero."""
+    z: np.ndarray
+    """(n_hyp, n_sensors, 3)"""
+    W: np.ndarray
+    """(n_hyp, n_sensors, 6) lower triangle, row by row."""
+
+    @classmethod
+    def of(cls, H, n_own, n_x):
+        """To be filled by the update that has the derivative `H`, of `n_x` states."""
+        n_hyp, n_sensors = H.shape[:2]
+        return cls(H, n_own, np.empty((n_hyp, n_sensors, 3, n_x)), np.empty((n_hyp, n_sensors, 3)),
+                   np.empty((n_hyp, n_sensors, 6)))
+
+
+_NO_GAINS = np.empty((0, 0, 3, 0)), np.empty((0, 0, 3)), np.empty((0, 0, 6))
+
+
+def update(x, P, y, h, H, C, inflation, x_lin=None, n_own=0, gains=None):
     """Measurement update of every hypothesis, in place.
 
     Parameters
@@ -254,6 +305,8 @@ def update(x, P, y, h, H, C, inflation, x_lin=None, n_own=0):
         Linearisation point; the predicted state if left out.
     n_own : int
         States of each sensor between the target's and the backgrounds.
+    gains : Gains, optional
+        Is filled, for a backward pass.
 
     Returns
     -------
@@ -272,8 +325,10 @@ def update(x, P, y, h, H, C, inflation, x_lin=None, n_own=0):
     """
     x_lin = x.copy() if x_lin is None else x_lin
     log_likelihood, nis = np.empty(len(x)), np.empty(inflation.shape)
+    G, z, W = _NO_GAINS if gains is None else (gains.G, gains.z, gains.W)
     try:
-        status = _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis)
+        status = _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis,
+                              G, z, W)
     except TypeError as error:
         raise ValueError(f'arrays have to be C-contiguous and of float64: {error}') from error
     if status == -2:

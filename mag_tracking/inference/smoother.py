@@ -1,62 +1,114 @@
-"""The backward pass of the Rauch-Tung-Striebel smoother."""
+"""The backward pass of a smoother, batched over hypotheses.
+
+In the form of Bryson and Frazier: what comes later is carried backwards as a vector l and a
+matrix L, so that a state that was filtered as (x, P) is x + P l given everything, with covariance
+P - P L P. No covariance is inverted, so states that are known exactly, or that are one, need no
+care. Source: Bierman 1973, Fixed interval smoothing with discrete measurements (modified
+Bryson-Frazier), here sensor by sensor as `kalman.update` goes.
+"""
+
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve
+from numba import njit
 
-SMALLEST_PIVOT = 1e-4
-"""Of a covariance at unit diagonal: below it two states are nearly one, and the inverse is that in
-the directions which have a variance."""
+from mag_tracking.inference.kalman import Gains
 
 
-def smooth(filtered, predicted, jacobians):
-    """States given all measurements, from those given the measurements up to each time.
+@dataclass(frozen=True)
+class Step:
+    """What a filter did at one time."""
 
-    Parameters
-    ----------
-    filtered : list of n (x (n_x,), P (n_x, n_x))
-        After the update at each time.
-    predicted : list of n - 1 (x, P)
-        Before the update at each time but the first.
-    jacobians : list of n - 1 (F (n_t, n_t), decay (n_x - n_t,))
-        Of the propagation to each time but the first: of the first n_t states, and the factors
-        of the others, which go each their own way.
+    x: np.ndarray
+    """(n_hyp, n_x) states after the update."""
+    P: np.ndarray
+    """(n_hyp, n_x, n_x) their covariances."""
+    gains: Gains | None
+    """Of the update; None where there was none."""
+    F: np.ndarray | None = None
+    """(n_t, n_t) or (n_hyp, n_t, n_t) Jacobian of the propagation to this time; None at the first
+    one."""
+    decay: np.ndarray | None = None
+    """(n_x - n_t,) what the other states were multiplied by, each on its own; None at the first
+    one."""
 
-    Returns
-    -------
-    list of n (x, P)
 
-    Where a prediction has no variance in some direction nothing is learnt there, and the
-    filtered value stays. Source: Rauch, Tung & Striebel 1965 (fixed interval).
-    """
-    x, P = filtered[-1]
-    out = [(x, P)]
-    for k in range(len(filtered) - 2, -1, -1):
-        x_f, P_f = filtered[k]
-        x_p, P_p = predicted[k]
-        G = _solve(P_p, _propagated(*jacobians[k], P_f)).T
-        x = x_f + G @ (x - x_p)
-        P = P_f + G @ (P - P_p) @ G.T
-        P = 0.5 * (P + P.T)
-        out.append((x, P))
+def smoothed_states(steps):
+    """[(n_hyp, n_x)] states at each of the `steps` given the measurements of all of them."""
+    after, out = np.zeros_like(steps[-1].x), []
+    for step in reversed(steps):
+        out.append(step.x + np.einsum('pik,pk->pi', step.P, after))
+        if step.gains is not None:
+            g = step.gains
+            _adjoint_of_update(after, g.H, g.n_own, g.G, g.z, g.W)
+        if step.F is not None:
+            after = _before(step, after[:, :, None])[:, :, 0]
     return out[::-1]
 
 
-def _propagated(F, decay, P):
-    """blockdiag(F, diag(decay)) P."""
-    n_t = len(F)
-    return np.vstack([F @ P[:n_t], decay[:, None] * P[n_t:]])
+def smoothed_covariances(steps):
+    """[(n_hyp, n_x, n_x)] covariances at each of the `steps`, as `smoothed_states`."""
+    after, out = np.zeros_like(steps[-1].P), []
+    for step in reversed(steps):
+        P = step.P - step.P @ after @ step.P
+        out.append(0.5 * (P + np.swapaxes(P, 1, 2)))
+        if step.gains is not None:
+            after = _information_before_update(after, step.gains)
+        if step.F is not None:
+            after = _before(step, np.swapaxes(_before(step, after), 1, 2))
+    return out[::-1]
 
 
-def _solve(P, B):
-    """P^-1 B, scaled to unit diagonal first: metres and teslas are decades apart."""
-    std = np.sqrt(np.diagonal(P))
-    scale = np.where(std > 0.0, std, 1.0)
-    unit, B = P / np.outer(scale, scale), B / scale[:, None]
-    try:
-        L = np.linalg.cholesky(unit)
-        if np.diagonal(L).min() > SMALLEST_PIVOT:
-            return cho_solve((L, True), B) / scale[:, None]
-    except np.linalg.LinAlgError:
-        pass  # a point among rows: states without variance, or that are one
-    # The rounding of a filter's covariance is near 1e-12 of its diagonal.
-    return np.linalg.pinv(unit, rcond=1e-10, hermitian=True) @ B / scale[:, None]
+def _before(step, after):
+    """Phi' `after` (n_hyp, n_x, m), where Phi is the propagation to `step`."""
+    n_t = step.F.shape[-1]
+    return np.concatenate([np.swapaxes(step.F, -1, -2) @ after[:, :n_t],
+                           step.decay[:, None] * after[:, n_t:]], axis=1)
+
+
+def _information_before_update(after, gains):
+    """(n_hyp, n_x, n_x): `after` carried back over an update, sensor by sensor."""
+    n_sensors, n_t = gains.H.shape[1], gains.H.shape[3] - gains.n_own
+    n_x = after.shape[1]
+    rows, columns = np.tril_indices(3)
+    for j in range(n_sensors - 1, -1, -1):
+        W = np.zeros((len(after), 3, 3))
+        W[:, rows, columns] = gains.W[:, j]
+        H = np.zeros((len(after), 3, n_x))
+        own = n_t + gains.n_own * j
+        H[:, :, :n_t] = gains.H[:, j, :, :n_t]
+        H[:, :, own:own + gains.n_own] = gains.H[:, j, :, n_t:]
+        first = n_x - 3 * (n_sensors - j)
+        H[:, :, first:first + 3] = np.eye(3)
+        # A missing axis has no gain, and tells nothing.
+        H[~gains.G[:, j].any(axis=2)] = 0.0
+        W_H, G = W @ H, gains.G[:, j]
+        back = np.swapaxes(W_H, 1, 2)
+        kept = after - back @ (G @ after)
+        after = kept - (kept @ np.swapaxes(G, 1, 2)) @ W_H + back @ W_H
+    return after
+
+
+@njit('void(float64[:,::1], float64[:,:,:,::1], int64, float64[:,:,:,::1], float64[:,:,::1], '
+      'float64[:,:,::1])', cache=True, error_model='numpy')
+def _adjoint_of_update(after, H, n_own, G, z, W):
+    """`after` (n_hyp, n_x) carried back over an update, in place, sensor by sensor."""
+    n_hyp, n_sensors, n_x = H.shape[0], H.shape[1], after.shape[1]
+    n_t = H.shape[3] - n_own
+    for p in range(n_hyp):
+        for j in range(n_sensors - 1, -1, -1):
+            v0, v1, v2 = z[p, j, 0], z[p, j, 1], z[p, j, 2]
+            for i in range(n_x):
+                v0 -= G[p, j, 0, i] * after[p, i]
+                v1 -= G[p, j, 1, i] * after[p, i]
+                v2 -= G[p, j, 2, i] * after[p, i]
+            u0 = W[p, j, 0] * v0 + W[p, j, 1] * v1 + W[p, j, 3] * v2
+            u1 = W[p, j, 2] * v1 + W[p, j, 4] * v2
+            u2 = W[p, j, 5] * v2
+            for c in range(n_t + n_own):
+                i = c if c < n_t else c + n_own * j
+                after[p, i] += u0 * H[p, j, 0, c] + u1 * H[p, j, 1, c] + u2 * H[p, j, 2, c]
+            first = n_x - 3 * (n_sensors - j)
+            after[p, first] += u0
+            after[p, first + 1] += u1
+            after[p, first + 2] += u2

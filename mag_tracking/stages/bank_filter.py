@@ -69,6 +69,15 @@ class BankFilter:
         It is linearised at `x_lin` (n_hyp, n_x), or if that is left out at the prediction and
         then again as often as the settings say. Returns the log-likelihood (n_hyp,) of the frame.
         """
+        return self._update(bank, frame, dt, x_lin)[0]
+
+    def update_with_gains(self, bank, frame, dt, x_lin=None):
+        """The same, for a backward pass: (log-likelihood (n_hyp,), `kalman.Gains`)."""
+        return self._update(bank, frame, dt, x_lin, lambda H: kalman.Gains.of(
+            H, self.observation.n_own, bank.x.shape[1]))
+
+    def _update(self, bank, frame, dt, x_lin, gains_of=lambda H: None):
+        """Log-likelihood and what `gains_of` the derivative makes, filled."""
         covariance = known_covariance(frame)
         x_prior, P_prior = bank.x.copy(), bank.P.copy()
         iterations = self._settings.iterations if x_lin is None else 1
@@ -80,13 +89,14 @@ class BankFilter:
             lost = ~(np.isfinite(h).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3))
                      & np.isfinite(inflation).all(axis=1))
             h[lost], H[lost], inflation[lost] = 0.0, 0.0, 0.0
+            gains = gains_of(H)
             log_likelihood, bank.nis = kalman.update(
                 bank.x, bank.P, frame.field, h, H, covariance, inflation, x_lin,
-                self.observation.n_own)
+                self.observation.n_own, gains)
             log_likelihood[lost] = -np.inf
             x_lin = bank.x.copy()
         bank.nis[:, np.isnan(frame.field).all(axis=1)] = np.nan
-        return log_likelihood
+        return log_likelihood, gains
 
     def is_strange(self, bank, i, frame):
         """Whether hypothesis `i`, just updated with the `frame`, is contradicted by it."""

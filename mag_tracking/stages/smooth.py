@@ -10,7 +10,7 @@ from copy import copy
 
 import numpy as np
 
-from mag_tracking.inference.smoother import smooth
+from mag_tracking.inference.smoother import Step, smoothed_covariances, smoothed_states
 from mag_tracking.stages.stage import NS
 
 RELINEARISATIONS = 1
@@ -21,7 +21,7 @@ MOST_NUMBERS = 10_000_000
 """Frames times states squared that are smoothed at most: 80 MB, and a few seconds."""
 
 
-def smoothed_states(bank_filter, bank, frames, intervals, updated=False,
+def smoothed_track(bank_filter, bank, frames, intervals, updated=False,
                     relinearisations=RELINEARISATIONS):
     """States of a hypothesis at each frame, given all of them.
 
@@ -53,20 +53,20 @@ def smoothed_states(bank_filter, bank, frames, intervals, updated=False,
 
 def _forth_and_back(bank_filter, bank, frames, intervals, updated, x_lin):
     """One pass of filter and smoother, linearised at `x_lin`; None = at the predictions."""
-    filtered, predicted, jacobians, left_out = [], [], [], 0
+    steps, left_out = [], 0
     for k, (frame, dt) in enumerate(zip(frames, intervals, strict=True)):
-        if k:
-            F, decay = bank_filter.predict(bank, dt)
-            predicted.append((bank.x[0].copy(), bank.P[0].copy()))
-            jacobians.append((F if F.ndim == 2 else F[0], decay))
+        F, decay = bank_filter.predict(bank, dt) if k else (None, None)
+        gains = None
         if k or not updated:
             before = bank.x.copy(), bank.P.copy()
-            bank_filter.update(bank, frame, dt, x_lin[k])
+            _, gains = bank_filter.update_with_gains(bank, frame, dt, x_lin[k])
             if bank_filter.is_strange(bank, 0, frame):
                 bank.x, bank.P = before
+                gains = None
                 left_out += 1
-        filtered.append((bank.x[0].copy(), bank.P[0].copy()))
-    return smooth(filtered, predicted, jacobians), left_out
+        steps.append(Step(bank.x.copy(), bank.P.copy(), gains, F, decay))
+    return [(x[0], P[0]) for x, P in zip(smoothed_states(steps), smoothed_covariances(steps),
+                                         strict=True)], left_out
 
 
 class WholeTrack:
@@ -115,7 +115,7 @@ class WholeTrack:
             return [], 0
         one, row = bank.alone(best), np.flatnonzero(self._origin == bank.origin[best])
         one.x, one.P = self._x[row].copy(), self._P[row].copy()
-        states, left_out = smoothed_states(self._filter, one, self._frames, self._intervals)
+        states, left_out = smoothed_track(self._filter, one, self._frames, self._intervals)
         return [(frame.stamp_ns, x, P) for frame, (x, P), published in zip(
             self._frames, states, self._published, strict=True) if published], left_out
 
@@ -159,5 +159,5 @@ class FixedLag:
         _, _, _, origin, x, P = self._kept[0]
         one, row = bank.alone(best), np.flatnonzero(origin == bank.origin[best])
         one.x, one.P = x[row].copy(), P[row].copy()
-        return smoothed_states(bank_filter, one, [k[0] for k in self._kept],
+        return smoothed_track(bank_filter, one, [k[0] for k in self._kept],
                                [k[1] for k in self._kept], updated=True, relinearisations=0)[0]
