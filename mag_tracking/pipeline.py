@@ -37,6 +37,7 @@ TARGET_DEFAULTS = {
         'track.model_error_time_s': 0.0,
         'track.background_std': 5e-7,
         'track.iterations': 5,
+        'track.relinearise_window_s': 0.0,
         'track.lookback_s': 0.0,
         'track.end_gap_s': 30.0,
         'track.smooth_longest_s': 3600.0,

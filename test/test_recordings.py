@@ -51,8 +51,6 @@ def expected_to_fail(names, reasons):
 
 
 RMS_NOT_REACHED = {
-    'junction_left_to_right': '0.65 m: with 260 A m^2 it is between a small vehicle and a car, and '
-                              'is taken for a larger one that is faster and farther ahead',
     'straight_truck_right': '1.8 m: until its middle has passed, its front is like a car',
 }
 
@@ -75,7 +73,6 @@ def test_cars_are_no_surer_than_they_are_right(vehicle_replays, name):
 
 
 CLOSEST_NOT_REACHED = {
-    'junction_left_to_right': '0.61 m: as above',
     'junction_left_turns_to_rear': '0.61 m, twice what its covariance says: the clocks of the '
                                    'sensors are 21 ms apart',
 }
@@ -100,9 +97,7 @@ def speed_error(vehicle_replays, name):
 
 
 SPEED_NOT_REACHED = {
-    'junction_left_to_right': '+12 %: as above',
     'junction_right_turns_to_rear': '+13 %, in the turn',
-    'straight_car_right': '+10.2 %',
 }
 
 

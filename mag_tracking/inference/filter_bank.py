@@ -84,10 +84,18 @@ class FilterBank:
             - 0.5 * np.einsum('ijk,jkl,ijl->ij', d, np.linalg.inv(P), d)
         return int(rows[np.argmax(log_sum_exp(log_density, axis=1))])
 
+    def copy(self):
+        """The same bank with arrays of its own."""
+        return FilterBank(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
+
+    def rows(self, rows):
+        """A bank of the hypotheses `rows` (n,) int, weighted alike; its arrays are its own."""
+        chosen = {f.name: np.ascontiguousarray(getattr(self, f.name)[rows]) for f in fields(self)}
+        return FilterBank(**{**chosen, 'log_w': np.full(len(rows), -np.log(len(rows)))})
+
     def alone(self, i):
         """A bank of the hypothesis `i` alone; its arrays are its own."""
-        rows = {f.name: getattr(self, f.name)[i:i + 1].copy() for f in fields(self)}
-        return FilterBank(**{**rows, 'log_w': np.zeros(1)})
+        return self.rows(np.array([i]))
 
     def _heaviest(self, kind, rows):
         """Those of `rows` that are of the kind (n_hyp,) which weighs most."""

@@ -7,6 +7,8 @@ hold it constant over a sample, and PHD15 Paper A eq. (18) is misprinted.)
 
 import numpy as np
 
+_INTEGRAL, _RATE = np.arange(3), np.arange(3, 6)
+
 
 def integrator_noise(dt, density):
     """Process noise of a double integrator driven by white noise.
@@ -24,10 +26,15 @@ def integrator_noise(dt, density):
 
     Source: PHD15 Paper A eq. (24), the form that (18) should have.
     """
-    block = np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
-    return np.kron(block, np.diag(np.asarray(density, dtype=float)))
+    Q, density = np.zeros((6, 6)), np.asarray(density, dtype=float)
+    Q[_INTEGRAL, _INTEGRAL] = density * (dt**3 / 3.0)
+    Q[_INTEGRAL, _RATE] = Q[_RATE, _INTEGRAL] = density * (dt**2 / 2.0)
+    Q[_RATE, _RATE] = density * dt
+    return Q
 
 
 def constant_velocity(dt):
     """Transition matrix (6, 6) of position and velocity over `dt` seconds."""
-    return np.kron(np.array([[1.0, dt], [0.0, 1.0]]), np.eye(3))
+    F = np.eye(6)
+    F[_INTEGRAL, _RATE] = dt
+    return F

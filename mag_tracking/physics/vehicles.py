@@ -104,6 +104,14 @@ class RowVehicle:
         d = self.n_dipoles
         return np.linspace(-0.5, 0.5, d) if d > 1 else np.zeros(1)
 
+    @cached_property
+    def _walk(self):
+        """(3 d, 3 d) [1/s] random walk of the hard iron moments, relative to the iron's size."""
+        d = self.n_dipoles
+        mean = np.full((d, d), 1.0 / d)
+        return np.kron(self.moment_drift**2 / d * mean
+                       + self.difference_drift**2 * (np.eye(d) - mean), np.eye(3))
+
     def dipoles(self, x):
         """`n_dipoles` dipoles a hypothesis; see `SourceModel.dipoles`.
 
@@ -125,11 +133,8 @@ class RowVehicle:
         F[:6, :6] = constant_velocity(dt)
         Q = np.zeros((len(x), n, n))
         Q[:, :6, :6] = integrator_noise(dt, self.acceleration_density)
-        mean = np.full((d, d), 1.0 / d)
-        per_dipole = (self.moment_drift**2 / d * mean
-                      + self.difference_drift**2 * (np.eye(d) - mean))
         hard = slice(6, 6 + 3 * d)
         size2 = (np.square(x[:, hard].reshape(-1, d, 3).sum(axis=1)).sum(axis=1)
                  + np.square(x[:, hard.stop]) * (self._induction @ self._induction))
-        Q[:, hard, hard] = size2[:, None, None] * np.kron(per_dipole, np.eye(3)) * abs(dt)
+        Q[:, hard, hard] = size2[:, None, None] * (abs(dt) * self._walk)
         return x @ F.T, F, Q

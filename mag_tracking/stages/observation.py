@@ -69,6 +69,8 @@ class Observation:
     def target_fields(self, x, time_offset):
         """Field of the target alone, at each sensor's own time; see `sensor_fields`."""
         n_hyp, n, n_t = len(x), len(self._positions), self.n_target
+        if not time_offset.any():
+            return sensor_fields(self._positions, self._R_sw, *self._model.dipoles(x[:, :n_t]))
         h, H = np.empty((n_hyp, n, 3)), np.empty((n_hyp, n, 3, n_t))
         gradient = np.empty((n_hyp, n))
         steps = np.round(time_offset / SAME_TIME_S)
@@ -103,8 +105,10 @@ class Observation:
         there as noise.
         """
         h, H, gradient = self.target_fields(x, time_offset)
-        variance = (np.square(near_field_length)[:, None] * gradient**2
-                    + field_error**2 * np.einsum('pji,pji->pj', h, h))
+        # NaN where a dipole is on a sensor, as the field there: also where the length is zero.
+        with np.errstate(invalid='ignore'):
+            variance = (np.square(near_field_length)[:, None] * gradient**2
+                        + field_error**2 * np.einsum('pji,pji->pj', h, h))
         own = self.own(x)
         if self._n_angles:
             h, H = turned_fields(h, H, np.ascontiguousarray(own[..., :3]))

@@ -21,6 +21,7 @@ from mag_tracking.stages.pose import (
     smoothed_pose,
     vehicle_orientation,
 )
+from mag_tracking.stages.relinearise import Relinearisation
 from mag_tracking.stages.smooth import FixedLag, WholeTrack
 from mag_tracking.stages.stage import NS
 from mag_tracking.stages.vehicle_start import VehicleSettings, start_vehicle, vehicle_model
@@ -57,6 +58,15 @@ class TrackSettings:
         '', (1e-300, 0.5), live=True)
     most_hypotheses: int = param(
         600, 'No more than the heaviest so many are kept.', '', (1, 100000), live=True)
+    relinearise_window_s: float = param(
+        2.0, 'While a track runs, its leading hypotheses are linearised anew along what is now '
+        'known of their path, over the latest frames of once to twice so much time. 0 = never, '
+        'which is several times faster.', 's', (0.0, 60.0))
+    relinearise_interval_s: float = param(
+        0.15, 'How often that is done; each time takes about a millisecond for each frame of the '
+        'window.', 's', (0.0, 60.0))
+    relinearise_most: int = param(
+        20, 'For how many hypotheses it is done at most.', '', (1, 100000))
     lookback_s: float = param(
         1.0, 'A track begins so long before its detection, with the frames kept since: what is '
         'too weak to detect still tells where the target came from.', 's', (0.0, 60.0))
@@ -118,6 +128,8 @@ class TrackStage:
                                 f'got {settings.target!r}')
         self._filter = BankFilter(network, self._model, settings)
         self._whole = WholeTrack(settings.smooth_longest_s)
+        self._anew = Relinearisation(settings.relinearise_interval_s, settings.relinearise_window_s,
+                                     settings.relinearise_most)
         self._lag = FixedLag(settings.smoothing_lag_s) if settings.smoothing_lag_s else None
         self._next_id = 1
         self._bank = None
@@ -134,6 +146,8 @@ class TrackStage:
         """Take new values of the live settings; the running bank goes on with them."""
         self._settings = settings
         self._filter.configure(settings)
+        if self._bank is not None and settings.relinearise_window_s:
+            self._anew.begin(self._bank, updated=True)
 
     @property
     def bank(self):
@@ -198,6 +212,8 @@ class TrackStage:
         if recent:
             self._filter.predict(self._bank, (recent[0].stamp_ns - frame.stamp_ns) / NS)
         self._whole.begin(self._bank, self._filter)
+        if s.relinearise_window_s:
+            self._anew.begin(self._bank)
         dt = 0.0
         for before, after in pairwise([*recent, frame]):
             self._step(before, dt, publish=False)
@@ -211,6 +227,7 @@ class TrackStage:
             return []
         if dt > 0.0:
             self._filter.predict(bank, dt)
+        predicted = bank.x.copy()
         log_likelihood = self._filter.update(bank, frame, dt)
         evidence = bank.reweight(log_likelihood)
         if not np.isfinite(evidence):
@@ -218,8 +235,12 @@ class TrackStage:
             return self._end('no hypothesis explains the field')
         self._log_odds += evidence - self._no_target.log_density(
             frame, dt, self._settings.background_drift)
+        self._anew.add(bank, predicted, log_likelihood, frame, dt)
         self.counts['hypotheses dropped'] += bank.prune(
             -np.log(self._settings.prune_ratio), self._settings.most_hypotheses)
+        tried, in_vain = self._anew.improve(self._filter, bank)
+        self.counts['paths linearised anew'] += tried
+        self.counts['paths linearised anew in vain'] += in_vain
         best = bank.best()
         self._whole.add(bank, frame, dt, publish)
         late = [] if self._lag is None else self._smoothed(best, False, self._lag.smoothed(
@@ -289,6 +310,7 @@ class TrackStage:
         last, self._last = self._last, None
         smoothed = [] if last is None else self._smoothed_at_the_end()
         self._whole.clear()
+        self._anew.clear()
         if self._lag is not None:
             self._lag.clear()
         self._bank = None

@@ -1,9 +1,9 @@
 """`make bench`: the tracker's bank on targets that are as it believes, against the path bound.
 
 Truths are drawn from a wide prior, moved with the process noise of the model and measured with
-the noise of the sensors; a point, and a row of three dipoles. The bank starts as the tracker's
-does, from the first frame. The bound is the covariance of a filter that is linearised at the truth
-and starts with the covariance of that prior.
+the noise of the sensors; a point, and a row of three dipoles. The tracker starts at the first
+frame. The bound is the covariance of a filter that is linearised at the truth and starts with the
+covariance of that prior.
 """
 
 import os
@@ -11,6 +11,7 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
+from scipy.linalg import block_diag
 from tqdm import tqdm
 
 from mag_tracking.inference.crlb import path_bound
@@ -18,8 +19,9 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import sensor_fields
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import FieldFrame
-from mag_tracking.stages.bank_filter import BankFilter
-from mag_tracking.stages.vehicle_start import start_vehicle, vehicle_model
+from mag_tracking.stages.stage import NS
+from mag_tracking.stages.track import TrackStage
+from mag_tracking.stages.vehicle_start import vehicle_model
 
 PERIOD, SIGMA, STEPS = 0.08, 1.2e-8 / np.sqrt(8.0), 26
 NETWORK = SensorNetwork(
@@ -27,6 +29,7 @@ NETWORK = SensorNetwork(
     np.tile(np.eye(3), (2, 1, 1)), ('/mag_1/imu/mag', '/mag_2/imu/mag'),
     earth_field=np.array([2e-6, 1.55e-5, -4.9e-5]))
 MATCHED = {'track.mounting_std_deg': 0.0, 'track.model_error_time_s': 0.0,
+           'track.end_std': 1e6, 'track.end_nis': 1e12,
            'track.field_error': 0.0, 'track.vehicle.near_field_lengths': [0.0],
            'track.vehicle.kinds': ['car'], 'track.vehicle.moments': [400.0],
            'track.vehicle.moment_stds': [150.0], 'track.vehicle.heights': [0.5],
@@ -62,39 +65,39 @@ def prior_of(settings, n_t):
     return x, P
 
 
+def truths(model, settings, rng):
+    """A truth drawn from the prior at each step (n_x,), and what the bound wants: F, Q (lists)."""
+    n_t = len(model.state_names)
+    x0, P0 = prior_of(settings, n_t)
+    states, F, Q = [rng.multivariate_normal(x0, P0, method='eigh')], [np.eye(n_t + 6)], []
+    Q.append(np.zeros((n_t + 6, n_t + 6)))
+    walk = settings.background_drift**2 * PERIOD * np.eye(6)
+    for _ in range(STEPS - 1):
+        moved, F_t, Q_t = model.propagate(states[-1][None, :n_t], PERIOD)
+        F.append(block_diag(F_t, np.eye(6)))
+        Q.append(block_diag(Q_t[0], walk))
+        states.append(np.append(moved[0], states[-1][n_t:])
+                      + rng.multivariate_normal(np.zeros(n_t + 6), Q[-1], method='eigh'))
+    return states, F, Q
+
+
 def one_run(target, seed):
     """(error [m], bound [m]) in the plane at each step."""
     settings = settings_for('vehicle', TARGETS[target]).track
-    model = vehicle_model(settings.vehicle, NETWORK)
-    filter_, bank, rng = BankFilter(NETWORK, model, settings), None, np.random.default_rng(seed)
+    model, rng = vehicle_model(settings.vehicle, NETWORK), np.random.default_rng(seed)
     n_t = len(model.state_names)
-    x0, P0 = prior_of(settings, n_t)
-    truth = rng.multivariate_normal(x0, P0, method='eigh')
-    errors, F, Q, H = [], [], [], []
-    for k in range(STEPS):
-        if k:
-            moved, F_t, Q_t = model.propagate(truth[None, :n_t], PERIOD)
-            walk = settings.background_drift**2 * PERIOD * np.eye(6)
-            F.append(np.block([[F_t, np.zeros((n_t, 6))], [np.zeros((6, n_t)), np.eye(6)]]))
-            Q.append(np.block([[Q_t[0], np.zeros((n_t, 6))], [np.zeros((6, n_t)), walk]]))
-            truth = np.append(moved[0], truth[n_t:]) + rng.multivariate_normal(
-                np.zeros(n_t + 6), Q[-1], method='eigh')
-            filter_.predict(bank, PERIOD)
-        else:
-            F.append(np.eye(n_t + 6))
-            Q.append(np.zeros((n_t + 6, n_t + 6)))
+    states, F, Q = truths(model, settings, rng)
+    stage, errors, H = TrackStage(NETWORK, settings), [], []
+    for k, truth in enumerate(states):
         h, H_t, _ = sensor_fields(NETWORK.positions, NETWORK.R_sw,
                                   *model.dipoles(truth[None, :n_t]))
         H.append(np.hstack([H_t[0].reshape(6, n_t), np.eye(6)]))
         y = h[0] + truth[n_t:].reshape(2, 3) + SIGMA * rng.standard_normal((2, 3))
-        frame = FieldFrame(k, y, np.tile(SIGMA**2 * np.eye(3), (2, 1, 1)), np.full(2, 8),
-                           np.zeros(2), True)
-        if bank is None:
-            bank = start_vehicle(settings.vehicle, NETWORK, frame, settings.background_std, ())
-        bank.reweight(filter_.update(bank, frame, PERIOD if k else 0.0))
-        bank.prune(-np.log(settings.prune_ratio), settings.most_hypotheses)
-        errors.append(np.linalg.norm((bank.x[bank.best()] - truth)[:2]))
-    bound = path_bound(np.array(F), np.array(Q), np.array(H), SIGMA**2 * np.eye(6), P0)
+        stage.feed(FieldFrame(round(k * PERIOD * NS), y, np.tile(SIGMA**2 * np.eye(3), (2, 1, 1)),
+                              np.full(2, 8), np.zeros(2), True))
+        errors.append(np.linalg.norm((stage.bank.x[stage.bank.best()] - truth)[:2]))
+    bound = path_bound(np.array(F), np.array(Q), np.array(H), SIGMA**2 * np.eye(6),
+                       prior_of(settings, n_t)[1])
     return np.array(errors), np.sqrt(bound[:, 0, 0] + bound[:, 1, 1])
 
 
