@@ -94,12 +94,12 @@ class Relinearisation:
         paths = [path[rows] for path in self._paths]
         for _ in range(PASSES):
             last, log_likelihood, new = self._pass(bank_filter, rows, paths)
-            moved, paths = _largest_move(paths, new), [x for x, _ in new]
-        finite = np.isfinite(log_likelihood) & np.isfinite(moved)
+            settled, paths = _settled(paths, new), [x for x, _ in new]
+        finite = np.isfinite(log_likelihood) & np.isfinite(paths).all(axis=(0, 2))
         for path, improved in zip(self._paths, paths, strict=True):
             path[rows[finite]] = improved[finite]
         filtered = np.sum(self._log_likelihoods[int(self._updated):], axis=0)[rows]
-        taken = finite & (moved < SETTLED) & (log_likelihood >= filtered)
+        taken = finite & settled & (log_likelihood >= filtered)
         bank.x[leading[taken]], bank.P[leading[taken]] = last.x[taken], last.P[taken]
         return len(taken), int(np.count_nonzero(~taken))
 
@@ -140,7 +140,7 @@ class Relinearisation:
         return steps[-1], log_likelihood, list(zip(smoothed_states(steps), std, strict=True))
 
 
-def _largest_move(paths, new):
-    """(n_rows,) largest distance of the `new` [(states, deviation)] from `paths`, in deviations."""
-    return np.max([np.linalg.norm((x - path)[:, :3], axis=1) / std
+def _settled(paths, new):
+    """(n_rows,) whether the `new` [(states, deviation of the position)] are where `paths` are."""
+    return np.all([np.linalg.norm((x - path)[:, :3], axis=1) <= SETTLED * std
                    for path, (x, std) in zip(paths, new, strict=True)], axis=0)
