@@ -26,6 +26,11 @@ SETTLED = 0.3
 anywhere."""
 
 
+MOST_FRAMES = 64
+"""The window is shorter where it would hold more than half of these: at 100 frames a second a window
+of seconds would take more than a core."""
+
+
 class Relinearisation:
     """The latest frames of a running track, and the path of each hypothesis through them."""
 
@@ -105,11 +110,12 @@ class Relinearisation:
 
     def _move_on(self, bank_filter, bank):
         """Once the frames are of twice the window, the anchor moves to where the window begins."""
-        now = self._frames[-1].stamp_ns
-        if now - self._frames[0].stamp_ns <= 2 * self._window_ns:
+        now, n_frames = self._frames[-1].stamp_ns, len(self._frames)
+        if now - self._frames[0].stamp_ns <= 2 * self._window_ns and n_frames <= MOST_FRAMES:
             return
         self._keep(np.isin(self._anchor.origin, bank.origin))
-        n = next(k for k, f in enumerate(self._frames) if now - f.stamp_ns <= self._window_ns)
+        n = next(k for k, f in enumerate(self._frames) if now - f.stamp_ns <= self._window_ns
+                 and n_frames - k <= MOST_FRAMES // 2)
         for k in range(n + 1):
             self._forward(bank_filter, self._anchor, k, self._paths[k])
         self._frames, self._intervals = self._frames[n:], self._intervals[n:]
