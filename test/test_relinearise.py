@@ -1,5 +1,6 @@
 """Linearising anew: a linear target, a batch fit as the oracle, and the error over its bound."""
 
+from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 
@@ -22,19 +23,30 @@ from mag_tracking.stages.track import TrackStage
 from mag_tracking.stages.vehicle_start import vehicle_model
 
 N_T, PERIOD = 3, 0.08
+LATE = 22.5 * PERIOD
+"""[s] Done so often it is done once in 24 frames, with the last of them."""
 
 
 class LinearFilter:
     """As a `BankFilter`, of a target whose field is linear in its states; one sensor."""
 
-    F = np.array([[1.0, PERIOD, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    Q = np.diag([0.01, 0.02, 0.03])
+    better = 0.0
+    """What is added to the log-likelihood where it is told where to linearise."""
+
+    def __init__(self):
+        self.lengths = [0]
+        self.origins = set()
 
     def predict(self, bank, dt):
-        kalman.predict(bank.x, bank.P, bank.x[:, :N_T] @ self.F.T, self.F, self.Q, 0.01)
-        return self.F, np.ones(3)
+        F = np.array([[1.0, dt, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        kalman.predict(bank.x, bank.P, bank.x[:, :N_T] @ F.T, F, np.diag([0.1, 0.2, 0.3]) * dt,
+                       0.1 * dt)
+        return F, np.ones(3)
 
     def update_with_gains(self, bank, frame, dt, x_lin=None):
+        better = 0.0 if x_lin is None else self.better
+        self.lengths[-1] += x_lin is not None
+        self.origins |= set() if x_lin is None else set(bank.origin)
         x_lin = bank.x.copy() if x_lin is None else x_lin
         H = np.tile(np.random.default_rng(frame.stamp_ns).standard_normal((3, N_T)),
                     (len(bank), 1, 1, 1))
@@ -42,38 +54,87 @@ class LinearFilter:
         log_likelihood, bank.nis = kalman.update(
             bank.x, bank.P, frame.field, np.einsum('pjai,pi->pja', H, x_lin[:, :N_T]), H,
             frame.covariance, np.zeros((len(bank), 1)), x_lin, gains=gains)
-        return log_likelihood, gains
+        return log_likelihood + better, gains
 
 
-@pytest.mark.parametrize('window_s', [0.1, 0.5, 60.0])
-@pytest.mark.parametrize('interval_s', [0.0, 0.3])
-def test_where_all_is_linear_nothing_changes(window_s, interval_s):
-    """However often and over however many frames it is done, and while hypotheses go."""
-    rng, filter_ = np.random.default_rng(0), LinearFilter()
+def followed_beside_plain(filter_, anew, n=40, anew_at=(), prune=True):
+    """(bank, the same by the filter alone, Counter) after `n` frames, a gap among them."""
+    rng, counts, stamp_ns = np.random.default_rng(0), Counter(), 0
     bank = FilterBank.of_targets(rng.standard_normal((12, N_T)), np.tile(np.eye(N_T), (12, 1, 1)),
                                  np.zeros(12, dtype=int), 1, 1.0)
-    plain, anew, taken = bank.copy(), Relinearisation(interval_s, window_s, 5), 0
+    plain = bank.copy()
     anew.begin(bank)
-    for k in range(30):
-        frame = FieldFrame(round(k * PERIOD * NS), 3.0 * rng.standard_normal((1, 3)),
-                           np.eye(3)[None], np.full(1, 8), np.zeros(1), True)
+    for k in range(n):
+        dt = (1.7 if k == 20 else rng.choice([0.05, 0.08, 0.2])) if k else 0.0
+        stamp_ns += round(dt * NS)
+        frame = FieldFrame(stamp_ns, 3.0 * rng.standard_normal((1, 3)), np.eye(3)[None],
+                           np.full(1, 8), np.zeros(1), True)
         for b in (plain, bank):
             if k:
-                filter_.predict(b, PERIOD)
+                filter_.predict(b, dt)
             predicted = b.x.copy()
-            log_likelihood, _ = filter_.update_with_gains(b, frame, PERIOD)
+            log_likelihood, _ = filter_.update_with_gains(b, frame, dt)
             b.reweight(log_likelihood)
-        anew.add(bank, predicted, log_likelihood, frame, PERIOD if k else 0.0)
-        if k % 4 == 3:
-            mask = rng.uniform(size=len(bank)) < 0.8
+        if k in anew_at:
+            anew.begin_anew()
+        anew.add(bank, predicted, log_likelihood, frame, dt)
+        if prune and k % 6 == 3:
+            mask = np.append(True, rng.uniform(size=len(bank) - 1) < 0.8)
             plain.keep(mask)
             bank.keep(mask)
-        tried, in_vain = anew.improve(filter_, bank)
-        taken += tried - in_vain
+        filter_.lengths.append(0)
+        counts.update(anew.improve(filter_, bank))
         np.testing.assert_allclose(bank.x, plain.x, rtol=0, atol=1e-9)
         np.testing.assert_allclose(bank.P, plain.P, rtol=0, atol=1e-9)
     np.testing.assert_allclose(bank.log_w, plain.log_w, rtol=0, atol=1e-9)
-    assert taken > 5
+    return bank, plain, counts
+
+
+@pytest.mark.parametrize('window_s', [1e-9, 0.1, 0.5, 60.0])
+@pytest.mark.parametrize('interval_s', [0.0, 0.3])
+@pytest.mark.parametrize('anew_at', [(), (10, 11, 30)])
+def test_where_all_is_linear_nothing_changes(window_s, interval_s, anew_at):
+    """However often and over however many frames it is done, and while hypotheses go."""
+    filter_ = LinearFilter()
+    filter_.better = 1e-6  # or rounding decides what is taken
+    _, _, counts = followed_beside_plain(
+        filter_, Relinearisation(interval_s, window_s, 5), anew_at=anew_at)
+    if window_s > 0.1:
+        assert counts[relinearise.TRIED] > counts[relinearise.IN_VAIN] == 0
+
+
+def test_what_explains_the_frames_worse_is_not_taken():
+    filter_ = LinearFilter()
+    filter_.better = -1e-6
+    bank, plain, counts = followed_beside_plain(filter_, Relinearisation(0.0, 0.5, 5))
+    assert counts[relinearise.TRIED] == counts[relinearise.IN_VAIN] > 50
+    np.testing.assert_array_equal(bank.x, plain.x)
+
+
+@pytest.mark.parametrize('window_s, most_frames', [(0.5, 64), (60.0, 10)])
+def test_it_is_done_over_twice_the_window_at_most(monkeypatch, window_s, most_frames):
+    """Frames are 0.05 s apart or more; beside the passes the anchor moves over half of them."""
+    monkeypatch.setattr(relinearise, 'MOST_FRAMES', most_frames)
+    filter_ = LinearFilter()
+    followed_beside_plain(filter_, Relinearisation(0.0, window_s, 5), n=90)
+    frames = min(2 * round(window_s / 0.05), most_frames) + 1
+    assert relinearise.PASSES * 5 < max(filter_.lengths) <= (relinearise.PASSES + 1) * frames
+
+
+@pytest.mark.parametrize('most, affordable', [(1, 10**9), (5, 6**2 * 40)])
+def test_it_is_done_for_the_heaviest(monkeypatch, most, affordable):
+    """And for fewer where many states make it expensive: here for one over forty frames."""
+    monkeypatch.setattr(relinearise, 'MOST_NUMBERS', affordable)
+    filter_ = LinearFilter()
+    bank, *_ = followed_beside_plain(filter_, Relinearisation(60.0, 60.0, most), prune=False)
+    anew = Relinearisation(0.0, 60.0, most)
+    anew.begin(bank)
+    assert not filter_.origins
+    frame = FieldFrame(10**12, np.zeros((1, 3)), np.eye(3)[None], np.full(1, 8), np.zeros(1), True)
+    for _ in range(40):
+        anew.add(bank, bank.x.copy(), np.zeros(len(bank)), frame, 0.1)
+    assert anew.improve(filter_, bank)[relinearise.TRIED] == 1
+    assert filter_.origins == {bank.origin[np.argmax(bank.log_w)]}
 
 
 STILL = {**matched.TARGETS['point'], 'track.vehicle.acceleration': 0.0,
@@ -94,7 +155,7 @@ def fields_along(model, network, x0, n):
 
 
 def followed(filter_, bank, y, anew):
-    """`bank` through the measurements `y` (n, n_sensors, 3); (tried, in vain) of the last one."""
+    """`bank` through the measurements `y` (n, n_sensors, 3); (tried, in vain) with the last one."""
     anew.begin(bank)
     for k, field in enumerate(y):
         if k:
@@ -104,8 +165,8 @@ def followed(filter_, bank, y, anew):
                            np.tile(matched.SIGMA**2 * np.eye(3), (2, 1, 1)), np.full(2, 8),
                            np.zeros(2), True)
         anew.add(bank, predicted, filter_.update(bank, frame, dt), frame, dt)
-        tried = anew.improve(filter_, bank)
-    return tried
+        counts = anew.improve(filter_, bank)
+    return counts[relinearise.TRIED], counts[relinearise.IN_VAIN]
 
 
 def still_target(n):
@@ -142,16 +203,16 @@ def test_it_settles_where_a_batch_fit_does():
     assert np.abs((plain.x[0] - expected) / std).max() > 0.2
 
 
-def test_what_is_of_no_use_stays_as_it_was(monkeypatch):
-    filter_, bank_of, y, _ = still_target(12)
-    expected = bank_of(2)
-    followed(filter_, expected, y, Relinearisation(60.0, 60.0, 2))
-    for name, value in (('SETTLED', -1.0), ('PASSES', 1)):
-        monkeypatch.setattr(relinearise, name, value)
-    bank = bank_of(2)
-    assert followed(filter_, bank, y, Relinearisation(0.0, 60.0, 2)) == (2, 2)
-    np.testing.assert_array_equal(bank.x, expected.x)
-    np.testing.assert_array_equal(bank.P, expected.P)
+def test_what_has_not_settled_is_not_taken(monkeypatch):
+    """One step from where the filter linearised is too far; after some more it has."""
+    filter_, bank_of, y, _ = still_target(24)
+    expected, bank = bank_of(1), bank_of(1)
+    followed(filter_, expected, y, Relinearisation(60.0, 60.0, 1))
+    for passes, in_vain in ((1, 1), (8, 0)):
+        monkeypatch.setattr(relinearise, 'PASSES', passes)
+        bank = bank_of(1)
+        assert followed(filter_, bank, y, Relinearisation(LATE, 60.0, 1)) == (1, in_vain)
+        assert np.array_equal(bank.x, expected.x) == bool(in_vain)
 
 
 def test_a_path_over_a_sensor_is_of_no_use():
@@ -184,7 +245,7 @@ def test_settings_changed_in_mid_track_begin_it_anew():
         Path(np.array([-70.0, -1.2]), 0.0, 10.0), 100.0, 12.0, np.random.default_rng(1))
     pipeline = Pipeline(network, settings)
     frames = [r for s in samples for r in pipeline.feed(s) if isinstance(r, FieldFrame)]
-    stage, errors = TrackStage(network, settings.track), []
+    stage, errors, before = TrackStage(network, settings.track), [], None
     for frame in frames:
         for r in stage.feed(frame):
             if isinstance(r, Track) and not r.ended:
@@ -192,5 +253,6 @@ def test_settings_changed_in_mid_track_begin_it_anew():
                 errors.append(np.hypot(*(r.position[:2] - true)))
                 if len(errors) == 15:
                     stage.configure(settings.track)
-    assert stage.counts['paths linearised anew'] > stage.counts['paths linearised anew in vain'] > 0
+                    before = stage.counts[relinearise.TRIED] - stage.counts[relinearise.IN_VAIN]
+    assert stage.counts[relinearise.TRIED] - stage.counts[relinearise.IN_VAIN] > before > 0
     assert max(errors[15:]) < 1.5

@@ -259,13 +259,18 @@ def test_a_fixed_lag_gives_every_pose_once_when_its_time_has_come():
     np.testing.assert_array_equal([t.position for t in live], [t.position for t in plain])
 
 
+def pass_of(body, seed=0):
+    """(network, samples, times, positions) of a straight pass at 10 m/s."""
+    network = line_network(2, tilt=0.0)
+    return network, *simulate(network, body, Path(np.array([-70.0, -1.2]), 0.0, 10.0), 100.0, 12.0,
+                              np.random.default_rng(seed))[:3]
+
+
 def test_smoothing_can_be_left_out_and_what_is_too_long_is_counted():
     body = point_body([250.0, -150.0, 80.0], 4.0, 0.5)
     none, _ = run(body, {**POINT, 'track.smooth_longest_s': 0.0})
     assert not [r for r in none if isinstance(r, SmoothedPose)]
-    network = line_network(2, tilt=0.0)
-    samples, *_ = simulate(network, body, Path(np.array([-70.0, -1.2]), 0.0, 10.0), 100.0, 12.0,
-                           np.random.default_rng(0))
+    network, samples, _, _ = pass_of(body)
     pipeline = Pipeline(network, settings_for('vehicle', {
         **POINT, 'track.smooth_longest_s': 1.0}))
     records = [r for s in samples for r in pipeline.feed(s)] + pipeline.flush()
@@ -276,10 +281,7 @@ def test_smoothing_can_be_left_out_and_what_is_too_long_is_counted():
 
 def test_missing_frames_are_bridged():
     """Half a second without a measurement in the middle of a pass: smoothed from both sides."""
-    body = point_body([250.0, -150.0, 80.0], 4.0, 0.5)
-    network = line_network(2, tilt=0.0)
-    samples, t, position, _ = simulate(network, body, Path(np.array([-70.0, -1.2]), 0.0, 10.0),
-                                       100.0, 12.0, np.random.default_rng(0))
+    network, samples, t, position = pass_of(point_body([250.0, -150.0, 80.0], 4.0, 0.5))
     pipeline = Pipeline(network, settings_for('vehicle', POINT))
     stage = TrackStage(network, settings_for('vehicle', POINT).track)
     out = []
@@ -312,10 +314,8 @@ def spiked(stage, frames, at, size, n=1):
 @pytest.mark.parametrize('size', [1e-6, 1e-5, 1e-3])
 def test_a_frame_that_contradicts_the_track_does_not_bend_it(size):
     """One spike, long after the pass: what is known of the pass stays as it is."""
-    network = line_network(2, tilt=0.0)
-    samples, t, position, _ = simulate(
-        network, random_vehicle(np.random.default_rng(1), length=4.0),
-        Path(np.array([-70.0, -1.2]), 0.0, 10.0), 100.0, 12.0, np.random.default_rng(1))
+    network, samples, t, position = pass_of(
+        random_vehicle(np.random.default_rng(1), length=4.0), seed=1)
     pipeline = Pipeline(network, settings_for('vehicle'))
     frames = [r for s in samples for r in pipeline.feed(s) if isinstance(r, FieldFrame)]
     at = int(np.argmin([abs(np.interp(f.stamp_ns / 1e9, t, position[:, 0]) - 12.0)
@@ -334,10 +334,7 @@ def test_a_frame_that_contradicts_the_track_does_not_bend_it(size):
 
 
 def test_a_track_that_was_lost_is_smoothed_with_a_doubt():
-    network = line_network(2, tilt=0.0)
-    samples, *_ = simulate(network, point_body([250.0, -150.0, 80.0], 4.0, 0.5),
-                           Path(np.array([-70.0, -1.2]), 0.0, 10.0), 100.0, 12.0,
-                           np.random.default_rng(1))
+    network, samples, _, _ = pass_of(point_body([250.0, -150.0, 80.0], 4.0, 0.5), seed=1)
     pipeline = Pipeline(network, settings_for('vehicle'))
     frames = [r for s in samples for r in pipeline.feed(s) if isinstance(r, FieldFrame)]
     first = next(k for k, f in enumerate(frames) if f.target_present)

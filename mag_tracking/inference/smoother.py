@@ -34,7 +34,22 @@ class Step:
 
 
 def smoothed_states(steps):
-    """[(n_hyp, n_x)] states at each of the `steps` given the measurements of all of them."""
+    """States at each time given the measurements of all times.
+
+    Parameters
+    ----------
+    steps : list of Step
+        In the order of time. Where one has no gains nothing was measured.
+
+    Returns
+    -------
+    list of (n_hyp, n_x)
+
+    Raises ValueError where the gains are not of as many hypotheses and states as the steps.
+    """
+    for step in steps:
+        if step.gains is not None and step.gains.G.shape[::3] != step.x.shape:
+            raise ValueError(f'gains {step.gains.G.shape} of states {step.x.shape}')
     after, out = np.zeros_like(steps[-1].x), []
     for step in reversed(steps):
         out.append(step.x + np.einsum('pik,pk->pi', step.P, after))
@@ -47,7 +62,7 @@ def smoothed_states(steps):
 
 
 def smoothed_covariances(steps):
-    """[(n_hyp, n_x, n_x)] covariances at each of the `steps`, as `smoothed_states`."""
+    """[(n_hyp, n_x, n_x)] covariances at each of the `steps`; see `smoothed_states`."""
     after, out = np.zeros_like(steps[-1].P), []
     for step in reversed(steps):
         P = step.P - step.P @ after @ step.P

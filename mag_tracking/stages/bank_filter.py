@@ -73,11 +73,10 @@ class BankFilter:
 
     def update_with_gains(self, bank, frame, dt, x_lin=None):
         """The same, for a backward pass: (log-likelihood (n_hyp,), `kalman.Gains`)."""
-        return self._update(bank, frame, dt, x_lin, lambda H: kalman.Gains.of(
-            H, self.observation.n_own, bank.x.shape[1]))
+        return self._update(bank, frame, dt, x_lin, wants_gains=True)
 
-    def _update(self, bank, frame, dt, x_lin, gains_of=lambda H: None):
-        """Log-likelihood and what `gains_of` the derivative makes, filled."""
+    def _update(self, bank, frame, dt, x_lin, wants_gains=False):
+        """Log-likelihood (n_hyp,), and the `kalman.Gains` or None."""
         covariance = known_covariance(frame)
         x_prior, P_prior = bank.x.copy(), bank.P.copy()
         iterations = self._settings.iterations if x_lin is None else 1
@@ -89,7 +88,8 @@ class BankFilter:
             lost = ~(np.isfinite(h).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3))
                      & np.isfinite(inflation).all(axis=1))
             h[lost], H[lost], inflation[lost] = 0.0, 0.0, 0.0
-            gains = gains_of(H)
+            gains = kalman.Gains.of(H, self.observation.n_own, bank.x.shape[1]) \
+                if wants_gains else None
             log_likelihood, bank.nis = kalman.update(
                 bank.x, bank.P, frame.field, h, H, covariance, inflation, x_lin,
                 self.observation.n_own, gains)

@@ -10,6 +10,8 @@ Its weight stays: those of hypotheses that are done again and of others could no
 Source: Bell 1994, The iterated Kalman smoother as a Gauss-Newton method.
 """
 
+from collections import Counter
+
 import numpy as np
 
 from mag_tracking.inference.smoother import Step, smoothed_states
@@ -26,9 +28,15 @@ SETTLED = 0.3
 anywhere."""
 
 
+TRIED, IN_VAIN = 'paths linearised anew', 'paths linearised anew in vain'
+"""What is counted."""
+
 MOST_FRAMES = 64
-"""The window is shorter where it would hold more than half of these: at 100 frames a second a window
-of seconds would take more than a core."""
+"""The window is shorter where it would hold more than half of these: at 100 frames a second one of
+seconds would take more than a core."""
+
+MOST_NUMBERS = 5_000_000
+"""Frames times hypotheses times states squared: with many sensors it is done for fewer of them."""
 
 
 class Relinearisation:
@@ -42,25 +50,33 @@ class Relinearisation:
         """Nothing is kept: no track is running."""
         self._anchor = None
 
-    def begin(self, bank, updated=False):
-        """A track begins with `bank`, before its first frame, or goes on with it (`updated`).
+    def begin(self, bank):
+        """A track begins with the `FilterBank`, which is not yet updated with its first frame.
 
-        The bank is the anchor: where the passes start from.
+        A copy of it is the anchor: where the passes start from.
         """
-        self._anchor, self._updated = bank.copy(), updated
+        self._anchor, self._updated = bank.copy(), False
         self._frames, self._intervals = [], []
         # At each frame, and of each hypothesis of the anchor: where it is linearised, and the
         # log-likelihood that the filter gave it.
         self._paths, self._log_likelihoods = [], []
-        self._last_ns = None
+        self._last_ns, self._stale = None, False
+
+    def begin_anew(self):
+        """The filter has changed: what it did before the next frame is not to be done again."""
+        self._stale = self._anchor is not None
 
     def add(self, bank, predicted, log_likelihood, frame, dt):
-        """A frame was used, `dt` [s] after the one before.
+        """The `FilterBank` was updated with a `FieldFrame`, `dt` [s] after the one before.
 
-        `log_likelihood` (n_hyp,) of it, linearised at the states `predicted` (n_hyp, n_x).
+        `log_likelihood` (n_hyp,) of it, linearised at the states `predicted` (n_hyp, n_x); where
+        the filter iterates its updates that is not quite where it ended.
         """
         if self._anchor is None:
             return
+        if self._stale:
+            self.begin(bank)
+            self._updated = True
         if len(bank) < len(self._anchor) // 2:
             self._keep(np.isin(self._anchor.origin, bank.origin))
         rows = self._rows(bank)
@@ -84,17 +100,18 @@ class Relinearisation:
         self._log_likelihoods = [of_frame[mask] for of_frame in self._log_likelihoods]
 
     def improve(self, bank_filter, bank):
-        """Linearise the leading hypotheses of `bank` anew, in place, if it is time to.
+        """Linearise the leading hypotheses of the `FilterBank` anew, in place, if it is time to.
 
-        Returns how many it was tried for, and for how many it was of no use: these stay as they
-        were.
+        By the `BankFilter` that it is moved with. Returns a Counter of those it was tried for, and
+        of those for which it was of no use: they stay as they were.
         """
         if self._anchor is None or self._frames[-1].stamp_ns - self._last_ns < self._interval_ns:
-            return 0, 0
+            return Counter()
         self._last_ns = self._frames[-1].stamp_ns
         self._move_on(bank_filter, bank)
-        leading = np.flatnonzero(bank.log_w >= bank.log_w.max() - LEADING)
-        leading = leading[np.argsort(-bank.log_w[leading], kind='stable')][:self._most]
+        if self._updated and len(self._frames) == 1:
+            return Counter()
+        leading = self._leading(bank)
         rows = self._rows(bank)[leading]
         paths = [path[rows] for path in self._paths]
         for _ in range(PASSES):
@@ -106,7 +123,14 @@ class Relinearisation:
         filtered = np.sum(self._log_likelihoods[int(self._updated):], axis=0)[rows]
         taken = finite & settled & (log_likelihood >= filtered)
         bank.x[leading[taken]], bank.P[leading[taken]] = last.x[taken], last.P[taken]
-        return len(taken), int(np.count_nonzero(~taken))
+        return Counter({TRIED: len(taken), IN_VAIN: int(np.count_nonzero(~taken))})
+
+    def _leading(self, bank):
+        """Rows of the heaviest hypotheses, as many as it is done for."""
+        affordable = MOST_NUMBERS // (len(self._frames) * bank.x.shape[1]**2)
+        order = np.argsort(-bank.log_w, kind='stable')
+        leading = order[bank.log_w[order] >= bank.log_w.max() - LEADING]
+        return leading[:max(1, min(self._most, affordable))]
 
     def _move_on(self, bank_filter, bank):
         """Once the frames are of twice the window, the anchor moves to where the window begins."""
@@ -132,11 +156,7 @@ class Relinearisation:
         return log_likelihood, Step(bank.x.copy(), bank.P.copy(), gains, F, decay)
 
     def _pass(self, bank_filter, rows, paths):
-        """Rows of the anchor through all frames, linearised along `paths`, and back.
-
-        Returns the last `Step`, the log-likelihood (n_rows,), and at each frame the smoothed
-        states and the deviation of the position, filtered.
-        """
+        """Last `Step`, log-likelihood and [(smoothed states, deviation)] of rows of the anchor."""
         bank, log_likelihood, steps = self._anchor.rows(rows), np.zeros(len(rows)), []
         for k, path in enumerate(paths):
             of_frame, step = self._forward(bank_filter, bank, k, path)

@@ -1,8 +1,9 @@
 """Smooth: a track once more, by what came before and after each of its poses.
 
 One hypothesis of the bank, the one that stands at the end, is run through the frames again and
-then back. Hypotheses do not touch each other, so this is what it did in the bank, but for frames
-that contradict it: those are left out, as one of them would bend the whole track.
+then back, linearised once anew. Hypotheses do not touch each other, so it can be done alone. Frames
+that contradict it are left out: one of them would bend the whole track. What was published last
+need not be where the smoothed track ends: each was linearised elsewhere.
 """
 
 from collections import deque
@@ -22,7 +23,7 @@ MOST_NUMBERS = 10_000_000
 
 
 def smoothed_track(bank_filter, bank, frames, intervals, updated=False,
-                    relinearisations=RELINEARISATIONS):
+                   relinearisations=RELINEARISATIONS):
     """States of a hypothesis at each frame, given all of them.
 
     Parameters
@@ -160,4 +161,4 @@ class FixedLag:
         one, row = bank.alone(best), np.flatnonzero(origin == bank.origin[best])
         one.x, one.P = x[row].copy(), P[row].copy()
         return smoothed_track(bank_filter, one, [k[0] for k in self._kept],
-                               [k[1] for k in self._kept], updated=True, relinearisations=0)[0]
+                              [k[1] for k in self._kept], updated=True, relinearisations=0)[0]

@@ -64,7 +64,8 @@ class TrackSettings:
         '0 = never, which is two to three times faster.', 's', (0.0, 60.0))
     relinearise_interval_s: float = param(
         0.15, 'How often that is done. With two sensors and frames of 12.5 Hz tracking then takes '
-        'a quarter of a core, of 100 Hz a whole one: there rather choose 0.5.', 's', (0.0, 60.0))
+        'a quarter of a core, of 100 Hz a whole one: there rather choose 0.5. It grows with the '
+        'number of sensors.', 's', (0.0, 60.0))
     relinearise_most: int = param(
         20, 'For how many hypotheses it is done at most.', '', (1, 100000))
     lookback_s: float = param(
@@ -146,8 +147,7 @@ class TrackStage:
         """Take new values of the live settings; the running bank goes on with them."""
         self._settings = settings
         self._filter.configure(settings)
-        if self._bank is not None and settings.relinearise_window_s:
-            self._anew.begin(self._bank, updated=True)
+        self._anew.begin_anew()
 
     @property
     def bank(self):
@@ -238,9 +238,7 @@ class TrackStage:
         self._anew.add(bank, predicted, log_likelihood, frame, dt)
         self.counts['hypotheses dropped'] += bank.prune(
             -np.log(self._settings.prune_ratio), self._settings.most_hypotheses)
-        tried, in_vain = self._anew.improve(self._filter, bank)
-        self.counts['paths linearised anew'] += tried
-        self.counts['paths linearised anew in vain'] += in_vain
+        self.counts.update(self._anew.improve(self._filter, bank))
         best = bank.best()
         self._whole.add(bank, frame, dt, publish)
         late = [] if self._lag is None else self._smoothed(best, False, self._lag.smoothed(
