@@ -256,3 +256,22 @@ def test_settings_changed_in_mid_track_begin_it_anew():
                     before = stage.counts[relinearise.TRIED] - stage.counts[relinearise.IN_VAIN]
     assert stage.counts[relinearise.TRIED] - stage.counts[relinearise.IN_VAIN] > before > 0
     assert max(errors[15:]) < 1.5
+
+
+def test_it_is_told_the_time_between_the_frames(monkeypatch):
+    """Also where one is missing, and of those before the detection."""
+    told, add = [], Relinearisation.add
+    monkeypatch.setattr(Relinearisation, 'add', lambda self, *a: (
+        told.append((a[3].stamp_ns, a[4])), add(self, *a)))
+    network, settings = line_network(2, tilt=0.0), settings_for('vehicle')
+    samples, *_ = simulate(network, random_vehicle(np.random.default_rng(1), length=4.0),
+                           Path(np.array([-70.0, -1.2]), 0.0, 10.0), 100.0, 9.0,
+                           np.random.default_rng(1))
+    pipeline, stage = Pipeline(network, settings), TrackStage(network, settings.track)
+    frames = [r for s in samples for r in pipeline.feed(s) if isinstance(r, FieldFrame)]
+    for k, frame in enumerate(frames):
+        if k % 7:
+            stage.feed(frame)
+    stamps, intervals = np.array(told).T
+    np.testing.assert_allclose(np.diff(stamps) / NS, intervals[1:], rtol=0, atol=1e-6)
+    assert len(told) > 30 and np.ptp(intervals[1:]) > 0.05
