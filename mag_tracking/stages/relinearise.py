@@ -27,7 +27,6 @@ SETTLED = 0.3
 """In deviations of the position: a path has settled that the last step moved no more than this
 anywhere."""
 
-
 TRIED, IN_VAIN = 'paths linearised anew', 'paths linearised anew in vain'
 """What is counted."""
 
