@@ -1,0 +1,395 @@
+"""Hard and soft iron of a three-axis magnetometer that can be tumbled, from field sizes alone.
+
+In a uniform field the readings y of a turned sensor lie on an ellipsoid; B = C (y - o) puts them on
+a sphere. A rotation of B changes no size, so C is taken symmetric: which way the sensor's axes
+point cannot be told from sizes, and B keeps an unknown fixed rotation against the case.
+
+Source: the quadric fit and its change into offset and matrix as in Renaudin, Afzal and Lachapelle,
+Complete triaxis magnetometer calibration in the magnetic domain (2010), and Kok and Schön,
+Magnetometer calibration using inertial sensors (2016), section V.A. Weights by direction, the
+robust loss, the measure of coverage and the refusals are this package's own.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from mag_tracking.calibration.directions import counted, coverage, empty_octants, even_weights
+from mag_tracking.calibration.saturation import cut_off
+
+LEAST_READINGS = 50
+"""Fewer readings than so many are refused ..."""
+
+LEAST_DIRECTIONS = 18
+"""... and fewer cells with readings: two for each of the nine parameters."""
+
+LEAST_COVERAGE = 0.01
+"""Refused below: what disturbs neighbouring directions alike enters ten times as large."""
+
+GOOD_COVERAGE = 0.1
+"""Warned of below: three times as large."""
+
+LEAST_THICKNESS = 0.05
+"""Smallest over largest spread of readings about their mean; flatter is a rotation in a plane."""
+
+MOST_ELONGATED = 5.0
+"""Longest over shortest axis: soft iron on a sensor's board makes two, or little more."""
+
+MOST_SCATTER = 0.1
+"""Scatter about the ellipsoid, outliers apart, over its radius. A sensor that lies still gives a
+ball of noise, which scatters 0.3 to 0.4 about any ellipsoid through it; usual is 0.01 to 0.03."""
+
+MOST_UNCERTAIN = 0.1
+"""Worst standard deviation of the offset, over the radius."""
+
+GOOD_RESIDUAL = 0.05
+"""A larger std/mean of the corrected sizes is warned of: the field was not uniform."""
+
+OUTLIER = 4.0
+"""[std] Readings further from the ellipsoid are outliers ..."""
+
+MANY_OUTLIERS = 0.01
+"""... a larger share of which is warned of ..."""
+
+MOST_OUTLIERS = 0.2
+"""... and refused: the robust scatter has lost its meaning."""
+
+GLITCH = 5.0
+"""Readings further from the median reading than so many median distances are left out as glitches
+of the transfer ..."""
+
+FEW_GLITCHES = 0.02
+"""... if their share is no larger: where the sensor lay still most of the time, all others are far
+from the median."""
+
+SOFT = 2.0
+"""[std] Where the loss turns from square to linear; costs Gaussian noise little precision."""
+
+N_BLOCKS = 40
+"""Stretches of time that are left out in turn for the covariance; each must be long against the
+time over which residuals are correlated."""
+
+LEAST_SCALE = 1e-9
+"""Residual std, over the radius, below which it is rounding."""
+
+DOUBT = 'too few directions, a sensor that lay still, or a field that is not uniform'
+
+_UPPER = np.triu_indices(3)
+_BASIS = np.zeros((6, 3, 3))
+_BASIS[(range(6), *_UPPER)] = _BASIS[(range(6), *_UPPER[::-1])] = 1.0
+
+
+@dataclass(frozen=True)
+class EllipsoidFit:
+    """Calibration B = correction (y - offset), how well it is known, and what is wrong with it.
+
+    What a refused fit could not compute is NaN.
+    """
+
+    offset: np.ndarray
+    """(3,), unit of the readings, sensor frame: hard iron and bias."""
+    correction: np.ndarray
+    """(3, 3) symmetric positive definite, field unit per reading unit: soft iron, scale factors and
+    skewness, up to a rotation."""
+    field_size: float
+    """What |B| is after correction, as given; or else the mean radius that comes with
+    det(correction) = 1, in the unit of the readings."""
+    residual: float
+    """std/mean of |B| over all readings after correction, outliers and saturated ones included."""
+    residual_before: float
+    """std/mean of |y|."""
+    offset_std: np.ndarray
+    """(3,), unit of the readings."""
+    correction_std: np.ndarray
+    """(3, 3), of each entry of `correction`."""
+    field_size_std: float
+    """Zero where the field size was given."""
+    coverage: float
+    """0 to 1: smallest eigenvalue of the mean of f f^T over directions as the fit weighs them, f
+    the nine spherical harmonics to degree two, which are what the nine parameters do to |B|. One
+    for even coverage, 0.008 for half a sphere or a band of +-21 degrees, zero for a ring. Errors
+    that neighbouring directions share enter up to 1/sqrt(coverage) times as large as with one."""
+    empty_octants: tuple
+    """Names such as '+x-y+z', of corrected directions, sensor frame."""
+    n_readings: int
+    """Readings that the fit was made from."""
+    n_missing: int
+    """Rows left out for a NaN."""
+    n_saturated: int
+    """Rows left out for standing at the end of the range."""
+    n_outliers: int
+    """Glitches, which are left out, and readings further than OUTLIER robust deviations from the
+    ellipsoid, which the loss bounds."""
+    converged: bool
+    """Whether to use it."""
+    reason: str
+    """Why not; empty when converged."""
+    warnings: tuple
+    """What to know before using it."""
+
+    def correct(self, readings):
+        """(n, 3) corrected field of `readings` (n, 3)."""
+        return (np.asarray(readings, dtype=float) - self.offset) @ self.correction
+
+
+def fit_ellipsoid(readings, field_size=None):
+    """Offset and symmetric correction that give all readings one size.
+
+    A linear quadric fit starts a robust geometric least squares on |C (y - o)|. Readings count
+    by direction: where they crowd, as while the sensor lay still, each weighs less.
+    Noise of relative size s makes the radius s^2 too large, which is not corrected.
+
+    Parameters
+    ----------
+    readings : (n, 3), any one unit, sensor frame
+        In order of time, sensor turned in a uniform field; rows with a NaN are left out.
+    field_size : float, optional
+        Size of the true field, in the unit that the corrected field shall have.
+
+    Returns
+    -------
+    EllipsoidFit
+        Not converged, with a reason, where the readings do not tell the nine parameters. The
+        standard deviations come from leaving stretches of time out in turn.
+
+    Raises
+    ------
+    ValueError
+        Readings that are not (n, 3), one that is infinite, a field size that is not positive.
+    """
+    readings = _checked(readings, field_size)
+    present = ~np.isnan(readings).any(axis=1)
+    cut = np.stack([cut_off(axis) for axis in readings.T], axis=1) & present[:, None]
+    used = readings[present & ~cut.any(axis=1)]
+    glitches = _glitches(used)
+    used = used[~glitches]
+    counts = {'n_readings': len(used), 'n_missing': int((~present).sum()),
+              'n_saturated': int(cut.any(axis=1).sum()), 'n_outliers': int(glitches.sum()),
+              'residual_before': _spread(np.linalg.norm(readings[present], axis=1))}
+    notes = _notes_on_input(counts, cut)
+    reason = _too_little(used)
+    if reason:
+        return _refused(reason, counts, notes)
+    centre, scale = used.mean(axis=0), float(np.sqrt(used.var(axis=0).sum()))
+    z = (used - centre) / scale
+    o, C, reason = _quadric(z)
+    if reason:
+        return _refused(reason, counts, notes)
+    o, C, P, quality = _geometric(z, o, C)
+    axes = np.linalg.eigvalsh(C)
+    if not axes[0] * MOST_ELONGATED >= axes[2]:
+        return _refused(f'axes of the ellipsoid are as {axes[0]:.2g} to {axes[2]:.2g}, at most 1 '
+                        f'to {MOST_ELONGATED:g} is plausible: {DOUBT}', counts, notes)
+    counts['n_outliers'] += quality['n_outliers']
+    out = _in_units(o, C, P, centre, scale, field_size)
+    residual = _spread(np.linalg.norm((readings[present] - out['offset']) @ out['correction'],
+                                      axis=1))
+    share = counts['n_outliers'] / (len(used) + glitches.sum())
+    reason = _why_refused(C, P, quality, share)
+    return EllipsoidFit(**out, **counts, residual=residual, coverage=quality['coverage'],
+                        empty_octants=quality['empty'], converged=not reason, reason=reason,
+                        warnings=notes + _notes_on_fit(residual, quality, share))
+
+
+def _checked(readings, field_size):
+    """(n, 3) readings, or ValueError."""
+    readings = np.asarray(readings, dtype=float)
+    if readings.ndim != 2 or readings.shape[1] != 3:
+        raise ValueError(f'expected readings (n, 3), got {readings.shape}')
+    infinite = np.isinf(readings).any(axis=1)
+    if infinite.any():
+        raise ValueError(f'reading {infinite.argmax()} is infinite: {readings[infinite.argmax()]}')
+    if field_size is not None and not 0.0 < field_size < np.inf:
+        raise ValueError(f'field_size = {field_size}, must be positive and finite')
+    return readings
+
+
+def _spread(sizes):
+    """std/mean; NaN without readings or with zeros only."""
+    return float(sizes.std() / sizes.mean()) if sizes.any() else float('nan')
+
+
+def _notes_on_input(counts, cut):
+    """Warnings about readings that are left out."""
+    notes = ()
+    if counts['n_missing']:
+        notes += (f'{counts["n_missing"]} readings with a missing axis are left out',)
+    if counts['n_saturated']:
+        axes = ', '.join(name for name, any_ in zip('xyz', cut.any(axis=0), strict=True) if any_)
+        notes += (f'{counts["n_saturated"]} readings at the end of the range of {axes} '
+                  'are left out',)
+    return notes
+
+
+def _glitches(y):
+    """(n,) bool, few readings far from all others."""
+    distance = np.linalg.norm(y - np.median(y, axis=0), axis=1) if len(y) else np.zeros(0)
+    far = distance > GLITCH * np.median(distance) if len(y) else np.zeros(0, dtype=bool)
+    return far & (far.sum() <= FEW_GLITCHES * len(y))
+
+
+def _too_little(y):
+    """Why no quadric can be fitted; empty where one can."""
+    if len(y) < LEAST_READINGS:
+        return f'{len(y)} readings, needs {LEAST_READINGS}'
+    largest = np.abs(y - y[0]).max()
+    if not largest > 0.0:
+        return f'all {len(y)} readings are equal: the sensor lay still, or is stuck'
+    z = (y - y[0]) / largest
+    thick = np.linalg.svd(z - z.mean(axis=0), compute_uv=False)
+    if not thick[2] >= LEAST_THICKNESS * thick[0]:
+        return (f'readings lie in a plane: thickness {thick[2] / thick[0]:.2g} of their extent, '
+                f'needs {LEAST_THICKNESS}; turn the sensor about more than one axis')
+    return ''
+
+
+def _quadric(z):
+    """Offset, correction and reason of a linear fit to normalised readings, outliers set aside."""
+    # Half-way between the extremes is inside, however long the sensor lay still somewhere.
+    w = even_weights(z - 0.5 * (z.min(axis=0) + z.max(axis=0)))
+    o, C = np.full(3, np.nan), np.full((3, 3), np.nan)
+    for _ in range(5):
+        x, y, v = z.T
+        # sqrt(2) makes the length of the vector of coefficients independent of the axes.
+        D = np.column_stack([z * z, np.sqrt(2.0) * np.stack([x * y, x * v, y * v], 1), z,
+                             np.ones(len(z))])
+        a = np.linalg.svd(np.sqrt(w)[:, None] * D, full_matrices=False)[2][-1]
+        A = np.diag(a[:3])
+        A[[0, 0, 1], [1, 2, 2]] = A[[1, 2, 2], [0, 0, 1]] = a[3:6] / np.sqrt(2.0)
+        A, a = (A, a) if np.trace(A) > 0.0 else (-A, -a)
+        e = np.linalg.eigvalsh(A)
+        if not e[0] > 1e-6 * e[2]:
+            return o, C, ('the readings lie on no ellipsoid, smallest over largest eigenvalue of '
+                          f'the quadric {e[0] / e[2]:.2g}, must be positive: {DOUBT}')
+        o = -0.5 * np.linalg.solve(A, a[6:9])
+        k = o @ A @ o - a[9]
+        if not k > 0.0:
+            return o, C, f'the readings lie on no ellipsoid, squared radius {k:.2g}: {DOUBT}'
+        e, V = np.linalg.eigh(A / k)
+        C = (V * np.sqrt(e)) @ V.T
+        q = (z - o) @ C
+        w = even_weights(q)
+        d = np.abs(np.linalg.norm(q, axis=1) - 1.0)
+        w = w * (d <= OUTLIER * _robust_std(d, w))
+    return o, C, ''
+
+
+def _robust_std(d, w):
+    """Standard deviation from the weighted median of |d|."""
+    order = np.argsort(np.abs(d))
+    total = np.cumsum(w[order])
+    middle = np.abs(d)[order][np.searchsorted(total, 0.5 * total[-1])]
+    return max(1.4826 * float(middle), LEAST_SCALE)
+
+
+def _geometric(z, o, C):
+    """Offset, correction, covariance (9, 9) and quality of the robust fit of |C (z - o)| = 1."""
+    theta = np.concatenate([o, C[_UPPER]])
+    for _ in range(2):
+        w = even_weights(_model(theta, z)[0])
+        scale = SOFT * _robust_std(_model(theta, z)[1], w)
+        fit = least_squares(lambda p, s=scale: _model(p, z)[1] / s, theta,
+                            jac=lambda p, s=scale: _model(p, z)[2] / s,
+                            loss=lambda square, w=w: _loss(square, w), max_nfev=100)
+        theta = fit.x
+    q, d, J = _model(theta, z)
+    fine = np.abs(d) <= OUTLIER * _robust_std(d, w)
+    u, _, n = counted(q[fine])
+    quality = {'solved': fit.status > 0, 'directions': int((n > 0).sum()),
+               'coverage': coverage(u, w[fine]),
+               'scatter': float(np.sqrt(np.average(d[fine]**2, weights=w[fine]))),
+               'n_outliers': int((~fine).sum()),
+               'empty': empty_octants(u, w[fine])}
+    C = np.tensordot(theta[3:], _BASIS, 1)
+    return theta[:3], C, _covariance(d / scale, J / scale, w), quality
+
+
+def _model(theta, z):
+    """Corrected readings (n, 3), their sizes less one (n,), and its Jacobian (n, 9)."""
+    C = np.tensordot(theta[3:], _BASIS, 1)
+    y = z - theta[:3]
+    q = y @ C
+    r = np.linalg.norm(q, axis=1)
+    u = q / np.maximum(r, 1e-12)[:, None]
+    return q, r - 1.0, np.column_stack([-u @ C, np.einsum('ni,kij,nj->nk', u, _BASIS, y)])
+
+
+def _loss(square, w):
+    """Weighted soft L1 and its two derivatives, as scipy wants them."""
+    root = np.sqrt(1.0 + square)
+    return w * np.stack([2.0 * (root - 1.0), 1.0 / root, -0.5 / root**3])
+
+
+def _covariance(f, J, w):
+    """(9, 9) by leaving out stretches of time in turn, one Newton step each; inf if one is vital.
+
+    Residuals of a real sensor are correlated in time; what their number promises is not true.
+    """
+    n_blocks = min(N_BLOCKS, len(f))
+    starts = np.arange(n_blocks) * len(f) // n_blocks
+    scores = np.add.reduceat((w * f / np.sqrt(1.0 + f * f))[:, None] * J, starts)
+    K = np.sqrt(w * (1.0 + f * f)**-1.5)[:, None] * J
+    parts = np.stack([k.T @ k for k in np.split(K, starts[1:])])
+    try:
+        steps = np.linalg.solve(parts.sum(axis=0) - parts, scores[:, :, None])[:, :, 0]
+    except np.linalg.LinAlgError:
+        return np.full((9, 9), np.inf)
+    return (n_blocks - 1) / n_blocks * steps.T @ steps
+
+
+def _in_units(o, C, P, centre, scale, field_size):
+    """Parameters and deviations in the readings' units, by name."""
+    volume = np.linalg.det(C)**(-1.0 / 3.0)
+    t = np.einsum('ij,kji->k', np.linalg.inv(C), _BASIS)
+    if field_size is None:
+        k, size = volume, scale * volume
+        D = k * (_BASIS - C * t[:, None, None] / 3.0)
+        size_std = size / 3.0 * np.sqrt(t @ P[3:, 3:] @ t)
+    else:
+        k, size, size_std = field_size / scale, float(field_size), 0.0
+        D = k * _BASIS
+    return {'offset': centre + scale * o, 'correction': k * C, 'field_size': float(size),
+            'offset_std': scale * np.sqrt(np.diagonal(P)[:3]),
+            'correction_std': np.sqrt(np.einsum('kij,kl,lij->ij', D, P[3:, 3:], D)),
+            'field_size_std': float(size_std)}
+
+
+def _why_refused(C, P, quality, outliers):
+    """Why a fit is not to be used; empty where it is."""
+    if quality['scatter'] > MOST_SCATTER:
+        return (f'readings scatter {quality["scatter"]:.2g} of the radius about the ellipsoid, at '
+                f'most {MOST_SCATTER}: {DOUBT}')
+    if outliers > MOST_OUTLIERS:
+        return f'a share of {outliers:.2g} of the readings are outliers, at most {MOST_OUTLIERS}'
+    if quality['directions'] < LEAST_DIRECTIONS:
+        return f'{quality["directions"]} different directions, needs {LEAST_DIRECTIONS}'
+    if quality['coverage'] < LEAST_COVERAGE:
+        return (f'coverage {quality["coverage"]:.2g}, needs {LEAST_COVERAGE}; octants without '
+                f'readings: {", ".join(quality["empty"]) or "none"}')
+    uncertain = np.sqrt(np.linalg.eigvalsh(C @ P[:3, :3] @ C)[-1])
+    if not uncertain <= MOST_UNCERTAIN:
+        return f'offset uncertain by {uncertain:.2g} of the radius, at most {MOST_UNCERTAIN}'
+    return '' if quality['solved'] else 'least squares did not converge in 100 evaluations'
+
+
+def _notes_on_fit(residual, quality, outliers):
+    """Warnings about coverage, residual and outliers."""
+    checks = {
+        f'coverage {quality["coverage"]:.2g}, good is {GOOD_COVERAGE}':
+            quality['coverage'] < GOOD_COVERAGE,
+        f'few or no readings from {", ".join(quality["empty"])}': quality['empty'],
+        f'residual {residual:.2g} after correction, good is {GOOD_RESIDUAL}':
+            residual > GOOD_RESIDUAL,
+        f'a share of {outliers:.2g} of the readings are outliers': outliers > MANY_OUTLIERS}
+    return tuple(note for note, holds in checks.items() if holds)
+
+
+def _refused(reason, counts, notes):
+    """A fit of which nothing is known but why."""
+    nan = float('nan')
+    return EllipsoidFit(
+        offset=np.full(3, nan), correction=np.full((3, 3), nan), field_size=nan, residual=nan,
+        offset_std=np.full(3, nan), correction_std=np.full((3, 3), nan), field_size_std=nan,
+        coverage=nan, empty_octants=(), converged=False, reason=reason,
+        warnings=notes, **counts)
