@@ -1,0 +1,100 @@
+"""Tables of a magnet's poses over a board of sensors: a row a pose, all sensors in it."""
+
+import csv
+
+import numpy as np
+
+from mag_tracking.errors import RecordingError
+
+_POSE = ('mag_x0', 'mag_y0', 'mag_z0', 'mag_mx0', 'mag_my0', 'mag_mz0')
+
+
+def read_pose_table(path):
+    """Readings of fixed sensors and the tracked poses of a magnet.
+
+    Parameters
+    ----------
+    path : path
+        CSV with the columns `x0,y0,z0,x1...` [T, sensor frame; empty or nan = not measured],
+        `mag_x0..z0` [m, tracker] and `mag_mx0..mz0` (unit vector, tracker).
+
+    Returns
+    -------
+    field : (K, n, 3) [T], sensor frame
+    positions : (K, 3) [m], tracker
+    axes : (K, 3)
+        Made unit, of lengths that are one to 1e-3.
+
+    Raises RecordingError, which names file, row and column.
+    """
+    header, rows = _read(path)
+    n = sum(name[:1] == 'x' and name[1:].isdigit() for name in header)
+    fields = [f'{a}{j}' for j in range(n) for a in 'xyz']
+    if not n:
+        raise RecordingError(f'{path}: column x0 is missing')
+    for name in (*fields, *_POSE):
+        if header.count(name) != 1:
+            there = 'missing' if name not in header else 'there twice'
+            raise RecordingError(f'{path}: column {name} is {there}')
+    places = [header.index(name) for name in (*fields, *_POSE)]
+    values = np.array([[_number(path, line, name, row[i], name in _POSE)
+                        for name, i in zip((*fields, *_POSE), places, strict=True)]
+                       for line, row in rows])
+    axes = values[:, -3:]
+    length = np.linalg.norm(axes, axis=1)
+    for (line, _), size in zip(rows, length, strict=True):
+        if abs(size - 1.0) > 1e-3:
+            raise RecordingError(f'{path}: row {line}: mag_mx0..mag_mz0 has length {size:.6g}, '
+                                 'expected 1')
+    return values[:, :-6].reshape(len(rows), n, 3), values[:, -6:-3], axes / length[:, None]
+
+
+def read_sensor_positions(path):
+    """Positions (n, 3) [m] of a CSV of x,y,z with comments after #.
+
+    Raises RecordingError, which names file, row and column.
+    """
+    rows = [(line, row) for line, row in _lines(path) if not row[0].lstrip().startswith('#')]
+    if not rows:
+        raise RecordingError(f'{path} has no rows')
+    for line, row in rows:
+        if len(row) != 3:
+            raise RecordingError(f'{path}: row {line}: expected 3 columns, got {len(row)}')
+    return np.array([[_number(path, line, name, text, True)
+                      for name, text in zip('xyz', row, strict=True)] for line, row in rows])
+
+
+def _read(path):
+    """Header and [(line, row)]."""
+    lines = _lines(path)
+    if len(lines) < 2:
+        raise RecordingError(f'{path} has no rows')
+    header = [name.strip() for name in lines[0][1]]
+    for line, row in lines[1:]:
+        if len(row) != len(header):
+            raise RecordingError(f'{path}: row {line}: expected {len(header)} columns, '
+                                 f'got {len(row)}')
+    return header, lines[1:]
+
+
+def _lines(path):
+    """[(line, cells)] of the lines that are not empty."""
+    try:
+        with open(path, newline='', encoding='utf-8') as stream:
+            reader = csv.reader(stream)
+            return [(reader.line_num, row) for row in reader if row]
+    except OSError as error:
+        raise RecordingError(f'cannot read {path}: {error.strerror}') from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise RecordingError(f'{path}: {error}') from error
+
+
+def _number(path, line, column, text, finite):
+    """One cell; empty = NaN, where that is allowed."""
+    try:
+        value = float(text) if text.strip() else np.nan
+    except ValueError:
+        raise RecordingError(f'{path}: row {line}: {column} is {text!r}, no number') from None
+    if np.isinf(value) or (finite and np.isnan(value)):
+        raise RecordingError(f'{path}: row {line}: {column} is not a finite number')
+    return value
