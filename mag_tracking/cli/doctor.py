@@ -1,0 +1,82 @@
+"""mag-tracking doctor."""
+
+import signal
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from mag_tracking.cli.options import add_command, add_network, add_settings, settings_of
+from mag_tracking.doctoring import examine
+from mag_tracking.errors import SettingsError
+from mag_tracking.interrupts import noted_signals
+from mag_tracking.io.bag import Recording
+from mag_tracking.io.network_file import read_network
+
+_DOCTOR = '''
+Reads a recording, or listens to what is published now, and says what is wrong with each
+sensor and what to do: no readings, lost ones, duplicates, clocks that step, delays, noise
+beyond what was calibrated, a stuck or saturated sensor, spikes, axes that are flipped or
+swapped, gauss or microtesla published as tesla, backgrounds that are not learnt. The exit
+status is 0 where nothing serious was found, else 2.
+
+examples:
+  mag-tracking doctor night.mcap --network site.yaml
+  mag-tracking doctor --live 10 --network site.yaml
+'''
+
+
+def add(commands):
+    """Register the command."""
+    p = add_command(commands, 'doctor', _doctor, 'Say what is wrong with the sensors.', _DOCTOR)
+    p.add_argument('recording', nargs='?', type=Path, metavar='RECORDING',
+                   help='an .mcap file or a rosbag2 folder')
+    p.add_argument('--live', type=float, metavar='SECONDS',
+                   help='listen to the topics for so long instead (needs ROS 2)')
+    add_network(p)
+    add_settings(p)
+
+
+def _doctor(args):
+    """mag-tracking doctor."""
+    if (args.recording is None) == (args.live is None):
+        raise SettingsError('doctor: either a RECORDING or --live SECONDS')
+    network, settings = read_network(args.network), settings_of(args)
+    with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
+        if args.live is not None:
+            if not 1.0 <= args.live <= 86400.0:
+                raise SettingsError(f'--live: {args.live:g} is not between 1 and 86400 s')
+            # Only this needs ROS.
+            from mag_tracking.nodes.doctor_node import listen
+
+            doctor, more = listen(network, settings, args.live, lambda: bool(seen))
+        else:
+            recording = Recording(args.recording)
+            with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
+                      disable=None) as bar:
+                doctor, more = examine(recording, network, settings, bar.update,
+                                       lambda: bool(seen))
+    for name, health in doctor.sensors.items():
+        print(f'{name:11s} {_row(health)}')
+    findings = sorted(more + doctor.findings(), key=lambda f: not f.serious)
+    for finding in findings:
+        print(f'{"WRONG" if finding.serious else "note "} {finding.subject}: {finding.what}\n'
+              f'      {finding.advice}')
+    if not findings:
+        print('nothing is wrong')
+    if seen:
+        print('interrupted: this is of what was read until then')
+        return 130
+    return 2 if any(f.serious for f in findings) else 0
+
+
+def _row(health):
+    """One sensor in a line."""
+    c = health.counts
+    if not c['readings']:
+        return 'nothing'
+    delay = health.delay_s[0]
+    noise = ' '.join('  -  ' if np.isnan(v) else f'{1e9 * v:5.1f}' for v in health.noise_std)
+    return (f'{c["readings"]:8d} readings  {health.rate:7.1f} Hz  {c["lost"]:5d} lost  '
+            f'field {1e6 * np.sqrt(np.nansum(health.field**2)):7.2f} uT  noise {noise} nT'
+            + ('' if np.isnan(delay) else f'  delay {1e3 * delay:.1f} ms'))

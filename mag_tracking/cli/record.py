@@ -1,0 +1,84 @@
+"""mag-tracking record and repair."""
+
+import math
+from pathlib import Path
+
+from mag_tracking.cli.options import add_command, add_network
+from mag_tracking.errors import SettingsError
+from mag_tracking.io.network_file import read_network
+from mag_tracking.io.recording_repair import repair
+
+_RECORD = '''
+Records the magnetic fields of the network's topics, as they are, until Ctrl-C,
+and where they appear the sensors' sensor_msgs/Imu topics (/mag_1/imu/data_raw
+beside /mag_1/imu/mag). DIR becomes a rosbag2 recording: MCAP files and a
+metadata.yaml. Whatever is lost, before it came or on a full disk, is counted
+and told; after a full disk it goes on in a new file. After a crash less than a
+second is missing; `mag-tracking repair DIR` then gives the file its index.
+
+examples:
+  mag-tracking record --network config/network.yaml --out night
+  mag-tracking record --network site.yaml --out night --results --split-s 600
+  mag-tracking record --network site.yaml --out night --topics /camera /gps/fix
+'''
+
+_REPAIR = '''
+A recording that was cut off (power, a crash, a full disk) has no index.
+`mag-tracking replay` reads it as it is; rosbag2 and others need the index,
+which this writes, and a new metadata.yaml. The messages stay untouched.
+
+example:
+  mag-tracking repair night
+'''
+
+
+def add(commands):
+    """Register the commands."""
+    p = add_command(commands, 'record', _record, 'Record the sensors (needs ROS 2).', _RECORD)
+    add_network(p)
+    p.add_argument('--out', required=True, type=Path, metavar='DIR',
+                   help='folder for the recording')
+    p.add_argument('--topics', nargs='+', default=[], metavar='TOPIC', help='record these, too')
+    p.add_argument('--results', action='store_true',
+                   help='what the nodes make of it, too (tracks, detections, calibrated fields)')
+    p.add_argument('--all', action='store_true', help='record every topic')
+    p.add_argument('--split-mb', type=float, default=1000.0, metavar='N',
+                   help='size of a file in MB (default: 1000)')
+    p.add_argument('--split-s', type=float, default=3600.0, metavar='N',
+                   help='time in a file in s (default: 3600)')
+
+    p = add_command(commands, 'repair', _repair, 'Make a recording whole that was cut off.',
+                    _REPAIR)
+    p.add_argument('recording', type=Path, metavar='RECORDING',
+                   help='an .mcap file or a rosbag2 folder')
+
+
+def _record(args):
+    """mag-tracking record."""
+    for option, value, least in (('--split-mb', args.split_mb, 0.1),
+                                 ('--split-s', args.split_s, 1.0)):
+        if not (math.isfinite(value) and value >= least):
+            raise SettingsError(f'{option}: {value:g} is not a number of at least {least:g}')
+    for topic in args.topics:
+        if not topic.startswith('/'):
+            raise SettingsError(f'--topics: {topic!r} is not a whole name (it begins with /)')
+    network = read_network(args.network)
+    # Only this command needs ROS.
+    from mag_tracking.nodes.record_node import Selection, run
+
+    imus = tuple(filter(None, map(_imu_topic, network.topics)))
+    selection = Selection(tuple(network.topics), imus, tuple(args.topics), args.results, args.all)
+    return run(selection, args.out, int(args.split_mb * 1e6), int(args.split_s * 1e9))
+
+
+def _imu_topic(field):
+    """Where the sensor of a magnetic field publishes accelerations and rates, or None."""
+    owner, _, last = field.rpartition('/')
+    return f'{owner}/data_raw' if last == 'mag' else None
+
+
+def _repair(args):
+    """mag-tracking repair."""
+    n = repair(args.recording)
+    print(f'{args.recording}: files that were not whole: {n}')
+    return 0

@@ -1,0 +1,64 @@
+"""The texts of message types, for the schemas of recordings."""
+
+import functools
+import os
+import re
+import sys
+from pathlib import Path
+
+from mag_tracking.errors import RecordingError
+from mag_tracking.io.schema import definition
+
+_BUILT_IN = {'bool', 'byte', 'char', 'string', 'wstring', 'float32', 'float64',
+             *(f'{u}int{n}' for u in ('', 'u') for n in (8, 16, 32, 64))}
+_FIELD = re.compile(r'\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[(?:<=)?\d*\])?\s+[A-Za-z]\w*\s*(=?)')
+
+
+@functools.cache
+def definition_of(type_name):
+    """The text of a type with all that it needs, as a `ros2msg` schema has it.
+
+    None where a type's .msg file is not installed.
+    """
+    try:
+        return definition(type_name)
+    except RecordingError:
+        pass
+    seen, queue, text = [type_name], [type_name], ''
+    while queue:
+        name = queue.pop(0)
+        own = _own_text(name)
+        if own is None:
+            return None
+        package, _, leaf = name.split('/')
+        text += own if not text else f'{"=" * 80}\nMSG: {package}/{leaf}\n{own}'
+        new = [t for t in _named_in(own, package) if t not in seen]
+        seen += new
+        queue += new
+    return text
+
+
+def _own_text(type_name):
+    """The text of the type's .msg file, or None."""
+    package, kind, leaf = type_name.split('/')
+    # The wheels leave AMENT_PREFIX_PATH unset and install below sys.prefix.
+    prefixes = [p for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
+    for prefix in (*prefixes, sys.prefix):
+        file = Path(prefix) / 'share' / package / kind / f'{leaf}.msg'
+        if file.is_file():
+            text = file.read_text(encoding='utf-8', errors='replace')
+            return text if text.endswith('\n') else f'{text}\n'
+    return None
+
+
+def _named_in(text, package):
+    """The types that a definition names, each once."""
+    out = []
+    for line in text.splitlines():
+        field = _FIELD.match(line.partition('#')[0])
+        if field and not field[2] and field[1] not in _BUILT_IN:
+            owner, _, leaf = field[1].rpartition('/')
+            name = f'{(owner or package).partition("/")[0]}/msg/{leaf}'
+            if name not in out:
+                out.append(name)
+    return out
