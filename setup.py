@@ -37,6 +37,7 @@ setup(
         'mcap-ros2-support',
         'numba',
         'numpy',
+        'pygeomag',
         'PyYAML',
         'scipy',
         'tqdm',

@@ -62,6 +62,31 @@ def quaternion_from_yaw(yaw):
     return np.array([0.0, 0.0, np.sin(0.5 * yaw), np.cos(0.5 * yaw)])
 
 
+def rotation_about_z(angle):
+    """Matrix (3, 3) of a rotation about z by `angle` [rad]."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def yaw_between(R, other):
+    """[rad] Rotation about the world's z that takes orientation `R` (3, 3) nearest to `other`."""
+    M = other @ R.T
+    return float(np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1]))
+
+
+def quaternion_from_rotation(R):
+    """Unit quaternion xyzw (4,) of a rotation matrix (3, 3), by its largest component."""
+    w2 = np.array([1 + R[0, 0] - R[1, 1] - R[2, 2], 1 - R[0, 0] + R[1, 1] - R[2, 2],
+                   1 - R[0, 0] - R[1, 1] + R[2, 2], 1 + R[0, 0] + R[1, 1] + R[2, 2]])
+    k = int(np.argmax(w2))
+    symmetric = np.array([
+        [w2[0], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[2, 1] - R[1, 2]],
+        [R[0, 1] + R[1, 0], w2[1], R[1, 2] + R[2, 1], R[0, 2] - R[2, 0]],
+        [R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], w2[2], R[1, 0] - R[0, 1]],
+        [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], w2[3]]])
+    return symmetric[k] / np.linalg.norm(symmetric[k])
+
+
 def quaternion_between(a, b):
     """The shortest rotation, as quaternion xyzw (4,), that takes direction `a` to `b`.
 

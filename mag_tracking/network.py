@@ -8,6 +8,18 @@ from mag_tracking.errors import NetworkError
 
 
 @dataclass(frozen=True)
+class Calibrated:
+    """When and how a sensor was calibrated."""
+
+    date: str
+    """As ISO 8601 has it."""
+    by: str
+    """What its orientation comes from, in words."""
+    clock_offset_std: float
+    """[s]; NaN where the offset was not measured."""
+
+
+@dataclass(frozen=True)
 class SensorNetwork:
     """Stationary three-axis magnetometers; the order of `names` is that of every array."""
 
@@ -24,6 +36,19 @@ class SensorNetwork:
     """Per sensor (3,) [T]; None = to be estimated."""
     background: tuple[np.ndarray | None, ...] = ()
     """Per sensor (3,) [T], sensor frame; None = to be learnt."""
+    orientation_std: tuple[np.ndarray | None, ...] = ()
+    """Per sensor (3,) [rad], how far it may be turned from `R_ws` about each of the world's
+    axes; None = not known."""
+    clock_offset: np.ndarray | None = None
+    """(n,) [s] How far each sensor's clock is ahead; taken from its stamps. None = nothing."""
+    offset: tuple[np.ndarray | None, ...] = ()
+    """Per sensor (3,) [T], sensor frame: hard iron of the sensor itself, as a tumbling tells."""
+    correction: tuple[np.ndarray | None, ...] = ()
+    """Per sensor (3, 3): B = correction @ (reading - offset)."""
+    imu_topics: tuple[str | None, ...] = ()
+    """Per sensor, of its accelerometer; None = it has none."""
+    calibrated: tuple[Calibrated | None, ...] = ()
+    """Per sensor; None = never."""
 
     def __post_init__(self):
         n = len(self.names)
@@ -42,9 +67,12 @@ class SensorNetwork:
             other = places.setdefault(place, name)
             if other != name:
                 raise NetworkError(f'sensors {other} and {name} are both at {list(place)}')
-        for name in ('noise_std', 'background'):
+        for name in ('noise_std', 'background', 'orientation_std', 'offset', 'correction',
+                     'imu_topics', 'calibrated'):
             if not getattr(self, name):
                 object.__setattr__(self, name, (None,) * n)
+        if self.clock_offset is None:
+            object.__setattr__(self, 'clock_offset', np.zeros(n))
 
     def __len__(self):
         return len(self.names)

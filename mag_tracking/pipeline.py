@@ -9,6 +9,7 @@ from mag_tracking.stages.align import Align, AlignSettings
 from mag_tracking.stages.calibrate import Calibrate, CalibrateSettings
 from mag_tracking.stages.detect import Detect, DetectSettings
 from mag_tracking.stages.stage import rejected
+from mag_tracking.stages.survey import SurveySettings
 from mag_tracking.stages.track import TrackSettings, TrackStage
 
 
@@ -20,6 +21,7 @@ class Settings:
     align: AlignSettings = field(default_factory=AlignSettings)
     detect: DetectSettings = field(default_factory=DetectSettings)
     track: TrackSettings = field(default_factory=TrackSettings)
+    survey: SurveySettings = field(default_factory=SurveySettings)
 
 
 TARGET_DEFAULTS = {

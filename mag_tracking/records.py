@@ -21,6 +21,16 @@ class MagSample:
 
 
 @dataclass(frozen=True, slots=True)
+class AccelerationSample:
+    """One reading of a sensor's accelerometer."""
+
+    stamp_ns: int
+    sensor: str
+    acceleration: np.ndarray
+    """(3,) [m/s^2], sensor frame; at rest it points up."""
+
+
+@dataclass(frozen=True, slots=True)
 class FieldFrame:
     """One look of the whole network."""
 
@@ -154,7 +164,12 @@ class Track:
     without what it takes for errors of its model."""
     mounting: np.ndarray
     """(n_sensors, 3) [rad] angles as in `physics.mounting`; (0, 3) where they are not estimated."""
-    mounting_std: np.ndarray
-    """(n_sensors, 3) [rad], or (0, 3)."""
+    mounting_covariance: np.ndarray
+    """(n_sensors, 3, 3) [rad^2], or (0, 3, 3)."""
     hypotheses: tuple[Hypothesis, ...] = field(default=())
     """Heaviest first; the published one is among them."""
+
+    @property
+    def mounting_std(self):
+        """(n_sensors, 3) [rad], or (0, 3)."""
+        return np.sqrt(np.einsum('jii->ji', self.mounting_covariance))

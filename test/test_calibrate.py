@@ -190,3 +190,68 @@ def test_covariances():
 def test_forget_names_an_unknown_sensor():
     with pytest.raises(NetworkError, match='mag_9'):
         stage().forget(['mag_9'])
+
+
+SOFT = np.array([[1.02, 0.03, 0.0], [-0.01, 0.97, 0.02], [0.0, 0.04, 1.05]])
+HARD = np.array([4e-6, -3e-6, 7e-6])
+
+
+def corrected(**known):
+    """The stage of a network in which these are known of the second sensor, and its background."""
+    n = line_network(2)
+    known = {key: (None, value) for key, value in known.items() if key != 'clock_offset'} | {
+        key: np.array([0.0, known[key]]) for key in known if key == 'clock_offset'}
+    n = dataclasses.replace(n, background=(EARTH, EARTH), **known)
+    return Calibrate(n, CalibrateSettings())
+
+
+def test_a_clock_that_is_ahead_is_put_back():
+    s = corrected(clock_offset=0.0213)
+    (first,), (second,) = s.feed(sample(5.0)), s.feed(sample(5.0213, sensor='mag_2'))
+    assert first.stamp_ns == second.stamp_ns == 5_000_000_000
+    assert s.last_stamp_ns('mag_2') == 5_000_000_000
+    # Of one sensor the order stays.
+    assert s.feed(sample(5.0213, sensor='mag_2')) == []
+    assert rejected(s.counts) == {'duplicate stamp': 1}
+
+
+def test_a_sensors_own_iron_is_taken_away():
+    s = corrected(offset=HARD, correction=SOFT)
+    B = EARTH + [3e-7, -2e-7, 5e-7]
+    (out,) = s.feed(sample(1.0, np.linalg.solve(SOFT, B) + HARD, 'mag_2'))
+    np.testing.assert_allclose(out.field, B - EARTH, atol=1e-18)
+    # The other sensor has none.
+    (out,) = s.feed(sample(1.0, B))
+    np.testing.assert_allclose(out.field, B - EARTH, atol=1e-18)
+    (out,) = corrected(offset=HARD).feed(sample(1.0, B + HARD, 'mag_2'))
+    np.testing.assert_allclose(out.field, B - EARTH, atol=1e-18)
+
+
+def test_the_covariance_is_that_of_the_corrected_field():
+    own = np.diag([1e-16, 2e-16, 3e-16])
+    (out,) = corrected(correction=SOFT).feed(sample(1.0, sensor='mag_2', covariance=own))
+    np.testing.assert_allclose(out.covariance, SOFT @ own @ SOFT.T)
+    rng = np.random.default_rng(0)
+    drawn = (rng.standard_normal((20000, 3)) * np.sqrt(np.diagonal(own))) @ SOFT.T
+    np.testing.assert_allclose(out.covariance, np.cov(drawn.T), atol=0.03 * 3e-16)
+
+
+def test_an_axis_that_a_correction_needs_is_missed():
+    field = [EARTH[0], EARTH[1], np.nan]
+    s = corrected(correction=SOFT + 0.01)
+    assert s.feed(sample(1.0, field, 'mag_2')) == []
+    assert rejected(s.counts) == {'an axis is missing that the correction needs': 1}
+    # An offset needs no other axis.
+    (out,) = corrected(offset=HARD).feed(sample(1.0, field, 'mag_2'))
+    np.testing.assert_allclose(out.field[:2], -HARD[:2], atol=1e-18)
+    assert np.isnan(out.field[2])
+
+
+@pytest.mark.parametrize('C', [np.diag([1.02, 0.97, 1.05]),
+                               [[1.02, 0.03, 0.0], [-0.01, 0.97, 0.0], [0.0, 0.0, 1.0]]])
+def test_an_axis_that_a_correction_does_not_need_is_not_missed(C):
+    """Scales of a sensor with two axes."""
+    s, C = corrected(correction=np.array(C)), np.array(C)
+    (out,) = s.feed(sample(1.0, [EARTH[0], EARTH[1], np.nan], 'mag_2'))
+    np.testing.assert_allclose(out.field[:2], (C[:2, :2] - np.eye(2)) @ EARTH[:2], atol=1e-18)
+    assert np.isnan(out.field[2])

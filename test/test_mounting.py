@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import POINT, line_network
+from scipy.spatial.transform import Rotation
 from test_track import NOISE, drive
 
 from mag_tracking.geometry import quaternion_from_rotation_vector, rotation_from_quaternion
@@ -13,6 +14,8 @@ from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.physics.mounting import turned_fields
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
+from mag_tracking.stages.observation import Observation
+from mag_tracking.stages.vehicle_start import vehicle_model
 
 
 def case():
@@ -150,3 +153,73 @@ def test_estimated_mounting_makes_the_covariance_honest(passes):
     assert passes[5.0][0] < 2.0
     assert passes[5.0][0] < 0.5 * passes[0.0][0]
     assert passes[5.0][1] < passes[0.0][1]
+
+
+STD = np.deg2rad([0.3, 0.3, 2.3])
+
+
+def observation(network, mounting_std_deg=5.0, error_time=0.3):
+    model = vehicle_model(settings_for('vehicle').track.vehicle, network)
+    return Observation(network, model, np.deg2rad(mounting_std_deg), error_time)
+
+
+def turned_network(*rotations, std):
+    """A network of sensors with these orientations and deviations."""
+    network = line_network(len(rotations), tilt=0.0)
+    return replace(network, R_ws=np.array([R.as_matrix() for R in rotations]),
+                   orientation_std=tuple(std))
+
+
+def test_what_is_known_about_the_worlds_axes_is_turned_into_the_sensors():
+    upright, side = Rotation.identity(), Rotation.from_euler('x', 90.0, True)
+    askew = Rotation.from_euler('zyx', [40.0, 20.0, -70.0], True)
+    o = observation(turned_network(upright, side, askew, side, std=(STD, STD, STD, None)))
+    P = o.own_covariance
+    np.testing.assert_allclose(P[0, :3, :3], np.diag(STD**2), atol=1e-18)
+    # Its y axis is the world's z: about that the heading turns it.
+    np.testing.assert_allclose(P[1, :3, :3], np.diag(STD[[0, 2, 1]]**2), atol=1e-18)
+    # A turn about the vertical, as the sensor has it, is as likely as the heading.
+    up = askew.inv().apply([0.0, 0.0, 1.0])
+    assert up @ P[2, :3, :3] @ up == pytest.approx(STD[2]**2)
+    assert np.trace(P[2, :3, :3]) == pytest.approx(STD @ STD)
+    # Nothing is known of this one but the setting.
+    np.testing.assert_allclose(P[3, :3, :3], np.deg2rad(5.0)**2 * np.eye(3), atol=1e-15)
+    for block in P:
+        np.testing.assert_array_equal(block[3:, 3:], np.eye(3))
+        assert not block[:3, 3:].any()
+
+
+def test_angle_covariances_are_those_of_each_sensor():
+    o = observation(line_network(3))
+    n = o.n_target + 3 * o.n_own + 9
+    A = np.random.default_rng(0).standard_normal((n, n))
+    P = A @ A.T
+    found = o.angle_covariances(P)
+    for j in range(3):
+        first = o.n_target + 6 * j
+        np.testing.assert_array_equal(found[j], P[first:first + 3, first:first + 3])
+    x = np.arange(float(n))
+    np.testing.assert_array_equal(o.angles(x)[1], x[o.n_target + 6:o.n_target + 9])
+    # Without angles there are none, with new errors in every frame they are all.
+    assert observation(line_network(3), 0.0).angle_covariances(P).shape == (0, 3, 3)
+    bare = observation(line_network(3), error_time=0.0)
+    rows = slice(o.n_target + 6, o.n_target + 9)
+    np.testing.assert_array_equal(bare.angle_covariances(P)[2], P[rows, rows])
+
+
+def test_a_narrow_prior_stays_narrow():
+    """A sensor that lies on its side, of which all but the heading is known."""
+    side = Rotation.from_euler('x', 90.0, True)
+    network = turned_network(side, Rotation.identity(), std=(STD, None))
+    tracks, *_ = drive(network, point_body([300.0, -150.0, 80.0], 5.0, 0.5),
+                       Path(np.array([-70.0, -1.2]), 0.0, 10.0), POINT)
+    live = [t for t in tracks if not t.ended]
+    first, last = live[0].mounting_std, live[-1].mounting_std
+    assert (last[0] <= 1.02 * STD[[0, 2, 1]]).all()
+    # Its own y axis is upright: the heading was the least known, and the tracker began with that.
+    assert first[0, 1] == pytest.approx(STD[2], rel=0.2)
+    np.testing.assert_allclose(first[0, [0, 2]], STD[0], rtol=0.2)
+    assert last[1].max() > 2.0 * STD[0]
+    assert (np.abs(live[-1].mounting[0]) < 4.0 * STD[[0, 2, 1]]).all()
+    np.testing.assert_allclose(
+        last, np.sqrt(np.diagonal(live[-1].mounting_covariance, axis1=1, axis2=2)))

@@ -248,7 +248,8 @@ def test_conversion_survives_the_message():
     stage = TrackStage(network, settings_for('magnet').track)
     track = dataclasses.replace(
         [t for f in frames for t in stage.feed(f)][-1],
-        mounting=np.arange(27.0).reshape(9, 3), mounting_std=np.arange(27.0).reshape(9, 3) / 7.0)
+        mounting=np.arange(27.0).reshape(9, 3),
+        mounting_covariance=np.arange(81.0).reshape(9, 3, 3) / 7.0)
     from mag_tracking_msgs.msg import Track as TrackMessage
     back = track_of(to_message(TrackMessage, track_dict(track, 'map')),
                     to_message(HypothesisArray, hypotheses_dict(track, 'map')))
@@ -258,7 +259,7 @@ def test_conversion_survives_the_message():
         assert getattr(back, name) == getattr(track, name), name
     for name in ('position', 'velocity', 'covariance', 'orientation', 'orientation_covariance',
                  'position_orientation_covariance', 'moment', 'moment_covariance', 'predicted',
-                 'mounting', 'mounting_std', 'nis_by_sensor'):
+                 'mounting', 'mounting_covariance', 'nis_by_sensor'):
         np.testing.assert_array_equal(getattr(back, name), getattr(track, name))
     assert len(back.hypotheses) == len(track.hypotheses)
 

@@ -15,8 +15,8 @@ from mag_tracking.stages.vehicle_start import start_vehicle, vehicle_model
 SETTINGS = settings_for('magnet').track.magnet
 
 
-def start(frame, network, relative_std=0.0, own_std=()):
-    return start_magnet(SETTINGS, network, frame, 1e-12, own_std, relative_std)
+def start(frame, network, relative_std=0.0, own_covariance=None):
+    return start_magnet(SETTINGS, network, frame, 1e-12, own_covariance, relative_std)
 
 
 def test_the_side_that_fits_better_is_the_heavier():
@@ -41,7 +41,7 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
     vehicle = settings_for('vehicle').track.vehicle
     frame = FieldFrame(0, np.full((2, 3), 1e-7), np.repeat(1e-16 * np.eye(3)[None], 2, axis=0),
                        np.full(2, 8), np.zeros(2))
-    bank = start_vehicle(vehicle, road_network, frame, 2e-8, ())
+    bank = start_vehicle(vehicle, road_network, frame, 2e-8, None)
     m = vehicle_model(vehicle, road_network).dipoles(bank.x[:, :17]).m.sum(axis=1)
     np.testing.assert_allclose(np.linalg.norm(m, axis=1), np.take(vehicle.moments, bank.kind),
                                rtol=1e-9)

@@ -90,6 +90,11 @@ class RunningBackground:
         """(3, 3) [T^2] noise of one sample, or None; NaN for an axis not reported."""
         return self._noise
 
+    @property
+    def drift(self):
+        """(3,) [T/s] of the background; NaN before it is ready, and of an axis not reported."""
+        return np.full(3, np.nan) if self._line is None else self._line[2]
+
     def level(self, time):
         """(3,) [T] background at `time` [s].
 

@@ -43,20 +43,25 @@ class FilterBank:
     and of a sensor that is missing."""
 
     @classmethod
-    def of_targets(cls, x, P, label, n_sensors, background_std, own_std=(), kind=None):
+    def of_targets(cls, x, P, label, n_sensors, background_std, own_covariance=None, kind=None):
         """A bank with equal weights from target states alone.
 
         `x` (n_hyp, n_t), `P` (n_hyp, n_t, n_t). Behind them are put each sensor's own
-        states with the deviations `own_std` (n_own,), and three backgrounds a sensor
-        with `background_std` [T]; all are zero. `kind` (n_hyp,) is 0 if left out.
+        states with the covariances `own_covariance` (n_sensors, n_own, n_own; none if left
+        out), and three backgrounds a sensor with `background_std` [T]; all are zero. `kind`
+        (n_hyp,) is 0 if left out.
         """
         n, n_t = x.shape
-        std = np.append(np.tile(own_std, n_sensors), np.full(3 * n_sensors, background_std))
-        n_x = n_t + len(std)
+        own = np.zeros((n_sensors, 0, 0)) if own_covariance is None else own_covariance
+        n_own = own.shape[1]
+        n_x = n_t + (n_own + 3) * n_sensors
         full_x, full_P = np.zeros((n, n_x)), np.zeros((n, n_x, n_x))
         full_x[:, :n_t], full_P[:, :n_t, :n_t] = x, P
-        rest = np.arange(n_t, n_x)
-        full_P[:, rest, rest] = std**2
+        for j, block in enumerate(own):
+            rows = slice(n_t + j * n_own, n_t + (j + 1) * n_own)
+            full_P[:, rows, rows] = block
+        backgrounds = np.arange(n_x - 3 * n_sensors, n_x)
+        full_P[:, backgrounds, backgrounds] = background_std**2
         return cls(full_x, full_P, np.full(n, -np.log(n)), label,
                    np.zeros(n, dtype=int) if kind is None else kind, np.arange(n),
                    np.full((n, n_sensors), np.nan))

@@ -69,7 +69,7 @@ def import_pose_table(table, background, out, noise_std):
                 q = quaternion_from_rotation_vector(rows['magnet_rotation'][k])
                 writer.write('/ground_truth/magnet/pose', POSE,
                              pose_dict(stamp, 'map', rows['magnet'][k] * 1e-3, q), stamp)
-    write_network(out / 'network.yaml', network, quaternions,
+    write_network(out / 'network.yaml', network,
                   f'Imported from {Path(table).name} and {Path(background).name}.')
     return recording, out / 'network.yaml', len(order)
 

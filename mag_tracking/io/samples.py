@@ -5,7 +5,15 @@ from collections import Counter
 import numpy as np
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.io.schema import MAGNETIC_FIELD, POSE, decode, sample_of, stamp_ns
+from mag_tracking.io.schema import (
+    IMU,
+    MAGNETIC_FIELD,
+    POSE,
+    acceleration_of,
+    decode,
+    sample_of,
+    stamp_ns,
+)
 
 TRUTH_PREFIX = '/ground_truth/'
 """Poses on topics below this are truth: for reports, never for tracking."""
@@ -25,6 +33,10 @@ class SampleReader:
         """Raises RecordingError where the recording has none of the network's topics."""
         self._recording = recording
         self._sensors = dict(zip(network.topics, network.names, strict=True))
+        self._imus = {}
+        for topic, name in zip(network.imu_topics, network.names, strict=True):
+            if topic is not None:
+                self._imus.setdefault(topic, []).append(name)
         self.rejected = Counter()
         self.truth = {}
         if recording.types and not any(t in recording.types for t in self._sensors):
@@ -44,10 +56,23 @@ class SampleReader:
 
     def samples(self, progress=None):
         """Iterate over `MagSample`s in order of log time; see `Recording.messages`."""
+        return (sample for sample, _ in self._records({}, progress))
+
+    def samples_as_received(self, progress=None):
+        """Iterate over (`MagSample`, log time [ns]) in order of the latter."""
+        return self._records({}, progress)
+
+    def samples_and_accelerations(self, progress=None):
+        """Iterate over `MagSample`s and `AccelerationSample`s in order of log time."""
+        return (sample for sample, _ in self._records(self._imus, progress))
+
+    def _records(self, imus, progress):
+        """(sample, log time) of the sensors, and of the accelerometers {topic: sensors}."""
         for message in self._recording.messages(progress=progress):
             sensor = self._sensors.get(message.topic)
             truth = message.topic.startswith(TRUTH_PREFIX) and message.type == POSE
-            if sensor is None and not truth:
+            shaken = imus.get(message.topic) if message.type == IMU else None
+            if sensor is None and shaken is None and not truth:
                 continue
             try:
                 content = decode(message)
@@ -56,8 +81,11 @@ class SampleReader:
                 continue
             if truth:
                 self._add_truth(message.topic, content)
+            elif shaken is not None:
+                for name in shaken:
+                    yield acceleration_of(content, name), message.log_time_ns
             else:
-                yield sample_of(content, sensor)
+                yield sample_of(content, sensor), message.log_time_ns
 
     def _add_truth(self, topic, content):
         """Keep a pose for the report."""

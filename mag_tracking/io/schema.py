@@ -14,9 +14,10 @@ from mcap_ros2.decoder import DecoderFactory
 
 from mag_tracking.errors import RecordingError
 from mag_tracking.geometry import rotation_from_quaternion
-from mag_tracking.records import FieldFrame, MagSample
+from mag_tracking.records import AccelerationSample, FieldFrame, MagSample
 
 MAGNETIC_FIELD = 'sensor_msgs/msg/MagneticField'
+IMU = 'sensor_msgs/msg/Imu'
 POSE = 'geometry_msgs/msg/PoseStamped'
 POSE_WITH_COVARIANCE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 TRACK_ARRAY = 'mag_tracking_msgs/msg/TrackArray'
@@ -56,7 +57,7 @@ DEFINITIONS = {
         'float64[] innovation_by_sensor\nuint32 degrees_of_freedom\nstring arrival\nstring kind\n'
         'float64 kind_weight\nfloat64 length\nfloat64 length_std\nbool ambiguous\n'
         'bool[6] unobservable\n'
-        'float64[] predicted_field\nfloat64[] mounting\nfloat64[] mounting_std\n'),
+        'float64[] predicted_field\nfloat64[] mounting\nfloat64[] mounting_covariance\n'),
     TRACK_ARRAY: (('std_msgs/msg/Header', 'mag_tracking_msgs/msg/Track'),
                   'std_msgs/Header header\nmag_tracking_msgs/Track[] tracks\n'),
 }
@@ -140,7 +141,18 @@ def sample_of(message, sensor):
                      None if unknown else C.reshape(3, 3))
 
 
-def _xyz(v):
+def acceleration_of(message, sensor):
+    """`AccelerationSample` of a message-shaped sensor_msgs/Imu of `sensor`.
+
+    NaN where the message says that it has none (its covariance begins with -1).
+    """
+    a = message.linear_acceleration
+    there = message.linear_acceleration_covariance[0] != -1.0
+    return AccelerationSample(stamp_ns(message.header.stamp), sensor,
+                              np.array([a.x, a.y, a.z]) if there else np.full(3, np.nan))
+
+
+def xyz(v):
     """Vector as a dict."""
     return {'x': float(v[0]), 'y': float(v[1]), 'z': float(v[2])}
 
@@ -153,7 +165,7 @@ def header_dict(ns, frame):
 def sample_dict(sample, frame):
     """sensor_msgs/MagneticField of a `MagSample`; `frame` is the sensor's."""
     C = np.zeros(9) if sample.covariance is None else sample.covariance.ravel()
-    return {'header': header_dict(sample.stamp_ns, frame), 'magnetic_field': _xyz(sample.field),
+    return {'header': header_dict(sample.stamp_ns, frame), 'magnetic_field': xyz(sample.field),
             'magnetic_field_covariance': C.tolist()}
 
 
@@ -164,8 +176,8 @@ def pose_dict(ns, frame, position, quaternion):
 
 def _pose(position, quaternion):
     """geometry_msgs/Pose."""
-    return {'position': _xyz(position),
-            'orientation': {**_xyz(quaternion), 'w': float(quaternion[3])}}
+    return {'position': xyz(position),
+            'orientation': {**xyz(quaternion), 'w': float(quaternion[3])}}
 
 
 def pose_covariance(track):
@@ -188,8 +200,8 @@ def track_dict(track, frame):
     """mag_tracking_msgs/Track of a `Track`."""
     return {'header': header_dict(track.stamp_ns, frame), 'id': track.id,
             'status': int(track.ended), 'pose': pose_with_covariance_dict(track),
-            'velocity': _xyz(track.velocity), 'covariance': track.covariance.ravel().tolist(),
-            'moment': _xyz(track.moment),
+            'velocity': xyz(track.velocity), 'covariance': track.covariance.ravel().tolist(),
+            'moment': xyz(track.moment),
             'moment_covariance': track.moment_covariance.ravel().tolist(),
             'existence': track.existence, 'weight': track.weight,
             'normalised_innovation': track.nis, 'degrees_of_freedom': track.degrees_of_freedom,
@@ -199,7 +211,7 @@ def track_dict(track, frame):
             'unobservable': list(track.unobservable),
             'predicted_field': track.predicted.ravel().tolist(),
             'mounting': track.mounting.ravel().tolist(),
-            'mounting_std': track.mounting_std.ravel().tolist()}
+            'mounting_covariance': track.mounting_covariance.ravel().tolist()}
 
 
 def hypotheses_dict(track, frame):
@@ -207,8 +219,8 @@ def hypotheses_dict(track, frame):
     return {'header': header_dict(track.stamp_ns, frame), 'track_id': track.id,
             'hypotheses': [
                 {'arrival': h.arrival, 'kind': h.kind, 'weight': h.weight,
-                 'position': _xyz(h.position), 'velocity': _xyz(h.velocity),
-                 'covariance': h.covariance.ravel().tolist(), 'moment': _xyz(h.moment)}
+                 'position': xyz(h.position), 'velocity': xyz(h.velocity),
+                 'covariance': h.covariance.ravel().tolist(), 'moment': xyz(h.moment)}
                 for h in track.hypotheses]}
 
 
@@ -223,7 +235,7 @@ def smoothed_track_dict(poses, frame):
     return {'header': header_dict(last.stamp_ns, frame), 'track_id': last.id, 'kind': last.kind,
             'length': last.length, 'length_std': last.length_std, 'ambiguous': last.ambiguous,
             'poses': [smoothed_pose_dict(p, frame) for p in poses],
-            'velocities': [_xyz(p.velocity) for p in poses]}
+            'velocities': [xyz(p.velocity) for p in poses]}
 
 
 def frame_dict(frame, network):
@@ -295,21 +307,5 @@ def odometry_dict(track, frame, child_frame):
     twist[3:, 3:] = np.pi**2 * np.eye(3)
     return {'header': header_dict(track.stamp_ns, frame), 'child_frame_id': child_frame,
             'pose': pose_with_covariance_dict(track),
-            'twist': {'twist': {'linear': _xyz(R.T @ track.velocity), 'angular': _xyz(np.zeros(3))},
+            'twist': {'twist': {'linear': xyz(R.T @ track.velocity), 'angular': xyz(np.zeros(3))},
                       'covariance': twist.ravel().tolist()}}
-
-
-def calibration_dict(calibrate, network, ns):
-    """mag_tracking_msgs/CalibrationState of a `Calibrate` stage at time `ns`."""
-    sensors = []
-    for name, background in calibrate.backgrounds().items():
-        last = calibrate.last_stamp_ns(name)
-        ready = background.ready and last is not None
-        counts = calibrate.per_sensor[name]
-        sensors.append({
-            'sensor': name, 'ready': ready, 'frozen': background.frozen,
-            'background': _xyz(calibrate.background(name) if ready else np.full(3, np.nan)),
-            'covariance': (background.covariance if ready
-                           else np.full((3, 3), np.nan)).ravel().tolist(),
-            'n_samples': counts['accepted'], 'n_rejected': counts['rejected']})
-    return {'header': header_dict(ns, network.frame), 'sensors': sensors}

@@ -1,44 +1,71 @@
 """calibration_node: raw magnetic fields in, calibrated ones out."""
 
+import datetime
 import sys
 from functools import partial
+from pathlib import Path
 
 from mag_tracking_msgs.msg import CalibrationState
 from mag_tracking_msgs.srv import Calibrate as CalibrateService
-from sensor_msgs.msg import MagneticField
+from mag_tracking_msgs.srv import Survey as SurveyService
+from sensor_msgs.msg import Imu, MagneticField
 
-from mag_tracking.errors import NetworkError
-from mag_tracking.io.schema import calibration_dict, sample_dict, sample_of
+from mag_tracking.errors import NetworkError, OutputError
+from mag_tracking.io.calibration_state import calibration_dict
+from mag_tracking.io.network_file import write_network
+from mag_tracking.io.schema import acceleration_of, sample_dict, sample_of
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
+from mag_tracking.nodes.ros_params import declare_settings
+from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.stage_node import LATCHED, STREAM, StageNode
 from mag_tracking.stages.calibrate import Calibrate
+from mag_tracking.stages.survey import Survey
 
 
 class CalibrationNode(StageNode):
     """Subscribes to each sensor's topic; publishes it with `_calibrated` behind its name."""
 
+    OWN_PARAMETERS = (*StageNode.OWN_PARAMETERS, 'save_as')
+
     def __init__(self, **node_arguments):
         super().__init__('calibration_node', 'calibrate', **node_arguments)
+        self.settings = declare_settings(self, self.settings, 'survey', self.OWN_PARAMETERS)
+        self._save_as = self.declare_parameter('save_as', '').value
         self._stage = Calibrate(self.network, self.settings.calibrate)
+        self._survey = Survey(self.network, self.settings.survey)
+        self._health = HealthDiagnostics(self.network, self.settings.calibrate.max_field)
         self._publishers_by_sensor = {}
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self._publishers_by_sensor[sensor] = self.publisher(
                 MagneticField, f'{topic}_calibrated', STREAM)
             self.subscription(MagneticField, topic, partial(self._take, sensor), self.input_qos)
+        for sensor, topic in zip(self.network.names, self.network.imu_topics, strict=True):
+            if topic is not None:
+                self.subscription(Imu, topic, partial(self._shaken, sensor), self.input_qos)
         self._state = self.publisher(CalibrationState, '~/calibration', LATCHED)
         self._published = None
         self.create_timer(1.0, self._publish_state)
         self.create_service(CalibrateService, '~/calibrate', self._calibrate)
+        self.create_service(SurveyService, '~/survey', self._solve)
 
     def stages(self):
-        return {'calibrate': self._stage}
+        return {'calibrate': self._stage, 'survey': self._survey}
+
+    def statuses(self):
+        return self._health.statuses(self.get_name(), self._stage)
 
     def _take(self, sensor, message):
         """One raw reading."""
-        for sample in self._stage.feed(sample_of(message, sensor)):
+        raw = sample_of(message, sensor)
+        self._health.add(raw, self.get_clock().now().nanoseconds)
+        for sample in self._stage.feed(raw):
             self._publishers_by_sensor[sensor].publish(
                 to_message(MagneticField, sample_dict(sample, message.header.frame_id)))
+
+    def _shaken(self, sensor, message):
+        """One acceleration."""
+        self._survey.feed(acceleration_of(message, sensor))
 
     def _publish_state(self):
         """The calibration, where it has changed."""
@@ -58,6 +85,42 @@ class CalibrationNode(StageNode):
         response.success = True
         response.message = f'learning {", ".join(request.sensors) or "all sensors"} anew'
         return response
+
+    def _solve(self, request, response):
+        """Orientations and clocks, as the service asks; tracks that run keep theirs to the end."""
+        backgrounds = self._stage.backgrounds()
+        fields = {name: self._stage.background(name) for name, b in backgrounds.items()
+                  if b.ready and not b.frozen and self._stage.last_stamp_ns(name) is not None}
+        if not fields or not self._survey.counts['accelerations']:
+            response.message = 'no background has been learnt' if not fields else \
+                f'no acceleration has come on {", ".join(filter(None, self.network.imu_topics))}'
+            return response
+        date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
+        found = self._survey.solve(fields, date)
+        if request.save:
+            path = self._save_as or self._beside()
+            try:
+                write_network(path, found.network, 'Written by calibration_node.')
+            except OutputError as error:
+                response.message = str(error)
+                return response
+        self.network = found.network
+        self._stage.renew(found.network)
+        self._publish_state()
+        response.success = True
+        response.message = ('in force' + (f', and saved in {path}' if request.save else '')
+                            + f'; clocks against {found.reference or "none: no knock was felt"}')
+        response.warnings = [str(d) for d in found.disagreements] + [
+            f'{s.sensor}: {text}' for s in found.sensors
+            for text in (*s.warnings, *([s.lag.reason] if s.lag and s.lag.reason else []))]
+        for text in response.warnings:
+            self.get_logger().warning(text)
+        return response
+
+    def _beside(self):
+        """A file beside the network file, which somebody wrote by hand."""
+        path = Path(self.get_parameter('network').value)
+        return path.with_name(f'{path.stem}_calibrated.yaml')
 
 
 def main(arguments=None):

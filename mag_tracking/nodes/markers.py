@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from mag_tracking.geometry import quaternion_from_rotation
 from mag_tracking.io.schema import header_dict
 
 _ELLIPSOID, _MOMENT = 0, 1
@@ -17,20 +18,6 @@ def _marker(track, frame, kind, shape, **content):
             'type': shape, **content}
 
 
-def _quaternion(R):
-    """Quaternion of a rotation matrix by its largest component, as a dict."""
-    w2 = np.array([1 + R[0, 0] - R[1, 1] - R[2, 2], 1 - R[0, 0] + R[1, 1] - R[2, 2],
-                   1 - R[0, 0] - R[1, 1] + R[2, 2], 1 + R[0, 0] + R[1, 1] + R[2, 2]])
-    k = int(np.argmax(w2))
-    symmetric = np.array([
-        [w2[0], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[2, 1] - R[1, 2]],
-        [R[0, 1] + R[1, 0], w2[1], R[1, 2] + R[2, 1], R[0, 2] - R[2, 0]],
-        [R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], w2[2], R[1, 0] - R[0, 1]],
-        [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], w2[3]]])
-    q = symmetric[k] / np.linalg.norm(symmetric[k])
-    return dict(zip('xyzw', q.tolist(), strict=True))
-
-
 def track_markers(track, frame):
     """visualization_msgs/MarkerArray of a `Track`, as a dict."""
     values, R = np.linalg.eigh(track.covariance[:3, :3])
@@ -40,7 +27,8 @@ def track_markers(track, frame):
     position = dict(zip('xyz', track.position.tolist(), strict=True))
     ellipsoid = _marker(
         track, frame, _ELLIPSOID, _SPHERE, action=_ADD,
-        pose={'position': position, 'orientation': _quaternion(R)},
+        pose={'position': position, 'orientation': dict(
+            zip('xyzw', quaternion_from_rotation(R).tolist(), strict=True))},
         # A sphere of no thickness is refused by RViz.
         scale=dict(zip('xyz', np.maximum(axes, 1e-6).tolist(), strict=True)),
         color={'r': 0.2, 'g': 0.5, 'b': 1.0, 'a': 0.15 if track.ambiguous else 0.35})

@@ -55,6 +55,10 @@ class StageNode(Node):
         """{name: stage} whose counts are published."""
         raise NotImplementedError
 
+    def statuses(self):
+        """More [DiagnosticStatus] than the counts of the stages."""
+        return []
+
     def publisher(self, message_type, topic, qos):
         """A publisher that logs a subscriber with unfit QoS."""
         events = PublisherEventCallbacks(incompatible_qos=lambda e: self.get_logger().warning(
@@ -85,6 +89,7 @@ class StageNode(Node):
                 name=f'{self.get_name()}: {name}', hardware_id='magnetometer network',
                 message='samples were rejected' if news else 'running',
                 values=[KeyValue(key=k, value=str(n)) for k, n in sorted(stage.counts.items())]))
+        array.status += self.statuses()
         self._diagnostics.publish(array)
 
 

@@ -2,12 +2,20 @@
 
 import sys
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from mag_tracking_msgs.msg import HypothesisArray, NetworkFrame, SmoothedTrack, TrackArray
+from mag_tracking_msgs.msg import (
+    CalibrationState,
+    HypothesisArray,
+    NetworkFrame,
+    SmoothedTrack,
+    TrackArray,
+)
 from nav_msgs.msg import Odometry, Path
 from visualization_msgs.msg import MarkerArray
 
 from mag_tracking.errors import RecordingError
+from mag_tracking.io.calibration_state import with_orientations
 from mag_tracking.io.schema import (
     frame_of,
     header_dict,
@@ -23,7 +31,7 @@ from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.markers import delete_markers, track_markers
 from mag_tracking.nodes.ros_params import follow_changes
-from mag_tracking.nodes.stage_node import RESULTS, STREAM, StageNode
+from mag_tracking.nodes.stage_node import LATCHED, RESULTS, STREAM, StageNode
 from mag_tracking.records import SmoothedPose
 from mag_tracking.stages.track import TrackStage
 
@@ -50,9 +58,25 @@ class TrackerNode(StageNode):
         self._markers = self.publisher(MarkerArray, '~/markers', RESULTS)
         self._path = Path()
         self.subscription(NetworkFrame, '/detection_node/frame', self._take, STREAM)
+        self.subscription(CalibrationState, '/calibration_node/calibration', self._calibrated,
+                          LATCHED)
 
     def stages(self):
         return {'track': self._stage}
+
+    def _calibrated(self, message):
+        """The sensors' orientations, which a survey may have changed."""
+        try:
+            network = with_orientations(self.network, message)
+        except RecordingError as error:
+            self._stage.counts['rejected: bad calibration'] += 1
+            self.get_logger().error(str(error), throttle_duration_sec=10.0)
+            return
+        if _same_orientations(network, self.network):
+            return
+        self.network = network
+        self._stage.use_network(network)
+        self.get_logger().info('the next track is of sensors as they were surveyed')
 
     def _take(self, message):
         """One frame."""
@@ -106,6 +130,13 @@ class TrackerNode(StageNode):
         self._path.poses = [*self._path.poses[1 - LONGEST_PATH:], step]
         self._path_publisher.publish(self._path)
         self._markers.publish(to_message(MarkerArray, track_markers(track, frame)))
+
+
+def _same_orientations(one, other):
+    """Whether two networks are turned alike, but for the rounding of quaternions."""
+    known = [(a is None) == (b is None) and (a is None or np.allclose(a, b))
+             for a, b in zip(one.orientation_std, other.orientation_std, strict=True)]
+    return all(known) and bool(np.abs(one.R_ws - other.R_ws).max() < 1e-9)
 
 
 def main(arguments=None):

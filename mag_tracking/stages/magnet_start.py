@@ -40,7 +40,7 @@ def magnet_model(settings):
     return Magnet(np.full(3, settings.acceleration**2), settings.angular_acceleration**2)
 
 
-def start_magnet(settings, network, frame, background_std, own_std, relative_std):
+def start_magnet(settings, network, frame, background_std, own_covariance, relative_std):
     """Hypotheses of a magnet at its first frame, wherever it is.
 
     On a coarse grid the moment is projected out; the best points are refined,
@@ -76,7 +76,7 @@ def start_magnet(settings, network, frame, background_std, own_std, relative_std
     if not len(cost):
         return None
     bank = FilterBank.of_targets(state, P, np.zeros(len(cost), dtype=int), len(network),
-                                 background_std, own_std)
+                                 background_std, own_covariance)
     bank.reweight(-0.5 * cost)
     return bank
 

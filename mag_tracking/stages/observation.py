@@ -5,6 +5,10 @@ import numpy as np
 from mag_tracking.physics.dipole import sensor_fields
 from mag_tracking.physics.mounting import turned_fields
 
+MOST_TURNED = np.deg2rad(15.0)
+"""[rad] A sensor whose orientation is less certain is tracked as if it were as certain as this: the
+angles are of first order. `TrackStage` counts such sensors."""
+
 SAME_TIME_S = 1e-3
 """[s] Samples closer than this are taken together: at 20 m/s a target moves two centimetres."""
 
@@ -20,19 +24,29 @@ class Observation:
     """
 
     def __init__(self, network, model, mounting_std, error_time):
+        """`mounting_std` [rad] is that of a sensor whose `orientation_std` is not known."""
         self._positions = np.ascontiguousarray(network.positions, dtype=float)
         self._R_sw = network.R_sw
         self._model = model
         self._error_time = error_time
         self._n_angles = 3 if mounting_std else 0
         self.n_target = len(model.state_names)
-        self.own_std = np.repeat([mounting_std, 1.0], [self._n_angles, 3 if error_time else 0])
-        """(n_own,) deviations of a sensor's own states when a track begins."""
+        n_own = self._n_angles + (3 if error_time else 0)
+        self.own_covariance = np.zeros((len(network), n_own, n_own))
+        """(n_sensors, n_own, n_own) of the sensors' own states when a track begins."""
+        errors = np.arange(self._n_angles, n_own)
+        self.own_covariance[:, errors, errors] = 1.0
+        if mounting_std:
+            std = [np.full(3, mounting_std) if s is None else np.minimum(s, MOST_TURNED)
+                   for s in network.orientation_std]
+            # The angles are about the sensor's axes, what is known of them about the world's.
+            self.own_covariance[:, :3, :3] = np.einsum(
+                'jik,jk,jlk->jil', self._R_sw, np.square(std), self._R_sw)
 
     @property
     def n_own(self):
         """States of each sensor between the target's and the backgrounds."""
-        return len(self.own_std)
+        return self.own_covariance.shape[1]
 
     def own(self, x):
         """(..., n_sensors, n_own): the sensors' own states among those on the last axis of `x`."""
@@ -43,6 +57,12 @@ class Observation:
     def angles(self, x):
         """(..., n_sensors, 3) [rad] mounting angles; (..., 0, 3) where they are not estimated."""
         return self.own(x)[..., :3] if self._n_angles else np.zeros((*x.shape[:-1], 0, 3))
+
+    def angle_covariances(self, P):
+        """(n_sensors, 3, 3) [rad^2] of the mounting angles, among `P` (n_x, n_x); or (0, 3, 3)."""
+        first = self.n_target + self.n_own * np.arange(len(self._positions))
+        rows = first[:, None] + np.arange(3)
+        return P[rows[:, :, None], rows[:, None, :]] if self._n_angles else np.zeros((0, 3, 3))
 
     def without_errors(self, x):
         """The states `x` (n_hyp, n_x), copied, with model errors of zero."""

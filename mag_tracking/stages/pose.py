@@ -78,7 +78,7 @@ def published_track(bank, best, model, orientation, names, kinds, strange, **kno
         The measurement does not fit even the best hypothesis: ambiguous, too.
     known : fields of `Track` that the bank does not know
         stamp_ns, id, ended, existence, degrees_of_freedom, predicted, mounting,
-        mounting_std.
+        mounting_covariance.
     """
     n_t = len(model.state_names)
     said, flags = _said_of(model, orientation, bank.x[best, :n_t], bank.P[best, :n_t, :n_t])

@@ -10,10 +10,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from mag_tracking.errors import SettingsError
+from mag_tracking.errors import NetworkError, SettingsError
 from mag_tracking.settings import param
 from mag_tracking.stages.bank_filter import BankFilter, NoTarget
 from mag_tracking.stages.magnet_start import MagnetSettings, magnet_model, start_magnet
+from mag_tracking.stages.observation import MOST_TURNED
 from mag_tracking.stages.pose import (
     is_ambiguous,
     magnet_orientation,
@@ -128,6 +129,9 @@ class TrackStage:
             raise SettingsError(f'track.target: expected vehicle or magnet, '
                                 f'got {settings.target!r}')
         self._filter = BankFilter(network, self._model, settings)
+        hardly = sum(s is not None and s.max() > MOST_TURNED for s in network.orientation_std)
+        if hardly:
+            self.counts['sensors whose orientation is hardly known'] = hardly
         self._whole = WholeTrack(settings.smooth_longest_s)
         self._anew = Relinearisation(settings.relinearise_interval_s, settings.relinearise_window_s,
                                      settings.relinearise_most)
@@ -142,6 +146,17 @@ class TrackStage:
         self._out_of_reach = False
         self._last = None
         self._last_ns = None
+        self._next_network = None
+
+    def use_network(self, network):
+        """Go on with another calibration of the same sensors, as soon as no track runs.
+
+        Raises NetworkError where they are others.
+        """
+        if network.names != self._network.names:
+            raise NetworkError(f'a network of {", ".join(network.names)} in place of one of '
+                               f'{", ".join(self._network.names)}')
+        self._next_network = network
 
     def configure(self, settings):
         """Take new values of the live settings; the running bank goes on with them."""
@@ -157,6 +172,9 @@ class TrackStage:
     def feed(self, frame):
         """A `FieldFrame` gives the `Track`s that follow from it."""
         out = []
+        if self._next_network is not None and self._bank is None:
+            self._network, self._next_network = self._next_network, None
+            self._filter = BankFilter(self._network, self._model, self._settings)
         if self._last_ns is not None:
             dt = (frame.stamp_ns - self._last_ns) / NS
             if dt <= 0.0:
@@ -197,10 +215,10 @@ class TrackStage:
         s = self._settings
         if s.target == 'vehicle':
             self._bank = start_vehicle(s.vehicle, self._network, frame, s.background_std,
-                                       self._filter.observation.own_std)
+                                       self._filter.observation.own_covariance)
         else:
             self._bank = start_magnet(s.magnet, self._network, frame, s.background_std,
-                                      self._filter.observation.own_std, s.field_error)
+                                      self._filter.observation.own_covariance, s.field_error)
         recent = [f for f in self._recent if frame.stamp_ns - f.stamp_ns <= s.lookback_s * NS]
         self._recent.clear()
         if self._bank is None:
@@ -299,7 +317,7 @@ class TrackStage:
             strange=self._filter.is_strange(bank, best, frame),
             predicted=self._filter.predicted_field(bank, best, frame, dt),
             mounting=observation.angles(bank.x[best]),
-            mounting_std=observation.angles(np.sqrt(np.diagonal(bank.P[best]))))
+            mounting_covariance=observation.angle_covariances(bank.P[best]))
 
     def _end(self, reason):
         """Close the running track: its last record once more, marked as ended, then it smoothed."""

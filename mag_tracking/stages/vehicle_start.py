@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mag_tracking.errors import SettingsError
+from mag_tracking.geometry import rotation_about_z
 from mag_tracking.inference.detection_theory import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.physics.dipole import MU0, dipole_field
@@ -122,7 +123,7 @@ def moment_directions():
     return np.vstack([axes, diagonals / np.sqrt(3.0)])
 
 
-def start_vehicle(settings, network, frame, background_std, own_std):
+def start_vehicle(settings, network, frame, background_std, own_covariance):
     """Hypotheses of a vehicle at its first frame.
 
     Kinds x arrival lines x moment directions x lateral offsets x speeds, each at the
@@ -135,8 +136,7 @@ def start_vehicle(settings, network, frame, background_std, own_std):
     for kind in range(len(settings.kinds)):
         moments = settings.moments[kind] * moment_directions()
         for label, heading in enumerate(np.deg2rad(settings.arrival_headings_deg)):
-            c, s = np.cos(heading), np.sin(heading)
-            R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+            R = rotation_about_z(heading)
             hard = (moments - settings.soft_iron * _earth_field(network) / MU0) @ R
             for offset in settings.lateral_offsets:
                 starts = _matching_positions(settings, network, frame, R, offset, moments,
@@ -147,7 +147,7 @@ def start_vehicle(settings, network, frame, background_std, own_std):
                     labels += [label] * len(moments)
                     kinds += [kind] * len(moments)
     return FilterBank.of_targets(np.vstack(states), np.array(covariances), np.array(labels),
-                                 len(network), background_std, own_std, np.array(kinds))
+                                 len(network), background_std, own_covariance, np.array(kinds))
 
 
 def _matching_positions(settings, network, frame, R, offset, moments, height):

@@ -1,0 +1,202 @@
+"""Calibration of a network from a recording: what `mag-tracking calibrate` and `tumble` do."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mag_tracking.analysis.pass_mounting import MountingEvidence, fold_mounting, with_evidence
+from mag_tracking.calibration.ellipsoid_fit import fit_ellipsoid
+from mag_tracking.errors import RecordingError
+from mag_tracking.io.samples import SampleReader
+from mag_tracking.network import SensorNetwork
+from mag_tracking.pipeline import Pipeline
+from mag_tracking.records import AccelerationSample, Track
+from mag_tracking.stages.calibrate import Calibrate
+from mag_tracking.stages.stage import rejected
+from mag_tracking.stages.survey import NetworkSurvey, Survey
+
+LEAST_POSES = 8
+"""A track with fewer tells nothing of the sensors."""
+
+
+@dataclass
+class Calibration:
+    """What a recording told."""
+
+    network: SensorNetwork
+    """To be used from now on."""
+    survey: NetworkSurvey
+    """From accelerometers, compasses and knocks."""
+    evidence: MountingEvidence | None
+    """From the passes; None where they were not asked, or there was none."""
+    levels: dict
+    """{sensor: (3,) [T], sensor frame} the field without a target."""
+    rejected: dict
+    """{cause: number}."""
+    without_background: tuple[str, ...]
+    interrupted: bool
+
+
+class _Stopped(Exception):
+    """The reading is to end here."""
+
+
+def calibrate(recording, network, settings, date, passes=True, progress=None, stopped=None):
+    """Orientations, clock offsets and noise of a network, from one recording of it.
+
+    The recording begins without a target, and with knocks where clocks are to be compared.
+
+    Parameters
+    ----------
+    recording : Recording
+    network : SensorNetwork
+        As it was installed.
+    settings : Settings
+    date : str
+        What the calibration is marked with.
+    passes : bool
+        Track what passes, too, and take what it tells of the orientations. Only where
+        `track.mounting_std_deg` is not zero.
+    progress : function, optional
+        Called with the bytes done since the last call; with passes the recording is read twice.
+    stopped : function, optional
+        Asked before every sample; when it is true, what was read so far counts.
+
+    Returns
+    -------
+    Calibration
+
+    Raises RecordingError where the recording has none of the network's topics, or no sample.
+    """
+    levels, survey, calibrated, interrupted = _surveyed(
+        recording, network, settings, date, progress, stopped)
+    if not calibrated.counts.total():
+        raise RecordingError(f'{recording.path} has no sample of the network')
+    found = _with_noise(survey.network, calibrated)
+    evidence = None
+    if passes and not interrupted and settings.track.mounting_std_deg:
+        tracks, interrupted = _passes(recording, found, settings, progress, stopped)
+        if tracks:
+            prior = [np.full(3, np.deg2rad(settings.track.mounting_std_deg)) if s is None else s
+                     for s in found.orientation_std]
+            evidence = fold_mounting(found, prior, tracks)
+            found = _marked(with_evidence(found, evidence), date, evidence.n_tracks)
+    waiting = tuple(name for name in network.names if name not in levels)
+    return Calibration(found, survey, evidence, levels, rejected(calibrated.counts), waiting,
+                       interrupted)
+
+
+def _samples(recording, reader_of, progress, stopped):
+    """Iterate over what `reader_of` reads; raises _Stopped."""
+    def advance(n):
+        if progress is not None:
+            progress(n)
+        if stopped is not None and stopped():
+            raise _Stopped
+
+    for sample in reader_of(advance):
+        if stopped is not None and stopped():
+            raise _Stopped
+        yield sample
+
+
+def _surveyed(recording, network, settings, date, progress, stopped):
+    """First reading: (levels, NetworkSurvey, Calibrate, interrupted)."""
+    reader = SampleReader(recording, network)
+    stage, survey = Calibrate(network, settings.calibrate), Survey(network, settings.survey)
+    levels, interrupted = {}, False
+    try:
+        for sample in _samples(recording, reader.samples_and_accelerations, progress, stopped):
+            if isinstance(sample, AccelerationSample):
+                survey.feed(sample)
+                continue
+            stage.feed(sample)
+            # The first that is known: later a target may stand there.
+            if sample.sensor not in levels and stage.backgrounds()[sample.sensor].ready:
+                levels[sample.sensor] = stage.background(sample.sensor)
+    except _Stopped:
+        interrupted = True
+    stage.counts.update({f'rejected: {cause}': n for cause, n in reader.rejected.items()})
+    stage.counts.update({k: n for k, n in survey.counts.items() if k.startswith('rejected: ')})
+    return levels, survey.solve(levels, date), stage, interrupted
+
+
+def _with_noise(network, calibrated):
+    """The network with the noise that was found, where the file said nothing."""
+    noise = list(network.noise_std)
+    for j, background in enumerate(calibrated.backgrounds().values()):
+        if noise[j] is None and background.ready:
+            std = np.sqrt(np.diagonal(background.covariance))
+            # An axis that is not reported has no noise; the file wants three numbers.
+            noise[j] = None if np.isnan(std).any() else std
+    return replace(network, noise_std=tuple(noise))
+
+
+def _passes(recording, network, settings, progress, stopped):
+    """Second reading: (the last certain pose of each track, interrupted)."""
+    reader, pipeline = SampleReader(recording, network), Pipeline(network, settings)
+    poses, interrupted = {}, False
+
+    def take(records):
+        for record in records:
+            if isinstance(record, Track) and not record.ended and not record.ambiguous:
+                n = poses[record.id][0] + 1 if record.id in poses else 1
+                poses[record.id] = n, record
+
+    try:
+        for sample in _samples(recording, reader.samples, progress, stopped):
+            take(pipeline.feed(sample))
+    except _Stopped:
+        interrupted = True
+    take(pipeline.flush())
+    return [track for n, track in poses.values() if n >= LEAST_POSES], interrupted
+
+
+def _marked(network, date, n_tracks):
+    """The network whose calibration says that passes are in it."""
+    passes = f'{n_tracks} pass{"es" if n_tracks > 1 else ""}'
+    return replace(network, calibrated=tuple(
+        None if c is None else replace(c, date=date, by=f'{c.by}; {passes}')
+        for c in network.calibrated))
+
+
+def tumble(recording, network, sensors, field_size=None, progress=None, stopped=None):
+    """Hard and soft iron of sensors that were turned about while a recording was made.
+
+    Parameters
+    ----------
+    recording : Recording
+    network : SensorNetwork
+    sensors : collection of str
+        Names; empty = all.
+    field_size : float [T], optional
+        Of the field where they were turned; without it the sensors' gain is left as it is.
+    progress, stopped : function, optional
+        As for `calibrate`.
+
+    Returns
+    -------
+    (SensorNetwork with what converged, {sensor: EllipsoidFit}, {sensor: readings (n, 3)},
+    interrupted)
+
+    Raises NetworkError for an unknown sensor, RecordingError where the recording has none
+    of the network's topics.
+    """
+    wanted = tuple(sensors) or network.names
+    rows = {name: network.index(name) for name in wanted}
+    readings, interrupted = {name: [] for name in wanted}, False
+    reader = SampleReader(recording, network)
+    try:
+        for sample in _samples(recording, reader.samples, progress, stopped):
+            if sample.sensor in readings and not np.isinf(sample.field).any():
+                readings[sample.sensor].append(sample.field)
+    except _Stopped:
+        interrupted = True
+    readings = {name: np.array(r).reshape(-1, 3) for name, r in readings.items()}
+    fits = {name: fit_ellipsoid(r, field_size) for name, r in readings.items()}
+    offset, correction = list(network.offset), list(network.correction)
+    for name, fit in fits.items():
+        if fit.converged:
+            offset[rows[name]], correction[rows[name]] = fit.offset, fit.correction
+    return (replace(network, offset=tuple(offset), correction=tuple(correction)), fits, readings,
+            interrupted)

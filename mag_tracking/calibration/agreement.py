@@ -1,0 +1,144 @@
+"""Whether all sensors of a network measure the same Earth, and what is wrong where they do not.
+
+Without a target every sensor has the same field in another frame. A flipped axis, a swapped
+pair, another unit or two sensors in each other's place are seen at once, and told by name.
+"""
+
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+from scipy.stats import chi2
+
+IMPROBABLE = 1e-5
+"""A sensor that is right disagrees with this probability."""
+
+FARTHEST = 5.0
+"""A heading that is off by more deviations is not tried."""
+
+YAW_STEP = np.deg2rad(0.25)
+"""Headings are tried so far apart: of 20 uT across the vertical a tenth of a microtesla."""
+
+UNITS = (('gauss', 1e4), ('millitesla', 1e3), ('microtesla', 1e6), ('nanotesla', 1e9))
+_AXES = 'xyz'
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """A sensor whose field is not the Earth's."""
+
+    sensor: str
+    size: float
+    """[T] Measured less expected."""
+    explanations: tuple[str, ...]
+    """What would explain it, the simplest only; empty where nothing that is known does."""
+
+    def __str__(self):
+        because = ' or '.join(self.explanations) or (
+            'no axis, unit or exchange of sensors explains it: iron or a magnet beside it, or '
+            'another orientation than stated')
+        return f'{self.sensor} is {self.size * 1e6:.3g} uT from the field of the Earth: {because}'
+
+
+def consensus(fields, R_ws):
+    """(3,) [T] the field, in the world, that most sensors of a network agree on.
+
+    `fields` (n, 3) [T], sensor frames, NaN = not reported; `R_ws` (n, 3, 3). Raises
+    ValueError with fewer than three sensors with all axes: of two nobody knows which is right.
+    """
+    whole = ~np.isnan(fields).any(axis=1)
+    if np.count_nonzero(whole) < 3:
+        raise ValueError('without an earth_field three sensors with three axes are needed to '
+                         f'compare, there are {np.count_nonzero(whole)}')
+    return np.median(np.einsum('jik,jk->ji', R_ws[whole], fields[whole]), axis=0)
+
+
+def disagreements(names, fields, R_ws, orientation_std, earth_field, bias_std):
+    """The sensors that do not measure the field of the Earth.
+
+    Parameters
+    ----------
+    names : (n,) of str
+    fields : (n, 3) [T], sensor frames
+        Without a target; NaN = not reported.
+    R_ws : (n, 3, 3)
+    orientation_std : (n, 3) [rad]
+        How far each may be turned, about the world's axes.
+    earth_field : (3,) [T], world
+    bias_std : float [T]
+        What a sensor and the iron near it may add, on each axis.
+
+    Returns
+    -------
+    list of Disagreement, in the order of `names`
+    """
+    B0 = np.asarray(earth_field, dtype=float)
+    odd = [j for j in range(len(names))
+           if not _fits(fields[j], R_ws[j], orientation_std[j], B0, bias_std)]
+    out = []
+    for j in odd:
+        size = np.sqrt(np.nansum((fields[j] - R_ws[j].T @ B0)**2))
+        out.append(Disagreement(names[j], float(size), _explanations(
+            j, odd, names, fields, R_ws, orientation_std, B0, bias_std)))
+    return out
+
+
+def _fits(y, R_ws, std, B0, bias_std):
+    """Whether a field is no less likely than IMPROBABLE, at the heading that suits it best."""
+    there = ~np.isnan(y)
+    if not there.any():
+        return True
+    # A heading may be far off, and is tried; a tilt is small, and its effect is its slope.
+    most = min(np.pi, FARTHEST * std[2])
+    yaw = np.linspace(-most, most, 1 + 2 * max(1, round(most / YAW_STEP)))
+    B = np.stack([B0[0] * np.cos(yaw) + B0[1] * np.sin(yaw),
+                  B0[1] * np.cos(yaw) - B0[0] * np.sin(yaw), np.full(len(yaw), B0[2])], axis=1)
+    turn = (R_ws.T @ np.cross(np.eye(3), B0).T * std)[:, :2]
+    S = (bias_std**2 * np.eye(3) + turn @ turn.T)[np.ix_(there, there)]
+    r = (y - B @ R_ws)[:, there]
+    energy = np.einsum('ni,ij,nj->n', r, np.linalg.inv(S), r) + (yaw / std[2])**2
+    return bool(energy.min() <= chi2.isf(IMPROBABLE, np.count_nonzero(there)))
+
+
+def _explanations(j, odd, names, fields, R_ws, orientation_std, B0, bias_std):
+    """The simplest of what makes the field of sensor `j` fit."""
+    def fits(y, R=R_ws[j], std=orientation_std[j]):
+        return _fits(y, R, std, B0, bias_std)
+
+    y = fields[j]
+    # Sensors in each other's place: both have to be odd, and both to fit then.
+    found = [f'it and {names[i]} are exchanged' for i in odd if i != j
+             and fits(y, R_ws[i], orientation_std[i])
+             and fits(fields[i], R_ws[j], orientation_std[j])]
+    found += [f'its unit is {unit}' for unit, scale in UNITS if fits(y / scale)]
+    if found:
+        return tuple(found)
+    for others in _changes():
+        found = [text for text, order, signs in others if fits(signs * y[list(order)])]
+        if found:
+            return tuple(found)
+    return ()
+
+
+def _changes():
+    """Signed permutations in groups, the simplest first: lists of (text, order, signs)."""
+    groups = {}
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            moved = sum(k != i for i, k in enumerate(order))
+            flipped = [_AXES[i] for i, s in enumerate(signs) if s < 0.0]
+            if not moved and not flipped:
+                continue
+            parts = []
+            if moved == 2:
+                parts.append(' and '.join(_AXES[i] for i in range(3) if order[i] != i)
+                             + ' are swapped')
+            elif moved:
+                parts.append('its axes are in the order '
+                             + ', '.join(_AXES[order.index(i)] for i in range(3)))
+            if flipped:
+                parts.append(f'{" and ".join(flipped)} {"is" if len(flipped) == 1 else "are"} '
+                             'flipped')
+            groups.setdefault((moved + len(flipped) + (moved > 0), moved), []).append(
+                (', '.join(parts), order, np.array(signs)))
+    return [groups[key] for key in sorted(groups)]

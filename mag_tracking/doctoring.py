@@ -1,0 +1,123 @@
+"""What is wrong with a network and its readings: what `mag-tracking doctor` finds."""
+
+import numpy as np
+
+from mag_tracking.calibration.agreement import disagreements
+from mag_tracking.io.samples import SampleReader
+from mag_tracking.stages.calibrate import Calibrate
+from mag_tracking.stages.health import Finding, SensorHealth
+from mag_tracking.stages.stage import NS, rejected
+
+STEADY_S = 30.0
+"""[s] A background that has been frozen for longer is worth a word."""
+
+_ADVICE = (
+    ('above', 'gauss or microtesla published as tesla? Near a magnet raise calibrate.max_field'),
+    ('unknown sensor', 'it is not in the network file'),
+    ('duplicate', 'the driver publishes readings twice, or stamps too coarsely'),
+    ('out of order', 'two publishers on one topic, or a clock that was set'),
+    ('stamp too far ahead', 'a clock stepped, or a message is corrupt'),
+    ('no axis', 'look at the sensor and its driver'),
+    ('infinite', 'look at the driver'),
+    ('covariance', 'publish zeros where the noise is not known'),
+    ('undecodable', 'the recording is damaged, or its type is another'))
+
+
+class Doctor:
+    """Looks at the readings of a network as they come, and says what is wrong."""
+
+    def __init__(self, network, settings):
+        self.network, self._settings = network, settings
+        self.sensors = {name: SensorHealth() for name in network.names}
+        self.calibrate = Calibrate(network, settings.calibrate)
+        self._frozen_ns = {}
+
+    def feed(self, sample, received_ns=None):
+        """Look at a raw `MagSample` that was received at `received_ns`."""
+        self.sensors[sample.sensor].add(sample.stamp_ns, sample.field, received_ns)
+        self.calibrate.feed(sample)
+        if self.calibrate.backgrounds()[sample.sensor].frozen:
+            self._frozen_ns.setdefault(sample.sensor, sample.stamp_ns)
+        else:
+            self._frozen_ns.pop(sample.sensor, None)
+
+    def findings(self):
+        """List of `Finding`, the serious ones first."""
+        found = []
+        for j, (name, health) in enumerate(self.sensors.items()):
+            found += health.findings(name, self.network.noise_std[j],
+                                     self._settings.calibrate.max_field)
+            found += self._background_findings(name)
+        found += self._disagreements()
+        for cause, n in rejected(self.calibrate.counts).items():
+            advice = next((a for key, a in _ADVICE if key in cause), 'look at the driver')
+            found.append(Finding(n > 100, 'calibrate', f'{n} readings rejected: {cause}', advice))
+        return sorted(found, key=lambda f: not f.serious)
+
+    def _background_findings(self, name):
+        """What is wrong with the background of one sensor."""
+        background = self.calibrate.backgrounds()[name]
+        last, since = self.calibrate.last_stamp_ns(name), self._frozen_ns.get(name)
+        if last is not None and not background.ready and not background.stuck:
+            yield Finding(True, name, 'no background was learnt', 'begin without a target for '
+                          f'{self._settings.calibrate.learn_s:g} s, or give background and '
+                          'noise_std in the network file')
+        if background.n_relearnt:
+            yield Finding(False, name, f'a steady change was taken for its background '
+                          f'{background.n_relearnt} times', 'a parked vehicle, or something that '
+                          'was put beside it; calibrate.relearn_s: 0 would wait for ever')
+        if since is not None and (last - since) / NS > STEADY_S:
+            yield Finding(False, name, f'its background has not been learnt for '
+                          f'{(last - since) / NS:.0f} s', 'a target stays near, or the field has '
+                          'changed for good: call the service calibrate')
+
+    def _level(self, name):
+        """(3,) [T] background of a sensor, or the median of what it read last."""
+        background = self.calibrate.backgrounds()[name]
+        if background.ready and self.calibrate.last_stamp_ns(name) is not None:
+            return self.calibrate.background(name)
+        return self.sensors[name].field
+
+    def _disagreements(self):
+        """The sensors that do not measure the Earth."""
+        network, known = self.network, self._settings.survey
+        if network.earth_field is None:
+            return
+        fields = np.array([self._level(name) for name in network.names])
+        std = np.array([np.full(3, np.deg2rad(known.stated_std_deg)) if s is None else s
+                        for s in network.orientation_std])
+        for d in disagreements(network.names, fields, network.R_ws, std, network.earth_field,
+                               known.compass_bias_std):
+            yield Finding(True, d.sensor, str(d).removeprefix(f'{d.sensor} '),
+                          'mend it, or its orientation in the network file')
+
+
+def examine(recording, network, settings, progress=None, stopped=None):
+    """A `Doctor` that has seen a whole recording, and what the reading itself lost.
+
+    Parameters
+    ----------
+    recording : Recording
+    network : SensorNetwork
+    settings : Settings
+    progress : function, optional
+        Called with the bytes done since the last call.
+    stopped : function, optional
+        Asked before every sample; when it is true, what was read so far counts.
+
+    Returns
+    -------
+    (Doctor, list of Finding)
+
+    Raises RecordingError where the recording has none of the network's topics.
+    """
+    reader, doctor = SampleReader(recording, network), Doctor(network, settings)
+    for sample, received_ns in reader.samples_as_received(progress):
+        doctor.feed(sample, received_ns)
+        if stopped is not None and stopped():
+            break
+    lost = [Finding(True, recording.path.name, f'{what}: {n}', 'the recording is damaged: see '
+                    'mag-tracking repair') for what, n in recording.losses.items()]
+    lost += [Finding(False, 'recording', f'{n} times {what}', 'the recording is damaged, or its '
+                     'type is another') for what, n in reader.rejected.items()]
+    return doctor, lost

@@ -1,0 +1,103 @@
+"""Figures of a calibration: one function a figure, each returns the figure."""
+
+import matplotlib
+import numpy as np
+
+matplotlib.use('Agg')
+from matplotlib.figure import Figure  # noqa: E402  (the backend has to be chosen first)
+
+from mag_tracking.geometry import yaw_between  # noqa: E402
+from mag_tracking.report.figures import SCALE_1D  # noqa: E402
+
+
+def calibration_figure(found, stated, most=8):
+    """The knocks by the clocks as they were and as they are now, and the headings.
+
+    Parameters
+    ----------
+    found : Calibration
+    stated : SensorNetwork
+        As it was installed.
+    most : int
+        Sensors whose knocks are drawn.
+    """
+    figure = Figure(figsize=(11.0, 4.6), layout='constrained')
+    left, middle, right = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
+    _knocks(left, middle, found, most)
+    _headings(right, found, stated)
+    return figure
+
+
+def _knocks(before, after, found, most):
+    """The first loud second of each sensor."""
+    shocks = {name: found.survey.shocks[name] for name in list(found.survey.shocks)[:most]}
+    first = min((t[s > 0.3 * s.max()][0] for t, s in shocks.values() if len(s) and s.max() > 0.0),
+                default=0.0)
+    for k, (name, (t, s)) in enumerate(shocks.items()):
+        offset = found.network.clock_offset[found.network.index(name)]
+        for axes, shift in ((before, 0.0), (after, offset)):
+            near = np.abs(t - shift - first) < 0.25
+            axes.plot(t[near] - shift - first, s[near], '.-', ms=4, lw=0.8, color=f'C{k}',
+                      label=name)
+    for axes, title in ((before, 'a knock, clocks as they were'), (after, 'clocks set by it')):
+        axes.set_title(title, fontsize=10)
+        axes.set_xlabel('time [s]')
+        axes.grid(alpha=0.3)
+    before.set_ylabel('acceleration from rest [m/s²]')
+    if shocks:
+        after.legend(fontsize=8)
+
+
+def _headings(axes, found, stated):
+    """How far each sensor is turned from what was stated, by what is known when."""
+    n = len(stated)
+    steps = [('compass', found.survey.network, 'tab:orange', 0.12)]
+    if found.evidence is not None:
+        steps.append(('and passes', found.network, 'tab:blue', -0.12))
+    for label, network, colour, shift in steps:
+        yaw = [np.degrees(yaw_between(stated.R_ws[j], network.R_ws[j])) for j in range(n)]
+        std = [0.0 if s is None else SCALE_1D * np.degrees(s[2]) for s in network.orientation_std]
+        axes.errorbar(yaw, np.arange(n) + shift, xerr=std, fmt='o', ms=4, capsize=3, color=colour,
+                      label=label)
+    axes.axvline(0.0, color='k', lw=0.8, ls=':', label='as stated')
+    axes.set_yticks(range(n), stated.names)
+    axes.invert_yaxis()
+    axes.set_title('turned about the vertical (90 %)', fontsize=10)
+    axes.set_xlabel('[degrees]')
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+
+
+def tumble_figure(fits, readings):
+    """Field sizes before and after, and the directions that the sensors were turned to.
+
+    Parameters
+    ----------
+    fits : {sensor: EllipsoidFit}
+    readings : {sensor: (n, 3)}
+        In order of time.
+    """
+    figure = Figure(figsize=(10.0, 0.6 + 2.7 * len(fits)), layout='constrained')
+    rows = figure.subplots(len(fits), 2, squeeze=False, width_ratios=(1.5, 1.0))
+    for (left, right), (name, fit) in zip(rows, fits.items(), strict=True):
+        y = readings[name][~np.isnan(readings[name]).any(axis=1)]
+        B = fit.correct(y)
+        for values, colour, label in ((y, 'tab:orange', 'as read'), (B, 'tab:blue', 'corrected')):
+            size = np.linalg.norm(values, axis=1)
+            left.plot(size / size.mean(), '.', ms=2, color=colour, rasterized=True,
+                      label=f'{label}: scatters by {100 * size.std() / size.mean():.2f} %')
+        left.set_title(name, fontsize=9)
+        left.set_xlabel('reading')
+        left.set_ylabel('size of the field\nover its mean')
+        left.legend(fontsize=8, loc='upper right')
+        u = B / np.linalg.norm(B, axis=1, keepdims=True)
+        right.plot(np.degrees(np.arctan2(u[:, 1], u[:, 0])), u[:, 2], '.', ms=2,
+                   color='tab:blue', rasterized=True)
+        right.set_xlim(-180.0, 180.0)
+        right.set_ylim(-1.0, 1.0)
+        right.set_xlabel('azimuth of the field [degrees]')
+        right.set_ylabel('upward part')
+        right.set_title(f'directions (equal areas), coverage {fit.coverage:.2f}', fontsize=9)
+        for axes in (left, right):
+            axes.grid(alpha=0.3)
+    return figure

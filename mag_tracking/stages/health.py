@@ -1,0 +1,264 @@
+"""Health: what is wrong with the readings of a sensor, and what to do about it.
+
+It only looks: nothing is changed or held back. Memory is bounded by a window of readings.
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from mag_tracking.calibration.saturation import cut_off
+from mag_tracking.stages.stage import NS
+
+WINDOW = 512
+"""Readings that rates, noise and delays are of; the latest."""
+EVERY = 64
+"""So often they are looked at as a whole."""
+UNKNOWN = np.iinfo(np.int64).min
+"""Of a reading whose receipt is not known."""
+STEP_S = 0.25
+"""[s] A clock has stepped where the delay changes by more from one reading to the next."""
+LOST = 1.5
+"""An interval longer than so many usual ones has lost readings in it."""
+IRREGULAR = 0.3
+"""Where intervals scatter by more than this share, nobody can count what is lost."""
+STUCK_S = 1.0
+"""[s] Readings that stay the same for longer are of a sensor that is stuck."""
+SPIKE = 30.0
+"""A reading that is off both its neighbours, the same way, by so many noise deviations."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that is wrong."""
+
+    serious: bool
+    """What comes of it is wrong, not only worse."""
+    subject: str
+    """The sensor, or the stage."""
+    what: str
+    advice: str
+
+    def __str__(self):
+        return f'{self.subject}: {self.what}; {self.advice}'
+
+
+class SensorHealth:
+    """Looks at the readings of one sensor as they come, sixty-four at a time."""
+
+    def __init__(self):
+        self._counts = Counter()
+        self._largest_step_s = 0.0
+        self._new = []
+        self._stamps, self._received = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        self._fields = np.zeros((0, 3))
+        self._interval_ns, self._spread = float('nan'), float('inf')
+        self._noise = np.full(3, np.nan)
+        # Since when the reading has been what it is, and how long ago one was stuck.
+        self._since_ns, self._stuck_ago = None, WINDOW
+
+    def add(self, stamp_ns, field, received_ns=None):
+        """A reading: `field` (3,) [T] as the sensor gave it; `received_ns` by the host's clock."""
+        self._new.append((stamp_ns, field, UNKNOWN if received_ns is None else received_ns))
+        if len(self._new) == EVERY:
+            self._look()
+
+    @property
+    def counts(self):
+        """`readings`, `lost`, `duplicates`, `stamps that went back`, `clock steps`, `spikes`,
+        `saturated`, `without any axis`, `stuck readings`; and `x`, `y`, `z` missing."""
+        self._look()
+        return self._counts
+
+    def _look(self):
+        """Take the new readings into the window."""
+        if not self._new:
+            return
+        stamps, fields, received = zip(*self._new, strict=True)
+        n, self._new = len(stamps), []
+        self._stamps = np.append(self._stamps, np.array(stamps, dtype=np.int64))[-WINDOW:]
+        self._received = np.append(self._received, np.array(received, dtype=np.int64))[-WINDOW:]
+        self._fields = np.append(self._fields, np.array(fields, dtype=float), axis=0)[-WINDOW:]
+        self._counts['readings'] += n
+        self._in_time(n)
+        self._values(n)
+
+    def _in_time(self, n):
+        """Count what is wrong with the stamps of the `n` latest."""
+        # With the one before them, where there is one.
+        intervals = np.diff(self._stamps[-n - 1:])
+        delays = (self._received - self._stamps)[-n - 1:] / NS
+        steps = np.where(self._received[-n - 1:] == UNKNOWN, 0.0, delays)
+        steps = np.diff(steps)
+        stepped = np.abs(steps) > STEP_S
+        if stepped.any():
+            self._counts['clock steps'] += int(stepped.sum())
+            self._largest_step_s = max(self._largest_step_s, *steps[stepped].tolist(), key=abs)
+        self._counts['duplicates'] += int((intervals == 0).sum())
+        self._counts['stamps that went back'] += int((intervals < 0).sum())
+        if self._spread < IRREGULAR:
+            long = (intervals > LOST * self._interval_ns) & (intervals < 3600 * NS) & ~stepped
+            self._counts['lost'] += int(np.sum(np.round(intervals[long] / self._interval_ns) - 1))
+        forward = np.diff(self._stamps)
+        forward = forward[forward > 0]
+        if len(forward) >= 8:
+            self._interval_ns = float(np.median(forward))
+            self._spread = float(np.median(np.abs(forward - self._interval_ns))
+                                 / self._interval_ns)
+
+    def _values(self, n):
+        """Count what is wrong with the fields of the `n` latest."""
+        missing = np.isnan(self._fields[-n:])
+        for axis, count in zip('xyz', missing.sum(axis=0).tolist(), strict=True):
+            self._counts[axis] += count
+        self._counts['without any axis'] += int(missing.all(axis=1).sum())
+        self._stuck(n)
+        # With the two before them; the last one's neighbour is still to come.
+        fields = self._fields[-n - 2:]
+        before, after = np.diff(fields, axis=0)[:-1], -np.diff(fields, axis=0)[1:]
+        # A comparison with NaN is false: without a known noise there is no spike.
+        alone = (np.minimum(np.abs(before), np.abs(after)) > SPIKE * self._noise) \
+            & (before * after > 0.0)
+        self._counts['spikes'] += int(alone.any(axis=1).sum())
+        if self._stuck_ago >= WINDOW:
+            self._noise = _noise(self._fields)
+        cut = np.array([cut_off(axis) for axis in self._fields.T]).any(axis=0)
+        self._counts['saturated'] += int(np.count_nonzero(cut[-n:]))
+
+    def _stuck(self, n):
+        """Count those of the `n` latest that have been the same for too long."""
+        stamps, fields = self._stamps[-n:], self._fields[-n - 1:]
+        same = ((fields[1:] == fields[:-1]) | np.isnan(fields[1:]) & np.isnan(fields[:-1])).all(1)
+        if len(same) < n:
+            same = np.append(False, same)
+        # Of each reading the place of the one that it repeats; -1: from before these.
+        origin = np.maximum.accumulate(np.where(same, -1, np.arange(n)))
+        since = np.where(origin < 0, self._since_ns or 0, stamps[origin])
+        stuck = np.flatnonzero(stamps - since > STUCK_S * NS)
+        self._since_ns = int(since[-1])
+        self._counts['stuck readings'] += len(stuck)
+        self._stuck_ago = n - 1 - int(stuck[-1]) if len(stuck) else self._stuck_ago + n
+
+    @property
+    def rate(self):
+        """[Hz] of the latest readings; NaN before there are enough."""
+        self._look()
+        return NS / self._interval_ns
+
+    @property
+    def noise_std(self):
+        """(3,) [T] by differences of neighbours, so that a target that passes is not in it."""
+        self._look()
+        return _noise(self._fields)
+
+    @property
+    def field(self):
+        """(3,) [T] median of the latest readings; NaN of an axis that none has."""
+        self._look()
+        there = ~np.isnan(self._fields).all(axis=0) & bool(len(self._fields))
+        out = np.full(3, np.nan)
+        out[there] = np.nanmedian(self._fields[:, there], axis=0)
+        return out
+
+    @property
+    def delay_s(self):
+        """(median, 5 %, 95 %) [s] from stamp to receipt; NaN where receipts are not known."""
+        self._look()
+        known = self._received != UNKNOWN
+        if not known.any():
+            return float('nan'), float('nan'), float('nan')
+        delays = (self._received - self._stamps)[known] / NS
+        return tuple(float(v) for v in np.quantile(delays, (0.5, 0.05, 0.95)))
+
+    def findings(self, name, noise_std=None, max_field=1e-3):
+        """What is wrong, the worst first: list of `Finding`.
+
+        Parameters
+        ----------
+        name : str
+            Of the sensor.
+        noise_std : (3,) [T], optional
+            That it was calibrated to.
+        max_field : float [T]
+            Beyond this it is rejected.
+        """
+        n = self.counts['readings']
+        if not n:
+            return [Finding(True, name, 'no reading', 'look at its cable, its driver and the topic '
+                            'in the network file')]
+        found = [*self._time_findings(name, n), *self._value_findings(name, n, max_field)]
+        if noise_std is not None and not np.nanmax(np.abs(self.field), initial=0.0) > max_field:
+            worse = self.noise_std / noise_std
+            if np.nanmax(worse, initial=0.0) > 3.0:
+                axis = int(np.nanargmax(worse))
+                found.append(Finding(False, name, f'{"xyz"[axis]} is {worse[axis]:.0f} times as '
+                                     'noisy as it was calibrated', 'look for a new source beside '
+                                     'it (a motor, a cable), or calibrate anew'))
+        return sorted(found, key=lambda f: not f.serious)
+
+    def _time_findings(self, name, n):
+        """What is wrong with stamps."""
+        c = self.counts
+        middle, low, high = self.delay_s
+        if c['clock steps']:
+            yield Finding(True, name, f'its clock stepped {c["clock steps"]} times against the '
+                          f'host\'s, by up to {self._largest_step_s:+.2f} s', 'let the clocks '
+                          'follow one source (chrony, PTP), and stamp by a monotonic one')
+        if c['stamps that went back']:
+            yield Finding(True, name, f'stamps went back {c["stamps that went back"]} times',
+                          'two publishers on one topic, a clock that was set, or a looped replay')
+        if c['duplicates'] > 0.001 * n:
+            yield Finding(False, name, f'{c["duplicates"]} of {n} readings have the stamp of the '
+                          'one before', 'the driver publishes readings twice, or stamps too '
+                          'coarsely')
+        if c['lost'] > 0.01 * n:
+            yield Finding(c['lost'] > 0.2 * n, name, f'{c["lost"]} readings are missing between '
+                          f'{n}', 'look at the link, and at the queue of whoever records')
+        if high - low > 0.05 and not c['clock steps']:
+            yield Finding(False, name, f'readings take {1e3 * low:.0f} to {1e3 * high:.0f} ms to '
+                          'come', 'stamps by the sensor itself would be truer than by receipt')
+        elif abs(middle) > 1.0 and not c['clock steps']:
+            yield Finding(False, name, f'stamps are {middle:.1f} s before they are received',
+                          'the clocks of sensor and host disagree; calibrate with knocks')
+
+    def _value_findings(self, name, n, max_field):
+        """What is wrong with fields."""
+        c = self.counts
+        size = float(np.sqrt(np.nansum(self.field**2)))
+        if size > max_field:
+            yield Finding(True, name, f'a field of {size:.3g} T is rejected, the limit is '
+                          f'{max_field:g} T', 'gauss or microtesla published as tesla? Near a '
+                          'magnet raise calibrate.max_field')
+        if c['without any axis'] > 0.01 * n:
+            yield Finding(True, name, f'{c["without any axis"]} of {n} readings have no axis at '
+                          'all', 'look at the sensor and its driver')
+        for axis in 'xyz':
+            if 0.01 * n < c[axis] - c['without any axis'] and c[axis] < 0.99 * n:
+                yield Finding(False, name, f'{axis} is missing in {c[axis]} of {n} readings',
+                              'look at the sensor and its driver')
+        if c['stuck readings']:
+            yield Finding(True, name, f'{c["stuck readings"]} readings are the same as all for '
+                          f'more than {STUCK_S:g} s before', 'the sensor or its driver is stuck: '
+                          'switch it off and on')
+        if c['saturated'] > 0.001 * n:
+            yield Finding(True, name, f'{c["saturated"]} of {n} readings stand at the end of the '
+                          'range', 'set a larger range, or move the sensor away')
+        if c['spikes'] > 0.001 * n:
+            yield Finding(False, name, f'{c["spikes"]} of {n} readings are spikes', 'look at '
+                          'plugs, supply and checksums')
+
+
+def _noise(fields):
+    """(3,) [T] deviation by second differences, without the largest; NaN of a missing axis.
+
+    Of the second: a passing target has a slope, but hardly a curve from one reading to the next.
+    """
+    out = np.full(3, np.nan)
+    for axis, d in enumerate(np.abs(np.diff(fields, n=2, axis=0)).T):
+        d = d[~np.isnan(d)]
+        if len(d) >= 8:
+            # Their mean, not their median: of coarse steps the median is one.
+            usual = d[d <= 6.0 * np.quantile(d, 0.75)]
+            out[axis] = np.sqrt(np.pi / 12.0) * usual.mean()
+    return out

@@ -1,0 +1,210 @@
+"""All sensors measure the same Earth: faults are named, a right network is left in peace."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import binom
+
+from mag_tracking.calibration.agreement import IMPROBABLE, UNITS, consensus, disagreements
+from mag_tracking.geometry import rotation_about_z
+
+EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
+BIAS = 6e-7
+STD = np.deg2rad([0.3, 0.3, 5.0])
+NAMES = ('a', 'b', 'c', 'd')
+
+# So that no axis lies across the field, and no two sensors alike.
+R_WS = np.array([Rotation.from_euler('zyx', angles, True).as_matrix() for angles in (
+    [50.0, 10.0, -20.0], [140.0, -15.0, 25.0], [-60.0, 20.0, 10.0], [-130.0, -25.0, -12.0])])
+
+
+def right(rng=None, R_ws=R_WS, std=STD):
+    """(n, 3) [T] what right sensors measure; of `rng` come biases and turns."""
+    out = np.einsum('jki,k->ji', R_ws, EARTH)
+    if rng is not None:
+        turns = Rotation.from_rotvec(std * rng.standard_normal((len(R_ws), 3))).as_matrix()
+        out = np.einsum('jki,k->ji', turns @ R_ws, EARTH)
+        out = out + BIAS * rng.standard_normal(out.shape)
+    return out
+
+
+def told(fields, R_ws=R_WS, std=STD, earth=EARTH, bias_std=BIAS):
+    """{sensor: explanations}."""
+    n = len(fields)
+    found = disagreements(NAMES[:n], fields, R_ws, np.tile(std, (n, 1)), earth, bias_std)
+    return {d.sensor: d.explanations for d in found}
+
+
+def test_right_sensors_are_left_in_peace():
+    assert told(right()) == {}
+
+
+@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize('axis', range(3))
+def test_a_flipped_axis_is_named(axis, seed):
+    fields = right(np.random.default_rng(seed))
+    fields[1, axis] *= -1.0
+    assert told(fields) == {'b': (f'{"xyz"[axis]} is flipped',)}
+
+
+@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize('pair', list(combinations(range(3), 2)))
+def test_a_swapped_pair_is_named(pair, seed):
+    fields = right(np.random.default_rng(seed))
+    fields[2, list(pair)] = fields[2, list(pair[::-1])]
+    first, second = (f'{"xyz"[i]}' for i in pair)
+    assert f'{first} and {second} are swapped' in told(fields)['c']
+
+
+@pytest.mark.parametrize('order, text', [([2, 0, 1], 'z, x, y'), ([1, 2, 0], 'y, z, x')])
+def test_axes_in_another_order_are_named_by_what_the_sensor_sends(order, text):
+    """What is sent as x is its z, as y its x, and so on."""
+    fields = right()
+    fields[0] = fields[0][order]
+    assert told(fields) == {'a': (f'its axes are in the order {text}',)}
+
+
+@pytest.mark.parametrize('unit, scale', UNITS)
+def test_another_unit_is_named(unit, scale):
+    fields = right(np.random.default_rng(3))
+    fields[3] *= scale
+    assert told(fields) == {'d': (f'its unit is {unit}',)}
+
+
+def test_what_a_unit_is_worth():
+    assert dict(UNITS) == {'gauss': 1e4, 'millitesla': 1e3, 'microtesla': 1e6, 'nanotesla': 1e9}
+
+
+@pytest.mark.parametrize('i, j', list(combinations(range(4), 2)))
+def test_sensors_in_each_others_place_are_named(i, j):
+    fields = right(np.random.default_rng(7))
+    fields[[i, j]] = fields[[j, i]]
+    found = told(fields)
+    assert set(found) == {NAMES[i], NAMES[j]}
+    assert f'it and {NAMES[j]} are exchanged' in found[NAMES[i]]
+    assert f'it and {NAMES[i]} are exchanged' in found[NAMES[j]]
+
+
+def test_one_that_would_fit_anothers_place_is_not_exchanged_with_it():
+    """The other is odd, too, but would not fit here."""
+    fields = right()
+    fields[0], fields[1] = fields[1], fields[1] + [9e-6, -7e-6, 8e-6]
+    assert told(fields) == {'a': (), 'b': ()}
+
+
+@pytest.mark.parametrize('turn', [90.0, 180.0])
+def test_sensors_turned_by_right_angles_in_each_others_place_are_named(turn):
+    """As most are installed; two sensors with the same two axes flipped are less likely."""
+    R_ws = np.array([np.eye(3), rotation_about_z(np.deg2rad(turn)), *R_WS[2:]])
+    fields = right(None, R_ws)
+    fields[[0, 1]] = fields[[1, 0]]
+    found = told(fields, R_ws)
+    assert set(found) == {'a', 'b'}
+    assert 'it and b are exchanged' in found['a'] and 'it and a are exchanged' in found['b']
+
+
+def test_iron_beside_a_sensor_is_not_explained_away():
+    fields = right()
+    fields[1] += [9e-6, -7e-6, 8e-6]
+    (d,) = disagreements(NAMES, fields, R_WS, np.tile(STD, (4, 1)), EARTH, BIAS)
+    assert (d.sensor, d.explanations) == ('b', ())
+    assert d.size == pytest.approx(np.sqrt(194.0) * 1e-6, rel=1e-9)
+    assert str(d).startswith('b is 13.9 uT from the field of the Earth: no axis, unit or')
+
+
+def test_the_message_names_what_would_explain_it():
+    fields = right()
+    fields[0, 2] *= -1.0
+    (d,) = disagreements(NAMES, fields, R_WS, np.tile(STD, (4, 1)), EARTH, BIAS)
+    assert str(d).endswith('uT from the field of the Earth: z is flipped')
+
+
+def test_what_cannot_be_seen_is_not_claimed():
+    """An upright sensor with x to the east: x is 2 uT, less than five degrees and a bias."""
+    R_ws = np.tile(np.eye(3), (3, 1, 1))
+    fields = right(None, R_ws)
+    fields[0, 0] *= -1.0
+    assert told(fields, R_ws) == {}
+    # Of two sensors alike nobody sees that they are exchanged.
+    fields = right(np.random.default_rng(0), R_ws)
+    fields[[0, 1]] = fields[[1, 0]]
+    assert told(fields, R_ws) == {}
+
+
+@pytest.mark.parametrize('yaw', [10.0, 30.0, 45.0, 90.0, 180.0])
+def test_a_heading_that_nobody_stated_is_no_fault(yaw):
+    """Turned by less than its deviation; an upright axis that is flipped is seen all the same."""
+    R_ws, std = np.tile(np.eye(3), (3, 1, 1)), np.deg2rad([0.3, 0.3, 180.0])
+    fields = right(None, R_ws)
+    fields[0] = rotation_about_z(np.deg2rad(yaw)).T @ EARTH
+    assert told(fields, R_ws, std) == {}
+    fields[0, 2] *= -1.0
+    assert 'a' in told(fields, R_ws, std)
+
+
+@pytest.mark.parametrize('std', [np.deg2rad([0.3, 0.3, 5.0]), np.deg2rad([2.0, 2.0, 2.0])])
+@pytest.mark.parametrize('missing', [None, 2])
+def test_false_alarms_are_as_rare_as_stated(std, missing, n=300):
+    """Against the limit of a single sensor, which a hundredth of its own size tells early."""
+    rng = np.random.default_rng(11)
+    alarms = 0
+    for k in range(n):
+        R_ws = Rotation.random(4, random_state=k).as_matrix()
+        fields = right(rng, R_ws, std)
+        if missing is not None:
+            fields[:, missing] = np.nan
+        alarms += len(told(fields, R_ws, std))
+    assert alarms <= binom.ppf(0.999, 4 * n, IMPROBABLE)
+
+
+def test_the_statistic_is_chi_square(monkeypatch, n=200):
+    """With a limit that is met often, alarms are as frequent as it says."""
+    monkeypatch.setattr('mag_tracking.calibration.agreement.IMPROBABLE', 0.1)
+    std, rng = np.deg2rad([0.3, 0.5, 2.0]), np.random.default_rng(12)
+    for missing in ([], [2]):
+        alarms = 0
+        for k in range(n):
+            R_ws = Rotation.random(4, random_state=k).as_matrix()
+            fields = right(rng, R_ws, std)
+            fields[:, missing] = np.nan
+            alarms += len(told(fields, R_ws, std))
+        low, high = binom.ppf([0.001, 0.999], 4 * n, 0.1)
+        assert low <= alarms <= high
+
+
+def test_sensors_agree_without_being_told_the_field():
+    fields = right(np.random.default_rng(2))
+    fields[1] *= -1.0
+    fields[3, 1] = np.nan
+    with pytest.raises(ValueError, match='three sensors with three axes .* there are 2'):
+        consensus(fields[[0, 1, 3]], R_WS[[0, 1, 3]])
+    five, R = np.vstack([fields, right(R_ws=R_WS[:1])]), np.vstack([R_WS, R_WS[:1]])
+    # The one that is wrong has no say, the one with two axes neither.
+    assert np.abs(consensus(five, R) - EARTH).max() < 3e-6
+    np.testing.assert_allclose(consensus(right(), R_WS), EARTH, rtol=1e-9)
+
+
+def test_axes_that_are_not_reported_are_not_compared():
+    fields = right(np.random.default_rng(1))
+    fields[:, 2] = np.nan
+    assert told(fields) == {}
+    fields[1, 0] *= -1.0
+    assert 'x is flipped' in told(fields)['b']
+    fields[1] = np.nan
+    assert told(fields) == {}
+
+
+def test_the_simplest_explanation_is_the_only_one():
+    """A flipped pair is told as that, not as an order with three signs."""
+    fields = right(np.random.default_rng(4))
+    fields[2, :2] *= -1.0
+    assert told(fields) == {'c': ('x and y are flipped',)}
+
+
+def test_two_faults_are_told_apart():
+    fields = right(np.random.default_rng(6))
+    fields[0, 2] *= -1.0
+    fields[3] *= 1e4
+    assert told(fields) == {'a': ('z is flipped',), 'd': ('its unit is gauss',)}

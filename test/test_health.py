@@ -1,0 +1,217 @@
+"""Health and the doctor: each fault is found and named, and nothing is found where nothing is."""
+
+import numpy as np
+import pytest
+from conftest import DATA, NETWORK_FILE, VEHICLES, line_network, vehicle_path
+
+from mag_tracking.cli import main
+from mag_tracking.doctoring import Doctor, examine
+from mag_tracking.io.bag import Recording, RecordingWriter
+from mag_tracking.io.network_file import read_network
+from mag_tracking.io.schema import MAGNETIC_FIELD, sample_dict
+from mag_tracking.pipeline import settings_for
+from mag_tracking.records import MagSample
+from mag_tracking.stages.health import WINDOW, SensorHealth
+
+NS = 10**9
+EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
+SIGMA = 1.2e-8
+
+
+def readings(n=3000, rate=100.0, seed=0):
+    """(stamps [ns], fields) of a good sensor."""
+    rng = np.random.default_rng(seed)
+    return (10**18 + (np.arange(n) * NS / rate).astype(np.int64),
+            EARTH + SIGMA * rng.standard_normal((n, 3)))
+
+
+def examined(stamps, fields, received=None):
+    """`SensorHealth` of readings."""
+    health = SensorHealth()
+    for k, (stamp, field) in enumerate(zip(stamps, fields, strict=True)):
+        health.add(int(stamp), field, None if received is None else int(received[k]))
+    return health
+
+
+def texts(health, **known):
+    return [str(f) for f in health.findings('mag_1', **known)]
+
+
+def test_of_a_good_sensor_nothing_is_found():
+    stamps, fields = readings()
+    health = examined(stamps, fields, stamps + 2_000_000)
+    assert texts(health, noise_std=np.full(3, SIGMA)) == []
+    assert health.rate == pytest.approx(100.0, rel=1e-6)
+    # Second differences overlap: an eighth as many are independent.
+    np.testing.assert_allclose(health.noise_std, SIGMA, rtol=5 / np.sqrt(WINDOW / 2))
+    np.testing.assert_allclose(health.field, EARTH, atol=5 * SIGMA / np.sqrt(WINDOW) * 1.3)
+    np.testing.assert_allclose(health.delay_s, 2e-3, rtol=1e-6)
+
+
+def test_noise_is_found_through_coarse_steps_and_a_passing_target():
+    stamps, fields = readings()
+    passing = fields + 3e-6 * np.exp(-0.5 * ((np.arange(3000) - 2750) / 60) ** 2)[:, None]
+    np.testing.assert_allclose(examined(stamps, passing).noise_std, SIGMA, rtol=0.3)
+    coarse = np.round(fields / 2e-8) * 2e-8
+    expected = np.sqrt(SIGMA**2 + 2e-8**2 / 12)
+    np.testing.assert_allclose(examined(stamps, coarse).noise_std, expected, rtol=0.3)
+
+
+def broken(what):
+    """(stamps, fields, received) of a sensor with a fault."""
+    stamps, fields = readings()
+    received = stamps + 1_000_000
+    if what == 'lost':
+        keep = np.random.default_rng(1).random(3000) > 0.05
+        stamps, fields, received = stamps[keep], fields[keep], received[keep]
+    elif what == 'twice':
+        stamps, fields, received = (np.repeat(a, 2, axis=0) for a in (stamps, fields, received))
+    elif what == 'back':
+        stamps[1500:] -= 5 * NS
+    elif what == 'step':
+        stamps[1500:] += NS
+    elif what == 'late':
+        received = received + (np.random.default_rng(2).random(3000) * 0.12 * NS).astype(np.int64)
+    elif what == 'ahead':
+        stamps = stamps + 3 * NS
+    elif what == 'stuck':
+        fields[2000:2400] = fields[2000]
+    elif what == 'saturated':
+        fields[1000:1200, 1] = np.minimum(1.55e-5 + 1e-6 * np.sin(np.arange(200) / 6.0), 1.6e-5)
+        fields[1000:1200, 1] = np.maximum(fields[1000:1200, 1], 1.5e-5)
+    elif what == 'spikes':
+        fields[::200] += 1e-4
+    elif what == 'axis':
+        fields[::10, 2] = np.nan
+    elif what == 'nothing':
+        fields[::10] = np.nan
+    elif what == 'gauss':
+        fields = fields * 1e4
+    elif what == 'noisy':
+        fields[:, 1] += 10 * SIGMA * np.random.default_rng(3).standard_normal(3000)
+    return stamps, fields, received
+
+
+@pytest.mark.parametrize('what, serious, said', [
+    ('lost', False, 'readings are missing between'),
+    ('twice', False, '3000 of 6000 readings have the stamp of the one before'),
+    ('back', True, 'stamps went back 1 times'),
+    ('step', True, "its clock stepped 1 times against the host's, by up to -1.00 s"),
+    ('late', False, 'ms to come'),
+    ('ahead', False, 'stamps are -3.0 s before they are received'),
+    ('stuck', True, 'readings are the same as all for more than 1 s before'),
+    ('saturated', True, 'stand at the end of the range'),
+    ('spikes', False, '14 of 3000 readings are spikes'),
+    ('axis', False, 'z is missing in 300 of 3000 readings'),
+    ('nothing', True, '300 of 3000 readings have no axis at all'),
+    ('gauss', True, 'a field of 0.514 T is rejected, the limit is 0.001 T'),
+    ('noisy', False, 'y is 10 times as noisy as it was calibrated'),
+])
+def test_each_fault_is_named(what, serious, said):
+    health = examined(*broken(what))
+    found = health.findings('mag_1', noise_std=np.full(3, SIGMA))
+    match = [f for f in found if said in str(f)]
+    assert len(match) == 1 and match[0].serious == serious, [str(f) for f in found]
+    assert match[0].subject == 'mag_1' and match[0].advice
+    # A stamp that goes back is also a clock that steps.
+    assert len(found) == 1 + (what == 'back'), [str(f) for f in found]
+
+
+def test_what_is_lost_is_counted():
+    stamps, fields = readings()
+    keep = np.ones(3000, dtype=bool)
+    keep[[500, 900, 901, 902, 2000]] = False
+    assert examined(stamps[keep], fields[keep]).counts['lost'] == 5
+
+
+def test_of_an_irregular_sensor_nothing_is_called_lost():
+    rng = np.random.default_rng(4)
+    stamps = 10**18 + np.cumsum(rng.exponential(0.01, 3000) * NS).astype(np.int64)
+    assert examined(stamps, readings()[1]).counts['lost'] == 0
+
+
+def test_a_two_axis_sensor_is_no_fault():
+    stamps, fields = readings()
+    fields[:, 2] = np.nan
+    assert texts(examined(stamps, fields), noise_std=np.array([SIGMA, SIGMA, SIGMA])) == []
+
+
+def test_a_sensor_that_says_nothing():
+    assert ['no reading' in t for t in texts(SensorHealth())] == [True]
+
+
+def doctored(change=lambda k, field: field, seconds=10.0, **settings):
+    """Findings of the doctor on three sensors, the second of which is changed."""
+    network = line_network(3)
+    doctor = Doctor(network, settings_for('vehicle', settings))
+    rng = np.random.default_rng(5)
+    for k in range(int(seconds * 50)):
+        for j, name in enumerate(network.names):
+            field = network.R_sw[j] @ network.earth_field + SIGMA * rng.standard_normal(3)
+            if j == 1:
+                field = change(k, field)
+            doctor.feed(MagSample(10**18 + k * 20_000_000, name, field))
+    return [str(f) for f in doctor.findings()]
+
+
+def test_the_doctor_compares_sensors_with_the_earth():
+    assert doctored() == []
+    found = doctored(lambda k, field: field * [1.0, -1.0, 1.0])
+    assert len(found) == 1 and 'mag_2: is' in found[0] and 'y is flipped' in found[0]
+    found = doctored(lambda k, field: field * 1e6)
+    assert any('its unit is microtesla' in text for text in found), found
+    assert any(text.startswith('calibrate: 500 readings rejected: above') for text in found)
+
+
+def test_the_doctor_looks_at_backgrounds():
+    steps = doctored(lambda k, field: field + 1e-6 * (k > 250), seconds=60.0)
+    assert len(steps) == 1 and 'its background has not been learnt for 5' in steps[0]
+    parked = doctored(lambda k, field: field + 1e-6 * (k > 250), seconds=80.0)
+    assert len(parked) == 1 and 'was taken for its background 1 times' in parked[0]
+    early = doctored(seconds=2.0)
+    assert len(early) == 3 and all('no background was learnt' in text for text in early)
+
+
+@pytest.mark.parametrize('name', VEHICLES)
+def test_the_doctor_finds_nothing_in_good_recordings(name, road_network):
+    doctor, lost = examine(Recording(vehicle_path(name)), road_network, settings_for('vehicle'))
+    found = [str(f) for f in doctor.findings()]
+    if name == 'straight_truck_right':
+        # Its sensors end at 100 uT, and it was that near.
+        assert found.pop().startswith('mag_2: 9 of 1400 readings stand at the end of the range')
+    assert not lost and not found
+
+
+def test_saturated_sensors_of_the_corridor(capsys):
+    """Two of its sensors end at 100 uT, and the car came that near."""
+    folder = DATA / 'corridor'
+    assert main(['doctor', str(folder / 'corridor_8_sensors.mcap'), '--network',
+                 str(folder / 'network.yaml')]) == 2
+    said = capsys.readouterr().out
+    assert [line.split()[1] for line in said.splitlines() if 'end of the range' in line] == [
+        'mag_2:', 'mag_4:']
+
+
+def test_the_command(tmp_path, capsys):
+    arguments = ['doctor', '--network', str(NETWORK_FILE)]
+    assert main([*arguments, str(vehicle_path('straight_car_right'))]) == 0
+    said = capsys.readouterr().out
+    assert 'nothing is wrong' in said and '100.0 Hz      0 lost' in said
+    assert main(arguments) == 1
+    assert main([*arguments, 'x.mcap', '--live', '3']) == 1
+    assert capsys.readouterr().err.count('either a RECORDING or --live SECONDS') == 2
+    assert main([*arguments, '--live', '0']) == 1
+    assert 'is not between 1 and 86400 s' in capsys.readouterr().err
+
+
+def test_the_command_on_one_silent_sensor(tmp_path, capsys):
+    stamps, fields = readings(500)
+    network = read_network(NETWORK_FILE)
+    with RecordingWriter(tmp_path / 'one.mcap') as writer:
+        for stamp, field in zip(stamps.tolist(), fields, strict=True):
+            writer.write('/mag_1/imu/mag', MAGNETIC_FIELD,
+                         sample_dict(MagSample(stamp, 'mag_1', field), 'mag_1'), stamp)
+    assert main(['doctor', str(tmp_path / 'one.mcap'), '--network', str(NETWORK_FILE)]) == 2
+    said = capsys.readouterr().out
+    assert 'WRONG mag_2: no reading' in said and 'mag_1: ' not in said
+    assert len(network) == 2

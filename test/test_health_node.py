@@ -1,0 +1,116 @@
+"""Health over the middleware: diagnostics of each sensor, and the doctor on a live system."""
+
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from conftest import NETWORK_FILE
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from node_processes import start, stop
+from sensor_msgs.msg import MagneticField
+
+from mag_tracking.io.network_file import read_network
+from mag_tracking.io.schema import sample_dict
+from mag_tracking.nodes.convert import to_message
+from mag_tracking.nodes.doctor_node import DoctorNode
+from mag_tracking.nodes.stage_node import RESULTS, STREAM
+from mag_tracking.pipeline import settings_for
+from mag_tracking.records import MagSample
+
+EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
+STRANGER = """
+import time
+import rclpy
+from std_msgs.msg import String
+rclpy.init()
+node = rclpy.create_node('stranger')
+publisher = node.create_publisher(String, '/mag_2/imu/mag', 10)
+time.sleep(60.0)
+"""
+
+
+@pytest.fixture
+def talking(ros):
+    """Both sensors publish at 100 Hz, but those that are told to be `silent`, while it waits."""
+    node, spin_until = ros
+    publishers = {}
+    rng = np.random.default_rng(0)
+
+    now = {'silent': ('mag_1', 'mag_2')}
+
+    def publish():
+        for name in ('mag_1', 'mag_2'):
+            if name not in now['silent']:
+                publisher = publishers.setdefault(name, None) or node.create_publisher(
+                    MagneticField, f'/{name}/imu/mag', STREAM)
+                publishers[name] = publisher
+                sample = MagSample(time.time_ns(), name, EARTH + 1.2e-8 * rng.standard_normal(3))
+                publisher.publish(to_message(MagneticField, sample_dict(sample, name)))
+
+    node.create_timer(0.01, publish)
+
+    def talk(condition, silent=(), seconds=30.0):
+        now['silent'] = silent
+        return spin_until(condition, seconds)
+
+    return talk
+
+
+def test_each_sensor_has_its_status(ros, talking):
+    node, spin_until = ros
+    latest = {}
+    node.create_subscription(
+        DiagnosticArray, '/diagnostics',
+        lambda m: latest.update({s.name: s for s in m.status}), RESULTS)
+    process = start('calibration_node', '-p', f'network:={NETWORK_FILE}')
+
+    def status(name):
+        return latest.get(f'calibration_node: {name}')
+
+    def values(name):
+        return {v.key: v.value for v in status(name).values}
+
+    try:
+        assert talking(lambda: status('mag_1') is not None, silent=('mag_1', 'mag_2'))
+        assert status('mag_1').level == DiagnosticStatus.ERROR
+        assert status('mag_1').message.startswith('nothing has come; look at its cable')
+        assert talking(lambda: values('mag_1')['background'] == values('mag_2')['background']
+                       == 'ready' and status('mag_1').level == DiagnosticStatus.OK)
+        assert status('mag_2').message == 'running' and status('mag_2').hardware_id == 'mag_2'
+        assert float(values('mag_1')['rate [Hz]']) > 20.0
+        assert [5.0 < float(v) < 30.0 for v in values('mag_2')['noise [nT]'].split()] == [True] * 3
+        assert float(values('mag_1')['delay [ms]']) < 100.0
+        assert talking(lambda: 'silent for' in status('mag_2').message, silent=('mag_2',))
+        assert status('mag_2').level == DiagnosticStatus.ERROR
+        assert status('mag_1').level == DiagnosticStatus.OK
+        assert talking(lambda: 'readings are missing' in status('mag_2').message)
+    finally:
+        codes, outputs = stop([process])
+    assert codes == [0], outputs
+
+
+def test_the_doctor_on_a_live_system(ros, talking):
+    node, spin_until = ros
+    stranger = subprocess.Popen([sys.executable, '-c', STRANGER])
+    doctor = DoctorNode(read_network(NETWORK_FILE), settings_for('vehicle'))
+    executor = node.executor
+    executor.add_node(doctor)
+    try:
+        health = doctor.doctor.sensors
+        assert talking(lambda: health['mag_1'].counts['readings'] > 300, silent=('mag_2',))
+        found = [str(f) for f in doctor.findings() + doctor.doctor.findings()]
+        assert any(t.startswith('mag_2: no reading') for t in found), found
+        twin = node.create_publisher(MagneticField, '/mag_1/imu/mag', RESULTS)
+        assert spin_until(lambda: len(doctor.get_publishers_info_by_topic('/mag_1/imu/mag')) == 2
+                          and len(doctor.get_publishers_info_by_topic('/mag_2/imu/mag')) == 1)
+        found = [str(f) for f in doctor.findings()]
+        assert any('mag_1: 2 nodes publish /mag_1/imu/mag' in t for t in found), found
+        assert any('publishes std_msgs/msg/String on /mag_2/imu/mag' in t for t in found), found
+        assert twin
+    finally:
+        stranger.kill()
+        stranger.wait()
+        executor.remove_node(doctor)
+        doctor.destroy_node()

@@ -1,0 +1,328 @@
+"""Tilt and heading: laws, honest deviations, and what cannot be told."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from scipy.stats import binom, chi2
+
+from mag_tracking.calibration.orientation import (
+    GRAVITY,
+    RIVAL,
+    Orientation,
+    Up,
+    compass_orientation,
+    levelled,
+    pooled_bias_std,
+    up_direction,
+    with_stated_heading,
+)
+from mag_tracking.geometry import quaternion_from_rotation, rotation_about_z, yaw_between
+
+EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
+UP = np.array([0.0, 0.0, 1.0])
+BIAS = 6e-7
+
+POSTURES = {'upright': np.eye(3), 'on its head': Rotation.from_euler('x', 180.0, True).as_matrix(),
+            'on its side': Rotation.from_euler('x', 90.0, True).as_matrix(),
+            'on its front': Rotation.from_euler('y', -90.0, True).as_matrix(),
+            'askew': Rotation.from_euler('zyx', [130.0, 40.0, -70.0], True).as_matrix()}
+
+
+def up_of(R_ws, std=0.0):
+    """`Up` of a sensor that is turned by `R_ws`."""
+    return Up(R_ws.T @ UP, GRAVITY, std, 100, 0)
+
+
+def angles_between(R, S):
+    """(3,) [rad] rotation vector that takes R to S, world."""
+    return Rotation.from_matrix(S @ R.T).as_rotvec()
+
+
+def at_rest(R_ws, n=200, noise=0.02, seed=0, bias=0.0):
+    """(n, 3) [m/s^2]."""
+    rng = np.random.default_rng(seed)
+    return GRAVITY * R_ws.T @ UP + bias + noise * rng.standard_normal((n, 3))
+
+
+rotations = st.integers(0, 2**31).map(lambda s: Rotation.random(random_state=s).as_matrix())
+
+
+@settings(max_examples=40, derandomize=True, deadline=None)
+@given(rotations)
+def test_up_turns_with_the_sensor(R):
+    a = at_rest(np.eye(3))
+    up, turned = up_direction(a, 0.05), up_direction(a @ R, 0.05)
+    np.testing.assert_allclose(turned.direction, R.T @ up.direction, atol=2e-3)
+    exact = up_direction(at_rest(R, noise=0.0), 0.05)
+    np.testing.assert_allclose(exact.direction, R.T @ UP, atol=1e-12)
+    assert exact.size == pytest.approx(GRAVITY)
+    assert exact.std == pytest.approx(0.05 / GRAVITY)
+    assert (exact.n, exact.n_left_out) == (200, 0)
+
+
+def test_knocks_and_what_is_not_finite_are_left_out():
+    a = at_rest(np.eye(3))
+    still = up_direction(a, 0.0)
+    a[50:60] += [30.0, -20.0, 10.0]
+    a[70], a[71, 1] = np.nan, np.inf
+    up = up_direction(a, 0.0)
+    assert up.n_left_out >= 12 and up.n + up.n_left_out == 200
+    assert np.arccos(up.direction @ still.direction) < 1e-3
+    # An accelerometer with coarse steps has no scatter at rest.
+    coarse = np.tile([0.0, 0.0, GRAVITY], (50, 1))
+    coarse[20] += [0.0, 5.0, 0.0]
+    assert up_direction(coarse, 0.0).n == 49
+
+
+@pytest.mark.parametrize('a, message', [
+    (np.zeros((0, 3)), '0 accelerations are too few'),
+    (at_rest(np.eye(3), 7), '7 accelerations are too few'),
+    (np.full((50, 3), np.nan), '0 accelerations are too few'),
+    (at_rest(np.eye(3)) / GRAVITY, r'in g\?'),
+    (np.zeros((50, 3)), 'at rest is 0, not 9.81'),
+    (1.2 * at_rest(np.eye(3)), 'at rest is 11.8, not 9.81')])
+def test_what_is_no_accelerometer_at_rest_is_refused(a, message):
+    with pytest.raises(ValueError, match=message):
+        up_direction(a, 0.05)
+
+
+def test_the_tilt_is_as_far_off_as_its_deviation_says(n=400):
+    rng = np.random.default_rng(1)
+    squares = []
+    for k in range(n):
+        R = Rotation.random(random_state=k).as_matrix()
+        up = up_direction(at_rest(R, 20, 0.1, k, 0.05 * rng.standard_normal(3)), 0.05)
+        off = np.cross(R @ up.direction, UP)[:2]
+        squares.append(off @ off / up.std**2)
+    low, high = chi2.ppf([0.001, 0.999], 2 * n)
+    # 20 readings tell their own scatter to a sixth; it is a seventh of the variance.
+    assert 0.9 * low < np.sum(squares) < 1.1 * high
+
+
+@pytest.mark.parametrize('posture', POSTURES)
+@pytest.mark.parametrize('yaw', [0.0, 37.0, 90.0, 180.0, -120.0])
+def test_without_bias_the_orientation_is_exact(posture, yaw):
+    R = rotation_about_z(np.deg2rad(yaw)) @ POSTURES[posture]
+    found = compass_orientation(up_of(R), R.T @ EARTH, EARTH, BIAS)
+    np.testing.assert_allclose(angles_between(found.R_ws, R), 0.0, atol=1e-9)
+    np.testing.assert_allclose(found.bias, 0.0, atol=1e-14)
+    assert np.isnan(found.rival)
+    level = np.hypot(*EARTH[:2])
+    np.testing.assert_allclose(found.std, [0.0, 0.0, BIAS / level], rtol=1e-9)
+
+
+@settings(max_examples=40, derandomize=True, deadline=None)
+@given(rotations, rotations)
+def test_the_orientation_turns_with_the_sensor(R, S):
+    """What the sensor measures is turned by S: so is the answer, and nothing else."""
+    rng = np.random.default_rng(0)
+    y, up = R.T @ EARTH + BIAS * rng.standard_normal(3), up_of(R, 5e-3)
+    a = compass_orientation(up, y, EARTH, BIAS)
+    b = compass_orientation(Up(S.T @ up.direction, GRAVITY, 5e-3, 100, 0), S.T @ y, EARTH, BIAS)
+    np.testing.assert_allclose(angles_between(b.R_ws, a.R_ws @ S), 0.0, atol=1e-8)
+    np.testing.assert_allclose(b.std, a.std, rtol=1e-6)
+    np.testing.assert_allclose(b.bias, S.T @ a.bias, atol=1e-13)
+    # Up stays up.
+    np.testing.assert_allclose(a.R_ws @ up.direction, UP, atol=1e-12)
+
+
+def test_the_orientation_turns_with_the_world():
+    y = EARTH + [3e-7, -5e-7, 1e-7]
+    a = compass_orientation(up_of(np.eye(3)), y, EARTH, BIAS)
+    for yaw in (0.7, -2.5):
+        Rz = rotation_about_z(yaw)
+        b = compass_orientation(up_of(np.eye(3)), y, Rz @ EARTH, BIAS)
+        np.testing.assert_allclose(angles_between(b.R_ws, Rz @ a.R_ws), 0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize('lean, missing', [(0.3, None), (3.0, None), (0.3, 2), (3.0, 2)])
+def test_the_heading_is_as_far_off_as_its_deviation_says(lean, missing, n=300):
+    """Unknown bias on each axis, an accelerometer that is off: over many mountings."""
+    rng = np.random.default_rng(5)
+    heading, tilt, gross = [], [], 0
+    for k in range(n):
+        R = rotation_about_z(rng.uniform(-np.pi, np.pi)) @ Rotation.from_rotvec(
+            lean * rng.standard_normal(3)).as_matrix()
+        up = up_direction(at_rest(R, 50, 0.02, k, 0.05 * rng.standard_normal(3)), 0.05)
+        y = R.T @ EARTH + BIAS * rng.standard_normal(3)
+        if missing is not None:
+            y[missing] = np.nan
+        try:
+            found = compass_orientation(up, y, EARTH, BIAS)
+        except ValueError:
+            continue
+        # A missing axis that lies level leaves two headings, or one that is hardly known.
+        if not np.isnan(found.rival) or found.std[2] > np.deg2rad(5.0):
+            continue
+        off = angles_between(found.R_ws, R)
+        if abs(off[2]) > 0.5:
+            gross += 1
+            continue
+        # To second order a rotation vector's parts do not mix: tilts are a third of a degree.
+        heading.append((off[2] / found.std[2])**2)
+        tilt.append(np.sum((off[:2] / found.std[:2])**2))
+    print(f'missing {missing}: heading {np.mean(heading):.3f}, tilt {np.mean(tilt) / 2:.3f}, '
+          f'{len(heading)} of {n}')
+    for squares, each in ((heading, 1), (tilt, 2)):
+        low, high = chi2.ppf([0.001, 0.999], each * len(squares))
+        assert low < np.sum(squares) < high
+    assert len(heading) > (0.95 if missing is None or lean < 1.0 else 0.4) * n
+    # The true one of two headings is dropped when its bias is worse than RIVAL.
+    assert gross <= binom.ppf(0.999, n, chi2.sf(RIVAL, 1)) * (missing is not None)
+
+
+@pytest.mark.parametrize('posture', POSTURES)
+def test_a_compass_without_bias_is_as_far_off_as_its_tilt_makes_it(posture, n=200):
+    """At 72 degrees of dip a tilt turns the heading by three times itself."""
+    rng, squares = np.random.default_rng(8), []
+    for k in range(n):
+        R = rotation_about_z(rng.uniform(-np.pi, np.pi)) @ POSTURES[posture]
+        up = up_direction(at_rest(R, 50, 0.02, k, 0.05 * rng.standard_normal(3)), 0.05)
+        found = compass_orientation(up, R.T @ EARTH, EARTH, 1e-9)
+        squares.append((angles_between(found.R_ws, R)[2] / found.std[2])**2)
+    assert found.std[2] == pytest.approx(49.0 / np.hypot(2.0, 15.5) * found.std[0], rel=1e-3)
+    low, high = chi2.ppf([0.001, 0.999], n)
+    assert low < np.sum(squares) < high
+
+
+@pytest.mark.parametrize('earth', [[0.0, 0.0, -5e-5], [0.0, 0.0, 5e-5], [3e-7, 0.0, -5e-5],
+                                   [0.0, 0.0, 0.0]])
+def test_a_field_straight_down_tells_no_heading(earth):
+    with pytest.raises(ValueError, match='does not tell the heading'):
+        compass_orientation(up_of(np.eye(3)), np.array(earth), earth, BIAS)
+
+
+def test_an_upright_axis_alone_tells_no_heading():
+    y = np.array([np.nan, np.nan, EARTH[2]])
+    with pytest.raises(ValueError, match='does not tell the heading'):
+        compass_orientation(up_of(np.eye(3)), y, EARTH, BIAS)
+    with pytest.raises(ValueError, match='does not tell the heading'):
+        compass_orientation(up_of(np.eye(3)), np.full(3, np.nan), EARTH, BIAS)
+
+
+def test_two_axes_tell_what_three_do_where_the_third_is_upright():
+    R = rotation_about_z(0.4)
+    y = R.T @ EARTH + [2e-7, 1e-7, 0.0]
+    three = compass_orientation(up_of(R, 5e-3), y, EARTH, BIAS)
+    two = compass_orientation(up_of(R, 5e-3), [*y[:2], np.nan], EARTH, BIAS)
+    np.testing.assert_allclose(two.R_ws, three.R_ws, atol=1e-9)
+    np.testing.assert_allclose(two.std, three.std)
+    assert np.isnan(two.bias[2]) and not np.isnan(two.bias[:2]).any()
+
+
+@pytest.mark.parametrize('yaw', [-140.0, -60.0, 25.0, 60.0, 120.0])
+def test_a_single_level_axis_has_a_rival(yaw):
+    R = rotation_about_z(np.deg2rad(yaw))
+    y = np.array([(R.T @ EARTH)[0], np.nan, np.nan])
+    found = compass_orientation(up_of(R), y, EARTH, BIAS)
+    # The axis may lie to either side of the field.
+    to_field = np.arctan2(EARTH[1], EARTH[0]) - np.deg2rad(yaw)
+    other = np.deg2rad(yaw) + 2.0 * to_field
+    headings = np.angle(np.exp(1j * np.array([np.deg2rad(yaw), other])))
+    one = np.arctan2(found.R_ws[1, 0], found.R_ws[0, 0])
+    k = int(np.abs(np.angle(np.exp(1j * (headings - one)))).argmin())
+    assert one == pytest.approx(headings[k], abs=1e-6)
+    rival = np.angle(np.exp(1j * (headings[1 - k] - one)))
+    assert np.angle(np.exp(1j * (found.rival - rival))) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize('yaw', np.linspace(-180.0, 150.0, 12))
+def test_sensors_with_two_level_axes_or_three_have_no_rival(yaw):
+    R = rotation_about_z(np.deg2rad(yaw))
+    for gone in ([], [2]):
+        y = R.T @ EARTH + BIAS * np.array([1.0, -1.0, 0.5])
+        y[gone] = np.nan
+        assert np.isnan(compass_orientation(up_of(R), y, EARTH, BIAS).rival)
+
+
+@settings(max_examples=40, derandomize=True, deadline=None)
+@given(rotations, st.floats(-3.0, 3.0))
+def test_yaw_between_is_the_turn_about_the_vertical(R, yaw):
+    assert yaw_between(R, rotation_about_z(yaw) @ R) == pytest.approx(yaw, abs=1e-9)
+    assert yaw_between(rotation_about_z(yaw) @ R, R) == pytest.approx(-yaw, abs=1e-9)
+
+
+def test_yaw_between_is_the_nearest():
+    R, S = Rotation.random(2, random_state=3).as_matrix()
+    yaws = np.deg2rad(np.arange(-180.0, 180.0, 0.05))
+    traces = [np.trace((rotation_about_z(a) @ R).T @ S) for a in yaws]
+    assert yaw_between(R, S) == pytest.approx(yaws[int(np.argmax(traces))], abs=1e-3)
+
+
+def heading_of(yaw_deg, std_deg, R=POSTURES['upright']):
+    """`Orientation` with that heading."""
+    return Orientation(rotation_about_z(np.deg2rad(yaw_deg)) @ R,
+                       np.deg2rad([0.3, 0.4, std_deg]), np.array([1e-7, 0.0, 0.0]), np.nan)
+
+
+@pytest.mark.parametrize('compass, stated, expected, std', [
+    (2.0, 2.0, 3.0, np.sqrt(2.0)), (1.0, 3.0, 0.6, np.sqrt(0.9)), (3.0, 1.0, 5.4, np.sqrt(0.9)),
+    (2.0, 180.0, 6.0 * 4.0 / 32404.0, 2.0)])
+def test_each_heading_counts_by_its_variance(compass, stated, expected, std):
+    R = POSTURES['askew']
+    both = with_stated_heading(heading_of(0.0, compass, R), heading_of(6.0, 0.0, R).R_ws,
+                               np.deg2rad(stated))
+    assert np.degrees(yaw_between(R, both.R_ws)) == pytest.approx(expected, rel=1e-3)
+    np.testing.assert_allclose(np.degrees(both.std), [0.3, 0.4, std], rtol=1e-3)
+    # The tilt is the accelerometer's.
+    np.testing.assert_allclose(both.R_ws.T @ UP, R.T @ UP, atol=1e-12)
+    assert both.bias[0] == 1e-7
+
+
+def test_a_stated_heading_that_is_too_far_off_is_not_mixed_in():
+    def both(apart):
+        return with_stated_heading(heading_of(0.0, 3.0), heading_of(apart, 0.0).R_ws,
+                                   np.deg2rad(4.0))
+    for sign in (1.0, -1.0):
+        assert both(14.9 * sign) is not None
+        assert both(15.1 * sign) is None
+    assert both(180.0) is None
+
+
+def test_levelling_turns_the_least_and_makes_up_up():
+    for posture in POSTURES.values():
+        lean = Rotation.from_rotvec([0.05, -0.08, 0.0]).as_matrix()
+        truth = lean @ posture
+        found = levelled(up_of(truth, 5e-3), posture, np.deg2rad([5.0, 5.0, 4.0]))
+        np.testing.assert_allclose(found.R_ws @ (truth.T @ UP), UP, atol=1e-12)
+        turn = angles_between(posture, found.R_ws)
+        # About a level axis, by no more than the sensor leans.
+        assert abs(turn[2]) < 1e-12
+        assert np.linalg.norm(turn) == pytest.approx(np.hypot(0.05, 0.08), rel=1e-6)
+        np.testing.assert_allclose(found.std, [5e-3, 5e-3, np.deg2rad(4.0)])
+        assert np.isnan(found.bias).all() and np.isnan(found.rival)
+    assert levelled(None, np.eye(3), np.ones(3)) is None
+
+
+def biased(bias):
+    return Orientation(np.eye(3), np.zeros(3), np.array(bias), np.nan)
+
+
+def test_the_pooled_bias_counts_what_is_seen():
+    assert pooled_bias_std([], BIAS) == pytest.approx(BIAS)
+    one = pooled_bias_std([biased([0.0, 3e-7, 4e-7])], BIAS, 4.0)
+    assert one == pytest.approx(np.sqrt((4.0 * BIAS**2 + 25e-14) / 6.0))
+    two = pooled_bias_std([biased([0.0, 5e-7, np.nan])], BIAS, 4.0)
+    assert two == pytest.approx(np.sqrt((4.0 * BIAS**2 + 25e-14) / 5.0))
+
+
+def test_the_pooled_bias_is_that_of_many_sensors():
+    rng, found = np.random.default_rng(2), []
+    for k in range(200):
+        R = Rotation.random(random_state=k).as_matrix()
+        y = R.T @ EARTH + 1.5e-6 * rng.standard_normal(3)
+        found.append(compass_orientation(up_of(R), y, EARTH, BIAS))
+    low, high = np.sqrt(chi2.ppf([0.001, 0.999], 400) / 400)
+    assert low < pooled_bias_std(found, 1.5e-6) / 1.5e-6 < high
+
+
+def test_a_rotation_and_its_quaternion():
+    R = Rotation.random(50, random_state=0).as_matrix()
+    # Half turns are where all but one component vanish.
+    for M in [*R, *(Rotation.from_rotvec(np.pi * e).as_matrix() for e in np.eye(3)), np.eye(3)]:
+        q = quaternion_from_rotation(M)
+        assert np.linalg.norm(q) == pytest.approx(1.0)
+        np.testing.assert_allclose(Rotation.from_quat(q).as_matrix(), M, atol=1e-12)
+    np.testing.assert_allclose(rotation_about_z(0.3), Rotation.from_euler('z', 0.3).as_matrix())
