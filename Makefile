@@ -55,7 +55,8 @@ config: $(STAMP)  ## write config/ and docs/parameters.md anew from the settings
 test: $(STAMP)  ## check style, floors and behaviour
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
-	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest -q
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not alone'
+	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest -q -m alone
 
 bench: $(STAMP)  ## measure times and accuracies
 	$(BIN)/python test/bench/bench.py

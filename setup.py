@@ -59,6 +59,7 @@ setup(
             'magpylib',
             'pytest',
             'pytest-timeout',
+            'pytest-xdist',
             'rosbags',
             'ruff',
         ],

@@ -30,6 +30,14 @@ os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
 
 
+def pytest_collection_modifyitems(items):
+    """Tests of nodes and of what is killed in time are not run beside others (`make test`)."""
+    for item in items:
+        if any(word in item.path.stem for word in ('node', 'record')) \
+                and item.path.stem != 'test_recordings':
+            item.add_marker('alone')
+
+
 @pytest.fixture(scope='session')
 def road_network():
     return read_network(NETWORK_FILE)

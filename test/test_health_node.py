@@ -33,12 +33,14 @@ time.sleep(60.0)
 
 @pytest.fixture
 def talking(ros):
-    """Both sensors publish at 100 Hz, but those that are told to be `silent`, while it waits."""
+    """Both sensors publish at 100 Hz, but those that are told to be `silent`, while it waits.
+
+    A `step` [T] is added to the field of mag_1.
+    """
     node, spin_until = ros
     publishers = {}
     rng = np.random.default_rng(0)
-
-    now = {'silent': ('mag_1', 'mag_2')}
+    now = {'silent': ('mag_1', 'mag_2'), 'mag_1': 0.0, 'mag_2': 0.0}
 
     def publish():
         for name in ('mag_1', 'mag_2'):
@@ -46,28 +48,55 @@ def talking(ros):
                 publisher = publishers.setdefault(name, None) or node.create_publisher(
                     MagneticField, f'/{name}/imu/mag', STREAM)
                 publishers[name] = publisher
-                sample = MagSample(time.time_ns(), name, EARTH + 1.2e-8 * rng.standard_normal(3))
+                field = EARTH + now[name] + 1.2e-8 * rng.standard_normal(3)
+                sample = MagSample(time.time_ns(), name, field)
                 publisher.publish(to_message(MagneticField, sample_dict(sample, name)))
 
     node.create_timer(0.01, publish)
 
-    def talk(condition, silent=(), seconds=30.0):
-        now['silent'] = silent
+    def talk(condition, silent=(), step=0.0, seconds=30.0):
+        now.update(silent=silent, mag_1=step)
         return spin_until(condition, seconds)
 
     return talk
 
 
-def test_each_sensor_has_its_status(ros, talking):
-    node, spin_until = ros
+@pytest.fixture
+def statuses(ros):
+    """{name: latest DiagnosticStatus}."""
+    node, _ = ros
     latest = {}
     node.create_subscription(
         DiagnosticArray, '/diagnostics',
         lambda m: latest.update({s.name: s for s in m.status}), RESULTS)
+    return latest
+
+
+def test_a_parked_car_is_not_swallowed_without_a_word(talking, statuses):
+    """The background follows a step that stays, and the diagnostics say so."""
+    process = start('calibration_node', '-p', f'network:={NETWORK_FILE}',
+                    '-p', 'calibrate.relearn_s:=4.0')
+
+    def message(name):
+        status = statuses.get(f'calibration_node: {name}')
+        return status.message if status else ''
+
+    try:
+        assert talking(lambda: message('mag_1') == message('mag_2') == 'running')
+        assert talking(lambda: 'taken for its background' in message('mag_1'), step=1e-6)
+        assert message('mag_2') == 'running'
+        state = {v.key: v.value for v in statuses['calibration_node: mag_1'].values}
+        assert state['backgrounds taken anew'] == '1' and state['background'] == 'ready'
+    finally:
+        codes, outputs = stop([process])
+    assert codes == [0], outputs
+
+
+def test_each_sensor_has_its_status(talking, statuses):
     process = start('calibration_node', '-p', f'network:={NETWORK_FILE}')
 
     def status(name):
-        return latest.get(f'calibration_node: {name}')
+        return statuses.get(f'calibration_node: {name}')
 
     def values(name):
         return {v.key: v.value for v in status(name).values}

@@ -66,15 +66,9 @@ def _record(args):
     # Only this command needs ROS.
     from mag_tracking.nodes.record_node import Selection, run
 
-    imus = tuple(filter(None, map(_imu_topic, network.topics)))
+    imus = tuple(filter(None, network.imu_topics))
     selection = Selection(tuple(network.topics), imus, tuple(args.topics), args.results, args.all)
     return run(selection, args.out, int(args.split_mb * 1e6), int(args.split_s * 1e9))
-
-
-def _imu_topic(field):
-    """Where the sensor of a magnetic field publishes accelerations and rates, or None."""
-    owner, _, last = field.rpartition('/')
-    return f'{owner}/data_raw' if last == 'mag' else None
 
 
 def _repair(args):

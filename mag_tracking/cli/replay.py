@@ -103,6 +103,10 @@ def _print_summary(path, summary):
     if waiting:
         print(f'  warning: no background was learnt for {", ".join(waiting)}: the recording needs '
               'a target-free beginning, or the network file a background and a noise_std')
+    hardly = summary['counts']['track'].get('sensors whose orientation is hardly known', 0)
+    if hardly:
+        print(f'  warning: {hardly} sensors may be turned by more than 15 degrees, as the network '
+              'file says: calibrate them')
     too_long = summary['counts']['track'].get('tracks too long to smooth', 0)
     if too_long:
         print(f'  warning: {too_long} tracks were too long to smooth (track.smooth_longest_s, or '

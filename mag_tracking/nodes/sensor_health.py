@@ -23,7 +23,8 @@ class HealthDiagnostics:
     def __init__(self, network, max_field):
         self._network, self._max_field = network, max_field
         self._term_ends = time.monotonic() + TERM_S
-        self._heard = dict.fromkeys(network.names)
+        self._heard, self._adopted = dict.fromkeys(network.names), dict.fromkeys(network.names)
+        self._relearnt = dict.fromkeys(network.names, 0)
         self._past = {name: None for name in network.names}
         self._present = {name: SensorHealth() for name in network.names}
 
@@ -39,6 +40,10 @@ class HealthDiagnostics:
             self._term_ends = time.monotonic() + TERM_S
             self._past, self._present = self._present, {
                 name: SensorHealth() for name in self._network.names}
+        for name, background in calibrate.backgrounds().items():
+            if background.n_relearnt != self._relearnt[name]:
+                self._relearnt[name] = background.n_relearnt
+                self._adopted[name] = time.monotonic()
         return [self._status(node, j, name, calibrate)
                 for j, name in enumerate(self._network.names)]
 
@@ -51,6 +56,10 @@ class HealthDiagnostics:
             return [Finding(True, name, what, 'look at its cable, its driver and the topic '
                             f'{self._network.topics[j]}')]
         found = {}
+        adopted = self._adopted[name]
+        if adopted is not None and time.monotonic() - adopted < 2.0 * TERM_S:
+            found[''] = Finding(False, name, 'a steady change was taken for its background',
+                                'a parked vehicle, or something that was put beside it')
         for health in (self._past[name], self._present[name]):
             if health is not None and health.counts['readings']:
                 for f in health.findings(name, self._network.noise_std[j], self._max_field):
