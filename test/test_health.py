@@ -124,6 +124,26 @@ def test_what_is_lost_is_counted():
     assert examined(stamps[keep], fields[keep]).counts['lost'] == 5
 
 
+def test_a_steep_slope_is_no_spike():
+    stamps, fields = readings()
+    fields[1500:1520] += 1e-6 * np.arange(20)[:, None]
+    fields[1520:] += 2e-5
+    assert examined(stamps, fields).counts['spikes'] == 0
+
+
+def test_what_is_saturated_is_counted_once():
+    stamps, fields, _ = broken('saturated')
+    clipped = np.isin(fields[:, 1], [1.5e-5, 1.6e-5]).sum()
+    # With the neighbours, which are not to be trusted either.
+    assert clipped <= examined(stamps, fields).counts['saturated'] <= 200 + 12
+
+
+def test_a_stuck_two_axis_sensor_is_found():
+    stamps, fields, _ = broken('stuck')
+    fields[:, 2] = np.nan
+    assert examined(stamps, fields).counts['stuck readings'] == 299
+
+
 def test_of_an_irregular_sensor_nothing_is_called_lost():
     rng = np.random.default_rng(4)
     stamps = 10**18 + np.cumsum(rng.exponential(0.01, 3000) * NS).astype(np.int64)
@@ -151,7 +171,15 @@ def doctored(change=lambda k, field: field, seconds=10.0, **settings):
             if j == 1:
                 field = change(k, field)
             doctor.feed(MagSample(10**18 + k * 20_000_000, name, field))
-    return [str(f) for f in doctor.findings()]
+    found = doctor.findings()
+    # The serious ones first.
+    assert found == sorted(found, key=lambda f: not f.serious)
+    return [str(f) for f in found]
+
+
+def test_a_target_that_stays_is_no_disagreement():
+    """What is compared is the background, which is frozen meanwhile."""
+    assert doctored(lambda k, field: field + 2e-5 * (k > 750), seconds=25.0) == []
 
 
 def test_the_doctor_compares_sensors_with_the_earth():
@@ -161,6 +189,9 @@ def test_the_doctor_compares_sensors_with_the_earth():
     found = doctored(lambda k, field: field * 1e6)
     assert any('its unit is microtesla' in text for text in found), found
     assert any(text.startswith('calibrate: 500 readings rejected: above') for text in found)
+    # Not the first: of noise nothing is known yet.
+    few = doctored(lambda k, field: field * (1e6 if k % 100 == 1 else 1.0), seconds=20.0)
+    assert 'mag_2: 9 of 1000 readings are spikes' in few[0] and 'above' in few[1]
 
 
 def test_the_doctor_looks_at_backgrounds():
