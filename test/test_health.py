@@ -117,6 +117,14 @@ def test_each_fault_is_named(what, serious, said):
     assert len(found) == 1 + (what == 'back'), [str(f) for f in found]
 
 
+def test_a_sensor_whose_noise_is_below_its_steps_has_no_spikes():
+    stamps, fields = readings()
+    coarse = np.round(fields / 2e-7) * 2e-7
+    coarse[::50] += 2e-7
+    health = examined(stamps, coarse)
+    assert health.counts['spikes'] == 0 and (health.noise_std > 2e-8).all()
+
+
 def test_what_is_lost_is_counted():
     stamps, fields = readings()
     keep = np.ones(3000, dtype=bool)
@@ -189,9 +197,12 @@ def test_the_doctor_compares_sensors_with_the_earth():
     found = doctored(lambda k, field: field * 1e6)
     assert any('its unit is microtesla' in text for text in found), found
     assert any(text.startswith('calibrate: 500 readings rejected: above') for text in found)
-    # Not the first: of noise nothing is known yet.
+    # Not the first of the spikes: of noise nothing is known yet.
     few = doctored(lambda k, field: field * (1e6 if k % 100 == 1 else 1.0), seconds=20.0)
-    assert 'mag_2: 9 of 1000 readings are spikes' in few[0] and 'above' in few[1]
+    assert 'mag_2: 9 of 1000 readings are spikes' in few[0] and '10 readings rejected' in few[1]
+    # So many rejections are serious, and come first.
+    many = doctored(lambda k, field: field * (1e6 if k % 8 == 1 else 1.0), seconds=20.0)
+    assert '125 readings rejected' in many[0] and 'are spikes' in many[1]
 
 
 def test_the_doctor_looks_at_backgrounds():

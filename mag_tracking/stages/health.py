@@ -258,7 +258,10 @@ def _noise(fields):
     for axis, d in enumerate(np.abs(np.diff(fields, n=2, axis=0)).T):
         d = d[~np.isnan(d)]
         if len(d) >= 8:
+            # A sensor with coarse steps is no better than those.
+            step = d[d > 0.0].min(initial=np.inf)
+            least = step / np.sqrt(12.0) if np.isfinite(step) else 0.0
             # Their mean, not their median: of coarse steps the median is one.
-            usual = d[d <= 6.0 * np.quantile(d, 0.75)]
-            out[axis] = np.sqrt(np.pi / 12.0) * usual.mean()
+            usual = d[d <= max(8.0 * np.quantile(d, 0.6), least)]
+            out[axis] = max(np.sqrt(np.pi / 12.0) * usual.mean(), least)
     return out
