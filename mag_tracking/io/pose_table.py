@@ -27,26 +27,23 @@ def read_pose_table(path):
 
     Raises RecordingError, which names file, row and column.
     """
-    header, rows = _read(path)
-    n = sum(name[:1] == 'x' and name[1:].isdigit() for name in header)
-    fields = [f'{a}{j}' for j in range(n) for a in 'xyz']
-    if not n:
-        raise RecordingError(f'{path}: column x0 is missing')
-    for name in (*fields, *_POSE):
-        if header.count(name) != 1:
-            there = 'missing' if name not in header else 'there twice'
-            raise RecordingError(f'{path}: column {name} is {there}')
-    places = [header.index(name) for name in (*fields, *_POSE)]
-    values = np.array([[_number(path, line, name, row[i], name in _POSE)
-                        for name, i in zip((*fields, *_POSE), places, strict=True)]
-                       for line, row in rows])
+    rows, values = _values(path, _POSE)
     axes = values[:, -3:]
     length = np.linalg.norm(axes, axis=1)
     for (line, _), size in zip(rows, length, strict=True):
         if abs(size - 1.0) > 1e-3:
             raise RecordingError(f'{path}: row {line}: mag_mx0..mag_mz0 has length {size:.6g}, '
                                  'expected 1')
-    return values[:, :-6].reshape(len(rows), n, 3), values[:, -6:-3], axes / length[:, None]
+    return (values[:, :-6].reshape(len(rows), -1, 3), values[:, -6:-3], axes / length[:, None])
+
+
+def read_readings(path):
+    """Readings (K, n, 3) [T, sensor frame] alone of such a table, which needs no poses.
+
+    Raises RecordingError, which names file, row and column.
+    """
+    rows, values = _values(path, ())
+    return values.reshape(len(rows), -1, 3)
 
 
 def read_sensor_positions(path):
@@ -62,6 +59,24 @@ def read_sensor_positions(path):
             raise RecordingError(f'{path}: row {line}: expected 3 columns, got {len(row)}')
     return np.array([[_number(path, line, name, text, True)
                       for name, text in zip('xyz', row, strict=True)] for line, row in rows])
+
+
+def _values(path, pose):
+    """[(line, row)] and the numbers of all readings, then of the columns `pose`."""
+    header, rows = _read(path)
+    n = sum(name[:1] == 'x' and name[1:].isdigit() for name in header)
+    fields = [f'{a}{j}' for j in range(n) for a in 'xyz']
+    if not n:
+        raise RecordingError(f'{path}: column x0 is missing')
+    for name in (*fields, *pose):
+        if header.count(name) != 1:
+            there = 'missing' if name not in header else 'there twice'
+            raise RecordingError(f'{path}: column {name} is {there}')
+    places = [header.index(name) for name in (*fields, *pose)]
+    values = np.array([[_number(path, line, name, row[i], name in pose)
+                        for name, i in zip((*fields, *pose), places, strict=True)]
+                       for line, row in rows])
+    return rows, values
 
 
 def _read(path):

@@ -1,0 +1,132 @@
+"""Figures of a board's geometry: one function a figure, each returns the figure."""
+
+import matplotlib
+import numpy as np
+
+matplotlib.use('Agg')
+from matplotlib.figure import Figure  # noqa: E402  (the backend has to be chosen first)
+
+from mag_tracking.report.figures import SCALE_1D  # noqa: E402
+
+_SUSPECT = 'tab:red'
+_MOST_NAMES = 60
+"""With more sensors only every second, third, ... is named."""
+
+
+def geometry_figure(found):
+    """Where the sensors moved to, how they are turned, their gains, and what is left over.
+
+    Parameters
+    ----------
+    found : GeometrySurvey
+    """
+    g, names = found.geometry, found.network.names
+    n = len(names)
+    suspect = np.isin(names, g.suspect_sensors)
+    figure = Figure(figsize=(15.0, 9.5), layout='constrained')
+    left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.15))
+    board, poses = left.subplots(2, 1, height_ratios=(2.4, 1.0))
+    _moves(left, board, found, suspect)
+    _poses(poses, found)
+    rows = right.subplots(4, 1, sharex=True)
+    along = np.arange(n)
+    moved = found.network.positions - found.stated.positions
+    _spread(rows[0], along, 1e3 * np.linalg.norm(moved, axis=1), 1e3 * g.position_std,
+            'moved [mm]')
+    _spread(rows[1], along, np.rad2deg(found.turned), np.rad2deg(g.rotation_std), 'turned [deg]')
+    rows[2].errorbar(along, g.gain, yerr=SCALE_1D * g.gain_std, fmt='o', ms=4, capsize=2,
+                     color='tab:blue')
+    rows[2].axhline(1.0, color='k', lw=0.8, ls=':')
+    rows[2].set_title('gain (90 %)', fontsize=10, loc='left')
+    _bars(rows[3], along, g.sensor_residual, suspect,
+          'residual, in its deviations (rms; about 1 where noise and field error are right)')
+    step = -(-n // _MOST_NAMES)
+    rows[3].set_xticks(along[::step], names[::step], rotation=90, fontsize=7)
+    rows[3].set_xlim(-0.7, n - 0.3)
+    return figure
+
+
+def _moves(figure, axes, found, suspect):
+    """The board from its flattest side: arrows of the moves, much enlarged."""
+    places = found.stated.positions
+    a, b = _widest(places)
+    c = 3 - a - b
+    shift = 1e3 * (found.network.positions - places)
+    extent = np.ptp(places, axis=0).max() or 1.0
+    longest = np.linalg.norm(shift[:, [a, b]], axis=1).max()
+    key = _round_down(longest) or 1.0
+    r, _ = found.geometry.poses
+    axes.plot(r[:, a], r[:, b], '.', ms=3, color='0.85', zorder=0, label='poses of the magnet')
+    most = np.abs(shift[:, c]).max() or 1.0
+    arrows = axes.quiver(
+        places[:, a], places[:, b], shift[:, a], shift[:, b], shift[:, c], cmap='coolwarm',
+        clim=(-most, most), angles='xy', scale_units='xy', width=0.006, edgecolor='k',
+        linewidth=0.4, scale=8.0 * (longest or 1.0) / extent, zorder=2)
+    axes.quiverkey(arrows, 0.86, 1.03, key, f'{key:g} mm', labelpos='E')
+    axes.plot(places[:, a], places[:, b], 'k.', ms=3, zorder=3, label='sensors as stated')
+    if suspect.any():
+        axes.plot(places[suspect, a], places[suspect, b], 'o', ms=12, mfc='none', mew=1.5,
+                  color=_SUSPECT, label='does not fit')
+    if len(places) <= _MOST_NAMES:
+        for name, place in zip(found.network.names, places, strict=True):
+            axes.annotate(name, place[[a, b]], xytext=(3, -8), textcoords='offset points',
+                          fontsize=6, color='0.35')
+    # Not stretched by a few poses far off.
+    low, high = places.min(axis=0) - 0.15 * extent, places.max(axis=0) + 0.15 * extent
+    axes.set_xlim(low[a], high[a])
+    axes.set_ylim(low[b], high[b])
+    axes.set_aspect('equal')
+    axes.set_xlabel(f'{"xyz"[a]} [m]')
+    axes.set_ylabel(f'{"xyz"[b]} [m]')
+    axes.set_title('moved from where it was stated', fontsize=10, loc='left')
+    axes.legend(fontsize=7, ncols=3, loc='upper center', bbox_to_anchor=(0.5, -0.12),
+                frameon=False)
+    figure.colorbar(arrows, ax=axes, shrink=0.7, label=f'moved along {"xyz"[c]} [mm]')
+
+
+def _widest(places):
+    """The two axes along which the board is widest, in their order."""
+    a, b = sorted(np.argsort(np.ptp(places, axis=0), kind='stable')[1:])
+    return int(a), int(b)
+
+
+def _round_down(value):
+    """The largest of 1, 2, 5, 10, ... that is not above; zero of zero."""
+    if not value > 0.0:
+        return 0.0
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(power * max(m for m in (1.0, 2.0, 5.0) if m * power <= value * (1.0 + 1e-9)))
+
+
+def _spread(axes, along, size, std, title):
+    """Sizes of the corrections as dots, over what one axis of them is known to."""
+    axes.bar(along, SCALE_1D * np.sqrt(np.square(std).mean(axis=1)), color='0.85', width=0.8,
+             label='known to (90 %, per axis)')
+    axes.plot(along, size, 'o', ms=4, color='tab:blue', label='found')
+    axes.set_title(title, fontsize=10, loc='left')
+    axes.legend(fontsize=7, ncols=2, loc='lower right', bbox_to_anchor=(1.0, 1.0), frameon=False)
+    axes.grid(alpha=0.3)
+
+
+def _bars(axes, along, residual, suspect, title):
+    """Residuals; what does not fit in red."""
+    axes.bar(along, np.nan_to_num(residual), width=0.8,
+             color=np.where(suspect, _SUSPECT, 'tab:blue').tolist())
+    axes.axhline(1.0, color='k', lw=0.8, ls=':')
+    axes.set_title(title, fontsize=10, loc='left')
+    axes.grid(alpha=0.3)
+
+
+def _poses(axes, found):
+    """Residuals of the poses by their row of the table."""
+    suspect = np.isin(found.rows, found.suspect_rows)
+    residual = found.geometry.pose_residual
+    axes.plot(found.rows[~suspect], residual[~suspect], '.', ms=4, color='tab:blue')
+    axes.plot(found.rows[suspect], residual[suspect], 'o', ms=5, color=_SUSPECT)
+    axes.set_ylim(0.0)
+    axes.axhline(1.0, color='k', lw=0.8, ls=':')
+    axes.set_title('residual of the poses, over that of the noise'
+                   + (f'; do not fit: {suspect.sum()} (red)' if suspect.any() else ''),
+                   fontsize=10, loc='left')
+    axes.grid(alpha=0.3)
+    axes.set_xlabel('row of the table')

@@ -1,0 +1,91 @@
+"""Simulated boards of sensors under a magnet, for the tests."""
+
+from functools import cache
+
+import numpy as np
+
+from mag_tracking.analysis.network_geometry import GeometrySettings, calibrate_geometry
+from mag_tracking.analysis.network_readings import (
+    TrackedMagnet,
+    predicted_readings,
+    rotation,
+    tool_rotations,
+)
+from mag_tracking.network import SensorNetwork
+
+MOMENT = 0.264
+SETTINGS = GeometrySettings(moment_std=0.02)
+LOW, HIGH = np.array([-0.08, -0.08, 0.03]), np.array([0.2, 0.2, 0.25])
+
+
+def board(n_side=3, spacing=0.06, noise=1e-7, seed=3):
+    """Sensors on a grid, each turned anyhow."""
+    places = np.array([(x, y, 0.0) for y in range(n_side) for x in range(n_side)]) * spacing
+    R = rotation(np.random.default_rng(seed).standard_normal((n_side**2, 3)))
+    names = tuple(f'mag_{j}' for j in range(len(places)))
+    return SensorNetwork(names, places, R, tuple(f'/{name}' for name in names),
+                         noise_std=(np.full(3, noise),) * len(names))
+
+
+def tracked(n_poses, rng):
+    """Positions and axes of a tool over the board."""
+    positions = rng.uniform([0.0, 0.0, 0.05], [0.12, 0.12, 0.13], (n_poses, 3))
+    axes = np.array([0.0, 0.0, 1.0]) + 0.6 * rng.uniform(-1.0, 1.0, (n_poses, 3))
+    return positions, axes / np.linalg.norm(axes, axis=1)[:, None]
+
+
+def truth(network, n_poses, rng, settings=SETTINGS):
+    """Unknowns as the priors have them: sensors (n, 10), shared (12,), poses (K, 8)."""
+    s, deg = settings, np.pi / 180.0
+    n = len(network)
+    sensor = rng.standard_normal((n, 10)) * np.repeat(
+        [3e-5, s.gain_std, s.rotation_std_deg * deg, s.position_std], [3, 1, 3, 3])
+    shared = rng.standard_normal(12) * np.repeat(
+        [s.board_shift_std, s.board_rotation_std_deg * deg, s.tool_offset_std,
+         s.tool_tilt_std_deg * deg, s.moment_std], [3, 3, 3, 2, 1])
+    pose = rng.standard_normal((n_poses, 8)) * np.repeat(
+        [s.tracker_position_std, s.tracker_tilt_std_deg * deg, s.ambient_std], [3, 2, 3])
+    return sensor, shared, pose
+
+
+def simulated(seed, n_poses=40, network=None, settings=SETTINGS):
+    """(network, field (K, n, 3), positions, axes, truth) of a board with all that may be wrong."""
+    rng = np.random.default_rng(seed)
+    network = network or board()
+    positions, axes = tracked(n_poses, rng)
+    x = truth(network, n_poses, rng, settings)
+    magnet = TrackedMagnet(positions, tool_rotations(axes), positions.mean(axis=0), MOMENT)
+    f, signal, *_ = predicted_readings(network, magnet, *x)
+    size = np.linalg.norm(signal, axis=2)[:, :, None]
+    std = np.sqrt(np.square(np.array(network.noise_std))[:, None]
+                  + (settings.field_error * size) ** 2)
+    f = f + std * rng.standard_normal(f.shape)
+    return network, np.swapaxes(f, 0, 1).copy(), positions, axes, x
+
+
+def estimated(geometry, network):
+    """(10 n + 12,) in the order of the covariance."""
+    n = len(network)
+    turn = [_rotation_vector(a.T @ b)
+            for a, b in zip(network.R_ws, geometry.network.R_ws, strict=True)]
+    sensor = np.hstack([geometry.bias, geometry.gain[:, None] - 1.0, np.array(turn),
+                        geometry.network.positions - network.positions])
+    return np.append(sensor.reshape(10 * n), geometry.shared)
+
+
+def _rotation_vector(R):
+    """(3,) of a rotation by less than a right angle."""
+    v = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    s = np.linalg.norm(v)
+    return v if s == 0.0 else v * np.arcsin(s) / s
+
+
+@cache
+def calibrated_boards():
+    """((simulated, geometry), ...) of several boards, not to be changed."""
+    out = []
+    for seed in range(16):
+        case = simulated(seed)
+        network, field, positions, axes, _ = case
+        out.append((case, calibrate_geometry(network, field, positions, axes, MOMENT, SETTINGS)))
+    return tuple(out)
