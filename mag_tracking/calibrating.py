@@ -13,7 +13,7 @@ from mag_tracking.pipeline import Pipeline
 from mag_tracking.records import AccelerationSample, Track
 from mag_tracking.stages.calibrate import Calibrate
 from mag_tracking.stages.stage import rejected
-from mag_tracking.stages.survey import NetworkSurvey, Survey
+from mag_tracking.stages.survey import NetworkSurvey, Survey, with_noise
 
 LEAST_POSES = 8
 """A track with fewer tells nothing of the sensors."""
@@ -72,15 +72,17 @@ def calibrate(recording, network, settings, date, passes=True, progress=None, st
         recording, network, settings, date, progress, stopped)
     if not calibrated.counts.total():
         raise RecordingError(f'{recording.path} has no sample of the network')
-    found = _with_noise(survey.network, calibrated)
+    found = with_noise(survey.network, calibrated)
     evidence = None
-    if passes and not interrupted and settings.track.mounting_std_deg:
+    # A sensor that cannot be right would spoil what passes tell of the others.
+    if passes and not interrupted and settings.track.mounting_std_deg \
+            and not survey.disagreements:
         tracks, interrupted = _passes(recording, found, settings, progress, stopped)
         if tracks:
             prior = [np.full(3, np.deg2rad(settings.track.mounting_std_deg)) if s is None else s
                      for s in found.orientation_std]
             evidence = fold_mounting(found, prior, tracks)
-            found = _marked(with_evidence(found, evidence), date, evidence.n_tracks)
+            found = _marked(with_evidence(found, evidence), found, date, evidence.n_tracks)
     waiting = tuple(name for name in network.names if name not in levels)
     return Calibration(found, survey, evidence, levels, rejected(calibrated.counts), waiting,
                        interrupted)
@@ -103,7 +105,9 @@ def _samples(recording, reader_of, progress, stopped):
 def _surveyed(recording, network, settings, date, progress, stopped):
     """First reading: (levels, NetworkSurvey, Calibrate, interrupted)."""
     reader = SampleReader(recording, network)
-    stage, survey = Calibrate(network, settings.calibrate), Survey(network, settings.survey)
+    # What the file says of backgrounds and noise is not what the sensors say now.
+    untold = replace(network, background=(), noise_std=())
+    stage, survey = Calibrate(untold, settings.calibrate), Survey(network, settings.survey)
     levels, interrupted = {}, False
     try:
         for sample in _samples(recording, reader.samples_and_accelerations, progress, stopped):
@@ -119,17 +123,6 @@ def _surveyed(recording, network, settings, date, progress, stopped):
     stage.counts.update({f'rejected: {cause}': n for cause, n in reader.rejected.items()})
     stage.counts.update({k: n for k, n in survey.counts.items() if k.startswith('rejected: ')})
     return levels, survey.solve(levels, date), stage, interrupted
-
-
-def _with_noise(network, calibrated):
-    """The network with the noise that was found, where the file said nothing."""
-    noise = list(network.noise_std)
-    for j, background in enumerate(calibrated.backgrounds().values()):
-        if noise[j] is None and background.ready:
-            std = np.sqrt(np.diagonal(background.covariance))
-            # An axis that is not reported has no noise; the file wants three numbers.
-            noise[j] = None if np.isnan(std).any() else std
-    return replace(network, noise_std=tuple(noise))
 
 
 def _passes(recording, network, settings, progress, stopped):
@@ -152,15 +145,16 @@ def _passes(recording, network, settings, progress, stopped):
     return [track for n, track in poses.values() if n >= LEAST_POSES], interrupted
 
 
-def _marked(network, date, n_tracks):
-    """The network whose calibration says that passes are in it."""
+def _marked(network, surveyed, date, n_tracks):
+    """The `network` whose calibration says that passes are in it; before them it was `surveyed`."""
     passes = f'{n_tracks} pass{"es" if n_tracks > 1 else ""}'
     return replace(network, calibrated=tuple(
-        None if c is None else replace(c, date=date, by=f'{c.by}; {passes}')
-        for c in network.calibrated))
+        surveyed.marked(j, date, f'as stated; {passes}') if c is None
+        else replace(c, date=date, by=f'{c.by}; {passes}')
+        for j, c in enumerate(surveyed.calibrated)))
 
 
-def tumble(recording, network, sensors, field_size=None, progress=None, stopped=None):
+def tumble(recording, network, sensors, date, field_size=None, progress=None, stopped=None):
     """Hard and soft iron of sensors that were turned about while a recording was made.
 
     Parameters
@@ -169,6 +163,8 @@ def tumble(recording, network, sensors, field_size=None, progress=None, stopped=
     network : SensorNetwork
     sensors : collection of str
         Names; empty = all.
+    date : str
+        What the calibration is marked with.
     field_size : float [T], optional
         Of the field where they were turned; without it the sensors' gain is left as it is.
     progress, stopped : function, optional
@@ -176,7 +172,8 @@ def tumble(recording, network, sensors, field_size=None, progress=None, stopped=
 
     Returns
     -------
-    (SensorNetwork with what converged, {sensor: EllipsoidFit}, {sensor: readings (n, 3)},
+    (SensorNetwork with what converged, but without those sensors' backgrounds and noise, which were
+    of uncorrected readings; {sensor: EllipsoidFit}, {sensor: readings (n, 3)},
     interrupted)
 
     Raises NetworkError for an unknown sensor, RecordingError where the recording has none
@@ -194,9 +191,19 @@ def tumble(recording, network, sensors, field_size=None, progress=None, stopped=
         interrupted = True
     readings = {name: np.array(r).reshape(-1, 3) for name, r in readings.items()}
     fits = {name: fit_ellipsoid(r, field_size) for name, r in readings.items()}
-    offset, correction = list(network.offset), list(network.correction)
+    columns = {key: list(getattr(network, key)) for key in (
+        'offset', 'correction', 'background', 'noise_std', 'calibrated')}
     for name, fit in fits.items():
-        if fit.converged:
-            offset[rows[name]], correction[rows[name]] = fit.offset, fit.correction
-    return (replace(network, offset=tuple(offset), correction=tuple(correction)), fits, readings,
+        j = rows[name]
+        if not fit.converged:
+            continue
+        columns['offset'][j], columns['correction'][j] = fit.offset, fit.correction
+        # They were of readings that were not corrected so; both are learnt anew.
+        columns['background'][j] = columns['noise_std'][j] = None
+        done = network.calibrated[j]
+        columns['calibrated'][j] = network.marked(
+            j, date, f'{"as stated" if done is None else done.by}; tumbled to '
+            f'{100 * fit.residual:.1f} % of the field', float('nan') if done is None
+            else done.clock_offset_std)
+    return (replace(network, **{key: tuple(v) for key, v in columns.items()}), fits, readings,
             interrupted)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mag_tracking.calibration.agreement import disagreements
+from mag_tracking.calibration.agreement import consensus, disagreements
 from mag_tracking.io.samples import SampleReader
 from mag_tracking.stages.calibrate import Calibrate
 from mag_tracking.stages.health import Finding, SensorHealth
@@ -10,6 +10,9 @@ from mag_tracking.stages.stage import NS, rejected
 
 STEADY_S = 30.0
 """[s] A background that has been frozen for longer is worth a word."""
+
+APART_S = 60.0
+"""[s] Stamps of sensors that are farther apart are not of one time."""
 
 _ADVICE = (
     ('above', 'gauss or microtesla published as tesla? Near a magnet raise calibrate.max_field'),
@@ -23,6 +26,79 @@ _ADVICE = (
     ('undecodable', 'the recording is damaged, or its type is another'))
 
 
+def level_of(calibrate, name, health):
+    """(3,) [T] field of a sensor without a target, as well as it is known.
+
+    Its background where that was learnt from readings, else the median of what it read last.
+    """
+    background = calibrate.backgrounds()[name]
+    if background.measured and calibrate.last_stamp_ns(name) is not None:
+        return calibrate.background(name)
+    return health.field
+
+
+def network_findings(network, survey, calibrate, sensors):
+    """What is only seen by comparing sensors: list of `Finding`.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    survey : SurveySettings
+    calibrate : Calibrate
+    sensors : {name: SensorHealth}
+    """
+    found = list(_clock_findings(network, sensors))
+    levels = np.array([level_of(calibrate, name, sensors[name]) for name in network.names])
+    std = np.array([np.full(3, np.deg2rad(survey.stated_std_deg)) if s is None else s
+                    for s in network.orientation_std])
+    earth = network.earth_field
+    if earth is None:
+        try:
+            earth = consensus(levels, network.R_ws)
+        except ValueError as error:
+            return [*found, Finding(False, 'network', f'sensors are not compared: {error}',
+                                    'give earth_field or site in the network file')]
+    return found + [
+        Finding(True, d.sensor, str(d).removeprefix(f'{d.sensor} '),
+                'mend it, or its orientation in the network file')
+        for d in disagreements(network.names, levels, network.R_ws, std, earth,
+                               survey.compass_bias_std)]
+
+
+def _clock_findings(network, sensors):
+    """Sensors whose clock is far from that of the others."""
+    delays = {name: sensors[name].delay_s[0] for name in network.names}
+    delays = {name: d for name, d in delays.items() if not np.isnan(d)}
+    if not delays:
+        return
+    # The one nearest to the host's clock is right; in a replay all are as far from it.
+    right = min(delays.values(), key=abs)
+    for name, delay in delays.items():
+        if abs(delay - right) > APART_S:
+            yield Finding(True, name, f'its stamps are {right - delay:+.4g} s off those of other '
+                          'sensors', 'set its clock (chrony, PTP); knocks compare only what is '
+                          'within survey.longest_clock_offset_s')
+
+
+def background_findings(name, calibrate, frozen_since_ns):
+    """What is wrong with the background of one sensor: iterator of `Finding`.
+
+    `frozen_since_ns` is the stamp since which it has been frozen, or None.
+    """
+    background, last = calibrate.backgrounds()[name], calibrate.last_stamp_ns(name)
+    if last is not None and not background.ready:
+        yield Finding(True, name, 'no background was learnt', 'begin without a target for a few '
+                      'seconds, or give background and noise_std in the network file')
+    if background.n_relearnt:
+        yield Finding(False, name, f'a steady change was taken for its background '
+                      f'{background.n_relearnt} times', 'a parked vehicle, or something that was '
+                      'put beside it; calibrate.relearn_s: 0 would wait for ever')
+    if frozen_since_ns is not None and (last - frozen_since_ns) / NS > STEADY_S:
+        yield Finding(False, name, f'its background has not been learnt for '
+                      f'{(last - frozen_since_ns) / NS:.0f} s', 'a target stays near, or the field '
+                      'has changed for good: call the service calibrate')
+
+
 class Doctor:
     """Looks at the readings of a network as they come, and says what is wrong."""
 
@@ -30,11 +106,14 @@ class Doctor:
         self.network, self._settings = network, settings
         self.sensors = {name: SensorHealth() for name in network.names}
         self.calibrate = Calibrate(network, settings.calibrate)
+        self._clock_ns = {name: round(s * NS) for name, s in
+                          zip(network.names, network.clock_offset, strict=True)}
         self._frozen_ns = {}
 
     def feed(self, sample, received_ns=None):
         """Look at a raw `MagSample` that was received at `received_ns`."""
-        self.sensors[sample.sensor].add(sample.stamp_ns, sample.field, received_ns)
+        self.sensors[sample.sensor].add(sample.stamp_ns - self._clock_ns[sample.sensor],
+                                        sample.field, received_ns)
         self.calibrate.feed(sample)
         if self.calibrate.backgrounds()[sample.sensor].frozen:
             self._frozen_ns.setdefault(sample.sensor, sample.stamp_ns)
@@ -47,49 +126,13 @@ class Doctor:
         for j, (name, health) in enumerate(self.sensors.items()):
             found += health.findings(name, self.network.noise_std[j],
                                      self._settings.calibrate.max_field)
-            found += self._background_findings(name)
-        found += self._disagreements()
+            found += background_findings(name, self.calibrate, self._frozen_ns.get(name))
+        found += network_findings(self.network, self._settings.survey, self.calibrate,
+                                  self.sensors)
         for cause, n in rejected(self.calibrate.counts).items():
             advice = next((a for key, a in _ADVICE if key in cause), 'look at the driver')
             found.append(Finding(n > 100, 'calibrate', f'{n} readings rejected: {cause}', advice))
         return sorted(found, key=lambda f: not f.serious)
-
-    def _background_findings(self, name):
-        """What is wrong with the background of one sensor."""
-        background = self.calibrate.backgrounds()[name]
-        last, since = self.calibrate.last_stamp_ns(name), self._frozen_ns.get(name)
-        if last is not None and not background.ready and not background.stuck:
-            yield Finding(True, name, 'no background was learnt', 'begin without a target for '
-                          f'{self._settings.calibrate.learn_s:g} s, or give background and '
-                          'noise_std in the network file')
-        if background.n_relearnt:
-            yield Finding(False, name, f'a steady change was taken for its background '
-                          f'{background.n_relearnt} times', 'a parked vehicle, or something that '
-                          'was put beside it; calibrate.relearn_s: 0 would wait for ever')
-        if since is not None and (last - since) / NS > STEADY_S:
-            yield Finding(False, name, f'its background has not been learnt for '
-                          f'{(last - since) / NS:.0f} s', 'a target stays near, or the field has '
-                          'changed for good: call the service calibrate')
-
-    def _level(self, name):
-        """(3,) [T] background of a sensor, or the median of what it read last."""
-        background = self.calibrate.backgrounds()[name]
-        if background.ready and self.calibrate.last_stamp_ns(name) is not None:
-            return self.calibrate.background(name)
-        return self.sensors[name].field
-
-    def _disagreements(self):
-        """The sensors that do not measure the Earth."""
-        network, known = self.network, self._settings.survey
-        if network.earth_field is None:
-            return
-        fields = np.array([self._level(name) for name in network.names])
-        std = np.array([np.full(3, np.deg2rad(known.stated_std_deg)) if s is None else s
-                        for s in network.orientation_std])
-        for d in disagreements(network.names, fields, network.R_ws, std, network.earth_field,
-                               known.compass_bias_std):
-            yield Finding(True, d.sensor, str(d).removeprefix(f'{d.sensor} '),
-                          'mend it, or its orientation in the network file')
 
 
 def examine(recording, network, settings, progress=None, stopped=None):

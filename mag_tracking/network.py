@@ -1,10 +1,11 @@
 """The sensor network: where each sensor is, how it is turned, what it was calibrated to."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mag_tracking.errors import NetworkError
+from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
 
 
 @dataclass(frozen=True)
@@ -17,6 +18,11 @@ class Calibrated:
     """What its orientation comes from, in words."""
     clock_offset_std: float
     """[s]; NaN where the offset was not measured."""
+    stated: tuple[float, ...] | None = None
+    """(4,) quaternion xyzw, sensor to world, as it was stated by hand; None = not kept. A later
+    survey begins there: what an earlier one found is not another statement."""
+    stated_std: tuple[float, ...] | None = None
+    """(3,) [rad] of `stated`, about the world's axes; None = not known."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +92,24 @@ class SensorNetwork:
     def centre(self):
         """(3,) [m], mean of the sensor positions."""
         return self.positions.mean(axis=0)
+
+    def as_stated(self):
+        """The network with the orientations that were stated before any calibration."""
+        R_ws, std = self.R_ws.copy(), list(self.orientation_std)
+        for j, done in enumerate(self.calibrated):
+            if done is not None and done.stated is not None:
+                R_ws[j] = rotation_from_quaternion(done.stated)
+                std[j] = None if done.stated_std is None else np.array(done.stated_std)
+        return replace(self, R_ws=R_ws, orientation_std=tuple(std))
+
+    def marked(self, j, date, by, clock_offset_std=float('nan')):
+        """The `Calibrated` of sensor `j` from now on; what was stated by hand is kept in it."""
+        done, std = self.calibrated[j], self.orientation_std[j]
+        if done is not None and done.stated is not None:
+            return replace(done, date=date, by=by, clock_offset_std=clock_offset_std)
+        return Calibrated(date, by, clock_offset_std,
+                          tuple(quaternion_from_rotation(self.R_ws[j]).tolist()),
+                          None if std is None else tuple(std.tolist()))
 
     def index(self, name):
         """Row of sensor `name`; raises NetworkError if there is none."""

@@ -12,7 +12,7 @@ from mag_tracking.io.pose_table import (
     read_readings,
     read_sensor_positions,
 )
-from mag_tracking.network import Calibrated, SensorNetwork
+from mag_tracking.network import SensorNetwork
 
 ASSUMED_NOISE = 1e-7
 """[T] Of sensors of which nobody says it; near a magnet the error of the field is larger."""
@@ -150,8 +150,8 @@ def calibrated_network(network, geometry, date, by):
         if (std > LEAST_TURN).all():
             columns['orientation_std'][j] = std
         before = network.calibrated[j]
-        columns['calibrated'][j] = Calibrated(
-            date, by, np.nan if before is None else before.clock_offset_std)
+        columns['calibrated'][j] = network.marked(
+            j, date, by, np.nan if before is None else before.clock_offset_std)
     return replace(network, positions=found.positions, R_ws=found.R_ws,
                    **{name: tuple(column) for name, column in columns.items()})
 

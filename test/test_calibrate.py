@@ -255,3 +255,42 @@ def test_an_axis_that_a_correction_does_not_need_is_not_missed(C):
     (out,) = s.feed(sample(1.0, [EARTH[0], EARTH[1], np.nan], 'mag_2'))
     np.testing.assert_allclose(out.field[:2], (C[:2, :2] - np.eye(2)) @ EARTH[:2], atol=1e-18)
     assert np.isnan(out.field[2])
+
+
+def test_another_calibration_keeps_a_background_that_a_target_stands_on():
+    """Only clocks and orientations were surveyed: what stands there must not become the level."""
+    network = line_network(1)
+    stage = Calibrate(network, CalibrateSettings())
+    rng = np.random.default_rng(3)
+
+    def feed(first, last, extra=0.0):
+        out = []
+        for k in range(first, last):
+            out += stage.feed(MagSample(k * 10**7, 'mag_1', EARTH + extra
+                                        + SIGMA * rng.standard_normal(3)))
+        return out
+
+    feed(0, 800)
+    car = np.array([5.8e-7, 0.0, 0.0])
+    feed(800, 1000, car)
+    assert stage.backgrounds()['mag_1'].frozen
+    stage.renew(dataclasses.replace(network, clock_offset=np.array([0.25])))
+    out = feed(1000, 2000, car)
+    assert stage.backgrounds()['mag_1'].frozen and stage.backgrounds()['mag_1'].n_relearnt == 0
+    assert len(out) == 1000
+    np.testing.assert_allclose(np.mean([s.field for s in out], axis=0), car, atol=1e-8)
+    # By the new clock, and on the same line in time.
+    assert out[0].stamp_ns == 1000 * 10**7 - 250_000_000
+    assert stage.counts['rejected: out of order'] == 0
+
+
+def test_another_correction_is_learnt_anew():
+    network = line_network(1)
+    stage = Calibrate(network, CalibrateSettings())
+    for k in range(500):
+        stage.feed(MagSample(k * 10**7, 'mag_1', EARTH + SIGMA * np.sin([k, 2 * k, 3 * k])))
+    assert stage.backgrounds()['mag_1'].ready
+    stage.renew(dataclasses.replace(network, offset=(np.full(3, 1e-6),)))
+    assert not stage.backgrounds()['mag_1'].measured
+    with pytest.raises(NetworkError, match='in place of one of mag_1'):
+        stage.renew(line_network(2))

@@ -1,6 +1,7 @@
 """mag-tracking calibrate and tumble, as somebody types them."""
 
 import gzip
+import json
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from conftest import DATA, NETWORK_FILE, vehicle_path
 
 from mag_tracking.cli import main
 from mag_tracking.io.bag import Recording, RecordingWriter
-from mag_tracking.io.network_file import read_network
+from mag_tracking.io.network_file import read_network, write_network
 from mag_tracking.io.samples import SampleReader
 from mag_tracking.io.schema import MAGNETIC_FIELD, sample_dict
 from mag_tracking.records import MagSample
@@ -53,6 +54,44 @@ def test_calibrate_writes_a_network_that_replay_takes(tmp_path, capsys):
     assert '1 tracks' in capsys.readouterr().out
 
 
+def test_calibrated_again_it_knows_no_more(tmp_path):
+    """The same compass and the same pass are no further evidence."""
+    first, again = tmp_path / 'first.yaml', tmp_path / 'again.yaml'
+    for network, out in ((NETWORK_FILE, first), (first, again)):
+        assert main(['calibrate', str(ROAD), '--network', str(network), '--out', str(out)]) == 0
+    a, b = read_network(first), read_network(again)
+    np.testing.assert_allclose(b.R_ws, a.R_ws, atol=1e-9)
+    np.testing.assert_allclose(b.orientation_std, a.orientation_std, rtol=1e-6)
+
+
+def test_a_background_in_the_file_hides_no_flipped_axis(tmp_path, capsys):
+    first, flipped = tmp_path / 'first.yaml', tmp_path / 'flipped.yaml'
+    main(['calibrate', str(ROAD), '--network', str(NETWORK_FILE), '--no-passes', '--out',
+          str(first)])
+    network = read_network(first)
+    given = tuple(R.T @ (network.earth_field * [1.0, 1.0, -1.0]) for R in network.R_ws)
+    write_network(flipped, replace(network, background=given,
+                                   earth_field=network.earth_field * [1.0, 1.0, -1.0]))
+    capsys.readouterr()
+    assert main(['calibrate', str(ROAD), '--network', str(flipped), '--out',
+                 str(tmp_path / 'out.yaml')]) == 2
+    assert 'mag_1 is' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('std', [20.0, 180.0])
+def test_a_sensor_that_may_be_turned_far_is_tracked_with_a_warning(tmp_path, capsys, std):
+    network = read_network(NETWORK_FILE)
+    path = tmp_path / 'network.yaml'
+    write_network(path, replace(network, orientation_std=(np.full(3, np.deg2rad(std)), None)))
+    assert main(['replay', str(ROAD), '--network', str(path), '--out', str(tmp_path / 'run'),
+                 '--no-figures']) == 0
+    said = capsys.readouterr().out
+    assert '1 sensors may be turned by more than 15 degrees' in said and '1 tracks' in said
+    angles = json.loads((tmp_path / 'run' / 'summary.json').read_text())['tracks'][0]['mounting']
+    # It is tracked as if it were known to 15 degrees.
+    assert 5.0 < max(angles['mag_1']['std_deg']) <= 15.0
+
+
 def test_without_passes_it_says_less(tmp_path, capsys):
     stds = []
     for extra in ([], ['--no-passes']):
@@ -72,18 +111,19 @@ def test_a_flipped_axis_is_named(tmp_path, capsys):
             writer.write(f'/{sample.sensor}/imu/mag', MAGNETIC_FIELD, sample_dict(
                 replace(sample, field=sample.field * flipped), sample.sensor), sample.stamp_ns)
     assert main(['calibrate', str(tmp_path / 'flipped.mcap'), '--network', str(NETWORK_FILE),
-                 '--no-passes', '--out', str(tmp_path / 'out.yaml')]) == 0
+                 '--out', str(tmp_path / 'out.yaml')]) == 2
     said = capsys.readouterr().out
     assert 'mag_2 is 9' in said and 'uT from the field of the Earth: z is flipped\n' in said
-    assert 'mag_1 is' not in said
-    assert said.count('no accelerations: its orientation stays as stated') == 2
-    assert 'no knock that two sensors felt' in said
+    assert 'mag_1 is' not in said and 'passes were left out' in said
+    assert said.count('no accelerations: its orientation is not surveyed') == 2
+    assert 'clocks stay as they were: too few accelerometers' in said
 
 
 @pytest.mark.parametrize('arguments, message', [
     (['calibrate', 'nothing.mcap'], 'there is no nothing.mcap'),
     (['tumble', 'nothing.mcap'], 'there is no nothing.mcap'),
     (['tumble', str(ROAD), '--sensor', 'mag_9'], 'unknown sensor mag_9'),
+    (['calibrate', str(ROAD), '--figure', 'found.xyz'], 'found.xyz ends in none of .png, .pdf'),
     (['tumble', str(ROAD), '--field-size', '50'], '--field-size: 50 is not between'),
 ])
 def test_what_cannot_be_done_is_said(tmp_path, capsys, arguments, message):
@@ -128,6 +168,19 @@ def test_tumbling_a_real_sensor(tmp_path, capsys):
     size = np.linalg.norm((readings - found.offset[0]) @ found.correction[0].T, axis=1)
     assert size.std() / size.mean() <= 0.015
     assert found.offset[1] is None and found.correction[1] is None
+    assert 'as stated; tumbled to 1.3 % of the field' == found.calibrated[0].by
+
+
+def test_tumbling_takes_out_what_was_of_uncorrected_readings(tmp_path, capsys):
+    network = read_network(NETWORK_FILE)
+    stated = replace(network, background=(np.full(3, 1e-5),) * 2, noise_std=(np.full(3, 1e-8),) * 2)
+    write_network(tmp_path / 'stated.yaml', stated)
+    recording = record(tmp_path / 'hand', tumbled())
+    assert main(['tumble', str(recording), '--network', str(tmp_path / 'stated.yaml'), '--sensor',
+                 'mag_1', '--out', str(tmp_path / 'out.yaml')]) == 0
+    found = read_network(tmp_path / 'out.yaml')
+    assert found.background[0] is None and found.noise_std[0] is None
+    np.testing.assert_array_equal(found.background[1], stated.background[1])
 
 
 def test_tumbling_raw_counts(tmp_path, capsys):

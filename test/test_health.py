@@ -1,5 +1,7 @@
 """Health and the doctor: each fault is found and named, and nothing is found where nothing is."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import DATA, NETWORK_FILE, VEHICLES, line_network, vehicle_path
@@ -81,6 +83,8 @@ def broken(what):
         fields[1000:1200, 1] = np.maximum(fields[1000:1200, 1], 1.5e-5)
     elif what == 'spikes':
         fields[::200] += 1e-4
+    elif what == 'dead':
+        fields[:, 0] = fields[0, 0]
     elif what == 'axis':
         fields[::10, 2] = np.nan
     elif what == 'nothing':
@@ -102,6 +106,7 @@ def broken(what):
     ('stuck', True, 'readings are the same as all for more than 1 s before'),
     ('saturated', True, 'stand at the end of the range'),
     ('spikes', False, '14 of 3000 readings are spikes'),
+    ('dead', True, 'x does not change'),
     ('axis', False, 'z is missing in 300 of 3000 readings'),
     ('nothing', True, '300 of 3000 readings have no axis at all'),
     ('gauss', True, 'a field of 0.514 T is rejected, the limit is 0.001 T'),
@@ -123,6 +128,17 @@ def test_a_sensor_whose_noise_is_below_its_steps_has_no_spikes():
     coarse[::50] += 2e-7
     health = examined(stamps, coarse)
     assert health.counts['spikes'] == 0 and (health.noise_std > 2e-8).all()
+
+
+def test_a_host_that_stalls_is_no_step_of_a_clock():
+    """What waited meanwhile comes in a burst."""
+    stamps, fields = readings()
+    received = stamps + 1_000_000
+    for first in range(500, 3000, 500):
+        until = received[first] + 400_000_000
+        received[first:] = np.maximum(received[first:], until)
+    found = texts(examined(stamps, fields, received))
+    assert not any('stepped' in text for text in found), found
 
 
 def test_what_is_lost_is_counted():
@@ -203,6 +219,50 @@ def test_the_doctor_compares_sensors_with_the_earth():
     # So many rejections are serious, and come first.
     many = doctored(lambda k, field: field * (1e6 if k % 8 == 1 else 1.0), seconds=20.0)
     assert '125 readings rejected' in many[0] and 'are spikes' in many[1]
+
+
+def test_a_background_in_the_file_does_not_hide_what_the_sensor_says():
+    network = line_network(3)
+    given = tuple(network.R_sw[j] @ network.earth_field for j in range(3))
+    doctor = Doctor(replace(network, background=given), settings_for('vehicle'))
+    rng = np.random.default_rng(6)
+    for k in range(600):
+        for j, name in enumerate(network.names):
+            field = given[j] * ([1.0, 1.0, -1.0] if j == 2 else np.ones(3))
+            doctor.feed(MagSample(k * 20_000_000, name, field + SIGMA * rng.standard_normal(3)))
+    found = [str(f) for f in doctor.findings()]
+    assert 'mag_3: is' in found[0] and 'z is flipped' in found[0]
+
+
+def test_without_an_earth_field_sensors_are_compared_with_each_other():
+    for n, said in ((3, 'mag_2: is'), (2, 'network: sensors are not compared')):
+        network = replace(line_network(n), earth_field=None)
+        doctor = Doctor(network, settings_for('vehicle'))
+        rng = np.random.default_rng(7)
+        for k in range(400):
+            for j, name in enumerate(network.names):
+                field = network.R_sw[j] @ EARTH * ([1.0, -1.0, 1.0] if j == 1 else np.ones(3))
+                doctor.feed(MagSample(k * 20_000_000, name,
+                                      field + SIGMA * rng.standard_normal(3)))
+        found = [str(f) for f in doctor.findings()]
+        assert len(found) == 1 and found[0].startswith(said), found
+
+
+def test_clocks_that_are_far_apart_are_named_but_not_those_of_a_replay():
+    for late, n in ((120 * NS, 1), (0, 0)):
+        network = line_network(2)
+        doctor = Doctor(network, settings_for('vehicle'))
+        rng = np.random.default_rng(8)
+        for k in range(400):
+            received = 10**18 + k * 20_000_000
+            for j, name in enumerate(network.names):
+                field = network.R_sw[j] @ network.earth_field + SIGMA * rng.standard_normal(3)
+                # All of it years ago: a replay.
+                stamp = received - 10**17 - (late if j else 0)
+                doctor.feed(MagSample(stamp, name, field), received)
+        found = [str(f) for f in doctor.findings()]
+        assert len(found) == n, found
+        assert not n or found[0].startswith('mag_2: its stamps are -120 s off those of other')
 
 
 def test_the_doctor_looks_at_backgrounds():

@@ -77,16 +77,33 @@ def test_a_parked_car_is_not_swallowed_without_a_word(talking, statuses):
     process = start('calibration_node', '-p', f'network:={NETWORK_FILE}',
                     '-p', 'calibrate.relearn_s:=4.0')
 
+    def background(name):
+        status = statuses.get(f'calibration_node: {name}')
+        return status and {v.key: v.value for v in status.values}['background']
+
     def message(name):
         status = statuses.get(f'calibration_node: {name}')
         return status.message if status else ''
 
     try:
-        assert talking(lambda: message('mag_1') == message('mag_2') == 'running')
+        assert talking(lambda: background('mag_1') == background('mag_2') == 'ready')
         assert talking(lambda: 'taken for its background' in message('mag_1'), step=1e-6)
         assert message('mag_2') == 'running'
         state = {v.key: v.value for v in statuses['calibration_node: mag_1'].values}
         assert state['backgrounds taken anew'] == '1' and state['background'] == 'ready'
+    finally:
+        codes, outputs = stop([process])
+    assert codes == [0], outputs
+
+
+def test_a_flipped_axis_is_an_error_for_as_long_as_it_is_there(talking, statuses):
+    process = start('calibration_node', '-p', f'network:={NETWORK_FILE}')
+    try:
+        assert talking(lambda: any(
+            'from the field of the Earth: z is flipped' in s.message for s in statuses.values()),
+            step=np.array([0.0, 0.0, 9.8e-5]))
+        assert statuses['calibration_node: mag_1'].level == DiagnosticStatus.ERROR
+        assert statuses['calibration_node: mag_2'].level == DiagnosticStatus.OK
     finally:
         codes, outputs = stop([process])
     assert codes == [0], outputs

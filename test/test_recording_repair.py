@@ -11,6 +11,7 @@ from mcap.reader import make_reader
 from recorded_numbers import TOPIC, S, by_rosbags, field, numbers, started
 
 from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.io.bag import Recording
 from mag_tracking.io.recording_repair import finish_file, repair
 from mag_tracking.io.schema import MAGNETIC_FIELD, definition
 
@@ -83,6 +84,27 @@ def test_repair_keeps_the_order_of_many_files(tmp_path):
     metadata.unlink()
     assert repair(tmp_path / 'a') == 0 and numbers(tmp_path / 'a')[0] == list(range(24))
     assert yaml.safe_load(metadata.read_text()) == whole
+
+
+@pytest.mark.parametrize('name', ['a_0.mcap', 'a_12.mcap'])
+def test_an_empty_file_of_a_crash_costs_nothing_else(tmp_path, name):
+    """A split had begun, or the first file."""
+    recorder, _ = started(tmp_path / 'a', split_ns=S)
+    for k in range(24):
+        recorder.write(TOPIC, field(k), k)
+        recorder.tick(2 * (k + 2) * S)
+    recorder.close()
+    kept = sorted(set(range(24)) - set(numbers(tmp_path / 'a' / name)[0]))
+    assert len(kept) < 24
+    (tmp_path / 'a' / name).write_bytes(b'')
+    (tmp_path / 'a' / 'metadata.yaml').unlink()
+    whole = Recording(tmp_path / 'a')
+    assert len(list(whole.messages())) == len(kept)
+    assert whole.losses[f'{name} is empty (0 bytes)'] == 1
+    said = []
+    repair(tmp_path / 'a', said.append)
+    assert said == [f'{tmp_path / "a" / name} is empty: it is left out']
+    assert numbers(tmp_path / 'a')[0] == kept
 
 
 def test_repair_leaves_out_and_tells_a_damaged_chunk(tmp_path):

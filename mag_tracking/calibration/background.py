@@ -91,6 +91,11 @@ class RunningBackground:
         return self._noise
 
     @property
+    def measured(self):
+        """Whether the background is from readings, not from what was given beforehand."""
+        return bool(self._window) and self.ready
+
+    @property
     def drift(self):
         """(3,) [T/s] of the background; NaN before it is ready, and of an axis not reported."""
         return np.full(3, np.nan) if self._line is None else self._line[2]

@@ -20,6 +20,9 @@ ALIKE = 0.7
 RIVAL = 0.9
 """Another lag that correlates so well compared with the best is as likely."""
 
+AROUND_S = 5.0
+"""[s] Of a long recording only what is so near to knocks is compared; it tells what rest is."""
+
 MARGIN_S = 0.1
 """[s] What is compared before and after a knock."""
 
@@ -74,6 +77,10 @@ def knock_lag(t_reference, reference, t, signal, longest):
     """
     a, b = _series(t_reference, reference, 'reference'), _series(t, signal, 'sensor')
     a, b = _whole(*a), _whole(*b)
+    apart = _apart(a, b, longest)
+    if apart is not None:
+        return _none(f'the knocks are {apart:.3g} s apart, more than {longest:g} s')
+    a, b = _near(a, b, longest), _near(b, a, longest)
     for name, (_, s) in (('reference', a), ('sensor', b)):
         if len(s) < 8 or not _loud(s).any():
             return _none(f'the {name} felt no knock')
@@ -118,6 +125,25 @@ def _whole(t, s):
         if not len(t):
             break
     return t, s
+
+
+def _apart(a, b, longest):
+    """[s] between the knocks of two series where all are farther apart than `longest`, or None."""
+    if not (len(a[1]) > 7 and len(b[1]) > 7 and _loud(a[1]).any() and _loud(b[1]).any()):
+        return None
+    s, t = a[0][_loud(a[1])], b[0][_loud(b[1])]
+    after = np.clip(np.searchsorted(t, s), 0, len(t) - 1)
+    distance = np.minimum(np.abs(t[after] - s), np.abs(t[np.maximum(after - 1, 0)] - s)).min()
+    return float(distance) if distance > longest + MARGIN_S else None
+
+
+def _near(a, b, longest):
+    """Series `a` from a while before the other's first knock to a while after its last."""
+    if len(b[1]) < 8 or not _loud(b[1]).any():
+        return a
+    first, last = _event_times(*b)
+    near = (a[0] >= first - longest - AROUND_S) & (a[0] <= last + longest + AROUND_S)
+    return a[0][near], a[1][near]
 
 
 def _loud(s):

@@ -21,6 +21,8 @@ it), its noise, and whether all sensors measure the same Earth: a flipped axis, 
 pair or another unit is named. What passes tells more of the headings (--no-passes to
 leave that out). An unknown bias of 0.6 uT turns a compass by two degrees: the deviations
 that are written into the network file say what is known, and the tracker counts with them.
+What was stated by hand is kept there, too: calibrating again begins from that. The exit
+status is 2 where a sensor cannot be right.
 
 The network file needs the Earth's field, as earth_field (tesla) or as the site:
   site: {latitude: 58.4, longitude: 15.6, height: 60, date: 2026-05-01, x_azimuth_deg: 90}
@@ -34,11 +36,15 @@ _TUMBLE = '''
 For sensors that can be taken in the hand: turn each slowly through all directions, far
 from iron, while `mag-tracking record` runs. Readings then lie on an ellipsoid; what takes
 it to a sphere (hard iron, soft iron, scale, skewness) is written into the network file and
-taken from every reading from then on. A turning that leaves directions out is refused.
+taken from every reading from then on. Do this first: background and noise in the file were
+of other readings, and are taken out. A turning that leaves directions out is refused.
 
 example:
   mag-tracking tumble hand.mcap --network site.yaml --sensor mag_3 --out site_tumbled.yaml
 '''
+
+
+FIGURES = ('.png', '.pdf', '.svg')
 
 
 def add(commands):
@@ -77,8 +83,8 @@ def _tumble(args):
     with noted_signals(signal.SIGINT) as seen:
         with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
                   disable=None) as bar:
-            found, fits, readings, _ = tumble(recording, network, args.sensor, args.field_size,
-                                              bar.update, lambda: bool(seen))
+            found, fits, readings, _ = tumble(recording, network, args.sensor, _now(),
+                                              args.field_size, bar.update, lambda: bool(seen))
     for name, fit in fits.items():
         _print_fit(name, fit)
     for what, n in recording.losses.items():
@@ -111,11 +117,20 @@ def _print_fit(name, fit):
         print(f'  warning: {name}: {text}')
 
 
+def _now():
+    """The time, as a calibration is marked with it."""
+    return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
+
+
 def _check_folders(args):
     """Raise OutputError where what is to be written has no folder to be in."""
     for path in (args.out, args.figure):
         if path is not None and not path.absolute().parent.is_dir():
             raise OutputError(f'cannot write {path}: there is no folder {path.parent}')
+        if path is not None and path.is_dir():
+            raise OutputError(f'cannot write {path}: it is a folder')
+    if args.figure is not None and args.figure.suffix.lower() not in FIGURES:
+        raise SettingsError(f'--figure: {args.figure.name} ends in none of {", ".join(FIGURES)}')
 
 
 def _calibrate(args):
@@ -123,12 +138,11 @@ def _calibrate(args):
     network, settings = read_network(args.network), settings_of(args)
     recording = Recording(args.recording)
     _check_folders(args)
-    date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
     times = 1 if args.no_passes else 2
     with noted_signals(signal.SIGINT) as seen:
         with tqdm(total=times * recording.size, unit='B', unit_scale=True,
                   desc=args.recording.name, disable=None) as bar:
-            found = calibrate(recording, network, settings, date, not args.no_passes, bar.update,
+            found = calibrate(recording, network, settings, _now(), not args.no_passes, bar.update,
                               lambda: bool(seen))
     _print(found, recording)
     if seen:
@@ -142,7 +156,7 @@ def _calibrate(args):
 
         calibration_figure(found, network).savefig(args.figure, dpi=110)
     print(f'the network is in {args.out}')
-    return 0
+    return 2 if found.survey.disagreements else 0
 
 
 def _print(found, recording):
@@ -158,18 +172,13 @@ def _print(found, recording):
         print(f'{found.evidence.n_tracks} passes counted in'
               + (f'; they differ by {np.sqrt(scatter.max()):.1f} of what they claim at most'
                  if len(scatter) else ''))
-    for d in survey.disagreements:
-        print(f'  warning: {d}')
-    for sensor in survey.sensors:
-        for text in sensor.warnings:
-            print(f'  warning: {sensor.sensor}: {text}')
-        if sensor.lag is not None and sensor.lag.reason:
-            print(f'  warning: {sensor.sensor}: clock: {sensor.lag.reason}')
-    if not survey.reference and len(survey.sensors) > 1:
-        print('  warning: no knock that two sensors felt: clocks stay as they were')
+    for text in survey.warnings():
+        print(f'  warning: {text}')
     for name in found.without_background:
         print(f'  warning: {name}: no background was learnt: the recording needs a target-free '
-              'beginning')
+              'beginning (mag-tracking doctor may say more)')
+    if survey.disagreements and found.evidence is None:
+        print('  note: passes were left out, because of sensors that cannot be right')
     for what, n in {**found.rejected, **recording.losses}.items():
         print(f'  warning: {what}: {n}')
 

@@ -56,9 +56,14 @@ class Recording:
     def __init__(self, path):
         """Raises RecordingError where there is no readable recording at `path`."""
         self.path = Path(path)
-        self._files = _files(self.path)
         self.types, self.message_counts = {}, Counter()
         self.losses = Counter()
+        self._files = _files(self.path)
+        empty = [f for f in self._files if f.stat().st_size == 0]
+        if len(empty) < len(self._files):
+            # A crash at a split leaves one; an only file is told by `_inspect`.
+            self._files = [f for f in self._files if f not in empty]
+            self.losses.update(f'{f.name} is empty (0 bytes)' for f in empty)
         self.start_ns = self.end_ns = None
         self._indexes = [self._inspect(f) for f in self._files]
 

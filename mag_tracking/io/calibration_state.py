@@ -42,6 +42,9 @@ def with_orientations(network, message):
     if names != network.names:
         raise RecordingError(f'a calibration of {", ".join(names)} does not fit the network of '
                              f'{", ".join(network.names)}')
+    if message.header.frame_id != network.frame:
+        raise RecordingError(f'a calibration in the frame {message.header.frame_id!r}, not '
+                             f'{network.frame!r}')
     q = np.array([[s.orientation.x, s.orientation.y, s.orientation.z, s.orientation.w]
                   for s in message.sensors])
     std = [np.array(s.orientation_std, dtype=float) for s in message.sensors]

@@ -2,10 +2,12 @@
 
 import datetime
 import json
+import os
 import re
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 from mag_tracking.calibration.geomagnetic import Site, decimal_year, earth_field
 from mag_tracking.errors import NetworkError, OutputError
@@ -65,10 +67,7 @@ def _sensor(name, entry):
     if np.abs(position).max() > _LONGEST:
         raise NetworkError(f'{what}: position: {position.tolist()} m is nowhere on Earth')
     q = _vector(f'{what}: orientation', entry.get('orientation', [0, 0, 0, 1]), (4,))
-    try:
-        R_ws = rotation_from_quaternion(q)
-    except ValueError as error:
-        raise NetworkError(f'{what}: orientation: {error}') from error
+    R_ws = _rotation(f'{what}: orientation', q)
     topic = _topic(what, 'topic', entry.get('topic', f'/{name}/imu/mag'))
     # Where a driver puts a sensor's accelerometer, by REP-145, beside its magnetometer.
     beside = topic.removesuffix('/mag') + '/data_raw' if topic.endswith('/mag') else None
@@ -143,13 +142,29 @@ def _calibrated(what, value):
     if value is None:
         return None
     what = f'{what}: calibrated'
-    _known(what, value, {'date', 'by', 'clock_offset_std'})
+    _known(what, value, {'date', 'by', 'clock_offset_std', 'stated', 'stated_std_deg'})
     for key in ('date', 'by'):
         if not isinstance(value.get(key), str):
             raise NetworkError(f"{what}: {key} must be text ('...'), got {value.get(key)!r}")
-    std = value.get('clock_offset_std')
-    return Calibrated(value['date'], value['by'],
-                      float('nan') if std is None else float(_vector(what, [std], (1,))[0]))
+    std, stated = value.get('clock_offset_std'), value.get('stated')
+    std = float('nan') if std is None else float(_vector(what, [std], (1,))[0])
+    if std < 0.0:
+        raise NetworkError(f'{what}: clock_offset_std: {std} s is negative')
+    if stated is not None:
+        stated = _vector(f'{what}: stated', stated, (4,))
+        _rotation(f'{what}: stated', stated)
+        stated = tuple(stated.tolist())
+    spread = _orientation_std(what, value.get('stated_std_deg'))
+    return Calibrated(value['date'], value['by'], std, stated,
+                      None if spread is None else tuple(spread.tolist()))
+
+
+def _rotation(what, q):
+    """(3, 3) of a quaternion."""
+    try:
+        return rotation_from_quaternion(q)
+    except ValueError as error:
+        raise NetworkError(f'{what}: {error}') from error
 
 
 def _topic(what, key, topic):
@@ -238,11 +253,11 @@ def _number(value):
 
 def _sensor_lines(network, i):
     """The entry of sensor `i`."""
-    lines = [f'  {network.names[i]}:', f'    position: {_numbers(network.positions[i])}',
+    lines = [f'  {_text(network.names[i])}:', f'    position: {_numbers(network.positions[i])}',
              f'    orientation: {_numbers(quaternion_from_rotation(network.R_ws[i]))}']
     if network.orientation_std[i] is not None:
         lines.append('    orientation_std_deg: '
-                     f'{_numbers(np.rad2deg(network.orientation_std[i]).round(6))}')
+                     f'{_numbers(np.rad2deg(network.orientation_std[i]))}')
     if network.clock_offset[i]:
         lines.append(f'    clock_offset: {_number(network.clock_offset[i])}')
     for key in ('noise_std', 'background', 'offset', 'correction'):
@@ -257,7 +272,16 @@ def _sensor_lines(network, i):
                   f'      by: {json.dumps(done.by)}']
         if not np.isnan(done.clock_offset_std):
             lines.append(f'      clock_offset_std: {_number(done.clock_offset_std)}')
+        if done.stated is not None:
+            lines.append(f'      stated: {_numbers(done.stated)}')
+        if done.stated_std is not None:
+            lines.append(f'      stated_std_deg: {_numbers(np.rad2deg(done.stated_std))}')
     return lines
+
+
+def _text(text):
+    """Text as YAML that reads back as the same text: 'no' and '01' would not."""
+    return text if yaml.safe_load(text) == text else json.dumps(text)
 
 
 def write_network(path, network, comment=''):
@@ -272,7 +296,7 @@ def write_network(path, network, comment=''):
 
     Raises OutputError where the file cannot be written.
     """
-    lines = [f'# {line}' for line in comment.splitlines()] + [f'frame: {network.frame}']
+    lines = [f'# {line}' for line in comment.splitlines()] + [f'frame: {_text(network.frame)}']
     if network.earth_field is not None:
         lines.append(f'earth_field: {_numbers(network.earth_field)}')
     lines.append('sensors:')
@@ -280,7 +304,12 @@ def write_network(path, network, comment=''):
         lines += _sensor_lines(network, i)
     draft = Path(f'{path}.part')
     try:
-        draft.write_text('\n'.join(lines) + '\n', encoding='utf-8')
+        with open(draft, 'w', encoding='utf-8') as stream:
+            stream.write('\n'.join(lines) + '\n')
+            stream.flush()
+            # Else a power cut might leave an empty file in the place of the old one.
+            os.fsync(stream.fileno())
         draft.replace(path)
     except OSError as error:
+        draft.unlink(missing_ok=True)
         raise OutputError(f'cannot write {path}: {error.strerror}') from error

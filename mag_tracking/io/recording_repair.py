@@ -215,7 +215,13 @@ def repair(path, report=print):
     if not files:
         raise RecordingError(f'{path} holds no .mcap file')
     n, summaries, topics = 0, [], {}
-    for file in files:
+    # A crash at a split leaves a file without a first byte.
+    empty = [file for file in files if file.stat().st_size < len(_MAGIC)]
+    if len(empty) == len(files):
+        raise RecordingError(f'{path}: {len(files)} files, and nothing in any')
+    for file in empty:
+        report(f'{file} is empty: it is left out')
+    for file in [file for file in files if file not in empty]:
         try:
             lines = finish_file(file)
         except OSError as error:

@@ -20,7 +20,7 @@ from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.stage_node import LATCHED, STREAM, StageNode
 from mag_tracking.stages.calibrate import Calibrate
-from mag_tracking.stages.survey import Survey
+from mag_tracking.stages.survey import Survey, with_noise
 
 
 class CalibrationNode(StageNode):
@@ -34,7 +34,7 @@ class CalibrationNode(StageNode):
         self._save_as = self.declare_parameter('save_as', '').value
         self._stage = Calibrate(self.network, self.settings.calibrate)
         self._survey = Survey(self.network, self.settings.survey)
-        self._health = HealthDiagnostics(self.network, self.settings.calibrate.max_field)
+        self._health = HealthDiagnostics(self.network, self.settings)
         self._publishers_by_sensor = {}
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self._publishers_by_sensor[sensor] = self.publisher(
@@ -88,31 +88,35 @@ class CalibrationNode(StageNode):
 
     def _solve(self, request, response):
         """Orientations and clocks, as the service asks; tracks that run keep theirs to the end."""
-        backgrounds = self._stage.backgrounds()
-        fields = {name: self._stage.background(name) for name, b in backgrounds.items()
-                  if b.ready and not b.frozen and self._stage.last_stamp_ns(name) is not None}
+        # Of a sensor near which a target stands, what was learnt before it came.
+        fields = {name: self._stage.background(name) for name, b in
+                  self._stage.backgrounds().items()
+                  if b.ready and self._stage.last_stamp_ns(name) is not None}
         if not fields or not self._survey.counts['accelerations']:
-            response.message = 'no background has been learnt' if not fields else \
+            response.message = 'no background has been learnt yet' if not fields else \
                 f'no acceleration has come on {", ".join(filter(None, self.network.imu_topics))}'
             return response
         date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
         found = self._survey.solve(fields, date)
+        network = with_noise(found.network, self._stage)
         if request.save:
             path = self._save_as or self._beside()
             try:
-                write_network(path, found.network, 'Written by calibration_node.')
+                write_network(path, network, 'Written by calibration_node.')
             except OutputError as error:
                 response.message = str(error)
                 return response
-        self.network = found.network
-        self._stage.renew(found.network)
+        self.network = network
+        self._stage.renew(network)
+        self._health.renew(network)
         self._publish_state()
         response.success = True
-        response.message = ('in force' + (f', and saved in {path}' if request.save else '')
+        response.message = ('in force' + (f', and saved in {path}, to be given at the next start'
+                                           if request.save else '')
                             + f'; clocks against {found.reference or "none: no knock was felt"}')
-        response.warnings = [str(d) for d in found.disagreements] + [
-            f'{s.sensor}: {text}' for s in found.sensors
-            for text in (*s.warnings, *([s.lag.reason] if s.lag and s.lag.reason else []))]
+        response.warnings = found.warnings()
+        response.warnings += [f'{name}: no background has been learnt: its heading stays as stated'
+                              for name in network.names if name not in fields]
         for text in response.warnings:
             self.get_logger().warning(text)
         return response

@@ -6,48 +6,76 @@ import time
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-from mag_tracking.stages.health import Finding, SensorHealth
+from mag_tracking.doctoring import background_findings, network_findings
+from mag_tracking.stages.health import EVERY, Finding, SensorHealth
 from mag_tracking.stages.stage import NS
 
 TERM_S = 60.0
 """[s] What was wrong is forgotten after one to two of these."""
 SILENT_S = 2.0
 """[s] A sensor of which nothing came for longer is silent."""
-LONGEST_DELAY_S = 86400.0
-"""[s] Stamps that are older are of a replay, of which no delay is known."""
+PATIENCE = 3.0
+"""A background that has not been learnt is a fault after so many times what that takes."""
 
 
 class HealthDiagnostics:
     """Looks at the raw readings of a network; `statuses` says how the sensors are."""
 
-    def __init__(self, network, max_field):
-        self._network, self._max_field = network, max_field
-        self._term_ends = time.monotonic() + TERM_S
-        self._heard, self._adopted = dict.fromkeys(network.names), dict.fromkeys(network.names)
-        self._relearnt = dict.fromkeys(network.names, 0)
-        self._past = {name: None for name in network.names}
+    def __init__(self, network, settings):
+        self._settings = settings
+        self._heard = dict.fromkeys(network.names)
+        self._frozen_ns, self._compared = {}, {}
+        self._begin(network)
+
+    def _begin(self, network):
+        """Forget what was; `network` is the one from now on."""
+        self._network = network
+        self._clock_ns = {name: round(s * NS) for name, s in
+                          zip(network.names, network.clock_offset, strict=True)}
+        self._past = dict.fromkeys(network.names)
         self._present = {name: SensorHealth() for name in network.names}
+        self._began = time.monotonic()
+        self._term_ends = self._began + TERM_S
+
+    def renew(self, network):
+        """Go on with another calibration of the same sensors."""
+        self._begin(network)
 
     def add(self, sample, now_ns):
         """A raw reading that came at `now_ns`."""
-        received = now_ns if abs(now_ns - sample.stamp_ns) < LONGEST_DELAY_S * NS else None
-        self._present[sample.sensor].add(sample.stamp_ns, sample.field, received)
+        self._present[sample.sensor].add(
+            sample.stamp_ns - self._clock_ns[sample.sensor], sample.field, now_ns)
         self._heard[sample.sensor] = time.monotonic()
 
     def statuses(self, node, calibrate):
         """[DiagnosticStatus], one a sensor; `calibrate` is the `Calibrate` stage."""
+        self._compare(calibrate)
         if time.monotonic() > self._term_ends:
             self._term_ends = time.monotonic() + TERM_S
             self._past, self._present = self._present, {
                 name: SensorHealth() for name in self._network.names}
-        for name, background in calibrate.backgrounds().items():
-            if background.n_relearnt != self._relearnt[name]:
-                self._relearnt[name] = background.n_relearnt
-                self._adopted[name] = time.monotonic()
         return [self._status(node, j, name, calibrate)
                 for j, name in enumerate(self._network.names)]
 
-    def _findings(self, j, name):
+    def _compare(self, calibrate):
+        """Compare the sensors with each other and with the Earth."""
+        for name, background in calibrate.backgrounds().items():
+            if not background.frozen:
+                self._frozen_ns.pop(name, None)
+            elif calibrate.last_stamp_ns(name) is not None:
+                self._frozen_ns.setdefault(name, calibrate.last_stamp_ns(name))
+        health = {name: self._latest(name) for name in self._network.names}
+        self._compared = {name: [] for name in self._network.names}
+        for finding in network_findings(self._network, self._settings.survey, calibrate, health):
+            if finding.subject in self._compared:
+                self._compared[finding.subject].append(finding)
+
+    def _latest(self, name):
+        """The `SensorHealth` of this term, or of the one before where this has just begun."""
+        past, present = self._past[name], self._present[name]
+        return past if past is not None and present.counts['readings'] < EVERY else present
+
+    def _findings(self, j, name, calibrate):
         """What is wrong with a sensor, the worst first."""
         heard = self._heard[name]
         if heard is None or time.monotonic() - heard > SILENT_S:
@@ -55,26 +83,26 @@ class HealthDiagnostics:
                 f'silent for {time.monotonic() - heard:.0f} s'
             return [Finding(True, name, what, 'look at its cable, its driver and the topic '
                             f'{self._network.topics[j]}')]
-        found = {}
-        adopted = self._adopted[name]
-        if adopted is not None and time.monotonic() - adopted < 2.0 * TERM_S:
-            found[''] = Finding(False, name, 'a steady change was taken for its background',
-                                'a parked vehicle, or something that was put beside it')
+        found = {f.what: f for f in self._compared[name]}
+        # While it learns for the first time that is no fault yet.
+        patience = 5.0 + PATIENCE * self._settings.calibrate.learn_s
+        if time.monotonic() - self._began > patience:
+            found.update({f.what: f for f in background_findings(
+                name, calibrate, self._frozen_ns.get(name))})
         for health in (self._past[name], self._present[name]):
             if health is not None and health.counts['readings']:
-                for f in health.findings(name, self._network.noise_std[j], self._max_field):
+                for f in health.findings(name, self._network.noise_std[j],
+                                         self._settings.calibrate.max_field):
                     found.setdefault(f.what, f)
         return sorted(found.values(), key=lambda f: not f.serious)
 
     def _status(self, node, j, name, calibrate):
         """The DiagnosticStatus of one sensor."""
-        found = self._findings(j, name)
+        found = self._findings(j, name, calibrate)
         level = DiagnosticStatus.OK
         if found:
             level = DiagnosticStatus.ERROR if found[0].serious else DiagnosticStatus.WARN
-        health = self._present[name]
-        if not health.counts['readings'] and self._past[name] is not None:
-            health = self._past[name]
+        health = self._latest(name)
         background = calibrate.backgrounds()[name]
         c, n = health.counts, max(1, health.counts['readings'])
         values = {

@@ -66,27 +66,40 @@ class Calibrate:
         self.per_sensor = {name: Counter() for name in network.names}
         self._settings = settings
         self._index = {name: i for i, name in enumerate(network.names)}
+        self._network, self._clock_ns, self._background = None, [], {}
+        self._first_ns, self._last_ns, self._ahead_ns = {}, {}, {}
         self.renew(network)
 
     def renew(self, network):
-        """Go on with another calibration of the same sensors; backgrounds are learnt anew.
+        """Go on with another calibration of the same sensors.
 
-        Raises NetworkError where they are others.
+        A background is learnt anew where the sensor's own offset or correction is
+        another; else it stays, also a frozen one: a target that stands there must not
+        become the background by this. Raises NetworkError where the sensors are others.
         """
         if network.names != tuple(self._index):
             raise NetworkError(f'a network of {", ".join(network.names)} in place of one of '
                                f'{", ".join(self._index)}')
-        settings = self._settings
+        before, clock_before = self._network, self._clock_ns
         self._network = network
         self._clock_ns = [round(s * NS) for s in network.clock_offset]
-        self._first_ns, self._last_ns, self._ahead_ns = {}, {}, {}
-        self._decimators = {name: Decimator(settings.decimate_to_hz) for name in network.names}
-        self._background = {
-            name: RunningBackground(
-                settings.learn_s, settings.memory_s, settings.guard_s, settings.block_s,
-                settings.freeze_std, settings.relearn_s,
-                network.background[i], network.noise_std[i])
-            for i, name in enumerate(network.names)}
+        self._decimators = {name: Decimator(self._settings.decimate_to_hz)
+                            for name in network.names}
+        for i, name in enumerate(network.names):
+            if before is None or not (_same(before.offset[i], network.offset[i])
+                                      and _same(before.correction[i], network.correction[i])):
+                self._background[name] = self._new_background(i)
+            else:
+                # The same readings have other stamps from now on.
+                for times in (self._first_ns, self._last_ns, self._ahead_ns):
+                    if name in times:
+                        times[name] -= self._clock_ns[i] - clock_before[i]
+
+    def _new_background(self, i):
+        """Of sensor `i`, from what the network file says of it."""
+        s, network = self._settings, self._network
+        return RunningBackground(s.learn_s, s.memory_s, s.guard_s, s.block_s, s.freeze_std,
+                                 s.relearn_s, network.background[i], network.noise_std[i])
 
     def feed(self, sample):
         """A raw `MagSample` gives at most one calibrated `MagSample`."""
@@ -234,6 +247,11 @@ class Calibrate:
     def backgrounds(self):
         """{sensor: RunningBackground}, to look at."""
         return dict(self._background)
+
+
+def _same(a, b):
+    """Whether two arrays, or None, are the same."""
+    return (a is None) == (b is None) and (a is None or np.array_equal(a, b))
 
 
 def _is_covariance(C):

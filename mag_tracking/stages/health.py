@@ -18,7 +18,9 @@ EVERY = 64
 UNKNOWN = np.iinfo(np.int64).min
 """Of a reading whose receipt is not known."""
 STEP_S = 0.25
-"""[s] A clock has stepped where the delay changes by more from one reading to the next."""
+"""[s] A clock has stepped where a stamp is off by more while the reading came in time."""
+REPLAYED_S = 86400.0
+"""[s] Stamps that are older are of a replay (or of another clock: `doctoring` compares sensors)."""
 LOST = 1.5
 """An interval longer than so many usual ones has lost readings in it."""
 IRREGULAR = 0.3
@@ -88,10 +90,14 @@ class SensorHealth:
         """Count what is wrong with the stamps of the `n` latest."""
         # With the one before them, where there is one.
         intervals = np.diff(self._stamps[-n - 1:])
-        delays = (self._received - self._stamps)[-n - 1:] / NS
-        steps = np.where(self._received[-n - 1:] == UNKNOWN, 0.0, delays)
-        steps = np.diff(steps)
-        stepped = np.abs(steps) > STEP_S
+        known = self._received[-n - 1:] != UNKNOWN
+        receipts = np.diff(np.where(known, self._received[-n - 1:], 0)) / NS
+        steps = receipts - intervals / NS
+        usual = 0.0 if np.isnan(self._interval_ns) else self._interval_ns / NS
+        # Of the two the stamp has to be the odd one: a host that stalls, and what it reads in a
+        # burst then, are no step.
+        stepped = known[1:] & known[:-1] & (np.abs(steps) > STEP_S) \
+            & (np.abs(receipts - usual) < STEP_S) & (np.abs(intervals / NS - usual) > STEP_S)
         if stepped.any():
             self._counts['clock steps'] += int(stepped.sum())
             self._largest_step_s = max(self._largest_step_s, *steps[stepped].tolist(), key=abs)
@@ -162,6 +168,16 @@ class SensorHealth:
         return out
 
     @property
+    def dead_axes(self):
+        """Such as 'xz': axes that have not changed in a window in which another one did."""
+        self._look()
+        if len(self._fields) < WINDOW:
+            return ''
+        there = ~np.isnan(self._fields).any(axis=0)
+        still = there & (self._fields == self._fields[0]).all(axis=0)
+        return ''.join(np.array(list('xyz'))[still]) if still.sum() < there.sum() else ''
+
+    @property
     def delay_s(self):
         """(median, 5 %, 95 %) [s] from stamp to receipt; NaN where receipts are not known."""
         self._look()
@@ -215,10 +231,12 @@ class SensorHealth:
         if c['lost'] > 0.01 * n:
             yield Finding(c['lost'] > 0.2 * n, name, f'{c["lost"]} readings are missing between '
                           f'{n}', 'look at the link, and at the queue of whoever records')
-        if high - low > 0.05 and not c['clock steps']:
+        if c['clock steps'] or abs(middle) > REPLAYED_S:
+            return
+        if high - low > 0.05:
             yield Finding(False, name, f'readings take {1e3 * low:.0f} to {1e3 * high:.0f} ms to '
                           'come', 'stamps by the sensor itself would be truer than by receipt')
-        elif abs(middle) > 1.0 and not c['clock steps']:
+        elif abs(middle) > 1.0:
             yield Finding(False, name, f'stamps are {middle:.1f} s before they are received',
                           'the clocks of sensor and host disagree; calibrate with knocks')
 
@@ -233,6 +251,9 @@ class SensorHealth:
         if c['without any axis'] > 0.01 * n:
             yield Finding(True, name, f'{c["without any axis"]} of {n} readings have no axis at '
                           'all', 'look at the sensor and its driver')
+        for axis in self.dead_axes:
+            yield Finding(True, name, f'{axis} does not change', 'the axis is dead, or its steps '
+                          'are coarser than its noise: then give noise_std in the network file')
         for axis in 'xyz':
             if 0.01 * n < c[axis] - c['without any axis'] and c[axis] < 0.99 * n:
                 yield Finding(False, name, f'{axis} is missing in {c[axis]} of {n} readings',

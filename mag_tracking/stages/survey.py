@@ -19,9 +19,12 @@ from mag_tracking.calibration.orientation import (
     with_stated_heading,
 )
 from mag_tracking.geometry import yaw_between
-from mag_tracking.network import Calibrated, SensorNetwork
+from mag_tracking.network import SensorNetwork
 from mag_tracking.settings import param
 from mag_tracking.stages.stage import NS
+
+LONGEST_GAP_S = 3600.0
+"""[s] After a longer gap, or a step back, what was collected is of another time."""
 
 SURE_STATED = 1e-3
 """[rad] Nobody states an orientation better than this."""
@@ -78,13 +81,26 @@ class NetworkSurvey:
     """{sensor: (t (n,) [s], shock (n,) [m/s^2])} of those with accelerations; each by its own
     clock, from the first reading of all."""
 
+    def warnings(self):
+        """What somebody should know: list of text."""
+        out = [str(d) for d in self.disagreements]
+        reasons = {s.sensor: s.lag.reason for s in self.sensors if s.lag and s.lag.reason}
+        out += [f'{s.sensor}: {text}' for s in self.sensors for text in s.warnings]
+        if self.reference:
+            out += [f'{name}: clock: {reason}' for name, reason in reasons.items()]
+        elif len(self.sensors) > 1:
+            because = ', '.join(sorted(set(reasons.values()))) or 'too few accelerometers'
+            out.append(f'clocks stay as they were: {because}')
+        return out
+
 
 class Survey:
     """Collects accelerations; `solve` makes orientations and clock offsets of them."""
 
     def __init__(self, network, settings):
         self.counts = Counter()
-        self._network, self._settings = network, settings
+        # What an earlier survey found is no further evidence.
+        self._network, self._settings = network.as_stated(), settings
         self._kept = {name: deque(maxlen=settings.most_accelerations) for name in network.names}
 
     def feed(self, sample):
@@ -94,11 +110,11 @@ class Survey:
             self.counts[f'rejected: acceleration of unknown sensor {sample.sensor}'] += 1
         elif not np.isfinite(sample.acceleration).all():
             self.counts['rejected: acceleration is not finite'] += 1
-        elif kept and sample.stamp_ns <= kept[-1][0]:
-            if kept[-1][0] - sample.stamp_ns > NS:
+        elif kept and not 0 < sample.stamp_ns - kept[-1][0] < LONGEST_GAP_S * NS:
+            if abs(kept[-1][0] - sample.stamp_ns) > NS:
                 kept.clear()
                 kept.append((sample.stamp_ns, sample.acceleration))
-                self.counts['time jumped back'] += 1
+                self.counts['time jumped'] += 1
             else:
                 self.counts['rejected: acceleration out of order'] += 1
         else:
@@ -154,7 +170,7 @@ class Survey:
     def _up(self, name, warnings):
         """`Up` of a sensor, or None with a warning."""
         if not self._kept[name]:
-            warnings.append('no accelerations: its orientation stays as stated')
+            warnings.append('no accelerations: its orientation is not surveyed')
             return None
         try:
             return up_direction(np.array([a for _, a in self._kept[name]]),
@@ -220,13 +236,14 @@ class Survey:
 
     def _lags(self, signals):
         """(reference sensor, {sensor: Lag}) by the knocks."""
-        longest = self._settings.longest_clock_offset_s
+        longest, first = self._settings.longest_clock_offset_s, {}
         for reference, (t, s) in signals.items():
             lags = {name: knock_lag(t, s, *signals[name], longest)
                     for name in signals if name != reference}
             if any(not lag.reason for lag in lags.values()):
                 return reference, lags
-        return '', {}
+            first = first or lags
+        return '', first
 
     def _surveyed(self, sensors, reference, date):
         """The network with what was found."""
@@ -243,9 +260,20 @@ class Survey:
                 R_ws[j], std[j] = s.orientation.R_ws, s.orientation.std
             if s.orientation is not None or measured or s.sensor == reference:
                 lag_std = s.lag.std if measured else 0.0 if s.sensor == reference else np.nan
-                done[j] = Calibrated(date, s.by, lag_std)
+                done[j] = network.marked(j, date, s.by, lag_std)
         return replace(network, R_ws=R_ws, orientation_std=tuple(std), clock_offset=clock,
                        calibrated=tuple(done))
+
+
+def with_noise(network, calibrate):
+    """The network with the noise that a `Calibrate` stage has found, where it has."""
+    noise = list(network.noise_std)
+    for j, background in enumerate(calibrate.backgrounds().values()):
+        std = None if background.covariance is None else np.sqrt(np.diagonal(background.covariance))
+        # The file wants three numbers: an axis that is not reported has none.
+        if std is not None and not np.isnan(std).any():
+            noise[j] = std
+    return replace(network, noise_std=tuple(noise))
 
 
 def _tilt_warning(stated, found, stated_std, found_std):

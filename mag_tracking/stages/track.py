@@ -129,7 +129,8 @@ class TrackStage:
             raise SettingsError(f'track.target: expected vehicle or magnet, '
                                 f'got {settings.target!r}')
         self._filter = BankFilter(network, self._model, settings)
-        hardly = sum(s is not None and s.max() > MOST_TURNED for s in network.orientation_std)
+        hardly = sum(bool(s is not None and s.max() > MOST_TURNED)
+                     for s in network.orientation_std)
         if hardly:
             self.counts['sensors whose orientation is hardly known'] = hardly
         self._whole = WholeTrack(settings.smooth_longest_s)
