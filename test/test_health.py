@@ -146,6 +146,11 @@ def test_what_is_lost_is_counted():
     keep = np.ones(3000, dtype=bool)
     keep[[500, 900, 901, 902, 2000]] = False
     assert examined(stamps[keep], fields[keep]).counts['lost'] == 5
+    # One that came late is none, one that came so late has another before it.
+    for late, lost in ((1.4, 0), (1.7, 1)):
+        later = np.array(stamps)
+        later[1500:] += round((late - 1.0) * 1e7)
+        assert examined(later, fields).counts['lost'] == lost
 
 
 def test_a_steep_slope_is_no_spike():
