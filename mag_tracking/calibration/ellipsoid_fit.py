@@ -16,6 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from mag_tracking.calibration.directions import counted, coverage, empty_octants, even_weights
+from mag_tracking.calibration.quadric import DOUBT, OUTLIER, fit_quadric, robust_std
 from mag_tracking.calibration.saturation import cut_off
 
 LEAST_READINGS = 50
@@ -46,11 +47,8 @@ MOST_UNCERTAIN = 0.1
 GOOD_RESIDUAL = 0.05
 """A larger std/mean of the corrected sizes is warned of: the field was not uniform."""
 
-OUTLIER = 4.0
-"""[std] Readings further from the ellipsoid are outliers ..."""
-
 MANY_OUTLIERS = 0.01
-"""... a larger share of which is warned of ..."""
+"""A larger share of outliers is warned of ..."""
 
 MOST_OUTLIERS = 0.2
 """... and refused: the robust scatter has lost its meaning."""
@@ -69,11 +67,6 @@ SOFT = 2.0
 N_BLOCKS = 40
 """Stretches of time that are left out in turn for the covariance; each must be long against the
 time over which residuals are correlated."""
-
-LEAST_SCALE = 1e-9
-"""Residual std, over the radius, below which it is rounding."""
-
-DOUBT = 'too few directions, a sensor that lay still, or a field that is not uniform'
 
 _UPPER = np.triu_indices(3)
 _BASIS = np.zeros((6, 3, 3))
@@ -173,7 +166,7 @@ def fit_ellipsoid(readings, field_size=None):
         return _refused(reason, counts, notes)
     centre, scale = used.mean(axis=0), float(np.sqrt(used.var(axis=0).sum()))
     z = (used - centre) / scale
-    o, C, reason = _quadric(z)
+    o, C, reason = fit_quadric(z)
     if reason:
         return _refused(reason, counts, notes)
     o, C, P, quality = _geometric(z, o, C)
@@ -244,57 +237,18 @@ def _too_little(y):
     return ''
 
 
-def _quadric(z):
-    """Offset, correction and reason of a linear fit to normalised readings, outliers set aside."""
-    # Half-way between the extremes is inside, however long the sensor lay still somewhere.
-    w = even_weights(z - 0.5 * (z.min(axis=0) + z.max(axis=0)))
-    o, C = np.full(3, np.nan), np.full((3, 3), np.nan)
-    for _ in range(5):
-        x, y, v = z.T
-        # sqrt(2) makes the length of the vector of coefficients independent of the axes.
-        D = np.column_stack([z * z, np.sqrt(2.0) * np.stack([x * y, x * v, y * v], 1), z,
-                             np.ones(len(z))])
-        a = np.linalg.svd(np.sqrt(w)[:, None] * D, full_matrices=False)[2][-1]
-        A = np.diag(a[:3])
-        A[[0, 0, 1], [1, 2, 2]] = A[[1, 2, 2], [0, 0, 1]] = a[3:6] / np.sqrt(2.0)
-        A, a = (A, a) if np.trace(A) > 0.0 else (-A, -a)
-        e = np.linalg.eigvalsh(A)
-        if not e[0] > 1e-6 * e[2]:
-            return o, C, ('the readings lie on no ellipsoid, smallest over largest eigenvalue of '
-                          f'the quadric {e[0] / e[2]:.2g}, must be positive: {DOUBT}')
-        o = -0.5 * np.linalg.solve(A, a[6:9])
-        k = o @ A @ o - a[9]
-        if not k > 0.0:
-            return o, C, f'the readings lie on no ellipsoid, squared radius {k:.2g}: {DOUBT}'
-        e, V = np.linalg.eigh(A / k)
-        C = (V * np.sqrt(e)) @ V.T
-        q = (z - o) @ C
-        w = even_weights(q)
-        d = np.abs(np.linalg.norm(q, axis=1) - 1.0)
-        w = w * (d <= OUTLIER * _robust_std(d, w))
-    return o, C, ''
-
-
-def _robust_std(d, w):
-    """Standard deviation from the weighted median of |d|."""
-    order = np.argsort(np.abs(d))
-    total = np.cumsum(w[order])
-    middle = np.abs(d)[order][np.searchsorted(total, 0.5 * total[-1])]
-    return max(1.4826 * float(middle), LEAST_SCALE)
-
-
 def _geometric(z, o, C):
     """Offset, correction, covariance (9, 9) and quality of the robust fit of |C (z - o)| = 1."""
     theta = np.concatenate([o, C[_UPPER]])
     for _ in range(2):
         w = even_weights(_model(theta, z)[0])
-        scale = SOFT * _robust_std(_model(theta, z)[1], w)
+        scale = SOFT * robust_std(_model(theta, z)[1], w)
         fit = least_squares(lambda p, s=scale: _model(p, z)[1] / s, theta,
                             jac=lambda p, s=scale: _model(p, z)[2] / s,
                             loss=lambda square, w=w: _loss(square, w), max_nfev=100)
         theta = fit.x
     q, d, J = _model(theta, z)
-    fine = np.abs(d) <= OUTLIER * _robust_std(d, w)
+    fine = np.abs(d) <= OUTLIER * robust_std(d, w)
     u, _, n = counted(q[fine])
     quality = {'solved': fit.status > 0, 'directions': int((n > 0).sum()),
                'coverage': coverage(u, w[fine]),
