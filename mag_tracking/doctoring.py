@@ -80,19 +80,20 @@ def _clock_findings(network, sensors):
                           'within survey.longest_clock_offset_s')
 
 
-def background_findings(name, calibrate, frozen_since_ns):
+def background_findings(name, calibrate, frozen_since_ns, n_known=0):
     """What is wrong with the background of one sensor: iterator of `Finding`.
 
-    `frozen_since_ns` is the stamp since which it has been frozen, or None.
+    `frozen_since_ns` is the stamp since which it has been frozen, or None; `n_known` of the
+    backgrounds that were taken anew are no news.
     """
     background, last = calibrate.backgrounds()[name], calibrate.last_stamp_ns(name)
     if last is not None and not background.ready:
         yield Finding(True, name, 'no background was learnt', 'begin without a target for a few '
                       'seconds, or give background and noise_std in the network file')
-    if background.n_relearnt:
+    if background.n_relearnt > n_known:
         yield Finding(False, name, f'a steady change was taken for its background '
-                      f'{background.n_relearnt} times', 'a parked vehicle, or something that was '
-                      'put beside it; calibrate.relearn_s: 0 would wait for ever')
+                      f'{background.n_relearnt - n_known} times', 'a parked vehicle, or something '
+                      'that was put beside it; calibrate.relearn_s: 0 would wait for ever')
     if frozen_since_ns is not None and (last - frozen_since_ns) / NS > STEADY_S:
         yield Finding(False, name, f'its background has not been learnt for '
                       f'{(last - frozen_since_ns) / NS:.0f} s', 'a target stays near, or the field '

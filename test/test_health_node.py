@@ -13,11 +13,14 @@ from sensor_msgs.msg import MagneticField
 
 from mag_tracking.io.network_file import read_network
 from mag_tracking.io.schema import sample_dict
+from mag_tracking.nodes import sensor_health
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.doctor_node import DoctorNode
+from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.stage_node import RESULTS, STREAM
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import MagSample
+from mag_tracking.stages.calibrate import Calibrate
 
 EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
 STRANGER = """
@@ -160,3 +163,27 @@ def test_the_doctor_on_a_live_system(ros, talking):
         stranger.wait()
         executor.remove_node(doctor)
         doctor.destroy_node()
+
+
+def test_what_was_wrong_is_forgotten_after_two_terms(monkeypatch):
+    """A car that parked in spring is no warning in autumn."""
+    now = [0.0]
+    monkeypatch.setattr(sensor_health.time, 'monotonic', lambda: now[0])
+    network = read_network(NETWORK_FILE)
+    settings = settings_for('vehicle', {'calibrate.relearn_s': 4.0})
+    stage = Calibrate(network, settings.calibrate)
+    health, rng, said = HealthDiagnostics(network, settings), np.random.default_rng(1), []
+    for k in range(250 * 20):
+        now[0] = k / 20
+        for name in network.names:
+            parked = 1e-6 * (name == 'mag_1' and now[0] > 20.0)
+            sample = MagSample(k * 50_000_000, name,
+                               EARTH + parked + 1.2e-8 * rng.standard_normal(3))
+            health.add(sample, sample.stamp_ns)
+            stage.feed(sample)
+        if k % 100 == 99:
+            said.append((now[0], [s.message for s in health.statuses('node', stage)]))
+    told = [t for t, messages in said if 'taken for its background 1 times' in messages[0]]
+    assert 20.0 < min(told) < 35.0
+    assert sensor_health.TERM_S < max(told) - min(told) <= 2.0 * sensor_health.TERM_S + 5.0
+    assert said[-1][1] == ['running', 'running']

@@ -25,6 +25,8 @@ class HealthDiagnostics:
         self._settings = settings
         self._heard = dict.fromkeys(network.names)
         self._frozen_ns, self._compared = {}, {}
+        # How many backgrounds had been taken anew when the last term began, and this one.
+        self._relearnt = [dict.fromkeys(network.names, 0)] * 2
         self._begin(network)
 
     def _begin(self, network):
@@ -54,6 +56,8 @@ class HealthDiagnostics:
             self._term_ends = time.monotonic() + TERM_S
             self._past, self._present = self._present, {
                 name: SensorHealth() for name in self._network.names}
+            self._relearnt = [self._relearnt[1], {
+                name: b.n_relearnt for name, b in calibrate.backgrounds().items()}]
         return [self._status(node, j, name, calibrate)
                 for j, name in enumerate(self._network.names)]
 
@@ -88,7 +92,7 @@ class HealthDiagnostics:
         patience = 5.0 + PATIENCE * self._settings.calibrate.learn_s
         if time.monotonic() - self._began > patience:
             found.update({f.what: f for f in background_findings(
-                name, calibrate, self._frozen_ns.get(name))})
+                name, calibrate, self._frozen_ns.get(name), self._relearnt[0][name])})
         for health in (self._past[name], self._present[name]):
             if health is not None and health.counts['readings']:
                 for f in health.findings(name, self._network.noise_std[j],
