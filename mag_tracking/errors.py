@@ -19,3 +19,7 @@ class RecordingError(MagTrackingError):
 
 class OutputError(MagTrackingError):
     """A result cannot be written where it was asked for."""
+
+
+class DeviceError(MagTrackingError):
+    """A device cannot be opened or read: a port, a socket, a broker or a bus."""
