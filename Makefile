@@ -24,7 +24,7 @@ QUIET_EDITABLE := PYTHONWARNINGS=ignore
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo config test bench colcon lock clean
+.PHONY: help setup demo config test bench fuzz colcon lock clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -53,6 +53,7 @@ config: $(STAMP)  ## write config/ and docs/parameters.md anew from the settings
 	$(BIN)/python tools/generate_config.py
 
 test: $(STAMP)  ## check style, floors and behaviour
+	@sh tools/check_broker.sh
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not alone'
@@ -63,6 +64,10 @@ bench: $(STAMP)  ## measure times and accuracies
 	$(BIN)/python test/bench/matched.py
 	$(BIN)/python test/bench/extended_target.py
 	$(BIN)/python test/bench/pass_search.py
+
+fuzz: $(STAMP)  ## a million frames between garbage through every parser of the drivers
+	$(BIN)/python test/framing_fuzz.py --frames 1000000
+	PYTHONPATH=. $(BIN)/python test/xsens_messages.py --frames 1000000
 
 # As a user of a ROS from apt would, but with the generators from PyPI.
 colcon: $(STAMP)  ## build and test both packages with colcon

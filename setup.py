@@ -3,7 +3,7 @@ from glob import glob
 from setuptools import Distribution, find_packages, setup
 
 NAME = 'mag_tracking'
-NODES = ('replay_node', 'calibration_node', 'detection_node', 'tracker_node')
+NODES = ('driver_node', 'replay_node', 'calibration_node', 'detection_node', 'tracker_node')
 
 class DataFilesDistribution(Distribution):
     """Workaround: `pip install -e` leaves data_files out, as setuptools asks for `has_data`, which
@@ -37,9 +37,12 @@ setup(
         'mcap-ros2-support',
         'numba',
         'numpy',
+        'paho-mqtt>=2',
         'pygeomag',
+        'pyserial',
         'PyYAML',
         'scipy',
+        'smbus2',
         'tqdm',
         'zstandard',
     ],
@@ -53,6 +56,9 @@ setup(
         ],
         # `colcon test` runs pytest only where the extra "test" names it.
         'test': [
+            # Drivers for CircuitPython, as users have them.
+            'adafruit-circuitpython-lis3mdl',
+            'adafruit-circuitpython-mmc56x3',
             'filterpy',
             'hypothesis',
             'import-linter',

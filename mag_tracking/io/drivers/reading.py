@@ -83,15 +83,25 @@ class Transport(Protocol):
         """Close it; may be called twice, and before `open`."""
 
 
+class Arrival(NamedTuple):
+    """A reading that came."""
+
+    arrival_ns: int
+    """`time.monotonic_ns()` when it came."""
+    reading: Reading
+    source: str = ''
+    """As of its `Chunk`. What comes from one source is stamped by one clock."""
+
+
 class Device(Protocol):
-    """Gives readings with `time.monotonic_ns()` of their arrival; otherwise as `Transport`."""
+    """Gives readings; otherwise as `Transport`."""
 
     counts: Counter
 
     def open(self) -> None:
         """As `Transport.open`."""
 
-    def read(self, timeout_s: float) -> list[tuple[int, Reading]]:
+    def read(self, timeout_s: float) -> list[Arrival]:
         """As `Transport.read`."""
 
     def close(self) -> None:

@@ -1,0 +1,92 @@
+"""Checksums of the frames that devices send.
+
+Source: names, polynomials and check values of the "Catalogue of parametrised CRC
+algorithms" (G. Cook); the check value is that of the ASCII text '123456789'.
+"""
+
+import binascii
+import zlib
+from collections.abc import Callable
+from functools import reduce
+from operator import xor
+from typing import NamedTuple
+
+
+class Checksum(NamedTuple):
+    """One checksum: how many bytes it takes in a frame, and how it is reckoned."""
+
+    size: int
+    """Bytes."""
+    value: Callable[[bytes], int]
+    """From the bytes that it covers to the number that stands in the frame."""
+
+
+def sum8(data):
+    """Sum of the bytes modulo 256; check value 0xDD."""
+    return sum(data) & 0xFF
+
+
+def xor8(data):
+    """All bytes joined by exclusive or, as NMEA 0183 has it; check value 0x31."""
+    return reduce(xor, data, 0)
+
+
+def _forward_table(polynomial):
+    """The 256 remainders of an 8-bit CRC, highest bit first."""
+    table = []
+    for byte in range(256):
+        for _ in range(8):
+            byte = byte << 1 ^ (polynomial if byte & 0x80 else 0)
+        table.append(byte & 0xFF)
+    return tuple(table)
+
+
+def _reflected_table(polynomial):
+    """The 256 remainders of a CRC, lowest bit first; `polynomial` reflected too."""
+    table = []
+    for byte in range(256):
+        for _ in range(8):
+            byte = byte >> 1 ^ (polynomial if byte & 1 else 0)
+        table.append(byte)
+    return tuple(table)
+
+
+_CRC8 = _forward_table(0x107)
+_MODBUS = _reflected_table(0xA001)
+
+
+def crc8(data):
+    """CRC-8/SMBUS: polynomial 0x07, start 0; check value 0xF4."""
+    crc, table = 0, _CRC8
+    for byte in data:
+        crc = table[crc ^ byte]
+    return crc
+
+
+def crc16_ccitt(data):
+    """CRC-16/CCITT-FALSE (IBM-3740): polynomial 0x1021, start 0xFFFF; check value 0x29B1."""
+    return binascii.crc_hqx(data, 0xFFFF)
+
+
+def crc16_modbus(data):
+    """CRC-16/MODBUS: polynomial 0x8005 reflected, start 0xFFFF; check value 0x4B37."""
+    crc, table = 0xFFFF, _MODBUS
+    for byte in data:
+        crc = crc >> 8 ^ table[(crc ^ byte) & 0xFF]
+    return crc
+
+
+def crc32(data):
+    """CRC-32 (ISO-HDLC), as in Ethernet and zip; check value 0xCBF43926."""
+    return zlib.crc32(data)
+
+
+CHECKSUMS = {
+    'sum8': Checksum(1, sum8),
+    'xor8': Checksum(1, xor8),
+    'crc8': Checksum(1, crc8),
+    'crc16_ccitt': Checksum(2, crc16_ccitt),
+    'crc16_modbus': Checksum(2, crc16_modbus),
+    'crc32': Checksum(4, crc32),
+}
+"""By the name that the settings use."""

@@ -1,0 +1,272 @@
+"""A driver: one device, kept open, and its readings as samples.
+
+It opens the device and opens it again, with back-off, whenever it is lost; names
+the sensors, turns units into SI, stamps every reading with the time of its
+measurement on this machine's clock, and counts what is missing.
+"""
+
+import time
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from mag_tracking.errors import DeviceError, SettingsError
+from mag_tracking.io.drivers.device_clock import ArrivalClock, DeviceClock
+from mag_tracking.io.drivers.sequence import SequenceCheck
+from mag_tracking.records import AccelerationSample, MagSample
+from mag_tracking.settings import param
+
+FIELD_UNITS = {'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'G': 1e-4, 'mG': 1e-7}
+"""{unit: tesla}."""
+ACCELERATION_UNITS = {'m/s2': 1.0, 'g': 9.80665, 'mg': 9.80665e-3}
+"""{unit: m/s^2}."""
+POLL_S = 0.2
+"""[s] A driver that is served is asked to stop so often."""
+STAMPED_BY = ('auto', 'ticks', 'sequence', 'arrival')
+STEP_NS = 10_000_000
+"""[ns] The clock of this machine was set when it differs by more from one moment to the next."""
+
+
+@dataclass(frozen=True)
+class DriverSettings:
+    """Settings of what every driver does."""
+
+    unit: str = param(
+        'T', 'Unit of the field: T, mT, uT, nT, G, mG, or the tesla of one count.')
+    acceleration_unit: str = param(
+        'm/s2', 'Unit of the acceleration: m/s2, g, mg, or the m/s^2 of one count.')
+    stamp_by: str = param(
+        'auto', 'What a reading is stamped by: ticks, sequence (the count of a device that '
+        'measures at a steady rate), arrival, or auto: its ticks if it has any, else arrival.')
+    sequence_wrap: int = param(
+        0, 'The number at which the count of readings goes back to 0; 0 = never.', '',
+        (0, 2**64))
+    retry_s: float = param(
+        0.1, 'A device that is lost is opened again after so long, twice that the next time, '
+        'and so on.', 's', (1e-3, 60.0))
+    longest_retry_s: float = param(
+        1.0, 'It is never waited longer than that.', 's', (1e-3, 3600.0))
+    gather_s: float = param(
+        0.0, 'Readings are gathered for so long before they go on: with `batches` they are one '
+        'message then.', 's', (0.0, 1.0))
+    silent_s: float = param(
+        10.0, 'A device of which nothing comes for so long is closed and opened again; 0 = '
+        'never.', 's', (0.0, 86400.0))
+
+
+def scale_of(unit, units, name):
+    """What one of `unit` is in SI: a name in `units`, or a number.
+
+    Raises SettingsError, which calls the setting `name`.
+    """
+    if unit in units:
+        return units[unit]
+    try:
+        scale = float(unit)
+    except ValueError:
+        scale = float('nan')
+    if not np.isfinite(scale) or scale == 0.0:
+        raise SettingsError(f'{name}: {unit!r} is neither a number nor one of '
+                            f'{", ".join(units)}')
+    return scale
+
+
+class Driver:
+    """Samples of one device.
+
+    Parameters
+    ----------
+    name : str
+        Of the device, for people.
+    device : reading.Device
+    settings : DriverSettings
+    clock_settings : ClockSettings
+    sensors : {str: str}
+        The device's name of each sensor, or the source that it sends from: the
+        network's name of it. `{'': name}`: all is of the one sensor there is.
+    monotonic_ns, wall_ns, sleep : functions
+        The clocks of this machine; tests have their own.
+    """
+
+    def __init__(self, name, device, settings, clock_settings, sensors,
+                 monotonic_ns=time.monotonic_ns, wall_ns=time.time_ns, sleep=time.sleep):
+        self.name = name
+        self.sensors = dict(sensors)
+        self.own_counts = Counter()
+        self._device, self._settings = device, settings
+        self._clock_settings = clock_settings
+        self._scale = scale_of(settings.unit, FIELD_UNITS, f'{name}: unit')
+        self._acceleration_scale = scale_of(
+            settings.acceleration_unit, ACCELERATION_UNITS, f'{name}: acceleration_unit')
+        if settings.stamp_by not in STAMPED_BY:
+            raise SettingsError(f'{name}: stamp_by: expected {", ".join(STAMPED_BY)}, got '
+                                f'{settings.stamp_by!r}')
+        self._monotonic_ns, self._wall_ns, self._sleep = monotonic_ns, wall_ns, sleep
+        self._sequences = {s: SequenceCheck(settings.sequence_wrap) for s in sensors.values()}
+        self._clocks = {}
+        self._open, self.trouble = False, ''
+        self._retry_s, self._retry_ns = settings.retry_s, None
+        self._heard_ns, self._offset_ns = None, None
+
+    @property
+    def is_open(self):
+        """Whether the device is open."""
+        return self._open
+
+    def clocks(self):
+        """{source: DeviceClock or ArrivalClock} of those that something has come from."""
+        return dict(self._clocks)
+
+    def counts(self):
+        """{what: number} of all that was lost, refused or found odd, and of the samples."""
+        # Copied as wholes: the thread that polls may count something new in the meantime.
+        total = self.own_counts.copy()
+        total.update(self._device.counts.copy())
+        for sensor, check in self._sequences.items():
+            total.update({f'{what}: {sensor}': n for what, n in check.counts.copy().items() if n})
+        for clock in self.clocks().values():
+            total.update(clock.counts.copy())
+            total.update(clock.restarts.copy())
+        return total
+
+    def poll(self, timeout_s):
+        """What has come, as `MagSample`s and `AccelerationSample`s; [] after `timeout_s`.
+
+        Opens the device where it is not open and it is time to try. Never raises for
+        the device's sake: what is wrong stands in `trouble`.
+        """
+        if not self._open and not self._try_to_open(timeout_s):
+            return []
+        try:
+            arrivals = self._read(timeout_s)
+        except DeviceError as error:
+            self.own_counts['connections lost'] += 1
+            self._give_up(error)
+            return []
+        now = self._monotonic_ns()
+        if arrivals:
+            self._heard_ns, self._retry_s = now, self._settings.retry_s
+        elif self._settings.silent_s and now - self._heard_ns > self._settings.silent_s * 1e9:
+            self.own_counts['silent, so opened again'] += 1
+            self._give_up(f'nothing has come for {self._settings.silent_s:g} s')
+        if not arrivals:
+            return []
+        offset = self._wall_offset(now)
+        samples = [self._samples(a, offset) for a in arrivals]
+        return [s for some in samples for s in some]
+
+    def _read(self, timeout_s):
+        """What the device has, and what comes within `gather_s` after the first of it."""
+        arrivals = self._device.read(timeout_s)
+        if not arrivals or not self._settings.gather_s:
+            return arrivals
+        end = self._monotonic_ns() + round(self._settings.gather_s * 1e9)
+        while (left_ns := end - self._monotonic_ns()) > 0:
+            try:
+                arrivals += self._device.read(left_ns / 1e9)
+            except DeviceError:
+                # What has come goes on; the next read says so again.
+                break
+        return arrivals
+
+    def close(self):
+        """Close the device; the next `poll` opens it again."""
+        self._device.close()
+        self._open, self._retry_ns = False, None
+
+    def fail(self, error):
+        """Something else went wrong with the device: close it, and open it again after a while."""
+        self.own_counts['errors'] += 1
+        self._give_up(f'{type(error).__name__}: {error}')
+
+    def _try_to_open(self, timeout_s):
+        """Open the device if it is time to; whether it is open. Waits at most `timeout_s`."""
+        if self._retry_ns is not None:
+            wait_s = (self._retry_ns - self._monotonic_ns()) / 1e9
+            if wait_s > 0.0:
+                self._sleep(min(timeout_s, wait_s))
+                return False
+        try:
+            self._device.open()
+        except DeviceError as error:
+            self.own_counts['openings that failed'] += 1
+            self._give_up(error)
+            return False
+        self._open, self.trouble = True, ''
+        self._heard_ns = self._monotonic_ns()
+        return True
+
+    def _give_up(self, why):
+        """Close the device, and wait longer than the last time before it is opened again."""
+        self._device.close()
+        self._open, self.trouble = False, str(why)
+        self._retry_ns = self._monotonic_ns() + round(self._retry_s * 1e9)
+        self._retry_s = min(2.0 * self._retry_s, self._settings.longest_retry_s)
+
+    def _wall_offset(self, monotonic_ns):
+        """[ns] Time of day minus monotonic time; stamps follow where somebody sets the clock."""
+        offset = self._wall_ns() - monotonic_ns
+        if self._offset_ns is not None and abs(offset - self._offset_ns) > STEP_NS:
+            self.own_counts["steps of this machine's clock"] += 1
+        self._offset_ns = offset
+        return offset
+
+    def _samples(self, arrival, offset_ns):
+        """The samples of one reading."""
+        reading = arrival.reading
+        sensor = self._sensor_of(reading.sensor, arrival.source)
+        if sensor is None:
+            return []
+        if reading.sequence is not None and not self._sequences[sensor].is_new(
+                reading.sequence, reading[1:3]):
+            return []
+        stamp_ns = self._stamp(reading, arrival)
+        if stamp_ns is None:
+            return []
+        stamp_ns += offset_ns
+        out = []
+        if reading.field is not None:
+            self.own_counts[f'samples: {sensor}'] += 1
+            out.append(MagSample(stamp_ns, sensor, self._scale * np.array(reading.field)))
+        if reading.acceleration is not None:
+            out.append(AccelerationSample(
+                stamp_ns, sensor, self._acceleration_scale * np.array(reading.acceleration)))
+        return out
+
+    def _sensor_of(self, at_device, source):
+        """The network's name of a sensor; None for one that nobody has named."""
+        sensor = self.sensors.get(at_device) or self.sensors.get(source) or self.sensors.get('')
+        if sensor is None:
+            self.own_counts[f'of unknown sensors: {at_device or source}'[:80]] += 1
+        return sensor
+
+    def _stamp(self, reading, arrival):
+        """Monotonic ns of the measurement; None where no clock can tell."""
+        by = self._settings.stamp_by
+        ticks = reading.sequence if by == 'sequence' else reading.ticks
+        clock = self._clocks.get(arrival.source)
+        if clock is None:
+            without = by == 'arrival' or by == 'auto' and ticks is None
+            clock = (ArrivalClock if without else DeviceClock)(self._clock_settings)
+            self._clocks[arrival.source] = clock
+        if ticks is None and isinstance(clock, DeviceClock):
+            self.own_counts['readings without the time of the device'] += 1
+            return None
+        return clock.stamp(ticks, arrival.arrival_ns)
+
+
+def serve(driver, take, stopping):
+    """Hand what `driver` says to `take`, a function of a list of samples, until `stopping()`.
+
+    For a thread of its own. What is wrong stands in `driver.trouble`, also where `take` or
+    the device itself raises an error that it should not: nobody would see its thread die.
+    """
+    while not stopping():
+        try:
+            samples = driver.poll(POLL_S)
+            if samples:
+                take(samples)
+        except Exception as error:
+            driver.fail(error)
+    driver.close()

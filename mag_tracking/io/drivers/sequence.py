@@ -1,0 +1,73 @@
+"""What was lost on the way, by the count of readings that a device sends along."""
+
+from collections import Counter
+
+MEMORY = 1000
+"""Readings that are remembered. What is further behind is not late: the count has begun anew."""
+
+
+class SequenceCheck:
+    """Looks at the sequence numbers of one sensor."""
+
+    def __init__(self, wrap):
+        """`wrap` is the number at which the count goes back to 0; 0 = never."""
+        self._wrap = wrap
+        self.counts = Counter()
+        self._begin()
+
+    def _begin(self):
+        """A new count."""
+        self._last = None
+        self._seen, self._missing = {}, {}
+
+    def is_new(self, sequence, values):
+        """Whether the reading with this number and these `values` has not come before.
+
+        Counts what is missing; a late one is taken off again. A number that has come
+        already with other values is not a duplicate but a count begun anew.
+        """
+        if sequence < 0 or self._wrap and sequence >= self._wrap:
+            self.counts['sequence numbers out of range'] += 1
+            return True
+        ahead = 1 if self._last is None else self._ahead(sequence)
+        if ahead > 0:
+            self._skip(sequence, ahead - 1)
+        elif sequence in self._missing:
+            del self._missing[sequence]
+            self.counts['lost'] -= 1
+            self.counts['came late'] += 1
+        # As text, for a missing axis is NaN, which equals nothing.
+        elif repr(self._seen.get(sequence)) == repr(values):
+            self.counts['duplicates'] += 1
+            return False
+        else:
+            self.counts['sequence begun anew'] += 1
+            self._begin()
+            ahead = 1
+        if ahead > 0:
+            self._last = sequence
+        self._seen[sequence] = values
+        _shorten(self._seen)
+        return True
+
+    def _ahead(self, sequence):
+        """How far `sequence` is ahead of the last; negative where it is behind."""
+        ahead = sequence - self._last
+        if self._wrap:
+            ahead = (ahead + self._wrap // 2) % self._wrap - self._wrap // 2
+        return ahead
+
+    def _skip(self, sequence, n):
+        """Note that the `n` numbers before `sequence` have not come."""
+        if not n:
+            return
+        self.counts['lost'] += n
+        for number in range(sequence - min(n, MEMORY), sequence):
+            self._missing[number % self._wrap if self._wrap else number] = True
+        _shorten(self._missing)
+
+
+def _shorten(memory):
+    """Forget the oldest of a dict."""
+    while len(memory) > MEMORY:
+        del memory[next(iter(memory))]
