@@ -21,10 +21,16 @@ def stop(processes):
 
 
 def call(ros, kind, name, request):
-    """The response of a service."""
+    """The response of a service; asked again where none comes.
+
+    A client that finds a server is not yet known to it, and a response to nobody is dropped by
+    the middleware.
+    """
     node, spin_until = ros
     client = node.create_client(kind, name)
-    assert spin_until(client.service_is_ready)
-    future = client.call_async(request)
-    assert spin_until(future.done)
-    return future.result()
+    assert spin_until(client.service_is_ready), f'there is no {name}'
+    for _ in range(6):
+        future = client.call_async(request)
+        if spin_until(future.done, 5.0):
+            return future.result()
+    raise AssertionError(f'{name} has not answered')

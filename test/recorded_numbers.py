@@ -5,15 +5,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from mag_tracking.io.bag import Recording
+from mag_tracking.io.message_types import MAGNETIC_FIELD, decode, definition, encoder
 from mag_tracking.io.recorder import Recorder
-from mag_tracking.io.schema import (
-    MAGNETIC_FIELD,
-    decode,
-    definition,
-    encoder,
-    sample_dict,
-    stamp_ns,
-)
+from mag_tracking.io.schema import sample_dict, stamp_ns
 from mag_tracking.records import MagSample
 
 TOPIC = '/mag_1/imu/mag'

@@ -12,17 +12,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.io.bag import Recording, RecordingWriter
+from mag_tracking.io.message_types import DEFINITIONS, MAGNETIC_FIELD, TRACK_ARRAY, decode
 from mag_tracking.io.samples import SampleReader
-from mag_tracking.io.schema import (
-    DEFINITIONS,
-    MAGNETIC_FIELD,
-    TRACK_ARRAY,
-    decode,
-    header_dict,
-    sample_dict,
-    sample_of,
-    track_dict,
-)
+from mag_tracking.io.schema import header_dict, sample_dict, sample_of, track_dict
 from mag_tracking.records import MagSample
 
 JUNCTION = 'junction_left_to_right'

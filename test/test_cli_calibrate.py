@@ -13,9 +13,10 @@ from conftest import DATA, NETWORK_FILE, vehicle_path
 
 from mag_tracking.cli import main
 from mag_tracking.io.bag import Recording, RecordingWriter
+from mag_tracking.io.message_types import MAGNETIC_FIELD
 from mag_tracking.io.network_file import read_network, write_network
 from mag_tracking.io.samples import SampleReader
-from mag_tracking.io.schema import MAGNETIC_FIELD, sample_dict
+from mag_tracking.io.schema import sample_dict
 from mag_tracking.records import MagSample
 
 ROAD = vehicle_path('straight_car_right')

@@ -9,8 +9,9 @@ from conftest import DATA, NETWORK_FILE, VEHICLES, line_network, vehicle_path
 from mag_tracking.cli import main
 from mag_tracking.doctoring import Doctor, examine
 from mag_tracking.io.bag import Recording, RecordingWriter
+from mag_tracking.io.message_types import MAGNETIC_FIELD
 from mag_tracking.io.network_file import read_network
-from mag_tracking.io.schema import MAGNETIC_FIELD, sample_dict
+from mag_tracking.io.schema import sample_dict
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import MagSample
 from mag_tracking.stages.health import WINDOW, SensorHealth

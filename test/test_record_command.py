@@ -18,8 +18,8 @@ from sensor_msgs.msg import MagneticField
 from mag_tracking.cli import record
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.io.bag import Recording
+from mag_tracking.io.message_types import decode
 from mag_tracking.io.recorder import Recorder
-from mag_tracking.io.schema import decode
 from mag_tracking.nodes import record_node
 from mag_tracking.nodes.record_node import Selection
 

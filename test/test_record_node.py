@@ -13,8 +13,8 @@ from sensor_msgs.msg import Imu, MagneticField
 from std_msgs.msg import Header
 
 from mag_tracking.io.bag import Recording
+from mag_tracking.io.message_types import decode
 from mag_tracking.io.recorder import Recorder
-from mag_tracking.io.schema import decode
 from mag_tracking.nodes import record_node
 from mag_tracking.nodes.record_node import RecordNode, Selection
 from mag_tracking.nodes.stage_node import LATCHED, STREAM

@@ -21,8 +21,8 @@ from sensor_msgs.msg import MagneticField
 from std_srvs.srv import Trigger
 
 from mag_tracking.io.bag import Recording
+from mag_tracking.io.message_types import decode
 from mag_tracking.io.recording_repair import repair
-from mag_tracking.io.schema import decode
 from mag_tracking.nodes import record_node
 from mag_tracking.nodes.stage_node import STREAM
 from mag_tracking.offline import replay

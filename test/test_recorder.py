@@ -10,9 +10,9 @@ from rosbags.rosbag2 import Reader
 
 from mag_tracking.errors import OutputError
 from mag_tracking.io.bag import Recording
+from mag_tracking.io.message_types import MAGNETIC_FIELD, definition, encoder
 from mag_tracking.io.recorder import FLUSH_NS, Recorder
 from mag_tracking.io.rosbag2_folder import offered_qos
-from mag_tracking.io.schema import MAGNETIC_FIELD, definition, encoder
 
 
 def test_what_is_recorded_is_read_by_others(tmp_path):

@@ -12,8 +12,8 @@ from recorded_numbers import TOPIC, S, by_rosbags, field, numbers, started
 
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.io.bag import Recording
+from mag_tracking.io.message_types import MAGNETIC_FIELD, definition
 from mag_tracking.io.recording_repair import finish_file, repair
-from mag_tracking.io.schema import MAGNETIC_FIELD, definition
 
 
 def torn_recording(tmp_path, tick=True):

@@ -3,7 +3,17 @@
 import argparse
 import sys
 
-from mag_tracking.cli import calibrate, doctor, fit, geometry, plan, record, recordings, replay
+from mag_tracking.cli import (
+    calibrate,
+    doctor,
+    fit,
+    geometry,
+    listen,
+    plan,
+    record,
+    recordings,
+    replay,
+)
 from mag_tracking.errors import MagTrackingError
 
 
@@ -12,7 +22,7 @@ def _parser():
     parser = argparse.ArgumentParser(
         prog='mag-tracking', description='Track magnetic targets with stationary magnetometers.')
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
-    for module in (replay, calibrate, geometry, doctor, fit, plan, record, recordings):
+    for module in (replay, calibrate, geometry, doctor, fit, plan, listen, record, recordings):
         module.add(commands)
     return parser
 

@@ -8,11 +8,12 @@ from mag_tracking.io.network_file import read_network
 
 _RUN = '''
 Starts calibration, detection and tracker nodes in one process, and with a
-RECORDING the replay node as well. Drivers publish sensor_msgs/MagneticField on
-the topics of the network file. Ctrl-C ends it.
+RECORDING the replay node, with DRIVERS the driver node as well. Drivers of your
+own publish sensor_msgs/MagneticField on the topics of the network file. Ctrl-C
+ends it.
 
 examples:
-  mag-tracking run --network config/network.yaml
+  mag-tracking run --network config/network.yaml --drivers config/drivers.yaml
   mag-tracking run --network config/network.yaml --recording junction.mcap --rate 2
 '''
 
@@ -33,6 +34,11 @@ def add(commands):
     add_network(p)
     add_settings(p)
     p.add_argument('--recording', type=Path, metavar='RECORDING', help='replay this, too')
+    p.add_argument('--drivers', type=Path, metavar='DRIVERS',
+                   help='run the devices of this drivers file, too')
+    p.add_argument('--batches', action='store_true',
+                   help='the drivers put readings of many sensors in one message, which dozens of '
+                   'sensors need')
     p.add_argument('--rate', type=float, default=1.0, help='speed of the replay (default: 1)')
     p.add_argument('--loop', action='store_true', help='begin again at the end')
 
@@ -58,7 +64,8 @@ def _run(args):
     read_network(args.network)
     if args.recording:
         Recording(args.recording)
-    return run(args.network, settings, args.recording, args.rate, args.loop)
+    return run(args.network, settings, args.recording, args.rate, args.loop,
+               drivers=args.drivers, batches=args.batches)
 
 
 def _info(args):

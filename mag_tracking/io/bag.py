@@ -22,7 +22,7 @@ from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from mag_tracking.errors import OutputError, RecordingError
-from mag_tracking.io.schema import definition, encoder
+from mag_tracking.io.message_types import definition, encoder
 
 _DAMAGE = (McapError, CRCValidationError, ValueError, KeyError, EOFError, struct.error,
            zlib.error, zstandard.ZstdError, RuntimeError, UnicodeDecodeError, MemoryError)

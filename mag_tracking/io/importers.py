@@ -8,8 +8,9 @@ import numpy as np
 from mag_tracking.errors import RecordingError
 from mag_tracking.geometry import quaternion_from_rotation_vector, rotation_from_quaternion
 from mag_tracking.io.bag import RecordingWriter
+from mag_tracking.io.message_types import MAGNETIC_FIELD, POSE
 from mag_tracking.io.network_file import write_network
-from mag_tracking.io.schema import MAGNETIC_FIELD, POSE, pose_dict, sample_dict
+from mag_tracking.io.schema import pose_dict, sample_dict
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import MagSample
 

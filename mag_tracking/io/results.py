@@ -9,13 +9,8 @@ import numpy as np
 
 from mag_tracking.errors import OutputError
 from mag_tracking.io.bag import RecordingWriter
-from mag_tracking.io.schema import (
-    POSE_WITH_COVARIANCE,
-    TRACK_ARRAY,
-    header_dict,
-    pose_with_covariance_dict,
-    track_dict,
-)
+from mag_tracking.io.message_types import POSE_WITH_COVARIANCE, TRACK_ARRAY
+from mag_tracking.io.schema import header_dict, pose_with_covariance_dict, track_dict
 
 POSE_COLUMNS = ('stamp_ns', 'track_id', 'x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z',
                 'sd_vx', 'sd_vy', 'sd_vz', 'mx', 'my', 'mz', 'weight', 'ambiguous',

@@ -5,15 +5,15 @@ from collections import Counter
 import numpy as np
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.io.schema import (
+from mag_tracking.io.message_types import (
+    FIELD_READINGS,
     IMU,
     MAGNETIC_FIELD,
     POSE,
-    acceleration_of,
+    RAW_READINGS,
     decode,
-    sample_of,
-    stamp_ns,
 )
+from mag_tracking.io.schema import acceleration_of, sample_of, samples_of, stamp_ns
 
 TRUTH_PREFIX = '/ground_truth/'
 """Poses on topics below this are truth: for reports, never for tracking."""
@@ -39,7 +39,8 @@ class SampleReader:
                 self._imus.setdefault(topic, []).append(name)
         self.rejected = Counter()
         self.truth = {}
-        if recording.types and not any(t in recording.types for t in self._sensors):
+        if recording.types and not any(t in recording.types for t in (*self._sensors,
+                                                                      RAW_READINGS)):
             fields = sorted(t for t, k in recording.types.items() if k == MAGNETIC_FIELD)
             raise RecordingError(
                 f'{recording.path} has none of the network\'s topics ({", ".join(self._sensors)}); '
@@ -51,7 +52,9 @@ class SampleReader:
                                      f'not {MAGNETIC_FIELD}')
 
     def missing_topics(self):
-        """The network's topics that are not in the recording."""
+        """The network's topics that are not in the recording; none where readings came together."""
+        if RAW_READINGS in self._recording.types:
+            return []
         return [t for t in self._sensors if t not in self._recording.types]
 
     def samples(self, progress=None):
@@ -71,21 +74,34 @@ class SampleReader:
         for message in self._recording.messages(progress=progress):
             sensor = self._sensors.get(message.topic)
             truth = message.topic.startswith(TRUTH_PREFIX) and message.type == POSE
+            many = message.topic == RAW_READINGS and message.type == FIELD_READINGS
             shaken = imus.get(message.topic) if message.type == IMU else None
-            if sensor is None and shaken is None and not truth:
+            if sensor is None and shaken is None and not truth and not many:
                 continue
             try:
                 content = decode(message)
+                readings = samples_of(content) if many else ()
             except RecordingError:
                 self.rejected[f'undecodable message on {message.topic}'] += 1
                 continue
             if truth:
                 self._add_truth(message.topic, content)
+            elif many:
+                yield from ((s, message.log_time_ns) for s in self._of_network(readings))
             elif shaken is not None:
                 for name in shaken:
                     yield acceleration_of(content, name), message.log_time_ns
             else:
                 yield sample_of(content, sensor), message.log_time_ns
+
+    def _of_network(self, samples):
+        """Those of the network's sensors; the others are counted."""
+        known = set(self._sensors.values())
+        for sample in samples:
+            if sample.sensor in known:
+                yield sample
+            else:
+                self.rejected[f'reading of {sample.sensor}, which is not in the network'] += 1
 
     def _add_truth(self, topic, content):
         """Keep a pose for the report."""

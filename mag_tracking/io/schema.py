@@ -1,122 +1,15 @@
-"""Records to and from messages, as nested dicts and CDR bytes, without ROS.
+"""Records to and from messages, as nested dicts, without ROS."""
 
-The definitions of this package's own messages stand in `msg_defs/`; the copy
-here is what a recording carries, and a test compares the two.
-"""
-
-import functools
-import struct
+from array import array
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap_ros2 import _dynamic
-from mcap_ros2.decoder import DecoderFactory
 
 from mag_tracking.errors import RecordingError
 from mag_tracking.geometry import rotation_from_quaternion
 from mag_tracking.records import AccelerationSample, FieldFrame, MagSample
 
-MAGNETIC_FIELD = 'sensor_msgs/msg/MagneticField'
-IMU = 'sensor_msgs/msg/Imu'
-POSE = 'geometry_msgs/msg/PoseStamped'
-POSE_WITH_COVARIANCE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
-TRACK_ARRAY = 'mag_tracking_msgs/msg/TrackArray'
-
 LONGEST_OFFSET_S = 60.0
 """[s] The longest frame there can be (`align.period_s`)."""
-
-DEFINITIONS = {
-    'builtin_interfaces/msg/Time': ((), 'int32 sec\nuint32 nanosec\n'),
-    'std_msgs/msg/Header': (('builtin_interfaces/msg/Time',),
-                            'builtin_interfaces/Time stamp\nstring frame_id\n'),
-    'geometry_msgs/msg/Vector3': ((), 'float64 x\nfloat64 y\nfloat64 z\n'),
-    'geometry_msgs/msg/Point': ((), 'float64 x\nfloat64 y\nfloat64 z\n'),
-    'geometry_msgs/msg/Quaternion': (
-        (), 'float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n'),
-    'geometry_msgs/msg/Pose': (
-        ('geometry_msgs/msg/Point', 'geometry_msgs/msg/Quaternion'),
-        'geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n'),
-    'geometry_msgs/msg/PoseWithCovariance': (
-        ('geometry_msgs/msg/Pose',), 'geometry_msgs/Pose pose\nfloat64[36] covariance\n'),
-    POSE: (('std_msgs/msg/Header', 'geometry_msgs/msg/Pose'),
-           'std_msgs/Header header\ngeometry_msgs/Pose pose\n'),
-    POSE_WITH_COVARIANCE: (
-        ('std_msgs/msg/Header', 'geometry_msgs/msg/PoseWithCovariance'),
-        'std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose\n'),
-    MAGNETIC_FIELD: (
-        ('std_msgs/msg/Header', 'geometry_msgs/msg/Vector3'),
-        'std_msgs/Header header\ngeometry_msgs/Vector3 magnetic_field\n'
-        'float64[9] magnetic_field_covariance\n'),
-    'mag_tracking_msgs/msg/Track': (
-        ('std_msgs/msg/Header', 'geometry_msgs/msg/PoseWithCovariance',
-         'geometry_msgs/msg/Vector3'),
-        'uint8 ACTIVE=0\nuint8 ENDED=1\nstd_msgs/Header header\nuint32 id\nuint8 status\n'
-        'geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/Vector3 velocity\n'
-        'float64[36] covariance\ngeometry_msgs/Vector3 moment\nfloat64[9] moment_covariance\n'
-        'float64 existence\nfloat64 weight\nfloat64 normalised_innovation\n'
-        'float64[] innovation_by_sensor\nuint32 degrees_of_freedom\nstring arrival\nstring kind\n'
-        'float64 kind_weight\nfloat64 length\nfloat64 length_std\nbool ambiguous\n'
-        'bool[6] unobservable\n'
-        'float64[] predicted_field\nfloat64[] mounting\nfloat64[] mounting_covariance\n'),
-    TRACK_ARRAY: (('std_msgs/msg/Header', 'mag_tracking_msgs/msg/Track'),
-                  'std_msgs/Header header\nmag_tracking_msgs/Track[] tracks\n'),
-}
-"""{type: (types that it names, text)}; Jazzy's definitions without comments."""
-
-
-def _closure(type_name):
-    """The types below `type_name`, each once, in the order met."""
-    seen = []
-    queue = list(DEFINITIONS[type_name][0])
-    while queue:
-        name = queue.pop(0)
-        if name not in seen:
-            seen.append(name)
-            queue += DEFINITIONS[name][0]
-    return seen
-
-
-def definition(type_name):
-    """The text of a type with all that it needs, as a `ros2msg` schema has it.
-
-    Raises RecordingError for a type that is not defined here.
-    """
-    if type_name not in DEFINITIONS:
-        raise RecordingError(f'no definition of {type_name} to write it with')
-    text = DEFINITIONS[type_name][1]
-    for name in _closure(type_name):
-        package, _, leaf = name.split('/')
-        text += f'{"=" * 80}\nMSG: {package}/{leaf}\n{DEFINITIONS[name][1]}'
-    return text
-
-
-@functools.cache
-def encoder(type_name):
-    """Function from nested dicts to CDR bytes."""
-    # The library offers this function only through its own writer, which cannot
-    # write channel metadata; the version is pinned, so this private name is safe.
-    return _dynamic.serialize_dynamic(type_name, definition(type_name))[type_name]
-
-
-_decoders = {}
-_DECODE_ERRORS = (ValueError, IndexError, KeyError, OverflowError, struct.error, McapError)
-
-
-def decode(message):
-    """A `RawMessage` as an object with the fields of its type.
-
-    Raises RecordingError where the bytes do not fit the type.
-    """
-    key = message.schema.name, message.schema.data
-    try:
-        if key not in _decoders:
-            _decoders[key] = DecoderFactory().decoder_for('cdr', message.schema)
-        if _decoders[key] is None:
-            raise ValueError(f'its schema is in {message.schema.encoding}, not in ros2msg')
-        return _decoders[key](message.data)
-    except _DECODE_ERRORS as error:
-        raise RecordingError(f'a message on {message.topic} is not a {message.type}: '
-                             f'{error}') from error
 
 
 def stamp_ns(stamp):
@@ -167,6 +60,53 @@ def sample_dict(sample, frame):
     C = np.zeros(9) if sample.covariance is None else sample.covariance.ravel()
     return {'header': header_dict(sample.stamp_ns, frame), 'magnetic_field': xyz(sample.field),
             'magnetic_field_covariance': C.tolist()}
+
+
+def readings_dict(samples):
+    """mag_tracking_msgs/FieldReadings of `MagSample`s, whose covariances are all known or none.
+
+    Raises RecordingError where some are known, or there is no sample at all.
+    """
+    known = [s.covariance is not None for s in samples]
+    if not samples or any(known) != all(known):
+        raise RecordingError('readings in one message: expected some, and the covariance of all '
+                             'or of none')
+    names = list(dict.fromkeys(s.sensor for s in samples))
+    rows = {name: j for j, name in enumerate(names)}
+    covariance = np.array([s.covariance for s in samples]) if known[0] else np.zeros(0)
+    # As array.array a message takes them as they are; a list is looked at number by number.
+    return {'header': header_dict(max(s.stamp_ns for s in samples), ''), 'sensors': names,
+            'sensor': array('H', [rows[s.sensor] for s in samples]),
+            'stamp': array('q', [s.stamp_ns for s in samples]),
+            'field': array('d', np.array([s.field for s in samples], dtype=float).tobytes()),
+            'covariance': array('d', covariance.tobytes())}
+
+
+def samples_of(message):
+    """[`MagSample`] of a message-shaped FieldReadings; raises RecordingError where it is none."""
+    n, names = len(message.sensor), tuple(message.sensors)
+    sizes = len(message.stamp), len(message.field), len(message.covariance)
+    if sizes not in ((n, 3 * n, 0), (n, 3 * n, 9 * n)):
+        raise RecordingError(f'{n} readings with {sizes[0]} stamps, {sizes[1]} numbers of their '
+                             f'fields and {sizes[2]} of their covariances')
+    if max(message.sensor, default=-1) >= len(names):
+        raise RecordingError(f'a reading of sensor {max(message.sensor)} of {len(names)}')
+    field = np.array(message.field, dtype=float).reshape(n, 3)
+    covariance = [None] * n if not len(message.covariance) else \
+        np.array(message.covariance, dtype=float).reshape(n, 3, 3)
+    return [MagSample(stamp, names[j], B, C) for j, stamp, B, C in zip(
+        message.sensor, message.stamp, field, covariance, strict=True)]
+
+
+def acceleration_dict(sample, frame):
+    """sensor_msgs/Imu of an `AccelerationSample`; `frame` is the sensor's.
+
+    Its deviations are unknown, and of orientation and angular velocity there is nothing.
+    """
+    nothing = [-1.0] + 8 * [0.0]
+    return {'header': header_dict(sample.stamp_ns, frame),
+            'orientation_covariance': nothing, 'angular_velocity_covariance': nothing,
+            'linear_acceleration': xyz(sample.acceleration)}
 
 
 def pose_dict(ns, frame, position, quaternion):

@@ -5,15 +5,22 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from mag_tracking_msgs.msg import CalibrationState
+from mag_tracking_msgs.msg import CalibrationState, FieldReadings
 from mag_tracking_msgs.srv import Calibrate as CalibrateService
 from mag_tracking_msgs.srv import Survey as SurveyService
 from sensor_msgs.msg import Imu, MagneticField
 
-from mag_tracking.errors import NetworkError, OutputError
+from mag_tracking.errors import NetworkError, OutputError, RecordingError
 from mag_tracking.io.calibration_state import calibration_dict
+from mag_tracking.io.message_types import CALIBRATED_READINGS, RAW_READINGS
 from mag_tracking.io.network_file import write_network
-from mag_tracking.io.schema import acceleration_of, sample_dict, sample_of
+from mag_tracking.io.schema import (
+    acceleration_of,
+    readings_dict,
+    sample_dict,
+    sample_of,
+    samples_of,
+)
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
@@ -43,6 +50,8 @@ class CalibrationNode(StageNode):
         for sensor, topic in zip(self.network.names, self.network.imu_topics, strict=True):
             if topic is not None:
                 self.subscription(Imu, topic, partial(self._shaken, sensor), self.input_qos)
+        self._readings = self.publisher(FieldReadings, CALIBRATED_READINGS, STREAM)
+        self.subscription(FieldReadings, RAW_READINGS, self._take_many, STREAM)
         self._state = self.publisher(CalibrationState, '~/calibration', LATCHED)
         self._published = None
         self.create_timer(1.0, self._publish_state)
@@ -57,11 +66,27 @@ class CalibrationNode(StageNode):
 
     def _take(self, sensor, message):
         """One raw reading."""
-        raw = sample_of(message, sensor)
-        self._health.add(raw, self.get_clock().now().nanoseconds)
-        for sample in self._stage.feed(raw):
+        for sample in self._calibrated(sample_of(message, sensor)):
             self._publishers_by_sensor[sensor].publish(
                 to_message(MagneticField, sample_dict(sample, message.header.frame_id)))
+
+    def _take_many(self, message):
+        """Raw readings of many sensors; they go on together."""
+        try:
+            raw = samples_of(message)
+        except RecordingError as error:
+            self._stage.counts['rejected: bad readings'] += 1
+            self.get_logger().error(str(error), throttle_duration_sec=10.0)
+            return
+        samples = [s for r in raw for s in self._calibrated(r)]
+        if samples:
+            self._readings.publish(to_message(FieldReadings, readings_dict(samples)))
+
+    def _calibrated(self, raw):
+        """What the stage makes of one raw reading."""
+        if raw.sensor in self._publishers_by_sensor:
+            self._health.add(raw, self.get_clock().now().nanoseconds)
+        return self._stage.feed(raw)
 
     def _shaken(self, sensor, message):
         """One acceleration."""

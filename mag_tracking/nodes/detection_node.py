@@ -4,10 +4,12 @@ import sys
 from functools import partial
 
 from mag_tracking_msgs.msg import Detection as DetectionMessage
-from mag_tracking_msgs.msg import NetworkFrame
+from mag_tracking_msgs.msg import FieldReadings, NetworkFrame
 from sensor_msgs.msg import MagneticField
 
-from mag_tracking.io.schema import detection_dict, frame_dict, sample_of
+from mag_tracking.errors import RecordingError
+from mag_tracking.io.message_types import CALIBRATED_READINGS
+from mag_tracking.io.schema import detection_dict, frame_dict, sample_of, samples_of
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
@@ -30,13 +32,29 @@ class DetectionNode(StageNode):
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self.subscription(MagneticField, f'{topic}_calibrated', partial(self._take, sensor),
                               STREAM)
+        self.subscription(FieldReadings, CALIBRATED_READINGS, self._take_many, STREAM)
 
     def stages(self):
         return {'align': self._align, 'detect': self._detect}
 
     def _take(self, sensor, message):
         """One calibrated reading."""
-        for frame in self._align.feed(sample_of(message, sensor)):
+        self._feed(sample_of(message, sensor))
+
+    def _take_many(self, message):
+        """Calibrated readings of many sensors."""
+        try:
+            samples = samples_of(message)
+        except RecordingError as error:
+            self._align.counts['rejected: bad readings'] += 1
+            self.get_logger().error(str(error), throttle_duration_sec=10.0)
+            return
+        for sample in samples:
+            self._feed(sample)
+
+    def _feed(self, sample):
+        """One sample through the stages."""
+        for frame in self._align.feed(sample):
             for record in self._detect.feed(frame):
                 if isinstance(record, Detection):
                     self._detections.publish(to_message(

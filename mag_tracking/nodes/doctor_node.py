@@ -1,16 +1,20 @@
 """The doctor on a live system: listens to the sensors' topics for a while."""
 
 import time
+from collections import Counter
 from functools import partial
 
 import rclpy
+from mag_tracking_msgs.msg import FieldReadings
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import MagneticField
 
 from mag_tracking.doctoring import Doctor
-from mag_tracking.io.schema import sample_of
-from mag_tracking.nodes.stage_node import SENSORS, make_executor, spin
+from mag_tracking.errors import RecordingError
+from mag_tracking.io.message_types import RAW_READINGS
+from mag_tracking.io.schema import sample_of, samples_of
+from mag_tracking.nodes.stage_node import SENSORS, STREAM, make_executor, spin
 from mag_tracking.stages.health import Finding
 
 
@@ -22,18 +26,33 @@ class DoctorNode(Node):
         self.doctor = Doctor(network, settings)
         for sensor, topic in zip(network.names, network.topics, strict=True):
             self.create_subscription(MagneticField, topic, partial(self._take, sensor), SENSORS)
+        self._in_batches, self._bad = set(), Counter()
+        self.create_subscription(FieldReadings, RAW_READINGS, self._take_many, STREAM)
 
     def _take(self, sensor, message):
         """One reading."""
         self.doctor.feed(sample_of(message, sensor), time.time_ns())
 
+    def _take_many(self, message):
+        """Readings of many sensors; of those in the network."""
+        try:
+            samples = samples_of(message)
+        except RecordingError as error:
+            self._bad[str(error)] += 1
+            return
+        for sample in samples:
+            if sample.sensor in self.doctor.network.names:
+                self._in_batches.add(sample.sensor)
+                self.doctor.feed(sample, time.time_ns())
+
     def findings(self):
         """What only the graph tells: list of `Finding`."""
-        found = []
+        found = [Finding(True, RAW_READINGS, f'{n} messages that are none: {error}', 'look at the '
+                         'driver that publishes it') for error, n in self._bad.items()]
         network = self.doctor.network
         for sensor, topic in zip(network.names, network.topics, strict=True):
             publishers = self.get_publishers_info_by_topic(topic)
-            if not publishers:
+            if not publishers and sensor not in self._in_batches:
                 found.append(Finding(True, sensor, f'nobody publishes {topic}', 'start its driver, '
                                      'and compare its topic with the network file'))
             elif len(publishers) > 1:

@@ -14,20 +14,24 @@ from rclpy.signals import SignalHandlerOptions
 from tqdm import tqdm
 
 from mag_tracking.interrupts import noted_signals
+from mag_tracking.io.message_types import (
+    FIELD_READINGS,
+    IMU,
+    MAGNETIC_FIELD,
+    RAW_READINGS,
+)
 from mag_tracking.io.recorder import Recorder
 from mag_tracking.io.rosbag2_folder import offered_qos
-from mag_tracking.io.schema import MAGNETIC_FIELD
 from mag_tracking.nodes.convert import message_class
 from mag_tracking.nodes.definitions import definition_of
 
-IMU = 'sensor_msgs/msg/Imu'
 POLL_S = 0.02
 """How often messages are fetched [s]."""
 DISCOVER_S = 0.5
 """How often topics are looked for [s]."""
 LINE_S = 10.0
 """Time between two lines of progress where there is no terminal [s]."""
-DEPTHS = {MAGNETIC_FIELD: 1000, IMU: 1000}
+DEPTHS = {MAGNETIC_FIELD: 1000, IMU: 1000, FIELD_READINGS: 1000}
 """Messages that may wait between two fetches (a disk may stall for a second or more)."""
 OTHER_DEPTH = 100
 """The same of other types: images are large."""
@@ -47,7 +51,7 @@ class Selection(NamedTuple):
 
     def wants(self, topic):
         """Whether to record a topic."""
-        if topic in self.fields + self.imus + self.topics:
+        if topic == RAW_READINGS or topic in self.fields + self.imus + self.topics:
             return True
         # ROS hides what has a part that begins with an underscore, and so does rosbag2.
         if self.everything and '/_' not in topic:

@@ -12,7 +12,7 @@ from std_srvs.srv import Trigger
 
 from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.io.bag import Recording
-from mag_tracking.io.schema import MAGNETIC_FIELD
+from mag_tracking.io.message_types import MAGNETIC_FIELD
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import message_class
 from mag_tracking.nodes.stage_node import STREAM

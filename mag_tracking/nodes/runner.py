@@ -3,6 +3,7 @@
 import signal
 import sys
 import time
+from functools import partial
 
 import rclpy
 from mag_tracking_msgs.msg import TrackArray
@@ -15,6 +16,7 @@ from mag_tracking.interrupts import noted_signals
 from mag_tracking.nodes.calibration_node import CalibrationNode
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.detection_node import DetectionNode
+from mag_tracking.nodes.driver_node import DriverNode
 from mag_tracking.nodes.replay_node import ReplayNode
 from mag_tracking.nodes.stage_node import STREAM, make_executor, spin
 from mag_tracking.nodes.tracker_node import TrackerNode
@@ -65,6 +67,13 @@ def parameters(network_path, settings, reliable):
                   for p in flatten(settings)]
 
 
+def driver_node(drivers_path, network_path, batches):
+    """The driver node; it begins at once."""
+    return DriverNode(parameter_overrides=[
+        Parameter('drivers', value=str(drivers_path)),
+        Parameter('network', value=str(network_path)), Parameter('batches', value=batches)])
+
+
 def make_nodes(network_path, settings, recording=None, rate=1.0, loop=False):
     """(stage nodes, replay node or None), ready to be added to an executor.
 
@@ -91,7 +100,8 @@ def all_connected(stages, replay):
     return all(p.get_subscription_count() > 0 for p in raw + calibrated + frames)
 
 
-def run(network_path, settings, recording=None, rate=1.0, loop=False, observers=()):
+def run(network_path, settings, recording=None, rate=1.0, loop=False, observers=(), drivers=None,
+        batches=False):
     """Run the nodes until Ctrl-C, or until the recording has been played and worked off.
 
     Parameters
@@ -103,10 +113,17 @@ def run(network_path, settings, recording=None, rate=1.0, loop=False, observers=
     loop : bool
     observers : nodes to run beside, created after `rclpy.init`, given as functions;
         a `TrackPrinter` if there are none.
+    drivers : path, optional
+        A drivers file: run its devices as well.
+    batches : bool
+        Readings of many sensors go in one message.
 
     Returns the exit status.
     """
     with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
+        # The driver node comes last, when there is somebody to hear it.
+        observers = [*(observers or (TrackPrinter,)), *(
+            [partial(driver_node, drivers, network_path, batches)] if drivers else [])]
         return _run_until(lambda: bool(seen), network_path, settings, recording, rate, loop,
                           observers)
 
@@ -117,7 +134,7 @@ def _run_until(stopped, network_path, settings, recording, rate, loop, observers
     executor, nodes = make_executor(), []
     try:
         stages, replay = make_nodes(network_path, settings, recording, rate, loop)
-        nodes = stages + [make() for make in observers or (TrackPrinter,)]
+        nodes = stages + [make() for make in observers]
         nodes += [replay] if replay else []
         for node in nodes:
             executor.add_node(node)

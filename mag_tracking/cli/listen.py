@@ -1,0 +1,104 @@
+"""mag-tracking listen."""
+
+import math
+import signal
+import threading
+import time
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+
+from mag_tracking.cli.options import add_command, add_network
+from mag_tracking.errors import SettingsError
+from mag_tracking.interrupts import noted_signals
+from mag_tracking.io.drivers.configuration import read_drivers
+from mag_tracking.io.drivers.driver import serve
+from mag_tracking.io.network_file import read_network
+from mag_tracking.records import MagSample
+
+_LISTEN = '''
+Opens the devices of a drivers file and prints what they say, once a second:
+each sensor's rate, its field and what was lost; each device's trouble. No ROS is
+needed: it is the first thing to try with a new cable. Ctrl-C ends it. The exit
+status is 1 where a sensor has said nothing.
+
+examples:
+  mag-tracking listen config/drivers.yaml
+  mag-tracking listen roadside.yaml --network site.yaml --seconds 10
+'''
+
+
+def add(commands):
+    """Register the command."""
+    p = add_command(commands, 'listen', _listen, 'Print what the devices of a drivers file say.',
+                    _LISTEN)
+    p.add_argument('drivers', type=Path, metavar='DRIVERS', help='which devices there are')
+    add_network(p, False, 'compare with its sensors')
+    p.add_argument('--seconds', type=float, default=math.inf, metavar='N',
+                   help='end after so long (default: at Ctrl-C)')
+
+
+class _Ear:
+    """Keeps one driver going in a thread, and what it said in the last second."""
+
+    def __init__(self, driver):
+        self.driver = driver
+        self._heard = {sensor: deque(maxlen=20_000) for sensor in driver.sensors.values()}
+        self.silent = set(self._heard)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=serve, daemon=True, args=(
+            driver, self._take, self._stop.is_set))
+        self._thread.start()
+
+    def _take(self, samples):
+        """Keep the fields."""
+        for sample in samples:
+            if isinstance(sample, MagSample):
+                self._heard[sample.sensor].append(sample)
+
+    def stop(self):
+        """Close the device."""
+        self._stop.set()
+        self._thread.join(10.0)
+
+    def lines(self, elapsed_s):
+        """What was said since the last time."""
+        counts = self.driver.counts()
+        odd = ', '.join(f'{what}: {n}' for what, n in sorted(counts.items())
+                        if not what.startswith('samples: '))
+        state = 'open' if self.driver.is_open else self.driver.trouble or 'not open yet'
+        out = [f'{self.driver.name}: {state}' + (f'  ({odd})' if odd else '')]
+        for sensor, heard in self._heard.items():
+            samples = [heard.popleft() for _ in range(len(heard))]
+            if not samples:
+                out.append(f'  {sensor:12s} nothing')
+                continue
+            self.silent.discard(sensor)
+            x, y, z = 1e6 * np.mean([s.field for s in samples], axis=0)
+            behind_ms = (time.time_ns() - samples[-1].stamp_ns) / 1e6
+            out.append(f'  {sensor:12s} {len(samples) / elapsed_s:7.1f} Hz  '
+                       f'{x:9.3f} {y:9.3f} {z:9.3f} uT  |B| {math.hypot(x, y, z):8.3f}  '
+                       f'latest {behind_ms:.0f} ms ago')
+        return out
+
+
+def _listen(args):
+    """mag-tracking listen."""
+    if not args.seconds > 0.0:
+        raise SettingsError(f'--seconds: {args.seconds:g} is not a number above 0')
+    network = read_network(args.network) if args.network else None
+    ears = [_Ear(driver) for driver in read_drivers(args.drivers, network)]
+    end = time.monotonic() + args.seconds
+    last = time.monotonic()
+    with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
+        while not seen and last < end:
+            while not seen and time.monotonic() < min(last + 1.0, end):
+                time.sleep(0.02)
+            now = time.monotonic()
+            for line in [line for ear in ears for line in ear.lines(now - last)]:
+                print(line, flush=True)
+            last = now
+    for ear in ears:
+        ear.stop()
+    return int(any(ear.silent for ear in ears))

@@ -1,0 +1,54 @@
+"""The health of the drivers as diagnostics."""
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+
+HARMLESS = ('samples: ', 'came late: ', 'other messages: ')
+"""What begins so is counted, but nothing to be warned of."""
+
+
+class DriverDiagnostics:
+    """Says how each device is, and logs when that changes."""
+
+    def __init__(self, node):
+        self._node = node
+        self._reported, self._trouble = {}, {}
+
+    def statuses(self, drivers, active):
+        """[DiagnosticStatus], one a device."""
+        return [self._status(driver, active) for driver in drivers]
+
+    def _status(self, driver, active):
+        """The DiagnosticStatus of one device."""
+        counts = driver.counts()
+        before = self._reported.get(driver.name, {})
+        news = [f'{what}: {n - before.get(what, 0)} more' for what, n in sorted(counts.items())
+                if n > before.get(what, 0) and not what.startswith(HARMLESS)]
+        self._reported[driver.name] = dict(counts)
+        level, message = DiagnosticStatus.OK, 'open'
+        if not active:
+            message = 'not active'
+        elif not driver.is_open:
+            level, message = DiagnosticStatus.ERROR, driver.trouble or 'not open yet'
+        elif news:
+            level, message = DiagnosticStatus.WARN, '; '.join(news)
+        self._log(driver.name, level, message, counts)
+        values = {what: str(n) for what, n in sorted(counts.items())}
+        for source, clock in driver.clocks().items():
+            behind = f' ({source})' if source else ''
+            values[f'drift of its clock [ppm]{behind}'] = f'{clock.drift_ppm:.2f}'
+            values[f'messages behind the quickest [ms]{behind}'] = f'{1e3 * clock.spread_s:.3g}'
+            values[f'std of its stamps [ms]{behind}'] = f'{1e3 * clock.stamp_std:.3g}'
+        return DiagnosticStatus(
+            level=level, name=f'{self._node.get_name()}: {driver.name}', hardware_id=driver.name,
+            message=message, values=[KeyValue(key=k, value=v) for k, v in values.items()])
+
+    def _log(self, name, level, message, counts):
+        """Log what has changed: what is wrong, and that it is well again."""
+        trouble = message if level == DiagnosticStatus.ERROR else ''
+        if trouble and trouble != self._trouble.get(name):
+            self._node.get_logger().error(f'{name}: {trouble}')
+        elif not trouble and self._trouble.get(name):
+            self._node.get_logger().info(f'{name}: open again')
+        elif level == DiagnosticStatus.WARN:
+            self._node.get_logger().warning(f'{name}: {message}', throttle_duration_sec=10.0)
+        self._trouble[name] = trouble

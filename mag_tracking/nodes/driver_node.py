@@ -1,0 +1,157 @@
+"""driver_node: devices in, magnetic fields and accelerations out.
+
+A lifecycle node: configuring reads the drivers file, activating opens the
+devices. With `autostart` (the default) it does both by itself.
+"""
+
+import sys
+import threading
+
+from diagnostic_msgs.msg import DiagnosticArray
+from mag_tracking_msgs.msg import FieldReadings
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+from sensor_msgs.msg import Imu, MagneticField
+
+from mag_tracking.errors import MagTrackingError, SettingsError
+from mag_tracking.io.drivers.configuration import read_drivers
+from mag_tracking.io.drivers.driver import serve
+from mag_tracking.io.message_types import RAW_READINGS
+from mag_tracking.io.network_file import read_network
+from mag_tracking.io.schema import acceleration_dict, readings_dict, sample_dict
+from mag_tracking.nodes import stage_node
+from mag_tracking.nodes.convert import to_message
+from mag_tracking.nodes.driver_health import DriverDiagnostics
+from mag_tracking.nodes.stage_node import RESULTS, STREAM
+from mag_tracking.records import MagSample
+
+PATIENCE_S = 15.0
+"""[s] Time that a driver has to stop; a broker that does not answer takes a while."""
+
+
+class DriverNode(LifecycleNode):
+    """One thread a device, which publishes what the device says."""
+
+    def __init__(self, **node_arguments):
+        """Raises MagTrackingError where `autostart` finds that the settings are unusable."""
+        super().__init__('driver_node', **node_arguments)
+        self._path = self.declare_parameter('drivers', '').value
+        self._network_path = self.declare_parameter('network', '').value
+        self._readings = self.create_publisher(FieldReadings, RAW_READINGS, STREAM) \
+            if self.declare_parameter('batches', False).value else None
+        self._drivers, self._threads, self._publishers_by_sensor = [], [], {}
+        self._stopping = threading.Event()
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RESULTS)
+        self._health = DriverDiagnostics(self)
+        self.create_timer(1.0, self._publish_diagnostics)
+        self._refused = None
+        if self.declare_parameter('autostart', True).value:
+            self.trigger_configure()
+            if self._refused is not None:
+                raise self._refused
+            self.trigger_activate()
+
+    @property
+    def drivers(self):
+        """The list of `Driver`s."""
+        return self._drivers
+
+    def on_configure(self, state):
+        """Read the drivers file and advertise the sensors' topics."""
+        try:
+            if not self._path:
+                raise SettingsError('parameter drivers: the path of a drivers.yaml is needed')
+            network = read_network(self._network_path) if self._network_path else None
+            self._drivers = read_drivers(self._path, network)
+        except MagTrackingError as error:
+            self._refused = error
+            self.get_logger().error(str(error))
+            return TransitionCallbackReturn.FAILURE
+        for driver in self._drivers:
+            for sensor in driver.sensors.values():
+                self._publishers_by_sensor[sensor] = self._advertise(sensor, network)
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state):
+        """Open the devices, each in a thread of its own."""
+        self._stopping.clear()
+        self._threads = [threading.Thread(
+            target=serve, args=(driver, self._publish, self._stopping.is_set),
+            name=driver.name, daemon=True) for driver in self._drivers]
+        for thread in self._threads:
+            thread.start()
+        return super().on_activate(state)
+
+    def on_deactivate(self, state):
+        """Close the devices."""
+        self._stop()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state):
+        """Forget the drivers file."""
+        self._forget()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state):
+        """Close the devices for good."""
+        self._stop()
+        self._forget()
+        return TransitionCallbackReturn.SUCCESS
+
+    def destroy_node(self):
+        """Stop the threads first: they publish."""
+        self._stop()
+        super().destroy_node()
+
+    def _advertise(self, sensor, network):
+        """Publishers (field, acceleration) of a sensor."""
+        topic, imu_topic = f'/{sensor}/imu/mag', f'/{sensor}/imu/data_raw'
+        if network is not None:
+            j = network.names.index(sensor)
+            topic, imu_topic = network.topics[j], network.imu_topics[j] or imu_topic
+        return (self.create_publisher(MagneticField, topic, STREAM),
+                self.create_publisher(Imu, imu_topic, STREAM))
+
+    def _publish(self, samples):
+        """Each sample on its topic, or with `batches` the fields together."""
+        together = []
+        for sample in samples:
+            fields, accelerations = self._publishers_by_sensor[sample.sensor]
+            if not isinstance(sample, MagSample):
+                accelerations.publish(to_message(Imu, acceleration_dict(sample, sample.sensor)))
+            elif self._readings is not None:
+                together.append(sample)
+            else:
+                fields.publish(to_message(MagneticField, sample_dict(sample, sample.sensor)))
+        if together:
+            self._readings.publish(to_message(FieldReadings, readings_dict(together)))
+
+    def _stop(self):
+        """End the threads; they close their devices."""
+        self._stopping.set()
+        for thread in self._threads:
+            thread.join(PATIENCE_S)
+            if thread.is_alive():
+                self.get_logger().error(f'{thread.name} has not stopped within {PATIENCE_S:g} s')
+        self._threads = []
+
+    def _forget(self):
+        """Withdraw topics and drivers."""
+        for pair in self._publishers_by_sensor.values():
+            for publisher in pair:
+                self.destroy_publisher(publisher)
+        self._drivers, self._publishers_by_sensor = [], {}
+
+    def _publish_diagnostics(self):
+        """How the devices are."""
+        array = DiagnosticArray(status=self._health.statuses(self._drivers, bool(self._threads)))
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+
+
+def main(arguments=None):
+    """Run the node."""
+    sys.exit(stage_node.main(DriverNode, arguments))
+
+
+if __name__ == '__main__':
+    main()
