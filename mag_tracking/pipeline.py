@@ -29,6 +29,7 @@ TARGET_DEFAULTS = {
     'magnet': {
         'calibrate.max_field': 0.1,
         'calibrate.relearn_s': 0.0,
+        'calibrate.spike_std': 0.0,
         'align.burst': True,
         'align.period_s': 0.5,
         'align.max_wait_s': 2.0,

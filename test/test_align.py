@@ -1,5 +1,8 @@
 """Alignment: the frames do not depend on how the samples arrive, and nobody waits for the dead."""
 
+import dataclasses
+from collections import Counter
+
 import numpy as np
 import pytest
 from conftest import line_network
@@ -117,6 +120,15 @@ def test_late_duplicate_and_unordered_samples_are_counted():
     assert rejected(slow.counts) == {'late': 1}
 
 
+def test_an_unknown_covariance_is_that_of_the_network_or_the_sample_is_rejected():
+    network = line_network(2)
+    stds = (None, np.array([1e-8, 2e-8, 3e-8]))
+    align = Align(dataclasses.replace(network, noise_std=stds), AlignSettings())
+    frames = feed(align, [MagSample(0, f'mag_{j}', np.ones(3)) for j in (1, 2)] + [sample(1, 0)])
+    np.testing.assert_array_equal(frames[0].covariance, [C, np.diag(stds[1] ** 2)])
+    assert rejected(align.counts) == {'covariance unknown, and no noise_std in the network': 1}
+
+
 def test_a_looped_recording_starts_anew_and_loses_nothing_before():
     align = stage()
     first = feed(align, stream(2, 2400), flush=False)
@@ -153,6 +165,18 @@ def test_burst_mode_does_not_mix_rounds_after_a_lost_sample():
     assert len(frames) == 100
 
 
+def test_burst_mode_reckons_who_is_dead_from_the_newest_sample_taken_ever():
+    """A sample of 10 ms makes a frame of its own, after one that reached to 150 ms."""
+    align = stage(2, burst=True, period_s=1.0, max_wait_s=0.05)
+    arrivals = [(0, 0), (10, 0), (150, 1), (155, 1)]
+    assert [len(align.feed(sample(ms, j))) for ms, j in arrivals] == [0, 0, 2, 1]
+
+
+def test_burst_mode_takes_samples_a_nanosecond_apart():
+    frames = feed(stage(1, burst=True), [sample(1e-6 * k, 0) for k in range(1, 6)])
+    assert [f.stamp_ns for f in frames] == [1, 2, 3, 4, 5]
+
+
 @pytest.mark.parametrize('period', [0.02, 0.08, 0.3])
 def test_every_sample_is_used_exactly_once(period):
     frames = feed(stage(2, period_s=period), stream(2, 3000))
@@ -175,3 +199,151 @@ def test_stamps_of_frames_always_increase_and_offsets_keep_the_true_times(seed):
         times = sum((f.n_samples * (f.stamp_ns / 1e9 + f.time_offset)).sum() for f in frames)
         assert sum(f.n_samples.sum() for f in frames) == len(samples)
         assert times == pytest.approx(sum(s.stamp_ns for s in samples) / 1e9)
+
+
+class Plain:
+    """The rules of the alignment, all sensors looked at anew at every sample."""
+
+    def __init__(self, n, s):
+        self.n, self.burst, self.most, self.counts = n, s.burst, s.most_pending, Counter()
+        self.period, self.wait, self.jump = (
+            round(1e9 * v) for v in (s.period_s, s.max_wait_s, s.jump_back_s))
+        self.begin()
+
+    def begin(self):
+        self.held, self.seen, self.latest, self.taken = [], [], {}, {}
+        self.end = self.stamp = None
+
+    def feed(self, x):
+        j, t, out = int(x.sensor[4:]) - 1, x.stamp_ns, []
+        if np.isnan(x.field).all() or np.isinf(x.field).any():
+            self.counts['rejected: no finite field'] += 1
+            return []
+        if t <= self.latest.get(j, -1):
+            back = self.latest[j] - t
+            if back <= self.jump:
+                self.counts['rejected: out of order' if back else 'rejected: duplicate stamp'] += 1
+                return []
+            out = self.flush()
+            self.begin()
+            self.counts['time jumped back'] += 1
+        self.latest[j] = t
+        if self.end is not None and t < self.end:
+            self.counts['rejected: late'] += 1
+            return []
+        self.seen.append(t)
+        self.held = sorted([*self.held, (t, j, x)], key=lambda h: h[:2])
+        if len([h for h in self.held if h[1] == j]) > self.most:
+            self.held.remove(next(h for h in self.held if h[1] == j))
+            self.counts['rejected: too many pending'] += 1
+        return out + self.flush(False)
+
+    def flush(self, final=True):
+        out = []
+        while self.held:
+            heads = {j: t for t, j, _ in reversed(self.held)}
+            start, length = min(heads.values()), self.period
+            if self.burst:
+                halves = [(t - self.taken[j]) // 2 for j, t in heads.items() if j in self.taken]
+                length = max(1, min([length, *halves]))
+            elif self.end is not None and start < self.end + self.period:
+                start = self.end
+            if not (final or self.complete(start + length, heads)):
+                break
+            out.append(self.frame(start + length, heads))
+        return out
+
+    def complete(self, end, heads):
+        newest, last, every = max(self.seen), max(self.taken.values(), default=0), range(self.n)
+        def alive(j, at):
+            return (self.latest[j] >= at - self.wait if j in self.latest
+                    else newest - min(self.seen) < self.wait)
+        return all(self.latest.get(j, -1) >= end for j in every if alive(j, newest)) or (
+            self.burst and all(heads[j] < end if j in heads else not alive(j, last)
+                               for j in every))
+
+    def frame(self, end, heads):
+        taken = [h for h in self.held if h[0] < end and (not self.burst or h[0] == heads[h[1]])]
+        self.held = [h for h in self.held if h not in taken]
+        self.taken.update({j: t for t, j, _ in taken})
+        times = [t for t, *_ in taken]
+        self.end = max(times) + 1 if self.burst else end
+        mean = min(times) + round(sum(t - min(times) for t in times) / len(times))
+        self.stamp = mean if self.stamp is None else max(mean, self.stamp + 1)
+        rows = [[h for h in taken if h[1] == j] for j in range(self.n)]
+        self.counts['frames'] += 1
+        self.counts['frames with a sensor missing'] += not all(rows)
+        return self.stamp, [self.average(row) for row in rows]
+
+    def average(self, row):
+        if not row:
+            return np.full(3, np.nan), np.full((3, 3), np.nan), 0, 0.0
+        values = np.array([x.field for *_, x in row])
+        n = np.count_nonzero(~np.isnan(values), axis=0)
+        return (np.nansum(values, axis=0) / np.where(n > 0, n, np.nan),
+                sum(x.covariance for *_, x in row) / len(row) / min(n[n > 0]),
+                len(row), sum(t - self.stamp for t, *_ in row) / len(row) / 1e9)
+
+
+def disorder(rng, n):
+    """Samples of `n` sensors with all that can go wrong; None = a flush."""
+    arrivals = []
+    for j in range(n):
+        step, count = rng.choice([10.0, 10.0, 10.0, 31.7]), rng.integers(5, 80)
+        t = step * (np.arange(count) + rng.choice([0.0, rng.uniform()]))
+        t += rng.choice([0.0, 0.1, 6.0]) * j
+        keep = rng.uniform(size=count) > rng.choice([0.0, 0.05, 0.3, 1.0], p=[0.4, 0.4, 0.15, 0.05])
+        if rng.uniform() < 0.4:
+            keep &= np.abs(t - rng.uniform(0.0, t[-1])) > rng.uniform(0.0, 0.5 * t[-1])
+        arrival = t + rng.uniform(0.0, rng.choice([1e-9, 3.0, 30.0, 300.0]), count)
+        arrival = np.maximum.accumulate(arrival) if rng.uniform() < 0.8 else arrival
+        arrivals += [(a + back, ms, j) for back in [0.0, 900.0][:1 + (rng.uniform() < 0.2)]
+                     for a, ms in zip(arrival[keep], t[keep], strict=True)]
+    for _, ms, j in sorted(arrivals):
+        field = rng.standard_normal(3)
+        field[rng.uniform(size=3) < 0.2] = rng.choice([np.nan, np.nan, np.nan, np.inf])
+        yield MagSample(round(1e6 * ms), f'mag_{j + 1}', field, rng.uniform() * C)
+        if rng.uniform() < 0.01:
+            yield None
+    yield None
+
+
+@settings(max_examples=200)
+@given(st.integers(0, 10 ** 6))
+def test_frames_and_counts_are_those_of_the_plain_rules_at_every_sample(seed):
+    n, rng = 1 + seed % 6, np.random.default_rng(seed)
+    wanted = replace(AlignSettings(), {
+        'burst': bool(rng.integers(2)), 'period_s': float(rng.choice([1e-4, 0.01, 0.03, 0.2])),
+        'max_wait_s': float(rng.choice([0.001, 0.02, 0.1, 0.5, 60.0])),
+        'jump_back_s': float(rng.choice([0.0, 0.05, 1.0])), 'ahead_s': 0.0,
+        'most_pending': int(rng.choice([2, 5, 20, 10000]))})
+    align, plain = Align(line_network(n), wanted), Plain(n, wanted)
+    frames, rows = [], []
+    for s in disorder(rng, n):
+        found, expected = [a.flush() if s is None else a.feed(s) for a in (align, plain)]
+        assert [f.stamp_ns for f in found] == [stamp for stamp, _ in expected]
+        assert +align.counts == +plain.counts
+        frames += found
+        rows += [row for _, sensors in expected for row in sensors]
+    for k, name in enumerate(('field', 'covariance', 'n_samples', 'time_offset')):
+        got = [v for f in frames for v in getattr(f, name)]
+        np.testing.assert_allclose(got, [row[k] for row in rows], rtol=1e-12, atol=1e-30)
+
+
+@pytest.mark.parametrize('changes', [{}, {'burst': True, 'period_s': 0.5, 'max_wait_s': 2.0},
+                                     {'max_wait_s': 3600.0, 'most_pending': 20}])
+def test_a_sample_costs_the_same_with_any_number_of_sensors(changes):
+    """By how often it looks up anything of its own, with lost samples and a gap of one sensor."""
+    class Counted(Align):
+        asked = Counter()
+        def __getattribute__(self, name):
+            Counted.asked[name] += 1
+            return super().__getattribute__(name)
+    rng, cost = np.random.default_rng(1), []
+    for n in (6, 60):
+        Counted.asked.clear()
+        samples = [s for s in stream(n, 1000.0, offset=3.6 / n) if rng.uniform() > 0.02
+                   and (s.sensor != 'mag_3' or not 300e6 < s.stamp_ns < 700e6)]
+        feed(Counted(line_network(n), replace(AlignSettings(), changes)), samples)
+        cost.append(Counted.asked.total() / len(samples))
+    assert cost[1] < 1.1 * cost[0]

@@ -66,6 +66,7 @@ class RunningBackground:
         self._given = None if background is None else np.asarray(background, dtype=float)
         self._noise = None if noise_std is None else np.diag(np.asarray(noise_std, float) ** 2)
         self._noise_given = self._noise is not None
+        self._std = (None, None)
         self.n_relearnt = 0
         self.forget()
 
@@ -89,6 +90,15 @@ class RunningBackground:
     def covariance(self):
         """(3, 3) [T^2] noise of one sample, or None; NaN for an axis not reported."""
         return self._noise
+
+    @property
+    def noise_std(self):
+        """[3 float] [T], or None; NaN for an axis not reported."""
+        # It is asked of every sample, and changes once a block.
+        if self._std[0] is not self._noise:
+            self._std = (self._noise, None if self._noise is None
+                         else np.sqrt(np.diagonal(self._noise)).tolist())
+        return self._std[1]
 
     @property
     def measured(self):

@@ -6,12 +6,14 @@ frames do not depend on the order in which the sensors' messages arrive.
 """
 
 from collections import Counter, deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from math import inf, isfinite, isinf, isnan
 
 import numpy as np
 
 from mag_tracking.records import FieldFrame
 from mag_tracking.settings import param
+from mag_tracking.stages.ahead import Ahead
 from mag_tracking.stages.stage import NS
 
 
@@ -28,6 +30,9 @@ class AlignSettings:
     max_wait_s: float = param(
         0.5, 'A sensor that is silent for longer is taken for dead and delays nobody.',
         's', (1e-3, 3600.0))
+    ahead_s: float = param(
+        0.5, 'A sensor whose stamps jump ahead by more than this while those of the others do not '
+        'is held back until they follow: its clock has stepped. 0 = never.', 's', (0.0, 3600.0))
     jump_back_s: float = param(
         1.0, 'A stamp that goes back by more than this is a restart (a looped recording).',
         's', (0.0, 3600.0))
@@ -37,151 +42,224 @@ class AlignSettings:
 
 
 class Align:
-    """Calibrated samples to frames; memory is bounded by `most_pending`."""
+    """Calibrated samples to frames; memory is bounded by `most_pending`.
+
+    Between two frames a sample costs the same with any number of sensors: it can
+    complete nothing while one sensor is known that the frame has to wait for.
+    """
 
     def __init__(self, network, settings):
         self.counts = Counter()
         self._n = len(network)
-        self._noise = network.noise_std
+        self._noise = [None if std is None else np.diag(std ** 2) for std in network.noise_std]
         self._index = {name: i for i, name in enumerate(network.names)}
-        self._settings = settings
+        self._burst = settings.burst
+        self._most_pending = settings.most_pending
+        self._jump_back = settings.jump_back_s * NS
+        self._names = network.names
+        self._longest_jump = int(round(settings.ahead_s * NS)) or inf
         self._period = int(round(settings.period_s * NS))
         self._wait = int(round(settings.max_wait_s * NS))
         self._reset()
 
     def _reset(self):
         """As new."""
+        # Of each sensor (stamp, field, covariance), oldest first.
         self._pending = [deque() for _ in range(self._n)]
         self._latest = [None] * self._n
         self._first = self._newest = self._end = self._stamp = None
         self._taken = [None] * self._n
+        self._last_taken = None
+        self._ahead = Ahead(self._n, self._longest_jump)
+        self._look_ahead()
 
     def feed(self, sample):
         """A calibrated `MagSample` gives the `FieldFrame`s that it completes."""
-        i, stamp = self._index.get(sample.sensor), sample.stamp_ns
-        if i is None:
-            self.counts[f'rejected: unknown sensor {sample.sensor}'] += 1
-            return []
-        if not np.isfinite(sample.field).any() or np.isinf(sample.field).any():
-            self.counts['rejected: no finite field'] += 1
-            return []
-        if sample.covariance is None:
-            if self._noise[i] is None:
-                self.counts['rejected: covariance unknown, and no noise_std in the network'] += 1
-                return []
-            sample = replace(sample, covariance=np.diag(self._noise[i] ** 2))
-        out = []
+        i = self._index.get(sample.sensor)
+        cause = self._fault(i, sample)
+        if cause:
+            return self._reject(cause)
+        passed, refused = self._ahead.feed(i, sample)
+        for j, _ in refused:
+            self._reject(f'ahead of all others: {self._names[j]}')
+        return [f for j, s in passed for f in self._take_in(j, s)]
+
+    def _take_in(self, i, sample):
+        """A sample whose stamp is not ahead of all others gives the frames that it completes."""
+        out, stamp = [], sample.stamp_ns
         last = self._latest[i]
         if last is not None and stamp <= last:
-            if last - stamp <= self._settings.jump_back_s * NS:
-                self.counts['rejected: duplicate stamp' if stamp == last
-                            else 'rejected: out of order'] += 1
-                return []
+            if last - stamp <= self._jump_back:
+                return self._reject('duplicate stamp' if stamp == last else 'out of order')
             out = self.flush()
             self._reset()
             self.counts['time jumped back'] += 1
         self._latest[i] = stamp
         if self._end is not None and stamp < self._end:
-            self.counts['rejected: late'] += 1
-            return out
-        self._first = stamp if self._first is None else min(self._first, stamp)
-        self._newest = stamp if self._newest is None else max(self._newest, stamp)
-        self._pending[i].append(sample)
-        if len(self._pending[i]) > self._settings.most_pending:
-            self._pending[i].popleft()
-            self.counts['rejected: too many pending'] += 1
-        return out + self._frames(self._watermark())
+            return self._reject('late')
+        if self._newest is None:
+            self._first = self._newest = stamp
+        elif stamp > self._newest:
+            self._newest = stamp
+        elif stamp < self._first:
+            self._first = stamp
+        self._hold(i, stamp, sample)
+        return out if self._waits() else out + self._frames()
 
     def flush(self):
         """All frames that can be made of what is pending."""
-        return self._frames(float('inf'))
+        out = [f for i, s in self._ahead.flush() for f in self._take_in(i, s)]
+        return out + self._frames(final=True)
 
-    def _expected(self):
-        """Rows of the sensors that are worth waiting for."""
-        young = self._newest - self._first < self._wait
-        return [i for i, t in enumerate(self._latest)
-                if (young if t is None else t >= self._newest - self._wait)]
+    def _fault(self, i, sample):
+        """Why the sample of sensor `i` cannot be used, or None."""
+        if i is None:
+            return f'unknown sensor {sample.sensor}'
+        # Of three numbers Python's own functions are several times as fast as NumPy's.
+        values = sample.field.tolist()
+        if not isfinite(sum(values)) and (any(map(isinf, values)) or all(map(isnan, values))):
+            return 'no finite field'
+        if sample.covariance is None and self._noise[i] is None:
+            return 'covariance unknown, and no noise_std in the network'
+        return None
 
-    def _watermark(self):
-        """Stamp up to which everything has arrived."""
-        latest = [self._latest[i] for i in self._expected()]
-        return -1 if None in latest else min(latest)
+    def _reject(self, cause):
+        """Count the rejection."""
+        self.counts[f'rejected: {cause}'] += 1
+        return []
 
-    def _frames(self, watermark):
-        """Frames that are complete at `watermark`."""
+    def _hold(self, i, stamp, sample):
+        """Put a sample of sensor `i` to those that are pending."""
+        queue = self._pending[i]
+        if not queue:
+            self._bring_forward(i, stamp)
+        covariance = self._noise[i] if sample.covariance is None else sample.covariance
+        queue.append((stamp, sample.field, covariance))
+        if len(queue) > self._most_pending:
+            queue.popleft()
+            self._reject('too many pending')
+            # The frame may end later than `_due` now: that somebody is behind still holds, but
+            # a sample that was too late for it may be in time.
+            self._missing.clear()
+
+    def _look_ahead(self):
+        """Find the end of the next frame; any sensor may be one to wait for."""
+        self._start, self._window, self._due = inf, self._period, inf
+        for i, queue in enumerate(self._pending):
+            if queue:
+                self._bring_forward(i, queue[0][0])
+        self._behind = list(range(self._n))
+        self._missing = list(range(self._n))
+
+    def _bring_forward(self, i, stamp):
+        """Have the next frame end early enough for `stamp`, the oldest pending of sensor `i`."""
+        if self._burst:
+            # A round spreads over the period, or half of any sensor's sample interval.
+            if self._taken[i] is not None:
+                self._window = min(self._window, max(1, (stamp - self._taken[i]) // 2))
+        elif self._end is not None and stamp < self._end + self._period:
+            stamp = self._end
+        self._start = min(self._start, stamp)
+        self._due = self._start + self._window
+
+    def _waits(self):
+        """Whether a sensor is known that the next frame has to wait for."""
+        # Who was never heard counts as heard up to -1: frames that end before are not held up.
+        if self._due < 0 and None in self._latest and self._is_young():
+            return False
+        return _some(self._behind, self._is_behind) and (
+            not self._burst or _some(self._missing, self._is_missing))
+
+    def _is_young(self):
+        """Whether a sensor that was never heard is worth waiting for."""
+        return self._newest - self._first < self._wait
+
+    def _is_behind(self, i):
+        """Whether sensor `i` is alive, and may still give a sample of before the end."""
+        latest = self._latest[i]
+        if latest is None:
+            return self._is_young()
+        return self._newest - self._wait <= latest < self._due
+
+    def _is_missing(self, i):
+        """Whether sensor `i` may still answer in this round, or its next sample is of another."""
+        if self._pending[i]:
+            return self._pending[i][0][0] >= self._due
+        if self._latest[i] is None:
+            return self._is_young()
+        # It was heard and is not pending, so frames were taken. At the head of a new round the
+        # others' latest samples are a round old.
+        return self._latest[i] >= self._last_taken - self._wait
+
+    def _frames(self, final=False):
+        """Frames that are complete, or all if what is pending is `final`."""
         out = []
         while True:
-            heads = [q[0].stamp_ns for q in self._pending if q]
-            if not heads:
+            self._look_ahead()
+            if self._due == inf or not final and self._waits():
                 return out
-            start = min(heads)
-            if self._settings.burst:
-                end = start + self._burst_window()
-                ready = watermark >= end or self._round_complete(end, watermark)
-            else:
-                if self._end is not None and start < self._end + self._period:
-                    start = self._end
-                end = start + self._period
-                ready = watermark >= end
-            if not ready:
-                return out
-            out.append(self._frame(end))
+            out.append(self._frame(self._due))
 
-    def _burst_window(self):
-        """Longest spread of one round: the period, and half of any sensor's sample interval."""
-        gaps = [q[0].stamp_ns - t for q, t in zip(self._pending, self._taken, strict=True)
-                if q and t is not None]
-        return max(1, min([self._period] + [g // 2 for g in gaps]))
-
-    def _round_complete(self, end, watermark):
-        """Whether every sensor that is alive has given a sample before `end`."""
-        if watermark == float('inf'):
-            return True
-        # At the head of a new round the others' latest samples are a round old.
-        awaited = [i for i in range(self._n) if self._pending[i] or self._alive(i)]
-        return all(self._pending[i] and self._pending[i][0].stamp_ns < end for i in awaited)
-
-    def _alive(self, i):
-        """Whether sensor `i` may still answer in this round."""
-        if self._latest[i] is None:
-            return self._newest - self._first < self._wait
-        taken = [t for t in self._taken if t is not None]
-        previous = max(taken) if taken else self._first
-        return self._latest[i] >= previous - self._wait
+    def _take(self, end):
+        """(samples by sensor, how many of each) of before `end`, in burst mode one of each."""
+        taken, n_samples = [], np.zeros(self._n, dtype=int)
+        for i, queue in enumerate(self._pending):
+            before = len(taken)
+            while queue and queue[0][0] < end:
+                taken.append(queue.popleft())
+                if self._burst:
+                    break
+            if len(taken) > before:
+                n_samples[i] = len(taken) - before
+                self._taken[i] = taken[-1][0]
+        return taken, n_samples
 
     def _frame(self, end):
         """Take the samples before `end` (in burst mode one each) and average them."""
-        field = np.full((self._n, 3), np.nan)
-        covariance = np.full((self._n, 3, 3), np.nan)
-        n_samples = np.zeros(self._n, dtype=int)
-        stamps = [[] for _ in range(self._n)]
-        for i, queue in enumerate(self._pending):
-            taken = []
-            while queue and queue[0].stamp_ns < end:
-                taken.append(queue.popleft())
-                if self._settings.burst:
-                    break
-            if not taken:
-                continue
-            self._taken[i] = taken[-1].stamp_ns
-            stamps[i] = [s.stamp_ns for s in taken]
-            n_samples[i] = len(taken)
-            values = np.array([s.field for s in taken])
-            there = np.count_nonzero(~np.isnan(values), axis=0)
-            field[i, there > 0] = np.nansum(values, axis=0)[there > 0] / there[there > 0]
-            # The fewest per axis counts for all: never better than it is.
-            n = there[there > 0].min() if there.any() else 1
-            covariance[i] = np.mean([s.covariance for s in taken], axis=0) / n
-        every = [t for row in stamps for t in row]
-        self._end = max(every) + 1 if self._settings.burst else end
+        taken, n_samples = self._take(end)
+        stamps, fields, covariances = zip(*taken, strict=True)
+        newest = max(stamps)
+        self._last_taken = newest if self._last_taken is None else max(self._last_taken, newest)
+        self._end = newest + 1 if self._burst else end
         self.counts['frames'] += 1
-        if (n_samples == 0).any():
+        if not n_samples.all():
             self.counts['frames with a sensor missing'] += 1
-        first = min(every)
-        stamp = first + round(sum(t - first for t in every) / len(every))
+        first = min(stamps)
+        since = [t - first for t in stamps]
+        stamp = first + round(sum(since) / len(since))
         if self._stamp is not None:
             # Rounds of sensors with different rates overlap; the offsets keep their true times.
             stamp = max(stamp, self._stamp + 1)
         self._stamp = stamp
-        offset = [sum(t - stamp for t in row) / len(row) / NS if row else 0.0 for row in stamps]
-        return FieldFrame(stamp, field, covariance, n_samples, np.array(offset))
+        since = np.array(since) - (stamp - first)
+        return FieldFrame(stamp, *_averages(fields, covariances, since, n_samples))
+
+
+def _some(rows, holds):
+    """Whether `holds` for one of the `rows`; those that it does not hold for are dropped."""
+    while rows:
+        if holds(rows[-1]):
+            return True
+        rows.pop()
+    return False
+
+
+def _averages(fields, covariances, since, n_samples):
+    """(field, covariance, n_samples, time_offset) of a frame, of samples sensor by sensor."""
+    n_sensors, values = len(n_samples), np.concatenate(fields).reshape(-1, 3)
+    known = ~np.isnan(values)
+    columns = np.empty((len(values), 16))
+    columns[:, :3] = np.where(known, values, 0.0)
+    columns[:, 3:6] = known
+    columns[:, 6:15] = np.concatenate(covariances).reshape(-1, 9)
+    columns[:, 15] = since
+    # It adds in the order of time, where np.add.reduceat adds in pairs.
+    row = np.repeat(16 * np.arange(n_sensors), n_samples)
+    total = np.bincount((row[:, None] + np.arange(16)).ravel(), columns.ravel(), 16 * n_sensors)
+    total = total.reshape(n_sensors, 16)
+    n_axis, n = total[:, 3:6], np.maximum(n_samples, 1)[:, None]
+    field = np.divide(total[:, :3], n_axis, out=np.full((n_sensors, 3), np.nan), where=n_axis > 0)
+    # The fewest per axis counts for all: never better than it is.
+    fewest = np.where(n_axis > 0, n_axis, np.nan)
+    C = total[:, 6:15] / n / np.fmin.reduce(fewest, axis=1, keepdims=True)
+    return field, C.reshape(-1, 3, 3), n_samples, total[:, 15] / n[:, 0] / NS

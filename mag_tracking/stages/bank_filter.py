@@ -64,7 +64,7 @@ class BankFilter:
         return h[0] + x[0, -3 * self._n_sensors:].reshape(-1, 3)
 
     def update(self, bank, frame, dt, x_lin=None):
-        """Measurement update in place.
+        """Measurement update in place; the arrays that `bank.x` and `bank.P` were stay as they are.
 
         It is linearised at `x_lin` (n_hyp, n_x), or if that is left out at the prediction and
         then again as often as the settings say. Returns the log-likelihood (n_hyp,) of the frame.
@@ -78,7 +78,7 @@ class BankFilter:
     def _update(self, bank, frame, dt, x_lin, wants_gains=False):
         """Log-likelihood (n_hyp,), and the `kalman.Gains` or None."""
         covariance = known_covariance(frame)
-        x_prior, P_prior = bank.x.copy(), bank.P.copy()
+        x_prior, P_prior = bank.x, bank.P
         iterations = self._settings.iterations if x_lin is None else 1
         x_lin = bank.x.copy() if x_lin is None else x_lin
         for _ in range(iterations):

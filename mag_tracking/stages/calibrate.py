@@ -8,6 +8,7 @@ import numpy as np
 
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.decimation import Decimator
+from mag_tracking.calibration.screening import SPIKE, STUCK, Repetition, SpikeFilter
 from mag_tracking.errors import NetworkError
 from mag_tracking.records import MagSample
 from mag_tracking.settings import param
@@ -41,6 +42,10 @@ class CalibrateSettings:
     jump_ahead_s: float = param(
         60.0, 'A stamp that is ahead by more than this has to be confirmed by the next one, else '
         'it is taken for corrupt.', 's', (1e-3, 1e9))
+    spike_std: float = param(
+        30.0, 'A reading, or up to three, that is off those around it by more noise deviations '
+        'than this is rejected as a spike; what may be one waits for the next. 0 = never.',
+        '', (0.0, 1e6))
     decimate_to_hz: float = param(
         0.0, 'Samples of a faster sensor are low-pass filtered and thinned to about this rate '
         '(a whole share of its own; 60 dB against folding, four intervals late). 0 = no: frames '
@@ -67,6 +72,8 @@ class Calibrate:
         self._settings = settings
         self._index = {name: i for i, name in enumerate(network.names)}
         self._network, self._clock_ns, self._background = None, [], {}
+        self._repetition = {name: Repetition() for name in network.names}
+        self._spikes = {name: SpikeFilter(settings.spike_std) for name in network.names}
         self._first_ns, self._last_ns, self._ahead_ns = {}, {}, {}
         self.renew(network)
 
@@ -114,8 +121,25 @@ class Calibrate:
         cause = self._misplaced(sample)
         if cause:
             return self._reject(sample, cause)
-        self.per_sensor[sample.sensor]['accepted'] += 1
-        return [c for s in self._thinned(sample) for c in self._calibrated(s)]
+        return [c for whole in self._screened(sample) for s in self._thinned(whole)
+                for c in self._calibrated(s)]
+
+    def _screened(self, sample):
+        """The samples that are known by now to be whole; the others are counted or wait."""
+        name, field = sample.sensor, sample.field.tolist()
+        if self._repetition[name].is_stuck(field):
+            return self._reject(sample, STUCK)
+        known = [(sample, False)]
+        if self._settings.spike_std:
+            background = self._background[name]
+            known = self._spikes[name].feed(
+                sample, field, background.noise_std if background.ready else None)
+        whole = [s for s, is_spike in known if not is_spike]
+        for s, is_spike in known:
+            if is_spike:
+                self._reject(s, SPIKE)
+        self.per_sensor[name]['accepted'] += len(whole)
+        return whole
 
     def _misplaced(self, sample):
         """Why the stamp of a sample cannot be used, or None; a restart is one to go on from."""
@@ -126,6 +150,7 @@ class Calibrate:
             if last - sample.stamp_ns <= self._settings.jump_back_s * NS:
                 return 'duplicate stamp' if sample.stamp_ns == last else 'out of order'
             self._background[sample.sensor].forget()
+            self._spikes[sample.sensor].clear()
             self.counts['time jumped back'] += 1
             self._first_ns.pop(sample.sensor)
         self._last_ns[sample.sensor] = sample.stamp_ns
@@ -186,8 +211,9 @@ class Calibrate:
         return MagSample(stamp_ns, sample.sensor, field, covariance)
 
     def flush(self):
-        """Nothing is held back for long: []."""
-        return []
+        """What waited for the next reading."""
+        return [c for spikes in self._spikes.values() for whole, _ in spikes.flush()
+                for s in self._thinned(whole) for c in self._calibrated(s)]
 
     def _is_ahead(self, sample, last):
         """Whether a stamp is far ahead of the `last`, and of the one that was so before it."""
@@ -223,6 +249,7 @@ class Calibrate:
         self.counts[f'rejected: {cause}'] += 1
         if sample.sensor in self.per_sensor:
             self.per_sensor[sample.sensor]['rejected'] += 1
+            self.per_sensor[sample.sensor][f'rejected: {cause}'] += 1
         return []
 
     def forget(self, sensors=()):

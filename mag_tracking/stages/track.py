@@ -13,6 +13,7 @@ import numpy as np
 from mag_tracking.errors import NetworkError, SettingsError
 from mag_tracking.settings import param
 from mag_tracking.stages.bank_filter import BankFilter, NoTarget
+from mag_tracking.stages.contradiction import Contradiction
 from mag_tracking.stages.magnet_start import MagnetSettings, magnet_model, start_magnet
 from mag_tracking.stages.observation import MOST_TURNED
 from mag_tracking.stages.pose import (
@@ -26,6 +27,9 @@ from mag_tracking.stages.relinearise import Relinearisation
 from mag_tracking.stages.smooth import FixedLag, WholeTrack
 from mag_tracking.stages.stage import NS
 from mag_tracking.stages.vehicle_start import VehicleSettings, start_vehicle, vehicle_model
+
+ALONE_S = 0.5
+"""[s] A track that one sensor of several has carried alone for longer stays ambiguous."""
 
 
 @dataclass(frozen=True)
@@ -137,10 +141,11 @@ class TrackStage:
         self._anew = Relinearisation(settings.relinearise_interval_s, settings.relinearise_window_s,
                                      settings.relinearise_most)
         self._lag = FixedLag(settings.smoothing_lag_s) if settings.smoothing_lag_s else None
+        self._contradiction = Contradiction(network.names)
         self._next_id = 1
         self._bank = None
         # Evidence for a target against backgrounds that wander, and the filter of the latter.
-        self._log_odds, self._surest, self._strange = 0.0, np.inf, 0
+        self._log_odds, self._surest, self._strange, self._alone_s = 0.0, np.inf, 0, 0.0
         self._no_target = None
         self._recent = deque()
         # A target that was lost is not to be started anew in the tail of its own detection.
@@ -214,19 +219,16 @@ class TrackStage:
     def _start(self, frame):
         """Make the first hypotheses and run them through the frames before the detection."""
         s = self._settings
-        if s.target == 'vehicle':
-            self._bank = start_vehicle(s.vehicle, self._network, frame, s.background_std,
-                                       self._filter.observation.own_covariance)
-        else:
-            self._bank = start_magnet(s.magnet, self._network, frame, s.background_std,
-                                      self._filter.observation.own_covariance, s.field_error)
+        known = self._network, frame, s.background_std, self._filter.observation.own_covariance
+        self._bank = start_vehicle(s.vehicle, *known) if s.target == 'vehicle' else \
+            start_magnet(s.magnet, *known, s.field_error)
         recent = [f for f in self._recent if frame.stamp_ns - f.stamp_ns <= s.lookback_s * NS]
         self._recent.clear()
         if self._bank is None:
             self.counts['frames without a start'] += 1
             return []
         self.counts['tracks'] += 1
-        self._log_odds, self._surest, self._strange = 0.0, np.inf, 0
+        self._log_odds, self._surest, self._strange, self._alone_s = 0.0, np.inf, 0, 0.0
         self._no_target = NoTarget(len(self._network), s.background_std)
         if recent:
             self._filter.predict(self._bank, (recent[0].stamp_ns - frame.stamp_ns) / NS)
@@ -247,7 +249,11 @@ class TrackStage:
         if dt > 0.0:
             self._filter.predict(bank, dt)
         predicted = bank.x.copy()
-        log_likelihood = self._filter.update(bank, frame, dt)
+        log_likelihood, frame, left_out = self._contradiction.update(self._filter, bank, frame, dt)
+        self.counts.update(left_out)
+        # Where no majority is left it may as well have been the track that was wrong.
+        if left_out and np.count_nonzero(frame.n_samples) <= len(left_out):
+            self._alone_s = np.inf
         evidence = bank.reweight(log_likelihood)
         if not np.isfinite(evidence):
             self.counts['banks lost'] += 1
@@ -308,14 +314,20 @@ class TrackStage:
     def _published(self, frame, dt, best):
         """The `Track` of the hypothesis `best`, with what it says of the sensors."""
         bank, observation = self._bank, self._filter.observation
-        n_y = int(np.count_nonzero(~np.isnan(frame.field)))
+        there = ~np.isnan(frame.field)
+        n_y = int(np.count_nonzero(there))
+        # One alone of several tells neither scale nor mirror image, and what has gone astray by it
+        # the others, when they are back, do not always put right.
+        alone = len(self._network) > 1 and np.count_nonzero(there.any(axis=1)) == 1
+        self._alone_s += dt if alone else 0.0
+        alone = alone or self._alone_s > ALONE_S
         return published_track(
             bank, best, self._model, self._orientation, self.arrivals, self.kinds,
             stamp_ns=frame.stamp_ns,
             id=self._next_id, ended=False,
             existence=float(1.0 / (1.0 + np.exp(-np.clip(self._log_odds, -700.0, 700.0)))),
             degrees_of_freedom=n_y,
-            strange=self._filter.is_strange(bank, best, frame),
+            strange=self._filter.is_strange(bank, best, frame) or alone,
             predicted=self._filter.predicted_field(bank, best, frame, dt),
             mounting=observation.angles(bank.x[best]),
             mounting_covariance=observation.angle_covariances(bank.P[best]))
@@ -328,6 +340,7 @@ class TrackStage:
         smoothed = [] if last is None else self._smoothed_at_the_end()
         self._whole.clear()
         self._anew.clear()
+        self._contradiction.clear()
         if self._lag is not None:
             self._lag.clear()
         self._bank = None

@@ -1,0 +1,114 @@
+"""Sensors that contradict the others: found while a target is tracked, and left out of a frame.
+
+A sensor whose axes were swapped, that was knocked over, or that another vehicle stands at, pulls
+a track away from what all others say. Where a frame does not fit the leading hypothesis, and fits
+it once one sensor, or a few, are taken for missing, it is they that are wrong.
+"""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+ONE_IN = 8
+"""No more than one sensor in so many can be wrong, but always one: else it is the track. Sensors far
+from the target agree with everything."""
+
+
+class Contradiction:
+    """Updates a bank with what of a frame can be believed."""
+
+    def __init__(self, names):
+        self._names = names
+        self.clear()
+
+    def clear(self):
+        """No track is running."""
+        self._left_out = ()
+
+    def update(self, bank_filter, bank, frame, dt):
+        """Measurement update of the `FilterBank` in place, without sensors that contradict.
+
+        Parameters
+        ----------
+        bank_filter : BankFilter
+        bank : FilterBank
+        frame : FieldFrame
+        dt : float [s]
+
+        Returns
+        -------
+        log_likelihood : (n_hyp,)
+        frame : FieldFrame
+            What was used: sensors that were left out are missing.
+        counts : Counter
+            {what: number}, of the sensors that were left out.
+        """
+        # The update replaces these arrays, it does not write into them.
+        before = bank.x, bank.P
+        log_likelihood = bank_filter.update(bank, frame, dt)
+        if self._fits(bank_filter, bank, frame, log_likelihood):
+            self._left_out = ()
+            return log_likelihood, frame, Counter()
+        whole = bank.x, bank.P, bank.nis, log_likelihood
+        for left_out in self._suspicions(bank_filter, bank, before, frame, dt):
+            log_likelihood, less = self._without(bank_filter, bank, before, frame, dt, left_out)
+            if self._fits(bank_filter, bank, less, log_likelihood):
+                self._left_out = left_out
+                return log_likelihood, less, Counter(
+                    {f'frames that {self._names[j]} contradicted': 1 for j in left_out})
+        self._left_out = ()
+        bank.x, bank.P, bank.nis, log_likelihood = whole
+        return log_likelihood, frame, Counter()
+
+    def _suspicions(self, bank_filter, bank, before, frame, dt):
+        """Sets of sensors, as tuples of rows, to be left out, one after the other."""
+        present = np.flatnonzero(~np.isnan(frame.field).all(axis=1)).tolist()
+        most = max(1, len(present) // ONE_IN) if len(present) > 1 else 0
+        # Those of the frame before are the first that are suspected.
+        again = tuple(j for j in self._left_out if j in present)
+        if again and len(again) <= most:
+            yield again
+        found = ()
+        while len(found) < most:
+            # The one without which the others fit best is the next.
+            misfit = {}
+            for j in present:
+                if j not in found:
+                    tried = (*found, j)
+                    log_likelihood, less = self._without(
+                        bank_filter, bank, before, frame, dt, tried)
+                    misfit[tried] = _misfit(bank, less, log_likelihood)
+            found = min(misfit, key=misfit.get)
+            yield found
+
+    @staticmethod
+    def _without(bank_filter, bank, before, frame, dt, left_out):
+        """The update once more, as if some sensors were missing: (log-likelihood, frame)."""
+        missing = np.isin(np.arange(len(frame.field)), left_out)
+        less = replace(frame, field=np.where(missing[:, None], np.nan, frame.field),
+                       covariance=np.where(missing[:, None, None], np.nan, frame.covariance),
+                       n_samples=np.where(missing, 0, frame.n_samples),
+                       time_offset=np.where(missing, 0.0, frame.time_offset))
+        bank.x, bank.P = before
+        return bank_filter.update(bank, less, dt), less
+
+    @staticmethod
+    def _fits(bank_filter, bank, frame, log_likelihood):
+        """Whether the frame fits the hypothesis that leads after it."""
+        leader = _leader(bank, log_likelihood)
+        return leader is not None and not bank_filter.is_strange(bank, leader, frame)
+
+
+def _leader(bank, log_likelihood):
+    """Row of the hypothesis that weighs most after the frame; None where none explains it."""
+    log_w = bank.log_w + log_likelihood
+    leader = int(np.argmax(log_w))
+    return leader if np.isfinite(log_w[leader]) else None
+
+
+def _misfit(bank, frame, log_likelihood):
+    """Normalised innovation squared per axis of the leading hypothesis."""
+    leader = _leader(bank, log_likelihood)
+    n_axes = np.count_nonzero(~np.isnan(frame.field))
+    return np.inf if leader is None else float(np.nansum(bank.nis[leader])) / n_axes
