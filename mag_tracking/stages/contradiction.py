@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 ONE_IN = 8
-"""No more than one sensor in so many can be wrong, but always one: else it is the track. Sensors far
-from the target agree with everything."""
+"""No more than one sensor in so many can be wrong, but always one: else it is the track. Sensors that
+are far from the target agree with everything."""
 
 
 class Contradiction:
