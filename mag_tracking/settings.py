@@ -220,11 +220,13 @@ def to_yaml(settings, node='/**'):
     return '\n'.join(lines) + '\n'
 
 
-def to_reference(settings):
-    """The parameter reference, as a Markdown table."""
-    lines = ['| parameter | default | unit | range | live | what |', '|---|---|---|---|---|---|']
+def to_reference(settings, live=True):
+    """The parameter reference, as a Markdown table; without the column `live` if it is false."""
+    head = ['parameter', 'default', 'unit', 'range', *(['live'] if live else []), 'what']
+    lines = [f'| {" | ".join(head)} |', '|' + '---|' * len(head)]
     for p in flatten(settings):
         bounds = f'{p.range[0]} .. {p.range[1]}' if p.range else ''
-        lines.append(f'| `{p.name}` | `{_yaml_value(p.value)}` | {p.unit} | {bounds} | '
-                     f'{"yes" if p.live else ""} | {p.doc} |')
+        row = [f'`{p.name}`', f'`{_yaml_value(p.value)}`', p.unit, bounds,
+               *(['yes' if p.live else ''] if live else []), p.doc.replace('|', '\\|')]
+        lines.append(f'| {" | ".join(row)} |')
     return '\n'.join(lines) + '\n'

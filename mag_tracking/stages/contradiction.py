@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 ONE_IN = 8
-"""No more than one sensor in so many can be wrong, but always one: else it is the track. Sensors that
+"""No more than one sensor in so many can be wrong, but always one: else it is the track. Those that
 are far from the target agree with everything."""
 
 
