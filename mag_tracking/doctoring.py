@@ -25,6 +25,9 @@ _ADVICE = (
     ('covariance', 'publish zeros where the noise is not known'),
     ('undecodable', 'the recording is damaged, or its type is another'))
 
+LEVEL_STEP = 1e-8
+"""[T] A fiftieth of what iron near a sensor adds."""
+
 
 def level_of(calibrate, name, health):
     """(3,) [T] field of a sensor without a target, as well as it is known.
@@ -49,6 +52,8 @@ def network_findings(network, survey, calibrate, sensors):
     """
     found = list(_clock_findings(network, sensors))
     levels = np.array([level_of(calibrate, name, sensors[name]) for name in network.names])
+    # What has hardly changed since the last time need not be compared anew.
+    levels = LEVEL_STEP * np.round(levels / LEVEL_STEP)
     std = np.array([np.full(3, np.deg2rad(survey.stated_std_deg)) if s is None else s
                     for s in network.orientation_std])
     earth = network.earth_field

@@ -93,6 +93,15 @@ class SensorNetwork:
         """(3,) [m], mean of the sensor positions."""
         return self.positions.mean(axis=0)
 
+    def part(self, rows):
+        """The network of the sensors `rows` (n,) alone."""
+        per_sensor = ('names', 'topics', 'noise_std', 'background', 'orientation_std', 'offset',
+                      'correction', 'imu_topics', 'calibrated')
+        return replace(self, positions=self.positions[rows], R_ws=self.R_ws[rows],
+                       clock_offset=self.clock_offset[rows],
+                       **{name: tuple(getattr(self, name)[j] for j in rows)
+                          for name in per_sensor})
+
     def as_stated(self):
         """The network with the orientations that were stated before any calibration."""
         R_ws, std = self.R_ws.copy(), list(self.orientation_std)

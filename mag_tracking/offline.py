@@ -18,7 +18,7 @@ from mag_tracking.report.metrics import (
     pass_errors,
 )
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
-from mag_tracking.stages.track import acceleration_density
+from mag_tracking.stages.track_settings import acceleration_density
 
 SUSPICIOUS = 2.0
 """A sensor that seems to be turned by more prior deviations than this is reported."""

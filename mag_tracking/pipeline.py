@@ -10,7 +10,8 @@ from mag_tracking.stages.calibrate import Calibrate, CalibrateSettings
 from mag_tracking.stages.detect import Detect, DetectSettings
 from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.survey import SurveySettings
-from mag_tracking.stages.track import TrackSettings, TrackStage
+from mag_tracking.stages.track import TrackStage
+from mag_tracking.stages.track_settings import TrackSettings
 
 
 @dataclass(frozen=True)

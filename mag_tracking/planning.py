@@ -18,7 +18,7 @@ from mag_tracking.inference.crlb import observability, path_bound, snr_range
 from mag_tracking.inference.detection_theory import energy_threshold, missed_probability
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.motion import constant_velocity, integrator_noise
-from mag_tracking.stages.track import acceleration_density
+from mag_tracking.stages.track_settings import acceleration_density
 
 MOST_FRAMES = 1000
 """Of a pass, when it is asked whether it is missed: slower ones are not missed more."""

@@ -300,12 +300,15 @@ def test_missing_frames_are_bridged():
 
 
 def spiked(stage, frames, at, size, n=1):
-    """Records of `stage` on `frames`, with `size` [T] on one axis of `n` of them from `at` on."""
+    """Records of `stage` on `frames`, with `size` [T] on an axis of each sensor in `n` of them.
+
+    On all sensors: one alone that contradicts is taken for missing, and the frame fits.
+    """
     out = []
     for k, f in enumerate(frames):
         if at <= k < at + n:
             field = f.field.copy()
-            field[0, 1] += size
+            field[:, 1] += size
             f = replace(f, field=field)
         out += stage.feed(f)
     return out + stage.flush()

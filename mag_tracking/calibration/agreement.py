@@ -4,6 +4,7 @@ Without a target every sensor has the same field in another frame. A flipped axi
 pair, another unit or two sensors in each other's place are seen at once, and told by name.
 """
 
+import functools
 from dataclasses import dataclass
 from itertools import permutations, product
 
@@ -85,6 +86,13 @@ def disagreements(names, fields, R_ws, orientation_std, earth_field, bias_std):
 
 def _fits(y, R_ws, std, B0, bias_std):
     """Whether a field is no less likely than IMPROBABLE, at the heading that suits it best."""
+    return _fits_numbers(*(tuple(np.ravel(a).tolist()) for a in (y, R_ws, std, B0)), bias_std)
+
+
+@functools.lru_cache(maxsize=4096)
+def _fits_numbers(y, R_ws, std, B0, bias_std):
+    """`_fits` of tuples; a network that is watched is asked the same every second."""
+    y, R_ws, std = np.array(y), np.array(R_ws).reshape(3, 3), np.array(std)
     there = ~np.isnan(y)
     if not there.any():
         return True
@@ -93,7 +101,7 @@ def _fits(y, R_ws, std, B0, bias_std):
     yaw = np.linspace(-most, most, 1 + 2 * max(1, round(most / YAW_STEP)))
     B = np.stack([B0[0] * np.cos(yaw) + B0[1] * np.sin(yaw),
                   B0[1] * np.cos(yaw) - B0[0] * np.sin(yaw), np.full(len(yaw), B0[2])], axis=1)
-    turn = (R_ws.T @ np.cross(np.eye(3), B0).T * std)[:, :2]
+    turn = (R_ws.T @ np.cross(np.eye(3), np.array(B0)).T * std)[:, :2]
     S = (bias_std**2 * np.eye(3) + turn @ turn.T)[np.ix_(there, there)]
     r = (y - B @ R_ws)[:, there]
     energy = np.einsum('ni,ij,nj->n', r, np.linalg.inv(S), r) + (yaw / std[2])**2

@@ -73,7 +73,7 @@ def readings_dict(samples):
                              'or of none')
     names = list(dict.fromkeys(s.sensor for s in samples))
     rows = {name: j for j, name in enumerate(names)}
-    covariance = np.array([s.covariance for s in samples]) if known[0] else np.zeros(0)
+    covariance = np.array([s.covariance for s in samples], dtype=float) if known[0] else np.zeros(0)
     # As array.array a message takes them as they are; a list is looked at number by number.
     return {'header': header_dict(max(s.stamp_ns for s in samples), ''), 'sensors': names,
             'sensor': array('H', [rows[s.sensor] for s in samples]),

@@ -55,6 +55,8 @@ class CalibrationNode(StageNode):
         self._state = self.publisher(CalibrationState, '~/calibration', LATCHED)
         self._published = None
         self.create_timer(1.0, self._publish_state)
+        self.create_timer(0.9 / len(self.network), lambda: self._health.look_at_next(
+            self.get_name(), self._stage))
         self.create_service(CalibrateService, '~/calibrate', self._calibrate)
         self.create_service(SurveyService, '~/survey', self._solve)
 
@@ -66,7 +68,8 @@ class CalibrationNode(StageNode):
 
     def _take(self, sensor, message):
         """One raw reading."""
-        for sample in self._calibrated(sample_of(message, sensor)):
+        now_ns = self.get_clock().now().nanoseconds
+        for sample in self._calibrated(sample_of(message, sensor), now_ns):
             self._publishers_by_sensor[sensor].publish(
                 to_message(MagneticField, sample_dict(sample, message.header.frame_id)))
 
@@ -78,14 +81,15 @@ class CalibrationNode(StageNode):
             self._stage.counts['rejected: bad readings'] += 1
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return
-        samples = [s for r in raw for s in self._calibrated(r)]
+        now_ns = self.get_clock().now().nanoseconds
+        samples = [s for r in raw for s in self._calibrated(r, now_ns)]
         if samples:
             self._readings.publish(to_message(FieldReadings, readings_dict(samples)))
 
-    def _calibrated(self, raw):
-        """What the stage makes of one raw reading."""
+    def _calibrated(self, raw, now_ns):
+        """What the stage makes of one raw reading, which came at `now_ns`."""
         if raw.sensor in self._publishers_by_sensor:
-            self._health.add(raw, self.get_clock().now().nanoseconds)
+            self._health.add(raw, now_ns)
         return self._stage.feed(raw)
 
     def _shaken(self, sensor, message):

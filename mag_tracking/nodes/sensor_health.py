@@ -24,6 +24,7 @@ class HealthDiagnostics:
     def __init__(self, network, settings):
         self._settings = settings
         self._heard = dict.fromkeys(network.names)
+        self._ready = {}
         self._frozen_ns, self._compared = {}, {}
         # How many backgrounds had been taken anew when the last term began, and this one.
         self._relearnt = [dict.fromkeys(network.names, 0)] * 2
@@ -50,7 +51,10 @@ class HealthDiagnostics:
         self._heard[sample.sensor] = time.monotonic()
 
     def statuses(self, node, calibrate):
-        """[DiagnosticStatus], one a sensor; `calibrate` is the `Calibrate` stage."""
+        """[DiagnosticStatus], one a sensor; `calibrate` is the `Calibrate` stage.
+
+        Made now, but for those that `look_at_next` has made since the last time.
+        """
         self._compare(calibrate)
         if time.monotonic() > self._term_ends:
             self._term_ends = time.monotonic() + TERM_S
@@ -58,8 +62,16 @@ class HealthDiagnostics:
                 name: SensorHealth() for name in self._network.names}
             self._relearnt = [self._relearnt[1], {
                 name: b.n_relearnt for name, b in calibrate.backgrounds().items()}]
-        return [self._status(node, j, name, calibrate)
+        ready, self._ready = self._ready, {}
+        return [ready.get(name) or self._status(node, j, name, calibrate)
                 for j, name in enumerate(self._network.names)]
+
+    def look_at_next(self, node, calibrate):
+        """Make the status of one more sensor: all at once would hold up the readings."""
+        j = len(self._ready)
+        if j < len(self._network):
+            name = self._network.names[j]
+            self._ready[name] = self._status(node, j, name, calibrate)
 
     def _compare(self, calibrate):
         """Compare the sensors with each other and with the Earth."""

@@ -10,12 +10,17 @@ class Ahead:
     All others pass at once.
     """
 
-    def __init__(self, n_sensors, limit):
-        """`limit` [ns]: a longer jump is looked at, and samples are held for so long."""
+    def __init__(self, n_sensors, limit, most):
+        """`limit` [ns]: a longer jump is looked at, and samples are held for so long, by the stamps
+        of the others or its own; `most` of a sensor are held."""
         self._limit = limit
+        self._most = most
         self._latest = [None] * n_sensors
-        self._newest = self._before = None
+        self._newest = None
+        # (sensor, sample, the newest stamp when it came), in the order in which they came.
         self._held = []
+        # {sensor that is ahead: (the newest stamp, its own when that was first the newest)}
+        self._quiet_since = {}
 
     def feed(self, i, sample):
         """What is known by now of a sample of sensor `i`, and of those that are held.
@@ -25,48 +30,67 @@ class Ahead:
         passed, refused : lists of (i, sample)
             In the order in which they came.
         """
-        stamp, last = sample.stamp_ns, self._latest[i]
-        jumps = last is not None and stamp - last > self._limit \
-            and stamp > self._newest + self._limit
-        if not jumps:
-            # It is back with the others: what it said of a time ahead of them was wrong.
-            refused = self._take_out(i, float('inf')) if self._held else []
-            return self._pass([(i, sample)]), refused
-        if not self._held:
-            self._before = self._newest
-        self._held.append((i, sample))
-        if self._most_agree(stamp) or self._is_alone(i, stamp):
-            held, self._held = self._held, []
-            return self._pass(held), []
-        return [], self._take_out(i, stamp - self._limit)
+        stamp = sample.stamp_ns
+        if not self._jumps(i, stamp):
+            passed = self._pass([(i, sample)])
+        else:
+            self._held.append((i, sample, self._newest))
+            if self._quiet_since.get(i, (None,))[0] != self._newest:
+                self._quiet_since[i] = self._newest, stamp
+            if not (self._most_agree(stamp) or self._is_alone(i, stamp)):
+                return [], self._too_old(i, stamp)
+            # Who is ahead of these, too, does not pass with them.
+            passed = self._pass(self._take_out(lambda _, s, __: s.stamp_ns <= stamp + self._limit))
+        # It is back with the others: what it said of a time ahead of them was wrong. And whom they
+        # did not follow for so long they will not follow.
+        return passed, self._take_out(
+            lambda j, _, newest: j == i or self._newest - newest > self._limit)
 
     def flush(self):
         """[(i, sample)] of those that are held when nothing comes any more."""
-        held, self._held = self._held, []
-        return self._pass(held)
+        return self._pass(self._take_out(lambda *_: True))
+
+    def _jumps(self, i, stamp):
+        """Whether a stamp is ahead of all that have passed."""
+        if self._newest is None or stamp <= self._newest + self._limit:
+            return False
+        # Of two, who is heard for the first time may as well be right.
+        return self._latest[i] is not None or bool(self._held) or len(self._alive()) > 1
 
     def _pass(self, samples):
         """Note that `samples` are as they should be."""
         for i, sample in samples:
             self._latest[i] = sample.stamp_ns
+            self._quiet_since.pop(i, None)
             if self._newest is None or sample.stamp_ns > self._newest:
                 self._newest = sample.stamp_ns
         return samples
 
+    def _alive(self):
+        """The sensors that have passed of late."""
+        return {j for j, latest in enumerate(self._latest)
+                if latest is not None and latest >= self._newest - self._limit}
+
     def _most_agree(self, stamp):
         """Whether most of the living sensors have jumped to about this stamp."""
-        agree = {j for j, s in self._held if abs(s.stamp_ns - stamp) <= self._limit}
-        alive = {j for j, latest in enumerate(self._latest)
-                 if latest is not None and latest >= self._newest - self._limit}
-        return 2 * len(agree) > len(agree | alive)
+        agree = {j for j, s, _ in self._held if abs(s.stamp_ns - stamp) <= self._limit}
+        return 2 * len(agree) > len(agree | self._alive())
 
     def _is_alone(self, i, stamp):
-        """Whether sensor `i` has jumped for a while and no other has said anything since."""
-        first = next(s.stamp_ns for j, s in self._held if j == i)
-        return self._newest == self._before and stamp - first >= self._limit
+        """Whether sensor `i` has been ahead for a while and no other has said anything since."""
+        return stamp - self._quiet_since[i][1] >= self._limit
 
-    def _take_out(self, i, before):
-        """Those that are held of sensor `i` with stamps `before` this; they are held no more."""
-        out = [(j, s) for j, s in self._held if j == i and s.stamp_ns < before]
-        self._held = [(j, s) for j, s in self._held if j != i or s.stamp_ns >= before]
+    def _too_old(self, i, stamp):
+        """What is held of sensor `i` for too long, or is too much, taken out."""
+        mine = [s for j, s, _ in self._held if j == i]
+        last = mine[-self._most:]
+        return self._take_out(lambda j, s, _: j == i and (
+            s.stamp_ns < stamp - self._limit or not any(s is kept for kept in last)))
+
+    def _take_out(self, is_meant):
+        """[(i, sample)] of those held that `is_meant`; they are held no more."""
+        if not self._held:
+            return []
+        out = [h[:2] for h in self._held if is_meant(*h)]
+        self._held = [h for h in self._held if not is_meant(*h)]
         return out

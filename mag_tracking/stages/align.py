@@ -70,7 +70,7 @@ class Align:
         self._first = self._newest = self._end = self._stamp = None
         self._taken = [None] * self._n
         self._last_taken = None
-        self._ahead = Ahead(self._n, self._longest_jump)
+        self._ahead = Ahead(self._n, self._longest_jump, self._most_pending)
         self._look_ahead()
 
     def feed(self, sample):

@@ -93,8 +93,11 @@ class Calibrate:
         self._decimators = {name: Decimator(self._settings.decimate_to_hz)
                             for name in network.names}
         for i, name in enumerate(network.names):
-            if before is None or not (_same(before.offset[i], network.offset[i])
-                                      and _same(before.correction[i], network.correction[i])):
+            same = before is not None and _same(before.offset[i], network.offset[i]) \
+                and _same(before.correction[i], network.correction[i])
+            if not same or self._clock_ns[i] != clock_before[i]:
+                self._give_up(name, 'another calibration came')
+            if not same:
                 self._background[name] = self._new_background(i)
             else:
                 # The same readings have other stamps from now on.
@@ -109,7 +112,7 @@ class Calibrate:
                                  s.relearn_s, network.background[i], network.noise_std[i])
 
     def feed(self, sample):
-        """A raw `MagSample` gives at most one calibrated `MagSample`."""
+        """A raw `MagSample` gives the calibrated ones that are now known to be whole."""
         if sample.sensor not in self._background:
             return self._reject(sample, f'unknown sensor {sample.sensor}')
         cause = self._fault(sample)
@@ -133,13 +136,23 @@ class Calibrate:
         if self._settings.spike_std:
             background = self._background[name]
             known = self._spikes[name].feed(
-                sample, field, background.noise_std if background.ready else None)
-        whole = [s for s, is_spike in known if not is_spike]
+                sample, sample.stamp_ns, field,
+                background.noise_std if background.ready else None)
         for s, is_spike in known:
             if is_spike:
                 self._reject(s, SPIKE)
-        self.per_sensor[name]['accepted'] += len(whole)
-        return whole
+        return self._accepted([s for s, is_spike in known if not is_spike])
+
+    def _accepted(self, samples):
+        """Count `samples`."""
+        for s in samples:
+            self.per_sensor[s.sensor]['accepted'] += 1
+        return samples
+
+    def _give_up(self, name, why):
+        """Nothing that comes tells any more whether what is held of a sensor was a spike."""
+        for held, _ in self._spikes[name].flush():
+            self._reject(held, f'may have been a spike when {why}')
 
     def _misplaced(self, sample):
         """Why the stamp of a sample cannot be used, or None; a restart is one to go on from."""
@@ -150,7 +163,7 @@ class Calibrate:
             if last - sample.stamp_ns <= self._settings.jump_back_s * NS:
                 return 'duplicate stamp' if sample.stamp_ns == last else 'out of order'
             self._background[sample.sensor].forget()
-            self._spikes[sample.sensor].clear()
+            self._give_up(sample.sensor, 'time jumped back')
             self.counts['time jumped back'] += 1
             self._first_ns.pop(sample.sensor)
         self._last_ns[sample.sensor] = sample.stamp_ns
@@ -212,8 +225,9 @@ class Calibrate:
 
     def flush(self):
         """What waited for the next reading."""
-        return [c for spikes in self._spikes.values() for whole, _ in spikes.flush()
-                for s in self._thinned(whole) for c in self._calibrated(s)]
+        held = [s for spikes in self._spikes.values() for s, _ in spikes.flush()]
+        return [c for whole in self._accepted(held) for s in self._thinned(whole)
+                for c in self._calibrated(s)]
 
     def _is_ahead(self, sample, last):
         """Whether a stamp is far ahead of the `last`, and of the one that was so before it."""

@@ -13,6 +13,17 @@ SAME_TIME_S = 1e-3
 """[s] Samples closer than this are taken together: at 20 m/s a target moves two centimetres."""
 
 
+def angle_priors(network, mounting_std):
+    """(n_sensors, 3, 3) [rad^2] of the mounting angles when a track begins.
+
+    `mounting_std` [rad] is that of a sensor whose `orientation_std` is not known.
+    """
+    std = [np.full(3, mounting_std) if s is None else np.minimum(s, MOST_TURNED)
+           for s in network.orientation_std]
+    # The angles are about the sensor's axes, what is known of them about the world's.
+    return np.einsum('jik,jk,jlk->jil', network.R_sw, np.square(std), network.R_sw)
+
+
 class Observation:
     """The field that a network has of hypotheses, and the states that belong to its sensors.
 
@@ -37,11 +48,7 @@ class Observation:
         errors = np.arange(self._n_angles, n_own)
         self.own_covariance[:, errors, errors] = 1.0
         if mounting_std:
-            std = [np.full(3, mounting_std) if s is None else np.minimum(s, MOST_TURNED)
-                   for s in network.orientation_std]
-            # The angles are about the sensor's axes, what is known of them about the world's.
-            self.own_covariance[:, :3, :3] = np.einsum(
-                'jik,jk,jlk->jil', self._R_sw, np.square(std), self._R_sw)
+            self.own_covariance[:, :3, :3] = angle_priors(network, mounting_std)
 
     @property
     def n_own(self):

@@ -90,6 +90,11 @@ class WholeTrack:
             self._filter = copy(bank_filter)
             self._x, self._P, self._origin = bank.x.copy(), bank.P.copy(), bank.origin
 
+    def give_up(self):
+        """It cannot be smoothed as a whole."""
+        self.clear()
+        self.too_long = True
+
     def add(self, bank, frame, dt, published):
         """A frame was used, `dt` [s] after the one before."""
         if self._filter is None:
@@ -97,8 +102,7 @@ class WholeTrack:
         self._length_s += dt
         n_numbers = (len(self._frames) + 1) * bank.x.shape[1]**2
         if self._length_s > self._longest_s or n_numbers > MOST_NUMBERS:
-            self.clear()
-            self.too_long = True
+            self.give_up()
             return
         self._frames.append(frame)
         self._intervals.append(dt)

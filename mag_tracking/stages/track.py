@@ -4,17 +4,18 @@ Source: ICASSP11 section 2, T10 Alg. 2 and 3; PHD15 Paper A for the magnet.
 """
 
 from collections import Counter, deque
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 
 import numpy as np
 
 from mag_tracking.errors import NetworkError, SettingsError
-from mag_tracking.settings import param
+from mag_tracking.inference.detection_theory import whitened_energy
 from mag_tracking.stages.bank_filter import BankFilter, NoTarget
 from mag_tracking.stages.contradiction import Contradiction
-from mag_tracking.stages.magnet_start import MagnetSettings, magnet_model, start_magnet
+from mag_tracking.stages.magnet_start import magnet_model, start_magnet
+from mag_tracking.stages.neighbourhood import AHEAD_S, hand_on, nearest, part_of_frame, widened
 from mag_tracking.stages.observation import MOST_TURNED
 from mag_tracking.stages.pose import (
     is_ambiguous,
@@ -26,83 +27,10 @@ from mag_tracking.stages.pose import (
 from mag_tracking.stages.relinearise import Relinearisation
 from mag_tracking.stages.smooth import FixedLag, WholeTrack
 from mag_tracking.stages.stage import NS
-from mag_tracking.stages.vehicle_start import VehicleSettings, start_vehicle, vehicle_model
+from mag_tracking.stages.vehicle_start import start_vehicle, vehicle_model
 
 ALONE_S = 0.5
 """[s] A track that one sensor of several has carried alone for longer stays ambiguous."""
-
-
-@dataclass(frozen=True)
-class TrackSettings:
-    """Settings of the tracker."""
-
-    target: str = param('vehicle', 'What moves: vehicle or magnet.')
-    field_error: float = param(
-        0.04, 'Error of the predicted field relative to its size: gains, axes, shape.',
-        '', (0.0, 10.0), live=True)
-    model_error_time_s: float = param(
-        0.3, 'What the model leaves out of a field near the target stays alike for so long '
-        '(first-order Gauss-Markov states of each sensor), so that what it counts does not depend '
-        'on the frame period. 0 = it is noise, new in every frame, which is faster with many '
-        'sensors.', 's', (0.0, 60.0))
-    background_std: float = param(
-        2e-8, 'What a background may be off by when a track starts.', 'T', (0.0, 1e-3), live=True)
-    background_drift: float = param(
-        1e-8, 'Random walk of a background during a track.', 'T/s^0.5', (0.0, 1e-3), live=True)
-    mounting_std_deg: float = param(
-        5.0, 'How far a sensor may be turned from its orientation in the network file, about '
-        'each axis; the angles are estimated with each track (to first order: at 15 degrees the '
-        'field is 3 % too long). 0 = as the file says; with dozens of sensors that is several '
-        'times faster.',
-        'deg', (0.0, 15.0))
-    iterations: int = param(
-        1, 'Linearisations an update: more than one helps when the field says far more than the '
-        'prediction (magnets); for vehicles it locks into the wrong side.', '', (1, 20), live=True)
-    prune_ratio: float = param(
-        1e-12, 'A hypothesis lighter than the heaviest by this ratio is dropped (T10 Alg. 3).',
-        '', (1e-300, 0.5), live=True)
-    most_hypotheses: int = param(
-        600, 'No more than the heaviest so many are kept.', '', (1, 100000), live=True)
-    relinearise_window_s: float = param(
-        2.0, 'While a track runs, its leading hypotheses are linearised anew along what is now '
-        'known of their path, over the latest frames (64 at most) of once to twice so much time. '
-        '0 = never, which is two to three times faster.', 's', (0.0, 60.0))
-    relinearise_interval_s: float = param(
-        0.15, 'How often that is done. With two sensors and frames of 12.5 Hz tracking then takes '
-        'a quarter of a core, of 100 Hz a whole one: there rather choose 0.5. It grows with the '
-        'number of sensors.', 's', (0.0, 60.0))
-    relinearise_most: int = param(
-        20, 'For how many hypotheses it is done at most.', '', (1, 100000))
-    lookback_s: float = param(
-        1.0, 'A track begins so long before its detection, with the frames kept since: what is '
-        'too weak to detect still tells where the target came from.', 's', (0.0, 60.0))
-    end_std: float = param(
-        5.0, 'A track ends when its horizontal position is less certain than this (one standard '
-        'deviation): the target is out of reach.', 'm', (1e-6, 1e6), live=True)
-    end_nis: float = param(
-        25.0, 'A track ends when its normalised innovation is larger than this per axis, twice '
-        'running: it has lost its target. Once makes it ambiguous.', '', (1.0, 1e12), live=True)
-    end_gap_s: float = param(
-        2.0, 'A track ends where the frames have a longer gap than this.', 's', (1e-3, 86400.0))
-    smooth_longest_s: float = param(
-        60.0, 'A track that is no longer than this is smoothed when it ends, over all of its '
-        'frames, which takes less than a millisecond a frame (more with many sensors); 0 = never.',
-        's', (0.0, 86400.0))
-    smoothing_lag_s: float = param(
-        0.0, 'While a track runs, each pose is given once more when so much time has passed, by '
-        'what came since; every frame then costs a quarter of a millisecond for each frame of the '
-        'lag. 0 = no.', 's', (0.0, 10.0))
-    vehicle: VehicleSettings = field(default_factory=VehicleSettings)
-    magnet: MagnetSettings = field(default_factory=MagnetSettings)
-
-
-def acceleration_density(settings):
-    """(3,) [m^2/s^3] spectral density of the acceleration that the tracker of these
-    `TrackSettings` assumes."""
-    if settings.target == 'magnet':
-        return np.full(3, settings.magnet.acceleration**2)
-    v = settings.vehicle
-    return np.square([v.acceleration, v.acceleration, v.climb_acceleration])
 
 
 class TrackStage:
@@ -113,8 +41,8 @@ class TrackStage:
 
     def __init__(self, network, settings):
         self.counts = Counter()
-        self._network = network
-        self._settings = settings
+        self._whole_network, self._settings = network, settings
+        self._is_large = len(network) > settings.most_sensors
         if settings.target == 'vehicle':
             v = settings.vehicle
             self._model = vehicle_model(v, network)
@@ -132,7 +60,7 @@ class TrackStage:
         else:
             raise SettingsError(f'track.target: expected vehicle or magnet, '
                                 f'got {settings.target!r}')
-        self._filter = BankFilter(network, self._model, settings)
+        self._use(np.arange(min(len(network), settings.most_sensors)))
         hardly = sum(bool(s is not None and s.max() > MOST_TURNED)
                      for s in network.orientation_std)
         if hardly:
@@ -141,7 +69,6 @@ class TrackStage:
         self._anew = Relinearisation(settings.relinearise_interval_s, settings.relinearise_window_s,
                                      settings.relinearise_most)
         self._lag = FixedLag(settings.smoothing_lag_s) if settings.smoothing_lag_s else None
-        self._contradiction = Contradiction(network.names)
         self._next_id = 1
         self._bank = None
         # Evidence for a target against backgrounds that wander, and the filter of the latter.
@@ -159,9 +86,9 @@ class TrackStage:
 
         Raises NetworkError where they are others.
         """
-        if network.names != self._network.names:
+        if network.names != self._whole_network.names:
             raise NetworkError(f'a network of {", ".join(network.names)} in place of one of '
-                               f'{", ".join(self._network.names)}')
+                               f'{", ".join(self._whole_network.names)}')
         self._next_network = network
 
     def configure(self, settings):
@@ -179,8 +106,8 @@ class TrackStage:
         """A `FieldFrame` gives the `Track`s that follow from it."""
         out = []
         if self._next_network is not None and self._bank is None:
-            self._network, self._next_network = self._next_network, None
-            self._filter = BankFilter(self._network, self._model, self._settings)
+            self._whole_network, self._next_network = self._next_network, None
+            self._use(self._rows)
         if self._last_ns is not None:
             dt = (frame.stamp_ns - self._last_ns) / NS
             if dt <= 0.0:
@@ -191,13 +118,41 @@ class TrackStage:
         previous, self._last_ns = self._last_ns, frame.stamp_ns
         self.counts['frames'] += 1
         if frame.target_present and self._bank is not None:
-            return out + self._step(frame, (frame.stamp_ns - previous) / NS)
+            return out + self._step(self._near(frame), (frame.stamp_ns - previous) / NS)
         if frame.target_present:
             return out if self._out_of_reach else out + self._start(frame)
         out += self._end('released')
         self._out_of_reach = False
         self._remember(frame)
         return out
+
+    def _use(self, rows):
+        """From now on a track is of the sensors `rows` of the whole network."""
+        self._rows = rows
+        self._network = self._whole_network.part(rows) if self._is_large else self._whole_network
+        self._filter = BankFilter(self._network, self._model, self._settings)
+        self._contradiction = Contradiction(self._network.names)
+
+    def _near(self, frame):
+        """What of a frame of the whole network the track uses."""
+        return part_of_frame(frame, self._rows) if self._is_large else frame
+
+    def _follow(self, best):
+        """Take the sensors near to where hypothesis `best` is going, if those used are others."""
+        x, positions = self._bank.x[best], self._whole_network.positions
+        place, n = x[:2] + AHEAD_S * x[3:5], self._settings.most_sensors
+        if np.isin(nearest(positions, place, n // 2), self._rows).all():
+            return
+        before = self._rows
+        self._use(nearest(positions, place, n))
+        observation, std = self._filter.observation, self._settings.background_std
+        hand_on(self._bank, observation.n_own, before, self._rows, observation.own_covariance, std)
+        self._no_target = NoTarget(len(self._network), std)
+        self._whole.give_up()
+        self._anew.begin_anew()
+        if self._lag is not None:
+            self._lag.clear()
+        self.counts['tracks handed on to other sensors'] += 1
 
     def _forget(self, reason):
         """What came before has nothing to do with what comes."""
@@ -219,10 +174,16 @@ class TrackStage:
     def _start(self, frame):
         """Make the first hypotheses and run them through the frames before the detection."""
         s = self._settings
+        if self._is_large:
+            strongest = int(np.argmax(whitened_energy(frame.field, frame.covariance)[0]))
+            self._use(nearest(self._whole_network.positions,
+                              self._whole_network.positions[strongest, :2], s.most_sensors))
+            frame = self._near(frame)
         known = self._network, frame, s.background_std, self._filter.observation.own_covariance
         self._bank = start_vehicle(s.vehicle, *known) if s.target == 'vehicle' else \
             start_magnet(s.magnet, *known, s.field_error)
-        recent = [f for f in self._recent if frame.stamp_ns - f.stamp_ns <= s.lookback_s * NS]
+        recent = [self._near(f) for f in self._recent
+                  if frame.stamp_ns - f.stamp_ns <= s.lookback_s * NS]
         self._recent.clear()
         if self._bank is None:
             self.counts['frames without a start'] += 1
@@ -272,6 +233,8 @@ class TrackStage:
             return []
         self._last = self._published(frame, dt, best)
         self.counts['poses'] += 1
+        if self._is_large:
+            self._follow(best)
         reason = self._reason_to_end(self._last)
         if reason:
             # In the tail of its own detection a vehicle would be started on the wrong line.
@@ -300,16 +263,20 @@ class TrackStage:
             kind=self.kinds[bank.kind[best]], complete=complete, ambiguous=ambiguous)
             for stamp_ns, x, P in states]
 
+    @property
+    def _is_doubtful(self):
+        """Whether the field contradicted the track at its end, or one sensor alone carried it."""
+        return self._strange > 0 or self._alone_s > ALONE_S
+
     def _smoothed_at_the_end(self):
         """What is left of a fixed lag, and the whole track."""
         best = self._bank.best()
         out = [] if self._lag is None else self._smoothed(best, False, self._lag.rest(
-            self._filter, self._bank, best), self._strange > 0)
+            self._filter, self._bank, best), self._is_doubtful)
         states, left_out = self._whole.smoothed(self._bank, best)
         self.counts['frames left out of smoothing'] += left_out
         self.counts['tracks too long to smooth'] += self._whole.too_long
-        # A track that ended because the field contradicted it may have been something else.
-        return out + self._smoothed(best, True, states, self._strange > 0)
+        return out + self._smoothed(best, True, states, self._is_doubtful)
 
     def _published(self, frame, dt, best):
         """The `Track` of the hypothesis `best`, with what it says of the sensors."""
@@ -321,7 +288,7 @@ class TrackStage:
         alone = len(self._network) > 1 and np.count_nonzero(there.any(axis=1)) == 1
         self._alone_s += dt if alone else 0.0
         alone = alone or self._alone_s > ALONE_S
-        return published_track(
+        track = published_track(
             bank, best, self._model, self._orientation, self.arrivals, self.kinds,
             stamp_ns=frame.stamp_ns,
             id=self._next_id, ended=False,
@@ -331,6 +298,8 @@ class TrackStage:
             predicted=self._filter.predicted_field(bank, best, frame, dt),
             mounting=observation.angles(bank.x[best]),
             mounting_covariance=observation.angle_covariances(bank.P[best]))
+        return widened(track, self._rows, self._whole_network, self._settings) \
+            if self._is_large else track
 
     def _end(self, reason):
         """Close the running track: its last record once more, marked as ended, then it smoothed."""

@@ -1,0 +1,186 @@
+"""What the nodes cost: driver, calibration, detection and tracker as processes, live.
+
+    python test/bench/load.py                                    # 100 sensors x 100 Hz, ten minutes
+    python test/bench/load.py --sensors 2 --minutes 2 --lean     # two sensors, 126 hypotheses
+
+The simulator is the hardware; it runs in the driver's process. Printed are how long a pose comes
+after the sample that completed its frame, by this machine's clock, what was lost, and what each
+process takes of a core and of memory. Exits with 1 where a sample or a frame was lost.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+os.environ.setdefault('ROS_DOMAIN_ID', str(101 + os.getpid() % 100))
+ROOT = Path(__file__).resolve().parents[2]
+NODES = ('calibration_node', 'detection_node', 'tracker_node', 'driver_node')
+RATE, PERIOD_S = 100.0, 0.08
+"""[Hz] of each sensor, and the length of a frame (`align.period_s`)."""
+WARM_UP_S = 20.0
+LEAN = {'arrival_names': "['left']", 'arrival_headings_deg': '[0.0]'}
+"""One kind, one arrival: 3 offsets x 14 moments x 3 speeds = 126 hypotheses."""
+
+
+def network_yaml(n):
+    """`n` sensors in pairs along a road."""
+    rows = [f'  mag_{i + 1}: {{position: [{9.0 * (i // 2)}, {4.5 if i % 2 else -4.5}, 0.0], '
+            'orientation: [0, 0, 0, 1], noise_std: 1.2e-8}' for i in range(n)]
+    return '\n'.join(['frame: map', 'earth_field: [2.0e-6, 1.55e-5, -4.9e-5]', 'sensors:', *rows,
+                      ''])
+
+
+def drivers_yaml(n, network):
+    """The simulator for all of them: a car at 20 m/s, as often as the road is free."""
+    return (f'road:\n  device: simulator\n  simulator: {{network: {network}, rate_hz: {RATE}, '
+            'speed: 20.0, period_s: 5.0, offset: 1.0}\n  sensors: {'
+            + ', '.join(f'mag_{i + 1}: mag_{i + 1}' for i in range(n)) + '}\n')
+
+
+def usage(process):
+    """(CPU seconds, resident MB) of a process."""
+    fields = Path(f'/proc/{process.pid}/stat').read_text().rpartition(')')[2].split()
+    cpu = (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+    return cpu, int(fields[21]) * os.sysconf('SC_PAGE_SIZE') / 1e6
+
+
+class Ear:
+    """Listens to poses and diagnostics."""
+
+    def __init__(self, node):
+        from diagnostic_msgs.msg import DiagnosticArray
+        from geometry_msgs.msg import PoseWithCovarianceStamped
+
+        from mag_tracking.nodes.stage_node import STREAM
+        self.latencies, self.values, self.troubles = [], {}, {}
+        node.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose', self._pose,
+                                 STREAM)
+        node.create_subscription(DiagnosticArray, '/diagnostics', self._diagnostics, STREAM)
+
+    def _pose(self, message):
+        """How long after the sample that completed the frame it came."""
+        stamp = message.header.stamp.sec + message.header.stamp.nanosec / 1e9
+        # The stamp is the mean of the samples; the one that shows that they were all comes behind.
+        completed = stamp + PERIOD_S / 2.0 + 0.5 / RATE
+        self.latencies.append(time.time() - completed)
+
+    def _diagnostics(self, message):
+        """Keep the latest."""
+        for status in message.status:
+            self.values[status.name] = {v.key: v.value for v in status.values}
+            if status.level != b'\x00':
+                self.troubles[status.name] = status.message
+
+    def losses(self):
+        """{what: how many} of all that says that something was lost."""
+        out = {}
+        for name, values in self.values.items():
+            for key, value in values.items():
+                lost = key.startswith(('rejected', 'lost', 'readings lost', 'frames with a sensor'))
+                if lost and value not in ('0', ''):
+                    out[f'{name}: {key}'] = value
+        return out
+
+
+def start(folder, n, parameters):
+    """The nodes as processes, the driver last."""
+    network, drivers = folder / 'network.yaml', folder / 'drivers.yaml'
+    network.write_text(network_yaml(n))
+    drivers.write_text(drivers_yaml(n, network))
+    processes = {}
+    for node in NODES:
+        more = ['-p', f'drivers:={drivers}', '-p', f'batches:={str(n > 16).lower()}'] \
+            if node == 'driver_node' else ['--params-file', str(parameters)]
+        processes[node] = subprocess.Popen(
+            [sys.executable, '-m', f'mag_tracking.nodes.{node}', '--ros-args', '-p',
+             f'network:={network}', *more], stdout=subprocess.DEVNULL, stderr=sys.stderr)
+        time.sleep(3.0 if node == 'tracker_node' else 0.0)
+    return processes
+
+
+def parameters_of(folder, lean):
+    """The parameter file."""
+    text = (ROOT / 'config' / 'large_network.yaml').read_text()
+    if lean:
+        text += ''.join(f'        {key}: {value}\n' for key, value in LEAN.items())
+    path = folder / 'parameters.yaml'
+    path.write_text(text)
+    return path
+
+
+def watch(processes, ear, executor, minutes):
+    """[(t, {node: (CPU s, MB)})] every ten seconds."""
+    from mag_tracking.nodes.stage_node import spin
+    begin, rows = time.monotonic(), []
+    while time.monotonic() - begin < 60.0 * minutes:
+        until = begin + 10.0 * (len(rows) + 1)
+        spin(executor, lambda until=until: time.monotonic() > until)
+        rows.append((time.monotonic() - begin, {k: usage(p) for k, p in processes.items()}))
+        print(f'{rows[-1][0]:6.0f} s  {len(ear.latencies):6d} poses  ' + '  '.join(
+            f'{k.removesuffix("_node")} {mb:.0f} MB' for k, (_, mb) in rows[-1][1].items()),
+            flush=True)
+    return rows
+
+
+def report(ear, rows, begin):
+    """Print what was measured; whether anything was lost."""
+    late = 1e3 * np.array(ear.latencies[begin:])
+    print(f'{len(late)} poses, after the sample that completed the frame: median '
+          f'{np.median(late):.1f} ms, p99 {np.quantile(late, 0.99):.1f} ms, '
+          f'worst {late.max():.1f} ms')
+    first, last = rows[min(len(rows) - 1, int(WARM_UP_S / 10.0))], rows[-1]
+    minute = rows[min(len(rows) - 1, 5)]
+    total = 0.0
+    for node in last[1]:
+        share = (last[1][node][0] - first[1][node][0]) / max(1e-9, last[0] - first[0])
+        total += share
+        print(f'{node}: {100.0 * share:.1f} % of a core, {last[1][node][1]:.1f} MB, '
+              f'{last[1][node][1] - minute[1][node][1]:+.1f} MB since the first minute')
+    print(f'together: {100.0 * total:.1f} % of a core')
+    losses = ear.losses()
+    print(f'lost: {losses or "nothing"}')
+    print(f'diagnostics that were not well: {ear.troubles or "none"}')
+    return bool(losses)
+
+
+def main():
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--sensors', type=int, default=100)
+    parser.add_argument('--minutes', type=float, default=10.0)
+    parser.add_argument('--lean', action='store_true', help='126 hypotheses')
+    args = parser.parse_args()
+    import rclpy
+
+    from mag_tracking.nodes.stage_node import make_executor, spin
+    rclpy.init()
+    node, executor = rclpy.create_node('load'), make_executor()
+    executor.add_node(node)
+    ear = Ear(node)
+    with tempfile.TemporaryDirectory() as folder:
+        processes = start(Path(folder), args.sensors, parameters_of(Path(folder), args.lean))
+        try:
+            end = time.monotonic() + WARM_UP_S
+            spin(executor, lambda: time.monotonic() > end)
+            begin = len(ear.latencies)
+            rows = watch(processes, ear, executor, args.minutes)
+        finally:
+            for process in reversed(list(processes.values())):
+                process.send_signal(2)
+                process.wait(30.0)
+    executor.remove_node(node)
+    node.destroy_node()
+    executor.shutdown()
+    rclpy.try_shutdown()
+    return int(report(ear, rows, begin))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
