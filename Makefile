@@ -57,7 +57,8 @@ test: $(STAMP)  ## check style, floors and behaviour
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not alone'
-	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest -q -m alone
+	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'alone and not single'
+	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest -q -m single
 
 bench: $(STAMP)  ## measure times and accuracies
 	$(BIN)/python test/bench/bench.py

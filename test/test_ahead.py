@@ -76,7 +76,7 @@ def test_quiet_streams_pass_at_once(seed):
 @pytest.mark.parametrize('step', [10, 100, 1000])
 @pytest.mark.parametrize('n', [2, 3, 6])
 def test_one_clock_steps_ahead_and_back(n, step):
-    arrivals = stepped(stream(n, 0, 20_000, step), {1}, 5000, 12_000, by=1800)
+    arrivals = stepped(stream(n, 0, 20_000, step), {1}, 5000, 12_000, by=1803)
     ahead = Ahead(n, LIMIT, 10_000)
     passed, refused = run(ahead, arrivals)
     wrong = [a for a, b in zip(arrivals, stream(n, 0, 20_000, step), strict=True) if a != b]
@@ -166,9 +166,14 @@ def test_a_clock_that_is_ahead_when_it_is_first_heard():
 
 def test_a_sensor_that_is_first_heard_confirms_a_jump():
     ahead = Ahead(3, LIMIT, 10)
-    run(ahead, [(0, 0), (1, 0)])
-    assert run(ahead, [(0, 600)]) == ([], [])
-    assert run(ahead, [(2, 700)]) == ([(0, 600), (2, 700)], [])
+    run(ahead, [(0, 0), (1, 900)])
+    assert run(ahead, [(0, 1450)]) == ([], [])
+    assert run(ahead, [(2, 1460)]) == ([(0, 1450), (2, 1460)], [])
+
+
+def test_each_jump_waits_anew():
+    ahead = after(2)
+    assert run(ahead, [(1, 3000), (1, 990), (1, 4000)]) == ([(1, 990)], [(1, 3000)])
 
 
 def test_a_stamp_that_nobody_follows_waits_for_so_long_only():
@@ -342,6 +347,13 @@ def test_a_gap_of_all_is_no_fault_and_a_setting_of_zero_is_never():
     never = align(6, ahead_s=0.0)
     frames_of(never, stepped(stream(6, 0, 3000), {2}, 1000, 9999, by=1000))
     assert set(rejected(never.counts)) == {'late'}
+
+
+def test_after_a_restart_it_goes_by_the_new_time():
+    stage = align(3)
+    frames_of(stage, stream(3, 100_000, 102_000))
+    frames_of(stage, stepped(stream(3, 0, 4000), {1}, 2000, 3000, by=1000))
+    assert rejected(stage.counts) == {'ahead of all others: mag_2': 100}
 
 
 def test_counts_name_each_sensor():

@@ -7,7 +7,7 @@ import pytest
 
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.io.drivers.device_clock import ClockSettings
-from mag_tracking.io.drivers.driver import Driver, DriverSettings
+from mag_tracking.io.drivers.driver import Driver, DriverSettings, serve
 from mag_tracking.io.drivers.framed_device import FramedDevice
 from mag_tracking.io.drivers.reading import Arrival, Chunk, Parsed, Reading
 from mag_tracking.io.drivers.sequence import MEMORY, SequenceCheck
@@ -240,7 +240,10 @@ def test_losses_by_sequence_number():
     assert checked([254, 255, 0, 1], wrap=256) == ([True] * 4, {})
     assert checked([250, 3, 255], wrap=256) == ([True] * 3, {'lost': 7, 'came late': 1})
     assert checked([0, 300, -1], wrap=256)[1] == {'sequence numbers out of range': 2}
-    assert checked([0, 10**9, 10**9 + 1])[1] == {'lost': 10**9 - 1}
+    assert checked([0, 1000, 1001])[1] == {'lost': 999}
+    # One corrupt number is not a billion that were lost.
+    assert checked([0, 1, 2**64 - 1, 2, 3]) == (
+        [True] * 5, {'sequence jumped': 1, 'sequence begun anew': 1})
 
 
 def test_duplicates_are_not_restarts():
@@ -258,6 +261,64 @@ def test_the_memory_of_a_sequence_is_bounded():
     for n in range(0, 100 * MEMORY, 2):
         check.is_new(n, (0.0,))
     assert len(check._seen) <= MEMORY and len(check._missing) <= MEMORY
+
+
+def test_one_topic_is_of_one_sensor():
+    driver, *_ = driver_of([[Reading('A', (1.0, 0.0, 0.0)), Reading('B', (2.0, 0.0, 0.0)),
+                             Reading('A', (3.0, 0.0, 0.0))]])
+    assert [s.field[0] for s in driver.poll(0.1)] == [1.0, 3.0]
+    assert driver.counts()['of unknown sensors: B'] == 1
+
+
+def test_a_sensor_that_is_not_used_is_no_news():
+    driver, *_ = driver_of([[Reading('A', (1.0, 0.0, 0.0), sequence=1),
+                             Reading('B', (2.0, 0.0, 0.0), sequence=1)]],
+                           sensors={'A': 'mag_1', 'B': '-'})
+    assert [s.sensor for s in driver.poll(0.1)] == ['mag_1']
+    assert driver.counts() == {'samples: mag_1': 1}
+
+
+def test_unknown_names_do_not_pile_up():
+    readings = [Reading(f'x{k}', (1.0, 0.0, 0.0)) for k in range(1000)]
+    driver, *_ = driver_of([readings], sensors={'A': 'mag_1'})
+    assert driver.poll(0.1) == []
+    assert len(driver.counts()) == 21
+    assert driver.counts()['of unknown sensors (and others)'] == 980
+
+
+def test_a_reading_beyond_all_numbers_is_none():
+    driver, *_ = driver_of([[Reading('', (1e308, 0.0, 0.0)), Reading('', (1.0, 0.0, 0.0))]],
+                           {'unit': '1e10'})
+    assert len(driver.poll(0.1)) == 1
+    assert driver.counts()['readings that are infinite in tesla'] == 1
+
+
+def test_a_device_that_does_not_even_close_is_opened_again():
+    driver, device, machine = driver_of([DeviceError('gone')])
+
+    def close():
+        raise OSError('stuck')
+    device.close = close
+    driver.poll(0.1)
+    assert not driver.is_open and 'gone (and it does not close: OSError: stuck)' in driver.trouble
+    machine.now_ns += 10**9
+    driver.poll(0.1)
+    assert driver.is_open and driver.counts()['closings that failed'] == 1
+    # What was wrong stays said until something has come.
+    assert driver.trouble
+
+
+def test_errors_behind_a_driver_are_not_the_devices():
+    driver, device, _ = driver_of([[Reading('', (1.0, 2.0, 3.0))]] * 3)
+    taken = []
+
+    def take(samples):
+        taken.append(samples)
+        if len(taken) == 1:
+            raise ValueError('nobody expected it')
+    serve(driver, take, lambda: len(taken) == 3)
+    assert device.calls == ['open', 'close']
+    assert driver.counts()['errors behind the driver: ValueError'] == 1
 
 
 class Lines:

@@ -66,8 +66,8 @@ def test_what_is_known_of_a_kind_need_not_be_said(tmp_path):
     (without(device='i2c'), 'a device has no transport and no framing beside it'),
     (without(transport='carrier pigeon'), "transport: expected serial, udp, mqtt or package.mod"),
     (without(framing=['text']), 'framing: expected text'),
-    (without(transport='no_such_module:Port'), "no_such_module:Port: No module named"),
-    (without(transport='yaml:Port'), "yaml:Port: module 'yaml' has no attribute 'Port'"),
+    (without(transport='no_such_module:Port'), "no_such_module:Port: ModuleNotFoundError: No"),
+    (without(transport='yaml:Port'), "module 'yaml' has no attribute 'Port'"),
     (without(serial={'prot': 'x'}), 'unknown setting prot; did you mean port?'),
     (without(serial={'port': 'x', 'baud': 'fast'}), "baud: expected int, got 'fast'"),
     (without(serial='/dev/ttyUSB0'), "serial: expected a mapping of settings, got '/dev/ttyUSB0'"),
@@ -77,8 +77,13 @@ def test_what_is_known_of_a_kind_need_not_be_said(tmp_path):
     (without(binary={'sync': 'A5'}), 'unknown setting binary'),
     (without('sensor'), 'expected `sensor: mag_1`, or `sensors:`'),
     (without(sensors={'A': 'mag_2'}), 'sensor and sensors exclude each other'),
-    (without('sensor', sensors={'A': 3}), 'sensors: A: expected the name of a sensor, got 3'),
+    (without('sensor', sensors={'A': 3}), 'sensors: A: expected the name of a sensor (letters'),
     (without('sensor', sensors={'1': 'a', 1: 'b'}), 'two of them have the same name'),
+    (without('sensor', sensors={1.1: 'a'}), 'sensors: 1.1 is no name; put it in quotes'),
+    (without('sensor', sensors={None: 'a'}), 'sensors: None is no name; put it in quotes'),
+    (without(sensor='mag 1'), 'expected the name of a sensor (letters, digits'),
+    (without(framing='collections:OrderedDict'), 'OrderedDict has no SETTINGS, parse'),
+    (without(framing='.x:Y'), 'framing: .x:Y: TypeError'),
     (without('sensor', sensors={'A': 'a', 'B': 'a'}), 'sensor a comes from board (A) already'),
     ({**without(), 'other': BOARD}, 'other: sensor mag_1 comes from board already'),
     ({'board': 7}, 'board: expected a mapping of settings, got 7'),
@@ -114,6 +119,9 @@ class Counting:
     SETTINGS = SimpleNamespace
 
     def __init__(self, settings):
+        pass
+
+    def parse(self, data, final=False):
         pass
 
 

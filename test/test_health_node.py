@@ -22,6 +22,9 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.records import MagSample
 from mag_tracking.stages.calibrate import Calibrate
 
+# They publish at a rate that is looked at.
+pytestmark = pytest.mark.single
+
 EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
 STRANGER = """
 import time

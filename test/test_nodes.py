@@ -264,6 +264,7 @@ def test_conversion_survives_the_message():
     assert len(back.hypotheses) == len(track.hypotheses)
 
 
+@pytest.mark.single
 @pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
 def test_nodes_leave_no_shared_memory_behind(how):
     """Killed nodes leave segments in /dev/shm; ours end cleanly."""

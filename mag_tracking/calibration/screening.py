@@ -39,7 +39,7 @@ class Repetition:
     """Tells when a sensor repeats itself longer than chance, or its coarse steps, would have it."""
 
     def __init__(self):
-        self._last, self._run, self._passed = None, 0, 0
+        self._last, self._run = None, 0
         self._repeats, self._changes = 0.0, 0.0
 
     def is_stuck(self, field):
@@ -48,17 +48,16 @@ class Repetition:
             a == b or isnan(a) and isnan(b) for a, b in zip(field, self._last, strict=True))
         self._last = field
         if not same:
-            # Of a run that was taken for a fault only what passed says what is usual.
-            self._repeats += self._passed
-            self._run = self._passed = 0
+            # A run that was taken for a fault says little about what is usual. But were it nothing,
+            # a sensor with coarse steps that began while a target passed would be stuck at rest.
+            self._repeats += 1.0 if self._too_long() else self._run
+            self._run = 0
             self._changes += 1.0
             if self._repeats + self._changes > MEMORY:
                 self._repeats, self._changes = 0.5 * self._repeats, 0.5 * self._changes
             return False
         self._run += 1
-        stuck = self._too_long()
-        self._passed += not stuck
-        return stuck
+        return self._too_long()
 
     def _too_long(self):
         """Whether the run so far is longer than what is likely."""
@@ -107,11 +106,15 @@ class SpikeFilter:
             return held + self._release(*new)
         steps = [abs(a - b) for a, b in zip(field, self._before, strict=True)]
         if self._held:
-            return self._settle(*new, steps)
+            return self._settle(*new, steps, noise_std)
+        return self._judge(*new, steps, noise_std)
+
+    def _judge(self, item, stamp_ns, field, steps, noise_std):
+        """Hold a reading that may be a spike; else it passes."""
         if len(self._steps) == RECENT and self._is_off(stamp_ns, steps, noise_std):
-            self._held.append((*new, steps))
+            self._held.append((item, stamp_ns, field, steps))
             return []
-        return self._release(*new, steps)
+        return self._release(item, stamp_ns, field, steps)
 
     def _is_off(self, stamp_ns, steps, noise_std):
         """Whether `steps` from the reading before are steeper than what passes could make them."""
@@ -128,7 +131,7 @@ class SpikeFilter:
                 return True
         return False
 
-    def _settle(self, item, stamp_ns, field, steps):
+    def _settle(self, item, stamp_ns, field, steps, noise_std):
         """Whether what is held was a spike, if `field` tells."""
         largest = [max((h[3][axis] for h in self._held if not isnan(h[3][axis])),
                        default=0.0)
@@ -142,7 +145,8 @@ class SpikeFilter:
         known = [(h[0], is_back) for h in self._held]
         self._held = []
         if is_back:
-            return known + self._release(item, stamp_ns, field, steps)
+            # It may be the next of several that differ.
+            return known + self._judge(item, stamp_ns, field, steps, noise_std)
         # A step: what was before it is nothing to compare with.
         self._steps.clear()
         return known + self._release(item, stamp_ns, field)

@@ -13,7 +13,7 @@ from mag_tracking.cli.options import add_command, add_network
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.io.drivers.configuration import read_drivers
-from mag_tracking.io.drivers.driver import serve
+from mag_tracking.io.drivers.driver import IGNORED, serve
 from mag_tracking.io.network_file import read_network
 from mag_tracking.records import MagSample
 
@@ -27,6 +27,9 @@ examples:
   mag-tracking listen config/drivers.yaml
   mag-tracking listen roadside.yaml --network site.yaml --seconds 10
 '''
+
+LARGE = 1e-3
+"""[T] Larger fields are those of magnets, or of a wrong unit."""
 
 
 def add(commands):
@@ -44,7 +47,8 @@ class _Ear:
 
     def __init__(self, driver):
         self.driver = driver
-        self._heard = {sensor: deque(maxlen=20_000) for sensor in driver.sensors.values()}
+        self._heard = {sensor: deque(maxlen=20_000) for sensor in driver.sensors.values()
+                       if sensor != IGNORED}
         self.silent = set(self._heard)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=serve, daemon=True, args=(
@@ -52,10 +56,9 @@ class _Ear:
         self._thread.start()
 
     def _take(self, samples):
-        """Keep the fields."""
+        """Keep what was said."""
         for sample in samples:
-            if isinstance(sample, MagSample):
-                self._heard[sample.sensor].append(sample)
+            self._heard[sample.sensor].append(sample)
 
     def stop(self):
         """Close the device."""
@@ -67,7 +70,7 @@ class _Ear:
         counts = self.driver.counts()
         odd = ', '.join(f'{what}: {n}' for what, n in sorted(counts.items())
                         if not what.startswith('samples: '))
-        state = 'open' if self.driver.is_open else self.driver.trouble or 'not open yet'
+        state = self.driver.trouble or ('open' if self.driver.is_open else 'not open yet')
         out = [f'{self.driver.name}: {state}' + (f'  ({odd})' if odd else '')]
         for sensor, heard in self._heard.items():
             samples = [heard.popleft() for _ in range(len(heard))]
@@ -75,12 +78,27 @@ class _Ear:
                 out.append(f'  {sensor:12s} nothing')
                 continue
             self.silent.discard(sensor)
-            x, y, z = 1e6 * np.mean([s.field for s in samples], axis=0)
             behind_ms = (time.time_ns() - samples[-1].stamp_ns) / 1e6
-            out.append(f'  {sensor:12s} {len(samples) / elapsed_s:7.1f} Hz  '
-                       f'{x:9.3f} {y:9.3f} {z:9.3f} uT  |B| {math.hypot(x, y, z):8.3f}  '
-                       f'latest {behind_ms:.0f} ms ago')
+            out.append(f'  {sensor:12s} {_said(samples, elapsed_s)}  latest {behind_ms:.0f} ms ago')
         return out
+
+
+def _said(samples, elapsed_s):
+    """What the samples of one sensor say, in a line."""
+    fields = np.array([s.field for s in samples if isinstance(s, MagSample)])
+    if not len(fields):
+        return f'{len(samples) / elapsed_s:7.1f} Hz of accelerations'
+    there = ~np.isnan(fields)
+    mean = np.array([1e6 * column[known].mean() if known.any() else np.nan
+                     for column, known in zip(fields.T, there.T, strict=True)])
+    text = (f'{len(fields) / elapsed_s:7.1f} Hz  ' + ' '.join(f'{v:9.3f}' for v in mean)
+            + f' uT  |B| {np.sqrt(np.nansum(mean**2)):8.3f}')
+    missing = fields.size - np.count_nonzero(there)
+    if missing and there.any(axis=0).all():
+        text += f'  {missing} axes missing'
+    if np.nanmax(np.abs(fields), initial=0.0) > LARGE:
+        text += '  (is `unit` right?)'
+    return text
 
 
 def _listen(args):

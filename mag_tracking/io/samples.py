@@ -39,8 +39,9 @@ class SampleReader:
                 self._imus.setdefault(topic, []).append(name)
         self.rejected = Counter()
         self.truth = {}
-        if recording.types and not any(t in recording.types for t in (*self._sensors,
-                                                                      RAW_READINGS)):
+        self._together = recording.types.get(RAW_READINGS) == FIELD_READINGS
+        if recording.types and not self._together \
+                and not any(t in recording.types for t in self._sensors):
             fields = sorted(t for t, k in recording.types.items() if k == MAGNETIC_FIELD)
             raise RecordingError(
                 f'{recording.path} has none of the network\'s topics ({", ".join(self._sensors)}); '
@@ -53,7 +54,7 @@ class SampleReader:
 
     def missing_topics(self):
         """The network's topics that are not in the recording; none where readings came together."""
-        if RAW_READINGS in self._recording.types:
+        if self._together:
             return []
         return [t for t in self._sensors if t not in self._recording.types]
 

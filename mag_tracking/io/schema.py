@@ -89,11 +89,15 @@ def samples_of(message):
     if sizes not in ((n, 3 * n, 0), (n, 3 * n, 9 * n)):
         raise RecordingError(f'{n} readings with {sizes[0]} stamps, {sizes[1]} numbers of their '
                              f'fields and {sizes[2]} of their covariances')
+    if len(set(names)) < len(names):
+        raise RecordingError(f'readings of sensors of which one is there twice: {", ".join(names)}')
     if max(message.sensor, default=-1) >= len(names):
         raise RecordingError(f'a reading of sensor {max(message.sensor)} of {len(names)}')
     field = np.array(message.field, dtype=float).reshape(n, 3)
-    covariance = [None] * n if not len(message.covariance) else \
-        np.array(message.covariance, dtype=float).reshape(n, 3, 3)
+    covariance = [None] * n
+    if len(message.covariance):
+        covariance = [None if C[0, 0] == -1.0 or not C.any() else C for C in np.array(
+            message.covariance, dtype=float).reshape(n, 3, 3)]
     return [MagSample(stamp, names[j], B, C) for j, stamp, B, C in zip(
         message.sensor, message.stamp, field, covariance, strict=True)]
 

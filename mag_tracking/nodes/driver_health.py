@@ -2,7 +2,9 @@
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-HARMLESS = ('samples: ', 'came late: ', 'other messages: ')
+HARMLESS = ('samples: ', 'came late: ', 'other messages: ', 'lines that are comments',
+            'lines without the prefix', 'lines that are empty', 'retained messages skipped',
+            'conversions overwritten', 'packets not used')
 """What begins so is counted, but nothing to be warned of."""
 
 
@@ -13,11 +15,11 @@ class DriverDiagnostics:
         self._node = node
         self._reported, self._trouble = {}, {}
 
-    def statuses(self, drivers, active):
-        """[DiagnosticStatus], one a device."""
-        return [self._status(driver, active) for driver in drivers]
+    def statuses(self, drivers, served, active):
+        """[DiagnosticStatus], one a device; `served` are the names of those with a thread."""
+        return [self._status(driver, driver.name in served, active) for driver in drivers]
 
-    def _status(self, driver, active):
+    def _status(self, driver, served, active):
         """The DiagnosticStatus of one device."""
         counts = driver.counts()
         before = self._reported.get(driver.name, {})
@@ -27,7 +29,9 @@ class DriverDiagnostics:
         level, message = DiagnosticStatus.OK, 'open'
         if not active:
             message = 'not active'
-        elif not driver.is_open:
+        elif not served:
+            level, message = DiagnosticStatus.ERROR, 'its thread has ended: start the node again'
+        elif driver.trouble or not driver.is_open:
             level, message = DiagnosticStatus.ERROR, driver.trouble or 'not open yet'
         elif news:
             level, message = DiagnosticStatus.WARN, '; '.join(news)

@@ -6,6 +6,7 @@ devices. With `autostart` (the default) it does both by itself.
 
 import sys
 import threading
+import time
 
 from diagnostic_msgs.msg import DiagnosticArray
 from mag_tracking_msgs.msg import FieldReadings
@@ -14,7 +15,7 @@ from sensor_msgs.msg import Imu, MagneticField
 
 from mag_tracking.errors import MagTrackingError, SettingsError
 from mag_tracking.io.drivers.configuration import read_drivers
-from mag_tracking.io.drivers.driver import serve
+from mag_tracking.io.drivers.driver import IGNORED, serve
 from mag_tracking.io.message_types import RAW_READINGS
 from mag_tracking.io.network_file import read_network
 from mag_tracking.io.schema import acceleration_dict, readings_dict, sample_dict
@@ -39,16 +40,17 @@ class DriverNode(LifecycleNode):
         self._readings = self.create_publisher(FieldReadings, RAW_READINGS, STREAM) \
             if self.declare_parameter('batches', False).value else None
         self._drivers, self._threads, self._publishers_by_sensor = [], [], {}
-        self._stopping = threading.Event()
+        self._stopping = None
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RESULTS)
         self._health = DriverDiagnostics(self)
         self.create_timer(1.0, self._publish_diagnostics)
         self._refused = None
         if self.declare_parameter('autostart', True).value:
-            self.trigger_configure()
+            done = self.trigger_configure()
             if self._refused is not None:
                 raise self._refused
-            self.trigger_activate()
+            if done == TransitionCallbackReturn.SUCCESS:
+                self.trigger_activate()
 
     @property
     def drivers(self):
@@ -67,13 +69,17 @@ class DriverNode(LifecycleNode):
             self.get_logger().error(str(error))
             return TransitionCallbackReturn.FAILURE
         for driver in self._drivers:
-            for sensor in driver.sensors.values():
+            for sensor in set(driver.sensors.values()) - {IGNORED}:
                 self._publishers_by_sensor[sensor] = self._advertise(sensor, network)
         return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state):
         """Open the devices, each in a thread of its own."""
-        self._stopping.clear()
+        if self._threads:
+            self.get_logger().error(f'{self._threads[0].name} has not stopped yet')
+            return TransitionCallbackReturn.FAILURE
+        # One for each time: an old thread must not be told to go on.
+        self._stopping = threading.Event()
         self._threads = [threading.Thread(
             target=serve, args=(driver, self._publish, self._stopping.is_set),
             name=driver.name, daemon=True) for driver in self._drivers]
@@ -127,12 +133,14 @@ class DriverNode(LifecycleNode):
 
     def _stop(self):
         """End the threads; they close their devices."""
-        self._stopping.set()
+        if self._stopping is not None:
+            self._stopping.set()
+        end = time.monotonic() + PATIENCE_S
         for thread in self._threads:
-            thread.join(PATIENCE_S)
+            thread.join(max(0.0, end - time.monotonic()))
             if thread.is_alive():
                 self.get_logger().error(f'{thread.name} has not stopped within {PATIENCE_S:g} s')
-        self._threads = []
+        self._threads = [thread for thread in self._threads if thread.is_alive()]
 
     def _forget(self):
         """Withdraw topics and drivers."""
@@ -143,7 +151,9 @@ class DriverNode(LifecycleNode):
 
     def _publish_diagnostics(self):
         """How the devices are."""
-        array = DiagnosticArray(status=self._health.statuses(self._drivers, bool(self._threads)))
+        array = DiagnosticArray(status=self._health.statuses(
+            self._drivers, {thread.name for thread in self._threads if thread.is_alive()},
+            self._stopping is not None and not self._stopping.is_set()))
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
 

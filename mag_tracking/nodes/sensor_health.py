@@ -69,7 +69,8 @@ class HealthDiagnostics:
     def look_at_next(self, node, calibrate):
         """Make the status of one more sensor: all at once would hold up the readings."""
         j = len(self._ready)
-        if j < len(self._network):
+        # Nothing has been compared before the first time.
+        if self._compared and j < len(self._network):
             name = self._network.names[j]
             self._ready[name] = self._status(node, j, name, calibrate)
 

@@ -42,9 +42,12 @@ class Ahead:
             # Who is ahead of these, too, does not pass with them.
             passed = self._pass(self._take_out(lambda _, s, __: s.stamp_ns <= stamp + self._limit))
         # It is back with the others: what it said of a time ahead of them was wrong. And whom they
-        # did not follow for so long they will not follow.
-        return passed, self._take_out(
-            lambda j, _, newest: j == i or self._newest - newest > self._limit)
+        # did not follow for so long they will not follow. The first that is held is the oldest.
+        if i in self._quiet_since or self._held and self._newest - self._held[0][2] > self._limit:
+            self._quiet_since.pop(i, None)
+            return passed, self._take_out(
+                lambda j, _, newest: j == i or self._newest - newest > self._limit)
+        return passed, []
 
     def flush(self):
         """[(i, sample)] of those that are held when nothing comes any more."""
@@ -61,7 +64,6 @@ class Ahead:
         """Note that `samples` are as they should be."""
         for i, sample in samples:
             self._latest[i] = sample.stamp_ns
-            self._quiet_since.pop(i, None)
             if self._newest is None or sample.stamp_ns > self._newest:
                 self._newest = sample.stamp_ns
         return samples
@@ -81,11 +83,11 @@ class Ahead:
         return stamp - self._quiet_since[i][1] >= self._limit
 
     def _too_old(self, i, stamp):
-        """What is held of sensor `i` for too long, or is too much, taken out."""
+        """What of sensor `i` has been held for too long, or is one too many."""
         mine = [s for j, s, _ in self._held if j == i]
-        last = mine[-self._most:]
+        first = mine[0] if len(mine) > self._most else None
         return self._take_out(lambda j, s, _: j == i and (
-            s.stamp_ns < stamp - self._limit or not any(s is kept for kept in last)))
+            s.stamp_ns < stamp - self._limit or s is first))
 
     def _take_out(self, is_meant):
         """[(i, sample)] of those held that `is_meant`; they are held no more."""

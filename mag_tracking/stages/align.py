@@ -16,6 +16,9 @@ from mag_tracking.settings import param
 from mag_tracking.stages.ahead import Ahead
 from mag_tracking.stages.stage import NS
 
+MOST_HELD = 16
+"""Samples of a sensor that are held while it is not known whether its clock has stepped."""
+
 
 @dataclass(frozen=True)
 class AlignSettings:
@@ -70,7 +73,7 @@ class Align:
         self._first = self._newest = self._end = self._stamp = None
         self._taken = [None] * self._n
         self._last_taken = None
-        self._ahead = Ahead(self._n, self._longest_jump, self._most_pending)
+        self._ahead = Ahead(self._n, self._longest_jump, min(self._most_pending, MOST_HELD))
         self._look_ahead()
 
     def feed(self, sample):

@@ -17,11 +17,12 @@ device of a framing or kind. Its settings stand under its own name, or under `tr
 """
 
 import importlib
+import re
 from collections.abc import Mapping
 
 from mag_tracking.errors import SettingsError
 from mag_tracking.io.drivers.device_clock import ClockSettings
-from mag_tracking.io.drivers.driver import Driver, DriverSettings
+from mag_tracking.io.drivers.driver import IGNORED, Driver, DriverSettings
 from mag_tracking.io.drivers.framed_device import FramedDevice
 from mag_tracking.settings import replace
 from mag_tracking.yaml_file import read_yaml
@@ -38,6 +39,10 @@ KINDS = {
     'device': {'i2c': f'{_HERE}.i2c_device:I2cDevice',
                'simulator': f'{_HERE}.simulated_device:SimulatedDevice'},
 }
+
+METHODS = {'transport': ('open', 'read', 'close'), 'framing': ('parse',),
+           'device': ('open', 'read', 'close')}
+_NAME = re.compile(r'[A-Za-z][A-Za-z0-9_/]*')
 
 
 def read_drivers(path, network=None):
@@ -71,9 +76,14 @@ def kind_of(role, name):
         raise SettingsError(f'{role}: expected {", ".join(KINDS[role])} or '
                             f'package.module:Class, got {name!r}')
     try:
-        return getattr(importlib.import_module(module), leaf)
-    except (ImportError, AttributeError) as error:
-        raise SettingsError(f'{role}: {name}: {error}') from error
+        cls = getattr(importlib.import_module(module), leaf)
+    # A module of somebody else's may fail with anything.
+    except Exception as error:
+        raise SettingsError(f'{role}: {name}: {type(error).__name__}: {error}') from error
+    lacking = [what for what in ('SETTINGS', *METHODS[role]) if not hasattr(cls, what)]
+    if lacking:
+        raise SettingsError(f'{role}: {name} has no {", ".join(lacking)}')
+    return cls
 
 
 def driver_of(name, entry):
@@ -85,6 +95,9 @@ def driver_of(name, entry):
         device = _device(rest)
         clock = replace(_usual(ClockSettings(), device, 'CLOCK'), _group(rest, 'clock'))
         sensors = _sensors(rest)
+        for unit in ('unit', 'acceleration_unit'):
+            if isinstance(rest.get(unit), (int, float)) and not isinstance(rest[unit], bool):
+                rest[unit] = repr(rest[unit])
         settings = replace(_usual(DriverSettings(), device, 'DRIVER'), rest)
         return Driver(name, device, settings, clock, sensors)
     except SettingsError as error:
@@ -137,8 +150,11 @@ def _sensors(rest):
         raise SettingsError('expected `sensor: mag_1`, or `sensors:` with the name in the network '
                             f'for each name at the device, got {sensors!r}')
     for key, value in sensors.items():
-        if not isinstance(value, str) or not value:
-            raise SettingsError(f'sensors: {key}: expected the name of a sensor, got {value!r}')
+        if isinstance(key, bool) or not isinstance(key, (str, int)):
+            raise SettingsError(f'sensors: {key!r} is no name; put it in quotes')
+        if not isinstance(value, str) or not (value == IGNORED or _NAME.fullmatch(value)):
+            raise SettingsError(f'sensors: {key}: expected the name of a sensor (letters, digits, '
+                                f'_ and /), or - to ignore it, got {value!r}')
     out = {str(key): value for key, value in sensors.items()}
     if len(out) < len(sensors):
         raise SettingsError('sensors: two of them have the same name at the device')
@@ -150,6 +166,8 @@ def _check_sensors(drivers, network):
     owner = {}
     for driver in drivers:
         for key, sensor in driver.sensors.items():
+            if sensor == IGNORED:
+                continue
             if sensor in owner:
                 raise SettingsError(f'{driver.name}: sensor {sensor} comes from {owner[sensor]} '
                                     'already')

@@ -5,6 +5,7 @@ the sensors, turns units into SI, stamps every reading with the time of its
 measurement on this machine's clock, and counts what is missing.
 """
 
+import math
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -23,6 +24,12 @@ ACCELERATION_UNITS = {'m/s2': 1.0, 'g': 9.80665, 'mg': 9.80665e-3}
 """{unit: m/s^2}."""
 POLL_S = 0.2
 """[s] A driver that is served is asked to stop so often."""
+IGNORED = '-'
+"""In place of a sensor's name: what comes of it is not used."""
+MOST_NAMES = 20
+"""Unknown sensors that are counted by name."""
+MOST_SOURCES = 4096
+"""Clocks that are kept."""
 STAMPED_BY = ('auto', 'ticks', 'sequence', 'arrival')
 STEP_NS = 10_000_000
 """[ns] The clock of this machine was set when it differs by more from one moment to the next."""
@@ -103,11 +110,13 @@ class Driver:
             raise SettingsError(f'{name}: stamp_by: expected {", ".join(STAMPED_BY)}, got '
                                 f'{settings.stamp_by!r}')
         self._monotonic_ns, self._wall_ns, self._sleep = monotonic_ns, wall_ns, sleep
-        self._sequences = {s: SequenceCheck(settings.sequence_wrap) for s in sensors.values()}
+        self._sequences = {s: SequenceCheck(settings.sequence_wrap) for s in sensors.values()
+                           if s != IGNORED}
         self._clocks = {}
         self._open, self.trouble = False, ''
         self._retry_s, self._retry_ns = settings.retry_s, None
         self._heard_ns, self._offset_ns = None, None
+        self._only, self._unknown = None, set()
 
     @property
     def is_open(self):
@@ -145,13 +154,12 @@ class Driver:
             self._give_up(error)
             return []
         now = self._monotonic_ns()
-        if arrivals:
-            self._heard_ns, self._retry_s = now, self._settings.retry_s
-        elif self._settings.silent_s and now - self._heard_ns > self._settings.silent_s * 1e9:
-            self.own_counts['silent, so opened again'] += 1
-            self._give_up(f'nothing has come for {self._settings.silent_s:g} s')
         if not arrivals:
+            if self._settings.silent_s and now - self._heard_ns > self._settings.silent_s * 1e9:
+                self.own_counts['silent, so opened again'] += 1
+                self._give_up(f'open, but nothing has come for {self._settings.silent_s:g} s')
             return []
+        self._heard_ns, self._retry_s, self.trouble = now, self._settings.retry_s, ''
         offset = self._wall_offset(now)
         samples = [self._samples(a, offset) for a in arrivals]
         return [s for some in samples for s in some]
@@ -193,14 +201,19 @@ class Driver:
             self.own_counts['openings that failed'] += 1
             self._give_up(error)
             return False
-        self._open, self.trouble = True, ''
-        self._heard_ns = self._monotonic_ns()
+        # What was wrong before stays said until something has come.
+        self._open, self._heard_ns = True, self._monotonic_ns()
         return True
 
     def _give_up(self, why):
         """Close the device, and wait longer than the last time before it is opened again."""
-        self._device.close()
         self._open, self.trouble = False, str(why)
+        try:
+            self._device.close()
+        # Of somebody else's device, or of a port that has vanished: it is given up all the same.
+        except Exception as error:
+            self.own_counts['closings that failed'] += 1
+            self.trouble += f' (and it does not close: {type(error).__name__}: {error})'
         self._retry_ns = self._monotonic_ns() + round(self._retry_s * 1e9)
         self._retry_s = min(2.0 * self._retry_s, self._settings.longest_retry_s)
 
@@ -227,8 +240,12 @@ class Driver:
         stamp_ns += offset_ns
         out = []
         if reading.field is not None:
+            field = [self._scale * v for v in reading.field]
+            if any(map(math.isinf, field)):
+                self.own_counts['readings that are infinite in tesla'] += 1
+                return []
             self.own_counts[f'samples: {sensor}'] += 1
-            out.append(MagSample(stamp_ns, sensor, self._scale * np.array(reading.field)))
+            out.append(MagSample(stamp_ns, sensor, np.array(field)))
         if reading.acceleration is not None:
             out.append(AccelerationSample(
                 stamp_ns, sensor, self._acceleration_scale * np.array(reading.acceleration)))
@@ -236,10 +253,19 @@ class Driver:
 
     def _sensor_of(self, at_device, source):
         """The network's name of a sensor; None for one that nobody has named."""
-        sensor = self.sensors.get(at_device) or self.sensors.get(source) or self.sensors.get('')
+        sensor = next((self.sensors[name] for name in (at_device, source)
+                       if name and name in self.sensors), None)
+        if sensor is None and '' in self.sensors:
+            # The one sensor there is: two of them in one topic would be neither.
+            self._only = self._only or (at_device, source)
+            if self._only == (at_device, source):
+                return self.sensors['']
         if sensor is None:
-            self.own_counts[f'of unknown sensors: {at_device or source}'[:80]] += 1
-        return sensor
+            self._unknown.add((at_device or source)[:80])
+            named = len(self._unknown) <= MOST_NAMES
+            self.own_counts['of unknown sensors' + (
+                f': {at_device or source}'[:82] if named else ' (and others)')] += 1
+        return None if sensor == IGNORED else sensor
 
     def _stamp(self, reading, arrival):
         """Monotonic ns of the measurement; None where no clock can tell."""
@@ -247,6 +273,9 @@ class Driver:
         ticks = reading.sequence if by == 'sequence' else reading.ticks
         clock = self._clocks.get(arrival.source)
         if clock is None:
+            if len(self._clocks) >= MOST_SOURCES:
+                self.own_counts['of more sources than there can be'] += 1
+                return None
             without = by == 'arrival' or by == 'auto' and ticks is None
             clock = (ArrivalClock if without else DeviceClock)(self._clock_settings)
             self._clocks[arrival.source] = clock
@@ -265,8 +294,13 @@ def serve(driver, take, stopping):
     while not stopping():
         try:
             samples = driver.poll(POLL_S)
+        except Exception as error:
+            driver.fail(error)
+            continue
+        try:
             if samples:
                 take(samples)
         except Exception as error:
-            driver.fail(error)
+            # Not the device's fault, which goes on.
+            driver.own_counts[f'errors behind the driver: {type(error).__name__}'] += 1
     driver.close()

@@ -4,6 +4,8 @@ from collections import Counter
 
 MEMORY = 1000
 """Readings that are remembered. What is further behind is not late: the count has begun anew."""
+FARTHEST = 1_000_000
+"""A count that is further ahead has jumped; hours of loss look otherwise."""
 
 
 class SequenceCheck:
@@ -30,7 +32,10 @@ class SequenceCheck:
             self.counts['sequence numbers out of range'] += 1
             return True
         ahead = 1 if self._last is None else self._ahead(sequence)
-        if ahead > 0:
+        if ahead > FARTHEST:
+            self.counts['sequence jumped'] += 1
+            self._begin()
+        elif ahead > 0:
             self._skip(sequence, ahead - 1)
         elif sequence in self._missing:
             del self._missing[sequence]
