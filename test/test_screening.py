@@ -1,24 +1,17 @@
 """Spikes and stuck sensors: found where they are, and nowhere else."""
 
-import dataclasses
 import functools
 import math
 from collections import Counter
 
 import numpy as np
 import pytest
-from conftest import VEHICLES, line_network, vehicle_path
+from conftest import line_network
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mag_tracking.calibration.screening import MOST_HELD, Repetition, SpikeFilter
-from mag_tracking.io.bag import Recording
-from mag_tracking.io.samples import SampleReader
 from mag_tracking.io.simulator import Path, point_body, random_vehicle, simulate
-from mag_tracking.records import MagSample
-from mag_tracking.settings import replace
-from mag_tracking.stages.calibrate import Calibrate, CalibrateSettings
-from mag_tracking.stages.stage import rejected
 
 SIGMA = 1.2e-8
 EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
@@ -92,21 +85,11 @@ def passes(rate, speed, n=4):
 def test_vehicles_at_a_metre_are_no_spikes(rate, step):
     """At ten readings a second all of a pass was once rejected, and behind it a sensor with coarse
     steps was taken for stuck, for as long as it was at rest."""
-    for speed in (3.0, 10.0, 17.0, 25.0):
+    for speed in (6.0, 13.0, 25.0):
         y = in_steps(passes(rate, speed), step)
         assert np.ptp(y) > 1000 * SIGMA
         assert screened(y, rate)[0] == []
         assert stuck(y) == []
-
-
-@pytest.mark.parametrize('name', VEHICLES)
-def test_nothing_is_found_in_the_recordings(name, road_network):
-    stage = Calibrate(road_network, CalibrateSettings())
-    for s in SampleReader(Recording(vehicle_path(name)), road_network).samples():
-        stage.feed(s)
-    stage.flush()
-    assert sum(c['accepted'] for c in stage.per_sensor.values()) > 1000
-    assert not {'spike', 'the same reading over and over'} & set(rejected(stage.counts))
 
 
 # Spikes.
@@ -250,7 +233,7 @@ def test_without_a_noise_nothing_waits():
     assert f.flush() == []
 
 
-@settings(derandomize=True, deadline=None, max_examples=60)
+@settings(derandomize=True, deadline=None, max_examples=40)
 @given(st.integers(0, 10_000))
 def test_every_reading_comes_out_once_in_order_and_at_most_three_wait(seed):
     rng = np.random.default_rng(seed)
@@ -344,97 +327,3 @@ def test_a_missing_axis_repeats_itself_too():
     assert stuck(y)[-1] == 499 and stuck(y)[0] < 306
     y[400, 1] = 0.0
     assert 400 not in stuck(y)
-
-
-# In the calibration stage.
-
-def calibrate(**changes):
-    network = dataclasses.replace(line_network(1, noise=SIGMA), background=(EARTH,))
-    return Calibrate(network, replace(CalibrateSettings(), changes)), network
-
-
-def feed(stage, y, first=0, rate=100.0):
-    return [c for k, field in enumerate(y) for c in stage.feed(
-        MagSample(round((first + k) * NS / rate), 'mag_1', field))]
-
-
-def total(stage):
-    c = stage.per_sensor['mag_1']
-    return c['accepted'] + c['rejected']
-
-
-def test_spikes_and_repetitions_are_counted_where_they_are():
-    stage, _ = calibrate()
-    y = noise(400)
-    y[[100, 150, 151]] += 5e-6
-    y[300:330] = y[299]
-    out = feed(stage, y)
-    stuck_ones = stage.per_sensor['mag_1']['rejected: the same reading over and over']
-    assert rejected(stage.counts) == {'spike': 3, 'the same reading over and over': stuck_ones}
-    assert 24 <= stuck_ones <= 27 and len(out) == 400 - 3 - stuck_ones
-    assert np.abs([c.field for c in out]).max() < 6 * SIGMA
-    assert (np.diff([c.stamp_ns for c in out]) > 0).all()
-    assert total(stage) == 400
-
-
-def test_the_setting_zero_is_never():
-    stage, _ = calibrate(spike_std=0.0)
-    y = noise(100)
-    y[50] += 5e-6
-    assert len(feed(stage, y)) == 100 and not rejected(stage.counts)
-
-
-def held_spike(stage):
-    y = noise(52)
-    y[50:] += 5e-6
-    assert len(feed(stage, y)) == 50
-
-
-def test_what_is_held_at_the_end_passes_and_is_counted():
-    stage, _ = calibrate()
-    held_spike(stage)
-    assert [c.stamp_ns for c in stage.flush()] == [500_000_000, 510_000_000]
-    assert stage.per_sensor['mag_1'] == {'accepted': 52} and stage.flush() == []
-
-
-def test_what_is_held_when_time_jumps_back_is_counted():
-    """Once it was lost without a word."""
-    stage, _ = calibrate()
-    held_spike(stage)
-    assert len(feed(stage, noise(50), first=-1000)) == 50
-    assert rejected(stage.counts) == {'may have been a spike when time jumped back': 2}
-    assert total(stage) == 102
-
-
-@pytest.mark.parametrize('what', ['offset', 'correction', 'clock_offset'])
-def test_what_is_held_when_another_calibration_comes_is_counted(what):
-    """It was corrected by the one before."""
-    stage, network = calibrate()
-    held_spike(stage)
-    new = {'offset': (np.full(3, 1e-6),), 'correction': (1.01 * np.eye(3),),
-           'clock_offset': (0.003,)}[what]
-    stage.renew(dataclasses.replace(network, **{what: new}))
-    assert rejected(stage.counts) == {'may have been a spike when another calibration came': 2}
-    out = feed(stage, noise(50), first=100)
-    assert len(out) == 50 and total(stage) == 102
-
-
-def test_the_same_calibration_once_more_changes_nothing():
-    stage, network = calibrate()
-    held_spike(stage)
-    stage.renew(dataclasses.replace(network))
-    assert len(feed(stage, noise(1), first=52)) == 1
-    assert rejected(stage.counts) == {'spike': 2} and total(stage) == 53
-
-
-def test_what_is_held_when_the_background_is_to_be_learnt_anew_comes_before_the_rest():
-    network = line_network(1, noise=SIGMA)
-    stage = Calibrate(network, CalibrateSettings())
-    y = noise(800)
-    y[602:605] += 5e-6
-    out = feed(stage, y[:604])
-    stage.forget(['mag_1'])
-    out += feed(stage, y[604:], first=604)
-    stamps = [c.stamp_ns for c in out]
-    assert (np.diff(stamps) > 0).all()
-    assert stage.per_sensor['mag_1'] == {'accepted': 800}

@@ -44,8 +44,12 @@ class CalibrateSettings:
         'it is taken for corrupt.', 's', (1e-3, 1e9))
     spike_std: float = param(
         30.0, 'A reading, or up to three, that is off those around it by more noise deviations '
-        'than this is rejected as a spike; what may be one waits for the next. 0 = never.',
+        'than this is rejected as a spike; what may be one waits for the next. Below 30 Hz, where a '
+        'vehicle changes much from one to the next, it has to be larger. 0 = never.',
         '', (0.0, 1e6))
+    reject_stuck: bool = param(
+        True, 'Readings that stay the same, from a sensor that does not repeat itself otherwise, '
+        'are rejected. Simulated sensors without noise need this to be false.')
     decimate_to_hz: float = param(
         0.0, 'Samples of a faster sensor are low-pass filtered and thinned to about this rate '
         '(a whole share of its own; 60 dB against folding, four intervals late). 0 = no: frames '
@@ -130,7 +134,7 @@ class Calibrate:
     def _screened(self, sample):
         """The samples that are known by now to be whole; the others are counted or wait."""
         name, field = sample.sensor, sample.field.tolist()
-        if self._repetition[name].is_stuck(field):
+        if self._settings.reject_stuck and self._repetition[name].is_stuck(field):
             return self._reject(sample, STUCK)
         known = [(sample, False)]
         if self._settings.spike_std:
