@@ -44,8 +44,8 @@ class CalibrateSettings:
         'it is taken for corrupt.', 's', (1e-3, 1e9))
     spike_std: float = param(
         30.0, 'A reading, or up to three, that is off those around it by more noise deviations '
-        'than this is rejected as a spike; what may be one waits for the next. Below 30 Hz, where a '
-        'vehicle changes much from one to the next, it has to be larger. 0 = never.',
+        'than this is rejected as a spike; what may be one waits for the next. Below 30 Hz, where '
+        'a vehicle changes much from one to the next, it has to be larger. 0 = never.',
         '', (0.0, 1e6))
     reject_stuck: bool = param(
         True, 'Readings that stay the same, from a sensor that does not repeat itself otherwise, '
