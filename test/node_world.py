@@ -5,12 +5,13 @@ import time
 from contextlib import contextmanager
 
 import numpy as np
+import pytest
 import rclpy
 import yaml
 from conftest import NETWORK_FILE, POINT
 from diagnostic_msgs.msg import DiagnosticArray
 from mag_tracking_msgs.msg import NetworkFrame, TrackArray
-from mqtt_broker import Broker
+from mqtt_broker import Broker, password_lines
 from node_processes import start, stop
 from rclpy.node import Node
 from rclpy.task import Future
@@ -26,11 +27,28 @@ from mag_tracking.nodes.stage_node import RESULTS, STREAM, make_executor
 
 WRONG = chi2.ppf(1.0 - 1e-4, 2)
 """A pose whose squared error is beyond this, in its own covariance, is wrong."""
+BODY = point_body([0.0, 300.0, -300.0], 5.0, 0.5)
+"""Its hard and soft iron do not cancel: it is noticed from 12 m."""
 TOPICS = {'driver_node': (MagneticField, '/mag_1/imu/mag'),
           'calibration_node': (MagneticField, '/mag_1/imu/mag_calibrated'),
           'detection_node': (NetworkFrame, '/detection_node/frame'),
           'tracker_node': (TrackArray, '/tracker_node/tracks')}
 """What each node gives."""
+FRAME_S = 0.08
+"""[s] The default of `align.period_s`."""
+NS = 1_000_000_000
+STEADY = {'calibration_node': {'calibrate.learn_s': 3600.0},
+          'detection_node': {'detect.background_drift': 0.0}}
+"""Settings of a background that is as the network file says: nothing is learnt of it between two
+vehicles, and nothing is allowed for it."""
+QUICK = """<dds xmlns="http://www.eprosima.com"><profiles>
+<participant profile_name="quick" is_default_profile="true"><rtps><builtin><discovery_config>
+<leaseAnnouncement><sec>0</sec><nanosec>250000000</nanosec></leaseAnnouncement>
+<initialAnnouncements><count>40</count><period><nanosec>50000000</nanosec></period>
+</initialAnnouncements></discovery_config></builtin></rtps></participant></profiles></dds>
+"""
+"""Profile of Fast DDS. By itself it announces a new node for half a second and then every 3 s, so
+that two nodes that miss each other in the beginning (one start in five) are strangers for 3 s."""
 
 
 def network_file(folder):
@@ -43,22 +61,28 @@ def network_file(folder):
     return path
 
 
-def drivers_files(folder, host_port, line):
-    """{name: path} of the files of one device: `mqtt` and `serial`."""
+def drivers_files(folder, broker, guarded, line):
+    """{name: path} of the files of one device: `mqtt`, `serial`.
+
+    To `mqtt` belongs a device at a broker that does not let it in, `guarded`.
+    """
     common = {'clock': {'tick_s': 1e-6, 'wrap': 0}, 'unit': 'nT'}
     content = {
         'mqtt': {'transport': 'mqtt', 'framing': 'json',
-                 'mqtt': {'host': '127.0.0.1', 'port': host_port, 'topics': ['road/+']},
+                 'mqtt': {'host': '127.0.0.1', 'port': broker.port, 'topics': ['road/+']},
                  'json': {'field': ['x', 'y', 'z'], 'ticks': 't', 'sequence': 'n'},
                  'sensors': {'road/A': 'mag_1', 'road/B': 'mag_2'}},
         'serial': {'transport': 'serial', 'framing': 'text', 'serial': {'port': str(line.path)},
                    'text': {'fields': ['sensor', 'sequence', 'ticks', 'x', 'y', 'z'],
                             'checksum': 'nmea'},
                    'sensors': {'A': 'mag_1', 'B': 'mag_2'}}}
-    paths = {}
-    for name, entry in content.items():
-        paths[name] = folder / f'{name}.yaml'
-        paths[name].write_text(yaml.safe_dump({name: {**entry, **common}}))
+    files = {name: {name: {**entry, **common}} for name, entry in content.items()}
+    files['mqtt']['guarded'] = {
+        'transport': 'mqtt', 'mqtt': {'host': '127.0.0.1', 'port': guarded.port, 'topics': ['#']},
+        'framing': 'json', 'json': {'field': ['b']}, 'sensor': 'mag_3'}
+    paths = {name: folder / f'{name}.yaml' for name in files}
+    for name, path in paths.items():
+        path.write_text(yaml.safe_dump(files[name]))
     return paths
 
 
@@ -72,10 +96,10 @@ class World:
     statuses : [(came_ns, DiagnosticStatus)]
     """
 
-    def __init__(self, folder, broker, roadside, line):
-        self.broker, self.roadside = broker, roadside
+    def __init__(self, folder, broker, guarded, roadside, line):
+        self.broker, self.guarded, self.roadside, self.line = broker, guarded, roadside, line
         self.network = network_file(folder)
-        self.drivers = drivers_files(folder, broker.port, line)
+        self.drivers = drivers_files(folder, broker, guarded, line)
         self.node, self._executor = Node('tester'), make_executor()
         self._executor.add_node(self.node)
         self._processes, self.heard, self.statuses = {}, {name: [] for name in TOPICS}, []
@@ -113,15 +137,15 @@ class World:
         """Listen for a while."""
         self.wait(lambda: False, seconds)
 
-    def start(self, name, *arguments):
-        """Start a node as a process."""
-        self._processes[name] = start(name, '-p', f'network:={self.network}', *arguments)
-
-    def start_again(self, name):
-        """Start a node with what it is given in this world."""
-        given = {'tracker_node': POINT, 'calibration_node': {'calibrate.learn_s': 3600.0},
-                 'driver_node': {'drivers': self.drivers[self.link]}}.get(name, {})
-        self.start(name, *(a for key, value in given.items() for a in ('-p', f'{key}:={value}')))
+    def start(self, name):
+        """Start a node as a process, with what it is given in this world."""
+        given = {'driver_node': {'drivers': self.drivers[self.link]},
+                 'tracker_node': POINT, **STEADY}[name]
+        if name != 'driver_node':
+            # To the driver a sensor of no network (`guarded`) would be an error.
+            given = {'network': self.network, **given}
+        self._processes[name] = start(name, *(
+            a for key, value in given.items() for a in ('-p', f'{key}:={value}')))
 
     def kill(self, name):
         """End a node without a word."""
@@ -131,20 +155,49 @@ class World:
         # What is still on its way is of the dead.
         self.pause(0.05)
 
-    def endpoints(self, name):
-        """The publishers that nodes of this name have announced, also of the dead."""
-        return {tuple(p.endpoint_gid) for p in self.node.get_publishers_info_by_topic(
-            '/diagnostics') if p.node_name == name}
+    def publishers(self):
+        """The publishers of diagnostics that were announced, also those of the dead."""
+        return {tuple(p.endpoint_gid) for p in
+                self.node.get_publishers_info_by_topic('/diagnostics')}
+
+    def recovery(self, name):
+        """Start a node: (seconds until it is up, seconds from then to the first that it gives).
+
+        It is up when its publisher appears, or at the first that it gives. The tracker gives
+        nothing while nobody comes: of it that is the first frame that it takes, by its count.
+        """
+        known, began_ns = self.publishers(), time.time_ns()
+        self.start(name)
+        up, first_ns = None, None
+        while first_ns is None and time.time_ns() < began_ns + 20 * NS:
+            self.pause(0.01)
+            first_ns = self._first_ns(name, began_ns)
+            if up is None and (first_ns or self.publishers() - known):
+                up = (time.time_ns() - began_ns) / NS
+        assert first_ns is not None, f'{name} gives nothing'
+        up = min(up, (first_ns - began_ns) / NS)
+        return up, (first_ns - began_ns) / NS - up
+
+    def _first_ns(self, name, since_ns):
+        """When the first came that a node gives since then; None = not yet."""
+        if name != 'tracker_node':
+            return next((came for came, _ in self.since(since_ns, name)), None)
+        for came, status in self.told(since_ns, 'tracker_node: track'):
+            frames = next((int(v.value) for v in status.values if v.key == 'frames'), 0)
+            if frames:
+                return came - round(frames * FRAME_S * NS)
+        return None
 
     def use(self, link):
-        """Have the driver listen to `link`, 'mqtt' or 'serial'."""
+        """Have the driver listen to `link`, 'mqtt' or 'serial', and wait until something comes."""
         if link == self.link:
             return
         if self.link is not None:
             codes, outputs = stop([self._processes.pop('driver_node')])
             assert codes == [0], outputs
-        self.link = link
-        self.start_again('driver_node')
+        self.link, began_ns = link, time.time_ns()
+        self.start('driver_node')
+        assert self.wait(lambda: self.since(began_ns, 'driver_node'), 20.0)
 
     def since(self, came_ns, name):
         """[(came_ns, message)] of a node since then."""
@@ -159,36 +212,56 @@ class World:
         """[Track] that have come since then."""
         return [track_of(t) for _, m in self.since(since_ns, 'tracker_node') for t in m.tracks]
 
-    def rows(self, since_ns):
-        """[(stamp_ns, id, error [m], squared error in deviations, ambiguous)] of the poses."""
-        out = []
-        for t in self.tracks(since_ns):
-            if not t.ended:
-                e = t.position[:2] - self.roadside.truth(t.stamp_ns)
-                out.append((t.stamp_ns, t.id, float(np.linalg.norm(e)),
-                            float(e @ np.linalg.solve(t.covariance[:2, :2], e)), t.ambiguous))
-        return out
+    def is_quiet(self):
+        """Whether the vehicle before is gone and forgotten."""
+        frames = self.heard['detection_node']
+        return frames and not frames[-1][1].target_present and self.roadside.is_gone()
+
+    def call(self):
+        """A vehicle comes, as soon as the one before is forgotten; returns the time [ns]."""
+        assert self.wait(self.is_quiet, 20.0)
+        self.roadside.call()
+        return time.time_ns()
+
+    def drive_to(self, x):
+        """Listen until the vehicle is at `x` [m]."""
+        assert self.wait(lambda: self.roadside.truth(time.time_ns())[0] >= x, 20.0)
+
+    def wrong(self, since_ns):
+        """The poses that have come since then and are wrong."""
+        return [t for t in self.tracks(since_ns)
+                if not t.ended and is_wrong(t, self.roadside.truth(t.stamp_ns))]
+
+
+def is_wrong(track, truth):
+    """Whether a pose is not where it says to be, within its covariance, and is not flagged."""
+    e = track.position[:2] - truth
+    return not track.ambiguous and e @ np.linalg.solve(track.covariance[:2, :2], e) > WRONG
 
 
 @contextmanager
 def world(folder):
     """A `World` whose nodes run and give frames; at the end all have to end cleanly."""
     line = SerialLine(folder / 'port')
-    network = read_network(network_file(folder))
-    body = point_body([0.0, 300.0, -300.0], 5.0, 0.5)
-    rclpy.init()
-    try:
-        with Broker(folder) as broker, Roadside(network, body, broker.port, line) as roadside:
-            here = World(folder, broker, roadside, line)
-            try:
-                here.use('mqtt')
-                for name in list(TOPICS)[1:]:
-                    here.start_again(name)
-                assert here.wait(lambda: here.heard['detection_node'], 30.0)
-                yield here
-            finally:
-                codes, outputs = here.close()
-            assert not any(codes), outputs
-            assert not any('Traceback' in text for text in outputs), outputs
-    finally:
-        rclpy.try_shutdown()
+    profile = folder / 'fastdds.xml'
+    profile.write_text(QUICK)
+    own = folder / 'guarded'
+    own.mkdir()
+    with pytest.MonkeyPatch.context() as patch, Broker(folder) as broker, Broker(
+            own, *password_lines(own, 'somebody', 'secret')) as guarded, Roadside(
+            read_network(network_file(folder)), BODY, broker.port, line) as roadside:
+        for name in ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'):
+            patch.setenv(name, str(profile))
+        rclpy.init()
+        here = World(folder, broker, guarded, roadside, line)
+        try:
+            here.use('mqtt')
+            for name in list(TOPICS)[1:]:
+                here.start(name)
+            assert here.wait(lambda: here.heard['detection_node'], 30.0)
+            yield here
+        finally:
+            codes, outputs = here.close()
+            rclpy.try_shutdown()
+        assert not any(codes), outputs
+        assert not any('Traceback' in text for text in outputs), outputs

@@ -19,13 +19,14 @@ from mag_tracking.io.simulator import Path, body_field
 RATE_HZ = 100.0
 NOISE = 1.2e-8
 """[T]."""
-FIRST = np.array([-25.0, -1.5])
+FIRST = np.array([-20.0, -1.5])
 """[m] Where a vehicle appears; it is noticed some metres later."""
 SPEED = 10.0
-PASSING_S = 6.5
-"""[s] Then it is 40 m away, and its field below a nanotesla."""
+PASSING_S = 5.0
+"""[s] Then it is 30 m away, and its field below two nanotesla."""
 CONNECT = b'\x10\x12\x00\x04MQTT\x04\x02\x00\x00\x00\x06boards'
 """MQTT 3.1.1, 3.1: CONNECT of the client `boards`, clean session, no keep-alive."""
+TWIN_S = 3.0
 
 
 class MqttSender:
@@ -76,6 +77,11 @@ class Roadside:
     port : int
         Of the MQTT broker; the topics are `road/A`, `road/B`.
     line : SerialLine
+
+    Attributes
+    ----------
+    twin : bool
+        Whether a third board, which was switched on `TWIN_S` later, says that it is `A`, too.
     """
 
     def __init__(self, network, body, port, line):
@@ -88,7 +94,7 @@ class Roadside:
             body, network.earth_field, position, heading, network.positions), network.R_ws)
         self._rng = np.random.default_rng(1)
         self._called, self._start_ns = None, None
-        self.plugged = True
+        self.plugged, self.twin = True, False
         self._line_lock, self._stopping = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._measure, name='boards')
 
@@ -120,9 +126,13 @@ class Roadside:
 
     def call(self):
         """A vehicle appears at once; the one before has to be gone."""
-        assert self._called is None or self._elapsed(time.time_ns()) > PASSING_S
+        assert self.is_gone()
         # One round later, for this one may be half told.
         self._called = round((time.time_ns() - self._start_ns) / 1e9 * RATE_HZ) + 1
+
+    def is_gone(self):
+        """Whether there is no vehicle."""
+        return self._called is None or self._elapsed(time.time_ns()) > PASSING_S
 
     def truth(self, stamp_ns):
         """(2,) [m] Where the vehicle is, or would be when it is out of reach; NaN before any."""
@@ -143,11 +153,17 @@ class Roadside:
             there = row is not None and 0 <= row < len(self._table)
             field = self._table[row] if there else self._still
             field = 1e9 * (field + NOISE * self._rng.standard_normal(field.shape))
-            ticks = round(1e6 * k / RATE_HZ)
-            readings = [(board, k, ticks, tuple(np.round(values, 1).tolist()))
-                        for board, values in zip('AB', field, strict=True)]
+            readings = self._readings(k, field)
             self._mqtt.send(readings)
             with self._line_lock:
                 if self.plugged:
                     self._line.send(b''.join(nmea_line(*r) for r in readings))
             k += 1
+
+    def _readings(self, k, field):
+        """[(board, sequence, ticks [us], field [nT])] of round `k`."""
+        said = [('A', k, field[0]), ('B', k, field[1])]
+        if self.twin:
+            said.append(('A', k - round(TWIN_S * RATE_HZ), field[0] + 50.0))
+        return [(board, n, round(1e6 * n / RATE_HZ), tuple(np.round(values, 1).tolist()))
+                for board, n, values in said]

@@ -29,6 +29,8 @@ from mag_tracking.stages.smooth import FixedLag, WholeTrack
 from mag_tracking.stages.stage import NS
 from mag_tracking.stages.vehicle_start import start_vehicle, vehicle_model
 
+WATCHED = 0.5
+"""A track that begins with less than this share of its lookback is ambiguous."""
 ALONE_S = 0.5
 """[s] A track that one sensor of several has carried alone for longer stays ambiguous."""
 
@@ -191,6 +193,10 @@ class TrackStage:
         self.counts['tracks'] += 1
         self._log_odds, self._surest, self._strange, self._alone_s = 0.0, np.inf, 0, 0.0
         self._no_target = NoTarget(len(self._network), s.background_std)
+        watched_ns = frame.stamp_ns - recent[0].stamp_ns if recent else 0
+        if watched_ns < WATCHED * s.lookback_s * NS and not self._starts_anywhere:
+            # Nobody saw it come: it may be past the place where its field is first so strong.
+            self._alone_s = np.inf
         if recent:
             self._filter.predict(self._bank, (recent[0].stamp_ns - frame.stamp_ns) / NS)
         self._whole.begin(self._bank, self._filter)
