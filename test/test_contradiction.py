@@ -330,15 +330,31 @@ def test_one_that_carried_a_track_alone_leaves_it_flagged(alone_s, flagged):
     assert live and all(t.ambiguous for t in live) == flagged
 
 
-def test_the_next_track_begins_with_a_clean_slate():
-    """What one was flagged for says nothing of the next."""
+def first_tracks(n_quiet):
+    """(stage, tracks) of a target that is there after so many frames without one."""
     network = line_network(2, tilt=0.0)
     stage = TrackStage(network, SETTINGS)
     stage._alone_s = np.inf
     B = dipole_field(network.positions - [-8.0, -1.2, 0.5], MOMENT)
-    frame = FieldFrame(NS, np.einsum('jik,jk->ji', network.R_sw, B),
-                       np.tile(SIGMA**2 * np.eye(3), (2, 1, 1)), np.full(2, 8), np.zeros(2), True)
-    assert stage.feed(frame) and stage._alone_s == 0.0
+    C, field = np.tile(SIGMA**2 * np.eye(3), (2, 1, 1)), np.einsum('jik,jk->ji', network.R_sw, B)
+    for k in range(n_quiet):
+        assert not stage.feed(FieldFrame(NS + k * NS // 10, 0.0 * field, C, np.full(2, 8),
+                                         np.zeros(2), False))
+    return stage, stage.feed(FieldFrame(NS + n_quiet * NS // 10, field, C, np.full(2, 8),
+                                        np.zeros(2), True))
+
+
+def test_the_next_track_begins_with_a_clean_slate():
+    """What one was flagged for says nothing of the next."""
+    stage, tracks = first_tracks(8)
+    assert tracks and stage._alone_s == 0.0
     stage._contradiction._left_out = (1,)
     stage.flush()
     assert stage._contradiction._left_out == ()
+
+
+@pytest.mark.parametrize('n_quiet', [0, 4])
+def test_a_target_that_was_not_seen_to_come_is_ambiguous(n_quiet):
+    """A restart in the middle of a pass, for instance."""
+    _, tracks = first_tracks(n_quiet)
+    assert tracks and all(t.ambiguous for t in tracks)
