@@ -7,6 +7,7 @@ from scipy.special import logsumexp
 
 from mag_tracking.inference import kalman
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
+from mag_tracking.inference.time_update import predict
 from mag_tracking.physics.dipole import MU0, sensor_fields
 from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.stages.pose import published_track, vehicle_orientation
@@ -143,7 +144,7 @@ def matched_run(rng, network, model, sigma):
             truth[:10] = moved[0] + rng.multivariate_normal(np.zeros(10), Q[0])
             truth[10:] += 1e-9 * np.sqrt(dt) * rng.standard_normal(n_x - 10)
             x_target, F, Q = model.propagate(bank.x[:, :10], dt)
-            kalman.predict(bank.x, bank.P, x_target, F, Q, 1e-18 * dt)
+            predict(bank.x, bank.P, x_target, F, Q, 1e-18 * dt)
         h = sensor_fields(network.positions, network.R_sw, *model.dipoles(truth[None, :10]))[0][0]
         y = h + truth[10:].reshape(-1, 3) + sigma * rng.standard_normal(h.shape)
         h, H, _ = sensor_fields(network.positions, network.R_sw, *model.dipoles(bank.x[:, :10]))

@@ -334,7 +334,7 @@ def first_tracks(n_quiet):
     """(stage, tracks) of a target that is there after so many frames without one."""
     network = line_network(2, tilt=0.0)
     stage = TrackStage(network, SETTINGS)
-    stage._alone_s = np.inf
+    stage._alone_s, stage._doubted = np.inf, True
     B = dipole_field(network.positions - [-8.0, -1.2, 0.5], MOMENT)
     C, field = np.tile(SIGMA**2 * np.eye(3), (2, 1, 1)), np.einsum('jik,jk->ji', network.R_sw, B)
     for k in range(n_quiet):
@@ -347,7 +347,7 @@ def first_tracks(n_quiet):
 def test_the_next_track_begins_with_a_clean_slate():
     """What one was flagged for says nothing of the next."""
     stage, tracks = first_tracks(8)
-    assert tracks and stage._alone_s == 0.0
+    assert tracks and stage._alone_s == 0.0 and not stage._doubted
     stage._contradiction._left_out = (1,)
     stage.flush()
     assert stage._contradiction._left_out == ()

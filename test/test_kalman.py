@@ -7,6 +7,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from scipy.stats import chi2, multivariate_normal
 
 from mag_tracking.inference import kalman
+from mag_tracking.inference.time_update import predict
 from mag_tracking.io.simulator import Path, point_body, simulate
 from mag_tracking.physics.dipole import sensor_fields
 from mag_tracking.pipeline import Pipeline, settings_for
@@ -108,6 +109,33 @@ def test_update_with_missing_axes_and_sensors():
     assert max(compare(3, missing=True)) <= 1e-8
 
 
+@pytest.mark.parametrize('shared', [True, False])
+def test_prediction_equals_the_dense_oracle(shared):
+    """x = A x, P = A P A' + Q with A of the target's Jacobian and of what decays."""
+    rng = np.random.default_rng(3)
+    n_hyp, n_t, n_rest = 4, 5, 7
+    root = rng.standard_normal((n_hyp, n_t + n_rest, n_t + n_rest))
+    P, x = root @ np.swapaxes(root, 1, 2), rng.standard_normal((n_hyp, n_t + n_rest))
+    F, Q = rng.standard_normal((2, n_hyp, n_t, n_t))
+    F, Q = (F[0], Q[0] @ Q[0].T) if shared else (F, Q @ np.swapaxes(Q, 1, 2))
+    decay, variance = rng.uniform(0.2, 1.0, n_rest), rng.uniform(0.1, 1.0, n_rest)
+    A, noise = np.zeros((2, n_hyp, n_t + n_rest, n_t + n_rest))
+    A[:, :n_t, :n_t], noise[:, :n_t, :n_t] = F, Q
+    rest = np.arange(n_t, n_t + n_rest)
+    A[:, rest, rest], noise[:, rest, rest] = decay, variance
+    x_target = rng.standard_normal((n_hyp, n_t))
+    expected = A @ P @ np.swapaxes(A, 1, 2) + noise
+    x_rest = x[:, n_t:] * decay
+    predict(x, P, x_target, F, Q, variance, decay)
+    np.testing.assert_array_equal(x, np.concatenate([x_target, x_rest], axis=1))
+    np.testing.assert_allclose(P, expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(P, np.swapaxes(P, 1, 2))
+    with pytest.raises(ValueError, match='covariances of shape'):
+        predict(x, P[:2], x_target, F, Q, variance, decay)
+    with pytest.raises(ValueError, match='states of shape'):
+        predict(x, P[:1], x_target[:1], F[:1] if F.ndim == 3 else F, Q, variance, decay)
+
+
 @pytest.mark.parametrize('n_own', [0, 2, 3])
 @pytest.mark.parametrize('n_t', [0, 3, 5, 7, 12])
 def test_update_in_numbers_near_one_with_any_axes_missing(n_t, n_own):
@@ -191,7 +219,7 @@ def test_nees_of_a_linear_gaussian_case_is_chi_square():
         if k:
             truth[:, :n_t] = truth[:, :n_t] @ F.T + rng.multivariate_normal(np.zeros(6), Q, runs)
             truth[:, n_t:] += np.sqrt(0.01) * rng.standard_normal((runs, n_x - n_t))
-            kalman.predict(x, P, x[:, :n_t] @ F.T, F, Q, 0.01)
+            predict(x, P, x[:, :n_t] @ F.T, F, Q, 0.01)
         noise = rng.standard_normal((runs, n_sensors, 3)) * np.sqrt([0.5, 1.0, 2.0])
         y = np.einsum('pjic,pc->pji', H, truth[:, :n_t]) \
             + truth[:, n_t:].reshape(runs, n_sensors, 3) + noise

@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 
 from mag_tracking.inference import kalman
 from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.inference.time_update import predict
 from mag_tracking.io.simulator import Path, random_vehicle, simulate
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
@@ -39,7 +40,7 @@ class LinearFilter:
 
     def predict(self, bank, dt):
         F = np.array([[1.0, dt, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-        kalman.predict(bank.x, bank.P, bank.x[:, :N_T] @ F.T, F, np.diag([0.1, 0.2, 0.3]) * dt,
+        predict(bank.x, bank.P, bank.x[:, :N_T] @ F.T, F, np.diag([0.1, 0.2, 0.3]) * dt,
                        0.1 * dt)
         return F, np.ones(3)
 

@@ -9,6 +9,7 @@ from scipy.linalg import block_diag
 
 from mag_tracking.inference import kalman
 from mag_tracking.inference.smoother import Step, smoothed_covariances, smoothed_states
+from mag_tracking.inference.time_update import predict
 from mag_tracking.io.simulator import Path, point_body, random_vehicle, simulate
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
@@ -75,7 +76,7 @@ def steps_of(F, decay, Q, C, H, y, x, P, without=()):
     steps, n_hyp = [], len(x)
     for k in range(len(y)):
         if k:
-            kalman.predict(x, P, x[:, :N_T] @ F.T, F, np.diag(Q[:N_T]), Q[N_T:], decay)
+            predict(x, P, x[:, :N_T] @ F.T, F, np.diag(Q[:N_T]), Q[N_T:], decay)
         gains = None
         if k not in without:
             H_k = np.ascontiguousarray(np.tile(H[k], (n_hyp, 1, 1, 1)))

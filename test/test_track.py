@@ -185,6 +185,17 @@ def test_gaps_and_backward_jumps_end_a_track():
     assert stage.counts['tracks ended: time jumped back'] == 1
 
 
+def test_a_track_may_be_given_up_and_the_next_is_another():
+    network, frames, _ = magnet_frames(4)
+    stage = TrackStage(network, settings_for('magnet').track)
+    assert stage.give_up('no frames came') == []
+    stage.feed(frames[0])
+    ended = [t for t in stage.give_up('no frames came') if isinstance(t, Track)]
+    assert [(t.id, t.ended) for t in ended] == [(1, True)] and stage.bank is None
+    assert stage.counts['tracks ended: no frames came'] == 1
+    assert [(t.id, t.ended) for t in stage.feed(frames[1])] == [(2, False)]
+
+
 def test_a_frame_without_a_measurement_is_coasted_through():
     network, frames, _ = magnet_frames(10)
     stage = TrackStage(network, settings_for('magnet').track)

@@ -1,4 +1,4 @@
-"""Kalman prediction and update, batched over hypotheses.
+"""Kalman update, batched over hypotheses.
 
 The leading axis is always the hypothesis. A state is the n_t states of the
 target, which every sensor sees, then n_own states of each sensor that only it
@@ -15,41 +15,6 @@ import numpy as np
 from numba import njit
 
 _LOG_2PI = math.log(2.0 * math.pi)
-
-
-def predict(x, P, x_target, F, Q, variance, decay=None):
-    """Time update of every hypothesis, in place.
-
-    Parameters
-    ----------
-    x : (n_hyp, n_x)
-        States; the first n_t are replaced by `x_target`.
-    P : (n_hyp, n_x, n_x)
-        Covariances.
-    x_target : (n_hyp, n_t)
-        Propagated target states.
-    F, Q : (n_hyp, n_t, n_t) or (n_t, n_t)
-        Jacobian of the propagation and covariance of the process noise.
-    variance : float or (n_x - n_t,)
-        Added to the states behind the target's.
-    decay : (n_x - n_t,), optional
-        Before that they are multiplied by this.
-
-    Source: T10 Alg. 2, time update.
-    """
-    n_t = x_target.shape[1]
-    x[:, :n_t] = x_target
-    if decay is not None:
-        x[:, n_t:] *= decay
-        P[:, n_t:] *= decay[:, None]
-        P[:, :, n_t:] *= decay
-    P_tb = F @ P[:, :n_t, n_t:]
-    P[:, :n_t, n_t:] = P_tb
-    P[:, n_t:, :n_t] = np.swapaxes(P_tb, 1, 2)
-    P_tt = F @ P[:, :n_t, :n_t] @ np.swapaxes(F, -1, -2) + Q
-    P[:, :n_t, :n_t] = 0.5 * (P_tt + np.swapaxes(P_tt, 1, 2))
-    rest = np.arange(n_t, x.shape[1])
-    P[:, rest, rest] += variance
 
 
 _COMPILE = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}

@@ -22,6 +22,11 @@ class Ahead:
         # {sensor that is ahead: (the newest stamp, its own when that was first the newest)}
         self._quiet_since = {}
 
+    @property
+    def n_held(self):
+        """How many samples are held."""
+        return len(self._held)
+
     def feed(self, i, sample):
         """What is known by now of a sample of sensor `i`, and of those that are held.
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from mag_tracking.inference import kalman
+from mag_tracking.inference.time_update import predict
 from mag_tracking.stages.observation import Observation
 
 ONE_TIME = 0.05
@@ -41,7 +42,7 @@ class BankFilter:
         n_t = self.observation.n_target
         x_target, F, Q = self._model.propagate(bank.x[:, :n_t], dt, bank.P[:, :n_t, :n_t])
         decay, variance = self.observation.drift(dt, self._settings.background_drift)
-        kalman.predict(bank.x, bank.P, x_target, F, Q if dt > 0.0 else 0.0 * Q, variance, decay)
+        predict(bank.x, bank.P, x_target, F, Q if dt > 0.0 else 0.0 * Q, variance, decay)
         return F, decay
 
     def fields(self, x, kind, frame, dt):

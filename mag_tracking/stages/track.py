@@ -74,7 +74,9 @@ class TrackStage:
         self._next_id = 1
         self._bank = None
         # Evidence for a target against backgrounds that wander, and the filter of the latter.
-        self._log_odds, self._surest, self._strange, self._alone_s = 0.0, np.inf, 0, 0.0
+        self._log_odds, self._surest, self._strange = 0.0, np.inf, 0
+        # How long one sensor has carried the track; whether the whole of it may be wrong.
+        self._alone_s, self._doubted = 0.0, False
         self._no_target = None
         self._recent = deque()
         # A target that was lost is not to be started anew in the tail of its own detection.
@@ -169,6 +171,10 @@ class TrackStage:
         while self._recent and self._recent[0].stamp_ns < oldest:
             self._recent.popleft()
 
+    def give_up(self, reason):
+        """End the running track, as nothing is known of what came since; see `feed`."""
+        return self._forget(reason)
+
     def flush(self):
         """End the running track."""
         return self._end('input ended')
@@ -193,10 +199,9 @@ class TrackStage:
         self.counts['tracks'] += 1
         self._log_odds, self._surest, self._strange, self._alone_s = 0.0, np.inf, 0, 0.0
         self._no_target = NoTarget(len(self._network), s.background_std)
+        # Whom nobody saw come may be past the place where its field is first so strong.
         watched_ns = frame.stamp_ns - recent[0].stamp_ns if recent else 0
-        if watched_ns < WATCHED * s.lookback_s * NS and not self._starts_anywhere:
-            # Nobody saw it come: it may be past the place where its field is first so strong.
-            self._alone_s = np.inf
+        self._doubted = (watched_ns < WATCHED * s.lookback_s * NS) and not self._starts_anywhere
         if recent:
             self._filter.predict(self._bank, (recent[0].stamp_ns - frame.stamp_ns) / NS)
         self._whole.begin(self._bank, self._filter)
@@ -220,7 +225,7 @@ class TrackStage:
         self.counts.update(left_out)
         # Where no majority is left it may as well have been the track that was wrong.
         if left_out and np.count_nonzero(frame.n_samples) <= len(left_out):
-            self._alone_s = np.inf
+            self._doubted = True
         evidence = bank.reweight(log_likelihood)
         if not np.isfinite(evidence):
             self.counts['banks lost'] += 1
@@ -271,8 +276,8 @@ class TrackStage:
 
     @property
     def _is_doubtful(self):
-        """Whether the field contradicted the track at its end, or one sensor alone carried it."""
-        return self._strange > 0 or self._alone_s > ALONE_S
+        """Whether the field contradicted the track at its end, or all of it may be wrong."""
+        return self._strange > 0 or self._doubted
 
     def _smoothed_at_the_end(self):
         """What is left of a fixed lag, and the whole track."""
@@ -293,14 +298,14 @@ class TrackStage:
         # the others, when they are back, do not always put right.
         alone = len(self._network) > 1 and np.count_nonzero(there.any(axis=1)) == 1
         self._alone_s += dt if alone else 0.0
-        alone = alone or self._alone_s > ALONE_S
+        self._doubted = self._doubted or self._alone_s > ALONE_S
         track = published_track(
             bank, best, self._model, self._orientation, self.arrivals, self.kinds,
             stamp_ns=frame.stamp_ns,
             id=self._next_id, ended=False,
             existence=float(1.0 / (1.0 + np.exp(-np.clip(self._log_odds, -700.0, 700.0)))),
             degrees_of_freedom=n_y,
-            strange=self._filter.is_strange(bank, best, frame) or alone,
+            strange=self._filter.is_strange(bank, best, frame) or alone or self._doubted,
             predicted=self._filter.predicted_field(bank, best, frame, dt),
             mounting=observation.angles(bank.x[best]),
             mounting_covariance=observation.angle_covariances(bank.P[best]))

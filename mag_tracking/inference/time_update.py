@@ -1,0 +1,72 @@
+"""Kalman prediction, batched over hypotheses; the states are those of `inference.kalman`."""
+
+import numpy as np
+from numba import njit
+
+
+def predict(x, P, x_target, F, Q, variance, decay=None):
+    """Time update of every hypothesis, in place.
+
+    Parameters
+    ----------
+    x : (n_hyp, n_x)
+        States; the first n_t are replaced by `x_target`.
+    P : (n_hyp, n_x, n_x)
+        Covariances, symmetric.
+    x_target : (n_hyp, n_t)
+        Propagated target states.
+    F, Q : (n_hyp, n_t, n_t) or (n_t, n_t)
+        Jacobian of the propagation and covariance of the process noise.
+    variance : float or (n_x - n_t,)
+        Added to the states behind the target's.
+    decay : (n_x - n_t,), optional
+        Before that they are multiplied by this.
+
+    Raises ValueError where the shapes do not fit.
+
+    Source: T10 Alg. 2, time update.
+    """
+    n_hyp, n_t = x_target.shape
+    n_rest = x.shape[1] - n_t
+    if len(x) != n_hyp or P.shape != (n_hyp, n_t + n_rest, n_t + n_rest):
+        raise ValueError(f'covariances of shape {P.shape} and states of shape {x.shape} for '
+                         f'{n_hyp} targets')
+    x[:, :n_t] = x_target
+    decay = 1.0 if decay is None else decay
+    # Copies, as a broadcast array is of no layout that the kernel is compiled for.
+    _predict_bank(x, P, *(np.array(np.broadcast_to(A, (n_hyp, n_t, n_t)), dtype=float, order='C')
+                          for A in (F, Q)),
+                  *(np.array(np.broadcast_to(v, n_rest), dtype=float) for v in (variance, decay)))
+
+
+@njit('void(float64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[:,:,::1], '
+      'float64[::1], float64[::1])', cache=True, error_model='numpy', fastmath={'contract'})
+def _predict_bank(x, P, F, Q, variance, decay):
+    """Loop over the hypotheses; what is behind the target's states only decays and grows."""
+    n_t, n_x = F.shape[1], x.shape[1]
+    T = np.empty((n_t, n_x))
+    for p in range(len(x)):
+        for i in range(n_t, n_x):
+            x[p, i] *= decay[i - n_t]
+            for k in range(n_t, n_x):
+                P[p, i, k] *= decay[i - n_t] * decay[k - n_t]
+            P[p, i, i] += variance[i - n_t]
+        # T = F times the rows of the target.
+        T[:] = 0.0
+        for a in range(n_t):
+            for c in range(n_t):
+                f = F[p, a, c]
+                for i in range(n_x):
+                    T[a, i] += f * P[p, c, i]
+        for a in range(n_t):
+            for i in range(n_t, n_x):
+                P[p, a, i] = T[a, i] * decay[i - n_t]
+                P[p, i, a] = P[p, a, i]
+        for a in range(n_t):
+            for b in range(a + 1):
+                # Both triangles, so that no rounding makes it lopsided.
+                above, below = Q[p, b, a], Q[p, a, b]
+                for c in range(n_t):
+                    above += T[b, c] * F[p, a, c]
+                    below += T[a, c] * F[p, b, c]
+                P[p, a, b] = P[p, b, a] = 0.5 * (above + below)
