@@ -6,7 +6,8 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.records import FieldFrame
 from mag_tracking.settings import replace
 from mag_tracking.stages.align import Align, AlignSettings
-from mag_tracking.stages.calibrate import Calibrate, CalibrateSettings
+from mag_tracking.stages.calibrate import Calibrate
+from mag_tracking.stages.calibrate_settings import CalibrateSettings
 from mag_tracking.stages.detect import Detect, DetectSettings
 from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.survey import SurveySettings

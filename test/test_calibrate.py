@@ -10,7 +10,8 @@ from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.errors import NetworkError
 from mag_tracking.records import MagSample
 from mag_tracking.settings import replace
-from mag_tracking.stages.calibrate import Calibrate, CalibrateSettings
+from mag_tracking.stages.calibrate import Calibrate
+from mag_tracking.stages.calibrate_settings import CalibrateSettings
 from mag_tracking.stages.stage import rejected
 
 SIGMA = np.array([1.0e-8, 1.2e-8, 1.5e-8])
@@ -294,3 +295,28 @@ def test_another_correction_is_learnt_anew():
     assert not stage.backgrounds()['mag_1'].measured
     with pytest.raises(NetworkError, match='in place of one of mag_1'):
         stage.renew(line_network(2))
+
+
+def ends_of_blocks(phase):
+    """(times at which a block was judged, the background) of five seconds at 100 Hz."""
+    background = RunningBackground(3.0, 20.0, 1.5, 0.25, 2.0, 60.0, phase=phase)
+    rng, ends, n_held = np.random.default_rng(0), [], 0
+    for k in range(500):
+        background.add(k / 100.0, 1e-8 * rng.standard_normal(3))
+        if len(background._times) < n_held:
+            ends.append(k / 100.0)
+        n_held = len(background._times)
+    return ends, background
+
+
+def test_blocks_of_many_sensors_end_one_after_the_other():
+    """Judging one takes a while; those of a hundred sensors at once would hold up the readings."""
+    n, every = 10, []
+    for j in range(n):
+        ends, background = ends_of_blocks(j / n)
+        assert background.ready
+        # To one reading, by rounding.
+        np.testing.assert_allclose(np.diff(ends), 0.25, atol=0.011)
+        assert ends[0] == pytest.approx(0.25 * (1.0 + j / n), abs=0.011)
+        every += ends
+    assert max(np.count_nonzero(np.isclose(every, t)) for t in every) <= 2

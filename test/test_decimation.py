@@ -8,7 +8,8 @@ from scipy.signal import freqz
 from mag_tracking.calibration.decimation import Decimator, lowpass
 from mag_tracking.records import MagSample
 from mag_tracking.settings import replace
-from mag_tracking.stages.calibrate import Calibrate, CalibrateSettings
+from mag_tracking.stages.calibrate import Calibrate
+from mag_tracking.stages.calibrate_settings import CalibrateSettings
 
 NS = 10**9
 

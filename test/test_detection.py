@@ -14,7 +14,8 @@ from mag_tracking.inference.detection_theory import (
 from mag_tracking.records import Detection, FieldFrame, MagSample
 from mag_tracking.settings import replace
 from mag_tracking.stages.align import Align, AlignSettings
-from mag_tracking.stages.calibrate import Calibrate, CalibrateSettings
+from mag_tracking.stages.calibrate import Calibrate
+from mag_tracking.stages.calibrate_settings import CalibrateSettings
 from mag_tracking.stages.detect import Detect, DetectSettings
 
 SIGMA = 1.2e-8

@@ -14,7 +14,7 @@ from mag_tracking.io.network_file import read_network
 from mag_tracking.io.schema import sample_dict
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import MagSample
-from mag_tracking.stages.health import WINDOW, SensorHealth
+from mag_tracking.stages.health import WINDOW, SensorHealth, quantiles
 
 NS = 10**9
 EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
@@ -323,3 +323,46 @@ def test_the_command_on_one_silent_sensor(tmp_path, capsys):
     said = capsys.readouterr().out
     assert 'WRONG mag_2: no reading' in said and 'mag_1: ' not in said
     assert len(network) == 2
+
+
+@pytest.mark.parametrize('n', [1, 2, 7, 64, 513])
+def test_quantiles_are_those_of_numpy(n):
+    values, shares = np.random.default_rng(n).standard_normal(n), (0.0, 0.05, 0.5, 0.6, 0.95, 1.0)
+    np.testing.assert_allclose(quantiles(values, *shares), np.quantile(values, shares), rtol=1e-12)
+
+
+def test_there_are_no_quantiles_of_nothing():
+    assert np.isnan(quantiles(np.zeros(0), 0.1, 0.5)).tolist() == [True, True]
+
+
+def test_one_that_is_not_asked_to_looks_when_it_is_told():
+    """Its answers are as of the last look; nothing that came since is lost."""
+    health = SensorHealth(every=256, on_demand=False)
+    for k in range(100):
+        health.add(k * NS // 100, np.array([1e-6, 0.0, 1e-8 * (k % 7)]))
+    assert health.counts['readings'] == 0 and np.isnan(health.rate)
+    health.look()
+    assert health.counts['readings'] == 100 and health.rate == pytest.approx(100.0)
+    for k in range(100, 700):
+        health.add(k * NS // 100, np.array([1e-6, 0.0, 1e-8 * (k % 7)]))
+    assert health.counts['readings'] == 100 + 512
+    health.look()
+    assert health.counts['readings'] == 700
+
+
+def test_counts_do_not_depend_on_how_many_are_looked_at_together():
+    """Also of what happens between the last of one look and the first of the next."""
+    rng, fields = np.random.default_rng(5), []
+    for k in range(3000):
+        stuck = k % 900 > 600
+        fields.append(fields[-1] if stuck else 1e-5 + 1e-8 * rng.standard_normal(3))
+    stamps = np.cumsum([NS // 100 * (40 if k % 256 == 0 else 1) for k in range(3000)])
+    found = []
+    for every in (1, 64, 256):
+        health = SensorHealth(every)
+        for t, f in zip(stamps.tolist(), fields, strict=True):
+            health.add(t, f)
+        found.append({k: health.counts[k] for k in ('readings', 'lost', 'stuck readings')})
+    assert found[1] == found[2]
+    assert found[0]['stuck readings'] == found[1]['stuck readings'] > 500
+    assert found[1]['lost'] > 300

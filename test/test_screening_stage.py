@@ -11,7 +11,8 @@ from mag_tracking.io.bag import Recording
 from mag_tracking.io.samples import SampleReader
 from mag_tracking.records import MagSample
 from mag_tracking.settings import replace
-from mag_tracking.stages.calibrate import Calibrate, CalibrateSettings
+from mag_tracking.stages.calibrate import Calibrate
+from mag_tracking.stages.calibrate_settings import CalibrateSettings
 from mag_tracking.stages.stage import rejected
 
 

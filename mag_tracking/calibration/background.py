@@ -9,24 +9,11 @@ are this package's own.
 """
 
 from collections import deque
-from dataclasses import dataclass
+from math import inf, isnan
 
 import numpy as np
 
-
-@dataclass(frozen=True)
-class Block:
-    """Summary of one short stretch."""
-
-    time: float
-    """[s], centre."""
-    mean: np.ndarray
-    """(3,) [T]; NaN = axis not reported."""
-    scatter: np.ndarray
-    """(3, 3) [T^2], sum of squared deviations."""
-    n: np.ndarray
-    """(3,) samples per axis."""
-
+from mag_tracking.calibration.blocks import Block, BlockWindow, stacked
 
 LEAST_SAMPLES = 8
 """A block has at least so many samples, however slow the sensor: fewer tell nothing of noise."""
@@ -34,6 +21,9 @@ LEAST_SAMPLES = 8
 LOUDEST = 100.0
 """A block whose variance is so many times that of the quietest is no noise: a target passed within
 it, as it can within the long blocks of a slow sensor. Noise and coarse steps stay well below."""
+
+RESUMED_RELEARN_S = 10.0
+"""[s] What was resumed gives way to another steady level after so long, whatever `relearn` is."""
 
 LEAST_STD = 1e-11
 """[T] A block that scatters less teaches nothing: the sensor is stuck, or its steps are coarse."""
@@ -55,31 +45,46 @@ class RunningBackground:
         background; 0 = never.
     background, noise_std : (3,) [T], optional
         Known beforehand: with both it is ready at once.
+    phase : float
+        The first block is longer by this share: the blocks of many sensors that began
+        together are not all judged at once.
     """
 
     def __init__(self, learn, memory, guard, block, freeze_std, relearn,
-                 background=None, noise_std=None):
+                 background=None, noise_std=None, phase=0.0):
         self._learn, self._guard, self._block = learn, guard, block
         self._freeze_std, self._relearn = freeze_std, relearn
+        self._phase = phase
         self._most = max(3, int(round(memory / block)))
-        self._memory = memory
+        self._window = BlockWindow(self._most)
         self._given = None if background is None else np.asarray(background, dtype=float)
         self._noise = None if noise_std is None else np.diag(np.asarray(noise_std, float) ** 2)
         self._noise_given = self._noise is not None
-        self._std = (None, None)
+        self._std, self._numbers = (None, None, False), (None,)
         self.n_relearnt = 0
         self.forget()
 
     def forget(self):
         """Drop what was learnt; what was given beforehand stays."""
-        self._samples, self._start = [], None
-        self._window = deque(maxlen=self._most)
+        self._times, self._fields, self._end = [], [], None
+        self._longer = self._phase * self._block
+        self._window.clear()
         self._pending, self._strange = deque(), deque()
-        self.frozen = False
+        self.frozen = self._resumed = False
         if not self._noise_given:
             self._noise = None
         self._line = None if self._given is None else (0.0, self._given, np.zeros(3), 0.0)
         self.stuck = False
+
+    def resume(self, background, covariance):
+        """Go on from what was known a moment ago: (3,) [T] and (3, 3) [T^2], NaN as elsewhere.
+
+        It is a line again when a stretch as long as at first has been quiet.
+        """
+        if not self._noise_given:
+            self._noise = np.asarray(covariance, dtype=float)
+        self._line = (0.0, np.asarray(background, dtype=float), np.zeros(3), 0.0)
+        self._resumed = True
 
     @property
     def ready(self):
@@ -94,11 +99,20 @@ class RunningBackground:
     @property
     def noise_std(self):
         """[3 float] [T], or None; NaN for an axis not reported."""
-        # It is asked of every sample, and changes once a block.
-        if self._std[0] is not self._noise:
-            self._std = (self._noise, None if self._noise is None
-                         else np.sqrt(np.diagonal(self._noise)).tolist())
+        self._note_noise()
         return self._std[1]
+
+    @property
+    def is_whole(self):
+        """Whether the noise of all axes is known."""
+        self._note_noise()
+        return self._std[2]
+
+    def _note_noise(self):
+        """Keep what is asked of every sample, and changes once a block."""
+        if self._std[0] is not self._noise:
+            std = None if self._noise is None else np.sqrt(np.diagonal(self._noise)).tolist()
+            self._std = self._noise, std, std is not None and not isnan(sum(std))
 
     @property
     def measured(self):
@@ -122,27 +136,45 @@ class RunningBackground:
         centre, mean, slope, horizon = self._line
         return mean + slope * (min(time, horizon) - centre)
 
+    def departure(self, time, values):
+        """[3 float] [T]: `values`, a list, without the background at `time`; as fast as can be.
+
+        Raises ValueError before it is ready.
+        """
+        if self._line is None:
+            raise ValueError('the background has not been learnt yet')
+        if self._numbers[0] is not self._line:
+            centre, mean, slope, horizon = self._line
+            self._numbers = self._line, centre, mean.tolist(), slope.tolist(), horizon
+        _, centre, (a, b, c), (u, v, w), horizon = self._numbers
+        x, y, z = values
+        since = min(time, horizon) - centre
+        return [x - a - since * u, y - b - since * v, z - c - since * w]
+
     def add(self, time, field):
         """Take a sample: `time` [s], `field` (3,) [T], sensor frame."""
-        if self._start is not None and time >= self._start + self._block \
-                and len(self._samples) >= LEAST_SAMPLES:
+        if self._end is None:
+            self._end = time + self._block + self._longer
+        elif time >= self._end and len(self._times) >= LEAST_SAMPLES:
             self._close()
-        if self._start is None:
-            self._start = time
-        self._samples.append((time, field))
+            self._end, self._longer = time + self._block, 0.0
+        self._times.append(time)
+        self._fields.append(field)
 
     def _close(self):
         """Turn the collected samples into a block and judge it."""
-        times = np.array([t for t, _ in self._samples])
-        fields = np.array([f for _, f in self._samples])
-        n = np.count_nonzero(~np.isnan(fields), axis=0)
-        mean = np.where(n > 0, np.nansum(fields, axis=0) / np.maximum(n, 1), np.nan)
+        fields = np.concatenate(self._fields).reshape(-1, 3)
+        there = ~np.isnan(fields)
+        n = there.sum(axis=0)
+        mean = np.divide(np.where(there, fields, 0.0).sum(axis=0), n, out=np.full(3, np.nan),
+                         where=n > 0)
         # An axis that is missing now and then is missing in those products only.
-        deviation = np.nan_to_num(fields - mean)
-        block = Block(float(times.mean()), mean, deviation.T @ deviation, n)
-        self._samples, self._start = [], None
-        variance = np.diagonal(block.scatter)[n > 1] / (n[n > 1] - 1)
-        self.stuck = bool((variance < LEAST_STD**2).any())
+        deviation = np.where(there, fields - mean, 0.0)
+        block = Block(sum(self._times) / len(self._times), mean, deviation.T @ deviation, n)
+        self._times, self._fields = [], []
+        known = n > 1
+        self.stuck = bool((block.scatter.diagonal()[known]
+                           < LEAST_STD**2 * (n[known] - 1)).any())
         if self.stuck:
             return
         if self._line is not None and self._noise is not None:
@@ -162,20 +194,24 @@ class RunningBackground:
 
     def _follow(self, block):
         """Once ready: extend the quiet stretch, or freeze."""
-        std = np.sqrt(np.diagonal(self._noise))
-        off = np.abs(block.mean - self.level(block.time))
+        off = (block.mean - self.level(block.time)).tolist()
         # A comparison with NaN is false: an axis that is not reported freezes nothing.
-        self.frozen = bool(np.any(off > self._freeze_std * std))
+        self.frozen = any(abs(d) > self._freeze_std * std
+                          for d, std in zip(off, self.noise_std, strict=True))
         if self.frozen:
             self._pending.clear()
             self._strange.append(block)
-            if self._relearn and block.time - self._strange[0].time >= self._relearn:
+            relearn = self._relearn
+            if self._resumed:
+                # It may be that the sensor was moved, or its surroundings changed, meanwhile.
+                relearn = min(relearn or inf, max(self._learn, RESUMED_RELEARN_S))
+            if relearn and block.time - self._strange[0].time >= relearn:
                 if self._adopt_if_steady():
                     self.n_relearnt += 1
                     self.frozen = False
                 else:
                     self._strange.popleft()
-            elif not self._relearn:
+            elif not relearn:
                 self._strange.clear()
             return
         self._strange.clear()
@@ -186,7 +222,7 @@ class RunningBackground:
 
     def _adopt_if_steady(self):
         """Take the collected blocks as the background if they lie on one line."""
-        blocks = list(self._strange)
+        blocks = stacked(self._strange)
         if _one_is_loud(blocks):
             return False
         noise = _pooled_covariance(blocks)
@@ -196,8 +232,8 @@ class RunningBackground:
         if np.isnan(std).all():
             return False
         centre, mean, slope = _line_through(blocks)
-        off = [np.abs(b.mean - mean - slope * (b.time - centre)) for b in blocks]
-        if not np.nanmax(np.array(off) / std) <= self._freeze_std:
+        off = np.abs(blocks.mean - mean - slope * (blocks.time - centre)[:, None])
+        if not np.nanmax(off / std) <= self._freeze_std:
             return False
         if not self._noise_given:
             self._noise = noise
@@ -206,23 +242,27 @@ class RunningBackground:
             # The background was given and only the noise had to be learnt.
             self._strange.clear()
             return True
+        # A steady stretch was asked for its own length; it need not be as long as at first.
+        self._resumed = False
         self._window.clear()
-        self._window.extend(blocks[-self._most:])
+        for block in list(self._strange)[-self._most:]:
+            self._window.append(block)
         self._strange.clear()
         self._fit()
         return True
 
     def _fit(self):
         """Line and noise from the present window."""
-        blocks = list(self._window)
-        if self._given is not None and blocks[-1].time - blocks[0].time < self._learn:
+        blocks = self._window.blocks()
+        first, last = float(blocks.time.min()), float(blocks.time.max())
+        if (self._given is not None or self._resumed) and last - first < self._learn:
             return
+        self._resumed = False
         centre, mean, slope = _line_through(blocks)
-        span = blocks[-1].time - blocks[0].time
-        self._line = (centre, mean, slope, blocks[-1].time + 2.0 * span)
-        noise = _pooled_covariance(blocks)
-        if not self._noise_given and noise is not None:
-            self._noise = noise
+        self._line = (centre, mean, slope, last + 2.0 * (last - first))
+        if not self._noise_given:
+            noise = _pooled_covariance(blocks)
+            self._noise = self._noise if noise is None else noise
 
 
 def _line_through(blocks):
@@ -230,36 +270,33 @@ def _line_through(blocks):
 
     NaN for an axis that no block reports.
     """
-    t = np.array([b.time for b in blocks])
-    w = np.array([b.n for b in blocks], dtype=float)
-    y = np.nan_to_num(np.array([b.mean for b in blocks]))
-    total = w.sum(axis=0)
-    some = total > 0.0
-    total = np.where(some, total, np.nan)
-    centre = float(t.mean())
-    mean_t = (w * t[:, None]).sum(axis=0) / total
-    mean_y = (w * y).sum(axis=0) / total
-    d = t[:, None] - mean_t
-    spread = (w * d * d).sum(axis=0)
-    flat = ~(spread > 0.0)
-    slope = np.where(flat, 0.0, (w * d * (y - mean_y)).sum(axis=0) / np.where(flat, 1.0, spread))
+    time, n = blocks.time, blocks.n
+    y = np.where(n > 0.0, blocks.mean, 0.0)
+    total = n.sum(axis=0)
+    total = np.where(total > 0.0, total, np.nan)
+    centre = float(time.mean())
+    mean_t = time @ n / total
+    mean_y = (n * y).sum(axis=0) / total
+    d = time[:, None] - mean_t
+    weighted = n * d
+    spread = (weighted * d).sum(axis=0)
+    slope = np.divide((weighted * (y - mean_y)).sum(axis=0), spread, out=np.zeros(3),
+                      where=spread > 0.0)
     return centre, mean_y + slope * (centre - mean_t), slope
 
 
 def _one_is_loud(blocks):
     """Whether a block scatters far more than the others, on any axis."""
-    variance = np.array([np.where(b.n > 1, np.diagonal(b.scatter) / np.maximum(b.n - 1, 1), np.nan)
-                         for b in blocks])
+    n = blocks.n
+    variance = np.where(n > 1, np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1, 1), np.nan)
     known = variance[:, ~np.isnan(variance).all(axis=0)]
     return bool((np.nanmax(known, axis=0) > LOUDEST * np.nanmin(known, axis=0)).any())
 
 
 def _pooled_covariance(blocks):
     """Scatter within blocks, pooled; None with too few samples, NaN for an axis not reported."""
-    n = sum(b.n for b in blocks)
-    freedom = n - np.count_nonzero([b.n > 0 for b in blocks], axis=0)
+    freedom = blocks.n.sum(axis=0) - np.count_nonzero(blocks.n, axis=0)
     if freedom.max() <= 3:
         return None
-    freedom = np.where(freedom > 3, freedom, np.nan).astype(float)
-    scatter = sum(b.scatter for b in blocks)
-    return scatter / np.sqrt(freedom[:, None] * freedom[None, :])
+    freedom = np.where(freedom > 3, freedom, np.nan)
+    return blocks.scatter.sum(axis=0) / np.sqrt(freedom[:, None] * freedom[None, :])

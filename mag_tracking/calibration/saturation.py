@@ -33,6 +33,9 @@ def cut_off(values):
     out = np.zeros(len(values), dtype=bool)
     present = np.flatnonzero(~np.isnan(values))
     v = values[present]
+    if max(np.count_nonzero(v == v.min(initial=np.inf)),
+           np.count_nonzero(v == v.max(initial=-np.inf))) < LEAST_RUN:
+        return out
     jumps = np.abs(np.diff(v))
     if not (jumps > 0.0).any():
         return out

@@ -44,14 +44,15 @@ class Repetition:
 
     def is_stuck(self, field):
         """Whether the reading `field`, a list of three, is one of a sensor that is stuck."""
-        same = self._last is not None and all(
-            a == b or isnan(a) and isnan(b) for a, b in zip(field, self._last, strict=True))
-        self._last = field
+        last, self._last = self._last, field
+        same = field == last or last is not None and isnan(sum(field)) and all(
+            a == b or isnan(a) and isnan(b) for a, b in zip(field, last, strict=True))
         if not same:
             # A run that was taken for a fault says little about what is usual. But were it nothing,
             # a sensor with coarse steps that began while a target passed would be stuck at rest.
-            self._repeats += 1.0 if self._too_long() else self._run
-            self._run = 0
+            if self._run:
+                self._repeats += 1.0 if self._too_long() else self._run
+                self._run = 0
             self._changes += 1.0
             if self._repeats + self._changes > MEMORY:
                 self._repeats, self._changes = 0.5 * self._repeats, 0.5 * self._changes
@@ -80,6 +81,11 @@ class SpikeFilter:
         self._threshold = threshold
         self.clear()
 
+    @property
+    def n_held(self):
+        """How many readings are held."""
+        return len(self._held)
+
     def clear(self):
         """Forget what came before."""
         self._before, self._before_ns, self._held = None, None, []
@@ -104,7 +110,8 @@ class SpikeFilter:
             held = [(h[0], False) for h in self._held]
             self._held = []
             return held + self._release(*new)
-        steps = [abs(a - b) for a, b in zip(field, self._before, strict=True)]
+        (x, y, z), (a, b, c) = field, self._before
+        steps = abs(x - a), abs(y - b), abs(z - c)
         if self._held:
             return self._settle(*new, steps, noise_std)
         return self._judge(*new, steps, noise_std)
@@ -119,8 +126,9 @@ class SpikeFilter:
     def _is_off(self, stamp_ns, steps, noise_std):
         """Whether `steps` from the reading before are steeper than what passes could make them."""
         # A comparison with NaN is false: an axis that is missing is no spike.
-        high = [s > self._threshold * n for s, n in zip(steps, noise_std, strict=True)]
-        if not any(high):
+        (x, y, z), (a, b, c), most = steps, noise_std, self._threshold
+        high = x > most * a, y > most * b, z > most * c
+        if True not in high:
             return False
         passed = FASTEST * (stamp_ns - self._before_ns) * 1e-9
         steeper = max(STEEPER, STEEPEST * passed**3)

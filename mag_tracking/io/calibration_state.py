@@ -6,19 +6,17 @@ import numpy as np
 
 from mag_tracking.errors import RecordingError
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
-from mag_tracking.io.schema import header_dict, xyz
+from mag_tracking.io.schema import xyz
 
 
-def calibration_dict(calibrate, network, ns):
-    """mag_tracking_msgs/CalibrationState of a `Calibrate` stage of `network` at time `ns`."""
-    sensors = []
-    for j, (name, background) in enumerate(calibrate.backgrounds().items()):
-        ready = background.ready and calibrate.last_stamp_ns(name) is not None
-        counts = calibrate.per_sensor[name]
-        q, std = quaternion_from_rotation(network.R_ws[j]), network.orientation_std[j]
-        done = network.calibrated[j]
-        sensors.append({
-            'sensor': name, 'ready': ready, 'frozen': background.frozen,
+def sensor_dict(calibrate, network, j):
+    """mag_tracking_msgs/SensorCalibration of sensor `j`."""
+    name = network.names[j]
+    background, counts = calibrate.backgrounds()[name], calibrate.per_sensor[name]
+    ready = background.ready and calibrate.last_stamp_ns(name) is not None
+    q, std = quaternion_from_rotation(network.R_ws[j]), network.orientation_std[j]
+    done = network.calibrated[j]
+    return {'sensor': name, 'ready': ready, 'frozen': background.frozen,
             'background': xyz(calibrate.background(name) if ready else np.full(3, np.nan)),
             'covariance': (background.covariance if ready
                            else np.full((3, 3), np.nan)).ravel().tolist(),
@@ -29,8 +27,7 @@ def calibration_dict(calibrate, network, ns):
             'clock_offset': float(network.clock_offset[j]),
             'clock_offset_std': float('nan') if done is None else done.clock_offset_std,
             'calibrated_at': '' if done is None else done.date,
-            'calibrated_by': '' if done is None else done.by})
-    return {'header': header_dict(ns, network.frame), 'sensors': sensors}
+            'calibrated_by': '' if done is None else done.by}
 
 
 def with_orientations(network, message):

@@ -45,6 +45,14 @@ def acceleration_of(message, sensor):
                               np.array([a.x, a.y, a.z]) if there else np.full(3, np.nan))
 
 
+def doubles(values):
+    """Numbers for a float64[] of a message, which takes an array.array as it is.
+
+    A list it would look at number by number.
+    """
+    return array('d', np.ascontiguousarray(values, dtype=float).tobytes())
+
+
 def xyz(v):
     """Vector as a dict."""
     return {'x': float(v[0]), 'y': float(v[1]), 'z': float(v[2])}
@@ -73,13 +81,12 @@ def readings_dict(samples):
                              'or of none')
     names = list(dict.fromkeys(s.sensor for s in samples))
     rows = {name: j for j, name in enumerate(names)}
-    covariance = np.array([s.covariance for s in samples], dtype=float) if known[0] else np.zeros(0)
-    # As array.array a message takes them as they are; a list is looked at number by number.
+    covariance = np.concatenate([s.covariance for s in samples]) if known[0] else np.zeros(0)
     return {'header': header_dict(max(s.stamp_ns for s in samples), ''), 'sensors': names,
             'sensor': array('H', [rows[s.sensor] for s in samples]),
             'stamp': array('q', [s.stamp_ns for s in samples]),
-            'field': array('d', np.array([s.field for s in samples], dtype=float).tobytes()),
-            'covariance': array('d', covariance.tobytes())}
+            'field': doubles(np.concatenate([s.field for s in samples])),
+            'covariance': doubles(covariance)}
 
 
 def samples_of(message):
@@ -96,8 +103,9 @@ def samples_of(message):
     field = np.array(message.field, dtype=float).reshape(n, 3)
     covariance = [None] * n
     if len(message.covariance):
-        covariance = [None if C[0, 0] == -1.0 or not C.any() else C for C in np.array(
-            message.covariance, dtype=float).reshape(n, 3, 3)]
+        C = np.array(message.covariance, dtype=float).reshape(n, 3, 3)
+        known = ((C[:, 0, 0] != -1.0) & C.any(axis=(1, 2))).tolist()
+        covariance = [c if k else None for c, k in zip(C, known, strict=True)]
     return [MagSample(stamp, names[j], B, C) for j, stamp, B, C in zip(
         message.sensor, message.stamp, field, covariance, strict=True)]
 
@@ -149,13 +157,13 @@ def track_dict(track, frame):
             'moment_covariance': track.moment_covariance.ravel().tolist(),
             'existence': track.existence, 'weight': track.weight,
             'normalised_innovation': track.nis, 'degrees_of_freedom': track.degrees_of_freedom,
-            'innovation_by_sensor': track.nis_by_sensor.tolist(),
+            'innovation_by_sensor': doubles(track.nis_by_sensor),
             'arrival': track.arrival, 'kind': track.kind, 'kind_weight': track.kind_weight,
             'length': track.length, 'length_std': track.length_std, 'ambiguous': track.ambiguous,
             'unobservable': list(track.unobservable),
-            'predicted_field': track.predicted.ravel().tolist(),
-            'mounting': track.mounting.ravel().tolist(),
-            'mounting_covariance': track.mounting_covariance.ravel().tolist()}
+            'predicted_field': doubles(track.predicted),
+            'mounting': doubles(track.mounting),
+            'mounting_covariance': doubles(track.mounting_covariance)}
 
 
 def hypotheses_dict(track, frame):
@@ -185,9 +193,8 @@ def smoothed_track_dict(poses, frame):
 def frame_dict(frame, network):
     """mag_tracking_msgs/NetworkFrame of a `FieldFrame`."""
     return {'header': header_dict(frame.stamp_ns, network.frame), 'sensors': list(network.names),
-            'field': frame.field.ravel().tolist(),
-            'covariance': frame.covariance.ravel().tolist(),
-            'n_samples': frame.n_samples.tolist(), 'time_offset': frame.time_offset.tolist(),
+            'field': doubles(frame.field), 'covariance': doubles(frame.covariance),
+            'n_samples': frame.n_samples.tolist(), 'time_offset': doubles(frame.time_offset),
             'target_present': frame.target_present,
             'statistic': frame.statistic, 'degrees_of_freedom': frame.degrees_of_freedom}
 

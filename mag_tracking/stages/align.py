@@ -76,6 +76,11 @@ class Align:
         self._ahead = Ahead(self._n, self._longest_jump, min(self._most_pending, MOST_HELD))
         self._look_ahead()
 
+    @property
+    def n_held(self):
+        """How many samples wait for their frame, or for the other sensors' clocks."""
+        return sum(map(len, self._pending)) + self._ahead.n_held
+
     def feed(self, sample):
         """A calibrated `MagSample` gives the `FieldFrame`s that it completes."""
         i = self._index.get(sample.sensor)

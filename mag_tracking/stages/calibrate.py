@@ -11,53 +11,21 @@ from mag_tracking.calibration.decimation import Decimator
 from mag_tracking.calibration.screening import SPIKE, STUCK, Repetition, SpikeFilter
 from mag_tracking.errors import NetworkError
 from mag_tracking.records import MagSample
-from mag_tracking.settings import param
 from mag_tracking.stages.stage import NS
+
+AT_ONCE = 16
+"""The blocks of so many sensors may end at once; those of more would hold up the readings."""
 
 
 @dataclass(frozen=True)
-class CalibrateSettings:
-    """Settings of the calibration."""
+class Kept:
+    """The background of one sensor, to go on from after a restart."""
 
-    learn_s: float = param(
-        3.0, 'Quiet time needed before a sensor is used, unless its calibration is given.',
-        's', (0.1, 3600.0))
-    memory_s: float = param(
-        20.0, 'Length of the quiet stretch that level, drift and noise are fitted to.',
-        's', (1.0, 36000.0))
-    guard_s: float = param(
-        1.5, 'How far the background stays behind, so that a slow approach does not enter it.',
-        's', (0.0, 600.0))
-    block_s: float = param(
-        0.25, 'Samples are judged in blocks of this length.', 's', (0.01, 60.0))
-    freeze_std: float = param(
-        2.0, 'A block whose mean is off by this many noise deviations freezes the background.',
-        '', (0.5, 1000.0))
-    relearn_s: float = param(
-        60.0, 'After so long frozen on a steady level, that level becomes the background '
-        '(a parked car); 0 = never.', 's', (0.0, 86400.0))
-    max_field: float = param(
-        1e-3, 'A reading above this is rejected: gauss or microtesla published as tesla is the '
-        'commonest fault. Near magnets millitesla are legitimate.', 'T', (1e-6, 10.0))
-    jump_ahead_s: float = param(
-        60.0, 'A stamp that is ahead by more than this has to be confirmed by the next one, else '
-        'it is taken for corrupt.', 's', (1e-3, 1e9))
-    spike_std: float = param(
-        30.0, 'A reading, or up to three, that is off those around it by more noise deviations '
-        'than this is rejected as a spike; what may be one waits for the next. Below 30 Hz, where '
-        'a vehicle changes much from one to the next, it has to be larger. 0 = never.',
-        '', (0.0, 1e6))
-    reject_stuck: bool = param(
-        True, 'Readings that stay the same, from a sensor that does not repeat itself otherwise, '
-        'are rejected. Simulated sensors without noise need this to be false.')
-    decimate_to_hz: float = param(
-        0.0, 'Samples of a faster sensor are low-pass filtered and thinned to about this rate '
-        '(a whole share of its own; 60 dB against folding, four intervals late). 0 = no: frames '
-        'average anyway.',
-        'Hz', (0.0, 10000.0))
-    jump_back_s: float = param(
-        1.0, 'A stamp that goes back by more than this is a restart (a looped recording): '
-        'what was learnt is forgotten.', 's', (0.0, 3600.0))
+    stamp_ns: int
+    background: np.ndarray
+    """(3,) [T]; NaN = axis not reported."""
+    covariance: np.ndarray
+    """(3, 3) [T^2] noise of one sample."""
 
 
 class Calibrate:
@@ -74,11 +42,13 @@ class Calibrate:
         self.counts = Counter()
         self.per_sensor = {name: Counter() for name in network.names}
         self._settings = settings
+        self._longest_jump = settings.jump_ahead_s * NS
         self._index = {name: i for i, name in enumerate(network.names)}
         self._network, self._clock_ns, self._background = None, [], {}
         self._repetition = {name: Repetition() for name in network.names}
         self._spikes = {name: SpikeFilter(settings.spike_std) for name in network.names}
         self._first_ns, self._last_ns, self._ahead_ns = {}, {}, {}
+        self._kept = {}
         self.renew(network)
 
     def renew(self, network):
@@ -99,6 +69,8 @@ class Calibrate:
         for i, name in enumerate(network.names):
             same = before is not None and _same(before.offset[i], network.offset[i]) \
                 and _same(before.correction[i], network.correction[i])
+            if before is not None and (not same or self._clock_ns[i] != clock_before[i]):
+                self._kept.pop(name, None)
             if not same or self._clock_ns[i] != clock_before[i]:
                 self._give_up(name, 'another calibration came')
             if not same:
@@ -113,7 +85,8 @@ class Calibrate:
         """Of sensor `i`, from what the network file says of it."""
         s, network = self._settings, self._network
         return RunningBackground(s.learn_s, s.memory_s, s.guard_s, s.block_s, s.freeze_std,
-                                 s.relearn_s, network.background[i], network.noise_std[i])
+                                 s.relearn_s, network.background[i], network.noise_std[i],
+                                 phase=i / len(network) if len(network) > AT_ONCE else 0.0)
 
     def feed(self, sample):
         """A raw `MagSample` gives the calibrated ones that are now known to be whole."""
@@ -122,14 +95,22 @@ class Calibrate:
         cause = self._fault(sample)
         if cause:
             return self._reject(sample, cause)
-        sample = self._corrected(sample)
-        if isnan(sample.field[0]) and np.isnan(sample.field).all():
+        raw, sample = sample, self._corrected(sample)
+        if sample is not raw and np.isnan(sample.field).all():
             return self._reject(sample, 'an axis is missing that the correction needs')
         cause = self._misplaced(sample)
         if cause:
             return self._reject(sample, cause)
-        return [c for whole in self._screened(sample) for s in self._thinned(whole)
-                for c in self._calibrated(s)]
+        return self._used(self._screened(sample))
+
+    def _used(self, samples):
+        """What is made of whole samples: counted, thinned out and calibrated."""
+        out = []
+        for whole in samples:
+            self.per_sensor[whole.sensor]['accepted'] += 1
+            for s in self._thinned(whole) if self._settings.decimate_to_hz else (whole,):
+                out += self._calibrated(s)
+        return out
 
     def _screened(self, sample):
         """The samples that are known by now to be whole; the others are counted or wait."""
@@ -145,13 +126,12 @@ class Calibrate:
         for s, is_spike in known:
             if is_spike:
                 self._reject(s, SPIKE)
-        return self._accepted([s for s, is_spike in known if not is_spike])
+        return [s for s, is_spike in known if not is_spike]
 
-    def _accepted(self, samples):
-        """Count `samples`."""
-        for s in samples:
-            self.per_sensor[s.sensor]['accepted'] += 1
-        return samples
+    @property
+    def n_held(self):
+        """How many readings wait for the next."""
+        return sum(s.n_held for s in self._spikes.values())
 
     def _give_up(self, name, why):
         """Nothing that comes tells any more whether what is held of a sensor was a spike."""
@@ -161,6 +141,11 @@ class Calibrate:
     def _misplaced(self, sample):
         """Why the stamp of a sample cannot be used, or None; a restart is one to go on from."""
         last = self._last_ns.get(sample.sensor)
+        if last is not None and 0 < sample.stamp_ns - last <= self._longest_jump \
+                and sample.sensor not in self._ahead_ns:
+            # As nearly all are.
+            self._last_ns[sample.sensor] = sample.stamp_ns
+            return None
         if last is not None and self._is_ahead(sample, last):
             return 'stamp too far ahead'
         if last is not None and sample.stamp_ns <= last:
@@ -172,12 +157,34 @@ class Calibrate:
             self._first_ns.pop(sample.sensor)
         self._last_ns[sample.sensor] = sample.stamp_ns
         self._first_ns.setdefault(sample.sensor, sample.stamp_ns)
+        if sample.sensor in self._kept:
+            self._go_on_from(self._kept.pop(sample.sensor), sample)
         return None
 
+    def resume(self, kept):
+        """Go on from {sensor: `Kept`}, where the first reading of a sensor comes soon after."""
+        self._kept = dict(kept)
+
+    def kept(self, sensor):
+        """What `resume` wants of a sensor; None before its background is known."""
+        background = self._background[sensor]
+        if not background.ready or sensor not in self._last_ns:
+            return None
+        C = background.covariance
+        # An axis that has only just begun to report has a level, but no noise yet.
+        level = np.where(np.isnan(np.diagonal(C)), np.nan, self.background(sensor))
+        return None if np.isnan(level).all() else Kept(self._last_ns[sensor], level, C)
+
+    def _go_on_from(self, kept, sample):
+        """Take up a background at the first reading, if it is of a moment before."""
+        if 0 < sample.stamp_ns - kept.stamp_ns <= self._settings.resume_s * NS:
+            self._background[sample.sensor].resume(kept.background, kept.covariance)
+            self.counts['backgrounds resumed'] += 1
+        else:
+            self.counts['backgrounds of another time not resumed'] += 1
+
     def _thinned(self, sample):
-        """The samples that are left of a fast sensor; the sample itself without decimation."""
-        if not self._settings.decimate_to_hz:
-            return [sample]
+        """The samples that are left of a fast sensor."""
         decimator = self._decimators[sample.sensor]
         found = decimator.feed(sample.stamp_ns, sample.field)
         self.counts['thinned out'] += 1 - len(found)
@@ -195,9 +202,14 @@ class Calibrate:
         if not background.ready:
             self.counts['held back while learning'] += 1
             return []
-        covariance = background.covariance if sample.covariance is None else sample.covariance
-        field = sample.field - background.level(time)
-        if not isnan(field.sum() + covariance.trace()):
+        departure = background.departure(time, sample.field.tolist())
+        covariance, is_whole = sample.covariance, background.is_whole
+        if covariance is None:
+            covariance = background.covariance
+        else:
+            is_whole = not isnan(covariance.trace())
+        field = np.array(departure)
+        if is_whole and not isnan(sum(departure)):
             self.counts['calibrated'] += 1
             return [MagSample(sample.stamp_ns, sample.sensor, field, covariance)]
         unknown = ~np.isnan(field) & np.isnan(np.diagonal(covariance))
@@ -229,13 +241,11 @@ class Calibrate:
 
     def flush(self):
         """What waited for the next reading."""
-        held = [s for spikes in self._spikes.values() for s, _ in spikes.flush()]
-        return [c for whole in self._accepted(held) for s in self._thinned(whole)
-                for c in self._calibrated(s)]
+        return self._used([s for spikes in self._spikes.values() for s, _ in spikes.flush()])
 
     def _is_ahead(self, sample, last):
         """Whether a stamp is far ahead of the `last`, and of the one that was so before it."""
-        limit = self._settings.jump_ahead_s * NS
+        limit = self._longest_jump
         if sample.stamp_ns - last <= limit:
             self._ahead_ns.pop(sample.sensor, None)
             return False
@@ -246,14 +256,17 @@ class Calibrate:
     def _fault(self, sample):
         """Why the sample cannot be used, or None."""
         # Of three numbers Python's own functions are several times as fast as NumPy's.
-        values = [abs(v) for v in sample.field.tolist() if not isnan(v)]
-        if not values:
-            return 'no axis reported (all NaN)'
-        largest = max(values)
-        if largest == inf:
-            return 'infinite value'
-        if largest > self._settings.max_field:
-            return f'above {self._settings.max_field:g} T (gauss or microtesla as tesla?)'
+        x, y, z = sample.field.tolist()
+        most = self._settings.max_field
+        if not (abs(x) <= most and abs(y) <= most and abs(z) <= most):
+            # Or an axis is missing.
+            values = [abs(v) for v in (x, y, z) if not isnan(v)]
+            if not values:
+                return 'no axis reported (all NaN)'
+            if max(values) == inf:
+                return 'infinite value'
+            if max(values) > most:
+                return f'above {most:g} T (gauss or microtesla as tesla?)'
         if sample.covariance is None:
             return None
         there = ~np.isnan(sample.field)
@@ -279,6 +292,7 @@ class Calibrate:
             self._network.index(name)
         for name in sensors or self._network.names:
             self._background[name].forget()
+            self._kept.pop(name, None)
 
     def last_stamp_ns(self, sensor):
         """Stamp of the latest accepted sample of `sensor`, or None."""

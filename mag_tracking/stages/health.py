@@ -47,9 +47,15 @@ class Finding:
 
 
 class SensorHealth:
-    """Looks at the readings of one sensor as they come, sixty-four at a time."""
+    """Looks at the readings of one sensor as they come.
 
-    def __init__(self):
+    That is whenever `every` so many have come, and when `look` is called; `on_demand`
+    also before each answer.
+    """
+
+    def __init__(self, every=EVERY, on_demand=True):
+        self._every = every
+        self._demand = self.look if on_demand else lambda: None
         self._counts = Counter()
         self._largest_step_s = 0.0
         self._new = []
@@ -65,17 +71,17 @@ class SensorHealth:
     def add(self, stamp_ns, field, received_ns=None):
         """A reading: `field` (3,) [T] as the sensor gave it; `received_ns` by the host's clock."""
         self._new.append((stamp_ns, field, UNKNOWN if received_ns is None else received_ns))
-        if len(self._new) == EVERY:
-            self._look()
+        if len(self._new) == self._every:
+            self.look()
 
     @property
     def counts(self):
         """`readings`, `lost`, `duplicates`, `stamps that went back`, `clock steps`, `spikes`,
         `saturated`, `without any axis`, `stuck readings`; and `x`, `y`, `z` missing."""
-        self._look()
+        self._demand()
         return self._counts
 
-    def _look(self):
+    def look(self):
         """Take the new readings into the window."""
         if not self._new:
             return
@@ -111,9 +117,9 @@ class SensorHealth:
         forward = np.diff(self._stamps)
         forward = forward[forward > 0]
         if len(forward) >= 8:
-            self._interval_ns = float(np.median(forward))
-            self._spread = float(np.median(np.abs(forward - self._interval_ns))
-                                 / self._interval_ns)
+            self._interval_ns = quantiles(forward, 0.5)[0]
+            self._spread = quantiles(np.abs(forward - self._interval_ns), 0.5)[0] \
+                / self._interval_ns
 
     def _values(self, n):
         """Count what is wrong with the fields of the `n` latest."""
@@ -151,7 +157,7 @@ class SensorHealth:
     @property
     def rate(self):
         """[Hz] of the latest readings; NaN before there are enough."""
-        self._look()
+        self._demand()
         return NS / self._interval_ns
 
     @property
@@ -166,7 +172,7 @@ class SensorHealth:
 
     def _once(self, name, make):
         """`make` of the fields in the window; once, however often it is asked for."""
-        self._look()
+        self._demand()
         if name not in self._made:
             self._made[name] = make(self._fields)
         return self._made[name]
@@ -174,7 +180,7 @@ class SensorHealth:
     @property
     def dead_axes(self):
         """Such as 'xz': axes that have not changed in a window in which another one did."""
-        self._look()
+        self._demand()
         if len(self._fields) < WINDOW:
             return ''
         there = ~np.isnan(self._fields).any(axis=0)
@@ -184,12 +190,12 @@ class SensorHealth:
     @property
     def delay_s(self):
         """(median, 5 %, 95 %) [s] from stamp to receipt; NaN where receipts are not known."""
-        self._look()
-        known = self._received != UNKNOWN
-        if not known.any():
-            return float('nan'), float('nan'), float('nan')
-        delays = (self._received - self._stamps)[known] / NS
-        return tuple(float(v) for v in np.quantile(delays, (0.5, 0.05, 0.95)))
+        self._demand()
+        if 'delay' not in self._made:
+            known = self._received != UNKNOWN
+            delays = (self._received - self._stamps)[known] / NS
+            self._made['delay'] = quantiles(delays, 0.5, 0.05, 0.95)
+        return self._made['delay']
 
     def findings(self, name, noise_std=None, max_field=1e-3):
         """What is wrong, the worst first: list of `Finding`.
@@ -274,16 +280,25 @@ class SensorHealth:
                           'plugs, supply and checksums')
 
 
+def quantiles(values, *shares):
+    """[float] quantiles of (n,) finite `values`, by linear interpolation; NaN of none.
+
+    As `numpy.quantile`, whose checks take longer than the work where arrays are small.
+    """
+    if not len(values):
+        return [float('nan')] * len(shares)
+    ordered, out = np.sort(values), []
+    for share in shares:
+        place = share * (len(ordered) - 1)
+        low = int(place)
+        a, b = float(ordered[low]), float(ordered[min(low + 1, len(ordered) - 1)])
+        out.append(a + (place - low) * (b - a))
+    return out
+
+
 def _median(fields):
     """(3,) [T]; NaN of an axis that none has."""
-    there = ~np.isnan(fields)
-    if len(fields) and there.all():
-        # Forty times as fast.
-        return np.median(fields, axis=0)
-    known = there.any(axis=0)
-    out = np.full(3, np.nan)
-    out[known] = np.nanmedian(fields[:, known], axis=0)
-    return out
+    return np.array([quantiles(axis[~np.isnan(axis)], 0.5)[0] for axis in fields.T])
 
 
 def _noise(fields):
@@ -299,6 +314,6 @@ def _noise(fields):
             step = d[d > 0.0].min(initial=np.inf)
             least = step / np.sqrt(12.0) if np.isfinite(step) else 0.0
             # Their mean, not their median: of coarse steps the median is one.
-            usual = d[d <= max(8.0 * np.quantile(d, 0.6), least)]
+            usual = d[d <= max(8.0 * quantiles(d, 0.6)[0], least)]
             out[axis] = max(np.sqrt(np.pi / 12.0) * usual.mean(), least)
     return out
