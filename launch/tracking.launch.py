@@ -1,11 +1,16 @@
-"""Calibration, detection and tracking; with recording:=FILE the replay as well.
+"""Calibration, detection and tracking; with drivers:=FILE or recording:=FILE what feeds them.
 
 ros2 launch mag_tracking tracking.launch.py network:=/path/to/network.yaml
 """
 
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
 from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution, PythonExpression
+from launch.substitutions import (
+    EnvironmentVariable,
+    LaunchConfiguration,
+    PathJoinSubstitution,
+    PythonExpression,
+)
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
@@ -13,27 +18,44 @@ from launch_ros.substitutions import FindPackageShare
 from launch import LaunchDescription
 
 
+def config(name):
+    """Path of a file of config/."""
+    return PathJoinSubstitution([FindPackageShare('mag_tracking'), 'config', name])
+
+
 def generate_launch_description():
     """The nodes with their arguments."""
     network = LaunchConfiguration('network')
     target = LaunchConfiguration('target')
     recording = LaunchConfiguration('recording')
+    drivers = LaunchConfiguration('drivers')
     has_recording = PythonExpression(["'", recording, "' != ''"])
+    has_drivers = PythonExpression(["'", drivers, "' != ''"])
     common = [{'network': network, 'target': target,
                'reliable_input': ParameterValue(has_recording, value_type=bool)},
               LaunchConfiguration('params')]
     return LaunchDescription([
+        # A profile of your own stays.
+        *(SetEnvironmentVariable(name, EnvironmentVariable(
+            name, default_value=config('fastdds.xml')))
+          for name in ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')),
         DeclareLaunchArgument('network', description='path of a network.yaml'),
         DeclareLaunchArgument('target', default_value='vehicle', description='vehicle or magnet'),
         DeclareLaunchArgument(
-            'params', description='parameter file',
-            default_value=PathJoinSubstitution(
-                [FindPackageShare('mag_tracking'), 'config', 'empty.yaml'])),
+            'params', description='parameter file', default_value=config('empty.yaml')),
+        DeclareLaunchArgument('drivers', default_value='', description='drivers file'),
+        DeclareLaunchArgument('batches', default_value='false',
+                              description='readings of many sensors go in one message'),
         DeclareLaunchArgument('recording', default_value='', description='replay this as well'),
         DeclareLaunchArgument('rate', default_value='1.0', description='speed of the replay'),
         Node(package='mag_tracking', executable='calibration_node', parameters=common),
         Node(package='mag_tracking', executable='detection_node', parameters=common),
         Node(package='mag_tracking', executable='tracker_node', parameters=common),
+        # The last, when there is somebody to hear it.
+        Node(package='mag_tracking', executable='driver_node', condition=IfCondition(has_drivers),
+             parameters=[{'drivers': drivers, 'network': network,
+                          'batches': ParameterValue(LaunchConfiguration('batches'),
+                                                    value_type=bool)}]),
         Node(package='mag_tracking', executable='replay_node', condition=IfCondition(has_recording),
              parameters=[{'recording': recording,
                           'rate': ParameterValue(LaunchConfiguration('rate'),

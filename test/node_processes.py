@@ -1,15 +1,18 @@
 """Nodes as processes of their own, for the tests."""
 
+import os
 import signal
 import subprocess
 import sys
+import tempfile
 
 
-def start(module, *arguments):
-    """A node in a process of its own."""
+def start(module, *arguments, home=None):
+    """A node in a process of its own, with no memory but what it finds in `home`."""
     return subprocess.Popen(
         [sys.executable, '-m', f'mag_tracking.nodes.{module}', '--ros-args', *arguments],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        env={**os.environ, 'ROS_HOME': str(home or tempfile.mkdtemp(dir=os.environ['ROS_HOME']))})
 
 
 def stop(processes):

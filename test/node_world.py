@@ -3,6 +3,7 @@
 import signal
 import time
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,14 +42,9 @@ STEADY = {'calibration_node': {'calibrate.learn_s': 3600.0},
           'detection_node': {'detect.background_drift': 0.0}}
 """Settings of a background that is as the network file says: nothing is learnt of it between two
 vehicles, and nothing is allowed for it."""
-QUICK = """<dds xmlns="http://www.eprosima.com"><profiles>
-<participant profile_name="quick" is_default_profile="true"><rtps><builtin><discovery_config>
-<leaseAnnouncement><sec>0</sec><nanosec>250000000</nanosec></leaseAnnouncement>
-<initialAnnouncements><count>40</count><period><nanosec>50000000</nanosec></period>
-</initialAnnouncements></discovery_config></builtin></rtps></participant></profiles></dds>
-"""
-"""Profile of Fast DDS. By itself it announces a new node for half a second and then every 3 s, so
-that two nodes that miss each other in the beginning (one start in five) are strangers for 3 s."""
+PROFILE = Path(__file__).parents[1] / 'config' / 'fastdds.xml'
+"""Without it two nodes that miss each other in the beginning (one start in five) are strangers for
+3 s."""
 
 
 def network_file(folder):
@@ -243,15 +239,13 @@ def is_wrong(track, truth):
 def world(folder):
     """A `World` whose nodes run and give frames; at the end all have to end cleanly."""
     line = SerialLine(folder / 'port')
-    profile = folder / 'fastdds.xml'
-    profile.write_text(QUICK)
     own = folder / 'guarded'
     own.mkdir()
     with pytest.MonkeyPatch.context() as patch, Broker(folder) as broker, Broker(
             own, *password_lines(own, 'somebody', 'secret')) as guarded, Roadside(
             read_network(network_file(folder)), BODY, broker.port, line) as roadside:
         for name in ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'):
-            patch.setenv(name, str(profile))
+            patch.setenv(name, str(PROFILE))
         rclpy.init()
         here = World(folder, broker, guarded, roadside, line)
         try:

@@ -102,6 +102,32 @@ def test_a_node_is_killed_and_started_again(here, name):
     here.wrong_poses[name] = here.wrong(began)
 
 
+@pytest.mark.parametrize('name, by, words', [
+    ('calibration_node', 'detection_node: from calibration_node', 'nothing has come'),
+    ('detection_node', 'tracker_node: from detection_node', 'nothing has come'),
+    ('tracker_node', 'detection_node: to tracker_node', 'tracker_node has gone')])
+def test_a_dead_node_is_named_by_its_neighbour(here, name, by, words):
+    """And of a track that gets no frames any more it is said that it is lost."""
+    here.use('mqtt')
+    began = here.call()
+    here.drive_to(-6.0)
+    assert here.wait(lambda: here.tracks(began), 1.0)
+    killed = time.time_ns()
+    here.kill(name)
+    assert here.wait(lambda: here.told(killed, by, words, 'does it still run?'), 6.0)
+    [(came, status), *_] = here.told(killed, by, words, 'does it still run?')
+    assert status.level == DiagnosticStatus.ERROR
+    print(f'a dead {name}: named after {(came - killed) / NS:.1f} s')
+    if name != 'tracker_node':
+        assert here.wait(lambda: ended(here, began), 4.0)
+        [last] = ended(here, began)
+        assert last.stamp_ns < killed + NS
+    _, recovery = here.recovery(name)
+    assert recovery <= LIMIT_S
+    restarted = time.time_ns()
+    assert here.wait(lambda: [s for _, s in here.told(restarted, by, 'running')], 4.0)
+
+
 def test_a_dead_driver_is_named_by_the_calibration(here):
     here.use('mqtt')
     killed = time.time_ns()

@@ -2,16 +2,24 @@
 
 import datetime
 import sys
+import time
 from functools import partial
 from pathlib import Path
 
-from mag_tracking_msgs.msg import CalibrationState, FieldReadings
+from mag_tracking_msgs.msg import CalibrationState, FieldReadings, SensorCalibration
 from mag_tracking_msgs.srv import Calibrate as CalibrateService
 from mag_tracking_msgs.srv import Survey as SurveyService
+from rcl_interfaces.msg import ParameterDescriptor
 from sensor_msgs.msg import Imu, MagneticField
 
 from mag_tracking.errors import NetworkError, OutputError, RecordingError
-from mag_tracking.io.calibration_state import calibration_dict
+from mag_tracking.io.background_file import (
+    background_text,
+    read_backgrounds,
+    usual_path,
+    write_backgrounds,
+)
+from mag_tracking.io.calibration_state import sensor_dict
 from mag_tracking.io.message_types import CALIBRATED_READINGS, RAW_READINGS
 from mag_tracking.io.network_file import write_network
 from mag_tracking.io.schema import (
@@ -19,7 +27,6 @@ from mag_tracking.io.schema import (
     readings_dict,
     sample_dict,
     sample_of,
-    samples_of,
 )
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
@@ -29,80 +36,158 @@ from mag_tracking.nodes.stage_node import LATCHED, STREAM, StageNode
 from mag_tracking.stages.calibrate import Calibrate
 from mag_tracking.stages.survey import Survey, with_noise
 
+SHORTEST_TURN_S = 0.02
+"""[s] Each sensor has a turn once a second, or where they are more than fifty, one so often."""
+KEEP_EVERY_S = 5.0
+"""[s] The backgrounds are written down so often, or oftener where `calibrate.resume_s` is short."""
+
 
 class CalibrationNode(StageNode):
     """Subscribes to each sensor's topic; publishes it with `_calibrated` behind its name."""
 
-    OWN_PARAMETERS = (*StageNode.OWN_PARAMETERS, 'save_as')
+    OWN_PARAMETERS = (*StageNode.OWN_PARAMETERS, 'save_as', 'state_file')
 
     def __init__(self, **node_arguments):
         super().__init__('calibration_node', 'calibrate', **node_arguments)
         self.settings = declare_settings(self, self.settings, 'survey', self.OWN_PARAMETERS)
         self._save_as = self.declare_parameter('save_as', '').value
         self._stage = Calibrate(self.network, self.settings.calibrate)
+        self._state_file = self._place_of_state()
+        self._kept, self._write_again = {}, 0.0
+        self._resume()
         self._survey = Survey(self.network, self.settings.survey)
         self._health = HealthDiagnostics(self.network, self.settings)
         self._publishers_by_sensor = {}
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self._publishers_by_sensor[sensor] = self.publisher(
                 MagneticField, f'{topic}_calibrated', STREAM)
-            self.subscription(MagneticField, topic, partial(self._take, sensor), self.input_qos)
+            self.subscription(MagneticField, topic, partial(self._take, sensor), self.input_qos,
+                              source='sensors')
         for sensor, topic in zip(self.network.names, self.network.imu_topics, strict=True):
             if topic is not None:
                 self.subscription(Imu, topic, partial(self._shaken, sensor), self.input_qos)
         self._readings = self.publisher(FieldReadings, CALIBRATED_READINGS, STREAM)
-        self.subscription(FieldReadings, RAW_READINGS, self._take_many, STREAM)
+        self.subscription(FieldReadings, RAW_READINGS, self._take_many, STREAM, source='sensors')
+        self.expect('detection_node', CALIBRATED_READINGS)
         self._state = self.publisher(CalibrationState, '~/calibration', LATCHED)
-        self._published = None
-        self.create_timer(1.0, self._publish_state)
-        self.create_timer(0.9 / len(self.network), lambda: self._health.look_at_next(
-            self.get_name(), self._stage))
+        self._turn, self._states = len(self.network), []
+        self.create_timer(max(1.0 / (len(self.network) + 1), SHORTEST_TURN_S), self._next_turn)
         self.create_service(CalibrateService, '~/calibrate', self._calibrate)
         self.create_service(SurveyService, '~/survey', self._solve)
+
+    def _place_of_state(self):
+        """Path of the file of backgrounds; None where none is kept.
+
+        Who plays a recording has no business with what the sensors do now.
+        """
+        place = self.declare_parameter('state_file', '', ParameterDescriptor(
+            read_only=True, description='File in which the backgrounds are kept for a restart; '
+            'left out: below $ROS_HOME, or ~/.ros.')).value
+        if self.is_replayed or not self.settings.calibrate.resume_s:
+            return None
+        return Path(place) if place else usual_path(
+            self.get_parameter('network').value, self.get_fully_qualified_name())
+
+    def _resume(self):
+        """Go on from the backgrounds that were kept; the first readings decide."""
+        if self._state_file is None:
+            return
+        try:
+            kept, refused = read_backgrounds(
+                self._state_file, self.network, self.settings.calibrate)
+        except RecordingError as error:
+            self.get_logger().warning(f'what was learnt before is not used: {error}')
+            return
+        for name, why in refused.items():
+            self.get_logger().warning(f'what was learnt of {name} before is not used: {why}')
+        self._stage.resume(kept)
+        if kept:
+            self.get_logger().info(
+                f'goes on with the backgrounds of {", ".join(kept)}, where their readings go on '
+                f'within {self.settings.calibrate.resume_s:g} s; ~/calibrate learns anew')
 
     def stages(self):
         return {'calibrate': self._stage, 'survey': self._survey}
 
-    def statuses(self):
-        return self._health.statuses(self.get_name(), self._stage)
+    def queues(self):
+        return {'calibrate': self._stage.n_held}
+
+    def _next_turn(self):
+        """Say how one more sensor is, or compare them all.
+
+        All sensors at once would hold up the readings.
+        """
+        j = self._turn
+        if j < len(self.network):
+            self.publish_statuses([self._health.status(self.get_name(), j, self._stage)])
+            self._states.append(to_message(
+                SensorCalibration, sensor_dict(self._stage, self.network, j)))
+            self._keep(j)
+            self._turn += 1
+            return
+        self._health.begin_round(self._stage)
+        if self._states:
+            self._publish_state(self._states)
+        self._turn, self._states = 0, []
+        self._write_kept()
+
+    def _keep(self, j):
+        """Note the background of sensor `j`, if there is one to keep."""
+        kept = None if self._state_file is None else self._stage.kept(self.network.names[j])
+        if kept is None:
+            self._kept.pop(self.network.names[j], None)
+        else:
+            self._kept[self.network.names[j]] = background_text(
+                kept, self.network, j, self.settings.calibrate)
+
+    def _write_kept(self):
+        """Write down what has been noted, if it is time to."""
+        now = time.monotonic()
+        if self._state_file is None or now < self._write_again or not self.flows['sensors'].is_live:
+            return
+        self._write_again = now + min(KEEP_EVERY_S, self.settings.calibrate.resume_s / 4.0)
+        try:
+            write_backgrounds(self._state_file, self._kept)
+        except OutputError as error:
+            self.get_logger().warning(f'backgrounds are not kept for a restart: {error}',
+                                      throttle_duration_sec=60.0)
+
+    def _keep_no_more(self, sensors):
+        """Forget also in the file what was kept of `sensors`."""
+        for name in sensors:
+            self._kept.pop(name, None)
+        self._write_again = 0.0
+        self._write_kept()
 
     def _take(self, sensor, message):
         """One raw reading."""
-        now_ns = self.get_clock().now().nanoseconds
-        for sample in self._calibrated(sample_of(message, sensor), now_ns):
+        for sample in self._calibrated(sample_of(message, sensor)):
             self._publishers_by_sensor[sensor].publish(
                 to_message(MagneticField, sample_dict(sample, message.header.frame_id)))
 
     def _take_many(self, message):
         """Raw readings of many sensors; they go on together."""
-        try:
-            raw = samples_of(message)
-        except RecordingError as error:
-            self._stage.counts['rejected: bad readings'] += 1
-            self.get_logger().error(str(error), throttle_duration_sec=10.0)
-            return
-        now_ns = self.get_clock().now().nanoseconds
-        samples = [s for r in raw for s in self._calibrated(r, now_ns)]
+        samples = [s for raw in self.readings_of(message, self._stage)
+                   for s in self._calibrated(raw)]
         if samples:
             self._readings.publish(to_message(FieldReadings, readings_dict(samples)))
 
-    def _calibrated(self, raw, now_ns):
-        """What the stage makes of one raw reading, which came at `now_ns`."""
+    def _calibrated(self, raw):
+        """What the stage makes of one raw reading."""
         if raw.sensor in self._publishers_by_sensor:
-            self._health.add(raw, now_ns)
+            self._health.add(raw, self.now_ns)
         return self._stage.feed(raw)
 
     def _shaken(self, sensor, message):
         """One acceleration."""
         self._survey.feed(acceleration_of(message, sensor))
 
-    def _publish_state(self):
-        """The calibration, where it has changed."""
-        now = self.get_clock().now().nanoseconds
-        content = calibration_dict(self._stage, self.network, now)
-        if repr(content['sensors']) != self._published:
-            self._published = repr(content['sensors'])
-            self._state.publish(to_message(CalibrationState, content))
+    def _publish_state(self, states):
+        """The calibration of all sensors, [SensorCalibration]."""
+        message = CalibrationState(sensors=states)
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.frame_id = self.network.frame
+        self._state.publish(message)
 
     def _calibrate(self, request, response):
         """Learn anew, as the service asks."""
@@ -111,6 +196,7 @@ class CalibrationNode(StageNode):
         except NetworkError as error:
             response.success, response.message = False, str(error)
             return response
+        self._keep_no_more(request.sensors or self.network.names)
         response.success = True
         response.message = f'learning {", ".join(request.sensors) or "all sensors"} anew'
         return response
@@ -138,7 +224,10 @@ class CalibrationNode(StageNode):
         self.network = network
         self._stage.renew(network)
         self._health.renew(network)
-        self._publish_state()
+        self._publish_state([to_message(SensorCalibration, sensor_dict(self._stage, network, j))
+                             for j in range(len(network))])
+        self._turn, self._states = len(network), []
+        self._keep_no_more(network.names)
         response.success = True
         response.message = ('in force' + (f', and saved in {path}, to be given at the next start'
                                            if request.save else '')

@@ -5,6 +5,7 @@ become message objects. Messages read as records through the same functions
 that read a recording: both have the same attributes.
 """
 
+import functools
 import importlib
 
 import numpy as np
@@ -28,17 +29,22 @@ def to_message(cls, content):
     Raises AttributeError for a field that the message does not have.
     """
     message = cls()
-    fields = cls.get_fields_and_field_types()
     for name, value in content.items():
         if isinstance(value, dict):
             value = to_message(type(getattr(message, name)), value)
-        elif value and isinstance(value, list) and isinstance(value[0], dict):
-            element = fields[name].removeprefix('sequence<').removesuffix('>')
-            package, leaf = element.split('/')
-            element_class = message_class(f'{package}/msg/{leaf}')
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            element_class = _element_class(cls, name)
             value = [to_message(element_class, v) for v in value]
         setattr(message, name, value)
     return message
+
+
+@functools.cache
+def _element_class(cls, name):
+    """The class of what is in the sequence `name` of a message."""
+    element = cls.get_fields_and_field_types()[name].removeprefix('sequence<').removesuffix('>')
+    package, leaf = element.split('/')
+    return message_class(f'{package}/msg/{leaf}')
 
 
 def _vector(v):

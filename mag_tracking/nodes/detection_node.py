@@ -7,9 +7,8 @@ from mag_tracking_msgs.msg import Detection as DetectionMessage
 from mag_tracking_msgs.msg import FieldReadings, NetworkFrame
 from sensor_msgs.msg import MagneticField
 
-from mag_tracking.errors import RecordingError
 from mag_tracking.io.message_types import CALIBRATED_READINGS
-from mag_tracking.io.schema import detection_dict, frame_dict, sample_of, samples_of
+from mag_tracking.io.schema import detection_dict, frame_dict, sample_of
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
@@ -31,11 +30,16 @@ class DetectionNode(StageNode):
         self._detections = self.publisher(DetectionMessage, '~/detections', RESULTS)
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self.subscription(MagneticField, f'{topic}_calibrated', partial(self._take, sensor),
-                              STREAM)
-        self.subscription(FieldReadings, CALIBRATED_READINGS, self._take_many, STREAM)
+                              STREAM, source='calibration_node')
+        self.subscription(FieldReadings, CALIBRATED_READINGS, self._take_many, STREAM,
+                          source='calibration_node')
+        self.expect('tracker_node', '~/frame')
 
     def stages(self):
         return {'align': self._align, 'detect': self._detect}
+
+    def queues(self):
+        return {'align': self._align.n_held}
 
     def _take(self, sensor, message):
         """One calibrated reading."""
@@ -43,13 +47,7 @@ class DetectionNode(StageNode):
 
     def _take_many(self, message):
         """Calibrated readings of many sensors."""
-        try:
-            samples = samples_of(message)
-        except RecordingError as error:
-            self._align.counts['rejected: bad readings'] += 1
-            self.get_logger().error(str(error), throttle_duration_sec=10.0)
-            return
-        for sample in samples:
+        for sample in self.readings_of(message, self._align):
             self._feed(sample)
 
     def _feed(self, sample):

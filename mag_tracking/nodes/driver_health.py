@@ -35,7 +35,7 @@ class DriverDiagnostics:
             level, message = DiagnosticStatus.ERROR, driver.trouble or 'not open yet'
         elif news:
             level, message = DiagnosticStatus.WARN, '; '.join(news)
-        self._log(driver.name, level, message, counts)
+        self._log(driver.name, level, message)
         values = {what: str(n) for what, n in sorted(counts.items())}
         for source, clock in driver.clocks().items():
             behind = f' ({source})' if source else ''
@@ -46,7 +46,7 @@ class DriverDiagnostics:
             level=level, name=f'{self._node.get_name()}: {driver.name}', hardware_id=driver.name,
             message=message, values=[KeyValue(key=k, value=v) for k, v in values.items()])
 
-    def _log(self, name, level, message, counts):
+    def _log(self, name, level, message):
         """Log what has changed: what is wrong, and that it is well again."""
         trouble = message if level == DiagnosticStatus.ERROR else ''
         if trouble and trouble != self._trouble.get(name):

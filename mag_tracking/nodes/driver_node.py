@@ -52,11 +52,6 @@ class DriverNode(LifecycleNode):
             if done == TransitionCallbackReturn.SUCCESS:
                 self.trigger_activate()
 
-    @property
-    def drivers(self):
-        """The list of `Driver`s."""
-        return self._drivers
-
     def on_configure(self, state):
         """Read the drivers file and advertise the sensors' topics."""
         try:

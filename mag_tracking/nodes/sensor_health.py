@@ -7,13 +7,14 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from mag_tracking.doctoring import background_findings, network_findings
-from mag_tracking.stages.health import EVERY, Finding, SensorHealth
+from mag_tracking.nodes.flow import SILENT_S
+from mag_tracking.stages.health import WINDOW, Finding, SensorHealth
 from mag_tracking.stages.stage import NS
 
 TERM_S = 60.0
 """[s] What was wrong is forgotten after one to two of these."""
-SILENT_S = 2.0
-"""[s] A sensor of which nothing came for longer is silent."""
+FEW = 64
+"""Readings of this term that are too few to speak of; the term before it still speaks then."""
 PATIENCE = 3.0
 """A background that has not been learnt is a fault after so many times what that takes."""
 
@@ -24,7 +25,6 @@ class HealthDiagnostics:
     def __init__(self, network, settings):
         self._settings = settings
         self._heard = dict.fromkeys(network.names)
-        self._ready = {}
         self._frozen_ns, self._compared = {}, {}
         # How many backgrounds had been taken anew when the last term began, and this one.
         self._relearnt = [dict.fromkeys(network.names, 0)] * 2
@@ -36,9 +36,13 @@ class HealthDiagnostics:
         self._clock_ns = {name: round(s * NS) for name, s in
                           zip(network.names, network.clock_offset, strict=True)}
         self._past = dict.fromkeys(network.names)
-        self._present = {name: SensorHealth() for name in network.names}
+        self._present = self._new_term()
         self._began = time.monotonic()
         self._term_ends = self._began + TERM_S
+
+    def _new_term(self):
+        """{name: SensorHealth} that has seen nothing, and is looked at when it is its turn."""
+        return {name: SensorHealth(WINDOW // 2, on_demand=False) for name in self._network.names}
 
     def renew(self, network):
         """Go on with another calibration of the same sensors."""
@@ -51,28 +55,21 @@ class HealthDiagnostics:
         self._heard[sample.sensor] = time.monotonic()
 
     def statuses(self, node, calibrate):
-        """[DiagnosticStatus], one a sensor; `calibrate` is the `Calibrate` stage.
+        """[DiagnosticStatus], one a sensor; `calibrate` is the `Calibrate` stage."""
+        self.begin_round(calibrate)
+        return [self.status(node, j, calibrate) for j in range(len(self._network))]
 
-        Made now, but for those that `look_at_next` has made since the last time.
+    def begin_round(self, calibrate):
+        """Compare the sensors, and begin a term where it is time to.
+
+        Before the `status` of each of them, which may be asked for one at a time.
         """
         self._compare(calibrate)
         if time.monotonic() > self._term_ends:
             self._term_ends = time.monotonic() + TERM_S
-            self._past, self._present = self._present, {
-                name: SensorHealth() for name in self._network.names}
+            self._past, self._present = self._present, self._new_term()
             self._relearnt = [self._relearnt[1], {
                 name: b.n_relearnt for name, b in calibrate.backgrounds().items()}]
-        ready, self._ready = self._ready, {}
-        return [ready.get(name) or self._status(node, j, name, calibrate)
-                for j, name in enumerate(self._network.names)]
-
-    def look_at_next(self, node, calibrate):
-        """Make the status of one more sensor: all at once would hold up the readings."""
-        j = len(self._ready)
-        # Nothing has been compared before the first time.
-        if self._compared and j < len(self._network):
-            name = self._network.names[j]
-            self._ready[name] = self._status(node, j, name, calibrate)
 
     def _compare(self, calibrate):
         """Compare the sensors with each other and with the Earth."""
@@ -90,7 +87,7 @@ class HealthDiagnostics:
     def _latest(self, name):
         """The `SensorHealth` of this term, or of the one before where this has just begun."""
         past, present = self._past[name], self._present[name]
-        return past if past is not None and present.counts['readings'] < EVERY else present
+        return past if past is not None and present.counts['readings'] < FEW else present
 
     def _findings(self, j, name, calibrate):
         """What is wrong with a sensor, the worst first."""
@@ -113,8 +110,10 @@ class HealthDiagnostics:
                     found.setdefault(f.what, f)
         return sorted(found.values(), key=lambda f: not f.serious)
 
-    def _status(self, node, j, name, calibrate):
-        """The DiagnosticStatus of one sensor."""
+    def status(self, node, j, calibrate):
+        """The DiagnosticStatus of sensor `j`, as of its latest readings."""
+        name = self._network.names[j]
+        self._present[name].look()
         found = self._findings(j, name, calibrate)
         level = DiagnosticStatus.OK
         if found:

@@ -1,6 +1,7 @@
 """The generic node: parameters, network, diagnostics and the main loop."""
 
 import signal
+import time
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -12,9 +13,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
-from mag_tracking.errors import MagTrackingError, SettingsError
+from mag_tracking.errors import MagTrackingError, RecordingError, SettingsError
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.io.network_file import read_network
+from mag_tracking.io.schema import samples_of, stamp_ns
+from mag_tracking.nodes.flow import Flow, Listener
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.pipeline import settings_for
 
@@ -42,6 +45,7 @@ class StageNode(Node):
         target = self.declare_parameter('target', 'vehicle').value
         reliable = self.declare_parameter('reliable_input', False).value
         self.input_qos = STREAM if reliable else SENSORS
+        self.is_replayed = reliable or self.get_parameter('use_sim_time').value
         self.network = read_network(path)
         self.settings = declare_settings(self, settings_for(target), group, self.OWN_PARAMETERS)
         if self.settings.track.target != target:
@@ -49,15 +53,22 @@ class StageNode(Node):
                                 f'target is {target!r}')
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RESULTS)
         self._reported = {}
+        self.flows, self._listeners = {}, []
+        # When the message came that is worked on, by the clock of ROS.
+        self.now_ns = 0
         self.create_timer(1.0, self._publish_diagnostics)
 
     def stages(self):
         """{name: stage} whose counts are published."""
         raise NotImplementedError
 
-    def statuses(self):
-        """More [DiagnosticStatus] than the counts of the stages."""
-        return []
+    def queues(self):
+        """{name of a stage: how many records it holds}."""
+        return {}
+
+    def expect(self, listener, topic):
+        """Say so in diagnostics when the node named `listener` no longer listens to `topic`."""
+        self._listeners.append(Listener(listener, topic))
 
     def publisher(self, message_type, topic, qos):
         """A publisher that logs a subscriber with unfit QoS."""
@@ -66,31 +77,73 @@ class StageNode(Node):
             'it gets nothing'))
         return self.create_publisher(message_type, topic, qos, event_callbacks=events)
 
-    def subscription(self, message_type, topic, callback, qos):
-        """A subscription that logs a publisher with unfit QoS."""
-        events = SubscriptionEventCallbacks(incompatible_qos=lambda e: self.get_logger().warning(
-            f'the publisher of {topic} offers another QoS (policy {e.last_policy_kind}): '
-            'nothing comes from it'))
-        return self.create_subscription(message_type, topic, callback, qos,
-                                        event_callbacks=events)
+    def subscription(self, message_type, topic, callback, qos, source=''):
+        """A subscription that logs a publisher with unfit QoS.
+
+        With a `source`, the node that sends, diagnostics tell of what comes and how late.
+        """
+        flow = self.flows.setdefault(source, Flow(source)) if source else None
+        if flow is not None:
+            flow.topics.append(topic)
+
+        def unfit(event):
+            self.get_logger().warning(
+                f'the publisher of {topic} offers another QoS (policy {event.last_policy_kind}): '
+                'nothing comes from it')
+
+        def lost(event):
+            if flow is not None:
+                flow.n_lost += event.total_count_change
+
+        def take(message):
+            began = time.monotonic()
+            self.now_ns = self.get_clock().now().nanoseconds
+            callback(message)
+            flow.note(stamp_ns(message.header.stamp), self.now_ns, began)
+
+        return self.create_subscription(
+            message_type, topic, callback if flow is None else take, qos,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=unfit, message_lost=lost))
+
+    def readings_of(self, message, stage):
+        """[`MagSample`] of a FieldReadings; one that is none is a rejection of `stage`."""
+        try:
+            return samples_of(message)
+        except RecordingError as error:
+            stage.counts['rejected: bad readings'] += 1
+            self.get_logger().error(str(error), throttle_duration_sec=10.0)
+            return []
 
     def _publish_diagnostics(self):
         """Counts of the stages; a warning where something was rejected since the last time."""
-        array = DiagnosticArray()
-        array.header.stamp = self.get_clock().now().to_msg()
+        statuses, queues = [], self.queues()
         for name, stage in self.stages().items():
             bad = {k: n for k, n in stage.counts.items() if k.startswith('rejected: ')}
             news = {k: n for k, n in bad.items() if n != self._reported.get((name, k), 0)}
             for cause, n in news.items():
                 self._reported[name, cause] = n
                 self.get_logger().warning(f'{name}: {cause}: {n}')
-            array.status.append(DiagnosticStatus(
+            statuses.append(DiagnosticStatus(
                 level=DiagnosticStatus.WARN if news else DiagnosticStatus.OK,
                 name=f'{self.get_name()}: {name}', hardware_id='magnetometer network',
                 message='samples were rejected' if news else 'running',
-                values=[KeyValue(key=k, value=str(n)) for k, n in sorted(stage.counts.items())]))
-        array.status += self.statuses()
-        self._diagnostics.publish(array)
+                values=[KeyValue(key=k, value=str(n)) for k, n in sorted(
+                    {**stage.counts, **({'queue': queues[name]} if name in queues else {})}.items()
+                )]))
+        statuses += [flow.status(self.get_name(), lambda flow=flow: any(
+            map(self.count_publishers, flow.topics))) for flow in self.flows.values()]
+        for listener in self._listeners:
+            ends = self.get_subscriptions_info_by_topic(self.resolve_topic_name(listener.topic))
+            statuses.append(listener.status(self.get_name(), {
+                e.node_name for e in ends if e.node_namespace == self.get_namespace()}))
+        self.publish_statuses(statuses)
+
+    def publish_statuses(self, statuses):
+        """Publish [DiagnosticStatus], if there are any."""
+        if statuses:
+            array = DiagnosticArray(status=statuses)
+            array.header.stamp = self.get_clock().now().to_msg()
+            self._diagnostics.publish(array)
 
 
 def make_executor():

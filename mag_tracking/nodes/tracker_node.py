@@ -1,6 +1,8 @@
 """tracker_node: frames of the network in, poses and tracks out."""
 
 import sys
+import time
+from collections import deque
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
@@ -35,6 +37,8 @@ from mag_tracking.nodes.stage_node import LATCHED, RESULTS, STREAM, StageNode
 from mag_tracking.records import SmoothedPose
 from mag_tracking.stages.track import TrackStage
 
+SLACK_S = 1.0
+"""[s] What the way of a frame may take on top of the longest gap."""
 LONGEST_PATH = 2000
 """Poses kept in `~/path`."""
 
@@ -56,13 +60,30 @@ class TrackerNode(StageNode):
         self._smoothed = self.publisher(SmoothedTrack, '~/smoothed', RESULTS)
         self._smoothed_path = self.publisher(Path, '~/path_smoothed', RESULTS)
         self._markers = self.publisher(MarkerArray, '~/markers', RESULTS)
-        self._path = Path()
-        self.subscription(NetworkFrame, '/detection_node/frame', self._take, STREAM)
+        self._path, self._is_silent = deque(maxlen=LONGEST_PATH), False
+        self.subscription(NetworkFrame, '/detection_node/frame', self._take, STREAM,
+                          source='detection_node')
+        self.create_timer(0.25, self._end_without_frames)
         self.subscription(CalibrationState, '/calibration_node/calibration', self._calibrated,
                           LATCHED)
 
     def stages(self):
         return {'track': self._stage}
+
+    def _end_without_frames(self):
+        """Tell of a track that is lost because no frame comes any more.
+
+        By when they came: a clock may be behind. A recording may be played as slowly as
+        one likes, or pause.
+        """
+        if self._stage.bank is None or self.is_replayed:
+            return
+        silent_s = time.monotonic() - self.flows['detection_node'].heard
+        # Twice in a row: while the node was busy, frames may have come that wait.
+        was_silent, self._is_silent = self._is_silent, \
+            silent_s > self.settings.track.end_gap_s + SLACK_S
+        if was_silent and self._is_silent:
+            self._publish_all(self._stage.give_up('no frames came'))
 
     def _calibrated(self, message):
         """The sensors' orientations, which a survey may have changed."""
@@ -86,8 +107,12 @@ class TrackerNode(StageNode):
             self._stage.counts['rejected: bad frame'] += 1
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return
+        self._publish_all(self._stage.feed(frame))
+
+    def _publish_all(self, records):
+        """`Track`s and `SmoothedPose`s, each where it belongs."""
         whole = []
-        for record in self._stage.feed(frame):
+        for record in records:
             if not isinstance(record, SmoothedPose):
                 self._publish(record)
             elif record.complete:
@@ -109,27 +134,36 @@ class TrackerNode(StageNode):
     def _publish(self, track):
         """Everything about one track at one time."""
         frame = self.network.frame
-        content = track_dict(track, frame)
-        # Hypotheses first: who waits for the track then has them already.
         if not track.ended:
-            self._hypotheses.publish(to_message(HypothesisArray, hypotheses_dict(track, frame)))
+            # What somebody steers by comes first.
+            self._pose.publish(to_message(PoseWithCovarianceStamped, {
+                'header': header_dict(track.stamp_ns, frame),
+                'pose': pose_with_covariance_dict(track)}))
+            # Then the hypotheses: who waits for the track has them already.
+            if is_heard(self._hypotheses):
+                self._hypotheses.publish(
+                    to_message(HypothesisArray, hypotheses_dict(track, frame)))
+        content = track_dict(track, frame)
         self._tracks.publish(to_message(
             TrackArray, {'header': content['header'], 'tracks': [content]}))
         if track.ended:
-            self._path = Path()
+            self._path.clear()
             self._markers.publish(to_message(MarkerArray, delete_markers(track, frame)))
             return
-        self._pose.publish(to_message(PoseWithCovarianceStamped, {
-            'header': header_dict(track.stamp_ns, frame),
-            'pose': pose_with_covariance_dict(track)}))
         self._odometry.publish(to_message(
             Odometry, odometry_dict(track, frame, f'track_{track.id}')))
-        step = to_message(PoseStamped, pose_dict(track.stamp_ns, frame, track.position,
-                                                 track.orientation))
-        self._path.header = step.header
-        self._path.poses = [*self._path.poses[1 - LONGEST_PATH:], step]
-        self._path_publisher.publish(self._path)
-        self._markers.publish(to_message(MarkerArray, track_markers(track, frame)))
+        self._path.append(to_message(PoseStamped, pose_dict(
+            track.stamp_ns, frame, track.position, track.orientation)))
+        if is_heard(self._path_publisher):
+            self._path_publisher.publish(
+                Path(header=self._path[-1].header, poses=list(self._path)))
+        if is_heard(self._markers):
+            self._markers.publish(to_message(MarkerArray, track_markers(track, frame)))
+
+
+def is_heard(publisher):
+    """Whether somebody listens: what is large is made for nobody else."""
+    return publisher.get_subscription_count() > 0
 
 
 def _same_orientations(one, other):

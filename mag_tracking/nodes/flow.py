@@ -1,0 +1,93 @@
+"""What goes through a node: how much, how late, and whether somebody still sends and listens."""
+
+import time
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+
+from mag_tracking.stages.health import REPLAYED_S, quantiles
+from mag_tracking.stages.stage import NS
+
+SILENT_S = 2.0
+"""[s] A sensor or a node of which nothing came for longer is silent."""
+MOST_NOTED = 10_000
+"""Messages between two reports whose times are kept; a second of a thousand sensors has less."""
+
+
+class Flow:
+    """The messages that a node takes from `source`, another node."""
+
+    def __init__(self, source):
+        self.source, self.topics = source, []
+        self.heard = None
+        """`time.monotonic()` [s] of the latest message, or None."""
+        self.n_lost = 0
+        self._n, self._told_lost = 0, 0
+        self._ages, self._age_s = [], None
+        self._busy_s, self._reported = 0.0, time.monotonic()
+
+    def note(self, stamp_ns, came_ns, began):
+        """A message of `stamp_ns`, which came at `came_ns`, has been worked off since `began`.
+
+        That is in seconds by the monotonic clock.
+        """
+        self._n += 1
+        self.heard = time.monotonic()
+        took_s = self.heard - began
+        self._busy_s += took_s
+        self._age_s = (came_ns - stamp_ns) / NS + took_s
+        if len(self._ages) < MOST_NOTED:
+            self._ages.append(self._age_s)
+
+    @property
+    def is_live(self):
+        """Whether the latest message was of the present, not of a recording."""
+        return self._age_s is not None and abs(self._age_s) < REPLAYED_S
+
+    def status(self, node, is_there):
+        """The DiagnosticStatus of what came since the last one.
+
+        `is_there` is a function: whether somebody would still send.
+        """
+        now = time.monotonic()
+        elapsed, self._reported = max(now - self._reported, 1e-9), now
+        ages, self._ages = self._ages, []
+        news, self._told_lost = self.n_lost - self._told_lost, self.n_lost
+        level, message = DiagnosticStatus.OK, 'running'
+        if self.heard is None:
+            message = f'nothing has come from {self.source} yet'
+        elif now - self.heard > SILENT_S:
+            level = DiagnosticStatus.WARN
+            message = f'nothing has come from {self.source} for {now - self.heard:.0f} s'
+            if not is_there():
+                level = DiagnosticStatus.ERROR
+                message += ', and it has gone; does it still run?'
+        elif news:
+            level = DiagnosticStatus.WARN
+            message = f'{news} messages from {self.source} did not fit the queue'
+        middle, late = quantiles([a for a in ages if abs(a) < REPLAYED_S], 0.5, 0.99)
+        values = {'messages': self._n, 'lost in the queue': self.n_lost,
+                  'latency, median [ms]': f'{1e3 * middle:.4g}',
+                  'latency, 99 % [ms]': f'{1e3 * late:.4g}',
+                  'busy [%]': f'{100.0 * self._busy_s / elapsed:.3g}'}
+        self._busy_s = 0.0
+        return DiagnosticStatus(
+            level=level, name=f'{node}: from {self.source}', hardware_id='magnetometer network',
+            message=message, values=[KeyValue(key=k, value=str(v)) for k, v in values.items()])
+
+
+class Listener:
+    """The node that is to listen to a topic; it is known by its name."""
+
+    def __init__(self, name, topic):
+        self.name, self.topic = name, topic
+        self._seen = False
+
+    def status(self, node, names):
+        """The DiagnosticStatus; `names` are those of the nodes that listen now."""
+        self._seen = self._seen or self.name in names
+        gone = self._seen and self.name not in names
+        return DiagnosticStatus(
+            level=DiagnosticStatus.ERROR if gone else DiagnosticStatus.OK,
+            name=f'{node}: to {self.name}', hardware_id='magnetometer network',
+            message=f'{self.name} has gone; does it still run?' if gone else
+            'running' if self._seen else f'{self.name} has not been seen yet')
