@@ -27,7 +27,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/launch', sorted(glob('launch/*.py'))),
-        (f'share/{NAME}/config', sorted(glob('config/*.yaml'))),
+        (f'share/{NAME}/config', sorted(glob('config/*.yaml') + glob('config/*.xml'))),
     ],
     # ROS itself and mag_tracking_msgs stay out: people with a ROS from apt have them from there,
     # and pip would look for mag-tracking-msgs on the index, where it is not.

@@ -1,6 +1,7 @@
 """What the tests share: recordings, networks, a short way through the pipeline."""
 
 import os
+import tempfile
 import time
 from pathlib import Path
 
@@ -28,6 +29,9 @@ POINT = {f'track.vehicle.{name}': [value] for name, value in {
 # Keep the middleware to this machine, and apart from other runs on it.
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
+# What nodes keep and log is no business of who runs the tests.
+_HOME = tempfile.TemporaryDirectory(prefix='mag_tracking_test_')
+os.environ['ROS_HOME'] = _HOME.name
 
 
 def pytest_collection_modifyitems(items):

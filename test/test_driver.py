@@ -284,6 +284,7 @@ def test_unknown_names_do_not_pile_up():
     assert driver.poll(0.1) == []
     assert len(driver.counts()) == 21
     assert driver.counts()['of unknown sensors (and others)'] == 980
+    assert len(driver._unknown) == 20
 
 
 def test_a_reading_beyond_all_numbers_is_none():
@@ -318,7 +319,7 @@ def test_errors_behind_a_driver_are_not_the_devices():
             raise ValueError('nobody expected it')
     serve(driver, take, lambda: len(taken) == 3)
     assert device.calls == ['open', 'close']
-    assert driver.counts()['errors behind the driver: ValueError'] == 1
+    assert driver.counts()['errors behind the driver: ValueError: nobody expected it'] == 1
 
 
 class Lines:

@@ -8,7 +8,7 @@ from conftest import NETWORK_FILE
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from mag_tracking_msgs.msg import FieldReadings
+from mag_tracking_msgs.msg import FieldReadings, NetworkFrame
 from node_processes import call, start, stop
 from sensor_msgs.msg import Imu, MagneticField
 from serial_line import SerialLine
@@ -188,6 +188,33 @@ def test_readings_in_batches(board):
         assert (np.diff(stamps) > 5e6).all()
     assert samples[0][0].covariance is None
     np.testing.assert_allclose(samples[0][0].field[1:], [1.55e-5, -4.9e-5])
+
+
+def test_readings_in_batches_reach_the_tracker(ros, tmp_path):
+    """The simulator's readings go in batches from node to node, and none is missing in a frame."""
+    node, spin_until = ros
+    network, drivers = tmp_path / 'network.yaml', tmp_path / 'drivers.yaml'
+    rows = ''.join(f'  mag_{k}: {{position: [{9 * k}, 0, 0], noise_std: 1.2e-8, '
+                   'background: [2.0e-6, 1.55e-5, -4.9e-5]}\n' for k in range(20))
+    network.write_text(f'earth_field: [2.0e-6, 1.55e-5, -4.9e-5]\nsensors:\n{rows}')
+    drivers.write_text(
+        f'road:\n  device: simulator\n  simulator: {{network: {network}, moment: 0.0}}\n'
+        '  sensors: {' + ', '.join(f'mag_{k}: mag_{k}' for k in range(20)) + '}\n')
+    frames = listen(node, NetworkFrame, '/detection_node/frame')
+    processes = [start(name, '-p', f'network:={network}')
+                 for name in ('calibration_node', 'detection_node')]
+    try:
+        assert spin_until(lambda: node.count_subscribers('/driver_node/readings')
+                          and node.count_subscribers('/calibration_node/readings'))
+        processes.append(start('driver_node', '-p', f'drivers:={drivers}', '-p',
+                               f'network:={network}', '-p', 'batches:=true'))
+        assert spin_until(lambda: len(frames) > 30)
+    finally:
+        codes, outputs = stop(processes)
+    assert codes == [0] * 3, outputs
+    n = np.array([m.n_samples for _, m in frames[5:30]])
+    assert n.shape == (25, 20) and (n == 8).mean() > 0.95 and n.min() >= 7
+    assert np.nanmax(np.abs([m.field for _, m in frames[5:30]])) < 1e-7
 
 
 @pytest.mark.parametrize('content, told', [

@@ -456,8 +456,10 @@ def test_leaving_is_said_to_the_broker(topics):
     with ScriptedBroker(CONNECTED, granted) as server:
         mqtt = topics(server.port)
         mqtt.open()
+        assert server.heard[-1] != b'\xe0\x00'
         mqtt.close()
         wait_until(lambda: server.heard[-1] == b'\xe0\x00')
+        assert server.heard[-1] == b'\xe0\x00'
 
 
 def test_closing_while_it_opens(topics):

@@ -224,6 +224,8 @@ def test_two_at_one_port(device, port):
 def test_a_port_may_be_shared_where_that_is_wanted(device, port):
     other = SerialPort(SerialSettings(port=device.path, exclusive=False))
     other.open()
+    device.write(b'x')
+    assert gather(other, 1) == b'x'
     other.close()
 
 
@@ -255,7 +257,7 @@ def test_the_line_is_set_up_as_asked(device, parity, flags, stop_bits):
     assert ispeed == ospeed == termios.B57600
     # A pseudo-terminal knows no parity: the kernel clears it, and tells so.
     assert cflag & termios.CSTOPB == (termios.CSTOPB if stop_bits == 2 else 0)
-    assert port._port.parity == parity and bool(flags) == (parity != 'N')
+    assert port._handle.parity == parity and bool(flags) == (parity != 'N')
     assert cflag & termios.CSIZE == termios.CS8
     port.close()
 
@@ -327,7 +329,7 @@ def test_closing(device):
         port.read(0.0)
     for _ in range(2):
         port.open()
-        held = port._port
+        held = port._handle
         closer = threading.Timer(0.1, port.close)
         closer.start()
         start = time.monotonic()

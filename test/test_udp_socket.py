@@ -328,18 +328,18 @@ def test_a_port_of_the_system(monkeypatch):
 def test_a_buffer_that_the_kernel_does_not_give(listen):
     said = []
     udp = listen(said.append, receive_buffer=1 << 30)
-    given = udp._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+    given = udp._handle.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
     assert said == [f'UDP 127.0.0.1:{udp._settings.port}: the kernel gave a receive buffer of '
                     f'{given} bytes instead of {1 << 30}; raise net.core.rmem_max']
     said.clear()
     udp = listen(said.append, receive_buffer=100_000)
-    assert udp._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == 200_000
+    assert udp._handle.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == 200_000
     assert not said
 
 
 def test_a_socket_that_fails(listen):
     udp = listen()
-    udp._socket.close()
+    udp._handle.close()
     with pytest.raises(DeviceError, match='UDP 127.0.0.1'):
         udp.read(1.0)
 
@@ -353,7 +353,7 @@ def test_closing(listen, sender):
     for _ in range(2):
         udp.open()
         udp.open()
-        held = udp._socket
+        held = udp._handle
         closer = threading.Timer(0.1, udp.close)
         closer.start()
         start = time.monotonic()

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,8 @@ NODES = ('calibration_node', 'detection_node', 'tracker_node', 'driver_node')
 RATE, PERIOD_S = 100.0, 0.08
 """[Hz] of each sensor, and the length of a frame (`align.period_s`)."""
 WARM_UP_S = 20.0
+MANY, GATHER_S = 16, 0.002
+"""More sensors than this send their readings together; those of [s], where they measure in turn."""
 LEAN = {'arrival_names': "['left']", 'arrival_headings_deg': '[0.0]'}
 """One kind, one arrival: 3 offsets x 14 moments x 3 speeds = 126 hypotheses."""
 
@@ -37,10 +40,12 @@ def network_yaml(n):
                       ''])
 
 
-def drivers_yaml(n, network):
+def drivers_yaml(n, network, in_turn):
     """The simulator for all of them: a car at 20 m/s, as often as the road is free."""
-    return (f'road:\n  device: simulator\n  simulator: {{network: {network}, rate_hz: {RATE}, '
-            'speed: 20.0, period_s: 5.0, offset: 1.0}\n  sensors: {'
+    gather = f'  gather_s: {GATHER_S}\n' if in_turn and n > MANY else ''
+    return (f'road:\n  device: simulator\n{gather}  simulator: {{network: {network}, '
+            f'rate_hz: {RATE}, speed: 20.0, period_s: 5.0, offset: 1.0, '
+            f'in_turn: {str(in_turn).lower()}}}\n  sensors: {{'
             + ', '.join(f'mag_{i + 1}: mag_{i + 1}' for i in range(n)) + '}\n')
 
 
@@ -54,12 +59,15 @@ def usage(process):
 class Ear:
     """Listens to poses and diagnostics."""
 
-    def __init__(self, node):
+    def __init__(self, node, in_turn):
         from diagnostic_msgs.msg import DiagnosticArray
         from geometry_msgs.msg import PoseWithCovarianceStamped
 
         from mag_tracking.nodes.stage_node import STREAM
-        self.latencies, self.values, self.troubles = [], {}, {}
+        self.latencies, self.values, self.troubles, self._before = [], {}, {}, {}
+        # The stamp is the mean of the samples; the one that shows that they were all comes behind:
+        # half a frame, and what the sensors are apart.
+        self._completed_s = PERIOD_S / 2.0 + (1.0 if in_turn else 0.5) / RATE
         node.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose', self._pose,
                                  STREAM)
         node.create_subscription(DiagnosticArray, '/diagnostics', self._diagnostics, STREAM)
@@ -67,9 +75,7 @@ class Ear:
     def _pose(self, message):
         """How long after the sample that completed the frame it came."""
         stamp = message.header.stamp.sec + message.header.stamp.nanosec / 1e9
-        # The stamp is the mean of the samples; the one that shows that they were all comes behind.
-        completed = stamp + PERIOD_S / 2.0 + 0.5 / RATE
-        self.latencies.append(time.time() - completed)
+        self.latencies.append(time.time() - stamp - self._completed_s)
 
     def _diagnostics(self, message):
         """Keep the latest."""
@@ -78,25 +84,30 @@ class Ear:
             if status.level != b'\x00':
                 self.troubles[status.name] = status.message
 
+    def begin(self):
+        """What was before was the warm-up: sensors that a car stood at learn later than others."""
+        self._before, self.latencies, self.troubles = self._losses(), [], {}
+
     def losses(self):
-        """{what: how many} of all that says that something was lost."""
-        out = {}
-        for name, values in self.values.items():
-            for key, value in values.items():
-                lost = key.startswith(('rejected', 'lost', 'readings lost', 'frames with a sensor'))
-                if lost and value not in ('0', ''):
-                    out[f'{name}: {key}'] = value
-        return out
+        """{what: how many} of all that says that something was lost since `begin`."""
+        return {k: n - self._before.get(k, 0) for k, n in self._losses().items()
+                if n != self._before.get(k, 0)}
+
+    def _losses(self):
+        """The same, of all time."""
+        return {f'{name}: {key}': int(value) for name, values in self.values.items()
+                for key, value in values.items() if value and key.startswith(
+                    ('rejected', 'lost', 'readings lost', 'frames with a sensor'))}
 
 
-def start(folder, n, parameters):
+def start(folder, n, parameters, in_turn, batches):
     """The nodes as processes, the driver last."""
     network, drivers = folder / 'network.yaml', folder / 'drivers.yaml'
     network.write_text(network_yaml(n))
-    drivers.write_text(drivers_yaml(n, network))
+    drivers.write_text(drivers_yaml(n, network, in_turn))
     processes = {}
     for node in NODES:
-        more = ['-p', f'drivers:={drivers}', '-p', f'batches:={str(n > 16).lower()}'] \
+        more = ['-p', f'drivers:={drivers}', '-p', f'batches:={str(batches or n > MANY).lower()}'] \
             if node == 'driver_node' else ['--params-file', str(parameters)]
         processes[node] = subprocess.Popen(
             [sys.executable, '-m', f'mag_tracking.nodes.{node}', '--ros-args', '-p',
@@ -129,13 +140,16 @@ def watch(processes, ear, executor, minutes):
     return rows
 
 
-def report(ear, rows, begin):
+def report(ear, rows):
     """Print what was measured; whether anything was lost."""
-    late = 1e3 * np.array(ear.latencies[begin:])
-    print(f'{len(late)} poses, after the sample that completed the frame: median '
+    late = 1e3 * np.array(ear.latencies)
+    if not len(late):
+        print('no pose has come')
+    else:
+        print(f'{len(late)} poses, after the sample that completed the frame: median '
           f'{np.median(late):.1f} ms, p99 {np.quantile(late, 0.99):.1f} ms, '
           f'worst {late.max():.1f} ms')
-    first, last = rows[min(len(rows) - 1, int(WARM_UP_S / 10.0))], rows[-1]
+    first, last = rows[0], rows[-1]
     minute = rows[min(len(rows) - 1, 5)]
     total = 0.0
     for node in last[1]:
@@ -146,7 +160,8 @@ def report(ear, rows, begin):
     print(f'together: {100.0 * total:.1f} % of a core')
     losses = ear.losses()
     print(f'lost: {losses or "nothing"}')
-    print(f'diagnostics that were not well: {ear.troubles or "none"}')
+    for text, n in Counter(ear.troubles.values()).most_common(5):
+        print(f'diagnostics of {n}: {text}')
     return bool(losses)
 
 
@@ -155,7 +170,11 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--sensors', type=int, default=100)
     parser.add_argument('--minutes', type=float, default=10.0)
+    parser.add_argument('--batches', action='store_true',
+                        help='readings go together in one message, as they do of many sensors')
     parser.add_argument('--lean', action='store_true', help='126 hypotheses')
+    parser.add_argument('--in-turn', action='store_true',
+                        help='the sensors measure one after the other, not all at the same time')
     args = parser.parse_args()
     import rclpy
 
@@ -163,13 +182,15 @@ def main():
     rclpy.init()
     node, executor = rclpy.create_node('load'), make_executor()
     executor.add_node(node)
-    ear = Ear(node)
+    ear = Ear(node, args.in_turn)
     with tempfile.TemporaryDirectory() as folder:
-        processes = start(Path(folder), args.sensors, parameters_of(Path(folder), args.lean))
+        os.environ['ROS_HOME'] = folder
+        processes = start(Path(folder), args.sensors, parameters_of(Path(folder), args.lean),
+                          args.in_turn, args.batches)
         try:
             end = time.monotonic() + WARM_UP_S
             spin(executor, lambda: time.monotonic() > end)
-            begin = len(ear.latencies)
+            ear.begin()
             rows = watch(processes, ear, executor, args.minutes)
         finally:
             for process in reversed(list(processes.values())):
@@ -179,7 +200,7 @@ def main():
     node.destroy_node()
     executor.shutdown()
     rclpy.try_shutdown()
-    return int(report(ear, rows, begin))
+    return int(report(ear, rows))
 
 
 if __name__ == '__main__':

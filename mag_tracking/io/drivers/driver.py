@@ -117,6 +117,7 @@ class Driver:
         self._retry_s, self._retry_ns = settings.retry_s, None
         self._heard_ns, self._offset_ns = None, None
         self._only, self._unknown = None, set()
+        self._named, self._sample_counts = {}, {s: f'samples: {s}' for s in sensors.values()}
 
     @property
     def is_open(self):
@@ -227,8 +228,9 @@ class Driver:
 
     def _samples(self, arrival, offset_ns):
         """The samples of one reading."""
-        reading = arrival.reading
-        sensor = self._sensor_of(reading.sensor, arrival.source)
+        reading, source = arrival.reading, arrival.source
+        sensor = self._named.get((reading.sensor, source)) \
+            or self._sensor_of(reading.sensor, source)
         if sensor is None:
             return []
         if reading.sequence is not None and not self._sequences[sensor].is_new(
@@ -240,11 +242,12 @@ class Driver:
         stamp_ns += offset_ns
         out = []
         if reading.field is not None:
-            field = [self._scale * v for v in reading.field]
-            if any(map(math.isinf, field)):
+            x, y, z = reading.field
+            field = [self._scale * x, self._scale * y, self._scale * z]
+            if not math.isfinite(sum(field)) and any(map(math.isinf, field)):
                 self.own_counts['readings that are infinite in tesla'] += 1
                 return []
-            self.own_counts[f'samples: {sensor}'] += 1
+            self.own_counts[self._sample_counts[sensor]] += 1
             out.append(MagSample(stamp_ns, sensor, np.array(field)))
         if reading.acceleration is not None:
             out.append(AccelerationSample(
@@ -261,11 +264,16 @@ class Driver:
             if self._only == (at_device, source):
                 return self.sensors['']
         if sensor is None:
-            self._unknown.add((at_device or source)[:80])
-            named = len(self._unknown) <= MOST_NAMES
+            name = (at_device or source)[:80]
+            if len(self._unknown) < MOST_NAMES:
+                self._unknown.add(name)
             self.own_counts['of unknown sensors' + (
-                f': {at_device or source}'[:82] if named else ' (and others)')] += 1
-        return None if sensor == IGNORED else sensor
+                f': {name}' if name in self._unknown else ' (and others)')] += 1
+        if sensor is None or sensor == IGNORED:
+            return None
+        if len(self._named) < MOST_SOURCES:
+            self._named[at_device, source] = sensor
+        return sensor
 
     def _stamp(self, reading, arrival):
         """Monotonic ns of the measurement; None where no clock can tell."""
@@ -288,8 +296,8 @@ class Driver:
 def serve(driver, take, stopping):
     """Hand what `driver` says to `take`, a function of a list of samples, until `stopping()`.
 
-    For a thread of its own. What is wrong stands in `driver.trouble`, also where `take` or
-    the device itself raises an error that it should not: nobody would see its thread die.
+    For a thread of its own, which nobody would see die: what the device raises stands in
+    `driver.trouble`, what `take` raises in `driver.own_counts`.
     """
     while not stopping():
         try:
@@ -302,5 +310,9 @@ def serve(driver, take, stopping):
                 take(samples)
         except Exception as error:
             # Not the device's fault, which goes on.
-            driver.own_counts[f'errors behind the driver: {type(error).__name__}'] += 1
+            what = f'errors behind the driver: {type(error).__name__}'
+            text = f'{what}: {error}'[:100]
+            known = sum(key.startswith(what) for key in driver.own_counts)
+            driver.own_counts[text if text in driver.own_counts or known < MOST_NAMES
+                              else f'{what} (and others)'] += 1
     driver.close()

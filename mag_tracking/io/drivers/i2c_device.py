@@ -14,7 +14,6 @@ Sources: i2c-dev of Linux (Documentation/i2c/dev-interface.rst), and its error c
 
 import errno
 import math
-import threading
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -34,6 +33,7 @@ from mag_tracking.io.drivers.chips.memsic import (
 )
 from mag_tracking.io.drivers.chips.rm3100 import Rm3100, Rm3100Settings
 from mag_tracking.io.drivers.circuitpython import CircuitpythonChip
+from mag_tracking.io.drivers.polled import Closable
 from mag_tracking.io.drivers.reading import Arrival, Reading
 from mag_tracking.settings import param
 
@@ -68,7 +68,7 @@ class I2cSettings:
     lis3mdl: Lis3mdlSettings = Lis3mdlSettings()
 
 
-class I2cDevice:
+class I2cDevice(Closable):
     """The chips of one bus; see `reading.Device`. The field is in tesla.
 
     Parameters
@@ -94,7 +94,7 @@ class I2cDevice:
         self._settings, self._open_bus = settings, open_bus
         self._monotonic_ns, self._sleep = monotonic_ns, sleep
         self._period_ns = round(1e9 / settings.rate_hz)
-        self._lock, self._closing = threading.Lock(), False
+        super().__init__()
         self._bus = self._lost = self._due_ns = None
         self._failed, self._silent = Counter(), Counter()
         self._most_silent = max(3, math.ceil(settings.silent_s * settings.rate_hz))
@@ -264,13 +264,6 @@ class I2cDevice:
         if self._failed[name] >= self._settings.most_failures:
             self._lost = (f'{self._name}: {name} failed {self._failed[name]} times in a row: '
                           f'{self._fault(error)}')
-
-    def close(self):
-        """Close the bus; a `read` in another thread returns."""
-        self._closing = True
-        with self._lock:
-            self._release()
-            self._closing = False
 
     def _release(self):
         """Let go of the bus, if it is held."""

@@ -11,11 +11,8 @@ lost. A pseudo-terminal does not count, and loses nothing.
 
 import errno
 import fcntl
-import select
 import struct
 import termios
-import threading
-import time
 from collections import Counter
 from dataclasses import dataclass
 
@@ -23,11 +20,10 @@ import serial
 from serial.tools import list_ports
 
 from mag_tracking.errors import DeviceError, SettingsError
+from mag_tracking.io.drivers.polled import Polled
 from mag_tracking.io.drivers.reading import Chunk
 from mag_tracking.settings import param
 
-CLOSE_WAIT_S = 0.1
-"""How long `close` may have to wait for a `read` in another thread."""
 TIOCGICOUNT = 0x545D
 ICOUNTER = struct.Struct('20i')
 LINE_ERRORS = {
@@ -54,7 +50,7 @@ class SerialSettings:
         True, 'No other program that asks for the port alone gets it at the same time.')
 
 
-class SerialPort:
+class SerialPort(Polled):
     """Transport over a serial line; see `reading.Transport`.
 
     Raises SettingsError where no port is named, or where the parity is none of the three.
@@ -66,15 +62,14 @@ class SerialPort:
     whole = False
 
     def __init__(self, settings):
+        super().__init__()
         if not settings.port:
             raise SettingsError('port: the path of a serial port is needed')
         if settings.parity not in ('N', 'E', 'O'):
             raise SettingsError(f'parity: expected N, E or O, got {settings.parity!r}')
         self.counts = Counter()
         self._settings = settings
-        self._lock = threading.Lock()
-        self._closing = False
-        self._port = self._poll = self._line_errors = None
+        self._line_errors = None
 
     def open(self):
         """Open the port; raises DeviceError where it is not there, busy or not allowed."""
@@ -83,13 +78,12 @@ class SerialPort:
             self._release()
             try:
                 # Opening flushes what the port has received so far.
-                self._port = serial.Serial(
+                opened = serial.Serial(
                     s.port, s.baud, parity=s.parity, stopbits=s.stop_bits, timeout=0,
                     exclusive=s.exclusive or None)
             except (OSError, ValueError, termios.error) as error:
                 raise DeviceError(f'serial port {s.port}: {self._obstacle(error)}') from error
-            self._poll = select.poll()
-            self._poll.register(self._port.fileno(), select.POLLIN)
+            self._hold(opened)
             try:
                 self._line_errors = self._read_line_errors()
             except OSError:
@@ -118,7 +112,7 @@ class SerialPort:
         Raises DeviceError where the port is not open or is gone.
         """
         with self._lock:
-            if self._port is None:
+            if self._handle is None:
                 raise DeviceError(f'serial port {self._settings.port}: is not open')
             try:
                 arrival_ns = self._wait(timeout_s)
@@ -126,27 +120,16 @@ class SerialPort:
                     self._count_line_errors()
                 if arrival_ns is None:
                     return []
-                data = self._port.read(max(1, self._port.in_waiting))
+                data = self._handle.read(max(1, self._handle.in_waiting))
             except OSError as error:
                 raise DeviceError(f'serial port {self._settings.port}: is gone, perhaps unplugged '
                                   f'({error})') from error
         return [Chunk(arrival_ns, data)] if data else []
 
-    def _wait(self, timeout_s):
-        """Time when there was something to read [ns]; None if there was nothing."""
-        end = time.monotonic() + timeout_s
-        while not self._closing:
-            left = end - time.monotonic()
-            if self._poll.poll(1e3 * max(0.0, min(left, CLOSE_WAIT_S))):
-                return time.monotonic_ns()
-            if left <= 0.0:
-                break
-        return None
-
     def _read_line_errors(self):
         """The kernel's counters; raises OSError where the driver of the port has none."""
         return ICOUNTER.unpack(
-            fcntl.ioctl(self._port.fileno(), TIOCGICOUNT, bytes(ICOUNTER.size)))
+            fcntl.ioctl(self._handle.fileno(), TIOCGICOUNT, bytes(ICOUNTER.size)))
 
     def _count_line_errors(self):
         """Add what the line and the driver lost since last time."""
@@ -154,16 +137,3 @@ class SerialPort:
         for i, cause in LINE_ERRORS.items():
             if self._line_errors[i] != before[i]:
                 self.counts[cause] += (self._line_errors[i] - before[i]) % 2**32
-
-    def close(self):
-        """Close the port; a `read` in another thread returns."""
-        self._closing = True
-        with self._lock:
-            self._release()
-            self._closing = False
-
-    def _release(self):
-        """Let go of the port, if it is held."""
-        if self._port is not None:
-            self._port.close()
-            self._port = None

@@ -17,6 +17,8 @@ from mag_tracking.io.simulator import Path, body_field, random_vehicle
 from mag_tracking.settings import param
 
 TICK_S = 1e-6
+SHORTEST_WAIT_S = 1e-3
+"""As a port that is looked at so often."""
 LONGEST_BACKLOG_S = 5.0
 """What is older when it is asked for is lost, as in the buffer of a real device."""
 
@@ -38,6 +40,9 @@ class SimulatorSettings:
                             'gone, if that is later.', 's', (0.1, 86400.0))
     moment: float = param(400.0, 'Magnetic moment of a vehicle.', 'A m^2', (0.0, 1e6))
     length: float = param(4.3, 'Length of a vehicle.', 'm', (0.1, 50.0))
+    in_turn: bool = param(
+        False, 'The sensors measure one after the other, evenly in the interval, as they do where '
+        'each runs by itself; else all at the same time.')
     seed: int = param(1, 'Of the vehicle and of the noise.', '', (0, 2**31 - 1))
 
 
@@ -61,6 +66,8 @@ class SimulatedDevice:
         self._rng = np.random.default_rng(settings.seed)
         self._table = None
         self._start_ns, self._next = None, 0
+        self._shift_s = (np.arange(len(self._network)) * settings.in_turn
+                         / (len(self._network) * settings.rate_hz)).tolist()
 
     def open(self):
         """Compute one pass, and begin."""
@@ -68,38 +75,25 @@ class SimulatedDevice:
             self._table = self._one_pass()
         if self._start_ns is None:
             self._start_ns = self._monotonic_ns()
-        self._next = math.ceil(self._elapsed() * self._settings.rate_hz)
-
-    def truth(self, elapsed_s):
-        """Position (2,) [m] and heading [rad] of the vehicle so long after the first `open`.
-
-        NaN while none is there.
-        """
-        t = elapsed_s % self._period_s
-        if t > self._passing_s:
-            return np.full(2, np.nan), float('nan')
-        position, heading = self._path.at(np.array([t]))
-        return position[0], float(heading[0])
+        self._next = math.ceil(self._elapsed() * self._settings.rate_hz) * len(self._network)
 
     def read(self, timeout_s):
         """The readings that are due; waits for the next if none is."""
         if self._table is None:
             raise DeviceError('the simulator is not open')
-        rate = self._settings.rate_hz
-        wait = self._next / rate - self._elapsed()
+        wait = self._due(self._next) - self._elapsed()
         if wait > 0.0:
-            self._sleep(min(wait, timeout_s))
-        elapsed = self._elapsed()
-        oldest = math.ceil((elapsed - LONGEST_BACKLOG_S) * rate)
+            # Not for each of a thousand in turn: what is there when one looks comes together.
+            self._sleep(min(max(wait, SHORTEST_WAIT_S), timeout_s))
+        elapsed, n = self._elapsed(), len(self._network)
+        oldest = math.ceil((elapsed - LONGEST_BACKLOG_S) * self._settings.rate_hz) * n
         if oldest > self._next:
-            self.counts['readings lost, nobody took them'] += (
-                (oldest - self._next) * len(self._network))
+            self.counts['readings lost, nobody took them'] += oldest - self._next
             self._next = oldest
-        out = []
-        while self._next <= elapsed * rate:
-            out += self._round(self._next)
+        first = self._next
+        while self._due(self._next) <= elapsed:
             self._next += 1
-        return out
+        return self._readings(first, self._next)
 
     def close(self):
         """There is nothing to close; time goes on."""
@@ -113,27 +107,34 @@ class SimulatedDevice:
         """[s] since the first `open`."""
         return (self._monotonic_ns() - self._start_ns) / 1e9
 
-    def _round(self, index):
-        """One reading of every sensor."""
+    def _due(self, i):
+        """[s] When reading `i` is measured; the sensors take turns."""
+        index, j = divmod(i, len(self._network))
+        return index / self._settings.rate_hz + self._shift_s[j]
+
+    def _readings(self, first, end):
+        """The readings from `first` to before `end`."""
+        index, j = np.divmod(np.arange(first, end), len(self._network))
         # The table is that of the pass alone; before the next vehicle there is none.
         row = index % round(self._period_s * self._settings.rate_hz)
-        B = self._table[min(row, len(self._table) - 1)]
+        B = self._table[np.minimum(row, len(self._table) - 1), j]
         B = B + self._settings.noise * self._rng.standard_normal(B.shape)
-        ticks = round(index / self._settings.rate_hz / TICK_S)
-        now = self._monotonic_ns()
-        return [Arrival(now, Reading(name, tuple(b), ticks=ticks, sequence=index))
-                for name, b in zip(self._network.names, B.tolist(), strict=True)]
+        now, names = self._monotonic_ns(), self._network.names
+        return [Arrival(now, Reading(names[j], tuple(b), ticks=round(self._due(i) / TICK_S),
+                                     sequence=k))
+                for i, k, j, b in zip(range(first, end), index.tolist(), j.tolist(), B.tolist(),
+                                      strict=True)]
 
     def _one_pass(self):
         """(n, n_sensors, 3) [T], sensor frames; the last row is without a vehicle."""
         s, network = self._settings, self._network
         t = np.arange(0.0, self._passing_s, 1.0 / s.rate_hz)
-        position, heading = self._path.at(t)
         body = random_vehicle(np.random.default_rng(s.seed), length=s.length, moment=s.moment)
-        B = np.concatenate([body_field(body, network.earth_field, p, h, network.positions)
-                            for p, h in zip(np.array_split(position, 1 + len(t) // 256),
-                                            np.array_split(heading, 1 + len(t) // 256),
-                                            strict=True)] + [np.zeros((1, len(network), 3))])
+        B = np.zeros((len(t) + 1, len(network), 3))
+        for j, shift_s in enumerate(self._shift_s):
+            position, heading = self._path.at(t + shift_s)
+            B[:-1, j] = body_field(body, network.earth_field, position, heading,
+                                   network.positions[j:j + 1])[:, 0]
         return np.einsum('njw,jws->njs', B + network.earth_field, network.R_ws)
 
 

@@ -17,22 +17,19 @@ linux/sock_diag.h, described in sock_diag(7).
 
 import errno
 import ipaddress
-import select
 import socket
 import struct
-import threading
 import time
 from collections import Counter
 from dataclasses import dataclass
 
 from mag_tracking.errors import DeviceError, SettingsError
+from mag_tracking.io.drivers.polled import Polled
 from mag_tracking.io.drivers.reading import Chunk
 from mag_tracking.settings import param
 
 AT_ONCE = 1000
 """Datagrams that one `read` gives at most."""
-CLOSE_WAIT_S = 0.1
-"""How long `close` may have to wait for a `read` in another thread."""
 CLOCK_SET_NS = 1_000_000
 """A change of the clocks' difference by more is no error of measuring it."""
 SO_TIMESTAMPNS = getattr(socket, 'SO_TIMESTAMPNS', 35)
@@ -76,7 +73,7 @@ def clock_difference():
     return difference if took < CLOCK_SET_NS else None
 
 
-class UdpSocket:
+class UdpSocket(Polled):
     """Transport over UDP; see `reading.Transport`. One chunk per datagram, its source an address.
 
     Parameters
@@ -92,6 +89,7 @@ class UdpSocket:
     whole = True
 
     def __init__(self, settings, report=print):
+        super().__init__()
         if settings.port == 0:
             raise SettingsError('port: the number of a UDP port is needed')
         self._sources = frozenset(settings.sources) - {''}
@@ -105,9 +103,7 @@ class UdpSocket:
         self.counts = Counter()
         self._settings, self._report = settings, report
         self._any_source = '' in settings.sources
-        self._lock = threading.Lock()
-        self._closing = False
-        self._socket = self._poll = self._difference = None
+        self._difference = None
         self._drops = 0
 
     def open(self):
@@ -120,10 +116,8 @@ class UdpSocket:
             except OSError as error:
                 opened.close()
                 raise DeviceError(f'UDP {self._where()}: {self._obstacle(error)}') from error
-            self._socket, self._drops = opened, 0
-            self._difference = clock_difference()
-            self._poll = select.poll()
-            self._poll.register(opened, select.POLLIN)
+            self._drops, self._difference = 0, clock_difference()
+            self._hold(opened)
 
     def _set_up(self, opened):
         """Options first: from `bind` on datagrams come."""
@@ -169,7 +163,7 @@ class UdpSocket:
         Raises DeviceError where the socket is not open or fails.
         """
         with self._lock:
-            if self._socket is None:
+            if self._handle is None:
                 raise DeviceError(f'UDP {self._where()}: is not open')
             try:
                 woken_ns = self._wait(timeout_s)
@@ -179,24 +173,13 @@ class UdpSocket:
                 raise DeviceError(f'UDP {self._where()}: {error}') from error
         return chunks
 
-    def _wait(self, timeout_s):
-        """Time when there was something to read [ns]; None if there was nothing."""
-        end = time.monotonic() + timeout_s
-        while not self._closing:
-            left = end - time.monotonic()
-            if self._poll.poll(1e3 * max(0.0, min(left, CLOSE_WAIT_S))):
-                return time.monotonic_ns()
-            if left <= 0.0:
-                break
-        return None
-
     def _drain(self, woken_ns):
         """Chunks of what is in the queue."""
         came, empty = [], False
         room = socket.CMSG_SPACE(TIMESPEC.size)
         while len(came) < AT_ONCE and not empty:
             try:
-                came.append(self._socket.recvmsg(self._settings.longest, room))
+                came.append(self._handle.recvmsg(self._settings.longest, room))
             except BlockingIOError:
                 empty = True
         difference = clock_difference()
@@ -234,20 +217,7 @@ class UdpSocket:
     def _count_drops(self):
         """Add what the kernel has dropped since last time."""
         drops = MEMINFO.unpack(
-            self._socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size))[DROPS]
+            self._handle.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size))[DROPS]
         if drops != self._drops:
             self.counts['datagrams dropped by the kernel'] += (drops - self._drops) % 2**32
             self._drops = drops
-
-    def close(self):
-        """Close the socket; a `read` in another thread returns."""
-        self._closing = True
-        with self._lock:
-            self._release()
-            self._closing = False
-
-    def _release(self):
-        """Let go of the socket, if it is held."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
