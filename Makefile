@@ -24,7 +24,7 @@ QUIET_EDITABLE := PYTHONWARNINGS=ignore
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo config test bench fuzz colcon lock clean
+.PHONY: help setup demo config test studies bench fuzz colcon lock clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -56,9 +56,13 @@ test: $(STAMP)  ## check style, floors and behaviour
 	@sh tools/check_broker.sh
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not alone'
-	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'alone and not single'
-	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest -q -m single
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not alone and not study'
+	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'alone and not single and not study'
+	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest -q -m 'single and not study'
+
+studies: $(STAMP)  ## the tests that take many runs or all of the recordings
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -rP -n 2 -m 'study and not alone'
+	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest -q -rP -m 'study and alone'
 
 bench: $(STAMP)  ## measure times and accuracies
 	$(BIN)/python test/bench/bench.py

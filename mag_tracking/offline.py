@@ -123,7 +123,7 @@ def _summary(recording, reader, pipeline, taker, truth):
         rejections[cause] = rejections.get(cause, 0) + n
     sensors = {}
     for name, background in pipeline.calibrate.backgrounds().items():
-        counts = pipeline.calibrate.per_sensor[name]
+        counts = pipeline.calibrate.counts_of(name)
         sensors[name] = {'accepted': counts['accepted'], 'rejected': counts['rejected'],
                          'ready': background.ready, 'stuck': background.stuck,
                          'times_relearnt': background.n_relearnt}

@@ -21,6 +21,65 @@ class MagSample:
 
 
 @dataclass(frozen=True, slots=True)
+class Readings:
+    """Readings of many sensors, in the order in which they came: `MagSample`s as arrays."""
+
+    names: tuple[str, ...]
+    """Of sensors."""
+    sensor: np.ndarray
+    """(n,) int, which of `names`."""
+    stamp_ns: np.ndarray
+    """(n,) int64."""
+    field: np.ndarray
+    """(n, 3) [T]."""
+    covariance: np.ndarray | None = None
+    """(n, 3, 3) [T^2]; a row of NaN, or None for all: unknown."""
+
+    def __len__(self):
+        return len(self.sensor)
+
+    def sample(self, i):
+        """Reading `i` as a `MagSample`."""
+        C = None if self.covariance is None else self.covariance[i]
+        return MagSample(int(self.stamp_ns[i]), self.names[self.sensor[i]], self.field[i],
+                         None if C is None or np.isnan(C).all() else C)
+
+    def samples(self):
+        """All of them."""
+        return [self.sample(i) for i in range(len(self))]
+
+    @classmethod
+    def joined(cls, parts):
+        """One after the other, those of `parts`, [`Readings`]."""
+        parts = [p for p in parts if len(p)]
+        if len(parts) <= 1:
+            return parts[0] if parts else cls.of([])
+        names = tuple(dict.fromkeys(name for p in parts for name in p.names))
+        rows = {name: j for j, name in enumerate(names)}
+        covariance = None
+        if any(p.covariance is not None for p in parts):
+            covariance = np.concatenate([np.full((len(p), 3, 3), np.nan) if p.covariance is None
+                                         else p.covariance for p in parts])
+        return cls(names, np.concatenate([
+            np.array([rows[name] for name in p.names])[p.sensor] for p in parts]),
+            np.concatenate([p.stamp_ns for p in parts]), np.concatenate([p.field for p in parts]),
+            covariance)
+
+    @classmethod
+    def of(cls, samples):
+        """Of `MagSample`s."""
+        names = tuple(dict.fromkeys(s.sensor for s in samples))
+        rows, unknown = {name: j for j, name in enumerate(names)}, np.full((3, 3), np.nan)
+        covariance = None
+        if any(s.covariance is not None for s in samples):
+            covariance = np.array([unknown if s.covariance is None else s.covariance
+                                   for s in samples])
+        return cls(names, np.array([rows[s.sensor] for s in samples], dtype=np.int64),
+                   np.array([s.stamp_ns for s in samples], dtype=np.int64),
+                   np.array([s.field for s in samples], dtype=float).reshape(-1, 3), covariance)
+
+
+@dataclass(frozen=True, slots=True)
 class AccelerationSample:
     """One reading of a sensor's accelerometer."""
 

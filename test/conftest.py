@@ -34,6 +34,13 @@ _HOME = tempfile.TemporaryDirectory(prefix='mag_tracking_test_')
 os.environ['ROS_HOME'] = _HOME.name
 
 
+def studied(names, kept=(), also=lambda name: ()):
+    """Parameters: those in `kept` for every `make test`, the others for `make studies`; `also`
+    gives further marks."""
+    return [pytest.param(name, marks=[*also(name), *([] if name in kept else [pytest.mark.study])])
+            for name in names]
+
+
 def pytest_collection_modifyitems(items):
     """Tests of nodes and of what is killed in time are not run beside others (`make test`)."""
     for item in items:
@@ -63,10 +70,17 @@ def vehicle_path(name):
 
 @pytest.fixture(scope='session')
 def vehicle_replays(tmp_path_factory, road_network):
-    """{name: (Run, folder)}: every bundled vehicle recording, replayed once with the defaults."""
+    """{name: (Run, folder)}: a bundled vehicle recording, replayed with the defaults when it is
+    first asked for."""
     out = tmp_path_factory.mktemp('replays')
-    return {name: (replay(Recording(vehicle_path(name)), road_network, settings_for('vehicle'),
-                          out / name), out / name) for name in VEHICLES}
+
+    class Replays(dict):
+        def __missing__(self, name):
+            self[name] = replay(Recording(vehicle_path(name)), road_network,
+                                settings_for('vehicle'), out / name), out / name
+            return self[name]
+
+    return Replays()
 
 
 @pytest.fixture(scope='session')

@@ -7,6 +7,7 @@ import pytest
 from conftest import line_network
 
 from mag_tracking.calibration.background import RunningBackground
+from mag_tracking.calibration.ordinary import new_sensors
 from mag_tracking.errors import NetworkError
 from mag_tracking.records import MagSample
 from mag_tracking.settings import replace
@@ -144,7 +145,7 @@ def test_unusable_fields_are_counted_and_rejected(field, cause):
     s = stage()
     assert s.feed(sample(1.0, field)) == []
     assert len(rejected(s.counts)) == 1 and cause in next(iter(rejected(s.counts)))
-    assert s.per_sensor['mag_1']['rejected'] == 1
+    assert s.counts_of('mag_1')['rejected'] == 1
 
 
 def test_millitesla_are_legitimate_where_the_setting_says_so():
@@ -299,13 +300,14 @@ def test_another_correction_is_learnt_anew():
 
 def ends_of_blocks(phase):
     """(times at which a block was judged, the background) of five seconds at 100 Hz."""
-    background = RunningBackground(3.0, 20.0, 1.5, 0.25, 2.0, 60.0, phase=phase)
+    state = new_sensors(1)
+    background = RunningBackground(3.0, 20.0, 1.5, 0.25, 2.0, 60.0, phase=phase, sensors=state)
     rng, ends, n_held = np.random.default_rng(0), [], 0
     for k in range(500):
         background.add(k / 100.0, 1e-8 * rng.standard_normal(3))
-        if len(background._times) < n_held:
+        if state['n'][0] < n_held:
             ends.append(k / 100.0)
-        n_held = len(background._times)
+        n_held = state['n'][0]
     return ends, background
 
 

@@ -1,10 +1,11 @@
 """Calibration of the bundled recordings, from what an installer knows, against their truth."""
 
 import json
+from functools import cache
 
 import numpy as np
 import pytest
-from conftest import DATA, VEHICLES
+from conftest import DATA, VEHICLES, studied
 from scipy.stats import chi2
 
 from mag_tracking.calibrating import calibrate
@@ -34,41 +35,43 @@ def as_installed(truth):
                          imu_topics=tuple(f'/{s}/imu/data_raw' for s in names))
 
 
-@pytest.fixture(scope='session')
-def calibrations():
-    """{recording: Calibration}."""
-    return {name: calibrate(Recording(path), as_installed(truth_of(name)),
-                            settings_for('vehicle'), DATE, passes=True)
-            for name, path in FILES.items()}
+OFTEN = ['straight_car_right', 'junction_left_turns_to_rear', 'two_way_road']
+EVERY = studied(FILES, OFTEN)
 
 
-def errors(calibrations, name):
+@cache
+def calibration_of(name):
+    return calibrate(Recording(FILES[name]), as_installed(truth_of(name)),
+                     settings_for('vehicle'), DATE, passes=True)
+
+
+def errors(name):
     """(tilt (n,) [rad], heading (n,) [rad], clock (n,) [s]) of the network that was found."""
-    found, truth = calibrations[name].network, truth_of(name)['sensor_truth']
+    found, truth = calibration_of(name).network, truth_of(name)['sensor_truth']
     R = np.array(truth['mount_sensor_to_map'])
     # Where up is, in the sensor's frame.
     tilt = np.arccos(np.clip(np.einsum('ji,ji->j', found.R_ws[:, 2], R[:, 2]), -1.0, 1.0))
     heading = np.array([yaw_between(t, f) for t, f in zip(R, found.R_ws, strict=True)])
     clock = found.clock_offset - 1e-3 * np.array(truth['clock_offset_ms'])
     # Clocks are compared with each other: which one is right nobody knows.
-    return tilt, heading, clock - clock[found.names.index(calibrations[name].survey.reference)]
+    return tilt, heading, clock - clock[found.names.index(calibration_of(name).survey.reference)]
 
 
-def stds(calibrations, name):
+def stds(name):
     """(n, 3) [rad]."""
-    return np.array(calibrations[name].network.orientation_std)
+    return np.array(calibration_of(name).network.orientation_std)
 
 
-@pytest.mark.parametrize('name', FILES)
-def test_the_tilt_is_found_to_half_a_degree(calibrations, name):
-    tilt, *_ = errors(calibrations, name)
+@pytest.mark.parametrize('name', EVERY)
+def test_the_tilt_is_found_to_half_a_degree(name):
+    tilt, *_ = errors(name)
     print(f'{name}: tilt {np.degrees(tilt).max():.3f} degrees at most')
     assert np.degrees(tilt).max() <= 0.5
 
 
-@pytest.mark.parametrize('name', FILES)
-def test_clocks_are_found_to_three_milliseconds(calibrations, name):
-    *_, clock = errors(calibrations, name)
+@pytest.mark.parametrize('name', EVERY)
+def test_clocks_are_found_to_three_milliseconds(name):
+    *_, clock = errors(name)
     print(f'{name}: clock {1e3 * np.abs(clock).max():.3f} ms at most')
     assert np.abs(clock).max() <= 3e-3
     truth = 1e-3 * np.array(truth_of(name)['sensor_truth']['clock_offset_ms'])
@@ -81,25 +84,25 @@ UNKNOWN_BIAS = {
     'straight_car_fast_left': '3.04 degrees: mag_1 has an unknown bias of 1.3 uT'}
 
 
-@pytest.mark.parametrize('name', [
-    pytest.param(n, marks=pytest.mark.xfail(strict=True, reason=UNKNOWN_BIAS[n]))
-    if n in UNKNOWN_BIAS else n for n in FILES])
-def test_the_heading_is_found_to_three_degrees(calibrations, name):
-    _, heading, _ = errors(calibrations, name)
+@pytest.mark.parametrize('name', studied(FILES, OFTEN, lambda n: [
+    pytest.mark.xfail(strict=True, reason=UNKNOWN_BIAS[n])] if n in UNKNOWN_BIAS else []))
+def test_the_heading_is_found_to_three_degrees(name):
+    _, heading, _ = errors(name)
     assert np.degrees(np.abs(heading)).max() <= 3.0
 
 
-@pytest.mark.parametrize('name', FILES)
-def test_the_heading_is_within_its_deviations(calibrations, name):
-    _, heading, _ = errors(calibrations, name)
-    std = stds(calibrations, name)[:, 2]
+@pytest.mark.parametrize('name', EVERY)
+def test_the_heading_is_within_its_deviations(name):
+    _, heading, _ = errors(name)
+    std = stds(name)[:, 2]
     print(f'{name}: heading {np.degrees(heading).round(2)} of {np.degrees(std).round(2)} degrees')
     assert np.abs(heading / std).max() <= 3.0
     assert np.degrees(std).max() < 3.0
 
 
-def test_all_headings_together_are_as_far_off_as_they_say(calibrations):
-    z = np.concatenate([errors(calibrations, name)[1] / stds(calibrations, name)[:, 2]
+@pytest.mark.study
+def test_all_headings_together_are_as_far_off_as_they_say():
+    z = np.concatenate([errors(name)[1] / stds(name)[:, 2]
                         for name in FILES])
     high = chi2.ppf(0.99, len(z)) / len(z)
     print(f'{len(z)} headings: mean square of error over deviation {np.mean(z**2):.3f}, '
@@ -108,11 +111,12 @@ def test_all_headings_together_are_as_far_off_as_they_say(calibrations):
     assert np.mean(z**2) < high
 
 
-def test_all_clocks_together_are_as_far_off_as_they_say(calibrations):
+@pytest.mark.study
+def test_all_clocks_together_are_as_far_off_as_they_say():
     z = []
     for name in FILES:
-        *_, clock = errors(calibrations, name)
-        std = [c.clock_offset_std for c in calibrations[name].network.calibrated]
+        *_, clock = errors(name)
+        std = [c.clock_offset_std for c in calibration_of(name).network.calibrated]
         z += [e / s for e, s in zip(clock, std, strict=True) if s > 0.0]
     high = chi2.ppf(0.99, len(z)) / len(z)
     print(f'{len(z)} clocks: mean square {np.mean(np.square(z)):.3f}, limit {high:.3f}')
@@ -120,32 +124,33 @@ def test_all_clocks_together_are_as_far_off_as_they_say(calibrations):
     assert np.mean(np.square(z)) < high
 
 
-@pytest.mark.parametrize('name', FILES)
-def test_right_recordings_give_no_warning(calibrations, name):
-    found = calibrations[name]
+@pytest.mark.parametrize('name', EVERY)
+def test_right_recordings_give_no_warning(name):
+    found = calibration_of(name)
     assert found.survey.disagreements == () and not found.interrupted
     assert [s.warnings for s in found.survey.sensors] == [()] * len(found.network)
     assert found.rejected == {} and found.without_background == ()
     assert found.survey.reference == 'mag_1'
 
 
-def test_what_a_calibration_is_marked_with(calibrations):
-    for name, found in calibrations.items():
-        # The start of the two-way road ends before anything passes.
-        passes = '' if name == 'two_way_road' else '; 1 pass'
-        assert (found.evidence is None) == (not passes)
-        for c in found.network.calibrated:
-            assert (c.date, c.by) == (DATE, f'accelerometer, compass and stated heading{passes}')
+@pytest.mark.parametrize('name', EVERY)
+def test_what_a_calibration_is_marked_with(name):
+    found = calibration_of(name)
+    # The start of the two-way road ends before anything passes.
+    passes = '' if name == 'two_way_road' else '; 1 pass'
+    assert (found.evidence is None) == (not passes)
+    for c in found.network.calibrated:
+        assert (c.date, c.by) == (DATE, f'accelerometer, compass and stated heading{passes}')
 
 
-def test_the_noise_is_found(calibrations):
-    for name, found in calibrations.items():
-        truth = np.array(truth_of(name)['sensor_truth']['noise_std_T'])
-        for noise, expected in zip(found.network.noise_std, truth, strict=True):
-            # A sensor with two axes has no three numbers.
-            assert (noise is None) == (name == 'two_way_road')
-            if noise is not None:
-                np.testing.assert_allclose(noise, expected, rtol=0.35)
+@pytest.mark.parametrize('name', EVERY)
+def test_the_noise_is_found(name):
+    truth = np.array(truth_of(name)['sensor_truth']['noise_std_T'])
+    for noise, expected in zip(calibration_of(name).network.noise_std, truth, strict=True):
+        # A sensor with two axes has no three numbers.
+        assert (noise is None) == (name == 'two_way_road')
+        if noise is not None:
+            np.testing.assert_allclose(noise, expected, rtol=0.35)
 
 
 def test_a_recording_without_the_network_is_refused():

@@ -106,7 +106,7 @@ def test_the_stage_thins_and_tells():
         if k % 3 == 0:
             out += stage.feed(sample)
     assert stage.counts['rejected: duplicate stamp'] == 667
-    assert stage.per_sensor['mag_1']['accepted'] == 2000
+    assert stage.counts_of('mag_1')['accepted'] == 2000
     # Of 200 samples until the background is known none comes out.
     assert len(out) == stage.counts['calibrated'] > 120
     gain = Decimator(20.0)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import line_network
+from conftest import line_network, studied
 from scipy.stats import binom, chi2, ncx2
 
 from mag_tracking.inference.detection_theory import (
@@ -54,9 +54,10 @@ def test_measured_false_alarm_rate_is_the_stated_one(p):
     assert low <= alarms <= high
 
 
-def test_false_alarm_rate_through_calibration_and_alignment():
+@pytest.mark.parametrize('n', studied([40_000, 160_000], [40_000]))
+def test_false_alarm_rate_through_calibration_and_alignment(n):
     """Raw noise with learnt backgrounds, through the whole way: 100 Hz averaged to 12.5 Hz."""
-    network, rng, n = line_network(2), np.random.default_rng(8), 160_000
+    network, rng = line_network(2), np.random.default_rng(8)
     calibrate = Calibrate(network, replace(CalibrateSettings(), {'memory_s': 300.0,
                                                                  'learn_s': 60.0}))
     align = Align(network, AlignSettings())

@@ -53,12 +53,12 @@ def test_a_fault_while_a_target_passes(n_sensors, n, fault):
         _, whole, _ = passed(n_sensors, seed)
         pipeline, rows, (begin, end) = passed(n_sensors, seed, fault)
         where, what = NAMED[fault]
-        counts = pipeline.calibrate.per_sensor[where] if where == 'mag_2' else \
+        counts = pipeline.calibrate.counts_of(where) if where == 'mag_2' else \
             pipeline.counts()[where]
         # Named, and nothing of the others is held against them.
         assert counts[what] > 0
         assert not any(n for s in pipeline.network.names if s != 'mag_2'
-                       for key, n in pipeline.calibrate.per_sensor[s].items()
+                       for key, n in pipeline.calibrate.counts_of(s).items()
                        if key.startswith('rejected'))
         unflagged = sum(z > WRONG and not flagged for _, _, z, flagged in whole)
         wrong = [r for r in rows if r[2] > WRONG and not r[3]]

@@ -15,7 +15,7 @@ from mag_tracking.io.bag import Recording, RecordingWriter
 from mag_tracking.io.message_types import FIELD_READINGS, MAGNETIC_FIELD, RAW_READINGS
 from mag_tracking.io.samples import SampleReader
 from mag_tracking.io.schema import readings_dict, sample_dict, samples_of
-from mag_tracking.records import MagSample
+from mag_tracking.records import MagSample, Readings
 
 START = 1_700_000_000_123_456_789
 
@@ -50,7 +50,7 @@ def same(a, b):
 @given(st.integers(1, 40), st.booleans(), st.integers(0, 1000))
 def test_there_and_back_in_the_order_in_which_they_came(n, known, seed):
     samples = some(n, known, np.random.default_rng(seed))
-    content = readings_dict(samples)
+    content = readings_dict(Readings.of(samples))
     back = samples_of(message(content))
     assert same(back, samples)
     assert all(isinstance(s.stamp_ns, int) for s in back)
@@ -66,16 +66,16 @@ def test_the_arrays_are_those_of_the_definition():
                MagSample(5, 'a', np.array([0.5, 1.5, 2.5], dtype=np.float32),
                          np.arange(9, dtype=np.float32).reshape(3, 3)),
                MagSample(6, 'b', np.array([4.0, 5.0, 6.0]), np.eye(3))]
-    content = readings_dict(samples)
+    content = readings_dict(Readings.of(samples))
     assert (content['sensors'], content['sensor']) == (['b', 'a'], array('H', [0, 1, 0]))
     assert content['stamp'] == array('q', [7, 5, 6])
     assert content['field'] == array('d', [1, 2, 3, 0.5, 1.5, 2.5, 4, 5, 6])
     assert content['covariance'].tolist() == [
         1, 0, 0, 0, 2, 0, 0, 0, 3, *range(9), 1, 0, 0, 0, 1, 0, 0, 0, 1]
     whole = [MagSample(7, 'b', np.ones(3), np.eye(3, dtype=int))]
-    assert readings_dict(whole)['covariance'].tolist() == np.eye(3).ravel().tolist()
+    assert readings_dict(Readings.of(whole))['covariance'].tolist() == np.eye(3).ravel().tolist()
     single = [MagSample(7, 'b', np.ones(3, dtype=np.float32), np.eye(3, dtype=np.float32))]
-    assert same(samples_of(message(readings_dict(single))),
+    assert same(samples_of(message(readings_dict(Readings.of(single)))),
                 [MagSample(7, 'b', np.ones(3), np.eye(3))])
 
 
@@ -84,7 +84,7 @@ def test_some_covariances_known_or_no_sample_is_no_message():
     for samples in ([], some(2, True, rng) + some(1, False, rng),
                     some(1, False, rng) + some(2, True, rng)):
         with pytest.raises(RecordingError, match='covariance of all or of none'):
-            readings_dict(samples)
+            readings_dict(Readings.of(samples))
 
 
 @pytest.mark.parametrize('changes, said', [
@@ -95,7 +95,8 @@ def test_some_covariances_known_or_no_sample_is_no_message():
     ({'sensor': array('H', [0, 1])}, 'a reading of sensor 1 of 1'),
     ({'sensors': []}, 'a reading of sensor 0 of 0')])
 def test_what_does_not_fit_is_told(changes, said):
-    content = readings_dict([MagSample(k, 'a', np.ones(3), np.eye(3)) for k in range(2)])
+    content = readings_dict(Readings.of(
+        [MagSample(k, 'a', np.ones(3), np.eye(3)) for k in range(2)]))
     assert len(samples_of(message(content))) == 2
     with pytest.raises(RecordingError, match=said):
         samples_of(message(content | changes))
@@ -120,7 +121,8 @@ def test_a_recording_gives_the_same_samples(tmp_path, known):
     rng = np.random.default_rng(1)
     groups = [some(n, known, rng, ('mag_1', 'mag_2')) for n in (5, 1, 100)]
     reader = SampleReader(recording(tmp_path / 'a.mcap', [
-        (RAW_READINGS, FIELD_READINGS, readings_dict(g)) for g in groups]), line_network(2))
+        (RAW_READINGS, FIELD_READINGS, readings_dict(Readings.of(g))) for g in groups]),
+                          line_network(2))
     assert reader.missing_topics() == []
     got = list(reader.samples_as_received())
     assert same([s for s, _ in got], [s for g in groups for s in g])
@@ -132,10 +134,10 @@ def test_a_recording_gives_the_same_samples(tmp_path, known):
 def test_readings_of_others_and_messages_that_are_none_are_counted(tmp_path):
     rng = np.random.default_rng(2)
     mine, other = some(3, False, rng, ('mag_1',)), some(4, False, rng, ('elsewhere',))
-    broken = readings_dict(mine)
+    broken = readings_dict(Readings.of(mine))
     broken['stamp'] = broken['stamp'][:2]
     reader = SampleReader(recording(tmp_path / 'a.mcap', [
-        (RAW_READINGS, FIELD_READINGS, readings_dict(other + mine)),
+        (RAW_READINGS, FIELD_READINGS, readings_dict(Readings.of(other + mine))),
         (RAW_READINGS, FIELD_READINGS, broken)]), line_network(2))
     assert same(list(reader.samples()), mine)
     assert reader.rejected == {'reading of elsewhere, which is not in the network': 4,
@@ -147,7 +149,7 @@ def test_both_kinds_of_topics_are_read(tmp_path):
     (one,), many = some(1, True, rng, ('mag_2',)), some(3, True, rng, ('mag_1',))
     reader = SampleReader(recording(tmp_path / 'a.mcap', [
         ('/mag_2/imu/mag', MAGNETIC_FIELD, sample_dict(one, 'mag_2')),
-        (RAW_READINGS, FIELD_READINGS, readings_dict(many))]), line_network(2))
+        (RAW_READINGS, FIELD_READINGS, readings_dict(Readings.of(many)))]), line_network(2))
     assert same(list(reader.samples()), [one, *many])
 
 

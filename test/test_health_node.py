@@ -19,7 +19,7 @@ from mag_tracking.nodes.doctor_node import DoctorNode
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.stage_node import RESULTS, STREAM
 from mag_tracking.pipeline import settings_for
-from mag_tracking.records import MagSample
+from mag_tracking.records import MagSample, Readings
 from mag_tracking.stages.calibrate import Calibrate
 
 # They publish at a rate that is looked at.
@@ -215,7 +215,7 @@ def test_what_was_wrong_is_forgotten_after_two_terms(monkeypatch):
             parked = 1e-6 * (name == 'mag_1' and now[0] > 20.0)
             sample = MagSample(k * 50_000_000, name,
                                EARTH + parked + 1.2e-8 * rng.standard_normal(3))
-            health.add(sample, sample.stamp_ns)
+            health.add(Readings.of([sample]), sample.stamp_ns)
             stage.feed(sample)
         if k % 100 == 99:
             said.append((now[0], [s.message for s in health.statuses('node', stage)]))

@@ -24,6 +24,11 @@ ARRIVAL = {name: 'right' if '_left' in name and name.startswith('straight') else
 CARS = [name for name in VEHICLES if 'truck' not in name]
 
 
+def every(replays):
+    """{name: (Run, folder)} of all vehicles."""
+    return {name: replays[name] for name in VEHICLES}
+
+
 def pass_of(replays, name):
     """The one track of a recording, and its errors."""
     run, _ = replays[name]
@@ -201,7 +206,7 @@ def test_the_interleaving_of_the_sensors_does_not_matter(vehicle_replays, road_n
 
 
 def test_results_agree_with_each_other(vehicle_replays):
-    for name, (_, folder) in vehicle_replays.items():
+    for name, (_, folder) in every(vehicle_replays).items():
         poses, hypotheses = rows(folder / 'poses.csv'), rows(folder / 'hypotheses.csv')
         summary = json.loads((folder / 'summary.json').read_text())
         assert len(poses) == summary['tracks'][0]['poses']
@@ -217,7 +222,7 @@ def test_results_agree_with_each_other(vehicle_replays):
 
 
 def test_published_covariances_are_covariances(vehicle_replays, magnet_replays):
-    for run, _ in [*vehicle_replays.values(), *magnet_replays.values()]:
+    for run, _ in [*every(vehicle_replays).values(), *magnet_replays.values()]:
         for log in run.logs.values():
             C = np.array(log.covariance)
             np.testing.assert_allclose(C, np.swapaxes(C, 1, 2))
@@ -225,7 +230,7 @@ def test_published_covariances_are_covariances(vehicle_replays, magnet_replays):
 
 
 def test_no_sample_is_lost_without_a_word(vehicle_replays):
-    for run, _ in vehicle_replays.values():
+    for run, _ in every(vehicle_replays).values():
         c = run.summary['counts']['calibrate']
         taken = sum(s['accepted'] for s in run.summary['sensors'].values())
         assert c['calibrated'] + c['held back while learning'] == taken

@@ -227,6 +227,7 @@ def test_a_path_over_a_sensor_is_of_no_use():
     np.testing.assert_allclose(bank.x[0], alone.x[0], rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize('target', matched.TARGETS)
 def test_matched_targets_are_tracked_as_well_as_they_can_be(target, n=60):
     """RMS error over the bound of the path, a twentieth left out: 1.4 and 1.8 without it."""

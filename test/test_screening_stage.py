@@ -22,7 +22,7 @@ def test_nothing_is_found_in_the_recordings(name, road_network):
     for s in SampleReader(Recording(vehicle_path(name)), road_network).samples():
         stage.feed(s)
     stage.flush()
-    assert sum(c['accepted'] for c in stage.per_sensor.values()) > 1000
+    assert sum(stage.counts_of(name)['accepted'] for name in road_network.names) > 1000
     assert not {'spike', 'the same reading over and over'} & set(rejected(stage.counts))
 
 
@@ -37,7 +37,7 @@ def feed(stage, y, first=0, rate=100.0):
 
 
 def total(stage):
-    c = stage.per_sensor['mag_1']
+    c = stage.counts_of('mag_1')
     return c['accepted'] + c['rejected']
 
 
@@ -47,7 +47,7 @@ def test_spikes_and_repetitions_are_counted_where_they_are():
     y[[100, 150, 151]] += 5e-6
     y[300:330] = y[299]
     out = feed(stage, y)
-    stuck_ones = stage.per_sensor['mag_1']['rejected: the same reading over and over']
+    stuck_ones = stage.counts_of('mag_1')['rejected: the same reading over and over']
     assert rejected(stage.counts) == {'spike': 3, 'the same reading over and over': stuck_ones}
     assert 24 <= stuck_ones <= 27 and len(out) == 400 - 3 - stuck_ones
     assert np.abs([c.field for c in out]).max() < 6 * SIGMA
@@ -72,7 +72,7 @@ def test_what_is_held_at_the_end_passes_and_is_counted():
     stage, _ = calibrate()
     held_spike(stage)
     assert [c.stamp_ns for c in stage.flush()] == [500_000_000, 510_000_000]
-    assert stage.per_sensor['mag_1'] == {'accepted': 52} and stage.flush() == []
+    assert stage.counts_of('mag_1') == {'accepted': 52} and stage.flush() == []
 
 
 def test_what_is_held_when_time_jumps_back_is_counted():
@@ -115,4 +115,4 @@ def test_what_is_held_when_the_background_is_to_be_learnt_anew_comes_before_the_
     out += feed(stage, y[604:], first=604)
     stamps = [c.stamp_ns for c in out]
     assert (np.diff(stamps) > 0).all()
-    assert stage.per_sensor['mag_1'] == {'accepted': 800}
+    assert stage.counts_of('mag_1') == {'accepted': 800}

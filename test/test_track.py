@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from conftest import POINT, line_network
+from conftest import POINT, line_network, studied
 from scipy.stats import binom
 
 from mag_tracking.geometry import rotation_from_quaternion
@@ -68,7 +68,8 @@ def test_the_evidence_says_of_which_kind_a_vehicle_is(kind, body):
         tracks[-1].kind_weight)
 
 
-def test_most_trucks_are_told_and_of_the_others_it_is_not_sure(n=16):
+@pytest.mark.parametrize('n', studied([4, 16], [4]))
+def test_most_trucks_are_told_and_of_the_others_it_is_not_sure(n):
     """35 of 40 others, seeds 0 to 39, were told with other noise; the limit is the binomial's."""
     ends = []
     for seed in range(n):

@@ -13,7 +13,8 @@ from math import inf, isnan
 
 import numpy as np
 
-from mag_tracking.calibration.blocks import Block, BlockWindow, stacked
+from mag_tracking.calibration.blocks import BlockWindow, block_of, line_through, stacked
+from mag_tracking.calibration.ordinary import add_to_block, new_sensors
 
 LEAST_SAMPLES = 8
 """A block has at least so many samples, however slow the sensor: fewer tell nothing of noise."""
@@ -48,13 +49,17 @@ class RunningBackground:
     phase : float
         The first block is longer by this share: the blocks of many sensors that began
         together are not all judged at once.
+    sensors : (1,) ordinary.SENSOR, optional
+        Where the block is that is being collected.
     """
 
     def __init__(self, learn, memory, guard, block, freeze_std, relearn,
-                 background=None, noise_std=None, phase=0.0):
+                 background=None, noise_std=None, phase=0.0, sensors=None):
         self._learn, self._guard, self._block = learn, guard, block
         self._freeze_std, self._relearn = freeze_std, relearn
         self._phase = phase
+        self._sensors = new_sensors(1) if sensors is None else sensors
+        self._block_now = self._sensors[0]
         self._most = max(3, int(round(memory / block)))
         self._window = BlockWindow(self._most)
         self._given = None if background is None else np.asarray(background, dtype=float)
@@ -66,7 +71,7 @@ class RunningBackground:
 
     def forget(self):
         """Drop what was learnt; what was given beforehand stays."""
-        self._times, self._fields, self._end = [], [], None
+        self._block_now['n'], self._block_now['end'] = 0, np.nan
         self._longer = self._phase * self._block
         self._window.clear()
         self._pending, self._strange = deque(), deque()
@@ -115,6 +120,11 @@ class RunningBackground:
             self._std = self._noise, std, std is not None and not isnan(sum(std))
 
     @property
+    def line(self):
+        """(centre [s], (3,) mean [T], (3,) slope [T/s], horizon [s]) of `level`, or None."""
+        return self._line
+
+    @property
     def measured(self):
         """Whether the background is from readings, not from what was given beforehand."""
         return bool(self._window) and self.ready
@@ -153,28 +163,21 @@ class RunningBackground:
 
     def add(self, time, field):
         """Take a sample: `time` [s], `field` (3,) [T], sensor frame."""
-        if self._end is None:
-            self._end = time + self._block + self._longer
-        elif time >= self._end and len(self._times) >= LEAST_SAMPLES:
+        now = self._block_now
+        if isnan(now['end']):
+            now['end'] = time + self._block + self._longer
+        elif time >= now['end'] and now['n'] >= LEAST_SAMPLES:
             self._close()
-            self._end, self._longer = time + self._block, 0.0
-        self._times.append(time)
-        self._fields.append(field)
+            now['end'], self._longer = time + self._block, 0.0
+        add_to_block(self._sensors, 0, time, np.ascontiguousarray(field, dtype=float))
 
     def _close(self):
         """Turn the collected samples into a block and judge it."""
-        fields = np.concatenate(self._fields).reshape(-1, 3)
-        there = ~np.isnan(fields)
-        n = there.sum(axis=0)
-        mean = np.divide(np.where(there, fields, 0.0).sum(axis=0), n, out=np.full(3, np.nan),
-                         where=n > 0)
-        # An axis that is missing now and then is missing in those products only.
-        deviation = np.where(there, fields - mean, 0.0)
-        block = Block(sum(self._times) / len(self._times), mean, deviation.T @ deviation, n)
-        self._times, self._fields = [], []
-        known = n > 1
+        block = block_of(self._block_now)
+        self._block_now['n'] = 0
+        known = block.n > 1
         self.stuck = bool((block.scatter.diagonal()[known]
-                           < LEAST_STD**2 * (n[known] - 1)).any())
+                           < LEAST_STD**2 * (block.n[known] - 1)).any())
         if self.stuck:
             return
         if self._line is not None and self._noise is not None:
@@ -231,7 +234,7 @@ class RunningBackground:
         std = np.sqrt(np.diagonal(self._noise if self._noise_given else noise))
         if np.isnan(std).all():
             return False
-        centre, mean, slope = _line_through(blocks)
+        centre, mean, slope = line_through(blocks)
         off = np.abs(blocks.mean - mean - slope * (blocks.time - centre)[:, None])
         if not np.nanmax(off / std) <= self._freeze_std:
             return False
@@ -258,31 +261,11 @@ class RunningBackground:
         if (self._given is not None or self._resumed) and last - first < self._learn:
             return
         self._resumed = False
-        centre, mean, slope = _line_through(blocks)
+        centre, mean, slope = line_through(blocks)
         self._line = (centre, mean, slope, last + 2.0 * (last - first))
         if not self._noise_given:
             noise = _pooled_covariance(blocks)
             self._noise = self._noise if noise is None else noise
-
-
-def _line_through(blocks):
-    """Weighted least-squares line per axis: centre [s], mean (3,) and slope (3,) there.
-
-    NaN for an axis that no block reports.
-    """
-    time, n = blocks.time, blocks.n
-    y = np.where(n > 0.0, blocks.mean, 0.0)
-    total = n.sum(axis=0)
-    total = np.where(total > 0.0, total, np.nan)
-    centre = float(time.mean())
-    mean_t = time @ n / total
-    mean_y = (n * y).sum(axis=0) / total
-    d = time[:, None] - mean_t
-    weighted = n * d
-    spread = (weighted * d).sum(axis=0)
-    slope = np.divide((weighted * (y - mean_y)).sum(axis=0), spread, out=np.zeros(3),
-                      where=spread > 0.0)
-    return centre, mean_y + slope * (centre - mean_t), slope
 
 
 def _one_is_loud(blocks):

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numba import float64, njit, void
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,28 @@ class Block:
     """(3, 3) [T^2], sum of squared deviations."""
     n: np.ndarray
     """(3,) samples per axis."""
+
+
+def block_of(sensor):
+    """`Block` of the sums over its readings in an `ordinary.SENSOR`."""
+    mean, scatter = np.empty(3), np.empty((3, 3))
+    _moments(sensor['origin'], sensor['count'], sensor['sum'], sensor['product'], mean, scatter)
+    return Block(float(sensor['time'] / sensor['n']), mean, scatter,
+                 sensor['count'].diagonal().copy())
+
+
+@njit(void(float64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1],
+           float64[:, ::1]), cache=True)
+def _moments(origin, count, total, product, mean, scatter):
+    """Mean and sum of squared deviations; an axis that is missing is so in its products only."""
+    for a in range(3):
+        mean[a] = total[a, a] / count[a, a] if count[a, a] else np.nan
+    for a in range(3):
+        for b in range(3):
+            scatter[a, b] = product[a, b] - total[a, b] * mean[b] - total[b, a] * mean[a] \
+                + count[a, b] * mean[a] * mean[b] if count[a, b] else 0.0
+    for a in range(3):
+        mean[a] += origin[a]
 
 
 class Blocks(NamedTuple):
@@ -56,6 +79,38 @@ class BlockWindow:
         """The `Blocks`, in no order."""
         k = len(self)
         return Blocks(self._time[:k], self._mean[:k], self._scatter[:k], self._n[:k])
+
+
+def line_through(blocks):
+    """Weighted least-squares line per axis: centre [s], mean (3,) and slope (3,) there.
+
+    NaN for an axis that no block reports.
+    """
+    centre, mean, slope = float(blocks.time.mean()), np.empty(3), np.empty(3)
+    _line(blocks.time, blocks.n, blocks.mean, centre, mean, slope)
+    return centre, mean, slope
+
+
+@njit(void(float64[::1], float64[:, ::1], float64[:, ::1], float64, float64[::1], float64[::1]),
+      cache=True, error_model='numpy')
+def _line(time, n, y, centre, mean, slope):
+    """`line_through`; `y` (k, 3) are the means of the blocks."""
+    for a in range(3):
+        total = mean_t = mean_y = 0.0
+        for k in range(len(time)):
+            if n[k, a] > 0.0:
+                total += n[k, a]
+                mean_t += n[k, a] * time[k]
+                mean_y += n[k, a] * y[k, a]
+        mean_t, mean_y = mean_t / total, mean_y / total
+        spread = along = 0.0
+        for k in range(len(time)):
+            if n[k, a] > 0.0:
+                d = time[k] - mean_t
+                spread += n[k, a] * d * d
+                along += n[k, a] * d * (y[k, a] - mean_y)
+        slope[a] = along / spread if spread > 0.0 else 0.0
+        mean[a] = mean_y + slope[a] * (centre - mean_t)
 
 
 def stacked(blocks):

@@ -4,8 +4,9 @@ Neither waits for more than what is odd: all other readings pass at once.
 """
 
 import math
-from collections import deque
 from math import isnan
+
+from mag_tracking.calibration.ordinary import MEMORY, NEVER, RECENT, new_sensors
 
 LEAST_CHANGES = 50
 """A sensor that has changed less often may have steps so coarse that it repeats itself for long."""
@@ -15,12 +16,8 @@ SHORTEST_RUN = 4
 COARSE = 0.05
 """Of a sensor that repeats itself more often the steps are so coarse that at rest it may do so for
 ever; with a noise of one step or more, on three axes, it is below this."""
-MEMORY = 20_000
-"""Readings that the usual repetitions are counted over, about."""
 MOST_HELD = 3
 """A spike has at most so many readings; what stays for longer is a step."""
-RECENT = 8
-"""Steps from one reading to the next that a spike is compared with."""
 STEEPER = 8.0
 """A spike is steeper than the steepest of those by so much, and by more where readings are rare."""
 FASTEST = 30.0
@@ -36,36 +33,40 @@ STUCK, SPIKE = 'the same reading over and over', 'spike'
 
 
 class Repetition:
-    """Tells when a sensor repeats itself longer than chance, or its coarse steps, would have it."""
+    """Tells when a sensor repeats itself longer than chance, or its coarse steps, would have it.
 
-    def __init__(self):
-        self._last, self._run = None, 0
-        self._repeats, self._changes = 0.0, 0.0
+    Its state is in `sensors`, (1,) `ordinary.SENSOR`.
+    """
+
+    def __init__(self, sensors=None):
+        self._state = (new_sensors(1) if sensors is None else sensors)[0]
 
     def is_stuck(self, field):
         """Whether the reading `field`, a list of three, is one of a sensor that is stuck."""
-        last, self._last = self._last, field
-        same = field == last or last is not None and isnan(sum(field)) and all(
+        s = self._state
+        last, s['last'] = s['last'].tolist(), field
+        same = field == last or isnan(sum(field)) and all(
             a == b or isnan(a) and isnan(b) for a, b in zip(field, last, strict=True))
         if not same:
             # A run that was taken for a fault says little about what is usual. But were it nothing,
             # a sensor with coarse steps that began while a target passed would be stuck at rest.
-            if self._run:
-                self._repeats += 1.0 if self._too_long() else self._run
-                self._run = 0
-            self._changes += 1.0
-            if self._repeats + self._changes > MEMORY:
-                self._repeats, self._changes = 0.5 * self._repeats, 0.5 * self._changes
+            if s['run']:
+                s['repeats'] += 1.0 if self._too_long() else s['run']
+                s['run'] = 0
+            s['changes'] += 1.0
+            if s['repeats'] + s['changes'] > MEMORY:
+                s['repeats'], s['changes'] = 0.5 * s['repeats'], 0.5 * s['changes']
             return False
-        self._run += 1
+        s['run'] += 1
         return self._too_long()
 
     def _too_long(self):
         """Whether the run so far is longer than what is likely."""
-        if self._run < SHORTEST_RUN or self._changes < LEAST_CHANGES:
+        run, repeats, changes = (self._state[k] for k in ('run', 'repeats', 'changes'))
+        if run < SHORTEST_RUN or changes < LEAST_CHANGES:
             return False
-        usual = (self._repeats + 1.0) / (self._repeats + self._changes + 2.0)
-        return usual < COARSE and self._run * math.log(usual) < LIKELY
+        usual = (repeats + 1.0) / (repeats + changes + 2.0)
+        return bool(usual < COARSE and run * math.log(usual) < LIKELY)
 
 
 class SpikeFilter:
@@ -74,11 +75,13 @@ class SpikeFilter:
     A reading is off where it differs from the one before by more than `threshold`
     noise deviations, and by `STEEPER` times more than readings did just now: a
     vehicle comes nearer smoothly. Where readings are so rare that it may pass from
-    one to the next but a few, only what is steeper still can be told from it.
+    one to the next but a few, only what is steeper still can be told from it. What is
+    not held is in `sensors`, (1,) `ordinary.SENSOR`.
     """
 
-    def __init__(self, threshold):
+    def __init__(self, threshold, sensors=None):
         self._threshold = threshold
+        self._state = (new_sensors(1) if sensors is None else sensors)[0]
         self.clear()
 
     @property
@@ -88,8 +91,8 @@ class SpikeFilter:
 
     def clear(self):
         """Forget what came before."""
-        self._before, self._before_ns, self._held = None, None, []
-        self._steps = deque(maxlen=RECENT)
+        self._held = []
+        self._state['before_ns'], self._state['n_steps'] = NEVER, 0
 
     def feed(self, item, stamp_ns, field, noise_std):
         """What is known by now of `item`, a reading, and of those that are held.
@@ -106,11 +109,11 @@ class SpikeFilter:
         list of (item, whether it is a spike), in the order in which they came
         """
         new = item, stamp_ns, field
-        if self._before is None or noise_std is None:
+        if self._state['before_ns'] == NEVER or noise_std is None:
             held = [(h[0], False) for h in self._held]
             self._held = []
             return held + self._release(*new)
-        (x, y, z), (a, b, c) = field, self._before
+        (x, y, z), (a, b, c) = field, self._state['before'].tolist()
         steps = abs(x - a), abs(y - b), abs(z - c)
         if self._held:
             return self._settle(*new, steps, noise_std)
@@ -118,7 +121,7 @@ class SpikeFilter:
 
     def _judge(self, item, stamp_ns, field, steps, noise_std):
         """Hold a reading that may be a spike; else it passes."""
-        if len(self._steps) == RECENT and self._is_off(stamp_ns, steps, noise_std):
+        if self._state['n_steps'] >= RECENT and self._is_off(stamp_ns, steps, noise_std):
             self._held.append((item, stamp_ns, field, steps))
             return []
         return self._release(item, stamp_ns, field, steps)
@@ -130,10 +133,10 @@ class SpikeFilter:
         high = x > most * a, y > most * b, z > most * c
         if True not in high:
             return False
-        passed = FASTEST * (stamp_ns - self._before_ns) * 1e-9
-        steeper = max(STEEPER, STEEPEST * passed**3)
+        passed = FASTEST * (stamp_ns - int(self._state['before_ns'])) * 1e-9
+        steeper, recent = max(STEEPER, STEEPEST * passed**3), self._state['steps'].tolist()
         for axis in range(3):
-            known = [s[axis] for s in self._steps if not isnan(s[axis])]
+            known = [s[axis] for s in recent if not isnan(s[axis])]
             # A sensor with coarse steps did not move at all just now.
             if high[axis] and known and steps[axis] > steeper * max(*known, noise_std[axis]):
                 return True
@@ -156,14 +159,16 @@ class SpikeFilter:
             # It may be the next of several that differ.
             return known + self._judge(item, stamp_ns, field, steps, noise_std)
         # A step: what was before it is nothing to compare with.
-        self._steps.clear()
+        self._state['n_steps'] = 0
         return known + self._release(item, stamp_ns, field)
 
     def _release(self, item, stamp_ns, field, steps=None):
         """The reading passes."""
-        self._before, self._before_ns = field, stamp_ns
+        s = self._state
+        s['before'], s['before_ns'] = field, stamp_ns
         if steps is not None:
-            self._steps.append(steps)
+            s['steps'][s['n_steps'] % RECENT] = steps
+            s['n_steps'] += 1
         return [(item, False)]
 
     def flush(self):

@@ -12,7 +12,7 @@ from mag_tracking.io.schema import xyz
 def sensor_dict(calibrate, network, j):
     """mag_tracking_msgs/SensorCalibration of sensor `j`."""
     name = network.names[j]
-    background, counts = calibrate.backgrounds()[name], calibrate.per_sensor[name]
+    background, counts = calibrate.backgrounds()[name], calibrate.counts_of(name)
     ready = background.ready and calibrate.last_stamp_ns(name) is not None
     q, std = quaternion_from_rotation(network.R_ws[j]), network.orientation_std[j]
     done = network.calibrated[j]

@@ -6,7 +6,7 @@ import numpy as np
 
 from mag_tracking.errors import RecordingError
 from mag_tracking.geometry import rotation_from_quaternion
-from mag_tracking.records import AccelerationSample, FieldFrame, MagSample
+from mag_tracking.records import AccelerationSample, FieldFrame, MagSample, Readings
 
 LONGEST_OFFSET_S = 60.0
 """[s] The longest frame there can be (`align.period_s`)."""
@@ -70,27 +70,25 @@ def sample_dict(sample, frame):
             'magnetic_field_covariance': C.tolist()}
 
 
-def readings_dict(samples):
-    """mag_tracking_msgs/FieldReadings of `MagSample`s, whose covariances are all known or none.
+def readings_dict(readings):
+    """mag_tracking_msgs/FieldReadings of `Readings`, whose covariances are all known or none.
 
-    Raises RecordingError where some are known, or there is no sample at all.
+    Raises RecordingError where some are known, or there is no reading at all.
     """
-    known = [s.covariance is not None for s in samples]
-    if not samples or any(known) != all(known):
+    C = readings.covariance
+    if not len(readings) or C is not None and np.isnan(C).all(axis=(1, 2)).any():
         raise RecordingError('readings in one message: expected some, and the covariance of all '
                              'or of none')
-    names = list(dict.fromkeys(s.sensor for s in samples))
-    rows = {name: j for j, name in enumerate(names)}
-    covariance = np.concatenate([s.covariance for s in samples]) if known[0] else np.zeros(0)
-    return {'header': header_dict(max(s.stamp_ns for s in samples), ''), 'sensors': names,
-            'sensor': array('H', [rows[s.sensor] for s in samples]),
-            'stamp': array('q', [s.stamp_ns for s in samples]),
-            'field': doubles(np.concatenate([s.field for s in samples])),
-            'covariance': doubles(covariance)}
+    return {'header': header_dict(int(readings.stamp_ns.max()), ''),
+            'sensors': list(readings.names),
+            'sensor': array('H', readings.sensor.astype(np.uint16).tobytes()),
+            'stamp': array('q', np.ascontiguousarray(readings.stamp_ns).tobytes()),
+            'field': doubles(readings.field),
+            'covariance': doubles(np.zeros(0) if C is None else C)}
 
 
-def samples_of(message):
-    """[`MagSample`] of a message-shaped FieldReadings; raises RecordingError where it is none."""
+def readings_of(message):
+    """`Readings` of a message-shaped FieldReadings; raises RecordingError where it is none."""
     n, names = len(message.sensor), tuple(message.sensors)
     sizes = len(message.stamp), len(message.field), len(message.covariance)
     if sizes not in ((n, 3 * n, 0), (n, 3 * n, 9 * n)):
@@ -98,16 +96,21 @@ def samples_of(message):
                              f'fields and {sizes[2]} of their covariances')
     if len(set(names)) < len(names):
         raise RecordingError(f'readings of sensors of which one is there twice: {", ".join(names)}')
-    if max(message.sensor, default=-1) >= len(names):
-        raise RecordingError(f'a reading of sensor {max(message.sensor)} of {len(names)}')
-    field = np.array(message.field, dtype=float).reshape(n, 3)
-    covariance = [None] * n
+    sensor = np.array(message.sensor, dtype=np.int64)
+    if n and not 0 <= sensor.min() <= sensor.max() < len(names):
+        raise RecordingError(f'a reading of sensor {sensor.max()} of {len(names)}')
+    C = None
     if len(message.covariance):
         C = np.array(message.covariance, dtype=float).reshape(n, 3, 3)
-        known = ((C[:, 0, 0] != -1.0) & C.any(axis=(1, 2))).tolist()
-        covariance = [c if k else None for c, k in zip(C, known, strict=True)]
-    return [MagSample(stamp, names[j], B, C) for j, stamp, B, C in zip(
-        message.sensor, message.stamp, field, covariance, strict=True)]
+        known = (C[:, 0, 0] != -1.0) & C.any(axis=(1, 2))
+        C = np.where(known[:, None, None], C, np.nan) if known.any() else None
+    return Readings(names, sensor, np.array(message.stamp, dtype=np.int64),
+                    np.array(message.field, dtype=float).reshape(n, 3), C)
+
+
+def samples_of(message):
+    """[`MagSample`] of a message-shaped FieldReadings; raises RecordingError where it is none."""
+    return readings_of(message).samples()
 
 
 def acceleration_dict(sample, frame):

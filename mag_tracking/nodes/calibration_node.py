@@ -33,6 +33,7 @@ from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.stage_node import LATCHED, STREAM, StageNode
+from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate import Calibrate
 from mag_tracking.stages.survey import Survey, with_noise
 
@@ -161,22 +162,21 @@ class CalibrationNode(StageNode):
 
     def _take(self, sensor, message):
         """One raw reading."""
-        for sample in self._calibrated(sample_of(message, sensor)):
+        raw = sample_of(message, sensor)
+        self._health.add(Readings.of([raw]), self.now_ns)
+        for sample in self._stage.feed(raw):
             self._publishers_by_sensor[sensor].publish(
                 to_message(MagneticField, sample_dict(sample, message.header.frame_id)))
 
     def _take_many(self, message):
         """Raw readings of many sensors; they go on together."""
-        samples = [s for raw in self.readings_of(message, self._stage)
-                   for s in self._calibrated(raw)]
-        if samples:
-            self._readings.publish(to_message(FieldReadings, readings_dict(samples)))
-
-    def _calibrated(self, raw):
-        """What the stage makes of one raw reading."""
-        if raw.sensor in self._publishers_by_sensor:
-            self._health.add(raw, self.now_ns)
-        return self._stage.feed(raw)
+        raw = self.readings_of(message, self._stage)
+        if raw is None:
+            return
+        self._health.add(raw, self.now_ns)
+        calibrated = self._stage.feed_many(raw)
+        if len(calibrated):
+            self._readings.publish(to_message(FieldReadings, readings_dict(calibrated)))
 
     def _shaken(self, sensor, message):
         """One acceleration."""

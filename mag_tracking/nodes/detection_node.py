@@ -43,16 +43,17 @@ class DetectionNode(StageNode):
 
     def _take(self, sensor, message):
         """One calibrated reading."""
-        self._feed(sample_of(message, sensor))
+        self._publish(self._align.feed(sample_of(message, sensor)))
 
     def _take_many(self, message):
         """Calibrated readings of many sensors."""
-        for sample in self.readings_of(message, self._align):
-            self._feed(sample)
+        readings = self.readings_of(message, self._align)
+        if readings is not None:
+            self._publish(self._align.feed_many(readings))
 
-    def _feed(self, sample):
-        """One sample through the stages."""
-        for frame in self._align.feed(sample):
+    def _publish(self, frames):
+        """Frames that are complete, and what is detected in them."""
+        for frame in frames:
             for record in self._detect.feed(frame):
                 if isinstance(record, Detection):
                     self._detections.publish(to_message(

@@ -23,7 +23,7 @@ from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.driver_health import DriverDiagnostics
 from mag_tracking.nodes.stage_node import RESULTS, STREAM
-from mag_tracking.records import MagSample
+from mag_tracking.records import MagSample, Readings
 
 PATIENCE_S = 15.0
 """[s] Time that a driver has to stop; a broker that does not answer takes a while."""
@@ -124,7 +124,7 @@ class DriverNode(LifecycleNode):
             else:
                 fields.publish(to_message(MagneticField, sample_dict(sample, sample.sensor)))
         if together:
-            self._readings.publish(to_message(FieldReadings, readings_dict(together)))
+            self._readings.publish(to_message(FieldReadings, readings_dict(Readings.of(together))))
 
     def _stop(self):
         """End the threads; they close their devices."""

@@ -48,11 +48,16 @@ class HealthDiagnostics:
         """Go on with another calibration of the same sensors."""
         self._begin(network)
 
-    def add(self, sample, now_ns):
-        """A raw reading that came at `now_ns`."""
-        self._present[sample.sensor].add(
-            sample.stamp_ns - self._clock_ns[sample.sensor], sample.field, now_ns)
-        self._heard[sample.sensor] = time.monotonic()
+    def add(self, readings, now_ns):
+        """Raw `Readings` that came at `now_ns`; those of sensors of other networks are none."""
+        now, names = time.monotonic(), readings.names
+        # Copied: they are looked at later.
+        for j, stamp_ns, field in zip(readings.sensor.tolist(), readings.stamp_ns.tolist(),
+                                      readings.field.copy(), strict=True):
+            name = names[j]
+            if name in self._present:
+                self._present[name].add(stamp_ns - self._clock_ns[name], field, now_ns)
+                self._heard[name] = now
 
     def statuses(self, node, calibrate):
         """[DiagnosticStatus], one a sensor; `calibrate` is the `Calibrate` stage."""

@@ -16,7 +16,7 @@ from rclpy.task import Future
 from mag_tracking.errors import MagTrackingError, RecordingError, SettingsError
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.io.network_file import read_network
-from mag_tracking.io.schema import samples_of, stamp_ns
+from mag_tracking.io.schema import readings_of, stamp_ns
 from mag_tracking.nodes.flow import Flow, Listener
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.pipeline import settings_for
@@ -106,13 +106,13 @@ class StageNode(Node):
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=unfit, message_lost=lost))
 
     def readings_of(self, message, stage):
-        """[`MagSample`] of a FieldReadings; one that is none is a rejection of `stage`."""
+        """`Readings` of a FieldReadings; one that is none is a rejection of `stage`, and None."""
         try:
-            return samples_of(message)
+            return readings_of(message)
         except RecordingError as error:
             stage.counts['rejected: bad readings'] += 1
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
-            return []
+            return None
 
     def _publish_diagnostics(self):
         """Counts of the stages; a warning where something was rejected since the last time."""

@@ -3,6 +3,10 @@
 Where stamps decide what is late, one clock that steps ahead would make all other sensors late.
 """
 
+import numpy as np
+
+from mag_tracking.stages.pending import NEVER
+
 
 class Ahead:
     """Holds samples that jump ahead until it is known whether the other sensors jump, too.
@@ -15,8 +19,9 @@ class Ahead:
         of the others or its own; `most` of a sensor are held."""
         self._limit = limit
         self._most = most
-        self._latest = [None] * n_sensors
-        self._newest = None
+        # Of those that have passed: of each sensor, and of all.
+        self.latest = np.full(n_sensors, NEVER)
+        self.newest = None
         # (sensor, sample, the newest stamp when it came), in the order in which they came.
         self._held = []
         # {sensor that is ahead: (the newest stamp, its own when that was first the newest)}
@@ -26,6 +31,11 @@ class Ahead:
     def n_held(self):
         """How many samples are held."""
         return len(self._held)
+
+    @property
+    def is_calm(self):
+        """Whether nobody is ahead: what is no longer a jump than the limit passes."""
+        return not self._held and not self._quiet_since
 
     def feed(self, i, sample):
         """What is known by now of a sample of sensor `i`, and of those that are held.
@@ -39,19 +49,19 @@ class Ahead:
         if not self._jumps(i, stamp):
             passed = self._pass([(i, sample)])
         else:
-            self._held.append((i, sample, self._newest))
-            if self._quiet_since.get(i, (None,))[0] != self._newest:
-                self._quiet_since[i] = self._newest, stamp
+            self._held.append((i, sample, self.newest))
+            if self._quiet_since.get(i, (None,))[0] != self.newest:
+                self._quiet_since[i] = self.newest, stamp
             if not (self._most_agree(stamp) or self._is_alone(i, stamp)):
                 return [], self._too_old(i, stamp)
             # Who is ahead of these, too, does not pass with them.
             passed = self._pass(self._take_out(lambda _, s, __: s.stamp_ns <= stamp + self._limit))
         # It is back with the others: what it said of a time ahead of them was wrong. And whom they
         # did not follow for so long they will not follow. The first that is held is the oldest.
-        if i in self._quiet_since or self._held and self._newest - self._held[0][2] > self._limit:
+        if i in self._quiet_since or self._held and self.newest - self._held[0][2] > self._limit:
             self._quiet_since.pop(i, None)
             return passed, self._take_out(
-                lambda j, _, newest: j == i or self._newest - newest > self._limit)
+                lambda j, _, newest: j == i or self.newest - newest > self._limit)
         return passed, []
 
     def flush(self):
@@ -60,23 +70,23 @@ class Ahead:
 
     def _jumps(self, i, stamp):
         """Whether a stamp is ahead of all that have passed."""
-        if self._newest is None or stamp <= self._newest + self._limit:
+        if self.newest is None or stamp <= self.newest + self._limit:
             return False
         # Of two, who is heard for the first time may as well be right.
-        return self._latest[i] is not None or bool(self._held) or len(self._alive()) > 1
+        return self.latest[i] != NEVER or bool(self._held) or len(self._alive()) > 1
 
     def _pass(self, samples):
         """Note that `samples` are as they should be."""
         for i, sample in samples:
-            self._latest[i] = sample.stamp_ns
-            if self._newest is None or sample.stamp_ns > self._newest:
-                self._newest = sample.stamp_ns
+            self.latest[i] = sample.stamp_ns
+            if self.newest is None or sample.stamp_ns > self.newest:
+                self.newest = sample.stamp_ns
         return samples
 
     def _alive(self):
         """The sensors that have passed of late."""
-        return {j for j, latest in enumerate(self._latest)
-                if latest is not None and latest >= self._newest - self._limit}
+        return {j for j, latest in enumerate(self.latest.tolist())
+                if latest != NEVER and latest >= self.newest - self._limit}
 
     def _most_agree(self, stamp):
         """Whether most of the living sensors have jumped to about this stamp."""

@@ -8,9 +8,10 @@ import numpy as np
 
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.decimation import Decimator
+from mag_tracking.calibration.ordinary import LIMITS, NEVER, new_sensors, take_ordinary
 from mag_tracking.calibration.screening import SPIKE, STUCK, Repetition, SpikeFilter
 from mag_tracking.errors import NetworkError
-from mag_tracking.records import MagSample
+from mag_tracking.records import MagSample, Readings
 from mag_tracking.stages.stage import NS
 
 AT_ONCE = 16
@@ -36,18 +37,29 @@ class Calibrate:
     in the sensor's own frame, where a missing axis is a missing axis. The covariance
     is the sample's own if it carries one, else the configured one, else the
     estimated one.
+
+    Readings that nothing is odd about take a way that is compiled
+    (`calibration.ordinary`), one by one or many at once; it is the same as the one
+    through `_feed_any`, which they would take as well.
     """
 
     def __init__(self, network, settings):
         self.counts = Counter()
-        self.per_sensor = {name: Counter() for name in network.names}
+        self._per_sensor = {name: Counter() for name in network.names}
         self._settings = settings
+        self._sensors = new_sensors(len(network))
+        self._rows, self._limits = np.arange(len(network)), np.zeros(1, LIMITS)
+        self._limits[0] = (settings.max_field, settings.jump_ahead_s * NS, settings.reject_stuck,
+                           settings.spike_std)
+        # The noise of each sensor, once it may take the compiled way.
+        self._noise = np.full((len(network), 3, 3), np.nan)
         self._longest_jump = settings.jump_ahead_s * NS
         self._index = {name: i for i, name in enumerate(network.names)}
         self._network, self._clock_ns, self._background = None, [], {}
-        self._repetition = {name: Repetition() for name in network.names}
-        self._spikes = {name: SpikeFilter(settings.spike_std) for name in network.names}
-        self._first_ns, self._last_ns, self._ahead_ns = {}, {}, {}
+        self._repetition = {name: Repetition(self._of(name)) for name in network.names}
+        self._spikes = {name: SpikeFilter(settings.spike_std, self._of(name))
+                        for name in network.names}
+        self._ahead_ns = {}
         self._kept = {}
         self.renew(network)
 
@@ -76,20 +88,96 @@ class Calibrate:
             if not same:
                 self._background[name] = self._new_background(i)
             else:
-                # The same readings have other stamps from now on.
-                for times in (self._first_ns, self._last_ns, self._ahead_ns):
-                    if name in times:
-                        times[name] -= self._clock_ns[i] - clock_before[i]
+                self._shift(i, clock_before[i] - self._clock_ns[i])
+            self._note(i)
+
+    def _of(self, name):
+        """(1,) SENSOR of a sensor."""
+        i = self._index[name]
+        return self._sensors[i:i + 1]
+
+    def _shift(self, i, by_ns):
+        """The readings of sensor `i` have later stamps from now on."""
+        s, name = self._sensors[i], self._network.names[i]
+        if s['last_ns'] != NEVER:
+            s['first_ns'] += by_ns
+            s['last_ns'] += by_ns
+        if name in self._ahead_ns:
+            self._ahead_ns[name] += by_ns
+
+    def _note(self, i):
+        """Whether the readings of sensor `i` may take the compiled way, and what it has to know."""
+        s, name = self._sensors[i], self._network.names[i]
+        background, offset, C = (self._background[name], self._network.offset[i],
+                                 self._network.correction[i])
+        s['is_ordinary'] = (
+            background.ready and background.is_whole and s['last_ns'] != NEVER
+            and not self._settings.decimate_to_hz and not self._spikes[name].n_held
+            and name not in self._ahead_ns and name not in self._kept)
+        if s['is_ordinary']:
+            s['centre'], s['mean'], s['slope'], s['horizon'] = background.line
+            s['noise_std'], self._noise[i] = background.noise_std, background.covariance
+            s['clock_ns'], s['offset'] = self._clock_ns[i], 0.0 if offset is None else offset
+            s['is_turned'] = C is not None
+            if C is not None:
+                s['correction'] = C
 
     def _new_background(self, i):
         """Of sensor `i`, from what the network file says of it."""
         s, network = self._settings, self._network
         return RunningBackground(s.learn_s, s.memory_s, s.guard_s, s.block_s, s.freeze_std,
                                  s.relearn_s, network.background[i], network.noise_std[i],
-                                 phase=i / len(network) if len(network) > AT_ONCE else 0.0)
+                                 phase=i / len(network) if len(network) > AT_ONCE else 0.0,
+                                 sensors=self._sensors[i:i + 1])
+
+    def counts_of(self, sensor):
+        """Counter of what was `accepted` and `rejected` of a sensor, and why."""
+        return self._per_sensor[sensor] + Counter(accepted=int(self._of(sensor)[0]['accepted']))
 
     def feed(self, sample):
         """A raw `MagSample` gives the calibrated ones that are now known to be whole."""
+        i = self._index.get(sample.sensor)
+        if i is None:
+            return self._feed_any(sample)
+        if sample.covariance is None:
+            # What is the same with `feed_many`, which for one reading takes three times as long.
+            stamp, field = np.empty(1, dtype=np.int64), np.empty((1, 3))
+            if take_ordinary(self._sensors, self._limits, self._rows[i:i + 1],
+                             np.array([sample.stamp_ns]), np.array([sample.field], dtype=float),
+                             0, stamp, field):
+                self.counts['calibrated'] += 1
+                return [MagSample(int(stamp[0]), sample.sensor, field[0],
+                                  self._background[sample.sensor].covariance)]
+        out = self._feed_any(sample)
+        self._note(i)
+        return out
+
+    def feed_many(self, readings):
+        """Raw `Readings` give the calibrated ones that are now known to be whole."""
+        index = self._index
+        of = np.array([index.get(name, -1) for name in readings.names], dtype=np.int64)
+        rows, n, i, parts = of[readings.sensor], len(readings), 0, []
+        if readings.covariance is not None:
+            # What one says of its own covariance is looked at one by one.
+            rows = np.where(np.isnan(readings.covariance).all(axis=(1, 2)), rows, -1)
+        stamps, fields = np.empty(n, dtype=np.int64), np.empty((n, 3))
+        while i < n:
+            odd = take_ordinary(self._sensors, self._limits, rows, readings.stamp_ns,
+                                readings.field, i, stamps, fields)
+            if odd > i:
+                self.counts['calibrated'] += odd - i
+                parts.append(Readings(self._network.names, rows[i:odd], stamps[i:odd],
+                                      fields[i:odd], self._noise[rows[i:odd]]))
+            if odd < n:
+                sample = readings.sample(odd)
+                parts.append(Readings.of(self._feed_any(sample)))
+                if sample.sensor in index:
+                    self._note(index[sample.sensor])
+            i = odd + 1
+        return Readings.joined(parts)
+
+    def _feed_any(self, sample):
+        """As `feed`, of a sample that may be odd."""
         if sample.sensor not in self._background:
             return self._reject(sample, f'unknown sensor {sample.sensor}')
         cause = self._fault(sample)
@@ -107,7 +195,7 @@ class Calibrate:
         """What is made of whole samples: counted, thinned out and calibrated."""
         out = []
         for whole in samples:
-            self.per_sensor[whole.sensor]['accepted'] += 1
+            self._sensors[self._index[whole.sensor]]['accepted'] += 1
             for s in self._thinned(whole) if self._settings.decimate_to_hz else (whole,):
                 out += self._calibrated(s)
         return out
@@ -140,12 +228,7 @@ class Calibrate:
 
     def _misplaced(self, sample):
         """Why the stamp of a sample cannot be used, or None; a restart is one to go on from."""
-        last = self._last_ns.get(sample.sensor)
-        if last is not None and 0 < sample.stamp_ns - last <= self._longest_jump \
-                and sample.sensor not in self._ahead_ns:
-            # As nearly all are.
-            self._last_ns[sample.sensor] = sample.stamp_ns
-            return None
+        last, state = self.last_stamp_ns(sample.sensor), self._of(sample.sensor)[0]
         if last is not None and self._is_ahead(sample, last):
             return 'stamp too far ahead'
         if last is not None and sample.stamp_ns <= last:
@@ -154,9 +237,10 @@ class Calibrate:
             self._background[sample.sensor].forget()
             self._give_up(sample.sensor, 'time jumped back')
             self.counts['time jumped back'] += 1
-            self._first_ns.pop(sample.sensor)
-        self._last_ns[sample.sensor] = sample.stamp_ns
-        self._first_ns.setdefault(sample.sensor, sample.stamp_ns)
+            state['first_ns'] = NEVER
+        state['last_ns'] = sample.stamp_ns
+        if state['first_ns'] == NEVER:
+            state['first_ns'] = sample.stamp_ns
         if sample.sensor in self._kept:
             self._go_on_from(self._kept.pop(sample.sensor), sample)
         return None
@@ -164,16 +248,19 @@ class Calibrate:
     def resume(self, kept):
         """Go on from {sensor: `Kept`}, where the first reading of a sensor comes soon after."""
         self._kept = dict(kept)
+        for i in range(len(self._network)):
+            self._note(i)
 
     def kept(self, sensor):
         """What `resume` wants of a sensor; None before its background is known."""
         background = self._background[sensor]
-        if not background.ready or sensor not in self._last_ns:
+        last = self.last_stamp_ns(sensor)
+        if not background.ready or last is None:
             return None
         C = background.covariance
         # An axis that has only just begun to report has a level, but no noise yet.
         level = np.where(np.isnan(np.diagonal(C)), np.nan, self.background(sensor))
-        return None if np.isnan(level).all() else Kept(self._last_ns[sensor], level, C)
+        return None if np.isnan(level).all() else Kept(last, level, C)
 
     def _go_on_from(self, kept, sample):
         """Take up a background at the first reading, if it is of a moment before."""
@@ -197,7 +284,7 @@ class Calibrate:
         """A sample that is to be used gives at most one calibrated."""
         background = self._background[sample.sensor]
         # Counted from the first sample: seconds since 1970 leave a float few digits.
-        time = (sample.stamp_ns - self._first_ns[sample.sensor]) / NS
+        time = (sample.stamp_ns - int(self._of(sample.sensor)[0]['first_ns'])) / NS
         background.add(time, sample.field)
         if not background.ready:
             self.counts['held back while learning'] += 1
@@ -278,9 +365,9 @@ class Calibrate:
     def _reject(self, sample, cause):
         """Count the rejection."""
         self.counts[f'rejected: {cause}'] += 1
-        if sample.sensor in self.per_sensor:
-            self.per_sensor[sample.sensor]['rejected'] += 1
-            self.per_sensor[sample.sensor][f'rejected: {cause}'] += 1
+        if sample.sensor in self._per_sensor:
+            self._per_sensor[sample.sensor]['rejected'] += 1
+            self._per_sensor[sample.sensor][f'rejected: {cause}'] += 1
         return []
 
     def forget(self, sensors=()):
@@ -293,15 +380,17 @@ class Calibrate:
         for name in sensors or self._network.names:
             self._background[name].forget()
             self._kept.pop(name, None)
+            self._note(self._index[name])
 
     def last_stamp_ns(self, sensor):
         """Stamp of the latest accepted sample of `sensor`, or None."""
-        return self._last_ns.get(sensor)
+        last = int(self._of(sensor)[0]['last_ns'])
+        return None if last == NEVER else last
 
     def background(self, sensor):
         """(3,) [T] background of `sensor` at its latest sample; ValueError before it is ready."""
-        elapsed = self._last_ns[sensor] - self._first_ns[sensor]
-        return self._background[sensor].level(elapsed / NS)
+        state = self._of(sensor)[0]
+        return self._background[sensor].level(int(state['last_ns'] - state['first_ns']) / NS)
 
     def backgrounds(self):
         """{sensor: RunningBackground}, to look at."""

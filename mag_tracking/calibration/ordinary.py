@@ -1,0 +1,167 @@
+"""What changes with every reading of a sensor, as arrays, and the compiled way through it.
+
+Of a hundred sensors come ten thousand readings a second, and about nearly all of
+them nothing is odd. Those take the compiled way. At the first that is odd it
+stops, and Python, which knows all cases, goes on from the same arrays.
+"""
+
+import numpy as np
+from numba import float64, from_dtype, int64, njit, void
+
+NEVER = np.iinfo(np.int64).min
+"""[ns] Stamp of what has not been."""
+RECENT = 8
+"""Steps from one reading to the next that a spike is compared with."""
+MEMORY = 20_000
+"""Readings that the usual repetitions are counted over, about."""
+
+SENSOR = np.dtype([
+    # Whether its readings may take the compiled way, and what that needs to know of it then.
+    ('is_ordinary', np.int64), ('accepted', np.int64), ('clock_ns', np.int64),
+    ('offset', np.float64, 3), ('is_turned', np.int64), ('correction', np.float64, (3, 3)),
+    ('centre', np.float64), ('mean', np.float64, 3), ('slope', np.float64, 3),
+    ('horizon', np.float64), ('noise_std', np.float64, 3),
+    # Its first and latest stamp.
+    ('first_ns', np.int64), ('last_ns', np.int64),
+    # `screening.Repetition`
+    ('last', np.float64, 3), ('run', np.int64), ('repeats', np.float64), ('changes', np.float64),
+    # `screening.SpikeFilter`
+    ('before_ns', np.int64), ('before', np.float64, 3), ('n_steps', np.int64),
+    ('steps', np.float64, (RECENT, 3)),
+    # `background.RunningBackground`: the block that is being collected, from its first reading;
+    # of each pair of axes, over the readings that have both.
+    ('n', np.int64), ('end', np.float64), ('time', np.float64), ('origin', np.float64, 3),
+    ('count', np.float64, (3, 3)), ('sum', np.float64, (3, 3)), ('product', np.float64, (3, 3)),
+])
+"""State of one sensor, in [T] and [s], or [ns] where the name says so."""
+
+LIMITS = np.dtype([('max_field', np.float64), ('longest_jump_ns', np.float64),
+                   ('reject_stuck', np.int64), ('spike_std', np.float64)])
+"""What is asked of each reading; as in `CalibrateSettings`."""
+
+_SENSORS, _LIMITS = from_dtype(SENSOR)[::1], from_dtype(LIMITS)[::1]
+
+
+def new_sensors(n):
+    """(n,) SENSOR of which nothing has been heard."""
+    sensors = np.zeros(n, SENSOR)
+    for name in ('first_ns', 'last_ns', 'before_ns'):
+        sensors[name] = NEVER
+    for name in ('last', 'before', 'end'):
+        sensors[name] = np.nan
+    return sensors
+
+
+@njit(void(_SENSORS, int64, float64, float64[::1]), cache=True)
+def add_to_block(sensors, j, time, field):
+    """Take a reading of sensor `j`, `field` (3,) [T] at `time` [s], into its block."""
+    s = sensors[j]
+    if s.n == 0:
+        s.time = 0.0
+        for a in range(3):
+            s.origin[a] = np.nan
+            for b in range(3):
+                s.count[a, b] = s.sum[a, b] = s.product[a, b] = 0.0
+    s.n += 1
+    s.time += time
+    for a in range(3):
+        if np.isnan(field[a]):
+            continue
+        if np.isnan(s.origin[a]):
+            s.origin[a] = field[a]
+        d = field[a] - s.origin[a]
+        for b in range(3):
+            if not np.isnan(field[b]):
+                # Where it has not been heard before, this reading is the origin of that axis.
+                e = 0.0 if np.isnan(s.origin[b]) else field[b] - s.origin[b]
+                s.count[a, b] += 1.0
+                s.sum[a, b] += d
+                s.product[a, b] += d * e
+
+
+@njit(cache=True, inline='always')
+def _corrected(s, raw, field):
+    """`raw` (3,) without the sensor's own hard and soft iron."""
+    for a in range(3):
+        field[a] = raw[a] - s.offset[a]
+    if s.is_turned:
+        x, y, z = field[0], field[1], field[2]
+        for a in range(3):
+            field[a] = s.correction[a, 0] * x + s.correction[a, 1] * y + s.correction[a, 2] * z
+
+
+@njit(cache=True, inline='always')
+def _is_odd(s, limits, stamp, raw, field, time):
+    """Whether there is anything that Python has to look at."""
+    for a in range(3):
+        # A comparison with NaN is false: an axis that is missing is odd.
+        if not abs(raw[a]) <= limits.max_field:
+            return True
+    since = stamp - s.last_ns
+    if not (0 < since and since <= limits.longest_jump_ns) or time >= s.end or s.n == 0:
+        return True
+    if limits.reject_stuck:
+        is_same = field[0] == s.last[0] and field[1] == s.last[1] and field[2] == s.last[2]
+        if is_same or s.run > 0 or s.repeats + s.changes + 1.0 > MEMORY:
+            return True
+    if limits.spike_std > 0.0:
+        if s.before_ns == NEVER:
+            return True
+        for a in range(3):
+            if s.n_steps >= RECENT and not (
+                    abs(field[a] - s.before[a]) <= limits.spike_std * s.noise_std[a]):
+                return True
+    return False
+
+
+@njit(int64(_SENSORS, _LIMITS, int64[::1], int64[::1], float64[:, ::1], int64, int64[::1],
+            float64[:, ::1]), cache=True)
+def take_ordinary(sensors, limits, rows, stamps, fields, first, out_stamps, out_fields):
+    """Calibrate readings from the one at `first` on, as long as there is nothing odd about them.
+
+    Parameters
+    ----------
+    sensors : (n_sensors,) SENSOR
+        Changed.
+    limits : (1,) LIMITS
+    rows : (n,) int
+        Whose the readings are; negative = odd.
+    stamps : (n,) int [ns]
+    fields : (n, 3) [T]
+        As the sensors gave them.
+    first : int
+    out_stamps, out_fields : (n,) [ns], (n, 3) [T]
+        Where the readings of the same rows are put: by the network's clock and without the
+        background.
+
+    Returns
+    -------
+    int
+        The first reading that is odd, which nothing was done with; n if there is none.
+    """
+    limit, field = limits[0], np.empty(3)
+    for i in range(first, len(rows)):
+        if rows[i] < 0 or not sensors[rows[i]].is_ordinary:
+            return i
+        s = sensors[rows[i]]
+        stamp = stamps[i] - s.clock_ns
+        time = (stamp - s.first_ns) / 1e9
+        _corrected(s, fields[i], field)
+        if _is_odd(s, limit, stamp, fields[i], field, time):
+            return i
+        s.last_ns = stamp
+        s.accepted += 1
+        if limit.reject_stuck:
+            s.changes += 1.0
+        since = min(time, s.horizon) - s.centre
+        place = s.n_steps % RECENT
+        for a in range(3):
+            s.last[a] = field[a]
+            s.steps[place, a] = abs(field[a] - s.before[a])
+            s.before[a] = field[a]
+            out_fields[i, a] = field[a] - s.mean[a] - since * s.slope[a]
+        s.before_ns = stamp
+        s.n_steps += 1
+        add_to_block(sensors, rows[i], time, field)
+        out_stamps[i] = stamp
+    return len(rows)

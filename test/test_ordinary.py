@@ -1,0 +1,129 @@
+"""The compiled way of readings that nothing is odd about: it does what the other one does."""
+
+import numpy as np
+import pytest
+from faulty_streams import FAULTS, stream
+
+from mag_tracking.records import MagSample, Readings
+from mag_tracking.stages.calibrate import Calibrate
+from mag_tracking.stages.calibrate_settings import CalibrateSettings
+
+
+class Slow(Calibrate):
+    """All that comes goes the way of what is odd."""
+
+    def _note(self, i):
+        super()._note(i)
+        self._sensors[i]['is_ordinary'] = False
+
+
+def samples_alike(found, expected):
+    """Whether two lists of samples are the same, but for rounding."""
+    assert [(s.stamp_ns, s.sensor) for s in found] == [(s.stamp_ns, s.sensor) for s in expected]
+    for name in ('field', 'covariance'):
+        a, b = (np.array([getattr(s, name) for s in some]) for some in (found, expected))
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-16 if name == 'field' else 1e-30)
+
+
+def batches(samples, size, rng):
+    """The same as `Readings` of about `size`."""
+    ends = np.cumsum(rng.integers(1, 2 * size, len(samples)))
+    return [Readings.of(list(some)) for some in np.split(
+        np.array(samples, dtype=object), ends[ends < len(samples)])]
+
+
+def calibrated_in_three_ways(network, samples, size=20, **settings):
+    """(stage that went the slow way, one by one, in batches), which have given the same."""
+    slow, single, many = (kind(network, CalibrateSettings(**settings))
+                          for kind in (Slow, Calibrate, Calibrate))
+    expected = [c for s in samples for c in slow.feed(s)] + slow.flush()
+    samples_alike([c for s in samples for c in single.feed(s)] + single.flush(), expected)
+    samples_alike([c for b in batches(samples, size, np.random.default_rng(0))
+                   for c in many.feed_many(b).samples()] + many.flush(), expected)
+    for stage in (single, many):
+        assert stage.counts == slow.counts
+        for name in network.names:
+            assert stage.counts_of(name) == slow.counts_of(name)
+            assert stage.last_stamp_ns(name) == slow.last_stamp_ns(name)
+    return slow, single, many
+
+
+@pytest.mark.parametrize('fault', [None, *FAULTS])
+def test_a_pass_with_a_fault(fault):
+    network, samples, *_ = stream(4, 3, fault)
+    slow, _, many = calibrated_in_three_ways(network, samples)
+    assert slow.counts['calibrated'] > 1000
+    assert (many._sensors['is_ordinary'] == 1).any()
+
+
+def corrected(network):
+    """With clocks, offsets and soft iron of all sensors but the first."""
+    rng, n = np.random.default_rng(5), len(network)
+    return type(network)(**{
+        **{f: getattr(network, f) for f in network.__dataclass_fields__},
+        'clock_offset': np.array([0.0, *rng.uniform(-0.02, 0.02, n - 1)]),
+        'offset': (None, *(2e-6 * rng.standard_normal(3) for _ in range(n - 1))),
+        'correction': (None, *(np.eye(3) + 0.02 * rng.standard_normal((3, 3))
+                               for _ in range(n - 1)))})
+
+
+def odd_ones(samples, rng):
+    """With axes that are missing, covariances of their own, and sensors that nobody knows."""
+    for s in samples:
+        kind = rng.integers(60)
+        field = s.field.copy()
+        if kind == 0:
+            field[rng.integers(3)] = np.nan
+        C = 1e-16 * np.eye(3) if kind == 1 else None
+        yield MagSample(s.stamp_ns, 'stranger' if kind == 2 else s.sensor, field, C)
+        if kind == 3:
+            yield MagSample(s.stamp_ns - 5_000_000, s.sensor, field)
+
+
+def test_corrected_sensors_and_odd_readings():
+    network, samples, *_ = stream(4, 7)
+    samples = list(odd_ones(samples, np.random.default_rng(1)))
+    network = corrected(network)
+    calibrated_in_three_ways(network, samples)
+    calibrated_in_three_ways(network, samples, reject_stuck=False, spike_std=0.0)
+    calibrated_in_three_ways(network, samples, decimate_to_hz=20.0)
+
+
+def test_another_calibration_and_learning_anew_in_the_middle():
+    network, samples, *_ = stream(2, 9)
+    stages, out = [Slow(network, CalibrateSettings()), Calibrate(network, CalibrateSettings())], []
+    for stage in stages:
+        found = []
+        for k, s in enumerate(samples):
+            if k == 800:
+                stage.renew(corrected(network))
+            if k == 1600:
+                stage.forget(['mag_1'])
+            found += stage.feed(s)
+        out.append(found)
+    samples_alike(*out)
+    assert stages[0].counts == stages[1].counts
+
+
+def test_what_is_given_out_does_not_change_later():
+    network, samples, *_ = stream(2, 9)
+    stage = Calibrate(network, CalibrateSettings())
+    given = [stage.feed_many(b) for b in batches(samples, 30, np.random.default_rng(0))]
+    kept = [(g.field.copy(), None if g.covariance is None else g.covariance.copy())
+            for g in given]
+    stage.feed_many(Readings.of(samples[-2:]))
+    for g, (field, C) in zip(given, kept, strict=True):
+        np.testing.assert_array_equal(g.field, field)
+        assert C is None or np.array_equal(g.covariance, C, equal_nan=True)
+
+
+def test_nearly_all_readings_take_it(monkeypatch):
+    network, samples, *_ = stream(4, 3)
+    stage, odd = Calibrate(network, CalibrateSettings()), []
+    feed_any = stage._feed_any
+    monkeypatch.setattr(stage, '_feed_any', lambda s: odd.append(s) or feed_any(s))
+    for b in batches(samples, 20, np.random.default_rng(0)):
+        stage.feed_many(b)
+    # Three seconds of learning, and one in 25 closes a block.
+    learning = stage.counts['held back while learning']
+    assert len(odd) - learning < 0.1 * (len(samples) - learning)
