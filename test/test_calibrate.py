@@ -298,27 +298,37 @@ def test_another_correction_is_learnt_anew():
         stage.renew(line_network(2))
 
 
-def ends_of_blocks(phase):
-    """(times at which a block was judged, the background) of five seconds at 100 Hz."""
+def ends_of_blocks(phase, times):
+    """(readings, by number, with which a block was judged, the background) of `times` [s]."""
     state = new_sensors(1)
     background = RunningBackground(3.0, 20.0, 1.5, 0.25, 2.0, 60.0, phase=phase, sensors=state)
     rng, ends, n_held = np.random.default_rng(0), [], 0
-    for k in range(500):
-        background.add(k / 100.0, 1e-8 * rng.standard_normal(3))
+    for k, t in enumerate(times):
+        background.add(t, 1e-8 * rng.standard_normal(3))
         if state['n'][0] < n_held:
-            ends.append(k / 100.0)
+            ends.append(k)
         n_held = state['n'][0]
     return ends, background
 
 
 def test_blocks_of_many_sensors_end_one_after_the_other():
-    """Judging one takes a while; those of a hundred sensors at once would hold up the readings."""
-    n, every = 10, []
+    """Judging one takes a while; those of a hundred sensors at once would hold up the readings.
+
+    Also after a while, when all have had the same jitter of their stamps.
+    """
+    n, n_readings, every = 10, 10_000, []
+    times = (np.arange(n_readings) + np.random.default_rng(1).uniform(0.0, 0.05, n_readings)) / 100
     for j in range(n):
-        ends, background = ends_of_blocks(j / n)
+        ends, background = ends_of_blocks(j / n, times)
         assert background.ready
         # To one reading, by rounding.
-        np.testing.assert_allclose(np.diff(ends), 0.25, atol=0.011)
-        assert ends[0] == pytest.approx(0.25 * (1.0 + j / n), abs=0.011)
+        np.testing.assert_allclose(np.diff(ends), 25, atol=1.1)
+        assert ends[0] == pytest.approx(25 * (1.0 + j / n), abs=1.1)
         every += ends
-    assert max(np.count_nonzero(np.isclose(every, t)) for t in every) <= 2
+    assert np.bincount(every).max() <= 2
+
+
+def test_without_a_phase_a_block_has_its_whole_length():
+    times = np.arange(200) / 100.0 + 0.005 * (np.arange(200) % 25 == 0)
+    ends, _ = ends_of_blocks(None, times)
+    assert len(ends) > 5 and (np.diff(times[ends]) >= 0.25 - 1e-9).all()

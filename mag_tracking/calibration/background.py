@@ -46,15 +46,16 @@ class RunningBackground:
         background; 0 = never.
     background, noise_std : (3,) [T], optional
         Known beforehand: with both it is ready at once.
-    phase : float
-        The first block is longer by this share: the blocks of many sensors that began
-        together are not all judged at once.
+    phase : float, optional
+        The first block is longer by this share, and the others follow it at even times: the
+        blocks of many sensors that began together are not all judged at once. Else a block
+        is as long as it can be after the reading that ended the one before.
     sensors : (1,) ordinary.SENSOR, optional
         Where the block is that is being collected.
     """
 
     def __init__(self, learn, memory, guard, block, freeze_std, relearn,
-                 background=None, noise_std=None, phase=0.0, sensors=None):
+                 background=None, noise_std=None, phase=None, sensors=None):
         self._learn, self._guard, self._block = learn, guard, block
         self._freeze_std, self._relearn = freeze_std, relearn
         self._phase = phase
@@ -72,7 +73,7 @@ class RunningBackground:
     def forget(self):
         """Drop what was learnt; what was given beforehand stays."""
         self._block_now['n'], self._block_now['end'] = 0, np.nan
-        self._longer = self._phase * self._block
+        self._longer = (self._phase or 0.0) * self._block
         self._window.clear()
         self._pending, self._strange = deque(), deque()
         self.frozen = self._resumed = False
@@ -168,8 +169,16 @@ class RunningBackground:
             now['end'] = time + self._block + self._longer
         elif time >= now['end'] and now['n'] >= LEAST_SAMPLES:
             self._close()
-            now['end'], self._longer = time + self._block, 0.0
+            now['end'], self._longer = self._next_end(time, float(now['end'])), 0.0
         add_to_block(self._sensors, 0, time, np.ascontiguousarray(field, dtype=float))
+
+    def _next_end(self, time, end):
+        """When the next block ends, if one was to end at `end` and did so at `time`."""
+        if self._phase is None:
+            return time + self._block
+        # By the jitter of their stamps the blocks of all sensors would sooner or later end with
+        # the same reading, and once they did so they would for ever.
+        return end + ((time - end) // self._block + 1.0) * self._block
 
     def _close(self):
         """Turn the collected samples into a block and judge it."""

@@ -49,15 +49,19 @@ def _predict_bank(x, P, F, Q, variance, decay):
         for i in range(n_t, n_x):
             x[p, i] *= decay[i - n_t]
             for k in range(n_t, n_x):
-                P[p, i, k] *= decay[i - n_t] * decay[k - n_t]
+                both = decay[i - n_t] * decay[k - n_t]
+                if both != 1.0:
+                    P[p, i, k] *= both
             P[p, i, i] += variance[i - n_t]
         # T = F times the rows of the target.
         T[:] = 0.0
         for a in range(n_t):
             for c in range(n_t):
                 f = F[p, a, c]
-                for i in range(n_x):
-                    T[a, i] += f * P[p, c, i]
+                # Most of it is zero: nothing moves but what has a velocity.
+                if f != 0.0:
+                    for i in range(n_x):
+                        T[a, i] += f * P[p, c, i]
         for a in range(n_t):
             for i in range(n_t, n_x):
                 P[p, a, i] = T[a, i] * decay[i - n_t]

@@ -71,8 +71,8 @@ class CalibrationNode(StageNode):
         self.subscription(FieldReadings, RAW_READINGS, self._take_many, STREAM, source='sensors')
         self.expect('detection_node', CALIBRATED_READINGS)
         self._state = self.publisher(CalibrationState, '~/calibration', LATCHED)
-        self._turn, self._states = len(self.network), []
-        self.create_timer(max(1.0 / (len(self.network) + 1), SHORTEST_TURN_S), self._next_turn)
+        self._turn, self._states, self._turn_is_due = len(self.network), [], False
+        self.create_timer(max(1.0 / (len(self.network) + 1), SHORTEST_TURN_S), self._tick)
         self.create_service(CalibrateService, '~/calibrate', self._calibrate)
         self.create_service(SurveyService, '~/survey', self._solve)
 
@@ -113,11 +113,18 @@ class CalibrationNode(StageNode):
     def queues(self):
         return {'calibrate': self._stage.n_held}
 
+    def _tick(self):
+        """It is time for a turn: behind the next reading, where it holds up none; or else now."""
+        if self._turn_is_due:
+            self._next_turn()
+        self._turn_is_due = True
+
     def _next_turn(self):
         """Say how one more sensor is, or compare them all.
 
         All sensors at once would hold up the readings.
         """
+        self._turn_is_due = False
         j = self._turn
         if j < len(self.network):
             self.publish_statuses([self._health.status(self.get_name(), j, self._stage)])
@@ -163,20 +170,24 @@ class CalibrationNode(StageNode):
     def _take(self, sensor, message):
         """One raw reading."""
         raw = sample_of(message, sensor)
-        self._health.add(Readings.of([raw]), self.now_ns)
         for sample in self._stage.feed(raw):
             self._publishers_by_sensor[sensor].publish(
                 to_message(MagneticField, sample_dict(sample, message.header.frame_id)))
+        self._health.add(Readings.of([raw]), self.now_ns)
+        if self._turn_is_due:
+            self._next_turn()
 
     def _take_many(self, message):
         """Raw readings of many sensors; they go on together."""
         raw = self.readings_of(message, self._stage)
         if raw is None:
             return
-        self._health.add(raw, self.now_ns)
         calibrated = self._stage.feed_many(raw)
         if len(calibrated):
             self._readings.publish(to_message(FieldReadings, readings_dict(calibrated)))
+        self._health.add(raw, self.now_ns)
+        if self._turn_is_due:
+            self._next_turn()
 
     def _shaken(self, sensor, message):
         """One acceleration."""

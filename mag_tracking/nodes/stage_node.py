@@ -1,5 +1,6 @@
 """The generic node: parameters, network, diagnostics and the main loop."""
 
+import gc
 import signal
 import time
 
@@ -180,6 +181,10 @@ def _run_until(seen, node_class, arguments):
     try:
         node = node_class()
         executor.add_node(node)
+        # What was loaded stays for good: to look through it again and again for garbage takes
+        # longer than a reading may be late.
+        gc.collect()
+        gc.freeze()
         spin(executor, lambda: bool(seen))
     except (MagTrackingError, ParameterException) as error:
         rclpy.logging.get_logger(node_class.__name__).fatal(str(error))

@@ -108,6 +108,7 @@ class TrackerNode(StageNode):
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return
         self._publish_all(self._stage.feed(frame))
+        self._stage.settle()
 
     def _publish_all(self, records):
         """`Track`s and `SmoothedPose`s, each where it belongs."""

@@ -127,7 +127,7 @@ class Calibrate:
         s, network = self._settings, self._network
         return RunningBackground(s.learn_s, s.memory_s, s.guard_s, s.block_s, s.freeze_std,
                                  s.relearn_s, network.background[i], network.noise_std[i],
-                                 phase=i / len(network) if len(network) > AT_ONCE else 0.0,
+                                 phase=i / len(network) if len(network) > AT_ONCE else None,
                                  sensors=self._sensors[i:i + 1])
 
     def counts_of(self, sensor):

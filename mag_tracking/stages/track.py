@@ -83,7 +83,7 @@ class TrackStage:
         self._out_of_reach = False
         self._last = None
         self._last_ns = None
-        self._next_network = None
+        self._next_network = self._to_follow = None
 
     def use_network(self, network):
         """Go on with another calibration of the same sensors, as soon as no track runs.
@@ -108,6 +108,7 @@ class TrackStage:
 
     def feed(self, frame):
         """A `FieldFrame` gives the `Track`s that follow from it."""
+        self.settle()
         out = []
         if self._next_network is not None and self._bank is None:
             self._whole_network, self._next_network = self._next_network, None
@@ -129,6 +130,12 @@ class TrackStage:
         self._out_of_reach = False
         self._remember(frame)
         return out
+
+    def settle(self):
+        """Do what could wait until the latest frame's track was published; else `feed` does it."""
+        best, self._to_follow = self._to_follow, None
+        if best is not None and self._bank is not None:
+            self._follow(best)
 
     def _use(self, rows):
         """From now on a track is of the sensors `rows` of the whole network."""
@@ -236,16 +243,17 @@ class TrackStage:
         self.counts['hypotheses dropped'] += bank.prune(
             -np.log(self._settings.prune_ratio), self._settings.most_hypotheses)
         self.counts.update(self._anew.improve(self._filter, bank))
-        best = bank.best()
         self._whole.add(bank, frame, dt, publish)
+        if not publish and self._lag is None:
+            return []
+        best = bank.best()
         late = [] if self._lag is None else self._smoothed(best, False, self._lag.smoothed(
             self._filter, bank, best, frame, dt, publish))
         if not publish:
             return []
         self._last = self._published(frame, dt, best)
         self.counts['poses'] += 1
-        if self._is_large:
-            self._follow(best)
+        self._to_follow = best if self._is_large else None
         reason = self._reason_to_end(self._last)
         if reason:
             # In the tail of its own detection a vehicle would be started on the wrong line.

@@ -158,11 +158,11 @@ def _matching_positions(settings, network, frame, R, offset, moments, height):
     points = line + offset * R[:, 1] - distance[:, None] * R[:, 0]
     r = network.positions[None] - points[:, None]
     B = dipole_field(r[None], moments[:, None, None, :])
-    y = np.einsum('jik,mdjk->mdji', network.R_sw, B)
     present = ~np.isnan(frame.field)
     measured = float(whitened_energy(frame.field, frame.covariance)[0].sum())
     std = np.sqrt(np.einsum('jii->ji', frame.covariance))
-    energy = np.where(present, (y / np.where(present, std, 1.0)) ** 2, 0.0).sum(axis=(2, 3))
+    whitening = network.R_sw / np.where(present, std, np.inf)[:, :, None]
+    energy = sum(np.square(B[:, :, j] @ W.T).sum(axis=2) for j, W in enumerate(whitening))
     # Noise alone brings one unit of energy an axis.
     reached = energy >= max(measured - np.count_nonzero(present), 1.0)
     first = np.where(reached.any(axis=1), reached.argmax(axis=1), len(distance) - 1)

@@ -65,24 +65,31 @@ class Ear:
 
         from mag_tracking.nodes.stage_node import STREAM
         self.latencies, self.values, self.troubles, self._before = [], {}, {}, {}
+        self._unread = []
         # The stamp is the mean of the samples; the one that shows that they were all comes behind:
         # half a frame, and what the sensors are apart.
         self._completed_s = PERIOD_S / 2.0 + (1.0 if in_turn else 0.5) / RATE
         node.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose', self._pose,
                                  STREAM)
-        node.create_subscription(DiagnosticArray, '/diagnostics', self._diagnostics, STREAM)
+        # Read when all is over: what poses wait for here is no latency of theirs.
+        self._type = DiagnosticArray
+        node.create_subscription(DiagnosticArray, '/diagnostics', self._unread.append, STREAM,
+                                 raw=True)
 
     def _pose(self, message):
         """How long after the sample that completed the frame it came."""
         stamp = message.header.stamp.sec + message.header.stamp.nanosec / 1e9
         self.latencies.append(time.time() - stamp - self._completed_s)
 
-    def _diagnostics(self, message):
-        """Keep the latest."""
-        for status in message.status:
-            self.values[status.name] = {v.key: v.value for v in status.values}
-            if status.level != b'\x00':
-                self.troubles[status.name] = status.message
+    def _read(self):
+        """Keep the latest of what has been heard."""
+        from rclpy.serialization import deserialize_message
+        for raw in self._unread:
+            for status in deserialize_message(raw, self._type).status:
+                self.values[status.name] = {v.key: v.value for v in status.values}
+                if status.level != b'\x00':
+                    self.troubles[status.name] = status.message
+        self._unread.clear()
 
     def begin(self):
         """What was before was the warm-up: sensors that a car stood at learn later than others."""
@@ -95,6 +102,7 @@ class Ear:
 
     def _losses(self):
         """The same, of all time."""
+        self._read()
         return {f'{name}: {key}': int(value) for name, values in self.values.items()
                 for key, value in values.items() if value and key.startswith(
                     ('rejected', 'lost', 'readings lost', 'frames with a sensor'))}

@@ -117,6 +117,8 @@ class Driver:
         self._retry_s, self._retry_ns = settings.retry_s, None
         self._heard_ns, self._offset_ns = None, None
         self._only, self._unknown = None, set()
+        # Of the reading before: those that a device gives together were measured together.
+        self._stamped = None, None
         self._named, self._sample_counts = {}, {s: f'samples: {s}' for s in sensors.values()}
 
     @property
@@ -290,7 +292,10 @@ class Driver:
         if ticks is None and isinstance(clock, DeviceClock):
             self.own_counts['readings without the time of the device'] += 1
             return None
-        return clock.stamp(ticks, arrival.arrival_ns)
+        of = clock, ticks, arrival.arrival_ns
+        if self._stamped[0] != of:
+            self._stamped = of, clock.stamp(ticks, arrival.arrival_ns)
+        return self._stamped[1]
 
 
 def serve(driver, take, stopping):

@@ -3,6 +3,7 @@
 For trying the whole chain without hardware, and for measuring what it costs.
 """
 
+import bisect
 import math
 import time
 from collections import Counter
@@ -90,7 +91,7 @@ class SimulatedDevice:
         if oldest > self._next:
             self.counts['readings lost, nobody took them'] += oldest - self._next
             self._next = oldest
-        first = self._next
+        first, self._next = self._next, max(self._next, self._n_due(elapsed))
         while self._due(self._next) <= elapsed:
             self._next += 1
         return self._readings(first, self._next)
@@ -112,18 +113,24 @@ class SimulatedDevice:
         index, j = divmod(i, len(self._network))
         return index / self._settings.rate_hz + self._shift_s[j]
 
+    def _n_due(self, elapsed):
+        """How many readings have been measured; by rounding those of one interval fewer."""
+        whole = math.floor(elapsed * self._settings.rate_hz)
+        return whole * len(self._network) + bisect.bisect_right(
+            self._shift_s, elapsed - whole / self._settings.rate_hz)
+
     def _readings(self, first, end):
         """The readings from `first` to before `end`."""
         index, j = np.divmod(np.arange(first, end), len(self._network))
+        due_s = index / self._settings.rate_hz + np.array(self._shift_s)[j]
         # The table is that of the pass alone; before the next vehicle there is none.
         row = index % round(self._period_s * self._settings.rate_hz)
         B = self._table[np.minimum(row, len(self._table) - 1), j]
         B = B + self._settings.noise * self._rng.standard_normal(B.shape)
         now, names = self._monotonic_ns(), self._network.names
-        return [Arrival(now, Reading(names[j], tuple(b), ticks=round(self._due(i) / TICK_S),
-                                     sequence=k))
-                for i, k, j, b in zip(range(first, end), index.tolist(), j.tolist(), B.tolist(),
-                                      strict=True)]
+        return [Arrival(now, Reading(names[j], tuple(b), ticks=t, sequence=k))
+                for t, k, j, b in zip(np.round(due_s / TICK_S).astype(int).tolist(),
+                                      index.tolist(), j.tolist(), B.tolist(), strict=True)]
 
     def _one_pass(self):
         """(n, n_sensors, 3) [T], sensor frames; the last row is without a vehicle."""
