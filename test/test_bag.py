@@ -162,9 +162,11 @@ def test_random_damage_never_crashes(tmp_path, seed):
 def test_memory_is_flat(tmp_path):
     peaks = []
     for n in (10_000, 40_000):
-        write(tmp_path / f'{n}.mcap', n)
+        path = tmp_path / str(n) / 'a.mcap'
+        path.parent.mkdir()
+        write(path, n)
         tracemalloc.start()
-        assert sum(1 for _ in Recording(tmp_path / f'{n}.mcap').messages()) == 2 * n
+        assert sum(1 for _ in Recording(path).messages()) == 2 * n
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     # The messages alone are 3 and 11 MB.

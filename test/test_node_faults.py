@@ -72,6 +72,8 @@ def call_and_wait(world):
     assert world.wait(lambda: world.told(asked, f'driver_node: {world.link}'), 3.0)
     began = world.call()
     world.pause(1.65)
+    assert world.wait(lambda: world.tracks(began), 1.0)
+    print(f'first pose {(world.tracks(began)[0].stamp_ns - began) / NS:.2f} s after it came')
     return began, world.tracks(began)[0].id
 
 
