@@ -2,7 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass
-from math import inf, isnan
+from math import isnan
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from mag_tracking.calibration.ordinary import LIMITS, NEVER, new_sensors, take_o
 from mag_tracking.calibration.screening import SPIKE, STUCK, Repetition, SpikeFilter
 from mag_tracking.errors import NetworkError
 from mag_tracking.records import MagSample, Readings
+from mag_tracking.stages.raw_sample import corrected, fault_of
 from mag_tracking.stages.stage import NS
 
 AT_ONCE = 16
@@ -180,10 +181,12 @@ class Calibrate:
         """As `feed`, of a sample that may be odd."""
         if sample.sensor not in self._background:
             return self._reject(sample, f'unknown sensor {sample.sensor}')
-        cause = self._fault(sample)
+        cause = fault_of(sample, self._settings.max_field)
         if cause:
             return self._reject(sample, cause)
-        raw, sample = sample, self._corrected(sample)
+        raw, i = sample, self._index[sample.sensor]
+        sample = corrected(sample, self._clock_ns[i], self._network.offset[i],
+                           self._network.correction[i])
         if sample is not raw and np.isnan(sample.field).all():
             return self._reject(sample, 'an axis is missing that the correction needs')
         cause = self._misplaced(sample)
@@ -309,23 +312,6 @@ class Calibrate:
         self.counts['calibrated'] += 1
         return [MagSample(sample.stamp_ns, sample.sensor, field, covariance)]
 
-    def _corrected(self, sample):
-        """The sample by the network's clock, without the sensor's own hard and soft iron."""
-        i = self._index[sample.sensor]
-        offset, C = self._network.offset[i], self._network.correction[i]
-        if offset is None and C is None and not self._clock_ns[i]:
-            return sample
-        stamp_ns = sample.stamp_ns - self._clock_ns[i]
-        field, covariance = sample.field, sample.covariance
-        if offset is not None:
-            field = field - offset
-        if C is not None:
-            missing = np.isnan(field)
-            # An axis is missing where one is that it needs.
-            field = np.where((C != 0.0) @ missing, np.nan, C @ np.where(missing, 0.0, field))
-            covariance = None if covariance is None else C @ covariance @ C.T
-        return MagSample(stamp_ns, sample.sensor, field, covariance)
-
     def flush(self):
         """What waited for the next reading."""
         return self._used([s for spikes in self._spikes.values() for s, _ in spikes.flush()])
@@ -339,28 +325,6 @@ class Calibrate:
         before = self._ahead_ns.get(sample.sensor)
         self._ahead_ns[sample.sensor] = sample.stamp_ns
         return before is None or not 0 < sample.stamp_ns - before <= limit
-
-    def _fault(self, sample):
-        """Why the sample cannot be used, or None."""
-        # Of three numbers Python's own functions are several times as fast as NumPy's.
-        x, y, z = sample.field.tolist()
-        most = self._settings.max_field
-        if not (abs(x) <= most and abs(y) <= most and abs(z) <= most):
-            # Or an axis is missing.
-            values = [abs(v) for v in (x, y, z) if not isnan(v)]
-            if not values:
-                return 'no axis reported (all NaN)'
-            if max(values) == inf:
-                return 'infinite value'
-            if max(values) > most:
-                return f'above {most:g} T (gauss or microtesla as tesla?)'
-        if sample.covariance is None:
-            return None
-        there = ~np.isnan(sample.field)
-        if not (sample.covariance.shape == (3, 3)
-                and _is_covariance(sample.covariance[np.ix_(there, there)])):
-            return 'covariance is not positive definite'
-        return None
 
     def _reject(self, sample, cause):
         """Count the rejection."""
@@ -400,10 +364,3 @@ class Calibrate:
 def _same(a, b):
     """Whether two arrays, or None, are the same."""
     return (a is None) == (b is None) and (a is None or np.array_equal(a, b))
-
-
-def _is_covariance(C):
-    """Whether C is finite, symmetric and positive definite."""
-    if not np.isfinite(C).all() or np.abs(C - C.T).max() > 1e-6 * np.abs(C).max():
-        return False
-    return bool(np.linalg.eigvalsh(C)[0] > 0.0)

@@ -293,7 +293,8 @@ class Driver:
             self.own_counts['readings without the time of the device'] += 1
             return None
         of = clock, ticks, arrival.arrival_ns
-        if self._stamped[0] != of:
+        if self._stamped[0] != of or self._stamped[1] is None:
+            # Each that has no time is counted.
             self._stamped = of, clock.stamp(ticks, arrival.arrival_ns)
         return self._stamped[1]
 

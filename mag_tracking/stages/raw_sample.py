@@ -1,0 +1,61 @@
+"""What a raw sample itself, and the calibration of its sensor, say of it."""
+
+from math import inf, isnan
+
+import numpy as np
+
+from mag_tracking.records import MagSample
+
+
+def fault_of(sample, max_field):
+    """Why a `MagSample` cannot be used, or None; `max_field` [T]."""
+    # Of three numbers Python's own functions are several times as fast as NumPy's.
+    x, y, z = sample.field.tolist()
+    if not (abs(x) <= max_field and abs(y) <= max_field and abs(z) <= max_field):
+        # Or an axis is missing.
+        values = [abs(v) for v in (x, y, z) if not isnan(v)]
+        if not values:
+            return 'no axis reported (all NaN)'
+        if max(values) == inf:
+            return 'infinite value'
+        if max(values) > max_field:
+            return f'above {max_field:g} T (gauss or microtesla as tesla?)'
+    if sample.covariance is None:
+        return None
+    there = ~np.isnan(sample.field)
+    if not (sample.covariance.shape == (3, 3)
+            and _is_covariance(sample.covariance[np.ix_(there, there)])):
+        return 'covariance is not positive definite'
+    return None
+
+
+def corrected(sample, clock_ns, offset, C):
+    """The `MagSample` by the network's clock, without the sensor's own hard and soft iron.
+
+    Parameters
+    ----------
+    sample : MagSample
+    clock_ns : int
+        What the sensor's clock is ahead of the network's.
+    offset : (3,) [T] or None
+    C : (3, 3) or None
+        The correction of what is left; an axis that it would need and that is missing makes
+        those missing that need it.
+    """
+    if offset is None and C is None and not clock_ns:
+        return sample
+    field, covariance = sample.field, sample.covariance
+    if offset is not None:
+        field = field - offset
+    if C is not None:
+        missing = np.isnan(field)
+        field = np.where((C != 0.0) @ missing, np.nan, C @ np.where(missing, 0.0, field))
+        covariance = None if covariance is None else C @ covariance @ C.T
+    return MagSample(sample.stamp_ns - clock_ns, sample.sensor, field, covariance)
+
+
+def _is_covariance(C):
+    """Whether C is finite, symmetric and positive definite."""
+    if not np.isfinite(C).all() or np.abs(C - C.T).max() > 1e-6 * np.abs(C).max():
+        return False
+    return bool(np.linalg.eigvalsh(C)[0] > 0.0)

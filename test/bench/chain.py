@@ -1,0 +1,99 @@
+"""What the middleware alone takes: four bare rclpy nodes that hand on what the nodes hand on.
+
+    python test/bench/chain.py [--seconds 60]
+
+A source sends a message of a hundred readings a hundred times a second; two nodes hand it on as it
+is, and the last one sends a pose for every eighth: the peer of `load.py`, whose nodes do their work
+besides. Printed is how long a pose comes after its readings were sent, by this machine's clock.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+
+import numpy as np
+
+os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+os.environ.setdefault('ROS_DOMAIN_ID', str(101 + os.getpid() % 100))
+N_SENSORS, RATE, EVERY = 100, 100.0, 8
+ROLES = ('last', 'second', 'first', 'source')
+
+
+def readings(k):
+    """A FieldReadings with covariances."""
+    from mag_tracking_msgs.msg import FieldReadings
+
+    from mag_tracking.io.schema import readings_dict
+    from mag_tracking.nodes.convert import to_message
+    from mag_tracking.records import Readings
+    return to_message(FieldReadings, readings_dict(Readings(
+        tuple(f'mag_{i + 1}' for i in range(N_SENSORS)), np.arange(N_SENSORS),
+        np.full(N_SENSORS, time.time_ns()), np.full((N_SENSORS, 3), 1e-9 * k),
+        np.tile(1e-16 * np.eye(3), (N_SENSORS, 1, 1)))))
+
+
+def play(role):
+    """One node until it is stopped."""
+    import rclpy
+    from geometry_msgs.msg import PoseWithCovarianceStamped
+    from mag_tracking_msgs.msg import FieldReadings
+
+    from mag_tracking.nodes.stage_node import STREAM, make_executor, spin
+    rclpy.init()
+    node, executor, count = rclpy.create_node(f'chain_{role}'), make_executor(), [0]
+    out = {'last': 'pose', 'second': 'c', 'first': 'b', 'source': 'a'}[role]
+    kind = PoseWithCovarianceStamped if role == 'last' else FieldReadings
+    publisher = node.create_publisher(kind, f'/chain/{out}', STREAM)
+
+    def hand_on(message):
+        count[0] += 1
+        if role != 'last':
+            publisher.publish(message)
+        elif count[0] % EVERY == 0:
+            publisher.publish(PoseWithCovarianceStamped(header=message.header))
+
+    if role == 'source':
+        node.create_timer(1.0 / RATE, lambda: hand_on(readings(count[0])))
+    else:
+        source = {'last': 'c', 'second': 'b', 'first': 'a'}[role]
+        node.create_subscription(FieldReadings, f'/chain/{source}', hand_on, STREAM)
+    executor.add_node(node)
+    spin(executor)
+
+
+def main():
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--seconds', type=float, default=60.0)
+    parser.add_argument('--role', choices=ROLES, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.role:
+        return play(args.role)
+    import rclpy
+    from geometry_msgs.msg import PoseWithCovarianceStamped
+
+    from mag_tracking.nodes.stage_node import STREAM, make_executor, spin
+    rclpy.init()
+    node, executor, late = rclpy.create_node('chain'), make_executor(), []
+    executor.add_node(node)
+    node.create_subscription(
+        PoseWithCovarianceStamped, '/chain/pose', lambda m: late.append(
+            time.time() - m.header.stamp.sec - m.header.stamp.nanosec / 1e9), STREAM)
+    processes = [subprocess.Popen([sys.executable, __file__, '--role', role]) for role in ROLES]
+    try:
+        end = time.monotonic() + args.seconds + 5.0
+        spin(executor, lambda: time.monotonic() > end)
+    finally:
+        for process in processes:
+            process.send_signal(2)
+            process.wait(30.0)
+    late = 1e3 * np.array(late[60:])
+    print(f'{len(late)} poses of four bare nodes, after their readings were sent: median '
+          f'{np.median(late):.1f} ms, p99 {np.quantile(late, 0.99):.1f} ms, worst '
+          f'{late.max():.1f} ms')
+
+
+if __name__ == '__main__':
+    sys.exit(main())
