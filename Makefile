@@ -71,6 +71,8 @@ bench: $(STAMP)  ## measure times and accuracies
 	$(BIN)/python test/bench/pass_search.py
 	$(BIN)/python test/bench/load.py
 	$(BIN)/python test/bench/load.py --sensors 2 --lean --minutes 2
+	$(BIN)/python test/bench/load.py --sensors 2 --lean --minutes 2 --one-process --batches
+	$(BIN)/python test/bench/chain.py
 
 fuzz: $(STAMP)  ## a million frames between garbage through every parser of the drivers
 	$(BIN)/python test/framing_fuzz.py --frames 1000000

@@ -49,6 +49,8 @@ def play(role):
 
     def hand_on(message):
         count[0] += 1
+        if not rclpy.ok():
+            return
         if role != 'last':
             publisher.publish(message)
         elif count[0] % EVERY == 0:

@@ -2,6 +2,7 @@
 
     python test/bench/load.py                                    # 100 sensors x 100 Hz, ten minutes
     python test/bench/load.py --sensors 2 --minutes 2 --lean     # two sensors, 126 hypotheses
+                              --one-process --batches            # the same, as cheap as can be
 
 The simulator is the hardware; it runs in the driver's process. Printed are how long a pose comes
 after the sample that completed its frame, by this machine's clock, what was lost, and what each
@@ -108,11 +109,17 @@ class Ear:
                     ('rejected', 'lost', 'readings lost', 'frames with a sensor'))}
 
 
-def start(folder, n, parameters, in_turn, batches):
-    """The nodes as processes, the driver last."""
+def start(folder, n, parameters, in_turn, batches, together):
+    """The nodes as processes, the driver last; or all `together` in one."""
     network, drivers = folder / 'network.yaml', folder / 'drivers.yaml'
     network.write_text(network_yaml(n))
     drivers.write_text(drivers_yaml(n, network, in_turn))
+    if together:
+        return {'all_in_one': subprocess.Popen(
+            [Path(sys.executable).with_name('mag-tracking'), 'run', '--network', network,
+             '--drivers', drivers, '--params', parameters,
+             *(['--batches'] if batches or n > MANY else [])],
+            stdout=subprocess.DEVNULL, stderr=sys.stderr)}
     processes = {}
     for node in NODES:
         more = ['-p', f'drivers:={drivers}', '-p', f'batches:={str(batches or n > MANY).lower()}'] \
@@ -180,6 +187,8 @@ def main():
     parser.add_argument('--minutes', type=float, default=10.0)
     parser.add_argument('--batches', action='store_true',
                         help='readings go together in one message, as they do of many sensors')
+    parser.add_argument('--one-process', action='store_true',
+                        help='the nodes in one process, as `mag-tracking run` has them')
     parser.add_argument('--lean', action='store_true', help='126 hypotheses')
     parser.add_argument('--in-turn', action='store_true',
                         help='the sensors measure one after the other, not all at the same time')
@@ -194,7 +203,7 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         os.environ['ROS_HOME'] = folder
         processes = start(Path(folder), args.sensors, parameters_of(Path(folder), args.lean),
-                          args.in_turn, args.batches)
+                          args.in_turn, args.batches, args.one_process)
         try:
             end = time.monotonic() + WARM_UP_S
             spin(executor, lambda: time.monotonic() > end)
