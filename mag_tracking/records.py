@@ -20,6 +20,11 @@ class MagSample:
     """(3, 3) [T^2], sensor frame; None = unknown."""
 
 
+def plain(values, dtype=float):
+    """The array itself, or a copy where it is none that compiled code takes."""
+    return np.require(values, dtype, ['C', 'W'])
+
+
 @dataclass(frozen=True, slots=True)
 class Readings:
     """Readings of many sensors, in the order in which they came: `MagSample`s as arrays."""

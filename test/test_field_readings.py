@@ -93,7 +93,9 @@ def test_some_covariances_known_or_no_sample_is_no_message():
     ({'field': array('d', range(5))}, '5 numbers of their fields'),
     ({'covariance': array('d', range(9))}, '9 of their covariances'),
     ({'sensor': array('H', [0, 1])}, 'a reading of sensor 1 of 1'),
-    ({'sensors': []}, 'a reading of sensor 0 of 0')])
+    ({'sensors': []}, 'a reading of sensor 0 of 0'),
+    ({'stamp': array('q', [0, 2**63 - 1])}, 'readings of 0 to 9223372036854775807 ns'),
+    ({'stamp': array('q', [-2**63, 0])}, 'readings of -9223372036854775808')])
 def test_what_does_not_fit_is_told(changes, said):
     content = readings_dict(Readings.of(
         [MagSample(k, 'a', np.ones(3), np.eye(3)) for k in range(2)]))

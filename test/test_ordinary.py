@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from conftest import line_network
 from faulty_streams import FAULTS, stream
 
 from mag_tracking.records import MagSample, Readings
@@ -15,6 +16,11 @@ class Slow(Calibrate):
     def _note(self, i):
         super()._note(i)
         self._sensors[i]['is_ordinary'] = False
+
+
+KEPT = ('accepted', 'first_ns', 'last_ns', 'n', 'end', 'time', 'origin', 'count', 'sum')
+SCREENED = ('last', 'run', 'repeats', 'changes', 'before_ns', 'before', 'n_steps')
+"""What both ways have to have made of the readings, and where they are screened."""
 
 
 def samples_alike(found, expected):
@@ -42,15 +48,21 @@ def calibrated_in_three_ways(network, samples, size=20, **settings):
                    for c in many.feed_many(b).samples()] + many.flush(), expected)
     for stage in (single, many):
         assert stage.counts == slow.counts
+        for name in (*KEPT, *(() if settings.get('spike_std') == 0.0 else SCREENED)):
+            np.testing.assert_allclose(stage._sensors[name], slow._sensors[name], rtol=1e-9,
+                                       atol=1e-20, err_msg=name)
         for name in network.names:
             assert stage.counts_of(name) == slow.counts_of(name)
             assert stage.last_stamp_ns(name) == slow.last_stamp_ns(name)
     return slow, single, many
 
 
+@pytest.mark.parametrize('is_corrected', [False, True])
 @pytest.mark.parametrize('fault', [None, *FAULTS])
-def test_a_pass_with_a_fault(fault):
+def test_a_pass_with_a_fault(fault, is_corrected):
     network, samples, *_ = stream(4, 3, fault)
+    if is_corrected:
+        network = corrected(network)
     slow, _, many = calibrated_in_three_ways(network, samples)
     assert slow.counts['calibrated'] > 1000
     assert (many._sensors['is_ordinary'] == 1).any()
@@ -127,3 +139,33 @@ def test_nearly_all_readings_take_it(monkeypatch):
     # Three seconds of learning, and one in 25 closes a block.
     learning = stage.counts['held back while learning']
     assert len(odd) - learning < 0.1 * (len(samples) - learning)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_a_corrected_sensor_that_is_stuck(seed):
+    """Its readings are alike to the last bit whichever way they go."""
+    rng, network = np.random.default_rng(seed), corrected(line_network(2))
+    fields = np.array([2e-6, 1.55e-5, -4.9e-5]) + 1.2e-8 * rng.standard_normal((1600, 3))
+    fields[400:] = fields[400]
+    samples = [MagSample(10**18 + k * 25_000_000, 'mag_2', f) for k, f in enumerate(fields)]
+    slow, *_ = calibrated_in_three_ways(network, samples)
+    assert slow.counts['rejected: the same reading over and over'] > 1100
+
+
+def test_a_background_without_an_axis_is_no_ordinary_one():
+    network, rng = line_network(1), np.random.default_rng(0)
+    fields = np.array([2e-6, 1.55e-5, -4.9e-5]) + 1.2e-8 * rng.standard_normal((1000, 3))
+    fields[:600, 1] = np.nan
+    calibrated_in_three_ways(network, [MagSample(10**18 + k * 10**7, 'mag_1', f)
+                                       for k, f in enumerate(fields)])
+
+
+def test_arrays_of_other_kinds_are_readings_too():
+    network, samples, *_ = stream(2, 9)
+    readings = Readings.of(samples)
+    stage, other = (Calibrate(network, CalibrateSettings()) for _ in range(2))
+    field = np.asfortranarray(readings.field)
+    field.flags.writeable = False
+    odd = Readings(readings.names, readings.sensor.astype(np.uint16),
+                   readings.stamp_ns.astype(np.uint64), field)
+    np.testing.assert_array_equal(other.feed_many(odd).field, stage.feed_many(readings).field)

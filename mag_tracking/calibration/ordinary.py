@@ -80,14 +80,23 @@ def add_to_block(sensors, j, time, field):
 
 
 @njit(cache=True, inline='always')
-def _corrected(s, raw, field):
-    """`raw` (3,) without the sensor's own hard and soft iron."""
+def _without_iron(raw, offset, is_turned, correction, field):
+    """`without_iron`."""
     for a in range(3):
-        field[a] = raw[a] - s.offset[a]
-    if s.is_turned:
+        field[a] = raw[a] - offset[a]
+    if is_turned:
         x, y, z = field[0], field[1], field[2]
         for a in range(3):
-            field[a] = s.correction[a, 0] * x + s.correction[a, 1] * y + s.correction[a, 2] * z
+            field[a] = correction[a, 0] * x + correction[a, 1] * y + correction[a, 2] * z
+
+
+@njit(void(float64[::1], float64[::1], int64, float64[:, ::1], float64[::1]), cache=True)
+def without_iron(raw, offset, is_turned, correction, field):
+    """`raw` (3,) [T] without the sensor's own hard and soft iron, into `field`.
+
+    To the last bit the same for all: readings that repeat themselves have to stay alike.
+    """
+    _without_iron(raw, offset, is_turned, correction, field)
 
 
 @njit(cache=True, inline='always')
@@ -146,7 +155,7 @@ def take_ordinary(sensors, limits, rows, stamps, fields, first, out_stamps, out_
         s = sensors[rows[i]]
         stamp = stamps[i] - s.clock_ns
         time = (stamp - s.first_ns) / 1e9
-        _corrected(s, fields[i], field)
+        _without_iron(fields[i], s.offset, s.is_turned, s.correction, field)
         if _is_odd(s, limit, stamp, fields[i], field, time):
             return i
         s.last_ns = stamp

@@ -8,6 +8,8 @@ from mag_tracking.errors import RecordingError
 from mag_tracking.geometry import rotation_from_quaternion
 from mag_tracking.records import AccelerationSample, FieldFrame, MagSample, Readings
 
+LATEST_NS = 2**31 * 1_000_000_000
+"""[ns] Later than any stamp of a header."""
 LONGEST_OFFSET_S = 60.0
 """[s] The longest frame there can be (`align.period_s`)."""
 
@@ -99,13 +101,15 @@ def readings_of(message):
     sensor = np.array(message.sensor, dtype=np.int64)
     if n and not 0 <= sensor.min() <= sensor.max() < len(names):
         raise RecordingError(f'a reading of sensor {sensor.max()} of {len(names)}')
+    stamps = np.array(message.stamp, dtype=np.int64)
+    if n and not -LATEST_NS <= stamps.min() <= stamps.max() <= LATEST_NS:
+        raise RecordingError(f'readings of {stamps.min()} to {stamps.max()} ns')
     C = None
     if len(message.covariance):
         C = np.array(message.covariance, dtype=float).reshape(n, 3, 3)
         known = (C[:, 0, 0] != -1.0) & C.any(axis=(1, 2))
         C = np.where(known[:, None, None], C, np.nan) if known.any() else None
-    return Readings(names, sensor, np.array(message.stamp, dtype=np.int64),
-                    np.array(message.field, dtype=float).reshape(n, 3), C)
+    return Readings(names, sensor, stamps, np.array(message.field, dtype=float).reshape(n, 3), C)
 
 
 def samples_of(message):

@@ -35,7 +35,9 @@ class Ahead:
     @property
     def is_calm(self):
         """Whether nobody is ahead: what is no longer a jump than the limit passes."""
-        return not self._held and not self._quiet_since
+        # What is known of one whose samples are all gone holds for that newest stamp only.
+        return not self._held and all(
+            newest != self.newest for newest, _ in self._quiet_since.values())
 
     def feed(self, i, sample):
         """What is known by now of a sample of sensor `i`, and of those that are held.

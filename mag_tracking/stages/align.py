@@ -11,7 +11,7 @@ from math import isfinite, isinf, isnan
 
 import numpy as np
 
-from mag_tracking.records import FieldFrame
+from mag_tracking.records import FieldFrame, plain
 from mag_tracking.settings import param
 from mag_tracking.stages.ahead import Ahead
 from mag_tracking.stages.pending import CLOCK, NEVER, Pending, hold_ordinary, is_one_behind
@@ -82,7 +82,7 @@ class Align:
         for name in ('first', 'newest', 'end', 'passed'):
             self._clock[name] = NEVER
         for name, value in (('period', self._period), ('wait', self._wait),
-                            ('limit', self._longest_jump)):
+                            ('limit', self._longest_jump), ('most', self._most_pending)):
             self._clock[name] = value
         self._look_ahead()
 
@@ -109,8 +109,9 @@ class Align:
         C = readings.covariance
         if C is None:
             rows, C = np.full(n, -1), np.full((n, 3, 3), np.nan)
+        stamps, fields, C = plain(readings.stamp_ns, np.int64), plain(readings.field), plain(C)
         while k < n:
-            odd = self._hold_many(rows, readings.stamp_ns, readings.field, C, k)
+            odd = self._hold_many(rows, stamps, fields, C, k)
             if self._clock['is_complete']:
                 out, k = out + self._completed(), odd
             else:
@@ -123,9 +124,6 @@ class Align:
         pending, ahead, clock = self._pending, self._ahead, self._clock
         clock['is_complete'] = 0
         if self._burst or ahead.newest is None or not ahead.is_calm:
-            return begin
-        if pending.room > self._most_pending:
-            # Its room is no measure of when there are too many.
             return begin
         clock['passed'] = ahead.newest
         end = hold_ordinary(self._clocks, self._latest, ahead.latest, pending.first,

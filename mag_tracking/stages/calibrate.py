@@ -11,7 +11,7 @@ from mag_tracking.calibration.decimation import Decimator
 from mag_tracking.calibration.ordinary import LIMITS, NEVER, new_sensors, take_ordinary
 from mag_tracking.calibration.screening import SPIKE, STUCK, Repetition, SpikeFilter
 from mag_tracking.errors import NetworkError
-from mag_tracking.records import MagSample, Readings
+from mag_tracking.records import MagSample, Readings, plain
 from mag_tracking.stages.raw_sample import corrected, fault_of
 from mag_tracking.stages.stage import NS
 
@@ -88,7 +88,8 @@ class Calibrate:
                 self._give_up(name, 'another calibration came')
             if not same:
                 self._background[name] = self._new_background(i)
-            else:
+            if before is not None:
+                # The same readings have other stamps from now on.
                 self._shift(i, clock_before[i] - self._clock_ns[i])
             self._note(i)
 
@@ -113,6 +114,7 @@ class Calibrate:
                                  self._network.correction[i])
         s['is_ordinary'] = (
             background.ready and background.is_whole and s['last_ns'] != NEVER
+            and not np.isnan(background.line[1]).any()
             and not self._settings.decimate_to_hz and not self._spikes[name].n_held
             and name not in self._ahead_ns and name not in self._kept)
         if s['is_ordinary']:
@@ -162,9 +164,9 @@ class Calibrate:
             # What one says of its own covariance is looked at one by one.
             rows = np.where(np.isnan(readings.covariance).all(axis=(1, 2)), rows, -1)
         stamps, fields = np.empty(n, dtype=np.int64), np.empty((n, 3))
+        raw = plain(readings.stamp_ns, np.int64), plain(readings.field)
         while i < n:
-            odd = take_ordinary(self._sensors, self._limits, rows, readings.stamp_ns,
-                                readings.field, i, stamps, fields)
+            odd = take_ordinary(self._sensors, self._limits, rows, *raw, i, stamps, fields)
             if odd > i:
                 self.counts['calibrated'] += odd - i
                 parts.append(Readings(self._network.names, rows[i:odd], stamps[i:odd],

@@ -4,29 +4,51 @@ What `stages.align` does with a sample that nothing is odd about is here a secon
 time, for many at once; at the first that is odd it stops.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import boolean, float64, from_dtype, int64, njit, void
 
-NEVER = np.iinfo(np.int64).min
-"""[ns] Stamp of what has not been."""
+from mag_tracking.calibration.ordinary import NEVER
+
 ROOM = 32
 """Samples of a sensor that there is room for at first."""
 
 CLOCK = np.dtype([(name, np.int64) for name in (
     'first', 'newest', 'end', 'start', 'due', 'period', 'wait', 'watch', 'passed', 'limit',
-    'is_complete')])
+    'most', 'is_complete')])
 """[ns] The oldest stamp there was, and the newest; the end of the latest frame; where the next
 begins at the earliest, and before what it ends; its length; how long a sensor may be silent; a
 sensor that the next frame has to wait for, or -1; the newest stamp that was not ahead of all
-others, and how far ahead one may be. `is_complete`: nobody is known any more for whom the frame
-would have to wait."""
+others, and how far ahead one may be. `most` samples of a sensor are held. `is_complete`: nobody is
+known any more for whom the frame would have to wait."""
 
 _CLOCK = from_dtype(CLOCK)[::1]
 _I, _II = int64[::1], int64[:, ::1]
 
 
+class Taken(NamedTuple):
+    """Sums over the samples of each sensor."""
+
+    n: np.ndarray
+    """(n_sensors,) how many."""
+    n_axis: np.ndarray
+    """(n_sensors, 3) how many have the axis."""
+    field: np.ndarray
+    """(n_sensors, 3) [T]"""
+    covariance: np.ndarray
+    """(n_sensors, 3, 3) [T^2]"""
+    since: np.ndarray
+    """(n_sensors,) [ns] of the stamps, from the end that was asked for."""
+    last: np.ndarray
+    """(n_sensors,) [ns] the latest stamp; NEVER where there is none."""
+
+
 class Pending:
-    """Of each sensor its samples in the order of their stamps: stamp, field, covariance."""
+    """Of each sensor its samples in the order of their stamps: stamp, field, covariance.
+
+    There is room for as many of all as the one that has most needed.
+    """
 
     def __init__(self, n):
         self.first, self.count = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
@@ -67,8 +89,8 @@ class Pending:
         Taken
         """
         n = len(self.count)
-        taken = (np.zeros(n, dtype=np.int64), np.zeros((n, 3)), np.zeros((n, 3)),
-                 np.zeros((n, 3, 3)), np.zeros(n, dtype=np.int64), np.full(n, NEVER))
+        taken = Taken(np.zeros(n, dtype=np.int64), np.zeros((n, 3)), np.zeros((n, 3)),
+                      np.zeros((n, 3, 3)), np.zeros(n, dtype=np.int64), np.full(n, NEVER))
         _take(end, one_each, self.first, self.count, self.stamp, self.field, self.covariance,
               *taken)
         return taken
@@ -162,7 +184,7 @@ def hold_ordinary(clocks, latest, passed, first, count, stamp, field, covariance
     for k in range(begin, len(rows)):
         i, t = rows[k], stamps[k]
         if i < 0 or latest[i] == NEVER or t <= latest[i] or t < c.end or t - c.passed > c.limit \
-                or count[i] == room or np.isnan(covariances[k, 0, 0]) \
+                or count[i] == room or count[i] >= c.most or np.isnan(covariances[k, 0, 0]) \
                 or not np.isfinite(fields[k, 0] + fields[k, 1] + fields[k, 2]):
             return k
         latest[i] = passed[i] = t

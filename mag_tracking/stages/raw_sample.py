@@ -4,6 +4,7 @@ from math import inf, isnan
 
 import numpy as np
 
+from mag_tracking.calibration.ordinary import without_iron
 from mag_tracking.records import MagSample
 
 
@@ -44,13 +45,14 @@ def corrected(sample, clock_ns, offset, C):
     """
     if offset is None and C is None and not clock_ns:
         return sample
-    field, covariance = sample.field, sample.covariance
-    if offset is not None:
-        field = field - offset
-    if C is not None:
-        missing = np.isnan(field)
-        field = np.where((C != 0.0) @ missing, np.nan, C @ np.where(missing, 0.0, field))
-        covariance = None if covariance is None else C @ covariance @ C.T
+    field, covariance, missing = np.empty(3), sample.covariance, np.isnan(sample.field)
+    raw = np.array(np.where(missing, 0.0, sample.field), dtype=float)
+    without_iron(raw, np.zeros(3) if offset is None else np.where(missing, 0.0, offset),
+                 C is not None, np.eye(3) if C is None else np.array(C, dtype=float), field)
+    if missing.any():
+        field[missing if C is None else (C != 0.0) @ missing] = np.nan
+    if C is not None and covariance is not None:
+        covariance = C @ covariance @ C.T
     return MagSample(sample.stamp_ns - clock_ns, sample.sensor, field, covariance)
 
 
