@@ -169,3 +169,11 @@ def test_arrays_of_other_kinds_are_readings_too():
     odd = Readings(readings.names, readings.sensor.astype(np.uint16),
                    readings.stamp_ns.astype(np.uint64), field)
     np.testing.assert_array_equal(other.feed_many(odd).field, stage.feed_many(readings).field)
+
+
+def test_coarse_steps_repeat_themselves():
+    network, rng = line_network(1), np.random.default_rng(2)
+    fields = np.round(1.2e-8 * rng.standard_normal((2000, 3)) / 1.5e-8) * 1.5e-8 + 1e-5
+    slow, *_ = calibrated_in_three_ways(network, [MagSample(10**18 + k * 10**7, 'mag_1', f)
+                                                  for k, f in enumerate(fields)])
+    assert slow._sensors['repeats'][0] > 50
