@@ -49,6 +49,10 @@ class Readings:
         return MagSample(int(self.stamp_ns[i]), self.names[self.sensor[i]], self.field[i],
                          None if C is None or np.isnan(C).all() else C)
 
+    def rows(self, index):
+        """(n,) int: of each reading its sensor's place in `index`, {name: place}; -1: not in it."""
+        return np.array([index.get(name, -1) for name in self.names], dtype=np.int64)[self.sensor]
+
     def samples(self):
         """All of them."""
         return [self.sample(i) for i in range(len(self))]

@@ -299,15 +299,17 @@ def test_another_correction_is_learnt_anew():
 
 
 def ends_of_blocks(phase, times):
-    """(readings, by number, with which a block was judged, the background) of `times` [s]."""
+    """(readings, by number, that showed a block to be complete, the background) of `times` [s]."""
     state = new_sensors(1)
     background = RunningBackground(3.0, 20.0, 1.5, 0.25, 2.0, 60.0, phase=phase, sensors=state)
-    rng, ends, n_held = np.random.default_rng(0), [], 0
+    rng, ends, now = np.random.default_rng(0), [], 0
     for k, t in enumerate(times):
         background.add(t, 1e-8 * rng.standard_normal(3))
-        if state['n'][0] < n_held:
+        assert state['is_full'][0] == (phase is not None and state['now'][0] != now)
+        if state['now'][0] != now:
             ends.append(k)
-        n_held = state['n'][0]
+            background.settle()
+        now = state['now'][0]
     return ends, background
 
 

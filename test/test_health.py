@@ -15,6 +15,7 @@ from mag_tracking.io.schema import sample_dict
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import MagSample
 from mag_tracking.stages.health import WINDOW, SensorHealth, quantiles
+from mag_tracking.stages.waiting import Waiting
 
 NS = 10**9
 EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
@@ -335,19 +336,42 @@ def test_there_are_no_quantiles_of_nothing():
     assert np.isnan(quantiles(np.zeros(0), 0.1, 0.5)).tolist() == [True, True]
 
 
-def test_one_that_is_not_asked_to_looks_when_it_is_told():
-    """Its answers are as of the last look; nothing that came since is lost."""
-    health = SensorHealth(every=256, on_demand=False)
-    for k in range(100):
-        health.add(k * NS // 100, np.array([1e-6, 0.0, 1e-8 * (k % 7)]))
-    assert health.counts['readings'] == 0 and np.isnan(health.rate)
-    health.look()
-    assert health.counts['readings'] == 100 and health.rate == pytest.approx(100.0)
-    for k in range(100, 700):
-        health.add(k * NS // 100, np.array([1e-6, 0.0, 1e-8 * (k % 7)]))
-    assert health.counts['readings'] == 100 + 512
-    health.look()
-    assert health.counts['readings'] == 700
+def test_many_at_once_are_the_same_as_one_by_one():
+    """Also where the arrays that they came in are used for others afterwards."""
+    rng = np.random.default_rng(3)
+    stamps = np.arange(700) * NS // 100
+    fields = 1e-6 + 1e-8 * rng.standard_normal((700, 3))
+    single, many = SensorHealth(every=256), SensorHealth()
+    for t, f in zip(stamps.tolist(), fields, strict=True):
+        single.add(t, f, t + 10**6)
+    for begin, end in ((0, 0), (0, 300), (300, 301), (301, 700)):
+        given = stamps[begin:end].copy(), fields[begin:end].copy(), stamps[begin:end] + 10**6
+        many.take(*given)
+        for array in given:
+            array[:] = 0
+    assert many.counts == single.counts and many.counts['readings'] == 700
+    assert many.rate == single.rate == pytest.approx(100.0)
+    np.testing.assert_array_equal(many.noise_std, single.noise_std)
+    np.testing.assert_array_equal(many.field, single.field)
+    assert many.delay_s == single.delay_s
+
+
+def test_what_waits_comes_out_as_it_came():
+    """Of each sensor in its order; where there is no more room nothing is taken before there is."""
+    rng, waiting = np.random.default_rng(4), Waiting(5, 8)
+    rows, stamps = rng.integers(-1, 5, 300), np.arange(300)
+    fields, found, i = rng.standard_normal((300, 3)), {j: [] for j in range(5)}, 0
+    fields[7, 1] = np.nan
+
+    def take(j):
+        found[j] += [(int(t), f.tolist(), int(r)) for t, f, r in zip(*waiting.take(j), strict=True)]
+
+    while (i := waiting.add(rows, stamps, fields, 1000, i)) < len(rows):
+        take(rows[i])
+    for j in range(5):
+        take(j)
+        expected = [(k, fields[k].tolist(), 1000) for k in np.flatnonzero(rows == j).tolist()]
+        assert repr(found[j]) == repr(expected) and len(expected) > 30
 
 
 def test_counts_do_not_depend_on_how_many_are_looked_at_together():

@@ -16,9 +16,6 @@ import numpy as np
 from mag_tracking.calibration.blocks import BlockWindow, block_of, line_through, stacked
 from mag_tracking.calibration.ordinary import add_to_block, new_sensors
 
-LEAST_SAMPLES = 8
-"""A block has at least so many samples, however slow the sensor: fewer tell nothing of noise."""
-
 LOUDEST = 100.0
 """A block whose variance is so many times that of the quietest is no noise: a target passed within
 it, as it can within the long blocks of a slow sensor. Noise and coarse steps stay well below."""
@@ -48,19 +45,20 @@ class RunningBackground:
         Known beforehand: with both it is ready at once.
     phase : float, optional
         The first block is longer by this share, and the others follow it at even times: the
-        blocks of many sensors that began together are not all judged at once. Else a block
-        is as long as it can be after the reading that ended the one before.
+        blocks of many sensors that began together are not all judged at once. They are judged
+        by `settle`, or before the next sample: the one that shows a block to be complete holds up
+        nobody. Else a block is judged at once, and the next is a whole one again.
     sensors : (1,) ordinary.SENSOR, optional
         Where the block is that is being collected.
     """
 
     def __init__(self, learn, memory, guard, block, freeze_std, relearn,
                  background=None, noise_std=None, phase=None, sensors=None):
-        self._learn, self._guard, self._block = learn, guard, block
+        self._learn, self._guard, self._length = learn, guard, block
         self._freeze_std, self._relearn = freeze_std, relearn
-        self._phase = phase
         self._sensors = new_sensors(1) if sensors is None else sensors
-        self._block_now = self._sensors[0]
+        self._state = self._sensors[0]
+        self._state['length'], self._state['phase'] = block, np.nan if phase is None else phase
         self._most = max(3, int(round(memory / block)))
         self._window = BlockWindow(self._most)
         self._given = None if background is None else np.asarray(background, dtype=float)
@@ -72,8 +70,7 @@ class RunningBackground:
 
     def forget(self):
         """Drop what was learnt; what was given beforehand stays."""
-        self._block_now['n'], self._block_now['end'] = 0, np.nan
-        self._longer = (self._phase or 0.0) * self._block
+        self._state['n'], self._state['end'], self._state['is_full'] = 0, np.nan, False
         self._window.clear()
         self._pending, self._strange = deque(), deque()
         self.frozen = self._resumed = False
@@ -164,26 +161,17 @@ class RunningBackground:
 
     def add(self, time, field):
         """Take a sample: `time` [s], `field` (3,) [T], sensor frame."""
-        now = self._block_now
-        if isnan(now['end']):
-            now['end'] = time + self._block + self._longer
-        elif time >= now['end'] and now['n'] >= LEAST_SAMPLES:
-            self._close()
-            now['end'], self._longer = self._next_end(time, float(now['end'])), 0.0
+        self.settle()
         add_to_block(self._sensors, 0, time, np.ascontiguousarray(field, dtype=float))
+        if isnan(self._state['phase']):
+            self.settle()
 
-    def _next_end(self, time, end):
-        """When the next block ends, if one was to end at `end` and did so at `time`."""
-        if self._phase is None:
-            return time + self._block
-        # By the jitter of their stamps the blocks of all sensors would sooner or later end with
-        # the same reading, and once they did so they would for ever.
-        return end + ((time - end) // self._block + 1.0) * self._block
-
-    def _close(self):
-        """Turn the collected samples into a block and judge it."""
-        block = block_of(self._block_now)
-        self._block_now['n'] = 0
+    def settle(self):
+        """Judge the block that the latest sample has shown to be complete; else `add` does it."""
+        if not self._state['is_full']:
+            return
+        block = block_of(self._state)
+        self._state['is_full'] = False
         known = block.n > 1
         self.stuck = bool((block.scatter.diagonal()[known]
                            < LEAST_STD**2 * (block.n[known] - 1)).any())
@@ -197,8 +185,8 @@ class RunningBackground:
     def _begin(self, block):
         """Before it is ready: collect until a quiet stretch is long enough."""
         self._strange.append(block)
-        # From centre to centre; the blocks of a slow sensor may be longer than `_block`.
-        enough = self._learn - 1.5 * self._block
+        # From centre to centre; the blocks of a slow sensor may be longer than `_length`.
+        enough = self._learn - 1.5 * self._length
         while len(self._strange) > 3 and block.time - self._strange[1].time >= enough:
             self._strange.popleft()
         if len(self._strange) >= 3 and block.time - self._strange[0].time >= enough:

@@ -22,11 +22,12 @@ class Block:
 
 
 def block_of(sensor):
-    """`Block` of the sums over its readings in an `ordinary.SENSOR`."""
-    mean, scatter = np.empty(3), np.empty((3, 3))
-    _moments(sensor['origin'], sensor['count'], sensor['sum'], sensor['product'], mean, scatter)
-    return Block(float(sensor['time'] / sensor['n']), mean, scatter,
-                 sensor['count'].diagonal().copy())
+    """`Block` of the sums of an `ordinary.SENSOR` over the readings of the one that is complete."""
+    k, mean, scatter = 1 - sensor['now'], np.empty(3), np.empty((3, 3))
+    count = sensor['count'][k]
+    _moments(sensor['origin'][k], count, sensor['sum'][k], sensor['product'][k], mean, scatter)
+    return Block(float(sensor['time'][k] / sensor['n'][k]), mean, scatter,
+                 count.diagonal().copy())
 
 
 @njit(void(float64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1],

@@ -12,6 +12,8 @@ NEVER = np.iinfo(np.int64).min
 """[ns] Stamp of what has not been."""
 RECENT = 8
 """Steps from one reading to the next that a spike is compared with."""
+LEAST_SAMPLES = 8
+"""A block has at least so many readings, however slow the sensor: fewer tell nothing of noise."""
 MEMORY = 20_000
 """Readings that the usual repetitions are counted over, about."""
 
@@ -28,10 +30,15 @@ SENSOR = np.dtype([
     # `screening.SpikeFilter`
     ('before_ns', np.int64), ('before', np.float64, 3), ('n_steps', np.int64),
     ('steps', np.float64, (RECENT, 3)),
-    # `background.RunningBackground`: the block that is being collected, from its first reading;
-    # of each pair of axes, over the readings that have both.
-    ('n', np.int64), ('end', np.float64), ('time', np.float64), ('origin', np.float64, 3),
-    ('count', np.float64, (3, 3)), ('sum', np.float64, (3, 3)), ('product', np.float64, (3, 3)),
+    # `background.RunningBackground`: how long a block is, by which share the first is longer (NaN
+    # where they need not follow each other at even times, and are judged at once), and when the
+    # present one ends; which of two is being collected, and whether the other is complete.
+    ('length', np.float64), ('phase', np.float64), ('end', np.float64),
+    ('now', np.int64), ('is_full', np.int64),
+    # Both, from their first reading; of each pair of axes, over the readings that have both.
+    ('n', np.int64, 2), ('time', np.float64, 2), ('origin', np.float64, (2, 3)),
+    ('count', np.float64, (2, 3, 3)), ('sum', np.float64, (2, 3, 3)),
+    ('product', np.float64, (2, 3, 3)),
 ])
 """State of one sensor, in [T] and [s], or [ns] where the name says so."""
 
@@ -52,31 +59,59 @@ def new_sensors(n):
     return sensors
 
 
+@njit(cache=True, inline='always')
+def _ends_block(s, time):
+    """Whether a reading at `time` [s] is the first behind the block that is being collected."""
+    return time >= s.end and s.n[s.now] >= LEAST_SAMPLES
+
+
+@njit(cache=True, inline='always')
+def _begin_block(s, time):
+    """Collect the next block, from a reading at `time` [s] on."""
+    if np.isnan(s.end):
+        s.end = time + s.length * (1.0 if np.isnan(s.phase) else 1.0 + s.phase)
+        return
+    s.now, s.is_full = 1 - s.now, 1
+    s.n[s.now] = 0
+    if np.isnan(s.phase):
+        s.end = time + s.length
+    else:
+        # By the jitter of their stamps the blocks of all sensors would sooner or later end with
+        # the same reading, and once they did so they would for ever.
+        s.end += ((time - s.end) // s.length + 1.0) * s.length
+
+
 @njit(void(_SENSORS, int64, float64, float64[::1]), cache=True)
 def add_to_block(sensors, j, time, field):
-    """Take a reading of sensor `j`, `field` (3,) [T] at `time` [s], into its block."""
+    """Take a reading of sensor `j`, `field` (3,) [T] at `time` [s], into its block.
+
+    What was complete before (`is_full`) has to have been used by now.
+    """
     s = sensors[j]
-    if s.n == 0:
-        s.time = 0.0
+    if np.isnan(s.end) or _ends_block(s, time):
+        _begin_block(s, time)
+    k = s.now
+    if s.n[k] == 0:
+        s.time[k] = 0.0
         for a in range(3):
-            s.origin[a] = np.nan
+            s.origin[k, a] = np.nan
             for b in range(3):
-                s.count[a, b] = s.sum[a, b] = s.product[a, b] = 0.0
-    s.n += 1
-    s.time += time
+                s.count[k, a, b] = s.sum[k, a, b] = s.product[k, a, b] = 0.0
+    s.n[k] += 1
+    s.time[k] += time
     for a in range(3):
         if np.isnan(field[a]):
             continue
-        if np.isnan(s.origin[a]):
-            s.origin[a] = field[a]
-        d = field[a] - s.origin[a]
+        if np.isnan(s.origin[k, a]):
+            s.origin[k, a] = field[a]
+        d = field[a] - s.origin[k, a]
         for b in range(3):
             if not np.isnan(field[b]):
                 # Where it has not been heard before, this reading is the origin of that axis.
-                e = 0.0 if np.isnan(s.origin[b]) else field[b] - s.origin[b]
-                s.count[a, b] += 1.0
-                s.sum[a, b] += d
-                s.product[a, b] += d * e
+                e = 0.0 if np.isnan(s.origin[k, b]) else field[b] - s.origin[k, b]
+                s.count[k, a, b] += 1.0
+                s.sum[k, a, b] += d
+                s.product[k, a, b] += d * e
 
 
 @njit(cache=True, inline='always')
@@ -107,7 +142,9 @@ def _is_odd(s, limits, stamp, raw, field, time):
         if not abs(raw[a]) <= limits.max_field:
             return True
     since = stamp - s.last_ns
-    if not (0 < since and since <= limits.longest_jump_ns) or time >= s.end or s.n == 0:
+    if not (0 < since and since <= limits.longest_jump_ns):
+        return True
+    if s.is_full or np.isnan(s.phase) and _ends_block(s, time):
         return True
     if limits.reject_stuck:
         is_same = field[0] == s.last[0] and field[1] == s.last[1] and field[2] == s.last[2]

@@ -30,6 +30,7 @@ from mag_tracking.io.schema import (
 )
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
+from mag_tracking.nodes.later import Later
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.stage_node import LATCHED, STREAM, StageNode
@@ -39,6 +40,9 @@ from mag_tracking.stages.survey import Survey, with_noise
 
 SHORTEST_TURN_S = 0.02
 """[s] Each sensor has a turn once a second, or where they are more than fifty, one so often."""
+REST_S = 0.004
+"""[s] What need not come before readings are published comes so long behind: by then detection and
+tracker have made a pose of them. Also those of a thousand readings a second come less often."""
 KEEP_EVERY_S = 5.0
 """[s] The backgrounds are written down so often, or oftener where `calibrate.resume_s` is short."""
 
@@ -58,6 +62,7 @@ class CalibrationNode(StageNode):
         self._resume()
         self._survey = Survey(self.network, self.settings.survey)
         self._health = HealthDiagnostics(self.network, self.settings)
+        self._unseen, self._later = [], Later(self, REST_S, self._do_the_rest)
         self._publishers_by_sensor = {}
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self._publishers_by_sensor[sensor] = self.publisher(
@@ -114,7 +119,7 @@ class CalibrationNode(StageNode):
         return {'calibrate': self._stage.n_held}
 
     def _tick(self):
-        """It is time for a turn: behind the next reading, where it holds up none; or else now."""
+        """It is time for a turn: behind the next readings, where it holds up none; or else now."""
         if self._turn_is_due:
             self._next_turn()
         self._turn_is_due = True
@@ -173,9 +178,8 @@ class CalibrationNode(StageNode):
         for sample in self._stage.feed(raw):
             self._publishers_by_sensor[sensor].publish(
                 to_message(MagneticField, sample_dict(sample, message.header.frame_id)))
-        self._health.add(Readings.of([raw]), self.now_ns)
-        if self._turn_is_due:
-            self._next_turn()
+        self._unseen.append((Readings.of([raw]), self.now_ns))
+        self._do_the_rest()
 
     def _take_many(self, message):
         """Raw readings of many sensors; they go on together."""
@@ -185,7 +189,15 @@ class CalibrationNode(StageNode):
         calibrated = self._stage.feed_many(raw)
         if len(calibrated):
             self._readings.publish(to_message(FieldReadings, readings_dict(calibrated)))
-        self._health.add(raw, self.now_ns)
+        self._unseen.append((raw, self.now_ns))
+        self._later.ask()
+
+    def _do_the_rest(self):
+        """Learn from what has come, look at it, and say how one more sensor is."""
+        self._stage.settle()
+        for raw, now_ns in self._unseen:
+            self._health.add(raw, now_ns)
+        self._unseen.clear()
         if self._turn_is_due:
             self._next_turn()
 

@@ -8,8 +8,10 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from mag_tracking.doctoring import background_findings, network_findings
 from mag_tracking.nodes.flow import SILENT_S
+from mag_tracking.records import plain
 from mag_tracking.stages.health import WINDOW, Finding, SensorHealth
 from mag_tracking.stages.stage import NS
+from mag_tracking.stages.waiting import Waiting
 
 TERM_S = 60.0
 """[s] What was wrong is forgotten after one to two of these."""
@@ -24,7 +26,10 @@ class HealthDiagnostics:
 
     def __init__(self, network, settings):
         self._settings = settings
-        self._heard = dict.fromkeys(network.names)
+        self._index = {name: j for j, name in enumerate(network.names)}
+        self._waiting = Waiting(len(network), WINDOW // 2)
+        # When, by the monotonic clock [s]; NaN: never.
+        self._heard = np.full(len(network), np.nan)
         self._frozen_ns, self._compared = {}, {}
         # How many backgrounds had been taken anew when the last term began, and this one.
         self._relearnt = [dict.fromkeys(network.names, 0)] * 2
@@ -33,16 +38,15 @@ class HealthDiagnostics:
     def _begin(self, network):
         """Forget what was; `network` is the one from now on."""
         self._network = network
-        self._clock_ns = {name: round(s * NS) for name, s in
-                          zip(network.names, network.clock_offset, strict=True)}
+        self._clock_ns = np.array([round(s * NS) for s in network.clock_offset], dtype=np.int64)
         self._past = dict.fromkeys(network.names)
         self._present = self._new_term()
         self._began = time.monotonic()
         self._term_ends = self._began + TERM_S
 
     def _new_term(self):
-        """{name: SensorHealth} that has seen nothing, and is looked at when it is its turn."""
-        return {name: SensorHealth(WINDOW // 2, on_demand=False) for name in self._network.names}
+        """{name: SensorHealth} that has seen nothing."""
+        return {name: SensorHealth() for name in self._network.names}
 
     def renew(self, network):
         """Go on with another calibration of the same sensors."""
@@ -50,14 +54,16 @@ class HealthDiagnostics:
 
     def add(self, readings, now_ns):
         """Raw `Readings` that came at `now_ns`; those of sensors of other networks are none."""
-        now, names = time.monotonic(), readings.names
-        # Copied: they are looked at later.
-        for j, stamp_ns, field in zip(readings.sensor.tolist(), readings.stamp_ns.tolist(),
-                                      readings.field.copy(), strict=True):
-            name = names[j]
-            if name in self._present:
-                self._present[name].add(stamp_ns - self._clock_ns[name], field, now_ns)
-                self._heard[name] = now
+        rows = readings.rows(self._index)
+        self._heard[rows[rows >= 0]] = time.monotonic()
+        # A stamp of a row that is none is not used.
+        stamps, field, i = readings.stamp_ns - self._clock_ns[rows], plain(readings.field), 0
+        while (i := self._waiting.add(rows, stamps, field, now_ns, i)) < len(rows):
+            self._look(rows[i])
+
+    def _look(self, j):
+        """Look at what waits of sensor `j`."""
+        self._present[self._network.names[j]].take(*self._waiting.take(j))
 
     def statuses(self, node, calibrate):
         """[DiagnosticStatus], one a sensor; `calibrate` is the `Calibrate` stage."""
@@ -96,10 +102,9 @@ class HealthDiagnostics:
 
     def _findings(self, j, name, calibrate):
         """What is wrong with a sensor, the worst first."""
-        heard = self._heard[name]
-        if heard is None or time.monotonic() - heard > SILENT_S:
-            what = 'nothing has come' if heard is None else \
-                f'silent for {time.monotonic() - heard:.0f} s'
+        silent_s = time.monotonic() - self._heard[j]
+        if not silent_s <= SILENT_S:
+            what = 'nothing has come' if math.isnan(silent_s) else f'silent for {silent_s:.0f} s'
             return [Finding(True, name, what, 'look at its cable, its driver and the topic '
                             f'{self._network.topics[j]}')]
         found = {f.what: f for f in self._compared[name]}
@@ -118,7 +123,7 @@ class HealthDiagnostics:
     def status(self, node, j, calibrate):
         """The DiagnosticStatus of sensor `j`, as of its latest readings."""
         name = self._network.names[j]
-        self._present[name].look()
+        self._look(j)
         found = self._findings(j, name, calibrate)
         level = DiagnosticStatus.OK
         if found:

@@ -103,10 +103,8 @@ class Align:
 
     def feed_many(self, readings):
         """Calibrated `Readings` give the `FieldFrame`s that they complete."""
-        index, out, k, n = self._index, [], 0, len(readings)
-        of = np.array([index.get(name, -1) for name in readings.names], dtype=np.int64)
-        rows = of[readings.sensor]
-        C = readings.covariance
+        out, k, n = [], 0, len(readings)
+        rows, C = readings.rows(self._index), readings.covariance
         if C is None:
             rows, C = np.full(n, -1), np.full((n, 3, 3), np.nan)
         stamps, fields, C = plain(readings.stamp_ns, np.int64), plain(readings.field), plain(C)

@@ -157,9 +157,8 @@ class Calibrate:
 
     def feed_many(self, readings):
         """Raw `Readings` give the calibrated ones that are now known to be whole."""
-        index = self._index
-        of = np.array([index.get(name, -1) for name in readings.names], dtype=np.int64)
-        rows, n, i, parts = of[readings.sensor], len(readings), 0, []
+        index, n, i, parts = self._index, len(readings), 0, []
+        rows = readings.rows(index)
         if readings.covariance is not None:
             # What one says of its own covariance is looked at one by one.
             rows = np.where(np.isnan(readings.covariance).all(axis=(1, 2)), rows, -1)
@@ -183,6 +182,7 @@ class Calibrate:
         """As `feed`, of a sample that may be odd."""
         if sample.sensor not in self._background:
             return self._reject(sample, f'unknown sensor {sample.sensor}')
+        self._background[sample.sensor].settle()
         cause = fault_of(sample, self._settings.max_field)
         if cause:
             return self._reject(sample, cause)
@@ -313,6 +313,16 @@ class Calibrate:
             return []
         self.counts['calibrated'] += 1
         return [MagSample(sample.stamp_ns, sample.sensor, field, covariance)]
+
+    def settle(self):
+        """Learn from what is complete, which could wait until all was published; else `feed` does.
+
+        The same comes of it: in a large network the reading that shows that a block of the
+        background is complete is calibrated with what was known before.
+        """
+        for i in np.flatnonzero(self._sensors['is_full']):
+            self._background[self._network.names[i]].settle()
+            self._note(i)
 
     def flush(self):
         """What waited for the next reading."""

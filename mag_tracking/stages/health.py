@@ -49,13 +49,12 @@ class Finding:
 class SensorHealth:
     """Looks at the readings of one sensor as they come.
 
-    That is whenever `every` so many have come, and when `look` is called; `on_demand`
-    also before each answer.
+    That is whenever `every` so many have come, and before each answer; or when many are
+    given at once.
     """
 
-    def __init__(self, every=EVERY, on_demand=True):
+    def __init__(self, every=EVERY):
         self._every = every
-        self._demand = self.look if on_demand else lambda: None
         self._counts = Counter()
         self._largest_step_s = 0.0
         self._new = []
@@ -78,18 +77,28 @@ class SensorHealth:
     def counts(self):
         """`readings`, `lost`, `duplicates`, `stamps that went back`, `clock steps`, `spikes`,
         `saturated`, `without any axis`, `stuck readings`; and `x`, `y`, `z` missing."""
-        self._demand()
+        self.look()
         return self._counts
 
     def look(self):
         """Take the new readings into the window."""
-        if not self._new:
+        if self._new:
+            stamps, fields, received = zip(*self._new, strict=True)
+            self._new = []
+            self.take(np.array(stamps, dtype=np.int64), np.array(fields, dtype=float),
+                      np.array(received, dtype=np.int64))
+
+    def take(self, stamps, fields, received):
+        """Take readings into the window: (n,) [ns], (n, 3) [T], and (n,) [ns] or `UNKNOWN`.
+
+        No more than `WINDOW` at once; they may be changed later.
+        """
+        n, self._made = len(stamps), {}
+        if not n:
             return
-        stamps, fields, received = zip(*self._new, strict=True)
-        n, self._new, self._made = len(stamps), [], {}
-        self._stamps = np.append(self._stamps, np.array(stamps, dtype=np.int64))[-WINDOW:]
-        self._received = np.append(self._received, np.array(received, dtype=np.int64))[-WINDOW:]
-        self._fields = np.append(self._fields, np.array(fields, dtype=float), axis=0)[-WINDOW:]
+        self._stamps = np.append(self._stamps, stamps)[-WINDOW:]
+        self._received = np.append(self._received, received)[-WINDOW:]
+        self._fields = np.append(self._fields, fields, axis=0)[-WINDOW:]
         self._counts['readings'] += n
         self._in_time(n)
         self._values(n)
@@ -157,7 +166,7 @@ class SensorHealth:
     @property
     def rate(self):
         """[Hz] of the latest readings; NaN before there are enough."""
-        self._demand()
+        self.look()
         return NS / self._interval_ns
 
     @property
@@ -172,7 +181,7 @@ class SensorHealth:
 
     def _once(self, name, make):
         """`make` of the fields in the window; once, however often it is asked for."""
-        self._demand()
+        self.look()
         if name not in self._made:
             self._made[name] = make(self._fields)
         return self._made[name]
@@ -180,7 +189,7 @@ class SensorHealth:
     @property
     def dead_axes(self):
         """Such as 'xz': axes that have not changed in a window in which another one did."""
-        self._demand()
+        self.look()
         if len(self._fields) < WINDOW:
             return ''
         there = ~np.isnan(self._fields).any(axis=0)
@@ -190,7 +199,7 @@ class SensorHealth:
     @property
     def delay_s(self):
         """(median, 5 %, 95 %) [s] from stamp to receipt; NaN where receipts are not known."""
-        self._demand()
+        self.look()
         if 'delay' not in self._made:
             known = self._received != UNKNOWN
             delays = (self._received - self._stamps)[known] / NS
