@@ -53,6 +53,12 @@ class Readings:
         """(n,) int: of each reading its sensor's place in `index`, {name: place}; -1: not in it."""
         return np.array([index.get(name, -1) for name in self.names], dtype=np.int64)[self.sensor]
 
+    def part(self, which):
+        """Those of `which`, (n,) bool."""
+        C = self.covariance
+        return Readings(self.names, self.sensor[which], self.stamp_ns[which], self.field[which],
+                        None if C is None else C[which])
+
     def samples(self):
         """All of them."""
         return [self.sample(i) for i in range(len(self))]
@@ -77,15 +83,21 @@ class Readings:
     @classmethod
     def of(cls, samples):
         """Of `MagSample`s."""
-        names = tuple(dict.fromkeys(s.sensor for s in samples))
-        rows, unknown = {name: j for j, name in enumerate(names)}, np.full((3, 3), np.nan)
-        covariance = None
+        covariance, unknown = None, np.full((3, 3), np.nan)
         if any(s.covariance is not None for s in samples):
             covariance = np.array([unknown if s.covariance is None else s.covariance
                                    for s in samples])
-        return cls(names, np.array([rows[s.sensor] for s in samples], dtype=np.int64),
-                   np.array([s.stamp_ns for s in samples], dtype=np.int64),
-                   np.array([s.field for s in samples], dtype=float).reshape(-1, 3), covariance)
+        return cls.by_name([s.sensor for s in samples], [s.stamp_ns for s in samples],
+                           np.array([s.field for s in samples], dtype=float).reshape(-1, 3),
+                           covariance)
+
+    @classmethod
+    def by_name(cls, sensors, stamps, field, covariance=None):
+        """Of lists of each reading's sensor and stamp [ns], and its field (n, 3) [T]."""
+        names = tuple(dict.fromkeys(sensors))
+        rows = {name: j for j, name in enumerate(names)}
+        return cls(names, np.array([rows[s] for s in sensors], dtype=np.int64),
+                   np.array(stamps, dtype=np.int64), field, covariance)
 
 
 @dataclass(frozen=True, slots=True)

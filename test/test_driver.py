@@ -61,6 +61,12 @@ class ScriptedDevice:
         self.calls.append('close')
 
 
+def said(driver, timeout_s):
+    """What `driver` has, as samples."""
+    readings, accelerations = driver.poll(timeout_s)
+    return [*readings.samples(), *accelerations]
+
+
 def driver_of(script, settings=None, sensors=None, clock=CLOCK):
     machine = Machine()
     device = ScriptedDevice(machine, script)
@@ -73,7 +79,7 @@ def test_a_reading_is_a_sample_in_si_and_in_time_of_day():
     reading = Reading('A', (10.0, -20.0, float('nan')), (0.0, 0.0, 1.0), ticks=7)
     driver, _, machine = driver_of([[reading]], {'unit': 'mG', 'acceleration_unit': 'g'},
                                    {'A': 'mag_7'})
-    field, acceleration = driver.poll(0.2)
+    field, acceleration = said(driver, 0.2)
     assert isinstance(field, MagSample) and isinstance(acceleration, AccelerationSample)
     assert field.sensor == acceleration.sensor == 'mag_7'
     np.testing.assert_allclose(field.field, [1e-6, -2e-6, np.nan])
@@ -86,7 +92,7 @@ def test_a_reading_is_a_sample_in_si_and_in_time_of_day():
                                          ('G', 1e-4), ('mG', 1e-7), ('1.5e-8', 1.5e-8)])
 def test_units(unit, tesla):
     driver, *_ = driver_of([[Reading('', (2.0, 3.0, 4.0))]], {'unit': unit})
-    np.testing.assert_allclose(driver.poll(0.1)[0].field, np.array([2.0, 3.0, 4.0]) * tesla,
+    np.testing.assert_allclose(said(driver, 0.1)[0].field, np.array([2.0, 3.0, 4.0]) * tesla,
                                rtol=1e-12)
 
 
@@ -105,7 +111,7 @@ def test_a_lost_device_is_opened_again_with_back_off():
                            [Reading('', (1.0, 2.0, 3.0))]])
     opened, times, samples = 0, [], []
     while len(samples) < 2:
-        samples += driver.poll(0.01)
+        samples += said(driver, 0.01)
         if device.calls.count('open') > opened:
             opened = device.calls.count('open')
             times.append(machine.now_ns / 1e9)
@@ -152,7 +158,7 @@ def test_steps_of_the_machines_clock_move_stamps_at_once_and_are_counted():
     for k in range(3):
         machine.now_ns = 5_000_000_000 + 1_000_000 * k
         machine.step_ns = 0 if k < 2 else 3_600_000_000_000
-        stamps.append(driver.poll(0.1)[0].stamp_ns)
+        stamps.append(said(driver, 0.1)[0].stamp_ns)
     assert stamps[1] - stamps[0] == pytest.approx(1_000_000, abs=2)
     assert stamps[2] - stamps[1] == pytest.approx(3_600_001_000_000, abs=2)
     assert driver.counts()["steps of this machine's clock"] == 1
@@ -164,7 +170,7 @@ def test_what_stamps():
         out = []
         for k in range(len(readings)):
             machine.now_ns = 5_000_000_000 + 10_000_000 * k + (3_000_000 if k == 1 else 0)
-            out += [s.stamp_ns - DAY_NS - 5_000_000_000 for s in driver.poll(0.1)]
+            out += [s.stamp_ns - DAY_NS - 5_000_000_000 for s in said(driver, 0.1)]
         return driver, out
     field = (1.0, 2.0, 3.0)
     ticked = [Reading('', field, ticks=10_000 * k, sequence=k) for k in range(3)]
@@ -186,7 +192,7 @@ def test_each_source_has_its_own_clock_and_its_name():
     here, there = Reading('', (1.0, 0.0, 0.0), ticks=0), Reading('', (2.0, 0.0, 0.0), ticks=10**9)
     driver, _, _ = driver_of([[(here, 'road/a'), (there, 'road/b'), (here, 'road/c')]],
                              sensors={'road/a': 'mag_1', 'road/b': 'mag_2'})
-    samples = driver.poll(0.1)
+    samples = said(driver, 0.1)
     assert [(s.sensor, s.field[0]) for s in samples] == [('mag_1', 1.0), ('mag_2', 2.0)]
     assert samples[0].stamp_ns == samples[1].stamp_ns
     assert set(driver.clocks()) == {'road/a', 'road/b'}
@@ -194,12 +200,12 @@ def test_each_source_has_its_own_clock_and_its_name():
     # The device's own name counts before the place that it sends from.
     driver, _, _ = driver_of([[(Reading('A', (1.0, 0.0, 0.0)), 'road/b')]],
                              sensors={'A': 'mag_1', 'road/b': 'mag_2'})
-    assert driver.poll(0.1)[0].sensor == 'mag_1'
+    assert said(driver, 0.1)[0].sensor == 'mag_1'
 
 
 def test_an_acceleration_alone_is_no_field():
     driver, *_ = driver_of([[Reading('', None, (0.0, 0.0, 9.8))]])
-    assert [type(s) for s in driver.poll(0.1)] == [AccelerationSample]
+    assert [type(s) for s in said(driver, 0.1)] == [AccelerationSample]
 
 
 def test_errors_of_other_peoples_devices_are_trouble_like_any_other():
@@ -216,13 +222,13 @@ def test_errors_of_other_peoples_devices_are_trouble_like_any_other():
 def test_readings_are_gathered():
     script = [[Reading('', (float(k), 0.0, 0.0))] for k in range(3)]
     driver, _, machine = driver_of([*script, []], {'gather_s': 0.004})
-    assert [s.field[0] for s in driver.poll(0.2)] == [0.0, 1.0, 2.0]
+    assert [s.field[0] for s in said(driver, 0.2)] == [0.0, 1.0, 2.0]
     assert machine.slept == [pytest.approx(0.004)]
     # A loss on the way takes nothing of what has come.
     driver, *_ = driver_of([script[0], DeviceError('gone'), DeviceError('gone')],
                            {'gather_s': 0.004})
-    assert len(driver.poll(0.2)) == 1 and driver.is_open
-    assert driver.poll(0.2) == [] and driver.trouble == 'gone'
+    assert len(said(driver, 0.2)) == 1 and driver.is_open
+    assert said(driver, 0.2) == [] and driver.trouble == 'gone'
 
 
 def checked(numbers, wrap=0, values=None):
@@ -266,7 +272,7 @@ def test_the_memory_of_a_sequence_is_bounded():
 def test_one_topic_is_of_one_sensor():
     driver, *_ = driver_of([[Reading('A', (1.0, 0.0, 0.0)), Reading('B', (2.0, 0.0, 0.0)),
                              Reading('A', (3.0, 0.0, 0.0))]])
-    assert [s.field[0] for s in driver.poll(0.1)] == [1.0, 3.0]
+    assert [s.field[0] for s in said(driver, 0.1)] == [1.0, 3.0]
     assert driver.counts()['of unknown sensors: B'] == 1
 
 
@@ -274,14 +280,14 @@ def test_a_sensor_that_is_not_used_is_no_news():
     driver, *_ = driver_of([[Reading('A', (1.0, 0.0, 0.0), sequence=1),
                              Reading('B', (2.0, 0.0, 0.0), sequence=1)]],
                            sensors={'A': 'mag_1', 'B': '-'})
-    assert [s.sensor for s in driver.poll(0.1)] == ['mag_1']
+    assert [s.sensor for s in said(driver, 0.1)] == ['mag_1']
     assert driver.counts() == {'samples: mag_1': 1}
 
 
 def test_unknown_names_do_not_pile_up():
     readings = [Reading(f'x{k}', (1.0, 0.0, 0.0)) for k in range(1000)]
     driver, *_ = driver_of([readings], sensors={'A': 'mag_1'})
-    assert driver.poll(0.1) == []
+    assert said(driver, 0.1) == []
     assert len(driver.counts()) == 21
     assert driver.counts()['of unknown sensors (and others)'] == 980
     assert len(driver._unknown) == 20
@@ -290,7 +296,7 @@ def test_unknown_names_do_not_pile_up():
 def test_a_reading_beyond_all_numbers_is_none():
     driver, *_ = driver_of([[Reading('', (1e308, 0.0, 0.0)), Reading('', (1.0, 0.0, 0.0))]],
                            {'unit': '1e10'})
-    assert len(driver.poll(0.1)) == 1
+    assert len(said(driver, 0.1)) == 1
     assert driver.counts()['readings that are infinite in tesla'] == 1
 
 
@@ -313,8 +319,9 @@ def test_errors_behind_a_driver_are_not_the_devices():
     driver, device, _ = driver_of([[Reading('', (1.0, 2.0, 3.0))]] * 3)
     taken = []
 
-    def take(samples):
-        taken.append(samples)
+    def take(readings, accelerations):
+        assert not accelerations
+        taken.append(readings)
         if len(taken) == 1:
             raise ValueError('nobody expected it')
     serve(driver, take, lambda: len(taken) == 3)

@@ -55,9 +55,9 @@ class _Ear:
             driver, self._take, self._stop.is_set))
         self._thread.start()
 
-    def _take(self, samples):
+    def _take(self, readings, accelerations):
         """Keep what was said."""
-        for sample in samples:
+        for sample in (*readings.samples(), *accelerations):
             self._heard[sample.sensor].append(sample)
 
     def stop(self):
@@ -78,7 +78,7 @@ class _Ear:
                 out.append(f'  {sensor:12s} nothing')
                 continue
             self.silent.discard(sensor)
-            behind_ms = (time.time_ns() - samples[-1].stamp_ns) / 1e6
+            behind_ms = (time.time_ns() - max(s.stamp_ns for s in samples)) / 1e6
             out.append(f'  {sensor:12s} {_said(samples, elapsed_s)}  latest {behind_ms:.0f} ms ago')
         return out
 

@@ -12,6 +12,10 @@ _NEGLIGIBLE = np.log(100.0)
 """Hypotheses lighter than the heaviest by more than this have no say in which is published."""
 
 
+_SINGULAR = 1e-15
+"""A variance that is smaller than the largest by this is none."""
+
+
 def log_sum_exp(a, axis=None):
     """log(sum(exp(a))) without overflow; -inf where all are -inf."""
     a = np.asarray(a, dtype=float)
@@ -104,9 +108,12 @@ class FilterBank:
 
     def _heaviest(self, kind, rows):
         """Those of `rows` that are of the kind (n_hyp,) which weighs most."""
-        kinds = np.unique(kind[rows])
-        totals = [log_sum_exp(self.log_w[rows[kind[rows] == k]]) for k in kinds]
-        return rows[kind[rows] == kinds[int(np.argmax(totals))]]
+        of_rows = kind[rows]
+        if (of_rows == of_rows[0]).all():
+            return rows
+        kinds = np.unique(of_rows)
+        totals = [log_sum_exp(self.log_w[rows[of_rows == k]]) for k in kinds]
+        return rows[of_rows == kinds[int(np.argmax(totals))]]
 
     def separated_weight(self, i, distance=3.0):
         """Total weight of the hypotheses whose position is apart from that of row `i`.
@@ -115,8 +122,11 @@ class FilterBank:
         direction (both covariances), so neither explains the other.
         """
         difference = self.x[:, :3] - self.x[i, :3]
-        S = self.P[:, :3, :3] + self.P[i, :3, :3]
-        z = np.einsum('ni,nij,nj->n', difference, np.linalg.pinv(S, hermitian=True), difference)
+        variance, axes = np.linalg.eigh(self.P[:, :3, :3] + self.P[i, :3, :3])
+        along = np.einsum('ni,nij->nj', difference, axes)
+        # Where nothing varies there is nothing to be apart by.
+        varies = variance > _SINGULAR * variance[:, -1:]
+        z = (along**2 / np.where(varies, variance, np.inf)).sum(axis=1)
         apart = z > distance**2
         return float(np.exp(log_sum_exp(self.log_w[apart]))) if apart.any() else 0.0
 

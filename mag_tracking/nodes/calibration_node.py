@@ -40,7 +40,7 @@ from mag_tracking.stages.survey import Survey, with_noise
 
 SHORTEST_TURN_S = 0.02
 """[s] Each sensor has a turn once a second, or where they are more than fifty, one so often."""
-REST_S = 0.004
+REST_S = 0.0025
 """[s] What need not come before readings are published comes so long behind: by then detection and
 tracker have made a pose of them. Also those of a thousand readings a second come less often."""
 KEEP_EVERY_S = 5.0

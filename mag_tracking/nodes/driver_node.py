@@ -23,7 +23,6 @@ from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.driver_health import DriverDiagnostics
 from mag_tracking.nodes.stage_node import RESULTS, STREAM
-from mag_tracking.records import MagSample, Readings
 
 PATIENCE_S = 15.0
 """[s] Time that a driver has to stop; a broker that does not answer takes a while."""
@@ -112,19 +111,17 @@ class DriverNode(LifecycleNode):
         return (self.create_publisher(MagneticField, topic, STREAM),
                 self.create_publisher(Imu, imu_topic, STREAM))
 
-    def _publish(self, samples):
-        """Each sample on its topic, or with `batches` the fields together."""
-        together = []
-        for sample in samples:
-            fields, accelerations = self._publishers_by_sensor[sample.sensor]
-            if not isinstance(sample, MagSample):
-                accelerations.publish(to_message(Imu, acceleration_dict(sample, sample.sensor)))
-            elif self._readings is not None:
-                together.append(sample)
-            else:
-                fields.publish(to_message(MagneticField, sample_dict(sample, sample.sensor)))
-        if together:
-            self._readings.publish(to_message(FieldReadings, readings_dict(Readings.of(together))))
+    def _publish(self, readings, accelerations):
+        """Each reading on its sensor's topic, or with `batches` together."""
+        if self._readings is None:
+            for sample in readings.samples():
+                self._publishers_by_sensor[sample.sensor][0].publish(
+                    to_message(MagneticField, sample_dict(sample, sample.sensor)))
+        elif len(readings):
+            self._readings.publish(to_message(FieldReadings, readings_dict(readings)))
+        for sample in accelerations:
+            self._publishers_by_sensor[sample.sensor][1].publish(
+                to_message(Imu, acceleration_dict(sample, sample.sensor)))
 
     def _stop(self):
         """End the threads; they close their devices."""

@@ -1,5 +1,7 @@
 """What the sensors see of a bank's states: where the target's physics meets the filter's states."""
 
+import math
+
 import numpy as np
 
 from mag_tracking.physics.dipole import sensor_fields
@@ -86,12 +88,12 @@ class Observation:
             They are multiplied by the one, and the other is added.
         """
         n = len(self._positions)
-        fading = np.exp(-abs(dt) / self._error_time) if self._error_time else 1.0
-        angles, errors = self._n_angles, self.n_own - self._n_angles
-        decay = np.tile(np.repeat([1.0, fading], [angles, errors]), n)
-        variance = np.tile(np.repeat([0.0, 1.0 - fading**2], [angles, errors]), n)
-        walk = background_density**2 * max(dt, 0.0)
-        return np.append(decay, np.ones(3 * n)), np.append(variance, np.full(3 * n, walk))
+        fading = math.exp(-abs(dt) / self._error_time) if self._error_time else 1.0
+        decay, variance = np.ones((self.n_own + 3) * n), np.zeros((self.n_own + 3) * n)
+        decay[:-3 * n].reshape(n, self.n_own)[:, self._n_angles:] = fading
+        variance[:-3 * n].reshape(n, self.n_own)[:, self._n_angles:] = 1.0 - fading**2
+        variance[-3 * n:] = background_density**2 * max(dt, 0.0)
+        return decay, variance
 
     def target_fields(self, x, time_offset):
         """Field of the target alone, at each sensor's own time; see `sensor_fields`."""

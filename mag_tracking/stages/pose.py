@@ -84,12 +84,14 @@ def published_track(bank, best, model, orientation, names, kinds, strange, **kno
     said, flags = _said_of(model, orientation, bank.x[best, :n_t], bank.P[best, :n_t, :n_t])
     weights = np.exp(bank.log_w)
     moments = model.dipoles(bank.x[:, :n_t]).m.sum(axis=1)
+    # Copies all at once: there may be hundreds.
     order = np.argsort(-bank.log_w, kind='stable')
     hypotheses = tuple(
-        Hypothesis(names[bank.label[i]], float(weights[i]), bank.x[i, :3].copy(),
-                   bank.x[i, 3:6].copy(), bank.P[i, :6, :6].copy(), moments[i].copy(),
-                   kinds[bank.kind[i]])
-        for i in order)
+        Hypothesis(names[label], weight, position, velocity, covariance, moment, kinds[kind])
+        for label, weight, position, velocity, covariance, moment, kind in zip(
+            bank.label[order].tolist(), weights[order].tolist(), bank.x[order, :3],
+            bank.x[order, 3:6], bank.P[order, :6, :6], moments[order], bank.kind[order].tolist(),
+            strict=True))
     nis = bank.nis[best]
     return Track(
         nis=float('nan') if np.isnan(nis).all() else float(np.nansum(nis)),

@@ -5,7 +5,6 @@ the sensors, turns units into SI, stamps every reading with the time of its
 measurement on this machine's clock, and counts what is missing.
 """
 
-import math
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ import numpy as np
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.io.drivers.device_clock import ArrivalClock, DeviceClock
 from mag_tracking.io.drivers.sequence import SequenceCheck
-from mag_tracking.records import AccelerationSample, MagSample
+from mag_tracking.records import AccelerationSample, Readings
 from mag_tracking.settings import param
 
 FIELD_UNITS = {'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'G': 1e-4, 'mG': 1e-7}
@@ -31,6 +30,8 @@ MOST_NAMES = 20
 MOST_SOURCES = 4096
 """Clocks that are kept."""
 STAMPED_BY = ('auto', 'ticks', 'sequence', 'arrival')
+NOTHING = Readings.of([]), []
+"""That has come."""
 STEP_NS = 10_000_000
 """[ns] The clock of this machine was set when it differs by more from one moment to the next."""
 
@@ -143,29 +144,27 @@ class Driver:
         return total
 
     def poll(self, timeout_s):
-        """What has come, as `MagSample`s and `AccelerationSample`s; [] after `timeout_s`.
+        """What has come: (`Readings`, [`AccelerationSample`]); both empty after `timeout_s`.
 
         Opens the device where it is not open and it is time to try. Never raises for
         the device's sake: what is wrong stands in `trouble`.
         """
         if not self._open and not self._try_to_open(timeout_s):
-            return []
+            return NOTHING
         try:
             arrivals = self._read(timeout_s)
         except DeviceError as error:
             self.own_counts['connections lost'] += 1
             self._give_up(error)
-            return []
+            return NOTHING
         now = self._monotonic_ns()
         if not arrivals:
             if self._settings.silent_s and now - self._heard_ns > self._settings.silent_s * 1e9:
                 self.own_counts['silent, so opened again'] += 1
                 self._give_up(f'open, but nothing has come for {self._settings.silent_s:g} s')
-            return []
+            return NOTHING
         self._heard_ns, self._retry_s, self.trouble = now, self._settings.retry_s, ''
-        offset = self._wall_offset(now)
-        samples = [self._samples(a, offset) for a in arrivals]
-        return [s for some in samples for s in some]
+        return self._samples(arrivals, self._wall_offset(now))
 
     def _read(self, timeout_s):
         """What the device has, and what comes within `gather_s` after the first of it."""
@@ -228,33 +227,41 @@ class Driver:
         self._offset_ns = offset
         return offset
 
-    def _samples(self, arrival, offset_ns):
-        """The samples of one reading."""
-        reading, source = arrival.reading, arrival.source
-        sensor = self._named.get((reading.sensor, source)) \
-            or self._sensor_of(reading.sensor, source)
-        if sensor is None:
-            return []
-        if reading.sequence is not None and not self._sequences[sensor].is_new(
+    def _samples(self, arrivals, offset_ns):
+        """(`Readings`, [`AccelerationSample`]) of what has come."""
+        sensors, stamps, fields, accelerations = [], [], [], []
+        for arrival in arrivals:
+            reading = arrival.reading
+            sensor, stamp_ns = self._measured(reading, arrival)
+            if stamp_ns is None:
+                continue
+            if reading.field is not None:
+                sensors.append(sensor)
+                stamps.append(stamp_ns + offset_ns)
+                fields.append(reading.field)
+            if reading.acceleration is not None:
+                accelerations.append(AccelerationSample(
+                    stamp_ns + offset_ns, sensor,
+                    self._acceleration_scale * np.array(reading.acceleration)))
+        with np.errstate(over='ignore'):
+            field = self._scale * np.array(fields, dtype=float).reshape(-1, 3)
+        readings = Readings.by_name(sensors, stamps, field)
+        infinite = np.isinf(readings.field).any(axis=1)
+        if infinite.any():
+            self.own_counts['readings that are infinite in tesla'] += int(infinite.sum())
+            readings = readings.part(~infinite)
+        self.own_counts.update([self._sample_counts[readings.names[j]]
+                                for j in readings.sensor.tolist()])
+        return readings, accelerations
+
+    def _measured(self, reading, arrival):
+        """(the network's name of the sensor, monotonic ns) of a reading; None for what is not."""
+        sensor = self._named.get((reading.sensor, arrival.source)) \
+            or self._sensor_of(reading.sensor, arrival.source)
+        if sensor is None or reading.sequence is not None and not self._sequences[sensor].is_new(
                 reading.sequence, reading[1:3]):
-            return []
-        stamp_ns = self._stamp(reading, arrival)
-        if stamp_ns is None:
-            return []
-        stamp_ns += offset_ns
-        out = []
-        if reading.field is not None:
-            x, y, z = reading.field
-            field = [self._scale * x, self._scale * y, self._scale * z]
-            if not math.isfinite(sum(field)) and any(map(math.isinf, field)):
-                self.own_counts['readings that are infinite in tesla'] += 1
-                return []
-            self.own_counts[self._sample_counts[sensor]] += 1
-            out.append(MagSample(stamp_ns, sensor, np.array(field)))
-        if reading.acceleration is not None:
-            out.append(AccelerationSample(
-                stamp_ns, sensor, self._acceleration_scale * np.array(reading.acceleration)))
-        return out
+            return sensor, None
+        return sensor, self._stamp(reading, arrival)
 
     def _sensor_of(self, at_device, source):
         """The network's name of a sensor; None for one that nobody has named."""
@@ -300,20 +307,20 @@ class Driver:
 
 
 def serve(driver, take, stopping):
-    """Hand what `driver` says to `take`, a function of a list of samples, until `stopping()`.
+    """Hand what `driver` says to `take`, a function as of `poll`'s result, until `stopping()`.
 
     For a thread of its own, which nobody would see die: what the device raises stands in
     `driver.trouble`, what `take` raises in `driver.own_counts`.
     """
     while not stopping():
         try:
-            samples = driver.poll(POLL_S)
+            heard = driver.poll(POLL_S)
         except Exception as error:
             driver.fail(error)
             continue
         try:
-            if samples:
-                take(samples)
+            if any(map(len, heard)):
+                take(*heard)
         except Exception as error:
             # Not the device's fault, which goes on.
             what = f'errors behind the driver: {type(error).__name__}'
