@@ -1,5 +1,6 @@
 """A driver keeps its device open, names, scales and stamps what it says, and counts the rest."""
 
+import gc
 from collections import Counter
 
 import numpy as np
@@ -233,7 +234,7 @@ def test_readings_are_gathered():
 
 def checked(numbers, wrap=0, values=None):
     check = SequenceCheck(wrap)
-    new = [check.is_new(n, (float(k if values is None else values[k]), float('nan')))
+    new = [check.is_new(n, b'%d' % (k if values is None else values[k]))
            for k, n in enumerate(numbers)]
     return new, +check.counts
 
@@ -265,8 +266,21 @@ def test_duplicates_are_not_restarts():
 def test_the_memory_of_a_sequence_is_bounded():
     check = SequenceCheck(0)
     for n in range(0, 100 * MEMORY, 2):
-        check.is_new(n, (0.0,))
+        check.is_new(n, b'0')
     assert len(check._seen) <= MEMORY and len(check._missing) <= MEMORY
+
+
+def test_a_reading_that_comes_twice_is_one():
+    """Also with an axis that is missing; the same count with other numbers is another reading."""
+    def reading(x, sequence, acceleration=None):
+        return Reading('', (x, float('nan'), 3.0), acceleration, sequence=sequence)
+    driver, *_ = driver_of([
+        [reading(1.0, 1), reading(1.0, 1), reading(2.0, 2), reading(2.0, 2, (0.0, 0.0, 9.8))]])
+    assert [type(s) for s in said(driver, 0.1)] == [MagSample] * 3 + [AccelerationSample]
+    counts = driver.counts()
+    assert (counts['duplicates: mag_1'], counts['sequence begun anew: mag_1']) == (1, 1)
+    # What is kept by the thousand is nothing that is looked through for garbage.
+    assert not any(gc.is_tracked(v) for v in driver._sequences['mag_1']._seen.values())
 
 
 def test_one_topic_is_of_one_sensor():

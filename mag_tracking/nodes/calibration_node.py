@@ -41,8 +41,8 @@ from mag_tracking.stages.survey import Survey, with_noise
 SHORTEST_TURN_S = 0.02
 """[s] Each sensor has a turn once a second, or where they are more than fifty, one so often."""
 REST_S = 0.0025
-"""[s] What need not come before readings are published comes so long behind: by then detection and
-tracker have made a pose of them. Also those of a thousand readings a second come less often."""
+"""[s] What need not come before many readings are published comes so long behind: while the nodes
+behind are about to begin, and there are as few cores as two, this one is to sleep."""
 KEEP_EVERY_S = 5.0
 """[s] The backgrounds are written down so often, or oftener where `calibrate.resume_s` is short."""
 

@@ -5,6 +5,7 @@ the sensors, turns units into SI, stamps every reading with the time of its
 measurement on this machine's clock, and counts what is missing.
 """
 
+import struct
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ MOST_NAMES = 20
 MOST_SOURCES = 4096
 """Clocks that are kept."""
 STAMPED_BY = ('auto', 'ticks', 'sequence', 'arrival')
+_AXES = struct.Struct('3d')
 NOTHING = Readings.of([]), []
 """That has come."""
 STEP_NS = 10_000_000
@@ -259,7 +261,7 @@ class Driver:
         sensor = self._named.get((reading.sensor, arrival.source)) \
             or self._sensor_of(reading.sensor, arrival.source)
         if sensor is None or reading.sequence is not None and not self._sequences[sensor].is_new(
-                reading.sequence, reading[1:3]):
+                reading.sequence, _bytes_of(reading.field) + _bytes_of(reading.acceleration)):
             return sensor, None
         return sensor, self._stamp(reading, arrival)
 
@@ -304,6 +306,15 @@ class Driver:
             # Each that has no time is counted.
             self._stamped = of, clock.stamp(ticks, arrival.arrival_ns)
         return self._stamped[1]
+
+
+def _bytes_of(axes):
+    """Three numbers, or None, as bytes.
+
+    They are kept by the thousand. As tuples they would be looked through for garbage, all of them
+    at once: as many as come go, and that is what Python counts before it looks.
+    """
+    return b'-' if axes is None else _AXES.pack(*axes)
 
 
 def serve(driver, take, stopping):

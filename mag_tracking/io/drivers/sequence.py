@@ -23,7 +23,7 @@ class SequenceCheck:
         self._seen, self._missing = {}, {}
 
     def is_new(self, sequence, values):
-        """Whether the reading with this number and these `values` has not come before.
+        """Whether the reading with this number and these `values`, bytes, has not come before.
 
         Counts what is missing; a late one is taken off again. A number that has come
         already with other values is not a duplicate but a count begun anew.
@@ -41,8 +41,7 @@ class SequenceCheck:
             del self._missing[sequence]
             self.counts['lost'] -= 1
             self.counts['came late'] += 1
-        # As text, for a missing axis is NaN, which equals nothing.
-        elif repr(self._seen.get(sequence)) == repr(values):
+        elif self._seen.get(sequence) == values:
             self.counts['duplicates'] += 1
             return False
         else:
