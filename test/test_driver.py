@@ -283,6 +283,23 @@ def test_a_reading_that_comes_twice_is_one():
     assert not any(gc.is_tracked(v) for v in driver._sequences['mag_1']._seen.values())
 
 
+@pytest.mark.parametrize('sequence', [None, 1])
+@pytest.mark.parametrize('field', [(1.0, 2.0), (1.0, 2.0, 3.0) * 2, (10**400, 0.0, 0.0)])
+def test_other_than_three_axes_is_an_error_of_the_device(field, sequence):
+    """Also where it says so three times: their axes are not mixed."""
+    driver, *_ = driver_of([[Reading('', field, sequence=sequence)] * 3])
+    with pytest.raises((ValueError, OverflowError)):
+        driver.poll(0.1)
+
+
+def test_an_infinite_field_is_none_but_its_acceleration_is_one():
+    driver, *_ = driver_of([[Reading('', (float('inf'), 0.0, 0.0), (0.0, 0.0, 9.8)),
+                             Reading('', (1.0, 2.0, 3.0))]])
+    field, acceleration = said(driver, 0.1)
+    assert field.field.tolist() == [1.0, 2.0, 3.0] and isinstance(acceleration, AccelerationSample)
+    assert driver.counts()['readings that are infinite in tesla'] == 1
+
+
 def test_one_topic_is_of_one_sensor():
     driver, *_ = driver_of([[Reading('A', (1.0, 0.0, 0.0)), Reading('B', (2.0, 0.0, 0.0)),
                              Reading('A', (3.0, 0.0, 0.0))]])

@@ -1,5 +1,6 @@
 """Health over the middleware: diagnostics of each sensor, and the doctor on a live system."""
 
+import dataclasses
 import subprocess
 import sys
 import time
@@ -199,6 +200,25 @@ def test_the_doctor_on_a_live_system(ros, talking):
         stranger.wait()
         executor.remove_node(doctor)
         doctor.destroy_node()
+
+
+def test_another_clock_is_no_step_of_it():
+    """What waits to be looked at when a survey has found new clocks is by the old ones."""
+    network, settings = read_network(NETWORK_FILE), settings_for('vehicle')
+    stage, rng = Calibrate(network, settings.calibrate), np.random.default_rng(2)
+    health = HealthDiagnostics(network, settings)
+
+    def feed(begin, end):
+        for k in range(begin, end):
+            readings = Readings(network.names, np.arange(2), np.full(2, k * 10_000_000),
+                                EARTH + 1.2e-8 * rng.standard_normal((2, 3)))
+            health.add(readings, k * 10_000_000 + 2_000_000)
+    feed(0, 90)
+    health.renew(dataclasses.replace(network, clock_offset=np.array([0.5, -0.5])))
+    feed(90, 300)
+    for status in health.statuses('node', stage):
+        told = [status.message, *(v.value for v in status.values)]
+        assert not any('clock' in t or 'went back' in t for t in told), told
 
 
 def test_what_was_wrong_is_forgotten_after_two_terms(monkeypatch):

@@ -15,6 +15,7 @@ import numpy as np
 
 from mag_tracking.calibration.blocks import BlockWindow, block_of, line_through, stacked
 from mag_tracking.calibration.ordinary import add_to_block, new_sensors
+from mag_tracking.records import plain
 
 LOUDEST = 100.0
 """A block whose variance is so many times that of the quietest is no noise: a target passed within
@@ -162,7 +163,7 @@ class RunningBackground:
     def add(self, time, field):
         """Take a sample: `time` [s], `field` (3,) [T], sensor frame."""
         self.settle()
-        add_to_block(self._sensors, 0, time, np.ascontiguousarray(field, dtype=float))
+        add_to_block(self._sensors, 0, time, plain(field))
         if isnan(self._state['phase']):
             self.settle()
 

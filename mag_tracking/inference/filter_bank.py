@@ -10,10 +10,8 @@ import numpy as np
 
 _NEGLIGIBLE = np.log(100.0)
 """Hypotheses lighter than the heaviest by more than this have no say in which is published."""
-
-
 _SINGULAR = 1e-15
-"""A variance that is smaller than the largest by this is none."""
+"""A variance that is less than this share of the largest is none, as in `numpy.linalg.pinv`."""
 
 
 def log_sum_exp(a, axis=None):

@@ -195,9 +195,9 @@ class CalibrationNode(StageNode):
     def _do_the_rest(self):
         """Learn from what has come, look at it, and say how one more sensor is."""
         self._stage.settle()
-        for raw, now_ns in self._unseen:
+        unseen, self._unseen = self._unseen, []
+        for raw, now_ns in unseen:
             self._health.add(raw, now_ns)
-        self._unseen.clear()
         if self._turn_is_due:
             self._next_turn()
 

@@ -22,5 +22,6 @@ class Later:
             self._timer.reset()
 
     def _due(self):
+        """Call it, once."""
         self._timer.cancel()
         self._call()

@@ -27,7 +27,6 @@ class HealthDiagnostics:
     def __init__(self, network, settings):
         self._settings = settings
         self._index = {name: j for j, name in enumerate(network.names)}
-        self._waiting = Waiting(len(network), WINDOW // 2)
         # When, by the monotonic clock [s]; NaN: never.
         self._heard = np.full(len(network), np.nan)
         self._frozen_ns, self._compared = {}, {}
@@ -39,6 +38,8 @@ class HealthDiagnostics:
         """Forget what was; `network` is the one from now on."""
         self._network = network
         self._clock_ns = np.array([round(s * NS) for s in network.clock_offset], dtype=np.int64)
+        # Stamps of before are by other clocks.
+        self._waiting = Waiting(len(network), WINDOW // 2)
         self._past = dict.fromkeys(network.names)
         self._present = self._new_term()
         self._began = time.monotonic()

@@ -315,8 +315,9 @@ class Calibrate:
         return [MagSample(sample.stamp_ns, sample.sensor, field, covariance)]
 
     def settle(self):
-        """Learn from what is complete, which could wait until all was published; else `feed` does.
+        """Learn from what is complete, which could wait until all was published.
 
+        If nobody asks for it, the next reading of the sensor does.
         The same comes of it: in a large network the reading that shows that a block of the
         background is complete is calibrated with what was known before.
         """

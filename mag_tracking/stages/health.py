@@ -91,7 +91,8 @@ class SensorHealth:
     def take(self, stamps, fields, received):
         """Take readings into the window: (n,) [ns], (n, 3) [T], and (n,) [ns] or `UNKNOWN`.
 
-        No more than `WINDOW` at once; they may be changed later.
+        No more than `WINDOW` at once; they may be changed later. Those of `add` are not waited
+        for: it is either the one or the other.
         """
         n, self._made = len(stamps), {}
         if not n:

@@ -32,7 +32,7 @@ MOST_SOURCES = 4096
 """Clocks that are kept."""
 STAMPED_BY = ('auto', 'ticks', 'sequence', 'arrival')
 _AXES = struct.Struct('3d')
-NOTHING = Readings.of([]), []
+NOTHING = Readings.of([]), ()
 """That has come."""
 STEP_NS = 10_000_000
 """[ns] The clock of this machine was set when it differs by more from one moment to the next."""
@@ -146,7 +146,7 @@ class Driver:
         return total
 
     def poll(self, timeout_s):
-        """What has come: (`Readings`, [`AccelerationSample`]); both empty after `timeout_s`.
+        """What has come: (`Readings`, sequence of `AccelerationSample`), empty after `timeout_s`.
 
         Opens the device where it is not open and it is time to try. Never raises for
         the device's sake: what is wrong stands in `trouble`.
@@ -230,7 +230,11 @@ class Driver:
         return offset
 
     def _samples(self, arrivals, offset_ns):
-        """(`Readings`, [`AccelerationSample`]) of what has come."""
+        """(`Readings`, [`AccelerationSample`]) of what has come.
+
+        A field that is infinite in tesla is none; an acceleration that came with it is one.
+        Raises ValueError for other than three axes.
+        """
         sensors, stamps, fields, accelerations = [], [], [], []
         for arrival in arrivals:
             reading = arrival.reading
@@ -246,7 +250,7 @@ class Driver:
                     stamp_ns + offset_ns, sensor,
                     self._acceleration_scale * np.array(reading.acceleration)))
         with np.errstate(over='ignore'):
-            field = self._scale * np.array(fields, dtype=float).reshape(-1, 3)
+            field = self._scale * np.array(fields, dtype=float).reshape(len(fields), 3)
         readings = Readings.by_name(sensors, stamps, field)
         infinite = np.isinf(readings.field).any(axis=1)
         if infinite.any():
@@ -309,12 +313,15 @@ class Driver:
 
 
 def _bytes_of(axes):
-    """Three numbers, or None, as bytes.
+    """Three numbers, or None, as bytes; ValueError for anything else.
 
     They are kept by the thousand. As tuples they would be looked through for garbage, all of them
     at once: as many as come go, and that is what Python counts before it looks.
     """
-    return b'-' if axes is None else _AXES.pack(*axes)
+    try:
+        return b'-' if axes is None else _AXES.pack(*axes)
+    except struct.error as error:
+        raise ValueError(f'expected three numbers, got {axes}'[:100]) from error
 
 
 def serve(driver, take, stopping):
