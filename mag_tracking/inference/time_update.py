@@ -45,13 +45,16 @@ def _predict_bank(x, P, F, Q, variance, decay):
     """Loop over the hypotheses; what is behind the target's states only decays and grows."""
     n_t, n_x = F.shape[1], x.shape[1]
     T = np.empty((n_t, n_x))
+    fades = False
+    for i in range(n_x - n_t):
+        fades |= decay[i] != 1.0
     for p in range(len(x)):
+        if fades:
+            for i in range(n_t, n_x):
+                x[p, i] *= decay[i - n_t]
+                for k in range(n_t, n_x):
+                    P[p, i, k] *= decay[i - n_t] * decay[k - n_t]
         for i in range(n_t, n_x):
-            x[p, i] *= decay[i - n_t]
-            for k in range(n_t, n_x):
-                both = decay[i - n_t] * decay[k - n_t]
-                if both != 1.0:
-                    P[p, i, k] *= both
             P[p, i, i] += variance[i - n_t]
         # T = F times the rows of the target.
         T[:] = 0.0
@@ -67,10 +70,14 @@ def _predict_bank(x, P, F, Q, variance, decay):
                 P[p, a, i] = T[a, i] * decay[i - n_t]
                 P[p, i, a] = P[p, a, i]
         for a in range(n_t):
-            for b in range(a + 1):
-                # Both triangles, so that no rounding makes it lopsided.
-                above, below = Q[p, b, a], Q[p, a, b]
-                for c in range(n_t):
-                    above += T[b, c] * F[p, a, c]
-                    below += T[a, c] * F[p, b, c]
-                P[p, a, b] = P[p, b, a] = 0.5 * (above + below)
+            for b in range(n_t):
+                P[p, a, b] = Q[p, a, b]
+            for c in range(n_t):
+                f = F[p, a, c]
+                if f != 0.0:
+                    for b in range(n_t):
+                        P[p, a, b] += T[b, c] * f
+        # Both triangles, so that no rounding makes it lopsided.
+        for a in range(n_t):
+            for b in range(a):
+                P[p, a, b] = P[p, b, a] = 0.5 * (P[p, a, b] + P[p, b, a])

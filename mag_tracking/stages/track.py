@@ -240,8 +240,9 @@ class TrackStage:
         self._log_odds += evidence - self._no_target.log_density(
             frame, dt, self._settings.background_drift)
         self._anew.add(bank, predicted, log_likelihood, frame, dt)
+        s = self._settings
         self.counts['hypotheses dropped'] += bank.prune(
-            -np.log(self._settings.prune_ratio), self._settings.most_hypotheses)
+            -np.log(s.prune_ratio), s.most_hypotheses if publish else s.most_at_start)
         self.counts.update(self._anew.improve(self._filter, bank))
         self._whole.add(bank, frame, dt, publish)
         if not publish and self._lag is None:

@@ -156,13 +156,15 @@ def _matching_positions(settings, network, frame, R, offset, moments, height):
     distance = np.linspace(settings.farthest, 0.0, 160) - along.min()
     line = np.array([network.centre[0], network.centre[1], height])
     points = line + offset * R[:, 1] - distance[:, None] * R[:, 0]
-    r = network.positions[None] - points[:, None]
-    B = dipole_field(r[None], moments[:, None, None, :])
     present = ~np.isnan(frame.field)
     measured = float(whitened_energy(frame.field, frame.covariance)[0].sum())
     std = np.sqrt(np.einsum('jii->ji', frame.covariance))
     whitening = network.R_sw / np.where(present, std, np.inf)[:, :, None]
-    energy = sum(np.square(B[:, :, j] @ W.T).sum(axis=2) for j, W in enumerate(whitening))
+    # The field is linear in the moment: that of three unit moments tells that of any.
+    r = network.positions[None] - points[:, None]
+    B = dipole_field(r, np.eye(3)[:, None, None, :])
+    A = np.einsum('jab,kpjb->pjak', whitening, B).reshape(len(points), -1, 3)
+    energy = np.einsum('pmk,mk->mp', moments @ (np.swapaxes(A, 1, 2) @ A), moments)
     # Noise alone brings one unit of energy an axis.
     reached = energy >= max(measured - np.count_nonzero(present), 1.0)
     first = np.where(reached.any(axis=1), reached.argmax(axis=1), len(distance) - 1)
