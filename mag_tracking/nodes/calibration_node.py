@@ -38,8 +38,9 @@ from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate import Calibrate
 from mag_tracking.stages.survey import Survey, with_noise
 
-SHORTEST_TURN_S = 0.02
-"""[s] Each sensor has a turn once a second, or where they are more than fifty, one so often."""
+SHORTEST_TURN_S = 0.01
+"""[s] All sensors have their turns once a second, or where they are too many for that, in steps
+that come so often."""
 REST_S = 0.0025
 """[s] What need not come before many readings are published comes so long behind: while the nodes
 behind are about to begin, and there are as few cores as two, this one is to sleep."""
@@ -76,8 +77,8 @@ class CalibrationNode(StageNode):
         self.subscription(FieldReadings, RAW_READINGS, self._take_many, STREAM, source='sensors')
         self.expect('detection_node', CALIBRATED_READINGS)
         self._state = self.publisher(CalibrationState, '~/calibration', LATCHED)
-        self._turn, self._states, self._turn_is_due = len(self.network), [], False
-        self.create_timer(max(1.0 / (len(self.network) + 1), SHORTEST_TURN_S), self._tick)
+        self._turns, self._turn_is_due = self._rounds(), False
+        self.create_timer(max(0.5 / (len(self.network) + 1), SHORTEST_TURN_S), self._tick)
         self.create_service(CalibrateService, '~/calibrate', self._calibrate)
         self.create_service(SurveyService, '~/survey', self._solve)
 
@@ -125,24 +126,31 @@ class CalibrationNode(StageNode):
         self._turn_is_due = True
 
     def _next_turn(self):
-        """Say how one more sensor is, or compare them all.
-
-        All sensors at once would hold up the readings.
-        """
+        """Go on with the round."""
         self._turn_is_due = False
-        j = self._turn
-        if j < len(self.network):
-            self.publish_statuses([self._health.status(self.get_name(), j, self._stage)])
-            self._states.append(to_message(
-                SensorCalibration, sensor_dict(self._stage, self.network, j)))
-            self._keep(j)
-            self._turn += 1
-            return
-        self._health.begin_round(self._stage)
-        if self._states:
-            self._publish_state(self._states)
-        self._turn, self._states = 0, []
-        self._write_kept()
+        next(self._turns)
+
+    def _rounds(self):
+        """Compare all sensors, say how each is, and then how all are calibrated; again and again.
+
+        In steps that take about the same time: all at once would hold up the readings.
+        """
+        while True:
+            self._health.begin_round(self._stage)
+            yield
+            states = []
+            for j in range(len(self.network)):
+                self._health.look(j)
+                states.append(to_message(
+                    SensorCalibration, sensor_dict(self._stage, self.network, j)))
+                self._keep(j)
+                yield
+                self.publish_statuses([self._health.status(self.get_name(), j, self._stage)])
+                yield
+            self._publish_state(states)
+            yield
+            self._write_kept()
+            yield
 
     def _keep(self, j):
         """Note the background of sensor `j`, if there is one to keep."""
@@ -193,7 +201,7 @@ class CalibrationNode(StageNode):
         self._later.ask()
 
     def _do_the_rest(self):
-        """Learn from what has come, look at it, and say how one more sensor is."""
+        """Learn from what has come, look at it, and say a little more of the sensors."""
         self._stage.settle()
         unseen, self._unseen = self._unseen, []
         for raw, now_ns in unseen:
@@ -249,7 +257,7 @@ class CalibrationNode(StageNode):
         self._health.renew(network)
         self._publish_state([to_message(SensorCalibration, sensor_dict(self._stage, network, j))
                              for j in range(len(network))])
-        self._turn, self._states = len(network), []
+        self._turns = self._rounds()
         self._keep_no_more(network.names)
         response.success = True
         response.message = ('in force' + (f', and saved in {path}, to be given at the next start'

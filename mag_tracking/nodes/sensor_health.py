@@ -60,10 +60,10 @@ class HealthDiagnostics:
         # A stamp of a row that is none is not used.
         stamps, field, i = readings.stamp_ns - self._clock_ns[rows], plain(readings.field), 0
         while (i := self._waiting.add(rows, stamps, field, now_ns, i)) < len(rows):
-            self._look(rows[i])
+            self.look(rows[i])
 
-    def _look(self, j):
-        """Look at what waits of sensor `j`."""
+    def look(self, j):
+        """Look at what waits of sensor `j`; its `status` does so, too."""
         self._present[self._network.names[j]].take(*self._waiting.take(j))
 
     def statuses(self, node, calibrate):
@@ -124,7 +124,7 @@ class HealthDiagnostics:
     def status(self, node, j, calibrate):
         """The DiagnosticStatus of sensor `j`, as of its latest readings."""
         name = self._network.names[j]
-        self._look(j)
+        self.look(j)
         found = self._findings(j, name, calibrate)
         level = DiagnosticStatus.OK
         if found:
