@@ -4,8 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from conftest import POINT, line_network
 from test_track import magnet_frames
 
+from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.magnet_start import start_magnet
@@ -58,6 +60,45 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
         speed = np.hypot(*bank.x[rows, 3:5].T)
         np.testing.assert_allclose(bank.x[rows, 3], speed * np.cos(heading), atol=1e-9)
         assert set(np.round(speed, 6)) == set(vehicle.speeds)
+
+
+@pytest.mark.parametrize('missing', [None, 0])
+def test_a_vehicle_starts_where_its_field_first_has_the_energy_of_the_frame(missing):
+    """Nearer it has more, and at the place before it had less."""
+    network = line_network(6)
+    vehicle = settings_for('vehicle', POINT).track.vehicle
+    std = np.array([1e-8, 2e-8, 4e-8])
+    field = np.full((6, 3), 1e-7)
+    if missing is not None:
+        field[missing] = np.nan
+    C = np.repeat(np.diag(std**2)[None], 6, axis=0)
+    there = ~np.isnan(field)
+    wanted = np.nansum((field / std) ** 2) - there.sum()
+    bank = start_vehicle(vehicle, network, FieldFrame(0, field, C, np.full(6, 8), np.zeros(6)),
+                         2e-8, None)
+    model = vehicle_model(vehicle, network)
+
+    def energy(back):
+        """Of the hypotheses' fields, as the sensors have them, `back` [m] before their places."""
+        x = bank.x[:, :model_size].copy()
+        x[:, :2] -= back * x[:, 3:5] / np.hypot(*x[:, 3:5].T)[:, None]
+        m = model.dipoles(x).m.sum(axis=1)
+        B = dipole_field(network.positions - x[:, None, :3], m[:, None])
+        h = np.einsum('jsw,njw->njs', np.swapaxes(network.R_ws, 1, 2), B)
+        return np.sum(np.where(there, h / std, 0.0) ** 2, axis=(1, 2))
+
+    model_size = len(model.state_names)
+    ahead = bank.x[:, 3:5] / np.hypot(*bank.x[:, 3:5].T)[:, None]
+    # [m] Before the outermost sensor, as they come.
+    along = ahead @ (network.positions - network.centre)[:, :2].T
+    before = along.min(axis=1) - np.sum(ahead * (bank.x[:, :2] - network.centre[:2]), axis=1)
+    reached = energy(0.0) >= wanted * (1.0 - 1e-9)
+    assert reached.mean() > 0.5
+    # Who never has it starts where the sensors begin.
+    np.testing.assert_allclose(before[~reached], 0.0, atol=1e-9)
+    coming = reached & (before < vehicle.farthest - 1e-9)
+    assert coming.mean() > 0.5
+    assert (energy(vehicle.farthest / 159.0)[coming] < wanted).all()
 
 
 def test_a_start_is_as_sure_as_the_model_is_good():
