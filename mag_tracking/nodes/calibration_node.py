@@ -41,9 +41,9 @@ from mag_tracking.stages.survey import Survey, with_noise
 SHORTEST_TURN_S = 0.01
 """[s] All sensors have their turns once a second, or where they are too many for that, in steps
 that come so often."""
-REST_S = 0.0025
-"""[s] What need not come before many readings are published comes so long behind: while the nodes
-behind are about to begin, and there are as few cores as two, this one is to sleep."""
+REST_S = 0.0055
+"""[s] What need not come before many readings are published comes so long behind: until the pose is
+there, which takes about that long of a hundred sensors, those who make it are to have the cores."""
 KEEP_EVERY_S = 5.0
 """[s] The backgrounds are written down so often, or oftener where `calibrate.resume_s` is short."""
 
