@@ -10,8 +10,9 @@ from mag_tracking.records import Track
 from mag_tracking.settings import read_parameter_file
 
 SETTINGS = read_parameter_file(ROOT / 'config' / 'large_network.yaml')
-LOST = [8, 13, 15, 18]
-"""Of the seeds, vehicles whose arrival is lost where the bound holds from the first frame on."""
+LOST = [8, 13, 15, 18, 63, 118]
+"""Of the seeds, vehicles that are lost where that bound holds from the first frame on (the first
+four), or where it is 60."""
 
 
 @pytest.fixture(scope='module')
@@ -45,7 +46,7 @@ def apart(some, others):
 @pytest.mark.parametrize('seed', studied(range(150), kept=LOST))
 def test_more_hypotheses_would_tell_nothing_else(drive, seed):
     bounded = drive(seed, {})
-    free = drive(seed, {'track.most_hypotheses': 100_000, 'track.most_at_start': 100_000})
+    free = drive(seed, {'track.most_hypotheses': 100_000})
     d = apart(bounded, free)
     print(f'{seed}: poses differ by {d.max():.2g} deviations at most, at the end by {d[-1]:.2g}')
     assert bounded[-1].arrival == free[-1].arrival

@@ -78,7 +78,7 @@ class CalibrationNode(StageNode):
         self.expect('detection_node', CALIBRATED_READINGS)
         self._state = self.publisher(CalibrationState, '~/calibration', LATCHED)
         self._turns, self._turn_is_due = self._rounds(), False
-        self.create_timer(max(0.5 / (len(self.network) + 1), SHORTEST_TURN_S), self._tick)
+        self.create_timer(max(1.0 / (2 * len(self.network) + 3), SHORTEST_TURN_S), self._tick)
         self.create_service(CalibrateService, '~/calibrate', self._calibrate)
         self.create_service(SurveyService, '~/survey', self._solve)
 

@@ -242,7 +242,8 @@ class TrackStage:
         self._anew.add(bank, predicted, log_likelihood, frame, dt)
         s = self._settings
         self.counts['hypotheses dropped'] += bank.prune(
-            -np.log(s.prune_ratio), s.most_hypotheses if publish else s.most_at_start)
+            -np.log(s.prune_ratio),
+            s.most_hypotheses if publish else max(s.most_hypotheses, s.most_at_start))
         self.counts.update(self._anew.improve(self._filter, bank))
         self._whole.add(bank, frame, dt, publish)
         if not publish and self._lag is None:

@@ -44,8 +44,9 @@ class TrackSettings:
     most_hypotheses: int = param(
         600, 'No more than the heaviest so many are kept.', '', (1, 100000), live=True)
     most_at_start: int = param(
-        600, 'The same in the frames before the detection: they say so little of where a target '
-        'comes from that of few the right one is often lost.', '', (1, 100000), live=True)
+        600, 'In the frames before the detection so many are, if that is more: they say so '
+        'little of where a target comes from that of few the right one is often lost.', '',
+        (1, 100000), live=True)
     relinearise_window_s: float = param(
         2.0, 'While a track runs, its leading hypotheses are linearised anew along what is now '
         'known of their path, over the latest frames (64 at most) of once to twice so much time. '
