@@ -12,6 +12,7 @@ process takes of a core and of memory. Exits with 1 where a sample or a frame wa
 import argparse
 import gc
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -31,7 +32,7 @@ WARM_UP_S = 20.0
 MANY, GATHER_S = 16, 0.002
 """More sensors than this send their readings together; those of [s], where they measure in turn."""
 LEAN = {'arrival_names': "['left']", 'arrival_headings_deg': '[0.0]'}
-"""One kind, one arrival: 3 offsets x 14 moments x 3 speeds = 126 hypotheses."""
+"""One kind, one arrival: 3 offsets x 14 moments x 3 speeds = 126 hypotheses, all of them kept."""
 
 
 def network_yaml(n):
@@ -136,7 +137,8 @@ def parameters_of(folder, lean):
     """The parameter file."""
     text = (ROOT / 'config' / 'large_network.yaml').read_text()
     if lean:
-        text += ''.join(f'        {key}: {value}\n' for key, value in LEAN.items())
+        text = re.sub(r'most_hypotheses: \d+', 'most_hypotheses: 126', text) \
+            + ''.join(f'        {key}: {value}\n' for key, value in LEAN.items())
     path = folder / 'parameters.yaml'
     path.write_text(text)
     return path
