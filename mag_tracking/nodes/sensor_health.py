@@ -63,12 +63,14 @@ class HealthDiagnostics:
             self.look(rows[i])
 
     def look(self, j):
-        """Look at what waits of sensor `j`; its `status` does so, too."""
+        """Look at what waits of sensor `j`: its `status` is as of then."""
         self._present[self._network.names[j]].take(*self._waiting.take(j))
 
     def statuses(self, node, calibrate):
         """[DiagnosticStatus], one a sensor; `calibrate` is the `Calibrate` stage."""
         self.begin_round(calibrate)
+        for j in range(len(self._network)):
+            self.look(j)
         return [self.status(node, j, calibrate) for j in range(len(self._network))]
 
     def begin_round(self, calibrate):
@@ -122,9 +124,8 @@ class HealthDiagnostics:
         return sorted(found.values(), key=lambda f: not f.serious)
 
     def status(self, node, j, calibrate):
-        """The DiagnosticStatus of sensor `j`, as of its latest readings."""
+        """The DiagnosticStatus of sensor `j`, as of the latest `look` at it."""
         name = self._network.names[j]
-        self.look(j)
         found = self._findings(j, name, calibrate)
         level = DiagnosticStatus.OK
         if found:
