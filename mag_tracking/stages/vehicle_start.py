@@ -8,7 +8,7 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.geometry import rotation_about_z
 from mag_tracking.inference.detection_theory import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank
-from mag_tracking.physics.dipole import MU0, dipole_field
+from mag_tracking.physics.dipole import MU0, dipole_jacobians
 from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.settings import param
 
@@ -133,51 +133,64 @@ def start_vehicle(settings, network, frame, background_std, own_covariance):
     Source: ICASSP11 section 2.2, T10 Alg. 3 (there one hypothesis an arrival).
     """
     states, covariances, labels, kinds = [], [], [], []
+    measured = _Measured(network, frame)
     for kind in range(len(settings.kinds)):
         moments = settings.moments[kind] * moment_directions()
         for label, heading in enumerate(np.deg2rad(settings.arrival_headings_deg)):
             R = rotation_about_z(heading)
             hard = (moments - settings.soft_iron * _earth_field(network) / MU0) @ R
-            for offset in settings.lateral_offsets:
-                starts = _matching_positions(settings, network, frame, R, offset, moments,
-                                             settings.heights[kind])
-                for speed in settings.speeds:
-                    states.append(_states(settings, kind, starts, R @ [speed, 0.0, 0.0], hard))
-                    covariances += [_covariance(settings, kind, R, speed)] * len(moments)
-                    labels += [label] * len(moments)
-                    kinds += [kind] * len(moments)
-    return FilterBank.of_targets(np.vstack(states), np.array(covariances), np.array(labels),
+            starts = _matching_positions(settings, network, measured, R, moments,
+                                         settings.heights[kind])
+            states.append(_states(settings, kind, starts, np.outer(settings.speeds, R[:, 0]), hard))
+            by_speed = np.array([_covariance(settings, kind, R, v) for v in settings.speeds])
+            covariances.append(np.tile(by_speed.repeat(len(moments), 0), (len(starts), 1, 1)))
+            labels += [label] * len(states[-1])
+            kinds += [kind] * len(states[-1])
+    return FilterBank.of_targets(np.vstack(states), np.vstack(covariances), np.array(labels),
                                  len(network), background_std, own_covariance, np.array(kinds))
 
 
-def _matching_positions(settings, network, frame, R, offset, moments, height):
-    """Positions (n, 3) on one line where each moment's field first has the frame's energy."""
+class _Measured:
+    """What a frame says of how near a target is."""
+
+    def __init__(self, network, frame):
+        present = ~np.isnan(frame.field)
+        energy = float(whitened_energy(frame.field, frame.covariance)[0].sum())
+        # Noise alone brings one unit of energy an axis.
+        self.energy = max(energy - np.count_nonzero(present), 1.0)
+        std = np.sqrt(np.einsum('jii->ji', frame.covariance))
+        self.whitening = network.R_sw / np.where(present, std, np.inf)[:, :, None]
+        """(n_sensors, 3, 3) [1/T] from a field in the world to one in units of its noise."""
+
+
+def _matching_positions(settings, network, measured, R, moments, height):
+    """Positions (n_offsets, n_moments, 3) where on each line a field first has the energy."""
     along = (network.positions - network.centre) @ R[:, 0]
     distance = np.linspace(settings.farthest, 0.0, 160) - along.min()
     line = np.array([network.centre[0], network.centre[1], height])
-    points = line + offset * R[:, 1] - distance[:, None] * R[:, 0]
-    present = ~np.isnan(frame.field)
-    measured = float(whitened_energy(frame.field, frame.covariance)[0].sum())
-    std = np.sqrt(np.einsum('jii->ji', frame.covariance))
-    whitening = network.R_sw / np.where(present, std, np.inf)[:, :, None]
-    # The field is linear in the moment: that of three unit moments tells that of any.
-    r = network.positions[None] - points[:, None]
-    B = dipole_field(r, np.eye(3)[:, None, None, :])
-    A = np.einsum('jab,kpjb->pjak', whitening, B).reshape(len(points), -1, 3)
-    energy = np.einsum('pmk,mk->mp', moments @ (np.swapaxes(A, 1, 2) @ A), moments)
-    # Noise alone brings one unit of energy an axis.
-    reached = energy >= max(measured - np.count_nonzero(present), 1.0)
+    offsets = np.array(settings.lateral_offsets)
+    points = line + offsets[:, None, None] * R[:, 1] - distance[:, None] * R[:, 0]
+    # The field is linear in the moment: its derivative tells that of any.
+    _, field_of_moment = dipole_jacobians(network.positions - points[:, :, None], np.zeros(3))
+    A = (measured.whitening @ field_of_moment).reshape(*points.shape[:2], -1, 3)
+    energy = np.einsum('lpmk,mk->lpm', moments @ (np.swapaxes(A, 2, 3) @ A), moments)
+    reached = energy >= measured.energy
     first = np.where(reached.any(axis=1), reached.argmax(axis=1), len(distance) - 1)
-    return points[first]
+    return np.take_along_axis(points, first[:, :, None], axis=1)
 
 
-def _states(settings, kind, positions, velocity, hard):
-    """States (n, n_t) of `RowVehicle` with the whole hard iron moments `hard` (n, 3)."""
+def _states(settings, kind, positions, velocities, hard):
+    """States (n_offsets n_speeds n_moments, n_t) of `RowVehicle`.
+
+    `positions` (n_offsets, n_moments, 3), `velocities` (n_speeds, 3), whole hard iron moments
+    `hard` (n_moments, 3).
+    """
     d = _n_dipoles(settings)
-    n = len(positions)
-    rest = [settings.soft_iron] + ([settings.lengths[kind]] if d > 1 else [])
-    return np.hstack([positions, np.tile(velocity, (n, 1)), np.tile(hard / d, d),
-                      np.tile(rest, (n, 1))])
+    x = np.empty((len(positions), len(velocities), len(hard), 6 + 3 * d + min(d, 2)))
+    x[..., :3], x[..., 3:6] = positions[:, None], velocities[:, None]
+    x[..., 6:6 + 3 * d] = np.tile(hard / d, d)
+    x[..., 6 + 3 * d:] = [settings.soft_iron] + ([settings.lengths[kind]] if d > 1 else [])
+    return x.reshape(-1, x.shape[-1])
 
 
 def _covariance(settings, kind, R, speed):
