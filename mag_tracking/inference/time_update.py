@@ -31,10 +31,13 @@ def predict(x, P, x_target, F, Q, variance, decay=None):
     if len(x) != n_hyp or P.shape != (n_hyp, n_t + n_rest, n_t + n_rest):
         raise ValueError(f'covariances of shape {P.shape} and states of shape {x.shape} for '
                          f'{n_hyp} targets')
+    if any(A.shape not in ((n_t, n_t), (n_hyp, n_t, n_t)) for A in (F, Q)):
+        raise ValueError(f'a Jacobian of shape {F.shape} and a noise of shape {Q.shape} for '
+                         f'{n_hyp} targets of {n_t} states')
     x[:, :n_t] = x_target
     decay = 1.0 if decay is None else decay
-    # Copies, as a broadcast array is of no layout that the kernel is compiled for.
-    _predict_bank(x, P, *(np.array(np.broadcast_to(A, (n_hyp, n_t, n_t)), dtype=float, order='C')
+    # Copies of what is broadcast, as that is of no layout that the kernel is compiled for.
+    _predict_bank(x, P, *(np.ascontiguousarray(A.reshape(-1, n_t, n_t), dtype=float)
                           for A in (F, Q)),
                   *(np.array(np.broadcast_to(v, n_rest), dtype=float) for v in (variance, decay)))
 
@@ -42,13 +45,17 @@ def predict(x, P, x_target, F, Q, variance, decay=None):
 @njit('void(float64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[:,:,::1], '
       'float64[::1], float64[::1])', cache=True, error_model='numpy', fastmath={'contract'})
 def _predict_bank(x, P, F, Q, variance, decay):
-    """Loop over the hypotheses; what is behind the target's states only decays and grows."""
+    """Loop over the hypotheses; what is behind the target's states only decays and grows.
+
+    `F` and `Q` are one for each, or one for all.
+    """
     n_t, n_x = F.shape[1], x.shape[1]
     T = np.empty((n_t, n_x))
     fades = False
     for i in range(n_x - n_t):
         fades |= decay[i] != 1.0
     for p in range(len(x)):
+        of_f, of_q = p % len(F), p % len(Q)
         if fades:
             for i in range(n_t, n_x):
                 x[p, i] *= decay[i - n_t]
@@ -60,7 +67,7 @@ def _predict_bank(x, P, F, Q, variance, decay):
         T[:] = 0.0
         for a in range(n_t):
             for c in range(n_t):
-                f = F[p, a, c]
+                f = F[of_f, a, c]
                 # Most of it is zero: nothing moves but what has a velocity.
                 if f != 0.0:
                     for i in range(n_x):
@@ -71,9 +78,9 @@ def _predict_bank(x, P, F, Q, variance, decay):
                 P[p, i, a] = P[p, a, i]
         for a in range(n_t):
             for b in range(n_t):
-                P[p, a, b] = Q[p, a, b]
+                P[p, a, b] = Q[of_q, a, b]
             for c in range(n_t):
-                f = F[p, a, c]
+                f = F[of_f, a, c]
                 if f != 0.0:
                     for b in range(n_t):
                         P[p, a, b] += T[b, c] * f

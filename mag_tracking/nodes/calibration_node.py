@@ -44,6 +44,10 @@ that come so often."""
 REST_S = 0.0055
 """[s] What need not come before many readings are published comes so long behind: until the pose is
 there, which takes about that long of a hundred sensors, those who make it are to have the cores."""
+LATE_S = 0.0015
+"""[s] Where it comes later than that by more, a sensor's turn is left to the next time: the next
+readings are near. No more than `MOST_DUE` turns are."""
+MOST_DUE = 3
 KEEP_EVERY_S = 5.0
 """[s] The backgrounds are written down so often, or oftener where `calibrate.resume_s` is short."""
 
@@ -77,7 +81,7 @@ class CalibrationNode(StageNode):
         self.subscription(FieldReadings, RAW_READINGS, self._take_many, STREAM, source='sensors')
         self.expect('detection_node', CALIBRATED_READINGS)
         self._state = self.publisher(CalibrationState, '~/calibration', LATCHED)
-        self._turns, self._turn_is_due = self._rounds(), False
+        self._turns, self._n_due, self._came = self._rounds(), 0, 0.0
         self.create_timer(max(1.0 / (2 * len(self.network) + 3), SHORTEST_TURN_S), self._tick)
         self.create_service(CalibrateService, '~/calibrate', self._calibrate)
         self.create_service(SurveyService, '~/survey', self._solve)
@@ -120,14 +124,14 @@ class CalibrationNode(StageNode):
         return {'calibrate': self._stage.n_held}
 
     def _tick(self):
-        """It is time for a turn: behind the next readings, where it holds up none; or else now."""
-        if self._turn_is_due:
+        """It is time for a turn: behind readings, where some come soon enough; or else now."""
+        self._n_due += 1
+        if self._n_due > MOST_DUE:
             self._next_turn()
-        self._turn_is_due = True
 
     def _next_turn(self):
         """Go on with the round."""
-        self._turn_is_due = False
+        self._n_due -= 1
         next(self._turns)
 
     def _rounds(self):
@@ -187,6 +191,7 @@ class CalibrationNode(StageNode):
             self._publishers_by_sensor[sensor].publish(
                 to_message(MagneticField, sample_dict(sample, message.header.frame_id)))
         self._unseen.append((Readings.of([raw]), self.now_ns))
+        self._came = time.monotonic()
         self._do_the_rest()
 
     def _take_many(self, message):
@@ -198,6 +203,7 @@ class CalibrationNode(StageNode):
         if len(calibrated):
             self._readings.publish(to_message(FieldReadings, readings_dict(calibrated)))
         self._unseen.append((raw, self.now_ns))
+        self._came = time.monotonic()
         self._later.ask()
 
     def _do_the_rest(self):
@@ -206,7 +212,7 @@ class CalibrationNode(StageNode):
         unseen, self._unseen = self._unseen, []
         for raw, now_ns in unseen:
             self._health.add(raw, now_ns)
-        if self._turn_is_due:
+        if self._n_due and time.monotonic() - self._came < REST_S + LATE_S:
             self._next_turn()
 
     def _shaken(self, sensor, message):
