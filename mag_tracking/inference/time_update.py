@@ -42,6 +42,15 @@ def predict(x, P, x_target, F, Q, variance, decay=None):
                   *(np.array(np.broadcast_to(v, n_rest), dtype=float) for v in (variance, decay)))
 
 
+@njit(cache=True, error_model='numpy')
+def _find_what_moves(F, moves):
+    """Note the rows in which a Jacobian (n_t, n_t) is not that of what stays as it is."""
+    for a in range(len(F)):
+        moves[a] = F[a, a] != 1.0
+        for c in range(len(F)):
+            moves[a] |= c != a and F[a, c] != 0.0
+
+
 @njit('void(float64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[:,:,::1], '
       'float64[::1], float64[::1])', cache=True, error_model='numpy', fastmath={'contract'})
 def _predict_bank(x, P, F, Q, variance, decay):
@@ -50,7 +59,7 @@ def _predict_bank(x, P, F, Q, variance, decay):
     `F` and `Q` are one for each, or one for all.
     """
     n_t, n_x = F.shape[1], x.shape[1]
-    T = np.empty((n_t, n_x))
+    T, moves = np.empty((n_t, n_x)), np.zeros(n_t, np.bool_)
     fades = False
     for i in range(n_x - n_t):
         fades |= decay[i] != 1.0
@@ -61,30 +70,46 @@ def _predict_bank(x, P, F, Q, variance, decay):
                 x[p, i] *= decay[i - n_t]
                 for k in range(n_t, n_x):
                     P[p, i, k] *= decay[i - n_t] * decay[k - n_t]
+                for a in range(n_t):
+                    P[p, a, i] *= decay[i - n_t]
+                    P[p, i, a] = P[p, a, i]
         for i in range(n_t, n_x):
             P[p, i, i] += variance[i - n_t]
-        # T = F times the rows of the target.
-        T[:] = 0.0
+        if p == 0 or len(F) > 1:
+            _find_what_moves(F[of_f], moves)
+        # T = F times the rows of the target; most of F is zero, and most rows stay as they are.
         for a in range(n_t):
-            for c in range(n_t):
-                f = F[of_f, a, c]
-                # Most of it is zero: nothing moves but what has a velocity.
-                if f != 0.0:
-                    for i in range(n_x):
-                        T[a, i] += f * P[p, c, i]
+            if moves[a]:
+                T[a] = 0.0
+                for c in range(n_t):
+                    f = F[of_f, a, c]
+                    if f != 0.0:
+                        for i in range(n_x):
+                            T[a, i] += f * P[p, c, i]
         for a in range(n_t):
-            for i in range(n_t, n_x):
-                P[p, a, i] = T[a, i] * decay[i - n_t]
-                P[p, i, a] = P[p, a, i]
+            if moves[a]:
+                for i in range(n_t, n_x):
+                    P[p, a, i] = T[a, i]
+                    P[p, i, a] = T[a, i]
+                for b in range(n_t):
+                    P[p, a, b] = T[a, b]
+        # The same of their columns: F is applied from the right.
         for a in range(n_t):
-            for b in range(n_t):
-                P[p, a, b] = Q[of_q, a, b]
-            for c in range(n_t):
-                f = F[of_f, a, c]
-                if f != 0.0:
-                    for b in range(n_t):
-                        P[p, a, b] += T[b, c] * f
+            if moves[a]:
+                for b in range(n_t):
+                    T[a, b] = 0.0
+                for c in range(n_t):
+                    f = F[of_f, a, c]
+                    if f != 0.0:
+                        for b in range(n_t):
+                            T[a, b] += P[p, b, c] * f
+        for a in range(n_t):
+            if moves[a]:
+                for b in range(n_t):
+                    P[p, b, a] = T[a, b]
         # Both triangles, so that no rounding makes it lopsided.
         for a in range(n_t):
+            P[p, a, a] += Q[of_q, a, a]
             for b in range(a):
-                P[p, a, b] = P[p, b, a] = 0.5 * (P[p, a, b] + P[p, b, a])
+                P[p, a, b] = P[p, b, a] = 0.5 * (P[p, a, b] + P[p, b, a] + Q[of_q, a, b]
+                                                 + Q[of_q, b, a])

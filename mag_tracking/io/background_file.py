@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from mag_tracking.errors import OutputError, RecordingError
-from mag_tracking.stages.calibrate import Kept
+from mag_tracking.stages.resumption import Kept
 
 VERSION = 1
 

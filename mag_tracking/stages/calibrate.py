@@ -1,7 +1,6 @@
 """Calibrate: check a sample, remove the background, attach the noise."""
 
 from collections import Counter
-from dataclasses import dataclass
 from math import isnan
 
 import numpy as np
@@ -13,21 +12,11 @@ from mag_tracking.calibration.screening import SPIKE, STUCK, Repetition, SpikeFi
 from mag_tracking.errors import NetworkError
 from mag_tracking.records import MagSample, Readings, plain
 from mag_tracking.stages.raw_sample import corrected, fault_of
+from mag_tracking.stages.resumption import Resumption, to_keep
 from mag_tracking.stages.stage import NS
 
 AT_ONCE = 16
 """The blocks of so many sensors may end at once; those of more would hold up the readings."""
-
-
-@dataclass(frozen=True)
-class Kept:
-    """The background of one sensor, to go on from after a restart."""
-
-    stamp_ns: int
-    background: np.ndarray
-    """(3,) [T]; NaN = axis not reported."""
-    covariance: np.ndarray
-    """(3, 3) [T^2] noise of one sample."""
 
 
 class Calibrate:
@@ -61,7 +50,7 @@ class Calibrate:
         self._spikes = {name: SpikeFilter(settings.spike_std, self._of(name))
                         for name in network.names}
         self._ahead_ns = {}
-        self._kept = {}
+        self._resumption = Resumption(settings.resume_s)
         self.renew(network)
 
     def renew(self, network):
@@ -83,7 +72,7 @@ class Calibrate:
             same = before is not None and _same(before.offset[i], network.offset[i]) \
                 and _same(before.correction[i], network.correction[i])
             if before is not None and (not same or self._clock_ns[i] != clock_before[i]):
-                self._kept.pop(name, None)
+                self._resumption.forget(name)
             if not same or self._clock_ns[i] != clock_before[i]:
                 self._give_up(name, 'another calibration came')
             if not same:
@@ -116,7 +105,7 @@ class Calibrate:
             background.ready and background.is_whole and s['last_ns'] != NEVER
             and not np.isnan(background.line[1]).any()
             and not self._settings.decimate_to_hz and not self._spikes[name].n_held
-            and name not in self._ahead_ns and name not in self._kept)
+            and name not in self._ahead_ns and name not in self._resumption)
         if s['is_ordinary']:
             s['centre'], s['mean'], s['slope'], s['horizon'] = background.line
             s['noise_std'], self._noise[i] = background.noise_std, background.covariance
@@ -246,13 +235,14 @@ class Calibrate:
         state['last_ns'] = sample.stamp_ns
         if state['first_ns'] == NEVER:
             state['first_ns'] = sample.stamp_ns
-        if sample.sensor in self._kept:
-            self._go_on_from(self._kept.pop(sample.sensor), sample)
+        if sample.sensor in self._resumption:
+            self.counts[self._resumption.take_up(
+                sample.sensor, sample.stamp_ns, self._background[sample.sensor])] += 1
         return None
 
     def resume(self, kept):
         """Go on from {sensor: `Kept`}, where the first reading of a sensor comes soon after."""
-        self._kept = dict(kept)
+        self._resumption.offer(kept)
         for i in range(len(self._network)):
             self._note(i)
 
@@ -262,18 +252,7 @@ class Calibrate:
         last = self.last_stamp_ns(sensor)
         if not background.ready or last is None:
             return None
-        C = background.covariance
-        # An axis that has only just begun to report has a level, but no noise yet.
-        level = np.where(np.isnan(np.diagonal(C)), np.nan, self.background(sensor))
-        return None if np.isnan(level).all() else Kept(last, level, C)
-
-    def _go_on_from(self, kept, sample):
-        """Take up a background at the first reading, if it is of a moment before."""
-        if 0 < sample.stamp_ns - kept.stamp_ns <= self._settings.resume_s * NS:
-            self._background[sample.sensor].resume(kept.background, kept.covariance)
-            self.counts['backgrounds resumed'] += 1
-        else:
-            self.counts['backgrounds of another time not resumed'] += 1
+        return to_keep(background, last, self.background(sensor))
 
     def _thinned(self, sample):
         """The samples that are left of a fast sensor."""
@@ -356,7 +335,7 @@ class Calibrate:
             self._network.index(name)
         for name in sensors or self._network.names:
             self._background[name].forget()
-            self._kept.pop(name, None)
+            self._resumption.forget(name)
             self._note(self._index[name])
 
     def last_stamp_ns(self, sensor):
