@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.crlb import (
     bound,
     cpa_information,
@@ -15,7 +16,6 @@ from mag_tracking.inference.crlb import (
     snr_at_distance,
     snr_range,
 )
-from mag_tracking.inference.detection_theory import whitened_energy
 from mag_tracking.physics.dipole import K_DIPOLE, dipole_field, dipole_jacobians
 
 NAMES = [f'{state}_{axis}' for state in ('r0', 'v0', 'm') for axis in 'xyz']

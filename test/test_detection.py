@@ -5,11 +5,11 @@ import pytest
 from conftest import line_network, studied
 from scipy.stats import binom, chi2, ncx2
 
+from mag_tracking.inference.axes import smallest_pivots, whitened_energy
 from mag_tracking.inference.detection_theory import (
     detection_probability,
     energy_threshold,
     false_alarm_probability,
-    whitened_energy,
 )
 from mag_tracking.records import Detection, FieldFrame, MagSample
 from mag_tracking.settings import replace
@@ -97,6 +97,37 @@ def test_energy_of_missing_axes_and_sensors_counts_only_what_is_there():
     part = y[1, [0, 2]] @ np.linalg.inv(C[1][np.ix_([0, 2], [0, 2])]) @ y[1, [0, 2]]
     np.testing.assert_allclose(energy, [full, part, 0.0], rtol=1e-12)
     assert axes.tolist() == [3, 2, 0]
+    C[2, 0, 0] = np.nan  # of a sensor that is missing nothing is read
+    np.testing.assert_array_equal(whitened_energy(y, C)[0], energy)
+    C[1, 0, 0] = -1.0
+    with pytest.raises(np.linalg.LinAlgError, match='not positive definite'):
+        whitened_energy(y, C)
+    with pytest.raises(ValueError, match='shape'):
+        whitened_energy(y, C[:2])
+
+
+def test_the_smallest_pivot_tells_which_covariances_are_none():
+    """Of random ones it has the sign of the smallest eigenvalue, whatever their unit."""
+    rng, n = np.random.default_rng(3), 400
+    std = 10.0 ** rng.uniform(-12.0, 3.0, (n, 3, 1))
+    C = rng.uniform(-1.0, 1.0, (n, 3, 3))
+    C = 0.5 * (C + np.swapaxes(C, 1, 2)) + np.eye(3)
+    y = np.where(rng.random((n, 3)) < 0.2, np.nan, 1.0)
+    there = ~np.isnan(y)
+    of_present = np.where(there[:, :, None] & there[:, None, :], C, np.eye(3))
+    is_one = np.linalg.eigvalsh(of_present)[:, 0] > 0.0
+    assert 0.1 < is_one.mean() < 0.9
+    C = C * std * np.swapaxes(std, 1, 2)
+    np.testing.assert_array_equal(smallest_pivots(y, C) > 0.0, is_one)
+    # Two axes that go together but for a share of their variance.
+    C = np.repeat(np.array([[4.0, 2.0 * (1.0 - 1e-6), 0.0], [0, 1.0, 0], [0, 0, 9.0]])[None], 4, 0)
+    C[:, 1, 0] = C[:, 0, 1]
+    for k, bad in enumerate((np.nan, np.inf)):
+        C[1 + k, 0, 2] = bad
+    C[3, 2, 2] = np.inf
+    pivots = smallest_pivots(np.zeros((4, 3)), C)
+    assert pivots[0] == pytest.approx(2e-6, rel=1e-5)
+    assert np.isnan(pivots[1:]).all()
 
 
 def test_onset_hold_and_release():

@@ -41,36 +41,3 @@ def missed_probability(probability, run):
         waiting = np.concatenate([((1.0 - detected) * waiting.sum(axis=0))[None],
                                   detected * waiting[:-1]])
     return waiting.sum(axis=0)
-
-
-def whitened_energy(y, C):
-    """Energy of a measurement in units of its noise.
-
-    Parameters
-    ----------
-    y : (n, 3)
-        Per sensor; NaN = missing axis.
-    C : (n, 3, 3)
-        Noise covariance, same unit squared; not read where `y` is missing.
-
-    Returns
-    -------
-    energy : (n,)
-        y' C^-1 y over the axes present; 0 where there are none.
-    axes : (n,) int
-        How many were present.
-
-    Raises numpy.linalg.LinAlgError where a covariance is singular.
-    Source: T10 eq. (5.16).
-    """
-    present = ~np.isnan(y)
-    axes = present.sum(axis=1)
-    energy = np.zeros(len(y))
-    full = axes == 3
-    if full.any():
-        z = np.linalg.solve(C[full], y[full][:, :, None])[:, :, 0]
-        energy[full] = np.einsum('ni,ni->n', y[full], z)
-    for j in np.flatnonzero((axes > 0) & ~full):
-        p = present[j]
-        energy[j] = y[j, p] @ np.linalg.solve(C[j][np.ix_(p, p)], y[j, p])
-    return energy, axes

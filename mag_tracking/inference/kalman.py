@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from mag_tracking.inference.axes import INLINE, factor, of_present_axes
+
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
@@ -24,10 +26,7 @@ The kernels take whole arrays and row numbers, and give back scalars: a slice
 or a small array passed on costs more than the arithmetic it saves writing.
 """
 
-_INLINE = {'error_model': 'numpy', 'fastmath': {'contract'}, 'forceinline': True}
-
-
-@njit(**_INLINE)
+@njit(**INLINE)
 def _gain_rows(y, P, H, p, j, n_own, first, T):
     """T = [H | I] P, the three rows of sensor j; rows of missing axes are zero.
 
@@ -64,40 +63,14 @@ def _gain_rows(y, P, H, p, j, n_own, first, T):
                 T[a, i] = 0.0
 
 
-_LOWER = 'float64, float64, float64, float64, float64, float64'
-"""Lower triangle of a symmetric 3 x 3, row by row."""
-
-
-@njit(**_INLINE)
-def _of_present_axes(y, j, s00, s10, s11, s20, s21, s22):
-    """A covariance of sensor j with the rows and columns of missing axes as in identity."""
-    if math.isnan(y[j, 0]):
-        s00, s10, s20 = 1.0, 0.0, 0.0
-    if math.isnan(y[j, 1]):
-        s10, s11, s21 = 0.0, 1.0, 0.0
-    if math.isnan(y[j, 2]):
-        s20, s21, s22 = 0.0, 0.0, 1.0
-    return s00, s10, s11, s20, s21, s22
-
-
-@njit(**_INLINE)
-def _factor(s00, s10, s11, s20, s21, s22):
-    """Unit lower factor l10, l20, l21 and pivots e0, e1, e2: S = L diag(e) L'."""
-    l10, l20 = s10 / s00, s20 / s00
-    e1 = s11 - l10 * s10
-    e21 = s21 - l20 * s10
-    l21 = e21 / e1
-    return l10, l20, l21, s00, e1, s22 - l20 * s20 - l21 * e21
-
-
-@njit(**_INLINE)
+@njit(**INLINE)
 def _n_present(y, C):
     """How many axes are not NaN; -1 if the noise of a sensor's is not positive definite."""
     n = 0
     for j in range(y.shape[0]):
-        s00, s10, s11, s20, s21, s22 = _of_present_axes(
+        s00, s10, s11, s20, s21, s22 = of_present_axes(
             y, j, C[j, 0, 0], C[j, 1, 0], C[j, 1, 1], C[j, 2, 0], C[j, 2, 1], C[j, 2, 2])
-        _, _, _, e0, e1, e2 = _factor(s00, s10, s11, s20, s21, s22)
+        _, _, _, e0, e1, e2 = factor(s00, s10, s11, s20, s21, s22)
         if not (e0 > 0.0 and e1 > 0.0 and e2 > 0.0):
             return -1
         for a in range(3):
@@ -105,7 +78,7 @@ def _n_present(y, C):
     return n
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _innovation(y, C, inflation, h, H, x, x_lin, p, j, n_own, first, T):
     """Innovation u and its covariance T [H | I]' + C + inflation; u is zero on missing axes."""
     u0 = y[j, 0] - h[p, j, 0] - x[p, first]
@@ -133,10 +106,10 @@ def _innovation(y, C, inflation, h, H, x, x_lin, p, j, n_own, first, T):
     u0 = 0.0 if math.isnan(y[j, 0]) else u0
     u1 = 0.0 if math.isnan(y[j, 1]) else u1
     u2 = 0.0 if math.isnan(y[j, 2]) else u2
-    return (u0, u1, u2), _of_present_axes(y, j, s00, s10, s11, s20, s21, s22)
+    return (u0, u1, u2), of_present_axes(y, j, s00, s10, s11, s20, s21, s22)
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _apply(x, P, p, G, z0, z1, z2):
     """x += G' z and P -= G' G; both halves get the same products, so P stays symmetric."""
     n_x = x.shape[1]
@@ -147,7 +120,7 @@ def _apply(x, P, p, G, z0, z1, z2):
             P[p, i, k] -= g0 * G[0, k] + g1 * G[1, k] + g2 * G[2, k]
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _whiten(T, l10, l20, l21, r0, r1, r2):
     """Rows of T to diag(r) L^-1 T, where r is one over the root of the pivots."""
     for i in range(T.shape[1]):
@@ -158,7 +131,7 @@ def _whiten(T, l10, l20, l21, r0, r1, r2):
         T[0, i] = r0 * t0
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _keep(p, j, T, z0, z1, z2, l10, l20, l21, r0, r1, r2, G, z, W):
     """Store what `Gains` holds of hypothesis p and sensor j."""
     for a in range(3):
@@ -206,7 +179,7 @@ def _update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis,
             _gain_rows(y, P, H, p, j, n_own, first, T)
             (u0, u1, u2), (s00, s10, s11, s20, s21, s22) = _innovation(
                 y, C, inflation, h, H, x, x_lin, p, j, n_own, first, T)
-            l10, l20, l21, e0, e1, e2 = _factor(s00, s10, s11, s20, s21, s22)
+            l10, l20, l21, e0, e1, e2 = factor(s00, s10, s11, s20, s21, s22)
             r0, r1, r2 = 1.0 / math.sqrt(e0), 1.0 / math.sqrt(e1), 1.0 / math.sqrt(e2)
             _whiten(T, l10, l20, l21, r0, r1, r2)
             u1 -= l10 * u0

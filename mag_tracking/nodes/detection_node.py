@@ -7,8 +7,9 @@ from mag_tracking_msgs.msg import Detection as DetectionMessage
 from mag_tracking_msgs.msg import FieldReadings, NetworkFrame
 from sensor_msgs.msg import MagneticField
 
+from mag_tracking.io.frame_message import frame_dict
 from mag_tracking.io.message_types import CALIBRATED_READINGS
-from mag_tracking.io.schema import detection_dict, frame_dict, sample_of
+from mag_tracking.io.schema import detection_dict, sample_of
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings

@@ -18,8 +18,8 @@ from visualization_msgs.msg import MarkerArray
 
 from mag_tracking.errors import RecordingError
 from mag_tracking.io.calibration_state import with_orientations
+from mag_tracking.io.frame_message import frame_of
 from mag_tracking.io.schema import (
-    frame_of,
     header_dict,
     hypotheses_dict,
     odometry_dict,

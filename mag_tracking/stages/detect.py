@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mag_tracking.errors import SettingsError
-from mag_tracking.inference.detection_theory import energy_threshold, whitened_energy
+from mag_tracking.inference.axes import whitened_energy
+from mag_tracking.inference.detection_theory import energy_threshold
 from mag_tracking.records import Detection
 from mag_tracking.settings import param
 from mag_tracking.stages.stage import NS

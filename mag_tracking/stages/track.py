@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from mag_tracking.errors import NetworkError, SettingsError
-from mag_tracking.inference.detection_theory import whitened_energy
+from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.stages.bank_filter import BankFilter, NoTarget
 from mag_tracking.stages.contradiction import Contradiction
 from mag_tracking.stages.magnet_start import magnet_model, start_magnet

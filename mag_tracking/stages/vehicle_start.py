@@ -6,7 +6,7 @@ import numpy as np
 
 from mag_tracking.errors import SettingsError
 from mag_tracking.geometry import rotation_about_z
-from mag_tracking.inference.detection_theory import whitened_energy
+from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.physics.dipole import MU0, dipole_jacobians
 from mag_tracking.physics.vehicles import RowVehicle
