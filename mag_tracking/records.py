@@ -3,6 +3,7 @@
 A missing axis or sensor is NaN. Arrays in a record are not to be changed.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -162,6 +163,34 @@ class Hypothesis:
     """The kind of target that it assumed; empty for a magnet."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypotheses(Sequence):
+    """Members of a bank as arrays; each is a `Hypothesis`, made when it is asked for.
+
+    There may be hundreds in every frame, and hardly anybody looks at them.
+    """
+
+    arrivals: tuple[str, ...]
+    weights: np.ndarray
+    """(n,)"""
+    states: np.ndarray
+    """(n, 6) position and velocity, world."""
+    covariances: np.ndarray
+    """(n, 6, 6)"""
+    moments: np.ndarray
+    """(n, 3)"""
+    kinds: tuple[str, ...]
+
+    def __len__(self):
+        return len(self.weights)
+
+    def __getitem__(self, i):
+        if isinstance(i, slice):
+            return tuple(self[k] for k in range(*i.indices(len(self))))
+        return Hypothesis(self.arrivals[i], float(self.weights[i]), self.states[i, :3],
+                          self.states[i, 3:], self.covariances[i], self.moments[i], self.kinds[i])
+
+
 @dataclass(frozen=True, slots=True)
 class SmoothedPose:
     """A target at one time, by what came before it and after."""
@@ -246,7 +275,7 @@ class Track:
     """(n_sensors, 3) [rad] angles as in `physics.mounting`; (0, 3) where they are not estimated."""
     mounting_covariance: np.ndarray
     """(n_sensors, 3, 3) [rad^2], or (0, 3, 3)."""
-    hypotheses: tuple[Hypothesis, ...] = field(default=())
+    hypotheses: Sequence[Hypothesis] = field(default=())
     """Heaviest first; the published one is among them."""
 
     @property

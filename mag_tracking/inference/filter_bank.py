@@ -81,15 +81,17 @@ class FilterBank:
         rows = self._heaviest(self.label, np.arange(len(self)))
         rows = self._heaviest(self.kind, rows)
         rows = rows[self.log_w[rows] >= self.log_w[rows].max() - _NEGLIGIBLE]
-        P = self.P[rows, :3, :3]
-        values = np.linalg.eigvalsh(P)
-        if values[:, 0].min() <= 0.0:
+        try:
+            root = np.linalg.cholesky(self.P[rows, :3, :3])
+        except np.linalg.LinAlgError:
             return int(rows[np.argmax(self.log_w[rows])])
-        # [i, j]: position of i seen from hypothesis j.
-        d = self.x[rows, None, :3] - self.x[None, rows, :3]
-        log_density = self.log_w[rows] - 0.5 * np.log(values).sum(axis=1) \
-            - 0.5 * np.einsum('ijk,jkl,ijl->ij', d, np.linalg.inv(P), d)
-        return int(rows[np.argmax(log_sum_exp(log_density, axis=1))])
+        # [j, :, i]: position of i in units of hypothesis j.
+        at = np.linalg.inv(root) @ self.x[rows, :3].T
+        each = np.arange(len(rows))
+        d2 = np.square(at - at[each, :, each][:, :, None]).sum(axis=1)
+        log_density = -0.5 * d2 + (self.log_w[rows] - np.log(
+            np.einsum('jii->ji', root)).sum(axis=1))[:, None]
+        return int(rows[np.argmax(log_sum_exp(log_density, axis=0))])
 
     def copy(self):
         """The same bank with arrays of its own."""

@@ -3,7 +3,7 @@
 import numpy as np
 
 from mag_tracking.geometry import cross_matrix, quaternion_between, quaternion_from_yaw
-from mag_tracking.records import Hypothesis, SmoothedPose, Track
+from mag_tracking.records import Hypotheses, SmoothedPose, Track
 
 UNOBSERVED_VARIANCE = np.pi**2
 """[rad^2] of an angle that the field does not determine."""
@@ -84,14 +84,10 @@ def published_track(bank, best, model, orientation, names, kinds, strange, **kno
     said, flags = _said_of(model, orientation, bank.x[best, :n_t], bank.P[best, :n_t, :n_t])
     weights = np.exp(bank.log_w)
     moments = model.dipoles(bank.x[:, :n_t]).m.sum(axis=1)
-    # Copies all at once: there may be hundreds.
     order = np.argsort(-bank.log_w, kind='stable')
-    hypotheses = tuple(
-        Hypothesis(names[label], weight, position, velocity, covariance, moment, kinds[kind])
-        for label, weight, position, velocity, covariance, moment, kind in zip(
-            bank.label[order].tolist(), weights[order].tolist(), bank.x[order, :3],
-            bank.x[order, 3:6], bank.P[order, :6, :6], moments[order], bank.kind[order].tolist(),
-            strict=True))
+    hypotheses = Hypotheses(
+        tuple(names[k] for k in bank.label[order].tolist()), weights[order], bank.x[order, :6],
+        bank.P[order, :6, :6], moments[order], tuple(kinds[k] for k in bank.kind[order].tolist()))
     nis = bank.nis[best]
     return Track(
         nis=float('nan') if np.isnan(nis).all() else float(np.nansum(nis)),
