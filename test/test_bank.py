@@ -52,6 +52,14 @@ def test_another_arrival_makes_a_track_ambiguous_even_where_the_places_agree(
     assert track.nis_by_sensor.tolist() == [1.0, 2.0]
     assert track.kind_weight == pytest.approx(1.0 - other)
     assert [h.kind for h in track.hypotheses] == ['truck', 'car']
+    lighter = track.hypotheses[-1]
+    assert lighter.weight == pytest.approx(other)
+    assert lighter.arrival == ('left', 'right')[label]
+    assert lighter.position.tolist() == [1.0, 2.0, 0.5]
+    assert lighter.velocity.tolist() == [10.0, 0.0, 0.0]
+    assert lighter.moment.tolist() == [100.0, 0.0, 0.0]
+    np.testing.assert_array_equal(lighter.covariance, np.eye(6))
+    assert [h.weight for h in track.hypotheses[1:]] == [lighter.weight]
 
 
 def test_log_sum_exp_equals_scipy_and_survives_extremes():
@@ -106,6 +114,17 @@ def test_the_best_is_of_the_heaviest_kind_of_the_heaviest_arrival():
     b.kind = np.array([0, 0, 1, 1])
     b.log_w = np.log([0.35, 0.25, 0.22, 0.18])
     assert b.best() == 2
+
+
+def test_the_best_is_where_the_mixture_is_densest():
+    """Of two far apart with the same weight the surer; the heaviest where one is no Gaussian."""
+    b = bank(3, spread=100.0, label=[0, 0, 0])
+    b.P[1, :3, :3] *= 0.5
+    assert b.best() == 1
+    b.log_w = np.log([0.2, 0.3, 0.5])
+    for wrong in (np.nan, np.inf, -1.0):
+        b.P[0, 0, 0] = wrong
+        assert b.best() == 2
 
 
 def test_separated_weight_counts_only_what_is_apart():

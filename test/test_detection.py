@@ -99,6 +99,7 @@ def test_energy_of_missing_axes_and_sensors_counts_only_what_is_there():
     assert axes.tolist() == [3, 2, 0]
     C[2, 0, 0] = np.nan  # of a sensor that is missing nothing is read
     np.testing.assert_array_equal(whitened_energy(y, C)[0], energy)
+    np.testing.assert_allclose(smallest_pivots(y, C), [0.75, 1.0, 1.0], rtol=1e-12)
     C[1, 0, 0] = -1.0
     with pytest.raises(np.linalg.LinAlgError, match='not positive definite'):
         whitened_energy(y, C)
@@ -128,6 +129,17 @@ def test_the_smallest_pivot_tells_which_covariances_are_none():
     pivots = smallest_pivots(np.zeros((4, 3)), C)
     assert pivots[0] == pytest.approx(2e-6, rel=1e-5)
     assert np.isnan(pivots[1:]).all()
+
+
+@pytest.mark.parametrize('wrong', [-SIGMA**2, np.nan, np.inf])
+def test_a_frame_with_a_covariance_that_is_none_is_counted(wrong):
+    network = line_network(2)
+    stage = detector(network, onset_frames=1)
+    loud = frame(0, np.full((2, 3), 10 * SIGMA), network)
+    loud.covariance[1] = wrong
+    assert stage.feed(loud) == []
+    assert stage.counts['rejected: frame with a covariance that is not positive definite'] == 1
+    assert [type(r) for r in stage.feed(frame(1, loud.field, network))] == [Detection, FieldFrame]
 
 
 def test_onset_hold_and_release():

@@ -109,16 +109,22 @@ def test_update_with_missing_axes_and_sensors():
     assert max(compare(3, missing=True)) <= 1e-8
 
 
+@pytest.mark.parametrize('fades', [True, False])
+@pytest.mark.parametrize('moving', [0.0, 0.4, 1.0])
 @pytest.mark.parametrize('shared', [True, False])
-def test_prediction_equals_the_dense_oracle(shared):
+def test_prediction_equals_the_dense_oracle(shared, moving, fades):
     """x = A x, P = A P A' + Q with A of the target's Jacobian and of what decays."""
     rng = np.random.default_rng(3)
     n_hyp, n_t, n_rest = 4, 5, 7
     root = rng.standard_normal((n_hyp, n_t + n_rest, n_t + n_rest))
     P, x = root @ np.swapaxes(root, 1, 2), rng.standard_normal((n_hyp, n_t + n_rest))
     F, Q = rng.standard_normal((2, n_hyp, n_t, n_t))
+    # In some rows nothing but what is there already; of each hypothesis in others.
+    F = np.where(rng.random((n_hyp, n_t, 1)) < moving, F, np.eye(n_t))
     F, Q = (F[0], Q[0] @ Q[0].T) if shared else (F, Q @ np.swapaxes(Q, 1, 2))
-    decay, variance = rng.uniform(0.2, 1.0, n_rest), rng.uniform(0.1, 1.0, n_rest)
+    decay, variance = np.ones(n_rest), rng.uniform(0.1, 1.0, n_rest)
+    if fades:
+        decay = rng.uniform(0.2, 1.0, n_rest)
     A, noise = np.zeros((2, n_hyp, n_t + n_rest, n_t + n_rest))
     A[:, :n_t, :n_t], noise[:, :n_t, :n_t] = F, Q
     rest = np.arange(n_t, n_t + n_rest)
@@ -126,6 +132,7 @@ def test_prediction_equals_the_dense_oracle(shared):
     x_target = rng.standard_normal((n_hyp, n_t))
     expected = A @ P @ np.swapaxes(A, 1, 2) + noise
     x_rest = x[:, n_t:] * decay
+    F.flags.writeable = False
     predict(x, P, x_target, F, Q, variance, decay)
     np.testing.assert_array_equal(x, np.concatenate([x_target, x_rest], axis=1))
     np.testing.assert_allclose(P, expected, rtol=1e-12, atol=1e-12)
@@ -134,6 +141,8 @@ def test_prediction_equals_the_dense_oracle(shared):
         predict(x, P[:2], x_target, F, Q, variance, decay)
     with pytest.raises(ValueError, match='states of shape'):
         predict(x, P[:1], x_target[:1], F[:1] if F.ndim == 3 else F, Q, variance, decay)
+    with pytest.raises(ValueError, match='Jacobian of shape'):
+        predict(x, P, x_target, F[..., :1], Q, variance, decay)
 
 
 @pytest.mark.parametrize('n_own', [0, 2, 3])

@@ -1,6 +1,5 @@
 """Work that waits until the results are out: once, in time, and nothing of it is lost."""
 
-import itertools
 import time
 
 import numpy as np
@@ -12,7 +11,7 @@ from node_processes import start, stop
 from mag_tracking.io.message_types import RAW_READINGS
 from mag_tracking.io.schema import readings_dict
 from mag_tracking.nodes.convert import to_message
-from mag_tracking.nodes.later import Later, Turns
+from mag_tracking.nodes.later import Later
 from mag_tracking.nodes.stage_node import RESULTS, STREAM
 from mag_tracking.records import Readings
 
@@ -43,36 +42,6 @@ def test_what_waits_is_asked_for_all_the_time_and_done_all_the_same(ros):
     later = Later(node, 0.05, lambda: called.append(0))
     node.create_timer(0.01, later.ask)
     assert spin_until(lambda: len(called) >= 5, 5.0)
-
-
-def test_steps_are_taken_where_there_is_room_or_else_by_the_clock():
-    done = []
-
-    def steps():
-        for n in itertools.count():
-            done.append(n)
-            yield
-    turns = Turns(steps(), 3)
-    turns.take()
-    assert not done  # it is not time to
-    for n in range(1, 10):
-        turns.tick()
-        turns.take()
-        turns.take()
-        assert len(done) == n
-    for _ in range(3):
-        turns.tick()
-    assert len(done) == 9  # somebody may still have room
-    for n in (10, 11, 12):
-        turns.tick()
-        assert len(done) == n
-    # Somebody has again; what was left out is not made up for.
-    turns.take()
-    assert len(done) == 12
-    for n in (13, 14):
-        turns.tick()
-        turns.take()
-        assert len(done) == n
 
 
 def test_of_readings_that_come_together_each_is_looked_at(ros):

@@ -60,6 +60,12 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
         speed = np.hypot(*bank.x[rows, 3:5].T)
         np.testing.assert_allclose(bank.x[rows, 3], speed * np.cos(heading), atol=1e-9)
         assert set(np.round(speed, 6)) == set(vehicle.speeds)
+        # As sure of its speed as the settings say, relative to it, along and across.
+        ahead = np.array([np.cos(heading), np.sin(heading)])
+        across = np.array([-ahead[1], ahead[0]])
+        for direction, share in ((ahead, vehicle.speed_std), (across, vehicle.cross_speed_std)):
+            std = np.sqrt(direction @ bank.P[rows, 3:5, 3:5] @ direction)
+            np.testing.assert_allclose(std, share * speed, rtol=1e-9)
 
 
 @pytest.mark.parametrize('missing', [None, 0])

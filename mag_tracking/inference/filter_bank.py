@@ -84,6 +84,8 @@ class FilterBank:
         try:
             root = np.linalg.cholesky(self.P[rows, :3, :3])
         except np.linalg.LinAlgError:
+            root = np.full(1, np.nan)
+        if not np.isfinite(root).all():
             return int(rows[np.argmax(self.log_w[rows])])
         # [j, :, i]: position of i in units of hypothesis j.
         at = np.linalg.inv(root) @ self.x[rows, :3].T

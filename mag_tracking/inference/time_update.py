@@ -3,6 +3,8 @@
 import numpy as np
 from numba import njit
 
+from mag_tracking.records import plain
+
 
 def predict(x, P, x_target, F, Q, variance, decay=None):
     """Time update of every hypothesis, in place.
@@ -36,19 +38,63 @@ def predict(x, P, x_target, F, Q, variance, decay=None):
                          f'{n_hyp} targets of {n_t} states')
     x[:, :n_t] = x_target
     decay = 1.0 if decay is None else decay
-    # Copies of what is broadcast, as that is of no layout that the kernel is compiled for.
-    _predict_bank(x, P, *(np.ascontiguousarray(A.reshape(-1, n_t, n_t), dtype=float)
-                          for A in (F, Q)),
+    _predict_bank(x, P, plain(F).reshape(-1, n_t, n_t), plain(Q).reshape(-1, n_t, n_t),
                   *(np.array(np.broadcast_to(v, n_rest), dtype=float) for v in (variance, decay)))
 
 
-@njit(cache=True, error_model='numpy')
-def _find_what_moves(F, moves):
-    """Note the rows in which a Jacobian (n_t, n_t) is not that of what stays as it is."""
-    for a in range(len(F)):
-        moves[a] = F[a, a] != 1.0
-        for c in range(len(F)):
-            moves[a] |= c != a and F[a, c] != 0.0
+_INLINE = {'error_model': 'numpy', 'fastmath': {'contract'}, 'forceinline': True}
+
+
+@njit(**_INLINE)
+def _find_what_moves(F, f, moves):
+    """Note the rows in which Jacobian `f` is not that of what stays as it is."""
+    for a in range(len(moves)):
+        moves[a] = F[f, a, a] != 1.0
+        for c in range(len(moves)):
+            moves[a] |= c != a and F[f, a, c] != 0.0
+
+
+@njit(**_INLINE)
+def _fade(x, P, p, n_t, decay):
+    """Multiply the states behind the target's by `decay`."""
+    for i in range(n_t, x.shape[1]):
+        x[p, i] *= decay[i - n_t]
+        for k in range(n_t, x.shape[1]):
+            P[p, i, k] *= decay[i - n_t] * decay[k - n_t]
+        for a in range(n_t):
+            P[p, a, i] *= decay[i - n_t]
+            P[p, i, a] = P[p, a, i]
+
+
+@njit(**_INLINE)
+def _move(P, p, F, f, moves, T):
+    """P = F P F' for the target's states; most of F is zero, and most rows stay as they are."""
+    n_t, n_x = len(moves), P.shape[1]
+    for a in range(n_t):
+        if moves[a]:
+            T[a] = 0.0
+            for c in range(n_t):
+                if F[f, a, c] != 0.0:
+                    for i in range(n_x):
+                        T[a, i] += F[f, a, c] * P[p, c, i]
+    for a in range(n_t):
+        if moves[a]:
+            for i in range(n_x):
+                P[p, a, i] = T[a, i]
+            for i in range(n_t, n_x):
+                P[p, i, a] = T[a, i]
+    # The same of the target's columns: F is applied from the right.
+    for a in range(n_t):
+        if moves[a]:
+            for b in range(n_t):
+                T[a, b] = 0.0
+                for c in range(n_t):
+                    if F[f, a, c] != 0.0:
+                        T[a, b] += P[p, b, c] * F[f, a, c]
+    for a in range(n_t):
+        if moves[a]:
+            for b in range(n_t):
+                P[p, b, a] = T[a, b]
 
 
 @njit('void(float64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[:,:,::1], '
@@ -64,52 +110,17 @@ def _predict_bank(x, P, F, Q, variance, decay):
     for i in range(n_x - n_t):
         fades |= decay[i] != 1.0
     for p in range(len(x)):
-        of_f, of_q = p % len(F), p % len(Q)
+        f, q = p % len(F), p % len(Q)
         if fades:
-            for i in range(n_t, n_x):
-                x[p, i] *= decay[i - n_t]
-                for k in range(n_t, n_x):
-                    P[p, i, k] *= decay[i - n_t] * decay[k - n_t]
-                for a in range(n_t):
-                    P[p, a, i] *= decay[i - n_t]
-                    P[p, i, a] = P[p, a, i]
+            _fade(x, P, p, n_t, decay)
         for i in range(n_t, n_x):
             P[p, i, i] += variance[i - n_t]
         if p == 0 or len(F) > 1:
-            _find_what_moves(F[of_f], moves)
-        # T = F times the rows of the target; most of F is zero, and most rows stay as they are.
-        for a in range(n_t):
-            if moves[a]:
-                T[a] = 0.0
-                for c in range(n_t):
-                    f = F[of_f, a, c]
-                    if f != 0.0:
-                        for i in range(n_x):
-                            T[a, i] += f * P[p, c, i]
-        for a in range(n_t):
-            if moves[a]:
-                for i in range(n_t, n_x):
-                    P[p, a, i] = T[a, i]
-                    P[p, i, a] = T[a, i]
-                for b in range(n_t):
-                    P[p, a, b] = T[a, b]
-        # The same of their columns: F is applied from the right.
-        for a in range(n_t):
-            if moves[a]:
-                for b in range(n_t):
-                    T[a, b] = 0.0
-                for c in range(n_t):
-                    f = F[of_f, a, c]
-                    if f != 0.0:
-                        for b in range(n_t):
-                            T[a, b] += P[p, b, c] * f
-        for a in range(n_t):
-            if moves[a]:
-                for b in range(n_t):
-                    P[p, b, a] = T[a, b]
+            _find_what_moves(F, f, moves)
+        _move(P, p, F, f, moves, T)
         # Both triangles, so that no rounding makes it lopsided.
         for a in range(n_t):
-            P[p, a, a] += Q[of_q, a, a]
+            P[p, a, a] += Q[q, a, a]
             for b in range(a):
-                P[p, a, b] = P[p, b, a] = 0.5 * (P[p, a, b] + P[p, b, a] + Q[of_q, a, b]
-                                                 + Q[of_q, b, a])
+                P[p, a, b] = P[p, b, a] = 0.5 * (P[p, a, b] + P[p, b, a] + Q[q, a, b]
+                                                 + Q[q, b, a])

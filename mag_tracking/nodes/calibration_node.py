@@ -30,7 +30,7 @@ from mag_tracking.io.schema import (
 )
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
-from mag_tracking.nodes.later import Later, Turns
+from mag_tracking.nodes.later import Later
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.stage_node import LATCHED, STREAM, StageNode
@@ -44,10 +44,6 @@ that come so often."""
 REST_S = 0.0055
 """[s] What need not come before many readings are published comes so long behind: until the pose is
 there, which takes about that long of a hundred sensors, those who make it are to have the cores."""
-LATE_S = 0.0015
-"""[s] Where it comes later than that by more, no sensor has its turn: the next readings are near."""
-PATIENCE = 3
-"""Where nothing came for so many turns, they do not wait for readings."""
 KEEP_EVERY_S = 5.0
 """[s] The backgrounds are written down so often, or oftener where `calibrate.resume_s` is short."""
 
@@ -81,8 +77,8 @@ class CalibrationNode(StageNode):
         self.subscription(FieldReadings, RAW_READINGS, self._take_many, STREAM, source='sensors')
         self.expect('detection_node', CALIBRATED_READINGS)
         self._state = self.publisher(CalibrationState, '~/calibration', LATCHED)
-        self._turns, self._came = Turns(self._rounds(), PATIENCE), 0.0
-        self.create_timer(max(1.0 / (2 * len(self.network) + 3), SHORTEST_TURN_S), self._turns.tick)
+        self._turns, self._turn_is_due = self._rounds(), False
+        self.create_timer(max(1.0 / (2 * len(self.network) + 3), SHORTEST_TURN_S), self._tick)
         self.create_service(CalibrateService, '~/calibrate', self._calibrate)
         self.create_service(SurveyService, '~/survey', self._solve)
 
@@ -122,6 +118,17 @@ class CalibrationNode(StageNode):
 
     def queues(self):
         return {'calibrate': self._stage.n_held}
+
+    def _tick(self):
+        """It is time for a turn: behind the next readings, where it holds up none; or else now."""
+        if self._turn_is_due:
+            self._next_turn()
+        self._turn_is_due = True
+
+    def _next_turn(self):
+        """Go on with the round."""
+        self._turn_is_due = False
+        next(self._turns)
 
     def _rounds(self):
         """Compare all sensors, say how each is, and then how all are calibrated; again and again.
@@ -180,7 +187,6 @@ class CalibrationNode(StageNode):
             self._publishers_by_sensor[sensor].publish(
                 to_message(MagneticField, sample_dict(sample, message.header.frame_id)))
         self._unseen.append((Readings.of([raw]), self.now_ns))
-        self._came = time.monotonic()
         self._do_the_rest()
 
     def _take_many(self, message):
@@ -192,7 +198,6 @@ class CalibrationNode(StageNode):
         if len(calibrated):
             self._readings.publish(to_message(FieldReadings, readings_dict(calibrated)))
         self._unseen.append((raw, self.now_ns))
-        self._came = time.monotonic()
         self._later.ask()
 
     def _do_the_rest(self):
@@ -201,8 +206,8 @@ class CalibrationNode(StageNode):
         unseen, self._unseen = self._unseen, []
         for raw, now_ns in unseen:
             self._health.add(raw, now_ns)
-        if time.monotonic() - self._came < REST_S + LATE_S:
-            self._turns.take()
+        if self._turn_is_due:
+            self._next_turn()
 
     def _shaken(self, sensor, message):
         """One acceleration."""
@@ -252,7 +257,7 @@ class CalibrationNode(StageNode):
         self._health.renew(network)
         self._publish_state([to_message(SensorCalibration, sensor_dict(self._stage, network, j))
                              for j in range(len(network))])
-        self._turns.begin(self._rounds())
+        self._turns = self._rounds()
         self._keep_no_more(network.names)
         response.success = True
         response.message = ('in force' + (f', and saved in {path}, to be given at the next start'

@@ -1,4 +1,4 @@
-"""Work that can wait until those who wait for the results have them, and work in small steps."""
+"""Work that can wait until those who wait for the results have them."""
 
 from rclpy.clock import Clock, ClockType
 
@@ -25,37 +25,3 @@ class Later:
         """Call it, once."""
         self._timer.cancel()
         self._call()
-
-
-class Turns:
-    """Goes on with long work a step at a time: where there is room for one, or when it is time to.
-
-    There is at most one step each `tick` of a clock. Who finds that nobody waits for anything
-    takes it; where nobody has for `patience` ticks, the clock does.
-    """
-
-    def __init__(self, steps, patience):
-        """`steps` is an endless iterator."""
-        self._steps, self._patience = steps, patience
-        self._is_due, self._in_vain = False, 0
-
-    def begin(self, steps):
-        """Other work from now on."""
-        self._steps = steps
-
-    def tick(self):
-        """Another step may be taken."""
-        self._is_due, self._in_vain = True, self._in_vain + 1
-        if self._in_vain > self._patience:
-            self._step()
-
-    def take(self):
-        """Take a step, if there may be one."""
-        if self._is_due:
-            self._in_vain = 0
-            self._step()
-
-    def _step(self):
-        """The next."""
-        self._is_due = False
-        next(self._steps)

@@ -81,8 +81,12 @@ class Detect:
             out = self._release(self._last_ns, float('nan'), 0, '')
             self._reset()
         self._last_ns = frame.stamp_ns
-        energy, axes = whitened_energy(
-            frame.field, frame.covariance + self._allowance(frame.stamp_ns) * np.eye(3))
+        try:
+            energy, axes = whitened_energy(
+                frame.field, frame.covariance + self._allowance(frame.stamp_ns) * np.eye(3))
+        except np.linalg.LinAlgError:
+            self.counts['rejected: frame with a covariance that is not positive definite'] += 1
+            return out
         statistic, n = float(energy.sum()), int(axes.sum())
         self.counts['frames'] += 1
         if n:

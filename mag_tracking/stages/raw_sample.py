@@ -7,6 +7,9 @@ import numpy as np
 from mag_tracking.calibration.ordinary import without_iron
 from mag_tracking.records import MagSample
 
+LEAST_EIGENVALUE = 1e-12
+"""Of a covariance in units of its own variances; below it is singular, but for rounding."""
+
 
 def fault_of(sample, max_field):
     """Why a `MagSample` cannot be used, or None; `max_field` [T]."""
@@ -60,4 +63,6 @@ def _is_covariance(C):
     """Whether C is finite, symmetric and positive definite."""
     if not np.isfinite(C).all() or np.abs(C - C.T).max() > 1e-6 * np.abs(C).max():
         return False
-    return bool(np.linalg.eigvalsh(C)[0] > 0.0)
+    std = np.sqrt(np.diagonal(C).clip(0.0))
+    # Scaled to one: by rounding a singular one may have an eigenvalue above zero.
+    return bool(std.all() and np.linalg.eigvalsh(C / np.outer(std, std))[0] > LEAST_EIGENVALUE)
