@@ -120,7 +120,9 @@ def test_prediction_equals_the_dense_oracle(shared, moving, fades):
     P, x = root @ np.swapaxes(root, 1, 2), rng.standard_normal((n_hyp, n_t + n_rest))
     F, Q = rng.standard_normal((2, n_hyp, n_t, n_t))
     # In some rows nothing but what is there already; of each hypothesis in others.
-    F = np.where(rng.random((n_hyp, n_t, 1)) < moving, F, np.eye(n_t))
+    dense, F = F, np.where(rng.random((n_hyp, n_t, 1)) < moving, F, np.eye(n_t))
+    F[0, 0] = np.where(np.arange(n_t) == 0, 1.0, dense[0, 0])  # a place and its velocity
+    F[0, 1] = 0.5 * np.eye(n_t)[1]  # what fades
     F, Q = (F[0], Q[0] @ Q[0].T) if shared else (F, Q @ np.swapaxes(Q, 1, 2))
     decay, variance = np.ones(n_rest), rng.uniform(0.1, 1.0, n_rest)
     if fades:
