@@ -5,6 +5,9 @@ import numpy as np
 from mag_tracking.inference import update_kernels
 from mag_tracking.records import plain
 
+LEAST_PIVOT = 1e-12
+"""A covariance with a smaller one of `smallest_pivots` is singular, but for rounding."""
+
 
 def whitened_energy(y, C):
     """Energy of a measurement in units of its noise: y' C^-1 y over the axes present.

@@ -36,6 +36,13 @@ def _of_present_axes(y, j, s00, s10, s11, s20, s21, s22):
 
 
 @njit(**_INLINE)
+def _covariance(y, C, j):
+    """That of sensor j among `C` (n, 3, 3), as `_of_present_axes`."""
+    return _of_present_axes(
+        y, j, C[j, 0, 0], C[j, 1, 0], C[j, 1, 1], C[j, 2, 0], C[j, 2, 1], C[j, 2, 2])
+
+
+@njit(**_INLINE)
 def _factor(s00, s10, s11, s20, s21, s22):
     """Unit lower factor l10, l20, l21 and pivots e0, e1, e2: S = L diag(e) L'."""
     l10, l20 = s10 / s00, s20 / s00
@@ -87,9 +94,7 @@ def _n_present(y, C):
     """How many axes are not NaN; -1 if the noise of a sensor's is not positive definite."""
     n = 0
     for j in range(y.shape[0]):
-        s00, s10, s11, s20, s21, s22 = _of_present_axes(
-            y, j, C[j, 0, 0], C[j, 1, 0], C[j, 1, 1], C[j, 2, 0], C[j, 2, 1], C[j, 2, 2])
-        _, _, _, e0, e1, e2 = _factor(s00, s10, s11, s20, s21, s22)
+        _, _, _, e0, e1, e2 = _factor(*_covariance(y, C, j))
         if not (e0 > 0.0 and e1 > 0.0 and e2 > 0.0):
             return -1
         for a in range(3):
@@ -217,8 +222,7 @@ def update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis, 
 def energies(y, C, energy, axes):
     """`axes.whitened_energy`; False where a covariance is not positive definite."""
     for j in range(len(y)):
-        l10, l20, l21, e0, e1, e2 = _factor(*_of_present_axes(
-            y, j, C[j, 0, 0], C[j, 1, 0], C[j, 1, 1], C[j, 2, 0], C[j, 2, 1], C[j, 2, 2]))
+        l10, l20, l21, e0, e1, e2 = _factor(*_covariance(y, C, j))
         if not (e0 > 0.0 and e1 > 0.0 and e2 > 0.0):
             return False
         axes[j] = 0
@@ -235,8 +239,7 @@ def energies(y, C, energy, axes):
 def smallest_pivots(y, C, out):
     """`axes.smallest_pivots`."""
     for j in range(len(y)):
-        s00, s10, s11, s20, s21, s22 = _of_present_axes(
-            y, j, C[j, 0, 0], C[j, 1, 0], C[j, 1, 1], C[j, 2, 0], C[j, 2, 1], C[j, 2, 2])
+        s00, s10, s11, s20, s21, s22 = _covariance(y, C, j)
         # Scaled to one: in tesla squared every pivot looks like zero. Of what is negative NaN.
         a, b, c = math.sqrt(s00), math.sqrt(s11), math.sqrt(s22)
         _, _, _, e0, e1, e2 = _factor(s00 / (a * a), s10 / (a * b), s11 / (b * b),

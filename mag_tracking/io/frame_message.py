@@ -3,7 +3,7 @@
 import numpy as np
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.inference.axes import smallest_pivots
+from mag_tracking.inference.axes import LEAST_PIVOT, smallest_pivots
 from mag_tracking.io.schema import doubles, header_dict, stamp_ns
 from mag_tracking.records import FieldFrame
 
@@ -50,5 +50,5 @@ def _check_numbers(frame):
         raise RecordingError('a frame with an infinite field')
     if not (np.abs(frame.time_offset) <= LONGEST_OFFSET_S).all():
         raise RecordingError(f'a frame with time offsets of {frame.time_offset.tolist()} s')
-    if not (smallest_pivots(frame.field, frame.covariance) > 1e-12).all():
+    if not (smallest_pivots(frame.field, frame.covariance) > LEAST_PIVOT).all():
         raise RecordingError('a frame with a covariance that is not positive definite')

@@ -5,10 +5,8 @@ from math import inf, isnan
 import numpy as np
 
 from mag_tracking.calibration.ordinary import without_iron
+from mag_tracking.inference.axes import LEAST_PIVOT, smallest_pivots
 from mag_tracking.records import MagSample
-
-LEAST_EIGENVALUE = 1e-12
-"""Of a covariance in units of its own variances; below it is singular, but for rounding."""
 
 
 def fault_of(sample, max_field):
@@ -26,9 +24,8 @@ def fault_of(sample, max_field):
             return f'above {max_field:g} T (gauss or microtesla as tesla?)'
     if sample.covariance is None:
         return None
-    there = ~np.isnan(sample.field)
     if not (sample.covariance.shape == (3, 3)
-            and _is_covariance(sample.covariance[np.ix_(there, there)])):
+            and _is_covariance(sample.field, sample.covariance)):
         return 'covariance is not positive definite'
     return None
 
@@ -59,10 +56,11 @@ def corrected(sample, clock_ns, offset, C):
     return MagSample(sample.stamp_ns - clock_ns, sample.sensor, field, covariance)
 
 
-def _is_covariance(C):
-    """Whether C is finite, symmetric and positive definite."""
-    if not np.isfinite(C).all() or np.abs(C - C.T).max() > 1e-6 * np.abs(C).max():
+def _is_covariance(field, C):
+    """Whether C is finite, symmetric and positive definite, in the axes that `field` has."""
+    there = ~np.isnan(field)
+    of_present = C[np.ix_(there, there)]
+    if not np.isfinite(of_present).all() \
+            or np.abs(of_present - of_present.T).max() > 1e-6 * np.abs(of_present).max():
         return False
-    std = np.sqrt(np.diagonal(C).clip(0.0))
-    # Scaled to one: by rounding a singular one may have an eigenvalue above zero.
-    return bool(std.all() and np.linalg.eigvalsh(C / np.outer(std, std))[0] > LEAST_EIGENVALUE)
+    return bool(smallest_pivots(field[None], C[None])[0] > LEAST_PIVOT)
