@@ -22,12 +22,12 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['data/*']},
+    package_data={NAME: ['nodes/*.xml']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/launch', sorted(glob('launch/*.py'))),
-        (f'share/{NAME}/config', sorted(glob('config/*.yaml') + glob('config/*.xml'))),
+        (f'share/{NAME}/config', sorted(glob('config/*.yaml'))),
     ],
     # ROS itself and mag_tracking_msgs stay out: people with a ROS from apt have them from there,
     # and pip would look for mag-tracking-msgs on the index, where it is not.

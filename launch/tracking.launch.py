@@ -3,14 +3,9 @@
 ros2 launch mag_tracking tracking.launch.py network:=/path/to/network.yaml
 """
 
-from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
+from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
-from launch.substitutions import (
-    EnvironmentVariable,
-    LaunchConfiguration,
-    PathJoinSubstitution,
-    PythonExpression,
-)
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution, PythonExpression
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
@@ -35,10 +30,6 @@ def generate_launch_description():
                'reliable_input': ParameterValue(has_recording, value_type=bool)},
               LaunchConfiguration('params')]
     return LaunchDescription([
-        # A profile of your own stays.
-        *(SetEnvironmentVariable(name, EnvironmentVariable(
-            name, default_value=config('fastdds.xml')))
-          for name in ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')),
         DeclareLaunchArgument('network', description='path of a network.yaml'),
         DeclareLaunchArgument('target', default_value='vehicle', description='vehicle or magnet'),
         DeclareLaunchArgument(

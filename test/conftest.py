@@ -113,8 +113,9 @@ def ros():
     import rclpy
     from rclpy.node import Node
 
+    from mag_tracking.nodes.middleware import begin
     from mag_tracking.nodes.stage_node import make_executor, spin
-    rclpy.init()
+    begin()
     node, executor = Node('tester'), make_executor()
     executor.add_node(node)
 

@@ -3,10 +3,8 @@
 import signal
 import time
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
-import pytest
 import rclpy
 import yaml
 from conftest import NETWORK_FILE, POINT
@@ -24,6 +22,7 @@ from serial_line import SerialLine
 from mag_tracking.io.network_file import read_network
 from mag_tracking.io.simulator import point_body
 from mag_tracking.nodes.convert import track_of
+from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.stage_node import RESULTS, STREAM, make_executor
 
 WRONG = chi2.ppf(1.0 - 1e-4, 2)
@@ -42,9 +41,6 @@ STEADY = {'calibration_node': {'calibrate.learn_s': 3600.0},
           'detection_node': {'detect.background_drift': 0.0}}
 """Settings of a background that is as the network file says: nothing is learnt of it between two
 vehicles, and nothing is allowed for it."""
-PROFILE = Path(__file__).parents[1] / 'config' / 'fastdds.xml'
-"""Without it two nodes that miss each other in the beginning (one start in five) are strangers for
-3 s."""
 
 
 def network_file(folder):
@@ -241,12 +237,10 @@ def world(folder):
     line = SerialLine(folder / 'port')
     own = folder / 'guarded'
     own.mkdir()
-    with pytest.MonkeyPatch.context() as patch, Broker(folder) as broker, Broker(
+    with Broker(folder) as broker, Broker(
             own, *password_lines(own, 'somebody', 'secret')) as guarded, Roadside(
             read_network(network_file(folder)), BODY, broker.port, line) as roadside:
-        for name in ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'):
-            patch.setenv(name, str(PROFILE))
-        rclpy.init()
+        begin()
         here = World(folder, broker, guarded, roadside, line)
         try:
             here.use('mqtt')

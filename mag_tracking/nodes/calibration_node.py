@@ -33,7 +33,7 @@ from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.later import Later
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
-from mag_tracking.nodes.stage_node import LATCHED, STREAM, StageNode
+from mag_tracking.nodes.stage_node import LATCHED, SENT, STREAM, StageNode
 from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate import Calibrate
 from mag_tracking.stages.survey import Survey, with_noise
@@ -67,13 +67,13 @@ class CalibrationNode(StageNode):
         self._publishers_by_sensor = {}
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self._publishers_by_sensor[sensor] = self.publisher(
-                MagneticField, f'{topic}_calibrated', STREAM)
+                MagneticField, f'{topic}_calibrated', SENT)
             self.subscription(MagneticField, topic, partial(self._take, sensor), self.input_qos,
                               source='sensors')
         for sensor, topic in zip(self.network.names, self.network.imu_topics, strict=True):
             if topic is not None:
                 self.subscription(Imu, topic, partial(self._shaken, sensor), self.input_qos)
-        self._readings = self.publisher(FieldReadings, CALIBRATED_READINGS, STREAM)
+        self._readings = self.publisher(FieldReadings, CALIBRATED_READINGS, SENT)
         self.subscription(FieldReadings, RAW_READINGS, self._take_many, STREAM, source='sensors')
         self.expect('detection_node', CALIBRATED_READINGS)
         self._state = self.publisher(CalibrationState, '~/calibration', LATCHED)

@@ -13,7 +13,7 @@ from mag_tracking.io.schema import detection_dict, sample_of
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
-from mag_tracking.nodes.stage_node import RESULTS, STREAM, StageNode
+from mag_tracking.nodes.stage_node import RESULTS, SENT, STREAM, StageNode
 from mag_tracking.records import Detection
 from mag_tracking.stages.align import Align
 from mag_tracking.stages.detect import Detect
@@ -27,7 +27,7 @@ class DetectionNode(StageNode):
         self.settings = declare_settings(self, self.settings, 'detect', self.OWN_PARAMETERS)
         self._align = Align(self.network, self.settings.align)
         self._detect = Detect(self.network, self.settings.detect)
-        self._frames = self.publisher(NetworkFrame, '~/frame', STREAM)
+        self._frames = self.publisher(NetworkFrame, '~/frame', SENT)
         self._detections = self.publisher(DetectionMessage, '~/detections', RESULTS)
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self.subscription(MagneticField, f'{topic}_calibrated', partial(self._take, sensor),

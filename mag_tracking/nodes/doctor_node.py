@@ -7,13 +7,13 @@ from functools import partial
 import rclpy
 from mag_tracking_msgs.msg import FieldReadings
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import MagneticField
 
 from mag_tracking.doctoring import Doctor
 from mag_tracking.errors import RecordingError
 from mag_tracking.io.message_types import RAW_READINGS
 from mag_tracking.io.schema import sample_of, samples_of
+from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.stage_node import SENSORS, STREAM, make_executor, spin
 from mag_tracking.stages.health import Finding
 
@@ -68,7 +68,7 @@ class DoctorNode(Node):
 
 def listen(network, settings, seconds, stopped):
     """Listen for `seconds` or until `stopped()`: (Doctor, list of Finding of the graph)."""
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    begin()
     executor = make_executor()
     node = DoctorNode(network, settings)
     try:

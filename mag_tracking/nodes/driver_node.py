@@ -22,7 +22,7 @@ from mag_tracking.io.schema import acceleration_dict, readings_dict, sample_dict
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.driver_health import DriverDiagnostics
-from mag_tracking.nodes.stage_node import RESULTS, STREAM
+from mag_tracking.nodes.stage_node import RESULTS, SENT
 
 PATIENCE_S = 15.0
 """[s] Time that a driver has to stop; a broker that does not answer takes a while."""
@@ -36,7 +36,7 @@ class DriverNode(LifecycleNode):
         super().__init__('driver_node', **node_arguments)
         self._path = self.declare_parameter('drivers', '').value
         self._network_path = self.declare_parameter('network', '').value
-        self._readings = self.create_publisher(FieldReadings, RAW_READINGS, STREAM) \
+        self._readings = self.create_publisher(FieldReadings, RAW_READINGS, SENT) \
             if self.declare_parameter('batches', False).value else None
         self._drivers, self._threads, self._publishers_by_sensor = [], [], {}
         self._stopping = None
@@ -108,8 +108,8 @@ class DriverNode(LifecycleNode):
         if network is not None:
             j = network.names.index(sensor)
             topic, imu_topic = network.topics[j], network.imu_topics[j] or imu_topic
-        return (self.create_publisher(MagneticField, topic, STREAM),
-                self.create_publisher(Imu, imu_topic, STREAM))
+        return (self.create_publisher(MagneticField, topic, SENT),
+                self.create_publisher(Imu, imu_topic, SENT))
 
     def _publish(self, readings, accelerations):
         """Each reading on its sensor's topic, or with `batches` together."""

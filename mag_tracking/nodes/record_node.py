@@ -10,7 +10,6 @@ from typing import NamedTuple
 import rclpy
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from tqdm import tqdm
 
 from mag_tracking.interrupts import noted_signals
@@ -24,6 +23,7 @@ from mag_tracking.io.recorder import Recorder
 from mag_tracking.io.rosbag2_folder import offered_qos
 from mag_tracking.nodes.convert import message_class
 from mag_tracking.nodes.definitions import definition_of
+from mag_tracking.nodes.middleware import begin
 
 POLL_S = 0.02
 """How often messages are fetched [s]."""
@@ -235,7 +235,7 @@ def run(selection, out, split_bytes=10**9, split_ns=3600 * 10**9):
     """
     with noted_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as seen:
         with Recorder(out, split_bytes, split_ns, report=say) as recorder:
-            rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+            begin()
             node = None
             try:
                 node = RecordNode(recorder, selection, say)

@@ -9,7 +9,6 @@ import rclpy
 from mag_tracking_msgs.msg import TrackArray
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.signals import SignalHandlerOptions
 
 from mag_tracking.errors import MagTrackingError
 from mag_tracking.interrupts import noted_signals
@@ -17,6 +16,7 @@ from mag_tracking.nodes.calibration_node import CalibrationNode
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.detection_node import DetectionNode
 from mag_tracking.nodes.driver_node import DriverNode
+from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.replay_node import ReplayNode
 from mag_tracking.nodes.stage_node import STREAM, make_executor, spin
 from mag_tracking.nodes.tracker_node import TrackerNode
@@ -130,7 +130,7 @@ def run(network_path, settings, recording=None, rate=1.0, loop=False, observers=
 
 def _run_until(stopped, network_path, settings, recording, rate, loop, observers):
     """As `run`, until `stopped()`."""
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    begin()
     executor, nodes = make_executor(), []
     try:
         stages, replay = make_nodes(network_path, settings, recording, rate, loop)

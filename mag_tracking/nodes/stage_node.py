@@ -11,7 +11,6 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from mag_tracking.errors import MagTrackingError, RecordingError, SettingsError
@@ -19,13 +18,19 @@ from mag_tracking.interrupts import noted_signals
 from mag_tracking.io.network_file import read_network
 from mag_tracking.io.schema import readings_of, stamp_ns
 from mag_tracking.nodes.flow import Flow, Listener
+from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.pipeline import settings_for
 
 RESULTS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 """For what people subscribe to."""
 STREAM = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE)
-"""Between the nodes: nothing may be lost while the tracker starts a bank."""
+"""Between the nodes, for who hears, and for a replay, which may be fast: nothing may be lost while
+the tracker starts a bank."""
+SENT = QoSProfile(depth=250, reliability=ReliabilityPolicy.RELIABLE)
+"""Between the nodes, for who sends. So much is kept for a node that was killed; the one that comes
+after it has to be told that this is not for it, and can ask of 256 messages at once (RTPS 2.3,
+8.3.5.5). Of a longer past it asks for the rest only seconds later, and hears nothing till then."""
 SENSORS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Best effort matches reliable and best-effort drivers alike."""
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
@@ -175,8 +180,7 @@ def main(node_class, arguments=None):
 
 def _run_until(seen, node_class, arguments):
     """Run one node until there is something in `seen`."""
-    # Its own handlers raise KeyboardInterrupt wherever Python is, in its C++ too.
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    begin(arguments)
     executor, node = make_executor(), None
     try:
         node = node_class()

@@ -33,7 +33,7 @@ from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.markers import delete_markers, track_markers
 from mag_tracking.nodes.ros_params import follow_changes
-from mag_tracking.nodes.stage_node import LATCHED, RESULTS, STREAM, StageNode
+from mag_tracking.nodes.stage_node import LATCHED, RESULTS, SENT, STREAM, StageNode
 from mag_tracking.records import SmoothedPose
 from mag_tracking.stages.track import TrackStage
 
@@ -50,13 +50,13 @@ class TrackerNode(StageNode):
         super().__init__('tracker_node', 'track', **node_arguments)
         self._stage = TrackStage(self.network, self.settings.track)
         follow_changes(self, self.settings, lambda s: self._stage.configure(s.track))
-        self._pose = self.publisher(PoseWithCovarianceStamped, '~/pose', STREAM)
+        self._pose = self.publisher(PoseWithCovarianceStamped, '~/pose', SENT)
         self._odometry = self.publisher(Odometry, '~/odometry', RESULTS)
-        self._tracks = self.publisher(TrackArray, '~/tracks', STREAM)
-        self._hypotheses = self.publisher(HypothesisArray, '~/hypotheses', STREAM)
+        self._tracks = self.publisher(TrackArray, '~/tracks', SENT)
+        self._hypotheses = self.publisher(HypothesisArray, '~/hypotheses', SENT)
         self._path_publisher = self.publisher(Path, '~/path', RESULTS)
         self._smoothed_pose = self.publisher(
-            PoseWithCovarianceStamped, '~/pose_smoothed', STREAM)
+            PoseWithCovarianceStamped, '~/pose_smoothed', SENT)
         self._smoothed = self.publisher(SmoothedTrack, '~/smoothed', RESULTS)
         self._smoothed_path = self.publisher(Path, '~/path_smoothed', RESULTS)
         self._markers = self.publisher(MarkerArray, '~/markers', RESULTS)
