@@ -42,36 +42,29 @@ def begun(monkeypatch, tmp_path):
     monkeypatch.setattr(rclpy, 'init', lambda **k: calls.append(k))
     # A copy: what `begin` writes is gone after the test.
     monkeypatch.setattr(os, 'environ', {n: v for n, v in os.environ.items()
-                                        if n not in middleware.NAMES})
+                                        if n != middleware.NAME})
     monkeypatch.chdir(tmp_path)
     return calls
 
 
-def profiles():
-    return [os.environ.get(name) for name in middleware.NAMES]
-
-
-def test_the_profile_is_in_force_unless_somebody_has_his_own(begun, tmp_path):
+def test_the_profile_is_in_force_unless_somebody_has_his_own(begun):
     middleware.begin(['--ros-args'])
-    assert begun[0]['args'] == ['--ros-args'] and profiles() == [str(middleware.PROFILE)] * 2
-    assert middleware.PROFILE.exists()
+    assert begun[0]['args'] == ['--ros-args']
+    assert os.environ[middleware.NAME] == str(middleware.PROFILE) and middleware.PROFILE.exists()
 
 
 @pytest.mark.parametrize('own', ['/somewhere/else.xml', ''])
-@pytest.mark.parametrize('name', middleware.NAMES)
-def test_a_profile_of_the_user_stays(begun, name, own):
+def test_a_profile_of_the_user_stays(begun, own):
     """Also that he wants none."""
-    os.environ[name] = own
+    os.environ[middleware.NAME] = own
     middleware.begin()
-    assert sorted(profiles(), key=str) == sorted([own, None], key=str) and len(begun) == 1
+    assert os.environ[middleware.NAME] == own and len(begun) == 1
 
 
-@pytest.mark.parametrize('name', middleware.USUAL)
-def test_a_profile_in_the_working_folder_stays(begun, name):
-    with open(name, 'w') as file:
-        file.write('<dds/>')
+def test_a_profile_in_the_working_folder_stays(begun, tmp_path):
+    (tmp_path / middleware.USUAL).write_text('<dds/>')
     middleware.begin()
-    assert profiles() == [None, None] and len(begun) == 1
+    assert middleware.NAME not in os.environ and len(begun) == 1
 
 
 def test_a_node_that_is_killed_and_started_again_hears_at_once(ros, tmp_path):

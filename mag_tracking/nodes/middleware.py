@@ -8,10 +8,9 @@ from rclpy.signals import SignalHandlerOptions
 
 PROFILE = Path(__file__).with_name('fastdds.xml')
 """Nodes that find each other at once, also one that was killed and is started again."""
-NAMES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
-"""Where Fast DDS looks for a profile: of Jazzy, and of later releases."""
-USUAL = ('DEFAULT_FASTRTPS_PROFILES.xml', 'DEFAULT_FASTDDS_PROFILES.xml')
-"""What it takes from the working folder by itself."""
+NAME, USUAL = 'FASTRTPS_DEFAULT_PROFILES_FILE', 'DEFAULT_FASTRTPS_PROFILES.xml'
+"""The variable that names a profile to the Fast DDS of Jazzy (2.14), and the file in the working
+folder that it takes by itself."""
 
 
 def begin(arguments=None):
@@ -20,7 +19,6 @@ def begin(arguments=None):
     Other middlewares do not look at it. Signals stay with the caller: rclpy's own handlers raise
     KeyboardInterrupt wherever Python is, in its C++ too.
     """
-    if not any(n in os.environ for n in NAMES) and not any(Path(n).exists() for n in USUAL):
-        for name in NAMES:
-            os.environ[name] = str(PROFILE)
+    if not Path(USUAL).exists():
+        os.environ.setdefault(NAME, str(PROFILE))
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
