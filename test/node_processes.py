@@ -6,13 +6,20 @@ import subprocess
 import sys
 import tempfile
 
+from mag_tracking.nodes.middleware import PROFILE_VARIABLE
+
 
 def start(module, *arguments, home=None):
     """A node in a process of its own, with no memory but what it finds in `home`."""
     return subprocess.Popen(
         [sys.executable, '-m', f'mag_tracking.nodes.{module}', '--ros-args', *arguments],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        env={**os.environ, 'ROS_HOME': str(home or tempfile.mkdtemp(dir=os.environ['ROS_HOME']))})
+        env=environment(ROS_HOME=str(home or tempfile.mkdtemp(dir=os.environ['ROS_HOME']))))
+
+
+def environment(**more):
+    """That of a process that has to find the profile of the middleware by itself."""
+    return {n: v for n, v in os.environ.items() if n != PROFILE_VARIABLE} | more
 
 
 def stop(processes):

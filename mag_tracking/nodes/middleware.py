@@ -8,9 +8,10 @@ from rclpy.signals import SignalHandlerOptions
 
 PROFILE = Path(__file__).with_name('fastdds.xml')
 """Nodes that find each other at once, also one that was killed and is started again."""
-NAME, USUAL = 'FASTRTPS_DEFAULT_PROFILES_FILE', 'DEFAULT_FASTRTPS_PROFILES.xml'
-"""The variable that names a profile to the Fast DDS of Jazzy (2.14), and the file in the working
-folder that it takes by itself."""
+PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+"""Names a profile to the Fast DDS of Jazzy (2.14)."""
+PROFILE_IN_FOLDER = 'DEFAULT_FASTRTPS_PROFILES.xml'
+"""What it takes by itself, if there is one in the working folder."""
 
 
 def begin(arguments=None):
@@ -19,6 +20,11 @@ def begin(arguments=None):
     Other middlewares do not look at it. Signals stay with the caller: rclpy's own handlers raise
     KeyboardInterrupt wherever Python is, in its C++ too.
     """
-    if not Path(USUAL).exists():
-        os.environ.setdefault(NAME, str(PROFILE))
+    named = os.environ.get(PROFILE_VARIABLE)
+    if named is None and not Path(PROFILE_IN_FOLDER).exists():
+        os.environ[PROFILE_VARIABLE] = str(PROFILE)
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    if named and not Path(named).exists():
+        rclpy.logging.get_logger('middleware').warning(
+            f'{PROFILE_VARIABLE} names {named}, which does not exist: no profile is in force, and '
+            'a node that is started again may not be heard for seconds')

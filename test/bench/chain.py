@@ -40,8 +40,9 @@ def play(role):
     from geometry_msgs.msg import PoseWithCovarianceStamped
     from mag_tracking_msgs.msg import FieldReadings
 
+    from mag_tracking.nodes.middleware import begin
     from mag_tracking.nodes.stage_node import STREAM, make_executor, spin
-    rclpy.init()
+    begin()
     node, executor, count = rclpy.create_node(f'chain_{role}'), make_executor(), [0]
     out = {'last': 'pose', 'second': 'c', 'first': 'b', 'source': 'a'}[role]
     kind = PoseWithCovarianceStamped if role == 'last' else FieldReadings
@@ -76,8 +77,9 @@ def main():
     import rclpy
     from geometry_msgs.msg import PoseWithCovarianceStamped
 
+    from mag_tracking.nodes.middleware import begin
     from mag_tracking.nodes.stage_node import STREAM, make_executor, spin
-    rclpy.init()
+    begin()
     node, executor, late = rclpy.create_node('chain'), make_executor(), []
     executor.add_node(node)
     node.create_subscription(

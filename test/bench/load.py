@@ -198,8 +198,9 @@ def main():
     args = parser.parse_args()
     import rclpy
 
+    from mag_tracking.nodes.middleware import begin
     from mag_tracking.nodes.stage_node import make_executor, spin
-    rclpy.init()
+    begin()
     node, executor = rclpy.create_node('load'), make_executor()
     executor.add_node(node)
     ear = Ear(node, args.in_turn)
