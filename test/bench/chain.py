@@ -9,6 +9,7 @@ besides. Printed is how long a pose comes after its readings were sent, by this 
 
 import argparse
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -40,6 +41,7 @@ def play(role):
     from geometry_msgs.msg import PoseWithCovarianceStamped
     from mag_tracking_msgs.msg import FieldReadings
 
+    from mag_tracking.interrupts import noted_signals
     from mag_tracking.nodes.middleware import begin
     from mag_tracking.nodes.stage_node import STREAM, make_executor, spin
     begin()
@@ -50,8 +52,6 @@ def play(role):
 
     def hand_on(message):
         count[0] += 1
-        if not rclpy.ok():
-            return
         if role != 'last':
             publisher.publish(message)
         elif count[0] % EVERY == 0:
@@ -63,7 +63,8 @@ def play(role):
         source = {'last': 'c', 'second': 'b', 'first': 'a'}[role]
         node.create_subscription(FieldReadings, f'/chain/{source}', hand_on, STREAM)
     executor.add_node(node)
-    spin(executor)
+    with noted_signals(signal.SIGINT) as seen:
+        spin(executor, lambda: bool(seen))
 
 
 def main():

@@ -151,6 +151,9 @@ def watch(processes, ear, executor, minutes):
     while time.monotonic() - begin < 60.0 * minutes:
         until = begin + 10.0 * (len(rows) + 1)
         spin(executor, lambda until=until: time.monotonic() > until)
+        if time.monotonic() < until:
+            # Ctrl-C: the nodes have got it, too.
+            break
         rows.append((time.monotonic() - begin, {k: usage(p) for k, p in processes.items()}))
         print(f'{rows[-1][0]:6.0f} s  {len(ear.latencies):6d} poses  ' + '  '.join(
             f'{k.removesuffix("_node")} {mb:.0f} MB' for k, (_, mb) in rows[-1][1].items()),
@@ -198,9 +201,9 @@ def main():
     args = parser.parse_args()
     import rclpy
 
-    from mag_tracking.nodes.middleware import begin
     from mag_tracking.nodes.stage_node import make_executor, spin
-    begin()
+    # A listener of a user's, who knows nothing of profiles.
+    rclpy.init()  # noqa: TID251
     node, executor = rclpy.create_node('load'), make_executor()
     executor.add_node(node)
     ear = Ear(node, args.in_turn)
@@ -223,7 +226,7 @@ def main():
     node.destroy_node()
     executor.shutdown()
     rclpy.try_shutdown()
-    return int(report(ear, rows))
+    return int(report(ear, rows)) if rows else 1
 
 
 if __name__ == '__main__':
