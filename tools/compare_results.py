@@ -1,0 +1,126 @@
+"""Compare what two commits compute from the bundled recordings, number by number.
+
+    .venv/bin/python tools/compare_results.py BASE          # the working tree against commit BASE
+
+Every bundled recording is replayed with both through the command line; every number in
+poses.csv, poses_smoothed.csv, detections.csv and hypotheses.csv has to agree to the tolerance,
+every text and every count of rows exactly. Exit status 1 where something differs.
+"""
+
+import argparse
+import csv
+import math
+import os
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = ROOT / 'test' / 'data'
+TABLES = ('poses.csv', 'poses_smoothed.csv', 'detections.csv', 'hypotheses.csv')
+
+
+def mag_tracking(tree, *arguments):
+    """Run the command `mag-tracking` of the source tree `tree`."""
+    environment = {k: v for k, v in os.environ.items() if k != '_ROS_WHEELS_BOOTSTRAP_COMPLETE'}
+    environment['PYTHONPATH'] = str(tree)
+    environment.setdefault('OPENBLAS_NUM_THREADS', '1')
+    done = subprocess.run([sys.executable, '-m', 'mag_tracking.cli', *map(str, arguments)],
+                          cwd=tree, env=environment, capture_output=True, text=True)
+    if done.returncode:
+        sys.exit(f'{tree}: mag-tracking {" ".join(map(str, arguments))}\n{done.stderr}')
+
+
+def recordings(tree, out):
+    """[(name, recording, network, target)] of what is bundled; imports the magnet tables."""
+    road = ROOT / 'config' / 'network.yaml'
+    found = [(p.stem, p, road, 'vehicle') for p in sorted((DATA / 'vehicles').glob('*.mcap'))]
+    found.append(('two_way_road_start', DATA / 'two_way_road' / 'two_way_road_start.mcap', road,
+                  'vehicle'))
+    found.append(('corridor_8_sensors', DATA / 'corridor' / 'corridor_8_sensors.mcap',
+                  DATA / 'corridor' / 'network.yaml', 'vehicle'))
+    for n in (1, 2):
+        source, folder = DATA / 'magnet_16_sensors', out / f'lisa{n}'
+        mag_tracking(tree, 'import', source / f'lisa_data{n}.csv', '--background',
+                     source / f'lisa_data{n}_background.csv', '--out', folder)
+        recording = next(p for p in folder.rglob('*.mcap'))
+        network = next(p for p in folder.rglob('*.yaml') if p.name != 'metadata.yaml')
+        found.append((f'lisa_data{n}', recording, network, 'magnet'))
+    return found
+
+
+def replay_all(tree, out, workers):
+    """Replay every bundled recording with the source tree `tree` into `out`."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    todo = recordings(tree, out / 'imported')
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(lambda r: mag_tracking(
+            tree, 'replay', r[1], '--network', r[2], '--target', r[3], '--out', out / r[0],
+            '--no-figures'), todo))
+    return [name for name, *_ in todo]
+
+
+def difference(one, other):
+    """How far two texts are apart: relative where both are numbers, infinite where they differ."""
+    if one == other:
+        return 0.0
+    try:
+        a, b = float(one), float(other)
+    except ValueError:
+        return math.inf
+    if math.isnan(a) and math.isnan(b):
+        return 0.0
+    return abs(a - b) / max(abs(a), abs(b)) if math.isfinite(a) and math.isfinite(b) else math.inf
+
+
+def compare(one, other):
+    """(rows, numbers, largest difference, where) of two CSV files."""
+    with open(one, newline='') as a, open(other, newline='') as b:
+        rows, others = list(csv.reader(a)), list(csv.reader(b))
+    if len(rows) != len(others) or rows[0] != others[0]:
+        return len(rows), 0, math.inf, f'{len(rows)} against {len(others)} rows'
+    worst, where, n = 0.0, '', 0
+    for i, (row, other_row) in enumerate(zip(rows, others, strict=True)):
+        for column, x, y in zip(rows[0], row, other_row, strict=True):
+            n += 1
+            d = difference(x, y)
+            if d > worst:
+                worst, where = d, f'row {i}, {column}: {x} against {y}'
+    return len(rows), n, worst, where
+
+
+def main():
+    """Replay with both, compare, print a line for each table."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
+    parser.add_argument('base', help='commit to compare with')
+    parser.add_argument('--tolerance', type=float, default=1e-12, help='relative (default: 1e-12)')
+    parser.add_argument('--workers', type=int, default=2, help='replays at once (default: 2)')
+    args = parser.parse_args()
+    build = ROOT / 'build' / 'compare'
+    commit = subprocess.run(['git', 'rev-parse', '--short', args.base], cwd=ROOT, check=True,
+                            capture_output=True, text=True).stdout.strip()
+    tree, kept = build / f'tree_{commit}', build / f'results_{commit}'
+    if not tree.exists():
+        subprocess.run(['git', 'worktree', 'add', '--detach', tree, commit], cwd=ROOT, check=True,
+                       capture_output=True)
+    if not (kept / 'complete').exists():
+        replay_all(tree, kept, args.workers)
+        (kept / 'complete').touch()
+    names = replay_all(ROOT, build / 'results', args.workers)
+    failed = False
+    for name in names:
+        for table in TABLES:
+            n_rows, n, worst, where = compare(kept / name / table, build / 'results' / name / table)
+            bad = worst > args.tolerance
+            failed |= bad
+            print(f'{name} {table}: {n_rows} rows, {n} values, largest difference {worst:.2g}'
+                  + (f'  DIFFERS: {where}' if bad else ''))
+    print('different' if failed else f'all equal to {args.tolerance:g} relative')
+    return int(failed)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
