@@ -75,8 +75,8 @@ bench: $(STAMP)  ## measure times and accuracies
 	$(BIN)/python test/bench/chain.py
 
 fuzz: $(STAMP)  ## a million frames between garbage through every parser of the drivers
-	$(BIN)/python test/framing_fuzz.py --frames 1000000
-	PYTHONPATH=. $(BIN)/python test/xsens_messages.py --frames 1000000
+	PYTHONPATH=test $(BIN)/python -m support.framing_fuzz --frames 1000000
+	PYTHONPATH=test $(BIN)/python -m support.xsens_messages --frames 1000000
 
 # As a user of a ROS from apt would, but with the generators from PyPI.
 colcon: $(STAMP)  ## build and test both packages with colcon

@@ -17,9 +17,9 @@ from mag_tracking_msgs.msg import HypothesisArray, NetworkFrame, SmoothedTrack, 
 from rclpy.node import Node
 
 from mag_tracking.errors import MagTrackingError, OutputError
-from mag_tracking.io.frame_message import frame_of
-from mag_tracking.io.network_file import read_network
-from mag_tracking.io.schema import stamp_ns
+from mag_tracking.messages.frame import frame_of
+from mag_tracking.messages.schema import stamp_ns
+from mag_tracking.network.file import read_network
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.runner import line_of, run
 from mag_tracking.nodes.stage_node import RESULTS, STREAM

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from mag_tracking.io.bag import Recording
-from mag_tracking.io.network_file import read_network
-from mag_tracking.io.samples import SampleReader
+from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Track
 
 ROOT = Path(__file__).resolve().parents[1]

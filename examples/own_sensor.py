@@ -18,7 +18,7 @@ import struct
 from collections import Counter
 from dataclasses import dataclass
 
-from mag_tracking.io.drivers.reading import Parsed, Reading
+from mag_tracking.drivers.reading import Parsed, Reading
 from mag_tracking.settings import param
 
 END, ESCAPE = b'\xc0', b'\xdb'

@@ -6,10 +6,10 @@
 import argparse
 from pathlib import Path
 
-from mag_tracking.fitting import RecordingFit
-from mag_tracking.io.bag import Recording
-from mag_tracking.io.network_file import read_network
+from mag_tracking.apps.fit import RecordingFit
+from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.reader import Recording
 from mag_tracking.report.fit_figures import order_figure
 
 ROOT = Path(__file__).resolve().parents[1]

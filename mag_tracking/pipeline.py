@@ -5,14 +5,16 @@ from dataclasses import dataclass, field
 from mag_tracking.errors import SettingsError
 from mag_tracking.records import FieldFrame
 from mag_tracking.settings import replace
-from mag_tracking.stages.align import Align, AlignSettings
-from mag_tracking.stages.calibrate import Calibrate
-from mag_tracking.stages.calibrate_settings import CalibrateSettings
-from mag_tracking.stages.detect import Detect, DetectSettings
+from mag_tracking.stages.align.settings import AlignSettings
+from mag_tracking.stages.align.stage import Align
+from mag_tracking.stages.calibrate.settings import CalibrateSettings
+from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.detect.settings import DetectSettings
+from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.stage import rejected
-from mag_tracking.stages.survey import SurveySettings
-from mag_tracking.stages.track import TrackStage
-from mag_tracking.stages.track_settings import TrackSettings
+from mag_tracking.stages.survey.settings import SurveySettings
+from mag_tracking.stages.track.manager import TrackStage
+from mag_tracking.stages.track.settings import TrackSettings
 
 
 @dataclass(frozen=True)

@@ -1,30 +1,17 @@
-"""What the tests share: recordings, networks, a short way through the pipeline."""
+"""Fixtures that several tests share."""
 
 import os
 import tempfile
 import time
-from pathlib import Path
 
-import numpy as np
 import pytest
 
-from mag_tracking.io.bag import Recording
-from mag_tracking.io.importers import import_pose_table
-from mag_tracking.io.network_file import read_network
-from mag_tracking.network import SensorNetwork
-from mag_tracking.offline import replay
+from mag_tracking.apps.replay import replay
+from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
-
-ROOT = Path(__file__).resolve().parents[1]
-DATA = ROOT / 'test' / 'data'
-VEHICLES = sorted(p.stem for p in (DATA / 'vehicles').glob('*.mcap'))
-NETWORK_FILE = ROOT / 'config' / 'network.yaml'
-
-POINT = {f'track.vehicle.{name}': [value] for name, value in {
-    'kinds': 'car', 'lengths': 0.0, 'length_stds': 0.0, 'moments': 400.0, 'moment_stds': 150.0,
-    'difference_stds': 0.0, 'heights': 0.5, 'height_stds': 0.2,
-    'near_field_lengths': 1.0}.items()}
-"""Settings of a tracker that knows point targets only."""
+from mag_tracking.recording.importers import import_pose_table
+from mag_tracking.recording.reader import Recording
+from support.bundled import DATA, NETWORK_FILE, ROOT, vehicle_path
 
 # Keep the middleware to this machine, and apart from other runs on it.
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -34,18 +21,10 @@ _HOME = tempfile.TemporaryDirectory(prefix='mag_tracking_test_')
 os.environ['ROS_HOME'] = _HOME.name
 
 
-def studied(names, kept=(), also=lambda name: ()):
-    """Parameters: those in `kept` for every `make test`, the others for `make studies`; `also`
-    gives further marks."""
-    return [pytest.param(name, marks=[*also(name), *([] if name in kept else [pytest.mark.study])])
-            for name in names]
-
-
 def pytest_collection_modifyitems(items):
-    """Tests of nodes and of what is killed in time are not run beside others (`make test`)."""
+    """Mark all tests of nodes: they are not run beside tests that compute (`make test`)."""
     for item in items:
-        if any(word in item.path.stem for word in ('node', 'record')) \
-                and item.path.stem != 'test_recordings':
+        if item.path.is_relative_to(ROOT / 'test' / 'nodes'):
             item.add_marker('alone')
 
 
@@ -62,10 +41,6 @@ def magnet_runs(tmp_path_factory):
     return {n: import_pose_table(source / f'lisa_data{n}.csv',
                                  source / f'lisa_data{n}_background.csv',
                                  folder / f'run{n}', 1e-6)[:2] for n in (1, 2)}
-
-
-def vehicle_path(name):
-    return DATA / 'vehicles' / f'{name}.mcap'
 
 
 @pytest.fixture(scope='session')
@@ -90,20 +65,6 @@ def magnet_replays(tmp_path_factory, magnet_runs):
     return {n: (replay(Recording(recording), read_network(network), settings_for('magnet'),
                        out / str(n)), out / str(n))
             for n, (recording, network) in magnet_runs.items()}
-
-
-def line_network(n, spacing=9.0, earth=(2e-6, 1.55e-5, -4.9e-5), noise=1.2e-8, tilt=0.3):
-    """`n` sensors across and along a road, each turned differently."""
-    rng = np.random.default_rng(n)
-    positions = np.zeros((n, 3))
-    positions[:, 0] = spacing * (np.arange(n) // 2)
-    positions[:, 1] = np.where(np.arange(n) % 2, 4.5, -4.5)
-    from mag_tracking.geometry import quaternion_from_rotation_vector, rotation_from_quaternion
-    R = rotation_from_quaternion(
-        quaternion_from_rotation_vector(tilt * rng.standard_normal((n, 3))))
-    names = tuple(f'mag_{i + 1}' for i in range(n))
-    return SensorNetwork(names, positions, R, tuple(f'/{name}/imu/mag' for name in names),
-                         earth_field=np.array(earth), noise_std=(np.full(3, noise),) * n)
 
 
 @pytest.fixture

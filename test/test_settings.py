@@ -4,12 +4,12 @@ import importlib.util
 
 import pytest
 import yaml
-from conftest import ROOT
 
 from mag_tracking.errors import SettingsError
 from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.settings import flatten, read_parameter_file, replace, to_yaml
-from mag_tracking.stages.track import TrackStage
+from mag_tracking.stages.track.manager import TrackStage
+from support.bundled import ROOT
 
 
 def test_generated_files_are_up_to_date():

@@ -5,7 +5,7 @@
 
 from pathlib import Path
 
-from mag_tracking.io.drivers.configuration import settings_by_kind
+from mag_tracking.drivers.configuration import settings_by_kind
 from mag_tracking.pipeline import TARGET_DEFAULTS, Settings, settings_for
 from mag_tracking.settings import flatten, to_reference, to_yaml
 

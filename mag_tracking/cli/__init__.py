@@ -1,18 +1,22 @@
-"""The command `mag-tracking`: one module a command, or a few small ones."""
+"""The command `mag-tracking`: one module a command."""
 
 import argparse
 import sys
 
 from mag_tracking.cli import (
+    board_geometry,
     calibrate,
     doctor,
     fit,
-    geometry,
+    import_table,
+    info,
     listen,
     plan,
     record,
-    recordings,
+    repair,
     replay,
+    run,
+    tumble,
 )
 from mag_tracking.errors import MagTrackingError
 
@@ -22,7 +26,8 @@ def _parser():
     parser = argparse.ArgumentParser(
         prog='mag-tracking', description='Track magnetic targets with stationary magnetometers.')
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
-    for module in (replay, calibrate, geometry, doctor, fit, plan, listen, record, recordings):
+    for module in (replay, calibrate, tumble, board_geometry, doctor, fit, plan, listen, record,
+                   repair, run, info, import_table):
         module.add(commands)
     return parser
 

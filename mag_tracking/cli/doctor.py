@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from mag_tracking.apps.doctor import examine
 from mag_tracking.cli.options import add_command, add_network, add_settings, settings_of
-from mag_tracking.doctoring import examine
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import noted_signals
-from mag_tracking.io.bag import Recording
-from mag_tracking.io.network_file import read_network
+from mag_tracking.network.file import read_network
+from mag_tracking.recording.reader import Recording
 
 _DOCTOR = '''
 Reads a recording, or listens to what is published now, and says what is wrong with each

@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from mag_tracking.apps.fit import RecordingFit
 from mag_tracking.cli.options import add_command, add_network, distinct_names
 from mag_tracking.errors import OutputError, SettingsError
-from mag_tracking.fitting import RecordingFit
 from mag_tracking.inference.iron import hard_and_soft_iron
 from mag_tracking.interrupts import noted_signals
-from mag_tracking.io.bag import Recording
-from mag_tracking.io.fit_results import FitFolder
-from mag_tracking.io.network_file import read_network
+from mag_tracking.network.file import read_network
 from mag_tracking.physics.dipole import MU0
 from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.fit_folder import FitFolder
+from mag_tracking.recording.reader import Recording
 from mag_tracking.settings import read_parameter_file
 
 _FIT = '''

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from mag_tracking.cli.options import add_command, add_network
+from mag_tracking.drivers.configuration import read_drivers
+from mag_tracking.drivers.driver import IGNORED, serve
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import noted_signals
-from mag_tracking.io.drivers.configuration import read_drivers
-from mag_tracking.io.drivers.driver import IGNORED, serve
-from mag_tracking.io.network_file import read_network
+from mag_tracking.network.file import read_network
 from mag_tracking.records import MagSample
 
 _LISTEN = '''

@@ -1,16 +1,19 @@
 """What several commands share: options and settings."""
 
 import argparse
+import datetime
 from pathlib import Path
 
-from mag_tracking.errors import OutputError
+from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.pipeline import TARGET_DEFAULTS, settings_for
 from mag_tracking.settings import read_parameter_file
 
+FIGURES = ('.png', '.pdf', '.svg')
 
-def add_command(commands, name, run, short, text=''):
+
+def add_command(commands, name, run, short, text='', aliases=()):
     """A command's parser; `run` takes the parsed arguments and returns the exit status."""
-    parser = commands.add_parser(name, help=short, description=short, epilog=text,
+    parser = commands.add_parser(name, aliases=aliases, help=short, description=short, epilog=text,
                                  formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.set_defaults(run_command=run)
     return parser
@@ -43,3 +46,19 @@ def settings_of(args):
     """Settings of the command line's target and parameter file."""
     changes = read_parameter_file(args.params) if args.params else {}
     return settings_for(args.target, changes)
+
+
+def now():
+    """The time, as a calibration is marked with it."""
+    return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
+
+
+def check_outputs(args):
+    """Raise OutputError where what is to be written has no folder to be in."""
+    for path in (args.out, args.figure):
+        if path is not None and not path.absolute().parent.is_dir():
+            raise OutputError(f'cannot write {path}: there is no folder {path.parent}')
+        if path is not None and path.is_dir():
+            raise OutputError(f'cannot write {path}: it is a folder')
+    if args.figure is not None and args.figure.suffix.lower() not in FIGURES:
+        raise SettingsError(f'--figure: {args.figure.name} ends in none of {", ".join(FIGURES)}')

@@ -9,12 +9,12 @@ import numpy as np
 from tqdm import tqdm
 
 from mag_tracking.analysis.placement import PlannedTarget, Sampling
+from mag_tracking.apps.plan import GOOD_PD, detection_range, n_parts, plan
 from mag_tracking.cli.options import add_command, add_network
 from mag_tracking.errors import OutputError, SettingsError
-from mag_tracking.io.network_file import read_network
-from mag_tracking.io.results import without_nan
+from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
-from mag_tracking.planning import GOOD_PD, detection_range, n_parts, plan
+from mag_tracking.recording.result_folder import without_nan
 from mag_tracking.settings import read_parameter_file
 
 _PLAN = '''

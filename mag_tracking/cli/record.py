@@ -1,12 +1,12 @@
-"""mag-tracking record and repair."""
+"""mag-tracking record."""
 
 import math
 from pathlib import Path
 
+from mag_tracking.apps.record import Selection
 from mag_tracking.cli.options import add_command, add_network
 from mag_tracking.errors import SettingsError
-from mag_tracking.io.network_file import read_network
-from mag_tracking.io.recording_repair import repair
+from mag_tracking.network.file import read_network
 
 _RECORD = '''
 Records the magnetic fields of the network's topics, as they are, until Ctrl-C,
@@ -22,18 +22,8 @@ examples:
   mag-tracking record --network site.yaml --out night --topics /camera /gps/fix
 '''
 
-_REPAIR = '''
-A recording that was cut off (power, a crash, a full disk) has no index.
-`mag-tracking replay` reads it as it is; rosbag2 and others need the index,
-which this writes, and a new metadata.yaml. The messages stay untouched.
-
-example:
-  mag-tracking repair night
-'''
-
-
 def add(commands):
-    """Register the commands."""
+    """Register the command."""
     p = add_command(commands, 'record', _record, 'Record the sensors (needs ROS 2).', _RECORD)
     add_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR',
@@ -47,11 +37,6 @@ def add(commands):
     p.add_argument('--split-s', type=float, default=3600.0, metavar='N',
                    help='time in a file in s (default: 3600)')
 
-    p = add_command(commands, 'repair', _repair, 'Make a recording whole that was cut off.',
-                    _REPAIR)
-    p.add_argument('recording', type=Path, metavar='RECORDING',
-                   help='an .mcap file or a rosbag2 folder')
-
 
 def _record(args):
     """mag-tracking record."""
@@ -64,15 +49,8 @@ def _record(args):
             raise SettingsError(f'--topics: {topic!r} is not a whole name (it begins with /)')
     network = read_network(args.network)
     # Only this command needs ROS.
-    from mag_tracking.nodes.record_node import Selection, run
+    from mag_tracking.nodes.record_node import run
 
     imus = tuple(filter(None, network.imu_topics))
     selection = Selection(tuple(network.topics), imus, tuple(args.topics), args.results, args.all)
     return run(selection, args.out, int(args.split_mb * 1e6), int(args.split_s * 1e9))
-
-
-def _repair(args):
-    """mag-tracking repair."""
-    n = repair(args.recording)
-    print(f'{args.recording}: files that were not whole: {n}')
-    return 0

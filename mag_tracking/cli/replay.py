@@ -5,6 +5,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from mag_tracking.apps.replay import replay, write_figures
 from mag_tracking.cli.options import (
     add_command,
     add_network,
@@ -13,9 +14,8 @@ from mag_tracking.cli.options import (
     settings_of,
 )
 from mag_tracking.interrupts import noted_signals
-from mag_tracking.io.bag import Recording
-from mag_tracking.io.network_file import read_network
-from mag_tracking.offline import replay, write_figures
+from mag_tracking.network.file import read_network
+from mag_tracking.recording.reader import Recording
 
 _REPLAY = '''
 Reads the magnetic fields of the network's topics, learns each sensor's

@@ -13,30 +13,30 @@ from rcl_interfaces.msg import ParameterDescriptor
 from sensor_msgs.msg import Imu, MagneticField
 
 from mag_tracking.errors import NetworkError, OutputError, RecordingError
-from mag_tracking.io.background_file import (
-    background_text,
-    read_backgrounds,
-    usual_path,
-    write_backgrounds,
-)
-from mag_tracking.io.calibration_state import sensor_dict
-from mag_tracking.io.message_types import CALIBRATED_READINGS, RAW_READINGS
-from mag_tracking.io.network_file import write_network
-from mag_tracking.io.schema import (
+from mag_tracking.messages.calibration_state import sensor_dict
+from mag_tracking.messages.schema import (
     acceleration_of,
     readings_dict,
     sample_dict,
     sample_of,
 )
+from mag_tracking.messages.types import CALIBRATED_READINGS, RAW_READINGS
+from mag_tracking.network.file import write_network
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
-from mag_tracking.nodes.later import Later
+from mag_tracking.nodes.deferred import Later
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.stage_node import LATCHED, SENT, STREAM, StageNode
+from mag_tracking.recording.background_file import (
+    background_text,
+    read_backgrounds,
+    usual_path,
+    write_backgrounds,
+)
 from mag_tracking.records import Readings
-from mag_tracking.stages.calibrate import Calibrate
-from mag_tracking.stages.survey import Survey, with_noise
+from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.survey.stage import Survey, with_noise
 
 SHORTEST_TURN_S = 0.01
 """[s] All sensors have their turns once a second, or where they are too many for that, in steps

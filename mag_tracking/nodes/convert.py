@@ -10,7 +10,7 @@ import importlib
 
 import numpy as np
 
-from mag_tracking.io.schema import stamp_ns
+from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.records import Hypothesis, Track
 
 

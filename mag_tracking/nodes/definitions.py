@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.io.message_types import definition
+from mag_tracking.messages.types import definition
 
 _BUILT_IN = {'bool', 'byte', 'char', 'string', 'wstring', 'float32', 'float64',
              *(f'{u}int{n}' for u in ('', 'u') for n in (8, 16, 32, 64))}

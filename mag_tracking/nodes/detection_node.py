@@ -7,16 +7,16 @@ from mag_tracking_msgs.msg import Detection as DetectionMessage
 from mag_tracking_msgs.msg import FieldReadings, NetworkFrame
 from sensor_msgs.msg import MagneticField
 
-from mag_tracking.io.frame_message import frame_dict
-from mag_tracking.io.message_types import CALIBRATED_READINGS
-from mag_tracking.io.schema import detection_dict, sample_of
+from mag_tracking.messages.frame import frame_dict
+from mag_tracking.messages.schema import detection_dict, sample_of
+from mag_tracking.messages.types import CALIBRATED_READINGS
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.nodes.stage_node import RESULTS, SENT, STREAM, StageNode
 from mag_tracking.records import Detection
-from mag_tracking.stages.align import Align
-from mag_tracking.stages.detect import Detect
+from mag_tracking.stages.align.stage import Align
+from mag_tracking.stages.detect.stage import Detect
 
 
 class DetectionNode(StageNode):

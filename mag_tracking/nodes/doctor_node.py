@@ -9,13 +9,13 @@ from mag_tracking_msgs.msg import FieldReadings
 from rclpy.node import Node
 from sensor_msgs.msg import MagneticField
 
-from mag_tracking.doctoring import Doctor
+from mag_tracking.apps.doctor import Doctor
 from mag_tracking.errors import RecordingError
-from mag_tracking.io.message_types import RAW_READINGS
-from mag_tracking.io.schema import sample_of, samples_of
+from mag_tracking.messages.schema import sample_of, samples_of
+from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.stage_node import SENSORS, STREAM, make_executor, spin
-from mag_tracking.stages.health import Finding
+from mag_tracking.stages.health.sensor_health import Finding
 
 
 class DoctorNode(Node):

@@ -13,12 +13,12 @@ from mag_tracking_msgs.msg import FieldReadings
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from sensor_msgs.msg import Imu, MagneticField
 
+from mag_tracking.drivers.configuration import read_drivers
+from mag_tracking.drivers.driver import IGNORED, serve
 from mag_tracking.errors import MagTrackingError, SettingsError
-from mag_tracking.io.drivers.configuration import read_drivers
-from mag_tracking.io.drivers.driver import IGNORED, serve
-from mag_tracking.io.message_types import RAW_READINGS
-from mag_tracking.io.network_file import read_network
-from mag_tracking.io.schema import acceleration_dict, readings_dict, sample_dict
+from mag_tracking.messages.schema import acceleration_dict, readings_dict, sample_dict
+from mag_tracking.messages.types import RAW_READINGS
+from mag_tracking.network.file import read_network
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.driver_health import DriverDiagnostics

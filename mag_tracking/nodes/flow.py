@@ -4,8 +4,8 @@ import time
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-from mag_tracking.stages.health import REPLAYED_S, quantiles
-from mag_tracking.stages.stage import NS
+from mag_tracking.stages.health.sensor_health import REPLAYED_S, quantiles
+from mag_tracking.units import NS
 
 SILENT_S = 2.0
 """[s] A sensor or a node of which nothing came for longer is silent."""

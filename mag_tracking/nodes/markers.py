@@ -3,7 +3,7 @@
 import numpy as np
 
 from mag_tracking.geometry import quaternion_from_rotation
-from mag_tracking.io.schema import header_dict
+from mag_tracking.messages.schema import header_dict
 
 _ELLIPSOID, _MOMENT = 0, 1
 _SPHERE, _ARROW = 2, 0

@@ -5,25 +5,24 @@ import sys
 import time
 from collections import Counter
 from contextlib import suppress
-from typing import NamedTuple
 
 import rclpy
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from tqdm import tqdm
 
+from mag_tracking.apps.record import progress_line, summary
 from mag_tracking.interrupts import noted_signals
-from mag_tracking.io.message_types import (
+from mag_tracking.messages.types import (
     FIELD_READINGS,
     IMU,
     MAGNETIC_FIELD,
-    RAW_READINGS,
 )
-from mag_tracking.io.recorder import Recorder
-from mag_tracking.io.rosbag2_folder import offered_qos
 from mag_tracking.nodes.convert import message_class
 from mag_tracking.nodes.definitions import definition_of
 from mag_tracking.nodes.middleware import begin
+from mag_tracking.recording.recorder import Recorder
+from mag_tracking.recording.rosbag2_folder import offered_qos
 
 POLL_S = 0.02
 """How often messages are fetched [s]."""
@@ -35,29 +34,6 @@ DEPTHS = {MAGNETIC_FIELD: 1000, IMU: 1000, FIELD_READINGS: 1000}
 """Messages that may wait between two fetches (a disk may stall for a second or more)."""
 OTHER_DEPTH = 100
 """The same of other types: images are large."""
-RESULTS_OF = ('/calibration_node/', '/detection_node/', '/tracker_node/')
-
-
-class Selection(NamedTuple):
-    """Which topics to record."""
-
-    fields: tuple = ()
-    """Magnetic fields of the network."""
-    imus: tuple = ()
-    """Where its sensors may publish sensor_msgs/Imu."""
-    topics: tuple = ()
-    results: bool = False
-    everything: bool = False
-
-    def wants(self, topic):
-        """Whether to record a topic."""
-        if topic == RAW_READINGS or topic in self.fields + self.imus + self.topics:
-            return True
-        # ROS hides what has a part that begins with an underscore, and so does rosbag2.
-        if self.everything and '/_' not in topic:
-            return True
-        return self.results and (topic.startswith(RESULTS_OF) or topic == '/diagnostics'
-                                 or topic.removesuffix('_calibrated') in self.fields)
 
 
 class _Source:
@@ -268,7 +244,7 @@ def _record(node, stopped):
                 if heard != before:
                     say(f'{heard[0]} of {heard[1]} topics have a publisher')
             if bar.disable and now >= next_line:
-                say(_progress(node.recorder, now - begin))
+                say(progress_line(node.recorder, now - begin))
                 next_line += LINE_S
             with suppress(OSError):
                 bar.update(n)
@@ -278,26 +254,3 @@ def _record(node, stopped):
         # The terminal may be gone (SIGHUP); the recording goes on to its end.
         with suppress(OSError):
             bar.close()
-
-
-def _progress(recorder, seconds):
-    """What there is so far, as a line."""
-    dropped = recorder.dropped.total()
-    return (f'{seconds:.0f} s: {recorder.counts.total()} messages, {recorder.size / 1e6:.1f} MB'
-            + (f', dropped: {dropped}' if dropped else ''))
-
-
-def summary(recorder, selection, lost, refused):
-    """Lines that say what is in a recording, and what is not."""
-    yield f'{recorder.folder}: {recorder.counts.total()} messages, {recorder.size / 1e6:.2f} MB'
-    for topic, n in sorted((+recorder.counts).items()):
-        yield f'  {topic}  {n}'
-    for topic in selection.fields + selection.topics:
-        if not recorder.counts[topic] and topic not in refused:
-            yield f'  warning: nothing on {topic}'
-    for topic, n in sorted((+recorder.dropped).items()):
-        yield f'  warning: {topic}: dropped while the disk was full: {n}'
-    for topic, n in sorted(lost.items()):
-        yield f'  warning: {topic}: lost before they were recorded: {n}'
-    for topic, why in sorted(refused.items()):
-        yield f'  warning: {topic} is not recorded: {why}'

@@ -11,11 +11,11 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from mag_tracking.errors import RecordingError, SettingsError
-from mag_tracking.io.bag import Recording
-from mag_tracking.io.message_types import MAGNETIC_FIELD
+from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import message_class
 from mag_tracking.nodes.stage_node import STREAM
+from mag_tracking.recording.reader import Recording
 
 TICK_S = 0.005
 """How often the node looks for messages that are due [s]."""

@@ -6,12 +6,12 @@ import time
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-from mag_tracking.doctoring import background_findings, network_findings
+from mag_tracking.apps.doctor import background_findings, network_findings
 from mag_tracking.nodes.flow import SILENT_S
 from mag_tracking.records import plain
-from mag_tracking.stages.health import WINDOW, Finding, SensorHealth
-from mag_tracking.stages.stage import NS
-from mag_tracking.stages.waiting import Waiting
+from mag_tracking.stages.health.reading_buffer import Waiting
+from mag_tracking.stages.health.sensor_health import WINDOW, Finding, SensorHealth
+from mag_tracking.units import NS
 
 TERM_S = 60.0
 """[s] What was wrong is forgotten after one to two of these."""

@@ -15,8 +15,8 @@ from rclpy.task import Future
 
 from mag_tracking.errors import MagTrackingError, RecordingError, SettingsError
 from mag_tracking.interrupts import noted_signals
-from mag_tracking.io.network_file import read_network
-from mag_tracking.io.schema import readings_of, stamp_ns
+from mag_tracking.messages.schema import readings_of, stamp_ns
+from mag_tracking.network.file import read_network
 from mag_tracking.nodes.flow import Flow, Listener
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.ros_params import declare_settings

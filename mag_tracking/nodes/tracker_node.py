@@ -17,9 +17,9 @@ from nav_msgs.msg import Odometry, Path
 from visualization_msgs.msg import MarkerArray
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.io.calibration_state import with_orientations
-from mag_tracking.io.frame_message import frame_of
-from mag_tracking.io.schema import (
+from mag_tracking.messages.calibration_state import with_orientations
+from mag_tracking.messages.frame import frame_of
+from mag_tracking.messages.schema import (
     header_dict,
     hypotheses_dict,
     odometry_dict,
@@ -35,7 +35,7 @@ from mag_tracking.nodes.markers import delete_markers, track_markers
 from mag_tracking.nodes.ros_params import follow_changes
 from mag_tracking.nodes.stage_node import LATCHED, RESULTS, SENT, STREAM, StageNode
 from mag_tracking.records import SmoothedPose
-from mag_tracking.stages.track import TrackStage
+from mag_tracking.stages.track.manager import TrackStage
 
 SLACK_S = 1.0
 """[s] What the way of a frame may take on top of the longest gap."""

@@ -24,10 +24,6 @@ class Stage(Protocol[In, Out]):
         """The input has ended: return what was still held back."""
 
 
-NS = 1_000_000_000
-"""Nanoseconds in a second."""
-
-
 def rejected(counts):
     """The rejections among `counts`: {cause: number}, without their prefix."""
     return {k.removeprefix('rejected: '): n for k, n in sorted(counts.items())

@@ -209,9 +209,9 @@ def bank_ratio(peer_class, n_sensors, turned, n_hyp=64, rounds=12, repeats=100):
 FIRST_POSE = '''
 import sys, time
 start = float(sys.argv[1])
-from mag_tracking.io.bag import Recording
-from mag_tracking.io.network_file import read_network
-from mag_tracking.io.samples import SampleReader
+from mag_tracking.recording.reader import Recording
+from mag_tracking.network.file import read_network
+from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
 network = read_network(sys.argv[2])

@@ -26,7 +26,7 @@ def readings(k):
     """A FieldReadings with covariances."""
     from mag_tracking_msgs.msg import FieldReadings
 
-    from mag_tracking.io.schema import readings_dict
+    from mag_tracking.messages.schema import readings_dict
     from mag_tracking.nodes.convert import to_message
     from mag_tracking.records import Readings
     return to_message(FieldReadings, readings_dict(Readings(

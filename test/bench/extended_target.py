@@ -15,14 +15,14 @@ from pathlib import Path as FilePath
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.io.bag import Recording
-from mag_tracking.io.network_file import read_network
-from mag_tracking.io.samples import SampleReader
-from mag_tracking.io.simulator import Imperfections, Path, random_vehicle, simulate
+from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.report.metrics import pass_errors
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
+from mag_tracking.simulation.scenario import Imperfections, Path, random_vehicle, simulate
 
 ROOT = FilePath(__file__).resolve().parents[2]
 NETWORK = ROOT / 'config' / 'network.yaml'

@@ -19,9 +19,9 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import sensor_fields
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import FieldFrame
-from mag_tracking.stages.stage import NS
-from mag_tracking.stages.track import TrackStage
-from mag_tracking.stages.vehicle_start import vehicle_model
+from mag_tracking.stages.track.initiation_vehicle import vehicle_model
+from mag_tracking.stages.track.manager import TrackStage
+from mag_tracking.units import NS
 
 PERIOD, SIGMA, STEPS = 0.08, 1.2e-8 / np.sqrt(8.0), 26
 NETWORK = SensorNetwork(

@@ -16,12 +16,11 @@ from scipy.optimize import least_squares
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from passes import NOISE, ROAD, measured, random_path  # noqa: E402
-
 from mag_tracking.analysis.pass_data import background_columns, separable_problem  # noqa: E402
 from mag_tracking.analysis.pass_fit import fit_pass, starting_paths  # noqa: E402
 from mag_tracking.inference.least_squares import refine  # noqa: E402
 from mag_tracking.physics.passes import RowPass  # noqa: E402
+from support.passes import NOISE, ROAD, measured, random_path  # noqa: E402
 
 
 def timed(function, *args, **kwargs):

@@ -1,0 +1,1 @@
+"""The use cases, callable from Python without ROS: one module a command, with its name."""

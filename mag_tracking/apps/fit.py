@@ -1,0 +1,206 @@
+"""The passes of a recording, cut out and fitted, offline."""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from mag_tracking.analysis.model_order import choose_order
+from mag_tracking.analysis.pass_data import PassData
+from mag_tracking.analysis.pass_fit import fit_pass
+from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.calibration.saturation import cut_off
+from mag_tracking.inference.detection_theory import energy_threshold
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.records import Detection
+from mag_tracking.stages.align.stage import Align
+from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.detect.stage import Detect
+from mag_tracking.stages.stage import rejected
+from mag_tracking.units import NS
+
+PAD_S = 1.0
+"""[s] What is taken before a detection begins: there the background is seen alone."""
+
+
+LONGEST_S = 60.0
+"""[s] What is seen for longer does not pass; it is cut there."""
+
+
+NEARLY = 1.25
+"""A fit whose cost is not larger than this times that of the best describes the pass as well."""
+
+
+@dataclass(frozen=True)
+class FittedPass:
+    """One detection of a recording, fitted with several numbers of dipoles."""
+
+    recording: str
+    number: int
+    fits: tuple[PassFit, ...]
+    notes: tuple[str, ...]
+    """What was left out of the measurements, and why."""
+
+    @property
+    def chosen(self):
+        """The fit of the order that the measurements are worth, or None."""
+        return choose_order(self.fits)
+
+    @property
+    def disagreement(self):
+        """Largest difference [m], [m/s] to the chosen fit of those with nearly its cost.
+
+        That is what the model leaves open. NaN where there is no other fit, and where the chosen
+        one describes the measurements to the noise: then richer ones only fit noise.
+        """
+        best, others = self.chosen, []
+        if best is not None and best.cost > energy_threshold(1e-3, best.degrees_of_freedom):
+            others = [f for f in self.fits if f is not best and not f.reason
+                      and f.normalised_cost <= NEARLY * best.normalised_cost]
+        if not others:
+            return np.nan, np.nan
+        return (max(float(np.linalg.norm(f.position - best.position)) for f in others),
+                max(float(np.linalg.norm(f.velocity - best.velocity)) for f in others))
+
+
+class PassCollector:
+    """Samples to passes: what the network measured from before a detection until it ended."""
+
+    def __init__(self, network, settings):
+        self._network = network
+        self._stages = (Calibrate(network, settings.calibrate), Align(network, settings.align),
+                        Detect(network, settings.detect))
+        self._kept = deque()
+        self._onset_ns = None
+        self._last_ns = None
+
+    @property
+    def rejected(self):
+        """{cause: number} of samples that were not used."""
+        total = {}
+        for stage in self._stages[:2]:
+            for cause, n in rejected(stage.counts).items():
+                total[cause] = total.get(cause, 0) + n
+        return total
+
+    def waiting(self):
+        """Names of sensors whose background was never learnt."""
+        return [n for n, b in self._stages[0].backgrounds().items() if not b.ready]
+
+    def feed(self, sample):
+        """A raw `MagSample` gives the passes that it completes: [(PassData, notes)]."""
+        calibrate, align, _ = self._stages
+        out = []
+        for calibrated in calibrate.feed(sample):
+            self._kept.append((calibrated, sample.field))
+            for frame in align.feed(calibrated):
+                out += self._judge(frame)
+        return out
+
+    def flush(self):
+        """The recording has ended: the pass that was still going on."""
+        out = [p for frame in self._stages[1].flush() for p in self._judge(frame)]
+        if self._onset_ns is not None:
+            out.append(self._cut(self._last_ns, 'the recording ends while it is still seen'))
+        return out
+
+    def _judge(self, frame):
+        """Take a frame; the pass that has ended with it."""
+        out = []
+        for record in self._stages[2].feed(frame):
+            if not isinstance(record, Detection):
+                continue
+            if record.onset:
+                self._onset_ns = record.stamp_ns
+            elif self._onset_ns is not None:
+                out.append(self._cut(record.stamp_ns))
+        if self._onset_ns is not None and frame.stamp_ns - self._onset_ns > LONGEST_S * NS:
+            out.append(self._cut(frame.stamp_ns, f'it is seen for more than {LONGEST_S:.0f} s: '
+                                 'what comes after, until it is gone, is left out'))
+        self._last_ns = frame.stamp_ns
+        begin = (frame.stamp_ns if self._onset_ns is None else self._onset_ns) - PAD_S * NS
+        while self._kept and self._kept[0][0].stamp_ns < begin:
+            self._kept.popleft()
+        return out
+
+    def _cut(self, end_ns, *notes):
+        """(PassData, notes) of what was kept up to a time; the pass is over."""
+        begin = self._onset_ns - int(PAD_S * NS)
+        rows = sorted(((self._network.index(s.sensor), s.stamp_ns, s, raw)
+                       for s, raw in self._kept if begin <= s.stamp_ns <= end_ns),
+                      key=lambda row: row[:2])
+        sensor = np.array([row[0] for row in rows], dtype=int)
+        field = np.array([row[2].field for row in rows]).reshape(-1, 3)
+        raw = np.array([row[3] for row in rows]).reshape(-1, 3)
+        covariance = np.full((len(self._network), 3, 3), np.nan)
+        notes = list(notes)
+        for j in np.unique(sensor):
+            mine = np.flatnonzero(sensor == j)
+            covariance[j] = rows[mine[0]][2].covariance
+            for a, axis in enumerate('xyz'):
+                bad = mine[cut_off(raw[mine, a])]
+                if len(bad):
+                    field[bad, a] = np.nan
+                    notes.append(f'{self._network.names[j]}: {axis} was saturated in {len(bad)} '
+                                 f'of {len(mine)} samples at {raw[bad[0], a]:.3g} T; left out')
+        self._onset_ns = None
+        t = np.array([(row[1] - begin) / NS for row in rows])
+        return PassData(self._network, begin, t, sensor, field, covariance), tuple(notes)
+
+
+class RecordingFit:
+    """Fits every pass of a recording, one after the other.
+
+    Parameters
+    ----------
+    recording : Recording
+    network : SensorNetwork
+    settings : Settings
+        Of calibration, alignment and detection.
+    orders : sequence of int
+        Numbers of dipoles.
+    cpa_range : (range, std) [m], optional
+        For a network of one sensor; see `fit_pass`.
+
+    Raises RecordingError where the recording does not fit the network.
+    """
+
+    def __init__(self, recording, network, settings, orders, cpa_range=None):
+        self._name = recording.path.resolve().stem
+        self._recording = recording
+        self._reader = SampleReader(recording, network)
+        self._collector = PassCollector(network, settings)
+        self._orders, self._cpa_range = tuple(orders), cpa_range
+        self._n = 0
+
+    def passes(self, progress=None, stopped=None):
+        """Iterate over the `FittedPass`es, each as soon as it is done.
+
+        `progress` and `stopped` are as for `offline.replay`.
+        """
+        for sample in self._reader.samples(progress):
+            if stopped is not None and stopped():
+                return
+            yield from self._fitted(self._collector.feed(sample), stopped)
+        yield from self._fitted(self._collector.flush(), stopped)
+
+    def _fitted(self, passes, stopped):
+        """The fits of what the collector gave; a pass that is stopped in the middle is left out."""
+        for data, notes in passes:
+            fits = []
+            for n_dipoles in self._orders:
+                if stopped is not None and stopped():
+                    return
+                fits.append(fit_pass(data, n_dipoles, self._cpa_range))
+            self._n += 1
+            yield FittedPass(self._name, self._n, tuple(fits), notes)
+
+    def warnings(self):
+        """What was lost or rejected, and which sensors were never heard; a list of lines."""
+        lines = [f'nothing on {topic}' for topic in self._reader.missing_topics()]
+        lines += [f'no background was learnt for {name}: the recording needs a target-free '
+                  'beginning, or the network file a background and a noise_std'
+                  for name in self._collector.waiting()]
+        for counts in (self._reader.rejected, self._collector.rejected, self._recording.losses):
+            lines += [f'{cause}: {n}' for cause, n in counts.items()]
+        return lines

@@ -1,0 +1,267 @@
+"""What an installer wants to know before the first hole is drilled."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mag_tracking.analysis.placement import (
+    DIRECTIONS,
+    STATES,
+    PlannedTarget,
+    Sampling,
+    bounds_of,
+    detection_probabilities,
+    pass_fields,
+    pass_information,
+)
+from mag_tracking.inference.crlb import observability, path_bound, snr_range
+from mag_tracking.inference.detection_theory import energy_threshold, missed_probability
+from mag_tracking.network import SensorNetwork
+from mag_tracking.physics.motion import constant_velocity, integrator_noise
+from mag_tracking.stages.track.settings import acceleration_density
+
+MOST_FRAMES = 1000
+"""Of a pass, when it is asked whether it is missed: slower ones are not missed more."""
+
+GOOD_PD = 0.9
+"""A target is counted as seen where a frame detects it with this probability."""
+
+
+@dataclass(frozen=True)
+class Lane:
+    """A straight way through the network, with what is known along it."""
+
+    name: str
+    heading: float
+    """[rad]."""
+    along: np.ndarray
+    """(n,) [m] from the point nearest to the middle of the sensors."""
+    points: np.ndarray
+    """(n, 2) [m]."""
+    pass_std: np.ndarray
+    """(n, 3) position, velocity, moment, by the whole pass; median over the moment's directions."""
+    filter_std: np.ndarray
+    """(n,) [m] position, by what a filter has seen so far."""
+    detection: np.ndarray
+    """(n,) probability that a frame detects it, mean over the moment's directions."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The answers; maps are [y, x]."""
+
+    network: SensorNetwork
+    target: PlannedTarget
+    sampling: Sampling
+    x: np.ndarray
+    y: np.ndarray
+    position_std: np.ndarray
+    """[m] bound by a whole pass through the point, median over headings and directions."""
+    detection: np.ndarray
+    """Probability that one frame detects the target at the point."""
+    lanes: tuple[Lane, ...]
+    with_one_more: np.ndarray
+    """[m] median bound over the lanes, near the network, with one more sensor there; NaN where none
+    may stand."""
+    without: float
+    """[m] the same as it is."""
+    best_place: tuple[float, float]
+    observability: object
+    """Of the first lane's closest point, for one direction of the moment, without priors."""
+    blocks: dict
+    """{'with prior', 'without prior': (3,)} bounds at the first lane's closest point."""
+    missed: np.ndarray
+    """(n, 2) [m] lateral distance of a pass on the first lane's heading, probability that it is
+    not detected at all."""
+
+
+def detection_range(target, noise_std, n_axes, false_alarm):
+    """[m] where a frame of one sensor detects half of such targets, about; T10 eq. (5.20).
+
+    Over all directions of the moment the energy is twice that of a dipole abeam.
+    """
+    return float(snr_range(np.sqrt(2.0) * target.moment, noise_std,
+                           energy_threshold(false_alarm, n_axes)))
+
+
+def plan(network, target, sampling, lanes, area, settings, clearance=0.0, n_grid=41,
+         progress=None):
+    """Answer all of it.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    target : PlannedTarget
+    sampling : Sampling
+    lanes : sequence of (name, heading [rad], lateral offset [m])
+        The offset is to the left of the line through the middle of the sensors.
+    area : (x0, y0, x1, y1) [m]
+    settings : Settings
+        Of detection and tracking.
+    clearance : float [m]
+        No sensor may stand nearer to a lane.
+    n_grid : int
+        Points of the map on its longer side.
+    progress : function, optional
+        Called with 1 whenever one of the `n_parts` parts is done.
+
+    Returns
+    -------
+    Plan
+    """
+    step = progress or (lambda n: None)
+    x, y = _grid(area, n_grid)
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    place = network.positions, network.R_sw
+    prior = target.prior()
+    std = []
+    for heading in sorted({heading % np.pi for _, heading, _ in lanes}):
+        J = pass_information(*place, target, sampling, points, heading).sum(axis=2)
+        std.append(bounds_of(J, prior)[..., 0])
+        step(1)
+    detect = settings.detect
+    seen = detection_probabilities(*place, target, sampling, points,
+                                   detect.false_alarm_probability, detect.background_std)
+    step(1)
+    done = tuple(_lane(network, target, sampling, *lane, area, settings) for lane in lanes)
+    step(1)
+    # One more sensor: where the lanes are near the network, as that is where it is to be good.
+    reach = 0.5 * max(np.ptp(network.positions[:, :2], axis=0).max(), 8.0 * target.height)
+    near = [(lane.heading, lane.points[np.abs(lane.along) <= reach][::4]) for lane in done]
+    coarse_x, coarse_y = _grid(area, max(11, n_grid // 2))
+    places = np.stack(np.meshgrid(coarse_x, coarse_y), axis=-1).reshape(-1, 2)
+    free = np.all([_distance(lane, places) >= clearance for lane in done], axis=0)
+    more = np.full(len(places), np.nan)
+    without, found = _one_more(network, target, sampling, near, places[free])
+    more[free] = found
+    step(1)
+    best = int(np.nanargmin(more)) if free.any() else 0
+    known, blocks = _at_closest(network, target, sampling, done[0], reach)
+    shape = len(coarse_y), len(coarse_x)
+    return Plan(
+        network, target, sampling, x, y,
+        np.median(np.concatenate(std, axis=1), axis=1).reshape(len(y), len(x)),
+        seen.mean(axis=1).reshape(len(y), len(x)), done, more.reshape(shape), without,
+        (float(coarse_x[best % shape[1]]), float(coarse_y[best // shape[1]])),
+        known, blocks, _missed(network, target, sampling, done[0], area, settings))
+
+
+def _at_closest(network, target, sampling, lane, reach):
+    """`Plan.observability` and `Plan.blocks`; `reach` [m] is a typical distance."""
+    closest = lane.points[np.argmin(np.abs(lane.along))][None]
+    J = pass_information(network.positions, network.R_sw, target, sampling, closest,
+                         lane.heading)[0].sum(axis=1)
+    scale = np.repeat([max(reach, 1e-3), target.speed, target.moment], 3)
+    return (observability(J[3], STATES, scale),
+            {'with prior': np.median(bounds_of(J, target.prior()), axis=0),
+             'without prior': np.median(bounds_of(J, np.zeros((9, 9))), axis=0)})
+
+
+def _distance(lane, places):
+    """(n,) [m] of places (n, 2) from the line of a lane."""
+    u = lane.points[-1] - lane.points[0]
+    r = places - lane.points[0]
+    return np.abs(u[0] * r[:, 1] - u[1] * r[:, 0]) / np.hypot(*u)
+
+
+def n_parts(lanes):
+    """How often `plan` calls its `progress`."""
+    return len({heading % np.pi for _, heading, _ in lanes}) + 3
+
+
+def _grid(area, n):
+    """Coordinates of a map with square cells."""
+    x0, y0, x1, y1 = area
+    cell = max(x1 - x0, y1 - y0) / (n - 1)
+    return (np.linspace(x0, x1, max(2, int(round((x1 - x0) / cell)) + 1)),
+            np.linspace(y0, y1, max(2, int(round((y1 - y0) / cell)) + 1)))
+
+
+def _lane(network, target, sampling, name, heading, offset, area, settings):
+    """What is known along one lane, every frame."""
+    u = np.array([np.cos(heading), np.sin(heading)])
+    half = 0.5 * np.hypot(area[2] - area[0], area[3] - area[1])
+    n = int(np.clip(half / (target.speed * sampling.period), 10, 60))
+    along = np.linspace(-half, half, 2 * n + 1)
+    points = network.centre[:2] + offset * np.array([-u[1], u[0]]) + along[:, None] * u
+    place = network.positions, network.R_sw
+    J = pass_information(*place, target, sampling, points, heading).sum(axis=2)
+    detect = settings.detect
+    seen = detection_probabilities(*place, target, sampling, points,
+                                   detect.false_alarm_probability, detect.background_std)
+    return Lane(name, heading, along, points,
+                np.median(bounds_of(J, target.prior()), axis=1),
+                _filter_bound(network, target, sampling, points, heading, settings),
+                seen.mean(axis=1))
+
+
+def _filter_bound(network, target, sampling, points, heading, settings):
+    """(n,) [m] the path bound of a filter that follows a lane from its beginning.
+
+    Its motion is the tracker's, the backgrounds are states as well; median over directions.
+    """
+    n_sensors, dt = len(network), np.hypot(*(points[1] - points[0])) / target.speed
+    each = dt / sampling.period
+    still = Sampling(sampling.period, sampling.noise_std, half_window=0.0)
+    n_x = 9 + 3 * n_sensors
+    F, Q, P0 = np.eye(n_x), np.zeros((n_x, n_x)), np.zeros((n_x, n_x))
+    F[:6, :6] = constant_velocity(dt)
+    Q[:6, :6] = integrator_noise(dt, acceleration_density(settings.track))
+    known = np.diagonal(target.prior())[[2, 5]]
+    wide = np.array([1.0, 1.0, 1.0, target.speed, target.speed, target.speed])
+    wide[:3] *= np.hypot(*(points[-1] - points[0]))
+    wide[[2, 5]] = np.where(known > 0.0, 1.0 / np.sqrt(np.maximum(known, 1e-30)), wide[[2, 5]])
+    P0[range(6), range(6)] = wide**2
+    P0[range(6, 9), range(6, 9)] = target.moment**2 / 3.0
+    P0[range(9, n_x), range(9, n_x)] = min(sampling.background_std, 1e-6)**2
+    _, h, H = zip(*pass_fields(network.positions, network.R_sw, target, still, points, heading),
+                  strict=True)
+    h, H = np.concatenate(h), np.concatenate(H)
+    std = np.empty((len(points), len(DIRECTIONS)))
+    backgrounds = np.broadcast_to(np.eye(3 * n_sensors).reshape(n_sensors, 3, -1),
+                                  (len(points), n_sensors, 3, 3 * n_sensors))
+    for d in range(len(DIRECTIONS)):
+        variance = (np.square(sampling.noise_std) + sampling.field_error**2 * np.square(
+            h[:, d, 0]).sum(axis=-1)) / each
+        P = path_bound(F, Q, np.concatenate([H[:, d, 0], backgrounds], axis=-1),
+                       variance[..., None, None] * np.eye(3), P0)
+        std[:, d] = np.sqrt(P[:, 0, 0] + P[:, 1, 1])
+    return np.median(std, axis=1)
+
+
+def _one_more(network, target, sampling, near, places):
+    """(median bound as it is, (n_places,) with one more sensor at each of the places)."""
+    height = network.positions[:, 2].mean()
+    candidates = np.column_stack([places, np.full(len(places), height)])
+    upright = np.tile(np.eye(3), (len(places), 1, 1))
+    alike = replace(sampling, noise_std=float(np.median(sampling.noise_std)))
+    prior = target.prior()
+    base, more = [], []
+    for heading, points in near:
+        if not len(places):
+            continue
+        J = pass_information(network.positions, network.R_sw, target, sampling, points,
+                             heading).sum(axis=2)
+        base.append(bounds_of(J, prior)[..., 0].ravel())
+        extra = pass_information(candidates, upright, target, alike, points, heading)
+        more.append(bounds_of(J[:, :, None] + extra, prior)[..., 0].reshape(-1, len(places)))
+    if not base:
+        return float('nan'), np.zeros(0)
+    return float(np.median(np.concatenate(base))), np.median(np.concatenate(more), axis=0)
+
+
+def _missed(network, target, sampling, lane, area, settings):
+    """`Plan.missed`: no so many frames in a row detect the target as an onset needs."""
+    half = 0.5 * max(area[2] - area[0], area[3] - area[1])
+    offsets = np.linspace(0.0, 2.0 * half, 25)
+    u = np.array([np.cos(lane.heading), np.sin(lane.heading)])
+    n = int(np.clip(4.0 * half / (target.speed * sampling.period), 1, MOST_FRAMES))
+    along = np.linspace(-2.0 * half, 2.0 * half, n)[:, None]
+    detect, out = settings.detect, []
+    for offset in offsets:
+        points = network.centre[:2] + offset * np.array([-u[1], u[0]]) + along * u
+        seen = detection_probabilities(
+            network.positions, network.R_sw, target, sampling, points,
+            detect.false_alarm_probability, detect.background_std)
+        out.append((offset, float(np.mean(missed_probability(seen, detect.onset_frames)))))
+    return np.array(out)

@@ -1,0 +1,52 @@
+"""Which topics `mag-tracking record` records, and what it reports."""
+
+from typing import NamedTuple
+
+from mag_tracking.messages.types import RAW_READINGS
+
+RESULTS_OF = ('/calibration_node/', '/detection_node/', '/tracker_node/')
+
+
+class Selection(NamedTuple):
+    """Which topics to record."""
+
+    fields: tuple = ()
+    """Magnetic fields of the network."""
+    imus: tuple = ()
+    """Where its sensors may publish sensor_msgs/Imu."""
+    topics: tuple = ()
+    results: bool = False
+    everything: bool = False
+
+    def wants(self, topic):
+        """Whether to record a topic."""
+        if topic == RAW_READINGS or topic in self.fields + self.imus + self.topics:
+            return True
+        # ROS hides what has a part that begins with an underscore, and so does rosbag2.
+        if self.everything and '/_' not in topic:
+            return True
+        return self.results and (topic.startswith(RESULTS_OF) or topic == '/diagnostics'
+                                 or topic.removesuffix('_calibrated') in self.fields)
+
+
+def progress_line(recorder, seconds):
+    """What there is so far, as a line."""
+    dropped = recorder.dropped.total()
+    return (f'{seconds:.0f} s: {recorder.counts.total()} messages, {recorder.size / 1e6:.1f} MB'
+            + (f', dropped: {dropped}' if dropped else ''))
+
+
+def summary(recorder, selection, lost, refused):
+    """Lines that say what is in a recording, and what is not."""
+    yield f'{recorder.folder}: {recorder.counts.total()} messages, {recorder.size / 1e6:.2f} MB'
+    for topic, n in sorted((+recorder.counts).items()):
+        yield f'  {topic}  {n}'
+    for topic in selection.fields + selection.topics:
+        if not recorder.counts[topic] and topic not in refused:
+            yield f'  warning: nothing on {topic}'
+    for topic, n in sorted((+recorder.dropped).items()):
+        yield f'  warning: {topic}: dropped while the disk was full: {n}'
+    for topic, n in sorted(lost.items()):
+        yield f'  warning: {topic}: lost before they were recorded: {n}'
+    for topic, why in sorted(refused.items()):
+        yield f'  warning: {topic} is not recorded: {why}'

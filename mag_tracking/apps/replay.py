@@ -1,0 +1,208 @@
+"""One recording through the chain, offline: tables, summary, recording and figures."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mag_tracking.analysis.consistency import error_over_bound
+from mag_tracking.errors import OutputError
+from mag_tracking.pipeline import Pipeline
+from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
+from mag_tracking.recording.result_folder import ResultFolder
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.records import Detection, FieldFrame, SmoothedPose
+from mag_tracking.report.metrics import (
+    MAGNET_SKIP,
+    interpolate_truth,
+    magnet_errors,
+    near_poses,
+    pass_errors,
+)
+from mag_tracking.report.track_log import SmoothedLog, TrackLog
+from mag_tracking.stages.track.settings import acceleration_density
+
+SUSPICIOUS = 2.0
+"""A sensor that seems to be turned by more prior deviations than this is reported."""
+
+
+@dataclass
+class Run:
+    """What came of a recording."""
+
+    summary: dict
+    logs: dict = field(default_factory=dict)
+    """{track id: TrackLog}."""
+    smoothed: dict = field(default_factory=dict)
+    """{track id: SmoothedLog}, of the tracks that were smoothed."""
+    truth: dict = field(default_factory=dict)
+    """{name: (stamps, positions, quaternions)}."""
+
+
+def replay(recording, network, settings, out, progress=None, stopped=None):
+    """Track everything in a recording and write the results.
+
+    Parameters
+    ----------
+    recording : Recording
+    network : SensorNetwork
+    settings : Settings
+    out : path
+        Folder for the results; made if it is not there.
+    progress : function, optional
+        Called with the bytes done since the last call.
+    stopped : function, optional
+        Asked before every sample and whenever the reading has got on. When it is
+        true the reading ends, what was done is written, and the summary says so.
+
+    Returns
+    -------
+    Run
+
+    Raises RecordingError and OutputError.
+    """
+    if recording.lies_in(out):
+        raise OutputError(f'{out} is the folder of the recording; the results would overwrite it')
+    reader = SampleReader(recording, network)
+    pipeline = Pipeline(network, settings)
+    interrupted = False
+
+    with ResultFolder(out, network.frame) as results:
+        taker = RunCollector(results)
+        try:
+            for sample in until_stopped(reader.samples, progress, stopped):
+                taker.take(pipeline.feed(sample))
+        except ReadingStopped:
+            interrupted = True
+        taker.take(pipeline.flush())
+        truth = reader.truth_arrays()
+        summary = summarise(recording, reader, pipeline, taker, truth)
+        summary['interrupted'] = interrupted
+        results.write_summary(summary)
+    return Run(summary, taker.logs, taker.smoothed, truth)
+
+
+class RunCollector:
+    """Writes what leaves the pipeline, and remembers it for the summary and the figures."""
+
+    def __init__(self, results):
+        self._results = results
+        self._frame = None
+        self.logs, self.smoothed = {}, {}
+
+    def take(self, records):
+        """Take what one sample led to."""
+        for record in records:
+            if isinstance(record, FieldFrame):
+                self._frame = record
+            elif isinstance(record, Detection):
+                self._results.add_detection(record)
+            elif isinstance(record, SmoothedPose):
+                self._results.add_smoothed(record)
+                if record.complete:
+                    self.smoothed.setdefault(record.id, SmoothedLog(record.id)).add(record)
+            else:
+                self._results.add_track(record)
+                self.logs.setdefault(record.id, TrackLog(record.id)).add(record, self._frame)
+
+
+def summarise(recording, reader, pipeline, taker, truth):
+    """The content of `summary.json`."""
+    rejections = dict(reader.rejected)
+    for cause, n in pipeline.rejections().items():
+        rejections[cause] = rejections.get(cause, 0) + n
+    sensors = {}
+    for name, background in pipeline.calibrate.backgrounds().items():
+        counts = pipeline.calibrate.counts_of(name)
+        sensors[name] = {'accepted': counts['accepted'], 'rejected': counts['rejected'],
+                         'ready': background.ready, 'stuck': background.stuck,
+                         'times_relearnt': background.n_relearnt}
+        if background.ready and counts['accepted']:
+            std = np.sqrt(np.diagonal(background.covariance))
+            sensors[name]['noise_std'] = [None if np.isnan(v) else float(v) for v in std]
+            sensors[name]['background'] = [
+                None if np.isnan(v) else float(v) for v in pipeline.calibrate.background(name)]
+    tracks = [_track_entry(log, taker.smoothed.get(log.id), pipeline, truth)
+              for log in taker.logs.values()]
+    return {'recording': recording.path.name, 'target': pipeline.settings.track.target,
+            'counts': pipeline.counts(), 'rejected': rejections, 'lost': dict(recording.losses),
+            'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks}
+
+
+def _track_entry(log, smoothed, pipeline, truth):
+    """One track in the summary; `smoothed` is its `SmoothedLog` or None."""
+    entry = log.summary()
+    entry['nis_by_sensor'] = log.nis_of(pipeline.network.names)
+    entry['mounting'] = _mounting(log, pipeline)
+    errors = errors_against_truth(log, pipeline, truth)
+    if errors:
+        entry['truth'] = errors
+        entry['truth']['error_over_bound'] = _bound_ratio(log, pipeline, truth[errors['name']])
+    if smoothed is not None:
+        entry['smoothed'] = smoothed.summary()
+        errors = errors_against_truth(smoothed, pipeline, truth)
+        if errors:
+            entry['smoothed']['truth'] = errors
+    return entry
+
+
+def _mounting(log, pipeline):
+    """{sensor: how it seems to be turned} of a track; empty where that is not estimated."""
+    allowed = SUSPICIOUS * pipeline.settings.track.mounting_std_deg
+    return {name: {'angles_deg': angles.tolist(), 'std_deg': std.tolist(),
+                   'suspicious': bool(np.abs(angles).max() > allowed)}
+            for name, (angles, std) in log.mounting_of(pipeline.network.names).items()}
+
+
+def errors_against_truth(log, pipeline, truth):
+    """Errors against the truth that fits best, or None."""
+    best = None
+    for name, arrays in truth.items():
+        if pipeline.settings.track.target == 'magnet':
+            errors = magnet_errors(log, arrays, pipeline.settings.track.magnet.axis)
+            size = errors and errors['position_mean']
+        else:
+            errors = pass_errors(log, arrays, pipeline.network.centre)
+            size = errors and errors['closest']
+        if errors and (best is None or size < best[0]):
+            best = size, {'name': name, **errors}
+    return best and best[1]
+
+
+def _bound_ratio(log, pipeline, truth):
+    """Error over the path bound of a track, over the poses that its errors are of, or None."""
+    track = pipeline.settings.track
+    if track.target == 'magnet':
+        # Between two poses it may have turned anywhere.
+        return error_over_bound(pipeline.network, log, truth, acceleration_density(track), 1.0,
+                                track.field_error, track.background_std,
+                                np.arange(MAGNET_SKIP, len(log.stamp_ns)), 3)
+    rows = near_poses(log, truth, pipeline.network.centre)
+    return error_over_bound(pipeline.network, log, truth, acceleration_density(track),
+                            track.vehicle.moment_drift, track.field_error, track.background_std,
+                            rows, 2)
+
+
+def write_figures(run, network, out, most=6, stopped=None):
+    """Draw the figures of the first `most` tracks into folder `out`; returns their paths.
+
+    `stopped` is asked before each track; when it is true no more are drawn.
+    """
+    # Drawing needs matplotlib, which a run without figures should not wait for.
+    from mag_tracking.report.figures import field_figure, map_figure, weights_figure
+
+    paths = []
+    for log in list(run.logs.values())[:most]:
+        if stopped is not None and stopped():
+            break
+        entry = next(t for t in run.summary['tracks'] if t['id'] == log.id)
+        truth = None
+        if 'truth' in entry:
+            truth = interpolate_truth(run.truth[entry['truth']['name']], log.stamp_ns)
+        smoothed = run.smoothed[log.id].position if log.id in run.smoothed else None
+        for name, figure in (('map', map_figure(log, network, truth, smoothed)),
+                             ('weights', weights_figure(log)),
+                             ('field', field_figure(log, network))):
+            path = out / f'{name}_track_{log.id}.png'
+            figure.savefig(path, dpi=110)
+            paths.append(path)
+    return paths

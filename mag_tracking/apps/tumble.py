@@ -1,0 +1,64 @@
+"""Hard and soft iron of tumbled sensors: what `mag-tracking tumble` does."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from mag_tracking.calibration.ellipsoid_fit import fit_ellipsoid
+from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
+from mag_tracking.recording.sample_reader import SampleReader
+
+
+def tumble(recording, network, sensors, date, field_size=None, progress=None, stopped=None):
+    """Hard and soft iron of sensors that were turned about while a recording was made.
+
+    Parameters
+    ----------
+    recording : Recording
+    network : SensorNetwork
+    sensors : collection of str
+        Names; empty = all.
+    date : str
+        What the calibration is marked with.
+    field_size : float [T], optional
+        Of the field where they were turned; without it the sensors' gain is left as it is.
+    progress, stopped : function, optional
+        As for `calibrate`.
+
+    Returns
+    -------
+    (SensorNetwork with what converged, but without those sensors' backgrounds and noise, which were
+    of uncorrected readings; {sensor: EllipsoidFit}, {sensor: readings (n, 3)},
+    interrupted)
+
+    Raises NetworkError for an unknown sensor, RecordingError where the recording has none
+    of the network's topics.
+    """
+    wanted = tuple(sensors) or network.names
+    rows = {name: network.index(name) for name in wanted}
+    readings, interrupted = {name: [] for name in wanted}, False
+    reader = SampleReader(recording, network)
+    try:
+        for sample in until_stopped(reader.samples, progress, stopped):
+            if sample.sensor in readings and not np.isinf(sample.field).any():
+                readings[sample.sensor].append(sample.field)
+    except ReadingStopped:
+        interrupted = True
+    readings = {name: np.array(r).reshape(-1, 3) for name, r in readings.items()}
+    fits = {name: fit_ellipsoid(r, field_size) for name, r in readings.items()}
+    columns = {key: list(getattr(network, key)) for key in (
+        'offset', 'correction', 'background', 'noise_std', 'calibrated')}
+    for name, fit in fits.items():
+        j = rows[name]
+        if not fit.converged:
+            continue
+        columns['offset'][j], columns['correction'][j] = fit.offset, fit.correction
+        # They were of readings that were not corrected so; both are learnt anew.
+        columns['background'][j] = columns['noise_std'][j] = None
+        done = network.calibrated[j]
+        columns['calibrated'][j] = network.marked(
+            j, date, f'{"as stated" if done is None else done.by}; tumbled to '
+            f'{100 * fit.residual:.1f} % of the field', float('nan') if done is None
+            else done.clock_offset_std)
+    return (replace(network, **{key: tuple(v) for key, v in columns.items()}), fits, readings,
+            interrupted)

@@ -1,0 +1,36 @@
+"""mag-tracking info."""
+
+from pathlib import Path
+
+from mag_tracking.cli.options import add_command, add_network
+from mag_tracking.network.file import read_network
+from mag_tracking.recording.reader import Recording
+
+
+def add(commands):
+    """Register the command."""
+    p = add_command(commands, 'info', _info, 'Tell what is in a recording.')
+    p.add_argument('recording', type=Path, metavar='RECORDING')
+    add_network(p, False, 'compare with its topics')
+
+
+def _info(args):
+    """mag-tracking info."""
+    recording = Recording(args.recording)
+    if not recording.message_counts:
+        for message in recording.messages():
+            recording.message_counts[message.topic] += 1
+    print(f'{recording.path}: {recording.size / 1e6:.2f} MB, '
+          f'{sum(recording.message_counts.values())} messages')
+    if recording.start_ns is not None:
+        print(f'  {(recording.end_ns - recording.start_ns) / 1e9:.2f} s')
+    for topic in sorted(recording.types):
+        print(f'  {topic}  {recording.types[topic]}  {recording.message_counts[topic]}')
+    for what, n in recording.losses.items():
+        print(f'  warning: {what}: {n}')
+    if args.network:
+        network = read_network(args.network)
+        for name, topic in zip(network.names, network.topics, strict=True):
+            state = 'there' if topic in recording.types else 'MISSING'
+            print(f'  sensor {name}: {topic} is {state}')
+    return 0

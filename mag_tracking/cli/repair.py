@@ -1,0 +1,30 @@
+"""mag-tracking repair."""
+
+from pathlib import Path
+
+from mag_tracking.cli.options import add_command
+from mag_tracking.recording.repair import repair
+
+_REPAIR = '''
+A recording that was cut off (power, a crash, a full disk) has no index.
+`mag-tracking replay` reads it as it is; rosbag2 and others need the index,
+which this writes, and a new metadata.yaml. The messages stay untouched.
+
+example:
+  mag-tracking repair night
+'''
+
+
+def add(commands):
+    """Register the command."""
+    p = add_command(commands, 'repair', _repair, 'Make a recording whole that was cut off.',
+                    _REPAIR)
+    p.add_argument('recording', type=Path, metavar='RECORDING',
+                   help='an .mcap file or a rosbag2 folder')
+
+
+def _repair(args):
+    """mag-tracking repair."""
+    n = repair(args.recording)
+    print(f'{args.recording}: files that were not whole: {n}')
+    return 0

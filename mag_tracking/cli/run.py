@@ -1,0 +1,46 @@
+"""mag-tracking run."""
+
+from pathlib import Path
+
+from mag_tracking.cli.options import add_command, add_network, add_settings, settings_of
+from mag_tracking.network.file import read_network
+from mag_tracking.recording.reader import Recording
+
+_RUN = '''
+Starts calibration, detection and tracker nodes in one process, and with a
+RECORDING the replay node, with DRIVERS the driver node as well. Drivers of your
+own publish sensor_msgs/MagneticField on the topics of the network file. Ctrl-C
+ends it.
+
+examples:
+  mag-tracking run --network config/network.yaml --drivers config/drivers.yaml
+  mag-tracking run --network config/network.yaml --recording junction.mcap --rate 2
+'''
+
+
+def add(commands):
+    """Register the command."""
+    p = add_command(commands, 'run', _run, 'Run the nodes in one process (needs ROS 2).', _RUN)
+    add_network(p)
+    add_settings(p)
+    p.add_argument('--recording', type=Path, metavar='RECORDING', help='replay this, too')
+    p.add_argument('--drivers', type=Path, metavar='DRIVERS',
+                   help='run the devices of this drivers file, too')
+    p.add_argument('--batches', action='store_true',
+                   help='the drivers put readings of many sensors in one message, which dozens of '
+                   'sensors need')
+    p.add_argument('--rate', type=float, default=1.0, help='speed of the replay (default: 1)')
+    p.add_argument('--loop', action='store_true', help='begin again at the end')
+
+
+def _run(args):
+    """mag-tracking run."""
+    # Only this command needs ROS.
+    from mag_tracking.nodes.runner import run
+
+    settings = settings_of(args)
+    read_network(args.network)
+    if args.recording:
+        Recording(args.recording)
+    return run(args.network, settings, args.recording, args.rate, args.loop,
+               drivers=args.drivers, batches=args.batches)

@@ -1,0 +1,1 @@
+"""Framings: from bytes to readings, one file a format; each is pure."""

@@ -1,0 +1,193 @@
+"""Framing of binary frames of a fixed length: sync, payload, checksum, tail."""
+
+import struct
+from collections import Counter
+from dataclasses import dataclass
+
+from mag_tracking.drivers.framings.checksums import CHECKSUMS, Checksum
+from mag_tracking.drivers.framings.fields import (
+    AXES,
+    SKIP,
+    FieldLayout,
+    Rejected,
+    axis_value,
+    chosen,
+    skipped,
+    ticks_value,
+)
+from mag_tracking.drivers.reading import Parsed
+from mag_tracking.errors import SettingsError
+from mag_tracking.settings import param
+
+_CODES = {'u8': 'B', 'i8': 'b', 'u16': 'H', 'i16': 'h', 'u24': '3s', 'i24': '3s', 'u32': 'I',
+          'i32': 'i', 'u64': 'Q', 'i64': 'q', 'f32': 'f', 'f64': 'd'}
+
+
+@dataclass(frozen=True)
+class BinarySettings:
+    """Settings of the framing of binary frames."""
+
+    sync: str = param('', 'What a frame begins with, hexadecimal: A5 5A.')
+    fields: tuple[str, ...] = param(
+        (), 'What stands in a frame, in order, each with its type: sensor, ticks, sequence, x, y, '
+        'z, ax, ay, az, or - to be skipped, as in x:i16; x.A:i16 is the axis of a sensor A, where '
+        'there are several. Types: ' + ' '.join(_CODES) + '.')
+    each: tuple[str, ...] = param(
+        (), 'Axes of one sensor with their types, which follow count times behind the fields.')
+    count: int = param(0, 'How many sensors follow in the order of each.', '', (0, 4096))
+    byte_order: str = param('little', 'little or big, of all numbers and of the checksum.')
+    checksum: str = param(
+        'none', 'What stands behind the payload: none, ' + ', '.join(CHECKSUMS) + '.')
+    checksum_from: str = param('payload', 'Where it begins to count: sync or payload.')
+    tail: str = param('', 'What a frame ends with, hexadecimal; empty = nothing.')
+
+
+class BinaryFraming:
+    """Readings from binary frames.
+
+    Where a frame fails, the search goes on one byte behind the beginning of its sync.
+    With a checksum of n bits every true frame is found wherever it stands, save that a
+    sync that stands in garbage or in a payload passes for a frame with a chance of
+    2^-n, and then hides the true frames that begin within its length. Without a checksum (a
+    tail is a weak one) every sync passes: true frames are found as long as they follow
+    each other without a gap, or with a gap that holds no sync; behind another gap
+    there may be invented readings and lost ones until a frame happens to be in step
+    again.
+
+    Attributes
+    ----------
+    CLOCK, DRIVER : dict
+        The settings of the clock and of the driver that follow from the types: a
+        counter goes back to 0 where its type ends.
+
+    Source: no standard; the frame that makers of sensor boards commonly choose.
+    """
+
+    SETTINGS = BinarySettings
+
+    def __init__(self, settings):
+        """Raises SettingsError."""
+        self._sync = _hexadecimal('sync', settings.sync)
+        if not self._sync:
+            raise SettingsError('sync: a frame must begin with one byte at least')
+        self._tail = _hexadecimal('tail', settings.tail)
+        self._order = chosen('byte_order', settings.byte_order, ('little', 'big'))
+        name = chosen('checksum', settings.checksum, ('none', *CHECKSUMS))
+        self._checksum = CHECKSUMS.get(name, Checksum(0, _zero))
+        since = chosen('checksum_from', settings.checksum_from, ('sync', 'payload'))
+        fields, each = _typed('fields', settings.fields), _typed('each', settings.each)
+        self._layout = FieldLayout([name for name, _ in fields], [name for name, _ in each],
+                                   settings.count)
+        types = [kind for _, kind in fields + each * settings.count]
+        self._struct = struct.Struct(
+            '<>'[self._order == 'big'] + ''.join(_CODES[kind] for kind in types))
+        self._converters = [_converter(quantity, kind, self._order) for quantity, kind
+                            in zip(self._layout.quantities, types, strict=True)]
+        self._payload = len(self._sync)
+        self._covered = 0 if since == 'sync' else self._payload
+        self._payload_end = self._payload + self._struct.size
+        self._checksum_end = self._payload_end + self._checksum.size
+        self.size = self._checksum_end + len(self._tail)
+        kinds = dict(fields)
+        self.CLOCK = {'wrap': _wrap(kinds['ticks'])} if 'ticks' in kinds else {}
+        self.DRIVER = ({'sequence_wrap': _wrap(kinds['sequence'])} if 'sequence' in kinds else {})
+
+    def parse(self, data, final=False):
+        """All readings in `data`; see `Framing.parse`."""
+        readings, rejected = [], Counter()
+        at = frames = 0
+        while True:
+            start = data.find(self._sync, at)
+            if start < 0:
+                at = len(data) - self._begun(data, at)
+                break
+            if start + self.size > len(data):
+                at = start
+                break
+            cause = self._fault(data, start)
+            if not cause:
+                try:
+                    readings += self._read(data, start)
+                except Rejected as error:
+                    cause = str(error)
+            if cause:
+                rejected[f'frames {cause}'] += 1
+                at = start + 1
+            else:
+                frames += 1
+                at = start + self.size
+        consumed = len(data) if final else at
+        if between := consumed - frames * self.size:
+            rejected['bytes between frames'] = between
+        return Parsed(tuple(readings), consumed, rejected)
+
+    def _begun(self, data, at):
+        """How many bytes at the end of `data`, from `at` on, may be the beginning of a sync."""
+        for n in range(min(len(self._sync) - 1, len(data) - at), 0, -1):
+            if data.endswith(self._sync[:n]):
+                return n
+        return 0
+
+    def _fault(self, data, start):
+        """Why there is no frame at `start`; empty = there is one."""
+        # No exception: among bytes like the sync this is asked for each of them.
+        if not data.startswith(self._tail, start + self._checksum_end):
+            return 'with a wrong tail'
+        end = start + self._payload_end
+        sent = int.from_bytes(data[end:start + self._checksum_end], self._order)
+        if sent != self._checksum.value(data[start + self._covered:end]):
+            return 'with a wrong checksum'
+        return ''
+
+    def _read(self, data, start):
+        """The readings of the frame at `start`, or Rejected."""
+        values = self._struct.unpack_from(data, start + self._payload)
+        return self._layout.readings(
+            [convert(value) for convert, value in zip(self._converters, values, strict=True)])
+
+
+def _zero(data):
+    """The checksum of no bytes."""
+    return 0
+
+
+def _hexadecimal(setting, text):
+    """The bytes of a hexadecimal text."""
+    try:
+        return bytes.fromhex(text)
+    except ValueError:
+        raise SettingsError(f'{setting}: {text!r} is not hexadecimal, as in A5 5A') from None
+
+
+def _typed(setting, fields):
+    """[(name, type)] of fields such as x:i16."""
+    out = []
+    for text in fields:
+        name, _, kind = text.rpartition(':')
+        if kind not in _CODES:
+            raise SettingsError(f'{setting}: {text!r} has none of the types {" ".join(_CODES)}, '
+                                'as in x:i16')
+        if kind[0] == 'f' and name in ('sensor', 'sequence'):
+            raise SettingsError(f'{setting}: {name} must be an integer, got {kind}')
+        out.append((name, kind))
+    return out
+
+
+def _wrap(kind):
+    """Where a counter of this type goes back to 0; 0 = it will not live to see it."""
+    bits = int(kind[1:])
+    return 0 if kind[0] == 'f' or bits == 64 else 2**bits
+
+
+def _converter(quantity, kind, order):
+    """From what `struct` gives to the value that `FieldLayout` takes."""
+    if quantity == SKIP:
+        return skipped
+    if quantity in AXES or quantity == 'ticks':
+        convert = float if kind[0] != 'f' else axis_value if quantity in AXES else ticks_value
+    else:
+        convert = str if quantity == 'sensor' else int
+    if not kind.endswith('24'):
+        return convert
+    signed = kind[0] == 'i'
+    return lambda raw: convert(int.from_bytes(raw, order, signed=signed))

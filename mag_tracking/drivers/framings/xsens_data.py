@@ -1,0 +1,187 @@
+"""What the DATA of Xsens' two data messages, MTData2 and MTData, says of the field.
+
+The magnetic field is in arbitrary units, 1 = the size of the field where Xsens
+calibrated the sensor; the acceleration is in m/s^2. Both are in the sensor's frame:
+the coordinate bits of a data identifier (0x4 NED, 0x8 NWU) belong to the orientation
+only (MT0101P, note to revision W) and are not looked at.
+
+Sources: Xsens, "MT Low Level Communication Protocol Documentation", MT0101P, revision
+2019.A: MTData2, the table of its data identifiers, and the fixed point formats; Xsens,
+"MTi and MTx User Manual and Technical Documentation", MT0100P.N, section 5.3:
+SetOutputSettings and MTData.
+"""
+
+import struct
+from typing import NamedTuple
+
+from mag_tracking.drivers.reading import Reading
+from mag_tracking.errors import SettingsError
+
+TICK_S = 1e-4
+"""[s] Of SampleTimeFine. It goes back to 0 at 2^32 (MTi 1 and 600 series), or at 864 000 000
+ticks, which is a day (MTi 10 and 100 series)."""
+
+_PACKET_COUNTER = 0x1020
+_SAMPLE_TIME_FINE = 0x1060
+_ACCELERATION = 0x4020
+_MAGNETIC_FIELD = 0xC020
+_COMPONENT_READOUT = 0xA000
+"""The group of raw values."""
+_MAGNETIC = 0xC000
+_KIND = 0xFFF0
+_GROUP = 0xFE00
+
+_FLOAT, _FIXED_12_20, _FIXED_16_32 = 0, 1, 2
+_THREE = (struct.Struct('>3f'), struct.Struct('>3i'), struct.Struct('>IhIhIh'),
+          struct.Struct('>3d'))
+"""Three reals, by the two bits of the precision."""
+
+_BLOCKS = {
+    'temp': 4, 'acc': 12, 'gyr': 12, 'mag': 12, 'quaternion': 16, 'euler': 12, 'matrix': 36,
+    'analog_1': 2, 'analog_2': 2, 'status': 1, 'counter': 2}
+"""Bytes of the blocks of MTData, in the order of the protocol."""
+_ORIENTATIONS = {'quaternion', 'euler', 'matrix'}
+_FORMATS = {'float': _FLOAT, 'fp12.20': _FIXED_12_20}
+
+
+class Content(NamedTuple):
+    """What a data message says."""
+
+    reading: Reading | None
+    """None = nothing of field or acceleration."""
+    causes: tuple[str, ...]
+    """Of what is not in the reading, one for each time."""
+
+
+def _three_reals(data, precision):
+    """Three reals, or None where `data` is not as long as they are."""
+    layout = _THREE[precision]
+    if len(data) != layout.size:
+        return None
+    values = layout.unpack(data)
+    if precision == _FIXED_12_20:
+        return tuple(v / 2**20 for v in values)
+    if precision == _FIXED_16_32:
+        # The fraction is sent first, then the whole part with the sign.
+        return tuple(whole + fraction / 2**32
+                     for fraction, whole in zip(values[::2], values[1::2], strict=True))
+    return values
+
+
+def _value(identifier, data):
+    """(what of a reading it is, the value), or None for any other packet.
+
+    The value is None where `data` is not as long as such a packet.
+    """
+    if identifier == _PACKET_COUNTER:
+        return 'sequence', int.from_bytes(data, 'big') if len(data) == 2 else None
+    if identifier == _SAMPLE_TIME_FINE:
+        return 'ticks', float(int.from_bytes(data, 'big')) if len(data) == 4 else None
+    kind = identifier & _KIND
+    if kind == _MAGNETIC_FIELD:
+        return 'field', _three_reals(data, identifier & 3)
+    if kind == _ACCELERATION:
+        return 'acceleration', _three_reals(data, identifier & 3)
+    return None
+
+
+def read_mtdata2(data):
+    """The content of the DATA of an MTData2 message.
+
+    A packet is an identifier (u16), the size of its data (u8), and the data. From
+    packets of no interest only the raw ones (0xA0..) and other kinds of magnetic ones
+    (0xC0..) get a cause; SampleTimeCoarse (0x1070) is too coarse to be a clock.
+
+    Parameters
+    ----------
+    data : bytes
+
+    Returns
+    -------
+    Content or None
+        None where the packets do not fill `data`, or one of those that a reading is
+        made of has another size than its kind.
+    """
+    found, causes = {}, []
+    position, end = 0, len(data)
+    while position < end:
+        begin = position + 3
+        if begin > end:
+            return None
+        identifier = data[position] << 8 | data[position + 1]
+        position = begin + data[begin - 1]
+        if position > end:
+            return None
+        named = _value(identifier, data[begin:position])
+        if named is None:
+            if identifier & _GROUP in (_COMPONENT_READOUT, _MAGNETIC):
+                causes.append(f'packets not used: 0x{identifier:04X}')
+            continue
+        name, value = named
+        if value is None:
+            return None
+        if name in found:
+            causes.append(f'packets that the message had already: 0x{identifier:04X}')
+            continue
+        found[name] = value
+    return _content(found, causes)
+
+
+def _content(found, causes):
+    """The content, with a reading where there is something to read."""
+    if 'field' in found or 'acceleration' in found:
+        return Content(Reading(**found), tuple(causes))
+    return Content(None, (*causes, 'messages without field or acceleration'))
+
+
+class MTDataLayout:
+    """What is where in an MTData message; the message itself does not say.
+
+    Attributes
+    ----------
+    size : int
+        Bytes of DATA.
+    """
+
+    def __init__(self, blocks, number_format):
+        """
+        Parameters
+        ----------
+        blocks : sequence of str
+            'temp', 'acc', 'gyr', 'mag', then one of 'quaternion', 'euler' and 'matrix',
+            'analog_1', 'analog_2', 'status', 'counter'; each only if it is switched on.
+        number_format : str
+            Of all reals: 'float' or 'fp12.20'.
+
+        Raises SettingsError for an unknown name, another order than this, a second
+        orientation, or nothing that a reading could be made of.
+        """
+        for name in blocks:
+            if name not in _BLOCKS:
+                raise SettingsError(f'mtdata: unknown block {name!r}; known: {", ".join(_BLOCKS)}')
+        if list(blocks) != [name for name in _BLOCKS if name in blocks]:
+            raise SettingsError(f'mtdata: {", ".join(blocks)} is not in the order of the protocol, '
+                                f'which is {", ".join(_BLOCKS)}, each at most once')
+        if len(_ORIENTATIONS.intersection(blocks)) > 1:
+            raise SettingsError('mtdata: more than one of ' + ', '.join(sorted(_ORIENTATIONS)))
+        if not {'acc', 'mag'}.intersection(blocks):
+            raise SettingsError(f'mtdata: neither acc nor mag in {", ".join(blocks)}')
+        if number_format not in _FORMATS:
+            raise SettingsError(f'mtdata_format: {number_format!r} is none of '
+                                f'{", ".join(_FORMATS)}')
+        self._precision = _FORMATS[number_format]
+        self._begin, self.size = {}, 0
+        for name in blocks:
+            self._begin[name] = self.size
+            self.size += _BLOCKS[name]
+
+    def read(self, data):
+        """The `Content` of DATA of just this size, bytes."""
+        found = {}
+        for block, name in (('mag', 'field'), ('acc', 'acceleration')):
+            if block in self._begin:
+                begin = self._begin[block]
+                found[name] = _three_reals(data[begin:begin + 12], self._precision)
+        if 'counter' in self._begin:
+            found['sequence'] = int.from_bytes(data[self._begin['counter']:], 'big')
+        return _content(found, ())

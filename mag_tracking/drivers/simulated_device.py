@@ -1,0 +1,159 @@
+"""A simulated roadside: vehicles pass the sensors of a network, in real time, for ever.
+
+For trying the whole chain without hardware, and for measuring what it costs.
+"""
+
+import bisect
+import math
+import time
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from mag_tracking.drivers.reading import Arrival, Reading
+from mag_tracking.errors import DeviceError, SettingsError
+from mag_tracking.network.file import read_network
+from mag_tracking.settings import param
+from mag_tracking.simulation.scenario import Path, body_field, random_vehicle
+
+TICK_S = 1e-6
+SHORTEST_WAIT_S = 1e-3
+"""As a port that is looked at so often."""
+LONGEST_BACKLOG_S = 5.0
+"""What is older when it is asked for is lost, as in the buffer of a real device."""
+
+
+@dataclass(frozen=True)
+class SimulatorSettings:
+    """Settings of the simulated roadside."""
+
+    network: str = param('', 'Path of the network.yaml whose sensors are simulated.')
+    rate_hz: float = param(100.0, 'Readings of each sensor a second.', 'Hz', (0.1, 10_000.0))
+    noise: float = param(1.2e-8, 'Standard deviation of the noise.', 'T', (0.0, 1e-3))
+    speed: float = param(10.0, 'Speed of the vehicles.', 'm/s', (0.01, 100.0))
+    heading_deg: float = param(0.0, 'Where they head; 0 = along x.', 'deg', (-360.0, 360.0))
+    offset: float = param(
+        0.0, 'How far to the left of the middle of the network they pass.', 'm', (-1e4, 1e4))
+    lead: float = param(60.0, 'How far before the first sensor they begin, and how far behind '
+                        'the last they end.', 'm', (0.0, 1e4))
+    period_s: float = param(30.0, 'A vehicle comes every so often, or when the one before it is '
+                            'gone, if that is later.', 's', (0.1, 86400.0))
+    moment: float = param(400.0, 'Magnetic moment of a vehicle.', 'A m^2', (0.0, 1e6))
+    length: float = param(4.3, 'Length of a vehicle.', 'm', (0.1, 50.0))
+    in_turn: bool = param(
+        False, 'The sensors measure one after the other, evenly in the interval, as they do where '
+        'each runs by itself; else all at the same time.')
+    seed: int = param(1, 'Of the vehicle and of the noise.', '', (0, 2**31 - 1))
+
+
+class SimulatedDevice:
+    """All sensors of a network as one device; see `reading.Device`. The field is in tesla."""
+
+    SETTINGS = SimulatorSettings
+    CLOCK = {'tick_s': TICK_S}
+
+    def __init__(self, settings, monotonic_ns=time.monotonic_ns, sleep=time.sleep):
+        """Raises SettingsError or NetworkError where there is no usable network."""
+        if not settings.network:
+            raise SettingsError('simulator: network: the path of a network.yaml is needed')
+        self._network = read_network(settings.network)
+        if self._network.earth_field is None:
+            raise SettingsError(f'{settings.network} has no earth_field, which the simulator needs')
+        self.counts = Counter()
+        self._settings = settings
+        self._monotonic_ns, self._sleep = monotonic_ns, sleep
+        self._path, self._passing_s = _path_along(self._network, settings)
+        self._rng = np.random.default_rng(settings.seed)
+        self._table = None
+        self._start_ns, self._next = None, 0
+        self._shift_s = (np.arange(len(self._network)) * settings.in_turn
+                         / (len(self._network) * settings.rate_hz)).tolist()
+
+    def open(self):
+        """Compute one pass, and begin."""
+        if self._table is None:
+            self._table = self._one_pass()
+        if self._start_ns is None:
+            self._start_ns = self._monotonic_ns()
+        self._next = math.ceil(self._elapsed() * self._settings.rate_hz) * len(self._network)
+
+    def read(self, timeout_s):
+        """The readings that are due; waits for the next if none is."""
+        if self._table is None:
+            raise DeviceError('the simulator is not open')
+        wait = self._due(self._next) - self._elapsed()
+        if wait > 0.0:
+            # Not for each of a thousand in turn: what is there when one looks comes together.
+            self._sleep(min(max(wait, SHORTEST_WAIT_S), timeout_s))
+        elapsed, n = self._elapsed(), len(self._network)
+        oldest = math.ceil((elapsed - LONGEST_BACKLOG_S) * self._settings.rate_hz) * n
+        if oldest > self._next:
+            self.counts['readings lost, nobody took them'] += oldest - self._next
+            self._next = oldest
+        first, self._next = self._next, max(self._next, self._n_due(elapsed))
+        while self._due(self._next) <= elapsed:
+            self._next += 1
+        return self._readings(first, self._next)
+
+    def close(self):
+        """There is nothing to close; time goes on."""
+
+    @property
+    def _period_s(self):
+        """[s] From one vehicle to the next."""
+        return max(self._settings.period_s, self._passing_s)
+
+    def _elapsed(self):
+        """[s] since the first `open`."""
+        return (self._monotonic_ns() - self._start_ns) / 1e9
+
+    def _due(self, i):
+        """[s] When reading `i` is measured; the sensors take turns."""
+        index, j = divmod(i, len(self._network))
+        return index / self._settings.rate_hz + self._shift_s[j]
+
+    def _n_due(self, elapsed):
+        """How many readings have been measured; by rounding those of one interval fewer."""
+        whole = math.floor(elapsed * self._settings.rate_hz)
+        return whole * len(self._network) + bisect.bisect_right(
+            self._shift_s, elapsed - whole / self._settings.rate_hz)
+
+    def _readings(self, first, end):
+        """The readings from `first` to before `end`."""
+        index, j = np.divmod(np.arange(first, end), len(self._network))
+        due_s = index / self._settings.rate_hz + np.array(self._shift_s)[j]
+        # The table is that of the pass alone; before the next vehicle there is none.
+        row = index % round(self._period_s * self._settings.rate_hz)
+        B = self._table[np.minimum(row, len(self._table) - 1), j]
+        B = B + self._settings.noise * self._rng.standard_normal(B.shape)
+        now, names = self._monotonic_ns(), self._network.names
+        return [Arrival(now, Reading(names[j], tuple(b), ticks=t, sequence=k))
+                for t, k, j, b in zip(np.round(due_s / TICK_S).astype(int).tolist(),
+                                      index.tolist(), j.tolist(), B.tolist(), strict=True)]
+
+    def _one_pass(self):
+        """(n, n_sensors, 3) [T], sensor frames; the last row is without a vehicle."""
+        s, network = self._settings, self._network
+        t = np.arange(0.0, self._passing_s, 1.0 / s.rate_hz)
+        body = random_vehicle(np.random.default_rng(s.seed), length=s.length, moment=s.moment)
+        B = np.zeros((len(t) + 1, len(network), 3))
+        for j, shift_s in enumerate(self._shift_s):
+            position, heading = self._path.at(t + shift_s)
+            B[:-1, j] = body_field(body, network.earth_field, position, heading,
+                                   network.positions[j:j + 1])[:, 0]
+        return np.einsum('njw,jws->njs', B + network.earth_field, network.R_ws)
+
+
+def _path_along(network, settings):
+    """The straight way past all sensors, and the seconds that it takes."""
+    heading = math.radians(settings.heading_deg)
+    forward = np.array([math.cos(heading), math.sin(heading)])
+    left = np.array([-forward[1], forward[0]])
+    along, across = network.positions[:, :2] @ forward, network.positions[:, :2] @ left
+    middle = (across.min() + across.max()) / 2.0 + settings.offset
+    start = (along.min() - settings.lead) * forward + middle * left
+    way = along.max() - along.min() + 2.0 * settings.lead
+    if way <= 0.0:
+        raise SettingsError('simulator: lead: a way of length 0')
+    return Path(start, heading, settings.speed), way / settings.speed

@@ -1,1 +1,0 @@
-"""The edges: recordings, network files, importers, the simulator."""

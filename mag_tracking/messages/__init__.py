@@ -1,0 +1,1 @@
+"""Records to and from message-shaped dicts: declared once, used by recordings and nodes."""

@@ -1,0 +1,56 @@
+"""What the calibration knows of a network, to and from its message."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from mag_tracking.errors import RecordingError
+from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
+from mag_tracking.messages.schema import xyz
+
+
+def sensor_dict(calibrate, network, j):
+    """mag_tracking_msgs/SensorCalibration of sensor `j`."""
+    name = network.names[j]
+    background, counts = calibrate.backgrounds()[name], calibrate.counts_of(name)
+    ready = background.ready and calibrate.last_stamp_ns(name) is not None
+    q, std = quaternion_from_rotation(network.R_ws[j]), network.orientation_std[j]
+    done = network.calibrated[j]
+    return {'sensor': name, 'ready': ready, 'frozen': background.frozen,
+            'background': xyz(calibrate.background(name) if ready else np.full(3, np.nan)),
+            'covariance': (background.covariance if ready
+                           else np.full((3, 3), np.nan)).ravel().tolist(),
+            'n_samples': counts['accepted'], 'n_rejected': counts['rejected'],
+            'n_relearnt': background.n_relearnt,
+            'orientation': {**xyz(q), 'w': float(q[3])},
+            'orientation_std': (np.full(3, np.nan) if std is None else std).tolist(),
+            'clock_offset': float(network.clock_offset[j]),
+            'clock_offset_std': float('nan') if done is None else done.clock_offset_std,
+            'calibrated_at': '' if done is None else done.date,
+            'calibrated_by': '' if done is None else done.by}
+
+
+def with_orientations(network, message):
+    """The `SensorNetwork` turned as a message-shaped CalibrationState says.
+
+    Raises RecordingError where that is of other sensors, or turns one by no rotation.
+    """
+    names = tuple(s.sensor for s in message.sensors)
+    if names != network.names:
+        raise RecordingError(f'a calibration of {", ".join(names)} does not fit the network of '
+                             f'{", ".join(network.names)}')
+    if message.header.frame_id != network.frame:
+        raise RecordingError(f'a calibration in the frame {message.header.frame_id!r}, not '
+                             f'{network.frame!r}')
+    q = np.array([[s.orientation.x, s.orientation.y, s.orientation.z, s.orientation.w]
+                  for s in message.sensors])
+    std = [np.array(s.orientation_std, dtype=float) for s in message.sensors]
+    for name, v in zip(names, std, strict=True):
+        if not (np.isnan(v).all() or (np.isfinite(v) & (v > 0.0)).all()):
+            raise RecordingError(f'a calibration of {name} with deviations of {v.tolist()} rad')
+    try:
+        R_ws = rotation_from_quaternion(q)
+    except ValueError as error:
+        raise RecordingError(f'a calibration with an orientation that is none: {error}') from error
+    return replace(network, R_ws=R_ws, orientation_std=tuple(
+        None if np.isnan(v).all() else v for v in std))

@@ -1,0 +1,1 @@
+"""Recordings and other files: read, write, record, repair, import."""

@@ -1,0 +1,102 @@
+"""What a calibration had learnt of the backgrounds, kept for the case that it is started again.
+
+A network file says what holds for years; this is of the last minute, and goes with the readings.
+"""
+
+import hashlib
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+
+from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.stages.calibrate.restoration import Kept
+
+VERSION = 1
+
+
+def usual_path(network_path, node):
+    """Where node `node` keeps the backgrounds of a network file: below $ROS_HOME, or ~/.ros."""
+    path = Path(network_path).resolve()
+    home = Path(os.environ.get('ROS_HOME') or Path.home() / '.ros')
+    mark = hashlib.sha256(f'{path} {node}'.encode()).hexdigest()[:8]
+    return home / 'mag_tracking' / f'{path.stem}_{mark}.json'
+
+
+def _made_of(network, j, settings):
+    """All that a background of sensor `j` rests on, as lists: where that differs, it is another."""
+    arrays = (network.offset[j], network.correction[j], network.clock_offset[j],
+              network.background[j], network.noise_std[j], network.positions[j], network.R_ws[j])
+    return [None if a is None else np.asarray(a).tolist() for a in arrays] \
+        + [settings.decimate_to_hz]
+
+
+def background_text(kept, network, j, settings):
+    """JSON of the `Kept` background of sensor `j`; `settings` are `CalibrateSettings`."""
+    return json.dumps({'stamp_ns': kept.stamp_ns, 'background': kept.background.tolist(),
+                       'covariance': kept.covariance.tolist(),
+                       'made_of': _made_of(network, j, settings)})
+
+
+def write_backgrounds(path, texts):
+    """Write {sensor: `background_text`}; what was there stays whole until the new is.
+
+    Raises OutputError.
+    """
+    path = Path(path)
+    rows = ',\n'.join(f'{json.dumps(name)}: {text}' for name, text in texts.items())
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        beside = path.with_name(f'{path.name}.{os.getpid()}.new')
+        beside.write_text(f'{{"version": {VERSION}, "sensors": {{\n{rows}\n}}}}\n')
+        beside.replace(path)
+    except (OSError, ValueError) as error:
+        raise OutputError(f'{path}: {getattr(error, "strerror", None) or error}') from error
+
+
+def read_backgrounds(path, network, settings):
+    """What was kept of the sensors of `network`, as far as it rests on the same.
+
+    Returns
+    -------
+    kept : {sensor: `Kept`}
+        {} where there is no file.
+    refused : {sensor: why}
+        Of what cannot be used.
+
+    Raises RecordingError where the file is none of this kind.
+    """
+    try:
+        content = json.loads(Path(path).read_text())
+    except FileNotFoundError:
+        return {}, {}
+    except (OSError, ValueError, RecursionError) as error:
+        raise RecordingError(f'{path}: {error}') from error
+    entries = content.get('sensors') if isinstance(content, dict) else None
+    if not isinstance(entries, dict) or content.get('version') != VERSION:
+        raise RecordingError(f'{path}: not what calibration_node keeps, version {VERSION}')
+    kept, refused = {}, {}
+    for j, name in enumerate(network.names):
+        try:
+            if name in entries and entries[name]['made_of'] != _made_of(network, j, settings):
+                refused[name] = 'it is of another network file or of other settings'
+            elif name in entries:
+                kept[name] = _kept(entries[name])
+        except (KeyError, TypeError, ValueError) as error:
+            refused[name] = f'{type(error).__name__}: {error}'
+    return kept, refused
+
+
+def _kept(entry):
+    """`Kept` of an entry; raises ValueError where its numbers are none."""
+    background = np.array(entry['background'], dtype=float)
+    covariance = np.array(entry['covariance'], dtype=float)
+    if background.shape != (3,) or covariance.shape != (3, 3) or np.isinf(background).any() \
+            or not isinstance(entry['stamp_ns'], int):
+        raise ValueError(f'a background of {background.tolist()} at {entry["stamp_ns"]}')
+    there = ~np.isnan(background)
+    C = covariance[np.ix_(there, there)]
+    if not there.any() or not np.isfinite(C).all() or np.linalg.eigvalsh(C)[0] <= 0.0:
+        raise ValueError('a covariance that is not positive definite')
+    return Kept(entry['stamp_ns'], background, covariance)

@@ -1,0 +1,11 @@
+"""Exceptions that the MCAP library and its decompressors raise on damaged bytes."""
+
+import struct
+import zlib
+
+import zstandard
+from mcap.exceptions import McapError
+from mcap.stream_reader import CRCValidationError
+
+DAMAGE = (McapError, CRCValidationError, ValueError, KeyError, EOFError, struct.error,
+          zlib.error, zstandard.ZstdError, RuntimeError, UnicodeDecodeError, MemoryError)

@@ -1,0 +1,113 @@
+"""Importers: other people's tables to recordings and network files."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from mag_tracking.errors import RecordingError
+from mag_tracking.geometry import quaternion_from_rotation_vector, rotation_from_quaternion
+from mag_tracking.messages.schema import pose_dict, sample_dict
+from mag_tracking.messages.types import MAGNETIC_FIELD, POSE
+from mag_tracking.network import SensorNetwork
+from mag_tracking.network.file import write_network
+from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.records import MagSample
+
+_COLUMNS = ('id', 'timestamp', 'Bx', 'By', 'Bz', 'sensor_x', 'sensor_y', 'sensor_z',
+            'sensor_ox', 'sensor_oy', 'sensor_oz', 'm_x', 'm_y', 'm_z', 'm_ox', 'm_oy', 'm_oz')
+
+
+def import_pose_table(table, background, out, noise_std):
+    """A table of magnet poses seen by fixed sensors, as recording and network file.
+
+    Parameters
+    ----------
+    table : path
+        CSV with a row a sensor and pose: `id`, `timestamp` [s], `Bx By Bz`
+        [microtesla, sensor frame, background included], `sensor_x..z` [mm] and
+        `sensor_ox..oz` (rotation vector, sensor to world), the true magnet
+        `m_x..z` [mm] and `m_ox..oz` (its axis is the rotated z).
+    background : path
+        CSV with a row a sensor, in the order of their ids: field without the
+        magnet [microtesla, sensor frame].
+    out : path
+        Folder for `<table>.mcap`, `metadata.yaml` and `network.yaml`.
+    noise_std : float [T]
+        Of one reading; the table does not tell.
+
+    Returns
+    -------
+    (recording, network file, number of readings)
+
+    Raises RecordingError where the tables do not fit, OutputError where `out`
+    cannot be written. The sensors were measured anew for every pose: the
+    median of each is taken.
+    """
+    rows = _read_table(table)
+    field_free = _read_background(background)
+    ids = np.unique(rows['id']).astype(int)
+    if len(field_free) != len(ids):
+        raise RecordingError(f'{background} has {len(field_free)} sensors, {table} has {len(ids)}')
+    names = tuple(f'mag_{i}' for i in ids)
+    position, vectors = (np.array([np.median(rows[kind][rows['id'] == i], axis=0) for i in ids])
+                         for kind in ('sensor', 'sensor_rotation'))
+    quaternions = quaternion_from_rotation_vector(vectors)
+    network = SensorNetwork(
+        names, position * 1e-3, rotation_from_quaternion(quaternions),
+        tuple(f'/{name}/imu/mag' for name in names),
+        noise_std=(np.full(3, noise_std),) * len(ids), background=tuple(field_free * 1e-6))
+    out = Path(out)
+    recording = out / f'{Path(table).stem}.mcap'
+    order = np.argsort(rows['timestamp'], kind='stable')
+    with RecordingWriter(recording) as writer:
+        for k in order:
+            stamp = int(round(rows['timestamp'][k] * 1e9))
+            name = f'mag_{int(rows["id"][k])}'
+            sample = MagSample(stamp, name, rows['field'][k] * 1e-6)
+            writer.write(f'/{name}/imu/mag', MAGNETIC_FIELD, sample_dict(sample, name), stamp)
+            if rows['id'][k] == ids[0]:
+                q = quaternion_from_rotation_vector(rows['magnet_rotation'][k])
+                writer.write('/ground_truth/magnet/pose', POSE,
+                             pose_dict(stamp, 'map', rows['magnet'][k] * 1e-3, q), stamp)
+    write_network(out / 'network.yaml', network,
+                  f'Imported from {Path(table).name} and {Path(background).name}.')
+    return recording, out / 'network.yaml', len(order)
+
+
+def _read_table(path):
+    """The columns of the table as arrays."""
+    try:
+        with open(path, newline='', encoding='utf-8') as stream:
+            reader = csv.DictReader(stream)
+            missing = [c for c in _COLUMNS if c not in (reader.fieldnames or ())]
+            if missing:
+                raise RecordingError(f'{path}: column {missing[0]} is missing')
+            values = [[float(row[c]) for c in _COLUMNS] for row in reader]
+    except OSError as error:
+        raise RecordingError(f'cannot read {path}: {error.strerror}') from error
+    except (ValueError, TypeError) as error:
+        raise RecordingError(f'{path}: {error}') from error
+    if not values:
+        raise RecordingError(f'{path} has no rows')
+    a = np.array(values)
+    if not np.isfinite(a).all():
+        row, column = np.argwhere(~np.isfinite(a))[0]
+        raise RecordingError(f'{path}: row {row + 2}: {_COLUMNS[column]} is not a finite number')
+    if (a[:, 0] != a[:, 0].astype(int)).any():
+        raise RecordingError(f'{path}: column id has numbers that are not whole')
+    return {'id': a[:, 0], 'timestamp': a[:, 1], 'field': a[:, 2:5], 'sensor': a[:, 5:8],
+            'sensor_rotation': a[:, 8:11], 'magnet': a[:, 11:14], 'magnet_rotation': a[:, 14:17]}
+
+
+def _read_background(path):
+    """(n_sensors, 3) [microtesla]."""
+    try:
+        values = np.loadtxt(path, delimiter=',', ndmin=2)
+    except OSError as error:
+        raise RecordingError(f'cannot read {path}: {error}') from error
+    except ValueError as error:
+        raise RecordingError(f'{path}: {error}') from error
+    if values.shape[1] != 3:
+        raise RecordingError(f'{path}: expected 3 columns, got {values.shape[1]}')
+    return values

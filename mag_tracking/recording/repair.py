@@ -1,0 +1,260 @@
+"""Gives recordings that were cut off (a crash, a full disk) the index that other readers need."""
+
+import fcntl
+import io
+import shutil
+import struct
+import zlib
+from collections import Counter
+from pathlib import Path
+
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Message,
+    MessageIndex,
+    Schema,
+    Statistics,
+)
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
+
+from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.recording.damage import DAMAGE
+from mag_tracking.recording.rosbag2_folder import FileSummary, Topic, WholeStream, write_metadata
+
+_MAGIC = b'\x89MCAP0\r\n'
+
+
+class _Scan:
+    """What is whole in a file: where it ends, and all that its index is to say."""
+
+    def __init__(self, stream):
+        """Read `stream` up to where it breaks off."""
+        self.schemas, self.channels, self.counts = {}, {}, Counter()
+        self.times, self.chunks, self.end, self.damaged = [], [], 0, 0
+        self.has_data_end = False
+        self._index = {}
+        try:
+            for record in StreamReader(stream, emit_chunks=True).records:
+                if isinstance(record, (DataEnd, Footer)):
+                    self.has_data_end = True
+                    break
+                self._take(record, stream.tell())
+                self.end = stream.tell()
+        except DAMAGE:
+            pass
+        self._remade = b''
+        if self._lacks_index():
+            self._remake_index()
+
+    def _take(self, record, end):
+        """Note a record that ends at byte `end`."""
+        if isinstance(record, Schema):
+            self.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self.channels[record.id] = record
+        elif isinstance(record, Message):
+            self._count(record.channel_id, record.log_time)
+        elif isinstance(record, Chunk):
+            if self._lacks_index():
+                self._drop_index()
+            try:
+                self._take_chunk(record, end)
+            except DAMAGE:
+                self.damaged += 1
+        elif isinstance(record, MessageIndex) and self.chunks:
+            index, length = self.chunks[-1], 15 + 16 * len(record.records)
+            index.message_index_offsets[record.channel_id] = end - length
+            index.message_index_length += length
+
+    def _count(self, channel, time_ns):
+        """Count a message."""
+        self.counts[channel] += 1
+        low, high = self.times or (time_ns, time_ns)
+        self.times = [min(low, time_ns), max(high, time_ns)]
+
+    def _take_chunk(self, chunk, end):
+        """Note a chunk and what is in it; raises where it is damaged."""
+        stream, length = get_chunk_data_stream(chunk, validate_crc=True)
+        data = stream.read(length)
+        self._index, offset = {}, 0
+        while offset < length:
+            opcode, size = struct.unpack_from('<BQ', data, offset)
+            offset += 9
+            if opcode == Opcode.MESSAGE:
+                channel, _, time_ns = struct.unpack_from('<HIQ', data, offset)
+                index = self._index.setdefault(channel, MessageIndex(channel, []))
+                index.records.append((time_ns, offset - 9))
+                self._count(channel, time_ns)
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                kind = Schema if opcode == Opcode.SCHEMA else Channel
+                self._take(kind.read(ReadDataStream(io.BytesIO(data[offset:offset + size]))), end)
+            offset += size
+        whole = 9 + 40 + len(chunk.compression.encode()) + len(chunk.data)
+        self.chunks.append(ChunkIndex(
+            whole, end - whole, chunk.compression, len(chunk.data), chunk.message_end_time, 0, {},
+            chunk.message_start_time, chunk.uncompressed_size))
+
+    def _lacks_index(self):
+        """Whether the last chunk has not an index of each of its channels."""
+        return self.chunks and set(self.chunks[-1].message_index_offsets) != set(self._index)
+
+    def _drop_index(self):
+        """Forget the last chunk's indexes: a part of them would hide the other channels."""
+        self.chunks[-1].message_index_offsets = {}
+        self.chunks[-1].message_index_length = 0
+
+    def _remake_index(self):
+        """Make the last chunk's indexes anew; they belong right behind it."""
+        self._drop_index()
+        chunk, builder = self.chunks[-1], RecordBuilder()
+        self.end = chunk.chunk_start_offset + chunk.chunk_length
+        for channel, index in self._index.items():
+            chunk.message_index_offsets[channel] = self.end + builder.count
+            index.write(builder)
+        chunk.message_index_length = builder.count
+        self._remade = builder.end()
+
+    def index(self):
+        """All that a file ends with, as bytes that belong at `end`."""
+        builder = RecordBuilder()
+        DataEnd(0).write(builder)
+        data_end = self._remade + builder.end()
+        times = self.times or [0, 0]
+        for record in (*self.schemas.values(), *self.channels.values(), Statistics(
+                0, len(self.channels), dict(self.counts), len(self.chunks), self.counts.total(),
+                times[1], times[0], 0, len(self.schemas)), *self.chunks):
+            record.write(builder)
+        summary, start = builder.end(), self.end + len(data_end)
+        crc = zlib.crc32(struct.pack('<BQQQ', Opcode.FOOTER, 20, start, 0), zlib.crc32(summary))
+        Footer(start, 0, crc).write(builder)
+        return data_end + summary + builder.end() + _MAGIC
+
+
+def _summary(stream):
+    """The index of a file that has one, else None."""
+    stream.seek(0)
+    try:
+        return make_reader(stream).get_summary()
+    except DAMAGE:
+        return None
+
+
+def finish_file(path):
+    """Give a file that was cut off its index, in place; a file that has one stays as it is.
+
+    A torn record at the end, which nobody can read, goes to `<name>.cut`.
+
+    Returns
+    -------
+    list of str
+        What was found and done, as lines for the user; empty for a whole file.
+
+    Raises RecordingError for what is not MCAP, OutputError for a file that is still
+    recorded, OSError where it cannot be written; the messages are untouched then.
+    """
+    path = Path(path)
+    with open(path, 'r+b', buffering=0) as raw, open(path, 'rb') as stream:
+        try:
+            fcntl.flock(raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise OutputError(f'{path} is being recorded: end that first') from None
+        if _summary(stream) is not None:
+            return []
+        stream.seek(0)
+        if stream.read(len(_MAGIC)) != _MAGIC:
+            raise RecordingError(f'{path} is not an MCAP file')
+        stream.seek(0)
+        scan = _Scan(stream)
+        torn = 0 if scan.has_data_end else path.stat().st_size - scan.end
+        if torn:
+            stream.seek(scan.end)
+            with open(f'{path}.cut', 'wb') as cut:
+                shutil.copyfileobj(stream, cut)
+        _replace_end(raw, scan.end, scan.index())
+    lines = [f'{path.name}: {scan.counts.total()} messages, index written']
+    if torn:
+        lines.append(f'{path.name}: the last {torn} bytes are torn; they are in {path.name}.cut')
+    if scan.damaged:
+        lines.append(f'{path.name}: damaged chunks, left out: {scan.damaged}')
+    return lines
+
+
+def _replace_end(raw, end, index):
+    """Put the index where the whole records end; nothing, if there is no room for it."""
+    raw.truncate(end)
+    raw.seek(end)
+    try:
+        WholeStream(raw).write(index)
+    except OSError:
+        raw.truncate(end)
+        raise
+
+
+def repair(path, report=print):
+    """Make a recording whole that was cut off.
+
+    Parameters
+    ----------
+    path : path
+        An MCAP file, or a folder of them; the folder gets a new `metadata.yaml`.
+    report : function
+        Takes lines of text for the user.
+
+    Returns the number of files that were not whole. Raises RecordingError where there
+    is no recording, OutputError where it cannot be written or is still recorded.
+    """
+    path = Path(path)
+    files = [path] if path.is_file() else sorted(path.glob('*.mcap'), key=_number)
+    if not files:
+        raise RecordingError(f'{path} holds no .mcap file')
+    n, summaries, topics = 0, [], {}
+    # A crash at a split leaves a file without a first byte.
+    empty = [file for file in files if file.stat().st_size < len(_MAGIC)]
+    if len(empty) == len(files):
+        raise RecordingError(f'{path}: {len(files)} files, and nothing in any')
+    for file in empty:
+        report(f'{file} is empty: it is left out')
+    for file in [file for file in files if file not in empty]:
+        try:
+            lines = finish_file(file)
+        except OSError as error:
+            raise OutputError(f'cannot repair {file}: {error.strerror}') from error
+        n += bool(lines)
+        for line in lines:
+            report(line)
+        summaries.append(_summary_of(file, topics))
+    if path.is_dir():
+        try:
+            write_metadata(path, summaries, topics)
+        except OSError as error:
+            raise OutputError(f'cannot write {path}/metadata.yaml: {error.strerror}') from error
+    return n
+
+
+def _number(file):
+    """Sorts by the number at the end of the name, as recorders count."""
+    number = file.stem.rpartition('_')[2]
+    return (int(number) if number.isdigit() else -1, file.name)
+
+
+def _summary_of(file, topics):
+    """`FileSummary` of a whole file; its topics are added to `topics`."""
+    with open(file, 'rb') as stream:
+        summary = make_reader(stream).get_summary()
+    counts = Counter()
+    for i, channel in summary.channels.items():
+        schema = summary.schemas.get(channel.schema_id)
+        qos = channel.metadata.get('offered_qos_profiles', '')
+        topics.setdefault(channel.topic, Topic(schema.name if schema else '', '', qos))
+        counts[channel.topic] += summary.statistics.channel_message_counts.get(i, 0)
+    if not counts.total():
+        return FileSummary(file.name, counts)
+    s = summary.statistics
+    return FileSummary(file.name, counts, s.message_start_time, s.message_end_time)

@@ -1,0 +1,121 @@
+"""What an offline run writes: CSV tables as it goes, a summary at the end, a recording."""
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from mag_tracking.errors import OutputError
+from mag_tracking.messages.schema import header_dict, pose_with_covariance_dict, track_dict
+from mag_tracking.messages.types import POSE_WITH_COVARIANCE, TRACK_ARRAY
+from mag_tracking.recording.writer import RecordingWriter
+
+POSE_COLUMNS = ('stamp_ns', 'track_id', 'x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z',
+                'sd_vx', 'sd_vy', 'sd_vz', 'mx', 'my', 'mz', 'weight', 'ambiguous',
+                'kind', 'kind_weight', 'length', 'sd_length')
+SMOOTHED_COLUMNS = (*POSE_COLUMNS[:17], 'ambiguous', 'kind', 'length', 'sd_length')
+DETECTION_COLUMNS = ('stamp_ns', 'id', 'event', 'statistic', 'degrees_of_freedom', 'threshold',
+                     'false_alarm_probability', 'strongest_sensor')
+HYPOTHESIS_COLUMNS = ('stamp_ns', 'track_id', 'arrival', 'kind', 'weight', 'x', 'y', 'z', 'vx',
+                      'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz', 'mx', 'my',
+                      'mz')
+
+
+class ResultFolder:
+    """The tables and the recording of one run; a context manager.
+
+    Rows are written as they come, so that an interrupted run keeps them.
+    """
+
+    def __init__(self, folder, frame):
+        """Raises OutputError where the folder cannot be made or written."""
+        self.folder = Path(folder)
+        self._frame = frame
+        self._files = []
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._poses = self._table('poses.csv', POSE_COLUMNS)
+            self._smoothed = self._table('poses_smoothed.csv', SMOOTHED_COLUMNS)
+            self._detections = self._table('detections.csv', DETECTION_COLUMNS)
+            self._hypotheses = self._table('hypotheses.csv', HYPOTHESIS_COLUMNS)
+        except OSError as error:
+            self._close_tables()
+            raise OutputError(f'cannot write to {self.folder}: {error.strerror}') from error
+        self._recording = RecordingWriter(self.folder / 'tracks.mcap')
+
+    def _table(self, name, columns):
+        """Open one CSV file and write its head."""
+        stream = open(self.folder / name, 'w', newline='', encoding='utf-8')
+        self._files.append(stream)
+        writer = csv.writer(stream)
+        writer.writerow(columns)
+        return writer
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._close_tables()
+        self._recording.close()
+
+    def _close_tables(self):
+        """Close what is open."""
+        for stream in self._files:
+            stream.close()
+
+    def add_detection(self, d):
+        """One row for a `Detection`."""
+        self._detections.writerow([
+            d.stamp_ns, d.id, 'onset' if d.onset else 'release', repr(d.statistic),
+            d.degrees_of_freedom, repr(d.threshold), repr(d.false_alarm_probability),
+            d.strongest_sensor])
+
+    def add_track(self, track):
+        """One row a pose and one a hypothesis; the closing record of a track has no row."""
+        message = track_dict(track, self._frame)
+        self._recording.write('/tracker_node/tracks', TRACK_ARRAY, {
+            'header': message['header'], 'tracks': [message]}, track.stamp_ns)
+        if track.ended:
+            return
+        self._recording.write('/tracker_node/pose', POSE_WITH_COVARIANCE, {
+            'header': header_dict(track.stamp_ns, self._frame),
+            'pose': pose_with_covariance_dict(track)}, track.stamp_ns)
+        sd = np.sqrt(np.diagonal(track.covariance))
+        self._poses.writerow([track.stamp_ns, track.id, *_floats(
+            track.position, track.velocity, sd, track.moment, [track.weight]),
+            int(track.ambiguous), track.kind, *_floats(
+                [track.kind_weight, track.length, track.length_std])])
+        for h in track.hypotheses:
+            sd = np.sqrt(np.diagonal(h.covariance))
+            self._hypotheses.writerow([track.stamp_ns, track.id, h.arrival, h.kind, *_floats(
+                [h.weight], h.position, h.velocity, sd, h.moment)])
+
+    def add_smoothed(self, pose):
+        """One row for a `SmoothedPose` of a whole track; those of a fixed lag have none."""
+        if pose.complete:
+            sd = np.sqrt(np.diagonal(pose.covariance))
+            self._smoothed.writerow([
+                pose.stamp_ns, pose.id, *_floats(pose.position, pose.velocity, sd, pose.moment),
+                int(pose.ambiguous), pose.kind, *_floats([pose.length, pose.length_std])])
+
+    def write_summary(self, summary):
+        """`summary.json`."""
+        with open(self.folder / 'summary.json', 'w', encoding='utf-8') as stream:
+            json.dump(without_nan(summary), stream, indent=1, allow_nan=False)
+            stream.write('\n')
+
+
+def without_nan(value):
+    """NaN and infinity are no JSON: null instead."""
+    if isinstance(value, dict):
+        return {k: without_nan(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [without_nan(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _floats(*groups):
+    """The shortest texts that read back as the same numbers."""
+    return [repr(float(v)) for group in groups for v in group]

@@ -1,0 +1,121 @@
+"""What a rosbag2 folder of MCAP files consists of: new files, `metadata.yaml`."""
+
+import fcntl
+import os
+from collections import Counter
+from contextlib import suppress
+from typing import NamedTuple
+
+import yaml
+
+from mag_tracking.errors import OutputError
+from mag_tracking.recording.writer import OFFERED_QOS
+
+
+class Topic(NamedTuple):
+    """What a recording says about a topic."""
+
+    type: str
+    definition: str = ''
+    qos: str = OFFERED_QOS
+
+
+class FileSummary(NamedTuple):
+    """What `metadata.yaml` says about one file."""
+
+    name: str
+    counts: Counter
+    first_ns: int | None = None
+    last_ns: int | None = None
+
+
+def offered_qos(reliable=True, latched=False):
+    """`offered_qos_profiles` of a topic, as rosbag2 writes it."""
+    text = OFFERED_QOS if reliable else OFFERED_QOS.replace('reliability: reliable',
+                                                            'reliability: best_effort')
+    return text.replace('durability: volatile', 'durability: transient_local') if latched else text
+
+
+def open_new(path):
+    """A file of one's own to write to, without a buffer that a crash would lose."""
+    stream = open(path, 'xb', buffering=0)
+    # A repair of a file that is still written would spoil it. Some file systems know no locks.
+    with suppress(OSError):
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return stream
+
+
+class WholeStream:
+    """Writes all of what it is given, or raises: a full disk takes a part of it without a word."""
+
+    def __init__(self, raw):
+        self.raw, self.offset = raw, 0
+
+    def write(self, data):
+        """Append `data`."""
+        rest = memoryview(data)
+        while rest:
+            n = self.raw.write(rest)
+            self.offset += n
+            rest = rest[n:]
+
+    def tell(self):
+        """Bytes written."""
+        return self.offset
+
+    def flush(self):
+        """Nothing waits here."""
+
+
+def check_is_free(folder):
+    """Raise OutputError where `folder` is no place for a new recording."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f'{folder} is not a folder')
+    there = sorted(p.name for pattern in ('metadata.yaml', '*.mcap', '*.db3')
+                   for p in folder.glob(pattern))
+    if there:
+        raise OutputError(f'{folder} holds a recording already ({there[0]}); choose another '
+                          f'folder (one that was cut off is made whole by mag-tracking repair)')
+
+
+def write_metadata(folder, files, topics, opener=open_new):
+    """Write rosbag2's `metadata.yaml`, all or nothing.
+
+    Parameters
+    ----------
+    files : list of FileSummary
+    topics : {name: Topic}
+    """
+    counts = sum((f.counts for f in files), Counter())
+    firsts = [f.first_ns for f in files if f.first_ns is not None]
+    lasts = [f.last_ns for f in files if f.last_ns is not None]
+    content = {'rosbag2_bagfile_information': {
+        'version': 9, 'storage_identifier': 'mcap', **_span(firsts, lasts),
+        'message_count': counts.total(),
+        'topics_with_message_count': [
+            {'topic_metadata': {'name': name, 'type': topics[name].type,
+                                'serialization_format': 'cdr',
+                                'offered_qos_profiles': yaml.safe_load(topics[name].qos),
+                                'type_description_hash': ''},
+             'message_count': n} for name, n in counts.items()],
+        'compression_format': '', 'compression_mode': '',
+        'relative_file_paths': [f.name for f in files],
+        'files': [{'path': f.name, 'message_count': f.counts.total(),
+                   **_span([f.first_ns or 0], [f.last_ns or 0])} for f in files],
+        'custom_data': None, 'ros_distro': 'jazzy'}}
+    new = folder / '.metadata.yaml.new'
+    new.unlink(missing_ok=True)
+    stream = WholeStream(opener(new))
+    try:
+        stream.write(yaml.safe_dump(content, sort_keys=False).encode())
+        os.replace(new, folder / 'metadata.yaml')
+    finally:
+        stream.raw.close()
+        new.unlink(missing_ok=True)
+
+
+def _span(firsts, lasts):
+    """Start and duration, as rosbag2 has them."""
+    first, last = min(firsts, default=0), max(lasts, default=0)
+    return {'starting_time': {'nanoseconds_since_epoch': first},
+            'duration': {'nanoseconds': last - first}}

@@ -1,0 +1,121 @@
+"""From a recording to samples and truth."""
+
+from collections import Counter
+
+import numpy as np
+
+from mag_tracking.errors import RecordingError
+from mag_tracking.messages.schema import acceleration_of, sample_of, samples_of, stamp_ns
+from mag_tracking.messages.types import (
+    FIELD_READINGS,
+    IMU,
+    MAGNETIC_FIELD,
+    POSE,
+    RAW_READINGS,
+    decode,
+)
+
+TRUTH_PREFIX = '/ground_truth/'
+"""Poses on topics below this are truth: for reports, never for tracking."""
+
+
+class SampleReader:
+    """Iterates over the samples of a network in a recording; collects the truth beside them.
+
+    Attributes
+    ----------
+    rejected : Counter
+        {cause: number} of messages that are no samples.
+    truth : {topic: list of (stamp_ns, x, y, z, qx, qy, qz, qw)}
+    """
+
+    def __init__(self, recording, network):
+        """Raises RecordingError where the recording has none of the network's topics."""
+        self._recording = recording
+        self._sensors = dict(zip(network.topics, network.names, strict=True))
+        self._imus = {}
+        for topic, name in zip(network.imu_topics, network.names, strict=True):
+            if topic is not None:
+                self._imus.setdefault(topic, []).append(name)
+        self.rejected = Counter()
+        self.truth = {}
+        self._together = recording.types.get(RAW_READINGS) == FIELD_READINGS
+        if recording.types and not self._together \
+                and not any(t in recording.types for t in self._sensors):
+            fields = sorted(t for t, k in recording.types.items() if k == MAGNETIC_FIELD)
+            raise RecordingError(
+                f'{recording.path} has none of the network\'s topics ({", ".join(self._sensors)}); '
+                f'its magnetic fields are on: {", ".join(fields) or "no topic at all"}')
+        for topic in self._sensors:
+            kind = recording.types.get(topic)
+            if kind not in (None, MAGNETIC_FIELD):
+                raise RecordingError(f'{recording.path}: {topic} carries {kind}, '
+                                     f'not {MAGNETIC_FIELD}')
+
+    def missing_topics(self):
+        """The network's topics that are not in the recording; none where readings came together."""
+        if self._together:
+            return []
+        return [t for t in self._sensors if t not in self._recording.types]
+
+    def samples(self, progress=None):
+        """Iterate over `MagSample`s in order of log time; see `Recording.messages`."""
+        return (sample for sample, _ in self._records({}, progress))
+
+    def samples_as_received(self, progress=None):
+        """Iterate over (`MagSample`, log time [ns]) in order of the latter."""
+        return self._records({}, progress)
+
+    def samples_and_accelerations(self, progress=None):
+        """Iterate over `MagSample`s and `AccelerationSample`s in order of log time."""
+        return (sample for sample, _ in self._records(self._imus, progress))
+
+    def _records(self, imus, progress):
+        """(sample, log time) of the sensors, and of the accelerometers {topic: sensors}."""
+        for message in self._recording.messages(progress=progress):
+            sensor = self._sensors.get(message.topic)
+            truth = message.topic.startswith(TRUTH_PREFIX) and message.type == POSE
+            many = message.topic == RAW_READINGS and message.type == FIELD_READINGS
+            shaken = imus.get(message.topic) if message.type == IMU else None
+            if sensor is None and shaken is None and not truth and not many:
+                continue
+            try:
+                content = decode(message)
+                readings = samples_of(content) if many else ()
+            except RecordingError:
+                self.rejected[f'undecodable message on {message.topic}'] += 1
+                continue
+            if truth:
+                self._add_truth(message.topic, content)
+            elif many:
+                yield from ((s, message.log_time_ns) for s in self._of_network(readings))
+            elif shaken is not None:
+                for name in shaken:
+                    yield acceleration_of(content, name), message.log_time_ns
+            else:
+                yield sample_of(content, sensor), message.log_time_ns
+
+    def _of_network(self, samples):
+        """Those of the network's sensors; the others are counted."""
+        known = set(self._sensors.values())
+        for sample in samples:
+            if sample.sensor in known:
+                yield sample
+            else:
+                self.rejected[f'reading of {sample.sensor}, which is not in the network'] += 1
+
+    def _add_truth(self, topic, content):
+        """Keep a pose for the report."""
+        p, q = content.pose.position, content.pose.orientation
+        self.truth.setdefault(topic, []).append(
+            (stamp_ns(content.header.stamp), p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+
+    def truth_arrays(self):
+        """{name: (stamps_ns (n,), positions (n, 3), quaternions (n, 4))}."""
+        out = {}
+        for topic, rows in self.truth.items():
+            rows = sorted(rows)
+            out[topic.removeprefix(TRUTH_PREFIX).removesuffix('/pose')] = (
+                np.array([r[0] for r in rows], dtype=np.int64),
+                np.array([r[1:4] for r in rows]), np.array([r[4:] for r in rows]))
+        return out

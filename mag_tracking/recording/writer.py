@@ -1,0 +1,107 @@
+"""Writer of MCAP recordings that rosbag2 plays."""
+
+from collections import Counter
+from pathlib import Path
+
+import yaml
+from mcap.writer import CompressionType, Writer
+
+from mag_tracking.errors import OutputError
+from mag_tracking.messages.types import definition, encoder
+
+
+class RecordingWriter:
+    """Writes messages to an MCAP file that rosbag2 plays; a context manager.
+
+    Beside the file goes a `metadata.yaml`, so that its folder is a rosbag2
+    recording. Chunks are small, so that a crash loses little.
+    """
+
+    def __init__(self, path):
+        """Raises OutputError where the file cannot be written."""
+        self.path = Path(path)
+        metadata = self.path.parent / 'metadata.yaml'
+        if metadata.exists() and f'- {self.path.name}\n' not in metadata.read_text(
+                encoding='utf-8', errors='replace'):
+            raise OutputError(f'{self.path.parent} holds another recording (its metadata.yaml does '
+                              f'not name {self.path.name}); choose another folder')
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._stream = open(self.path, 'wb')
+        except OSError as error:
+            raise OutputError(f'cannot write {self.path}: {error.strerror}') from error
+        self._writer = Writer(self._stream, chunk_size=1 << 20, compression=CompressionType.ZSTD)
+        self._writer.start(profile='ros2', library='mag_tracking')
+        self._schemas, self._channels, self._counts = {}, {}, Counter()
+        self._sequence = Counter()
+        self._first = self._last = None
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+    def write(self, topic, type_name, message, time_ns):
+        """Append a message, given as nested dicts, logged at `time_ns`.
+
+        Raises RecordingError for a type that `schema` has no definition of.
+        """
+        if topic not in self._channels:
+            self._open_channel(topic, type_name)
+        self._writer.add_message(
+            self._channels[topic][0], log_time=time_ns, publish_time=time_ns,
+            sequence=self._sequence[topic], data=encoder(type_name)(message))
+        self._sequence[topic] += 1
+        self._counts[topic] += 1
+        self._first = time_ns if self._first is None else min(self._first, time_ns)
+        self._last = time_ns if self._last is None else max(self._last, time_ns)
+
+    def _open_channel(self, topic, type_name):
+        """Register schema and channel."""
+        if type_name not in self._schemas:
+            self._schemas[type_name] = self._writer.register_schema(
+                type_name, 'ros2msg', definition(type_name).encode())
+        channel = self._writer.register_channel(
+            topic, 'cdr', self._schemas[type_name], {'offered_qos_profiles': OFFERED_QOS})
+        self._channels[topic] = channel, type_name
+
+    def close(self):
+        """Finish the file and write `metadata.yaml`."""
+        if self._stream.closed:
+            return
+        self._writer.finish()
+        self._stream.close()
+        first, last = self._first or 0, self._last or 0
+        metadata = {'rosbag2_bagfile_information': {
+            'version': 9, 'storage_identifier': 'mcap',
+            'duration': {'nanoseconds': last - first},
+            'starting_time': {'nanoseconds_since_epoch': first},
+            'message_count': sum(self._counts.values()),
+            'topics_with_message_count': [
+                {'topic_metadata': {'name': t, 'type': type_name, 'serialization_format': 'cdr',
+                                    'offered_qos_profiles': yaml.safe_load(OFFERED_QOS),
+                                    'type_description_hash': ''},
+                 'message_count': self._counts[t]}
+                for t, (_, type_name) in self._channels.items()],
+            'compression_format': '', 'compression_mode': '',
+            'relative_file_paths': [self.path.name],
+            'files': [{'path': self.path.name,
+                       'starting_time': {'nanoseconds_since_epoch': first},
+                       'duration': {'nanoseconds': last - first},
+                       'message_count': sum(self._counts.values())}],
+            'custom_data': None, 'ros_distro': 'jazzy'}}
+        with open(self.path.parent / 'metadata.yaml', 'w', encoding='utf-8') as stream:
+            yaml.safe_dump(metadata, stream, sort_keys=False)
+
+
+OFFERED_QOS = '''- history: keep_last
+  depth: 10
+  reliability: reliable
+  durability: volatile
+  deadline: {sec: 9223372036, nsec: 854775807}
+  lifespan: {sec: 9223372036, nsec: 854775807}
+  liveliness: automatic
+  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}
+  avoid_ros_namespace_conventions: false
+'''

@@ -1,0 +1,1 @@
+"""Align: calibrated readings to frames of the whole network."""

@@ -1,0 +1,1 @@
+"""Calibrate: raw readings to calibrated ones."""

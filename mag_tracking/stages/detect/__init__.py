@@ -1,0 +1,1 @@
+"""Detect: the energy test on frames."""

@@ -1,0 +1,121 @@
+"""Detect: the chi-square energy test on whitened frames.
+
+Source: T10 section 5.4, eq. (5.14)-(5.19), over all sensors at once.
+"""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from mag_tracking.errors import SettingsError
+from mag_tracking.inference.axes import whitened_energy
+from mag_tracking.inference.detection_theory import energy_threshold
+from mag_tracking.records import Detection
+from mag_tracking.units import NS
+
+RECOVERY_S = 5.0
+"""[s] After a target the calibration needs about this long to learn the background anew."""
+
+
+class Detect:
+    """Frames to frames with a verdict, and a `Detection` at onset and release."""
+
+    def __init__(self, network, settings):
+        if settings.release_probability < settings.false_alarm_probability:
+            raise SettingsError(
+                f'detect.release_probability: {settings.release_probability:g} is below '
+                f'false_alarm_probability ({settings.false_alarm_probability:g}): what is loud '
+                'enough to begin would be quiet enough to end')
+        self.counts = Counter()
+        self._names = network.names
+        self._settings = settings
+        self._thresholds = {}
+        self._next_id = 1
+        self._reset()
+
+    def _reset(self):
+        """No target."""
+        self._present = False
+        self._above = 0
+        self._last_ns = self._loud_ns = self._onset_ns = None
+        self._unlearnt_s = 0.0
+
+    def threshold(self, probability, degrees_of_freedom):
+        """Threshold of the energy, remembered."""
+        key = probability, degrees_of_freedom
+        if key not in self._thresholds:
+            self._thresholds[key] = float(energy_threshold(probability, degrees_of_freedom))
+        return self._thresholds[key]
+
+    def feed(self, frame):
+        """A `FieldFrame` gives itself with the verdict, after any `Detection`."""
+        out = []
+        if self._last_ns is not None and frame.stamp_ns <= self._last_ns:
+            self.counts['time jumped back'] += 1
+            out = self._release(self._last_ns, float('nan'), 0, '')
+            self._reset()
+        self._last_ns = frame.stamp_ns
+        try:
+            energy, axes = whitened_energy(
+                frame.field, frame.covariance + self._allowance(frame.stamp_ns) * np.eye(3))
+        except np.linalg.LinAlgError:
+            self.counts['rejected: frame with a covariance that is not positive definite'] += 1
+            return out
+        statistic, n = float(energy.sum()), int(axes.sum())
+        self.counts['frames'] += 1
+        if n:
+            per_axis = np.divide(energy, axes, out=np.zeros(len(energy)), where=axes > 0)
+            out += self._judge(frame.stamp_ns, statistic, n, self._names[int(per_axis.argmax())])
+        else:
+            self.counts['frames without a measurement'] += 1
+        return [*out, replace(frame, target_present=self._present, statistic=statistic,
+                              degrees_of_freedom=n)]
+
+    def _allowance(self, stamp_ns):
+        """[T^2] Variance of what the background may be off by."""
+        if self._present:
+            self._unlearnt_s = (stamp_ns - self._onset_ns) / NS
+        elif self._loud_ns is not None and stamp_ns - self._loud_ns > RECOVERY_S * NS:
+            self._unlearnt_s = 0.0
+        s = self._settings
+        return (s.background_std + s.background_drift * self._unlearnt_s) ** 2
+
+    def _judge(self, stamp_ns, statistic, n, strongest):
+        """Onset, hold and release; the detections that follow."""
+        s = self._settings
+        if statistic > self.threshold(s.false_alarm_probability, n):
+            self.counts['frames above the threshold'] += 1
+            self._above += 1
+        else:
+            self._above = 0
+        if statistic > self.threshold(s.release_probability, n):
+            self._loud_ns = stamp_ns
+        if not self._present and self._above >= s.onset_frames:
+            self._present, self._loud_ns = True, stamp_ns
+            # What was not learnt for an earlier target is still not learnt.
+            self._onset_ns = stamp_ns - int(self._unlearnt_s * NS)
+            self.counts['onsets'] += 1
+            return [self._detection(stamp_ns, True, statistic, n, strongest)]
+        if self._present and stamp_ns - self._loud_ns > s.hold_s * NS:
+            return self._release(stamp_ns, statistic, n, strongest)
+        return []
+
+    def _release(self, stamp_ns, statistic, n, strongest):
+        """End the detection, if there is one."""
+        if not self._present:
+            return []
+        self._present = False
+        detection = self._detection(stamp_ns, False, statistic, n, strongest)
+        self._next_id += 1
+        return [detection]
+
+    def _detection(self, stamp_ns, onset, statistic, n, strongest):
+        """The record."""
+        p = self._settings.false_alarm_probability
+        return Detection(stamp_ns, self._next_id, onset, statistic, n,
+                         self.threshold(p, n) if n else float('nan'), p, strongest)
+
+    def flush(self):
+        """Nothing is held back: []."""
+        return []

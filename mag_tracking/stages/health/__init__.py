@@ -1,0 +1,1 @@
+"""Health: what is wrong with the readings of a sensor."""

@@ -1,0 +1,329 @@
+"""Health: what is wrong with the readings of a sensor, and what to do about it.
+
+It only looks: nothing is changed or held back. Memory is bounded by a window of readings.
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from mag_tracking.calibration.saturation import cut_off
+from mag_tracking.units import NS
+
+WINDOW = 512
+"""Readings that rates, noise and delays are of; the latest."""
+EVERY = 64
+"""So often they are looked at as a whole."""
+UNKNOWN = np.iinfo(np.int64).min
+"""Of a reading whose receipt is not known."""
+STEP_S = 0.25
+"""[s] A clock has stepped where a stamp is off by more while the reading came in time."""
+REPLAYED_S = 86400.0
+"""[s] Stamps that are older are of a replay (or of another clock: `doctoring` compares sensors)."""
+LOST = 1.5
+"""An interval longer than so many usual ones has lost readings in it."""
+IRREGULAR = 0.3
+"""Where intervals scatter by more than this share, nobody can count what is lost."""
+STUCK_S = 1.0
+"""[s] Readings that stay the same for longer are of a sensor that is stuck."""
+SPIKE = 30.0
+"""A reading that is off both its neighbours, the same way, by so many noise deviations."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that is wrong."""
+
+    serious: bool
+    """What comes of it is wrong, not only worse."""
+    subject: str
+    """The sensor, or the stage."""
+    what: str
+    advice: str
+
+    def __str__(self):
+        return f'{self.subject}: {self.what}; {self.advice}'
+
+
+class SensorHealth:
+    """Looks at the readings of one sensor as they come.
+
+    That is whenever `every` so many have come, and before each answer; or when many are
+    given at once.
+    """
+
+    def __init__(self, every=EVERY):
+        self._every = every
+        self._counts = Counter()
+        self._largest_step_s = 0.0
+        self._new = []
+        self._stamps, self._received = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        self._fields = np.zeros((0, 3))
+        self._interval_ns, self._spread = float('nan'), float('inf')
+        self._noise = np.full(3, np.nan)
+        # What was made of the window, until new readings are taken into it.
+        self._made = {}
+        # Since when the reading has been what it is, and how long ago one was stuck.
+        self._since_ns, self._stuck_ago = None, WINDOW
+
+    def add(self, stamp_ns, field, received_ns=None):
+        """A reading: `field` (3,) [T] as the sensor gave it; `received_ns` by the host's clock."""
+        self._new.append((stamp_ns, field, UNKNOWN if received_ns is None else received_ns))
+        if len(self._new) == self._every:
+            self.look()
+
+    @property
+    def counts(self):
+        """`readings`, `lost`, `duplicates`, `stamps that went back`, `clock steps`, `spikes`,
+        `saturated`, `without any axis`, `stuck readings`; and `x`, `y`, `z` missing."""
+        self.look()
+        return self._counts
+
+    def look(self):
+        """Take the new readings into the window."""
+        if self._new:
+            stamps, fields, received = zip(*self._new, strict=True)
+            self._new = []
+            self.take(np.array(stamps, dtype=np.int64), np.array(fields, dtype=float),
+                      np.array(received, dtype=np.int64))
+
+    def take(self, stamps, fields, received):
+        """Take readings into the window: (n,) [ns], (n, 3) [T], and (n,) [ns] or `UNKNOWN`.
+
+        No more than `WINDOW` at once; they may be changed later. Those of `add` are not waited
+        for: it is either the one or the other.
+        """
+        n, self._made = len(stamps), {}
+        if not n:
+            return
+        self._stamps = np.append(self._stamps, stamps)[-WINDOW:]
+        self._received = np.append(self._received, received)[-WINDOW:]
+        self._fields = np.append(self._fields, fields, axis=0)[-WINDOW:]
+        self._counts['readings'] += n
+        self._in_time(n)
+        self._values(n)
+
+    def _in_time(self, n):
+        """Count what is wrong with the stamps of the `n` latest."""
+        # With the one before them, where there is one.
+        intervals = np.diff(self._stamps[-n - 1:])
+        known = self._received[-n - 1:] != UNKNOWN
+        receipts = np.diff(np.where(known, self._received[-n - 1:], 0)) / NS
+        steps = receipts - intervals / NS
+        usual = 0.0 if np.isnan(self._interval_ns) else self._interval_ns / NS
+        # Of the two the stamp has to be the odd one: a host that stalls, and what it reads in a
+        # burst then, are no step.
+        stepped = known[1:] & known[:-1] & (np.abs(steps) > STEP_S) \
+            & (np.abs(receipts - usual) < STEP_S) & (np.abs(intervals / NS - usual) > STEP_S)
+        if stepped.any():
+            self._counts['clock steps'] += int(stepped.sum())
+            self._largest_step_s = max(self._largest_step_s, *steps[stepped].tolist(), key=abs)
+        self._counts['duplicates'] += int((intervals == 0).sum())
+        self._counts['stamps that went back'] += int((intervals < 0).sum())
+        if self._spread < IRREGULAR:
+            long = (intervals > LOST * self._interval_ns) & (intervals < 3600 * NS) & ~stepped
+            self._counts['lost'] += int(np.sum(np.round(intervals[long] / self._interval_ns) - 1))
+        forward = np.diff(self._stamps)
+        forward = forward[forward > 0]
+        if len(forward) >= 8:
+            self._interval_ns = quantiles(forward, 0.5)[0]
+            self._spread = quantiles(np.abs(forward - self._interval_ns), 0.5)[0] \
+                / self._interval_ns
+
+    def _values(self, n):
+        """Count what is wrong with the fields of the `n` latest."""
+        missing = np.isnan(self._fields[-n:])
+        for axis, count in zip('xyz', missing.sum(axis=0).tolist(), strict=True):
+            self._counts[axis] += count
+        self._counts['without any axis'] += int(missing.all(axis=1).sum())
+        self._stuck(n)
+        # With the two before them; the last one's neighbour is still to come.
+        fields = self._fields[-n - 2:]
+        before, after = np.diff(fields, axis=0)[:-1], -np.diff(fields, axis=0)[1:]
+        # A comparison with NaN is false: without a known noise there is no spike.
+        alone = (np.minimum(np.abs(before), np.abs(after)) > SPIKE * self._noise) \
+            & (before * after > 0.0)
+        self._counts['spikes'] += int(alone.any(axis=1).sum())
+        if self._stuck_ago >= WINDOW:
+            self._noise = self._made['noise'] = _noise(self._fields)
+        cut = np.array([cut_off(axis) for axis in self._fields.T]).any(axis=0)
+        self._counts['saturated'] += int(np.count_nonzero(cut[-n:]))
+
+    def _stuck(self, n):
+        """Count those of the `n` latest that have been the same for too long."""
+        stamps, fields = self._stamps[-n:], self._fields[-n - 1:]
+        same = ((fields[1:] == fields[:-1]) | np.isnan(fields[1:]) & np.isnan(fields[:-1])).all(1)
+        if len(same) < n:
+            same = np.append(False, same)
+        # Of each reading the place of the one that it repeats; -1: from before these.
+        origin = np.maximum.accumulate(np.where(same, -1, np.arange(n)))
+        since = np.where(origin < 0, self._since_ns or 0, stamps[origin])
+        stuck = np.flatnonzero(stamps - since > STUCK_S * NS)
+        self._since_ns = int(since[-1])
+        self._counts['stuck readings'] += len(stuck)
+        self._stuck_ago = n - 1 - int(stuck[-1]) if len(stuck) else self._stuck_ago + n
+
+    @property
+    def rate(self):
+        """[Hz] of the latest readings; NaN before there are enough."""
+        self.look()
+        return NS / self._interval_ns
+
+    @property
+    def noise_std(self):
+        """(3,) [T] by differences of neighbours, so that a target that passes is not in it."""
+        return self._once('noise', _noise)
+
+    @property
+    def field(self):
+        """(3,) [T] median of the latest readings; NaN of an axis that none has."""
+        return self._once('median', _median)
+
+    def _once(self, name, make):
+        """`make` of the fields in the window; once, however often it is asked for."""
+        self.look()
+        if name not in self._made:
+            self._made[name] = make(self._fields)
+        return self._made[name]
+
+    @property
+    def dead_axes(self):
+        """Such as 'xz': axes that have not changed in a window in which another one did."""
+        self.look()
+        if len(self._fields) < WINDOW:
+            return ''
+        there = ~np.isnan(self._fields).any(axis=0)
+        still = there & (self._fields == self._fields[0]).all(axis=0)
+        return ''.join(np.array(list('xyz'))[still]) if still.sum() < there.sum() else ''
+
+    @property
+    def delay_s(self):
+        """(median, 5 %, 95 %) [s] from stamp to receipt; NaN where receipts are not known."""
+        self.look()
+        if 'delay' not in self._made:
+            known = self._received != UNKNOWN
+            delays = (self._received - self._stamps)[known] / NS
+            self._made['delay'] = quantiles(delays, 0.5, 0.05, 0.95)
+        return self._made['delay']
+
+    def findings(self, name, noise_std=None, max_field=1e-3):
+        """What is wrong, the worst first: list of `Finding`.
+
+        Parameters
+        ----------
+        name : str
+            Of the sensor.
+        noise_std : (3,) [T], optional
+            That it was calibrated to.
+        max_field : float [T]
+            Beyond this it is rejected.
+        """
+        n = self.counts['readings']
+        if not n:
+            return [Finding(True, name, 'no reading', 'look at its cable, its driver and the topic '
+                            'in the network file')]
+        found = [*self._time_findings(name, n), *self._value_findings(name, n, max_field)]
+        if noise_std is not None and not np.nanmax(np.abs(self.field), initial=0.0) > max_field:
+            worse = self.noise_std / noise_std
+            if np.nanmax(worse, initial=0.0) > 3.0:
+                axis = int(np.nanargmax(worse))
+                found.append(Finding(False, name, f'{"xyz"[axis]} is {worse[axis]:.0f} times as '
+                                     'noisy as it was calibrated', 'look for a new source beside '
+                                     'it (a motor, a cable), or calibrate anew'))
+        return sorted(found, key=lambda f: not f.serious)
+
+    def _time_findings(self, name, n):
+        """What is wrong with stamps."""
+        c = self.counts
+        middle, low, high = self.delay_s
+        if c['clock steps']:
+            yield Finding(True, name, f'its clock stepped {c["clock steps"]} times against the '
+                          f'host\'s, by up to {self._largest_step_s:+.2f} s', 'let the clocks '
+                          'follow one source (chrony, PTP), and stamp by a monotonic one')
+        if c['stamps that went back']:
+            yield Finding(True, name, f'stamps went back {c["stamps that went back"]} times',
+                          'two publishers on one topic, a clock that was set, or a looped replay')
+        if c['duplicates'] > 0.001 * n:
+            yield Finding(False, name, f'{c["duplicates"]} of {n} readings have the stamp of the '
+                          'one before', 'the driver publishes readings twice, or stamps too '
+                          'coarsely')
+        if c['lost'] > 0.01 * n:
+            yield Finding(c['lost'] > 0.2 * n, name, f'{c["lost"]} readings are missing between '
+                          f'{n}', 'look at the link, and at the queue of whoever records')
+        if c['clock steps'] or abs(middle) > REPLAYED_S:
+            return
+        if high - low > 0.05:
+            yield Finding(False, name, f'readings take {1e3 * low:.0f} to {1e3 * high:.0f} ms to '
+                          'come', 'stamps by the sensor itself would be truer than by receipt')
+        elif abs(middle) > 1.0:
+            yield Finding(False, name, f'stamps are {middle:.1f} s before they are received',
+                          'the clocks of sensor and host disagree; calibrate with knocks')
+
+    def _value_findings(self, name, n, max_field):
+        """What is wrong with fields."""
+        c = self.counts
+        size = float(np.sqrt(np.nansum(self.field**2)))
+        if size > max_field:
+            yield Finding(True, name, f'a field of {size:.3g} T is rejected, the limit is '
+                          f'{max_field:g} T', 'gauss or microtesla published as tesla? Near a '
+                          'magnet raise calibrate.max_field')
+        if c['without any axis'] > 0.01 * n:
+            yield Finding(True, name, f'{c["without any axis"]} of {n} readings have no axis at '
+                          'all', 'look at the sensor and its driver')
+        for axis in self.dead_axes:
+            yield Finding(True, name, f'{axis} does not change', 'the axis is dead, or its steps '
+                          'are coarser than its noise: then give noise_std in the network file')
+        for axis in 'xyz':
+            if 0.01 * n < c[axis] - c['without any axis'] and c[axis] < 0.99 * n:
+                yield Finding(False, name, f'{axis} is missing in {c[axis]} of {n} readings',
+                              'look at the sensor and its driver')
+        if c['stuck readings']:
+            yield Finding(True, name, f'{c["stuck readings"]} readings are the same as all for '
+                          f'more than {STUCK_S:g} s before', 'the sensor or its driver is stuck: '
+                          'switch it off and on')
+        if c['saturated'] > 0.001 * n:
+            yield Finding(True, name, f'{c["saturated"]} of {n} readings stand at the end of the '
+                          'range', 'set a larger range, or move the sensor away')
+        if c['spikes'] > 0.001 * n:
+            yield Finding(False, name, f'{c["spikes"]} of {n} readings are spikes', 'look at '
+                          'plugs, supply and checksums')
+
+
+def quantiles(values, *shares):
+    """[float] quantiles of (n,) finite `values`, by linear interpolation; NaN of none.
+
+    As `numpy.quantile`, whose checks take longer than the work where arrays are small.
+    """
+    if not len(values):
+        return [float('nan')] * len(shares)
+    ordered, out = np.sort(values), []
+    for share in shares:
+        place = share * (len(ordered) - 1)
+        low = int(place)
+        a, b = float(ordered[low]), float(ordered[min(low + 1, len(ordered) - 1)])
+        out.append(a + (place - low) * (b - a))
+    return out
+
+
+def _median(fields):
+    """(3,) [T]; NaN of an axis that none has."""
+    return np.array([quantiles(axis[~np.isnan(axis)], 0.5)[0] for axis in fields.T])
+
+
+def _noise(fields):
+    """(3,) [T] deviation by second differences, without the largest; NaN of a missing axis.
+
+    Of the second: a passing target has a slope, but hardly a curve from one reading to the next.
+    """
+    out = np.full(3, np.nan)
+    for axis, d in enumerate(np.abs(np.diff(fields, n=2, axis=0)).T):
+        d = d[~np.isnan(d)]
+        if len(d) >= 8:
+            # A sensor with coarse steps is no better than those.
+            step = d[d > 0.0].min(initial=np.inf)
+            least = step / np.sqrt(12.0) if np.isfinite(step) else 0.0
+            # Their mean, not their median: of coarse steps the median is one.
+            usual = d[d <= max(8.0 * quantiles(d, 0.6)[0], least)]
+            out[axis] = max(np.sqrt(np.pi / 12.0) * usual.mean(), least)
+    return out

@@ -1,0 +1,1 @@
+"""Survey: orientations and clock offsets of a network."""

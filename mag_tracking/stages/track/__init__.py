@@ -1,0 +1,1 @@
+"""Track: from frames to tracks."""

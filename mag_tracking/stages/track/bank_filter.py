@@ -1,0 +1,129 @@
+"""Prediction and update of a bank: where the target's physics meets the filter."""
+
+import numpy as np
+
+from mag_tracking.inference import kalman
+from mag_tracking.inference.time_update import predict
+from mag_tracking.stages.track.observation import Observation
+
+ONE_TIME = 0.05
+"""A frame that is shorter than this share of the time since the frame before is one time, and so
+is the first of a track: velocities are better learnt from frame to frame than within one."""
+
+
+class BankFilter:
+    """Moves a `FilterBank` through frames; has no memory of its own."""
+
+    def __init__(self, network, model, settings):
+        """`settings` is a `TrackSettings`; the live ones may be changed by `configure`."""
+        self._n_sensors = len(network)
+        self._model = model
+        self.observation = Observation(network, model, np.deg2rad(settings.mounting_std_deg),
+                                       settings.model_error_time_s)
+        self.configure(settings)
+
+    def configure(self, settings):
+        """Take new values of the live settings."""
+        self._settings = settings
+        group = settings.vehicle if settings.target == 'vehicle' else settings.magnet
+        self._near_field_lengths = np.atleast_1d(getattr(
+            group, 'near_field_lengths' if settings.target == 'vehicle' else 'near_field_length'))
+
+    def predict(self, bank, dt):
+        """Time update in place; backwards in time without process noise.
+
+        Returns
+        -------
+        F : (n_hyp, n_t, n_t) or (n_t, n_t)
+            Jacobian of the target's motion.
+        decay : (n_x - n_t,)
+            What the other states were multiplied by.
+        """
+        n_t = self.observation.n_target
+        x_target, F, Q = self._model.propagate(bank.x[:, :n_t], dt, bank.P[:, :n_t, :n_t])
+        decay, variance = self.observation.drift(dt, self._settings.background_drift)
+        predict(bank.x, bank.P, x_target, F, Q if dt > 0.0 else 0.0 * Q, variance, decay)
+        return F, decay
+
+    def fields(self, x, kind, frame, dt):
+        """Fields of the states `x` (n_hyp, n_x) of the kinds `kind`; see `Observation.fields`.
+
+        `dt` [s] since the frame before says whether the frame is one time.
+        """
+        one_time = dt <= 0.0 or np.ptp(frame.time_offset) < ONE_TIME * dt
+        offset = np.zeros(self._n_sensors) if one_time else frame.time_offset
+        return self.observation.fields(x, offset, self._near_field_lengths[kind],
+                                       self._settings.field_error)
+
+    def predicted_field(self, bank, i, frame, dt):
+        """(n_sensors, 3) [T] the field of the frame as hypothesis `i` has it, with backgrounds.
+
+        Without what it takes for errors of its model: with them anything would seem to fit.
+        """
+        x = self.observation.without_errors(bank.x[i:i + 1])
+        h, _, _ = self.fields(x, bank.kind[i:i + 1], frame, dt)
+        return h[0] + x[0, -3 * self._n_sensors:].reshape(-1, 3)
+
+    def update(self, bank, frame, dt, x_lin=None):
+        """Measurement update in place; the arrays that `bank.x` and `bank.P` were stay as they are.
+
+        It is linearised at `x_lin` (n_hyp, n_x), or if that is left out at the prediction and
+        then again as often as the settings say. Returns the log-likelihood (n_hyp,) of the frame.
+        """
+        return self._update(bank, frame, dt, x_lin)[0]
+
+    def update_with_gains(self, bank, frame, dt, x_lin=None):
+        """The same, for a backward pass: (log-likelihood (n_hyp,), `kalman.Gains`)."""
+        return self._update(bank, frame, dt, x_lin, wants_gains=True)
+
+    def _update(self, bank, frame, dt, x_lin, wants_gains=False):
+        """Log-likelihood (n_hyp,), and the `kalman.Gains` or None."""
+        covariance = known_covariance(frame)
+        x_prior, P_prior = bank.x, bank.P
+        iterations = self._settings.iterations if x_lin is None else 1
+        x_lin = bank.x.copy() if x_lin is None else x_lin
+        for _ in range(iterations):
+            bank.x, bank.P = x_prior.copy(), P_prior.copy()
+            h, H, inflation = self.fields(x_lin, bank.kind, frame, dt)
+            # A dipole on a sensor has no field: such a hypothesis is as good as ruled out.
+            lost = ~(np.isfinite(h).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3))
+                     & np.isfinite(inflation).all(axis=1))
+            h[lost], H[lost], inflation[lost] = 0.0, 0.0, 0.0
+            gains = kalman.Gains.of(H, self.observation.n_own, bank.x.shape[1]) \
+                if wants_gains else None
+            log_likelihood, bank.nis = kalman.update(
+                bank.x, bank.P, frame.field, h, H, covariance, inflation, x_lin,
+                self.observation.n_own, gains)
+            log_likelihood[lost] = -np.inf
+            x_lin = bank.x.copy()
+        bank.nis[:, np.isnan(frame.field).all(axis=1)] = np.nan
+        return log_likelihood, gains
+
+    def is_strange(self, bank, i, frame):
+        """Whether hypothesis `i`, just updated with the `frame`, is contradicted by it."""
+        n_y = np.count_nonzero(~np.isnan(frame.field))
+        return bool(np.nansum(bank.nis[i]) > self._settings.end_nis * n_y)
+
+
+class NoTarget:
+    """The filter of no target at all, only backgrounds that wander: what evidence is against."""
+
+    def __init__(self, n_sensors, background_std):
+        self._x = np.zeros((1, 3 * n_sensors))
+        self._P = background_std**2 * np.eye(3 * n_sensors)[None]
+
+    def log_density(self, frame, dt, background_drift):
+        """Log-density of the frame given those before; `dt` [s] since the last one."""
+        n = len(frame.field)
+        i = np.arange(3 * n)
+        self._P[0, i, i] += background_drift**2 * dt
+        log_likelihood, _ = kalman.update(
+            self._x, self._P, frame.field, np.zeros((1, n, 3)), np.zeros((1, n, 3, 0)),
+            known_covariance(frame), np.zeros((1, n)))
+        return float(log_likelihood[0])
+
+
+def known_covariance(frame):
+    """(n_sensors, 3, 3) [T^2]; identity where an axis is missing."""
+    return np.where(np.isnan(frame.covariance), np.eye(3), frame.covariance)
+

@@ -1,0 +1,171 @@
+"""Relinearise: the leading hypotheses of a running track once more, by what is known by now.
+
+An extended Kalman filter linearises each frame where it then believed the target to be. Far ahead
+of the sensors that is metres off, and what it wrongly took for known there it never unlearns. So
+the latest frames are filtered and smoothed again, linearised along the smoothed path of each
+leading hypothesis: Gauss-Newton steps on its path. Where they have settled, and the path explains
+the frames no worse than the filter did, its state and covariance take the place of the filter's.
+Its weight stays: those of hypotheses that are done again and of others could not be compared.
+
+Source: Bell 1994, The iterated Kalman smoother as a Gauss-Newton method.
+"""
+
+from collections import Counter
+
+import numpy as np
+
+from mag_tracking.inference.smoother import Step, smoothed_states
+from mag_tracking.units import NS
+
+LEADING = np.log(1e3)
+"""A hypothesis leads that is not lighter than the heaviest by more than this."""
+
+PASSES = 3
+"""Gauss-Newton steps each time; the next time goes on from where they led."""
+
+SETTLED = 0.3
+"""In deviations of the position: a path has settled that the last step moved no more than this
+anywhere."""
+
+TRIED, IN_VAIN = 'paths linearised anew', 'paths linearised anew in vain'
+"""What is counted."""
+
+MOST_FRAMES = 64
+"""The window is shorter where it would hold more than half of these: at 100 frames a second one of
+seconds would take more than a core."""
+
+MOST_NUMBERS = 5_000_000
+"""Frames times hypotheses times states squared: with many sensors it is done for fewer of them."""
+
+
+class Relinearisation:
+    """The latest frames of a running track, and the path of each hypothesis through them."""
+
+    def __init__(self, interval_s, window_s, most):
+        self._interval_ns, self._window_ns, self._most = interval_s * NS, window_s * NS, most
+        self.clear()
+
+    def clear(self):
+        """Nothing is kept: no track is running."""
+        self._anchor = None
+
+    def begin(self, bank):
+        """A track begins with the `FilterBank`, which is not yet updated with its first frame.
+
+        A copy of it is the anchor: where the passes start from.
+        """
+        self._anchor, self._updated = bank.copy(), False
+        self._frames, self._intervals = [], []
+        # At each frame, and of each hypothesis of the anchor: where it is linearised, and the
+        # log-likelihood that the filter gave it.
+        self._paths, self._log_likelihoods = [], []
+        self._last_ns, self._stale = None, False
+
+    def begin_anew(self):
+        """The filter has changed: what it did before the next frame is not to be done again."""
+        self._stale = self._anchor is not None
+
+    def add(self, bank, predicted, log_likelihood, frame, dt):
+        """The `FilterBank` was updated with a `FieldFrame`, `dt` [s] after the one before.
+
+        `log_likelihood` (n_hyp,) of it, linearised at the states `predicted` (n_hyp, n_x); where
+        the filter iterates its updates that is not quite where it ended.
+        """
+        if self._anchor is None:
+            return
+        if self._stale:
+            self.begin(bank)
+            self._updated = True
+        if len(bank) < len(self._anchor) // 2:
+            self._keep(np.isin(self._anchor.origin, bank.origin))
+        rows = self._rows(bank)
+        path, of_frame = self._anchor.x.copy(), np.full(len(self._anchor), -np.inf)
+        path[rows], of_frame[rows] = predicted, log_likelihood
+        self._frames.append(frame)
+        self._intervals.append(dt)
+        self._paths.append(path)
+        self._log_likelihoods.append(of_frame)
+        if self._last_ns is None:
+            self._last_ns = frame.stamp_ns
+
+    def _rows(self, bank):
+        """Rows of the anchor that the hypotheses of `bank` started from."""
+        return np.searchsorted(self._anchor.origin, bank.origin)
+
+    def _keep(self, mask):
+        """Keep the rows of `mask` of all that is kept for each hypothesis of the anchor."""
+        self._anchor.keep(mask)
+        self._paths = [path[mask] for path in self._paths]
+        self._log_likelihoods = [of_frame[mask] for of_frame in self._log_likelihoods]
+
+    def improve(self, bank_filter, bank):
+        """Linearise the leading hypotheses of the `FilterBank` anew, in place, if it is time to.
+
+        By the `BankFilter` that it is moved with. Returns a Counter of those it was tried for, and
+        of those for which it was of no use: they stay as they were.
+        """
+        if self._anchor is None or self._frames[-1].stamp_ns - self._last_ns < self._interval_ns:
+            return Counter()
+        self._last_ns = self._frames[-1].stamp_ns
+        self._move_on(bank_filter, bank)
+        if self._updated and len(self._frames) == 1:
+            return Counter()
+        leading = self._leading(bank)
+        rows = self._rows(bank)[leading]
+        paths = [path[rows] for path in self._paths]
+        for _ in range(PASSES):
+            last, log_likelihood, new = self._pass(bank_filter, rows, paths)
+            settled, paths = _settled(paths, new), [x for x, _ in new]
+        finite = np.isfinite(log_likelihood) & np.isfinite(paths).all(axis=(0, 2))
+        for path, improved in zip(self._paths, paths, strict=True):
+            path[rows[finite]] = improved[finite]
+        filtered = np.sum(self._log_likelihoods[int(self._updated):], axis=0)[rows]
+        taken = finite & settled & (log_likelihood >= filtered)
+        bank.x[leading[taken]], bank.P[leading[taken]] = last.x[taken], last.P[taken]
+        return Counter({TRIED: len(taken), IN_VAIN: int(np.count_nonzero(~taken))})
+
+    def _leading(self, bank):
+        """Rows of the heaviest hypotheses, as many as it is done for."""
+        affordable = MOST_NUMBERS // (len(self._frames) * bank.x.shape[1]**2)
+        order = np.argsort(-bank.log_w, kind='stable')
+        leading = order[bank.log_w[order] >= bank.log_w.max() - LEADING]
+        return leading[:max(1, min(self._most, affordable))]
+
+    def _move_on(self, bank_filter, bank):
+        """Once the frames are of twice the window, the anchor moves to where the window begins."""
+        now, n_frames = self._frames[-1].stamp_ns, len(self._frames)
+        if now - self._frames[0].stamp_ns <= 2 * self._window_ns and n_frames <= MOST_FRAMES:
+            return
+        self._keep(np.isin(self._anchor.origin, bank.origin))
+        n = next(k for k, f in enumerate(self._frames) if now - f.stamp_ns <= self._window_ns
+                 and n_frames - k <= MOST_FRAMES // 2)
+        for k in range(n + 1):
+            self._forward(bank_filter, self._anchor, k, self._paths[k])
+        self._frames, self._intervals = self._frames[n:], self._intervals[n:]
+        self._paths, self._log_likelihoods = self._paths[n:], self._log_likelihoods[n:]
+        self._updated = True
+
+    def _forward(self, bank_filter, bank, k, path):
+        """`bank` through frame k, linearised at `path`; its log-likelihood and the `Step`."""
+        F, decay = bank_filter.predict(bank, self._intervals[k]) if k else (None, None)
+        if k == 0 and self._updated:
+            return 0.0, Step(bank.x.copy(), bank.P.copy(), None)
+        log_likelihood, gains = bank_filter.update_with_gains(
+            bank, self._frames[k], self._intervals[k], path)
+        return log_likelihood, Step(bank.x.copy(), bank.P.copy(), gains, F, decay)
+
+    def _pass(self, bank_filter, rows, paths):
+        """Last `Step`, log-likelihood and [(smoothed states, deviation)] of rows of the anchor."""
+        bank, log_likelihood, steps = self._anchor.rows(rows), np.zeros(len(rows)), []
+        for k, path in enumerate(paths):
+            of_frame, step = self._forward(bank_filter, bank, k, path)
+            log_likelihood = log_likelihood + of_frame
+            steps.append(step)
+        std = [np.sqrt(np.einsum('pii->p', step.P[:, :3, :3])) for step in steps]
+        return steps[-1], log_likelihood, list(zip(smoothed_states(steps), std, strict=True))
+
+
+def _settled(paths, new):
+    """(n_rows,) whether the `new` [(states, deviation of the position)] are where `paths` are."""
+    return np.all([np.linalg.norm((x - path)[:, :3], axis=1) <= SETTLED * std
+                   for path, (x, std) in zip(paths, new, strict=True)], axis=0)

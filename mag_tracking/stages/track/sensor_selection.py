@@ -1,0 +1,83 @@
+"""Neighbourhood: of a large network the sensors that a track needs, which change as it moves on.
+
+A state has up to nine numbers of each sensor, and an update takes time with the cube of
+the sensors. Far ones see nothing of the target; what they could still tell of it is given away.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from mag_tracking.stages.track.observation import angle_priors
+
+AHEAD_S = 0.5
+"""[s] The sensors are chosen for where the target will be then."""
+
+
+def nearest(positions, place, n):
+    """Rows (n,), ascending, of the sensors at `positions` (n_sensors, 3) nearest to a `place`."""
+    distance = np.hypot(*(positions[:, :2] - place).T)
+    return np.sort(np.argsort(distance, kind='stable')[:n])
+
+
+def part_of_frame(frame, rows):
+    """The `FieldFrame` of some sensors alone."""
+    return replace(frame, field=frame.field[rows], covariance=frame.covariance[rows],
+                   n_samples=frame.n_samples[rows], time_offset=frame.time_offset[rows])
+
+
+def hand_on(bank, n_own, before, after, own_covariance, background_std):
+    """Give the hypotheses of a `FilterBank`, in place, the states of other sensors.
+
+    Parameters
+    ----------
+    bank : FilterBank
+    n_own : int
+        States of each sensor between the target's and the backgrounds.
+    before, after : (n_before,), (n_after,) int
+        Rows in the network of the sensors whose states they have and shall have; those of both
+        keep what is known of them, and how it hangs together.
+    own_covariance : (n_after, n_own, n_own)
+        Of a new sensor's own states.
+    background_std : float [T]
+        Of a new sensor's background.
+    """
+    n_t = bank.x.shape[1] - (n_own + 3) * len(before)
+    old, new = [_places(n_t, n_own, len(rows)) for rows in (before, after)]
+    kept = [(list(before).index(row), k) for k, row in enumerate(after) if row in before]
+    source = np.concatenate([np.arange(n_t), *(old[j] for j, _ in kept)])
+    target = np.concatenate([np.arange(n_t), *(new[k] for _, k in kept)])
+    n_x = n_t + (n_own + 3) * len(after)
+    x, P = np.zeros((len(bank), n_x)), np.zeros((len(bank), n_x, n_x))
+    for k in set(range(len(after))) - {k for _, k in kept}:
+        own, background = new[k][:n_own], new[k][n_own:]
+        P[:, own[:, None], own] = own_covariance[k]
+        P[:, background, background] = background_std**2
+    x[:, target] = bank.x[:, source]
+    P[:, target[:, None], target] = bank.P[:, source[:, None], source]
+    bank.x, bank.P = x, P
+    bank.nis = np.full((len(bank), len(after)), np.nan)
+
+
+def _places(n_t, n_own, n_sensors):
+    """Of each sensor the places of its states: (n_sensors, n_own + 3)."""
+    j = np.arange(n_sensors)[:, None]
+    return np.hstack([n_t + n_own * j + np.arange(n_own),
+                      n_t + n_own * n_sensors + 3 * j + np.arange(3)])
+
+
+def widened(track, rows, network, settings):
+    """A `Track` of the sensors `rows` as one of the whole `network`.
+
+    What it says nothing of is NaN, and a mounting is what was known of it before.
+    """
+    n_sensors = len(network)
+    predicted, nis = np.full((n_sensors, 3), np.nan), np.full(n_sensors, np.nan)
+    predicted[rows], nis[rows] = track.predicted, track.nis_by_sensor
+    mounting, covariance = track.mounting, track.mounting_covariance
+    if len(mounting):
+        mounting = np.zeros((n_sensors, 3))
+        covariance = angle_priors(network, np.deg2rad(settings.mounting_std_deg))
+        mounting[rows], covariance[rows] = track.mounting, track.mounting_covariance
+    return replace(track, predicted=predicted, nis_by_sensor=nis, mounting=mounting,
+                   mounting_covariance=covariance)

@@ -1,0 +1,89 @@
+"""Settings of the tracker."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mag_tracking.settings import param
+from mag_tracking.stages.track.initiation_magnet import MagnetSettings
+from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """Settings of the tracker."""
+
+    target: str = param('vehicle', 'What moves: vehicle or magnet.')
+    field_error: float = param(
+        0.04, 'Error of the predicted field relative to its size: gains, axes, shape.',
+        '', (0.0, 10.0), live=True)
+    model_error_time_s: float = param(
+        0.3, 'What the model leaves out of a field near the target stays alike for so long '
+        '(first-order Gauss-Markov states of each sensor), so that what it counts does not depend '
+        'on the frame period. 0 = it is noise, new in every frame, which is faster with many '
+        'sensors.', 's', (0.0, 60.0))
+    background_std: float = param(
+        2e-8, 'What a background may be off by when a track starts.', 'T', (0.0, 1e-3), live=True)
+    background_drift: float = param(
+        1e-8, 'Random walk of a background during a track.', 'T/s^0.5', (0.0, 1e-3), live=True)
+    mounting_std_deg: float = param(
+        5.0, 'How far a sensor may be turned from its orientation in the network file, about '
+        'each axis; the angles are estimated with each track (to first order: at 15 degrees the '
+        'field is 3 % too long). 0 = as the file says; with dozens of sensors that is several '
+        'times faster.',
+        'deg', (0.0, 15.0))
+    iterations: int = param(
+        1, 'Linearisations an update: more than one helps when the field says far more than the '
+        'prediction (magnets); for vehicles it locks into the wrong side.', '', (1, 20), live=True)
+    most_sensors: int = param(
+        16, 'Of a larger network a track uses the nearest so many, others as it moves on; it is '
+        'not smoothed then.', '', (2, 1000))
+    prune_ratio: float = param(
+        1e-12, 'A hypothesis lighter than the heaviest by this ratio is dropped (T10 Alg. 3).',
+        '', (1e-300, 0.5), live=True)
+    most_hypotheses: int = param(
+        600, 'No more than the heaviest so many are kept.', '', (1, 100000), live=True)
+    most_at_start: int = param(
+        600, 'In the frames before the detection so many are, if that is more: they say so '
+        'little of where a target comes from that of few the right one is often lost.', '',
+        (1, 100000), live=True)
+    relinearise_window_s: float = param(
+        2.0, 'While a track runs, its leading hypotheses are linearised anew along what is now '
+        'known of their path, over the latest frames (64 at most) of once to twice so much time. '
+        '0 = never, which is two to three times faster.', 's', (0.0, 60.0))
+    relinearise_interval_s: float = param(
+        0.15, 'How often that is done. With two sensors and frames of 12.5 Hz tracking then takes '
+        'a quarter of a core, of 100 Hz a whole one: there rather choose 0.5. It grows with the '
+        'number of sensors.', 's', (0.0, 60.0))
+    relinearise_most: int = param(
+        20, 'For how many hypotheses it is done at most.', '', (1, 100000))
+    lookback_s: float = param(
+        1.0, 'A track begins so long before its detection, with the frames kept since: what is '
+        'too weak to detect still tells where the target came from.', 's', (0.0, 60.0))
+    end_std: float = param(
+        5.0, 'A track ends when its horizontal position is less certain than this (one standard '
+        'deviation): the target is out of reach.', 'm', (1e-6, 1e6), live=True)
+    end_nis: float = param(
+        25.0, 'A track ends when its normalised innovation is larger than this per axis, twice '
+        'running: it has lost its target. Once makes it ambiguous.', '', (1.0, 1e12), live=True)
+    end_gap_s: float = param(
+        2.0, 'A track ends where the frames have a longer gap than this.', 's', (1e-3, 86400.0))
+    smooth_longest_s: float = param(
+        60.0, 'A track that is no longer than this is smoothed when it ends, over all of its '
+        'frames, which takes less than a millisecond a frame (more with many sensors); 0 = never.',
+        's', (0.0, 86400.0))
+    smoothing_lag_s: float = param(
+        0.0, 'While a track runs, each pose is given once more when so much time has passed, by '
+        'what came since; every frame then costs a quarter of a millisecond for each frame of the '
+        'lag. 0 = no.', 's', (0.0, 10.0))
+    vehicle: VehicleSettings = field(default_factory=VehicleSettings)
+    magnet: MagnetSettings = field(default_factory=MagnetSettings)
+
+
+def acceleration_density(settings):
+    """(3,) [m^2/s^3] spectral density of the acceleration that the tracker of these
+    `TrackSettings` assumes."""
+    if settings.target == 'magnet':
+        return np.full(3, settings.magnet.acceleration**2)
+    v = settings.vehicle
+    return np.square([v.acceleration, v.acceleration, v.climb_acceleration])

@@ -1,0 +1,66 @@
+"""The ratio of a track's error to the path bound that every replay with truth reports."""
+
+import numpy as np
+import pytest
+
+from mag_tracking.analysis.consistency import error_over_bound
+from mag_tracking.report.track_log import TrackLog
+from support.bundled import VEHICLES
+from support.passes import NOISE, ROAD
+
+N = 30
+
+
+def passed(errors, noise=NOISE, missing=False):
+    """A log with such position errors (n, 3) on a straight way, and its truth."""
+    t = 0.08 * np.arange(N)
+    true = np.column_stack([10.0 * t - 12.0, np.full(N, 1.0), np.full(N, 0.5)])
+    log = TrackLog(1)
+    log.stamp_ns = np.round(1e9 * t).astype(np.int64).tolist()
+    log.position, log.moment = list(true + errors), [np.array([100.0, 200.0, -300.0])] * N
+    field = np.zeros((N, 2, 3))
+    if missing:
+        field[:, 1] = np.nan
+    log.measured, log.noise = list(field), [np.tile(noise**2 * np.eye(3), (2, 1, 1))] * N
+    return log, (np.array(log.stamp_ns), true, np.zeros((N, 4)))
+
+
+def ratio(log, truth, rows=range(N), field_error=0.0):
+    return error_over_bound(ROAD, log, truth, np.array([1.0, 1.0, 0.01]), 0.1, field_error, 1e-8,
+                            np.array(rows), 2)
+
+
+def test_the_ratio_is_that_of_the_error():
+    e = 0.1 * np.random.default_rng(1).standard_normal((N, 3)) * [1.0, 1.0, 0.0]
+    once = ratio(*passed(e))
+    assert ratio(*passed(3.0 * e)) == pytest.approx(3.0 * once)
+    assert ratio(*passed(np.zeros((N, 3)))) == 0.0
+
+
+def test_poorer_sensors_have_a_larger_bound():
+    e = np.full((N, 3), 0.1)
+    once = ratio(*passed(e))
+    assert ratio(*passed(e, 4.0 * NOISE)) < 0.7 * once
+    assert ratio(*passed(e, missing=True)) < 0.7 * once
+    assert ratio(*passed(e), field_error=0.1) < once
+
+
+def test_only_poses_with_truth_count():
+    log, (stamps, true, q) = passed(np.full((N, 3), 0.1))
+    assert ratio(log, (stamps[:1], true[:1], q[:1])) is None
+    assert ratio(log, (stamps[:20], true[:20], q[:20]), range(25, N)) is None
+    log.position[0] = np.array([1e3, 0.0, 0.0])
+    assert ratio(log, (stamps, true, q), range(5, N)) < 20.0
+
+
+@pytest.mark.parametrize('name', VEHICLES)
+def test_every_replay_with_truth_says_it(vehicle_replays, name):
+    run, _ = vehicle_replays[name]
+    found = run.summary['tracks'][0]['truth']['error_over_bound']
+    print(f'{name}: error over path bound {found:.1f}')
+    assert 0.1 < found < (20.0 if 'truck' in name else 6.0)
+
+
+def test_magnets_too(magnet_replays):
+    for run, _ in magnet_replays.values():
+        assert 0.1 < run.summary['tracks'][0]['truth']['error_over_bound'] < 3.0

@@ -1,0 +1,110 @@
+"""Single poses of a magnet, and its poses together with the geometry of the network."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from mag_tracking.analysis.magnet_pose import PoseSettings, locate_magnet
+from mag_tracking.analysis.network_blind import calibrate_geometry_blind
+from mag_tracking.analysis.network_readings import TrackedMagnet, tool_rotations
+from mag_tracking.physics.dipole import dipole_field
+from support.magnet_boards import HIGH, LOW, MOMENT, SETTINGS, board, estimated, simulated
+
+
+def test_single_poses_and_their_covariance():
+    """Anywhere in the box, from one reading each; the field's error is part of the noise."""
+    network = board(4, 0.05)
+    rng = np.random.default_rng(5)
+    settings = PoseSettings()
+    nees, costs = [], []
+    for _ in range(300):
+        r = rng.uniform([-0.03, -0.03, 0.05], [0.18, 0.18, 0.16])
+        u = rng.standard_normal(3)
+        u /= np.linalg.norm(u)
+        A = settings.ambient_std * rng.standard_normal(3)
+        B = np.einsum('nij,nj->ni', network.R_sw,
+                      dipole_field(network.positions - r, MOMENT * u) + A)
+        size = np.linalg.norm(B, axis=1)[:, None]
+        B += np.hypot(1e-7, settings.field_error * size) * rng.standard_normal(B.shape)
+        B[rng.integers(16)] = np.nan
+        pose = locate_magnet(network, B, MOMENT, LOW, HIGH, settings)
+        assert pose.converged, pose.reason
+        assert np.linalg.norm(pose.axis) == pytest.approx(1.0)
+        assert np.abs(pose.covariance[3:] @ np.append(np.zeros(3), pose.axis)).max() < 1e-9 * (
+            pose.covariance[3:, 3:].max())
+        # To first order, as the covariance is: across the axis.
+        e = np.append(pose.position - r, pose.axis * (pose.axis @ u) - u)
+        C = pose.covariance / max(1.0, pose.normalised_cost)
+        scale = np.sqrt(np.diagonal(C))
+        C, e = C / np.outer(scale, scale), e / scale
+        nees.append(e @ np.linalg.pinv(C, rcond=1e-9, hermitian=True) @ e)
+        costs.append(pose.normalised_cost)
+    low, high = chi2.ppf([0.005, 0.995], 5 * 300) / 300
+    print(f'NEES {np.mean(nees):.2f} in {low:.2f} .. {high:.2f}, cost {np.mean(costs):.3f}')
+    assert low <= np.mean(nees) <= high
+    assert np.mean(costs) == pytest.approx(1.0, abs=0.06)
+
+
+def test_what_is_no_pose_says_so():
+    network = board()
+    u = np.array([0.6, 0.0, 0.8])
+
+    def reading(r, m):
+        return np.einsum('nij,nj->ni', network.R_sw,
+                         dipole_field(network.positions - np.array(r), m * u))
+
+    few = np.full((9, 3), np.nan)
+    few[:2, :2] = 1e-6
+    pose = locate_magnet(network, few, MOMENT, LOW, HIGH, PoseSettings())
+    assert not pose.converged and '4 axes measured' in pose.reason
+    assert np.isnan(pose.position).all()
+    pose = locate_magnet(network, reading([0.06, 0.05, 0.3], MOMENT), MOMENT, LOW, HIGH,
+                         PoseSettings())
+    assert not pose.converged and 'outside the box' in pose.reason
+    np.testing.assert_allclose(pose.position, [0.06, 0.05, 0.3], atol=1e-5)
+    pose = locate_magnet(network, reading([0.06, 0.05, 0.08], 4.0 * MOMENT), MOMENT, LOW, HIGH,
+                         PoseSettings())
+    assert not pose.converged and 'normalised cost' in pose.reason
+    good = reading([0.06, 0.05, 0.08], MOMENT)
+    for change, message in (
+            ({'field': good[:8]}, r'expected field \(9, 3\)'), ({'moment': -1.0}, 'moment is -1.0'),
+            ({'high': LOW}, 'has no size'), ({'field': good * np.inf}, 'infinite'),
+            ({'network': replace(network, noise_std=(None,) * 9)}, 'noise_std is None')):
+        with pytest.raises(ValueError, match=message):
+            locate_magnet(**{'network': network, 'field': good, 'moment': MOMENT, 'low': LOW,
+                             'high': HIGH, 'settings': PoseSettings(), **change})
+
+
+# Without a tracker.
+
+def test_unknown_poses_and_geometry_together():
+    nees = []
+    for seed in (21, 22, 23):
+        network, field, positions, axes, x = simulated(seed, settings=replace(
+            SETTINGS, moment_std=0.0))
+        magnet = TrackedMagnet(positions, tool_rotations(axes), positions.mean(axis=0), MOMENT)
+        r, *_ = magnet.poses(x[1], x[2])
+        field[5] = np.nan
+        g = calibrate_geometry_blind(network, field, MOMENT, LOW, HIGH,
+                                     replace(SETTINGS, moment_std=0.0))
+        assert g.converged and len(g.rows) >= 36 and 5 not in g.rows
+        assert np.median(np.linalg.norm(g.poses[0] - r[g.rows], axis=1)) < 2e-3
+        assert not g.shared.any()
+        e = (estimated(g, network)[:90] - x[0].ravel())
+        unit = np.sqrt(np.diagonal(g.covariance)[:90])
+        z = e / unit
+        nees.append(z @ np.linalg.solve(g.covariance[:90, :90] / np.outer(unit, unit), z))
+    low, high = chi2.ppf([0.005, 0.995], 90 * 3) / 3
+    print(f'NEES {np.mean(nees):.1f} in {low:.1f} .. {high:.1f}')
+    assert low <= np.mean(nees) <= high
+
+
+def test_without_a_magnet_nothing_is_calibrated():
+    network = board()
+    field = 3e-5 + 1e-7 * np.random.default_rng(0).standard_normal((10, 9, 3))
+    with pytest.raises(ValueError, match='of 10 poses were found in the box'):
+        calibrate_geometry_blind(network, field, MOMENT, LOW, HIGH, SETTINGS)
+    with pytest.raises(ValueError, match=r'expected field \(K, 9, 3\)'):
+        calibrate_geometry_blind(network, field[0], MOMENT, LOW, HIGH, SETTINGS)

@@ -1,0 +1,176 @@
+"""A network's geometry where sensors, poses or input are at fault."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mag_tracking.analysis.network_geometry import calibrate_geometry, fitted_geometry
+from mag_tracking.analysis.network_readings import rotation
+from mag_tracking.physics.dipole import dipole_field
+from support.magnet_boards import MOMENT, SETTINGS, board, calibrated_boards, estimated, simulated
+
+
+@pytest.fixture(scope='module')
+def many():
+    """[(simulated, geometry)] of several boards."""
+    return calibrated_boards()
+
+
+def within(g, h, network, most):
+    """Whether two estimates agree to `most` deviations of the first; NaN agrees with nothing."""
+    return bool((np.abs(estimated(g, network) - estimated(h, network))
+                 < most * np.sqrt(np.diagonal(g.covariance))).all())
+
+
+def test_a_dead_sensor_is_as_none(many):
+    (network, field, positions, axes, _), _ = many[2]
+    dead = field.copy()
+    dead[:, 4] = np.nan
+    dead[3, 5, 1] = np.nan
+    dead[:, 6, 2] = np.nan
+    g = calibrate_geometry(network, dead, positions, axes, MOMENT, SETTINGS)
+    assert g.converged
+    assert np.isnan(g.bias[4]).all() and np.isinf(g.bias_std[4]).all()
+    assert np.isnan(g.bias[6]).tolist() == [False, False, True]
+    np.testing.assert_allclose(g.position_std[4], SETTINGS.position_std, rtol=0.1)
+    assert g.gain[4] == 1.0 and np.isnan(g.sensor_residual[4])
+    assert g.network.background[4] is None and g.network.background[0] is not None
+    others = np.delete(np.arange(9), 4)
+    less = replace(network, names=tuple(np.array(network.names)[others].tolist()),
+                   positions=network.positions[others], R_ws=network.R_ws[others],
+                   topics=tuple(np.array(network.topics)[others].tolist()),
+                   noise_std=network.noise_std[:8], background=())
+    h = calibrate_geometry(less, dead[:, others], positions, axes, MOMENT, SETTINGS)
+    assert (np.abs(g.gain[others] - h.gain) < 1e-4 * h.gain_std).all()
+    assert (np.abs(g.network.positions[others] - h.network.positions)
+            < 1e-4 * h.position_std).all()
+    assert (np.abs(g.shared - h.shared) < 1e-4 * h.shared_std).all()
+
+
+@pytest.mark.parametrize('shift', [2e-2, 4e-3])
+def test_an_outlying_pose_is_named_and_harms_little(many, shift):
+    (network, field, positions, axes, _), g = many[5]
+    wrong = positions.copy()
+    wrong[7, 0] += shift
+    h = calibrate_geometry(network, field, wrong, axes, MOMENT, SETTINGS)
+    assert h.converged and h.suspect_poses == (7,) and h.suspect_sensors == ()
+    assert within(g, h, network, 1.0)
+    # One pose is not held against the sensors.
+    np.testing.assert_allclose(h.sensor_residual, g.sensor_residual, rtol=0.1)
+
+
+def test_a_pose_of_a_moved_board_is_named(many):
+    """The readings are wrong this time: those of another pose."""
+    (network, field, positions, axes, _), g = many[6]
+    wrong = field.copy()
+    wrong[7] = field[8]
+    h = calibrate_geometry(network, wrong, positions, axes, MOMENT, SETTINGS)
+    assert h.converged and h.suspect_poses == (7,) and h.suspect_sensors == ()
+    assert within(g, h, network, 1.0)
+
+
+def spoilt(field, fault):
+    """A copy in which sensor 2 is at fault."""
+    wrong = field.copy()
+    if fault == 'flipped':
+        wrong[:, 2, 1] *= -1.0
+    elif fault == 'swapped':
+        wrong[:, 2] = wrong[:, 2][:, [1, 0, 2]]
+    elif fault == 'turned':
+        wrong[:, 2] = wrong[:, 2] @ rotation(np.array([0.0, 0.4, 0.0]))
+    elif fault == 'gain':
+        wrong[:, 2] *= 2.0
+    else:
+        wrong[:, 2] = np.nan
+    return wrong
+
+
+@pytest.mark.parametrize('fault', ['flipped', 'swapped', 'turned', 'gain'])
+def test_a_bad_sensor_is_named(many, fault):
+    """And what is found of the others is hardly farther out than without it."""
+    others, z2 = np.delete(np.arange(9), 2), {fault: [], 'dead': []}
+    for (network, field, positions, axes, x), _ in many[:8]:
+        for what, found in z2.items():
+            g = calibrate_geometry(network, spoilt(field, what), positions, axes, MOMENT, SETTINGS)
+            z = (_corrections(g, network) - x[0][:, 3:]) / _corrections_std(g)
+            found.append(np.square(z[others]).mean())
+            assert g.converged and g.suspect_poses == ()
+            assert g.suspect_sensors == (() if what == 'dead' else ('mag_2',))
+    print(f'mean squared z with a sensor {fault} {np.mean(z2[fault]):.2f}, '
+          f'without it {np.mean(z2["dead"]):.2f}')
+    assert np.mean(z2[fault]) < 1.25 * np.mean(z2['dead'])
+
+
+def _corrections(geometry, network):
+    """(n, 7) of all but the biases."""
+    return estimated(geometry, network)[:-12].reshape(-1, 10)[:, 3:]
+
+
+def _corrections_std(geometry):
+    """(n, 7)."""
+    return np.sqrt(np.diagonal(geometry.covariance))[:-12].reshape(-1, 10)[:, 3:]
+
+
+def test_too_few_poses_are_no_answer():
+    network, field, positions, axes, _ = simulated(9)
+    for K in (1, 2):
+        g = calibrate_geometry(network, field[:K], positions[:K], axes[:K], MOMENT, SETTINGS)
+        assert not g.converged and f'{K} poses' in g.reason
+    g = calibrate_geometry(network, field, positions, axes, MOMENT, replace(SETTINGS, iterations=1))
+    assert not g.converged and 'no minimum within 1 steps' in g.reason
+
+
+def test_one_sensor_alone_tells_next_to_nothing():
+    network, field, positions, axes, _ = simulated(9)
+    scarce = np.full((3, 9, 3), np.nan)
+    scarce[:, 0] = field[:3, 0]
+    g = calibrate_geometry(network, scarce, positions[:3], axes[:3], MOMENT, SETTINGS)
+    assert (g.position_std > 0.95 * SETTINGS.position_std).all()
+    assert (g.gain_std > 0.95 * SETTINGS.gain_std).all()
+    # A prior is never lost, however bad the fit.
+    assert (g.position_std <= (1.0 + 1e-9) * SETTINGS.position_std).all()
+    free = np.repeat([0.1, 0.5, 0.0], [3, 2, 3])
+    g = fitted_geometry(network, scarce, positions[:3], axes[:3], MOMENT, SETTINGS,
+                        np.zeros(12), free)
+    assert not g.converged and 'fewer readings than unknowns' in g.reason
+    assert np.isnan(g.normalised_cost)
+
+
+def test_poses_at_one_place_tell_nothing_of_the_geometry():
+    network, *_ = simulated(9)
+    rng = np.random.default_rng(1)
+    B = np.einsum('nij,nj->ni', network.R_sw,
+                  dipole_field(network.positions - [0.05, 0.05, 0.08], [0.0, 0.0, MOMENT]))
+    field = B + 3e-5 + 1e-7 * rng.standard_normal((30, 9, 3))
+    g = calibrate_geometry(network, field, np.tile([0.05, 0.05, 0.08], (30, 1)),
+                           np.tile([0.0, 0.0, 1.0], (30, 1)), MOMENT, SETTINGS)
+    assert not g.converged and 'at one place' in g.reason
+    assert (g.position_std > 0.9 * SETTINGS.position_std).all()
+    assert (g.gain_std > 0.9 * SETTINGS.gain_std).all()
+
+
+def test_another_magnet_is_refused():
+    network, field, positions, axes, _ = simulated(9)
+    g = calibrate_geometry(network, field, positions, -axes, MOMENT, SETTINGS)
+    assert not g.converged and 'normalised cost' in g.reason
+
+
+@pytest.mark.parametrize('change, message', [
+    ({'field': np.zeros((5, 8, 3))}, r'expected field \(K, 9, 3\)'),
+    ({'positions': np.zeros((5, 2))}, r'positions and axes \(K, 3\)'),
+    ({'axes': np.ones((5, 3))}, 'pose 0: expected a finite position and a unit axis'),
+    ({'positions': np.full((5, 3), np.nan)}, 'pose 0: expected a finite position'),
+    ({'field': np.full((5, 9, 3), np.nan)}, 'pose 0: no sensor has a reading'),
+    ({'field': np.full((5, 9, 3), np.inf)}, 'infinite'),
+    ({'positions': np.full((5, 3), 0.0)}, r'pose 0: \[0.0, 0.0, 0.0\] m is the place of a sensor'),
+    ({'moment': 0.0}, 'moment is 0.0'), ({'moment': np.nan}, 'moment is nan'),
+    ({'network': replace(board(), noise_std=(None,) * 9)}, 'sensor mag_0: noise_std is None'),
+    ({'field': np.zeros((0, 9, 3)), 'positions': np.zeros((0, 3)), 'axes': np.zeros((0, 3))},
+     'no poses')])
+def test_bad_input_is_named(change, message):
+    network, field, positions, axes, _ = simulated(1, n_poses=5)
+    given = {'network': network, 'field': field, 'positions': positions, 'axes': axes,
+             'moment': MOMENT, **change}
+    with pytest.raises(ValueError, match=message):
+        calibrate_geometry(**given, settings=SETTINGS)

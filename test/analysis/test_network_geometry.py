@@ -1,0 +1,127 @@
+"""A network's geometry from a magnet's poses: errors and deviations on simulated boards."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from mag_tracking.analysis.network_geometry import GeometrySettings, calibrate_geometry
+from mag_tracking.analysis.network_readings import TrackedMagnet, rotation, tool_rotations
+from support.magnet_boards import MOMENT, SETTINGS, board, calibrated_boards, estimated, simulated
+
+
+@pytest.fixture(scope='module')
+def many():
+    """[(simulated, geometry)] of several boards."""
+    return calibrated_boards()
+
+
+def test_the_covariance_is_that_of_the_errors(many):
+    nees, outside, costs = [], [], []
+    for (network, *_, x), g in many:
+        assert g.converged and not g.reason
+        assert g.suspect_sensors == () and g.suspect_poses == ()
+        e = estimated(g, network) - np.append(x[0].ravel(), x[1])
+        unit = np.sqrt(np.diagonal(g.covariance))
+        z = e / unit
+        nees.append(z @ np.linalg.solve(g.covariance / np.outer(unit, unit), z))
+        outside.append(np.abs(z) > 2.0)
+        costs.append(g.normalised_cost)
+    low, high = chi2.ppf([0.005, 0.995], 102 * len(many)) / len(many)
+    print(f'NEES {np.mean(nees):.1f} in {low:.1f} .. {high:.1f}, cost {np.mean(costs):.3f}, '
+          f'outside 2 std {np.mean(outside):.3f}')
+    assert low <= np.mean(nees) <= high
+    # Neighbours share the gauge: more spread than the binomial's.
+    assert np.mean(outside) == pytest.approx(0.0455, abs=0.02)
+    assert np.mean(costs) == pytest.approx(1.0, abs=0.03)
+
+
+def test_much_is_learnt(many):
+    """Against the priors, and against each other: what all sensors share is the gauge's."""
+    for part, share in ((slice(3, 4), 0.35), (slice(4, 7), 0.35), (slice(7, 10), 0.6)):
+        error, before, std = [], [], []
+        for (network, *_, x), g in many:
+            e = (estimated(g, network)[:90] - x[0].ravel()).reshape(9, 10)[:, part]
+            if part.start == 4:
+                e, was = (np.einsum('nij,nj->ni', network.R_ws, v) for v in (e, x[0][:, part]))
+            else:
+                was = x[0][:, part]
+            error.append(e - e.mean(axis=0))
+            before.append(was - was.mean(axis=0))
+            std.append(np.sqrt(np.diagonal(g.covariance)[:90]).reshape(9, 10)[:, part])
+        error, before = (np.sqrt(np.mean(np.square(v))) for v in (error, before))
+        print(f'left over of {part}: {error / before:.2f}')
+        assert error < share * before
+        # No gain at the price of doubt: never better than it is said.
+        assert error < 1.1 * np.sqrt(np.mean(np.square(std)))
+
+
+def test_poses_are_found_again(many):
+    left, without, z2 = [], [], []
+    for (_, _, positions, axes, x), g in many:
+        magnet = TrackedMagnet(positions, tool_rotations(axes), positions.mean(axis=0), MOMENT)
+        r, u = g.magnet_poses(positions, axes)
+        as_tracked, m, *_ = magnet.poses(x[1], np.zeros((40, 8)))
+        assert np.linalg.norm(r - as_tracked, axis=1).max() < 2.5e-3
+        assert (np.einsum('ki,ki->k', u, m) / np.linalg.norm(m, axis=1)).min() > np.cos(0.025)
+        is_, *_ = magnet.poses(x[1], x[2])
+        # What is common to all poses is the gauge's; the rest is the tracker's deviations.
+        for found, out in ((g.poses[0], left), (r, without)):
+            e = found - is_
+            out.append(np.square(e - e.mean(axis=0)).mean())
+        z2.append(np.mean(np.square(g.pose - x[2]) / np.einsum('kii->ki', g.pose_covariance)))
+    print(f'left over of the tracker: {np.sqrt(np.mean(left) / np.mean(without)):.2f}')
+    assert np.mean(left) < 0.8 * np.mean(without)
+    assert np.mean(z2) == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_order_of_the_poses_does_not_matter(many):
+    (network, field, positions, axes, _), g = many[0]
+    order = np.random.default_rng(0).permutation(len(field))
+    h = calibrate_geometry(network, field[order], positions[order], axes[order], MOMENT, SETTINGS)
+    std = np.sqrt(np.diagonal(g.covariance))
+    assert (np.abs(estimated(g, network) - estimated(h, network)) < 1e-5 * std).all()
+    np.testing.assert_allclose(h.pose_residual, g.pose_residual[order], rtol=1e-4)
+
+
+def test_a_turn_of_the_world_about_z_changes_nothing_but_places(many):
+    (network, field, positions, axes, _), g = many[1]
+    R, d = rotation(np.array([0.0, 0.0, 2.0])), np.array([3.0, -2.0, 1.0])
+    turned = replace(network, positions=network.positions @ R.T + d, R_ws=R @ network.R_ws)
+    h = calibrate_geometry(turned, field, positions @ R.T + d, axes @ R.T, MOMENT, SETTINGS)
+    assert (np.abs(h.gain - g.gain) < 1e-4 * g.gain_std).all()
+    assert (np.abs(h.bias - g.bias) < 1e-4 * g.bias_std).all()
+    assert np.abs(h.network.positions - (g.network.positions @ R.T + d)).max() < 1e-8
+    assert h.normalised_cost == pytest.approx(g.normalised_cost, rel=1e-6)
+
+
+def test_what_is_known_stays():
+    exact = GeometrySettings(
+        gain_std=0.0, rotation_std_deg=0.0, position_std=0.0, tracker_position_std=0.0,
+        tracker_tilt_std_deg=0.0, ambient_std=0.0)
+    network, field, positions, axes, x = simulated(3, settings=exact)
+    g = calibrate_geometry(network, field, positions, axes, MOMENT, exact)
+    assert g.converged
+    np.testing.assert_array_equal(g.network.positions, network.positions)
+    np.testing.assert_array_equal(g.gain, 1.0)
+    assert not g.position_std.any() and not g.gain_std.any() and not g.rotation_std.any()
+    assert g.moment == (MOMENT, 0.0)
+    assert not g.pose.any()
+    z = (g.bias - x[0][:, :3]) / g.bias_std
+    assert chi2.ppf(0.001, 27) < (z**2).sum() < chi2.ppf(0.999, 27)
+
+
+def test_a_worse_fit_has_larger_deviations():
+    """Noise that is five times what is stated: the deviations know."""
+    loud = board(noise=5e-7)
+    network, field, positions, axes, x = simulated(
+        4, network=loud, settings=replace(SETTINGS, field_error=0.05))
+    stated = board()
+    g = calibrate_geometry(stated, field, positions, axes, MOMENT, SETTINGS)
+    assert g.converged and 15.0 < g.normalised_cost < 30.0
+    e = estimated(g, network) - np.append(x[0].ravel(), x[1])
+    assert np.mean(np.square(e / np.sqrt(np.diagonal(g.covariance)))) < 1.6
+    quiet = calibrate_geometry(stated, simulated(4)[1], positions, axes, MOMENT, SETTINGS)
+    assert (g.bias_std > 3.0 * quiet.bias_std).all()
+    assert (g.position_std <= (1.0 + 1e-9) * SETTINGS.position_std).all()

@@ -1,0 +1,367 @@
+"""The batch fit of a pass: its model, its search, its covariance, and what it refuses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import chi2
+
+from mag_tracking.analysis.model_order import choose_order, order_criteria
+from mag_tracking.analysis.pass_data import separable_problem
+from mag_tracking.analysis.pass_fit import fit_pass
+from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.apps.fit import RecordingFit
+from mag_tracking.inference.iron import hard_and_soft_iron
+from mag_tracking.inference.least_squares import correlated_scores, refine
+from mag_tracking.physics.dipole import MU0, dipole_field
+from mag_tracking.physics.passes import RowPass
+from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.reader import Recording
+from support.bundled import VEHICLES, vehicle_path
+from support.passes import (
+    EARTH,
+    NOISE,
+    ROAD,
+    measured,
+    network_of,
+    random_path,
+    together,
+    unknowns_at,
+)
+
+ORDERS = (1, 2, 3)
+
+
+def rows(n_dipoles, n=6, seed=4):
+    """A model of `n` samples at two places, and paths past them."""
+    rng = np.random.default_rng(seed)
+    M = rng.standard_normal((n, 3, 3))
+    model = RowPass(rng.uniform(-1.0, 1.0, n), rng.uniform(-5.0, 5.0, (n, 3)), M, n_dipoles)
+    theta = rng.uniform(1.0, 4.0, (5, len(model.names)))
+    theta[:, 3] += 5.0
+    return model, theta, rng.standard_normal((5, 3 * n_dipoles))
+
+
+@pytest.mark.parametrize('n_dipoles', [1, 2, 3, 4])
+def test_a_row_is_the_sum_of_its_dipoles(n_dipoles):
+    model, theta, p = rows(n_dipoles)
+    moments = (model.combinations @ p[0]).reshape(-1, 3)
+    direction = theta[0, 3:6] / np.linalg.norm(theta[0, 3:6])
+    expected = np.zeros((6, 3))
+    for i, m in enumerate(moments):
+        ahead = (i - (n_dipoles - 1) / 2) * theta[0, 6] / (n_dipoles - 1) if n_dipoles > 1 else 0.0
+        r = theta[0, :3] + model.t[:, None] * theta[0, 3:6] + ahead * direction
+        expected += np.einsum('nij,nj->ni', model.M, dipole_field(model.positions - r, m))
+    field = (model.basis(theta)[0] @ p[0]).reshape(-1, 3)
+    np.testing.assert_allclose(field, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize('road', [True, False], ids=['road', 'any heading'])
+@pytest.mark.parametrize('n_dipoles', ORDERS)
+def test_the_search_finds_the_global_optimum(n_dipoles, road):
+    """No higher than the minimum that belongs to the truth; `make bench` counts over 200."""
+    missed = []
+    for seed in range(10):
+        rng = np.random.default_rng([seed, n_dipoles, road])
+        path, moments = random_path(rng, n_dipoles, road)
+        data = measured(ROAD, path, moments, rng)
+        fit = fit_pass(data, n_dipoles)
+        problem = separable_problem(data, lambda *a: RowPass(*a, n_dipoles=n_dipoles))
+        _, cost, _, _ = refine(problem.residual_and_jacobian, path[None], 100, 1e-8)
+        if not fit.cost <= cost[0] * (1.0 + 1e-6):
+            missed.append((seed, fit.cost, cost[0], fit.reason))
+    assert not missed
+
+
+@pytest.mark.parametrize('n_dipoles', ORDERS)
+def test_errors_are_as_large_as_the_covariance_says(n_dipoles):
+    """NEES of 25 passes inside its band, TSP14 eq. (47); the cost is chi-square."""
+    nees, costs, n = [], [], 25
+    for seed in range(n):
+        rng = np.random.default_rng([seed, n_dipoles, 7])
+        path, moments = random_path(rng, n_dipoles, True)
+        fit = fit_pass(measured(ROAD, path, moments, rng), n_dipoles)
+        true = unknowns_at(path, moments, (fit.data.stamp_ns) / 1e9)
+        k = len(true)
+        error = fit.x[:k] - true
+        # A row of three may have a rival; and so short a length that the model is not linear.
+        if not fit.ambiguous and fit.length[1] < 0.3:
+            nees.append(error @ np.linalg.solve(fit.covariance[:k, :k], error))
+        costs.append(fit.cost)
+    assert len(nees) >= 18
+    low, high = chi2.ppf([0.0005, 0.9995], k * len(nees))
+    assert low < sum(nees) < high
+    low, high = chi2.ppf([0.0005, 0.9995], fit.degrees_of_freedom * n)
+    assert low < sum(costs) < high
+
+
+def test_deviations_of_what_follows_from_a_fit_are_right():
+    """Heading, speed, time and range of the closest point: squared errors over variances."""
+    squares, n = [], 30
+    for seed in range(n):
+        rng = np.random.default_rng([seed, 21])
+        path, moments = random_path(rng, 1, False)
+        # The further from zero in time the closest point is, the more its derivatives matter.
+        place = np.array([12.0, -9.0, 0.0])
+        fit = fit_pass(measured(ROAD, path, moments, rng), 1)
+        fit = replace(fit, honest_covariance=fit.covariance)
+        true = unknowns_at(path, moments, fit.data.stamp_ns / 1e9)
+        r, v = true[:3] - place, true[3:6]
+        t = -(r @ v) / (v @ v)
+        time, time_std, distance, distance_std = fit.closest_approach(place)
+        heading = fit.heading[0] - np.arctan2(v[1], v[0])
+        squares.append(np.square([
+            np.arctan2(np.sin(heading), np.cos(heading)) / fit.heading[1],
+            (fit.speed[0] - np.linalg.norm(v)) / fit.speed[1], (time - t) / time_std,
+            (distance - np.linalg.norm(r + t * v)) / distance_std]))
+    low, high = chi2.ppf([0.0005, 0.9995], n)
+    total = np.sum(squares, axis=0)
+    assert ((low < total) & (total < high)).all(), total
+
+
+def test_what_no_order_describes_is_no_reason_for_the_next_one():
+    """The cost counts relative to that of the richest order."""
+    data = measured(ROAD, *random_path(np.random.default_rng(1), 1, True),
+                    np.random.default_rng(1))
+    n = data.n_values
+
+    def fit(n_dipoles, cost):
+        k = 6 + 3 * n_dipoles + (n_dipoles > 1) + 6
+        x = np.full(k, 2.0)
+        return PassFit(n_dipoles, data, '', True, tuple('u' * k), x, np.eye(k) * 1e-4,
+                       np.eye(k) * 1e-4, float(cost), 1.0, 2.0)
+
+    # The second order takes away thirty, which is worth its four unknowns where noise is all ...
+    assert choose_order([fit(1, n + 40.0), fit(2, n + 5.0)]).n_dipoles == 2
+    # ... and nothing where ten times the noise is left anyway.
+    assert choose_order([fit(1, 10.0 * n + 40.0), fit(2, 10.0 * n + 5.0)]).n_dipoles == 1
+
+
+def test_correlated_residuals_count_for_less():
+    """Newey and West's covariance of a straight line's parameters in noise of 0.1 s."""
+    rng, n, keep = np.random.default_rng(3), 3000, np.exp(-0.1)
+    H = np.column_stack([np.ones(n), np.linspace(-1.0, 1.0, n)])
+    P = np.linalg.inv(H.T @ H)
+    found, errors = np.zeros((2, 2)), []
+    for _ in range(300):
+        e = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(n))
+        x = P @ (H.T @ e)
+        errors.append(x)
+        found += P @ correlated_scores(H * (e - H @ x)[:, None], 60) @ P / 300.0
+    true = np.cov(np.transpose(errors))
+    # White, it would be said to be a twentieth of that.
+    assert (np.diagonal(P) < 0.1 * np.diagonal(true)).all()
+    assert (np.diagonal(found) > 0.7 * np.diagonal(true)).all()
+    assert (np.diagonal(found) < 1.2 * np.diagonal(true)).all()
+
+
+@pytest.mark.parametrize('n_dipoles', ORDERS)
+def test_the_honest_covariance_is_never_smaller_and_no_larger_where_all_is_right(n_dipoles):
+    ratios = []
+    for seed in range(6):
+        rng = np.random.default_rng([seed, n_dipoles, 9])
+        fit = fit_pass(measured(ROAD, *random_path(rng, n_dipoles, True), rng), n_dipoles)
+        excess = fit.honest_covariance - fit.covariance
+        scale = np.sqrt(np.diagonal(fit.covariance))
+        assert np.linalg.eigvalsh(excess / np.outer(scale, scale)).min() > -1e-6
+        ratios.append(np.sqrt(np.diagonal(fit.honest_covariance)) / scale)
+    assert 1.0 <= np.median(ratios) < 1.4
+
+
+def test_hard_and_soft_iron_from_four_headings():
+    """m0 and D within three deviations, from passes of a row of three; TSP14 section VI.E."""
+    rng = np.random.default_rng(5)
+    hard, soft = np.array([[60.0, 30.0, -40.0], [120.0, -10.0, -70.0], [20.0, 40.0, 30.0]]), 5.0
+    moments, headings, covariances = [], [], []
+    for heading in np.deg2rad([0.0, 90.0, 180.0, 225.0]):
+        c, s = np.cos(heading), np.sin(heading)
+        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        m = hard @ R.T + soft / 3.0 * EARTH / MU0
+        path = np.array([-1.5 * s, 1.5 * c, 0.5, 8.0 * c, 8.0 * s, 0.0, 3.0])
+        fit = fit_pass(measured(ROAD, path, m, rng), 3)
+        assert not fit.reason
+        moment, P = fit.moment
+        moments.append(moment)
+        covariances.append(P)
+        headings.append(fit.heading[0])
+    iron = hard_and_soft_iron(moments, headings, EARTH / MU0, covariances)
+    std = np.sqrt(np.diagonal(iron.covariance))
+    assert (np.abs(np.append(iron.hard - hard.sum(axis=0), iron.soft - soft)) < 3.0 * std).all()
+    assert std[3] < 0.5 and (std[:3] < 20.0).all()
+
+
+def test_the_order_is_what_the_measurements_are_worth():
+    """A point is not taken for a row, nor a row of three for a point."""
+    chosen = {1: [], 3: []}
+    for n_dipoles, orders in chosen.items():
+        for seed in range(8):
+            rng = np.random.default_rng([seed, n_dipoles, 3])
+            path, moments = random_path(rng, n_dipoles, True)
+            path[3:6] *= 8.0 / np.linalg.norm(path[3:6])
+            if n_dipoles > 1:
+                path[6] = 4.0
+            fits = [fit_pass(measured(ROAD, path, moments, np.random.default_rng(seed)), d)
+                    for d in (1, 2, 3)]
+            criteria = order_criteria(fits)
+            assert criteria.min() == 0.0
+            orders.append(choose_order(fits).n_dipoles)
+    assert chosen[1] == [1] * 8
+    assert min(chosen[3]) >= 2 and chosen[3].count(3) >= 5
+
+
+ALONE = network_of([[0.0, -4.5, 0.0]])
+
+
+def alone(moments, seed=1, path=(0.5, 0.0, 0.6, 9.0, 0.3, 0.0)):
+    path, moments = np.array(path), np.atleast_2d(np.array(moments, dtype=float))
+    return measured(ALONE, path, moments, np.random.default_rng(seed)), path, moments
+
+
+def test_one_sensor_gives_directions_and_a_time_but_no_scale():
+    data, path, moments = alone([100.0, 250.0, -200.0])
+    fit = fit_pass(data, 1)
+    assert fit.reason.startswith('one sensor: the scale is not observable')
+    b = fit.bearing
+    r, v = path[:3] - ALONE.positions[0], path[3:6]
+    t_cpa = -(r @ v) / (v @ v)
+    r_cpa = r + t_cpa * v
+    zero = fit.data.stamp_ns / 1e9
+    assert abs(b.cpa_time + zero - t_cpa) < 3.0 * b.cpa_time_std
+    assert abs(b.rate - np.linalg.norm(v) / np.linalg.norm(r_cpa)) < 3.0 * b.rate_std
+    for found, true, std in zip((b.cpa_direction, b.motion_direction, b.moment_direction),
+                                (r_cpa, v, moments[0]), b.direction_std, strict=True):
+        assert np.arccos(found @ true / np.linalg.norm(true)) < 3.0 * std < 0.2
+
+
+def test_one_sensor_never_says_which_end_is_true_without_saying_that_it_does_not_know():
+    """(r, v) and (-r, -v) give the same field: taken is the one above the sensor."""
+    for seed in range(12):
+        rng = np.random.default_rng([seed, 5])
+        path, moments = random_path(rng, 1, False)
+        data = measured(ALONE, path, moments, rng)
+        r, v = path[:3] - ALONE.positions[0], path[3:6]
+        distance = np.linalg.norm(np.cross(r, v)) / np.linalg.norm(v)
+        if not 1.5 < distance < 8.0:
+            continue
+        fit = fit_pass(data, 1, (distance, 0.05 * distance))
+        if fit.reason:
+            continue
+        assert fit.ambiguous and fit.rivals[0][0] == 0.0
+        both = np.array([fit.velocity, fit.rivals[0][1][3:6]])
+        assert np.abs(both @ v / (v @ v) - [[1.0], [-1.0]]).min(axis=0).max() < 0.3
+        t, _, _, _ = fit.closest_approach(ALONE.positions[0])
+        assert (fit.position + t * fit.velocity)[2] >= ALONE.positions[0, 2]
+
+
+def test_one_sensor_with_a_known_range_gives_all():
+    data, path, moments = alone([100.0, 250.0, -200.0])
+    r, v = path[:3] - ALONE.positions[0], path[3:6]
+    distance = np.linalg.norm(np.cross(r, v)) / np.linalg.norm(v)
+    fit = fit_pass(data, 1, (distance + 0.1, 0.2))
+    assert not fit.reason and fit.bearing is None and fit.ambiguous
+    error = fit.x[:9] - unknowns_at(path, moments, fit.data.stamp_ns / 1e9)
+    assert (np.abs(error) < 3.0 * np.sqrt(np.diagonal(fit.covariance)[:9])).all()
+    # The range is known to 4 %, and so is the speed.
+    assert fit.speed[1] / fit.speed[0] == pytest.approx(0.2 / distance, rel=0.2)
+    with pytest.raises(ValueError, match='for one sensor'):
+        fit_pass(measured(ROAD, path, moments, np.random.default_rng(1)), 1, (4.0, 0.1))
+
+
+def test_a_moment_at_right_angles_to_the_plane_leaves_directions_open():
+    """The kernel has two dimensions (TSP14 section IV.A): what it reaches is NaN."""
+    data, _, _ = alone([0.0, 0.0, 300.0], path=(0.5, 0.0, 0.0, 9.0, 0.0, 0.0))
+    b = fit_pass(data, 1).bearing
+    assert np.isnan(b.cpa_direction).all() and np.isnan(b.motion_direction).all()
+    assert np.isfinite(b.cpa_time) and np.isfinite(b.rate)
+
+
+def test_a_path_through_the_sensor_is_refused():
+    data, _, _ = alone([0.0, 200.0, -200.0], path=(0.04, -4.5, 0.0, 9.0, 0.0, 0.0))
+    assert 'r0 parallel to v0' in fit_pass(data, 1).reason
+
+
+def test_what_cannot_be_fitted_has_a_reason():
+    rng = np.random.default_rng(2)
+    path, moments = random_path(rng, 3, True)
+    data = measured(ROAD, path, moments, rng)
+
+    def reason(changed, n_dipoles=3):
+        fit = fit_pass(changed, n_dipoles)
+        assert not len(fit.x) or fit.reason
+        return fit.reason
+
+    assert 'no sensor' in reason(replace(data, field=np.full_like(data.field, np.nan)))
+    few = np.r_[198:201, 598:601]
+    assert 'fewer measurements (18) than unknowns (22)' in reason(replace(
+        data, t=data.t[few], sensor=data.sensor[few], field=data.field[few]))
+    noise = NOISE * rng.standard_normal(data.field.shape)
+    assert 'no stronger than noise' in reason(replace(data, field=noise))
+    far = path.copy()
+    far[1] += 45.0
+    assert 'out of range' in reason(measured(ROAD, far, moments, rng), 1)
+    with pytest.raises(ValueError, match='at least one dipole'):
+        fit_pass(data, 0)
+
+
+def test_two_vehicles_in_one_window_are_refused():
+    for seed, heading in ((1, 0.0), (2, np.pi)):
+        rng = np.random.default_rng(seed)
+        one, m1 = random_path(rng, 3, True)
+        other, m2 = random_path(rng, 3, True)
+        one[:7] = 0.0, -1.75, 0.5, 9.0, 0.0, 0.0, 3.0
+        other[:7] = 6.0, 1.75, 0.5, 11.0 * np.cos(heading), 0.0, 0.0, 3.0
+        both = together(measured(ROAD, one, m1, rng), measured(ROAD, other, m2, rng, noise=1e-15))
+        assert choose_order([fit_pass(both, d) for d in (1, 2, 3)]) is None
+
+
+def test_missing_axes_and_sensors_cost_accuracy_and_nothing_else():
+    rng = np.random.default_rng(8)
+    path, moments = random_path(rng, 1, True)
+    data = measured(ROAD, path, moments, rng)
+    field = data.field.copy()
+    field[data.sensor == 1, 2] = np.nan
+    field[100:140] = np.nan
+    fit, whole = fit_pass(replace(data, field=field), 1), fit_pass(data, 1)
+    assert not fit.reason and fit.data.n_values == 2 * 400 * 3 - 400 - 120
+    assert len(fit.x) == 6 + 3 + 5 and len(whole.x) == 6 + 3 + 6
+    error = fit.x[:9] - unknowns_at(path, moments, fit.data.stamp_ns / 1e9)
+    assert error @ np.linalg.solve(fit.covariance[:9, :9], error) < chi2.ppf(0.999, 9)
+    assert (np.diagonal(fit.covariance)[:9] > np.diagonal(whole.covariance)[:9]).all()
+
+
+@pytest.fixture(scope='session')
+def recorded_passes(road_network):
+    """{name: FittedPass} of the bundled vehicle recordings."""
+    out = {}
+    for name in VEHICLES:
+        job = RecordingFit(Recording(vehicle_path(name)), road_network, settings_for('vehicle'),
+                           (1, 2, 3, 4))
+        passes = list(job.passes())
+        assert len(passes) == 1 and not job.warnings(), name
+        out[name] = passes[0]
+    return out
+
+
+STRAIGHT = {'straight_car_right': 8.3, 'straight_small_left': 11.1, 'straight_car_fast_left': 20.0,
+            'straight_truck_right': 6.0}
+
+
+@pytest.mark.parametrize('name', STRAIGHT)
+def test_order_three_describes_vehicles(recorded_passes, name):
+    """Normalised cost, speed: the project's aims."""
+    fit = next(f for f in recorded_passes[name].fits if f.n_dipoles == 3)
+    assert not fit.reason
+    assert fit.normalised_cost < (8.0 if 'truck' in name else 2.0)
+    assert fit.speed[0] == pytest.approx(STRAIGHT[name], rel=0.08)
+    # A truck is no row of three: its deviations are several times those of noise alone.
+    honest = np.sqrt(np.diagonal(fit.honest_covariance) / np.diagonal(fit.covariance))[:6]
+    assert np.median(honest) > (5.0 if 'truck' in name else 1.0)
+    # The order that is chosen may be another one.
+    assert recorded_passes[name].chosen.speed[0] == pytest.approx(STRAIGHT[name], rel=0.1)
+
+
+@pytest.mark.parametrize('name', [n for n in VEHICLES if 'turns' in n])
+def test_a_turn_is_no_pass_at_constant_velocity(recorded_passes, name):
+    assert recorded_passes[name].chosen is None
+    assert any('not at constant velocity' in f.reason for f in recorded_passes[name].fits)

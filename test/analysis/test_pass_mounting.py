@@ -1,0 +1,207 @@
+"""What tracks say of the sensors' angles: folded as one estimate of all of them would be."""
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from mag_tracking.analysis.pass_mounting import MountingEvidence, fold_mounting, with_evidence
+from mag_tracking.geometry import rotation_about_z
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.records import Track
+from mag_tracking.simulation.scenario import Path, point_body, simulate
+from support.bundled import POINT
+from support.networks import line_network
+from support.track_runs import drive
+
+NETWORK = line_network(3, tilt=0.6)
+PRIOR = np.deg2rad([[0.3, 0.3, 2.0], [1.0, 2.0, 3.0], [5.0, 5.0, 5.0]])
+
+
+@dataclass
+class Toy:
+    """Tracks that measure every sensor's turn, linearly; and the joint answer."""
+
+    tracks: list
+    truth: np.ndarray
+    mean: np.ndarray
+    covariance: np.ndarray
+
+
+def toy(n_tracks, seed=0, noise=0.01, claimed=1.0, axes=3, network=NETWORK, prior=PRIOR):
+    """`axes` directions are measured by each track, with `noise` [rad], and `claimed` times that
+    is what the track believes. The oracle is one least-squares solution of all rows."""
+    rng = np.random.default_rng(seed)
+    n = len(network)
+    truth = prior * rng.standard_normal((n, 3))
+    rows = [[(np.eye(3) / prior[j], np.zeros(3))] for j in range(n)]
+    tracks = []
+    for k in range(n_tracks):
+        mounting, covariance = np.empty((n, 3)), np.empty((n, 3, 3))
+        for j in range(n):
+            A = rng.standard_normal((axes, 3)) / noise
+            y = A @ truth[j] + rng.standard_normal(axes)
+            A, y = A / claimed, y / claimed
+            rows[j].append((A, y))
+            P = np.linalg.inv(np.diag(prior[j]**-2.0) + A.T @ A)
+            # A filter's angles turn the field in the sensor's frame: the sensor is turned back.
+            R_sw = network.R_sw[j]
+            mounting[j], covariance[j] = -R_sw @ (P @ A.T @ y), R_sw @ P @ R_sw.T
+        tracks.append(SimpleNamespace(id=k + 1, mounting=mounting, mounting_covariance=covariance))
+    mean, joint = np.empty((n, 3)), np.empty((n, 3, 3))
+    for j in range(n):
+        A, y = (np.concatenate(part) for part in zip(*rows[j], strict=True))
+        mean[j] = np.linalg.lstsq(A, y, rcond=None)[0]
+        joint[j] = np.linalg.inv(A.T @ A)
+    return Toy(tracks, truth, mean, joint)
+
+
+@pytest.mark.parametrize('axes', [1, 2, 3])
+@pytest.mark.parametrize('n_tracks', [1, 2, 7])
+def test_folded_tracks_are_one_estimate_of_all(n_tracks, axes):
+    # They claim too much noise, so that nothing is widened.
+    t = toy(n_tracks, noise=0.01, claimed=3.0, axes=axes)
+    e = fold_mounting(NETWORK, PRIOR, t.tracks)
+    assert e.n_tracks == n_tracks
+    np.testing.assert_allclose(e.turn, t.mean, rtol=1e-6, atol=1e-10)
+    np.testing.assert_allclose(e.covariance, t.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_the_order_of_the_tracks_does_not_matter():
+    t = toy(6)
+    a, b = (fold_mounting(NETWORK, PRIOR, tracks) for tracks in (t.tracks, t.tracks[::-1]))
+    for name in ('turn', 'covariance', 'scatter'):
+        np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-9)
+
+
+def test_no_track_leaves_what_was_known():
+    e = fold_mounting(NETWORK, PRIOR, [])
+    assert e.n_tracks == 0 and not e.turn.any() and np.isnan(e.scatter).all()
+    np.testing.assert_allclose(np.sqrt(np.einsum('jii->ji', e.covariance)), PRIOR)
+    assert np.isnan(fold_mounting(NETWORK, PRIOR, toy(1).tracks).scatter).all()
+
+
+def test_a_track_that_learnt_nothing_says_nothing():
+    """Its covariance is the prior's, or by the linearisation of the mean a little above."""
+    prior = np.einsum('jik,jk,jlk->jil', NETWORK.R_sw, PRIOR**2, NETWORK.R_sw)
+    idle = SimpleNamespace(id=9, mounting=np.zeros((3, 3)),
+                           mounting_covariance=1.02 * prior)
+    e = fold_mounting(NETWORK, PRIOR, [idle, idle])
+    np.testing.assert_allclose(e.covariance, np.array([np.diag(s**2) for s in PRIOR]),
+                               rtol=1e-6, atol=1e-15)
+    assert np.abs(e.turn).max() < 1e-9
+
+
+def scatters(n_runs, n_tracks, **kwargs):
+    """(n_runs * n_sensors,), and the mean NEES of the turns."""
+    out, nees = [], []
+    for seed in range(n_runs):
+        t = toy(n_tracks, seed, **kwargs)
+        e = fold_mounting(NETWORK, PRIOR, t.tracks)
+        out += e.scatter.tolist()
+        off = e.turn - t.truth
+        nees += [d @ np.linalg.solve(C, d) for d, C in zip(off, e.covariance, strict=True)]
+    return np.array(out), np.array(nees)
+
+
+def test_honest_claims_scatter_about_one():
+    # Tracks that tell far more than the prior: this compares them with each other only.
+    scatter, nees = scatters(60, 5, noise=1e-4)
+    freedom = 3 * (5 - 1)
+    low, high = chi2.ppf([0.001, 0.999], freedom * len(scatter)) / (freedom * len(scatter))
+    print(f'scatter {scatter.mean():.3f}, NEES {nees.mean() / 3:.3f}')
+    assert low < scatter.mean() < high
+    # Where chance says more than one it is widened, and never the other way.
+    assert 0.6 < nees.mean() / 3 < chi2.ppf(0.999, 3 * len(nees)) / (3 * len(nees))
+
+
+@pytest.mark.parametrize('n_tracks', [2, 5])
+def test_honest_claims_that_are_weak_scatter_about_one(n_tracks):
+    """Tracks that tell a tenth of what was known: what the prior holds back is no scatter."""
+    scatter, _ = scatters(80, n_tracks, noise=0.15)
+    freedom = 3 * (n_tracks - 1)
+    high = chi2.ppf(0.999, freedom * len(scatter)) / (freedom * len(scatter))
+    print(f'{n_tracks} weak tracks: scatter {scatter.mean():.3f}')
+    assert scatter.mean() < high
+
+
+def test_what_tracks_claim_falsely_is_widened():
+    scatter, nees = scatters(60, 5, noise=1e-3, claimed=0.2)
+    assert scatter.mean() == pytest.approx(25.0, rel=0.1)
+    # Without it, twenty-five; by it, as by a Student's t of twelve degrees of freedom.
+    assert 0.6 < nees.mean() / 3 < 1.5
+    t = toy(5, 3, noise=1e-3, claimed=0.2)
+    e = fold_mounting(NETWORK, PRIOR, t.tracks)
+    ratio = np.trace(e.covariance, axis1=1, axis2=2) / np.trace(t.covariance, axis1=1, axis2=2)
+    np.testing.assert_allclose(ratio, e.scatter, rtol=0.02)
+
+
+def test_a_track_of_another_network_is_refused():
+    t = toy(2)
+    t.tracks[1].mounting = t.tracks[1].mounting[:2]
+    with pytest.raises(ValueError, match='track 2 has the mounting angles of 2 sensors, not of 3'):
+        fold_mounting(NETWORK, PRIOR, t.tracks)
+
+
+def test_the_network_is_turned_about_the_worlds_axes():
+    turn = np.deg2rad([[0.0, 0.0, 6.0], [2.0, 0.0, 0.0], [1.0, -2.0, 3.0]])
+    C = np.tile(np.diag(np.deg2rad([1.0, 2.0, 3.0])**2), (3, 1, 1))
+    found = with_evidence(NETWORK, MountingEvidence(turn, C, np.full(3, np.nan), 1))
+    np.testing.assert_allclose(found.R_ws[0], rotation_about_z(np.deg2rad(6.0)) @ NETWORK.R_ws[0])
+    np.testing.assert_allclose(found.R_ws, Rotation.from_rotvec(turn).as_matrix() @ NETWORK.R_ws)
+    np.testing.assert_allclose(found.orientation_std[2], np.deg2rad([1.0, 2.0, 3.0]))
+    assert found.names == NETWORK.names and found.earth_field is NETWORK.earth_field
+
+
+CHANGES = {**POINT, 'track.field_error': 0.0, 'track.vehicle.near_field_lengths': [0.0],
+           'track.mounting_std_deg': 5.0}
+
+
+@pytest.fixture(scope='module')
+def turned_passes():
+    """(network as stated, as it is, evidence) of passes by a sensor turned by 6 degrees."""
+    stated = line_network(4, tilt=0.5)
+    R_ws = stated.R_ws.copy()
+    R_ws[1] = rotation_about_z(np.deg2rad(6.0)) @ R_ws[1]
+    tracks = []
+    for k, (start, heading, hard) in enumerate((
+            ([-60.0, -1.2], 0.0, [600.0, -300.0, 160.0]),
+            ([70.0, 1.2], np.pi, [-300.0, 500.0, -250.0]))):
+        samples, *_ = simulate(
+            SimpleNamespace(names=stated.names, positions=stated.positions, R_ws=R_ws,
+                            earth_field=stated.earth_field),
+            point_body(hard, 5.0, 0.5), Path(np.array(start), heading, 10.0), 50.0, 12.0,
+            np.random.default_rng(k))
+        pipeline = Pipeline(stated, settings_for('vehicle', CHANGES))
+        records = [r for s in samples for r in pipeline.feed(s)]
+        tracks.append([r for r in records if isinstance(r, Track) and not r.ended][-1])
+    prior = np.full((4, 3), np.deg2rad(5.0))
+    return stated, R_ws, fold_mounting(stated, prior, tracks)
+
+
+def test_passes_turn_a_sensor_to_where_it_points(turned_passes):
+    stated, truth, evidence = turned_passes
+    found = with_evidence(stated, evidence)
+    before, after = (Rotation.from_matrix(truth @ np.swapaxes(R, 1, 2)).as_rotvec()
+                     for R in (stated.R_ws, found.R_ws))
+    print(np.degrees(evidence.turn).round(2), np.degrees(after).round(2),
+          np.degrees(found.orientation_std).round(2))
+    # To the truth, not away from it, about the vertical.
+    assert evidence.turn[1, 2] > np.deg2rad(3.0)
+    assert abs(after[1, 2]) < 0.5 * abs(before[1, 2])
+    # The others are left about where they were, and all are as well known as is claimed.
+    assert np.abs(evidence.turn[[0, 2, 3]]).max() < 3.0 * np.deg2rad(5.0) / 3.0
+    assert np.abs(after / np.array(found.orientation_std)).max() < 4.0
+    assert np.array(found.orientation_std)[:, 2].max() < np.deg2rad(5.0)
+
+
+def test_a_tracker_without_angles_is_refused():
+    network = line_network(2)
+    tracks, *_ = drive(network, point_body([300.0, -150.0, 80.0], 5.0, 0.5),
+                       Path(np.array([-70.0, -1.2]), 0.0, 10.0),
+                       changes={'track.mounting_std_deg': 0.0})
+    with pytest.raises(ValueError, match='angles of 0 sensors, not of 2'):
+        fold_mounting(network, np.full((2, 3), 0.1), tracks[:1])

@@ -1,0 +1,357 @@
+"""Hard and soft iron from the sizes of a tumbled sensor's readings."""
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+from scipy.stats import binom, special_ortho_group, t
+
+from mag_tracking.calibration import ellipsoid_fit
+from mag_tracking.calibration.ellipsoid_fit import N_BLOCKS, fit_ellipsoid
+from support.bundled import DATA
+
+CORRECTION = np.array([[1.1, 0.05, -0.02], [0.05, 0.9, 0.03], [-0.02, 0.03, 1.05]])
+CORRECTION /= np.cbrt(np.linalg.det(CORRECTION))
+OFFSET = np.array([0.3, -0.2, 0.5])
+PERIOD = 618
+
+
+def tumbling(n):
+    """(n, 3) unit vectors that go round smoothly, all over the sphere."""
+    k = np.arange(n)
+    z = 0.98 * np.cos(2.0 * np.pi * k / PERIOD * 1.236)
+    rho, angle = np.sqrt(1.0 - z * z), 2.0 * np.pi * k / PERIOD * 13.0
+    return np.stack([rho * np.cos(angle), rho * np.sin(angle), z], axis=1)
+
+
+def scattered(n, seed=0):
+    """(n, 3) unit vectors at random."""
+    u = np.random.default_rng(seed).standard_normal((n, 3))
+    return u / np.linalg.norm(u, axis=1)[:, None]
+
+
+def readings(u, noise=0.01, seed=1, correction=CORRECTION, offset=OFFSET):
+    """(n, 3) readings of a field of size one from directions `u`."""
+    field = u + noise * np.random.default_rng(seed).standard_normal(u.shape)
+    return offset + np.linalg.solve(correction, field.T).T
+
+
+def recording(name, skip):
+    return np.loadtxt(DATA / 'calibration' / name, delimiter=',', skiprows=skip)[:, -3:]
+
+
+def spread(values):
+    sizes = np.linalg.norm(values, axis=1)
+    return sizes.std() / sizes.mean()
+
+
+@pytest.fixture(scope='module')
+def recordings():
+    return {'tumbled': recording('tumbled_acc_mag.csv', 1),
+            'counts': recording('qmc5883l_raw_counts.csv.gz', 3)}
+
+
+RECORDINGS = [('tumbled', 0.015, 0.31951, [0.148, 0.389, -0.059], 5e-4),
+              ('counts', 0.03, 0.09519, [6195.0, 250.0, 3480.0], 0.5)]
+"""Largest residual, residual before, offset of another program and half of its last digit."""
+
+
+@pytest.mark.parametrize('name, limit, before, offset, digit', RECORDINGS)
+def test_recordings(recordings, name, limit, before, offset, digit):
+    y = recordings[name]
+    fit = fit_ellipsoid(y)
+    print(f'{name}: {fit.residual_before:.5f} to {fit.residual:.5f}, offset {fit.offset} '
+          f'+- {fit.offset_std}, radius {fit.field_size:.6g}, coverage {fit.coverage:.3f}')
+    assert fit.converged and fit.reason == '' and fit.warnings == ()
+    assert fit.n_readings == len(y) and fit.n_outliers < 0.001 * len(y)
+    assert fit.residual_before == pytest.approx(before, abs=1e-5)
+    assert fit.residual == pytest.approx(spread(fit.correct(y)), rel=1e-12)
+    assert fit.residual <= limit
+    assert (np.abs(fit.offset - offset) < 3.0 * fit.offset_std + digit).all()
+    assert np.linalg.det(fit.correction) == pytest.approx(1.0, rel=1e-9)
+    sizes = np.linalg.norm(fit.correct(y), axis=1)
+    assert abs(sizes.mean() / fit.field_size - 1.0) < 0.2 * limit
+
+
+@pytest.mark.parametrize('name, limit', [(r[0], r[1]) for r in RECORDINGS])
+def test_half_of_a_recording_predicts_the_other(recordings, name, limit):
+    y = recordings[name]
+    fits = [fit_ellipsoid(y[k::2], field_size=1.0) for k in (0, 1)]
+    for fit, rest in zip(fits, (y[1::2], y[::2]), strict=True):
+        assert spread(fit.correct(rest)) <= limit
+    # Neighbours share their errors: the two differ by less than either is off the truth.
+    assert (np.abs(fits[0].offset - fits[1].offset) < 3.0 * fits[0].offset_std).all()
+
+
+def test_a_recording_of_a_still_sensor_is_refused(recordings):
+    fit = fit_ellipsoid(recordings['counts'][:3000])
+    assert not fit.converged and 'lay still' in fit.reason
+
+
+@settings(derandomize=True, deadline=None, max_examples=25)
+@given(st.integers(0, 10**6), st.floats(-9.0, 5.0))
+def test_exact_readings_give_exact_parameters(seed, decade):
+    rng = np.random.default_rng(seed)
+    V = special_ortho_group.rvs(3, random_state=rng)
+    true = (V * rng.uniform(0.6, 1.6, 3)) @ V.T
+    true /= np.cbrt(np.linalg.det(true))
+    offset, unit = 3.0 * rng.standard_normal(3), 10.0**decade
+    fit = fit_ellipsoid(unit * readings(tumbling(700), 0.0, correction=true, offset=offset))
+    assert fit.converged and fit.warnings == ()
+    np.testing.assert_allclose(fit.offset, unit * offset, atol=1e-9 * unit)
+    np.testing.assert_allclose(fit.correction, true, atol=1e-9)
+    assert fit.field_size == pytest.approx(unit, rel=1e-9)
+    assert fit.residual < 1e-9 and fit.coverage > 0.5
+
+
+@pytest.mark.parametrize('unit', [1e-9, 3e-5, 2e4])
+@pytest.mark.parametrize('size', [None, 5e-5])
+def test_units_change_nothing_else(unit, size):
+    y = readings(tumbling(1000))
+    one, other = fit_ellipsoid(y, size), fit_ellipsoid(unit * y, size)
+    scale = unit if size is None else 1.0
+    for a, b in [(one.offset * unit, other.offset), (one.offset_std * unit, other.offset_std),
+                 (one.correction * scale, other.correction * unit),
+                 (one.correction_std * scale, other.correction_std * unit),
+                 (one.field_size * scale, other.field_size),
+                 (one.field_size_std * scale, other.field_size_std),
+                 (one.residual, other.residual), (one.coverage, other.coverage)]:
+        np.testing.assert_allclose(b, a, rtol=1e-5)
+
+
+def test_the_field_size_given_is_that_of_the_corrected_field():
+    y = readings(tumbling(1000))
+    free, fit = fit_ellipsoid(y), fit_ellipsoid(y, 5e-5)
+    assert fit.field_size == 5e-5 and fit.field_size_std == 0.0 and free.field_size_std > 0.0
+    assert np.linalg.norm(fit.correct(y), axis=1).mean() == pytest.approx(5e-5, rel=0.002)
+    np.testing.assert_allclose(fit.correction * free.field_size, 5e-5 * free.correction,
+                               rtol=1e-9)
+    assert np.array_equal(fit.offset, free.offset)
+
+
+def test_turned_and_shifted_readings_turn_and_shift_the_fit():
+    y = readings(tumbling(3000))
+    one = fit_ellipsoid(y)
+    for seed in range(4):
+        R = special_ortho_group.rvs(3, random_state=seed)
+        shift = np.array([5.0, -3.0, 2.0])
+        other = fit_ellipsoid(y @ R.T + shift)
+        # The cells stay where they are, and with them the weights change a little.
+        assert np.abs(R.T @ (other.offset - shift) - one.offset).max() \
+            < 0.3 * one.offset_std.max()
+        assert np.abs(R.T @ other.correction @ R - one.correction).max() \
+            < 0.3 * one.correction_std.max()
+        assert other.coverage == pytest.approx(one.coverage, abs=0.05)
+
+
+def test_the_optimum_is_that_of_a_general_solver():
+    """Of the soft L1 of sizes, with differences for a Jacobian; evenly spread, all weights one."""
+    y = readings(scattered(2000), 0.03)
+    y[::30] = OFFSET + 1.3 * (y[::30] - OFFSET)
+    rows, columns = np.triu_indices(3)
+
+    def off(theta):
+        C = np.zeros((3, 3))
+        C[rows, columns] = C[columns, rows] = theta[3:]
+        return np.linalg.norm((y - theta[:3]) @ C, axis=1) - 1.0
+
+    theta = np.concatenate([OFFSET, CORRECTION[rows, columns]])
+    for _ in range(3):
+        scale = 2.0 * 1.4826 * np.median(np.abs(off(theta)))
+        theta = least_squares(off, theta, loss='soft_l1', f_scale=scale, xtol=1e-12).x
+    fit = fit_ellipsoid(y, 1.0)
+    assert (np.abs(fit.offset - theta[:3]) < 0.02 * fit.offset_std).all()
+    assert (np.abs(fit.correction[rows, columns] - theta[3:])
+            < 0.02 * fit.correction_std[rows, columns]).all()
+
+
+@pytest.mark.parametrize('correlation', [0.0, 0.8])
+def test_the_stated_deviations_cover_the_truth(correlation):
+    """Also where noise is correlated in time, as that of real sensors is. It is small: the radius
+    is too large by its square."""
+    n_runs, n, rng = 150, 1500, np.random.default_rng(3)
+    u, errors = tumbling(n), []
+    for _ in range(n_runs):
+        e = 0.003 * rng.standard_normal((n, 3))
+        for k in range(1, n if correlation else 0):
+            e[k] = correlation * e[k - 1] + np.sqrt(1.0 - correlation**2) * e[k]
+        fit = fit_ellipsoid(readings(u + e, 0.0))
+        errors.append(np.concatenate([
+            (fit.offset - OFFSET) / fit.offset_std,
+            ((fit.correction - CORRECTION) / fit.correction_std)[np.triu_indices(3)],
+            [(fit.field_size - 1.0) / fit.field_size_std]]))
+    inside = np.abs(errors) < t.ppf(0.9, N_BLOCKS - 1)
+    rates = inside.mean(axis=0)
+    print(f'{correlation}: {rates.round(3)}')
+    low, high = binom.ppf([5e-4, 1.0 - 5e-4], n_runs, 0.8)
+    assert (low <= inside.sum(axis=0)).all() and (inside.sum(axis=0) <= high).all()
+
+
+def test_a_field_whose_size_wanders_leaves_the_shape_certain():
+    """Each stretch of time sees the whole sphere at a size of its own; det(correction) is one."""
+    size = 1.0 + 0.02 * np.random.default_rng(6).standard_normal(N_BLOCKS)
+    fit = fit_ellipsoid(readings(tumbling(20000) * np.repeat(size, 20000 // N_BLOCKS)[:, None]))
+    assert fit.field_size_std == pytest.approx(0.02 / np.sqrt(N_BLOCKS), rel=0.4)
+    assert np.diagonal(fit.correction_std).max() < 0.5 * fit.field_size_std
+
+
+def test_a_still_sensor_weighs_no_more_than_one_direction():
+    """Something bends the field by three percent in a pattern that no ellipsoid follows."""
+    u = tumbling(2000)
+    x, y, z = u.T
+    bent = readings(u * (1.0 + 0.03 * (5.0 * z**3 - 3.0 * z) / 2.0)[:, None], 0.002)
+    still = readings(np.tile([0.0, 0.0, 1.03], (6000, 1)), 0.002, seed=5)
+    even, piled = fit_ellipsoid(bent), fit_ellipsoid(np.concatenate([still, bent]))
+    assert piled.converged
+    # The pile has the weight of three cells in five hundred; as readings, of three in four.
+    assert np.abs(piled.offset - even.offset).max() < 0.001
+
+
+@pytest.mark.parametrize('factor', [1.3, 0.5, 2.2])
+def test_outliers_are_bounded_and_counted(factor):
+    y = readings(scattered(2000))
+    clean = fit_ellipsoid(y)
+    y[::25] = OFFSET + factor * (y[::25] - OFFSET)
+    fit = fit_ellipsoid(y)
+    assert fit.converged and fit.n_outliers == 80 and fit.n_readings == 2000
+    assert fit.warnings[-1] == 'a share of 0.04 of the readings are outliers'
+    assert (np.abs(fit.offset - OFFSET) < 4.0 * fit.offset_std).all()
+    assert (fit.offset_std < 1.5 * clean.offset_std).all()
+    assert fit.residual == pytest.approx(spread(fit.correct(y)), rel=1e-12)
+
+
+def test_glitches_are_left_out_and_counted():
+    y = readings(tumbling(2000))
+    clean = fit_ellipsoid(y)
+    y[::100] = [[32767.0, -32768.0, 40.0]]
+    fit = fit_ellipsoid(y)
+    assert fit.converged and fit.n_outliers == 20 and fit.n_readings == 1980
+    assert (np.abs(fit.offset - clean.offset) < clean.offset_std).all()
+    # Nothing is left out of the residual.
+    assert fit.residual > 1.0 and any('residual' in w for w in fit.warnings)
+
+
+def test_missing_readings_are_left_out_and_counted():
+    y = readings(tumbling(1000))
+    gaps = np.insert(y, range(0, 1000, 10), [np.nan, 1.0, 1.0], axis=0)
+    fit, whole = fit_ellipsoid(gaps), fit_ellipsoid(y)
+    assert fit.n_missing == 100 and fit.n_readings == 1000 and fit.converged
+    assert fit.warnings == ('100 readings with a missing axis are left out',)
+    np.testing.assert_array_equal(fit.offset, whole.offset)
+    assert fit.residual == whole.residual and fit.residual_before == whole.residual_before
+
+
+def test_readings_at_the_end_of_the_range_are_left_out_and_named():
+    y = readings(tumbling(20000))
+    top = 0.5 * (OFFSET[1] + y[:, 1].max())
+    y[:, 1] = np.minimum(y[:, 1], top)
+    y[::50, 0] = np.nan
+    fit = fit_ellipsoid(y)
+    assert fit.n_readings + fit.n_missing + fit.n_saturated == 20000 and fit.n_missing == 400
+    assert fit.converged and fit.n_saturated > (y[:, 1] == top).sum() > 1000
+    assert fit.warnings[1] == (f'{fit.n_saturated} readings at the end of the range of y '
+                               'are left out')
+    assert (np.abs(fit.offset - OFFSET) < 4.0 * fit.offset_std).all()
+    assert fit.residual == pytest.approx(spread(fit.correct(y[~np.isnan(y[:, 0])])), rel=1e-12)
+
+
+def ball(n):
+    """(n, 3) vectors that fill a ball."""
+    return scattered(n) * np.cbrt(np.random.default_rng(9).uniform(size=n))[:, None]
+
+
+U = scattered(3000)
+EVEN = tumbling(1500)
+RING = np.stack([np.cos(0.1 * np.arange(600)), np.sin(0.1 * np.arange(600)), np.zeros(600)], 1)
+POSES = np.repeat(scattered(16, seed=2), 100, axis=0)
+LONG = np.diag([1.0, 1.0, 8.0])
+
+
+@pytest.mark.parametrize('y, reason', [
+    (np.zeros((0, 3)), '^0 readings, needs 50'),
+    (readings(EVEN[:49]), '^49 readings, needs 50'),
+    (np.full((100, 3), np.nan), '^0 readings, needs 50'),
+    (np.zeros((100, 3)), '^all 100 readings are equal'),
+    (readings(np.tile(EVEN[0], (900, 1))), 'lay still'),
+    (readings(RING, 0.0), 'in a plane: thickness .* needs 0.05'),
+    (readings(RING), 'in a plane: thickness .* needs 0.05'),
+    (readings(0.9 * RING + [0.0, 0.0, np.sqrt(0.19)]), 'in a plane: thickness .* needs 0.05'),
+    (readings(U[np.abs(U[:, 2]) < 0.3]), r'^coverage 0.00.*, needs 0.01; .*: none'),
+    (readings(U[U[:, 2] > 0.0]),
+     r'^coverage 0.00.*, needs 0.01; .*: \+x\+y-z, \+x-y-z, -x\+y-z, -x-y-z$'),
+    (readings(U[U[:, 0] < 0.0], 0.0), r'^coverage 0.00.*, needs 0.01'),
+    (readings(U[U @ [0.6, 0.0, 0.8] > 0.6], 0.0), r'^coverage .*e-05, needs 0.01'),
+    (readings(U[U @ [0.6, 0.0, 0.8] > 0.6]), 'different directions|differ by a factor|no ellips'),
+    (readings(EVEN, correction=LONG), 'are as 0.73 to 5.8, at most 1 to 5 is'),
+    (readings(U) * np.where(np.arange(3000) % 12 == 0, 3.0, 1.0)[:, None],
+     'scatter 0.* of the radius .* at most 0.1'),
+    (readings(ball(3000)), 'scatter 0.* of the radius .* at most 0.1'),
+    (readings(POSES, 1e-4), '^15 different directions, needs 18'),
+    (readings(EVEN) * np.where(np.arange(1500) % 25 == 0, 100.0, 1.0)[:, None],
+     'share of 0.96 of the readings are outliers, at most 0.2')])
+def test_what_cannot_be_fitted_is_refused(y, reason):
+    fit = fit_ellipsoid(y)
+    print(fit.reason)
+    assert not fit.converged and re.search(reason, fit.reason)
+
+
+@pytest.mark.parametrize('seed', range(40))
+def test_a_fit_that_is_not_refused_is_near_the_truth(seed):
+    """Parts of the sphere of any shape, few readings, much noise."""
+    rng = np.random.default_rng(seed)
+    u = scattered(1200, seed)
+    along = u @ scattered(1, seed + 1000)[0]
+    part = np.abs(along) < rng.uniform() if seed % 2 else along > rng.uniform(-1.0, 0.9)
+    u = u[part][:rng.choice([80, 300])]
+    fit = fit_ellipsoid(readings(u, rng.choice([0.003, 0.01, 0.03]), seed))
+    assert bool(fit.reason) != fit.converged
+    if fit.converged:
+        assert (np.abs(fit.offset - OFFSET) < 6.0 * fit.offset_std).all()
+        assert np.linalg.norm(fit.offset - OFFSET) < 0.1
+
+
+def test_an_offset_that_is_uncertain_is_refused():
+    fit = fit_ellipsoid(readings(U[U[:, 2] > -0.3][:60], 0.06, seed=4))
+    print(fit.reason)
+    assert not fit.converged and 'offset uncertain by 0.' in fit.reason
+
+
+def test_least_squares_that_stop_early_are_refused(monkeypatch):
+    solve = ellipsoid_fit.least_squares
+    monkeypatch.setattr(ellipsoid_fit, 'least_squares',
+                        lambda *a, **k: solve(*a, **(k | {'max_nfev': 1})))
+    fit = fit_ellipsoid(readings(EVEN))
+    assert not fit.converged and 'least squares did not converge' in fit.reason
+
+
+@pytest.mark.parametrize('y, note', [
+    (readings(U[np.abs(U[:, 2]) < 0.5]), 'coverage 0.0.*, good is 0.1'),
+    (readings(U[(U < 0.0).any(axis=1)]), r'few or no readings from \+x\+y\+z$'),
+    (readings(EVEN, 0.08), 'residual 0.0.* after correction, good is 0.05')])
+def test_what_is_mediocre_is_warned_of(y, note):
+    fit = fit_ellipsoid(y)
+    assert fit.converged and len(fit.warnings) == 1 and re.match(note, fit.warnings[0])
+
+
+def test_coverage_is_that_of_the_directions():
+    """Known: the harmonics to degree two, integrated over part of a sphere."""
+    u = scattered(60000)
+    for least, known in [(-1.0, 1.0), (-0.5, 0.10852), (0.0, 0.0078433)]:
+        fit = fit_ellipsoid(readings(u[u[:, 0] > least], 0.0))
+        assert fit.coverage == pytest.approx(known, rel=0.25)
+
+
+@pytest.mark.parametrize('y, size, message', [
+    (np.zeros((5, 2)), None, r'expected readings \(n, 3\), got \(5, 2\)'),
+    (np.zeros(3), None, r'expected readings \(n, 3\), got \(3,\)'),
+    (np.where(np.arange(1500)[:, None] == 7, -np.inf, EVEN), None, 'reading 7 is infinite'),
+    (EVEN, 0.0, 'field_size = 0.0, must be positive'),
+    (EVEN, -1.0, 'field_size = -1.0, must be positive'),
+    (EVEN, np.nan, 'field_size = nan, must be positive'),
+    (EVEN, np.inf, 'field_size = inf, must be positive')])
+def test_bad_input_is_named(y, size, message):
+    with pytest.raises(ValueError, match=message):
+        fit_ellipsoid(y, size)

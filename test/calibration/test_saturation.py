@@ -1,0 +1,66 @@
+"""Readings at the end of a sensor's range."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from mag_tracking.apps.fit import PassCollector
+from mag_tracking.calibration.saturation import MARGIN, cut_off
+from mag_tracking.pipeline import settings_for
+from mag_tracking.records import MagSample
+from support.passes import ROAD, measured, random_path, unknowns_at
+
+
+def curve(n=200):
+    return 500.0 * np.exp(-((np.arange(n) - 90.0) / 15.0)**2)
+
+
+def test_a_limit_is_seen_through_noise():
+    noisy = curve() + np.random.default_rng(1).standard_normal(200)
+    cut = np.minimum(noisy, 300.0)
+    expected = np.convolve(noisy >= 300.0, np.ones(2 * MARGIN + 1), 'same') > 0.0
+    assert expected.sum() < 60
+    assert np.array_equal(cut_off(cut), expected)
+    assert np.array_equal(cut_off(-cut), expected)
+    assert not cut_off(noisy).any()
+
+
+@pytest.mark.parametrize('step', [1.0, 5.0, 20.0])
+def test_coarse_steps_are_no_limit(step):
+    assert not cut_off(np.round(curve() / step) * step).any()
+
+
+def test_short_stretches():
+    assert cut_off([0.0, 1.0, 5.0, 5.0, 5.0, 1.0, 0.0]).all()
+    assert not cut_off([0.0, 1.0, 5.0, 5.0, 1.0]).any() and not cut_off([]).any()
+
+
+def test_what_is_missing_or_stuck_is_no_limit():
+    cut = np.minimum(curve() + np.random.default_rng(1).standard_normal(200), 300.0)
+    cut[::7] = np.nan
+    found = cut_off(cut)
+    assert found.any() and not found[::7].any()
+    assert not cut_off(np.full(50, 3.0)).any() and not cut_off(np.full(5, np.nan)).any()
+
+
+def test_a_saturated_stretch_is_left_out_of_a_pass_and_named():
+    """Cut off at a third of its field; what is left is fitted, within its covariance."""
+    from mag_tracking.analysis.pass_fit import fit_pass
+
+    rng = np.random.default_rng(11)
+    path, moments = random_path(rng, 1, True)
+    path[3:6] = [8.0, 0.0, 0.0]
+    data = measured(ROAD, path, moments, rng, seconds=16.0)
+    limit = np.abs(data.field[data.sensor == 0]).max() / 3.0
+    field = np.where((data.sensor == 0)[:, None], np.clip(data.field, -limit, limit), data.field)
+    collector, passes = PassCollector(ROAD, settings_for('vehicle')), []
+    for k in np.argsort(data.t, kind='stable'):
+        passes += collector.feed(MagSample(int(round(1e9 * (20.0 + data.t[k]))),
+                                           ROAD.names[data.sensor[k]], field[k] + 4e-5))
+    passes += collector.flush()
+    (cut, notes), = passes
+    assert any('mag_1' in n and 'saturated' in n and 'left out' in n for n in notes)
+    fit = fit_pass(cut, 1)
+    assert not fit.reason
+    error = fit.x[:9] - unknowns_at(path, moments, fit.data.stamp_ns / 1e9 - 20.0)
+    assert error @ np.linalg.solve(fit.covariance[:9, :9], error) < chi2.ppf(0.999, 9)

@@ -1,0 +1,322 @@
+"""Spikes and stuck sensors: found where they are, and nowhere else."""
+
+import functools
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mag_tracking.calibration.screening import MOST_HELD, Repetition, SpikeFilter
+from mag_tracking.simulation.scenario import Path, point_body, random_vehicle, simulate
+from support.networks import line_network
+from support.sensor_noise import EARTH, NS, SIGMA, noise
+
+
+def in_steps(fields, step):
+    """Fields as a sensor has them whose steps are `step` noise deviations; 0 = fine ones."""
+    return np.round(fields / (step * SIGMA)) * step * SIGMA if step else fields
+
+
+def screened(fields, rate=100.0, std=SIGMA, threshold=30.0):
+    """([row that was taken for a spike], most that waited at once, [rows that were given late])."""
+    spikes, most, late, out, f = [], 0, [], 0, SpikeFilter(threshold)
+    for k, field in enumerate(fields.tolist()):
+        got = f.feed(k, round(k * NS / rate), field, None if std is None else [std] * 3)
+        assert [row for row, _ in got] == list(range(out, out + len(got)))
+        out += len(got)
+        most = max(most, k + 1 - out)
+        spikes += [row for row, is_spike in got if is_spike]
+        late += [row for row, _ in got if row < k]
+    rest = f.flush()
+    assert [row for row, _ in rest] == list(range(out, len(fields)))
+    assert not any(is_spike for _, is_spike in rest)
+    return spikes, most, late
+
+
+def stuck(fields):
+    """[row that was taken for a repetition]."""
+    r = Repetition()
+    return [k for k, field in enumerate(fields.tolist()) if r.is_stuck(field)]
+
+
+# Nothing is found where nothing is.
+
+@pytest.mark.parametrize('step', [0.0, 0.3, 1.0, 3.0, 10.0])
+@pytest.mark.parametrize('slope', [0.0, 2e-11])
+@pytest.mark.parametrize('rate', [10.0, 100.0])
+def test_noise_and_coarse_steps_at_rest_pass_at_once(step, slope, rate):
+    """10 000 readings, also with a background that drifts from one step of the sensor to the next:
+    there a sensor of coarse steps was once taken for stuck."""
+    y = noise(10_000) + slope * np.arange(10_000)[:, None] * [1.0, 0.8, -0.6]
+    y = in_steps(y, step)
+    assert stuck(y) == []
+    assert screened(y, rate) == ([], 0, [])
+
+
+@functools.cache
+def passes(rate, speed, n=4):
+    """Readings of a sensor that `n` vehicles pass, a metre from it, one after the other."""
+    rng, fields = np.random.default_rng(1), []
+    network = line_network(1)
+    for k in range(n):
+        if k % 2:
+            body, aside = random_vehicle(rng), 1.0 + 1.7 / 2
+        else:
+            body, aside = point_body(rng.normal(0.0, 250.0, 3), 5.0, 0.5), 1.0
+        begin = -40.0 - rng.uniform(0.0, speed / rate)
+        samples, *_ = simulate(network, body, Path(np.array([begin, -4.5 + aside]), 0.0, speed),
+                               rate, 80.0 / speed + 3.0, rng)
+        fields += [s.field for s in samples]
+    return np.array(fields)
+
+
+@pytest.mark.parametrize('step', [0.0, 1.0, 3.0, 10.0])
+@pytest.mark.parametrize('rate', [10.0, 50.0, 100.0])
+def test_vehicles_at_a_metre_are_no_spikes(rate, step):
+    """At ten readings a second all of a pass was once rejected, and behind it a sensor with coarse
+    steps was taken for stuck, for as long as it was at rest."""
+    for speed in (6.0, 13.0, 25.0):
+        y = in_steps(passes(rate, speed), step)
+        assert np.ptp(y) > 1000 * SIGMA
+        assert screened(y, rate)[0] == []
+        assert stuck(y) == []
+
+
+# Spikes.
+
+@pytest.mark.parametrize('sign', [-1.0, 1.0])
+@pytest.mark.parametrize('n', [1, 2, 3])
+@pytest.mark.parametrize('axis', [0, 1, 2])
+@pytest.mark.parametrize('size, rate', [(2e-6, 100.0), (5e-4, 100.0), (5e-4, 10.0)])
+def test_spikes_are_taken_out_and_nothing_else(size, rate, axis, n, sign):
+    y = noise(60)
+    y[30:30 + n, axis] += sign * size * np.array([1.0, 0.8, 1.3])[:n]
+    spikes, most, late = screened(y, rate)
+    assert spikes == late == list(range(30, 30 + n)) and most == n
+
+
+def test_spikes_of_changing_sign_and_axis():
+    y = noise(60)
+    y[30:33] += [[3e-6, 0.0, 0.0], [-4e-6, 0.0, 1e-6], [0.0, 9e-6, 0.0]]
+    assert screened(y)[0] == [30, 31, 32]
+
+
+def test_spikes_one_after_the_other():
+    """They leave nothing behind that the next would be compared with."""
+    y = noise(200)
+    rows = [20, 22, 24, 40, 41, 43, 100, 105]
+    y[rows] += 5e-6
+    assert screened(y)[0] == rows
+
+
+@pytest.mark.parametrize('size, found', [(28.0, False), (35.0, True)])
+def test_the_threshold_is_in_noise_deviations(size, found):
+    y = np.tile(EARTH, (40, 1))
+    y[30, 1] += size * SIGMA
+    assert screened(y)[0] == ([30] if found else [])
+    assert screened(y, threshold=60.0) == ([], 0, [])
+
+
+@pytest.mark.parametrize('before, found', [(3.0, True), (5.0, False)])
+def test_a_spike_is_steeper_than_what_was_before(before, found):
+    y = np.tile(EARTH, (40, 1))
+    y[22:, 0] += before * SIGMA
+    y[25, 0] += 36.0 * SIGMA
+    assert bool(screened(y)[0]) == found
+    # Eight readings later it is forgotten.
+    later = np.tile(EARTH, (40, 1))
+    later[16:, 0] += before * SIGMA
+    later[25, 0] += 36.0 * SIGMA
+    assert screened(later)[0] == [25]
+
+
+@pytest.mark.parametrize('rate, size, found', [
+    (50.0, 25.0, False), (50.0, 35.0, True), (10.0, 3300.0, False), (10.0, 3700.0, True)])
+def test_rare_readings_need_a_larger_spike(rate, size, found):
+    """130 (30 m/s at 1 m: s = 30 / rate)^3 times the noise, where that is more than 30."""
+    y = np.tile(EARTH, (40, 1))
+    y[30, 1] += size * SIGMA
+    assert screened(y, rate)[0] == ([30] if found else [])
+
+
+def test_a_gap_counts_as_rare_readings():
+    f, spikes = SpikeFilter(30.0), []
+    for k in range(40):
+        stamp = k * NS // 100 + (NS if k >= 20 else 0)
+        field = EARTH + (2e-6 if k == 20 else 0.0)
+        spikes += [row for row, is_spike in f.feed(k, stamp, field.tolist(), [SIGMA] * 3)
+                   if is_spike]
+    assert spikes == []
+
+
+@pytest.mark.parametrize('size', [2e-6, -5e-4])
+def test_a_step_is_a_step(size):
+    y = noise(80)
+    y[30:] += size
+    spikes, most, late = screened(y)
+    assert (spikes, most, late) == ([], MOST_HELD, [30, 31, 32])
+
+
+def test_behind_a_step_it_learns_anew_what_is_usual():
+    y = np.tile(EARTH, (60, 1))
+    y[30:] += 3e-6
+    y[34:] += 40.0 * SIGMA * np.arange(26)[:, None]
+    assert screened(y) == ([], MOST_HELD, [30, 31, 32])
+
+
+def test_eight_steps_are_needed_to_compare_with():
+    for row, found in ((8, []), (9, [9])):
+        y = np.tile(EARTH, (20, 1))
+        y[row] += 3e-6
+        assert screened(y)[0] == found
+
+
+def test_the_axis_that_is_steep_is_the_one_that_is_high():
+    y = np.tile(EARTH, (40, 1))
+    y[22:, 0] += 5.0 * SIGMA
+    y[25] += np.array([36.0, 9.0, 0.0]) * SIGMA
+    assert screened(y) == ([], 0, [])
+
+
+def test_four_readings_are_a_step_and_a_spike_behind_it_is_found_again():
+    y = noise(80)
+    y[30:34] += 3e-6
+    y[60] += 3e-6
+    assert screened(y)[0] == [60]
+
+
+def test_back_to_a_share_of_it():
+    for share, found in ((0.25, True), (0.35, False)):
+        y = np.tile(EARTH, (60, 1))
+        y[30] += 3e-6
+        y[31:] += share * 3e-6
+        assert bool(screened(y)[0]) == found
+
+
+def test_a_missing_axis_is_no_spike_and_hides_none():
+    y = noise(80)
+    y[20:50, 2] = np.nan
+    y[30] += 4e-6
+    y[55:58, 0] = np.nan
+    assert screened(y)[0] == [30]
+    once = noise(60)
+    once[21, 0] = np.nan
+    once[30, 0] += 4e-6
+    assert screened(once)[0] == [30]
+    y[:, 0] = np.nan
+    y[31, 1] = np.nan
+    spikes, most, _ = screened(y)
+    # Where the axis of the spike is missing behind it, the next tells.
+    assert spikes == [30, 31] and most == 2
+    assert screened(np.full((30, 3), np.nan)) == ([], 0, [])
+
+
+def test_without_a_noise_nothing_waits():
+    y = noise(60)
+    y[30] += 5e-6
+    assert screened(y, std=None) == ([], 0, [])
+    f = SpikeFilter(30.0)
+    for k in range(31):
+        f.feed(k, k * NS // 100, y[k].tolist(), [SIGMA] * 3)
+    # What waited comes before what comes when the noise is not known any more.
+    assert f.feed(31, 31 * NS // 100, y[31].tolist(), None) == [(30, False), (31, False)]
+    assert f.flush() == []
+
+
+@settings(derandomize=True, deadline=None, max_examples=40)
+@given(st.integers(0, 10_000))
+def test_every_reading_comes_out_once_in_order_and_at_most_three_wait(seed):
+    rng = np.random.default_rng(seed)
+    y = noise(300, seed)
+    off = rng.random(300) < rng.choice([0.02, 0.2, 0.6])
+    y[off] += rng.standard_normal((off.sum(), 3)) * 10.0 ** rng.uniform(-8, -3)
+    y[rng.random((300, 3)) < 0.05] = np.nan
+    _, most, _ = screened(y, float(rng.choice([10.0, 100.0, 1000.0])))
+    assert most <= MOST_HELD
+
+
+# Repetition.
+
+@pytest.mark.parametrize('step, seen', [(0.0, 6), (0.3, 6), (1.0, 7)])
+@pytest.mark.parametrize('n', [15, 150])
+def test_a_sensor_that_freezes_is_found_soon_and_returns_at_once(step, seen, n):
+    y = in_steps(noise(2000), step)
+    y[1500:1500 + n] = y[1499]
+    found = stuck(y)
+    assert found == list(range(found[0], 1500 + n)) and 1500 <= found[0] < 1500 + seen
+
+
+def test_again_and_again():
+    y = noise(3000)
+    for k in range(500, 3000, 100):
+        y[k:k + 60] = y[k - 1]
+    rows = stuck(y)
+    frozen = {r for k in range(500, 3000, 100) for r in range(k, k + 60)}
+    assert set(rows) <= frozen
+    # Of each freeze all but the first few.
+    assert len(rows) >= 25 * 50
+    assert max(Counter(r // 100 for r in frozen - set(rows)).values()) <= 7
+
+
+def test_not_before_it_has_changed_often_enough_nor_in_fewer_than_five():
+    few, many = noise(49), noise(51)
+    assert stuck(np.concatenate([few, np.tile(few[-1], (100, 1))])) == []
+    assert stuck(np.concatenate([many, np.tile(many[-1], (100, 1))])) != []
+    long = noise(30_000)
+    y = np.concatenate([long, np.tile(long[-1], (10, 1))])
+    assert stuck(y) == list(range(30_003, 30_010))
+
+
+def test_chance_is_that_of_the_usual_repetitions():
+    """One of 30 readings repeats the one before: seven of them in a row are a fault, not six."""
+    y = noise(9000)
+    y[29::30] = y[28::30]
+    assert stuck(y) == []
+    limit = math.ceil(math.log(1e-9) / math.log(1 / 30))
+    y = np.concatenate([y, np.tile(y[-2] + SIGMA, (20, 1))])
+    assert stuck(y) == list(range(9000 + limit, 9020))
+
+
+def test_what_was_usual_long_ago_is_forgotten():
+    """It sent the same for a while when it began; later it is judged as any other."""
+    y = noise(70_000)
+    y[60:2000] = y[59]
+    begin, end = stuck(y), 30_000
+    assert begin == list(range(begin[0], 2000))
+    late = noise(60_000)
+    late[:4000] = late[0]
+    late[end:end + 50] = late[end - 1]
+    late[59_000:59_050] = late[58_999]
+    rows = stuck(late)
+    assert {59_010, 59_049} <= set(rows)
+
+
+def test_coarse_steps_are_not_judged():
+    """At rest on one step such a sensor says the same for ever, after any number of changes."""
+    rng = np.random.default_rng(0)
+    changes = np.eye(3)[rng.integers(0, 3, 4000)] * rng.choice([-1.0, 0.0, 1.0], (4000, 1))
+    moving = np.cumsum(changes, axis=0) * 1e-7
+    y = np.concatenate([np.zeros((300, 3)), moving, np.tile(moving[-1], (20_000, 1)), moving,
+                        np.tile(moving[-1], (20_000, 1))])
+    assert stuck(y) == []
+
+
+def test_a_coarse_sensor_that_begins_in_a_passing_target_recovers():
+    """A hundred changes, then rests with a few changes between: it is not stuck for ever."""
+    moving = np.arange(100.0)[:, None] * np.array([1e-7, 2e-7, -1e-7])
+    rest = [np.tile(moving[-1] + (k % 2) * 1e-7, (500, 1)) for k in range(20)]
+    rows = np.array(stuck(np.concatenate([moving, *rest])))
+    assert rows.max() < 100 + 5 * 500
+
+
+def test_a_missing_axis_repeats_itself_too():
+    y = noise(500)
+    y[:, 1] = np.nan
+    assert stuck(y) == []
+    y[300:] = y[299]
+    assert stuck(y)[-1] == 499 and stuck(y)[0] < 306
+    y[400, 1] = 0.0
+    assert 400 not in stuck(y)

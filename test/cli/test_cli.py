@@ -1,0 +1,339 @@
+"""The command line: what it writes, what it says, how it fails."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from mag_tracking.cli import main
+from mag_tracking.recording.fit_folder import FIT_COLUMNS
+from mag_tracking.recording.result_folder import DETECTION_COLUMNS, POSE_COLUMNS, SMOOTHED_COLUMNS
+from support.bundled import DATA, NETWORK_FILE, vehicle_path
+
+NAME = 'junction_left_to_right'
+
+
+def test_replay_writes_all_that_it_promises(tmp_path, capsys):
+    out = tmp_path / 'out'
+    assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE),
+                 '--out', str(out)]) == 0
+    assert {p.name for p in out.iterdir()} == {
+        'poses.csv', 'poses_smoothed.csv', 'detections.csv', 'hypotheses.csv', 'summary.json',
+        'tracks.mcap', 'metadata.yaml', 'map_track_1.png', 'weights_track_1.png',
+        'field_track_1.png'}
+    head = (out / 'poses.csv').read_text().splitlines()[0]
+    assert head == ('stamp_ns,track_id,x,y,z,vx,vy,vz,sd_x,sd_y,sd_z,sd_vx,sd_vy,sd_vz,'
+                    'mx,my,mz,weight,ambiguous,kind,kind_weight,length,sd_length'
+                    ) == ','.join(POSE_COLUMNS)
+    assert (out / 'poses_smoothed.csv').read_text().splitlines()[0] == ','.join(SMOOTHED_COLUMNS)
+    assert (out / 'detections.csv').read_text().splitlines()[0] == ','.join(DETECTION_COLUMNS)
+    track = json.loads((out / 'summary.json').read_text())['tracks'][0]
+    assert track['arrival'] == 'left' and track['verdict'] == 'unique'
+    assert {'speed', 'moment', 'poses', 'truth', 'smoothed', 'kind'} <= set(track)
+    assert 'from left (100%), a car (100%)' in capsys.readouterr().out
+
+
+def test_a_track_that_is_too_long_to_smooth_is_said(tmp_path, capsys):
+    params = tmp_path / 'short.yaml'
+    params.write_text('track: {smooth_longest_s: 1.0}')
+    assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--params',
+                 str(params), '--no-figures', '--out', str(tmp_path / 'out')]) == 0
+    assert 'warning: 1 tracks were too long to smooth' in capsys.readouterr().out
+    assert len((tmp_path / 'out' / 'poses_smoothed.csv').read_text().splitlines()) == 1
+
+
+def test_several_recordings_get_a_folder_each(tmp_path):
+    names = ['straight_car_right', 'straight_small_left']
+    assert main(['replay', *(str(vehicle_path(n)) for n in names), '--network', str(NETWORK_FILE),
+                 '--out', str(tmp_path), '--no-figures']) == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == names
+
+
+def test_import_and_replay_of_a_magnet(tmp_path, capsys):
+    source = DATA / 'magnet_16_sensors'
+    assert main(['import', str(source / 'lisa_data1.csv'), '--background',
+                 str(source / 'lisa_data1_background.csv'), '--out', str(tmp_path / 'm')]) == 0
+    assert main(['replay', str(tmp_path / 'm'), '--network', str(tmp_path / 'm/network.yaml'),
+                 '--target', 'magnet', '--out', str(tmp_path / 'out')]) == 0
+    assert '63 poses' in capsys.readouterr().out
+
+
+def test_info(capsys):
+    assert main(['info', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE)]) == 0
+    out = capsys.readouterr().out
+    assert '/mag_1/imu/mag  sensor_msgs/msg/MagneticField  2000' in out
+    assert 'sensor mag_2: /mag_2/imu/mag is there' in out
+
+
+def fail(capsys, *arguments):
+    """Run, expect failure, return the one line of the message."""
+    assert main([str(a) for a in arguments]) == 1
+    error = capsys.readouterr().err.strip()
+    assert error.startswith('mag-tracking: ') and '\n' not in error
+    return error
+
+
+def test_failures_are_one_clear_line(tmp_path, capsys):
+    common = ['--network', NETWORK_FILE, '--out', tmp_path / 'out']
+    recording = vehicle_path(NAME)
+    assert 'there is no' in fail(capsys, 'replay', tmp_path / 'x.mcap', *common)
+    typo = tmp_path / 'typo.yaml'
+    typo.write_text('track: {vehicle: {momnet: 3.0}}')
+    assert 'did you mean track.vehicle.moments?' in fail(
+        capsys, 'replay', recording, *common, '--params', typo)
+    blocked = tmp_path / 'blocked'
+    blocked.write_text('a file')
+    assert 'cannot write to' in fail(capsys, 'replay', recording, '--network', NETWORK_FILE,
+                                     '--out', blocked / 'out')
+    network = tmp_path / 'network.yaml'
+    network.write_text('sensors: {mag_7: {position: [0, 0, 0]}}')
+    assert "none of the network's topics" in fail(
+        capsys, 'replay', recording, '--network', network, '--out', tmp_path / 'out')
+    bad = tmp_path / 'bad.csv'
+    bad.write_text('a,b\n1,2\n')
+    assert 'column id is missing' in fail(capsys, 'import', bad, '--background', bad,
+                                          '--out', tmp_path / 'out')
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason='root may write everywhere')
+def test_a_read_only_folder_is_named(tmp_path, capsys):
+    tmp_path.chmod(0o500)
+    assert 'cannot write' in fail(capsys, 'replay', vehicle_path(NAME), '--network', NETWORK_FILE,
+                                  '--out', tmp_path / 'out')
+
+
+def test_a_recording_too_short_to_learn_says_so(tmp_path, capsys):
+    params = tmp_path / 'p.yaml'
+    params.write_text('calibrate: {learn_s: 600.0}')
+    assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--params',
+                 str(params), '--out', str(tmp_path / 'out')]) == 0
+    out = capsys.readouterr().out
+    assert 'no background was learnt for mag_1, mag_2' in out
+    assert json.loads((tmp_path / 'out/summary.json').read_text())['tracks'] == []
+
+
+def test_help_teaches():
+    for command in ('replay', 'run', 'import'):
+        text = subprocess.run([sys.executable, '-m', 'mag_tracking.cli', command, '--help'],
+                              capture_output=True, text=True, check=True).stdout
+        assert 'example' in text
+
+
+def test_a_sensor_on_its_head_is_named(tmp_path, capsys):
+    network = tmp_path / 'turned.yaml'
+    text, upright = NETWORK_FILE.read_text(), 'orientation: [0.0, 0.0, 0.0, 1.0]'
+    assert text.count(upright) == 1
+    network.write_text(text.replace(upright, 'orientation: [1.0, 0.0, 0.0, 0.0]'))
+    assert main(['replay', str(vehicle_path('straight_car_right')), '--network', str(network),
+                 '--out', str(tmp_path / 'out'), '--no-figures']) == 0
+    assert 'orientation in the network file is wrong' in capsys.readouterr().out
+    # And a network that is right raises no alarm.
+    assert replay_one(tmp_path / 'right', '--no-figures') == 0
+    assert 'fits best if turned' not in capsys.readouterr().out
+
+
+def test_a_recording_without_a_target_says_so(tmp_path, capsys):
+    assert replay_one(tmp_path, '--no-figures', '--target', 'magnet') == 0
+    assert 'nothing was detected with the settings for a magnet' in capsys.readouterr().out
+
+
+def test_an_interrupted_replay_keeps_what_is_done(tmp_path):
+    out = tmp_path / 'out'
+    recordings = [tmp_path / f'{NAME}_{k}.mcap' for k in range(40)]
+    for path in recordings:
+        path.write_bytes(vehicle_path(NAME).read_bytes())
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'mag_tracking.cli', 'replay', *map(str, recordings), '--network',
+         str(NETWORK_FILE), '--out', str(out), '--no-figures'],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    table = out / f'{NAME}_0' / 'summary.json'
+    deadline = time.monotonic() + 60
+    while not table.exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130, stderr
+    assert 'Traceback' not in stderr
+    assert json.loads(table.read_text())['recording'] == f'{NAME}_0.mcap'
+
+
+def interrupt_feed(monkeypatch, at):
+    """Let a signal come at one of the pipeline's samples; returns the list of samples fed."""
+    from mag_tracking.pipeline import Pipeline
+    feed, calls = Pipeline.feed, []
+
+    def interrupted(self, sample):
+        calls.append(sample)
+        if len(calls) == at:
+            signal.raise_signal(signal.SIGINT)
+        return feed(self, sample)
+
+    monkeypatch.setattr(Pipeline, 'feed', interrupted)
+    return calls
+
+
+def replay_one(out, *options):
+    return main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--out',
+                 str(out), *options])
+
+
+def summary_of(out):
+    return json.loads((out / 'summary.json').read_text())
+
+
+def test_an_interruption_ends_the_reading_after_the_sample(tmp_path, monkeypatch):
+    calls = interrupt_feed(monkeypatch, 300)
+    before = signal.getsignal(signal.SIGINT)
+    assert replay_one(tmp_path, '--no-figures') == 130
+    assert signal.getsignal(signal.SIGINT) is before
+    assert len(calls) == 300
+    assert summary_of(tmp_path)['interrupted'] is True
+
+
+def test_an_interruption_need_not_wait_for_the_next_sample(tmp_path, monkeypatch):
+    from mag_tracking.recording.sample_reader import SampleReader
+    waited = []
+
+    def no_sample_for_long(self, progress):
+        signal.raise_signal(signal.SIGINT)
+        progress(1)
+        waited.append(True)
+        yield from ()
+
+    monkeypatch.setattr(SampleReader, 'samples', no_sample_for_long)
+    assert replay_one(tmp_path, '--no-figures') == 130
+    assert not waited and summary_of(tmp_path)['interrupted'] is True
+
+
+@pytest.mark.parametrize('step', ['summarise', 'take', 'errors_against_truth', 'write_figures'])
+def test_an_interruption_while_writing_loses_nothing(tmp_path, monkeypatch, capsys, step):
+    """First or second, in the middle of an update or of what is written at the end."""
+    from mag_tracking.apps import replay as app
+    from mag_tracking.cli import replay
+
+    module = {'write_figures': replay, 'take': app.RunCollector}.get(step, app)
+    whole, count = getattr(module, step), []
+
+    def impatient(*args, **named):
+        count.append(step)
+        if len(count) in (1, 2):
+            signal.raise_signal(signal.SIGINT)
+        return whole(*args, **named)
+
+    monkeypatch.setattr(module, step, impatient)
+    assert replay_one(tmp_path) == 130
+    assert summary_of(tmp_path)['interrupted'] is (step == 'take')
+    assert 'interrupted; what was done is in' in capsys.readouterr().out
+    assert not list(tmp_path.glob('*.png'))
+
+
+def test_who_insists_is_obeyed(tmp_path, monkeypatch):
+    from mag_tracking.apps import replay as app
+
+    def hanging(*_):
+        for _ in range(3):
+            signal.raise_signal(signal.SIGINT)
+        raise AssertionError('not reached')
+
+    monkeypatch.setattr(app, 'summarise', hanging)
+    assert replay_one(tmp_path, '--no-figures') == 130
+
+
+def test_a_background_job_ignores_interruptions_as_it_was_told(tmp_path, monkeypatch):
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        interrupt_feed(monkeypatch, 300)
+        assert replay_one(tmp_path, '--no-figures') == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_the_command_works_outside_the_main_thread(tmp_path):
+    status = []
+    thread = threading.Thread(target=lambda: status.append(replay_one(tmp_path, '--no-figures')))
+    thread.start()
+    thread.join()
+    assert status == [0]
+
+
+def test_the_example_runs():
+    from support.bundled import ROOT
+    out = subprocess.run([sys.executable, str(ROOT / 'examples/offline.py')], check=True,
+                         capture_output=True, text=True).stdout
+    assert 'left' in out and len(out.splitlines()) > 30
+
+
+def test_the_demo_draws_a_track_over_topics(tmp_path):
+    from support.bundled import ROOT
+    out = subprocess.run([sys.executable, str(ROOT / 'examples/demo.py'), '--rate', '6',
+                          '--out', str(tmp_path)], check=True, capture_output=True,
+                         text=True, timeout=120).stdout
+    assert 'from left' in out
+    assert {'map_track_1.png', 'weights_track_1.png', 'field_track_1.png'} <= {
+        p.name for p in tmp_path.iterdir()}
+
+
+def test_fit_writes_all_that_it_promises(tmp_path, capsys):
+    out = tmp_path / 'out'
+    names = ['straight_car_fast_left', 'junction_right_turns_to_rear']
+    assert main(['fit', *(str(vehicle_path(n)) for n in names), '--network', str(NETWORK_FILE),
+                 '--orders', '1', '3', '--out', str(out)]) == 0
+    assert {p.name for p in out.iterdir()} == {'fits.csv', 'fits.json', 'orders.png',
+                                               *(f'{n}_pass_1.png' for n in names)}
+    lines = (out / 'fits.csv').read_text().splitlines()
+    assert lines[0] == ','.join(FIT_COLUMNS) and len(lines) == 5
+    content = json.loads((out / 'fits.json').read_text())
+    assert content['iron'] is None and not content['interrupted']
+    car, turn = content['fits'][1], content['fits'][3]
+    assert car['chosen'] == 1 and abs(car['speed'] - 20.0) < 1.6 and not car['reason']
+    assert turn['reason'].startswith('not at constant velocity') and turn['speed'] is None
+    text = capsys.readouterr().out
+    assert 'a turn, braking' in text and 'closest to the middle of the sensors' in text
+
+
+def test_fit_of_one_vehicle_tells_its_iron(tmp_path, capsys):
+    """Two passes of the same heading cannot; the file says so with a null."""
+    name = str(vehicle_path('straight_car_right'))
+    assert main(['fit', name, '--network', str(NETWORK_FILE), '--orders', '3', '--same-vehicle',
+                 '--no-figures', '--out', str(tmp_path)]) == 0
+    assert 'cannot be told apart' in capsys.readouterr().out
+    assert json.loads((tmp_path / 'fits.json').read_text())['iron'] is None
+
+
+def test_fit_of_one_sensor_keeps_what_it_knows(tmp_path, capsys):
+    network = tmp_path / 'one.yaml'
+    network.write_text('sensors:\n  mag_1:\n    position: [0.0, -4.5, 0.0]\n')
+    assert main(['fit', str(vehicle_path('straight_car_right')), '--network', str(network),
+                 '--orders', '2', '--no-figures', '--out', str(tmp_path / 'out')]) == 0
+    row, = json.loads((tmp_path / 'out' / 'fits.json').read_text())['fits']
+    assert row['x'] is None and row['rate'] > 0.0 and row['sd_cpa_time'] > 0.0
+    assert len(row['bearing']['motion']) == 3 and 'reversed' in row['bearing']['or_reversed']
+    assert 'or both reversed' in capsys.readouterr().out
+
+
+def test_fit_opens_everything_before_it_writes(tmp_path, capsys):
+    out = tmp_path / 'out'
+    out.mkdir()
+    (out / 'fits.csv').write_text('old')
+    for names in (['nosuch'], [NAME, 'nosuch'], [NAME, NAME]):
+        assert main(['fit', *(str(vehicle_path(n)) for n in names), '--network',
+                     str(NETWORK_FILE), '--out', str(out)]) == 1
+        assert (out / 'fits.csv').read_text() == 'old'
+    assert f'two recordings are named {NAME}' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('options, text', [
+    (['--orders', '0'], '--orders: expected different numbers from 1 to 8'),
+    (['--orders', '2', '2'], '--orders'),
+    (['--cpa-range', '4', '1'], 'for one sensor; the network has 2'),
+])
+def test_fit_refuses_options_that_make_no_sense(tmp_path, capsys, options, text):
+    assert main(['fit', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), *options,
+                 '--out', str(tmp_path / 'out')]) == 1
+    assert text in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()

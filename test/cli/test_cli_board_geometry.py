@@ -1,0 +1,255 @@
+"""mag-tracking board-geometry, as somebody types it."""
+
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from mag_tracking.analysis.magnet_pose import PoseSettings, locate_magnet
+from mag_tracking.analysis.network_geometry import GeometrySettings, calibrate_geometry
+from mag_tracking.network.file import read_network, write_network
+from support.geometry_command import command, through_calibrate, write_table
+from support.magnet_boards import MOMENT, board, simulated
+from support.real_board import BOX, FOLDER, board_of_41, said, within_limits
+
+POSITIONS = FOLDER / 'sensor_positions_m.csv'
+
+
+@pytest.fixture(scope='module')
+def calibrated(tmp_path_factory):
+    """(network as read from the written file, what was said, folder); from every other row."""
+    folder = tmp_path_factory.mktemp('geometry')
+    stated, field, positions, axes = board_of_41()
+    write_network(folder / 'stated.yaml', stated)
+    table = write_table(folder / 'poses.csv', field[::2], positions[::2], axes[::2])
+    run = subprocess.run(
+        [sys.executable, '-m', 'mag_tracking.cli', 'board-geometry', table, '--network',
+         folder / 'stated.yaml', '--moment', str(MOMENT), '--out', folder / 'board.yaml',
+         '--figure', folder / 'board.png'], capture_output=True, text=True, check=True)
+    return read_network(folder / 'board.yaml'), run.stdout, folder
+
+
+def test_the_written_network_locates_the_magnet(calibrated):
+    """Raw readings that were held out, through the stage Calibrate."""
+    network, *_ = calibrated
+    stated, field, positions, axes = board_of_41()
+    g = calibrate_geometry(stated, field[::2], positions[::2], axes[::2], MOMENT,
+                           GeometrySettings())
+    B = through_calibrate(network, field[1::2])
+    # Within the file's digits, and nowhere drifted away from the background.
+    np.testing.assert_allclose(B, g.signal(field[1::2]), rtol=0, atol=1e-12)
+    found = [locate_magnet(network, b, MOMENT, *BOX, PoseSettings()) for b in B]
+    assert all(p.converged for p in found)
+    r, u = g.magnet_poses(positions[1::2], axes[1::2])
+    place = np.linalg.norm([p.position for p in found] - r, axis=1)
+    turn = np.rad2deg([np.arccos(np.clip(p.axis @ a, -1.0, 1.0))
+                       for p, a in zip(found, u, strict=True)])
+    low = positions[1::2, 2] < 0.1
+    said('by the written file', place, turn, low)
+    within_limits(place, turn, low)
+
+
+def test_what_is_said_and_drawn(calibrated):
+    network, text, folder = calibrated
+    rows = [line.split() for line in text.splitlines() if line.startswith('mag_')]
+    assert [r[0] for r in rows] == list(network.names)
+    stated = board_of_41()[0]
+    moved = 1e3 * np.linalg.norm(network.positions - stated.positions, axis=1)
+    np.testing.assert_allclose([float(r[1]) for r in rows], moved, atol=0.006)
+    turned = np.rad2deg([np.arccos(0.5 * (np.trace(R) - 1.0)) for R in network.R_ws])
+    np.testing.assert_allclose([float(r[3]) for r in rows], turned, atol=0.006)
+    gain = 1.0 / np.array([C[0, 0] for C in network.correction])
+    np.testing.assert_allclose([float(r[5]) for r in rows], gain, atol=6e-5)
+    bias = gain[:, None] * network.background
+    np.testing.assert_allclose([[float(v) for v in r[7:10]] for r in rows], 1e6 * bias, atol=0.006)
+    assert np.ptp(gain) > 0.01 and moved.max() > 0.5 and turned.max() > 1.0
+    assert 'moment 0.264 A m^2, as given' in text and ' mm; tilted by ' in text
+    assert '162 of 162 poses, normalised cost 0.6' in text
+    assert 'warning' not in text and 'note' not in text
+    assert all(c.by == 'magnet, 162 tracked poses' and c.date.startswith('20')
+               and np.isnan(c.clock_offset_std) for c in network.calibrated)
+    assert (folder / 'board.png').stat().st_size > 50_000
+    noise = np.array(stated.noise_std) / gain[:, None]
+    np.testing.assert_allclose(np.array(network.noise_std), noise, rtol=1e-9)
+
+
+def test_positions_alone_are_enough(tmp_path, capsys):
+    out = tmp_path / 'board.yaml'
+    few = write_table(tmp_path / 'poses.csv', *(v[::6] for v in board_of_41()[1:]))
+    assert command(few, '--sensors', POSITIONS, out=out) == 0
+    text = capsys.readouterr().out
+    assert 'nobody says the noise of 41 sensors: counted with 1e-07 T' in text
+    # One noise for two kinds of sensors: the noisier kind stands out.
+    assert 'warning: sensors that do not fit' in text
+    network = read_network(out)
+    assert network.noise_std == (None,) * 41 and network.imu_topics == (None,) * 41
+    assert command(few, '--sensors', POSITIONS, '--noise-std', 3e-7, out=out) == 0
+    assert 'nobody says' not in capsys.readouterr().out
+    noise = np.array(read_network(out).noise_std) * [[C[0, 0] ** -1] for C in
+                                                     read_network(out).correction]
+    np.testing.assert_allclose(noise, 3e-7, rtol=1e-9)
+
+
+def test_what_does_not_fit_is_named(tmp_path, capsys, monkeypatch):
+    """A sensor with a swapped pair; a pose, by its row in the file, before it a row is lost."""
+    stated, field, positions, axes, _ = simulated(5)
+    field[:, 2] = field[:, 2][:, [1, 0, 2]]
+    field[3] = np.nan
+    positions[7, 0] += 0.02
+    write_network(tmp_path / 'stated.yaml', stated)
+    table = write_table(tmp_path / 'poses.csv', field, positions, axes)
+    drawn, save = [], Figure.savefig
+    monkeypatch.setattr(Figure, 'savefig', lambda figure, *a, **k: drawn.append(figure)
+                        or save(figure, *a, **k))
+    assert command(table, '--network', tmp_path / 'stated.yaml', '--figure',
+                   tmp_path / 'board.png', out=tmp_path / 'out.yaml') == 0
+    text = capsys.readouterr().out
+    assert 'noise?): mag_2\n' in text
+    assert 'rows of poses that do not fit (the header is row 1): 9\n' in text
+    lines = table.read_text().splitlines()
+    assert lines[8].endswith(','.join(map(str, [*positions[7].tolist(), *axes[7].tolist()])))
+    labels = [t.get_text() for f in drawn[0].subfigs for a in f.axes for t in
+              (a.get_legend().get_texts() if a.get_legend() else [])]
+    assert 'does not fit' in labels
+    titles = [a.get_title(loc='left') for f in drawn[0].subfigs for a in f.axes]
+    assert any('do not fit: 1' in title for title in titles)
+
+
+# Nothing is written.
+
+def test_a_magnet_the_wrong_way_round_is_refused(tmp_path, capsys):
+    stated, field, positions, axes, _ = simulated(9)
+    write_network(tmp_path / 'stated.yaml', stated)
+    table = write_table(tmp_path / 'poses.csv', field, positions, -axes)
+    assert command(table, '--network', tmp_path / 'stated.yaml', '--figure',
+                   tmp_path / 'board.png', out=tmp_path / 'out.yaml') == 1
+    out, err = capsys.readouterr()
+    assert 'refused: not what the model describes: the normalised cost is' in err
+    assert 'the network is in' not in out
+    assert {p.name for p in tmp_path.iterdir()} == {'stated.yaml', 'poses.csv'}
+
+
+def test_settings_come_from_a_file(tmp_path, capsys):
+    stated, field, positions, axes, _ = simulated(9)
+    write_network(tmp_path / 'stated.yaml', stated)
+    table = write_table(tmp_path / 'poses.csv', field, positions, axes)
+    params = tmp_path / 'params.yaml'
+    params.write_text('{rotation_std_deg: 0.0, moment_std: 0.02}')
+    common = '--network', tmp_path / 'stated.yaml', '--params', params
+    assert command(table, *common, out=tmp_path / 'out.yaml') == 0
+    network = read_network(tmp_path / 'out.yaml')
+    np.testing.assert_allclose(network.R_ws, stated.R_ws, atol=1e-12)
+    # What was held fixed has no deviation that a file could hold.
+    assert network.orientation_std == (None,) * 9
+    assert 'moment 0.26' in (text := capsys.readouterr().out) and 'as given' not in text
+    params.write_text('gain_sdt: 0.1')
+    assert command(table, *common, out=tmp_path / 'new.yaml') == 1
+    assert 'unknown setting gain_sdt; did you mean gain_std?' in capsys.readouterr().err
+    params.write_text('iterations: 1')
+    assert command(table, *common, out=tmp_path / 'new.yaml') == 1
+    assert 'refused: no minimum within 1 steps' in capsys.readouterr().err
+    assert not (tmp_path / 'new.yaml').exists()
+
+
+@pytest.mark.parametrize('options, message', [
+    (['--unknown-poses', '--low', 0, 0, 0], '--low and --high are needed'),
+    (['--low', 0, 0, 0], '--low and --high are for --unknown-poses'),
+    (['--unknown-poses', '--low', 0, 0, 0, '--high', 1, 0, 1], r'--high: expected it above'),
+    (['--unknown-poses', '--low', 0, 0, 0, '--high', 1, 'nan', 1], r'--high: expected it above'),
+    (['--moment', 'nan'], '--moment: expected it above 0 A m^2, got nan'),
+    (['--moment', '-1'], '--moment: expected it above 0'),
+    (['--noise-std', '0.01'], '--noise-std: expected it above a femtotesla'),
+    (['--figure', '/nowhere/board.png'], 'there is no folder /nowhere'),
+    (['--params', '/nowhere.yaml'], '/nowhere.yaml')])
+def test_bad_options_are_named(tmp_path, capsys, options, message):
+    assert command(FOLDER / 'poses.csv', '--sensors', POSITIONS, *options,
+                   out=tmp_path / 'out.yaml') == 1
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_bad_files_are_named(tmp_path, capsys):
+    few = tmp_path / 'few.csv'
+    few.write_text('0,0,0\n1,0,0\n')
+    out = tmp_path / 'out.yaml'
+    assert command(FOLDER / 'poses.csv', '--sensors', few, out=out) == 1
+    assert 'readings of 41 sensors, but the network has 2' in capsys.readouterr().err
+    few.write_text('0,0,0\n0,0,0\n')
+    assert command(FOLDER / 'poses.csv', '--sensors', few, out=out) == 1
+    assert 'few.csv: sensors mag_0 and mag_1 are both at' in capsys.readouterr().err
+    assert command(tmp_path / 'none.csv', '--sensors', POSITIONS, out=out) == 1
+    assert 'cannot read' in capsys.readouterr().err
+    stated, field, positions, axes, _ = simulated(1, n_poses=5)
+    write_network(tmp_path / 'stated.yaml', stated)
+    write_table(few, field, np.tile(stated.positions[0], (5, 1)), axes)
+    assert command(few, '--network', tmp_path / 'stated.yaml', out=out) == 1
+    assert 'few.csv: pose 0: [0.0, 0.0, 0.0] m is the place of a sensor' in capsys.readouterr().err
+    assert not out.exists()
+
+
+# Without a tracker.
+
+BOX_OPTIONS = ('--unknown-poses', '--low', -0.08, -0.08, 0.03, '--high', 0.2, 0.2, 0.25)
+
+
+def test_unknown_poses(tmp_path, capsys):
+    """The table need not have any."""
+    stated, field, positions, axes, _ = simulated(21)
+    field[4] = np.nan
+    write_network(tmp_path / 'stated.yaml', stated)
+    table = write_table(tmp_path / 'poses.csv', field, 0.0 * positions, axes)
+    table.write_text('\n'.join(','.join(line.split(',')[:-6])
+                               for line in table.read_text().splitlines()))
+    assert command(table, '--network', tmp_path / 'stated.yaml', *BOX_OPTIONS,
+                   out=tmp_path / 'out.yaml') == 0
+    text = capsys.readouterr().out
+    n = int(text.split(' of 40 poses')[0].split()[-1])
+    assert 36 <= n < 40 and f'left out: {40 - n}' in text and 'tilted' not in text
+    network = read_network(tmp_path / 'out.yaml')
+    assert network.calibrated[0].by == f'magnet, {n} unknown poses'
+    B = through_calibrate(network, field)
+    pose = locate_magnet(network, B[0], MOMENT, [-0.08, -0.08, 0.03], [0.2, 0.2, 0.25],
+                         PoseSettings())
+    assert pose.converged and pose.normalised_cost < 3.0
+
+
+def test_ctrl_c_ends_it_and_nothing_is_written(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'mag_tracking.cli', 'board-geometry', FOLDER / 'poses.csv',
+         '--sensors',
+         POSITIONS, '--moment', str(MOMENT), '--unknown-poses', '--low', *map(str, BOX[0]),
+         '--high', *map(str, BOX[1]), '--out', tmp_path / 'out.yaml'],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        # A background job, which these tests may be, passes on that it ignores SIGINT.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+    assert process.stdout.readline() == 'finding the poses and geometry of 41 sensors\n'
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 130, err
+    assert 'interrupted' in err and 'Traceback' not in err and not out
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_being_written_is_written(tmp_path, monkeypatch):
+    """A Ctrl-C between network and figure leaves no half of the two."""
+    from mag_tracking.cli import board_geometry as geometry
+    stated, field, positions, axes, _ = simulated(9)
+    write_network(tmp_path / 'stated.yaml', stated)
+    table = write_table(tmp_path / 'poses.csv', field, positions, axes)
+
+    def impatient(*args):
+        write_network(*args)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(geometry, 'write_network', impatient)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert command(table, '--network', tmp_path / 'stated.yaml', '--figure',
+                       tmp_path / 'board.pdf', out=tmp_path / 'out.yaml') == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert (tmp_path / 'board.pdf').stat().st_size > 10_000
+    assert len(read_network(tmp_path / 'out.yaml')) == len(board())

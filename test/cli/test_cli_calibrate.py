@@ -1,0 +1,206 @@
+"""mag-tracking calibrate and tumble, as somebody types them."""
+
+import gzip
+import json
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mag_tracking.cli import main
+from mag_tracking.messages.schema import sample_dict
+from mag_tracking.messages.types import MAGNETIC_FIELD
+from mag_tracking.network.file import read_network, write_network
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.records import MagSample
+from support.bundled import DATA, NETWORK_FILE, vehicle_path
+
+ROAD = vehicle_path('straight_car_right')
+
+
+def record(folder, readings, name='mag_1'):
+    """A recording of readings (n, 3) [T] at 100 Hz."""
+    with RecordingWriter(folder / 'hand.mcap') as writer:
+        for k, field in enumerate(readings):
+            stamp = 10**18 + k * 10**7
+            writer.write(f'/{name}/imu/mag', MAGNETIC_FIELD,
+                         sample_dict(MagSample(stamp, name, field), name), stamp)
+    return folder / 'hand.mcap'
+
+
+def tumbled():
+    """Bundled readings of a tumbled sensor, in tesla."""
+    gauss = np.loadtxt(DATA / 'calibration' / 'tumbled_acc_mag.csv', delimiter=',', skiprows=1)
+    return gauss[:, 3:] * 1e-4
+
+
+def test_calibrate_writes_a_network_that_replay_takes(tmp_path, capsys):
+    out, figure = tmp_path / 'calibrated.yaml', tmp_path / 'calibration.png'
+    assert main(['calibrate', str(ROAD), '--network', str(NETWORK_FILE), '--out', str(out),
+                 '--figure', str(figure)]) == 0
+    said = capsys.readouterr().out
+    assert 'clocks against that of mag_1' in said and '1 pass' in said and 'warning' not in said
+    assert figure.stat().st_size > 20000
+    found = read_network(out)
+    assert all(c.date.startswith('20') and 'compass' in c.by for c in found.calibrated)
+    assert abs(found.clock_offset[1]) > 5e-3 and found.calibrated[1].clock_offset_std < 1e-3
+    assert all((std < np.deg2rad(5.0)).all() for std in found.orientation_std)
+    assert all(1e-9 < std.min() < std.max() < 1e-7 for std in found.noise_std)
+    assert main(['replay', str(ROAD), '--network', str(out), '--out', str(tmp_path / 'run'),
+                 '--no-figures']) == 0
+    assert '1 tracks' in capsys.readouterr().out
+
+
+def test_calibrated_again_it_knows_no_more(tmp_path):
+    """The same compass and the same pass are no further evidence."""
+    first, again = tmp_path / 'first.yaml', tmp_path / 'again.yaml'
+    for network, out in ((NETWORK_FILE, first), (first, again)):
+        assert main(['calibrate', str(ROAD), '--network', str(network), '--out', str(out)]) == 0
+    a, b = read_network(first), read_network(again)
+    np.testing.assert_allclose(b.R_ws, a.R_ws, atol=1e-9)
+    np.testing.assert_allclose(b.orientation_std, a.orientation_std, rtol=1e-6)
+
+
+def test_a_background_in_the_file_hides_no_flipped_axis(tmp_path, capsys):
+    first, flipped = tmp_path / 'first.yaml', tmp_path / 'flipped.yaml'
+    main(['calibrate', str(ROAD), '--network', str(NETWORK_FILE), '--no-passes', '--out',
+          str(first)])
+    network = read_network(first)
+    given = tuple(R.T @ (network.earth_field * [1.0, 1.0, -1.0]) for R in network.R_ws)
+    write_network(flipped, replace(network, background=given,
+                                   earth_field=network.earth_field * [1.0, 1.0, -1.0]))
+    capsys.readouterr()
+    assert main(['calibrate', str(ROAD), '--network', str(flipped), '--out',
+                 str(tmp_path / 'out.yaml')]) == 2
+    assert 'mag_1 is' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('std', [20.0, 180.0])
+def test_a_sensor_that_may_be_turned_far_is_tracked_with_a_warning(tmp_path, capsys, std):
+    network = read_network(NETWORK_FILE)
+    path = tmp_path / 'network.yaml'
+    write_network(path, replace(network, orientation_std=(np.full(3, np.deg2rad(std)), None)))
+    assert main(['replay', str(ROAD), '--network', str(path), '--out', str(tmp_path / 'run'),
+                 '--no-figures']) == 0
+    said = capsys.readouterr().out
+    assert '1 sensors may be turned by more than 15 degrees' in said and '1 tracks' in said
+    angles = json.loads((tmp_path / 'run' / 'summary.json').read_text())['tracks'][0]['mounting']
+    # It is tracked as if it were known to 15 degrees.
+    assert 5.0 < max(angles['mag_1']['std_deg']) <= 15.0
+
+
+def test_without_passes_it_says_less(tmp_path, capsys):
+    stds = []
+    for extra in ([], ['--no-passes']):
+        out = tmp_path / f'{len(extra)}.yaml'
+        assert main(['calibrate', str(ROAD), '--network', str(NETWORK_FILE), '--out', str(out),
+                     *extra]) == 0
+        stds.append([std[2] for std in read_network(out).orientation_std])
+    assert 'compass and stated heading\n' in capsys.readouterr().out.split('the network is in')[1]
+    assert (np.array(stds[0]) < np.array(stds[1])).all()
+
+
+def test_a_flipped_axis_is_named(tmp_path, capsys):
+    network = read_network(NETWORK_FILE)
+    with RecordingWriter(tmp_path / 'flipped.mcap') as writer:
+        for sample in SampleReader(Recording(ROAD), network).samples():
+            flipped = [1.0, 1.0, -1.0] if sample.sensor == 'mag_2' else np.ones(3)
+            writer.write(f'/{sample.sensor}/imu/mag', MAGNETIC_FIELD, sample_dict(
+                replace(sample, field=sample.field * flipped), sample.sensor), sample.stamp_ns)
+    assert main(['calibrate', str(tmp_path / 'flipped.mcap'), '--network', str(NETWORK_FILE),
+                 '--out', str(tmp_path / 'out.yaml')]) == 2
+    said = capsys.readouterr().out
+    assert 'mag_2 is 9' in said and 'uT from the field of the Earth: z is flipped\n' in said
+    assert 'mag_1 is' not in said and 'passes were left out' in said
+    assert said.count('no accelerations: its orientation is not surveyed') == 2
+    assert 'clocks stay as they were: too few accelerometers' in said
+
+
+@pytest.mark.parametrize('arguments, message', [
+    (['calibrate', 'nothing.mcap'], 'there is no nothing.mcap'),
+    (['tumble', 'nothing.mcap'], 'there is no nothing.mcap'),
+    (['tumble', str(ROAD), '--sensor', 'mag_9'], 'unknown sensor mag_9'),
+    (['calibrate', str(ROAD), '--figure', 'found.xyz'], 'found.xyz ends in none of .png, .pdf'),
+    (['tumble', str(ROAD), '--field-size', '50'], '--field-size: 50 is not between'),
+])
+def test_what_cannot_be_done_is_said(tmp_path, capsys, arguments, message):
+    command, *rest = arguments
+    status = main([command, *rest, '--network', str(NETWORK_FILE), '--out',
+                   str(tmp_path / 'out.yaml')])
+    assert status == 1 and message in capsys.readouterr().err
+    assert not (tmp_path / 'out.yaml').exists()
+
+
+@pytest.mark.parametrize('option', ['--out', '--figure'])
+def test_a_folder_that_is_not_there_is_told_before_the_work(tmp_path, capsys, option):
+    missing = ['--out', str(tmp_path / 'o.yaml')] if option == '--figure' else []
+    assert main(['calibrate', str(ROAD), '--network', str(NETWORK_FILE), *missing, option,
+                 str(tmp_path / 'no' / 'x.png')]) == 1
+    assert 'there is no folder' in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_interrupted_it_writes_nothing(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, '-c', 'import os, signal, sys\n'
+         'from mag_tracking.apps import calibrate as calibrating\n'
+         'from mag_tracking.cli import main\n'
+         'feed = calibrating.Survey.feed\n'
+         'def struck(self, sample):\n'
+         '    os.kill(os.getpid(), signal.SIGINT)\n    return feed(self, sample)\n'
+         'calibrating.Survey.feed = struck\nsys.exit(main(sys.argv[1:]))',
+         'calibrate', str(ROAD), '--network', str(NETWORK_FILE), '--out', str(tmp_path / 'o.yaml')],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    said, _ = process.communicate(timeout=120)
+    assert process.returncode == 130 and 'interrupted: nothing was written' in said, said
+    assert process.returncode != -signal.SIGINT and not (tmp_path / 'o.yaml').exists()
+
+
+def test_tumbling_a_real_sensor(tmp_path, capsys):
+    readings = tumbled()
+    out, figure = tmp_path / 'out.yaml', tmp_path / 'tumbled.png'
+    assert main(['tumble', str(record(tmp_path, readings)), '--network', str(NETWORK_FILE),
+                 '--sensor', 'mag_1', '--out', str(out), '--figure', str(figure)]) == 0
+    assert 'size of the field scatters by 1.26 %, before 32.0 %' in capsys.readouterr().out
+    assert figure.stat().st_size > 20000
+    found = read_network(out)
+    size = np.linalg.norm((readings - found.offset[0]) @ found.correction[0].T, axis=1)
+    assert size.std() / size.mean() <= 0.015
+    assert found.offset[1] is None and found.correction[1] is None
+    assert 'as stated; tumbled to 1.3 % of the field' == found.calibrated[0].by
+
+
+def test_tumbling_takes_out_what_was_of_uncorrected_readings(tmp_path, capsys):
+    network = read_network(NETWORK_FILE)
+    stated = replace(network, background=(np.full(3, 1e-5),) * 2, noise_std=(np.full(3, 1e-8),) * 2)
+    write_network(tmp_path / 'stated.yaml', stated)
+    recording = record(tmp_path / 'hand', tumbled())
+    assert main(['tumble', str(recording), '--network', str(tmp_path / 'stated.yaml'), '--sensor',
+                 'mag_1', '--out', str(tmp_path / 'out.yaml')]) == 0
+    found = read_network(tmp_path / 'out.yaml')
+    assert found.background[0] is None and found.noise_std[0] is None
+    np.testing.assert_array_equal(found.background[1], stated.background[1])
+
+
+def test_tumbling_raw_counts(tmp_path, capsys):
+    """The other sensor lay still for a minute first."""
+    with gzip.open(DATA / 'calibration' / 'qmc5883l_raw_counts.csv.gz', 'rt') as stream:
+        counts = np.loadtxt(stream, delimiter=',', skiprows=3)
+    assert main(['tumble', str(record(tmp_path, counts * 1e-9)), '--network', str(NETWORK_FILE),
+                 '--sensor', 'mag_1', '--out', str(tmp_path / 'out.yaml')]) == 0
+    found = read_network(tmp_path / 'out.yaml')
+    size = np.linalg.norm((counts * 1e-9 - found.offset[0]) @ found.correction[0].T, axis=1)
+    print(capsys.readouterr().out, size.std() / size.mean())
+    assert size.std() / size.mean() <= 0.03
+
+
+def test_sensors_that_were_not_turned_are_refused(tmp_path, capsys):
+    assert main(['tumble', str(ROAD), '--network', str(NETWORK_FILE), '--out',
+                 str(tmp_path / 'out.yaml')]) == 1
+    said = capsys.readouterr().out
+    assert said.count('refused') == 2 and 'nothing was written' in said
+    assert not (tmp_path / 'out.yaml').exists()

@@ -1,0 +1,123 @@
+"""`mag-tracking record` and `repair` in this process: lines, options, refusals."""
+
+import argparse
+import os
+import signal
+import threading
+import time
+
+import pytest
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.rosbag2 import Reader
+from sensor_msgs.msg import MagneticField
+
+from mag_tracking.apps.record import Selection
+from mag_tracking.cli import record, repair
+from mag_tracking.errors import OutputError, SettingsError
+from mag_tracking.messages.types import decode
+from mag_tracking.nodes import record_node
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.recorder import Recorder
+from support.bundled import NETWORK_FILE
+from support.recorded_topics import FIELDS, IMUS
+
+pytestmark = [pytest.mark.alone, pytest.mark.timeout(120)]
+S = 10**9
+
+
+def arguments_of(*words):
+    """The parsed command line."""
+    parser = argparse.ArgumentParser()
+    commands = parser.add_subparsers()
+    record.add(commands)
+    repair.add(commands)
+    return parser.parse_args([str(w) for w in words])
+
+
+def test_the_command_in_this_process(tmp_path, monkeypatch, capsys):
+    """Lines of progress, a SIGINT, the summary; a best-effort driver's QoS is noted."""
+    monkeypatch.setattr(record_node, 'LINE_S', 0.2)
+    stopped = threading.Event()
+
+    def drive():
+        while not rclpy.ok() and not stopped.wait(0.01):
+            pass
+        node = Node('driver')
+        publisher = node.create_publisher(MagneticField, FIELDS[0], QoSProfile(
+            depth=10, reliability=ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.VOLATILE))
+        end = time.monotonic() + 2.5
+        while time.monotonic() < end:
+            publisher.publish(MagneticField())
+            time.sleep(0.01)
+        last = MagneticField()
+        last.header.frame_id = 'last'
+        publisher.publish(last)
+        time.sleep(0.003)
+        os.kill(os.getpid(), signal.SIGINT)
+        node.destroy_node()
+    driver = threading.Thread(target=drive)
+    driver.start()
+    args = arguments_of('record', '--network', NETWORK_FILE, '--out', tmp_path / 'a',
+                        '--split-s', 1)
+    try:
+        assert args.run_command(args) == 0
+    finally:
+        stopped.set()
+        driver.join()
+    out, err = capsys.readouterr()
+    n = Recording(tmp_path / 'a').message_counts[FIELDS[0]]
+    assert len(list((tmp_path / 'a').glob('*.mcap'))) > 1
+    assert n > 50 and f'  {FIELDS[0]}  {n}\n  warning: nothing on {FIELDS[1]}\n' in out
+    assert decode(list(Recording(tmp_path / 'a').messages())[-1]).header.frame_id == 'last'
+    assert err.count(' s: ') >= 3 and ' messages, 0.0 MB' in err
+    with Reader(tmp_path / 'a') as reader:
+        assert reader.connections[0].ext.offered_qos_profiles[0].reliability.name == 'BEST_EFFORT'
+
+
+def test_what_the_options_mean(tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(record_node, 'run', lambda *a: calls.append(a) or 7)
+    words = ('record', '--network', NETWORK_FILE, '--out', tmp_path)
+    for more in ((), ('--topics', '/a', '/b', '--split-mb', 0.5, '--split-s', 60, '--all'),
+                 ('--results',)):
+        args = arguments_of(*words, *more)
+        assert args.run_command(args) == 7
+    assert calls == [
+        (Selection(FIELDS, IMUS), tmp_path, 10**9, 3600 * S),
+        (Selection(FIELDS, IMUS, ('/a', '/b'), everything=True), tmp_path, 500_000, 60 * S),
+        (Selection(FIELDS, IMUS, results=True), tmp_path, 10**9, 3600 * S)]
+
+
+@pytest.mark.parametrize(('options', 'message'), [
+    (('--split-mb', '0'), '--split-mb: 0 is not a number of at least 0.1'),
+    (('--split-mb', 'nan'), '--split-mb: nan'), (('--split-s', 'inf'), '--split-s: inf'),
+    (('--split-s', '-5'), '--split-s: -5'), (('--topics', '/a', 'imu'), "--topics: 'imu'")])
+def test_bad_options_are_named(tmp_path, options, message):
+    args = arguments_of('record', '--network', NETWORK_FILE, '--out', tmp_path / 'a', *options)
+    with pytest.raises(SettingsError, match=message):
+        args.run_command(args)
+    assert not (tmp_path / 'a').exists()
+
+
+def test_another_recording_is_not_touched(tmp_path):
+    (tmp_path / 'a_0.mcap').write_text('theirs')
+    args = arguments_of('record', '--network', NETWORK_FILE, '--out', tmp_path)
+    with pytest.raises(OutputError, match='holds a recording already'):
+        args.run_command(args)
+    assert not rclpy.ok() and [p.name for p in tmp_path.iterdir()] == ['a_0.mcap']
+
+
+def test_the_command_repair(tmp_path, capsys):
+    with Recorder(tmp_path / 'a') as recorder:
+        recorder.add_topic('/x', 'std_msgs/msg/Header')
+        recorder.write('/x', b'\0\1\0\0', 1)
+    file = tmp_path / 'a' / 'a_0.mcap'
+    file.write_bytes(file.read_bytes()[:-20])
+    args = arguments_of('repair', tmp_path / 'a')
+    assert args.run_command(args) == 0
+    assert capsys.readouterr().out == (f'a_0.mcap: 1 messages, index written\n{tmp_path / "a"}: '
+                                       'files that were not whole: 1\n')
+    assert Recording(tmp_path / 'a').message_counts == {'/x': 1}

@@ -1,0 +1,336 @@
+import math
+import random
+import struct
+import time
+import zlib
+from collections import Counter
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mag_tracking.drivers.framings.binary import BinaryFraming, BinarySettings
+from mag_tracking.drivers.framings.checksums import CHECKSUMS
+from mag_tracking.drivers.framings.fields import FieldLayout, unescaped
+from mag_tracking.drivers.framings.json_objects import JsonFraming, JsonSettings
+from mag_tracking.drivers.framings.text import TextFraming, TextSettings
+from mag_tracking.drivers.reading import Reading
+from mag_tracking.errors import SettingsError
+from mag_tracking.settings import replace
+from support.framing_fuzz import CASES, fuzz, some_garbage
+
+XYZ = ('x', 'y', 'z')
+XYZ_I16 = ('x:i16', 'y:i16', 'z:i16')
+ONE = Reading('', (1.0, 2.0, 3.0))
+
+
+def binary(**changes):
+    return BinaryFraming(replace(BinarySettings(), {
+        'sync': 'A5 5A', 'fields': XYZ_I16, **changes}))
+
+
+# Checksums.
+
+@pytest.mark.parametrize('name, value', [
+    ('sum8', 0xDD), ('xor8', 0x31), ('crc8', 0xF4), ('crc16_ccitt', 0x29B1),
+    ('crc16_modbus', 0x4B37), ('crc32', 0xCBF43926)])
+def test_check_values(name, value):
+    size, function = CHECKSUMS[name]
+    assert function(b'123456789') == value
+    assert function(bytes(range(256)) * 3) < 256**size
+
+
+# Fields.
+
+@pytest.mark.parametrize('fields, each, count, values, expected', [
+    (XYZ, (), 0, [1.0, 2.0, 3.0], [ONE]),
+    (('z', '-', 'x', '-'), (), 0, [3.0, None, 1.0, None], [Reading('', (1.0, math.nan, 3.0))]),
+    (('ticks', 'ay'), (), 0, [9.0, 2.0],
+     [Reading('', None, (math.nan, 2.0, math.nan), 9.0)]),
+    (('sensor', 'x', 'y', 'z', 'ax', 'ay', 'az', 'sequence'), (), 0,
+     ['S', 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7],
+     [Reading('S', (1.0, 2.0, 3.0), (4.0, 5.0, 6.0), None, 7)]),
+    (('y.B', 'x.A', 'sequence', 'x.B', 'ax.A.1'), (), 0, [1.0, 2.0, 7, 3.0, 4.0],
+     [Reading('B', (3.0, 1.0, math.nan), None, None, 7),
+      Reading('A', (2.0, math.nan, math.nan), None, None, 7),
+      Reading('A.1', None, (4.0, math.nan, math.nan), None, 7)]),
+    (('sensor', 'x.A'), ('z', '-', 'y'), 2, ['board', 1.0, 2.0, None, 3.0, 4.0, None, 5.0],
+     [Reading('board.A', (1.0, math.nan, math.nan)), Reading('board.0', (math.nan, 3.0, 2.0)),
+      Reading('board.1', (math.nan, 5.0, 4.0))])])
+def test_what_the_values_of_a_frame_mean(fields, each, count, values, expected):
+    layout = FieldLayout(fields, each, count)
+    assert len(layout.quantities) == len(values)
+    assert repr(layout.readings(values)) == repr(expected)
+
+
+@pytest.mark.parametrize('fields, each, count, message', [
+    ((), (), 0, 'none of x y z ax ay az is there'),
+    (('ticks', '-'), (), 0, 'none of x y z ax ay az is there'),
+    (('x', 'w'), (), 0, "'w' is none of"),
+    (('x', 'y', 'x'), (), 0, 'x is there twice'),
+    (('x.A', 'x.A'), (), 0, 'x.A is there twice'),
+    (('ticks', 'ticks', 'x'), (), 0, 'ticks is there twice'),
+    (('x.0',), ('x',), 1, 'x.0 is there twice'),
+    (('x', 'y.A'), (), 0, 'either every axis'),
+    (('x',), ('y',), 1, 'either every axis'),
+    (('x', 'ticks.A'), (), 0, "'ticks.A' is none of"),
+    (('x', '-.A'), (), 0, "'-.A' is none of"),
+    (('x.',), (), 0, '1 to 64 printable'),
+    (('x.' + 65 * 'a',), (), 0, '1 to 64 printable'),
+    (('x.\n',), (), 0, '1 to 64 printable'),
+    ((), ('x', 'ticks'), 2, "each: 'ticks' is none of"),
+    ((), ('x.A',), 2, "each: 'x.A' is none of"),
+    ((), ('x',), 0, 'go together'),
+    (XYZ, (), 3, 'go together')])
+def test_fields_that_mean_nothing_are_refused(fields, each, count, message):
+    with pytest.raises(SettingsError, match=message):
+        FieldLayout(fields, each, count)
+
+
+def test_the_longest_name_of_a_sensor():
+    assert FieldLayout(('x.' + 64 * 'a',)).readings([1.0])[0].sensor == 64 * 'a'
+
+
+def test_escapes_mean_the_same_in_both_quotes_of_yaml():
+    assert unescaped('end', '\\r\\n') == unescaped('end', '\r\n') == b'\r\n'
+    assert unescaped('end', '\\t\\0\\x1e\\\\n') == b'\t\x00\x1e\\n'
+    for bad in ('\\q', '\\', '\\x80', '\\x1', '\ud800'):
+        with pytest.raises(SettingsError, match='end'):
+            unescaped('end', bad)
+
+
+# Binary.
+
+LIMITS = {'u8': (0, 255), 'i8': (-128, 127), 'u16': (0, 65535), 'i16': (-32768, 32767),
+          'u24': (0, 2**24 - 1), 'i24': (-2**23, 2**23 - 1), 'u32': (0, 2**32 - 1),
+          'i32': (-2**31, 2**31 - 1), 'u64': (0, 2**64 - 1), 'i64': (-2**63, 2**63 - 1)}
+
+
+@pytest.mark.parametrize('order', ['little', 'big'])
+@pytest.mark.parametrize('kind', LIMITS)
+def test_every_integer_type(kind, order):
+    low, high = LIMITS[kind]
+    values = (low, high, 1)
+    payload = b''.join(v.to_bytes(int(kind[1:]) // 8, order, signed=low < 0)
+                       for v in (*values, high, high, low, 5))
+    fields = ['x', 'y', 'z', 'sequence', '-', 'ticks', 'sensor']
+    framing = binary(sync='01', byte_order=order, fields=[f'{name}:{kind}' for name in fields])
+    parsed = framing.parse(b'\x01' + payload)
+    assert parsed.readings == (
+        Reading('5', tuple(map(float, values)), None, float(low), high),)
+    reading = parsed.readings[0]
+    assert [type(v) for v in (*reading.field, reading.ticks)] == [float] * 4
+    assert framing.size == parsed.consumed == len(payload) + 1
+
+
+@pytest.mark.parametrize('kind, code', [('f32', 'f'), ('f64', 'd')])
+def test_floats_that_are_not_finite(kind, code):
+    framing = binary(fields=[f'{name}:{kind}' for name in ('x', 'y', 'z', 'ticks', '-')],
+                     byte_order='big')
+
+    def parse(*values):
+        return framing.parse(b'\xA5\x5A' + struct.pack(f'>5{code}', *values))
+
+    nan = math.nan
+    assert repr(parse(nan, -1.5, 0, 2, math.inf).readings) == repr(
+        (Reading('', (nan, -1.5, 0.0), None, 2.0),))
+    for values, cause in (((1, 2, -math.inf, 4, 5), 'with an infinite number'),
+                          ((1, 2, 3, math.inf, 5), 'with an infinite number'),
+                          ((1, 2, 3, nan, 5), 'without ticks')):
+        parsed = parse(*values)
+        assert not parsed.readings and parsed.rejected[f'frames {cause}'] == 1
+        assert parsed.rejected['bytes between frames'] == framing.size == parsed.consumed
+
+
+@pytest.mark.parametrize('name', ['none', *CHECKSUMS])
+@pytest.mark.parametrize('order', ['little', 'big'])
+@pytest.mark.parametrize('since', ['sync', 'payload'])
+def test_where_checksum_and_tail_stand(name, order, since):
+    framing = binary(checksum=name, byte_order=order, checksum_from=since, tail='0D 0A')
+    sync, payload = b'\xA5\x5A', b''.join(v.to_bytes(2, order) for v in (1, 2, 3))
+    checksum = b''
+    if name != 'none':
+        size, function = CHECKSUMS[name]
+        checksum = function((sync if since == 'sync' else b'') + payload).to_bytes(size, order)
+    frame = sync + payload + checksum + b'\r\n'
+    assert framing.parse(frame).readings == (ONE,) and framing.size == len(frame)
+    for at in range(2, len(frame)):
+        bad = framing.parse(frame[:at] + bytes([frame[at] ^ 1]) + frame[at + 1:])
+        if at >= len(frame) - 2:
+            assert bad.rejected['frames with a wrong tail'] == 1 and not bad.readings
+        elif name != 'none':
+            assert bad.rejected['frames with a wrong checksum'] == 1 and not bad.readings
+        else:
+            assert bad.readings != (ONE,)
+
+
+def test_a_sync_that_is_no_beginning_hides_no_frame():
+    framing = binary(checksum='crc32', sync='A5 A5', each=['x:i16', 'y:i16'], count=2,
+                     fields=['sequence:u16', '-:u24'])
+    payload = b'\xA5' * 13
+    frame = b'\xA5\xA5' + payload + zlib.crc32(payload).to_bytes(4, 'little')
+    for before in (b'', b'\xA5', b'\xA5\xA5', frame[:7], frame[:-1], b'\x00', b'\xA5\x00'):
+        parsed = framing.parse(before + frame + frame + b'\x00\xA5')
+        assert len(parsed.readings) == 4 and parsed.consumed == len(before + frame + frame) + 1
+        assert parsed.rejected['bytes between frames'] == len(before) + 1
+
+
+def test_what_follows_from_the_types():
+    known = {}
+    for kind in ('u8', 'u24', 'u32', 'u64', 'f64'):
+        framing = binary(fields=[f'ticks:{kind}', 'x:i16'])
+        known[kind] = framing.CLOCK['wrap']
+        assert framing.DRIVER == {}
+    assert known == {'u8': 256, 'u24': 2**24, 'u32': 2**32, 'u64': 0, 'f64': 0}
+    framing = binary(fields=['sequence:u16', 'x:i16'])
+    assert framing.DRIVER == {'sequence_wrap': 65536} and framing.CLOCK == {}
+
+
+@pytest.mark.parametrize('changes, message', [
+    ({'sync': ''}, 'sync: a frame must begin'), ({'sync': 'A5 5'}, "sync: 'A5 5' is not hexa"),
+    ({'sync': 'xy'}, 'sync'), ({'tail': '0'}, "tail: '0' is not hexadecimal"),
+    ({'fields': ['x']}, "fields: 'x' has none of the types"),
+    ({'fields': ['x:u12']}, "fields: 'x:u12' has none of the types"),
+    ({'each': ['x.A'], 'count': 1}, "each: 'x.A' has none of the types"),
+    ({'fields': ['w:u8']}, "'w' is none of"), ({'fields': []}, 'fields'),
+    ({'fields': ['sequence:f32', 'x:u8']}, 'sequence must be an integer'),
+    ({'fields': ['sensor:f64', 'x:u8']}, 'sensor must be an integer'),
+    ({'byte_order': 'middle'}, 'byte_order'), ({'checksum': 'md5'}, 'checksum'),
+    ({'checksum_from': 'tail'}, 'checksum_from'), ({'count': -1}, 'count')])
+def test_binary_settings_that_mean_nothing_are_refused(changes, message):
+    with pytest.raises(SettingsError, match=message):
+        binary(**changes)
+
+
+# Laws of every framing.
+
+FRAMINGS = {
+    **{name: (case.make_framing(), None) for name, case in CASES.items()},
+    'short lines': (TextFraming(TextSettings(fields=XYZ, longest=12, comment='#')), (
+        b'1,2,3', b'4,5,6\r', b'\n', b'\n', b'123,4567,890', b'1234,5678,90\r', b'9' * 12,
+        b'\xc3', b'\xa9', b'\r', b'#', b' ')),
+    'lines with a long end': (TextFraming(TextSettings(fields=XYZ, longest=8, end='\r\n\r')), (
+        b'1,2,3', b'\r', b'\n', b'\r\n\r', b'12345678', b'\r\n')),
+    'objects': (JsonFraming(JsonSettings(field=('m',), longest=24)), (
+        b'{"m":[1,2,3]}', b'{"m":[4,null,6]}', b'\n', b'\n', b'\xff', b'[', b'1', b' ' * 11)),
+    'no checksum': (BinaryFraming(BinarySettings(sync='01 01 02', fields=('x:i8', 'y:i16'))), (
+        b'\x01', b'\x01\x01', b'\x02', b'\x03', b'\x01\x01\x02abc')),
+    'tail': (BinaryFraming(BinarySettings(sync='01', fields=('x:f32',), tail='02')), (
+        b'\x01', b'\x02', b'\x01\x00\x00\x80\x7f\x02', b'\x01\x00\x00\x80\x3f\x02')),
+}
+LONGEST = {'text': 121, 'json': 257, 'binary': 24, 'binary of a board': 41, 'short lines': 13,
+           'lines with a long end': 11, 'objects': 25, 'no checksum': 6, 'tail': 6}
+
+
+def some_stream(name, seed):
+    """A stream made of what is hard for this framing."""
+    rng, atoms = random.Random(seed), FRAMINGS[name][1]
+    if atoms:
+        return b''.join(rng.choices(atoms, k=rng.randint(0, 40)))
+    out, case = b'', CASES[name]
+    for _ in range(rng.randint(0, 6)):
+        frame = case.encode_random_frame(rng)[0]
+        out += some_garbage(rng, case, frame) + frame
+    return out[rng.randint(0, 20):-rng.randint(1, 20)]
+
+
+def fed(name, pieces, final):
+    """(readings, counts, rest) of what comes in pieces."""
+    framing = FRAMINGS[name][0]
+    readings, counts, rest = [], Counter(), b''
+    for i, piece in enumerate(pieces):
+        data, last = rest + piece, final and i == len(pieces) - 1
+        parsed = framing.parse(data, last)
+        assert repr(framing.parse(data, last)) == repr(parsed)
+        assert 0 <= parsed.consumed <= len(data)
+        assert all(count > 0 for count in parsed.rejected.values())
+        readings += map(repr, parsed.readings)
+        counts.update(parsed.rejected)
+        rest = data[parsed.consumed:]
+        assert len(rest) <= (0 if last else LONGEST[name])
+    return readings, counts, rest
+
+
+@pytest.mark.parametrize('name', FRAMINGS)
+@settings(derandomize=True, deadline=None, max_examples=120)
+@given(seed=st.integers(0, 2**32), places=st.lists(st.integers(0, 2**16), max_size=12),
+       final=st.booleans(), single=st.booleans())
+def test_any_pieces_give_the_same(name, seed, places, final, single):
+    stream = some_stream(name, seed)
+    if single:
+        pieces = [stream[i:i + 1] for i in range(len(stream))] or [b'']
+    else:
+        cuts = sorted({p % (len(stream) + 1) for p in places})
+        pieces = [stream[a:b] for a, b in zip([0, *cuts], [*cuts, len(stream)], strict=True)]
+    assert fed(name, pieces, final) == fed(name, [stream], final)
+
+
+@pytest.mark.parametrize('name', FRAMINGS)
+def test_nothing_is_lost_without_a_count(name):
+    framing = FRAMINGS[name][0]
+    n_found = n_rejected = 0
+    for seed in range(300):
+        stream = some_stream(name, seed)
+        readings, counts, rest = fed(name, [stream], bool(seed % 2))
+        n_found, n_rejected = n_found + len(readings), n_rejected + sum(counts.values())
+        if isinstance(framing, BinaryFraming):
+            n_sensors = 4 if name == 'binary of a board' else 1
+            frames = len(readings) // n_sensors
+            assert frames * framing.size + counts['bytes between frames'] + len(rest) == len(stream)
+        else:
+            end = b'\r\n\r' if name == 'lines with a long end' else b'\n'
+            *lines, tail = stream.split(end)
+            assert len(readings) + sum(counts.values()) == len(lines) + bool(seed % 2 and tail)
+    assert n_found > 50 and n_rejected > 50
+
+
+@pytest.mark.parametrize('name', CASES)
+def test_every_frame_between_garbage_is_found_and_none_invented(name):
+    result = fuzz(CASES[name], 20_000)
+    # Of the frames whose 16 bits decide, a false one passes in 65536; here none does.
+    assert result.lost == result.invented == 0
+    assert result.found == result.readings >= result.sent == 20_000
+    assert result.garbage > 200_000 and result.worst_rest <= LONGEST[name]
+
+
+def test_the_fuzzer_sees_a_framing_that_loses_or_invents():
+    case = CASES['binary']
+
+    class Deaf(BinaryFraming):
+        def parse(self, data, final=False):
+            parsed = super().parse(data, final)
+            return parsed if len(data) % 5 else type(parsed)((), parsed.consumed)
+
+    deaf = BinarySettings(sync='A5 5A', checksum='crc32', fields=(
+        'sequence:u16', 'ticks:u32', 'x:f32', 'y:f32', 'z:f32'))
+    assert fuzz(case._replace(make_framing=lambda: Deaf(deaf)), 500).lost > 0
+    blind = BinarySettings(sync='A5 5A', fields=(*deaf.fields, '-:u32'))
+    result = fuzz(case._replace(make_framing=lambda: BinaryFraming(blind)), 500)
+    assert result.invented > 0 and result.lost > 0 and result.failed(0.0)
+    assert not fuzz(case, 500).failed(0.0)
+
+
+@pytest.mark.parametrize('name, piece, size', [
+    ('text', b'9', 2**20), ('text', b'\n', 2**18), ('text', b'$MAG,', 2**20), ('json', b'{', 2**20),
+    ('json', b'[\n', 2**16), ('binary', b'\xa5\x5a', 2**20), ('binary', b'\xa5', 2**20),
+    ('binary of a board', b'\xff', 2**19)])
+def test_a_megabyte_of_nothing_takes_linear_time(name, piece, size):
+    framing = FRAMINGS[name][0]
+    stream = piece * (size // len(piece))
+    start = time.process_time()
+    parsed = framing.parse(stream)
+    # About a second; quadratic time would be hours.
+    assert time.process_time() - start < 20.0
+    assert not parsed.readings and len(stream) - parsed.consumed <= LONGEST[name]
+    pieces = [stream[i:i + 1000] for i in range(0, 2**16, 1000)]
+    assert fed(name, pieces, True) == fed(name, [b''.join(pieces)], True)
+
+
+@pytest.mark.parametrize('value', [b'1' * 60_000 + b'x', b' ' * 60_000 + b'x', b'1.' + b'1' * 60_000
+                                   + b'e', b'nan' * 20_000, b'+' * 60_000, b'.' * 60_000])
+def test_a_long_value_takes_no_time(value):
+    framing = TextFraming(TextSettings(fields=('x',), longest=65536))
+    start = time.process_time()
+    assert framing.parse(value, final=True).rejected == {
+        'lines with something that is no number': 1}
+    assert time.process_time() - start < 1.0

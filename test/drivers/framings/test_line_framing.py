@@ -1,0 +1,225 @@
+import math
+
+import pytest
+
+from mag_tracking.drivers.framings.json_objects import JsonFraming, JsonSettings
+from mag_tracking.drivers.framings.text import TextFraming, TextSettings
+from mag_tracking.drivers.reading import Reading
+from mag_tracking.errors import SettingsError
+from mag_tracking.settings import replace
+
+XYZ = ('x', 'y', 'z')
+ONE = Reading('', (1.0, 2.0, 3.0))
+
+
+def text(**changes):
+    return TextFraming(replace(TextSettings(), {'fields': XYZ, **changes}))
+
+
+def objects(**changes):
+    return JsonFraming(replace(JsonSettings(), {'field': ['m'], **changes}))
+
+
+# Text.
+
+ALL = ('sensor', 'ticks', 'sequence', '-', 'x', 'y', 'z')
+
+
+@pytest.mark.parametrize('line, expected', [
+    (b'A,1.5,7,?,1,2,3', Reading('A', (1.0, 2.0, 3.0), None, 1.5, 7)),
+    (b'A b\t, 2 ,\t+7,, -1.e1 ,.5,+2.5E-1 \r', Reading('A b', (-10.0, 0.5, 0.25), None, 2.0, 7)),
+    ('ß,1,-7,１,,nan,-NaN'.encode(), Reading('ß', (math.nan,) * 3, None, 1.0, -7)),
+    (b'a,1,18446744073709551615,,1,2,' + b'0' * 400, Reading(
+        'a', (1.0, 2.0, 0.0), None, 1.0, 2**64 - 1))])
+def test_a_line_of_text(line, expected):
+    for data, final in ((line + b'\n', False), (line, True)):
+        parsed = text(fields=ALL).parse(data, final)
+        assert repr(parsed.readings) == repr((expected,))
+        assert parsed.consumed == len(data) and not parsed.rejected
+
+
+@pytest.mark.parametrize('line, cause', [
+    (b'1,2', 'with another number of fields'),
+    (b'1,2,3,', 'with another number of fields'),
+    (b'1_0,2,3', 'with something that is no number'),
+    ('１,2,3'.encode(), 'with something that is no number'),
+    (b'0x1,2,3', 'with something that is no number'),
+    (b'1e,2,3', 'with something that is no number'),
+    (b'.,2,3', 'with something that is no number'),
+    (b'1 2,2,3', 'with something that is no number'),
+    (b'1,2,3\r\r', 'with something that is no number'),
+    (b'1,2,\xa03', 'that are no UTF-8'),
+    (b'1,2,inf', 'with an infinite number'),
+    (b'1,2,-Infinity', 'with an infinite number'),
+    (b'1,2,1e999', 'with an infinite number'),
+    (b'1,2,' + b'9' * 400, 'with an infinite number'),
+    (b'1,2,' + b'0' * 509, 'that are too long'),
+    (b'', 'that are empty'),
+    (b' \t\r', 'that are empty')])
+def test_a_line_that_is_rejected(line, cause):
+    parsed = text().parse(line + b'\n1,2,3\n')
+    assert parsed.rejected == {f'lines {cause}': 1}
+    assert parsed.readings == (ONE,)
+
+
+@pytest.mark.parametrize('line, cause', [
+    (b',1,7,?,1,2,3', 'with an unusable sensor name'),
+    (b'a' * 65 + b',1,7,?,1,2,3', 'with an unusable sensor name'),
+    (b'a\x07,1,7,?,1,2,3', 'with an unusable sensor name'),
+    (b'A,,7,?,1,2,3', 'without ticks'),
+    (b'A,nan,7,?,1,2,3', 'without ticks'),
+    (b'A,inf,7,?,1,2,3', 'with an infinite number'),
+    (b'A,1,,?,1,2,3', 'with a sequence that is no integer'),
+    (b'A,1,7.0,?,1,2,3', 'with a sequence that is no integer'),
+    (b'A,1,1_0,?,1,2,3', 'with a sequence that is no integer'),
+    (b'A,1,' + b'1' * 5000 + b',?,1,2,3', 'with a sequence that is no integer'),
+    (b'A,1,18446744073709551616,?,1,2,3', 'with a sequence of more than 64 bits'),
+    (b'A,1,-9223372036854775809,?,1,2,3', 'with a sequence of more than 64 bits')])
+def test_a_value_that_must_be_there(line, cause):
+    parsed = text(fields=ALL, longest=6000).parse(line, final=True)
+    assert parsed.rejected == {f'lines {cause}': 1} and not parsed.readings
+
+
+def test_separators_ends_prefixes_and_comments():
+    assert text(separator=' ').parse(b' 1 \t2   3\n').readings == (ONE,)
+    assert text(separator='; ').parse(b'1; 2; 3\n').readings == (ONE,)
+    assert text(separator='\\t').parse(b'1\t2\t3\n').readings == (ONE,)
+    assert text(end=';').parse(b'1,2,3\r;').readings == (ONE,)
+    assert text(end='\r\n').parse(b'1,2,3\r\n1,2').consumed == 7
+    parsed = text(prefix='$MAG,', comment='#').parse(
+        b'$MAG,1,2,3\n# $MAG,1,2,3\n1,2,3\n $MAG,1,2,3\n')
+    assert parsed.readings == (ONE,)
+    assert parsed.rejected == {'lines without the prefix': 2, 'lines that are comments': 1}
+    assert text().parse(b'#1,2,3\n').rejected == {'lines with something that is no number': 1}
+
+
+@pytest.mark.parametrize('line, cause', [
+    (b'$GPGLL,5300.97914,N,00259.98174,E,125926,A*28', None),
+    (b'GPGLL,5300.97914,N,00259.98174,E,125926,A*28\r', None),
+    (b'$MAG,1,-,2,-,5.5,*66', None), (b'$MAG,1,-,2,-,3e1,*2F', None),
+    (b'$MAG,1,-,2,-,3e1,*2f', None),
+    (b'$MAG,1,-,2,-,5.5,*67', 'with a wrong checksum'),
+    (b'$MAG,1,-,2,-,5.5,* 6', 'with a wrong checksum'),
+    (b'$MAG,1,-,2,-,5.5,*6', 'without a checksum'),
+    (b'$MAG,1,-,2,-,5.5,*066', 'without a checksum'),
+    (b'$MAG,1,-,2,-,5.5,', 'without a checksum')])
+def test_the_checksum_of_nmea(line, cause):
+    framing = text(fields=('-', 'x', '-', 'y', '-', 'z', '-'), checksum='nmea')
+    parsed = framing.parse(line + b'\n')
+    assert parsed.rejected == ({f'lines {cause}': 1} if cause else {})
+    assert len(parsed.readings) == (cause is None)
+
+
+@pytest.mark.parametrize('changes, message', [
+    ({'end': ''}, 'end'), ({'separator': ''}, 'separator'), ({'separator': '.'}, 'separator'),
+    ({'separator': 'e'}, 'separator'), ({'separator': '\\n'}, 'holds the end'),
+    ({'prefix': 'a\n'}, 'prefix: .* holds the end'), ({'comment': '\\n'}, 'comment: .* holds'),
+    ({'prefix': '$M', 'comment': '$'}, 'would be passed over'),
+    ({'checksum': 'crc8'}, "checksum: 'crc8' is none of none, nmea"),
+    ({'longest': 0}, 'longest'), ({'fields': ['B']}, "'B' is none of")])
+def test_text_settings_that_mean_nothing_are_refused(changes, message):
+    with pytest.raises(SettingsError, match=message):
+        text(**changes)
+
+
+# JSON.
+
+PATHS = {'sensor': 'id', 'ticks': 'clock.t', 'sequence': 'n', 'field': ['m.x', '', 'm.y.1'],
+         'acceleration': ['a']}
+
+
+def test_an_object_with_everything():
+    line = (b'{"id": "A", "clock": {"t": 1e3}, "n": 7, "m": {"x": 1, "y": [0, 2.5]}, '
+            b'"a": [null, NaN, -3], "else": {"huge": Infinity}}\r\n')
+    expected = Reading('A', (1.0, math.nan, 2.5), (math.nan, math.nan, -3.0), 1000.0, 7)
+    for data in (line, line.replace(b'"A"', b'"\\u0041"'), line.replace(b'7', b'7.0')):
+        parsed = objects(**PATHS).parse(data)
+        assert repr(parsed.readings) == repr((expected,)) and not parsed.rejected
+    assert [type(v) for v in parsed.readings[0].field] == [float] * 3
+    assert isinstance(parsed.readings[0].sequence, int)
+    assert objects(**PATHS).parse(line.replace(b'"A"', b'12')).readings[0].sensor == '12'
+
+
+@pytest.mark.parametrize('line, cause', [
+    (b'{"m": [1, 2]}', 'whose m is no list of three'),
+    (b'{"m": [1, 2, 3, 4]}', 'whose m is no list of three'),
+    (b'{"m": {"0": 1, "1": 2, "2": 3}}', 'whose m is no list of three'),
+    (b'{"m": null}', 'whose m is no list of three'),
+    (b'{"x": [1, 2, 3]}', 'without m'),
+    (b'{"m": [1, 2, true]}', 'whose m.2 is no number'),
+    (b'{"m": [1, 2, "3"]}', 'whose m.2 is no number'),
+    (b'{"m": [1, 2, Infinity]}', 'with an infinite number'),
+    (b'{"m": [1, 2, 1e999]}', 'with an infinite number'),
+    (b'{"m": [1, 2, 1' + b'0' * 400 + b']}', 'with an infinite number'),
+    (b'{"m": [1, 2, 1' + b'0' * 5000 + b']}', 'that are no JSON'),
+    (b'{"m": [1, 2, 3], "m": [1, 2, 3]}', 'with a key twice'),
+    (b'{"m": [1, 2, 3], "d": [{"a": 0, "a": 0}]}', 'with a key twice'),
+    (b'{"m": [1, 2, 3], "d": ' + b'[' * 60_000 + b']' * 60_000 + b'}',
+     'that are nested too deeply'),
+    (b'{"m":' * 30_000, 'that are nested too deeply'),
+    (b'{"m": [1, 2, 3]', 'that are no JSON'),
+    (b'{"m": [1, 2, 3]} {}', 'that are no JSON'),
+    (b'{"m": [1, 2, 3,]}', 'that are no JSON'),
+    (b'\xef\xbb\xbf{"m": [1, 2, 3]}', 'that are no JSON'),
+    (b'[1, 2, 3]', 'that are no JSON object'),
+    (b'"m"', 'that are no JSON object'),
+    (b'{"m": [1, 2, 3], "\xff": 1}', 'that are no UTF-8'),
+    ('{"m": [1, 2, 3]}'.encode('utf-16'), 'that are no UTF-8'),
+    (b' ', 'that are empty'),
+    (b'{"m": [1, 2, 3]' + b' ' * 200_000 + b'}', 'that are too long')])
+def test_an_object_that_is_rejected(line, cause):
+    framing = objects(longest=200_000)
+    parsed = framing.parse(line + b'\n{"m":[1,2,3]}\n')
+    assert parsed.rejected == {f'lines {cause}': 1} and parsed.readings == (ONE,)
+    assert framing.parse(line, final=True).rejected == {f'lines {cause}': 1}
+
+
+@pytest.mark.parametrize('old, new, cause', [
+    (b'"A"', b'true', 'whose id is no name'), (b'"A"', b'1.5', 'whose id is no name'),
+    (b'"A"', b'null', 'whose id is no name'), (b'"A"', b'""', 'with an unusable sensor name'),
+    (b'"A"', b'"\\ud800"', 'with an unusable sensor name'),
+    (b'"A"', b'9' * 4000, 'with an unusable sensor name'),
+    (b'"t": 5', b'"t": null', 'whose clock.t is no number'),
+    (b'"t": 5', b'"t": NaN', 'without ticks'), (b'"t": 5', b'"u": 5', 'without clock.t'),
+    (b'"n": 7', b'"n": 7.5', 'whose n is no integer'),
+    (b'"n": 7', b'"n": NaN', 'whose n is no integer'),
+    (b'"n": 7', b'"n": -Infinity', 'whose n is no integer'),
+    (b'"n": 7', b'"n": 1e30', 'with a sequence of more than 64 bits'),
+    (b'"n": 7', b'"n": false', 'whose n is no number'),
+    (b'[1, 2]', b'[1]', 'without m.y.1'), (b'[1, 2]', b'{"0": 1}', 'without m.y.1'),
+    (b'{"x"', b'{"q"', 'without m.x'), (b'{"x": 1, "y": [1, 2]}', b'"xy"', 'without m.x'),
+    (b'{"x": 1, "y": [1, 2]}', b'[1]', 'without m.x')])
+def test_a_path_that_must_lead_somewhere(old, new, cause):
+    line = (b'{"id": "A", "clock": {"t": 5}, "n": 7, "m": {"x": 1, "y": [1, 2]}, '
+            b'"a": [1, 2, 3]}\n')
+    framing = objects(**PATHS, longest=5000)
+    assert len(framing.parse(line).readings) == 1 and line.count(old) == 1
+    parsed = framing.parse(line.replace(old, new))
+    assert parsed.rejected == {f'lines {cause}': 1} and not parsed.readings
+
+
+def test_an_object_of_several_lines_is_only_read_from_a_whole_message():
+    pretty = b'{\n "m": [1,\n 2, 3]\n}\n'
+    assert objects().parse(pretty).rejected == {'lines that are no JSON': 4}
+    parsed = objects().parse(pretty, final=True)
+    assert parsed.readings == (ONE,) and parsed.consumed == len(pretty) and not parsed.rejected
+    assert objects(longest=len(pretty) - 1).parse(pretty, final=True).rejected == {
+        'lines that are no JSON': 4}
+    # Several objects in a message are lines, whatever one of them is like.
+    for bad in (b'{"m": 1, "m": 1}', b'\xff', b'['):
+        parsed = objects().parse(bad + b'\n{"m":[1,2,3]}\n{"m":[1,2,3]}', final=True)
+        assert parsed.readings == (ONE, ONE) and sum(parsed.rejected.values()) == 1
+    assert objects().parse(b'[1,\n2]', final=True).rejected == {'lines that are no JSON object': 1}
+
+
+@pytest.mark.parametrize('changes, message', [
+    ({'field': ['a', 'b']}, 'field: expected the paths of three axes'),
+    ({'field': ['']}, 'neither the field nor the acceleration'),
+    ({'field': [''], 'ticks': 't'}, 'neither the field nor the acceleration'),
+    ({'field': ['', '', '']}, 'neither the field nor the acceleration'),
+    ({'acceleration': ['a', 'b', 'c', 'd']}, 'acceleration: expected'),
+    ({'ticks': 'a..b'}, "ticks: 'a..b' has an empty key"), ({'field': ['.a']}, 'empty key'),
+    ({'end': ''}, 'end')])
+def test_json_settings_that_mean_nothing_are_refused(changes, message):
+    with pytest.raises(SettingsError, match=message):
+        objects(**changes)

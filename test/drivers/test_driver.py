@@ -1,0 +1,405 @@
+"""A driver keeps its device open, names, scales and stamps what it says, and counts the rest."""
+
+import gc
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from mag_tracking.drivers.device_clock import ClockSettings
+from mag_tracking.drivers.driver import Driver, DriverSettings, serve
+from mag_tracking.drivers.framed_device import FramedDevice
+from mag_tracking.drivers.reading import Arrival, Chunk, Parsed, Reading
+from mag_tracking.drivers.sequence import MEMORY, SequenceCheck
+from mag_tracking.errors import DeviceError, SettingsError
+from mag_tracking.records import AccelerationSample, MagSample
+
+DAY_NS = 1_700_000_000_000_000_000
+CLOCK = ClockSettings(tick_s=1e-6, shortest_delay_s=0.0)
+
+
+class Machine:
+    """The clocks of a machine whose time the test makes."""
+
+    def __init__(self):
+        self.now_ns, self.step_ns = 5_000_000_000, 0
+        self.slept = []
+
+    def monotonic_ns(self):
+        return self.now_ns
+
+    def wall_ns(self):
+        return DAY_NS + self.step_ns + self.now_ns
+
+    def sleep(self, seconds):
+        self.slept.append(seconds)
+        self.now_ns += round(seconds * 1e9)
+
+
+class ScriptedDevice:
+    """Does what stands in `script` one after the other: errors are raised, lists are given."""
+
+    def __init__(self, machine, script):
+        self.counts = Counter()
+        self.calls = []
+        self._machine, self._script = machine, list(script)
+
+    def open(self):
+        self.calls.append('open')
+        if self._script and self._script[0] == 'no port':
+            raise DeviceError(self._script.pop(0))
+
+    def read(self, timeout_s):
+        item = self._script.pop(0) if self._script else []
+        if isinstance(item, Exception):
+            raise item
+        if not item:
+            self._machine.sleep(timeout_s)
+        return [Arrival(self._machine.now_ns, *a) if isinstance(a, tuple) and not isinstance(
+            a, Reading) else Arrival(self._machine.now_ns, a) for a in item]
+
+    def close(self):
+        self.calls.append('close')
+
+
+def said(driver, timeout_s):
+    """What `driver` has, as samples."""
+    readings, accelerations = driver.poll(timeout_s)
+    return [*readings.samples(), *accelerations]
+
+
+def driver_of(script, settings=None, sensors=None, clock=CLOCK):
+    machine = Machine()
+    device = ScriptedDevice(machine, script)
+    driver = Driver('board', device, DriverSettings(**(settings or {})), clock,
+                    sensors or {'': 'mag_1'}, machine.monotonic_ns, machine.wall_ns, machine.sleep)
+    return driver, device, machine
+
+
+def test_a_reading_is_a_sample_in_si_and_in_time_of_day():
+    reading = Reading('A', (10.0, -20.0, float('nan')), (0.0, 0.0, 1.0), ticks=7)
+    driver, _, machine = driver_of([[reading]], {'unit': 'mG', 'acceleration_unit': 'g'},
+                                   {'A': 'mag_7'})
+    field, acceleration = said(driver, 0.2)
+    assert isinstance(field, MagSample) and isinstance(acceleration, AccelerationSample)
+    assert field.sensor == acceleration.sensor == 'mag_7'
+    np.testing.assert_allclose(field.field, [1e-6, -2e-6, np.nan])
+    np.testing.assert_allclose(acceleration.acceleration, [0.0, 0.0, 9.80665])
+    assert field.covariance is None
+    assert field.stamp_ns == acceleration.stamp_ns == DAY_NS + machine.now_ns
+
+
+@pytest.mark.parametrize('unit, tesla', [('T', 1.0), ('mT', 1e-3), ('uT', 1e-6), ('nT', 1e-9),
+                                         ('G', 1e-4), ('mG', 1e-7), ('1.5e-8', 1.5e-8)])
+def test_units(unit, tesla):
+    driver, *_ = driver_of([[Reading('', (2.0, 3.0, 4.0))]], {'unit': unit})
+    np.testing.assert_allclose(said(driver, 0.1)[0].field, np.array([2.0, 3.0, 4.0]) * tesla,
+                               rtol=1e-12)
+
+
+@pytest.mark.parametrize('settings, told', [
+    ({'unit': 'gauss'}, "board: unit: 'gauss' is neither"), ({'unit': '0'}, 'unit'),
+    ({'unit': 'nan'}, 'unit'), ({'acceleration_unit': 'G'}, 'board: acceleration_unit'),
+    ({'stamp_by': 'sundial'}, 'board: stamp_by: expected auto, ticks')])
+def test_settings_that_are_none(settings, told):
+    with pytest.raises(SettingsError, match=told):
+        driver_of([], settings)
+
+
+def test_a_lost_device_is_opened_again_with_back_off():
+    driver, device, machine = driver_of(
+        ['no port'] * 6 + [[Reading('', (1.0, 2.0, 3.0))], DeviceError('pulled out'), 'no port',
+                           [Reading('', (1.0, 2.0, 3.0))]])
+    opened, times, samples = 0, [], []
+    while len(samples) < 2:
+        samples += said(driver, 0.01)
+        if device.calls.count('open') > opened:
+            opened = device.calls.count('open')
+            times.append(machine.now_ns / 1e9)
+            assert driver.is_open == (opened in (7, 9))
+        if opened == 3:
+            assert driver.trouble == 'no port'
+    waits = np.diff(times)
+    # Twice as long each time, up to a second; from the beginning once something has come.
+    np.testing.assert_allclose(waits[:6], [0.1, 0.2, 0.4, 0.8, 1.0, 1.0], atol=0.011)
+    np.testing.assert_allclose(waits[6:], [0.1, 0.2], atol=0.011)
+    assert driver.trouble == ''
+    assert driver.counts()['openings that failed'] == 7
+    assert driver.counts()['connections lost'] == 1
+    # What failed to open has been closed, too: it may hold half of what it needs.
+    assert device.calls.count('close') == 8
+    assert max(machine.slept) <= 0.01 + 1e-9
+
+
+def test_a_port_that_opens_but_says_nothing_backs_off_too():
+    driver, device, machine = driver_of([DeviceError('gone')] * 5)
+    while machine.now_ns < 9e9:
+        driver.poll(0.01)
+    assert driver.counts()['connections lost'] == 5
+    assert device.calls.count('open') == 6
+
+
+def test_a_silent_device_is_opened_again():
+    driver, device, machine = driver_of([[Reading('', (1.0, 2.0, 3.0))]], {'silent_s': 3.0})
+    begin = machine.now_ns
+    while device.calls.count('open') < 2:
+        driver.poll(0.2)
+    assert 3.0 <= (machine.now_ns - begin) / 1e9 <= 3.6
+    assert driver.counts()['silent, so opened again'] == 1
+    never, device, machine = driver_of([], {'silent_s': 0.0})
+    for _ in range(1000):
+        never.poll(0.2)
+    assert device.calls == ['open']
+
+
+def test_steps_of_the_machines_clock_move_stamps_at_once_and_are_counted():
+    script = [[Reading('', (1.0, 2.0, 3.0), ticks=1000 * k)] for k in range(3)]
+    driver, _, machine = driver_of(script)
+    stamps = []
+    for k in range(3):
+        machine.now_ns = 5_000_000_000 + 1_000_000 * k
+        machine.step_ns = 0 if k < 2 else 3_600_000_000_000
+        stamps.append(said(driver, 0.1)[0].stamp_ns)
+    assert stamps[1] - stamps[0] == pytest.approx(1_000_000, abs=2)
+    assert stamps[2] - stamps[1] == pytest.approx(3_600_001_000_000, abs=2)
+    assert driver.counts()["steps of this machine's clock"] == 1
+
+
+def test_what_stamps():
+    def stamps(settings, readings, clock=CLOCK):
+        driver, _, machine = driver_of([[r] for r in readings], settings, clock=clock)
+        out = []
+        for k in range(len(readings)):
+            machine.now_ns = 5_000_000_000 + 10_000_000 * k + (3_000_000 if k == 1 else 0)
+            out += [s.stamp_ns - DAY_NS - 5_000_000_000 for s in said(driver, 0.1)]
+        return driver, out
+    field = (1.0, 2.0, 3.0)
+    ticked = [Reading('', field, ticks=10_000 * k, sequence=k) for k in range(3)]
+    # The second came 3 ms late: a clock of the device's own knows better.
+    _, by_ticks = stamps({}, ticked)
+    np.testing.assert_allclose(by_ticks, [0, 1e7, 2e7], atol=1e4)
+    _, by_sequence = stamps({'stamp_by': 'sequence'}, ticked, ClockSettings(tick_s=0.01))
+    np.testing.assert_allclose(by_sequence, [0, 1e7, 2e7], atol=1e4)
+    _, by_arrival = stamps({'stamp_by': 'arrival'}, ticked)
+    assert by_arrival == [0, 13_000_000, 20_000_000]
+    _, auto = stamps({}, [Reading('', field)] * 3)
+    assert auto == by_arrival
+    driver, mixed = stamps({}, [ticked[0], Reading('', field), ticked[2]])
+    assert len(mixed) == 2
+    assert driver.counts()['readings without the time of the device'] == 1
+
+
+def test_each_source_has_its_own_clock_and_its_name():
+    here, there = Reading('', (1.0, 0.0, 0.0), ticks=0), Reading('', (2.0, 0.0, 0.0), ticks=10**9)
+    driver, _, _ = driver_of([[(here, 'road/a'), (there, 'road/b'), (here, 'road/c')]],
+                             sensors={'road/a': 'mag_1', 'road/b': 'mag_2'})
+    samples = said(driver, 0.1)
+    assert [(s.sensor, s.field[0]) for s in samples] == [('mag_1', 1.0), ('mag_2', 2.0)]
+    assert samples[0].stamp_ns == samples[1].stamp_ns
+    assert set(driver.clocks()) == {'road/a', 'road/b'}
+    assert driver.counts()['of unknown sensors: road/c'] == 1
+    # The device's own name counts before the place that it sends from.
+    driver, _, _ = driver_of([[(Reading('A', (1.0, 0.0, 0.0)), 'road/b')]],
+                             sensors={'A': 'mag_1', 'road/b': 'mag_2'})
+    assert said(driver, 0.1)[0].sensor == 'mag_1'
+
+
+def test_an_acceleration_alone_is_no_field():
+    driver, *_ = driver_of([[Reading('', None, (0.0, 0.0, 9.8))]])
+    assert [type(s) for s in said(driver, 0.1)] == [AccelerationSample]
+
+
+def test_errors_of_other_peoples_devices_are_trouble_like_any_other():
+    driver, device, machine = driver_of([])
+    driver.poll(0.01)
+    driver.fail(ZeroDivisionError('division by zero'))
+    assert driver.trouble == 'ZeroDivisionError: division by zero' and not driver.is_open
+    assert driver.counts()['errors'] == 1
+    machine.now_ns += 200_000_000
+    driver.poll(0.01)
+    assert driver.is_open and device.calls == ['open', 'close', 'open']
+
+
+def test_readings_are_gathered():
+    script = [[Reading('', (float(k), 0.0, 0.0))] for k in range(3)]
+    driver, _, machine = driver_of([*script, []], {'gather_s': 0.004})
+    assert [s.field[0] for s in said(driver, 0.2)] == [0.0, 1.0, 2.0]
+    assert machine.slept == [pytest.approx(0.004)]
+    # A loss on the way takes nothing of what has come.
+    driver, *_ = driver_of([script[0], DeviceError('gone'), DeviceError('gone')],
+                           {'gather_s': 0.004})
+    assert len(said(driver, 0.2)) == 1 and driver.is_open
+    assert said(driver, 0.2) == [] and driver.trouble == 'gone'
+
+
+def checked(numbers, wrap=0, values=None):
+    check = SequenceCheck(wrap)
+    new = [check.is_new(n, b'%d' % (k if values is None else values[k]))
+           for k, n in enumerate(numbers)]
+    return new, +check.counts
+
+
+def test_losses_by_sequence_number():
+    assert checked(range(5, 50)) == ([True] * 45, {})
+    assert checked([0, 1, 5, 6, 16]) == ([True] * 5, {'lost': 3 + 9})
+    # A late one was not lost, and is handed on.
+    assert checked([0, 1, 4, 2, 5]) == ([True] * 5, {'lost': 1, 'came late': 1})
+    assert checked([254, 255, 0, 1], wrap=256) == ([True] * 4, {})
+    assert checked([250, 3, 255], wrap=256) == ([True] * 3, {'lost': 7, 'came late': 1})
+    assert checked([0, 300, -1], wrap=256)[1] == {'sequence numbers out of range': 2}
+    assert checked([0, 1000, 1001])[1] == {'lost': 999}
+    # One corrupt number is not a billion that were lost.
+    assert checked([0, 1, 2**64 - 1, 2, 3]) == (
+        [True] * 5, {'sequence jumped': 1, 'sequence begun anew': 1})
+
+
+def test_duplicates_are_not_restarts():
+    # The same number with the same values is the same reading, NaN or not.
+    assert checked([0, 1, 1, 2, 0], values=[5, 6, 6, 7, 5]) == (
+        [True, True, False, True, False], {'duplicates': 2})
+    # With other values the device has begun anew, near its beginning or far from it.
+    for begin in (3, 500, 100_000):
+        assert checked([begin, begin + 1, 0, 1, 2]) == (
+            [True] * 5, {'sequence begun anew': 1})
+
+
+def test_the_memory_of_a_sequence_is_bounded():
+    check = SequenceCheck(0)
+    for n in range(0, 100 * MEMORY, 2):
+        check.is_new(n, b'0')
+    assert len(check._seen) <= MEMORY and len(check._missing) <= MEMORY
+
+
+def test_a_reading_that_comes_twice_is_one():
+    """Also with an axis that is missing; the same count with other numbers is another reading."""
+    def reading(x, sequence, acceleration=None):
+        return Reading('', (x, float('nan'), 3.0), acceleration, sequence=sequence)
+    driver, *_ = driver_of([
+        [reading(1.0, 1), reading(1.0, 1), reading(2.0, 2), reading(2.0, 2, (0.0, 0.0, 9.8))]])
+    assert [type(s) for s in said(driver, 0.1)] == [MagSample] * 3 + [AccelerationSample]
+    counts = driver.counts()
+    assert (counts['duplicates: mag_1'], counts['sequence begun anew: mag_1']) == (1, 1)
+    # What is kept by the thousand is nothing that is looked through for garbage.
+    assert not any(gc.is_tracked(v) for v in driver._sequences['mag_1']._seen.values())
+
+
+@pytest.mark.parametrize('sequence', [None, 1])
+@pytest.mark.parametrize('field', [(1.0, 2.0), (1.0, 2.0, 3.0) * 2, (10**400, 0.0, 0.0)])
+def test_other_than_three_axes_is_an_error_of_the_device(field, sequence):
+    """Also where it says so three times: their axes are not mixed."""
+    driver, *_ = driver_of([[Reading('', field, sequence=sequence)] * 3])
+    with pytest.raises((ValueError, OverflowError)):
+        driver.poll(0.1)
+
+
+def test_an_infinite_field_is_none_but_its_acceleration_is_one():
+    driver, *_ = driver_of([[Reading('', (float('inf'), 0.0, 0.0), (0.0, 0.0, 9.8)),
+                             Reading('', (1.0, 2.0, 3.0))]])
+    field, acceleration = said(driver, 0.1)
+    assert field.field.tolist() == [1.0, 2.0, 3.0] and isinstance(acceleration, AccelerationSample)
+    assert driver.counts()['readings that are infinite in tesla'] == 1
+
+
+def test_one_topic_is_of_one_sensor():
+    driver, *_ = driver_of([[Reading('A', (1.0, 0.0, 0.0)), Reading('B', (2.0, 0.0, 0.0)),
+                             Reading('A', (3.0, 0.0, 0.0))]])
+    assert [s.field[0] for s in said(driver, 0.1)] == [1.0, 3.0]
+    assert driver.counts()['of unknown sensors: B'] == 1
+
+
+def test_a_sensor_that_is_not_used_is_no_news():
+    driver, *_ = driver_of([[Reading('A', (1.0, 0.0, 0.0), sequence=1),
+                             Reading('B', (2.0, 0.0, 0.0), sequence=1)]],
+                           sensors={'A': 'mag_1', 'B': '-'})
+    assert [s.sensor for s in said(driver, 0.1)] == ['mag_1']
+    assert driver.counts() == {'samples: mag_1': 1}
+
+
+def test_unknown_names_do_not_pile_up():
+    readings = [Reading(f'x{k}', (1.0, 0.0, 0.0)) for k in range(1000)]
+    driver, *_ = driver_of([readings], sensors={'A': 'mag_1'})
+    assert said(driver, 0.1) == []
+    assert len(driver.counts()) == 21
+    assert driver.counts()['of unknown sensors (and others)'] == 980
+    assert len(driver._unknown) == 20
+
+
+def test_a_reading_beyond_all_numbers_is_none():
+    driver, *_ = driver_of([[Reading('', (1e308, 0.0, 0.0)), Reading('', (1.0, 0.0, 0.0))]],
+                           {'unit': '1e10'})
+    assert len(said(driver, 0.1)) == 1
+    assert driver.counts()['readings that are infinite in tesla'] == 1
+
+
+def test_a_device_that_does_not_even_close_is_opened_again():
+    driver, device, machine = driver_of([DeviceError('gone')])
+
+    def close():
+        raise OSError('stuck')
+    device.close = close
+    driver.poll(0.1)
+    assert not driver.is_open and 'gone (and it does not close: OSError: stuck)' in driver.trouble
+    machine.now_ns += 10**9
+    driver.poll(0.1)
+    assert driver.is_open and driver.counts()['closings that failed'] == 1
+    # What was wrong stays said until something has come.
+    assert driver.trouble
+
+
+def test_errors_behind_a_driver_are_not_the_devices():
+    driver, device, _ = driver_of([[Reading('', (1.0, 2.0, 3.0))]] * 3)
+    taken = []
+
+    def take(readings, accelerations):
+        assert not accelerations
+        taken.append(readings)
+        if len(taken) == 1:
+            raise ValueError('nobody expected it')
+    serve(driver, take, lambda: len(taken) == 3)
+    assert device.calls == ['open', 'close']
+    assert driver.counts()['errors behind the driver: ValueError: nobody expected it'] == 1
+
+
+class Lines:
+    """Frames of two bytes: a digit and a new line."""
+
+    def parse(self, data, final=False):
+        n = len(data) // 2 * 2
+        readings = [Reading('', (float(data[i:i + 1]), 0.0, 0.0)) for i in range(0, n, 2)]
+        rest = len(data) - n
+        return Parsed(tuple(readings), len(data) if final else n,
+                      {'bytes between frames': rest} if final and rest else {})
+
+
+class Bytes:
+    """A transport of given chunks."""
+
+    def __init__(self, chunks, whole=False):
+        self.whole, self.counts, self._chunks = whole, Counter(dropped=2), list(chunks)
+
+    def open(self):
+        pass
+
+    def read(self, timeout_s):
+        return [self._chunks.pop(0)] if self._chunks else []
+
+    def close(self):
+        pass
+
+
+def test_frames_are_put_together_from_a_stream():
+    device = FramedDevice(Bytes([Chunk(1, b'1\n2'), Chunk(2, b'\n3'), Chunk(3, b'4\n')]), Lines())
+    device.open()
+    assert [(a.arrival_ns, a.reading.field[0]) for a in device.read(0.0)] == [(1, 1.0)]
+    assert [(a.arrival_ns, a.reading.field[0]) for a in device.read(0.0)] == [(2, 2.0)]
+    # The connection is lost in the middle of a frame: its beginning fits no other end.
+    device.open()
+    assert [a.reading.field[0] for a in device.read(0.0)] == [4.0]
+    assert device.counts == {'dropped': 2, 'bytes of a frame that was cut off': 1}
+
+
+def test_messages_are_whole():
+    device = FramedDevice(Bytes([Chunk(1, b'1\n2', 'a'), Chunk(2, b'3\n', 'b')], True), Lines())
+    arrivals = device.read(0.0) + device.read(0.0)
+    assert [(a.source, a.reading.field[0]) for a in arrivals] == [('a', 1.0), ('b', 3.0)]
+    assert device.counts == {'dropped': 2, 'bytes between frames': 1}

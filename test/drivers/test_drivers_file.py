@@ -1,0 +1,138 @@
+"""The drivers file: what it describes, and what it is told where it describes nothing."""
+
+from types import SimpleNamespace
+
+import pytest
+import yaml
+
+from mag_tracking.drivers.configuration import KINDS, kind_of, read_drivers
+from mag_tracking.drivers.framed_device import FramedDevice
+from mag_tracking.drivers.transports.i2c import I2cDevice
+from mag_tracking.errors import SettingsError
+from mag_tracking.network.file import read_network
+from support.bundled import NETWORK_FILE, ROOT
+
+BOARD = {'transport': 'serial', 'serial': {'port': '/dev/ttyUSB0'}, 'framing': 'text',
+         'text': {'fields': ['x', 'y', 'z']}, 'sensor': 'mag_1'}
+
+
+def read(tmp_path, content, network=None):
+    """The drivers of a file with this content."""
+    path = tmp_path / 'drivers.yaml'
+    path.write_text(content if isinstance(content, str) else yaml.safe_dump(content))
+    return read_drivers(path, network)
+
+
+def without(*keys, **more):
+    """The board without some keys, and with others."""
+    return {'board': {**{k: v for k, v in BOARD.items() if k not in keys}, **more}}
+
+
+def test_the_example_as_it_is():
+    path = ROOT / 'config' / 'drivers.yaml'
+    assert [d.name for d in read_drivers(path, read_network(NETWORK_FILE))] == ['roadside']
+
+
+def test_every_entry_of_the_example_is_one(tmp_path):
+    text = (ROOT / 'config' / 'drivers.yaml').read_text()
+    blocks = [b for b in text.split('\n\n') if 'sensor' in b and ('transport:' in b
+                                                                 or 'device:' in b)]
+    assert len(blocks) == 6
+    for block in blocks:
+        lines = block.splitlines()
+        body = [line for line in lines if not line.startswith('#')] or [
+            line.removeprefix('# ') for line in lines
+            if line.startswith('#   ') or line.rstrip().endswith(':')]
+        [driver] = read(tmp_path, '\n'.join(body).replace('config/network.yaml',
+                                                          str(NETWORK_FILE)))
+        assert driver.sensors and not driver.is_open
+
+
+def test_what_is_known_of_a_kind_need_not_be_said(tmp_path):
+    [driver] = read(tmp_path, {'mti': {
+        'transport': 'serial', 'serial': {'port': '/dev/x'}, 'framing': 'xsens', 'sensor': 'a'}})
+    assert driver._clock_settings.tick_s == 1e-4
+    assert driver._settings.sequence_wrap == 2**16
+    [driver] = read(tmp_path, {'mti': {
+        'transport': 'serial', 'serial': {'port': '/dev/x'}, 'framing': 'xsens', 'sensor': 'a',
+        'clock': {'wrap': 864000000}, 'sequence_wrap': 0, 'stamp_by': 'sequence'}})
+    assert driver._clock_settings.tick_s == 1e-4 and driver._clock_settings.wrap == 864000000
+    assert driver._settings.sequence_wrap == 0 and driver._settings.stamp_by == 'sequence'
+
+
+@pytest.mark.parametrize('content, told', [
+    (without('framing'), 'board: there is no framing (one of text, json, binary, xsens)'),
+    (without('transport'), 'board: there is no transport (one of serial, udp, mqtt)'),
+    (without(device='i2c'), 'a device has no transport and no framing beside it'),
+    (without(transport='carrier pigeon'), "transport: expected serial, udp, mqtt or package.mod"),
+    (without(framing=['text']), 'framing: expected text'),
+    (without(transport='no_such_module:Port'), "no_such_module:Port: ModuleNotFoundError: No"),
+    (without(transport='yaml:Port'), "module 'yaml' has no attribute 'Port'"),
+    (without(serial={'prot': 'x'}), 'unknown setting prot; did you mean port?'),
+    (without(serial={'port': 'x', 'baud': 'fast'}), "baud: expected int, got 'fast'"),
+    (without(serial='/dev/ttyUSB0'), "serial: expected a mapping of settings, got '/dev/ttyUSB0'"),
+    (without(text={'fields': ['x', 'y', 'w']}), 'board: '),
+    (without(clock={'tick_s': -1.0}), 'tick_s: -1.0 is outside'),
+    (without(uint='nT'), 'unknown setting uint; did you mean unit?'),
+    (without(binary={'sync': 'A5'}), 'unknown setting binary'),
+    (without('sensor'), 'expected `sensor: mag_1`, or `sensors:`'),
+    (without(sensors={'A': 'mag_2'}), 'sensor and sensors exclude each other'),
+    (without('sensor', sensors={'A': 3}), 'sensors: A: expected the name of a sensor (letters'),
+    (without('sensor', sensors={'1': 'a', 1: 'b'}), 'two of them have the same name'),
+    (without('sensor', sensors={1.1: 'a'}), 'sensors: 1.1 is no name; put it in quotes'),
+    (without('sensor', sensors={None: 'a'}), 'sensors: None is no name; put it in quotes'),
+    (without(sensor='mag 1'), 'expected the name of a sensor (letters, digits'),
+    (without(framing='collections:OrderedDict'), 'OrderedDict has no SETTINGS, parse'),
+    (without(framing='.x:Y'), 'framing: .x:Y: TypeError'),
+    (without('sensor', sensors={'A': 'a', 'B': 'a'}), 'sensor a comes from board (A) already'),
+    ({**without(), 'other': BOARD}, 'other: sensor mag_1 comes from board already'),
+    ({'board': 7}, 'board: expected a mapping of settings, got 7'),
+    ('[1, 2]', 'expected a mapping of devices'), ('', 'expected a mapping of devices'),
+    ('a: [', 'is not YAML as it should be'), ('a: 1\na: 2', 'a is there twice')])
+def test_files_that_are_none(tmp_path, content, told):
+    with pytest.raises(SettingsError) as error:
+        read(tmp_path, content)
+    assert told in str(error.value) and 'drivers.yaml' in str(error.value)
+
+
+def test_a_sensor_of_unknown_geometry(tmp_path):
+    network = read_network(NETWORK_FILE)
+    assert read(tmp_path, BOARD and {'board': BOARD}, network)
+    with pytest.raises(SettingsError, match='sensor mag_7 is not in the network, whose sensors '
+                       'are mag_1, mag_2'):
+        read(tmp_path, {'board': {**BOARD, 'sensor': 'mag_7'}}, network)
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(SettingsError, match='cannot read .*: No such file'):
+        read_drivers(tmp_path / 'nowhere.yaml')
+
+
+@pytest.mark.parametrize('role, name', [(r, n) for r, kinds in KINDS.items() for n in kinds])
+def test_every_kind_is_there_and_says_its_settings(role, name):
+    assert kind_of(role, name).SETTINGS()
+
+
+class Counting:
+    """Somebody's own framing: a byte is a reading."""
+
+    SETTINGS = SimpleNamespace
+
+    def __init__(self, settings):
+        pass
+
+    def parse(self, data, final=False):
+        pass
+
+
+def test_kinds_of_ones_own(tmp_path, monkeypatch):
+    from mag_tracking.drivers.framings.text import TextSettings
+    monkeypatch.setattr(Counting, 'SETTINGS', TextSettings)
+    [driver] = read(tmp_path, {'mine': {
+        **{k: v for k, v in BOARD.items() if k != 'text'}, 'framing': f'{__name__}:Counting',
+        'framing_settings': {'longest': 7}}})
+    assert isinstance(driver._device, FramedDevice)
+    [driver] = read(tmp_path, {'mine': {
+        'device': 'mag_tracking.drivers.transports.i2c:I2cDevice', 'sensor': 'a',
+        'device_settings': {'sensors': ['A:lis3mdl:0x1c']}}})
+    assert isinstance(driver._device, I2cDevice)

@@ -1,0 +1,173 @@
+"""The simulated roadside: right fields at the right times, and the command that listens to it."""
+
+import dataclasses
+import math
+import re
+
+import numpy as np
+import pytest
+
+from mag_tracking import cli
+from mag_tracking.drivers.simulated_device import (
+    LONGEST_BACKLOG_S,
+    SimulatedDevice,
+    SimulatorSettings,
+)
+from mag_tracking.errors import DeviceError, NetworkError, SettingsError
+from mag_tracking.network.file import read_network
+from mag_tracking.simulation.scenario import Path, body_field, random_vehicle
+from support.bundled import NETWORK_FILE
+
+QUIET = SimulatorSettings(network=str(NETWORK_FILE), rate_hz=50.0, noise=0.0, period_s=12.0,
+                          lead=30.0, offset=-1.0)
+
+
+class Clock:
+    """A clock that goes on when somebody sleeps: never for less than was asked."""
+
+    def __init__(self):
+        self.ns = 10**15
+
+    def sleep(self, seconds):
+        self.ns += math.ceil(seconds * 1e9)
+
+
+def device_of(settings=QUIET):
+    """(the device, its clock)."""
+    clock = Clock()
+    return SimulatedDevice(settings, lambda: clock.ns, clock.sleep), clock
+
+
+def gathered(device, n, timeout_s=1.0):
+    """The first `n` arrivals."""
+    out = []
+    while len(out) < n:
+        out += device.read(timeout_s)
+    return out[:n]
+
+
+def true_field(network, t):
+    """(n_sensors, 3) [T], world, at `t` [s] after the beginning of a pass by the settings `QUIET`.
+
+    Both sensors stand at x = 0; the way begins 30 m before and takes 6 s at 10 m/s.
+    """
+    path = Path(np.array([-30.0, network.positions[:, 1].mean() - 1.0]), 0.0, 10.0)
+    body = random_vehicle(np.random.default_rng(QUIET.seed), length=QUIET.length,
+                          moment=QUIET.moment)
+    position, heading = path.at(np.array([t]))
+    return network.earth_field + body_field(body, network.earth_field, position, heading,
+                                            network.positions)[0]
+
+
+def test_the_fields_are_those_of_a_vehicle_that_passes():
+    device, _ = device_of()
+    device.open()
+    network = read_network(NETWORK_FILE)
+    arrivals = gathered(device, 2 * 350)
+    for k in (0, 100, 150, 220, 299):
+        B = true_field(network, k / 50.0)
+        for j, name in enumerate(network.names):
+            reading = arrivals[2 * k + j].reading
+            assert (reading.sensor, reading.sequence, reading.ticks) == (name, k, 20_000 * k)
+            np.testing.assert_allclose(reading.field, network.R_ws[j].T @ B[j], rtol=1e-9)
+    # Then the road is free, until the next comes after 12 s.
+    for j in range(2):
+        np.testing.assert_allclose(arrivals[2 * 330 + j].reading.field,
+                                   network.R_ws[j].T @ network.earth_field, rtol=1e-12)
+    again = gathered(device, 2 * 400)
+    assert again[2 * 250].reading.sequence == 600
+    np.testing.assert_array_equal(again[2 * 250].reading.field, arrivals[0].reading.field)
+
+
+def test_readings_come_in_time_and_noise_is_as_stated():
+    device, clock = device_of(SimulatorSettings(network=str(NETWORK_FILE), noise=2e-8, lead=150.0,
+                                                moment=0.0))
+    device.open()
+    begin, fields = clock.ns, []
+    while clock.ns < begin + 20e9:
+        for arrival in device.read(0.2):
+            assert 0 <= arrival.arrival_ns - begin - 1000 * arrival.reading.ticks < 2e6
+            fields.append(arrival.reading.field)
+    assert len(fields) == pytest.approx(2 * 2000, abs=4)
+    std = np.std(np.array(fields)[::2], axis=0)
+    # Of 2000 readings the deviation is known to 1.6 %.
+    np.testing.assert_allclose(std, 2e-8, rtol=0.08)
+
+
+def test_sensors_in_turn_measure_at_their_own_times():
+    """Each is a share of the interval behind the one before, and so is its field."""
+    device, _ = device_of(dataclasses.replace(QUIET, in_turn=True))
+    device.open()
+    network = read_network(NETWORK_FILE)
+    arrivals = gathered(device, 2 * 250)
+    for i in (0, 1, 300, 301, 499):
+        k, j = divmod(i, 2)
+        reading, t = arrivals[i].reading, k / 50.0 + j / 100.0
+        assert (reading.sensor, reading.sequence) == (network.names[j], k)
+        assert reading.ticks == round(1e6 * t)
+        B = true_field(network, t)
+        np.testing.assert_allclose(reading.field, network.R_ws[j].T @ B[j], rtol=1e-9)
+
+
+def test_what_nobody_took_in_time_is_lost_and_counted():
+    device, clock = device_of()
+    device.open()
+    gathered(device, 2)
+    clock.sleep(LONGEST_BACKLOG_S + 10.0)
+    first = device.read(0.1)[0].reading
+    lost = device.counts['readings lost, nobody took them']
+    assert lost == 2 * (first.sequence - 1) == pytest.approx(2 * 500, abs=4)
+
+
+def test_a_device_that_is_opened_again_goes_on_with_its_clock():
+    device, clock = device_of()
+    with pytest.raises(DeviceError, match='not open'):
+        device.read(0.1)
+    device.open()
+    gathered(device, 2)
+    device.close()
+    clock.sleep(3.0)
+    device.open()
+    assert gathered(device, 1)[0].reading.ticks >= 3_000_000
+
+
+def test_networks_that_cannot_be_simulated(tmp_path):
+    with pytest.raises(SettingsError, match='network: the path'):
+        SimulatedDevice(SimulatorSettings())
+    with pytest.raises(NetworkError):
+        SimulatedDevice(SimulatorSettings(network=str(tmp_path / 'none.yaml')))
+    path = tmp_path / 'no_earth.yaml'
+    path.write_text('sensors: {a: {position: [0, 0, 0]}}')
+    with pytest.raises(SettingsError, match='has no earth_field'):
+        SimulatedDevice(SimulatorSettings(network=str(path)))
+    with pytest.raises(SettingsError, match='length 0'):
+        SimulatedDevice(SimulatorSettings(network=str(NETWORK_FILE), lead=0.0))
+
+
+def drivers_file(tmp_path, sensors):
+    """The simulator as a drivers file."""
+    path = tmp_path / 'drivers.yaml'
+    path.write_text(f'road:\n  device: simulator\n  simulator: {{network: {NETWORK_FILE}, '
+                    f'moment: 0.0}}\n  sensors: {sensors}\n')
+    return path
+
+
+def test_listening(tmp_path, capsys):
+    path = drivers_file(tmp_path, '{mag_1: mag_1, mag_2: mag_2}')
+    assert cli.main(['listen', str(path), '--network', str(NETWORK_FILE), '--seconds', '2']) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == 'road: open'
+    [rate] = re.findall(r'mag_2 +([\d.]+) Hz +2.0\d\d +15.\d+ +-4[89].\d+ uT', lines[-1])
+    assert 80.0 < float(rate) < 120.0
+
+
+def test_listening_to_nothing_is_told(tmp_path, capsys):
+    path = drivers_file(tmp_path, '{mag_1: mag_1, north: mag_2}')
+    assert cli.main(['listen', str(path), '--seconds', '1']) == 1
+    said = capsys.readouterr().out
+    assert 'of unknown sensors: mag_2' in said
+    assert re.search(r'^  mag_2 +nothing$', said, re.M)
+    assert cli.main(['listen', str(path), '--network', str(NETWORK_FILE), '--seconds', '0']) == 1
+    assert '--seconds: 0 is not a number above 0' in capsys.readouterr().err
+    assert cli.main(['listen', str(tmp_path / 'none.yaml')]) == 1
+    assert 'No such file' in capsys.readouterr().err

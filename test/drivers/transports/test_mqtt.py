@@ -1,0 +1,495 @@
+"""MQTT at a real broker: whole, in order, counted; every way to fail names the broker."""
+
+import os
+import threading
+import time
+from dataclasses import replace
+
+import pytest
+from paho.mqtt import publish
+
+from mag_tracking.drivers.transports import mqtt as mqtt_topics
+from mag_tracking.drivers.transports.mqtt import MqttSettings, MqttTopics
+from mag_tracking.errors import DeviceError, SettingsError
+from support.mqtt_broker import (
+    CONNECTED,
+    Broker,
+    ScriptedBroker,
+    certificate,
+    free_port,
+    granted,
+    password_lines,
+    publish_packet,
+    subscription_lines,
+)
+
+SETTINGS = MqttSettings(host='127.0.0.1', topics=('mag/#',))
+
+
+@pytest.fixture(scope='module')
+def broker(tmp_path_factory):
+    with Broker(tmp_path_factory.mktemp('broker')) as running:
+        yield running
+
+
+@pytest.fixture
+def topics(monkeypatch):
+    """Makes transports that are closed at the end."""
+    monkeypatch.setattr(mqtt_topics, 'CLOSE_WAIT_S', 0.01)
+    made = []
+
+    def make(port, **changes):
+        made.append(MqttTopics(replace(SETTINGS, port=port, **changes)))
+        return made[-1]
+
+    yield make
+    for transport in made:
+        transport.close()
+    assert not [t for t in threading.enumerate() if t.name.startswith('mqtt ')]
+
+
+def send(port, messages, **kwargs):
+    publish.multiple([{'topic': topic, 'payload': payload, **kwargs}
+                      for topic, payload in messages], '127.0.0.1', port)
+
+
+def gather(transport, n, seconds=5.0):
+    """Chunks until there are `n`, or nothing comes for a while."""
+    chunks, end = [], time.monotonic() + seconds
+    while len(chunks) < n and time.monotonic() < end:
+        chunks += transport.read(0.2)
+    return chunks
+
+
+def wait_until(condition, seconds=5.0):
+    end = time.monotonic() + seconds
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.005)
+    assert condition()
+
+
+def failure(transport):
+    """What `open` says; it is done in time, and leaves no thread."""
+    start = time.monotonic()
+    with pytest.raises(DeviceError) as caught:
+        transport.open()
+    assert time.monotonic() - start < 2.0 * transport._settings.connect_timeout_s + 1.0
+    assert transport._thread is None
+    with pytest.raises(DeviceError, match='is not open'):
+        transport.read(0.0)
+    assert str(caught.value).startswith(
+        f'MQTT broker {transport._settings.host}:{transport._settings.port}: ')
+    return str(caught.value)
+
+
+@pytest.mark.parametrize('qos', [0, 1, 2])
+def test_messages_are_whole_in_order_and_have_their_topic(broker, topics, qos):
+    mqtt = topics(broker.port, qos=qos)
+    mqtt.open()
+    sent = [(f'mag/{i % 7}', bytes([i % 256]) * (1 + i % 90)) for i in range(1000)]
+    before = time.monotonic_ns()
+    send(broker.port, sent, qos=qos)
+    chunks = gather(mqtt, len(sent))
+    assert [(c.source, c.data) for c in chunks] == sent
+    arrivals = [c.arrival_ns for c in chunks]
+    assert arrivals == sorted(arrivals)
+    assert before < arrivals[0] and arrivals[-1] < time.monotonic_ns()
+    assert not mqtt.counts
+    assert mqtt.whole
+
+
+def test_only_the_topics_that_were_asked_for_come(broker, topics):
+    mqtt = topics(broker.port, topics=('mag/a', 'mag/+/b'))
+    mqtt.open()
+    send(broker.port, [('mag/c', b'1'), ('mag/a', b'2'), ('other', b'3'), ('mag/x/b', b'4')])
+    assert [(c.source, c.data) for c in gather(mqtt, 2)] == [('mag/a', b'2'), ('mag/x/b', b'4')]
+    assert mqtt.read(0.1) == []
+
+
+def test_read_waits_no_longer_than_it_is_told_and_no_longer_than_needed(broker, topics):
+    mqtt = topics(broker.port)
+    mqtt.open()
+    start = time.monotonic()
+    assert mqtt.read(0.2) == []
+    assert 0.2 <= time.monotonic() - start < 0.8
+    late = threading.Timer(0.2, send, (broker.port, [('mag/a', b'x')]))
+    late.start()
+    start = time.monotonic()
+    chunk, = mqtt.read(5.0)
+    assert 0.15 < time.monotonic() - start < 2.0
+    late.join()
+    # The time is of the coming, not of the reading.
+    send(broker.port, [('mag/a', b'y')])
+    time.sleep(0.2)
+    chunk, = mqtt.read(0.0)
+    assert time.monotonic_ns() - chunk.arrival_ns > 150e6
+
+
+def test_the_oldest_are_dropped_for_a_slow_reader_and_counted(broker, topics):
+    mqtt = topics(broker.port, queue=50)
+    mqtt.open()
+    send(broker.port, [('mag/a', str(i).encode()) for i in range(300)] + [('mag/end', b'end')])
+    wait_until(lambda: mqtt._queue and mqtt._queue[-1].source == 'mag/end')
+    assert not mqtt.counts
+    chunks = mqtt.read(1.0)
+    assert [c.data for c in chunks] == [str(i).encode() for i in range(251, 300)] + [b'end']
+    assert mqtt.counts == {'messages dropped, queue full': 251}
+    mqtt.read(0.0)
+    assert mqtt.counts == {'messages dropped, queue full': 251}
+
+
+def test_a_queue_that_is_just_full_loses_nothing(broker, topics):
+    mqtt = topics(broker.port, queue=50)
+    mqtt.open()
+    send(broker.port, [('mag/a', str(i).encode()) for i in range(50)])
+    wait_until(lambda: len(mqtt._queue) == 50)
+    assert [c.data for c in mqtt.read(1.0)] == [str(i).encode() for i in range(50)]
+    assert not mqtt.counts
+
+
+def test_a_message_that_is_too_long_is_counted(broker, topics):
+    mqtt = topics(broker.port, longest=1000)
+    mqtt.open()
+    send(broker.port, [('mag/a', b'x' * 1000), ('mag/a', b'x' * 1001), ('mag/a', b'x' * 500_000),
+                       ('mag/a', b''), ('mag/a', b'z')])
+    assert [len(c.data) for c in gather(mqtt, 2)] == [1000, 1]
+    assert mqtt.counts == {'messages that were too long': 2, 'empty messages': 1}
+
+
+def test_half_a_million_bytes_come_whole_where_they_are_allowed(broker, topics):
+    mqtt = topics(broker.port, longest=1_000_000)
+    mqtt.open()
+    payload = os.urandom(500_000)
+    send(broker.port, [('mag/a', payload)])
+    assert [c.data for c in gather(mqtt, 1)] == [payload]
+
+
+@pytest.mark.parametrize('wanted', [False, True])
+def test_retained_messages_are_old_news(broker, topics, wanted):
+    send(broker.port, [('mag/kept', b'old')], retain=True)
+    try:
+        mqtt = topics(broker.port, retained=wanted)
+        mqtt.open()
+        send(broker.port, [('mag/kept', b'new')], retain=True)
+        sent = [b'old', b'new'] if wanted else [b'new']
+        assert [c.data for c in gather(mqtt, len(sent))] == sent
+        assert mqtt.counts == ({} if wanted else {'retained messages skipped': 1})
+    finally:
+        send(broker.port, [('mag/kept', b'')], retain=True)
+
+
+def test_what_was_sent_while_nobody_listened_does_not_come_later(broker, topics):
+    mqtt = topics(broker.port, client_id='reader', qos=1)
+    mqtt.open()
+    mqtt.close()
+    send(broker.port, [('mag/a', b'meanwhile')], qos=1)
+    mqtt.open()
+    send(broker.port, [('mag/a', b'now')], qos=1)
+    assert [c.data for c in gather(mqtt, 1)] == [b'now']
+
+
+def test_what_was_not_read_before_closing_does_not_come_later(broker, topics):
+    mqtt = topics(broker.port)
+    mqtt.open()
+    send(broker.port, [('mag/a', b'meanwhile')])
+    wait_until(lambda: mqtt._queue)
+    mqtt.close()
+    with pytest.raises(DeviceError, match='is not open'):
+        mqtt.read(1.0)
+    mqtt.open()
+    assert mqtt.read(0.1) == []
+
+
+def test_two_without_an_identifier_do_not_throw_each_other_out(broker, topics):
+    both = [topics(broker.port), topics(broker.port)]
+    for mqtt in both:
+        mqtt.open()
+    send(broker.port, [('mag/a', b'x')])
+    assert [[c.data for c in gather(mqtt, 1)] for mqtt in both] == [[b'x'], [b'x']]
+
+
+def test_an_identifier_belongs_to_one_connection(broker, topics):
+    first, second = topics(broker.port, client_id='same'), topics(broker.port, client_id='same')
+    first.open()
+    second.open()
+    with pytest.raises(DeviceError, match='lost'):
+        first.read(5.0)
+    assert second.read(0.1) == []
+
+
+def test_a_broker_that_is_killed_is_told_after_what_came_before(tmp_path, topics):
+    with Broker(tmp_path) as broker:
+        mqtt = topics(broker.port)
+        mqtt.open()
+        send(broker.port, [('mag/a', b'1'), ('mag/a', b'2')])
+        wait_until(lambda: len(mqtt._queue) == 2)
+        broker.kill()
+        killed = time.monotonic()
+        wait_until(lambda: mqtt._lost)
+        assert [c.data for c in mqtt.read(5.0)] == [b'1', b'2']
+        for _ in range(2):
+            with pytest.raises(DeviceError, match=f'127.0.0.1:{broker.port}: .*lost'):
+                mqtt.read(5.0)
+        assert time.monotonic() - killed < 2.0
+        assert 'nobody listens' in failure(mqtt)
+        broker.start()
+        mqtt.open()
+        send(broker.port, [('mag/a', b'3')])
+        assert [c.data for c in gather(mqtt, 1)] == [b'3']
+
+
+def test_a_read_that_waits_is_told_of_the_end_at_once(tmp_path, topics):
+    with Broker(tmp_path) as broker:
+        mqtt = topics(broker.port)
+        mqtt.open()
+        killer = threading.Timer(0.2, broker.kill)
+        killer.start()
+        start = time.monotonic()
+        with pytest.raises(DeviceError, match='lost'):
+            mqtt.read(20.0)
+        killer.join()
+        assert time.monotonic() - start < 2.0
+
+
+def test_a_broker_that_is_silent_is_given_up(tmp_path, topics):
+    with Broker(tmp_path) as broker:
+        mqtt = topics(broker.port, keepalive_s=1)
+        mqtt.open()
+        # A healthy connection on which nothing is published lasts.
+        assert mqtt.read(1.5) == []
+        broker.freeze()
+        start = time.monotonic()
+        with pytest.raises(DeviceError, match='has not answered for 2 s'):
+            mqtt.read(10.0)
+        assert time.monotonic() - start < 4.0
+
+
+def test_password(tmp_path, topics):
+    file = tmp_path / 'secret'
+    with Broker(tmp_path, *password_lines(tmp_path, 'reader', 'pass word ')) as broker:
+        for content, username in (('pass word \nsecond line\n', 'reader'),
+                                  ('pass word ', 'reader')):
+            file.write_text(content)
+            mqtt = topics(broker.port, username=username, password_file=str(file))
+            mqtt.open()
+            mqtt.close()
+        file.write_text('wrong\n')
+        for changes in ({}, {'username': 'reader'},
+                        {'username': 'reader', 'password_file': str(file)}):
+            assert 'refused the connection: Not authorized' in failure(
+                topics(broker.port, **changes))
+
+
+def test_a_password_file_that_cannot_be_used(tmp_path, topics):
+    file = tmp_path / 'secret'
+    mqtt = topics(free_port(), username='reader', password_file=str(file))
+    assert f'password_file {file} cannot be read: No such file' in failure(mqtt)
+    file.write_text('\nsecond line\n')
+    assert f'the first line of password_file {file} is empty' in failure(mqtt)
+    file.write_bytes(b'\xff\xfe')
+    assert f'password_file {file} cannot be read: \'utf-8\'' in failure(mqtt)
+
+
+def test_subscription_that_is_not_granted(tmp_path, topics):
+    lines = subscription_lines(tmp_path, 'reader', 'x', 'mag/open/#')
+    (tmp_path / 'secret').write_text('x')
+    user = {'username': 'reader', 'password_file': str(tmp_path / 'secret')}
+    with Broker(tmp_path, *lines) as broker:
+        topics(broker.port, topics=('mag/open/1',), **user).open()
+        mqtt = topics(broker.port, topics=('mag/open/1', 'mag/closed', 'all'), **user)
+        assert failure(mqtt).endswith('refused the subscription to mag/closed, all')
+
+
+def test_topic_filter_that_is_none(broker, topics):
+    assert "('mag/a', 'mag/#/b'): Invalid" in failure(
+        topics(broker.port, topics=('mag/a', 'mag/#/b')))
+
+
+def test_nobody_listens(topics):
+    assert failure(topics(free_port())).endswith('nobody listens there')
+
+
+def test_host_that_does_not_exist(topics):
+    assert 'cannot connect' in failure(topics(1883, host='no-such-host.invalid'))
+
+
+def test_something_else_listens(topics):
+    with ScriptedBroker(b'HTTP/1.1 400 Bad Request\r\n\r\n' + b'x' * 200) as server:
+        threading.Timer(0.2, server.hang_up).start()
+        assert 'Is that a broker, and does it expect tls to be false?' in failure(
+            topics(server.port))
+
+
+@pytest.mark.parametrize('tls', [False, True])
+def test_something_silent_listens(topics, tls):
+    with ScriptedBroker(b'') as server:
+        said = failure(topics(server.port, connect_timeout_s=0.3, tls=tls))
+    assert 'timed out' in said if tls else 'no answer within 0.3 s; is that a broker?' in said
+
+
+@pytest.mark.parametrize('code, text', [
+    # To paho a broker of another version of the protocol is none.
+    (1, 'A network protocol error occurred when communicating with the broker. Is that a broker'),
+    *((code, f'refused the connection: {text}') for code, text in (
+        (2, 'Client identifier not valid'), (3, 'Server unavailable'),
+        (4, 'Bad user name or password'), (5, 'Not authorized')))])
+def test_the_reason_of_a_refusal_is_told_and_not_tried_again(topics, code, text):
+    with ScriptedBroker(bytes([0x20, 2, 0, code])) as server:
+        assert f'127.0.0.1:{server.port}: {text}' in failure(topics(server.port))
+    assert len(server.heard) == 1
+
+
+@pytest.mark.parametrize('qos', [0, 1, 2])
+def test_the_quality_of_service_that_is_asked_for(topics, qos):
+    with ScriptedBroker(CONNECTED, granted) as server:
+        topics(server.port, qos=qos).open()
+    assert server.heard[1].endswith(b'mag/#' + bytes([qos]))
+
+
+def test_broker_that_accepts_and_then_is_silent(topics):
+    with ScriptedBroker(CONNECTED, b'') as server:
+        said = failure(topics(server.port, connect_timeout_s=0.3))
+        assert 'no answer within 0.3 s' in said
+    assert b'mag/#' in server.heard[1]
+
+
+@pytest.mark.parametrize('garbage', [
+    bytes([0x90, 5, 0, 1, 77, 88, 99]), bytes([0x90, 4, 0, 1, 0, 0]), bytes([0x90, 1, 0]),
+    bytes([0x20, 0]), bytes([0xF0, 0]), bytes([0x30, 1, 0]), bytes([0x32, 2, 0, 0]),
+    bytes([0x00, 0]), b'\x30\xff\xff\xff\xff\xff'])
+def test_bytes_that_are_no_mqtt_end_the_connection_and_are_told(topics, garbage):
+    with ScriptedBroker(CONNECTED, lambda heard: granted(heard) + garbage) as server:
+        mqtt = topics(server.port, connect_timeout_s=2.0)
+        try:
+            mqtt.open()
+        except DeviceError as error:
+            assert f'127.0.0.1:{server.port}: ' in str(error)
+        else:
+            with pytest.raises(DeviceError, match=f'127.0.0.1:{server.port}: '):
+                mqtt.read(5.0)
+
+
+def test_duplicates_are_counted_and_handed_on(topics):
+    packets = publish_packet(b'mag/a', b'1') + publish_packet(b'mag/a', b'1', 0x08)
+    with ScriptedBroker(CONNECTED, lambda heard: granted(heard) + packets) as server:
+        mqtt = topics(server.port)
+        mqtt.open()
+        assert [c.data for c in gather(mqtt, 2)] == [b'1', b'1']
+        assert mqtt.counts == {'messages with the dup flag': 1}
+
+
+def test_topic_that_is_no_text_is_counted(topics):
+    packets = publish_packet(b'mag/\xff', b'1') + publish_packet(b'mag/a', b'2')
+    with ScriptedBroker(CONNECTED, lambda heard: granted(heard) + packets) as server:
+        mqtt = topics(server.port)
+        mqtt.open()
+        assert [c.data for c in gather(mqtt, 1)] == [b'2']
+        assert mqtt.counts == {'messages whose topic is no text': 1}
+
+
+def test_what_was_counted_before_a_loss_is_not_forgotten(topics):
+    packets = publish_packet(b'mag/\xff', b'1')
+    with ScriptedBroker(CONNECTED, lambda heard: granted(heard) + packets) as server:
+        mqtt = topics(server.port)
+        mqtt.open()
+        server.hang_up()
+        wait_until(lambda: mqtt._lost)
+        assert not mqtt.counts
+        assert 'nobody listens' in failure(mqtt)
+        assert mqtt.counts == {'messages whose topic is no text': 1}
+
+
+def test_tls(tmp_path, topics):
+    cert, key = certificate(tmp_path)
+    with Broker(tmp_path, f'certfile {cert}', f'keyfile {key}') as broker:
+        mqtt = topics(broker.port, host='localhost', tls=True, ca_file=str(cert))
+        mqtt.open()
+        other = topics(broker.port, host='localhost', tls=True)
+        assert 'TLS failed' in failure(other) and 'certificate verify failed' in failure(other)
+        # The certificate is of localhost, and of nobody else.
+        other = topics(broker.port, tls=True, ca_file=str(cert))
+        assert 'TLS failed' in failure(other) and 'mismatch' in failure(other)
+        assert 'does it expect tls to be false?' in failure(topics(broker.port))
+        assert mqtt.read(0.0) == []
+
+
+def test_tls_at_a_broker_without(broker, topics):
+    said = failure(topics(broker.port, tls=True))
+    assert 'cannot connect: [Errno 104]' in said or 'TLS failed' in said
+
+
+def test_certificates_that_cannot_be_used(tmp_path, topics):
+    path = tmp_path / 'ca.pem'
+    mqtt = topics(free_port(), tls=True, ca_file=str(path))
+    assert f'ca_file {path} cannot be read: No such file' in failure(mqtt)
+    path.write_text('no certificate')
+    assert f'ca_file {path} cannot be read: ' in failure(mqtt)
+
+
+def test_closing(broker, topics):
+    mqtt = topics(broker.port)
+    mqtt.close()
+    with pytest.raises(DeviceError, match='is not open'):
+        mqtt.read(0.0)
+    mqtt.open()
+    closer = threading.Timer(0.2, mqtt.close)
+    closer.start()
+    start = time.monotonic()
+    assert mqtt.read(20.0) == []
+    assert 0.15 < time.monotonic() - start < 2.0
+    closer.join()
+    mqtt.close()
+    mqtt.close()
+    with pytest.raises(DeviceError, match='is not open'):
+        mqtt.read(20.0)
+
+
+def test_opening_again_closes_the_connection_before(topics):
+    with ScriptedBroker(CONNECTED, granted) as first:
+        mqtt = topics(first.port)
+        mqtt.open()
+        assert 'nobody listens' in failure(mqtt)
+        wait_until(lambda: first.heard[-1] == b'\xe0\x00')
+
+
+def test_leaving_is_said_to_the_broker(topics):
+    with ScriptedBroker(CONNECTED, granted) as server:
+        mqtt = topics(server.port)
+        mqtt.open()
+        assert server.heard[-1] != b'\xe0\x00'
+        mqtt.close()
+        wait_until(lambda: server.heard[-1] == b'\xe0\x00')
+        assert server.heard[-1] == b'\xe0\x00'
+
+
+def test_closing_while_it_opens(topics):
+    """The broker is reached, but has not answered."""
+    with ScriptedBroker() as server:
+        mqtt = topics(server.port)
+        real = mqtt._connect
+
+        def connect(client):
+            real(client)
+            mqtt.close()
+
+        mqtt._connect = connect
+        assert failure(mqtt).endswith('is not open')
+
+
+def test_closing_while_the_broker_thinks(topics):
+    with ScriptedBroker(b'') as server:
+        mqtt = topics(server.port)
+        closer = threading.Timer(0.1, mqtt.close)
+        closer.start()
+        start = time.monotonic()
+        assert failure(mqtt).endswith('is not open')
+        assert time.monotonic() - start < 2.0
+        closer.join()
+
+
+@pytest.mark.parametrize('changes, text', [
+    ({'topics': ('',)}, 'topics: '), ({'topics': ('mag', '')}, 'topics: '),
+    ({'password_file': 'x'}, 'password_file: '), ({'ca_file': 'x'}, 'ca_file: ')])
+def test_settings_that_make_no_sense(changes, text):
+    with pytest.raises(SettingsError, match=text):
+        MqttTopics(replace(SETTINGS, **changes))

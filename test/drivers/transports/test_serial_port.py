@@ -1,0 +1,351 @@
+"""Serial lines through real pseudo-terminals; only the kernel's error counters are made up."""
+
+import fcntl
+import os
+import select
+import struct
+import subprocess
+import sys
+import termios
+import threading
+import time
+import tty
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from mag_tracking.drivers.transports import serial_port
+from mag_tracking.drivers.transports.serial_port import SerialPort, SerialSettings
+from mag_tracking.errors import DeviceError, SettingsError
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+class Device:
+    """A device at the other end of a pseudo-terminal, reachable under a link that stays."""
+
+    def __init__(self, folder):
+        self.link = folder / 'magnetometer'
+        self.master = None
+        self.plug()
+
+    def plug(self):
+        """A new port under the old name."""
+        self.master, slave = os.openpty()
+        tty.setraw(slave)
+        self.path = os.ttyname(slave)
+        # One end stays open, as the device is there whether or not anybody reads.
+        self._slave = slave
+        self.link.unlink(missing_ok=True)
+        self.link.symlink_to(self.path)
+
+    def unplug(self):
+        """Pull it out."""
+        for end in (self.master, self._slave):
+            with suppress(OSError):
+                os.close(end)
+
+    def wait_for(self, n):
+        """Until the port holds `n` bytes."""
+        end = time.monotonic() + 5.0
+        while time.monotonic() < end:
+            if struct.unpack('i', fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4)))[0] == n:
+                return
+            time.sleep(0.001)
+        raise AssertionError(f'{n} bytes have not come')
+
+    def write(self, data):
+        while data:
+            data = data[os.write(self.master, data):]
+
+
+@pytest.fixture
+def device(tmp_path):
+    made = Device(tmp_path)
+    yield made
+    made.unplug()
+
+
+@pytest.fixture
+def port(device):
+    opened = SerialPort(SerialSettings(port=str(device.link)))
+    opened.open()
+    yield opened
+    opened.close()
+
+
+def failure(port):
+    with pytest.raises(DeviceError) as caught:
+        port.open()
+    return str(caught.value)
+
+
+def gather(port, n, seconds=5.0):
+    data, end = b'', time.monotonic() + seconds
+    while len(data) < n and time.monotonic() < end:
+        data += b''.join(chunk.data for chunk in port.read(0.2))
+    return data
+
+
+def test_a_million_bytes_come_whole_and_in_order(device, port):
+    sent = os.urandom(1_000_000)
+    writer = threading.Thread(target=device.write, args=(sent,))
+    writer.start()
+    assert gather(port, len(sent), 20.0) == sent
+    writer.join()
+    assert not port.counts and not port.whole
+
+
+def test_every_byte_comes_as_it_is(device, port):
+    """No end of line, control character or echo is made of any."""
+    sent = bytes(range(256)) * 3
+    device.write(sent)
+    assert gather(port, len(sent)) == sent
+    assert not select.select([device.master], [], [], 0.05)[0]
+
+
+def test_what_is_there_comes_at_once_as_one_chunk(device, port):
+    device.write(b'a first line\n')
+    device.write(b'and half of')
+    # The kernel moves them from end to end on its own time.
+    device.wait_for(24)
+    start = time.monotonic()
+    chunk, = port.read(20.0)
+    assert time.monotonic() - start < 1.0
+    assert chunk.data == b'a first line\nand half of' and chunk.source == ''
+
+
+def test_read_waits_no_longer_than_it_is_told(port):
+    for timeout in (0.0, 0.03, 0.1):
+        took = []
+        for _ in range(3):
+            start = time.monotonic()
+            assert port.read(timeout) == []
+            took.append(time.monotonic() - start)
+        # The machine may be busy at times, but not each time.
+        assert timeout <= min(took) < timeout + 0.04
+
+
+def test_the_time_is_that_of_the_wake_up(device, port):
+    threading.Timer(0.3, device.write, (b'x',)).start()
+    start = time.monotonic_ns()
+    chunk, = port.read(5.0)
+    assert 0.28e9 < chunk.arrival_ns - start
+    assert 0 <= time.monotonic_ns() - chunk.arrival_ns < 0.1e9
+
+
+def test_what_came_before_opening_is_thrown_away(device):
+    device.write(b'lf a frame\n')
+    device.wait_for(11)
+    port = SerialPort(SerialSettings(port=device.path))
+    port.open()
+    device.write(b'a whole one\n')
+    assert gather(port, 12) == b'a whole one\n'
+    port.close()
+
+
+def test_a_device_that_is_pulled_out_is_told(device, port):
+    device.write(b'x')
+    assert gather(port, 1) == b'x'
+    device.unplug()
+    start = time.monotonic()
+    for _ in range(2):
+        with pytest.raises(DeviceError, match=f'serial port {device.link}: is gone'):
+            port.read(20.0)
+    assert time.monotonic() - start < 1.0
+
+
+def test_a_read_that_waits_is_told_at_once(device, port):
+    threading.Timer(0.2, device.unplug).start()
+    start = time.monotonic()
+    with pytest.raises(DeviceError, match='is gone'):
+        port.read(20.0)
+    assert time.monotonic() - start < 1.0
+
+
+def test_the_same_device_after_it_was_plugged_in_again(device, port):
+    for text in (b'once', b'twice'):
+        device.unplug()
+        device.link.unlink()
+        with pytest.raises(DeviceError):
+            port.read(1.0)
+        port.close()
+        assert 'is not there' in failure(port)
+        device.plug()
+        port.open()
+        device.write(text)
+        assert gather(port, len(text)) == text
+
+
+def test_a_port_that_is_not_there_names_those_that_are(monkeypatch):
+    port = SerialPort(SerialSettings(port='/dev/ttyNONE0'))
+    monkeypatch.setattr(serial_port.list_ports, 'comports', lambda: [])
+    assert failure(port) == ('serial port /dev/ttyNONE0: is not there; there is no other either')
+
+    class Known:
+        device, description = '/dev/ttyUSB7', 'FT232R'
+
+    monkeypatch.setattr(serial_port.list_ports, 'comports', lambda: [Known, Known])
+    assert failure(port).endswith('there are /dev/ttyUSB7 (FT232R), /dev/ttyUSB7 (FT232R)')
+
+
+def test_no_permission(device):
+    os.chmod(device.path, 0)
+    code = ('import os, sys\n'
+            'from mag_tracking.errors import DeviceError\n'
+            'from mag_tracking.drivers.transports.serial_port import SerialPort, SerialSettings\n'
+            'if os.geteuid() == 0:\n'
+            '    os.setgroups([])\n'
+            '    os.setgid(65534)\n'
+            '    os.setuid(65534)\n'
+            'try:\n'
+            '    SerialPort(SerialSettings(port=sys.argv[1])).open()\n'
+            'except DeviceError as error:\n'
+            '    print(error)\n')
+    said = subprocess.run([sys.executable, '-c', code, device.path], cwd=ROOT, text=True,
+                          capture_output=True, check=True, timeout=60).stdout
+    assert said.startswith(f'serial port {device.path}: no permission; ')
+    assert 'usermod -aG dialout' in said
+
+
+def test_two_at_one_port(device, port):
+    other = SerialPort(SerialSettings(port=device.path))
+    assert failure(other) == f'serial port {device.path}: is in use by another program'
+    # The refused one leaves the port as it was, and gets it as soon as it is free.
+    device.write(b'x')
+    assert gather(port, 1) == b'x'
+    port.close()
+    other.open()
+    other.close()
+
+
+def test_a_port_may_be_shared_where_that_is_wanted(device, port):
+    other = SerialPort(SerialSettings(port=device.path, exclusive=False))
+    other.open()
+    device.write(b'x')
+    assert gather(other, 1) == b'x'
+    other.close()
+
+
+def test_what_is_no_serial_port(tmp_path):
+    (tmp_path / 'file').write_text('text')
+    for path in (tmp_path / 'file', tmp_path, Path('/dev/null')):
+        said = failure(SerialPort(SerialSettings(port=str(path))))
+        assert said.startswith(f'serial port {path}: is not a serial port, or there is no device')
+
+
+def test_a_refused_open_leaves_nothing_open(device, port, tmp_path):
+    before = len(os.listdir('/proc/self/fd'))
+    for path in (device.path, '/dev/null', '/dev/ttyNONE0', str(tmp_path)):
+        failure(SerialPort(SerialSettings(port=path)))
+    assert len(os.listdir('/proc/self/fd')) == before
+    for _ in range(5):
+        port.open()
+    port.close()
+    assert len(os.listdir('/proc/self/fd')) == before - 5
+
+
+@pytest.mark.parametrize('parity, flags', [
+    ('N', 0), ('E', termios.PARENB), ('O', termios.PARENB | termios.PARODD)])
+@pytest.mark.parametrize('stop_bits', [1, 2])
+def test_the_line_is_set_up_as_asked(device, parity, flags, stop_bits):
+    port = SerialPort(SerialSettings(str(device.link), 57600, parity, stop_bits))
+    port.open()
+    _, _, cflag, _, ispeed, ospeed, _ = termios.tcgetattr(device._slave)
+    assert ispeed == ospeed == termios.B57600
+    # A pseudo-terminal knows no parity: the kernel clears it, and tells so.
+    assert cflag & termios.CSTOPB == (termios.CSTOPB if stop_bits == 2 else 0)
+    assert port._handle.parity == parity and bool(flags) == (parity != 'N')
+    assert cflag & termios.CSIZE == termios.CS8
+    port.close()
+
+
+def test_a_device_that_goes_while_it_is_opened(device, monkeypatch):
+    def gone(*_):
+        raise termios.error(5, 'Input/output error')
+
+    monkeypatch.setattr(termios, 'tcflush', gone)
+    port = SerialPort(SerialSettings(port=device.path))
+    assert 'Input/output error' in failure(port)
+
+
+def test_a_speed_that_the_port_cannot(device, monkeypatch):
+    def refused(*_):
+        raise ValueError('Failed to set custom baud rate (12345): [Errno 22]')
+
+    monkeypatch.setattr('serial.Serial._set_special_baudrate', refused)
+    port = SerialPort(SerialSettings(port=device.path, baud=12345))
+    assert 'cannot be opened with 12345 bit/s: Failed' in failure(port)
+
+
+def test_what_the_line_loses_is_counted_from_opening_on(device, monkeypatch):
+    """The counters run since the machine's start, and overflow."""
+    real, now = serial_port.fcntl.ioctl, [7] * 20
+
+    def ioctl(fd, request, *args):
+        if request == 0x545D:
+            assert len(args[0]) == 80
+            return struct.pack('20i', *now)
+        return real(fd, request, *args)
+
+    monkeypatch.setattr(serial_port.fcntl, 'ioctl', ioctl)
+    now[9] = 2**31 - 1
+    port = SerialPort(SerialSettings(port=device.path))
+    port.open()
+    assert port.read(0.0) == [] and not port.counts
+    now[:] = [100 + i for i in range(20)]
+    now[9] = -2**31 + 1
+    now[7] = -2**31 + 20
+    device.write(b'x')
+    assert [c.data for c in port.read(1.0)] == [b'x']
+    lost = {'framing errors on the line (is the baud rate right?)': 99,
+            'bytes lost, overrun of the receiver': 2**31 + 13, 'parity errors on the line': 101,
+            'breaks on the line': 2, 'bytes lost, overrun of the driver\'s buffer': 103}
+    assert port.counts == lost
+    assert port.read(0.0) == [] and port.counts == lost
+    # Also where nothing arrives.
+    now[6] += 1
+    assert port.read(0.0) == []
+    assert port.counts['framing errors on the line (is the baud rate right?)'] == 100
+    # A port that was plugged in again counts from the beginning.
+    now[:] = [0] * 20
+    port.open()
+    assert port.read(0.0) == []
+    assert sum(port.counts.values()) == sum(lost.values()) + 1
+    # Nor does one that does not count stand in the way of reading.
+    monkeypatch.undo()
+    port.open()
+    device.write(b'y')
+    assert [c.data for c in port.read(1.0)] == [b'y']
+    port.close()
+
+
+def test_closing(device):
+    port = SerialPort(SerialSettings(port=device.path))
+    port.close()
+    with pytest.raises(DeviceError, match=f'{device.path}: is not open'):
+        port.read(0.0)
+    for _ in range(2):
+        port.open()
+        held = port._handle
+        closer = threading.Timer(0.1, port.close)
+        closer.start()
+        start = time.monotonic()
+        assert port.read(20.0) == []
+        assert 0.05 < time.monotonic() - start < 1.0
+        closer.join()
+        assert not held.is_open
+        port.close()
+        port.close()
+        with pytest.raises(DeviceError, match='is not open'):
+            port.read(0.0)
+
+
+def test_settings_that_make_no_sense():
+    with pytest.raises(SettingsError, match='port: '):
+        SerialPort(SerialSettings())
+    for parity in ('n', '', 'M', 'EO'):
+        with pytest.raises(SettingsError, match='parity: expected N, E or O'):
+            SerialPort(replace(SerialSettings(port='x'), parity=parity))

@@ -1,0 +1,377 @@
+"""UDP through real sockets of this machine."""
+
+import os
+import socket
+import threading
+import time
+from contextlib import closing
+from dataclasses import replace
+
+import pytest
+
+from mag_tracking.drivers.transports import udp as udp_socket
+from mag_tracking.drivers.transports.udp import UdpSettings, UdpSocket
+from mag_tracking.errors import DeviceError, SettingsError
+from support.mqtt_broker import free_port
+
+SETTINGS = UdpSettings(address='127.0.0.1')
+
+
+@pytest.fixture
+def listen():
+    """Makes sockets that are open, and closed at the end."""
+    made = []
+
+    def make(report=print, **changes):
+        port = free_port(socket.SOCK_DGRAM)
+        made.append(UdpSocket(replace(SETTINGS, **{'port': port} | changes), report))
+        made[-1].open()
+        return made[-1]
+
+    yield make
+    for udp in made:
+        udp.close()
+
+
+@pytest.fixture
+def sender():
+    """Sends datagrams to a `UdpSocket` at a loopback address."""
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as opened:
+        opened.bind(('127.0.0.1', 0))
+
+        def send(udp, *datagrams, to=None):
+            for data in datagrams:
+                opened.sendto(data, (to or '127.0.0.1', udp._settings.port))
+
+        send.port = opened.getsockname()[1]
+        yield send
+
+
+def failure(udp):
+    with pytest.raises(DeviceError) as caught:
+        udp.open()
+    return str(caught.value)
+
+
+def test_each_datagram_is_a_chunk(listen, sender):
+    udp = listen()
+    sent = [os.urandom(1 + 37 * i) for i in range(100)] + [os.urandom(65507)]
+    sender(udp, *sent[:100])
+    chunks = udp.read(5.0)
+    sender(udp, sent[100])
+    chunks += udp.read(5.0)
+    assert [c.data for c in chunks] == sent
+    assert {c.source for c in chunks} == {'127.0.0.1'}
+    assert not udp.counts and udp.whole
+
+
+def test_the_source_with_its_port(listen, sender):
+    udp = listen(source_port=True)
+    sender(udp, b'x')
+    assert [c.source for c in udp.read(5.0)] == [f'127.0.0.1:{sender.port}']
+
+
+def test_read_waits_no_longer_than_it_is_told(listen):
+    udp = listen()
+    for timeout in (0.0, 0.03, 0.1):
+        took = []
+        for _ in range(3):
+            start = time.monotonic()
+            assert udp.read(timeout) == []
+            took.append(time.monotonic() - start)
+        # The machine may be busy at times, but not each time.
+        assert timeout <= min(took) < timeout + 0.04
+
+
+def test_read_returns_as_soon_as_something_comes(listen, sender):
+    udp = listen()
+    threading.Timer(0.2, sender, (udp, b'x')).start()
+    start = time.monotonic()
+    assert [c.data for c in udp.read(20.0)] == [b'x']
+    assert 0.15 < time.monotonic() - start < 1.0
+
+
+def test_one_read_gives_so_many_at_most(listen, sender, monkeypatch):
+    monkeypatch.setattr(udp_socket, 'AT_ONCE', 10)
+    udp = listen()
+    sender(udp, *(bytes([i]) for i in range(25)))
+    assert [len(udp.read(0.0)) for _ in range(4)] == [10, 10, 5, 0]
+
+
+def wait_for_times(udp, sender):
+    """Until the kernel has begun to stamp what comes, and not only what is read."""
+    end = time.monotonic() + 5.0
+    while time.monotonic() < end:
+        sender(udp, b'x')
+        time.sleep(0.01)
+        now = time.monotonic_ns()
+        if [c for c in udp.read(0.0) if now - c.arrival_ns > 5e6]:
+            return
+    raise AssertionError('the times are those of the reading')
+
+
+def test_the_time_is_that_of_the_coming_not_of_the_reading(listen, sender):
+    udp = listen()
+    wait_for_times(udp, sender)
+    between = []
+    for i in range(3):
+        before = time.monotonic_ns()
+        sender(udp, bytes([i]))
+        between.append((before, time.monotonic_ns()))
+        time.sleep(0.1)
+    for chunk, (before, after) in zip(udp.read(0.0), between, strict=True):
+        # The clocks are compared to some microseconds.
+        assert before - 50_000 < chunk.arrival_ns < after + 50_000
+    assert not udp.counts
+
+
+TIMED = 'datagrams with the time of the wake-up instead of the kernel\'s'
+
+
+@pytest.mark.parametrize('step_s', [-3600.0, -0.02, 0.02, 3600.0])
+def test_a_wall_clock_that_is_set_does_no_harm(listen, sender, monkeypatch, step_s):
+    udp = listen()
+    sender(udp, b'before')
+    real = udp_socket.clock_difference
+    monkeypatch.setattr(udp_socket, 'clock_difference', lambda: real() + int(step_s * 1e9))
+    monkeypatch.setattr(udp_socket, 'AT_ONCE', 1)
+    sender(udp, b'behind')
+    for count in (1, 2):
+        # It lies in the queue since before the clock was set, though another was read since.
+        woken = time.monotonic_ns()
+        chunk, = udp.read(1.0)
+        assert 0 <= chunk.arrival_ns - woken < 50e6
+        assert udp.counts == {TIMED: count}
+    # The queue was seen to be full only; once it was empty, the kernel's time is taken again.
+    monkeypatch.setattr(udp_socket, 'AT_ONCE', 10)
+    sender(udp, b'last')
+    udp.read(1.0)
+    assert udp.counts == {TIMED: 3}
+    sender(udp, b'after')
+    chunk, = udp.read(1.0)
+    # The kernel knows nothing of the made-up step.
+    assert chunk.arrival_ns + step_s * 1e9 == pytest.approx(time.monotonic_ns(), abs=50e6)
+    assert udp.counts == {TIMED: 3}
+
+
+def test_clocks_that_cannot_be_compared_are_not(listen, sender, monkeypatch):
+    udp = listen()
+    real = time.time_ns
+
+    def slow():
+        time.sleep(0.002)
+        return real()
+
+    sender(udp, b'x')
+    monkeypatch.setattr(udp_socket.time, 'time_ns', slow)
+    assert udp_socket.clock_difference() is None
+    assert len(udp.read(1.0)) == 1
+    monkeypatch.undo()
+    assert udp.counts == {TIMED: 1}
+    # Not against a comparison that failed either.
+    sender(udp, b'x')
+    udp.read(1.0)
+    assert udp.counts == {TIMED: 2}
+    sender(udp, b'x')
+    udp.read(1.0)
+    assert udp.counts == {TIMED: 2}
+
+
+def test_the_difference_of_the_clocks():
+    between = time.time_ns() - time.monotonic_ns()
+    assert abs(udp_socket.clock_difference() - between) < 1e6
+
+
+def test_the_best_of_three_comparisons_counts(monkeypatch):
+    mono = iter([0, 500_000, 1_000_000, 1_000_100, 2_000_000, 2_400_000])
+    wall = iter([77, 5_000_050, 99])
+    monkeypatch.setattr(udp_socket.time, 'monotonic_ns', lambda: next(mono))
+    monkeypatch.setattr(udp_socket.time, 'time_ns', lambda: next(wall))
+    assert udp_socket.clock_difference() == 5_000_050 - 1_000_050
+
+
+def test_what_the_kernel_drops_is_counted(listen, sender):
+    udp = listen(receive_buffer=20_000)
+    got = 0
+    for burst in (3, 2000, 1, 3000):
+        sender(udp, *(b'x' * 50 for _ in range(burst)))
+        while chunks := udp.read(0.05):
+            got += len(chunks)
+    dropped = udp.counts['datagrams dropped by the kernel']
+    assert got + dropped == 5004
+    assert dropped > 3000 and set(udp.counts) == {'datagrams dropped by the kernel'}
+
+
+def test_a_reader_that_keeps_up_loses_nothing(listen, sender):
+    """A sender of 2000 a second, each larger than usual."""
+    udp = listen()
+    sent = [i.to_bytes(4, 'big') * 50 for i in range(1000)]
+
+    def send():
+        for i in range(0, 1000, 10):
+            sender(udp, *sent[i:i + 10])
+            time.sleep(0.004)
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    got, end = [], time.monotonic() + 10.0
+    while len(got) < len(sent) and time.monotonic() < end:
+        got += udp.read(0.1)
+    thread.join()
+    assert [c.data for c in got] == sent
+    arrivals = [c.arrival_ns for c in got]
+    # Each read compares the clocks anew, to some microseconds.
+    assert all(b - a > -50_000 for a, b in zip(arrivals, arrivals[1:], strict=False))
+    assert not udp.counts
+
+
+def test_the_counter_of_the_kernel_may_overflow(listen, monkeypatch):
+    udp = listen()
+    udp._drops = 2**32 - 5
+    assert udp.read(0.0) == []
+    assert udp.counts == {'datagrams dropped by the kernel': 5}
+
+
+def test_drops_are_counted_anew_after_opening_again(listen, sender):
+    udp = listen(receive_buffer=4096)
+    for total in (100, 200):
+        sender(udp, *(b'x' * 50 for _ in range(100)))
+        n = len(udp.read(0.0))
+        assert 0 < n < 100
+        total_dropped = udp.counts['datagrams dropped by the kernel']
+        assert total_dropped == total * (100 - n) // 100
+        udp.close()
+        udp.open()
+
+
+def test_what_is_too_long_or_empty_is_counted(listen, sender):
+    udp = listen(longest=100)
+    sender(udp, b'x' * 101, b'y' * 100, b'', b'z' * 5000, b'a')
+    assert [c.data for c in udp.read(1.0)] == [b'y' * 100, b'a']
+    assert udp.counts == {'datagrams that were too long': 2, 'empty datagrams': 1}
+
+
+def test_only_the_sources_that_were_named(listen, sender):
+    udp = listen(sources=('127.0.0.9', '127.0.0.8'))
+    sender(udp, b'foreign', b'foreign too')
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as known:
+        known.bind(('127.0.0.8', 0))
+        known.sendto(b'known', ('127.0.0.1', udp._settings.port))
+        chunks = udp.read(1.0)
+    assert [(c.data, c.source) for c in chunks] == [(b'known', '127.0.0.8')]
+    assert udp.counts == {'datagrams from other sources': 2}
+
+
+def multicast(port, group, data):
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as opened:
+        opened.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF,
+                          socket.inet_aton('127.0.0.1'))
+        opened.sendto(data, (group, port))
+
+
+def test_a_group_and_nothing_but_the_group(listen, sender):
+    first = listen(group='239.77.1.2')
+    port = first._settings.port
+    second = listen(group='239.77.1.2', port=port)
+    other = listen(group='239.77.1.3', port=port)
+    for group in ('239.77.1.2', '239.77.1.3'):
+        multicast(port, group, group.encode())
+    sender(first, b'not to the group')
+    for udp, data in ((first, b'239.77.1.2'), (second, b'239.77.1.2'), (other, b'239.77.1.3')):
+        assert [(c.data, c.source) for c in udp.read(1.0)] == [(data, '127.0.0.1')]
+        assert udp.read(0.05) == []
+
+
+def test_all_addresses_of_this_machine(listen, sender):
+    udp = listen(address='0.0.0.0')
+    sender(udp, b'x')
+    sender(udp, b'y', to='127.0.0.5')
+    assert [c.data for c in udp.read(1.0)] == [b'x', b'y']
+
+
+def test_a_port_that_is_in_use(listen):
+    udp = listen()
+    other = UdpSocket(udp._settings)
+    assert failure(other) == (
+        f'UDP 127.0.0.1:{udp._settings.port}: the port is in use by another program')
+    udp.close()
+    other.open()
+    other.close()
+
+
+@pytest.mark.parametrize('changes, text', [
+    ({'address': '192.0.2.1'}, 'UDP 192.0.2.1:{port}: no interface of this machine has the '
+                               'address 192.0.2.1'),
+    ({'address': '192.0.2.1', 'group': '239.1.2.3'}, 'group 239.1.2.3: no interface'),
+    ({'group': '192.0.2.9'}, '192.0.2.9 is no multicast group'),
+    ({'group': '127.0.0.1'}, '127.0.0.1 is no multicast group')])
+def test_an_address_that_cannot_be_listened_at(changes, text):
+    port = free_port(socket.SOCK_DGRAM)
+    udp = UdpSocket(replace(SETTINGS, port=port, **changes))
+    before = len(os.listdir('/proc/self/fd'))
+    assert text.format(port=port) in failure(udp)
+    assert len(os.listdir('/proc/self/fd')) == before
+    with pytest.raises(DeviceError, match='is not open'):
+        udp.read(0.0)
+
+
+def test_a_port_of_the_system(monkeypatch):
+    """Root may bind it, so the refusal is made up."""
+    def bind(*_):
+        raise PermissionError(13, 'Permission denied')
+
+    monkeypatch.setattr(udp_socket.socket, 'socket', type('Socket', (socket.socket,),
+                                                          {'bind': bind}))
+    assert 'ports below 1024 are the system' in failure(UdpSocket(replace(SETTINGS, port=514)))
+
+
+def test_a_buffer_that_the_kernel_does_not_give(listen):
+    said = []
+    udp = listen(said.append, receive_buffer=1 << 30)
+    given = udp._handle.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+    assert said == [f'UDP 127.0.0.1:{udp._settings.port}: the kernel gave a receive buffer of '
+                    f'{given} bytes instead of {1 << 30}; raise net.core.rmem_max']
+    said.clear()
+    udp = listen(said.append, receive_buffer=100_000)
+    assert udp._handle.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == 200_000
+    assert not said
+
+
+def test_a_socket_that_fails(listen):
+    udp = listen()
+    udp._handle.close()
+    with pytest.raises(DeviceError, match='UDP 127.0.0.1'):
+        udp.read(1.0)
+
+
+def test_closing(listen, sender):
+    udp = UdpSocket(replace(SETTINGS, port=free_port(socket.SOCK_DGRAM)))
+    udp.close()
+    with pytest.raises(DeviceError, match=f'UDP 127.0.0.1:{udp._settings.port}: is not open'):
+        udp.read(0.0)
+    before = len(os.listdir('/proc/self/fd'))
+    for _ in range(2):
+        udp.open()
+        udp.open()
+        held = udp._handle
+        closer = threading.Timer(0.1, udp.close)
+        closer.start()
+        start = time.monotonic()
+        assert udp.read(20.0) == []
+        assert 0.05 < time.monotonic() - start < 1.0
+        closer.join()
+        assert held.fileno() == -1
+        udp.close()
+        udp.close()
+        with pytest.raises(DeviceError, match='is not open'):
+            udp.read(0.0)
+    assert len(os.listdir('/proc/self/fd')) == before
+
+
+@pytest.mark.parametrize('changes, text', [
+    ({}, 'port: '), ({'port': 5000, 'address': 'localhost'}, 'address: .*localhost'),
+    ({'port': 5000, 'address': '::1'}, 'address: '), ({'port': 5000, 'group': 'x'}, 'group: '),
+    ({'port': 5000, 'sources': ('127.0.0.1', '1.2.3')}, 'sources: expected an IPv4 .*1.2.3')])
+def test_settings_that_make_no_sense(changes, text):
+    with pytest.raises(SettingsError, match=text):
+        UdpSocket(replace(SETTINGS, **changes))

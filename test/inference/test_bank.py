@@ -1,0 +1,190 @@
+"""The filter bank: weights in logarithms, pruning, merging, the verdict, and its statistics."""
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+
+from mag_tracking.inference import kalman
+from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
+from mag_tracking.inference.time_update import predict
+from mag_tracking.physics.dipole import MU0, sensor_fields
+from mag_tracking.physics.vehicles import RowVehicle
+from mag_tracking.stages.track.initiation_vehicle import moment_directions
+from mag_tracking.stages.track.published_pose import published_track, vehicle_orientation
+from support.networks import line_network
+
+
+def bank(n=4, spread=10.0, label=None):
+    x = np.zeros((n, 7))
+    x[:, 0] = spread * np.arange(n)
+    P = np.repeat(np.eye(7)[None], n, axis=0)
+    return FilterBank(x, P, np.full(n, -np.log(n)),
+                      np.arange(n) if label is None else np.array(label),
+                      np.zeros(n, dtype=int), np.arange(n), np.arange(n)[:, None] + 0.5)
+
+
+def test_the_innovations_stay_with_their_hypotheses():
+    b = bank(6)
+    b.log_w = np.log([0.1, 0.3, 1e-14, 0.2, 0.2, 0.2])
+    b.kind = 10 * np.arange(6)
+    b.prune(20.0, 100)
+    assert b.nis[:, 0].tolist() == [0.5, 1.5, 3.5, 4.5, 5.5]
+    assert b.kind.tolist() == [0, 10, 30, 40, 50]
+    assert b.origin.tolist() == b.label.tolist() == [0, 1, 3, 4, 5]
+
+
+@pytest.mark.parametrize('other, label, ambiguous', [
+    (0.01, 1, False), (0.2, 1, True), (0.2, 0, False)])
+def test_another_arrival_makes_a_track_ambiguous_even_where_the_places_agree(
+        other, label, ambiguous):
+    model = RowVehicle(np.zeros(3), np.ones(3), n_dipoles=1)
+    x = np.tile([1.0, 2.0, 0.5, 10.0, 0.0, 0.0, 100.0, 0.0, 0.0, 0.0], (2, 1))
+    b = FilterBank(x, np.repeat(np.eye(10)[None], 2, axis=0), np.log([other, 1.0 - other]),
+                   np.array([label, 0]), np.array([0, 1]), np.arange(2),
+                   np.array([[7.0, np.nan], [1.0, 2.0]]))
+    track = published_track(
+        b, 1, model, vehicle_orientation, ('left', 'right'), ('car', 'truck'),
+        False, stamp_ns=1, id=1, ended=False,
+        existence=1.0, degrees_of_freedom=6, predicted=np.zeros((2, 3)),
+        mounting=np.zeros((0, 3)), mounting_covariance=np.zeros((0, 3, 3)))
+    assert track.ambiguous == ambiguous
+    assert (track.arrival, track.nis, track.kind) == ('left', 3.0, 'truck')
+    assert track.nis_by_sensor.tolist() == [1.0, 2.0]
+    assert track.kind_weight == pytest.approx(1.0 - other)
+    assert [h.kind for h in track.hypotheses] == ['truck', 'car']
+    lighter = track.hypotheses[-1]
+    assert lighter.weight == pytest.approx(other)
+    assert lighter.arrival == ('left', 'right')[label]
+    assert lighter.position.tolist() == [1.0, 2.0, 0.5]
+    assert lighter.velocity.tolist() == [10.0, 0.0, 0.0]
+    assert lighter.moment.tolist() == [100.0, 0.0, 0.0]
+    np.testing.assert_array_equal(lighter.covariance, np.eye(6))
+    assert [h.weight for h in track.hypotheses[1:]] == [lighter.weight]
+
+
+def test_log_sum_exp_equals_scipy_and_survives_extremes():
+    a = np.array([[-4500.0, 0.0, 3.0], [-1e5, -1e5, -1e5 + 1]])
+    np.testing.assert_allclose(log_sum_exp(a, axis=1), logsumexp(a, axis=1), rtol=1e-14)
+    assert log_sum_exp([-np.inf, -np.inf]) == -np.inf
+
+
+def test_hypotheses_thousands_of_nats_apart_stay_apart():
+    b = bank(2)
+    b.reweight(np.array([-4500.0, 0.0]))
+    np.testing.assert_allclose(b.log_w, [-4500.0, 0.0], atol=1e-12)
+    b.reweight(np.array([4600.0, 0.0]))
+    np.testing.assert_allclose(b.log_w, [0.0, -100.0], atol=1e-9)
+
+
+def test_bayes_rule_of_the_weights():
+    rng = np.random.default_rng(0)
+    b, total = bank(5), np.zeros(5)
+    for _ in range(20):
+        ll = rng.normal(0.0, 2.0, 5)
+        total += ll
+        b.reweight(ll)
+    np.testing.assert_allclose(b.log_w, total - logsumexp(total), atol=1e-12)
+
+
+def test_a_hypothesis_that_is_not_finite_loses_its_weight_and_no_other():
+    b = bank(3)
+    assert np.isfinite(b.reweight(np.array([np.nan, 0.0, 0.0])))
+    np.testing.assert_allclose(np.exp(b.log_w), [0.0, 0.5, 0.5])
+    assert b.reweight(np.full(3, np.nan)) == -np.inf
+    np.testing.assert_allclose(np.exp(b.log_w), [0.0, 0.5, 0.5])
+
+
+def test_prune_by_ratio_and_by_number():
+    b = bank(4)
+    b.log_w = np.log([0.9, 0.1 - 1e-9 - 1e-14, 1e-9, 1e-14])
+    assert b.prune(-np.log(1e-12), 10) == 1
+    assert b.prune(-np.log(1e-12), 2) == 1
+    np.testing.assert_allclose(np.exp(b.log_w).sum(), 1.0)
+    assert len(b) == len(b.x) == len(b.P) == len(b.label) == 2
+
+
+def test_the_best_is_the_heaviest_of_the_heaviest_label():
+    b = bank(3, label=[0, 1, 1])
+    b.log_w = np.log([0.4, 0.35, 0.25])
+    assert b.best() == 1
+
+
+def test_the_best_is_of_the_heaviest_kind_of_the_heaviest_arrival():
+    b = bank(4, label=[0, 1, 1, 1])
+    b.kind = np.array([0, 0, 1, 1])
+    b.log_w = np.log([0.35, 0.25, 0.22, 0.18])
+    assert b.best() == 2
+
+
+def test_the_best_is_where_the_mixture_is_densest():
+    """Of two far apart with the same weight the surer; the heaviest where one is no Gaussian."""
+    b = bank(3, spread=100.0, label=[0, 0, 0])
+    b.P[1, :3, :3] *= 0.5
+    assert b.best() == 1
+    b.log_w = np.log([0.2, 0.3, 0.5])
+    for wrong in (np.nan, np.inf, -1.0):
+        b.P[0, 0, 0] = wrong
+        assert b.best() == 2
+
+
+def test_separated_weight_counts_only_what_is_apart():
+    b = bank(3, spread=1.0)
+    b.x[2, 0] = 30.0
+    b.log_w = np.log([0.6, 0.3, 0.1])
+    assert b.separated_weight(0) == pytest.approx(0.1)
+
+
+def starts(network, earth, offset_std=0.5):
+    """126 hypotheses about a tight prior, all for one arrival along x."""
+    x, P = [], []
+    for m in 300.0 * moment_directions():
+        for lateral in (-1.0, 0.0, 1.0):
+            for speed in (8.0, 10.0, 12.0):
+                x.append([-12.0, lateral, 0.5, speed, 0.0, 0.0, *(m - 4.0 * earth / MU0), 4.0])
+                P.append(np.diag([0.5, offset_std, 0.1, 1.0, 0.3, 0.02,
+                                  120.0, 120.0, 120.0, 1.0]) ** 2)
+    bank = FilterBank.of_targets(np.array(x), np.array(P), np.zeros(len(x), dtype=int),
+                                 len(network), 1e-8)
+    return bank
+
+
+def matched_run(rng, network, model, sigma):
+    """NEES of the best hypothesis at the closest point of one simulated, matched pass."""
+    earth = model.earth_field
+    bank = starts(network, earth)
+    row = rng.integers(len(bank))
+    n_x = bank.x.shape[1]
+    truth = rng.multivariate_normal(bank.x[row], bank.P[row])
+    dt = 0.08
+    C = np.repeat(sigma**2 * np.eye(3)[None], len(network), axis=0)
+    for k in range(22):
+        if k:
+            moved, F, Q = model.propagate(truth[None, :10], dt)
+            truth[:10] = moved[0] + rng.multivariate_normal(np.zeros(10), Q[0])
+            truth[10:] += 1e-9 * np.sqrt(dt) * rng.standard_normal(n_x - 10)
+            x_target, F, Q = model.propagate(bank.x[:, :10], dt)
+            predict(bank.x, bank.P, x_target, F, Q, 1e-18 * dt)
+        h = sensor_fields(network.positions, network.R_sw, *model.dipoles(truth[None, :10]))[0][0]
+        y = h + truth[10:].reshape(-1, 3) + sigma * rng.standard_normal(h.shape)
+        h, H, _ = sensor_fields(network.positions, network.R_sw, *model.dipoles(bank.x[:, :10]))
+        log_likelihood, _ = kalman.update(bank.x, bank.P, y, h, H, C,
+                                          np.zeros((len(bank), len(network))))
+        bank.reweight(log_likelihood)
+        bank.prune(-np.log(1e-12), 600)
+    i = bank.best()
+    e = (truth - bank.x[i])[:6]
+    return float(e @ np.linalg.solve(bank.P[i, :6, :6], e)) / 6.0
+
+
+def test_anees_of_the_matched_case():
+    """200 runs, two sensors, 12.5 Hz, tight prior, 126 starts: position and velocity."""
+    earth = np.array([2e-6, 1.55e-5, -4.9e-5])
+    network = line_network(2, tilt=0.0)
+    model = RowVehicle(earth, np.array([0.1, 0.1, 1e-4]), 0.003, n_dipoles=1)
+    rng = np.random.default_rng(42)
+    nees = np.array([matched_run(rng, network, model, 1.2e-8 / np.sqrt(8.0))
+                     for _ in range(200)])
+    print(f'matched ANEES {nees.mean():.3f}, median {np.median(nees):.3f}, max {nees.max():.1f}')
+    assert nees.mean() <= 1.3
+    # A covariance that says nothing would pass from below: it must also not be far too wide.
+    assert nees.mean() >= 0.7

@@ -1,0 +1,252 @@
+"""The compiled update against the dense filter and filterpy, and its statistics."""
+
+import numpy as np
+import pytest
+from filterpy.kalman import ExtendedKalmanFilter
+from scipy.stats import chi2, multivariate_normal
+
+from mag_tracking.inference import kalman
+from mag_tracking.inference.time_update import predict
+from mag_tracking.physics.dipole import sensor_fields
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.simulation.scenario import Path, point_body, simulate
+from support.bundled import POINT
+from support.networks import line_network
+
+
+def dense_update(x, P, y, h, H, C, inflation, x_lin, n_own=0):
+    """The textbook, stacked update of one hypothesis: the oracle."""
+    n_sensors, n_t = len(H), H.shape[2] - n_own
+    full = np.zeros((3 * n_sensors, len(x)))
+    full[:, -3 * n_sensors:] = np.eye(3 * n_sensors)
+    for j in range(n_sensors):
+        own = n_t + n_own * j
+        full[3 * j:3 * j + 3, :n_t] = H[j, :, :n_t]
+        full[3 * j:3 * j + 3, own:own + n_own] = H[j, :, n_t:]
+    R = np.zeros((3 * n_sensors, 3 * n_sensors))
+    for j in range(n_sensors):
+        R[3 * j:3 * j + 3, 3 * j:3 * j + 3] = C[j] + inflation[j] * np.eye(3)
+    there = ~np.isnan(y.ravel())
+    full, R = full[there], R[np.ix_(there, there)]
+    predicted = (h.ravel() + x_lin[-3 * n_sensors:])[there] + full @ (x - x_lin)
+    nu = y.ravel()[there] - predicted
+    # Whitened, as the tesla scale would be lost on general-purpose tolerances.
+    W = np.linalg.inv(np.linalg.cholesky(R))
+    A = W @ full
+    S = A @ P @ A.T + np.eye(len(A))
+    K = np.linalg.solve(S, A @ P).T
+    log_likelihood = multivariate_normal(np.zeros(len(A)), S).logpdf(W @ nu) \
+        + np.linalg.slogdet(W)[1]
+    z = W @ nu
+    P_new = P - K @ A @ P
+    return (x + K @ z, 0.5 * (P_new + P_new.T), log_likelihood, z @ np.linalg.solve(S, z),
+            (A, z, S))
+
+
+def tracked(n_sensors, missing=False):
+    """A bank in the middle of a simulated pass, and the ingredients of its next update."""
+    network = line_network(n_sensors)
+    rng = np.random.default_rng(5)
+    samples, *_ = simulate(network, point_body([250.0, -120.0, 90.0], 5.0, 0.5),
+                           Path(np.array([-60.0, -1.0]), 0.0, 10.0), 25.0, 12.0, rng)
+    pipeline = Pipeline(network, settings_for('vehicle', {
+        **POINT, 'align.period_s': 0.04, 'track.mounting_std_deg': 0.0,
+        'track.model_error_time_s': 0.0, 'track.most_sensors': 1000,
+        'track.vehicle.arrival_names': ['a'],
+        'track.vehicle.arrival_headings_deg': [0.0]}))
+    frame = None
+    for sample in samples:
+        for record in pipeline.feed(sample):
+            if hasattr(record, 'target_present') and record.target_present:
+                frame = record
+        if pipeline.track.counts['poses'] >= 25:
+            break
+    bank = pipeline.track.bank
+    y = frame.field + 1e-8 * rng.standard_normal(frame.field.shape)
+    if missing:
+        y[0, 2] = np.nan
+        y[1] = np.nan
+    x, P = bank.x.copy(), bank.P.copy()
+    model = pipeline.track._model
+    h, H, gradient = sensor_fields(network.positions, network.R_sw, *model.dipoles(x[:, :10]))
+    C = np.repeat(1.44e-16 * np.array([[1.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 0.8]])[None],
+                  n_sensors, axis=0)
+    return x, P, y, h, H, C, gradient**2
+
+
+def compare(n_sensors, missing=False, shift=0.0):
+    """Largest differences in mean [sd] and covariance [sd^2] from both oracles."""
+    x, P, y, h, H, C, inflation = tracked(n_sensors, missing)
+    x_lin = x + shift * np.sqrt(np.einsum('nii->ni', P))
+    new_x, new_P = x.copy(), P.copy()
+    log_likelihood, nis = kalman.update(new_x, new_P, y, h, H, C, inflation, x_lin)
+    worst = np.zeros(4)
+    for p in range(len(x)):
+        ox, oP, oll, onis, (A, z, _) = dense_update(x[p], P[p], y, h[p], H[p], C, inflation[p],
+                                                    x_lin[p])
+        sd = np.sqrt(np.diagonal(oP))
+        worst[0] = max(worst[0], np.abs((new_x[p] - ox) / sd).max())
+        worst[1] = max(worst[1], np.abs((new_P[p] - oP) / np.outer(sd, sd)).max())
+        assert abs(log_likelihood[p] - oll) <= 1e-8 * max(1.0, abs(oll))
+        assert abs(nis[p].sum() - onis) <= 1e-8 * max(1.0, onis)
+        ekf = ExtendedKalmanFilter(len(x[p]), len(z))
+        ekf.x, ekf.P, ekf.R = x[p].copy(), P[p].copy(), np.eye(len(z))
+        ekf.update(z, lambda _, A=A: A, lambda _, z=z: np.zeros_like(z))
+        worst[2] = max(worst[2], np.abs((new_x[p] - ekf.x) / sd).max())
+        worst[3] = max(worst[3], np.abs((new_P[p] - ekf.P) / np.outer(sd, sd)).max())
+    return worst
+
+
+@pytest.mark.parametrize('n_sensors', [2, 8, 32])
+def test_update_equals_dense_oracle_and_filterpy(n_sensors):
+    dense_mean, dense_cov, ekf_mean, ekf_cov = compare(n_sensors)
+    print(f'{n_sensors} sensors: dense {dense_mean:.1e} sd, {dense_cov:.1e}; '
+          f'filterpy {ekf_mean:.1e} sd, {ekf_cov:.1e}')
+    assert max(dense_mean, ekf_mean) <= 1e-8
+    assert max(dense_cov, ekf_cov) <= 1e-9
+
+
+def test_update_with_missing_axes_and_sensors():
+    assert max(compare(3, missing=True)) <= 1e-8
+
+
+@pytest.mark.parametrize('fades', [True, False])
+@pytest.mark.parametrize('moving', [0.0, 0.4, 1.0])
+@pytest.mark.parametrize('shared', [True, False])
+def test_prediction_equals_the_dense_oracle(shared, moving, fades):
+    """x = A x, P = A P A' + Q with A of the target's Jacobian and of what decays."""
+    rng = np.random.default_rng(3)
+    n_hyp, n_t, n_rest = 4, 5, 7
+    root = rng.standard_normal((n_hyp, n_t + n_rest, n_t + n_rest))
+    P, x = root @ np.swapaxes(root, 1, 2), rng.standard_normal((n_hyp, n_t + n_rest))
+    F, Q = rng.standard_normal((2, n_hyp, n_t, n_t))
+    # In some rows nothing but what is there already; of each hypothesis in others.
+    dense, F = F, np.where(rng.random((n_hyp, n_t, 1)) < moving, F, np.eye(n_t))
+    F[0, 0] = np.where(np.arange(n_t) == 0, 1.0, dense[0, 0])  # a place and its velocity
+    F[0, 1] = 0.5 * np.eye(n_t)[1]  # what fades
+    F, Q = (F[0], Q[0] @ Q[0].T) if shared else (F, Q @ np.swapaxes(Q, 1, 2))
+    decay, variance = np.ones(n_rest), rng.uniform(0.1, 1.0, n_rest)
+    if fades:
+        decay = rng.uniform(0.2, 1.0, n_rest)
+    A, noise = np.zeros((2, n_hyp, n_t + n_rest, n_t + n_rest))
+    A[:, :n_t, :n_t], noise[:, :n_t, :n_t] = F, Q
+    rest = np.arange(n_t, n_t + n_rest)
+    A[:, rest, rest], noise[:, rest, rest] = decay, variance
+    x_target = rng.standard_normal((n_hyp, n_t))
+    expected = A @ P @ np.swapaxes(A, 1, 2) + noise
+    x_rest = x[:, n_t:] * decay
+    F.flags.writeable = False
+    predict(x, P, x_target, F, Q, variance, decay)
+    np.testing.assert_array_equal(x, np.concatenate([x_target, x_rest], axis=1))
+    np.testing.assert_allclose(P, expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(P, np.swapaxes(P, 1, 2))
+    with pytest.raises(ValueError, match='covariances of shape'):
+        predict(x, P[:2], x_target, F, Q, variance, decay)
+    with pytest.raises(ValueError, match='states of shape'):
+        predict(x, P[:1], x_target[:1], F[:1] if F.ndim == 3 else F, Q, variance, decay)
+    with pytest.raises(ValueError, match='Jacobian of shape'):
+        predict(x, P, x_target, F[..., :1], Q, variance, decay)
+
+
+@pytest.mark.parametrize('n_own', [0, 2, 3])
+@pytest.mark.parametrize('n_t', [0, 3, 5, 7, 12])
+def test_update_in_numbers_near_one_with_any_axes_missing(n_t, n_own):
+    """In tesla a missing axis that is only given a large noise would look like one left out."""
+    rng = np.random.default_rng(n_t)
+    n_sensors = 8
+    n_x = n_t + (n_own + 3) * n_sensors
+    x = rng.standard_normal((1, n_x))
+    P, C = (np.stack([a @ a.T + 0.1 * np.eye(k) for a in rng.standard_normal((n, k, k))])
+            for n, k in ((1, n_x), (n_sensors, 3)))
+    h = rng.standard_normal((1, n_sensors, 3))
+    H = rng.standard_normal((1, n_sensors, 3, n_t + n_own))
+    inflation = rng.uniform(0.0, 1.0, (1, n_sensors))
+    x_lin = x + rng.standard_normal(x.shape)
+    y = rng.standard_normal((n_sensors, 3))
+    patterns = np.array([[j >> a & 1 for a in range(3)] for j in range(n_sensors)], dtype=bool)
+    y[patterns] = np.nan
+    C[patterns] = np.nan
+    C[np.broadcast_to(patterns[:, None, :], C.shape)] = np.nan
+    new_x, new_P = x.copy(), P.copy()
+    log_likelihood, nis = kalman.update(new_x, new_P, y, h, H, C, inflation, x_lin, n_own)
+    filled = np.where(np.isnan(C), np.eye(3), C)
+    ox, oP, oll, onis, _ = dense_update(x[0], P[0], y, h[0], H[0], filled, inflation[0], x_lin[0],
+                                        n_own)
+    np.testing.assert_allclose(new_x[0], ox, atol=1e-9)
+    np.testing.assert_allclose(new_P[0], oP, atol=1e-9)
+    np.testing.assert_allclose([log_likelihood[0], nis[0].sum()], [oll, onis], rtol=1e-9)
+
+
+def test_update_linearised_elsewhere():
+    assert max(compare(2, shift=0.3)[:2]) <= 1e-8
+
+
+def test_covariance_stays_exactly_symmetric():
+    x, P, y, h, H, C, inflation = tracked(2)
+    kalman.update(x, P, y, h, H, C, inflation)
+    np.testing.assert_array_equal(P, np.swapaxes(P, 1, 2))
+
+
+@pytest.mark.parametrize('bad', [np.zeros((3, 3)), np.diag([-1.0, 1.0, 1.0]),
+                                 [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+                                 [[1.0, 0.0, 2.0], [0.0, 1.0, 0.0], [2.0, 0.0, 1.0]]])
+def test_a_noise_that_is_not_positive_definite_is_refused(bad):
+    x, P, y, h, H, C, inflation = tracked(2)
+    before = x.copy()
+    C[1] = 1.44e-16 * np.array(bad)
+    with pytest.raises(ValueError, match='not positive definite'):
+        kalman.update(x, P, y, h, H, C, 0.0 * inflation)
+    np.testing.assert_array_equal(x, before)
+
+
+def test_states_that_do_not_fit_the_sensors_are_refused():
+    x, P, y, h, H, C, inflation = tracked(2)
+    with pytest.raises(ValueError, match='shapes that do not fit'):
+        kalman.update(x, P, y, h, H, C, inflation, n_own=3)
+    arguments = {'P': P, 'y': y, 'h': h, 'C': C, 'inflation': inflation, 'x_lin': x.copy()}
+    for name, array in arguments.items():
+        for bad in (array[..., :-1], array[:-1]):
+            with pytest.raises(ValueError, match='shapes that do not fit'):
+                kalman.update(x, H=H, **{**arguments, name: bad.copy()})
+        with pytest.raises(ValueError, match='C-contiguous'):
+            kalman.update(x, H=H, **{**arguments, name: np.asfortranarray(array)})
+    with pytest.raises(ValueError, match='shapes that do not fit'):
+        kalman.update(x, H=H[:, :, :2].copy(), **arguments)
+
+
+def test_nees_of_a_linear_gaussian_case_is_chi_square():
+    """Linear model, true prior and noise: the mean NEES lies in its 95 % band."""
+    rng = np.random.default_rng(11)
+    runs, steps, n_t, n_sensors, dt = 400, 12, 6, 2, 0.1
+    n_x = n_t + 3 * n_sensors
+    F, Q = np.eye(6), 0.02 * np.eye(6)
+    F[:3, 3:] = dt * np.eye(3)
+    P0 = np.diag(np.r_[np.full(3, 2.0), np.full(3, 1.0), np.full(6, 0.3)])
+    truth = rng.multivariate_normal(np.zeros(n_x), P0, runs)
+    x, P = np.zeros((runs, n_x)), np.repeat(P0[None], runs, axis=0)
+    H = np.repeat(rng.standard_normal((n_sensors, 3, n_t))[None], runs, axis=0)
+    C = np.repeat(np.diag([0.5, 1.0, 2.0])[None], n_sensors, axis=0)
+    nis = []
+    for k in range(steps):
+        if k:
+            truth[:, :n_t] = truth[:, :n_t] @ F.T + rng.multivariate_normal(np.zeros(6), Q, runs)
+            truth[:, n_t:] += np.sqrt(0.01) * rng.standard_normal((runs, n_x - n_t))
+            predict(x, P, x[:, :n_t] @ F.T, F, Q, 0.01)
+        noise = rng.standard_normal((runs, n_sensors, 3)) * np.sqrt([0.5, 1.0, 2.0])
+        y = np.einsum('pjic,pc->pji', H, truth[:, :n_t]) \
+            + truth[:, n_t:].reshape(runs, n_sensors, 3) + noise
+        # The measurement differs from run to run, so each is an update of its own.
+        for p in range(runs):
+            h = np.einsum('jic,c->ji', H[p], x[p, :n_t])[None]
+            nis.append(kalman.update(x[p:p + 1], P[p:p + 1], y[p], h, H[p:p + 1], C,
+                                     np.zeros((1, n_sensors)))[1][0])
+    e = truth - x
+    nees = np.einsum('pi,pij,pj->p', e, np.linalg.inv(P), e)
+    low, high = chi2.ppf([0.025, 0.975], runs * n_x) / runs
+    print(f'linear Gaussian NEES {nees.mean():.3f}, band {low:.3f} .. {high:.3f}')
+    assert low <= nees.mean() <= high
+    # Innovations are white: each sensor's alone has three degrees of freedom, in every step.
+    low, high = chi2.ppf([0.005, 0.995], 3 * len(nis)) / len(nis)
+    by_sensor = np.mean(nis, axis=0)
+    print(f'NIS by sensor {by_sensor.round(3)}, band {low:.3f} .. {high:.3f}')
+    assert (low <= by_sensor).all() and (by_sensor <= high).all()

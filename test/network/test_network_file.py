@@ -1,0 +1,230 @@
+"""network.yaml: what it means, and what becomes of a faulty one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mag_tracking.errors import NetworkError, OutputError
+from mag_tracking.geometry import (
+    quaternion_between,
+    quaternion_from_rotation_vector,
+    rotation_from_quaternion,
+)
+from mag_tracking.network import Calibrated
+from mag_tracking.network.file import read_network, write_network
+from mag_tracking.network.geomagnetic import Site, earth_field
+
+GOOD = '''
+frame: map
+earth_field: [2.0e-6, 1.55e-5, -4.9e-5]
+sensors:
+  a:
+    position: [0, -4.5, 0]
+    orientation: [0, 0, 0.7071067811865476, 0.7071067811865476]
+    noise_std: 1.2e-8
+  b:
+    position: [0.0, 4.5, 0.0]
+    noise_std: [1.0e-8, 2.0e-8, 3.0e-8]
+    background: [1.0e-6, 0.0, 0.0]
+    topic: /other/mag
+'''
+
+
+def read(tmp_path, text):
+    path = tmp_path / 'network.yaml'
+    path.write_text(text)
+    return read_network(path)
+
+
+def test_a_good_file(tmp_path):
+    n = read(tmp_path, GOOD)
+    assert n.names == ('a', 'b') and n.topics == ('/a/imu/mag', '/other/mag')
+    # A quarter turn about z takes the sensor's x to the world's y.
+    np.testing.assert_allclose(n.R_ws[0] @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_array_equal(n.R_ws[1], np.eye(3))
+    np.testing.assert_allclose(n.R_sw[0], n.R_ws[0].T)
+    np.testing.assert_allclose(n.noise_std[0], 1.2e-8)
+    assert n.background[0] is None and n.background[1][0] == 1e-6
+
+
+CALIBRATED = """
+site: {latitude: 58.4, longitude: 15.6, height: 60, date: 2026-05-01, x_azimuth_deg: 90}
+sensors:
+  a:
+    position: [0, -4.5, 0]
+    orientation_std_deg: [0.3, 0.4, 2.3]
+    clock_offset: -0.0223
+    offset: [1.0e-6, -2.0e-6, 3.0e-6]
+    correction: [1.01, 0.02, 0.0, 0.02, 0.98, 0.0, 0.0, -0.01, 1.0]
+    calibrated: {date: '2026-05-01', by: 'accelerometer and compass', clock_offset_std: 2.0e-5}
+  b:
+    position: [0.0, 4.5, 0.0]
+    orientation_std_deg: 5
+    topic: /b/field
+  c:
+    position: [0.0, 9.5, 0.0]
+    imu_topic: /imu_of_c
+    calibrated: {date: '2026-05-02', by: as stated}
+"""
+
+
+def test_what_is_known_of_a_calibrated_sensor(tmp_path):
+    n = read(tmp_path, CALIBRATED)
+    np.testing.assert_allclose(np.degrees(n.orientation_std[0]), [0.3, 0.4, 2.3])
+    np.testing.assert_allclose(np.degrees(n.orientation_std[1]), 5.0)
+    assert n.orientation_std[2] is None
+    np.testing.assert_array_equal(n.clock_offset, [-0.0223, 0.0, 0.0])
+    np.testing.assert_array_equal(n.offset[0], [1e-6, -2e-6, 3e-6])
+    # Nine numbers are its rows.
+    np.testing.assert_array_equal(n.correction[0],
+                                  [[1.01, 0.02, 0.0], [0.02, 0.98, 0.0], [0.0, -0.01, 1.0]])
+    assert n.offset[1] is n.correction[1] is n.calibrated[1] is None
+    assert n.calibrated[0] == Calibrated('2026-05-01', 'accelerometer and compass', 2e-5)
+    assert n.calibrated[2].by == 'as stated' and np.isnan(n.calibrated[2].clock_offset_std)
+    # Beside a topic that ends as REP-145 has it, else nobody knows.
+    assert n.imu_topics == ('/a/imu/data_raw', None, '/imu_of_c')
+
+
+def test_the_site_tells_the_field(tmp_path):
+    n = read(tmp_path, CALIBRATED)
+    np.testing.assert_array_equal(
+        n.earth_field, earth_field(Site(58.4, 15.6, 60.0, 2026.0 + 120 / 365, 90.0)))
+
+
+def agree(a, b):
+    """Whether two networks say the same."""
+    assert (a.names, a.topics, a.frame, a.imu_topics) == (b.names, b.topics, b.frame, b.imu_topics)
+    for name in ('positions', 'earth_field', 'clock_offset'):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    np.testing.assert_allclose(a.R_ws, b.R_ws, atol=1e-14)
+    for name in ('noise_std', 'background', 'offset', 'correction'):
+        for one, other in zip(getattr(a, name), getattr(b, name), strict=True):
+            np.testing.assert_array_equal(one, other)
+    for one, other in zip(a.orientation_std, b.orientation_std, strict=True):
+        assert (one is None) == (other is None)
+        np.testing.assert_allclose(1.0 if one is None else one, 1.0 if other is None else other,
+                                   atol=1e-8)
+    for one, other in zip(a.calibrated, b.calibrated, strict=True):
+        np.testing.assert_equal(one and (one.date, one.by, one.clock_offset_std),
+                                other and (other.date, other.by, other.clock_offset_std))
+
+
+@pytest.mark.parametrize('text', [GOOD, CALIBRATED])
+def test_what_is_written_reads_back(tmp_path, text):
+    n = read(tmp_path, text)
+    n = replace(n, R_ws=n.R_ws @ Rotation.random(len(n), random_state=1).as_matrix())
+    write_network(tmp_path / 'copy.yaml', n, 'A copy.\nOf two lines.')
+    assert (tmp_path / 'copy.yaml').read_text().startswith('# A copy.\n# Of two lines.\n')
+    agree(read_network(tmp_path / 'copy.yaml'), n)
+    with pytest.raises(OutputError, match='cannot write'):
+        write_network(tmp_path / 'no' / 'such' / 'folder.yaml', n)
+
+
+@pytest.mark.parametrize('deg', [1e-5, 0.06, 30.0, 45.0, 180.0])
+def test_any_deviation_that_a_survey_may_find_reads_back(tmp_path, deg):
+    """A heading that nobody stated is known to 180 degrees: survey.stated_std_deg allows it."""
+    n = read(tmp_path, GOOD)
+    n = replace(n, orientation_std=(np.deg2rad([0.3, 0.3, deg]), None))
+    write_network(tmp_path / 'copy.yaml', n)
+    agree(read_network(tmp_path / 'copy.yaml'), n)
+
+
+def test_a_sensor_without_an_accelerometer_stays_so(tmp_path):
+    n = read(tmp_path, GOOD.replace('topic: /other', 'imu_topic: null\n    topic: /other'))
+    assert n.imu_topics == ('/a/imu/data_raw', None)
+    write_network(tmp_path / 'copy.yaml', n)
+    agree(read_network(tmp_path / 'copy.yaml'), n)
+
+
+def test_any_words_read_back(tmp_path):
+    n = read(tmp_path, GOOD)
+    n = replace(n, calibrated=(Calibrated('2026-05-01', "the installer's eye: # 1", np.nan), None))
+    write_network(tmp_path / 'copy.yaml', n)
+    agree(read_network(tmp_path / 'copy.yaml'), n)
+
+
+@pytest.mark.parametrize('old, new, message', [
+    ('orientation_std_deg: 5', 'orientation_std_deg: 0', 'must be above 0'),
+    ('orientation_std_deg: 5', 'orientation_std_deg: -2.0', 'must be above 0'),
+    ('orientation_std_deg: 5', 'orientation_std_deg: [1, 2]', 'expected 1 or 3 numbers'),
+    ('clock_offset: -0.0223', 'clock_offset: 4000', 'clock_offset: 4000.0 s is more'),
+    ('clock_offset: -0.0223', 'clock_offset: soon', "'soon' is text"),
+    ('clock_offset: -0.0223', 'clock_offset: .nan', 'not a finite number'),
+    ('offset: [1.0e-6', 'offset: [1.0', 'offset: .* microtesla or gauss'),
+    ('[1.01, 0.02, 0.0,', '[1.01, 0.02,', 'correction: expected 9 numbers'),
+    ('0.0, -0.01, 1.0]', '0.0, 0.0, 0.0]', 'takes away a direction'),
+    ('imu_topic: /imu_of_c', 'imu_topic: imu', 'imu_topic must begin with /'),
+    ('imu_topic: /imu_of_c', 'imu_topic: /imu of c', 'no ROS topic'),
+    ("date: '2026-05-02'", 'date: 2026-05-02', 'date must be text'),
+    (', by: as stated', '', 'by must be text'),
+    ('by: as stated', 'by: as stated, who: me', "unknown key 'who'"),
+    ("calibrated: {date: '2026-05-02', by: as stated}", 'calibrated: yes', 'expected a mapping'),
+    ('site: {latitude: 58.4, ', 'site: {', 'site: latitude is missing'),
+    ('latitude: 58.4', 'latitude: 98.4', 'site: latitude: 98.4 is outside'),
+    ('latitude: 58.4', 'latitude: north', "'north' is text"),
+    ('date: 2026-05-01,', 'date: 2024-05-01,', 'site: year: 2024.33 is outside'),
+    ('date: 2026-05-01,', "date: '2026-05-01',", 'site: date: expected a day'),
+    ('x_azimuth_deg: 90', 'x_azimuth: 90', "site: unknown key 'x_azimuth'"),
+    ('site:', 'earth_field: [2.0e-6, 1.55e-5, -4.9e-5]\nsite:', 'leave one out'),
+])
+def test_faults_of_a_calibration_are_named(tmp_path, old, new, message):
+    assert old in CALIBRATED
+    with pytest.raises(NetworkError, match=message):
+        read(tmp_path, CALIBRATED.replace(old, new))
+
+
+@pytest.mark.parametrize('old, new, message', [
+    ('  b:', '  a:', 'a is there twice'),
+    ('/other/mag', '/a/imu/mag', 'topic /a/imu/mag is that of two sensors'),
+    ('/other/mag', 'other', 'must begin with /'),
+    ('position: [0, -4.5, 0]', 'position: [0, -4.5]', 'sensor a: position: expected 3'),
+    ('position: [0, -4.5, 0]', 'positon: [0, -4.5, 0]', "unknown key 'positon'"),
+    ('position: [0, -4.5, 0]', 'position: [0, .nan, 0]', 'not a finite number'),
+    ('    position: [0, -4.5, 0]\n', '', 'sensor a: position is missing'),
+    ('1.2e-8', '-1.2e-8', 'noise_std must be above a femto'),
+    ('1.2e-8', '1e-8', 'write numbers as 1.0e-8'),
+    ('1.2e-8', '1.0e-100', 'above a femtotesla'),
+    ('position: [0, -4.5, 0]', 'position: [0, 1.0e+200, 0]', 'nowhere on Earth'),
+    ('position: [0, -4.5, 0]', 'position: [0, 1.0e9, 0]', "'1.0e9' is text"),
+    ('position: [0, -4.5, 0]', 'position: [0, 4.5, 0]', 'sensors a and b are both at'),
+    ('0.7071067811865476, 0.7', '0.1, 0.7', 'needs norm 1'),
+    ('[2.0e-6, 1.55e-5, -4.9e-5]', '[0.02, 0.155, -0.49]', 'microtesla or gauss'),
+    ('frame: map', 'fram: map', 'unknown key'),
+    ('frame: map', 'frame: [', 'not YAML'),
+    ('frame: map', 'frame: "a b"', 'frame: expected a name'),
+    ('  b:', '  b/c:', "'b/c' is no name for a sensor"),
+    ('background: [1.0e-6', 'background: [0.2', 'background: .* is it in microtesla'),
+    ('[2.0e-6, 1.55e-5, -4.9e-5]', '[2.0e-3, 0.0, 0.0]', 'more than a millitesla'),
+    ('position: [0, -4.5, 0]', 'position: [0, 2.0e+8, 0]', 'nowhere on Earth'),
+])
+def test_faults_are_named(tmp_path, old, new, message):
+    assert old in GOOD
+    with pytest.raises(NetworkError, match=message.replace('[', r'\[')):
+        read(tmp_path, GOOD.replace(old, new))
+
+
+def test_missing_and_empty_files(tmp_path):
+    with pytest.raises(NetworkError, match='cannot read'):
+        read_network(tmp_path / 'nowhere.yaml')
+    for text in ('', 'sensors: {}', 'sensors: [a]'):
+        with pytest.raises(NetworkError):
+            read(tmp_path, text)
+
+
+def test_an_unknown_sensor_is_named(tmp_path):
+    with pytest.raises(NetworkError, match='unknown sensor c; the network has a, b'):
+        read(tmp_path, GOOD).index('c')
+
+
+def test_rotations_agree_with_scipy():
+    q = Rotation.random(20, random_state=0).as_quat()
+    np.testing.assert_allclose(rotation_from_quaternion(q), Rotation.from_quat(q).as_matrix(),
+                               atol=1e-14)
+    v = np.vstack([np.random.default_rng(0).standard_normal((20, 3)), np.zeros(3)])
+    np.testing.assert_allclose(rotation_from_quaternion(quaternion_from_rotation_vector(v)),
+                               Rotation.from_rotvec(v).as_matrix(), atol=1e-14)
+    for a, b in ((v[0], v[1]), (v[0], -2 * v[0]), (v[0], v[0])):
+        R = rotation_from_quaternion(quaternion_between(a, b))
+        np.testing.assert_allclose(R @ a / np.linalg.norm(a), b / np.linalg.norm(b), atol=1e-12)

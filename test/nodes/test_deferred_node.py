@@ -1,0 +1,78 @@
+"""Work that waits until the results are out: once, in time, and nothing of it is lost."""
+
+import time
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from mag_tracking_msgs.msg import FieldReadings
+
+from mag_tracking.messages.schema import readings_dict
+from mag_tracking.messages.types import RAW_READINGS
+from mag_tracking.nodes.convert import to_message
+from mag_tracking.nodes.deferred import Later
+from mag_tracking.nodes.stage_node import RESULTS, STREAM
+from mag_tracking.records import Readings
+from support.bundled import NETWORK_FILE
+from support.node_processes import start, stop
+
+EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
+
+
+def test_who_asks_twice_is_called_once(ros):
+    node, spin_until = ros
+    called, asked = [], []
+    later = Later(node, 0.05, lambda: called.append(time.monotonic()))
+
+    def ask():
+        asked.append(time.monotonic())
+        later.ask()
+    for n in (1, 2):
+        for _ in range(3):
+            ask()
+        assert spin_until(lambda n=n: len(called) == n, 5.0)
+        assert called[-1] - asked[-3] > 0.045
+        spin_until(lambda: False, 0.2)
+        assert len(called) == n
+
+
+def test_what_waits_is_asked_for_all_the_time_and_done_all_the_same(ros):
+    """Who asks while it waits does not put it off."""
+    node, spin_until = ros
+    called = []
+    later = Later(node, 0.05, lambda: called.append(0))
+    node.create_timer(0.01, later.ask)
+    assert spin_until(lambda: len(called) >= 5, 5.0)
+
+
+def test_of_readings_that_come_together_each_is_looked_at(ros):
+    """Though the calibration looks at them behind its publishing."""
+    node, spin_until = ros
+    heard, statuses, rng, stamps = [], {}, np.random.default_rng(0), []
+    publisher = node.create_publisher(FieldReadings, RAW_READINGS, STREAM)
+    node.create_subscription(FieldReadings, '/calibration_node/readings', heard.append, STREAM)
+    node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: statuses.update(
+        {s.name: {v.key: v.value for v in s.values} for s in m.status}), RESULTS)
+
+    def publish():
+        field = EARTH + 1.2e-8 * rng.standard_normal((2, 3))
+        stamps.append(time.time_ns())
+        publisher.publish(to_message(FieldReadings, readings_dict(Readings(
+            ('mag_1', 'mag_2'), np.arange(2), np.full(2, stamps[-1]), field))))
+    process = start('calibration_node', '-p', f'network:={NETWORK_FILE}')
+    try:
+        assert spin_until(lambda: publisher.get_subscription_count() > 0)
+        timer = node.create_timer(0.01, publish)
+
+        def values(name):
+            return statuses.get(f'calibration_node: {name}', {})
+        assert spin_until(lambda: heard and all(
+            values(name).get('background') == 'ready' for name in ('mag_1', 'mag_2')))
+        timer.cancel()
+        # Were it every other one, it would be half of this.
+        sent = 1e9 / np.median(np.diff(stamps))
+        for name in ('mag_1', 'mag_2'):
+            assert 0.75 * sent < float(values(name)['rate [Hz]']) < 1.33 * sent
+            assert [5.0 < float(v) < 30.0 for v in values(name)['noise [nT]'].split()] == [True] * 3
+    finally:
+        codes, outputs = stop([process])
+    assert codes == [0], outputs

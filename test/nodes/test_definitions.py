@@ -1,0 +1,49 @@
+"""Definitions of message types, as recordings carry them."""
+
+import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from mag_tracking.nodes.definitions import definition_of
+from support.bundled import ROOT
+
+
+@pytest.mark.parametrize('type_name', [
+    'sensor_msgs/msg/Imu', 'diagnostic_msgs/msg/DiagnosticArray', 'nav_msgs/msg/Odometry',
+    'sensor_msgs/msg/PointCloud2', 'visualization_msgs/msg/MarkerArray',
+    'rcl_interfaces/msg/ParameterEvent', 'nav_msgs/msg/Path', 'rosgraph_msgs/msg/Clock'])
+def test_definitions_are_those_of_ros(type_name):
+    """As rosbags has them of its own: every type, field and constant."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    found = get_types_from_msg(definition_of(type_name), type_name)
+    needed = {type_name}
+    while more := {n for t in needed for n in names_in(store.fielddefs[t])} - needed:
+        needed |= more
+    assert set(found) == needed
+    assert found == {name: store.fielddefs[name] for name in needed}
+
+
+def names_in(definition):
+    """The message types that a type of rosbags names."""
+    def walk(node):
+        if isinstance(node, str):
+            return {node} if '/msg/' in node else set()
+        return set().union(*map(walk, node)) if isinstance(node, (tuple, list)) else set()
+    return walk(definition[1])
+
+
+def test_definitions_of_our_own_and_of_unknown_types(monkeypatch, tmp_path):
+    ours = definition_of('mag_tracking_msgs/msg/HypothesisArray')
+    assert ours.count('MSG: mag_tracking_msgs/Hypothesis\n') == 1
+    assert ours.startswith((ROOT / 'msg_defs/msg/HypothesisArray.msg').read_text())
+    assert definition_of('odd_msgs/msg/Odd') is None
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'/nowhere:{tmp_path}')
+    folder = tmp_path / 'share' / 'new_msgs' / 'msg'
+    folder.mkdir(parents=True)
+    (folder / 'Outer.msg').write_text('int8 N=3 # Inner x\nInner[<=3] inner\nstring<=4 s "a/b c"')
+    (folder / 'Inner.msg').write_text('float64[2] v\n# Odd odd\n')
+    text = definition_of('new_msgs/msg/Outer')
+    assert text.count('MSG: ') == 1 and text.endswith('MSG: new_msgs/Inner\nfloat64[2] v\n'
+                                                      '# Odd odd\n')
+    (folder / 'Inner.msg').unlink()
+    definition_of.cache_clear()
+    assert definition_of('new_msgs/msg/Outer') is None

@@ -1,0 +1,252 @@
+"""The driver node: a device at one end, topics and diagnostics at the other; its life cycle."""
+
+import time
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from mag_tracking_msgs.msg import FieldReadings, NetworkFrame
+from sensor_msgs.msg import Imu, MagneticField
+
+from mag_tracking.messages.schema import samples_of, stamp_ns
+from mag_tracking.nodes.stage_node import RESULTS, STREAM
+from support.bundled import NETWORK_FILE
+from support.node_processes import call, start, stop
+from support.serial_line import SerialLine
+
+BOARD = """
+board:
+  transport: serial
+  serial: {port: PORT}
+  framing: text
+  text:
+    fields: [sensor, sequence, ticks, x, y, z, ax, ay, az]
+    checksum: nmea
+  clock: {tick_s: 1.0e-6}
+  unit: nT
+  acceleration_unit: g
+  sensors: {A: mag_1, B: mag_2}
+"""
+
+
+def line_of(sensor, k, field):
+    """A line of the board: reading k of a sensor [nT], at 100 Hz, lying flat."""
+    body = f'{sensor},{k},{10_000 * k},{field[0]},{field[1]},{field[2]},0,0,1'
+    checksum = 0
+    for c in body.encode():
+        checksum ^= c
+    return f'{body}*{checksum:02X}\n'.encode()
+
+
+@pytest.fixture
+def board(ros, tmp_path):
+    """(node, talk, files): a board that speaks at 100 Hz while `talk` waits for a condition."""
+    node, spin_until = ros
+    line = SerialLine(tmp_path / 'port')
+    line.plug_in()
+    drivers = tmp_path / 'drivers.yaml'
+    drivers.write_text(BOARD.replace('PORT', str(line.path)))
+    state = {'k': 0, 'plugged': True, 'garbage': b'', 'skip': 0}
+
+    def speak():
+        state['k'] += 1 + state['skip']
+        state['skip'] = 0
+        if state['plugged']:
+            line.send(state['garbage'] + b''.join(
+                line_of(s, state['k'], (2000 + state['k'], 15500, -49000)) for s in 'AB'))
+            state['garbage'] = b''
+
+    node.create_timer(0.01, speak)
+    yield node, spin_until, line, drivers, state
+    if state['plugged']:
+        line.pull_out()
+
+
+def listen(node, kind, topic, qos=STREAM):
+    """A list that fills with the messages of a topic, each with the time when it came."""
+    heard = []
+    node.create_subscription(kind, topic, lambda m: heard.append((time.time_ns(), m)), qos)
+    return heard
+
+
+def status_of(heard):
+    """The newest status of the board; None before the first."""
+    for _, array in reversed(heard):
+        for status in array.status:
+            if status.hardware_id == 'board':
+                return status
+    return None
+
+
+def values_of(status):
+    """{key: value} of a status."""
+    return {v.key: v.value for v in status.values}
+
+
+def test_a_board_on_a_serial_line(board):
+    node, spin_until, line, drivers, state = board
+    fields = listen(node, MagneticField, '/mag_1/imu/mag')
+    accelerations = listen(node, Imu, '/mag_2/imu/data_raw')
+    diagnostics = listen(node, DiagnosticArray, '/diagnostics', RESULTS)
+    process = start('driver_node', '-p', f'drivers:={drivers}', '-p', f'network:={NETWORK_FILE}')
+    try:
+        assert spin_until(lambda: len(fields) > 100 and len(accelerations) > 100)
+        _, message = fields[-1]
+        np.testing.assert_allclose(message.magnetic_field.y, 1.55e-5, rtol=1e-12)
+        assert message.header.frame_id == 'mag_1'
+        assert not any(message.magnetic_field_covariance)
+        _, shaken = accelerations[-1]
+        assert shaken.linear_acceleration.z == pytest.approx(9.80665)
+        assert shaken.orientation_covariance[0] == -1.0
+        # Stamped by the board's clock: evenly, however late they came; and close to now.
+        stamps = np.array([stamp_ns(m.header.stamp) for _, m in fields[20:]])
+        steps = np.array([round(1e9 * m.magnetic_field.x) for _, m in fields[20:]])
+        late = np.array([came for came, _ in fields[20:]]) - stamps
+        assert np.abs(np.diff(stamps) / np.diff(steps) - 1e7).max() < 1e6
+        assert 0 <= np.median(late) < 50_000_000
+
+        # What is lost or garbled is counted and told.
+        state['skip'], state['garbage'] = 7, b'A,1,2,3*00\nA,half a li'
+        assert spin_until(lambda: status_of(diagnostics) is not None
+                          and 'lost: mag_1' in values_of(status_of(diagnostics)), 10.0)
+        values = values_of(status_of(diagnostics))
+        # Seven were skipped, and the half line took the whole one behind it along.
+        assert (values['lost: mag_1'], values['lost: mag_2']) == ('8', '7')
+        assert any('checksum' in key for key in values)
+        assert status_of(diagnostics).level == DiagnosticStatus.WARN
+
+        # The port vanishes: an error that names it; it comes back, and within 2 s so do fields.
+        line.pull_out()
+        state['plugged'] = False
+        assert spin_until(lambda: status_of(diagnostics).level == DiagnosticStatus.ERROR, 5.0)
+        assert str(line.path) in status_of(diagnostics).message
+        spin_until(lambda: False, 2.0)
+        n = len(fields)
+        line.plug_in()
+        state['plugged'] = True
+        assert spin_until(lambda: len(fields) > n, 2.0)
+        assert spin_until(lambda: status_of(diagnostics).level != DiagnosticStatus.ERROR, 5.0)
+    finally:
+        codes, outputs = stop([process])
+    assert codes == [0], outputs
+    assert 'open again' in outputs[0]
+
+
+def test_a_life_cycle(board):
+    node, spin_until, line, drivers, _ = board
+    fields = listen(node, MagneticField, '/mag_2/imu/mag')
+    process = start('driver_node', '-p', 'autostart:=false', '-p', f'drivers:={drivers}')
+
+    def change(transition):
+        return call((node, spin_until), ChangeState, '/driver_node/change_state',
+                    ChangeState.Request(transition=Transition(id=transition))).success
+
+    def state():
+        return call((node, spin_until), GetState, '/driver_node/get_state',
+                    GetState.Request()).current_state.id
+
+    try:
+        assert state() == State.PRIMARY_STATE_UNCONFIGURED
+        drivers.write_text(drivers.read_text().replace('unit: nT', 'unit: gauss'))
+        assert not change(Transition.TRANSITION_CONFIGURE)
+        drivers.write_text(drivers.read_text().replace('unit: gauss', 'unit: nT'))
+        assert change(Transition.TRANSITION_CONFIGURE)
+        assert not spin_until(lambda: fields, 0.5)
+        for _ in range(2):
+            assert change(Transition.TRANSITION_ACTIVATE)
+            assert spin_until(lambda: len(fields) > 10)
+            assert change(Transition.TRANSITION_DEACTIVATE)
+            spin_until(lambda: False, 0.3)
+            fields.clear()
+            assert not spin_until(lambda: fields, 0.5)
+        assert change(Transition.TRANSITION_CLEANUP)
+        assert state() == State.PRIMARY_STATE_UNCONFIGURED
+    finally:
+        codes, outputs = stop([process])
+    assert codes == [0], outputs
+    assert 'gauss' in outputs[0]
+
+
+def test_readings_in_batches(board):
+    node, spin_until, _, drivers, _ = board
+    drivers.write_text(drivers.read_text().replace('  unit: nT', '  unit: nT\n  gather_s: 0.05'))
+    batches = listen(node, FieldReadings, '/driver_node/readings')
+    fields = listen(node, MagneticField, '/mag_2/imu/mag')
+    process = start('driver_node', '-p', f'drivers:={drivers}', '-p', 'batches:=true')
+    try:
+        assert spin_until(lambda: len(batches) > 20)
+    finally:
+        codes, outputs = stop([process])
+    assert codes == [0], outputs
+    assert not fields
+    samples = [samples_of(m) for _, m in batches[5:15]]
+    assert np.mean([len(s) for s in samples]) > 8
+    for sensor in ('mag_1', 'mag_2'):
+        stamps = [s.stamp_ns for some in samples for s in some if s.sensor == sensor]
+        assert (np.diff(stamps) > 5e6).all()
+    assert samples[0][0].covariance is None
+    np.testing.assert_allclose(samples[0][0].field[1:], [1.55e-5, -4.9e-5])
+
+
+def test_readings_in_batches_reach_the_tracker(ros, tmp_path):
+    """The simulator's readings go in batches from node to node, and none is missing in a frame."""
+    node, spin_until = ros
+    network, drivers = tmp_path / 'network.yaml', tmp_path / 'drivers.yaml'
+    rows = ''.join(f'  mag_{k}: {{position: [{9 * k}, 0, 0], noise_std: 1.2e-8, '
+                   'background: [2.0e-6, 1.55e-5, -4.9e-5]}\n' for k in range(20))
+    network.write_text(f'earth_field: [2.0e-6, 1.55e-5, -4.9e-5]\nsensors:\n{rows}')
+    drivers.write_text(
+        f'road:\n  device: simulator\n  simulator: {{network: {network}, moment: 0.0}}\n'
+        '  sensors: {' + ', '.join(f'mag_{k}: mag_{k}' for k in range(20)) + '}\n')
+    frames = listen(node, NetworkFrame, '/detection_node/frame')
+    processes = [start(name, '-p', f'network:={network}')
+                 for name in ('calibration_node', 'detection_node')]
+    try:
+        assert spin_until(lambda: node.count_subscribers('/driver_node/readings')
+                          and node.count_subscribers('/calibration_node/readings'))
+        processes.append(start('driver_node', '-p', f'drivers:={drivers}', '-p',
+                               f'network:={network}', '-p', 'batches:=true'))
+        assert spin_until(lambda: len(frames) > 30)
+    finally:
+        codes, outputs = stop(processes)
+    assert codes == [0] * 3, outputs
+    n = np.array([m.n_samples for _, m in frames[5:30]])
+    assert n.shape == (25, 20) and (n == 8).mean() > 0.95 and n.min() >= 7
+    assert np.nanmax(np.abs([m.field for _, m in frames[5:30]])) < 1e-7
+
+
+@pytest.mark.parametrize('content, told', [
+    (BOARD.replace('PORT', '/dev/null').replace('B: mag_2', 'B: mag_9'),
+     'sensor mag_9 is not in the network'),
+    (BOARD.replace('PORT', '/dev/null').replace('B: mag_2', 'B: mag_1'),
+     'sensor mag_1 comes from board'),
+    (BOARD.replace('PORT', '/dev/null').replace('  framing: text\n', ''), 'there is no framing'),
+    ('', 'expected a mapping of devices')])
+def test_a_drivers_file_that_is_none_ends_the_node(ros, tmp_path, content, told):
+    drivers = tmp_path / 'drivers.yaml'
+    drivers.write_text(content)
+    process = start('driver_node', '-p', f'drivers:={drivers}', '-p', f'network:={NETWORK_FILE}')
+    output = process.communicate(timeout=30)[0]
+    assert process.returncode == 1
+    assert told in output and 'Traceback' not in output
+
+
+def test_a_port_that_is_not_there_is_told_and_waited_for(board):
+    node, spin_until, line, drivers, state = board
+    line.pull_out()
+    state['plugged'] = False
+    fields = listen(node, MagneticField, '/mag_1/imu/mag')
+    diagnostics = listen(node, DiagnosticArray, '/diagnostics', RESULTS)
+    process = start('driver_node', '-p', f'drivers:={drivers}')
+    try:
+        assert spin_until(lambda: status_of(diagnostics) is not None
+                          and str(line.path) in status_of(diagnostics).message)
+        assert status_of(diagnostics).level == DiagnosticStatus.ERROR
+        line.plug_in()
+        state['plugged'] = True
+        assert spin_until(lambda: fields, 2.0)
+    finally:
+        codes, outputs = stop([process])
+    assert codes == [0], outputs

@@ -1,0 +1,196 @@
+"""What diagnostics say of the way between the nodes: latency, queues, and who is missing."""
+
+from types import SimpleNamespace
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from sensor_msgs.msg import MagneticField
+
+from mag_tracking.nodes import flow as module
+from mag_tracking.nodes.flow import MOST_NOTED, Flow, Listener
+from mag_tracking.nodes.stage_node import RESULTS, STREAM
+from mag_tracking.nodes.tracker_node import SLACK_S, TrackerNode
+from mag_tracking.pipeline import settings_for
+from support.bundled import NETWORK_FILE
+from support.node_processes import start, stop
+
+NS = 1_000_000_000
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A list with the time of `time.monotonic` in it."""
+    now = [100.0]
+    monkeypatch.setattr(module.time, 'monotonic', lambda: now[0])
+    return now
+
+
+def status_of(flow, is_there=True):
+    """The DiagnosticStatus of a `Flow` whose sender is there or not."""
+    return flow.status('me', lambda: is_there)
+
+
+def values(status):
+    """{key: value}."""
+    return {v.key: v.value for v in status.values}
+
+
+def test_latency_is_from_the_stamp_to_the_end_of_the_work(clock):
+    flow = Flow('a_node')
+    begin = clock[0]
+    for k in range(101):
+        clock[0] = begin + 0.01 * k
+        flow.note(10 * NS, 10 * NS + (k - 2) * 1_000_000, clock[0] - 0.002)
+    clock[0] = begin + 1.01
+    status = status_of(flow)
+    assert status.name == 'me: from a_node' and status.level == DiagnosticStatus.OK
+    said = values(status)
+    assert said['messages'] == '101'
+    assert float(said['latency, median [ms]']) == pytest.approx(50.0)
+    assert float(said['latency, 99 % [ms]']) == pytest.approx(99.0)
+    # 101 times 2 ms in 1.01 s.
+    assert float(said['busy [%]']) == pytest.approx(20.0)
+    clock[0] += 1.0
+    again = values(status_of(flow))
+    assert again['messages'] == '101' and again['busy [%]'] == '0'
+    assert again['latency, median [ms]'] == 'nan'
+
+
+def test_an_input_that_has_stopped_is_an_error_until_it_is_back(clock):
+    flow = Flow('a_node')
+    clock[0] += 10.0
+    first = status_of(flow)
+    # At first that may be as it should: the calibration learns.
+    assert first.level == DiagnosticStatus.OK
+    assert first.message == 'nothing has come from a_node yet'
+    flow.note(0, 0, clock[0])
+    clock[0] += module.SILENT_S
+    assert status_of(flow).message == 'running'
+    clock[0] += 1.0
+    silent = status_of(flow)
+    # It may have nothing to say.
+    assert silent.level == DiagnosticStatus.WARN
+    assert silent.message == 'nothing has come from a_node for 3 s'
+    gone = status_of(flow, is_there=False)
+    assert gone.level == DiagnosticStatus.ERROR
+    assert gone.message == silent.message + ', and it has gone; does it still run?'
+    flow.note(0, 0, clock[0])
+    assert status_of(flow).message == 'running'
+
+
+def test_what_did_not_fit_the_queue_is_told_once(clock):
+    flow = Flow('a_node')
+    flow.note(0, 0, clock[0])
+    flow.n_lost += 7
+    status = status_of(flow)
+    assert status.level == DiagnosticStatus.WARN and status.message.startswith('7 messages')
+    assert values(status)['lost in the queue'] == '7'
+    assert status_of(flow).level == DiagnosticStatus.OK
+    flow.n_lost += 1
+    assert status_of(flow).message.startswith('1 messages')
+
+
+def test_a_recording_of_old_is_not_late_and_not_live(clock):
+    flow = Flow('a_node')
+    assert not flow.is_live
+    flow.note(0, 10**18, clock[0])
+    assert not flow.is_live
+    assert values(status_of(flow))['latency, median [ms]'] == 'nan'
+    flow.note(10**18, 10**18 + NS, clock[0])
+    assert flow.is_live
+    status_of(flow)
+    assert flow.is_live
+
+
+def test_memory_is_bounded(clock):
+    flow = Flow('a_node')
+    for _ in range(MOST_NOTED + 50):
+        flow.note(0, 0, clock[0])
+    assert len(flow._ages) == MOST_NOTED
+    assert values(status_of(flow))['messages'] == str(MOST_NOTED + 50)
+
+
+def test_a_listener_is_missed_when_it_was_there():
+    listener = Listener('other', '~/frame')
+    assert listener.status('me', {'rviz'}).message == 'other has not been seen yet'
+    assert listener.status('me', {'rviz', 'other'}).message == 'running'
+    gone = listener.status('me', {'rviz'})
+    assert gone.level == DiagnosticStatus.ERROR and gone.name == 'me: to other'
+    assert gone.message == 'other has gone; does it still run?'
+    assert listener.status('me', {'other'}).level == DiagnosticStatus.OK
+
+
+class StandIn:
+    """What of a tracker node decides that its track is lost."""
+
+    def __init__(self, clock, is_replayed=False):
+        self._clock, self.is_replayed, self._is_silent = clock, is_replayed, False
+        self.flows = {'detection_node': Flow('detection_node')}
+        self.settings = settings_for('magnet')
+        self._stage = SimpleNamespace(bank=object(), give_up=lambda why: [why])
+        self.published = []
+
+    def _publish_all(self, records):
+        self.published += records
+
+    def ticks(self, seconds, frames):
+        """The timer, four times a second; `frames`: one comes before each, an hour old."""
+        for _ in range(round(4 * seconds)):
+            self._clock[0] += 0.25
+            if frames:
+                self.flows['detection_node'].note(0, 3600 * NS, self._clock[0])
+            TrackerNode._end_without_frames(self)
+
+
+def test_a_track_ends_when_frames_stop_not_when_they_are_old(clock):
+    end_s = settings_for('magnet').track.end_gap_s + SLACK_S
+    node = StandIn(clock)
+    node.ticks(end_s + 5.0, frames=True)
+    assert not node.published
+    node.ticks(end_s, frames=False)
+    assert not node.published
+    node.ticks(0.5, frames=False)
+    assert node.published[0] == 'no frames came'
+
+
+def test_what_waits_while_a_node_is_busy_is_no_silence(clock):
+    node = StandIn(clock)
+    node.ticks(1.0, frames=True)
+    # The timer is the first to run again, and then what has waited.
+    clock[0] += 100.0
+    TrackerNode._end_without_frames(node)
+    node.ticks(5.0, frames=True)
+    assert not node.published
+
+
+def test_a_recording_may_pause(clock):
+    node = StandIn(clock, is_replayed=True)
+    node.ticks(1.0, frames=True)
+    node.ticks(1000.0, frames=False)
+    assert not node.published
+
+
+@pytest.mark.alone
+def test_a_node_tells_its_queue_and_latency(ros):
+    node, spin_until = ros
+    statuses = {}
+    node.create_subscription(
+        DiagnosticArray, '/diagnostics',
+        lambda m: statuses.update({s.name: values(s) for s in m.status}), RESULTS)
+    out = node.create_publisher(MagneticField, '/mag_1/imu/mag_calibrated', STREAM)
+    process = start('detection_node', '-p', f'network:={NETWORK_FILE}')
+    try:
+        assert spin_until(lambda: out.get_subscription_count())
+        message = MagneticField()
+        message.header.stamp = node.get_clock().now().to_msg()
+        message.magnetic_field_covariance[::4] = 1e-16
+        # The other sensor is silent, so that it waits for it.
+        out.publish(message)
+        assert spin_until(lambda: statuses.get(
+            'detection_node: from calibration_node', {}).get('messages') == '1')
+        assert 0.0 < float(statuses['detection_node: from calibration_node']
+                           ['latency, median [ms]']) < 1000.0
+        assert spin_until(lambda: statuses['detection_node: align']['queue'] == '1')
+    finally:
+        codes, outputs = stop([process])
+    assert codes == [0], outputs

@@ -1,0 +1,279 @@
+"""The nodes over the real middleware: each a process, and equal to the offline replay."""
+
+import csv
+import dataclasses
+import os
+import signal
+import time
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from mag_tracking_msgs.msg import (
+    CalibrationState,
+    HypothesisArray,
+    NetworkFrame,
+    SmoothedTrack,
+    TrackArray,
+)
+from mag_tracking_msgs.srv import Seek
+from nav_msgs.msg import Odometry, Path
+from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import MagneticField
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
+
+from mag_tracking.apps.replay import replay
+from mag_tracking.messages.schema import stamp_ns
+from mag_tracking.network.file import read_network
+from mag_tracking.nodes.convert import to_message, track_of
+from mag_tracking.nodes.runner import run
+from mag_tracking.nodes.stage_node import LATCHED, RESULTS, STREAM
+from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.reader import Recording
+from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
+from support.marks import studied
+from support.node_processes import call, start, stop
+
+pytestmark = pytest.mark.timeout(120)
+
+# Over topics the sensors' messages mix differently: nobody is taken for dead over that.
+PATIENT = {'align.max_wait_s': 5.0}
+
+
+class Collector(Node):
+    """Keeps what the tracker publishes."""
+
+    def __init__(self):
+        super().__init__('collector')
+        self.poses, self.tracks, self.hypotheses, self.paths = [], [], [], []
+        self.late, self.smoothed = [], []
+        self.create_subscription(SmoothedTrack, '/tracker_node/smoothed', self.smoothed.append,
+                                 RESULTS)
+        self.create_subscription(Path, '/tracker_node/path_smoothed', self.paths.append, RESULTS)
+        self.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose_smoothed',
+                                 self.late.append, STREAM)
+        self.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose',
+                                 self.poses.append, STREAM)
+        self.create_subscription(TrackArray, '/tracker_node/tracks', self.tracks.append, STREAM)
+        self.create_subscription(HypothesisArray, '/tracker_node/hypotheses',
+                                 self.hypotheses.append, STREAM)
+
+
+def compare_with_offline(collector, folder):
+    """Every pose of the topics equals its row of poses.csv; returns the largest difference."""
+    with open(folder / 'poses.csv', newline='') as stream:
+        offline = {(int(r['stamp_ns'])): r for r in csv.DictReader(stream)}
+    tracks = [track_of(t) for m in collector.tracks for t in m.tracks]
+    live = [t for t in tracks if not t.ended]
+    assert len(live) == len(collector.poses)
+    # At the end of a stream the nodes may hold back what a flush would give: a frame or two.
+    assert len(offline) - 2 <= len(live) <= len(offline)
+    worst = 0.0
+    for t, pose in zip(live, collector.poses, strict=True):
+        row = offline[t.stamp_ns]
+        theirs = np.array([float(row[c]) for c in (
+            'x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz',
+            'mx', 'my', 'mz', 'weight')])
+        ours = np.r_[t.position, t.velocity, np.sqrt(np.diagonal(t.covariance)), t.moment, t.weight]
+        worst = max(worst, np.abs(ours - theirs).max() / np.abs(theirs).max(),
+                    (np.abs(ours - theirs) / np.maximum(np.abs(theirs), 1e-9)).max())
+        assert t.id == int(row['track_id']) and t.ambiguous == bool(int(row['ambiguous']))
+        p = pose.pose.pose.position
+        assert (p.x, p.y, p.z) == tuple(t.position) and stamp_ns(pose.header.stamp) == t.stamp_ns
+    return worst
+
+
+def compare_smoothed(collector, folder):
+    """The smoothed path equals poses_smoothed.csv; the late poses are there and are others."""
+    with open(folder / 'poses_smoothed.csv', newline='') as stream:
+        offline = list(csv.DictReader(stream))
+    assert len(collector.paths) == 1
+    steps = collector.paths[0].poses
+    assert [stamp_ns(s.header.stamp) for s in steps] == [int(r['stamp_ns']) for r in offline]
+    ours = np.array([[getattr(s.pose.position, a) for a in 'xyz'] for s in steps])
+    theirs = np.array([[float(r[a]) for a in 'xyz'] for r in offline])
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9)
+    whole = collector.smoothed[0]
+    assert len(collector.smoothed) == 1 and whole.track_id == int(offline[0]['track_id'])
+    assert (whole.kind, whole.ambiguous) == (offline[-1]['kind'], offline[-1]['ambiguous'] == '1')
+    assert whole.length == float(offline[-1]['length'])
+    for p, v, row in zip(whole.poses, whole.velocities, offline, strict=True):
+        C = np.array(p.pose.covariance).reshape(6, 6)
+        said = [p.pose.pose.position.x, p.pose.pose.position.y, v.x, v.y, C[0, 0]**0.5]
+        np.testing.assert_allclose(
+            said, [float(row[c]) for c in ('x', 'y', 'vx', 'vy', 'sd_x')], rtol=0, atol=1e-9)
+    late = {stamp_ns(m.header.stamp): m.pose.pose.position for m in collector.late}
+    assert list(late) == [stamp_ns(s.header.stamp) for s in steps]
+    apart = [np.hypot(late[s].x - x, late[s].y - y) for s, (x, y, _) in zip(
+        late, theirs, strict=True)]
+    assert 0.01 < np.median(apart) < 2.0
+
+
+def over_topics(network_file, settings, recording, rate):
+    """Play a recording through all the nodes; the collector."""
+    holder = []
+    run(network_file, settings, recording, rate,
+        observers=[lambda: holder.append(Collector()) or holder[-1]])
+    return holder[0]
+
+
+@pytest.mark.parametrize('name', studied(VEHICLES, [
+    'straight_truck_right', 'junction_rear_turns_right', 'straight_car_fast_left']))
+def test_nodes_equal_offline_on_vehicles(name, tmp_path, road_network):
+    settings = settings_for('vehicle', {**PATIENT, 'track.smoothing_lag_s': 0.3})
+    replay(Recording(vehicle_path(name)), road_network, settings, tmp_path)
+    collector = over_topics(NETWORK_FILE, settings, vehicle_path(name), 6.0)
+    worst = compare_with_offline(collector, tmp_path)
+    compare_smoothed(collector, tmp_path)
+    print(f'{name}: nodes against offline, largest relative difference {worst:.1e}')
+    assert worst <= 1e-9
+
+
+@pytest.mark.parametrize('run_number', [1, 2])
+def test_nodes_equal_offline_on_magnets(run_number, magnet_runs, tmp_path):
+    recording, network_file = magnet_runs[run_number]
+    settings = settings_for('magnet', {'align.max_wait_s': 60.0})
+    replay(Recording(recording), read_network(network_file), settings, tmp_path)
+    worst = compare_with_offline(over_topics(network_file, settings, recording, 80.0), tmp_path)
+    print(f'magnet run {run_number}: nodes against offline {worst:.1e}')
+    assert worst <= 1e-9
+
+
+def test_four_processes_over_the_middleware(ros, tmp_path, road_network):
+    """Each node a process, as on a robot; poses equal the offline ones, and all leave cleanly."""
+    node, spin_until = ros
+    name = 'straight_car_right'
+    received = {kind: [] for kind in (NetworkFrame, TrackArray, Odometry, MarkerArray, Clock)}
+    for kind, topic in ((NetworkFrame, '/detection_node/frame'),
+                        (TrackArray, '/tracker_node/tracks'), (Clock, '/clock'),
+                        (Odometry, '/tracker_node/odometry'),
+                        (MarkerArray, '/tracker_node/markers')):
+        node.create_subscription(kind, topic, received[kind].append, STREAM)
+    state = []
+    node.create_subscription(CalibrationState, '/calibration_node/calibration', state.append,
+                             LATCHED)
+    network = ['-p', f'network:={NETWORK_FILE}', '-p', 'reliable_input:=true']
+    patient = ['-p', 'align.max_wait_s:=5.0']
+    processes = [start('calibration_node', *network), start('detection_node', *network, *patient),
+                 start('tracker_node', *network)]
+    try:
+        frames = node.count_publishers
+        assert spin_until(lambda: frames('/detection_node/frame') and frames('/tracker_node/tracks')
+                          and frames('/mag_1/imu/mag_calibrated')
+                          and node.count_subscribers('/detection_node/frame') > 1
+                          and node.count_subscribers('/mag_1/imu/mag_calibrated'))
+        processes.append(start('replay_node', '-p', f'recording:={vehicle_path(name)}',
+                               '-p', 'rate:=5.0', '-p', 'start_delay:=3.0',
+                               '-p', 'wait_for_subscribers:=30.0'))
+        assert spin_until(lambda: any(t.status == t.ENDED for m in received[TrackArray]
+                                      for t in m.tracks), 60.0)
+    finally:
+        codes, outputs = stop(processes)
+    assert codes == [0, 0, 0, 0], outputs
+    assert not any('Traceback' in text for text in outputs), outputs
+    replay(Recording(vehicle_path(name)), road_network, settings_for('vehicle', PATIENT), tmp_path)
+    with open(tmp_path / 'poses.csv', newline='') as stream:
+        offline = {int(r['stamp_ns']): [float(r['x']), float(r['y'])]
+                   for r in csv.DictReader(stream)}
+    live = [t for m in received[TrackArray] for t in map(track_of, m.tracks) if not t.ended]
+    assert [t.stamp_ns for t in live] == list(offline)
+    np.testing.assert_allclose([t.position[:2] for t in live], list(offline.values()), rtol=1e-9)
+    assert received[Clock] and len(received[Odometry]) == len(live)
+    assert received[Odometry][0].child_frame_id == 'track_1'
+    # DELETE at the end of the track.
+    assert {m.action for m in received[MarkerArray][-1].markers} == {2}
+    assert state and all(s.ready for s in state[-1].sensors)
+
+
+def test_services_of_the_replay(ros):
+    node, spin_until = ros
+    fields = []
+    node.create_subscription(MagneticField, '/mag_1/imu/mag', fields.append, STREAM)
+    process = start('replay_node', '-p', f'recording:={vehicle_path("straight_car_right")}',
+                    '-p', 'topics:=[/mag_1/imu/mag]', '-p', 'start_offset:=4.0', '-p', 'loop:=true')
+    try:
+        assert spin_until(lambda: len(fields) > 20)
+        first = stamp_ns(fields[0].header.stamp)
+        begin = Recording(vehicle_path('straight_car_right')).start_ns
+        assert 4.0 <= (first - begin) / 1e9 < 5.5
+        assert call(ros, Trigger, '/replay_node/pause', Trigger.Request()).success
+        spin_until(lambda: False, 0.5)
+        n = len(fields)
+        spin_until(lambda: False, 0.5)
+        assert len(fields) == n
+        assert call(ros, Seek, '/replay_node/seek', Seek.Request(offset=13.5)).success
+        assert not call(ros, Seek, '/replay_node/seek', Seek.Request(offset=99.0)).success
+        assert call(ros, Trigger, '/replay_node/resume', Trigger.Request()).success
+        # Past the end it begins again: stamps fall back to the first.
+        assert spin_until(lambda: stamp_ns(fields[-1].header.stamp) - begin < 1_000_000_000
+                          and len(fields) > n)
+        assert (stamp_ns(fields[n].header.stamp) - begin) / 1e9 >= 13.4
+    finally:
+        codes, outputs = stop([process])
+    assert codes == [0], outputs
+
+
+def test_parameters_have_descriptors_and_are_checked(ros):
+    process = start('tracker_node', '-p', f'network:={NETWORK_FILE}')
+    try:
+        described = call(ros, DescribeParameters, '/tracker_node/describe_parameters',
+                         DescribeParameters.Request(names=[
+                             'track.field_error', 'track.vehicle.soft_iron'])).descriptors
+        assert all(d.description for d in described)
+        assert described[0].floating_point_range[0].to_value == 10.0
+        assert [d.read_only for d in described] == [False, True]
+
+        def set_parameter(name, value):
+            return call(ros, SetParameters, '/tracker_node/set_parameters',
+                        SetParameters.Request(parameters=[
+                            Parameter(name, value=value).to_parameter_msg()])).results[0]
+        assert set_parameter('track.field_error', 0.03).successful
+        for name, value in (('track.field_error', -1.0), ('track.vehicle.soft_iron', 1.0),
+                            ('track.nonsense', 1.0)):
+            assert not set_parameter(name, value).successful
+    finally:
+        codes, outputs = stop([process])
+    assert codes == [0], outputs
+
+
+def test_conversion_survives_the_message():
+    """A track that went through a message is the same track."""
+    from mag_tracking.messages.schema import hypotheses_dict, track_dict
+    from mag_tracking.stages.track.manager import TrackStage
+    from support.track_runs import magnet_frames
+    network, frames, _ = magnet_frames(3)
+    stage = TrackStage(network, settings_for('magnet').track)
+    track = dataclasses.replace(
+        [t for f in frames for t in stage.feed(f)][-1],
+        mounting=np.arange(27.0).reshape(9, 3),
+        mounting_covariance=np.arange(81.0).reshape(9, 3, 3) / 7.0)
+    from mag_tracking_msgs.msg import Track as TrackMessage
+    back = track_of(to_message(TrackMessage, track_dict(track, 'map')),
+                    to_message(HypothesisArray, hypotheses_dict(track, 'map')))
+    for name in ('stamp_ns', 'id', 'ended', 'existence', 'weight', 'nis', 'degrees_of_freedom',
+                 'arrival', 'ambiguous', 'unobservable', 'kind', 'kind_weight', 'length',
+                 'length_std'):
+        assert getattr(back, name) == getattr(track, name), name
+    for name in ('position', 'velocity', 'covariance', 'orientation', 'orientation_covariance',
+                 'position_orientation_covariance', 'moment', 'moment_covariance', 'predicted',
+                 'mounting', 'mounting_covariance', 'nis_by_sensor'):
+        np.testing.assert_array_equal(getattr(back, name), getattr(track, name))
+    assert len(back.hypotheses) == len(track.hypotheses)
+
+
+@pytest.mark.single
+@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
+def test_nodes_leave_no_shared_memory_behind(how):
+    """Killed nodes leave segments in /dev/shm; ours end cleanly."""
+    before = set(os.listdir('/dev/shm'))
+    process = start('tracker_node', '-p', f'network:={NETWORK_FILE}')
+    time.sleep(2.5)
+    process.send_signal(how)
+    output, _ = process.communicate(timeout=30)
+    assert (process.returncode, output) == (0, '')
+    left = {n for n in set(os.listdir('/dev/shm')) - before if not n.startswith('sem.')}
+    assert not left

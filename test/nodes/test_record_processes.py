@@ -1,0 +1,165 @@
+"""`mag-tracking record` as a process: equal to what was published, and a kill loses little."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+from sensor_msgs.msg import MagneticField
+from std_srvs.srv import Trigger
+
+from mag_tracking.apps.replay import replay
+from mag_tracking.messages.types import decode
+from mag_tracking.nodes import record_node
+from mag_tracking.nodes.stage_node import STREAM
+from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.repair import repair
+from support.bundled import NETWORK_FILE, vehicle_path
+from support.node_processes import call, start, stop
+from support.recorded_topics import FIELDS, IMUS
+
+pytestmark = pytest.mark.timeout(120)
+S = 10**9
+COMMAND = ('import argparse, sys; from mag_tracking.cli import record; '
+           'p = argparse.ArgumentParser(); record.add(p.add_subparsers()); '
+           'a = p.parse_args(); sys.exit(a.run_command(a))')
+
+
+def recording_process(out, *options):
+    """`mag-tracking record` in a process of its own, when it listens."""
+    process = subprocess.Popen(
+        [sys.executable, '-u', '-c', COMMAND, 'record', '--network', NETWORK_FILE, '--out', out,
+         *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    line = process.stdout.readline()
+    assert f'recording into {out}' in line, line + process.stdout.read()
+    return process
+
+
+def segments_of(pid):
+    """Names in /dev/shm that a process has open."""
+    files = [os.path.realpath(f'/proc/{pid}/fd/{n}') for n in os.listdir(f'/proc/{pid}/fd')]
+    with open(f'/proc/{pid}/maps') as stream:
+        files += [line.split()[-1] for line in stream]
+    return {f.removeprefix('/dev/shm/') for f in files if f.startswith('/dev/shm/')}
+
+
+def left_behind(names):
+    """Those of `names` that are in /dev/shm and that no living process has open.
+
+    A process also opens what belongs to others, such as those of another test.
+    """
+    left = {n for n in names & set(os.listdir('/dev/shm')) if not n.startswith('sem.')}
+    for pid in filter(str.isdigit, os.listdir('/proc') if left else ()):
+        with suppress(OSError):
+            left -= segments_of(pid)
+    return left
+
+
+def contents(path, topics):
+    """{topic: [message as text]}; text, as the padding of the bytes is not defined."""
+    out = {t: [] for t in topics}
+    for m in Recording(path).messages(topics):
+        out[m.topic].append(repr(decode(m)))
+    return out
+
+
+def poses(folder):
+    """poses.csv as an array."""
+    with open(folder / 'poses.csv', newline='') as stream:
+        rows = list(csv.DictReader(stream))
+    return np.array([[float(r[c]) for c in ('stamp_ns', 'x', 'y', 'vx', 'mx', 'weight')]
+                     for r in rows])
+
+
+def test_a_replay_that_is_recorded_is_the_same_recording(ros, tmp_path, road_network):
+    """Every message, also for rosbags; and the same track. SIGTERM ends it cleanly."""
+    before = set(os.listdir('/dev/shm'))
+    original, out = vehicle_path('straight_car_right'), tmp_path / 'night'
+    process = recording_process(out)
+    player = start('replay_node', '-p', f'recording:={original}', '-p', 'rate:=5.0',
+                   '-p', 'paused:=true', '-p', 'wait_for_subscribers:=30.0')
+    expected = {t: n for t, n in Recording(original).message_counts.items() if '/imu/' in t}
+    assert set(expected) == {*FIELDS, *IMUS}
+    try:
+        assert any('4 of 4 topics' in line for line in process.stdout)
+        # What they have found has still to find them.
+        time.sleep(1.0)
+        assert call(ros, Trigger, '/replay_node/resume', Trigger.Request()).success
+        assert 'messages played' in player.stdout.readline()
+        time.sleep(0.2)
+        used = segments_of(process.pid) - before
+    finally:
+        stop([player])
+        process.send_signal(signal.SIGTERM)
+        output = process.communicate(timeout=30)[0]
+    assert process.returncode == 0 and 'warning' not in output, output
+    for topic, n in expected.items():
+        assert f'  {topic}  {n}\n' in output, output
+    assert f'{out}: {sum(expected.values())} messages' in output
+    theirs, ours = contents(original, expected), contents(out, expected)
+    assert theirs == ours and set(Recording(out).types) == set(expected)
+    with AnyReader([out], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        counts = Counter(c.topic for c, _, raw in reader.messages()
+                         if reader.deserialize(raw, c.msgtype))
+    assert counts == expected
+    with open(out / 'night_0.mcap', 'rb') as stream:
+        times = [m.log_time for _, _, m in make_reader(stream).iter_messages(log_time_order=False)]
+    # In order also across topics, but for what comes between the fetches of two.
+    assert np.mean(np.diff(times) >= 0) > 0.9
+    patient = settings_for('vehicle', {'align.max_wait_s': 5.0})
+    for path in (original, out):
+        replay(Recording(path), road_network, patient, tmp_path / f'of_{path.stem}')
+    np.testing.assert_allclose(*(poses(tmp_path / f'of_{path.stem}') for path in (original, out)),
+                               rtol=1e-9, atol=1e-12)
+    assert used and not left_behind(used)
+
+
+def test_a_kill_of_the_command_loses_less_than_a_second(ros, tmp_path):
+    node, spin_until = ros
+    shm = set(os.listdir('/dev/shm'))
+    sent = []
+    publisher = node.create_publisher(MagneticField, FIELDS[0], STREAM)
+
+    def publish():
+        message = MagneticField()
+        message.header.stamp.nanosec = len(sent)
+        sent.append(time.time_ns())
+        publisher.publish(message)
+    process = recording_process(tmp_path / 'a')
+    try:
+        node.create_timer(0.005, publish)
+        # Some chunks are in the file, and the next is in the making.
+        assert spin_until(lambda: sum(
+            p.stat().st_size for p in (tmp_path / 'a').glob('*.mcap')) > 6000)
+        n = len(sent)
+        spin_until(lambda: len(sent) > n + 150)
+    finally:
+        used = segments_of(process.pid)
+        process.kill()
+        killed = time.time_ns()
+        process.communicate()
+        # A killed process leaves its segments; those that were there before are ours.
+        for name in used - shm & set(os.listdir('/dev/shm')):
+            os.unlink(f'/dev/shm/{name}')
+    messages = list(Recording(tmp_path / 'a').messages())
+    numbers = [decode(m).header.stamp.nanosec for m in messages]
+    assert numbers == sorted(set(numbers)) and len(numbers) > 100
+    print(f'lost: {(killed - sent[numbers[-1]]) / S:.2f} s')
+    assert killed - sent[numbers[-1]] < S
+    # Received after it was sent, and soon: the time is of the arrival, not of the fetching.
+    delays = [m.log_time_ns - sent[k] for m, k in zip(messages, numbers, strict=True)]
+    assert min(delays) > 0 and np.median(delays) < record_node.POLL_S * S / 4
+    assert repair(tmp_path / 'a', report=lambda _: None) == 1
+    with Reader(tmp_path / 'a') as reader:
+        assert reader.message_count == len(numbers)

@@ -1,0 +1,78 @@
+"""The survey over the middleware: service, latched state, file, and what the tracker takes."""
+
+import numpy as np
+from mag_tracking_msgs.msg import CalibrationState, TrackArray
+from mag_tracking_msgs.srv import Survey
+
+from mag_tracking.apps.calibrate import calibrate
+from mag_tracking.network.file import read_network
+from mag_tracking.nodes.convert import track_of
+from mag_tracking.nodes.stage_node import LATCHED, STREAM
+from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.reader import Recording
+from support.bundled import NETWORK_FILE, vehicle_path
+from support.node_processes import call, start, stop
+
+NAME = 'junction_left_turns_to_rear'
+
+
+def offline(road_network):
+    """What the command finds in the target-free beginning."""
+    return calibrate(Recording(vehicle_path(NAME)), road_network, settings_for('vehicle'), 'now',
+                     passes=False).network
+
+
+def test_a_survey_changes_the_network_of_the_next_track(ros, tmp_path, road_network):
+    node, spin_until = ros
+    states, tracks = [], []
+    node.create_subscription(CalibrationState, '/calibration_node/calibration', states.append,
+                             LATCHED)
+    node.create_subscription(TrackArray, '/tracker_node/tracks', tracks.append, STREAM)
+    saved = tmp_path / 'surveyed.yaml'
+    network = ['-p', f'network:={NETWORK_FILE}', '-p', 'reliable_input:=true']
+    processes = [start('calibration_node', *network, '-p', f'save_as:={saved}'),
+                 start('detection_node', *network), start('tracker_node', *network)]
+    try:
+        assert spin_until(lambda: node.count_publishers('/tracker_node/tracks')
+                          and node.count_publishers('/mag_1/imu/mag_calibrated')
+                          and node.count_subscribers('/detection_node/frame'))
+        refused = call(ros, Survey, '/calibration_node/survey', Survey.Request(save=True))
+        assert not refused.success and 'no background' in refused.message
+        assert not saved.exists()
+        processes.append(start('replay_node', '-p', f'recording:={vehicle_path(NAME)}',
+                               '-p', 'rate:=1.0', '-p', 'start_delay:=1.0',
+                               '-p', 'wait_for_subscribers:=30.0'))
+        assert spin_until(lambda: states and all(s.ready for s in states[-1].sensors))
+        # The knocks are over by then, the car is seconds away.
+        answer = call(ros, Survey, '/calibration_node/survey', Survey.Request(save=True))
+        assert answer.success and not answer.warnings, answer
+        assert spin_until(lambda: states[-1].sensors[1].clock_offset != 0.0)
+        assert spin_until(lambda: any(t.status == t.ENDED for m in tracks for t in m.tracks), 60.0)
+    finally:
+        codes, outputs = stop(processes)
+    assert codes == [0] * 4, outputs
+    found, expected = read_network(saved), offline(road_network)
+    state = states[-1].sensors
+    for j in range(2):
+        np.testing.assert_allclose(found.R_ws[j], expected.R_ws[j], atol=np.deg2rad(0.05))
+        np.testing.assert_allclose(found.orientation_std[j], expected.orientation_std[j], rtol=0.05)
+        assert abs(found.clock_offset[j] - expected.clock_offset[j]) < 1e-6
+        assert state[j].clock_offset == found.clock_offset[j]
+        assert state[j].calibrated_by == found.calibrated[j].by != ''
+    # A tracker that still had the old network would begin with five degrees about each axis.
+    assert 'as they were surveyed' in outputs[2]
+    first = next(track_of(t) for m in tracks for t in m.tracks if t.status == t.ACTIVE)
+    assert (first.mounting_std.min(axis=1) < np.deg2rad(0.4)).all()
+
+
+def test_a_calibration_of_other_sensors_is_refused(ros):
+    node, spin_until = ros
+    publisher = node.create_publisher(CalibrationState, '/calibration_node/calibration', LATCHED)
+    process = start('tracker_node', '-p', f'network:={NETWORK_FILE}')
+    try:
+        assert spin_until(lambda: publisher.get_subscription_count() > 0)
+        publisher.publish(CalibrationState())
+        spin_until(lambda: False, 1.0)
+    finally:
+        codes, outputs = stop([process])
+    assert codes == [0] and 'does not fit the network of mag_1, mag_2' in outputs[0], outputs

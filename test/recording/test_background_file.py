@@ -1,0 +1,236 @@
+"""A calibration that is started again goes on with what it had learnt a moment before."""
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.recording.background_file import (
+    background_text,
+    read_backgrounds,
+    usual_path,
+    write_backgrounds,
+)
+from mag_tracking.records import MagSample
+from mag_tracking.stages.calibrate.settings import CalibrateSettings
+from mag_tracking.stages.calibrate.stage import Calibrate
+from support.networks import line_network
+
+NS = 1_000_000_000
+RATE, STD = 50.0, 1.2e-8
+EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
+SETTINGS = CalibrateSettings()
+STEP = np.array([0.0, 4e-7, 0.0])
+
+
+def readings(begin_s, seconds, seed, step=0.0):
+    """[MagSample] of sensor 0."""
+    rng = np.random.default_rng(seed)
+    return [MagSample(int((begin_s + k / RATE) * NS), 'mag_1',
+                      EARTH + step + STD * rng.standard_normal(3))
+            for k in range(int(seconds * RATE))]
+
+
+def network_of(n=2):
+    """A network without backgrounds."""
+    network = line_network(n, tilt=0.0)
+    return replace(network, background=(None,) * n, noise_std=(None,) * n)
+
+
+def learnt():
+    """(network, a `Calibrate` that has learnt mag_1 until 10 s)."""
+    network = network_of()
+    assert network.names[0] == 'mag_1'
+    stage = Calibrate(network, CalibrateSettings())
+    for s in readings(1000.0, 10.0, 0):
+        stage.feed(s)
+    return network, stage
+
+
+def kept_in(path):
+    """(network, `read_backgrounds` of what was written to `path`)."""
+    network, stage = learnt()
+    write_backgrounds(path, {'mag_1': background_text(
+        stage.kept('mag_1'), network, 0, SETTINGS)})
+    kept, refused = read_backgrounds(path, network, SETTINGS)
+    assert not refused
+    return network, kept
+
+
+def test_what_is_kept_comes_back_as_it_was(tmp_path):
+    path = tmp_path / 'a' / 'b.json'
+    network, kept = kept_in(path)
+    _, stage = learnt()
+    assert list(kept) == ['mag_1'] and stage.kept('mag_2') is None
+    np.testing.assert_array_equal(kept['mag_1'].background, stage.background('mag_1'))
+    np.testing.assert_array_equal(kept['mag_1'].covariance,
+                                  stage.backgrounds()['mag_1'].covariance)
+    assert kept['mag_1'].stamp_ns == stage.last_stamp_ns('mag_1')
+    assert [p.name for p in path.parent.iterdir()] == ['b.json']
+
+
+def test_after_a_restart_the_first_reading_is_calibrated(tmp_path):
+    """Also where a target stands there by then: it must not become the background."""
+    network, kept = kept_in(tmp_path / 'kept.json')
+    stage = Calibrate(network, CalibrateSettings())
+    stage.resume(kept)
+    out = [c for s in readings(1012.0, 8.0, 1, STEP) for c in stage.feed(s)]
+    assert len(out) == 8 * RATE and out[0].stamp_ns == 1012 * NS
+    fields = np.array([c.field for c in out])
+    np.testing.assert_allclose(fields.mean(axis=0), STEP, atol=6e-9)
+    assert stage.backgrounds()['mag_1'].frozen and stage.counts['backgrounds resumed'] == 1
+    # Then it is gone, and what is learnt is as if nothing had been.
+    for s in readings(1020.0, 10.0, 2):
+        out += stage.feed(s)
+    assert not stage.backgrounds()['mag_1'].frozen
+    # The end of a line through ten seconds is known to 2 nT.
+    np.testing.assert_allclose(stage.background('mag_1'), EARTH, atol=6e-9)
+
+
+@pytest.mark.parametrize('begin_s, resume_s', [
+    (1009.0, 60.0), (1009.98, 60.0), (1080.0, 60.0), (1020.0, 5.0)])
+def test_what_is_of_another_time_is_learnt_anew(tmp_path, begin_s, resume_s):
+    network, kept = kept_in(tmp_path / 'kept.json')
+    stage = Calibrate(network, CalibrateSettings(resume_s=resume_s))
+    stage.resume(kept)
+    assert not [c for s in readings(begin_s, 2.0, 1) for c in stage.feed(s)]
+    assert stage.counts['backgrounds of another time not resumed'] == 1
+    assert stage.kept('mag_1') is None
+
+
+@pytest.mark.parametrize('has_begun', [False, True])
+def test_forgetting_forgets_also_what_was_kept(tmp_path, has_begun):
+    network, kept = kept_in(tmp_path / 'kept.json')
+    stage = Calibrate(network, SETTINGS)
+    stage.resume(kept)
+    if has_begun:
+        stage.feed(readings(1011.0, 1.0, 1)[0])
+    stage.forget()
+    assert not [c for s in readings(1011.5, 2.0, 1, STEP) for c in stage.feed(s)]
+    out = [c for s in readings(1013.5, 8.0, 1, STEP) for c in stage.feed(s)]
+    assert np.abs(np.mean([c.field for c in out], axis=0)).max() < 6e-9
+
+
+@pytest.mark.parametrize('change', [
+    {'offset': (np.array([1e-6, 0.0, 0.0]), None)}, {'clock_offset': (0.1, 0.0)}])
+def test_another_calibration_that_comes_before_the_readings(tmp_path, change):
+    network, kept = kept_in(tmp_path / 'kept.json')
+    stage = Calibrate(network, SETTINGS)
+    stage.resume(kept)
+    stage.renew(replace(network, **change))
+    assert not [c for s in readings(1011.0, 2.0, 1) for c in stage.feed(s)]
+
+
+def test_a_sensor_that_was_moved_meanwhile_is_learnt_anew_soon(tmp_path):
+    """Also where a steady change is never taken for the background otherwise."""
+    network, kept = kept_in(tmp_path / 'kept.json')
+    stage = Calibrate(network, CalibrateSettings(relearn_s=0.0))
+    stage.resume(kept)
+    out = [c for s in readings(1040.0, 20.0, 1, 25.0 * STEP) for c in stage.feed(s)]
+    late = np.array([c.field for c in out if c.stamp_ns > 1052 * NS])
+    assert np.abs(late.mean(axis=0)).max() < 6e-9
+    assert stage.backgrounds()['mag_1'].n_relearnt == 1
+    # What comes from then on is a target, for ever if it stays.
+    out = [c for s in readings(1060.0, 60.0, 2, 26.0 * STEP) for c in stage.feed(s)]
+    np.testing.assert_allclose(np.mean([c.field for c in out], axis=0), STEP, atol=1e-8)
+
+
+def test_what_has_been_learnt_again_is_as_any_other(tmp_path):
+    """A target that comes later and stays is none the sooner the background."""
+    network, kept = kept_in(tmp_path / 'kept.json')
+    stage = Calibrate(network, CalibrateSettings(relearn_s=0.0))
+    stage.resume(kept)
+    for s in readings(1012.0, 10.0, 1):
+        stage.feed(s)
+    out = [c for s in readings(1022.0, 40.0, 2, STEP) for c in stage.feed(s)]
+    np.testing.assert_allclose(np.mean([c.field for c in out], axis=0), STEP, atol=1.5e-8)
+    assert stage.backgrounds()['mag_1'].n_relearnt == 0
+
+
+@pytest.mark.parametrize('change', [
+    {'offset': (np.array([1e-6, 0.0, 0.0]), None)}, {'clock_offset': (0.1, 0.0)},
+    {'background': (EARTH + 5e-6, None)},
+    {'positions': np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])}])
+def test_a_sensor_that_is_another_is_learnt_anew(tmp_path, change):
+    network, _ = kept_in(tmp_path / 'kept.json')
+    kept, refused = read_backgrounds(tmp_path / 'kept.json', replace(network, **change), SETTINGS)
+    assert kept == {} and 'another network file' in refused['mag_1']
+
+
+def test_other_settings_are_another_noise(tmp_path):
+    network, _ = kept_in(tmp_path / 'kept.json')
+    kept, refused = read_backgrounds(
+        tmp_path / 'kept.json', network, CalibrateSettings(decimate_to_hz=10.0))
+    assert kept == {} and 'other settings' in refused['mag_1']
+    assert read_backgrounds(tmp_path / 'none.json', network, SETTINGS) == ({}, {})
+
+
+@pytest.mark.parametrize('change, told', [
+    (lambda c: 'not json', 'Expecting value'), (lambda c: '[' * 100_000, 'recursion'),
+    (lambda c: json.dumps([1]), 'not what calibration_node keeps'),
+    (lambda c: json.dumps({**c, 'version': 2}), 'keeps, version 1'),
+    (lambda c: json.dumps({'version': 1}), 'not what calibration_node keeps')])
+def test_a_file_that_is_none_is_told(tmp_path, change, told):
+    path = tmp_path / 'kept.json'
+    network, _ = kept_in(path)
+    path.write_text(change(json.loads(path.read_text())))
+    with pytest.raises(RecordingError, match=told):
+        read_backgrounds(path, network, SETTINGS)
+
+
+@pytest.mark.parametrize('key, value, told', [
+    ('background', [1.0, 2.0], 'ValueError: a background of'),
+    ('covariance', [[0.0] * 3] * 3, 'not positive definite'), ('stamp_ns', None, 'at None'),
+    ('made_of', None, 'another network file')])
+def test_one_bad_entry_costs_no_other(tmp_path, key, value, told):
+    path = tmp_path / 'kept.json'
+    network, stage = learnt()
+    for s in readings(1000.0, 10.0, 1):
+        stage.feed(replace(s, sensor='mag_2'))
+    write_backgrounds(path, {name: background_text(stage.kept(name), network, j, SETTINGS)
+                             for j, name in enumerate(network.names)})
+    content = json.loads(path.read_text())
+    content['sensors']['mag_1'][key] = value
+    path.write_text(json.dumps(content))
+    kept, refused = read_backgrounds(path, network, SETTINGS)
+    assert list(kept) == ['mag_2'] and list(refused) == ['mag_1'] and told in refused['mag_1']
+
+
+def test_an_axis_that_has_only_just_begun_is_not_kept(tmp_path):
+    network = network_of()
+    stage = Calibrate(network, SETTINGS)
+    for k, s in enumerate(readings(1000.0, 10.0, 0)):
+        field = s.field.copy()
+        field[2] = field[2] if k in (400, 401) else np.nan
+        stage.feed(replace(s, field=field))
+    kept = stage.kept('mag_1')
+    assert np.isnan(kept.background).tolist() == [False, False, True]
+    write_backgrounds(tmp_path / 'k', {'mag_1': background_text(kept, network, 0, SETTINGS)})
+    again, refused = read_backgrounds(tmp_path / 'k', network, SETTINGS)
+    assert not refused
+    np.testing.assert_array_equal(again['mag_1'].background, kept.background)
+
+
+def test_a_place_that_cannot_be_written_is_told(tmp_path):
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(OutputError, match='Not a directory|File exists'):
+        write_backgrounds(tmp_path / 'file' / 'kept.json', {})
+    with pytest.raises(OutputError):
+        write_backgrounds('/', {})
+
+
+def test_every_network_file_has_a_place_of_its_own(monkeypatch, tmp_path):
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    one = usual_path('/a/network.yaml', '/calibration_node')
+    others = {usual_path('/b/network.yaml', '/calibration_node'),
+              usual_path('/a/network.yaml', '/north/calibration_node')}
+    assert len(others | {one}) == 3
+    assert {p.parent for p in others | {one}} == {tmp_path / 'mag_tracking'}
+    assert one.name.startswith('network_')
+    monkeypatch.delenv('ROS_HOME')
+    assert usual_path('network.yaml', '/n').parent == Path(
+        os.path.expanduser('~/.ros/mag_tracking'))

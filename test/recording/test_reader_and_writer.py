@@ -1,0 +1,244 @@
+"""Recordings: written so that others read them, read so that damage is survived and told."""
+
+import io
+import tracemalloc
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.messages.schema import header_dict, sample_dict, sample_of, track_dict
+from mag_tracking.messages.types import DEFINITIONS, MAGNETIC_FIELD, TRACK_ARRAY, decode
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.records import MagSample
+from support.bundled import ROOT, vehicle_path
+
+JUNCTION = 'junction_left_to_right'
+
+
+def write(path, n, topics=2, step_ms=10):
+    """A recording of `n` samples a topic; returns them."""
+    rng = np.random.default_rng(0)
+    samples = []
+    with RecordingWriter(path) as writer:
+        for k in range(n):
+            for j in range(topics):
+                s = MagSample(k * step_ms * 1_000_000 + j, f'mag_{j + 1}',
+                              rng.standard_normal(3) * 1e-5, np.diag(rng.uniform(1, 2, 3)) * 1e-16)
+                samples.append(s)
+                writer.write(f'/{s.sensor}/imu/mag', MAGNETIC_FIELD, sample_dict(s, s.sensor),
+                             s.stamp_ns)
+    return samples
+
+
+def read(path, network=None):
+    """(messages, recording)."""
+    recording = Recording(path)
+    return list(recording.messages()), recording
+
+
+def test_what_is_written_reads_back(tmp_path):
+    samples = write(tmp_path / 'a.mcap', 200)
+    for path in (tmp_path, tmp_path / 'a.mcap'):
+        messages, recording = read(path)
+        assert not recording.losses and sum(recording.message_counts.values()) == 400
+        for m, s in zip(messages, samples, strict=True):
+            back = sample_of(decode(m), s.sensor)
+            assert back.stamp_ns == s.stamp_ns == m.log_time_ns
+            np.testing.assert_array_equal(back.field, s.field)
+            np.testing.assert_array_equal(back.covariance, s.covariance)
+
+
+def test_rosbags_reads_what_is_written(tmp_path):
+    samples = write(tmp_path / 'a.mcap', 50)
+    with AnyReader([tmp_path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        rows = [(t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
+    assert len(rows) == 100
+    for (t, m), s in zip(rows, samples, strict=True):
+        assert t == s.stamp_ns == m.header.stamp.sec * 10**9 + m.header.stamp.nanosec
+        assert (m.magnetic_field.x, m.magnetic_field.y, m.magnetic_field.z) == tuple(s.field)
+        np.testing.assert_array_equal(m.magnetic_field_covariance, s.covariance.ravel())
+
+
+def test_rosbags_reads_the_tracks(vehicle_replays):
+    run, folder = vehicle_replays['straight_car_right']
+    with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        poses = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages()
+                 if c.topic == '/tracker_node/pose']
+        tracks = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages()
+                  if c.topic == '/tracker_node/tracks']
+    log = next(iter(run.logs.values()))
+    assert len(poses) == len(log.stamp_ns) and len(tracks) == len(poses) + 1
+    for m, position, C in zip(poses, log.position, log.covariance, strict=True):
+        p = m.pose.pose.position
+        np.testing.assert_array_equal([p.x, p.y, p.z], position)
+        np.testing.assert_array_equal(m.pose.covariance.reshape(6, 6)[:3, :3], C[:3, :3])
+    assert [t.tracks[0].status for t in tracks] == [0] * len(poses) + [1]
+
+
+def fields(text):
+    """The declarations of a definition, without comments and spacing."""
+    lines = (line.split('#')[0].split() for line in text.splitlines())
+    return [' '.join(line) for line in lines if line]
+
+
+def test_definitions_are_those_of_the_message_package():
+    for name, (_, text) in DEFINITIONS.items():
+        if name.startswith('mag_tracking_msgs/'):
+            source = ROOT / 'msg_defs' / 'msg' / f'{name.split("/")[-1]}.msg'
+            assert fields(source.read_text()) == fields(text), name
+
+
+def test_definitions_are_those_of_jazzy():
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, (_, text) in DEFINITIONS.items():
+        if not name.startswith('mag_tracking_msgs/'):
+            ours = get_types_from_msg(text, name)[name]
+            # The generated text has them in the same order with the same types.
+            theirs = store.fielddefs[name]
+            assert [f[0] for f in ours[1]] == [f[0] for f in theirs[1]], name
+
+
+def test_every_field_of_a_track_is_written(vehicle_replays):
+    """The encoder fills a missing field with zero without a word: none may be missing."""
+    names = {line.split()[1] for line in fields(DEFINITIONS['mag_tracking_msgs/msg/Track'][1])
+             if '=' not in line}
+    _, folder = vehicle_replays['straight_car_right']
+    message = next(m for m in Recording(folder / 'tracks.mcap').messages()
+                   if m.type == TRACK_ARRAY)
+    assert {s for s in type(decode(message).tracks[0]).__slots__ if not s.startswith('_')} == names
+    import inspect
+    source = inspect.getsource(track_dict)
+    assert all(f"'{name}'" in source for name in names)
+
+
+def test_a_cut_file_is_read_up_to_the_cut(tmp_path):
+    path = tmp_path / 'cut.mcap'
+    write(tmp_path / 'a.mcap', 60_000)
+    whole = (tmp_path / 'a.mcap').read_bytes()
+    path.write_bytes(whole[:int(0.6 * len(whole))])
+    messages, recording = read(path)
+    assert 0.3 * 120_000 < len(messages) < 0.65 * 120_000
+    assert any('cut off' in k for k in recording.losses)
+    assert any('nothing readable after byte' in k for k in recording.losses)
+    assert [m.log_time_ns for m in messages] == sorted(m.log_time_ns for m in messages)
+
+
+def test_flipped_bytes_cost_their_chunk_and_are_told(tmp_path):
+    path = tmp_path / 'a.mcap'
+    write(path, 60_000)
+    data = bytearray(path.read_bytes())
+    chunks = make_reader(io.BytesIO(data)).get_summary().chunk_indexes
+    middle = chunks[len(chunks) // 2]
+    for i in range(200):
+        data[middle.chunk_start_offset + middle.chunk_length // 2 + i] ^= 0xFF
+    path.write_bytes(data)
+    messages, recording = read(path)
+    assert 0.5 * 120_000 < len(messages) < 120_000
+    assert any('damaged stretch' in k for k in recording.losses)
+
+
+@pytest.mark.parametrize('seed', range(12))
+def test_random_damage_never_crashes(tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    data = bytearray(vehicle_path(JUNCTION).read_bytes())
+    for i in rng.integers(0, len(data), 30):
+        data[i] ^= 1 << rng.integers(8)
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(data)
+    try:
+        messages, recording = read(path)
+    except RecordingError as error:
+        assert str(path) in str(error)
+        return
+    intact = len(list(Recording(vehicle_path(JUNCTION)).messages()))
+    assert len(messages) == intact or recording.losses
+
+
+def test_memory_is_flat(tmp_path):
+    peaks = []
+    for n in (10_000, 40_000):
+        path = tmp_path / str(n) / 'a.mcap'
+        path.parent.mkdir()
+        write(path, n)
+        tracemalloc.start()
+        assert sum(1 for _ in Recording(path).messages()) == 2 * n
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    # The messages alone are 3 and 11 MB.
+    assert peaks[1] < 1.2 * peaks[0] < 9e6, peaks
+
+
+def test_chunks_that_overlap_come_out_in_order(tmp_path):
+    """A file written topic by topic: every chunk of the second lies in the past."""
+    path = tmp_path / 'a.mcap'
+    with RecordingWriter(path) as writer:
+        for j in range(2):
+            for k in range(20_000):
+                s = MagSample(k * 10_000_000 + j, f'mag_{j}', np.zeros(3))
+                writer.write(f'/mag_{j}', MAGNETIC_FIELD, sample_dict(s, 'x'), s.stamp_ns)
+    times = [m.log_time_ns for m in Recording(path).messages()]
+    assert len(times) == 40_000 and times == sorted(times)
+
+
+def test_start_offset_and_topics():
+    recording = Recording(vehicle_path(JUNCTION))
+    start = recording.start_ns + 5_000_000_000
+    messages = list(recording.messages({'/mag_1/imu/mag'}, start))
+    assert {m.topic for m in messages} == {'/mag_1/imu/mag'}
+    assert min(m.log_time_ns for m in messages) >= start
+    assert len(messages) == 1500
+
+
+def test_unusable_recordings_are_named(tmp_path, road_network):
+    empty = tmp_path / 'empty.mcap'
+    empty.write_bytes(b'')
+    text = tmp_path / 'text.mcap'
+    text.write_text('this is no recording')
+    sqlite = tmp_path / 'a.db3'
+    sqlite.write_text('SQLite')
+    folder = tmp_path / 'folder'
+    folder.mkdir()
+    for path, message in ((tmp_path / 'nowhere.mcap', 'there is no'), (empty, 'is empty'),
+                          (text, 'not an MCAP file'), (sqlite, 'ros2 bag convert'),
+                          (folder, 'holds no .mcap')):
+        with pytest.raises(RecordingError, match=message):
+            Recording(path)
+    (folder / 'metadata.yaml').write_text('a: 1')
+    with pytest.raises(RecordingError, match='not rosbag2 metadata'):
+        Recording(folder)
+
+
+def test_a_recording_without_the_topics_says_what_it_has(tmp_path, road_network):
+    path = tmp_path / 'a.mcap'
+    with RecordingWriter(path) as writer:
+        s = MagSample(0, 'x', np.zeros(3))
+        writer.write('/elsewhere/mag', MAGNETIC_FIELD, sample_dict(s, 'x'), 0)
+    with pytest.raises(RecordingError, match='none of the network.s topics.*/elsewhere/mag'):
+        SampleReader(Recording(path), road_network)
+
+
+def test_a_topic_of_another_type_is_named(tmp_path, road_network):
+    path = tmp_path / 'a.mcap'
+    with RecordingWriter(path) as writer:
+        writer.write('/mag_1/imu/mag', 'std_msgs/msg/Header', header_dict(0, 'x'), 0)
+    with pytest.raises(RecordingError, match='carries std_msgs/msg/Header'):
+        SampleReader(Recording(path), road_network)
+
+
+def test_a_recording_without_messages_gives_none(tmp_path, road_network):
+    path = tmp_path / 'a.mcap'
+    with RecordingWriter(path):
+        pass
+    assert list(SampleReader(Recording(path), road_network).samples()) == []
+
+
+def test_an_unwritable_place_is_named(tmp_path):
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(OutputError, match='cannot write'):
+        RecordingWriter(tmp_path / 'file' / 'a.mcap')

@@ -1,0 +1,142 @@
+"""Repair of recordings that were cut or damaged, and of nothing else."""
+
+import io
+import struct
+import zlib
+
+import numpy as np
+import pytest
+import yaml
+from mcap.reader import make_reader
+
+from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.messages.types import MAGNETIC_FIELD, definition
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.repair import finish_file, repair
+from support.recorded_numbers import TOPIC, S, by_rosbags, field, numbers, started
+
+# A kill in time, or a full disk, is not tested beside what computes.
+pytestmark = pytest.mark.alone
+
+
+def torn_recording(tmp_path, tick=True):
+    """The bytes of a recording file of two topics, as it is before it is finished."""
+    recorder, _ = started(tmp_path / 'source')
+    recorder.add_topic('/other', MAGNETIC_FIELD, definition(MAGNETIC_FIELD))
+    for k in range(200):
+        recorder.write(TOPIC, field(k), k)
+        recorder.write('/other', field(k), k)
+        recorder.tick(S + k * S // 100)
+    whole = (tmp_path / 'source' / 'source_0.mcap').read_bytes()
+    recorder.close()
+    return whole, (tmp_path / 'source' / 'source_0.mcap').read_bytes()
+
+
+def test_repair_at_whatever_byte_it_was_cut(tmp_path):
+    unfinished, finished = torn_recording(tmp_path)
+    assert finished.startswith(unfinished)
+    data = finished[:-8]
+    last = [c for c in make_reader(io.BytesIO(finished)).get_summary().chunk_indexes
+            if c.chunk_start_offset < len(unfinished)][-1]
+    last_chunk_end = last.chunk_start_offset + last.chunk_length
+    file = tmp_path / 'cut' / 'x_0.mcap'
+    file.parent.mkdir()
+    for cut in sorted({*np.linspace(60, len(data), 60, dtype=int), last_chunk_end,
+                       last_chunk_end + 9, len(unfinished), len(data)}):
+        file.write_bytes(data[:cut])
+        before = {t: numbers(file, t)[0] for t in (TOPIC, '/other')}
+        told = []
+        assert repair(file.parent, told.append) == 1
+        with open(file, 'rb') as stream:
+            reader = make_reader(stream, validate_crcs=True)
+            for topic, found in before.items():
+                assert [stamp_ns_of(m) for _, _, m in reader.iter_messages([topic])] == found
+        for topic, found in before.items():
+            assert [k for _, k in by_rosbags(file.parent, topic)] == found
+        torn = file.with_name('x_0.mcap.cut')
+        kept = torn.read_bytes() if torn.exists() else b''
+        assert any(f'last {len(kept)} bytes' in line for line in told) == bool(kept)
+        if cut <= len(unfinished):
+            head = file.read_bytes()
+            assert head.startswith(data[:cut - len(kept)]) and data[:cut].endswith(kept)
+        torn.unlink(missing_ok=True)
+        repaired = file.read_bytes()
+        start, _, crc = struct.unpack('<QQI', repaired[-28:-8])
+        assert crc == zlib.crc32(repaired[start:-12])
+        if last_chunk_end <= cut <= len(unfinished):
+            # The indexes of the last chunk are made as they would have been.
+            assert repaired.startswith(unfinished)
+        assert repair(file.parent) == 0 and file.read_bytes() == repaired
+
+
+def stamp_ns_of(message):
+    """The number in the bytes of a magnetic field: its stamp comes first."""
+    sec, nanosec = struct.unpack_from('<iI', message.data, 4)
+    return sec * S + nanosec
+
+
+def test_repair_keeps_the_order_of_many_files(tmp_path):
+    recorder, _ = started(tmp_path / 'a', split_ns=S)
+    for k in range(24):
+        recorder.write(TOPIC, field(k), k)
+        recorder.tick(2 * (k + 2) * S)
+    recorder.close()
+    assert (tmp_path / 'a' / 'a_11.mcap').exists()
+    metadata = tmp_path / 'a' / 'metadata.yaml'
+    whole = yaml.safe_load(metadata.read_text())
+    metadata.unlink()
+    assert repair(tmp_path / 'a') == 0 and numbers(tmp_path / 'a')[0] == list(range(24))
+    assert yaml.safe_load(metadata.read_text()) == whole
+
+
+@pytest.mark.parametrize('name', ['a_0.mcap', 'a_12.mcap'])
+def test_an_empty_file_of_a_crash_costs_nothing_else(tmp_path, name):
+    """A split had begun, or the first file."""
+    recorder, _ = started(tmp_path / 'a', split_ns=S)
+    for k in range(24):
+        recorder.write(TOPIC, field(k), k)
+        recorder.tick(2 * (k + 2) * S)
+    recorder.close()
+    kept = sorted(set(range(24)) - set(numbers(tmp_path / 'a' / name)[0]))
+    assert len(kept) < 24
+    (tmp_path / 'a' / name).write_bytes(b'')
+    (tmp_path / 'a' / 'metadata.yaml').unlink()
+    whole = Recording(tmp_path / 'a')
+    assert len(list(whole.messages())) == len(kept)
+    assert whole.losses[f'{name} is empty (0 bytes)'] == 1
+    said = []
+    repair(tmp_path / 'a', said.append)
+    assert said == [f'{tmp_path / "a" / name} is empty: it is left out']
+    assert numbers(tmp_path / 'a')[0] == kept
+
+
+def test_repair_leaves_out_and_tells_a_damaged_chunk(tmp_path):
+    unfinished, finished = torn_recording(tmp_path)
+    file = tmp_path / 'x.mcap'
+    broken = bytearray(unfinished)
+    middle = make_reader(io.BytesIO(finished)).get_summary().chunk_indexes[2]
+    broken[middle.chunk_start_offset + middle.chunk_length // 2] ^= 0xFF
+    file.write_bytes(broken)
+    before, told = numbers(file)[0], []
+    assert 0 < len(before) < 200
+    assert repair(file, told.append) == 1
+    assert any('damaged chunks, left out: 1' in line for line in told), told
+    assert [k for _, k in by_rosbags(file)] == before
+
+
+def test_what_is_being_recorded_is_not_repaired(tmp_path):
+    recorder, _ = started(tmp_path / 'a')
+    recorder.write(TOPIC, field(0), 1)
+    with pytest.raises(OutputError, match='a_0.mcap is being recorded'):
+        repair(tmp_path / 'a')
+    recorder.close()
+    assert numbers(tmp_path / 'a')[0] == [0] and repair(tmp_path / 'a') == 0
+
+
+def test_repair_names_what_is_no_recording(tmp_path):
+    with pytest.raises(RecordingError, match='holds no .mcap file'):
+        repair(tmp_path / 'nothing')
+    (tmp_path / 'x.mcap').write_text('nonsense of some length')
+    with pytest.raises(RecordingError, match='x.mcap is not an MCAP file'):
+        finish_file(tmp_path / 'x.mcap')
+    assert (tmp_path / 'x.mcap').read_text() == 'nonsense of some length'

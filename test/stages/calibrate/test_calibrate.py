@@ -1,0 +1,313 @@
+"""Calibration: what is learnt, when it freezes, and what becomes of bad input."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mag_tracking.calibration.background import RunningBackground
+from mag_tracking.calibration.ordinary import new_sensors
+from mag_tracking.errors import NetworkError
+from mag_tracking.records import MagSample
+from mag_tracking.stages.calibrate.settings import CalibrateSettings
+from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.stage import rejected
+from support.calibration_runs import EARTH, SIGMA, feed, running, sample, stage
+from support.networks import line_network
+
+
+def test_level_noise_and_drift_are_learnt():
+    b = running()
+    drift = np.array([5e-9, -3e-9, 0.0])
+    feed(b, np.arange(0, 30, 0.01), drift=drift)
+    error = (b.level(30.0) - EARTH - 30.0 * drift) / SIGMA
+    # A line through 2000 samples, carried 1.5 s beyond its end.
+    assert np.abs(error).max() < 4.5 * np.sqrt(1 / 2000 * (1 + 3 * (1 + 2 * 1.75 / 20) ** 2))
+    std = np.sqrt(np.diagonal(b.covariance))
+    np.testing.assert_allclose(std, SIGMA, rtol=5 / np.sqrt(2 * 2000))
+
+
+def test_not_ready_before_it_has_learnt():
+    b = running()
+    feed(b, np.arange(0, 2.0, 0.01))
+    assert not b.ready
+    with pytest.raises(ValueError, match='not been learnt'):
+        b.level(2.0)
+
+
+@pytest.mark.parametrize('rate', [1.0, 5.0, 8.0, 10.0, 12.5, 15.0, 25.0, 70.0, 200.0])
+def test_a_sensor_of_any_rate_learns(rate):
+    # Ten and 12.5 Hz once never did: their blocks of eight samples did not fit into the stretch.
+    b = running()
+    feed(b, np.arange(0, 3.0 + 24 / rate, 1 / rate))
+    assert b.ready
+    assert np.abs((b.level(3.0) - EARTH) / SIGMA).max() < 4.5 * (24.0 ** -0.5) * 2.0
+
+
+@pytest.mark.parametrize('rate, at', [(1.0, 20.0), (1.0, 8.0), (2.0, 12.0), (2.0, 6.0)])
+def test_a_target_that_passes_while_it_learns_is_no_noise(rate, at):
+    """A block of a slow sensor is long enough for a whole pass: its mean hardly tells."""
+    def target(t):
+        return np.array([3e-6, -2e-6, 1e-6]) / (1 + ((t - at) / 0.8) ** 2) ** 2.5
+    b = running()
+    end = at + 10.0 + 60 / rate
+    feed(b, np.arange(0, end, 1 / rate), signal=target)
+    assert b.ready
+    assert np.sqrt(np.diagonal(b.covariance)).max() < 2.5 * SIGMA.max()
+    assert np.abs((b.level(end) - EARTH) / SIGMA).max() < 3.0
+
+
+def test_a_target_freezes_the_background():
+    def target(t):
+        return np.array([3e-6, -2e-6, 1e-6]) / (1 + ((t - 15.0) / 0.8) ** 2) ** 2.5
+    b = running()
+    feed(b, np.arange(0, 15.0, 0.01), signal=target)
+    assert b.frozen
+    assert np.abs((b.level(15.0) - EARTH) / SIGMA).max() < 0.5
+    feed(b, np.arange(15.0, 30.0, 0.01), signal=target, seed=1)
+    assert not b.frozen
+    assert np.abs((b.level(30.0) - EARTH) / SIGMA).max() < 0.5
+
+
+def test_a_parked_car_becomes_background_only_after_its_time():
+    parked = np.array([1e-6, 0.0, 0.0])
+    b = running(relearn=20.0)
+    feed(b, np.arange(0, 10, 0.01))
+    feed(b, np.arange(10, 25, 0.01), signal=parked)
+    assert b.frozen and b.n_relearnt == 0
+    feed(b, np.arange(25, 40, 0.01), signal=parked)
+    assert b.n_relearnt == 1
+    assert np.abs((b.level(40.0) - EARTH - parked) / SIGMA).max() < 0.5
+    never = running(relearn=0.0)
+    feed(never, np.arange(0, 10, 0.01))
+    feed(never, np.arange(10, 60, 0.05), signal=parked)
+    assert never.frozen and never.n_relearnt == 0
+
+
+def test_a_target_in_the_beginning_is_not_learnt():
+    def passing(t):
+        return np.array([2e-6, 1e-6, 0.0]) / (1 + ((t - 1.5) / 0.5) ** 2) ** 2.5
+    b = running()
+    feed(b, np.arange(0, 3.5, 0.01), signal=passing)
+    assert not b.ready
+    feed(b, np.arange(3.5, 12.0, 0.01), signal=passing, seed=1)
+    assert b.ready
+    assert np.abs((b.level(12.0) - EARTH) / SIGMA).max() < 0.6
+
+
+def test_given_background_and_noise_are_ready_at_once():
+    b = running(background=EARTH, noise_std=SIGMA)
+    assert b.ready
+    np.testing.assert_array_equal(b.level(0.0), EARTH)
+    np.testing.assert_allclose(np.diagonal(b.covariance), SIGMA**2)
+
+
+def test_given_background_without_noise_learns_the_noise():
+    b = running(background=EARTH)
+    assert not b.ready
+    feed(b, np.arange(0, 5, 0.01))
+    assert b.ready
+
+
+@pytest.mark.parametrize('field, cause', [
+    ([np.nan] * 3, 'all NaN'),
+    ([np.inf, 0, 0], 'infinite'),
+    ([0.02, 0.15, -0.49], 'gauss or microtesla'),
+    ([2.0, 15.0, -49.0], 'gauss or microtesla'),
+])
+def test_unusable_fields_are_counted_and_rejected(field, cause):
+    s = stage()
+    assert s.feed(sample(1.0, field)) == []
+    assert len(rejected(s.counts)) == 1 and cause in next(iter(rejected(s.counts)))
+    assert s.counts_of('mag_1')['rejected'] == 1
+
+
+def test_millitesla_are_legitimate_where_the_setting_says_so():
+    assert len(stage(max_field=0.1).feed(sample(1.0, [0.01, 0.0, 0.0]))) == 1
+
+
+def test_unknown_sensor_is_counted():
+    s = stage()
+    assert s.feed(sample(1.0, sensor='mag_9')) == []
+    assert rejected(s.counts) == {'unknown sensor mag_9': 1}
+
+
+def test_a_missing_axis_is_kept_missing():
+    out = stage().feed(sample(1.0, [EARTH[0], EARTH[1], np.nan]))
+    np.testing.assert_allclose(out[0].field[:2], 0.0, atol=1e-20)
+    assert np.isnan(out[0].field[2])
+
+
+def test_duplicate_and_late_stamps_are_counted_and_rejected():
+    s = stage()
+    for t in (1.0, 1.0, 0.5, 1.1):
+        s.feed(sample(t))
+    assert rejected(s.counts) == {'duplicate stamp': 1, 'out of order': 1}
+
+
+def test_a_restart_is_taken_and_counted():
+    s = stage()
+    s.feed(sample(100.0))
+    assert len(s.feed(sample(1.0))) == 1
+    assert s.counts['time jumped back'] == 1
+
+
+def test_covariances():
+    own = np.diag([1e-16, 2e-16, 3e-16])
+    s = stage()
+    np.testing.assert_array_equal(s.feed(sample(1.0, covariance=own))[0].covariance, own)
+    # Unknown: the configured one.
+    np.testing.assert_allclose(s.feed(sample(2.0))[0].covariance, 1.44e-16 * np.eye(3))
+    for bad in (-own, np.full((3, 3), np.nan), own + np.triu(np.ones((3, 3)), 1)):
+        assert s.feed(sample(3.0, covariance=bad)) == []
+    # By rounding, half of these have no eigenvalue that is not above zero.
+    for v in np.random.default_rng(0).standard_normal((20, 3)):
+        assert s.feed(sample(3.0, covariance=1e-16 * np.outer(v, v))) == []
+    assert rejected(s.counts) == {'covariance is not positive definite': 23}
+
+
+def test_forget_names_an_unknown_sensor():
+    with pytest.raises(NetworkError, match='mag_9'):
+        stage().forget(['mag_9'])
+
+
+SOFT = np.array([[1.02, 0.03, 0.0], [-0.01, 0.97, 0.02], [0.0, 0.04, 1.05]])
+HARD = np.array([4e-6, -3e-6, 7e-6])
+
+
+def corrected(**known):
+    """The stage of a network in which these are known of the second sensor, and its background."""
+    n = line_network(2)
+    known = {key: (None, value) for key, value in known.items() if key != 'clock_offset'} | {
+        key: np.array([0.0, known[key]]) for key in known if key == 'clock_offset'}
+    n = dataclasses.replace(n, background=(EARTH, EARTH), **known)
+    return Calibrate(n, CalibrateSettings())
+
+
+def test_a_clock_that_is_ahead_is_put_back():
+    s = corrected(clock_offset=0.0213)
+    (first,), (second,) = s.feed(sample(5.0)), s.feed(sample(5.0213, sensor='mag_2'))
+    assert first.stamp_ns == second.stamp_ns == 5_000_000_000
+    assert s.last_stamp_ns('mag_2') == 5_000_000_000
+    # Of one sensor the order stays.
+    assert s.feed(sample(5.0213, sensor='mag_2')) == []
+    assert rejected(s.counts) == {'duplicate stamp': 1}
+
+
+def test_a_sensors_own_iron_is_taken_away():
+    s = corrected(offset=HARD, correction=SOFT)
+    B = EARTH + [3e-7, -2e-7, 5e-7]
+    (out,) = s.feed(sample(1.0, np.linalg.solve(SOFT, B) + HARD, 'mag_2'))
+    np.testing.assert_allclose(out.field, B - EARTH, atol=1e-18)
+    # The other sensor has none.
+    (out,) = s.feed(sample(1.0, B))
+    np.testing.assert_allclose(out.field, B - EARTH, atol=1e-18)
+    (out,) = corrected(offset=HARD).feed(sample(1.0, B + HARD, 'mag_2'))
+    np.testing.assert_allclose(out.field, B - EARTH, atol=1e-18)
+
+
+def test_the_covariance_is_that_of_the_corrected_field():
+    own = np.diag([1e-16, 2e-16, 3e-16])
+    (out,) = corrected(correction=SOFT).feed(sample(1.0, sensor='mag_2', covariance=own))
+    np.testing.assert_allclose(out.covariance, SOFT @ own @ SOFT.T)
+    rng = np.random.default_rng(0)
+    drawn = (rng.standard_normal((20000, 3)) * np.sqrt(np.diagonal(own))) @ SOFT.T
+    np.testing.assert_allclose(out.covariance, np.cov(drawn.T), atol=0.03 * 3e-16)
+
+
+def test_an_axis_that_a_correction_needs_is_missed():
+    field = [EARTH[0], EARTH[1], np.nan]
+    s = corrected(correction=SOFT + 0.01)
+    assert s.feed(sample(1.0, field, 'mag_2')) == []
+    assert rejected(s.counts) == {'an axis is missing that the correction needs': 1}
+    # An offset needs no other axis.
+    (out,) = corrected(offset=HARD).feed(sample(1.0, field, 'mag_2'))
+    np.testing.assert_allclose(out.field[:2], -HARD[:2], atol=1e-18)
+    assert np.isnan(out.field[2])
+
+
+@pytest.mark.parametrize('C', [np.diag([1.02, 0.97, 1.05]),
+                               [[1.02, 0.03, 0.0], [-0.01, 0.97, 0.0], [0.0, 0.0, 1.0]]])
+def test_an_axis_that_a_correction_does_not_need_is_not_missed(C):
+    """Scales of a sensor with two axes."""
+    s, C = corrected(correction=np.array(C)), np.array(C)
+    (out,) = s.feed(sample(1.0, [EARTH[0], EARTH[1], np.nan], 'mag_2'))
+    np.testing.assert_allclose(out.field[:2], (C[:2, :2] - np.eye(2)) @ EARTH[:2], atol=1e-18)
+    assert np.isnan(out.field[2])
+
+
+def test_another_calibration_keeps_a_background_that_a_target_stands_on():
+    """Only clocks and orientations were surveyed: what stands there must not become the level."""
+    network = line_network(1)
+    stage = Calibrate(network, CalibrateSettings())
+    rng = np.random.default_rng(3)
+
+    def feed(first, last, extra=0.0):
+        out = []
+        for k in range(first, last):
+            out += stage.feed(MagSample(k * 10**7, 'mag_1', EARTH + extra
+                                        + SIGMA * rng.standard_normal(3)))
+        return out
+
+    feed(0, 800)
+    car = np.array([5.8e-7, 0.0, 0.0])
+    feed(800, 1000, car)
+    assert stage.backgrounds()['mag_1'].frozen
+    stage.renew(dataclasses.replace(network, clock_offset=np.array([0.25])))
+    out = feed(1000, 2000, car)
+    assert stage.backgrounds()['mag_1'].frozen and stage.backgrounds()['mag_1'].n_relearnt == 0
+    assert len(out) == 1000
+    np.testing.assert_allclose(np.mean([s.field for s in out], axis=0), car, atol=1e-8)
+    # By the new clock, and on the same line in time.
+    assert out[0].stamp_ns == 1000 * 10**7 - 250_000_000
+    assert stage.counts['rejected: out of order'] == 0
+
+
+def test_another_correction_is_learnt_anew():
+    network = line_network(1)
+    stage = Calibrate(network, CalibrateSettings())
+    for k in range(500):
+        stage.feed(MagSample(k * 10**7, 'mag_1', EARTH + SIGMA * np.sin([k, 2 * k, 3 * k])))
+    assert stage.backgrounds()['mag_1'].ready
+    stage.renew(dataclasses.replace(network, offset=(np.full(3, 1e-6),)))
+    assert not stage.backgrounds()['mag_1'].measured
+    with pytest.raises(NetworkError, match='in place of one of mag_1'):
+        stage.renew(line_network(2))
+
+
+def ends_of_blocks(phase, times):
+    """(readings, by number, that showed a block to be complete, the background) of `times` [s]."""
+    state = new_sensors(1)
+    background = RunningBackground(3.0, 20.0, 1.5, 0.25, 2.0, 60.0, phase=phase, sensors=state)
+    rng, ends, now = np.random.default_rng(0), [], 0
+    for k, t in enumerate(times):
+        background.add(t, 1e-8 * rng.standard_normal(3))
+        assert state['is_full'][0] == (phase is not None and state['now'][0] != now)
+        if state['now'][0] != now:
+            ends.append(k)
+            background.settle()
+        now = state['now'][0]
+    return ends, background
+
+
+def test_blocks_of_many_sensors_end_one_after_the_other():
+    """Judging one takes a while; those of a hundred sensors at once would hold up the readings.
+
+    Also after a while, when all have had the same jitter of their stamps.
+    """
+    n, n_readings, every = 10, 10_000, []
+    times = (np.arange(n_readings) + np.random.default_rng(1).uniform(0.0, 0.05, n_readings)) / 100
+    for j in range(n):
+        ends, background = ends_of_blocks(j / n, times)
+        assert background.ready
+        # To one reading, by rounding.
+        np.testing.assert_allclose(np.diff(ends), 25, atol=1.1)
+        assert ends[0] == pytest.approx(25 * (1.0 + j / n), abs=1.1)
+        every += ends
+    assert np.bincount(every).max() <= 2
+
+
+def test_without_a_phase_a_block_has_its_whole_length():
+    times = np.arange(200) / 100.0 + 0.005 * (np.arange(200) % 25 == 0)
+    ends, _ = ends_of_blocks(None, times)
+    assert len(ends) > 5 and (np.diff(times[ends]) >= 0.25 - 1e-9).all()

@@ -1,0 +1,119 @@
+"""Screening within the calibration: what is found is counted, and what waits is never lost."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.records import MagSample
+from mag_tracking.settings import replace
+from mag_tracking.stages.calibrate.settings import CalibrateSettings
+from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.stage import rejected
+from support.bundled import VEHICLES, vehicle_path
+from support.networks import line_network
+from support.sensor_noise import EARTH, NS, SIGMA, noise
+
+
+@pytest.mark.parametrize('name', VEHICLES)
+def test_nothing_is_found_in_the_recordings(name, road_network):
+    stage = Calibrate(road_network, CalibrateSettings())
+    for s in SampleReader(Recording(vehicle_path(name)), road_network).samples():
+        stage.feed(s)
+    stage.flush()
+    assert sum(stage.counts_of(name)['accepted'] for name in road_network.names) > 1000
+    assert not {'spike', 'the same reading over and over'} & set(rejected(stage.counts))
+
+
+def calibrate(**changes):
+    network = dataclasses.replace(line_network(1, noise=SIGMA), background=(EARTH,))
+    return Calibrate(network, replace(CalibrateSettings(), changes)), network
+
+
+def feed(stage, y, first=0, rate=100.0):
+    return [c for k, field in enumerate(y) for c in stage.feed(
+        MagSample(round((first + k) * NS / rate), 'mag_1', field))]
+
+
+def total(stage):
+    c = stage.counts_of('mag_1')
+    return c['accepted'] + c['rejected']
+
+
+def test_spikes_and_repetitions_are_counted_where_they_are():
+    stage, _ = calibrate()
+    y = noise(400)
+    y[[100, 150, 151]] += 5e-6
+    y[300:330] = y[299]
+    out = feed(stage, y)
+    stuck_ones = stage.counts_of('mag_1')['rejected: the same reading over and over']
+    assert rejected(stage.counts) == {'spike': 3, 'the same reading over and over': stuck_ones}
+    assert 24 <= stuck_ones <= 27 and len(out) == 400 - 3 - stuck_ones
+    assert np.abs([c.field for c in out]).max() < 6 * SIGMA
+    assert (np.diff([c.stamp_ns for c in out]) > 0).all()
+    assert total(stage) == 400
+
+
+def test_the_setting_zero_is_never():
+    stage, _ = calibrate(spike_std=0.0)
+    y = noise(100)
+    y[50] += 5e-6
+    assert len(feed(stage, y)) == 100 and not rejected(stage.counts)
+
+
+def held_spike(stage):
+    y = noise(52)
+    y[50:] += 5e-6
+    assert len(feed(stage, y)) == 50
+
+
+def test_what_is_held_at_the_end_passes_and_is_counted():
+    stage, _ = calibrate()
+    held_spike(stage)
+    assert [c.stamp_ns for c in stage.flush()] == [500_000_000, 510_000_000]
+    assert stage.counts_of('mag_1') == {'accepted': 52} and stage.flush() == []
+
+
+def test_what_is_held_when_time_jumps_back_is_counted():
+    """Once it was lost without a word."""
+    stage, _ = calibrate()
+    held_spike(stage)
+    assert len(feed(stage, noise(50), first=-1000)) == 50
+    assert rejected(stage.counts) == {'may have been a spike when time jumped back': 2}
+    assert total(stage) == 102
+
+
+@pytest.mark.parametrize('what', ['offset', 'correction', 'clock_offset'])
+def test_what_is_held_when_another_calibration_comes_is_counted(what):
+    """It was corrected by the one before."""
+    stage, network = calibrate()
+    held_spike(stage)
+    new = {'offset': (np.full(3, 1e-6),), 'correction': (1.01 * np.eye(3),),
+           'clock_offset': (0.003,)}[what]
+    stage.renew(dataclasses.replace(network, **{what: new}))
+    assert rejected(stage.counts) == {'may have been a spike when another calibration came': 2}
+    out = feed(stage, noise(50), first=100)
+    assert len(out) == 50 and total(stage) == 102
+
+
+def test_the_same_calibration_once_more_changes_nothing():
+    stage, network = calibrate()
+    held_spike(stage)
+    stage.renew(dataclasses.replace(network))
+    assert len(feed(stage, noise(1), first=52)) == 1
+    assert rejected(stage.counts) == {'spike': 2} and total(stage) == 53
+
+
+def test_what_is_held_when_the_background_is_to_be_learnt_anew_comes_before_the_rest():
+    network = line_network(1, noise=SIGMA)
+    stage = Calibrate(network, CalibrateSettings())
+    y = noise(800)
+    y[602:605] += 5e-6
+    out = feed(stage, y[:604])
+    stage.forget(['mag_1'])
+    out += feed(stage, y[604:], first=604)
+    stamps = [c.stamp_ns for c in out]
+    assert (np.diff(stamps) > 0).all()
+    assert stage.counts_of('mag_1') == {'accepted': 800}

@@ -1,0 +1,172 @@
+"""Detection: thresholds, measured false alarms and detections, onset, hold and release."""
+
+import numpy as np
+import pytest
+from scipy.stats import binom, chi2, ncx2
+
+from mag_tracking.inference.axes import smallest_pivots, whitened_energy
+from mag_tracking.inference.detection_theory import (
+    detection_probability,
+    energy_threshold,
+    false_alarm_probability,
+)
+from mag_tracking.records import Detection, FieldFrame, MagSample
+from mag_tracking.settings import replace
+from mag_tracking.stages.align.settings import AlignSettings
+from mag_tracking.stages.align.stage import Align
+from mag_tracking.stages.calibrate.settings import CalibrateSettings
+from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.detect.settings import DetectSettings
+from mag_tracking.stages.detect.stage import Detect
+from support.marks import studied
+from support.networks import line_network
+
+SIGMA = 1.2e-8
+
+
+def frame(k, field, network, period_ns=80_000_000):
+    n = len(network)
+    C = np.repeat(SIGMA**2 * np.eye(3)[None], n, axis=0)
+    return FieldFrame(k * period_ns, np.asarray(field, dtype=float), C, np.ones(n, dtype=int),
+                      np.zeros(n))
+
+
+def detector(network, **changes):
+    exact = {'background_std': 0.0, 'background_drift': 0.0}
+    return Detect(network, replace(DetectSettings(), {**exact, **changes}))
+
+
+def test_thresholds_are_those_of_the_source():
+    """T10 eq. (5.18), (5.19): 11.2 (11.34 exactly), and half detected at SNR 9.2."""
+    h = energy_threshold(0.01, 3)
+    assert h == pytest.approx(chi2.isf(0.01, 3), rel=1e-12)
+    assert false_alarm_probability(h, 3) == pytest.approx(0.01, rel=1e-12)
+    assert detection_probability(9.2, 11.2, 3) == pytest.approx(0.5, abs=0.01)
+    assert detection_probability(9.2, h, 3) == pytest.approx(ncx2.sf(h, 3, 9.2), rel=1e-9)
+
+
+@pytest.mark.parametrize('p', [1e-2, 1e-3])
+def test_measured_false_alarm_rate_is_the_stated_one(p):
+    network, rng, n = line_network(2), np.random.default_rng(7), 60_000
+    stage = detector(network, false_alarm_probability=p)
+    for k in range(n):
+        stage.feed(frame(k, SIGMA * rng.standard_normal((2, 3)), network))
+    alarms = stage.counts['frames above the threshold']
+    low, high = binom.ppf([0.005, 0.995], n, p)
+    print(f'stated {p:g}: measured {alarms / n:.2e}, limits {low / n:.2e} .. {high / n:.2e}')
+    assert low <= alarms <= high
+
+
+@pytest.mark.parametrize('n', studied([40_000, 160_000], [40_000]))
+def test_false_alarm_rate_through_calibration_and_alignment(n):
+    """Raw noise with learnt backgrounds, through the whole way: 100 Hz averaged to 12.5 Hz."""
+    network, rng = line_network(2), np.random.default_rng(8)
+    calibrate = Calibrate(network, replace(CalibrateSettings(), {'memory_s': 300.0,
+                                                                 'learn_s': 60.0}))
+    align = Align(network, AlignSettings())
+    detectors = {p: detector(network, false_alarm_probability=p) for p in (1e-2, 1e-3)}
+    noise = SIGMA * rng.standard_normal((n, 2, 3))
+    background = np.array([[2e-6, 1.5e-5, -4.9e-5], [3e-6, 1.4e-5, -5e-5]])
+    for k in range(n):
+        for j, name in enumerate(network.names):
+            sample = MagSample(k * 10_000_000, name, background[j] + noise[k, j])
+            for f in [f for s in calibrate.feed(sample) for f in align.feed(s)]:
+                for stage in detectors.values():
+                    stage.feed(f)
+    for p, stage in detectors.items():
+        frames, alarms = stage.counts['frames'], stage.counts['frames above the threshold']
+        low, high = binom.ppf([0.005, 0.995], frames, p)
+        print(f'whole way, stated {p:g}: measured {alarms / frames:.2e} of {frames}')
+        assert low <= alarms <= high
+
+
+def test_measured_detection_rate_is_the_theoretical_one():
+    network, rng, n = line_network(2), np.random.default_rng(9), 20_000
+    signal = SIGMA * np.array([[1.0, -2.0, 0.5], [0.0, 1.5, 2.0]])
+    snr = float((signal**2).sum() / SIGMA**2)
+    stage = detector(network, false_alarm_probability=1e-2)
+    for k in range(n):
+        stage.feed(frame(k, signal + SIGMA * rng.standard_normal((2, 3)), network))
+    expected = detection_probability(snr, energy_threshold(1e-2, 6), 6)
+    low, high = binom.ppf([0.005, 0.995], n, expected)
+    assert low <= stage.counts['frames above the threshold'] <= high
+
+
+def test_energy_of_missing_axes_and_sensors_counts_only_what_is_there():
+    C = np.repeat((SIGMA**2 * np.array([[2, 1, 0], [1, 2, 0], [0, 0, 1.0]]))[None], 3, axis=0)
+    y = SIGMA * np.array([[1.0, 2.0, 3.0], [1.0, np.nan, 2.0], [np.nan] * 3])
+    energy, axes = whitened_energy(y, C)
+    full = y[0] @ np.linalg.inv(C[0]) @ y[0]
+    part = y[1, [0, 2]] @ np.linalg.inv(C[1][np.ix_([0, 2], [0, 2])]) @ y[1, [0, 2]]
+    np.testing.assert_allclose(energy, [full, part, 0.0], rtol=1e-12)
+    assert axes.tolist() == [3, 2, 0]
+    C[2, 0, 0] = np.nan  # of a sensor that is missing nothing is read
+    np.testing.assert_array_equal(whitened_energy(y, C)[0], energy)
+    np.testing.assert_allclose(smallest_pivots(y, C), [0.75, 1.0, 1.0], rtol=1e-12)
+    C[1, 0, 0] = -1.0
+    with pytest.raises(np.linalg.LinAlgError, match='not positive definite'):
+        whitened_energy(y, C)
+    with pytest.raises(ValueError, match='shape'):
+        whitened_energy(y, C[:2])
+
+
+def test_the_smallest_pivot_tells_which_covariances_are_none():
+    """Of random ones it has the sign of the smallest eigenvalue, whatever their unit."""
+    rng, n = np.random.default_rng(3), 400
+    std = 10.0 ** rng.uniform(-12.0, 3.0, (n, 3, 1))
+    C = rng.uniform(-1.0, 1.0, (n, 3, 3))
+    C = 0.5 * (C + np.swapaxes(C, 1, 2)) + np.eye(3)
+    y = np.where(rng.random((n, 3)) < 0.2, np.nan, 1.0)
+    there = ~np.isnan(y)
+    of_present = np.where(there[:, :, None] & there[:, None, :], C, np.eye(3))
+    is_one = np.linalg.eigvalsh(of_present)[:, 0] > 0.0
+    assert 0.1 < is_one.mean() < 0.9
+    C = C * std * np.swapaxes(std, 1, 2)
+    np.testing.assert_array_equal(smallest_pivots(y, C) > 0.0, is_one)
+    # Two axes that go together but for a share of their variance.
+    C = np.repeat(np.array([[4.0, 2.0 * (1.0 - 1e-6), 0.0], [0, 1.0, 0], [0, 0, 9.0]])[None], 4, 0)
+    C[:, 1, 0] = C[:, 0, 1]
+    for k, bad in enumerate((np.nan, np.inf)):
+        C[1 + k, 0, 2] = bad
+    C[3, 2, 2] = np.inf
+    pivots = smallest_pivots(np.zeros((4, 3)), C)
+    assert pivots[0] == pytest.approx(2e-6, rel=1e-5)
+    assert np.isnan(pivots[1:]).all()
+
+
+@pytest.mark.parametrize('wrong', [-SIGMA**2, np.nan, np.inf])
+def test_a_frame_with_a_covariance_that_is_none_is_counted(wrong):
+    network = line_network(2)
+    stage = detector(network, onset_frames=1)
+    loud = frame(0, np.full((2, 3), 10 * SIGMA), network)
+    loud.covariance[1] = wrong
+    assert stage.feed(loud) == []
+    assert stage.counts['rejected: frame with a covariance that is not positive definite'] == 1
+    assert [type(r) for r in stage.feed(frame(1, loud.field, network))] == [Detection, FieldFrame]
+
+
+def test_onset_hold_and_release():
+    network = line_network(2)
+    stage = detector(network, onset_frames=3, hold_s=0.4)
+    loud, quiet = np.full((2, 3), 10 * SIGMA), np.zeros((2, 3))
+    pattern = [quiet] * 3 + [loud] * 2 + [quiet] + [loud] * 4 + [quiet] * 3 + [loud] + [quiet] * 8
+    events, present = [], []
+    for k, field in enumerate(pattern):
+        for r in stage.feed(frame(k, field, network)):
+            if isinstance(r, Detection):
+                events.append((k, r.onset, r.id))
+            else:
+                present.append(r.target_present)
+    # Two loud frames are no onset, three are; a short silence is bridged by the hold.
+    assert events == [(8, True, 1), (19, False, 1)]
+    assert present == [8 <= k < 19 for k in range(len(pattern))]
+
+
+def test_time_running_backwards_ends_the_detection():
+    network = line_network(2)
+    stage = detector(network, onset_frames=1)
+    stage.feed(frame(100, np.full((2, 3), 10 * SIGMA), network))
+    records = stage.feed(frame(5, np.zeros((2, 3)), network))
+    assert [r.onset for r in records if isinstance(r, Detection)] == [False]
+    assert records[-1].target_present is False
+    assert stage.counts['time jumped back'] == 1

@@ -1,0 +1,394 @@
+"""Health and the doctor: each fault is found and named, and nothing is found where nothing is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mag_tracking.apps.doctor import Doctor, examine
+from mag_tracking.cli import main
+from mag_tracking.messages.schema import sample_dict
+from mag_tracking.messages.types import MAGNETIC_FIELD
+from mag_tracking.network.file import read_network
+from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.records import MagSample
+from mag_tracking.stages.health.reading_buffer import Waiting
+from mag_tracking.stages.health.sensor_health import WINDOW, SensorHealth, quantiles
+from support.bundled import DATA, NETWORK_FILE, VEHICLES, vehicle_path
+from support.networks import line_network
+
+NS = 10**9
+EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
+SIGMA = 1.2e-8
+
+
+def readings(n=3000, rate=100.0, seed=0):
+    """(stamps [ns], fields) of a good sensor."""
+    rng = np.random.default_rng(seed)
+    return (10**18 + (np.arange(n) * NS / rate).astype(np.int64),
+            EARTH + SIGMA * rng.standard_normal((n, 3)))
+
+
+def examined(stamps, fields, received=None):
+    """`SensorHealth` of readings."""
+    health = SensorHealth()
+    for k, (stamp, field) in enumerate(zip(stamps, fields, strict=True)):
+        health.add(int(stamp), field, None if received is None else int(received[k]))
+    return health
+
+
+def texts(health, **known):
+    return [str(f) for f in health.findings('mag_1', **known)]
+
+
+def test_of_a_good_sensor_nothing_is_found():
+    stamps, fields = readings()
+    health = examined(stamps, fields, stamps + 2_000_000)
+    assert texts(health, noise_std=np.full(3, SIGMA)) == []
+    assert health.rate == pytest.approx(100.0, rel=1e-6)
+    # Second differences overlap: an eighth as many are independent.
+    np.testing.assert_allclose(health.noise_std, SIGMA, rtol=5 / np.sqrt(WINDOW / 2))
+    np.testing.assert_allclose(health.field, EARTH, atol=5 * SIGMA / np.sqrt(WINDOW) * 1.3)
+    np.testing.assert_allclose(health.delay_s, 2e-3, rtol=1e-6)
+
+
+def test_noise_is_found_through_coarse_steps_and_a_passing_target():
+    stamps, fields = readings()
+    passing = fields + 3e-6 * np.exp(-0.5 * ((np.arange(3000) - 2750) / 60) ** 2)[:, None]
+    np.testing.assert_allclose(examined(stamps, passing).noise_std, SIGMA, rtol=0.3)
+    coarse = np.round(fields / 2e-8) * 2e-8
+    expected = np.sqrt(SIGMA**2 + 2e-8**2 / 12)
+    np.testing.assert_allclose(examined(stamps, coarse).noise_std, expected, rtol=0.3)
+
+
+def broken(what):
+    """(stamps, fields, received) of a sensor with a fault."""
+    stamps, fields = readings()
+    received = stamps + 1_000_000
+    if what == 'lost':
+        keep = np.random.default_rng(1).random(3000) > 0.05
+        stamps, fields, received = stamps[keep], fields[keep], received[keep]
+    elif what == 'twice':
+        stamps, fields, received = (np.repeat(a, 2, axis=0) for a in (stamps, fields, received))
+    elif what == 'back':
+        stamps[1500:] -= 5 * NS
+    elif what == 'step':
+        stamps[1500:] += NS
+    elif what == 'late':
+        received = received + (np.random.default_rng(2).random(3000) * 0.12 * NS).astype(np.int64)
+    elif what == 'ahead':
+        stamps = stamps + 3 * NS
+    elif what == 'stuck':
+        fields[2000:2400] = fields[2000]
+    elif what == 'saturated':
+        fields[1000:1200, 1] = np.minimum(1.55e-5 + 1e-6 * np.sin(np.arange(200) / 6.0), 1.6e-5)
+        fields[1000:1200, 1] = np.maximum(fields[1000:1200, 1], 1.5e-5)
+    elif what == 'spikes':
+        fields[::200] += 1e-4
+    elif what == 'dead':
+        fields[:, 0] = fields[0, 0]
+    elif what == 'axis':
+        fields[::10, 2] = np.nan
+    elif what == 'nothing':
+        fields[::10] = np.nan
+    elif what == 'gauss':
+        fields = fields * 1e4
+    elif what == 'noisy':
+        fields[:, 1] += 10 * SIGMA * np.random.default_rng(3).standard_normal(3000)
+    return stamps, fields, received
+
+
+@pytest.mark.parametrize('what, serious, said', [
+    ('lost', False, 'readings are missing between'),
+    ('twice', False, '3000 of 6000 readings have the stamp of the one before'),
+    ('back', True, 'stamps went back 1 times'),
+    ('step', True, "its clock stepped 1 times against the host's, by up to -1.00 s"),
+    ('late', False, 'ms to come'),
+    ('ahead', False, 'stamps are -3.0 s before they are received'),
+    ('stuck', True, 'readings are the same as all for more than 1 s before'),
+    ('saturated', True, 'stand at the end of the range'),
+    ('spikes', False, '14 of 3000 readings are spikes'),
+    ('dead', True, 'x does not change'),
+    ('axis', False, 'z is missing in 300 of 3000 readings'),
+    ('nothing', True, '300 of 3000 readings have no axis at all'),
+    ('gauss', True, 'a field of 0.514 T is rejected, the limit is 0.001 T'),
+    ('noisy', False, 'y is 10 times as noisy as it was calibrated'),
+])
+def test_each_fault_is_named(what, serious, said):
+    health = examined(*broken(what))
+    found = health.findings('mag_1', noise_std=np.full(3, SIGMA))
+    match = [f for f in found if said in str(f)]
+    assert len(match) == 1 and match[0].serious == serious, [str(f) for f in found]
+    assert match[0].subject == 'mag_1' and match[0].advice
+    # A stamp that goes back is also a clock that steps.
+    assert len(found) == 1 + (what == 'back'), [str(f) for f in found]
+
+
+def test_a_sensor_whose_noise_is_below_its_steps_has_no_spikes():
+    stamps, fields = readings()
+    coarse = np.round(fields / 2e-7) * 2e-7
+    coarse[::50] += 2e-7
+    health = examined(stamps, coarse)
+    assert health.counts['spikes'] == 0 and (health.noise_std > 2e-8).all()
+
+
+def test_a_host_that_stalls_is_no_step_of_a_clock():
+    """What waited meanwhile comes in a burst."""
+    stamps, fields = readings()
+    received = stamps + 1_000_000
+    for first in range(500, 3000, 500):
+        until = received[first] + 400_000_000
+        received[first:] = np.maximum(received[first:], until)
+    found = texts(examined(stamps, fields, received))
+    assert not any('stepped' in text for text in found), found
+
+
+def test_what_is_lost_is_counted():
+    stamps, fields = readings()
+    keep = np.ones(3000, dtype=bool)
+    keep[[500, 900, 901, 902, 2000]] = False
+    assert examined(stamps[keep], fields[keep]).counts['lost'] == 5
+    # One that came late is none, one that came so late has another before it.
+    for late, lost in ((1.4, 0), (1.7, 1)):
+        later = np.array(stamps)
+        later[1500:] += round((late - 1.0) * 1e7)
+        assert examined(later, fields).counts['lost'] == lost
+
+
+def test_a_steep_slope_is_no_spike():
+    stamps, fields = readings()
+    fields[1500:1520] += 1e-6 * np.arange(20)[:, None]
+    fields[1520:] += 2e-5
+    assert examined(stamps, fields).counts['spikes'] == 0
+
+
+def test_what_is_saturated_is_counted_once():
+    stamps, fields, _ = broken('saturated')
+    clipped = np.isin(fields[:, 1], [1.5e-5, 1.6e-5]).sum()
+    # With the neighbours, which are not to be trusted either.
+    assert clipped <= examined(stamps, fields).counts['saturated'] <= 200 + 12
+
+
+def test_a_stuck_two_axis_sensor_is_found():
+    stamps, fields, _ = broken('stuck')
+    fields[:, 2] = np.nan
+    assert examined(stamps, fields).counts['stuck readings'] == 299
+
+
+def test_of_an_irregular_sensor_nothing_is_called_lost():
+    rng = np.random.default_rng(4)
+    stamps = 10**18 + np.cumsum(rng.exponential(0.01, 3000) * NS).astype(np.int64)
+    assert examined(stamps, readings()[1]).counts['lost'] == 0
+
+
+def test_a_two_axis_sensor_is_no_fault():
+    stamps, fields = readings()
+    fields[:, 2] = np.nan
+    assert texts(examined(stamps, fields), noise_std=np.array([SIGMA, SIGMA, SIGMA])) == []
+
+
+def test_a_sensor_that_says_nothing():
+    assert ['no reading' in t for t in texts(SensorHealth())] == [True]
+
+
+def doctored(change=lambda k, field: field, seconds=10.0, **settings):
+    """Findings of the doctor on three sensors, the second of which is changed."""
+    network = line_network(3)
+    doctor = Doctor(network, settings_for('vehicle', settings))
+    rng = np.random.default_rng(5)
+    for k in range(int(seconds * 50)):
+        for j, name in enumerate(network.names):
+            field = network.R_sw[j] @ network.earth_field + SIGMA * rng.standard_normal(3)
+            if j == 1:
+                field = change(k, field)
+            doctor.feed(MagSample(10**18 + k * 20_000_000, name, field))
+    found = doctor.findings()
+    # The serious ones first.
+    assert found == sorted(found, key=lambda f: not f.serious)
+    return [str(f) for f in found]
+
+
+def test_a_target_that_stays_is_no_disagreement():
+    """What is compared is the background, which is frozen meanwhile."""
+    assert doctored(lambda k, field: field + 2e-5 * (k > 750), seconds=25.0) == []
+
+
+def test_the_doctor_compares_sensors_with_the_earth():
+    assert doctored() == []
+    found = doctored(lambda k, field: field * [1.0, -1.0, 1.0])
+    assert len(found) == 1 and 'mag_2: is' in found[0] and 'y is flipped' in found[0]
+    found = doctored(lambda k, field: field * 1e6)
+    assert any('its unit is microtesla' in text for text in found), found
+    assert any(text.startswith('calibrate: 500 readings rejected: above') for text in found)
+    # Not the first of the spikes: of noise nothing is known yet.
+    few = doctored(lambda k, field: field * (1e6 if k % 100 == 1 else 1.0), seconds=20.0)
+    assert 'mag_2: 9 of 1000 readings are spikes' in few[0] and '10 readings rejected' in few[1]
+    # So many rejections are serious, and come first.
+    many = doctored(lambda k, field: field * (1e6 if k % 8 == 1 else 1.0), seconds=20.0)
+    assert '125 readings rejected' in many[0] and 'are spikes' in many[1]
+
+
+def test_a_background_in_the_file_does_not_hide_what_the_sensor_says():
+    network = line_network(3)
+    given = tuple(network.R_sw[j] @ network.earth_field for j in range(3))
+    doctor = Doctor(replace(network, background=given), settings_for('vehicle'))
+    rng = np.random.default_rng(6)
+    for k in range(600):
+        for j, name in enumerate(network.names):
+            field = given[j] * ([1.0, 1.0, -1.0] if j == 2 else np.ones(3))
+            doctor.feed(MagSample(k * 20_000_000, name, field + SIGMA * rng.standard_normal(3)))
+    found = [str(f) for f in doctor.findings()]
+    assert 'mag_3: is' in found[0] and 'z is flipped' in found[0]
+
+
+def test_without_an_earth_field_sensors_are_compared_with_each_other():
+    for n, said in ((3, 'mag_2: is'), (2, 'network: sensors are not compared')):
+        network = replace(line_network(n), earth_field=None)
+        doctor = Doctor(network, settings_for('vehicle'))
+        rng = np.random.default_rng(7)
+        for k in range(400):
+            for j, name in enumerate(network.names):
+                field = network.R_sw[j] @ EARTH * ([1.0, -1.0, 1.0] if j == 1 else np.ones(3))
+                doctor.feed(MagSample(k * 20_000_000, name,
+                                      field + SIGMA * rng.standard_normal(3)))
+        found = [str(f) for f in doctor.findings()]
+        assert len(found) == 1 and found[0].startswith(said), found
+
+
+def test_clocks_that_are_far_apart_are_named_but_not_those_of_a_replay():
+    for late, n in ((120 * NS, 1), (0, 0)):
+        network = line_network(2)
+        doctor = Doctor(network, settings_for('vehicle'))
+        rng = np.random.default_rng(8)
+        for k in range(400):
+            received = 10**18 + k * 20_000_000
+            for j, name in enumerate(network.names):
+                field = network.R_sw[j] @ network.earth_field + SIGMA * rng.standard_normal(3)
+                # All of it years ago: a replay.
+                stamp = received - 10**17 - (late if j else 0)
+                doctor.feed(MagSample(stamp, name, field), received)
+        found = [str(f) for f in doctor.findings()]
+        assert len(found) == n, found
+        assert not n or found[0].startswith('mag_2: its stamps are -120 s off those of other')
+
+
+def test_the_doctor_looks_at_backgrounds():
+    steps = doctored(lambda k, field: field + 1e-6 * (k > 250), seconds=60.0)
+    assert len(steps) == 1 and 'its background has not been learnt for 5' in steps[0]
+    parked = doctored(lambda k, field: field + 1e-6 * (k > 250), seconds=80.0)
+    assert len(parked) == 1 and 'was taken for its background 1 times' in parked[0]
+    early = doctored(seconds=2.0)
+    assert len(early) == 3 and all('no background was learnt' in text for text in early)
+
+
+@pytest.mark.parametrize('name', VEHICLES)
+def test_the_doctor_finds_nothing_in_good_recordings(name, road_network):
+    doctor, lost = examine(Recording(vehicle_path(name)), road_network, settings_for('vehicle'))
+    found = [str(f) for f in doctor.findings()]
+    if name == 'straight_truck_right':
+        # Its sensors end at 100 uT, and it was that near.
+        assert found.pop().startswith('mag_2: 9 of 1400 readings stand at the end of the range')
+    assert not lost and not found
+
+
+def test_saturated_sensors_of_the_corridor(capsys):
+    """Two of its sensors end at 100 uT, and the car came that near."""
+    folder = DATA / 'corridor'
+    assert main(['doctor', str(folder / 'corridor_8_sensors.mcap'), '--network',
+                 str(folder / 'network.yaml')]) == 2
+    said = capsys.readouterr().out
+    assert [line.split()[1] for line in said.splitlines() if 'end of the range' in line] == [
+        'mag_2:', 'mag_4:']
+
+
+def test_the_command(tmp_path, capsys):
+    arguments = ['doctor', '--network', str(NETWORK_FILE)]
+    assert main([*arguments, str(vehicle_path('straight_car_right'))]) == 0
+    said = capsys.readouterr().out
+    assert 'nothing is wrong' in said and '100.0 Hz      0 lost' in said
+    assert main(arguments) == 1
+    assert main([*arguments, 'x.mcap', '--live', '3']) == 1
+    assert capsys.readouterr().err.count('either a RECORDING or --live SECONDS') == 2
+    assert main([*arguments, '--live', '0']) == 1
+    assert 'is not between 1 and 86400 s' in capsys.readouterr().err
+
+
+def test_the_command_on_one_silent_sensor(tmp_path, capsys):
+    stamps, fields = readings(500)
+    network = read_network(NETWORK_FILE)
+    with RecordingWriter(tmp_path / 'one.mcap') as writer:
+        for stamp, field in zip(stamps.tolist(), fields, strict=True):
+            writer.write('/mag_1/imu/mag', MAGNETIC_FIELD,
+                         sample_dict(MagSample(stamp, 'mag_1', field), 'mag_1'), stamp)
+    assert main(['doctor', str(tmp_path / 'one.mcap'), '--network', str(NETWORK_FILE)]) == 2
+    said = capsys.readouterr().out
+    assert 'WRONG mag_2: no reading' in said and 'mag_1: ' not in said
+    assert len(network) == 2
+
+
+@pytest.mark.parametrize('n', [1, 2, 7, 64, 513])
+def test_quantiles_are_those_of_numpy(n):
+    values, shares = np.random.default_rng(n).standard_normal(n), (0.0, 0.05, 0.5, 0.6, 0.95, 1.0)
+    np.testing.assert_allclose(quantiles(values, *shares), np.quantile(values, shares), rtol=1e-12)
+
+
+def test_there_are_no_quantiles_of_nothing():
+    assert np.isnan(quantiles(np.zeros(0), 0.1, 0.5)).tolist() == [True, True]
+
+
+def test_many_at_once_are_the_same_as_one_by_one():
+    """Also where the arrays that they came in are used for others afterwards."""
+    rng = np.random.default_rng(3)
+    stamps = np.arange(700) * NS // 100
+    fields = 1e-6 + 1e-8 * rng.standard_normal((700, 3))
+    single, many = SensorHealth(every=256), SensorHealth()
+    for t, f in zip(stamps.tolist(), fields, strict=True):
+        single.add(t, f, t + 10**6)
+    for begin, end in ((0, 0), (0, 300), (300, 301), (301, 700)):
+        given = stamps[begin:end].copy(), fields[begin:end].copy(), stamps[begin:end] + 10**6
+        many.take(*given)
+        for array in given:
+            array[:] = 0
+    assert many.counts == single.counts and many.counts['readings'] == 700
+    assert many.rate == single.rate == pytest.approx(100.0)
+    np.testing.assert_array_equal(many.noise_std, single.noise_std)
+    np.testing.assert_array_equal(many.field, single.field)
+    assert many.delay_s == single.delay_s
+
+
+def test_what_waits_comes_out_as_it_came():
+    """Of each sensor in its order; where there is no more room nothing is taken before there is."""
+    rng, waiting = np.random.default_rng(4), Waiting(5, 8)
+    rows, stamps = rng.integers(-1, 5, 300), np.arange(300)
+    fields, found, i = rng.standard_normal((300, 3)), {j: [] for j in range(5)}, 0
+    fields[7, 1] = np.nan
+
+    def take(j):
+        found[j] += [(int(t), f.tolist(), int(r)) for t, f, r in zip(*waiting.take(j), strict=True)]
+
+    while (i := waiting.add(rows, stamps, fields, 1000, i)) < len(rows):
+        take(rows[i])
+    for j in range(5):
+        take(j)
+        expected = [(k, fields[k].tolist(), 1000) for k in np.flatnonzero(rows == j).tolist()]
+        assert repr(found[j]) == repr(expected) and len(expected) > 30
+
+
+def test_counts_do_not_depend_on_how_many_are_looked_at_together():
+    """Also of what happens between the last of one look and the first of the next."""
+    rng, fields = np.random.default_rng(5), []
+    for k in range(3000):
+        stuck = k % 900 > 600
+        fields.append(fields[-1] if stuck else 1e-5 + 1e-8 * rng.standard_normal(3))
+    stamps = np.cumsum([NS // 100 * (40 if k % 256 == 0 else 1) for k in range(3000)])
+    found = []
+    for every in (1, 64, 256):
+        health = SensorHealth(every)
+        for t, f in zip(stamps.tolist(), fields, strict=True):
+            health.add(t, f)
+        found.append({k: health.counts[k] for k in ('readings', 'lost', 'stuck readings')})
+    assert found[1] == found[2]
+    assert found[0]['stuck readings'] == found[1]['stuck readings'] > 500
+    assert found[1]['lost'] > 300

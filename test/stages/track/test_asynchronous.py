@@ -1,0 +1,165 @@
+"""Sensors that are not read at one time: each sees the target where it is at its own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mag_tracking.physics.dipole import dipole_field
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.records import FieldFrame, Track
+from mag_tracking.simulation.scenario import Path, point_body, simulate
+from mag_tracking.stages.track.manager import TrackStage
+from support.bundled import POINT
+from support.networks import line_network
+from support.track_runs import magnet_frames
+
+
+@pytest.mark.parametrize('target', ['vehicle', 'magnet'])
+def test_derivatives_hold_at_every_sensors_own_time(target):
+    network = line_network(3)
+    stage = TrackStage(network, settings_for(target, {
+        'track.mounting_std_deg': 3.0, 'track.model_error_time_s': 0.0}).track)
+    rng = np.random.default_rng(1)
+    n_t = len(stage._model.state_names)
+    x = np.zeros((1, n_t + 18))
+    x[0, :n_t] = rng.standard_normal(n_t)
+    x[0, n_t:n_t + 9] = 0.05 * rng.standard_normal(9)
+    offset = np.array([-0.03, 0.0, 0.05])
+    observation = stage._filter.observation
+
+    def fields(x):
+        return observation.fields(x, offset, np.zeros(1), 0.0)
+    H = fields(x)[1][0]
+    for k in range(n_t):
+        e = np.zeros_like(x)
+        e[0, k] = 1e-5
+        numeric = (fields(x + e)[0] - fields(x - e)[0])[0] / 2e-5
+        scale = np.abs(numeric).max() + np.abs(H[:, :, :n_t]).max() * 1e-3
+        np.testing.assert_allclose(H[:, :, k], numeric, atol=1e-6 * scale)
+
+
+def slow_passes(compensated):
+    """(mean NEES, RMS [m]) of fast passes by two sensors of 12.5 Hz, read 40 ms apart."""
+    network = line_network(2)
+    nees, squares = [], []
+    for seed in range(6):
+        samples, t, position, _ = simulate(
+            network, point_body([300.0, -150.0, 80.0], 5.0, 0.5),
+            Path(np.array([-140.0, 1.2 if seed % 2 else -1.2]), 0.0, 20.0), 100.0, 12.0,
+            np.random.default_rng(seed))
+        slow = [s for s in samples if round(s.stamp_ns / 1e7) % 8 == (
+            0 if s.sensor == 'mag_1' else 4)]
+        pipeline = Pipeline(network, settings_for('vehicle', {
+            **POINT, 'track.vehicle.speeds': [20.0], 'track.mounting_std_deg': 0.0,
+            'track.field_error': 0.01, 'track.vehicle.near_field_lengths': [0.0]}))
+        feed = pipeline.track.feed
+        if not compensated:
+            pipeline.track.feed = lambda f, feed=feed: feed(
+                replace(f, time_offset=0.0 * f.time_offset))
+        for track in (r for s in slow for r in pipeline.feed(s)):
+            if isinstance(track, Track) and not track.ended:
+                q = np.array([np.interp(track.stamp_ns / 1e9, t, position[:, k]) for k in (0, 1)])
+                if np.hypot(*q) < 8.0:
+                    e = track.position[:2] - q
+                    nees.append(e @ np.linalg.solve(track.covariance[:2, :2], e) / 2)
+                    squares.append(e @ e)
+    assert len(nees) > 30
+    return np.mean(nees), np.sqrt(np.mean(squares))
+
+
+def test_slow_sensors_out_of_step_are_tracked_honestly():
+    with_offsets, without = slow_passes(True), slow_passes(False)
+    print(f'with their times: NEES {with_offsets[0]:.2f}, RMS {with_offsets[1]:.2f} m; '
+          f'as one time: {without[0]:.2f}, {without[1]:.2f} m')
+    assert with_offsets[0] < 1.6
+    assert with_offsets[0] < 0.5 * without[0]
+    assert with_offsets[1] < without[1]
+
+
+def turning_magnet(offset, rate=0.4, n=60, dt=0.27):
+    """(network, frames, positions) of a magnet that circles and turns over a board of nine."""
+    network, still, _ = magnet_frames(1)
+    rng = np.random.default_rng(3)
+
+    def state(t):
+        return (np.array([0.06 * np.cos(rate * t), 0.06 * np.sin(rate * t), 0.06]),
+                0.3 * np.array([np.sin(rate * t), 0.0, np.cos(rate * t)]))
+
+    frames = []
+    for k in range(n):
+        y = 1e-7 * rng.standard_normal((9, 3))
+        for j in range(9):
+            r, m = state(dt * k + offset[j])
+            y[j] += network.R_sw[j] @ dipole_field(network.positions[j] - r, m)
+        frames.append(FieldFrame(round(dt * 1e9 * k), y, still[0].covariance,
+                                 np.ones(9, dtype=int), offset, True, 1e6, 27))
+    return network, frames, np.array([state(dt * k)[0] for k in range(n)])
+
+
+def errors_of(network, frames, truth):
+    """Position errors [m] and NEES of the tracks, ten frames after the start."""
+    stage = TrackStage(network, settings_for('magnet').track)
+    tracks = [t for f in frames for t in stage.feed(f)]
+    e = (np.array([t.position for t in tracks]) - truth)[10:]
+    nees = [a @ np.linalg.solve(t.covariance[:3, :3], a) / 3
+            for a, t in zip(e, tracks[10:], strict=True)]
+    return np.linalg.norm(e, axis=1), np.array(nees)
+
+
+def test_a_magnet_that_keeps_turning_keeps_its_size_and_its_place():
+    """Six degrees from frame to frame; first-order turning made it longer by each of them."""
+    error, nees = errors_of(*turning_magnet(np.zeros(9)))
+    assert error.max() < 0.5e-3
+    assert nees.max() < 3.0
+
+
+def test_a_magnet_over_sensors_that_are_read_in_turn():
+    """One sensor every 30 ms, while the magnet moves 6 mm and turns 6 degrees a round."""
+    network, frames, truth = turning_magnet(0.03 * (np.arange(9) - 4))
+    error, nees = errors_of(network, frames, truth)
+    as_one, _ = errors_of(
+        network, [replace(f, time_offset=0.0 * f.time_offset) for f in frames], truth)
+    print(f'median {1e3 * np.median(error):.2f} mm; as one time {1e3 * np.median(as_one):.2f} mm')
+    assert np.median(error) < 0.3e-3
+    assert nees.mean() < 1.5
+    assert np.median(error) < 0.2 * np.median(as_one)
+    stage = TrackStage(network, settings_for('magnet').track)
+    for frame in frames:
+        track = stage.feed(frame)[-1]
+    # Each sensor's field is predicted at its own time.
+    assert np.abs(track.predicted - frame.field).max() < 0.02 * np.abs(frame.field).max()
+
+
+@pytest.mark.parametrize('gap_s', [2.0, 5.0, 15.0])
+def test_a_magnet_that_was_not_seen_for_long_is_found_again(gap_s):
+    """Flagged, or ended, while it is wrong; right again by the third frame."""
+    network, frames, truth = turning_magnet(np.zeros(9), n=40 + round(gap_s / 0.1), dt=0.1)
+    keep = np.r_[0:20, -20:0]
+    frames, truth = [frames[k] for k in keep], truth[keep]
+    stage = TrackStage(network, settings_for('magnet').track)
+    for k, (frame, r) in enumerate(zip(frames, truth, strict=True)):
+        tracks = stage.feed(frame)
+        live = [t for t in tracks if isinstance(t, Track) and not t.ended]
+        wrong = [t for t in live if np.linalg.norm(t.position - r) > max(
+            1e-3, 5.0 * np.sqrt(np.trace(t.covariance[:3, :3])))]
+        assert all(t.ambiguous for t in wrong)
+        if k > 22:
+            assert len(live) == 1 and not wrong and not live[0].ambiguous
+    assert stage.counts['frames'] == 40
+
+
+def test_a_vehicle_that_the_field_contradicts_is_lost_and_not_started_anew():
+    network = line_network(2)
+    stage = TrackStage(network, settings_for('vehicle').track)
+    C = np.repeat(1e-16 * np.eye(3)[None], 2, axis=0)
+    rng = np.random.default_rng(1)
+    tracks = []
+    for k in range(30):
+        y = 1e-7 * np.ones((2, 3)) if k < 10 else 1e-4 * rng.standard_normal((2, 3))
+        tracks += stage.feed(FieldFrame(80_000_000 * k, y, C, np.full(2, 8), np.zeros(2), True,
+                                        1e3, 6))
+    tracks = [t for t in tracks if isinstance(t, Track)]
+    assert stage.counts['tracks ended: lost its target'] == 1
+    assert tracks[-1].ended and tracks[-2].ambiguous
+    assert stage.counts['tracks'] == 1 and stage.bank is None

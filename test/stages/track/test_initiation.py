@@ -1,0 +1,182 @@
+"""The first hypotheses: where they are, how sure they are, which is the heaviest."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mag_tracking.physics.dipole import dipole_field
+from mag_tracking.pipeline import settings_for
+from mag_tracking.records import FieldFrame, Track
+from mag_tracking.stages.track.initiation_magnet import start_magnet
+from mag_tracking.stages.track.initiation_vehicle import start_vehicle, vehicle_model
+from mag_tracking.stages.track.manager import TrackStage
+from support.bundled import POINT
+from support.networks import line_network
+from support.track_runs import magnet_frames
+
+SETTINGS = settings_for('magnet').track.magnet
+
+
+def start(frame, network, relative_std=0.0, own_covariance=None):
+    return start_magnet(SETTINGS, network, frame, 1e-12, own_covariance, relative_std)
+
+
+def test_the_side_that_fits_better_is_the_heavier():
+    """Without its z axes a flat board cannot tell above from below; one z axis, noisy, can."""
+    network, frames, truth = magnet_frames(1)
+    field = np.einsum('jik,jk->ji', network.R_ws, frames[0].field)
+    network = dataclasses.replace(network, R_ws=np.repeat(np.eye(3)[None], 9, axis=0))
+    field[1:, 2] = np.nan
+    C = frames[0].covariance.copy()
+    C[0, 2, 2] = (0.5 * abs(field[0, 2])) ** 2
+    bank = start(dataclasses.replace(frames[0], field=field, covariance=C), network)
+    above = np.linalg.norm(bank.x[:, :3] - truth[0, :3], axis=1) < 0.005
+    below = np.linalg.norm(bank.x[:, :3] - truth[0, :3] * [1, 1, -1], axis=1) < 0.005
+    assert above.sum() == below.sum() == 1
+    # Below it is off by four of its deviations: twice the field over half of it.
+    gap = float(bank.log_w[above][0] - bank.log_w[below][0])
+    assert gap == pytest.approx(0.5 * 4.0**2, rel=0.1)
+
+
+def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
+    """Hard and soft iron together: what the settings call the moment."""
+    vehicle = settings_for('vehicle').track.vehicle
+    frame = FieldFrame(0, np.full((2, 3), 1e-7), np.repeat(1e-16 * np.eye(3)[None], 2, axis=0),
+                       np.full(2, 8), np.zeros(2))
+    bank = start_vehicle(vehicle, road_network, frame, 2e-8, None)
+    m = vehicle_model(vehicle, road_network).dipoles(bank.x[:, :17]).m.sum(axis=1)
+    np.testing.assert_allclose(np.linalg.norm(m, axis=1), np.take(vehicle.moments, bank.kind),
+                               rtol=1e-9)
+    np.testing.assert_array_equal(bank.x[:, 16], np.take(vehicle.lengths, bank.kind))
+    assert len(bank) == 3 * 3 * 14 * 3 * 3
+    # What is called a point is one: neither a length nor differences.
+    points = bank.P[bank.kind == 0]
+    assert not points[:, 16, 16].any()
+    np.testing.assert_allclose(points[:, 6, 6], points[:, 6, 9], rtol=1e-12)
+    for label, heading in enumerate(np.deg2rad(vehicle.arrival_headings_deg)):
+        rows = bank.label == label
+        along = bank.x[rows, :2] @ [np.cos(heading), np.sin(heading)]
+        assert (along <= 0.0).all()  # all are before the sensors
+        speed = np.hypot(*bank.x[rows, 3:5].T)
+        np.testing.assert_allclose(bank.x[rows, 3], speed * np.cos(heading), atol=1e-9)
+        assert set(np.round(speed, 6)) == set(vehicle.speeds)
+        # As sure of its speed as the settings say, relative to it, along and across.
+        ahead = np.array([np.cos(heading), np.sin(heading)])
+        across = np.array([-ahead[1], ahead[0]])
+        for direction, share in ((ahead, vehicle.speed_std), (across, vehicle.cross_speed_std)):
+            std = np.sqrt(direction @ bank.P[rows, 3:5, 3:5] @ direction)
+            np.testing.assert_allclose(std, share * speed, rtol=1e-9)
+
+
+@pytest.mark.parametrize('missing', [None, 0])
+def test_a_vehicle_starts_where_its_field_first_has_the_energy_of_the_frame(missing):
+    """Nearer it has more, and at the place before it had less."""
+    network = line_network(6)
+    vehicle = settings_for('vehicle', POINT).track.vehicle
+    std = np.array([1e-8, 2e-8, 4e-8])
+    field = np.full((6, 3), 1e-7)
+    if missing is not None:
+        field[missing] = np.nan
+    C = np.repeat(np.diag(std**2)[None], 6, axis=0)
+    there = ~np.isnan(field)
+    wanted = np.nansum((field / std) ** 2) - there.sum()
+    bank = start_vehicle(vehicle, network, FieldFrame(0, field, C, np.full(6, 8), np.zeros(6)),
+                         2e-8, None)
+    model = vehicle_model(vehicle, network)
+
+    def energy(back):
+        """Of the hypotheses' fields, as the sensors have them, `back` [m] before their places."""
+        x = bank.x[:, :model_size].copy()
+        x[:, :2] -= back * x[:, 3:5] / np.hypot(*x[:, 3:5].T)[:, None]
+        m = model.dipoles(x).m.sum(axis=1)
+        B = dipole_field(network.positions - x[:, None, :3], m[:, None])
+        h = np.einsum('jsw,njw->njs', np.swapaxes(network.R_ws, 1, 2), B)
+        return np.sum(np.where(there, h / std, 0.0) ** 2, axis=(1, 2))
+
+    model_size = len(model.state_names)
+    ahead = bank.x[:, 3:5] / np.hypot(*bank.x[:, 3:5].T)[:, None]
+    # [m] Before the outermost sensor, as they come.
+    along = ahead @ (network.positions - network.centre)[:, :2].T
+    before = along.min(axis=1) - np.sum(ahead * (bank.x[:, :2] - network.centre[:2]), axis=1)
+    reached = energy(0.0) >= wanted * (1.0 - 1e-9)
+    assert reached.mean() > 0.5
+    # Who never has it starts where the sensors begin.
+    np.testing.assert_allclose(before[~reached], 0.0, atol=1e-9)
+    coming = reached & (before < vehicle.farthest - 1e-9)
+    assert coming.mean() > 0.5
+    assert (energy(vehicle.farthest / 159.0)[coming] < wanted).all()
+
+
+def test_a_start_is_as_sure_as_the_model_is_good():
+    network, frames, truth = magnet_frames(1)
+    sure, doubtful = start(frames[0], network), start(frames[0], network, relative_std=0.05)
+    assert np.trace(doubtful.P[0, :3, :3]) > 100.0 * np.trace(sure.P[0, :3, :3])
+    rng = np.random.default_rng(2)
+    nees = []
+    for _ in range(40):
+        field = frames[0].field + 0.05 * np.linalg.norm(
+            frames[0].field, axis=1)[:, None] * rng.standard_normal((9, 3))
+        bank = start(dataclasses.replace(frames[0], field=field), network, relative_std=0.05)
+        e = bank.x[bank.best(), :3] - truth[0, :3]
+        nees.append(e @ np.linalg.solve(bank.P[bank.best(), :3, :3], e) / 3.0)
+    assert 0.4 < np.mean(nees) < 1.6
+
+
+def test_what_a_fit_leaves_over_widens_the_start():
+    """The same errors, unannounced: the residuals tell."""
+    network, frames, truth = magnet_frames(1)
+    rng = np.random.default_rng(3)
+    nees = []
+    for _ in range(40):
+        field = frames[0].field + 2e-6 * rng.standard_normal((9, 3))
+        bank = start(dataclasses.replace(frames[0], field=field), network)
+        e = bank.x[bank.best(), :3] - truth[0, :3]
+        nees.append(e @ np.linalg.solve(bank.P[bank.best(), :3, :3], e) / 3.0)
+    # Stated is a twentieth of it: without the residuals this would be four hundred.
+    assert 0.4 < np.mean(nees) < 2.0
+
+
+def test_a_magnet_may_have_turned_sensors_too():
+    network, frames, truth = magnet_frames()
+    stage = TrackStage(network, settings_for('magnet', {'track.mounting_std_deg': 2.0}).track)
+    tracks = [t for f in frames for t in stage.feed(f)]
+    assert np.linalg.norm(tracks[-1].position - truth[-1, :3]) < 1e-3
+    assert tracks[-1].mounting.shape == (9, 3)
+    assert (tracks[0].mounting_std <= np.deg2rad(2.0)).all()
+    assert (tracks[0].mounting_std > np.deg2rad(0.1)).all()
+
+
+def test_backgrounds_that_wander_are_no_target(road_network):
+    """A frame said to hold a target, but the field only does what backgrounds do."""
+    drift = 3e-8
+    stage = TrackStage(road_network, settings_for(
+        'vehicle', {'track.background_drift': drift}).track)
+    rng = np.random.default_rng(5)
+    level, dt, noise, tracks = np.zeros((2, 3)), 0.08, 4e-9, []
+    C = np.repeat(noise**2 * np.eye(3)[None], 2, axis=0)
+    for k in range(100):
+        level += drift * np.sqrt(dt) * rng.standard_normal((2, 3))
+        y = level + noise * rng.standard_normal((2, 3))
+        tracks += stage.feed(FieldFrame(round(k * dt * 1e9), y, C, np.full(2, 8), np.zeros(2),
+                                        True, 1e3, 6))
+    existence = np.array([t.existence for t in tracks if isinstance(t, Track)])
+    assert len(existence) and existence[-1] < 0.5
+
+
+def test_backgrounds_wander_between_frames_and_angles_do_not(road_network):
+    drift, dt = 1e-8, 0.5
+    stage = TrackStage(road_network, settings_for(
+        'vehicle', {'track.background_drift': drift}).track)
+    C = np.repeat(1e-16 * np.eye(3)[None], 2, axis=0)
+    stage.feed(FieldFrame(0, np.full((2, 3), 1e-7), C, np.full(2, 8), np.zeros(2), True, 1e3, 6))
+    before = np.diagonal(stage.bank.P, axis1=1, axis2=2).copy()
+    stage._filter.predict(stage.bank, dt)
+    after = np.diagonal(stage.bank.P, axis1=1, axis2=2)
+    own, grown = before[:, 17:29].reshape(-1, 2, 6), after[:, 17:29].reshape(-1, 2, 6)
+    np.testing.assert_array_equal(grown[:, :, :3], own[:, :, :3])
+    # A model error forgets what was learnt of it, with its time of 0.3 s, and stays of size one.
+    np.testing.assert_allclose(1.0 - grown[:, :, 3:],
+                               np.exp(-2.0 * dt / 0.3) * (1.0 - own[:, :, 3:]), atol=1e-12)
+    assert (own[:, :, 3:] < 1.0 - 1e-6).any()
+    np.testing.assert_allclose(after[:, 29:] - before[:, 29:], drift**2 * dt, rtol=1e-6)

@@ -1,0 +1,231 @@
+"""Sensors turned from what the network says: derivatives, and what it does to a track."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mag_tracking.geometry import quaternion_from_rotation_vector, rotation_from_quaternion
+from mag_tracking.physics.dipole import dipole_field
+from mag_tracking.physics.mounting import turned_fields
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.records import FieldFrame, Track
+from mag_tracking.simulation.scenario import Imperfections, Path, point_body, simulate
+from mag_tracking.stages.track.initiation_vehicle import vehicle_model
+from mag_tracking.stages.track.observation import Observation
+from support.bundled import POINT
+from support.marks import studied
+from support.networks import line_network
+from support.track_runs import NOISE, drive
+
+
+def case():
+    rng = np.random.default_rng(4)
+    return (rng.standard_normal((5, 3, 3)), rng.standard_normal((5, 3, 3, 4)),
+            0.2 * rng.standard_normal((5, 3, 3)))
+
+
+def test_no_angle_changes_nothing():
+    h, H, angles = case()
+    turned, derivative = turned_fields(h, H, 0.0 * angles)
+    np.testing.assert_array_equal(turned, h)
+    np.testing.assert_array_equal(derivative[..., :4], H)
+
+
+def test_small_angles_are_a_rotation_to_first_order():
+    h, H, angles = case()
+    for scale in (1e-1, 1e-2, 1e-3):
+        R = rotation_from_quaternion(quaternion_from_rotation_vector(scale * angles))
+        turned, derivative = turned_fields(h, H, scale * angles)
+        worst = np.linalg.norm(turned - (R @ h[..., None])[..., 0], axis=-1)
+        limit = 0.5 * (scale * np.linalg.norm(angles, axis=-1)) ** 2
+        assert (worst <= 1.01 * limit * np.linalg.norm(h, axis=-1)).all()
+        assert (np.linalg.norm(derivative[..., :4] - R @ H, axis=-2)
+                <= 1.01 * limit[..., None] * np.linalg.norm(H, axis=-2)).all()
+
+
+def test_derivatives_by_state_and_angle():
+    """The field is a linear function of a state here, so that H is its derivative."""
+    h, H, angles = case()
+
+    def field(v):
+        return turned_fields(h + (H @ v[:4]), H, (v[4:].reshape(3, 3) + angles))[0]
+
+    v = np.zeros(4 + 9)
+    derivative = turned_fields(h, H, angles)[1]
+    for k in range(len(v)):
+        e = 1e-6 * np.eye(len(v))[k]
+        expected = (field(v + e) - field(v - e)) / 2e-6
+        if k < 4:
+            np.testing.assert_allclose(derivative[..., k], expected, atol=1e-8)
+            continue
+        # The angles of one sensor, and what the others see of them: nothing.
+        j, a = divmod(k - 4, 3)
+        np.testing.assert_allclose(derivative[:, j, :, 4 + a], expected[:, j], atol=1e-8)
+        assert not np.delete(expected, j, axis=1).any()
+
+
+ANGLES = np.deg2rad([[4.0, -3.0, 6.0], [-5.0, 2.0, 3.0]])
+
+
+@pytest.fixture(scope='module')
+def turned_pass():
+    """(network, tracks, {stamp: frame}) of a pass by sensors that are turned by `ANGLES`."""
+    network = line_network(2)
+    samples, *_ = simulate(network, point_body([600.0, -300.0, 160.0], 5.0, 0.5),
+                           Path(np.array([-70.0, -1.2]), 0.0, 10.0), 100.0, 12.0,
+                           np.random.default_rng(6))
+    R = rotation_from_quaternion(quaternion_from_rotation_vector(ANGLES))
+    pipeline = Pipeline(network, settings_for('vehicle', {
+        **POINT, 'track.field_error': 0.02, 'track.vehicle.near_field_lengths': [0.0]}))
+    tracks, frames = [], {}
+    for s in samples:
+        turned = R[network.names.index(s.sensor)] @ s.field
+        for record in pipeline.feed(replace(s, field=turned)):
+            if isinstance(record, FieldFrame):
+                frames[record.stamp_ns] = record
+            elif isinstance(record, Track) and not record.ended:
+                tracks.append(record)
+    return network, tracks, frames
+
+
+def test_the_angles_are_found_within_their_deviations(turned_pass):
+    last = turned_pass[1][-1]
+    z = (last.mounting - ANGLES) / last.mounting_std
+    assert np.abs(z).max() < 3.0
+    # Found, not only doubted: both sensors as a whole are better known than before the pass.
+    assert np.linalg.norm(last.mounting - ANGLES) < 0.5 * np.linalg.norm(ANGLES)
+    assert (last.mounting_std < 0.8 * np.deg2rad(5.0)).all()
+
+
+def test_the_predicted_field_is_that_of_the_published_pose(turned_pass):
+    network, tracks, frames = turned_pass
+    for t in tracks:
+        B_s = np.einsum('jik,jk->ji', network.R_sw,
+                        dipole_field(network.positions - t.position, t.moment))
+        model = B_s + np.cross(t.mounting, B_s)
+        # What is left is the background; the angles move the field by up to 6e-8 T.
+        assert np.abs(t.predicted - model).max() < 2.5e-8
+    near = [t for t in tracks if np.hypot(*t.position[:2]) < 6.0]
+    assert len(near) > 5
+    for t in near:
+        field = frames[t.stamp_ns].field
+        assert np.abs(field - t.predicted).max() < 4.0 * NOISE / np.sqrt(8) + 0.1 * np.abs(
+            field).max()
+        assert 0.0 < t.nis < 20.0 and t.degrees_of_freedom == 6
+
+
+def test_a_tracker_without_angles_publishes_none():
+    network = line_network(2)
+    tracks, *_ = drive(network, point_body([300.0, -150.0, 80.0], 5.0, 0.5),
+                       Path(np.array([-70.0, -1.2]), 0.0, 10.0),
+                       changes={'track.mounting_std_deg': 0.0})
+    assert tracks[0].mounting.shape == tracks[0].mounting_std.shape == (0, 3)
+    assert tracks[0].predicted.shape == (2, 3)
+
+
+@cache
+def passes(n):
+    """{mounting_std_deg: (mean NEES, RMS error [m])} of `n` passes by sensors turned by 5
+    degrees."""
+    network = line_network(2, tilt=0.0)
+    out = {}
+    for mounting in (0.0, 5.0):
+        nees, squares = [], []
+        for seed in range(n):
+            side = 1.2 if seed % 2 else -1.2
+            tracks, _, truth = drive(
+                network, point_body([300.0, -150.0, 80.0], 5.0, 0.5),
+                Path(np.array([-70.0, side]), 0.0, 10.0), seed=seed,
+                changes={**POINT, 'track.mounting_std_deg': mounting, 'track.field_error': 0.02,
+                         'track.vehicle.near_field_lengths': [0.0]},
+                flaws=Imperfections(bias_std=1e-6, tilt_std=np.deg2rad(5.0)))
+            live = [t for t in tracks if not t.ended]
+            for t, q in zip(live, truth, strict=True):
+                if np.hypot(*q) < 5.0:
+                    e = t.position[:2] - q
+                    nees.append(e @ np.linalg.solve(t.covariance[:2, :2], e) / 2)
+                    squares.append(e @ e)
+        out[mounting] = float(np.mean(nees)), float(np.sqrt(np.mean(squares)))
+    return out
+
+
+@pytest.mark.parametrize('n', studied([3, 8], [3]))
+def test_estimated_mounting_makes_the_covariance_honest(n):
+    trusted, estimated = (passes(n)[mounting] for mounting in (0.0, 5.0))
+    print(f'mean NEES and RMS error [m]: estimated {estimated}, trusted {trusted}')
+    assert estimated[0] < 2.0
+    assert estimated[0] < 0.5 * trusted[0]
+    assert estimated[1] < trusted[1]
+
+
+STD = np.deg2rad([0.3, 0.3, 2.3])
+
+
+def observation(network, mounting_std_deg=5.0, error_time=0.3):
+    model = vehicle_model(settings_for('vehicle').track.vehicle, network)
+    return Observation(network, model, np.deg2rad(mounting_std_deg), error_time)
+
+
+def turned_network(*rotations, std):
+    """A network of sensors with these orientations and deviations."""
+    network = line_network(len(rotations), tilt=0.0)
+    return replace(network, R_ws=np.array([R.as_matrix() for R in rotations]),
+                   orientation_std=tuple(std))
+
+
+def test_what_is_known_about_the_worlds_axes_is_turned_into_the_sensors():
+    upright, side = Rotation.identity(), Rotation.from_euler('x', 90.0, True)
+    askew = Rotation.from_euler('zyx', [40.0, 20.0, -70.0], True)
+    o = observation(turned_network(upright, side, askew, side, std=(STD, STD, STD, None)))
+    P = o.own_covariance
+    np.testing.assert_allclose(P[0, :3, :3], np.diag(STD**2), atol=1e-18)
+    # Its y axis is the world's z: about that the heading turns it.
+    np.testing.assert_allclose(P[1, :3, :3], np.diag(STD[[0, 2, 1]]**2), atol=1e-18)
+    # A turn about the vertical, as the sensor has it, is as likely as the heading.
+    up = askew.inv().apply([0.0, 0.0, 1.0])
+    assert up @ P[2, :3, :3] @ up == pytest.approx(STD[2]**2)
+    assert np.trace(P[2, :3, :3]) == pytest.approx(STD @ STD)
+    # Nothing is known of this one but the setting.
+    np.testing.assert_allclose(P[3, :3, :3], np.deg2rad(5.0)**2 * np.eye(3), atol=1e-15)
+    for block in P:
+        np.testing.assert_array_equal(block[3:, 3:], np.eye(3))
+        assert not block[:3, 3:].any()
+
+
+def test_angle_covariances_are_those_of_each_sensor():
+    o = observation(line_network(3))
+    n = o.n_target + 3 * o.n_own + 9
+    A = np.random.default_rng(0).standard_normal((n, n))
+    P = A @ A.T
+    found = o.angle_covariances(P)
+    for j in range(3):
+        first = o.n_target + 6 * j
+        np.testing.assert_array_equal(found[j], P[first:first + 3, first:first + 3])
+    x = np.arange(float(n))
+    np.testing.assert_array_equal(o.angles(x)[1], x[o.n_target + 6:o.n_target + 9])
+    # Without angles there are none, with new errors in every frame they are all.
+    assert observation(line_network(3), 0.0).angle_covariances(P).shape == (0, 3, 3)
+    bare = observation(line_network(3), error_time=0.0)
+    rows = slice(o.n_target + 6, o.n_target + 9)
+    np.testing.assert_array_equal(bare.angle_covariances(P)[2], P[rows, rows])
+
+
+def test_a_narrow_prior_stays_narrow():
+    """A sensor that lies on its side, of which all but the heading is known."""
+    side = Rotation.from_euler('x', 90.0, True)
+    network = turned_network(side, Rotation.identity(), std=(STD, None))
+    tracks, *_ = drive(network, point_body([300.0, -150.0, 80.0], 5.0, 0.5),
+                       Path(np.array([-70.0, -1.2]), 0.0, 10.0), POINT)
+    live = [t for t in tracks if not t.ended]
+    first, last = live[0].mounting_std, live[-1].mounting_std
+    assert (last[0] <= 1.02 * STD[[0, 2, 1]]).all()
+    # Its own y axis is upright: the heading was the least known, and the tracker began with that.
+    assert first[0, 1] == pytest.approx(STD[2], rel=0.2)
+    np.testing.assert_allclose(first[0, [0, 2]], STD[0], rtol=0.2)
+    assert last[1].max() > 2.0 * STD[0]
+    assert (np.abs(live[-1].mounting[0]) < 4.0 * STD[[0, 2, 1]]).all()
+    np.testing.assert_allclose(
+        last, np.sqrt(np.diagonal(live[-1].mounting_covariance, axis1=1, axis2=2)))

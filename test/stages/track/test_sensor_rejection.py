@@ -1,0 +1,361 @@
+"""A sensor that contradicts the others is left out; nothing else is, and nothing is paid for it."""
+
+import copy
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.physics.dipole import MU0, dipole_field
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.records import FieldFrame, Track
+from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.initiation_vehicle import vehicle_model
+from mag_tracking.stages.track.manager import ALONE_S, TrackStage
+from mag_tracking.stages.track.sensor_rejection import ONE_IN, Contradiction
+from support.bundled import POINT
+from support.faulty_streams import NS, stream
+from support.networks import line_network
+
+SETTINGS = settings_for('vehicle', {**POINT, 'track.mounting_std_deg': 0.0,
+                                    'track.model_error_time_s': 0.0}).track
+SIGMA = 1.2e-8 / 8**0.5
+TARGET = np.array([4.0, -1.0, 0.5])
+MOMENT = np.array([200.0, -150.0, 80.0])
+OFF = np.array([3e-5, -2e-5, 4e-5])
+DT = 0.08
+
+
+class Counted(BankFilter):
+    """Counts its updates."""
+
+    n = 0
+
+    def update(self, *args, **kwargs):
+        self.n += 1
+        return super().update(*args, **kwargs)
+
+
+def situation(n=6, seed=0, spread=0.3, n_hyp=5):
+    """(filter, bank of hypotheses near the truth, frame that fits, names)."""
+    rng = np.random.default_rng(seed)
+    network = line_network(n, spacing=4.0, tilt=0.2)
+    model = vehicle_model(SETTINGS.vehicle, network)
+    bank_filter = Counted(network, model, SETTINGS)
+    state = np.array([*TARGET, 10.0, 0.0, 0.0, *(MOMENT - 4.0 * network.earth_field / MU0), 4.0])
+    x = np.tile(state, (n_hyp, 1))
+    x[:, :2] += spread * rng.standard_normal((n_hyp, 2))
+    P = np.tile(np.diag([spread, spread, 0.1, 1.0, 0.3, 0.02, 30.0, 30.0, 30.0, 0.2]) ** 2,
+                (n_hyp, 1, 1))
+    bank = FilterBank.of_targets(x, P, np.arange(n_hyp), n, 1e-8,
+                                 bank_filter.observation.own_covariance)
+    B = dipole_field(network.positions - TARGET, MOMENT)
+    field = np.einsum('jik,jk->ji', network.R_sw, B) + SIGMA * rng.standard_normal((n, 3))
+    frame = FieldFrame(1000, field, np.tile(SIGMA**2 * np.eye(3), (n, 1, 1)), np.full(n, 8),
+                       1e-3 * np.arange(n), True, 99.0, 3 * n)
+    return bank_filter, bank, frame, network.names
+
+
+def spoilt(frame, *rows, size=1.0):
+    field = frame.field.copy()
+    for k, j in enumerate(rows):
+        field[j] += (1.0 + k) * size * OFF
+    return dataclasses.replace(frame, field=field)
+
+
+def without(frame, *rows):
+    """The frame as the alignment gives it when those sensors are missing."""
+    rows = list(rows)
+    field, covariance = frame.field.copy(), frame.covariance.copy()
+    n_samples, offset = frame.n_samples.copy(), frame.time_offset.copy()
+    field[rows], covariance[rows], n_samples[rows], offset[rows] = np.nan, np.nan, 0, 0.0
+    return dataclasses.replace(frame, field=field, covariance=covariance, n_samples=n_samples,
+                               time_offset=offset)
+
+
+def state(bank):
+    return [a.tobytes() for a in (bank.x, bank.P, bank.nis, bank.log_w)]
+
+
+def same_frame(a, b):
+    return all(np.array_equal(getattr(a, f.name), getattr(b, f.name), equal_nan=True)
+               if isinstance(getattr(a, f.name), np.ndarray)
+               else getattr(a, f.name) == getattr(b, f.name) for f in dataclasses.fields(a))
+
+
+def plain(bank_filter, bank, frame):
+    """(log-likelihood, state) of the update alone."""
+    bank = copy.deepcopy(bank)
+    return bank_filter.update(bank, frame, DT), state(bank)
+
+
+@pytest.mark.parametrize('n', [1, 2, 3, 6, 12])
+def test_where_all_fits_nothing_changes_and_one_update_is_all_it_costs(n):
+    bank_filter, bank, frame, names = situation(n)
+    expected, after = plain(bank_filter, bank, frame)
+    bank_filter.n = 0
+    got, used, counts = Contradiction(names).update(bank_filter, bank, frame, DT)
+    assert bank_filter.n == 1
+    assert used is frame and not counts
+    assert got.tobytes() == expected.tobytes() and state(bank) == after
+
+
+@pytest.mark.parametrize('n', [2, 3, 6])
+@pytest.mark.parametrize('seed', range(3))
+def test_one_that_is_wrong_is_left_out_as_if_it_were_missing(n, seed):
+    bank_filter, bank, frame, names = situation(n, seed)
+    for j in range(n) if n > 2 else ():
+        mine = copy.deepcopy(bank)
+        expected, after = plain(bank_filter, bank, without(frame, j))
+        got, used, counts = Contradiction(names).update(bank_filter, mine, spoilt(frame, j), DT)
+        assert counts == {f'frames that {names[j]} contradicted': 1}
+        assert got.tobytes() == expected.tobytes() and state(mine) == after
+        assert same_frame(used, without(frame, j))
+    if n == 2:
+        # Which of two it is cannot be told, but one is left out and the other used.
+        _, used, counts = Contradiction(names).update(bank_filter, bank, spoilt(frame, 1), DT)
+        assert sum(counts.values()) == 1 and np.count_nonzero(used.n_samples) == 1
+
+
+def test_the_frame_and_the_prior_are_not_written_into():
+    bank_filter, bank, frame, names = situation()
+    wrong = spoilt(frame, 2)
+    kept = copy.deepcopy(wrong)
+    before, prior = (bank.x, bank.P), (bank.x.copy(), bank.P.copy())
+    Contradiction(names).update(bank_filter, bank, wrong, DT)
+    assert same_frame(wrong, kept)
+    assert all(np.array_equal(a, b) for a, b in zip(before, prior, strict=True))
+
+
+@pytest.mark.parametrize('n, most', [(2, 1), (6, 1), (15, 1), (16, 2), (24, 3)])
+def test_never_more_than_one_in_eight_but_always_one(n, most):
+    assert most == max(1, n // ONE_IN)
+    for wrong in (most, most + 1):
+        bank_filter, bank, frame, names = situation(n, n_hyp=2)
+        # Those that are near: what is far away agrees with everything.
+        near = np.argsort(np.linalg.norm(frame.field, axis=1))[-wrong:].tolist()
+        bad = spoilt(frame, *near)
+        whole, after = plain(bank_filter, bank, bad)
+        got, used, counts = Contradiction(names).update(bank_filter, bank, bad, DT)
+        if wrong == most and n > 2:
+            assert set(counts) == {f'frames that {names[j]} contradicted' for j in near}
+            assert same_frame(used, without(frame, *near))
+        elif wrong > most:
+            # The frame as a whole, bit for bit: it is the track that is lost.
+            assert not counts and used is bad
+            assert got.tobytes() == whole.tobytes() and state(bank) == after
+
+
+def test_all_wrong_is_a_track_that_is_lost():
+    bank_filter, bank, frame, names = situation()
+    lost = dataclasses.replace(frame, field=-3.0 * frame.field[::-1])
+    expected, after = plain(bank_filter, bank, lost)
+    got, used, counts = Contradiction(names).update(bank_filter, bank, lost, DT)
+    assert used is lost and not counts
+    assert got.tobytes() == expected.tobytes() and state(bank) == after
+    best = int(np.argmax(bank.log_w + got))
+    assert bank_filter.is_strange(bank, best, lost)
+
+
+def test_one_sensor_alone_is_never_left_out():
+    for n in (1, 6):
+        bank_filter, bank, frame, names = situation(n)
+        alone = spoilt(without(frame, *range(1, n)), 0)
+        bank_filter.n = 0
+        _, used, counts = Contradiction(names).update(bank_filter, bank, alone, DT)
+        assert used is alone and not counts and bank_filter.n == 1
+
+
+def test_of_how_many_counts_who_is_there():
+    bank_filter, bank, frame, names = situation(16, n_hyp=2)
+    near = np.argsort(np.linalg.norm(frame.field, axis=1)).tolist()
+    bad = spoilt(without(frame, near[0]), *near[-2:])
+    _, used, counts = Contradiction(names).update(bank_filter, bank, bad, DT)
+    assert used is bad and not counts
+
+
+def test_an_axis_that_is_missing_leaves_a_sensor_there():
+    bank_filter, bank, frame, names = situation()
+    field = frame.field.copy()
+    field[:, 2] = np.nan
+    bad = spoilt(dataclasses.replace(frame, field=field), 3)
+    _, used, counts = Contradiction(names).update(bank_filter, bank, bad, DT)
+    assert counts == {f'frames that {names[3]} contradicted': 1}
+    assert np.isnan(used.field[3]).all() and not np.isnan(used.field[2, :2]).any()
+
+
+def cost(bank_filter, found, bank, frame):
+    """Updates that it takes, and who is left out; the bank stays as it is."""
+    bank_filter.n = 0
+    _, used, _ = found.update(bank_filter, copy.deepcopy(bank), frame, DT)
+    return bank_filter.n, np.flatnonzero(used.n_samples == 0).tolist()
+
+
+def test_the_one_of_the_frame_before_is_the_first_suspect():
+    bank_filter, bank, frame, names = situation()
+    found = Contradiction(names)
+    assert cost(bank_filter, found, bank, spoilt(frame, 2)) == (1 + 6 + 1, [2])
+    assert cost(bank_filter, found, bank, spoilt(frame, 2)) == (2, [2])
+    # Another one now.
+    assert cost(bank_filter, found, bank, spoilt(frame, 4)) == (1 + 1 + 6 + 1, [4])
+    # A frame that fits, or a track that ends, clears it of suspicion.
+    assert cost(bank_filter, found, bank, frame) == (1, [])
+    assert cost(bank_filter, found, bank, spoilt(frame, 4)) == (8, [4])
+    found.clear()
+    assert cost(bank_filter, found, bank, spoilt(frame, 4)) == (8, [4])
+    # As does one where nothing helped.
+    assert cost(bank_filter, found, bank, spoilt(frame, 2, 4)) == (9, [])
+    assert cost(bank_filter, found, bank, spoilt(frame, 4)) == (8, [4])
+    # Who is missing now is no suspect, and costs nothing.
+    assert cost(bank_filter, found, bank, spoilt(without(frame, 4), 2)) == (1 + 5 + 1, [2, 4])
+
+
+def test_two_suspects_of_the_frame_before_are_too_many_when_fewer_are_there():
+    bank_filter, bank, frame, names = situation(16, n_hyp=2)
+    near = np.argsort(np.linalg.norm(frame.field, axis=1)).tolist()
+    found = Contradiction(names)
+    assert cost(bank_filter, found, bank, spoilt(frame, *near[-2:]))[1] == sorted(near[-2:])
+    fewer = spoilt(without(frame, near[0]), *near[-2:])
+    assert cost(bank_filter, found, bank, fewer)[1] == [near[0]]
+
+
+def test_of_two_that_are_wrong_the_second_is_sought_among_the_others():
+    bank_filter, bank, frame, names = situation(16, n_hyp=2)
+    near = np.argsort(np.linalg.norm(frame.field, axis=1)).tolist()[-2:]
+    assert cost(bank_filter, Contradiction(names), bank, spoilt(frame, *near)) == (
+        1 + 16 + 1 + 15 + 1, sorted(near))
+
+
+def test_it_has_to_fit_what_leads_by_its_weight():
+    """Another explains the frame as it is, but was ruled out long ago."""
+    bank_filter, bank, frame, names = situation(n_hyp=2)
+    bank.x[1, bank_filter.observation.n_target + 3 * 2:][:3] = OFF
+    bad = spoilt(frame, 2)
+    assert cost(bank_filter, Contradiction(names), bank, bad) == (1, [])
+    bank.log_w = np.array([0.0, -1e9])
+    assert cost(bank_filter, Contradiction(names), bank, bad) == (8, [2])
+
+
+class Ruled(BankFilter):
+    """Rules all hypotheses out as soon as a certain sensor has something to say."""
+
+    def __init__(self, row, *args):
+        super().__init__(*args)
+        self._row = row
+
+    def update(self, bank, frame, dt, x_lin=None):
+        out = super().update(bank, frame, dt, x_lin)
+        return out if np.isnan(frame.field[self._row]).all() else np.full(len(out), -np.inf)
+
+
+def test_a_sensor_that_rules_out_every_hypothesis_is_left_out():
+    plain_filter, bank, frame, names = situation()
+    network = line_network(6, spacing=4.0, tilt=0.2)
+    ruled = Ruled(3, network, vehicle_model(SETTINGS.vehicle, network), SETTINGS)
+    _, after = plain(plain_filter, bank, without(frame, 3))
+    got, _, counts = Contradiction(names).update(ruled, bank, frame, DT)
+    assert counts == {f'frames that {names[3]} contradicted': 1}
+    assert np.isfinite(got).all() and state(bank) == after
+
+
+# In the tracker.
+
+@functools.cache
+def passing(n_sensors, fault, seed=0, network_at=None, lasting_s=1.0):
+    """(pipeline, live tracks, (begin, end)) of a pass with a fault at mag_2; `network_at` [s] after
+    its begin there is another network."""
+    network, samples, _, times = stream(n_sensors, seed, fault, lasting_s)
+    pipeline, tracks = Pipeline(network, settings_for('vehicle', POINT)), []
+    for s in samples:
+        if network_at is not None and s.stamp_ns >= (times[0] + network_at) * NS:
+            pipeline.track.use_network(dataclasses.replace(network, positions=-network.positions))
+            network_at = None
+        tracks += [r for r in pipeline.feed(s) if isinstance(r, Track) and not r.ended]
+    return pipeline, tracks, times
+
+
+def test_of_two_sensors_the_track_is_flagged_from_then_on():
+    flags = {}
+    for fault in (None, 'swaps axes'):
+        # So short that it is not for having been alone.
+        pipeline, tracks, (begin, _) = passing(2, fault, seed=1, lasting_s=ALONE_S - 0.2)
+        flags[fault] = [t.ambiguous for t in tracks if t.stamp_ns / NS > begin + 0.5]
+        contradicted = [what for what in pipeline.track.counts if 'contradicted' in what]
+        assert bool(contradicted) == bool(fault)
+    assert len(flags['swaps axes']) > 10 and all(flags['swaps axes'])
+    assert not any(flags[None])
+
+
+@pytest.mark.parametrize('n_sensors', [3, 6])
+def test_of_more_the_others_are_believed(n_sensors):
+    pipeline, tracks, (begin, end) = passing(n_sensors, 'swaps axes')
+    assert pipeline.track.counts['frames that mag_2 contradicted'] > 3
+    assert [what for what in pipeline.track.counts if 'contradicted' in what] == [
+        'frames that mag_2 contradicted']
+    assert not any(t.ambiguous for t in tracks if t.stamp_ns / NS > end + 0.3)
+    # The poses say themselves who was used.
+    used = [np.count_nonzero(~np.isnan(t.nis_by_sensor)) for t in tracks
+            if begin < t.stamp_ns / NS < end]
+    assert {n_sensors - 1} <= set(used) <= {n_sensors - 1, n_sensors}
+    assert all(t.degrees_of_freedom == 3 * np.count_nonzero(~np.isnan(t.nis_by_sensor))
+               for t in tracks)
+
+
+def test_without_a_fault_nobody_is_suspected():
+    pipeline, tracks, _ = passing(3, None)
+    assert len(tracks) > 20
+    assert not [what for what in pipeline.track.counts if 'contradicted' in what]
+
+
+def test_a_calibration_that_comes_while_one_is_left_out_waits_for_the_end_of_the_track():
+    pipeline, tracks, _ = passing(3, 'swaps axes', network_at=0.5)
+    _, expected, _ = passing(3, 'swaps axes')
+    assert [(t.stamp_ns, t.position.tobytes(), t.ambiguous) for t in tracks] == [
+        (t.stamp_ns, t.position.tobytes(), t.ambiguous) for t in expected]
+    assert pipeline.track._contradiction._left_out == ()
+
+
+@pytest.mark.parametrize('alone_s, flagged', [(ALONE_S - 0.1, False), (ALONE_S + 0.2, True)])
+def test_one_that_carried_a_track_alone_leaves_it_flagged(alone_s, flagged):
+    network, samples, _, (begin, end) = stream(2, 0)
+    pipeline, tracks = Pipeline(network, settings_for('vehicle', POINT)), []
+    for s in samples:
+        if s.sensor == 'mag_2' and begin <= s.stamp_ns / NS < begin + alone_s:
+            continue
+        tracks += [r for r in pipeline.feed(s) if isinstance(r, Track) and not r.ended]
+    live = [t for t in tracks if t.stamp_ns / NS > begin + alone_s + 0.1]
+    alone = [t for t in tracks if np.isnan(t.nis_by_sensor).any()]
+    assert len(alone) >= 4 and all(t.ambiguous for t in alone)
+    assert live and all(t.ambiguous for t in live) == flagged
+
+
+def first_tracks(n_quiet):
+    """(stage, tracks) of a target that is there after so many frames without one."""
+    network = line_network(2, tilt=0.0)
+    stage = TrackStage(network, SETTINGS)
+    stage._alone_s, stage._doubted = np.inf, True
+    B = dipole_field(network.positions - [-8.0, -1.2, 0.5], MOMENT)
+    C, field = np.tile(SIGMA**2 * np.eye(3), (2, 1, 1)), np.einsum('jik,jk->ji', network.R_sw, B)
+    for k in range(n_quiet):
+        assert not stage.feed(FieldFrame(NS + k * NS // 10, 0.0 * field, C, np.full(2, 8),
+                                         np.zeros(2), False))
+    return stage, stage.feed(FieldFrame(NS + n_quiet * NS // 10, field, C, np.full(2, 8),
+                                        np.zeros(2), True))
+
+
+def test_the_next_track_begins_with_a_clean_slate():
+    """What one was flagged for says nothing of the next."""
+    stage, tracks = first_tracks(8)
+    assert tracks and stage._alone_s == 0.0 and not stage._doubted
+    stage._contradiction._left_out = (1,)
+    stage.flush()
+    assert stage._contradiction._left_out == ()
+
+
+@pytest.mark.parametrize('n_quiet', [0, 4])
+def test_a_target_that_was_not_seen_to_come_is_ambiguous(n_quiet):
+    """A restart in the middle of a pass, for instance."""
+    _, tracks = first_tracks(n_quiet)
+    assert tracks and all(t.ambiguous for t in tracks)

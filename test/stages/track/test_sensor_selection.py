@@ -1,0 +1,128 @@
+"""Of a large network a track uses the sensors that are near, and others as it moves on."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.records import FieldFrame, SmoothedPose, Track
+from mag_tracking.simulation.scenario import Path, point_body, simulate
+from mag_tracking.stages.track.sensor_selection import hand_on, nearest, part_of_frame
+from support.bundled import POINT
+from support.networks import line_network
+
+
+def bank_of(rng, n_hyp, n_t, n_own, n_sensors):
+    """Hypotheses whose states all hang together."""
+    n_x = n_t + (n_own + 3) * n_sensors
+    A = rng.standard_normal((n_hyp, n_x, n_x))
+    bank = FilterBank.of_targets(np.zeros((n_hyp, n_t)), np.zeros((n_hyp, n_t, n_t)),
+                                 np.zeros(n_hyp, dtype=int), n_sensors, 1.0,
+                                 np.zeros((n_sensors, n_own, n_own)))
+    bank.x, bank.P = rng.standard_normal((n_hyp, n_x)), A @ np.swapaxes(A, 1, 2)
+    return bank
+
+
+@pytest.mark.parametrize('n_own', [0, 3, 6])
+def test_what_is_known_of_sensors_that_stay_is_kept(n_own):
+    rng = np.random.default_rng(n_own)
+    before, after = np.array([2, 5, 7]), np.array([5, 6, 7, 9])
+    bank = bank_of(rng, 4, 8, n_own, 3)
+    x, P = bank.x.copy(), bank.P.copy()
+    prior = np.array([np.diag(np.arange(1.0, n_own + 1.0)) * (j + 1) for j in range(4)])
+    hand_on(bank, n_own, before, after, prior.reshape(4, n_own, n_own), 0.25)
+    n_x = 8 + (n_own + 3) * 4
+    assert bank.x.shape == (4, n_x) and bank.P.shape == (4, n_x, n_x)
+    assert np.isnan(bank.nis).all() and bank.nis.shape == (4, 4)
+
+    def places(j, n):
+        return [*range(8 + n_own * j, 8 + n_own * (j + 1)),
+                *range(8 + n_own * n + 3 * j, 8 + n_own * n + 3 * j + 3)]
+    old = [*range(8), *places(1, 3), *places(2, 3)]
+    new = [*range(8), *places(0, 4), *places(2, 4)]
+    np.testing.assert_array_equal(bank.x[:, new], x[:, old])
+    np.testing.assert_array_equal(bank.P[np.ix_(range(4), new, new)],
+                                  P[np.ix_(range(4), old, old)])
+    for k in (1, 3):
+        here = places(k, 4)
+        others = [i for i in range(n_x) if i not in here]
+        assert not bank.x[:, here].any() and not bank.P[np.ix_(range(4), here, others)].any()
+        expected = np.diag([*np.diagonal(prior[k]), *[0.0625] * 3])
+        np.testing.assert_array_equal(bank.P[0][np.ix_(here, here)], expected)
+    np.testing.assert_array_equal(bank.P, np.swapaxes(bank.P, 1, 2))
+
+
+def test_the_nearest_in_the_plane_in_the_networks_order():
+    positions = np.array([[0.0, 0.0, 9.0], [5.0, 0.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 0.5, 0.0]])
+    assert nearest(positions, np.array([0.2, 0.0]), 2).tolist() == [0, 2]
+    assert nearest(positions, np.array([9.0, 0.0]), 3).tolist() == [0, 1, 2]
+
+
+def test_a_part_of_a_network():
+    network = dataclasses.replace(line_network(5), clock_offset=np.arange(5.0))
+    part = network.part(np.array([1, 4]))
+    assert part.names == ('mag_2', 'mag_5') and part.topics == ('/mag_2/imu/mag', '/mag_5/imu/mag')
+    np.testing.assert_array_equal(part.positions, network.positions[[1, 4]])
+    np.testing.assert_array_equal(part.clock_offset, [1.0, 4.0])
+    assert len(part.noise_std) == len(part.calibrated) == 2
+    assert part.earth_field is network.earth_field
+
+
+def driven(network, changes, speed=20.0, seed=1):
+    """(records, truth at t) of a point target along the network."""
+    farthest = float(network.positions[:, 0].max())
+    path = Path(np.array([-60.0, -1.5]), 0.0, speed)
+    samples, *_ = simulate(network, point_body([200.0, -150.0, 80.0], 5.0, 0.5), path, 50.0,
+                           (farthest + 120.0) / speed, np.random.default_rng(seed))
+    pipeline = Pipeline(network, settings_for('vehicle', {**POINT, **changes}))
+    records = [r for s in samples for r in pipeline.feed(s)] + pipeline.flush()
+    return records, pipeline, lambda t: path.start + [speed * t, 0.0]
+
+
+def test_a_target_is_followed_along_forty_sensors():
+    """180 m, with six sensors at a time; the error stays inside its covariance all the way."""
+    network = line_network(40, tilt=0.02)
+    records, pipeline, truth = driven(network, {'track.most_sensors': 6})
+    live = [r for r in records if isinstance(r, Track) and not r.ended]
+    assert len({t.id for t in live}) == 1
+    inside = [t for t in live if 0.0 < truth(t.stamp_ns / 1e9)[0] < 171.0]
+    assert len(inside) > 80
+    e = np.array([t.position[:2] - truth(t.stamp_ns / 1e9) for t in inside])
+    nees = [v @ np.linalg.solve(t.covariance[:2, :2], v) for v, t in zip(e, inside, strict=True)]
+    print(f'rms {np.sqrt((e**2).sum(axis=1).mean()):.2f} m, mean NEES {np.mean(nees):.2f} of 2')
+    assert np.sqrt((e**2).sum(axis=1).mean()) < 0.5
+    assert np.mean(nees) < 4.0
+    assert pipeline.counts()['track']['tracks handed on to other sensors'] >= 10
+    frames = {r.stamp_ns: r for r in records if isinstance(r, FieldFrame)}
+    for t in inside:
+        assert t.predicted.shape == (40, 3) and t.mounting.shape == (40, 3)
+        used = ~np.isnan(t.nis_by_sensor)
+        assert used.sum() <= 6 and (~np.isnan(t.predicted[used])).all()
+        # Those that see the target are among them, unless they have not learnt their background.
+        there = np.flatnonzero(frames[t.stamp_ns].n_samples)
+        nearest = there[np.argsort(np.abs(network.positions[there, 0] - t.position[0]))]
+        assert used[nearest[:2]].any()
+    assert not [r for r in records if isinstance(r, SmoothedPose) and r.complete]
+    assert pipeline.counts()['track']['tracks too long to smooth'] == 1
+
+
+def test_a_network_that_is_not_larger_is_used_whole():
+    network = line_network(6, tilt=0.02)
+    some, whole = ([r for r in driven(network, {'track.most_sensors': n})[0]
+                    if isinstance(r, Track)] for n in (6, 1000))
+    assert len(some) == len(whole) > 20
+    for a, b in zip(some, whole, strict=True):
+        np.testing.assert_array_equal(a.position, b.position)
+        np.testing.assert_array_equal(a.predicted, b.predicted)
+
+
+def test_a_part_of_a_frame():
+    network = line_network(4)
+    _, pipeline, _ = driven(network, {})
+    frame = next(r for r in driven(network, {})[0] if hasattr(r, 'n_samples'))
+    part = part_of_frame(frame, np.array([0, 3]))
+    np.testing.assert_array_equal(part.field, frame.field[[0, 3]])
+    np.testing.assert_array_equal(part.covariance, frame.covariance[[0, 3]])
+    assert part.stamp_ns == frame.stamp_ns and part.target_present == frame.target_present

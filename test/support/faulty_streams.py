@@ -1,0 +1,84 @@
+"""A vehicle passes while one sensor is at fault: streams of samples for the tests."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from mag_tracking.simulation.scenario import Path, point_body, simulate
+from support.networks import line_network
+
+START_S = 1000.0
+SPEED = 10.0
+FIRST = np.array([-60.0, -1.5])
+FULL_SCALE = 8e-4
+"""[T] of a sensor; a spike of 2000 times that is 1.6 T."""
+NS = 1_000_000_000
+
+
+def swapped(sample, rng):
+    """Two axes in each other's place."""
+    return [replace(sample, field=sample.field[[1, 0, 2]])]
+
+
+def spiky(size):
+    """One reading in twenty is off by `size` [T], up or down, on every axis."""
+    def spoil(sample, rng):
+        off = size * rng.choice([-1.0, 1.0], 3) if rng.random() < 0.05 else 0.0
+        return [replace(sample, field=sample.field + off)]
+    return spoil
+
+
+def late_by(seconds):
+    """The clock is behind by so much (ahead where negative)."""
+    return lambda sample, rng: [replace(sample, stamp_ns=sample.stamp_ns - round(seconds * NS))]
+
+
+class Frozen:
+    """The first reading over and over."""
+
+    def __init__(self):
+        self._field = None
+
+    def __call__(self, sample, rng):
+        self._field = sample.field if self._field is None else self._field
+        return [replace(sample, field=self._field)]
+
+
+FAULTS = {
+    'dies': lambda: lambda sample, rng: [],
+    'freezes': Frozen,
+    'spikes of 2000 times full scale': lambda: spiky(2000.0 * FULL_SCALE),
+    'spikes within full scale': lambda: spiky(0.6 * FULL_SCALE),
+    'small spikes': lambda: spiky(2e-6),
+    'swaps axes': lambda: swapped,
+    'jumps 1 s ahead': lambda: late_by(-1.0),
+    'jumps 1 s back': lambda: late_by(1.0),
+    'sends duplicates': lambda: lambda sample, rng: [sample, sample],
+    'sends gauss': lambda: lambda sample, rng: [replace(sample, field=1e4 * sample.field)],
+}
+
+
+def stream(n_sensors, seed, fault=None, lasting_s=1.5, sensor='mag_2'):
+    """Samples of a pass in the order in which they come, and when the fault begins and ends.
+
+    Returns
+    -------
+    network, samples, truth : function of t [s] to (2,) [m], (begin, end) [s]
+    """
+    network = line_network(n_sensors, tilt=0.0)
+    rng = np.random.default_rng(seed)
+    farthest = float(network.positions[:, 0].max())
+    body = point_body(rng.normal(0.0, 250.0, 3), 5.0, 0.5)
+    duration = (60.0 + farthest + 60.0) / SPEED
+    samples, *_ = simulate(network, body, Path(FIRST, 0.0, SPEED), 100.0, duration, rng,
+                           start_s=START_S)
+    begin = START_S + 6.0 + max(0.0, farthest / 2.0 - 5.0) / SPEED - 0.4
+    end = begin + lasting_s
+    spoil, out = None if fault is None else FAULTS[fault](), []
+    for sample in samples:
+        hit = spoil and sample.sensor == sensor and begin <= sample.stamp_ns / NS < end
+        out += spoil(sample, rng) if hit else [sample]
+
+    def truth(t):
+        return FIRST + [SPEED * (t - START_S), 0.0]
+    return network, out, truth, (begin, end)

@@ -1,0 +1,39 @@
+"""The command `mag-tracking board-geometry` and what it needs and writes, for the tests."""
+
+import csv
+
+import numpy as np
+
+from mag_tracking.cli import main
+from mag_tracking.pipeline import settings_for
+from mag_tracking.records import MagSample
+from mag_tracking.stages.calibrate.stage import Calibrate
+from support.magnet_boards import MOMENT
+
+
+def write_table(path, field, positions, axes):
+    """A pose table of readings (K, n, 3), positions and axes (K, 3)."""
+    names = [f'{a}{j}' for j in range(field.shape[1]) for a in 'xyz']
+    names += [f'mag_{v}0' for v in ('x', 'y', 'z', 'mx', 'my', 'mz')]
+    with open(path, 'w', newline='') as stream:
+        writer = csv.writer(stream)
+        writer.writerow(names)
+        writer.writerows(np.hstack([field.reshape(len(field), -1), positions, axes]).tolist())
+    return path
+
+
+def command(table, *options, out):
+    """The exit status."""
+    return main(['board-geometry', str(table), '--moment', str(MOMENT), '--out', str(out),
+                 *map(str, options)])
+
+
+def through_calibrate(network, readings):
+    """Calibrated fields (K, n, 3) of raw readings, as the stage has them; NaN where it has none."""
+    stage = Calibrate(network, settings_for('magnet').calibrate)
+    out = np.full(readings.shape, np.nan)
+    for k, frame in enumerate(readings):
+        for j, (name, reading) in enumerate(zip(network.names, frame, strict=True)):
+            for sample in stage.feed(MagSample(10**18 + k * 10**9, name, reading)):
+                out[k, j] = sample.field
+    return out

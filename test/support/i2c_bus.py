@@ -1,0 +1,133 @@
+"""A bus of simulated chips, with multiplexers and faults, in place of smbus2.SMBus."""
+
+import errno
+
+from mag_tracking.drivers.transports.i2c import I2cDevice, I2cSettings
+from mag_tracking.settings import replace
+from support.i2c_chips import (
+    MS,
+    Clock,
+    FakeChip,
+    FakeHmc5883l,
+    FakeLis3mdl,
+    FakeMmc5603,
+    FakeMmc5983ma,
+    FakeRm3100,
+)
+
+B = (2e-5, -1e-5, 4e-5)
+FAKES = {'mmc5983ma': (FakeMmc5983ma, 0x30), 'mmc5603': (FakeMmc5603, 0x30),
+         'hmc5883l': (FakeHmc5883l, 0x1E), 'hmc5983': (FakeHmc5883l, 0x1E),
+         'rm3100': (FakeRm3100, 0x20), 'lis3mdl': (FakeLis3mdl, 0x1C)}
+"""{chip: (its simulation, address)}."""
+
+
+class FakeMultiplexer(FakeChip):
+    """TCA9548A: one register, with a bit for each channel; `channels` are {number: {address}}."""
+
+    def __init__(self, clock, channels):
+        self.channels, self.mask = channels, 0xFF
+        super().__init__(clock)
+
+    def write(self, data):
+        self.mask = data[-1]
+        self.written.append(self.mask)
+
+    def behind(self, address):
+        return [chips[address] for n, chips in self.channels.items()
+                if self.mask >> n & 1 and address in chips]
+
+
+class FakeBus:
+    """`open_bus` gives it.
+
+    Attributes
+    ----------
+    chips : {int: FakeChip}
+    next_errors : list of OSError or None
+        What the next transactions end with; None = as it should.
+    hangs : bool
+    open, opened, closed : bool, int, int
+    """
+
+    def __init__(self, clock, chips, hz=400_000):
+        self.clock, self.chips, self._hz = clock, chips, hz
+        self.next_errors, self.hangs = [], False
+        self.open, self.opened, self.closed = False, 0, 0
+
+    def open_bus(self, number):
+        self.open, self.number = True, number
+        self.opened += 1
+        return self
+
+    def close(self):
+        self.open = False
+        self.closed += 1
+
+    def _chip(self, address, n_bytes):
+        """The one that answers."""
+        assert self.open
+        if self.hangs:
+            self.clock.ns += 1000 * MS
+            raise OSError(errno.ETIMEDOUT, 'Connection timed out')
+        self.clock.ns += round(9e9 * (n_bytes + 1) / self._hz)
+        error = self.next_errors.pop(0) if self.next_errors else None
+        if error is not None:
+            raise error
+        there = [self.chips[address]] if address in self.chips else []
+        for chip in self.chips.values():
+            if isinstance(chip, FakeMultiplexer):
+                there += chip.behind(address)
+        there = [chip for chip in there if chip.answers]
+        assert len(there) < 2, f'two chips answer at {address:#04x}'
+        if not there:
+            raise OSError(errno.EREMOTEIO, 'Remote I/O error')
+        return there[0]
+
+    def write_byte(self, address, value):
+        self._chip(address, 1).write(bytes([value]))
+
+    def write_byte_data(self, address, register, value):
+        self._chip(address, 2).write(bytes([register, value]))
+
+    def read_byte_data(self, address, register):
+        chip = self._chip(address, 3)
+        chip.write(bytes([register]))
+        return chip.read(1)[0]
+
+    def read_i2c_block_data(self, address, register, length):
+        assert 1 <= length <= 32
+        chip = self._chip(address, 2 + length)
+        chip.write(bytes([register]))
+        return list(chip.read(length))
+
+    def i2c_rdwr(self, *messages):
+        for message in messages:
+            assert message.len > 0, 'many adapters refuse a message without bytes'
+            chip = self._chip(message.addr, message.len)
+            if message.flags & 1:
+                for i, byte in enumerate(chip.read(message.len)):
+                    message.buf[i] = bytes([byte])
+            else:
+                chip.write(bytes(message))
+
+
+def rig(entries, chips=None, clock=None, **changes):
+    """(clock, bus, device); of every entry without a multiplexer there is a chip."""
+    clock = clock or Clock()
+    if chips is None:
+        chips = {}
+        for entry in entries:
+            _, chip, address = entry.split(':')
+            chips[int(address, 16)] = FAKES[chip][0](clock)
+    bus = FakeBus(clock, chips)
+    settings = replace(I2cSettings(), {'sensors': entries, **changes})
+    return clock, bus, I2cDevice(settings, bus.open_bus, clock.monotonic_ns, clock.sleep)
+
+
+def one(chip, **changes):
+    """(clock, bus, device, simulated chip) with the one sensor A, opened, at its address."""
+    address = FAKES[chip][1]
+    clock, bus, device = rig([f'A:{chip}:{address:#04x}'], **changes)
+    device.open()
+    return clock, bus, device, bus.chips[address]

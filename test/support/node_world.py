@@ -1,0 +1,255 @@
+"""A world for tests of faults: a roadside, a broker, a serial line, and the nodes as processes."""
+
+import signal
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import rclpy
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray
+from mag_tracking_msgs.msg import NetworkFrame, TrackArray
+from rclpy.node import Node
+from rclpy.task import Future
+from scipy.stats import chi2
+from sensor_msgs.msg import MagneticField
+
+from mag_tracking.network.file import read_network
+from mag_tracking.nodes.convert import track_of
+from mag_tracking.nodes.middleware import begin
+from mag_tracking.nodes.stage_node import RESULTS, STREAM, make_executor
+from mag_tracking.simulation.scenario import point_body
+from support.bundled import NETWORK_FILE, POINT
+from support.mqtt_broker import Broker, password_lines
+from support.node_processes import start, stop
+from support.roadside import NOISE, Roadside
+from support.serial_line import SerialLine
+
+WRONG = chi2.ppf(1.0 - 1e-4, 2)
+"""A pose whose squared error is beyond this, in its own covariance, is wrong."""
+BODY = point_body([0.0, 300.0, -300.0], 5.0, 0.5)
+"""Its hard and soft iron do not cancel: it is noticed from 12 m."""
+TOPICS = {'driver_node': (MagneticField, '/mag_1/imu/mag'),
+          'calibration_node': (MagneticField, '/mag_1/imu/mag_calibrated'),
+          'detection_node': (NetworkFrame, '/detection_node/frame'),
+          'tracker_node': (TrackArray, '/tracker_node/tracks')}
+"""What each node gives."""
+FRAME_S = 0.08
+"""[s] The default of `align.period_s`."""
+NS = 1_000_000_000
+STEADY = {'calibration_node': {'calibrate.learn_s': 3600.0},
+          'detection_node': {'detect.background_drift': 0.0}}
+"""Settings of a background that is as the network file says: nothing is learnt of it between two
+vehicles, and nothing is allowed for it."""
+
+
+def network_file(folder):
+    """A copy of the network of the road with noise and backgrounds, so that nothing is learnt."""
+    content = yaml.safe_load(NETWORK_FILE.read_text())
+    for sensor in content['sensors'].values():
+        sensor.update(noise_std=NOISE, background=content['earth_field'])
+    path = folder / 'network.yaml'
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def drivers_files(folder, broker, guarded, line):
+    """{name: path} of the files of one device: `mqtt`, `serial`.
+
+    To `mqtt` belongs a device at a broker that does not let it in, `guarded`.
+    """
+    common = {'clock': {'tick_s': 1e-6, 'wrap': 0}, 'unit': 'nT'}
+    content = {
+        'mqtt': {'transport': 'mqtt', 'framing': 'json',
+                 'mqtt': {'host': '127.0.0.1', 'port': broker.port, 'topics': ['road/+']},
+                 'json': {'field': ['x', 'y', 'z'], 'ticks': 't', 'sequence': 'n'},
+                 'sensors': {'road/A': 'mag_1', 'road/B': 'mag_2'}},
+        'serial': {'transport': 'serial', 'framing': 'text', 'serial': {'port': str(line.path)},
+                   'text': {'fields': ['sensor', 'sequence', 'ticks', 'x', 'y', 'z'],
+                            'checksum': 'nmea'},
+                   'sensors': {'A': 'mag_1', 'B': 'mag_2'}}}
+    files = {name: {name: {**entry, **common}} for name, entry in content.items()}
+    files['mqtt']['guarded'] = {
+        'transport': 'mqtt', 'mqtt': {'host': '127.0.0.1', 'port': guarded.port, 'topics': ['#']},
+        'framing': 'json', 'json': {'field': ['b']}, 'sensor': 'mag_3'}
+    paths = {name: folder / f'{name}.yaml' for name in files}
+    for name, path in paths.items():
+        path.write_text(yaml.safe_dump(files[name]))
+    return paths
+
+
+class World:
+    """The nodes, which may be killed, and all that is heard of them.
+
+    Attributes
+    ----------
+    heard : {node: [(came_ns, message)]}
+        Of the topics in `TOPICS`.
+    statuses : [(came_ns, DiagnosticStatus)]
+    """
+
+    def __init__(self, folder, broker, guarded, roadside, line):
+        self.broker, self.guarded, self.roadside, self.line = broker, guarded, roadside, line
+        self.network = network_file(folder)
+        self.drivers = drivers_files(folder, broker, guarded, line)
+        self.node, self._executor = Node('tester'), make_executor()
+        self._executor.add_node(self.node)
+        self._processes, self.heard, self.statuses = {}, {name: [] for name in TOPICS}, []
+        self.link = None
+        for name, (kind, topic) in TOPICS.items():
+            self._listen(kind, topic, STREAM, self.heard[name].append)
+        self._listen(DiagnosticArray, '/diagnostics', RESULTS, lambda heard: self.statuses.extend(
+            (heard[0], status) for status in heard[1].status))
+
+    def _listen(self, kind, topic, qos, take):
+        """Have `take` called with (when it came [ns], message)."""
+        self.node.create_subscription(
+            kind, topic, lambda m: take((time.time_ns(), m)), qos)
+
+    def close(self):
+        """End what runs, as Ctrl-C does; (exit codes, outputs)."""
+        try:
+            return stop(list(self._processes.values()))
+        finally:
+            self._executor.remove_node(self.node)
+            self.node.destroy_node()
+            self._executor.shutdown()
+
+    def wait(self, condition, seconds):
+        """Listen until there is something in what `condition` gives: that, or what it gives last.
+
+        It is asked a hundred times a second, and what it gives is worth as much in time.
+        """
+        end = time.monotonic() + seconds
+        while not (found := condition()) and time.monotonic() < end:
+            self._executor.spin_until_future_complete(Future(), 0.01)
+        return found
+
+    def pause(self, seconds):
+        """Listen for a while."""
+        self.wait(lambda: False, seconds)
+
+    def start(self, name):
+        """Start a node as a process, with what it is given in this world."""
+        given = {'driver_node': {'drivers': self.drivers[self.link]},
+                 'tracker_node': POINT, **STEADY}[name]
+        if name != 'driver_node':
+            # To the driver a sensor of no network (`guarded`) would be an error.
+            given = {'network': self.network, **given}
+        self._processes[name] = start(name, *(
+            a for key, value in given.items() for a in ('-p', f'{key}:={value}')))
+
+    def kill(self, name):
+        """End a node without a word."""
+        process = self._processes.pop(name)
+        process.send_signal(signal.SIGKILL)
+        process.communicate(timeout=10)
+        # What is still on its way is of the dead.
+        self.pause(0.05)
+
+    def publishers(self):
+        """The publishers of diagnostics that were announced, also those of the dead."""
+        return {tuple(p.endpoint_gid) for p in
+                self.node.get_publishers_info_by_topic('/diagnostics')}
+
+    def recovery(self, name):
+        """Start a node: (seconds until it is up, seconds from then to the first that it gives).
+
+        It is up when its publisher appears, or at the first that it gives. The tracker gives
+        nothing while nobody comes: of it that is the first frame that it takes, by its count.
+        """
+        known, began_ns = self.publishers(), time.time_ns()
+        self.start(name)
+        up, first_ns = None, None
+        while first_ns is None and time.time_ns() < began_ns + 20 * NS:
+            self.pause(0.01)
+            first_ns = self._first_ns(name, began_ns)
+            if up is None and (first_ns or self.publishers() - known):
+                up = (time.time_ns() - began_ns) / NS
+        assert first_ns is not None, f'{name} gives nothing'
+        up = min(up, (first_ns - began_ns) / NS)
+        return up, (first_ns - began_ns) / NS - up
+
+    def _first_ns(self, name, since_ns):
+        """When the first came that a node gives since then; None = not yet."""
+        if name != 'tracker_node':
+            return next((came for came, _ in self.since(since_ns, name)), None)
+        for came, status in self.told(since_ns, 'tracker_node: track'):
+            frames = next((int(v.value) for v in status.values if v.key == 'frames'), 0)
+            if frames:
+                return came - round(frames * FRAME_S * NS)
+        return None
+
+    def use(self, link):
+        """Have the driver listen to `link`, 'mqtt' or 'serial', and wait until something comes."""
+        if link == self.link:
+            return
+        if self.link is not None:
+            codes, outputs = stop([self._processes.pop('driver_node')])
+            assert codes == [0], outputs
+        self.link, began_ns = link, time.time_ns()
+        self.start('driver_node')
+        assert self.wait(lambda: self.since(began_ns, 'driver_node'), 20.0)
+
+    def since(self, came_ns, name):
+        """[(came_ns, message)] of a node since then."""
+        return [h for h in self.heard[name] if h[0] > came_ns]
+
+    def told(self, since_ns, name, *words):
+        """[(came_ns, DiagnosticStatus)] of a name since then that have all the `words`."""
+        return [(came, s) for came, s in self.statuses if came > since_ns and s.name == name
+                and all(word in s.message for word in words)]
+
+    def tracks(self, since_ns):
+        """[Track] that have come since then."""
+        return [track_of(t) for _, m in self.since(since_ns, 'tracker_node') for t in m.tracks]
+
+    def is_quiet(self):
+        """Whether the vehicle before is gone and forgotten."""
+        frames = self.heard['detection_node']
+        return frames and not frames[-1][1].target_present and self.roadside.is_gone()
+
+    def call(self):
+        """A vehicle comes, as soon as the one before is forgotten; returns the time [ns]."""
+        assert self.wait(self.is_quiet, 20.0)
+        self.roadside.call()
+        return time.time_ns()
+
+    def drive_to(self, x):
+        """Listen until the vehicle is at `x` [m]."""
+        assert self.wait(lambda: self.roadside.truth(time.time_ns())[0] >= x, 20.0)
+
+    def wrong(self, since_ns):
+        """The poses that have come since then and are wrong."""
+        return [t for t in self.tracks(since_ns)
+                if not t.ended and is_wrong(t, self.roadside.truth(t.stamp_ns))]
+
+
+def is_wrong(track, truth):
+    """Whether a pose is not where it says to be, within its covariance, and is not flagged."""
+    e = track.position[:2] - truth
+    return not track.ambiguous and e @ np.linalg.solve(track.covariance[:2, :2], e) > WRONG
+
+
+@contextmanager
+def world(folder):
+    """A `World` whose nodes run and give frames; at the end all have to end cleanly."""
+    line = SerialLine(folder / 'port')
+    own = folder / 'guarded'
+    own.mkdir()
+    with Broker(folder) as broker, Broker(
+            own, *password_lines(own, 'somebody', 'secret')) as guarded, Roadside(
+            read_network(network_file(folder)), BODY, broker.port, line) as roadside:
+        begin()
+        here = World(folder, broker, guarded, roadside, line)
+        try:
+            here.use('mqtt')
+            for name in list(TOPICS)[1:]:
+                here.start(name)
+            assert here.wait(lambda: here.heard['detection_node'], 30.0)
+            yield here
+        finally:
+            codes, outputs = here.close()
+            rclpy.try_shutdown()
+        assert not any(codes), outputs
+        assert not any('Traceback' in text for text in outputs), outputs

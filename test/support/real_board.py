@@ -1,0 +1,46 @@
+"""Real readings for the tests: 41 sensors, a magnet, an optical tracker."""
+
+import numpy as np
+
+from mag_tracking.analysis.magnet_pose import PoseSettings, locate_magnet
+from mag_tracking.network import SensorNetwork
+from mag_tracking.recording.pose_table import read_pose_table, read_sensor_positions
+from support.bundled import DATA
+
+MOMENT = 0.264
+FOLDER = DATA / 'magnet_41_sensors'
+BOX = np.array([-0.05, -0.05, 0.03]), np.array([0.2, 0.22, 0.3])
+
+
+def board_of_41():
+    """(network, field, positions, axes)."""
+    places = read_sensor_positions(FOLDER / 'sensor_positions_m.csv')
+    names = tuple(f'mag_{j}' for j in range(len(places)))
+    noise = (np.full(3, 4e-8),) * 25 + (np.array([3.2e-7, 3.2e-7, 4.1e-7]),) * 16
+    network = SensorNetwork(names, places, np.tile(np.eye(3), (41, 1, 1)),
+                            tuple(f'/{name}' for name in names), noise_std=noise)
+    return network, *read_pose_table(FOLDER / 'poses.csv')
+
+
+def errors(geometry, field, positions, axes, poses):
+    """Errors of single poses [m] and of their axes [deg]; `poses` maps tracked ones to world."""
+    r, u = poses(positions, axes)
+    found = [locate_magnet(geometry.network, B, geometry.moment[0], *BOX, PoseSettings())
+             for B in geometry.signal(field)]
+    assert all(p.converged for p in found)
+    turn = [np.rad2deg(np.arccos(np.clip(p.axis @ a, -1.0, 1.0)))
+            for p, a in zip(found, u, strict=True)]
+    return np.linalg.norm([p.position for p in found] - r, axis=1), np.array(turn)
+
+
+def said(what, place, turn, low):
+    print(f'{what}: {1e3 * np.median(place):.3f} mm, {1e3 * np.median(place[low]):.3f} mm below '
+          f'100 mm, {np.median(turn):.2f} deg; 90 % within {1e3 * np.quantile(place, 0.9):.2f} mm')
+
+
+def within_limits(place, turn, low):
+    """The project's limits, and those of what it has reached."""
+    assert np.median(place) <= 2.0e-3 and np.median(place[low]) <= 0.8e-3
+    assert np.median(turn) <= 2.5
+    assert np.median(place) <= 1.0e-3 and np.median(place[low]) <= 0.55e-3
+    assert np.median(turn) <= 1.1

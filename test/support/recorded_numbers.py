@@ -1,0 +1,43 @@
+"""Numbers as messages, and recordings of them, for the tests."""
+
+import numpy as np
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from mag_tracking.messages.schema import sample_dict, stamp_ns
+from mag_tracking.messages.types import MAGNETIC_FIELD, decode, definition, encoder
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.recorder import Recorder
+from mag_tracking.records import MagSample
+
+TOPIC = '/mag_1/imu/mag'
+S = 10**9
+
+
+def field(k):
+    """A serialised magnetic field that carries the number `k` as its stamp."""
+    noise = np.random.default_rng(k).standard_normal(3) * 1e-5
+    return encoder(MAGNETIC_FIELD)(sample_dict(MagSample(k, 'mag', noise, None), 'mag_1'))
+
+
+def started(folder, **arguments):
+    """A recorder that knows the topic, ticked once; and what it reports."""
+    told = []
+    recorder = Recorder(folder, report=told.append, **arguments)
+    recorder.add_topic(TOPIC, MAGNETIC_FIELD, definition(MAGNETIC_FIELD))
+    recorder.tick(S)
+    return recorder, told
+
+
+def numbers(path, topic=TOPIC):
+    """The numbers of the messages in a recording, in its order, and the recording."""
+    recording = Recording(path)
+    return [stamp_ns(decode(m).header.stamp) for m in recording.messages([topic])], recording
+
+
+def by_rosbags(path, topic=TOPIC):
+    """[(time, number)] as rosbags reads them."""
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        rows = [(t, reader.deserialize(raw, c.msgtype).header.stamp)
+                for c, t, raw in reader.messages() if c.topic == topic]
+    return [(t, s.sec * S + s.nanosec) for t, s in rows]

@@ -1,0 +1,169 @@
+"""A roadside in real time for the tests: two boards measure, and a vehicle comes when it is called.
+
+The boards count and have a clock, and say what they measure over MQTT and over a serial line at
+once. What nobody takes is lost, and a connection that is lost is made again soon, as by a board.
+"""
+
+import json
+import socket
+import threading
+import time
+from contextlib import suppress
+from functools import reduce
+
+import numpy as np
+
+from mag_tracking.simulation.scenario import Path, body_field
+from support.mqtt_broker import publish_packet
+
+RATE_HZ = 100.0
+NOISE = 1.2e-8
+"""[T]."""
+FIRST = np.array([-20.0, -1.5])
+"""[m] Where a vehicle appears; it is noticed some metres later."""
+SPEED = 10.0
+PASSING_S = 5.0
+"""[s] Then it is 30 m away, and its field below two nanotesla."""
+CONNECT = b'\x10\x12\x00\x04MQTT\x04\x02\x00\x00\x00\x06boards'
+"""MQTT 3.1.1, 3.1: CONNECT of the client `boards`, clean session, no keep-alive."""
+TWIN_S = 3.0
+
+
+class MqttSender:
+    """The boards' connection to a broker, which they try anew in every round."""
+
+    def __init__(self, port):
+        self._port, self._socket = port, None
+
+    def send(self, readings):
+        """A message for each reading (board, sequence, ticks, field [nT])."""
+        with suppress(OSError):
+            if self._socket is None:
+                self._connect()
+            self._socket.sendall(b''.join(
+                publish_packet(b'road/' + board.encode(), json.dumps(
+                    {'n': k, 't': ticks, 'x': x, 'y': y, 'z': z}).encode())
+                for board, k, ticks, (x, y, z) in readings))
+            return
+        self.close()
+
+    def _connect(self):
+        """Connect; raises OSError where nobody listens."""
+        self._socket = socket.create_connection(('127.0.0.1', self._port), 1.0)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.sendall(CONNECT)
+
+    def close(self):
+        """Hang up; may be called twice."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+def nmea_line(board, k, ticks, field):
+    """A line of text with the reading [nT] and the checksum of NMEA 0183."""
+    body = ','.join([board, str(k), str(ticks), *(f'{v:.1f}' for v in field)]).encode()
+    return body + b'*%02X\n' % reduce(lambda a, b: a ^ b, body)
+
+
+class Roadside:
+    """The boards of a network, in a thread of their own.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+        With an earth field; board `A` is its first sensor, `B` the second.
+    body : MagneticBody
+    port : int
+        Of the MQTT broker; the topics are `road/A`, `road/B`.
+    line : SerialLine
+
+    Attributes
+    ----------
+    twin : bool
+        Whether a third board, which was switched on `TWIN_S` later, says that it is `A`, too.
+    """
+
+    def __init__(self, network, body, port, line):
+        assert len(network) == 2
+        self._mqtt, self._line = MqttSender(port), line
+        self._path = Path(FIRST, 0.0, SPEED)
+        self._still = np.einsum('w,jws->js', network.earth_field, network.R_ws)
+        position, heading = self._path.at(np.arange(0.0, PASSING_S, 1.0 / RATE_HZ))
+        self._table = self._still + np.einsum('njw,jws->njs', body_field(
+            body, network.earth_field, position, heading, network.positions), network.R_ws)
+        self._rng = np.random.default_rng(1)
+        self._called, self._start_ns = None, None
+        self.plugged, self.twin = True, False
+        self._line_lock, self._stopping = threading.Lock(), threading.Event()
+        self._thread = threading.Thread(target=self._measure, name='boards')
+
+    def __enter__(self):
+        self._line.plug_in()
+        self._start_ns = time.time_ns()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._stopping.set()
+        self._thread.join(timeout=10.0)
+        self._mqtt.close()
+        if self.plugged:
+            self.pull_out()
+        assert not self._thread.is_alive()
+
+    def pull_out(self):
+        """The serial port vanishes."""
+        with self._line_lock:
+            self._line.pull_out()
+            self.plugged = False
+
+    def plug_in(self):
+        """The serial port is back."""
+        with self._line_lock:
+            self._line.plug_in()
+            self.plugged = True
+
+    def call(self):
+        """A vehicle appears at once; the one before has to be gone."""
+        assert self.is_gone()
+        # One round later, for this one may be half told.
+        self._called = round((time.time_ns() - self._start_ns) / 1e9 * RATE_HZ) + 1
+
+    def is_gone(self):
+        """Whether there is no vehicle."""
+        return self._called is None or self._elapsed(time.time_ns()) > PASSING_S
+
+    def truth(self, stamp_ns):
+        """(2,) [m] Where the vehicle is, or would be when it is out of reach; NaN before any."""
+        if self._called is None:
+            return np.full(2, np.nan)
+        return FIRST + [SPEED * self._elapsed(stamp_ns), 0.0]
+
+    def _elapsed(self, stamp_ns):
+        """[s] since the vehicle was called."""
+        return (stamp_ns - self._start_ns) / 1e9 - self._called / RATE_HZ
+
+    def _measure(self):
+        """A round of readings every so often, each as soon as it is due."""
+        k = 0
+        while not self._stopping.wait(max(
+                0.0, k / RATE_HZ - (time.time_ns() - self._start_ns) / 1e9)):
+            row = None if self._called is None else k - self._called
+            there = row is not None and 0 <= row < len(self._table)
+            field = self._table[row] if there else self._still
+            field = 1e9 * (field + NOISE * self._rng.standard_normal(field.shape))
+            readings = self._readings(k, field)
+            self._mqtt.send(readings)
+            with self._line_lock:
+                if self.plugged:
+                    self._line.send(b''.join(nmea_line(*r) for r in readings))
+            k += 1
+
+    def _readings(self, k, field):
+        """[(board, sequence, ticks [us], field [nT])] of round `k`."""
+        said = [('A', k, field[0]), ('B', k, field[1])]
+        if self.twin:
+            said.append(('A', k - round(TWIN_S * RATE_HZ), field[0] + 50.0))
+        return [(board, n, round(1e6 * n / RATE_HZ), tuple(np.round(values, 1).tolist()))
+                for board, n, values in said]

@@ -1,0 +1,186 @@
+"""An Xsens device for tests: its messages, written from the protocol and not from the parser.
+
+`encode_random_frame` and `garbage` make endless streams; the long run is
+`python test/xsens_messages.py --frames 1000000`.
+"""
+
+import argparse
+import random
+import struct
+import time
+
+from mag_tracking.drivers.reading import Reading
+
+LAYOUT = ('temp', 'acc', 'gyr', 'mag', 'counter')
+"""Of the MTData messages of `encode_random_frame`; their numbers are floats."""
+FLOAT, FP1220, FP1632, DOUBLE = range(4)
+MARKS = (0xFA, 0xFA, 0xFF, 0xFF, 0x36, 0x32, 0x3E)
+"""Bytes of which garbage has more than its share."""
+
+
+def message(mid, data, extended=None):
+    """A whole message; `extended` = whether its length takes two bytes more."""
+    if extended is None:
+        extended = len(data) > 254
+    length = b'\xff' + struct.pack('>H', len(data)) if extended else bytes([len(data)])
+    body = b'\xff' + bytes([mid]) + length + bytes(data)
+    return b'\xfa' + body + bytes([-sum(body) & 0xFF])
+
+
+def packet(identifier, data):
+    """A packet of MTData2."""
+    return struct.pack('>HB', identifier, len(data)) + data
+
+
+def reals(numbers, precision):
+    """Bytes of real numbers that can be written so."""
+    if precision == FLOAT:
+        return struct.pack(f'>{len(numbers)}f', *numbers)
+    if precision == DOUBLE:
+        return struct.pack(f'>{len(numbers)}d', *numbers)
+    if precision == FP1220:
+        return b''.join(int(x * 2**20).to_bytes(4, 'big', signed=True) for x in numbers)
+    out = b''
+    for x in numbers:
+        whole = int(x * 2**32).to_bytes(6, 'big', signed=True)
+        out += whole[2:] + whole[:2]
+    return out
+
+
+def mtdata2(reading, precision=FLOAT, before=b'', behind=b''):
+    """An MTData2 message of a reading, with other packets before and behind."""
+    data = before
+    if reading.sequence is not None:
+        data += packet(0x1020, struct.pack('>H', reading.sequence))
+    if reading.ticks is not None:
+        data += packet(0x1060, struct.pack('>I', int(reading.ticks)))
+    if reading.acceleration is not None:
+        data += packet(0x4020 + precision, reals(reading.acceleration, precision))
+    if reading.field is not None:
+        data += packet(0xC020 + precision, reals(reading.field, precision))
+    return message(0x36, data + behind)
+
+
+READING = Reading('', (0.25, -1.5, 0.125), (0.5, -0.75, 9.8125), 5719854.0, 42581)
+FRAME = mtdata2(READING)
+
+
+def random_reals(rng, precision, n=3):
+    """Numbers that `precision` can write, of all sizes."""
+    bits, fraction = {FLOAT: (25, 20), FP1220: (32, 20), FP1632: (48, 32), DOUBLE: (53, 40)}[
+        precision]
+    return tuple((rng.getrandbits(bits) - 2**(bits - 1)) / 2**fraction for _ in range(n))
+
+
+def random_reading(rng, precision):
+    """A reading of field, acceleration or both."""
+    what = rng.randrange(4)
+    return Reading(
+        field=None if what == 0 else random_reals(rng, precision),
+        acceleration=None if what == 1 else random_reals(rng, precision),
+        ticks=float(rng.getrandbits(32)) if rng.random() < 0.8 else None,
+        sequence=rng.getrandbits(16) if rng.random() < 0.8 else None)
+
+
+def other_packet(rng):
+    """A packet that no reading is made of, known or unknown."""
+    kind, size = rng.choice(((0x0810, 4), (0x1010, 12), (0x1070, 4), (0x2010, 16), (0x2034, 12),
+                             (0x4010, 12), (0x4030, 12), (0x8020, 12), (0xE020, 4),
+                             (0x5A5F, rng.randrange(40)), (0xFAFF, rng.randrange(40))))
+    return packet(kind, rng.randbytes(size))
+
+
+def encode_random_frame(rng):
+    """(bytes, [Reading]) of some message that a device may send; `rng` is a random.Random."""
+    kind = rng.random()
+    if kind < 0.08:
+        mid, size = rng.choice(((0x3E, 0), (0x42, 1), (0x31, 0), (0x0D, 118), (0xC1, 32),
+                                (0x01, 4), (0x63, 110)))
+        return message(mid, rng.randbytes(size)), []
+    if kind < 0.25:
+        field, acceleration = random_reals(rng, FLOAT), random_reals(rng, FLOAT)
+        count = rng.getrandbits(16)
+        data = (rng.randbytes(4) + reals(acceleration, FLOAT) + rng.randbytes(12)
+                + reals(field, FLOAT) + struct.pack('>H', count))
+        return message(0x32, data), [Reading('', field, acceleration, None, count)]
+    precision = rng.randrange(4)
+    reading = random_reading(rng, precision)
+    others = [b''.join(other_packet(rng) for _ in range(rng.randrange(4))) for _ in range(2)]
+    return mtdata2(reading, precision, *others), [reading]
+
+
+def garbage(rng, n):
+    """`n` bytes that look like the beginnings of messages."""
+    out = bytearray()
+    while len(out) < n:
+        kind = rng.random()
+        if kind < 0.3:
+            out += b'\xfa\xff' + bytes([rng.choice((0x36, 0x36, 0x32, 0x0D)), rng.getrandbits(8)])
+        elif kind < 0.35:
+            out += b'\xfa\xff\x36\xff' + struct.pack('>H', rng.randrange(600))
+        elif kind < 0.6:
+            out.append(rng.choice(MARKS))
+        else:
+            out.append(rng.getrandbits(8))
+    return bytes(out[:n])
+
+
+def stream(rng, frames):
+    """(bytes, [Reading], lengths of the frames) of frames with garbage between."""
+    parts, readings, lengths = [], [], []
+    for _ in range(frames):
+        if rng.random() < 0.5:
+            parts.append(garbage(rng, rng.randrange(30)))
+        data, said = encode_random_frame(rng)
+        parts.append(data)
+        lengths.append(len(data))
+        readings += said
+    return b''.join(parts), readings, lengths
+
+
+def lost_and_false(sent, found):
+    """(how many of `sent` are not in `found`, how many of `found` were not sent), in order."""
+    lost = position = false = 0
+    at = {}
+    for index, reading in enumerate(sent):
+        at.setdefault(repr(reading), []).append(index)
+    for reading in found:
+        where = [i for i in at.get(repr(reading), ()) if i >= position]
+        if where:
+            lost += where[0] - position
+            position = where[0] + 1
+        else:
+            false += 1
+    return lost + len(sent) - position, false
+
+
+def main():
+    """A long run, in pieces of the size that a serial port gives."""
+    from mag_tracking.drivers.framings.xsens import XsensFraming, XsensSettings
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--frames', type=int, default=1_000_000)
+    parser.add_argument('--seed', type=int, default=0)
+    arguments = parser.parse_args()
+    rng, framing = random.Random(arguments.seed), XsensFraming(XsensSettings(mtdata=LAYOUT))
+    sent = lost = false = fed = 0
+    spent = 0.0
+    for _ in range(0, arguments.frames, 10_000):
+        data, readings, _ = stream(rng, min(10_000, arguments.frames))
+        found, rest, position = [], b'', 0
+        begin = time.perf_counter()
+        while position < len(data):
+            piece = rest + data[position:position + 64]
+            position += 64
+            parsed = framing.parse(piece, final=position >= len(data))
+            rest = piece[parsed.consumed:]
+            found += parsed.readings
+        spent += time.perf_counter() - begin
+        fewer, more = lost_and_false(readings, found)
+        sent, lost, false, fed = sent + len(readings), lost + fewer, false + more, fed + len(data)
+    print(f'{arguments.frames} frames with {sent} readings in {fed} bytes: {lost} lost, {false} '
+          f'false, {1e6 * spent / arguments.frames:.1f} us a frame')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,73 @@
+"""A sensor fails while a target passes: the track goes on or is flagged, and the fault is named."""
+
+import functools
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.records import Track
+from support.bundled import POINT
+from support.faulty_streams import FAULTS, NS, stream
+
+WRONG = chi2.ppf(1.0 - 1e-4, 2)
+"""A pose whose squared error is beyond this, in its own covariance, is wrong."""
+
+
+@functools.cache
+def passed(n_sensors, seed, fault=None):
+    """Pipeline, [(t, error [m], squared error in deviations, flagged)], (begin, end)."""
+    network, samples, truth, times = stream(n_sensors, seed, fault)
+    pipeline = Pipeline(network, settings_for('vehicle', POINT))
+    records = [r for s in samples for r in pipeline.feed(s)] + pipeline.flush()
+    rows = []
+    for t in (r for r in records if isinstance(r, Track) and not r.ended):
+        now = t.stamp_ns / NS
+        e = t.position[:2] - truth(now)
+        rows.append((now, float(np.linalg.norm(e)),
+                     float(e @ np.linalg.solve(t.covariance[:2, :2], e)), t.ambiguous))
+    return pipeline, rows, times
+
+
+NAMED = {
+    'dies': ('align', 'frames with a sensor missing'),
+    'freezes': ('mag_2', 'rejected: the same reading over and over'),
+    'spikes of 2000 times full scale':
+        ('mag_2', 'rejected: above 0.001 T (gauss or microtesla as tesla?)'),
+    'spikes within full scale': ('mag_2', 'rejected: spike'),
+    'small spikes': ('mag_2', 'rejected: spike'),
+    'swaps axes': ('track', 'frames that mag_2 contradicted'),
+    'jumps 1 s ahead': ('align', 'rejected: ahead of all others: mag_2'),
+    'jumps 1 s back': ('mag_2', 'rejected: out of order'),
+    'sends duplicates': ('mag_2', 'rejected: duplicate stamp'),
+    'sends gauss': ('mag_2', 'rejected: above 0.001 T (gauss or microtesla as tesla?)'),
+}
+"""Where a fault is counted, and as what."""
+
+
+@pytest.mark.parametrize('fault', list(FAULTS))
+@pytest.mark.parametrize('n_sensors, n', [(2, 2), (6, 1)])
+def test_a_fault_while_a_target_passes(n_sensors, n, fault):
+    for seed in range(n):
+        _, whole, _ = passed(n_sensors, seed)
+        pipeline, rows, (begin, end) = passed(n_sensors, seed, fault)
+        where, what = NAMED[fault]
+        counts = pipeline.calibrate.counts_of(where) if where == 'mag_2' else \
+            pipeline.counts()[where]
+        # Named, and nothing of the others is held against them.
+        assert counts[what] > 0
+        assert not any(n for s in pipeline.network.names if s != 'mag_2'
+                       for key, n in pipeline.calibrate.counts_of(s).items()
+                       if key.startswith('rejected'))
+        unflagged = sum(z > WRONG and not flagged for _, _, z, flagged in whole)
+        wrong = [r for r in rows if r[2] > WRONG and not r[3]]
+        assert len(wrong) <= unflagged, (seed, wrong[:3])
+        if n_sensors > 2:
+            # The others carry the track; two seconds on it is as good as it would have been.
+            during = [r for r in rows if begin < r[0] < end]
+            assert len(during) >= 0.9 * (end - begin) / 0.08 - 1
+            late = [(r[1], w[1]) for r, w in zip(
+                [r for r in rows if end + 2.0 < r[0]],
+                [w for w in whole if end + 2.0 < w[0]], strict=False)]
+            assert all(mine < theirs + 1.0 for mine, theirs in late)

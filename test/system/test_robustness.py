@@ -1,0 +1,251 @@
+"""What a reviewer broke once, and must not break again."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from mag_tracking.apps.replay import replay
+from mag_tracking.cli import main
+from mag_tracking.errors import NetworkError, OutputError, SettingsError
+from mag_tracking.messages.schema import odometry_dict, pose_covariance
+from mag_tracking.network.file import read_network
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.records import Detection, FieldFrame, MagSample, Track
+from mag_tracking.settings import replace
+from mag_tracking.simulation.scenario import Path, point_body
+from mag_tracking.stages.align.settings import AlignSettings
+from mag_tracking.stages.align.stage import Align
+from mag_tracking.stages.detect.settings import DetectSettings
+from mag_tracking.stages.detect.stage import Detect
+from mag_tracking.stages.stage import rejected
+from mag_tracking.stages.track.manager import TrackStage
+from support.bundled import NETWORK_FILE, vehicle_path
+from support.calibration_runs import EARTH, SIGMA, feed, running, sample, stage
+from support.networks import line_network
+from support.track_runs import drive, magnet_frames
+
+NAME = 'straight_car_right'
+
+
+def test_a_replay_does_not_overwrite_its_recording(tmp_path, road_network):
+    path = tmp_path / 'tracks.mcap'
+    path.write_bytes(vehicle_path(NAME).read_bytes())
+    with pytest.raises(OutputError, match='folder of the recording'):
+        replay(Recording(path), road_network, settings_for('vehicle'), tmp_path)
+    assert path.read_bytes() == vehicle_path(NAME).read_bytes()
+    with RecordingWriter(tmp_path / 'other' / 'a.mcap'):
+        pass
+    with pytest.raises(OutputError, match='another recording'):
+        RecordingWriter(tmp_path / 'other' / 'b.mcap')
+
+
+def test_recordings_of_the_same_name_are_refused(tmp_path, capsys):
+    (tmp_path / 'b').mkdir()
+    other = tmp_path / 'b' / f'{NAME}.mcap'
+    other.write_bytes(vehicle_path(NAME).read_bytes())
+    assert main(['replay', str(vehicle_path(NAME)), str(other), '--network', str(NETWORK_FILE),
+                 '--out', str(tmp_path / 'out')]) == 1
+    assert 'two recordings are named' in capsys.readouterr().err
+
+
+def test_a_looped_recording_gives_the_same_track_again(road_network):
+    samples = list(SampleReader(Recording(vehicle_path(NAME)), road_network).samples())
+    pipeline = Pipeline(road_network, settings_for('vehicle'))
+    loops = []
+    for _ in range(2):
+        tracks = [r for s in samples for r in pipeline.feed(s) if isinstance(r, Track)]
+        loops.append([t for t in tracks if not t.ended])
+    # Frames are cut anew at the restart: the same but for the grid's phase at its very end.
+    assert abs(len(loops[0]) - len(loops[1])) <= 1
+    a, b = ({t.stamp_ns: t.position for t in loop} for loop in loops)
+    common = sorted(set(a) & set(b))
+    assert len(common) >= len(a) - 2
+    np.testing.assert_allclose([a[k] for k in common], [b[k] for k in common], rtol=1e-9)
+
+
+def test_a_release_below_the_onset_is_refused():
+    with pytest.raises(SettingsError, match='release_probability'):
+        Detect(line_network(2), replace(DetectSettings(), {
+            'false_alarm_probability': 0.2, 'release_probability': 1e-3}))
+
+
+@pytest.mark.parametrize('step', [0.0, 2e-6])
+def test_a_stuck_or_coarse_sensor_is_told_and_not_taken_for_perfect(step):
+    b = running()
+    rng = np.random.default_rng(0)
+    for t in np.arange(0, 10, 0.01):
+        value = EARTH + SIGMA * rng.standard_normal(3)
+        b.add(t, np.round(value / step) * step if step else EARTH)
+    assert not b.ready and b.stuck
+
+
+def test_a_sensor_that_gets_stuck_keeps_its_noise():
+    b = running(memory=3.0)
+    feed(b, np.arange(0, 6, 0.01))
+    for t in np.arange(6, 20, 0.01):
+        b.add(t, EARTH)
+    assert np.diagonal(b.covariance).min() > 0.5 * (SIGMA**2).min()
+
+
+def test_an_unknown_covariance_between_the_nodes_is_taken_from_the_network_or_rejected():
+    align = Align(line_network(1), AlignSettings())
+    out = [f for k in range(30) for f in align.feed(
+        MagSample(k * 10_000_000, 'mag_1', np.zeros(3), None))]
+    np.testing.assert_allclose(out[0].covariance[0], 1.44e-16 * np.eye(3) / 8)
+    align = Align(dataclasses.replace(line_network(1), noise_std=(None,)), AlignSettings())
+    align.feed(MagSample(0, 'mag_1', np.zeros(3), None))
+    align.feed(MagSample(1, 'mag_1', np.full(3, np.inf), None))
+    assert sorted(rejected(align.counts)) == [
+        'covariance unknown, and no noise_std in the network', 'no finite field']
+
+
+def test_an_axis_that_is_missing_now_and_then_stays_known():
+    b = running()
+    rng = np.random.default_rng(0)
+    for k, t in enumerate(np.arange(0, 20, 0.01)):
+        value = EARTH + SIGMA * rng.standard_normal(3)
+        if k % 37 == 0:
+            value[0] = np.nan
+        b.add(t, value)
+    assert np.isfinite(b.covariance).all()
+    assert np.abs((b.level(20.0) - EARTH) / SIGMA).max() < 0.5
+    np.testing.assert_allclose(np.sqrt(np.diagonal(b.covariance)), SIGMA, rtol=0.1)
+
+
+def test_a_present_axis_never_has_an_unknown_covariance():
+    """Two axes are learnt, then a third begins to report: it is held back and counted."""
+    s = stage(given=False)
+    network = dataclasses.replace(line_network(2), noise_std=(None, None))
+    s = type(s)(network, s._settings)
+    rng = np.random.default_rng(0)
+    out = []
+    for k in range(1000):
+        field = EARTH + SIGMA * rng.standard_normal(3)
+        if k < 800:
+            field[2] = np.nan
+        out += s.feed(sample(0.01 * k, field))
+    for r in out:
+        there = ~np.isnan(r.field)
+        assert there.any() and np.isfinite(r.covariance[np.ix_(there, there)]).all()
+    assert s.counts['axes held back while learning'] > 0
+
+
+def test_one_corrupt_stamp_costs_one_sample():
+    s = stage()
+    for t in (1.0, 1.1, 3601.0, 1.2, 1.3):
+        s.feed(sample(t))
+    assert rejected(s.counts) == {'stamp too far ahead': 1}
+    assert s.counts['calibrated'] == 4
+    # A real gap is confirmed by the next sample.
+    assert s.feed(sample(7200.0)) == [] and len(s.feed(sample(7200.1))) == 1
+
+
+def test_a_slow_sensor_is_learnt():
+    b = running(learn=20.0)
+    feed(b, np.arange(0, 120, 0.5))
+    assert b.ready and not b.frozen
+
+
+def test_no_second_detection_in_the_wake_of_a_target():
+    """A background learnt in three seconds has to last for the whole of a pass."""
+    network = dataclasses.replace(line_network(2), noise_std=(None, None))
+    for seed in range(3):
+        tracks, pipeline, _ = drive(network, point_body([200.0, -150.0, 80.0], 5.0, 0.5),
+                                    Path(np.array([-80.0, -1.2]), 0.0, 10.0), duration=30.0,
+                                    seed=seed)
+        assert pipeline.detect.counts['onsets'] == 1
+
+
+@pytest.mark.parametrize('content, message', [
+    (b'sensors: {"m\xff": 1}', 'not YAML'),
+    (b'sensors:\n  "m 1": {position: [0, 0, 0]}', 'no name for a sensor'),
+    (b'sensors:\n  1abc: {position: [0, 0, 0]}', 'no ROS topic'),
+    (b'frame:\nsensors:\n  a: {position: [0, 0, 0]}', 'frame: expected a name'),
+    (b'sensors:\n  a: {position: [0, 0, 0], noise_std: 12.0}', 'below a millitesla'),
+    (b'sensors:\n  a: {position: [0, 0, 0], background: [15.0, 0, 0]}', 'microtesla'),
+    (b'sensors:\n  a: {position: [0, 0, ' + b'9' * 400 + b']}', 'not a finite number'),
+    (b'sensors:\n  [a]: {position: [0, 0, 0]}', 'is no name'),
+])
+def test_more_faulty_network_files(tmp_path, content, message):
+    path = tmp_path / 'network.yaml'
+    path.write_bytes(content)
+    with pytest.raises(NetworkError, match=message):
+        read_network(path)
+
+
+def test_a_full_disk_is_one_line(tmp_path, capsys):
+    out = tmp_path / 'out'
+    out.mkdir()
+    (out / 'poses.csv').symlink_to('/dev/full')
+    assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE),
+                 '--out', str(out), '--no-figures']) == 1
+    assert 'No space left' in capsys.readouterr().err
+
+
+def test_a_summary_without_numbers_is_still_json(tmp_path):
+    from mag_tracking.recording.result_folder import ResultFolder
+    with ResultFolder(tmp_path, 'map') as folder:
+        folder.write_summary({'a': float('nan'), 'b': [1.0, float('inf')]})
+    assert json.loads((tmp_path / 'summary.json').read_text()) == {'a': None, 'b': [1.0, None]}
+
+
+def test_existence_falls_on_noise():
+    network = line_network(2)
+    stage_ = TrackStage(network, settings_for('vehicle').track)
+    rng = np.random.default_rng(0)
+    C = np.repeat(1.44e-16 * np.eye(3)[None] / 8, 2, axis=0)
+    tracks = []
+    for k in range(40):
+        y = 1.2e-8 / np.sqrt(8) * rng.standard_normal((2, 3))
+        tracks += stage_.feed(FieldFrame(k * 80_000_000, y, C, np.full(2, 8), np.zeros(2),
+                                          True, 6.0, 6))
+    assert [t for t in tracks if isinstance(t, Track)][-1].existence < 0.5
+
+
+def test_pose_covariance_is_that_of_sampled_states():
+    """Position, rotation and their cross terms against states drawn from the filter's Gaussian."""
+    network, frames, _ = magnet_frames(4)
+    stage_ = TrackStage(network, settings_for('magnet').track)
+    track = [t for f in frames for t in stage_.feed(f)][-1]
+    bank = stage_.bank
+    rng = np.random.default_rng(1)
+    x = rng.multivariate_normal(bank.x[0, :12], bank.P[0, :12, :12], 200_000)
+    m = track.moment
+    # The rotation that takes m to the drawn moment, to first order.
+    w = np.cross(m, x[:, 6:9]) / (m @ m)
+    drawn = np.cov(np.hstack([x[:, :3], w]).T)
+    ours = pose_covariance(track).copy()
+    ours[3:, 3:] -= np.pi**2 * np.outer(m, m) / (m @ m)
+    sd = np.sqrt(np.diagonal(drawn))
+    assert np.abs((drawn - ours) / np.outer(sd, sd)).max() < 0.03
+    # The cross terms are not nothing: a wrong sign would be seen.
+    assert np.abs(ours[:3, 3:] / np.outer(sd[:3], sd[3:])).max() > 0.1
+
+
+def test_odometry_is_in_the_childs_frame():
+    tracks, _, _ = drive(line_network(2), point_body([200.0, -150.0, 80.0], 5.0, 0.5),
+                         Path(np.array([1.2, -70.0]), np.pi / 2, 10.0),
+                         {'track.vehicle.arrival_names': ['south'],
+                          'track.vehicle.arrival_headings_deg': [90.0]})
+    live = [t for t in tracks if not t.ended]
+    track = live[len(live) // 2]
+    twist = odometry_dict(track, 'map', 'c')['twist']
+    speed = np.hypot(*track.velocity[:2])
+    assert twist['twist']['linear']['x'] == pytest.approx(speed)
+    assert twist['twist']['linear']['y'] == pytest.approx(0.0, abs=1e-9)
+    u = track.velocity[:2] / speed
+    C = np.array(twist['covariance']).reshape(6, 6)
+    assert C[0, 0] == pytest.approx(u @ track.covariance[3:5, 3:5] @ u, rel=1e-6)
+
+
+def test_detections_have_ids_that_count_the_onsets(road_network):
+    pipeline = Pipeline(road_network, settings_for('vehicle'))
+    samples = list(SampleReader(Recording(vehicle_path(NAME)), road_network).samples())
+    events = [(r.id, r.onset) for s in samples for r in pipeline.feed(s)
+              if isinstance(r, Detection)]
+    assert events == [(1, True), (1, False)]

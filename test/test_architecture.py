@@ -1,0 +1,134 @@
+"""The structure: floors, sizes, and what tests may reach."""
+
+import ast
+import re
+from collections import Counter
+from pathlib import Path
+
+import grimp
+import pytest
+from importlinter import api
+
+from support.bundled import ROOT
+
+PACKAGE = ROOT / 'mag_tracking'
+FILES = sorted(PACKAGE.rglob('*.py'))
+LARGEST_FILE, LARGEST_FUNCTION, LARGEST_SHARE = 350, 40, 0.2
+"""Lines of a file, lines of a function without its docstring, share of all lines in one room."""
+
+
+def layers():
+    """[{room}], highest floor first, as `lint-imports` checks them."""
+    contracts = api.read_configuration(str(ROOT / 'pyproject.toml'))['contracts_options']
+    rows = next(c['layers'] for c in contracts if c['type'] == 'layers')
+    return [set(re.split(r'\s*[|:]\s*', row)) for row in rows]
+
+
+def table():
+    """[{room}], highest floor first, as docs/architecture.md has them."""
+    text = (ROOT / 'docs' / 'architecture.md').read_text()
+    rows = re.findall(r'^\| (\d) \| ([^|]+)\|', text, re.M)
+    assert [int(n) for n, _ in rows] == list(range(len(rows), 0, -1))
+    return [{room.removesuffix('.py').rstrip('/') for room in re.findall(r'`([^`]+)`', rooms)}
+            for _, rooms in rows]
+
+
+def test_the_contracts_and_the_page_say_the_same_floors():
+    assert layers() == table()
+
+
+def test_every_module_has_a_floor():
+    rooms = {p.stem if p.is_file() else p.name for p in PACKAGE.iterdir()
+             if p.name != '__pycache__' and (p.suffix == '.py' or p.is_dir())}
+    assert rooms - {'__init__'} == set.union(*layers())
+
+
+def test_no_two_modules_import_each_other():
+    graph = grimp.build_graph('mag_tracking')
+    imports = {m: graph.find_modules_directly_imported_by(m) for m in graph.modules}
+    done, on_path = set(), []
+
+    def visit(module):
+        assert module not in on_path, f'circle: {on_path[on_path.index(module):]}'
+        if module not in done:
+            on_path.append(module)
+            for imported in imports[module]:
+                visit(imported)
+            on_path.pop()
+            done.add(module)
+
+    for module in sorted(imports):
+        visit(module)
+    assert len(done) > 100
+
+
+def n_lines(path):
+    return len(path.read_text().splitlines())
+
+
+def test_no_file_is_too_long():
+    assert {str(p.relative_to(ROOT)): n_lines(p) for p in FILES
+            if n_lines(p) > LARGEST_FILE} == {}
+
+
+def test_no_room_holds_too_much():
+    rooms = Counter()
+    for path in FILES:
+        rooms[path.relative_to(PACKAGE).parts[0]] += n_lines(path)
+    largest, n = rooms.most_common(1)[0]
+    assert n <= LARGEST_SHARE * rooms.total(), f'{largest}: {n} of {rooms.total()} lines'
+
+
+def definitions(path):
+    """(node, whether it is public) of every function and class of a module, methods included."""
+    def walk(body, public):
+        for node in body:
+            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+                shown = public and not node.name.startswith('_')
+                yield node, shown
+                yield from walk(node.body, shown and isinstance(node, ast.ClassDef))
+
+    return walk(ast.parse(path.read_text()).body, True)
+
+
+def length(node):
+    """Lines of a function without its docstring."""
+    text = ast.get_docstring(node, clean=False)
+    return node.end_lineno - node.lineno + 1 - (text.count('\n') + 1 if text is not None else 0)
+
+
+@pytest.mark.parametrize('path', FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_functions_are_short_and_public_names_have_docstrings(path):
+    assert ast.get_docstring(ast.parse(path.read_text()))
+    long = {node.name: length(node) for node, _ in definitions(path)
+            if not isinstance(node, ast.ClassDef) and length(node) > LARGEST_FUNCTION}
+    assert long == {}
+    silent = [node.name for node, public in definitions(path)
+              if public and ast.get_docstring(node) is None]
+    assert silent == []
+
+
+def private_uses(tree):
+    """Private names of the package that a test imports, or reads from anything but `self`."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or '').startswith('mag_tracking'):
+            yield from (a.name for a in node.names if a.name.startswith('_'))
+        elif isinstance(node, ast.Attribute) and re.match(r'_[a-z]', node.attr) \
+                and node.attr not in ('_replace', '_asdict', '_fields'):
+            if not (isinstance(node.value, ast.Name) and node.value.id in ('self', 'cls')):
+                yield node.attr
+
+
+@pytest.mark.parametrize('path', sorted((ROOT / 'test').rglob('*.py')),
+                         ids=lambda p: str(p.relative_to(ROOT / 'test')))
+def test_tests_reach_no_private_name(path):
+    assert sorted(private_uses(ast.parse(path.read_text()))) == []
+
+
+def test_the_tests_mirror_the_package():
+    """Every folder of tests below the system tests is a room of the package."""
+    apart = {'data', 'support', 'system', 'bench', '__pycache__'}
+    folders = [p.relative_to(ROOT / 'test') for p in (ROOT / 'test').rglob('*')
+               if p.is_dir() and not set(p.relative_to(ROOT / 'test').parts) & apart]
+    assert [str(f) for f in folders if not (PACKAGE / f).is_dir()] == []
+    assert Path('stages/track') in folders
