@@ -13,7 +13,7 @@ from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.survey.settings import SurveySettings
-from mag_tracking.stages.track.manager import TrackStage
+from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.settings import TrackSettings
 
 
@@ -77,7 +77,7 @@ class Pipeline:
         self.calibrate = Calibrate(network, settings.calibrate)
         self.align = Align(network, settings.align)
         self.detect = Detect(network, settings.detect)
-        self.track = TrackStage(network, settings.track)
+        self.track = TrackManager(network, settings.track)
 
     def feed(self, sample):
         """A raw `MagSample` gives the `FieldFrame | Detection | Track` records that follow."""

@@ -114,9 +114,11 @@ class CalibrationNode(StageNode):
                 f'within {self.settings.calibrate.resume_s:g} s; ~/calibrate learns anew')
 
     def stages(self):
+        """{name: stage} whose counts are published."""
         return {'calibrate': self._stage, 'survey': self._survey}
 
     def queues(self):
+        """{name of a stage: how many records it holds}."""
         return {'calibrate': self._stage.n_held}
 
     def _tick(self):
@@ -202,7 +204,7 @@ class CalibrationNode(StageNode):
 
     def _do_the_rest(self):
         """Learn from what has come, look at it, and say a little more of the sensors."""
-        self._stage.settle()
+        self._stage.idle()
         unseen, self._unseen = self._unseen, []
         for raw, now_ns in unseen:
             self._health.add(raw, now_ns)
