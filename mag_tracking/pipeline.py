@@ -81,28 +81,29 @@ class Pipeline:
 
     def feed(self, sample):
         """A raw `MagSample` gives the `FieldFrame | Detection | Track` records that follow."""
-        return self._chain(1, self.calibrate.feed(sample))
+        return self._after_calibrate(self.calibrate.feed(sample))
 
     def flush(self):
         """The input has ended: what was still held back."""
-        out = []
-        for position, stage in enumerate((self.calibrate, self.align, self.detect, self.track)):
-            out += self._chain(position + 1, stage.flush())
-        return out
+        return [*self._after_calibrate(self.calibrate.flush()),
+                *self._after_align(self.align.flush()),
+                *self._after_detect(self.detect.flush()), *self.track.flush()]
 
-    def _chain(self, position, items):
-        """Push `items` through the stages from `position` on; collect what leaves the chain."""
-        if position == 1:
-            items = [f for s in items for f in self.align.feed(s)]
-            position = 2
+    def _after_calibrate(self, samples):
+        """What follows from calibrated samples."""
+        return self._after_align([f for s in samples for f in self.align.feed(s)])
+
+    def _after_align(self, frames):
+        """What follows from frames."""
+        return self._after_detect([r for f in frames for r in self.detect.feed(f)])
+
+    def _after_detect(self, records):
+        """What follows from detections and frames with a verdict; they come first themselves."""
         out = []
-        if position == 2:
-            items = [r for f in items for r in self.detect.feed(f)]
-            position = 3
-        for item in items:
-            out.append(item)
-            if position == 3 and isinstance(item, FieldFrame):
-                out += self.track.feed(item)
+        for record in records:
+            out.append(record)
+            if isinstance(record, FieldFrame):
+                out += self.track.feed(record)
         return out
 
     def counts(self):
