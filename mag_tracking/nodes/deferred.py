@@ -3,7 +3,7 @@
 from rclpy.clock import Clock, ClockType
 
 
-class Later:
+class Deferred:
     """Calls a function once, a while after it was asked to; meanwhile the node sleeps.
 
     What a node does at once behind its publishing takes a core from those that it has just
@@ -16,7 +16,7 @@ class Later:
         self._timer = node.create_timer(delay_s, self._due, autostart=False,
                                         clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def ask(self):
+    def request(self):
         """Have it called; who has asked already waits no longer for that."""
         if self._timer.is_canceled():
             self._timer.reset()

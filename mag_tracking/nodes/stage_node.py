@@ -3,6 +3,8 @@
 import gc
 import signal
 import time
+from collections import Counter
+from typing import Protocol
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -35,6 +37,12 @@ SENSORS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Best effort matches reliable and best-effort drivers alike."""
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class Counted(Protocol):
+    """A stage whose counts are published."""
+
+    counts: 'Counter[str]'
 
 
 class StageNode(Node):
