@@ -181,7 +181,7 @@ class CalibrationNode(StageNode):
         return response
 
 
-def main(arguments=None):
+def main(arguments: list[str] | None = None) -> None:
     """Run the node."""
     sys.exit(stage_node.main(CalibrationNode, arguments))
 

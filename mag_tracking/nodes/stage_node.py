@@ -48,7 +48,7 @@ class Counted(Protocol):
 class StageNode(Node):
     """A node that knows the network and the settings of one group of stages."""
 
-    OWN_PARAMETERS = ('network', 'target', 'reliable_input', 'use_sim_time')
+    OWN_PARAMETERS: tuple[str, ...] = ('network', 'target', 'reliable_input', 'use_sim_time')
 
     def __init__(self, name, group, **node_arguments):
         """Raises SettingsError or NetworkError where parameters or network are unusable."""
