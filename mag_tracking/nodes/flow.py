@@ -42,6 +42,11 @@ class Flow:
             self._ages.append(self._age_s)
 
     @property
+    def n_ages(self) -> int:
+        """How many messages the latency of the next report is of."""
+        return len(self._ages)
+
+    @property
     def is_live(self) -> bool:
         """Whether the latest message was of the present, not of a recording."""
         return self._age_s is not None and abs(self._age_s) < REPLAYED_S

@@ -63,7 +63,7 @@ class TrackerNode(StageNode):
         self._path, self._is_silent = deque(maxlen=LONGEST_PATH), False
         self.subscription(NetworkFrame, '/detection_node/frame', self._take, STREAM,
                           source='detection_node')
-        self.create_timer(0.25, self._end_without_frames)
+        self.create_timer(0.25, self.end_without_frames)
         self.subscription(CalibrationState, '/calibration_node/calibration', self._calibrated,
                           LATCHED)
 
@@ -71,7 +71,7 @@ class TrackerNode(StageNode):
         """{name: stage} whose counts are published."""
         return {'track': self._stage}
 
-    def _end_without_frames(self):
+    def end_without_frames(self):
         """Tell of a track that is lost because no frame comes any more.
 
         By when they came: a clock may be behind. A recording may be played as slowly as

@@ -272,7 +272,8 @@ class Align:
             stamp = max(stamp, self._stamp + 1)
         self._stamp = stamp
         offset = (taken.since + n * (end - stamp)) / np.maximum(n, 1) / NS
-        return FieldFrame(stamp, *_averages(n, taken.n_axis, taken.field, taken.covariance), n, offset)
+        field, covariance = _averages(n, taken.n_axis, taken.field, taken.covariance)
+        return FieldFrame(stamp, field, covariance, n, offset)
 
 
 def _averages(n: IntArray, n_axis: FloatArray, total: FloatArray,
