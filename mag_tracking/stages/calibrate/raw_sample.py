@@ -4,12 +4,13 @@ from math import inf, isnan
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.ordinary import without_iron
 from mag_tracking.inference.axes import LEAST_PIVOT, smallest_pivots
 from mag_tracking.records import MagSample
 
 
-def fault_of(sample, max_field):
+def fault_of(sample: MagSample, max_field: float) -> str | None:
     """Why a `MagSample` cannot be used, or None; `max_field` [T]."""
     # Of three numbers Python's own functions are several times as fast as NumPy's.
     x, y, z = sample.field.tolist()
@@ -30,7 +31,8 @@ def fault_of(sample, max_field):
     return None
 
 
-def corrected(sample, clock_ns, offset, C):
+def corrected(sample: MagSample, clock_ns: int, offset: FloatArray | None,
+              C: FloatArray | None) -> MagSample:
     """The `MagSample` by the network's clock, without the sensor's own hard and soft iron.
 
     Parameters
@@ -56,7 +58,7 @@ def corrected(sample, clock_ns, offset, C):
     return MagSample(sample.stamp_ns - clock_ns, sample.sensor, field, covariance)
 
 
-def _is_covariance(field, C):
+def _is_covariance(field: FloatArray, C: FloatArray) -> bool:
     """Whether C is finite, symmetric and positive definite, in the axes that `field` has."""
     there = ~np.isnan(field)
     of_present = C[np.ix_(there, there)]

@@ -1,18 +1,23 @@
 """Calibrate: check a sample, remove the background, attach the noise."""
 
 from collections import Counter
+from collections.abc import Collection, Mapping
 from math import isnan
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.decimation import Decimator
 from mag_tracking.calibration.ordinary import LIMITS, NEVER, new_sensors, take_ordinary
 from mag_tracking.calibration.screening import SPIKE, STUCK, Repetition, SpikeFilter
 from mag_tracking.errors import NetworkError
+from mag_tracking.network import SensorNetwork
 from mag_tracking.records import MagSample, Readings, plain
 from mag_tracking.stages.calibrate.raw_sample import corrected, fault_of
-from mag_tracking.stages.calibrate.restoration import Resumption, to_keep
+from mag_tracking.stages.calibrate.restoration import BackgroundRestoration, Kept, to_keep
+from mag_tracking.stages.calibrate.settings import CalibrateSettings
+from mag_tracking.stages.calibrate.timestamps import JumpAheadCheck
 from mag_tracking.units import NS
 
 AT_ONCE = 16
@@ -28,14 +33,12 @@ class Calibrate:
     is the sample's own if it carries one, else the configured one, else the
     estimated one.
 
-    Readings that nothing is odd about take a way that is compiled
-    (`calibration.ordinary`), one by one or many at once; it is the same as the one
-    through `_feed_any`, which they would take as well.
+    Valid readings pass through compiled code (`calibration.ordinary`), one or many at once.
     """
 
-    def __init__(self, network, settings):
-        self.counts = Counter()
-        self._per_sensor = {name: Counter() for name in network.names}
+    def __init__(self, network: SensorNetwork, settings: CalibrateSettings) -> None:
+        self.counts: Counter[str] = Counter()
+        self._per_sensor: dict[str, Counter[str]] = {name: Counter() for name in network.names}
         self._settings = settings
         self._sensors = new_sensors(len(network))
         self._rows, self._limits = np.arange(len(network)), np.zeros(1, LIMITS)
@@ -43,17 +46,18 @@ class Calibrate:
                            settings.spike_std)
         # The noise of each sensor, once it may take the compiled way.
         self._noise = np.full((len(network), 3, 3), np.nan)
-        self._longest_jump = settings.jump_ahead_s * NS
         self._index = {name: i for i, name in enumerate(network.names)}
-        self._network, self._clock_ns, self._background = None, [], {}
+        self._network = network
+        self._clock_ns: list[int] = []
+        self._background: dict[str, RunningBackground] = {}
         self._repetition = {name: Repetition(self._of(name)) for name in network.names}
         self._spikes = {name: SpikeFilter(settings.spike_std, self._of(name))
                         for name in network.names}
-        self._ahead_ns = {}
-        self._resumption = Resumption(settings.resume_s)
+        self._jumps_ahead = JumpAheadCheck(settings.jump_ahead_s * NS)
+        self._restoration = BackgroundRestoration(settings.resume_s)
         self.renew(network)
 
-    def renew(self, network):
+    def renew(self, network: SensorNetwork) -> None:
         """Go on with another calibration of the same sensors.
 
         A background is learnt anew where the sensor's own offset or correction is
@@ -63,8 +67,8 @@ class Calibrate:
         if network.names != tuple(self._index):
             raise NetworkError(f'a network of {", ".join(network.names)} in place of one of '
                                f'{", ".join(self._index)}')
-        before, clock_before = self._network, self._clock_ns
-        self._network = network
+        before = self._network if self._background else None
+        clock_before, self._network = self._clock_ns, network
         self._clock_ns = [round(s * NS) for s in network.clock_offset]
         self._decimators = {name: Decimator(self._settings.decimate_to_hz)
                             for name in network.names}
@@ -72,7 +76,7 @@ class Calibrate:
             same = before is not None and _same(before.offset[i], network.offset[i]) \
                 and _same(before.correction[i], network.correction[i])
             if before is not None and (not same or self._clock_ns[i] != clock_before[i]):
-                self._resumption.forget(name)
+                self._restoration.forget(name)
             if not same or self._clock_ns[i] != clock_before[i]:
                 self._give_up(name, 'another calibration came')
             if not same:
@@ -82,21 +86,20 @@ class Calibrate:
                 self._shift(i, clock_before[i] - self._clock_ns[i])
             self._note(i)
 
-    def _of(self, name):
+    def _of(self, name: str) -> StructArray:
         """(1,) SENSOR of a sensor."""
         i = self._index[name]
         return self._sensors[i:i + 1]
 
-    def _shift(self, i, by_ns):
+    def _shift(self, i: int, by_ns: int) -> None:
         """The readings of sensor `i` have later stamps from now on."""
         s, name = self._sensors[i], self._network.names[i]
         if s['last_ns'] != NEVER:
             s['first_ns'] += by_ns
             s['last_ns'] += by_ns
-        if name in self._ahead_ns:
-            self._ahead_ns[name] += by_ns
+        self._jumps_ahead.shift(name, by_ns)
 
-    def _note(self, i):
+    def _note(self, i: int) -> None:
         """Whether the readings of sensor `i` may take the compiled way, and what it has to know."""
         s, name = self._sensors[i], self._network.names[i]
         background, offset, C = (self._background[name], self._network.offset[i],
@@ -105,7 +108,7 @@ class Calibrate:
             background.ready and background.is_whole and s['last_ns'] != NEVER
             and not np.isnan(background.line[1]).any()
             and not self._settings.decimate_to_hz and not self._spikes[name].n_held
-            and name not in self._ahead_ns and name not in self._resumption)
+            and name not in self._jumps_ahead and name not in self._restoration)
         if s['is_ordinary']:
             s['centre'], s['mean'], s['slope'], s['horizon'] = background.line
             s['noise_std'], self._noise[i] = background.noise_std, background.covariance
@@ -114,7 +117,7 @@ class Calibrate:
             if C is not None:
                 s['correction'] = C
 
-    def _new_background(self, i):
+    def _new_background(self, i: int) -> RunningBackground:
         """Of sensor `i`, from what the network file says of it."""
         s, network = self._settings, self._network
         return RunningBackground(s.learn_s, s.memory_s, s.guard_s, s.block_s, s.freeze_std,
@@ -122,11 +125,11 @@ class Calibrate:
                                  phase=i / len(network) if len(network) > AT_ONCE else None,
                                  sensors=self._sensors[i:i + 1])
 
-    def counts_of(self, sensor):
+    def counts_of(self, sensor: str) -> 'Counter[str]':
         """Counter of what was `accepted` and `rejected` of a sensor, and why."""
         return self._per_sensor[sensor] + Counter(accepted=int(self._of(sensor)[0]['accepted']))
 
-    def feed(self, sample):
+    def feed(self, sample: MagSample) -> list[MagSample]:
         """A raw `MagSample` gives the calibrated ones that are now known to be whole."""
         i = self._index.get(sample.sensor)
         if i is None:
@@ -144,9 +147,10 @@ class Calibrate:
         self._note(i)
         return out
 
-    def feed_many(self, readings):
+    def feed_many(self, readings: Readings) -> Readings:
         """Raw `Readings` give the calibrated ones that are now known to be whole."""
-        index, n, i, parts = self._index, len(readings), 0, []
+        index, n, i = self._index, len(readings), 0
+        parts: list[Readings] = []
         rows = readings.rows(index)
         if readings.covariance is not None:
             # What one says of its own covariance is looked at one by one.
@@ -167,7 +171,7 @@ class Calibrate:
             i = odd + 1
         return Readings.joined(parts)
 
-    def _feed_any(self, sample):
+    def _feed_any(self, sample: MagSample) -> list[MagSample]:
         """As `feed`, of a sample that may be odd."""
         if sample.sensor not in self._background:
             return self._reject(sample, f'unknown sensor {sample.sensor}')
@@ -185,16 +189,16 @@ class Calibrate:
             return self._reject(sample, cause)
         return self._used(self._screened(sample))
 
-    def _used(self, samples):
+    def _used(self, samples: list[MagSample]) -> list[MagSample]:
         """What is made of whole samples: counted, thinned out and calibrated."""
-        out = []
+        out: list[MagSample] = []
         for whole in samples:
             self._sensors[self._index[whole.sensor]]['accepted'] += 1
             for s in self._thinned(whole) if self._settings.decimate_to_hz else (whole,):
                 out += self._calibrated(s)
         return out
 
-    def _screened(self, sample):
+    def _screened(self, sample: MagSample) -> list[MagSample]:
         """The samples that are known by now to be whole; the others are counted or wait."""
         name, field = sample.sensor, sample.field.tolist()
         if self._settings.reject_stuck and self._repetition[name].is_stuck(field):
@@ -211,19 +215,19 @@ class Calibrate:
         return [s for s, is_spike in known if not is_spike]
 
     @property
-    def n_held(self):
+    def n_held(self) -> int:
         """How many readings wait for the next."""
         return sum(s.n_held for s in self._spikes.values())
 
-    def _give_up(self, name, why):
+    def _give_up(self, name: str, why: str) -> None:
         """Nothing that comes tells any more whether what is held of a sensor was a spike."""
         for held, _ in self._spikes[name].flush():
             self._reject(held, f'may have been a spike when {why}')
 
-    def _misplaced(self, sample):
+    def _misplaced(self, sample: MagSample) -> str | None:
         """Why the stamp of a sample cannot be used, or None; a restart is one to go on from."""
         last, state = self.last_stamp_ns(sample.sensor), self._of(sample.sensor)[0]
-        if last is not None and self._is_ahead(sample, last):
+        if last is not None and self._jumps_ahead.is_ahead(sample.sensor, sample.stamp_ns, last):
             return 'stamp too far ahead'
         if last is not None and sample.stamp_ns <= last:
             if last - sample.stamp_ns <= self._settings.jump_back_s * NS:
@@ -235,18 +239,18 @@ class Calibrate:
         state['last_ns'] = sample.stamp_ns
         if state['first_ns'] == NEVER:
             state['first_ns'] = sample.stamp_ns
-        if sample.sensor in self._resumption:
-            self.counts[self._resumption.take_up(
+        if sample.sensor in self._restoration:
+            self.counts[self._restoration.take_up(
                 sample.sensor, sample.stamp_ns, self._background[sample.sensor])] += 1
         return None
 
-    def resume(self, kept):
+    def resume(self, kept: Mapping[str, Kept]) -> None:
         """Go on from {sensor: `Kept`}, where the first reading of a sensor comes soon after."""
-        self._resumption.offer(kept)
+        self._restoration.offer(kept)
         for i in range(len(self._network)):
             self._note(i)
 
-    def kept(self, sensor):
+    def kept(self, sensor: str) -> Kept | None:
         """What `resume` wants of a sensor; None before its background is known."""
         background = self._background[sensor]
         last = self.last_stamp_ns(sensor)
@@ -254,7 +258,7 @@ class Calibrate:
             return None
         return to_keep(background, last, self.background(sensor))
 
-    def _thinned(self, sample):
+    def _thinned(self, sample: MagSample) -> list[MagSample]:
         """The samples that are left of a fast sensor."""
         decimator = self._decimators[sample.sensor]
         found = decimator.feed(sample.stamp_ns, sample.field)
@@ -264,7 +268,7 @@ class Calibrate:
                           None if C is None else C * decimator.noise_gain())
                 for stamp_ns, field in found]
 
-    def _calibrated(self, sample):
+    def _calibrated(self, sample: MagSample) -> list[MagSample]:
         """A sample that is to be used gives at most one calibrated."""
         background = self._background[sample.sensor]
         # Counted from the first sample: seconds since 1970 leave a float few digits.
@@ -293,32 +297,21 @@ class Calibrate:
         self.counts['calibrated'] += 1
         return [MagSample(sample.stamp_ns, sample.sensor, field, covariance)]
 
-    def idle(self):
-        """Learn from what is complete, which could wait until all was published.
+    def idle(self) -> None:
+        """Learn from complete blocks; without this call the sensor's next reading does it.
 
-        If nobody asks for it, the next reading of the sensor does.
-        The same comes of it: in a large network the reading that shows that a block of the
-        background is complete is calibrated with what was known before.
+        The result is the same: in a large network the reading that completes a block is
+        calibrated with what was known before.
         """
         for i in np.flatnonzero(self._sensors['is_full']):
             self._background[self._network.names[i]].settle()
             self._note(i)
 
-    def flush(self):
+    def flush(self) -> list[MagSample]:
         """What waited for the next reading."""
         return self._used([s for spikes in self._spikes.values() for s, _ in spikes.flush()])
 
-    def _is_ahead(self, sample, last):
-        """Whether a stamp is far ahead of the `last`, and of the one that was so before it."""
-        limit = self._longest_jump
-        if sample.stamp_ns - last <= limit:
-            self._ahead_ns.pop(sample.sensor, None)
-            return False
-        before = self._ahead_ns.get(sample.sensor)
-        self._ahead_ns[sample.sensor] = sample.stamp_ns
-        return before is None or not 0 < sample.stamp_ns - before <= limit
-
-    def _reject(self, sample, cause):
+    def _reject(self, sample: MagSample, cause: str) -> list[MagSample]:
         """Count the rejection."""
         self.counts[f'rejected: {cause}'] += 1
         if sample.sensor in self._per_sensor:
@@ -326,7 +319,7 @@ class Calibrate:
             self._per_sensor[sample.sensor][f'rejected: {cause}'] += 1
         return []
 
-    def forget(self, sensors=()):
+    def forget(self, sensors: Collection[str] = ()) -> None:
         """Learn the backgrounds of `sensors` (all if empty) anew.
 
         Raises NetworkError for a sensor that is not in the network.
@@ -335,24 +328,24 @@ class Calibrate:
             self._network.index(name)
         for name in sensors or self._network.names:
             self._background[name].forget()
-            self._resumption.forget(name)
+            self._restoration.forget(name)
             self._note(self._index[name])
 
-    def last_stamp_ns(self, sensor):
+    def last_stamp_ns(self, sensor: str) -> int | None:
         """Stamp of the latest accepted sample of `sensor`, or None."""
         last = int(self._of(sensor)[0]['last_ns'])
         return None if last == NEVER else last
 
-    def background(self, sensor):
+    def background(self, sensor: str) -> FloatArray:
         """(3,) [T] background of `sensor` at its latest sample; ValueError before it is ready."""
         state = self._of(sensor)[0]
         return self._background[sensor].level(int(state['last_ns'] - state['first_ns']) / NS)
 
-    def backgrounds(self):
+    def backgrounds(self) -> dict[str, RunningBackground]:
         """{sensor: RunningBackground}, to look at."""
         return dict(self._background)
 
 
-def _same(a, b):
+def _same(a: FloatArray | None, b: FloatArray | None) -> bool:
     """Whether two arrays, or None, are the same."""
-    return (a is None) == (b is None) and (a is None or np.array_equal(a, b))
+    return a is b if a is None or b is None else np.array_equal(a, b)
