@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from mag_tracking.drivers.device_clock import ClockSettings
-from mag_tracking.drivers.driver import Driver, DriverSettings, serve
+from mag_tracking.drivers.driver import Driver, serve
 from mag_tracking.drivers.framed_device import FramedDevice
 from mag_tracking.drivers.reading import Arrival, Chunk, Parsed, Reading
 from mag_tracking.drivers.sequence import MEMORY, SequenceCheck
+from mag_tracking.drivers.settings import DriverSettings
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.records import AccelerationSample, MagSample
 
