@@ -18,12 +18,17 @@ device of a framing or kind. Its settings stand under its own name, or under `tr
 
 import importlib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from os import PathLike
+from typing import Any, TypeVar
 
 from mag_tracking.drivers.device_clock import ClockSettings
-from mag_tracking.drivers.driver import IGNORED, Driver, DriverSettings
+from mag_tracking.drivers.driver import IGNORED, Driver
 from mag_tracking.drivers.framed_device import FramedDevice
+from mag_tracking.drivers.reading import Device
+from mag_tracking.drivers.settings import DriverSettings
 from mag_tracking.errors import SettingsError
+from mag_tracking.network.sensor_network import SensorNetwork
 from mag_tracking.settings import replace
 from mag_tracking.yaml_file import read_yaml
 
@@ -43,9 +48,10 @@ KINDS = {
 METHODS = {'transport': ('open', 'read', 'close'), 'framing': ('parse',),
            'device': ('open', 'read', 'close')}
 _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_/]*')
+Settings = TypeVar('Settings', ClockSettings, DriverSettings)
 
 
-def read_drivers(path, network=None):
+def read_drivers(path: str | PathLike[str], network: SensorNetwork | None = None) -> list[Driver]:
     """The drivers that a file describes.
 
     Parameters
@@ -68,7 +74,7 @@ def read_drivers(path, network=None):
     return drivers
 
 
-def kind_of(role, name):
+def kind_of(role: str, name: object) -> Any:
     """The class of a kind of transport, framing or device; raises SettingsError."""
     target = KINDS[role].get(name, name) if isinstance(name, str) else ''
     module, colon, leaf = target.partition(':')
@@ -86,7 +92,7 @@ def kind_of(role, name):
     return cls
 
 
-def driver_of(name, entry):
+def driver_of(name: object, entry: object) -> Driver:
     """The `Driver` of one entry of the file; raises SettingsError that names the device."""
     if not isinstance(name, str) or not isinstance(entry, Mapping):
         raise SettingsError(f'{name}: expected a mapping of settings, got {entry!r}')
@@ -104,17 +110,18 @@ def driver_of(name, entry):
         raise SettingsError(f'{name}: {error}') from error
 
 
-def _usual(settings, device, name):
+def _usual(settings: Settings, device: Device, name: str) -> Settings:
     """`settings` with what the device's class says of all of its kind."""
     return replace(settings, getattr(device, name, {}))
 
 
-def _device(rest):
+def _device(rest: dict[str, Any]) -> Device:
     """The device that an entry describes; takes what it used out of `rest`."""
     if 'device' in rest:
         if 'transport' in rest or 'framing' in rest:
             raise SettingsError('a device has no transport and no framing beside it')
-        return _made('device', rest)
+        device: Device = _made('device', rest)
+        return device
     for role in ('transport', 'framing'):
         if role not in rest:
             raise SettingsError(f'there is no {role} (one of {", ".join(KINDS[role])}), and no '
@@ -122,7 +129,7 @@ def _device(rest):
     return FramedDevice(_made('transport', rest), _made('framing', rest))
 
 
-def _made(role, rest):
+def _made(role: str, rest: dict[str, Any]) -> Any:
     """The transport, framing or device of an entry, with its settings."""
     kind = rest.pop(role)
     cls = kind_of(role, kind)
@@ -130,7 +137,7 @@ def _made(role, rest):
     return cls(replace(cls.SETTINGS(), _group(rest, group)))
 
 
-def _group(rest, name):
+def _group(rest: dict[str, Any], name: str) -> Mapping[str, Any]:
     """The mapping of settings under `name`, with the name before each; taken out of `rest`."""
     group = rest.pop(name, {})
     if not isinstance(group, Mapping):
@@ -138,7 +145,7 @@ def _group(rest, name):
     return group
 
 
-def _sensors(rest):
+def _sensors(rest: dict[str, Any]) -> dict[str, str]:
     """{name at the device: name in the network}."""
     if 'sensor' in rest:
         if 'sensors' in rest:
@@ -161,9 +168,9 @@ def _sensors(rest):
     return out
 
 
-def _check_sensors(drivers, network):
+def _check_sensors(drivers: Iterable[Driver], network: SensorNetwork | None) -> None:
     """Each sensor comes from one device only, and is one of the network; or SettingsError."""
-    owner = {}
+    owner: dict[str, str] = {}
     for driver in drivers:
         for key, sensor in driver.sensors.items():
             if sensor == IGNORED:
@@ -177,7 +184,7 @@ def _check_sensors(drivers, network):
                                     f'sensors are {", ".join(network.names)}')
 
 
-def settings_by_kind():
+def settings_by_kind() -> dict[str, Any]:
     """{group in the file: its settings with their defaults}, for the reference."""
     out = {'': DriverSettings(), 'clock': ClockSettings()}
     for role, kinds in KINDS.items():

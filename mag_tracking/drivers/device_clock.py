@@ -14,11 +14,11 @@ delays Moon's line is the most likely, and one that is lower by a K-th of the me
 height of K points above it is e times less so; slopes within that are about as likely.
 """
 
-import itertools
 import math
 from collections import Counter, deque
 from dataclasses import dataclass
 
+from mag_tracking.drivers.lower_line import Point, likely_slopes
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
 
@@ -74,11 +74,12 @@ class ArrivalClock:
 
     drift_ppm = spread_s = stamp_std = math.nan
 
-    def __init__(self, settings):
-        self.counts, self.restarts = Counter(), Counter()
+    def __init__(self, settings: ClockSettings) -> None:
+        self.counts: Counter[str] = Counter()
+        self.restarts: Counter[str] = Counter()
         self._shortest_ns = round(settings.shortest_delay_s * 1e9)
 
-    def stamp(self, ticks, arrival_ns):
+    def stamp(self, ticks: float | None, arrival_ns: int) -> int:
         """`arrival_ns` less the shortest delay, whatever `ticks` is."""
         return arrival_ns - self._shortest_ns
 
@@ -86,12 +87,13 @@ class ArrivalClock:
 class _Suspect:
     """Readings that may be the beginning of a new clock."""
 
-    def __init__(self, ticks, arrival_ns, heard_ns, near):
+    def __init__(self, ticks: float, arrival_ns: int, heard_ns: int, near: bool) -> None:
         self.since_ns, self.heard_ns, self._near = arrival_ns, heard_ns, near
         self.first, self.agreeing, self.total, self._fitted = (ticks, arrival_ns), 1, 0, 0
         self._last = ticks
 
-    def add(self, ticks, arrival_ns, tick_ns, wrap, tolerance_ns):
+    def add(self, ticks: float, arrival_ns: int, tick_ns: float, wrap: int,
+            tolerance_ns: float) -> int:
         """Take a reading; returns how long those that agree have lasted [ns]."""
         first, first_ns = self.first
         span = arrival_ns - first_ns
@@ -104,7 +106,7 @@ class _Suspect:
         self.total += 1
         return span
 
-    def is_refuted(self):
+    def is_refuted(self) -> bool:
         """Whether a reading that fits the old clock is enough to forget these."""
         # Messages may have become a little quicker, and come between others that have not.
         self._fitted += 1
@@ -138,7 +140,7 @@ class DeviceClock:
         comes on top. NaN until known, also after a restart.
     """
 
-    def __init__(self, settings):
+    def __init__(self, settings: ClockSettings) -> None:
         """Raises SettingsError where the settings contradict each other."""
         self._tick_ns, self._wrap = settings.tick_s * 1e9, settings.wrap
         self._top = settings.wrap or math.inf
@@ -153,11 +155,24 @@ class DeviceClock:
             raise SettingsError(
                 f'wrap: the counter goes round in {settings.wrap * settings.tick_s:g} s, less than '
                 f'four times least_step_s, {settings.least_step_s:g} s')
-        self.counts, self.restarts = Counter(), Counter()
+        self.counts: Counter[str] = Counter()
+        self.restarts: Counter[str] = Counter()
         self.drift_ppm = self.spread_s = self.stamp_std = math.nan
-        self._slope, self._delays, self._begun = 0.0, deque(maxlen=256), False
+        self._delays: deque[float] = deque(maxlen=256)
+        self._slope, self._begun = 0.0, False
 
-    def stamp(self, ticks, arrival_ns):
+    def _begin(self, ticks: float, arrival_ns: int) -> None:
+        """Begin a new clock with its first point; what is known of the drift remains."""
+        self._ticks, self._arrival_ns, self._last_ns = ticks, arrival_ns, arrival_ns
+        self._height = self._middle = self._newest = self._lowest = 0.0
+        self._points: list[Point] = []
+        self._point: Point = (0.0, 0.0)
+        self._block = self._block_end = self._window_ns / _MOST_BLOCKS * _SHORTEST_BLOCK
+        self._early_ns, self.stamp_std = self._longest_ns, math.nan
+        self._suspect: _Suspect | None = None
+        self._begun, self._unsure = True, self._most
+
+    def stamp(self, ticks: float | None, arrival_ns: int) -> int | None:
         """When a reading was measured.
 
         Parameters
@@ -187,8 +202,11 @@ class DeviceClock:
         fits = (delay <= self._longest_ns and t >= self._newest - self._tolerance_ns
                 and (delay >= 0.0 or -delay <= self._earliest(t, arrival_ns)))
         if not fits or delay > self._tolerance_ns + self._unsure * t:
-            if self._has_stepped(ticks, arrival_ns, delay, fits):
-                self._restart(ticks, arrival_ns, delay)
+            if self._suspect is None:
+                self._suspect = _Suspect(ticks, arrival_ns, self._last_ns,
+                                         abs(delay) <= self._tolerance_ns)
+            if self._has_stepped(ticks, arrival_ns, fits, self._suspect):
+                self._restart(ticks, arrival_ns, delay, self._suspect)
                 return arrival_ns - self._shortest_ns
             if not fits:
                 self.counts[NO_FIT] += 1
@@ -197,7 +215,7 @@ class DeviceClock:
             self._suspect = None
         return arrival_ns - self._shortest_ns - self._take(t, elapsed - t, low, arrival_ns)
 
-    def _device_time(self, ticks, elapsed):
+    def _device_time(self, ticks: float, elapsed: int) -> float:
         """Nominal time since the first reading [ns], by as many turns as the arrival says."""
         count = ticks - self._ticks
         if self._wrap:
@@ -205,7 +223,7 @@ class DeviceClock:
             count += round((t / self._tick_ns - count) / self._wrap) * self._wrap
         return count * self._tick_ns
 
-    def _take(self, t, offset, low, arrival_ns):
+    def _take(self, t: float, offset: float, low: float, arrival_ns: int) -> int:
         """Use a point that fits; returns its delay [ns]."""
         if t >= self._block_end:
             self._close_block(t)
@@ -217,7 +235,7 @@ class DeviceClock:
         self._delays.append(low - self._height)
         return int(low - self._height + 0.5)
 
-    def _earliest(self, t, arrival_ns):
+    def _earliest(self, t: float, arrival_ns: int) -> float:
         """How far below the line a message is believed [ns]."""
         # The first messages may all have waited, in a port that was opened late.
         if arrival_ns - self._arrival_ns < self._longest_ns:
@@ -225,19 +243,10 @@ class DeviceClock:
         since = t - (self._points[-1][0] if self._points else 0.0)
         return self._early_ns + self._most * since
 
-    def _begin(self, ticks, arrival_ns):
-        """Begin a new clock with its first point; what is known of the drift remains."""
-        self._ticks, self._arrival_ns, self._last_ns = ticks, arrival_ns, arrival_ns
-        self._height = self._middle = self._newest = self._lowest = 0.0
-        self._points, self._point = [], (0.0, 0.0)
-        self._block = self._block_end = self._window_ns / _MOST_BLOCKS * _SHORTEST_BLOCK
-        self._early_ns, self.stamp_std = self._longest_ns, math.nan
-        self._suspect, self._begun, self._unsure = None, True, self._most
-
-    def _restart(self, ticks, arrival_ns, delay):
+    def _restart(self, ticks: float, arrival_ns: int, delay: float, suspect: _Suspect) -> None:
         """Begin a new clock where `delay` after the line of the old one was too much."""
-        first, first_ns = self._suspect.first
-        silence = first_ns - self._suspect.heard_ns
+        first, first_ns = suspect.first
+        silence = first_ns - suspect.heard_ns
         if silence > self._window_ns:
             cause = LOST
         # It was counting from 0 only since it was last heard.
@@ -248,12 +257,10 @@ class DeviceClock:
         self.restarts[cause] += 1
         self._begin(ticks, arrival_ns)
 
-    def _has_stepped(self, ticks, arrival_ns, delay, fits):
+    def _has_stepped(self, ticks: float, arrival_ns: int, fits: bool,
+                     suspect: _Suspect) -> bool:
         """Hold a reading against the clock; whether it is one too many."""
-        if self._suspect is None:
-            self._suspect = _Suspect(ticks, arrival_ns, self._last_ns,
-                                     abs(delay) <= self._tolerance_ns)
-        suspect, wait = self._suspect, arrival_ns - self._suspect.since_ns
+        wait = arrival_ns - suspect.since_ns
         lasted = suspect.add(ticks, arrival_ns, self._tick_ns, self._wrap,
                              self._tolerance_ns + self._most * wait)
         # A queue that empties comes all at once, or in other steps than it was measured.
@@ -261,7 +268,7 @@ class DeviceClock:
         return (suspect.agreeing >= _CONFIRMING and lasted >= needed
                 or suspect.total >= _CONFIRMING and wait > self._window_ns)
 
-    def _close_block(self, t):
+    def _close_block(self, t: float) -> None:
         """Keep the lowest point of the block that ends, and estimate again."""
         points, longest = self._points, self._window_ns / _MOST_BLOCKS
         points.append(self._point)
@@ -283,11 +290,11 @@ class DeviceClock:
         if self._suspect is None:
             self._tolerance_ns = self._step_ns + 2e9 * self.spread_s
 
-    def _above(self, point):
+    def _above(self, point: Point) -> float:
         """Height of a point above the line [ns]."""
         return point[1] - self._height - self._slope * (point[0] - self._middle)
 
-    def _estimate(self, points):
+    def _estimate(self, points: list[Point]) -> None:
         """The line under the points."""
         self._middle = sum(t for t, _ in points) / len(points)
         if len(points) >= _FEWEST_POINTS and points[0][0] < points[-1][0]:
@@ -302,46 +309,3 @@ class DeviceClock:
             error = above[int(0.9 * (len(above) - 1))] - above[0]
             self.stamp_std = error * 1e-9
             self._early_ns, self._unsure = _EARLY_NS + 8.0 * error, 0.0
-
-
-def lower_hull(points):
-    """Corners of the lower convex hull, from left to right, of a sorted list of (x, y)."""
-    hull = []
-    for x, y in points:
-        while len(hull) > 1:
-            (u, v), (w, z) = hull[-2:]
-            if (w - u) * (y - v) > (z - v) * (x - u):
-                break
-            hull.pop()
-        hull.append((x, y))
-    return hull
-
-
-def likely_slopes(points):
-    """Slopes of lines under the points that are about as likely as the best.
-
-    Parameters
-    ----------
-    points : list of (x, y)
-        Sorted, three or more, of more than one x.
-
-    Returns
-    -------
-    low, high : float
-        Equal if all points are on the closest line.
-
-    Source: see the module; closest is Moon et al.'s (the hull's edge over the mean x).
-    """
-    hull = lower_hull(points)
-    middle = sum(x for x, _ in points) / len(points)
-    for (u, v), (x, y) in itertools.pairwise(hull):
-        if x >= middle:
-            slope = (y - v) / (x - u)
-            height = v + slope * (middle - u)
-            break
-    # Two are on the line whatever the delays are; the median, because a stall is no delay.
-    above = sorted(y - height - slope * (x - middle) for x, y in points)[2:]
-    floor = height - above[len(above) // 2] / math.log(2.0) / len(points)
-    low = max((y - floor) / (x - middle) for x, y in hull if x < middle)
-    high = min((y - floor) / (x - middle) for x, y in hull if x > middle)
-    return min(low, slope), max(high, slope)

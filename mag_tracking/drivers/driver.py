@@ -8,20 +8,25 @@ measurement on this machine's clock, and counts what is missing.
 import struct
 import time
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
-from mag_tracking.drivers.device_clock import ArrivalClock, DeviceClock
+from mag_tracking.arrays import BoolArray
+from mag_tracking.drivers.device_clock import ArrivalClock, ClockSettings, DeviceClock
+from mag_tracking.drivers.reading import Arrival, Axes, Device, Reading
 from mag_tracking.drivers.sequence import SequenceCheck
+from mag_tracking.drivers.settings import (
+    ACCELERATION_UNITS,
+    FIELD_UNITS,
+    STAMPED_BY,
+    DriverSettings,
+    scale_of,
+)
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.records import AccelerationSample, Readings
-from mag_tracking.settings import param
 
-FIELD_UNITS = {'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'G': 1e-4, 'mG': 1e-7}
-"""{unit: tesla}."""
-ACCELERATION_UNITS = {'m/s2': 1.0, 'g': 9.80665, 'mg': 9.80665e-3}
-"""{unit: m/s^2}."""
 POLL_S = 0.2
 """[s] A driver that is served is asked to stop so often."""
 IGNORED = '-'
@@ -30,56 +35,13 @@ MOST_NAMES = 20
 """Unknown sensors that are counted by name."""
 MOST_SOURCES = 4096
 """Clocks that are kept."""
-STAMPED_BY = ('auto', 'ticks', 'sequence', 'arrival')
 _AXES = struct.Struct('3d')
-NOTHING = Readings.of([]), ()
+Heard: TypeAlias = tuple[Readings, Sequence[AccelerationSample]]
+"""What has come."""
+NOTHING: Heard = Readings.of([]), ()
 """That has come."""
 STEP_NS = 10_000_000
 """[ns] The clock of this machine was set when it differs by more from one moment to the next."""
-
-
-@dataclass(frozen=True)
-class DriverSettings:
-    """Settings of what every driver does."""
-
-    unit: str = param(
-        'T', 'Unit of the field: T, mT, uT, nT, G, mG, or the tesla of one count.')
-    acceleration_unit: str = param(
-        'm/s2', 'Unit of the acceleration: m/s2, g, mg, or the m/s^2 of one count.')
-    stamp_by: str = param(
-        'auto', 'What a reading is stamped by: ticks, sequence (the count of a device that '
-        'measures at a steady rate), arrival, or auto: its ticks if it has any, else arrival.')
-    sequence_wrap: int = param(
-        0, 'The number at which the count of readings goes back to 0; 0 = never.', '',
-        (0, 2**64))
-    retry_s: float = param(
-        0.1, 'A device that is lost is opened again after so long, twice that the next time, '
-        'and so on.', 's', (1e-3, 60.0))
-    longest_retry_s: float = param(
-        1.0, 'It is never waited longer than that.', 's', (1e-3, 3600.0))
-    gather_s: float = param(
-        0.0, 'Readings are gathered for so long before they go on: with `batches` they are one '
-        'message then.', 's', (0.0, 1.0))
-    silent_s: float = param(
-        10.0, 'A device of which nothing comes for so long is closed and opened again; 0 = '
-        'never.', 's', (0.0, 86400.0))
-
-
-def scale_of(unit, units, name):
-    """What one of `unit` is in SI: a name in `units`, or a number.
-
-    Raises SettingsError, which calls the setting `name`.
-    """
-    if unit in units:
-        return units[unit]
-    try:
-        scale = float(unit)
-    except ValueError:
-        scale = float('nan')
-    if not np.isfinite(scale) or scale == 0.0:
-        raise SettingsError(f'{name}: {unit!r} is neither a number nor one of '
-                            f'{", ".join(units)}')
-    return scale
 
 
 class Driver:
@@ -99,11 +61,14 @@ class Driver:
         The clocks of this machine; tests have their own.
     """
 
-    def __init__(self, name, device, settings, clock_settings, sensors,
-                 monotonic_ns=time.monotonic_ns, wall_ns=time.time_ns, sleep=time.sleep):
+    def __init__(self, name: str, device: Device, settings: DriverSettings,
+                 clock_settings: ClockSettings, sensors: Mapping[str, str],
+                 monotonic_ns: Callable[[], int] = time.monotonic_ns,
+                 wall_ns: Callable[[], int] = time.time_ns,
+                 sleep: Callable[[float], object] = time.sleep) -> None:
         self.name = name
         self.sensors = dict(sensors)
-        self.own_counts = Counter()
+        self.own_counts: Counter[str] = Counter()
         self._device, self._settings = device, settings
         self._clock_settings = clock_settings
         self._scale = scale_of(settings.unit, FIELD_UNITS, f'{name}: unit')
@@ -115,25 +80,44 @@ class Driver:
         self._monotonic_ns, self._wall_ns, self._sleep = monotonic_ns, wall_ns, sleep
         self._sequences = {s: SequenceCheck(settings.sequence_wrap) for s in sensors.values()
                            if s != IGNORED}
-        self._clocks = {}
+        self._clocks: dict[str, ArrivalClock | DeviceClock] = {}
         self._open, self.trouble = False, ''
-        self._retry_s, self._retry_ns = settings.retry_s, None
-        self._heard_ns, self._offset_ns = None, None
-        self._only, self._unknown = None, set()
+        self._retry_s, self._heard_ns = settings.retry_s, 0
+        self._retry_ns: int | None = None
+        self._offset_ns: int | None = None
+        self._only: tuple[str, str] | None = None
+        self._unknown: set[str] = set()
         # Of the reading before: those that a device gives together were measured together.
-        self._stamped = None, None
-        self._named, self._sample_counts = {}, {s: f'samples: {s}' for s in sensors.values()}
+        self._measurement: tuple[ArrivalClock | DeviceClock, float | None, int] | None = None
+        self._measured_ns: int | None = None
+        self._named: dict[tuple[str, str], str] = {}
+        self._sample_counts = {s: f'samples: {s}' for s in sensors.values()}
 
     @property
-    def is_open(self):
+    def device(self) -> Device:
+        """What it keeps open."""
+        return self._device
+
+    @property
+    def settings(self) -> DriverSettings:
+        """As they were given."""
+        return self._settings
+
+    @property
+    def clock_settings(self) -> ClockSettings:
+        """Of the clock of each source."""
+        return self._clock_settings
+
+    @property
+    def is_open(self) -> bool:
         """Whether the device is open."""
         return self._open
 
-    def clocks(self):
+    def clocks(self) -> dict[str, ArrivalClock | DeviceClock]:
         """{source: DeviceClock or ArrivalClock} of those that something has come from."""
         return dict(self._clocks)
 
-    def counts(self):
+    def counts(self) -> Counter[str]:
         """{what: number} of all that was lost, refused or found odd, and of the samples."""
         # Copied as wholes: the thread that polls may count something new in the meantime.
         total = self.own_counts.copy()
@@ -145,7 +129,7 @@ class Driver:
             total.update(clock.restarts.copy())
         return total
 
-    def poll(self, timeout_s):
+    def poll(self, timeout_s: float) -> Heard:
         """What has come: (`Readings`, sequence of `AccelerationSample`), empty after `timeout_s`.
 
         Opens the device where it is not open and it is time to try. Never raises for
@@ -168,7 +152,7 @@ class Driver:
         self._heard_ns, self._retry_s, self.trouble = now, self._settings.retry_s, ''
         return self._samples(arrivals, self._wall_offset(now))
 
-    def _read(self, timeout_s):
+    def _read(self, timeout_s: float) -> list[Arrival]:
         """What the device has, and what comes within `gather_s` after the first of it."""
         arrivals = self._device.read(timeout_s)
         if not arrivals or not self._settings.gather_s:
@@ -182,17 +166,17 @@ class Driver:
                 break
         return arrivals
 
-    def close(self):
+    def close(self) -> None:
         """Close the device; the next `poll` opens it again."""
         self._device.close()
         self._open, self._retry_ns = False, None
 
-    def fail(self, error):
+    def fail(self, error: Exception) -> None:
         """Something else went wrong with the device: close it, and open it again after a while."""
         self.own_counts['errors'] += 1
         self._give_up(f'{type(error).__name__}: {error}')
 
-    def _try_to_open(self, timeout_s):
+    def _try_to_open(self, timeout_s: float) -> bool:
         """Open the device if it is time to; whether it is open. Waits at most `timeout_s`."""
         if self._retry_ns is not None:
             wait_s = (self._retry_ns - self._monotonic_ns()) / 1e9
@@ -209,7 +193,7 @@ class Driver:
         self._open, self._heard_ns = True, self._monotonic_ns()
         return True
 
-    def _give_up(self, why):
+    def _give_up(self, why: object) -> None:
         """Close the device, and wait longer than the last time before it is opened again."""
         self._open, self.trouble = False, str(why)
         try:
@@ -221,7 +205,7 @@ class Driver:
         self._retry_ns = self._monotonic_ns() + round(self._retry_s * 1e9)
         self._retry_s = min(2.0 * self._retry_s, self._settings.longest_retry_s)
 
-    def _wall_offset(self, monotonic_ns):
+    def _wall_offset(self, monotonic_ns: int) -> int:
         """[ns] Time of day minus monotonic time; stamps follow where somebody sets the clock."""
         offset = self._wall_ns() - monotonic_ns
         if self._offset_ns is not None and abs(offset - self._offset_ns) > STEP_NS:
@@ -229,17 +213,20 @@ class Driver:
         self._offset_ns = offset
         return offset
 
-    def _samples(self, arrivals, offset_ns):
+    def _samples(self, arrivals: Sequence[Arrival], offset_ns: int) -> Heard:
         """(`Readings`, [`AccelerationSample`]) of what has come.
 
         A field that is infinite in tesla is none; an acceleration that came with it is one.
         Raises ValueError for other than three axes.
         """
-        sensors, stamps, fields, accelerations = [], [], [], []
+        sensors: list[str] = []
+        stamps: list[int] = []
+        fields: list[Axes] = []
+        accelerations: list[AccelerationSample] = []
         for arrival in arrivals:
             reading = arrival.reading
             sensor, stamp_ns = self._measured(reading, arrival)
-            if stamp_ns is None:
+            if sensor is None or stamp_ns is None:
                 continue
             if reading.field is not None:
                 sensors.append(sensor)
@@ -252,7 +239,7 @@ class Driver:
         with np.errstate(over='ignore'):
             field = self._scale * np.array(fields, dtype=float).reshape(len(fields), 3)
         readings = Readings.by_name(sensors, stamps, field)
-        infinite = np.isinf(readings.field).any(axis=1)
+        infinite: BoolArray = np.any(np.isinf(readings.field), axis=1)
         if infinite.any():
             self.own_counts['readings that are infinite in tesla'] += int(infinite.sum())
             readings = readings.part(~infinite)
@@ -260,7 +247,7 @@ class Driver:
                                 for j in readings.sensor.tolist()])
         return readings, accelerations
 
-    def _measured(self, reading, arrival):
+    def _measured(self, reading: Reading, arrival: Arrival) -> tuple[str | None, int | None]:
         """(the network's name of the sensor, monotonic ns) of a reading; None for what is not."""
         sensor = self._named.get((reading.sensor, arrival.source)) \
             or self._sensor_of(reading.sensor, arrival.source)
@@ -269,7 +256,7 @@ class Driver:
             return sensor, None
         return sensor, self._stamp(reading, arrival)
 
-    def _sensor_of(self, at_device, source):
+    def _sensor_of(self, at_device: str, source: str) -> str | None:
         """The network's name of a sensor; None for one that nobody has named."""
         sensor = next((self.sensors[name] for name in (at_device, source)
                        if name and name in self.sensors), None)
@@ -290,7 +277,7 @@ class Driver:
             self._named[at_device, source] = sensor
         return sensor
 
-    def _stamp(self, reading, arrival):
+    def _stamp(self, reading: Reading, arrival: Arrival) -> int | None:
         """Monotonic ns of the measurement; None where no clock can tell."""
         by = self._settings.stamp_by
         ticks = reading.sequence if by == 'sequence' else reading.ticks
@@ -305,14 +292,15 @@ class Driver:
         if ticks is None and isinstance(clock, DeviceClock):
             self.own_counts['readings without the time of the device'] += 1
             return None
-        of = clock, ticks, arrival.arrival_ns
-        if self._stamped[0] != of or self._stamped[1] is None:
+        measurement = clock, ticks, arrival.arrival_ns
+        if self._measurement != measurement or self._measured_ns is None:
             # Each that has no time is counted.
-            self._stamped = of, clock.stamp(ticks, arrival.arrival_ns)
-        return self._stamped[1]
+            self._measured_ns = clock.stamp(ticks, arrival.arrival_ns)
+            self._measurement = measurement
+        return self._measured_ns
 
 
-def _bytes_of(axes):
+def _bytes_of(axes: Axes | None) -> bytes:
     """Three numbers, or None, as bytes; ValueError for anything else.
 
     They are kept by the thousand. As tuples they would be looked through for garbage, all of them
@@ -324,7 +312,8 @@ def _bytes_of(axes):
         raise ValueError(f'expected three numbers, got {axes}'[:100]) from error
 
 
-def serve(driver, take, stopping):
+def serve(driver: Driver, take: Callable[[Readings, Sequence[AccelerationSample]], object],
+          stopping: Callable[[], bool]) -> None:
     """Hand what `driver` says to `take`, a function as of `poll`'s result, until `stopping()`.
 
     For a thread of its own, which nobody would see die: what the device raises stands in
@@ -332,13 +321,13 @@ def serve(driver, take, stopping):
     """
     while not stopping():
         try:
-            heard = driver.poll(POLL_S)
+            readings, accelerations = driver.poll(POLL_S)
         except Exception as error:
             driver.fail(error)
             continue
         try:
-            if any(map(len, heard)):
-                take(*heard)
+            if len(readings) or len(accelerations):
+                take(readings, accelerations)
         except Exception as error:
             # Not the device's fault, which goes on.
             what = f'errors behind the driver: {type(error).__name__}'

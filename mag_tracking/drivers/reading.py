@@ -8,7 +8,10 @@ came: a transport with a framing, a chip on a bus, or the simulator.
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeAlias
+
+Axes: TypeAlias = tuple[float, float, float]
+"""x, y and z."""
 
 
 class Reading(NamedTuple):
@@ -16,10 +19,10 @@ class Reading(NamedTuple):
 
     sensor: str = ''
     """The device's name of the sensor; empty where it names none."""
-    field: tuple[float, float, float] | None = None
+    field: Axes | None = None
     """In the device's unit, sensor frame; NaN = an axis that it does not report, or that was over
     its range; None = it says nothing of the field."""
-    acceleration: tuple[float, float, float] | None = None
+    acceleration: Axes | None = None
     """In the device's unit, sensor frame; None = none."""
     ticks: float | None = None
     """The device's clock when it measured; None = it has none."""
@@ -67,7 +70,7 @@ class Transport(Protocol):
 
     whole: bool
     """Each chunk is a message of its own (a datagram), and no frame reaches into the next."""
-    counts: Counter
+    counts: Counter[str]
     """What was lost on the way, by cause ('messages dropped, queue full')."""
 
     def open(self) -> None:
@@ -96,7 +99,9 @@ class Arrival(NamedTuple):
 class Device(Protocol):
     """Gives readings; otherwise as `Transport`."""
 
-    counts: Counter
+    @property
+    def counts(self) -> Counter[str]:
+        """As `Transport.counts`."""
 
     def open(self) -> None:
         """As `Transport.open`."""

@@ -11,18 +11,19 @@ FARTHEST = 1_000_000
 class SequenceCheck:
     """Looks at the sequence numbers of one sensor."""
 
-    def __init__(self, wrap):
+    def __init__(self, wrap: int) -> None:
         """`wrap` is the number at which the count goes back to 0; 0 = never."""
         self._wrap = wrap
-        self.counts = Counter()
+        self.counts: Counter[str] = Counter()
         self._begin()
 
-    def _begin(self):
+    def _begin(self) -> None:
         """A new count."""
-        self._last = None
-        self._seen, self._missing = {}, {}
+        self._last: int | None = None
+        self._seen: dict[int, bytes] = {}
+        self._missing: dict[int, bool] = {}
 
-    def is_new(self, sequence, values):
+    def is_new(self, sequence: int, values: bytes) -> bool:
         """Whether the reading with this number and these `values`, bytes, has not come before.
 
         Counts what is missing; a late one is taken off again. A number that has come
@@ -31,7 +32,7 @@ class SequenceCheck:
         if sequence < 0 or self._wrap and sequence >= self._wrap:
             self.counts['sequence numbers out of range'] += 1
             return True
-        ahead = 1 if self._last is None else self._ahead(sequence)
+        ahead = 1 if self._last is None else self._ahead(sequence, self._last)
         if ahead > FARTHEST:
             self.counts['sequence jumped'] += 1
             self._begin()
@@ -54,14 +55,14 @@ class SequenceCheck:
         _shorten(self._seen)
         return True
 
-    def _ahead(self, sequence):
-        """How far `sequence` is ahead of the last; negative where it is behind."""
-        ahead = sequence - self._last
+    def _ahead(self, sequence: int, last: int) -> int:
+        """How far `sequence` is ahead of `last`; negative where it is behind."""
+        ahead = sequence - last
         if self._wrap:
             ahead = (ahead + self._wrap // 2) % self._wrap - self._wrap // 2
         return ahead
 
-    def _skip(self, sequence, n):
+    def _skip(self, sequence: int, n: int) -> None:
         """Note that the `n` numbers before `sequence` have not come."""
         if not n:
             return
@@ -71,7 +72,7 @@ class SequenceCheck:
         _shorten(self._missing)
 
 
-def _shorten(memory):
+def _shorten(memory: dict[int, bytes] | dict[int, bool]) -> None:
     """Forget the oldest of a dict."""
     while len(memory) > MEMORY:
         del memory[next(iter(memory))]

@@ -7,13 +7,16 @@ import bisect
 import math
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.drivers.reading import Arrival, Reading
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.network.file import read_network
+from mag_tracking.network.sensor_network import SensorNetwork
 from mag_tracking.settings import param
 from mag_tracking.simulation.scenario import Path, body_field, random_vehicle
 
@@ -53,32 +56,34 @@ class SimulatedDevice:
     SETTINGS = SimulatorSettings
     CLOCK = {'tick_s': TICK_S}
 
-    def __init__(self, settings, monotonic_ns=time.monotonic_ns, sleep=time.sleep):
+    def __init__(self, settings: SimulatorSettings,
+                 monotonic_ns: Callable[[], int] = time.monotonic_ns,
+                 sleep: Callable[[float], object] = time.sleep) -> None:
         """Raises SettingsError or NetworkError where there is no usable network."""
         if not settings.network:
             raise SettingsError('simulator: network: the path of a network.yaml is needed')
         self._network = read_network(settings.network)
         if self._network.earth_field is None:
             raise SettingsError(f'{settings.network} has no earth_field, which the simulator needs')
-        self.counts = Counter()
+        self._earth_field: FloatArray = self._network.earth_field
+        self.counts: Counter[str] = Counter()
         self._settings = settings
         self._monotonic_ns, self._sleep = monotonic_ns, sleep
         self._path, self._passing_s = _path_along(self._network, settings)
         self._rng = np.random.default_rng(settings.seed)
-        self._table = None
-        self._start_ns, self._next = None, 0
-        self._shift_s = (np.arange(len(self._network)) * settings.in_turn
+        self._table: FloatArray | None = None
+        self._start_ns = self._next = 0
+        self._shift_s: list[float] = (np.arange(len(self._network)) * settings.in_turn
                          / (len(self._network) * settings.rate_hz)).tolist()
 
-    def open(self):
+    def open(self) -> None:
         """Compute one pass, and begin."""
         if self._table is None:
             self._table = self._one_pass()
-        if self._start_ns is None:
             self._start_ns = self._monotonic_ns()
         self._next = math.ceil(self._elapsed() * self._settings.rate_hz) * len(self._network)
 
-    def read(self, timeout_s):
+    def read(self, timeout_s: float) -> list[Arrival]:
         """The readings that are due; waits for the next if none is."""
         if self._table is None:
             raise DeviceError('the simulator is not open')
@@ -94,45 +99,45 @@ class SimulatedDevice:
         first, self._next = self._next, max(self._next, self._n_due(elapsed))
         while self._due(self._next) <= elapsed:
             self._next += 1
-        return self._readings(first, self._next)
+        return self._readings(self._table, first, self._next)
 
-    def close(self):
+    def close(self) -> None:
         """There is nothing to close; time goes on."""
 
     @property
-    def _period_s(self):
+    def _period_s(self) -> float:
         """[s] From one vehicle to the next."""
         return max(self._settings.period_s, self._passing_s)
 
-    def _elapsed(self):
+    def _elapsed(self) -> float:
         """[s] since the first `open`."""
         return (self._monotonic_ns() - self._start_ns) / 1e9
 
-    def _due(self, i):
+    def _due(self, i: int) -> float:
         """[s] When reading `i` is measured; the sensors take turns."""
         index, j = divmod(i, len(self._network))
         return index / self._settings.rate_hz + self._shift_s[j]
 
-    def _n_due(self, elapsed):
+    def _n_due(self, elapsed: float) -> int:
         """How many readings have been measured; by rounding those of one interval fewer."""
         whole = math.floor(elapsed * self._settings.rate_hz)
         return whole * len(self._network) + bisect.bisect_right(
             self._shift_s, elapsed - whole / self._settings.rate_hz)
 
-    def _readings(self, first, end):
+    def _readings(self, table: FloatArray, first: int, end: int) -> list[Arrival]:
         """The readings from `first` to before `end`."""
         index, j = np.divmod(np.arange(first, end), len(self._network))
         due_s = index / self._settings.rate_hz + np.array(self._shift_s)[j]
         # The table is that of the pass alone; before the next vehicle there is none.
         row = index % round(self._period_s * self._settings.rate_hz)
-        B = self._table[np.minimum(row, len(self._table) - 1), j]
+        B = table[np.minimum(row, len(table) - 1), j]
         B = B + self._settings.noise * self._rng.standard_normal(B.shape)
         now, names = self._monotonic_ns(), self._network.names
         return [Arrival(now, Reading(names[j], tuple(b), ticks=t, sequence=k))
                 for t, k, j, b in zip(np.round(due_s / TICK_S).astype(int).tolist(),
                                       index.tolist(), j.tolist(), B.tolist(), strict=True)]
 
-    def _one_pass(self):
+    def _one_pass(self) -> FloatArray:
         """(n, n_sensors, 3) [T], sensor frames; the last row is without a vehicle."""
         s, network = self._settings, self._network
         t = np.arange(0.0, self._passing_s, 1.0 / s.rate_hz)
@@ -140,12 +145,13 @@ class SimulatedDevice:
         B = np.zeros((len(t) + 1, len(network), 3))
         for j, shift_s in enumerate(self._shift_s):
             position, heading = self._path.at(t + shift_s)
-            B[:-1, j] = body_field(body, network.earth_field, position, heading,
+            B[:-1, j] = body_field(body, self._earth_field, position, heading,
                                    network.positions[j:j + 1])[:, 0]
-        return np.einsum('njw,jws->njs', B + network.earth_field, network.R_ws)
+        B_s: FloatArray = np.einsum('njw,jws->njs', B + self._earth_field, network.R_ws)
+        return B_s
 
 
-def _path_along(network, settings):
+def _path_along(network: SensorNetwork, settings: SimulatorSettings) -> tuple[Path, float]:
     """The straight way past all sensors, and the seconds that it takes."""
     heading = math.radians(settings.heading_deg)
     forward = np.array([math.cos(heading), math.sin(heading)])

@@ -20,9 +20,8 @@ from mag_tracking.drivers.device_clock import (
     ArrivalClock,
     ClockSettings,
     DeviceClock,
-    likely_slopes,
-    lower_hull,
 )
+from mag_tracking.drivers.lower_line import likely_slopes, lower_hull
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import replace
 

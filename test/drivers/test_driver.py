@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from mag_tracking.drivers.device_clock import ClockSettings
-from mag_tracking.drivers.driver import Driver, DriverSettings, serve
+from mag_tracking.drivers.driver import Driver, serve
 from mag_tracking.drivers.framed_device import FramedDevice
 from mag_tracking.drivers.reading import Arrival, Chunk, Parsed, Reading
 from mag_tracking.drivers.sequence import MEMORY, SequenceCheck
+from mag_tracking.drivers.settings import DriverSettings
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.records import AccelerationSample, MagSample
 
@@ -264,10 +265,17 @@ def test_duplicates_are_not_restarts():
 
 
 def test_the_memory_of_a_sequence_is_bounded():
-    check = SequenceCheck(0)
-    for n in range(0, 100 * MEMORY, 2):
-        check.is_new(n, b'0')
-    assert len(check._seen) <= MEMORY and len(check._missing) <= MEMORY
+    even = range(0, 100 * MEMORY, 2)
+
+    def told_of(number):
+        return checked([*even, number], values=[0] * (len(even) + 1))[1].keys() - {'lost'}
+
+    # Of those that came and of those that did not.
+    last = even[-1]
+    assert told_of(last - 2 * (MEMORY - 1)) == {'duplicates'}
+    assert told_of(last - 2 * MEMORY) == {'sequence begun anew'}
+    assert told_of(last - 1 - 2 * (MEMORY - 1)) == {'came late'}
+    assert told_of(last - 1 - 2 * MEMORY) == {'sequence begun anew'}
 
 
 def test_a_reading_that_comes_twice_is_one():
@@ -279,8 +287,19 @@ def test_a_reading_that_comes_twice_is_one():
     assert [type(s) for s in said(driver, 0.1)] == [MagSample] * 3 + [AccelerationSample]
     counts = driver.counts()
     assert (counts['duplicates: mag_1'], counts['sequence begun anew: mag_1']) == (1, 1)
-    # What is kept by the thousand is nothing that is looked through for garbage.
-    assert not any(gc.is_tracked(v) for v in driver._sequences['mag_1']._seen.values())
+
+
+def test_what_is_kept_by_the_thousand_is_not_looked_through_for_garbage():
+    gc.collect()
+    gc.disable()
+    try:
+        before = len(gc.get_objects())
+        driver, *_ = driver_of([[Reading('', (float(k), 2.0, 3.0), (0.0, float(k), 9.8), sequence=k)
+                                 for k in range(MEMORY)]])
+        assert len(said(driver, 0.1)) == 2 * MEMORY
+        assert len(gc.get_objects()) - before < MEMORY // 4
+    finally:
+        gc.enable()
 
 
 @pytest.mark.parametrize('sequence', [None, 1])
@@ -317,11 +336,13 @@ def test_a_sensor_that_is_not_used_is_no_news():
 
 def test_unknown_names_do_not_pile_up():
     readings = [Reading(f'x{k}', (1.0, 0.0, 0.0)) for k in range(1000)]
-    driver, *_ = driver_of([readings], sensors={'A': 'mag_1'})
+    driver, *_ = driver_of([readings, [readings[0], readings[-1]]], sensors={'A': 'mag_1'})
     assert said(driver, 0.1) == []
     assert len(driver.counts()) == 21
     assert driver.counts()['of unknown sensors (and others)'] == 980
-    assert len(driver._unknown) == 20
+    assert said(driver, 0.1) == []
+    assert len(driver.counts()) == 21 and driver.counts()['of unknown sensors: x0'] == 2
+    assert driver.counts()['of unknown sensors (and others)'] == 981
 
 
 def test_a_reading_beyond_all_numbers_is_none():

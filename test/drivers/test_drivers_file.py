@@ -51,13 +51,13 @@ def test_every_entry_of_the_example_is_one(tmp_path):
 def test_what_is_known_of_a_kind_need_not_be_said(tmp_path):
     [driver] = read(tmp_path, {'mti': {
         'transport': 'serial', 'serial': {'port': '/dev/x'}, 'framing': 'xsens', 'sensor': 'a'}})
-    assert driver._clock_settings.tick_s == 1e-4
-    assert driver._settings.sequence_wrap == 2**16
+    assert driver.clock_settings.tick_s == 1e-4
+    assert driver.settings.sequence_wrap == 2**16
     [driver] = read(tmp_path, {'mti': {
         'transport': 'serial', 'serial': {'port': '/dev/x'}, 'framing': 'xsens', 'sensor': 'a',
         'clock': {'wrap': 864000000}, 'sequence_wrap': 0, 'stamp_by': 'sequence'}})
-    assert driver._clock_settings.tick_s == 1e-4 and driver._clock_settings.wrap == 864000000
-    assert driver._settings.sequence_wrap == 0 and driver._settings.stamp_by == 'sequence'
+    assert driver.clock_settings.tick_s == 1e-4 and driver.clock_settings.wrap == 864000000
+    assert driver.settings.sequence_wrap == 0 and driver.settings.stamp_by == 'sequence'
 
 
 @pytest.mark.parametrize('content, told', [
@@ -131,8 +131,8 @@ def test_kinds_of_ones_own(tmp_path, monkeypatch):
     [driver] = read(tmp_path, {'mine': {
         **{k: v for k, v in BOARD.items() if k != 'text'}, 'framing': f'{__name__}:Counting',
         'framing_settings': {'longest': 7}}})
-    assert isinstance(driver._device, FramedDevice)
+    assert isinstance(driver.device, FramedDevice)
     [driver] = read(tmp_path, {'mine': {
         'device': 'mag_tracking.drivers.transports.i2c:I2cDevice', 'sensor': 'a',
         'device_settings': {'sensors': ['A:lis3mdl:0x1c']}}})
-    assert isinstance(driver._device, I2cDevice)
+    assert isinstance(driver.device, I2cDevice)

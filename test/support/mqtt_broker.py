@@ -72,8 +72,11 @@ class Broker:
                 return self
             time.sleep(0.01)
         self.kill()
-        raise AssertionError('mosquitto does not start:\n'
-                             + (self._folder / 'mosquitto.log').read_text())
+        raise AssertionError(f'mosquitto does not start:\n{self.log()}')
+
+    def log(self):
+        """What it has written so far."""
+        return (self._folder / 'mosquitto.log').read_text()
 
     def kill(self):
         """End it without a word to its clients; may be called twice."""

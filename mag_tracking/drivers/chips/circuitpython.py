@@ -16,10 +16,11 @@ sensor properties and units": `magnetic` is in microtesla.
 
 import errno
 import importlib
+from typing import Any
 
 from smbus2 import i2c_msg
 
-from mag_tracking.drivers.chips.chip import Conversion
+from mag_tracking.drivers.chips.chip import Conversion, Measurement, Registers
 from mag_tracking.errors import DeviceError
 
 LONGEST_NS = 250_000_000
@@ -33,51 +34,55 @@ class BusioI2c:
     chip in loops without an end.
     """
 
-    def __init__(self, registers):
+    def __init__(self, registers: Registers) -> None:
         self._registers = registers
         self._locked = False
-        self._until_ns = None
+        self._until_ns = 0
 
-    def begin(self, longest_ns):
+    def begin(self, longest_ns: int) -> None:
         """Unlocked, and good for so long."""
         self._locked = False
         self._until_ns = self._registers.monotonic_ns() + longest_ns
 
-    def try_lock(self):
+    def try_lock(self) -> bool:
         """Whether it was free, and is locked now."""
         self._check_time()
         free, self._locked = not self._locked, True
         return free
 
-    def unlock(self):
+    def unlock(self) -> None:
         """Free it."""
         self._locked = False
 
-    def writeto(self, address, buffer, *, start=0, end=None):
+    def writeto(self, address: int, buffer: bytes | bytearray, *, start: int = 0,
+                end: int | None = None) -> None:
         """Write `buffer[start:end]`; nothing to write asks whether the chip is there."""
         data = bytes(buffer[start:end])
         # Many adapters refuse a message without bytes.
         self._transfer(i2c_msg.write(address, data) if data else i2c_msg.read(address, 1))
 
-    def readfrom_into(self, address, buffer, *, start=0, end=None):
+    def readfrom_into(self, address: int, buffer: bytearray, *, start: int = 0,
+                      end: int | None = None) -> None:
         """Read as many bytes as `buffer[start:end]` has, into it."""
         message = i2c_msg.read(address, len(buffer[start:end]))
         self._transfer(message)
         buffer[start:end] = bytes(message)
 
-    def writeto_then_readfrom(self, address, out_buffer, in_buffer, *, out_start=0, out_end=None,
-                              in_start=0, in_end=None):
+    def writeto_then_readfrom(self, address: int, out_buffer: bytes | bytearray,
+                              in_buffer: bytearray, *, out_start: int = 0,
+                              out_end: int | None = None, in_start: int = 0,
+                              in_end: int | None = None) -> None:
         """Both, as one transaction."""
         message = i2c_msg.read(address, len(in_buffer[in_start:in_end]))
         self._transfer(i2c_msg.write(address, bytes(out_buffer[out_start:out_end])), message)
         in_buffer[in_start:in_end] = bytes(message)
 
-    def _transfer(self, *messages):
+    def _transfer(self, *messages: i2c_msg) -> None:
         """One transaction, while there is time."""
         self._check_time()
         self._registers.transfer(*messages)
 
-    def _check_time(self):
+    def _check_time(self) -> None:
         """Raises OSError where the driver has taken too long."""
         if self._registers.monotonic_ns() > self._until_ns:
             raise OSError(errno.EIO, 'the driver waited too long for its chip')
@@ -96,12 +101,13 @@ class CircuitpythonChip:
 
     IDENTITY = ()
 
-    def __init__(self, registers, name, address):
+    def __init__(self, registers: Registers, name: str, address: int) -> None:
         self._registers, self._name, self._address = registers, name, address
         self._i2c = BusioI2c(registers)
-        self._driver = None
+        # Of somebody else's class.
+        self._driver: Any = None
 
-    def set_up(self):
+    def set_up(self) -> None:
         """See `Chip`; loads the module."""
         cls = load(self._name)
         self._i2c.begin(10 * LONGEST_NS)
@@ -110,7 +116,7 @@ class CircuitpythonChip:
         except (RuntimeError, ValueError) as error:
             raise DeviceError(f'{self._name}: {error}') from error
 
-    def measure(self):
+    def measure(self) -> Measurement:
         """See `Chip`."""
         yield from ()
         self._i2c.begin(LONGEST_NS)
@@ -123,7 +129,7 @@ class CircuitpythonChip:
         return Conversion(middle_ns, (x * 1e-6, y * 1e-6, z * 1e-6))
 
 
-def load(name):
+def load(name: str) -> Any:
     """The class `module.Class`; raises DeviceError that says what to install."""
     module_name, _, class_name = name.rpartition('.')
     try:

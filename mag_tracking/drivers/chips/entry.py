@@ -1,6 +1,7 @@
 """Which chip is where, as it stands in the settings: name:chip:address@multiplexer.channel."""
 
 import re
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 from mag_tracking.drivers.chips.chip import Place
@@ -18,7 +19,7 @@ class Sensor(NamedTuple):
     place: Place
 
 
-def sensors_of(entries, known):
+def sensors_of(entries: Sequence[str], known: Collection[str]) -> list[Sensor]:
     """The `Sensor`s of all entries.
 
     Parameters
@@ -44,13 +45,13 @@ def sensors_of(entries, known):
     return sensors
 
 
-def _both_answer(one, other):
+def _both_answer(one: Place, other: Place) -> bool:
     """What is on the bus itself also hears what goes through a multiplexer."""
     return one.address == other.address and (
         one == other or None in (one.multiplexer, other.multiplexer))
 
 
-def sensor_of(entry, known):
+def sensor_of(entry: str, known: Collection[str]) -> Sensor:
     """The `Sensor` of one entry; raises SettingsError."""
     match = ENTRY.fullmatch(entry)
     if match is None:
@@ -67,7 +68,7 @@ def sensor_of(entry, known):
     return Sensor(name, chip, Place(address, multiplexer, int(match['channel'])))
 
 
-def _address(name, what, digits, lowest):
+def _address(name: str, what: str, digits: str, lowest: int) -> int:
     """An address from `lowest` on; raises SettingsError."""
     address = int(digits, 16)
     if not lowest <= address <= 0x77:

@@ -17,10 +17,18 @@ Sources: HMC5883L data sheet 900405 Rev E (2013), tables 2 to 21; HMC5983 data s
 """
 
 import errno
+import math
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 
-from mag_tracking.drivers.chips.chip import MARGIN, Conversion, one_of
+from mag_tracking.drivers.chips.chip import (
+    MARGIN,
+    Conversion,
+    Measurement,
+    Registers,
+    one_of,
+)
 from mag_tracking.settings import param
 
 CONFIGURATION_A, CONFIGURATION_B, MODE = 0x00, 0x01, 0x02
@@ -49,12 +57,13 @@ class Hmc5883l:
     CONFIGURATION = 0x10
     """One conversion for each reading, 15 Hz (which counts for nothing here), no bias."""
 
-    def __init__(self, registers, settings, count):
+    def __init__(self, registers: Registers, settings: Hmc5883lSettings,
+                 count: Callable[[str], None]) -> None:
         self._registers = registers
         self._gain = one_of(f'{self.NAME}.range_ut', settings.range_ut, GAINS)
         self._gain_bits = list(GAINS).index(settings.range_ut) << 5
 
-    def set_up(self):
+    def set_up(self) -> None:
         """See `Chip`."""
         self._registers.write(CONFIGURATION_A, self.CONFIGURATION)
         self._registers.write(CONFIGURATION_B, self._gain_bits)
@@ -62,7 +71,7 @@ class Hmc5883l:
         self._registers.write(MODE, SINGLE_MEASUREMENT)
         self._registers.sleep(CONVERSION_S * MARGIN)
 
-    def measure(self):
+    def measure(self) -> Measurement:
         """See `Chip`."""
         self._registers.write(MODE, SINGLE_MEASUREMENT)
         start_ns = self._registers.monotonic_ns()
@@ -75,8 +84,8 @@ class Hmc5883l:
         # conversion to the next, and tells nothing of a new one.
         if mode & 0x03 == SINGLE_MEASUREMENT:
             return None
-        return Conversion(start_ns + round(CONVERSION_S * 1e9) // 2, tuple(
-            float('nan') if c == OVERFLOW else c / self._gain * 1e-4 for c in (x, y, z)))
+        x, y, z = (math.nan if c == OVERFLOW else c / self._gain * 1e-4 for c in (x, y, z))
+        return Conversion(start_ns + round(CONVERSION_S * 1e9) // 2, (x, y, z))
 
 
 class Hmc5983(Hmc5883l):

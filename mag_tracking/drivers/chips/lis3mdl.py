@@ -14,9 +14,17 @@ Source: LIS3MDL data sheet, ST DocID024204 Rev 4 (2015), tables 3, 16 and sectio
 """
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 
-from mag_tracking.drivers.chips.chip import MARGIN, Conversion, in_range, one_of
+from mag_tracking.drivers.chips.chip import (
+    MARGIN,
+    Conversion,
+    Measurement,
+    Registers,
+    in_range,
+    one_of,
+)
 from mag_tracking.settings import param
 
 CONTROL_1, STATUS, OUT = 0x20, 0x27, 0x28
@@ -45,12 +53,13 @@ class Lis3mdl:
     IDENTITY = ((0x0F, 0x3D),)
     NAME = 'lis3mdl'
 
-    def __init__(self, registers, settings, count):
+    def __init__(self, registers: Registers, settings: Lis3mdlSettings,
+                 count: Callable[[str], None]) -> None:
         self._registers, self._count = registers, count
         self._scale_bits, self._gain = one_of('lis3mdl.range_ut', settings.range_ut, FULL_SCALES)
         self._largest = settings.range_ut * 1e-6
 
-    def set_up(self):
+    def set_up(self) -> None:
         """See `Chip`."""
         self._registers.write(CONTROL_1 + 1, SOFT_RESET)
         self._registers.sleep(SOFT_RESET_S)
@@ -61,7 +70,7 @@ class Lis3mdl:
         self._registers.write(CONTROL_1 + 2, CONTINUOUS)
         self._registers.sleep(PERIOD_NS * 1e-9 * MARGIN)
 
-    def measure(self):
+    def measure(self) -> Measurement:
         """See `Chip`; it measures by itself, so there is nothing to wait for."""
         yield from ()
         now_ns = self._registers.monotonic_ns()

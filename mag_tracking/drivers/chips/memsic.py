@@ -28,9 +28,18 @@ to remove bridge offset"; MMC5603NJ data sheet Rev B (2018).
 """
 
 import math
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
-from mag_tracking.drivers.chips.chip import MARGIN, Conversion, in_range, one_of
+from mag_tracking.drivers.chips.chip import (
+    MARGIN,
+    Conversion,
+    Measurement,
+    Registers,
+    in_range,
+    one_of,
+)
+from mag_tracking.drivers.reading import Axes
 from mag_tracking.settings import param
 
 COUNTS_PER_TESLA = 16384e4
@@ -72,21 +81,23 @@ class Mmc5983ma:
     """Counts; beyond is the end of the converter's range."""
     N_BYTES = 7
 
-    def __init__(self, registers, settings, count):
+    def __init__(self, registers: Registers, settings: Mmc5983maSettings,
+                 count: Callable[[str], None]) -> None:
         self._registers = registers
         self._bandwidth = one_of(f'{self.NAME}.conversion_ms', settings.conversion_ms,
                                  self.BANDWIDTHS)
         self._conversion_ns = round(settings.conversion_ms * 1e6)
         self._renew_ns = round(settings.set_reset_s * 1e9)
-        self._offset = self._offset_ns = None
+        self._offset: Axes | None = None
+        self._offset_ns = 0
 
-    def set_up(self):
+    def set_up(self) -> None:
         """See `Chip`."""
         self._registers.write(self.CONTROL_1, SOFT_RESET)
         self._registers.sleep(self.SOFT_RESET_S)
         self._registers.write(self.CONTROL_1, self._bandwidth)
 
-    def measure(self):
+    def measure(self) -> Measurement:
         """See `Chip`."""
         if self._offset is None or (
                 self._registers.monotonic_ns() - self._offset_ns >= self._renew_ns):
@@ -95,9 +106,10 @@ class Mmc5983ma:
         if conversion is None:
             return None
         middle_ns, counts = conversion
-        return _field(middle_ns, [c - o for c, o in zip(counts, self._offset, strict=True)])
+        x, y, z = (c - o for c, o in zip(counts, self._offset, strict=True))
+        return _conversion(middle_ns, (x, y, z))
 
-    def _pair(self):
+    def _pair(self) -> Measurement:
         """A measurement in both directions, and the offset."""
         halves = []
         for pulse in (SET, RESET):
@@ -108,14 +120,14 @@ class Mmc5983ma:
                 return None
             halves.append(conversion)
         (set_ns, after_set), (reset_ns, after_reset) = halves
-        offset = [(r + s) / 2 for r, s in zip(after_reset, after_set, strict=True)]
+        x, y, z = ((r + s) / 2 for r, s in zip(after_reset, after_set, strict=True))
         # An axis over its range has no offset: the next measurement is a pair again.
-        self._offset = None if any(map(math.isnan, offset)) else offset
+        self._offset = None if any(map(math.isnan, (x, y, z))) else (x, y, z)
         self._offset_ns = reset_ns
-        return _field((set_ns + reset_ns) // 2,
-                      [(r - s) / 2 for r, s in zip(after_reset, after_set, strict=True)])
+        x, y, z = ((r - s) / 2 for r, s in zip(after_reset, after_set, strict=True))
+        return _conversion((set_ns + reset_ns) // 2, (x, y, z))
 
-    def _convert(self):
+    def _convert(self) -> Generator[float, None, tuple[int, Axes] | None]:
         """(middle [ns], counts of the three axes) of one conversion; None = not done in time."""
         self._registers.write(self.CONTROL_0, TAKE_MEASUREMENT)
         start_ns = self._registers.monotonic_ns()
@@ -126,7 +138,7 @@ class Mmc5983ma:
         return start_ns + self._conversion_ns // 2, in_range(counts, self.LARGEST)
 
     @staticmethod
-    def _counts(block):
+    def _counts(block: bytes) -> list[int]:
         """Signed counts: 16 bits of each axis, then the last two of all in one byte."""
         return [(block[2 * i] << 10 | block[2 * i + 1] << 2 | block[6] >> (6 - 2 * i) & 3)
                 - (1 << 17) for i in range(3)]
@@ -144,12 +156,13 @@ class Mmc5603(Mmc5983ma):
     N_BYTES = 9
 
     @staticmethod
-    def _counts(block):
+    def _counts(block: bytes) -> list[int]:
         """Signed counts: 16 bits of each axis, then the last four of each in a byte."""
         return [(block[2 * i] << 12 | block[2 * i + 1] << 4 | block[6 + i] >> 4) - (1 << 19)
                 for i in range(3)]
 
 
-def _field(middle_ns, counts):
+def _conversion(middle_ns: int, counts: Axes) -> Conversion:
     """The `Conversion` of counts."""
-    return Conversion(middle_ns, tuple(c / COUNTS_PER_TESLA for c in counts))
+    x, y, z = (c / COUNTS_PER_TESLA for c in counts)
+    return Conversion(middle_ns, (x, y, z))

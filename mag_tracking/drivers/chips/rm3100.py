@@ -15,9 +15,17 @@ Source: RM3100 & RM2100 Sensor Suite User Manual, PNI doc 1017252, table 3-1 (sc
 rate, noise), tables 5-1 to 5-4 and 5-8.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
-from mag_tracking.drivers.chips.chip import MARGIN, Conversion, in_range, one_of
+from mag_tracking.drivers.chips.chip import (
+    MARGIN,
+    Conversion,
+    Measurement,
+    Registers,
+    in_range,
+    one_of,
+)
 from mag_tracking.settings import param
 
 CONTINUOUS, CYCLE_COUNTS, RATE, RESULTS, STATUS = 0x01, 0x04, 0x0B, 0x24, 0x34
@@ -45,12 +53,13 @@ class Rm3100:
     IDENTITY = ((0x36, 0x22),)
     NAME = 'rm3100'
 
-    def __init__(self, registers, settings, count):
+    def __init__(self, registers: Registers, settings: Rm3100Settings,
+                 count: Callable[[str], None]) -> None:
         self._registers, self._cycles = registers, settings.cycle_count
         self._gain, rate_hz = one_of('rm3100.cycle_count', settings.cycle_count, CYCLES)
         self._delay_ns = round(1e9 / rate_hz)
 
-    def set_up(self):
+    def set_up(self) -> None:
         """See `Chip`."""
         # It takes new cycle counts and rates only while it does not measure.
         self._registers.write(CONTINUOUS, 0)
@@ -61,7 +70,7 @@ class Rm3100:
         self._registers.write(CONTINUOUS, ALL_AXES_READY)
         self._registers.sleep(self._delay_ns * 1e-9 * MARGIN)
 
-    def measure(self):
+    def measure(self) -> Measurement:
         """See `Chip`; it measures by itself, so there is nothing to wait for."""
         yield from ()
         now_ns = self._registers.monotonic_ns()

@@ -16,11 +16,21 @@ import errno
 import math
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import smbus2
 
-from mag_tracking.drivers.chips.chip import Bus, Registers, check_identity
+from mag_tracking.drivers.chips.chip import (
+    Bus,
+    Chip,
+    ChipClass,
+    Conversion,
+    Registers,
+    SmBus,
+    check_identity,
+)
 from mag_tracking.drivers.chips.circuitpython import CircuitpythonChip
 from mag_tracking.drivers.chips.entry import sensors_of
 from mag_tracking.drivers.chips.honeywell import Hmc5883l, Hmc5883lSettings, Hmc5983
@@ -39,7 +49,8 @@ from mag_tracking.settings import param
 
 CLOSE_WAIT_S = 0.1
 """How long `close` may have to wait for a `read` in another thread, besides a turn."""
-CHIPS = {cls.NAME: cls for cls in (Mmc5983ma, Mmc5603, Hmc5883l, Hmc5983, Rm3100, Lis3mdl)}
+_CLASSES: tuple[ChipClass, ...] = (Mmc5983ma, Mmc5603, Hmc5883l, Hmc5983, Rm3100, Lis3mdl)
+CHIPS = {cls.NAME: cls for cls in _CLASSES}
 NO_ANSWER = (errno.EREMOTEIO, errno.ENXIO)
 
 
@@ -85,23 +96,26 @@ class I2cDevice(Closable):
 
     SETTINGS = I2cSettings
 
-    def __init__(self, settings, open_bus=smbus2.SMBus, monotonic_ns=time.monotonic_ns,
-                 sleep=time.sleep):
+    def __init__(self, settings: I2cSettings, open_bus: Callable[[int], SmBus] = smbus2.SMBus,
+                 monotonic_ns: Callable[[], int] = time.monotonic_ns,
+                 sleep: Callable[[float], object] = time.sleep) -> None:
         if settings.sensors == ('',):
             raise SettingsError('sensors: at least one, such as A:lis3mdl:0x1c, is needed')
         self._sensors = {s.name: s for s in sensors_of(settings.sensors, CHIPS)}
-        self.counts = Counter()
+        self.counts: Counter[str] = Counter()
         self._settings, self._open_bus = settings, open_bus
         self._monotonic_ns, self._sleep = monotonic_ns, sleep
         self._period_ns = round(1e9 / settings.rate_hz)
         super().__init__()
-        self._bus = self._lost = self._due_ns = None
-        self._failed, self._silent = Counter(), Counter()
+        self._bus: Bus | None = None
+        self._lost, self._due_ns = '', 0
+        self._failed: Counter[str] = Counter()
+        self._silent: Counter[str] = Counter()
         self._most_silent = max(3, math.ceil(settings.silent_s * settings.rate_hz))
         # To make the chips tells what is wrong with their settings.
         self._chips = self._made_on(Bus(None, monotonic_ns, sleep))
 
-    def open(self):
+    def open(self) -> None:
         """Open the bus, find the chips and set them up; raises DeviceError."""
         with self._lock:
             self._release()
@@ -109,12 +123,13 @@ class I2cDevice(Closable):
                 opened = self._open_bus(self._settings.bus)
             except OSError as error:
                 raise DeviceError(f'{self._name}: {_obstacle(error)}') from error
-            multiplexers = {s.place.multiplexer for s in self._sensors.values()} - {None}
-            self._bus = Bus(opened, self._monotonic_ns, self._sleep, multiplexers)
+            multiplexers = {s.place.multiplexer for s in self._sensors.values()
+                            if s.place.multiplexer is not None}
+            self._bus = bus = Bus(opened, self._monotonic_ns, self._sleep, multiplexers)
             try:
-                self._chips = self._made_on(self._bus)
+                self._chips = self._made_on(bus)
                 for name, chip in self._chips.items():
-                    self._set_up(name, chip)
+                    self._set_up(name, chip, bus)
             except DeviceError:
                 self._release()
                 raise
@@ -123,31 +138,31 @@ class I2cDevice(Closable):
             self._silent.clear()
 
     @property
-    def _name(self):
+    def _name(self) -> str:
         """Of the bus, for messages."""
         return f'/dev/i2c-{self._settings.bus}'
 
-    def _made_on(self, bus):
+    def _made_on(self, bus: Bus) -> dict[str, Chip]:
         """{name of the sensor: its chip}; nothing is said to the chips yet."""
-        chips = {}
+        chips: dict[str, Chip] = {}
         for name, sensor in self._sensors.items():
             registers = Registers(bus, sensor.place)
             if sensor.chip in CHIPS:
                 chips[name] = CHIPS[sensor.chip](registers, getattr(self._settings, sensor.chip),
-                                                 lambda cause, name=name: self._count(cause, name))
+                                                 partial(self._count, name=name))
             else:
                 chips[name] = CircuitpythonChip(registers, sensor.chip, sensor.place.address)
         return chips
 
-    def _count(self, cause, name):
+    def _count(self, cause: str, name: str) -> None:
         """Count what is lost of a sensor."""
         self.counts[f'{cause}: {name}'] += 1
 
-    def _set_up(self, name, chip):
+    def _set_up(self, name: str, chip: Chip, bus: Bus) -> None:
         """Make sure it is the right chip, and set it up; raises DeviceError."""
         sensor = self._sensors[name]
         where = f'{self._name}: {name} ({sensor.chip}, {sensor.place})'
-        registers = Registers(self._bus, sensor.place)
+        registers = Registers(bus, sensor.place)
         try:
             check_identity(chip, registers)
             chip.set_up()
@@ -158,7 +173,7 @@ class I2cDevice(Closable):
         except OSError as error:
             raise DeviceError(f'{where}: {self._fault(error)}') from error
 
-    def _answers_as(self, registers):
+    def _answers_as(self, registers: Registers) -> list[str]:
         """Names of the chips whose identity a place has."""
         found = []
         for name, cls in CHIPS.items():
@@ -169,7 +184,7 @@ class I2cDevice(Closable):
             found.append(name)
         return found
 
-    def _fault(self, error):
+    def _fault(self, error: OSError) -> str:
         """What an error of the bus means, and what to do."""
         if error.errno in NO_ANSWER:
             return ('nothing answers; check its wiring, supply and address with i2cdetect -y '
@@ -180,7 +195,7 @@ class I2cDevice(Closable):
             return 'a driver of the kernel has taken the address; unload it'
         return f'cannot be read: {error.strerror or error}'
 
-    def read(self, timeout_s):
+    def read(self, timeout_s: float) -> list[Arrival]:
         """What the next turn gives, as soon as a turn gives something.
 
         Returns [] where no turn in time does, or where `close` is called meanwhile.
@@ -195,12 +210,12 @@ class I2cDevice(Closable):
                     raise DeviceError(self._lost)
                 if not self._wait(end_ns):
                     return []
-                arrivals = self._turn()
+                arrivals = self._turn(self._bus)
                 # A turn may take longer than there is time.
                 if arrivals or self._monotonic_ns() >= end_ns:
                     return sorted(arrivals, key=lambda a: a.arrival_ns)
 
-    def _wait(self, end_ns):
+    def _wait(self, end_ns: int) -> bool:
         """Whether the next turn is due before `end_ns`; waits for the one or the other."""
         while not self._closing:
             now_ns = self._monotonic_ns()
@@ -217,13 +232,13 @@ class I2cDevice(Closable):
             self._sleep(min((until_ns - now_ns) * 1e-9, CLOSE_WAIT_S))
         return False
 
-    def _turn(self):
+    def _turn(self, bus: Bus) -> list[Arrival]:
         """Let every chip measure once, all at the same time; a list of `Arrival`."""
-        arrivals = []
+        arrivals: list[Arrival] = []
         running = {name: chip.measure() for name, chip in self._chips.items()}
         wake_ns = dict.fromkeys(running, self._monotonic_ns())
         while wake_ns:
-            name = min(wake_ns, key=wake_ns.get)
+            name = min(wake_ns, key=wake_ns.__getitem__)
             wait_ns = wake_ns[name] - self._monotonic_ns()
             if wait_ns > 0:
                 self._sleep(wait_ns * 1e-9)
@@ -236,14 +251,14 @@ class I2cDevice(Closable):
             except TimeoutError as error:
                 # Each further try would wait as long.
                 for other in wake_ns:
-                    self._fail(other, error)
+                    self._fail(bus, other, error)
                 return arrivals
             except OSError as error:
-                self._fail(name, error)
+                self._fail(bus, name, error)
             del wake_ns[name]
         return arrivals
 
-    def _arrivals(self, name, conversion):
+    def _arrivals(self, name: str, conversion: Conversion | None) -> list[Arrival]:
         """A list of one `Arrival`, or of none."""
         self._failed[name] = 0
         if conversion is None:
@@ -256,24 +271,24 @@ class I2cDevice(Closable):
         self._silent[name] = 0
         return [Arrival(conversion.middle_ns, Reading(name, conversion.field))]
 
-    def _fail(self, name, error):
+    def _fail(self, bus: Bus, name: str, error: OSError) -> None:
         """Count a failure; too many in a row and the device is lost."""
-        self._bus.forget()
+        bus.forget()
         self._count('readings that failed', name)
         self._failed[name] += 1
         if self._failed[name] >= self._settings.most_failures:
             self._lost = (f'{self._name}: {name} failed {self._failed[name]} times in a row: '
                           f'{self._fault(error)}')
 
-    def _release(self):
+    def _release(self) -> None:
         """Let go of the bus, if it is held."""
-        self._lost = None
+        self._lost = ''
         if self._bus is not None:
             self._bus.smbus.close()
             self._bus = None
 
 
-def _obstacle(error):
+def _obstacle(error: OSError) -> str:
     """Why a bus cannot be opened, and what to do."""
     if error.errno == errno.ENOENT:
         return ('is not there; enable I2C (on a Raspberry Pi: raspi-config), load the module with '

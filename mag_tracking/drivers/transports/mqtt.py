@@ -14,14 +14,18 @@ CallbackAPIVersion.VERSION2.
 """
 
 import secrets
+import socket
 import ssl
 import threading
 import time
 from collections import Counter, deque
 from dataclasses import dataclass
+from typing import Any
 
 from paho.mqtt import client as paho
 from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
+from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
 
 from mag_tracking.drivers.reading import Chunk
 from mag_tracking.errors import DeviceError, SettingsError
@@ -64,9 +68,9 @@ class MqttSettings:
 class _Certificates(ssl.SSLContext):
     """Shakes hands at once: then the socket of a failure is closed, which paho leaves open."""
 
-    def wrap_socket(self, sock, **kwargs):
+    def wrap_socket(self, sock: socket.socket, *args: Any, **kwargs: Any) -> ssl.SSLSocket:
         """As in the base class."""
-        return super().wrap_socket(sock, **(kwargs | {'do_handshake_on_connect': True}))
+        return super().wrap_socket(sock, *args, **(kwargs | {'do_handshake_on_connect': True}))
 
 
 class MqttTopics:
@@ -82,7 +86,7 @@ class MqttTopics:
     SETTINGS = MqttSettings
     whole = True
 
-    def __init__(self, settings):
+    def __init__(self, settings: MqttSettings) -> None:
         s = settings
         if '' in s.topics:
             raise SettingsError('topics: the topic filters to subscribe to are needed')
@@ -90,17 +94,23 @@ class MqttTopics:
             raise SettingsError('password_file: a password needs a username')
         if s.ca_file and not s.tls:
             raise SettingsError('ca_file: certificates are of no use while tls is false')
-        self.counts = Counter()
+        self.counts: Counter[str] = Counter()
         self._settings = s
         self._name = f'MQTT broker {s.host}:{s.port}'
         # Guards all below; tells the reader of messages and of the end.
         self._news = threading.Condition()
-        self._queue, self._came = deque(), Counter()
-        self._thread = None
+        self._queue: deque[Chunk] = deque()
+        self._came: Counter[str] = Counter()
+        self._thread: threading.Thread | None = None
         self._ready = self._closing = False
         self._lost = f'{self._name}: is not open'
 
-    def open(self):
+    @property
+    def settings(self) -> MqttSettings:
+        """As they were given."""
+        return self._settings
+
+    def open(self) -> None:
         """Connect and subscribe; raises DeviceError that names the broker and what it said."""
         self.close()
         client = self._client()
@@ -123,7 +133,7 @@ class MqttTopics:
             raise DeviceError(lost or f'{self._name}: no answer within '
                               f'{self._settings.connect_timeout_s:g} s; is that a broker?')
 
-    def _client(self):
+    def _client(self) -> paho.Client:
         """A client that is ready to connect; raises DeviceError where a file is missing."""
         s = self._settings
         client = paho.Client(
@@ -138,7 +148,7 @@ class MqttTopics:
             client.tls_set_context(self._certificates())
         return client
 
-    def _certificates(self):
+    def _certificates(self) -> ssl.SSLContext:
         """Who may vouch for the broker."""
         path = self._settings.ca_file
         # Such a context demands a certificate, and that it is of the host.
@@ -153,7 +163,7 @@ class MqttTopics:
                               f'{error.strerror or error}') from error
         return certificates
 
-    def _password(self):
+    def _password(self) -> str | None:
         """First line of the password file; None where there is no file."""
         path = self._settings.password_file
         if not path:
@@ -168,7 +178,7 @@ class MqttTopics:
             raise DeviceError(f'{self._name}: the first line of password_file {path} is empty')
         return password
 
-    def _connect(self, client):
+    def _connect(self, client: paho.Client) -> None:
         """Connect, and shake hands where there is TLS."""
         s = self._settings
         try:
@@ -180,7 +190,7 @@ class MqttTopics:
         except (OSError, ValueError) as error:
             raise DeviceError(f'{self._name}: cannot connect: {error}') from error
 
-    def _run(self, client):
+    def _run(self, client: paho.Client) -> None:
         """The network loop; all that is done with the client from here on, is done here."""
         try:
             said = MQTTErrorCode.MQTT_ERR_SUCCESS
@@ -194,13 +204,14 @@ class MqttTopics:
         self._lose(reason if self._ready else f'{reason} Is that a broker, and does it expect tls '
                    f'to be {str(self._settings.tls).lower()}?')
 
-    def _lose(self, reason):
+    def _lose(self, reason: str) -> None:
         """The connection has ended; the first reason is the one that counts."""
         with self._news:
             self._lost = self._lost or f'{self._name}: {reason}'
             self._news.notify_all()
 
-    def _on_connect(self, client, _, flags, reason_code, properties):
+    def _on_connect(self, client: paho.Client, _: Any, flags: paho.ConnectFlags,
+                    reason_code: ReasonCode, properties: Properties | None) -> None:
         """The broker has answered."""
         if reason_code.is_failure:
             self._lose(f'refused the connection: {reason_code}')
@@ -210,7 +221,8 @@ class MqttTopics:
         except ValueError as error:
             self._lose(f'topics {self._settings.topics}: {error}')
 
-    def _on_subscribe(self, client, _, mid, reason_codes, properties):
+    def _on_subscribe(self, client: paho.Client, _: Any, mid: int,
+                      reason_codes: list[ReasonCode], properties: Properties | None) -> None:
         """The broker has said which subscriptions it grants."""
         refused = [topic for topic, code in zip(self._settings.topics, reason_codes, strict=True)
                    if code.is_failure]
@@ -221,7 +233,7 @@ class MqttTopics:
             self._ready = True
             self._news.notify_all()
 
-    def _on_message(self, client, _, message):
+    def _on_message(self, client: paho.Client, _: Any, message: paho.MQTTMessage) -> None:
         """Put a message into the queue, or count it."""
         arrival_ns = time.monotonic_ns()
         with self._news:
@@ -237,7 +249,7 @@ class MqttTopics:
             self._queue.append(Chunk(arrival_ns, bytes(message.payload), topic))
             self._news.notify_all()
 
-    def _objection(self, message):
+    def _objection(self, message: paho.MQTTMessage) -> tuple[str, str]:
         """(why a message is not handed on, or '', and its topic)."""
         try:
             topic = message.topic
@@ -249,12 +261,13 @@ class MqttTopics:
             return 'messages that were too long', topic
         return ('' if message.payload else 'empty messages'), topic
 
-    def _on_disconnect(self, client, _, flags, reason_code, properties):
+    def _on_disconnect(self, client: paho.Client, _: Any, flags: paho.DisconnectFlags,
+                       reason_code: ReasonCode, properties: Properties | None) -> None:
         """Only the keep-alive is known here alone; `_run` knows better of all else."""
         if reason_code.getName() == 'Keep alive timeout':
             self._lose(f'has not answered for {2 * self._settings.keepalive_s} s')
 
-    def read(self, timeout_s):
+    def read(self, timeout_s: float) -> list[Chunk]:
         """All messages that have come, as soon as there is one.
 
         Returns [] where nothing comes in time, or where `close` is called meanwhile.
@@ -272,12 +285,12 @@ class MqttTopics:
                 raise DeviceError(self._lost)
             return chunks
 
-    def _count(self):
+    def _count(self) -> None:
         """Add what was counted since last time."""
         self.counts += self._came
         self._came.clear()
 
-    def close(self):
+    def close(self) -> None:
         """Leave the broker and end the thread; a `read` in another thread returns."""
         with self._news:
             self._closing = True

@@ -50,7 +50,7 @@ class SerialSettings:
         True, 'No other program that asks for the port alone gets it at the same time.')
 
 
-class SerialPort(Polled):
+class SerialPort(Polled[serial.Serial]):
     """Transport over a serial line; see `reading.Transport`.
 
     Raises SettingsError where no port is named, or where the parity is none of the three.
@@ -61,17 +61,17 @@ class SerialPort(Polled):
     SETTINGS = SerialSettings
     whole = False
 
-    def __init__(self, settings):
+    def __init__(self, settings: SerialSettings) -> None:
         super().__init__()
         if not settings.port:
             raise SettingsError('port: the path of a serial port is needed')
         if settings.parity not in ('N', 'E', 'O'):
             raise SettingsError(f'parity: expected N, E or O, got {settings.parity!r}')
-        self.counts = Counter()
+        self.counts: Counter[str] = Counter()
         self._settings = settings
-        self._line_errors = None
+        self._line_errors: tuple[int, ...] | None = None
 
-    def open(self):
+    def open(self) -> None:
         """Open the port; raises DeviceError where it is not there, busy or not allowed."""
         s = self._settings
         with self._lock:
@@ -85,12 +85,12 @@ class SerialPort(Polled):
                 raise DeviceError(f'serial port {s.port}: {self._obstacle(error)}') from error
             self._hold(opened)
             try:
-                self._line_errors = self._read_line_errors()
+                self._line_errors = _line_errors_of(opened)
             except OSError:
                 # Many drivers, and all pseudo-terminals, do not count.
                 self._line_errors = None
 
-    def _obstacle(self, error):
+    def _obstacle(self, error: Exception) -> str:
         """What stands in the way, and what to do."""
         code = getattr(error, 'errno', None)
         if code in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
@@ -105,7 +105,7 @@ class SerialPort(Polled):
             return f'is not a serial port, or there is no device behind it ({error})'
         return f'cannot be opened with {self._settings.baud} bit/s: {error}'
 
-    def read(self, timeout_s):
+    def read(self, timeout_s: float) -> list[Chunk]:
         """At most one chunk: what is there as soon as something is; its time is the wake-up's.
 
         Returns [] where nothing comes in time, or where `close` is called meanwhile.
@@ -117,7 +117,8 @@ class SerialPort(Polled):
             try:
                 arrival_ns = self._wait(timeout_s)
                 if self._line_errors is not None:
-                    self._count_line_errors()
+                    before, self._line_errors = self._line_errors, _line_errors_of(self._handle)
+                    self._count_line_errors(before, self._line_errors)
                 if arrival_ns is None:
                     return []
                 data = self._handle.read(max(1, self._handle.in_waiting))
@@ -126,14 +127,13 @@ class SerialPort(Polled):
                                   f'({error})') from error
         return [Chunk(arrival_ns, data)] if data else []
 
-    def _read_line_errors(self):
-        """The kernel's counters; raises OSError where the driver of the port has none."""
-        return ICOUNTER.unpack(
-            fcntl.ioctl(self._handle.fileno(), TIOCGICOUNT, bytes(ICOUNTER.size)))
-
-    def _count_line_errors(self):
-        """Add what the line and the driver lost since last time."""
-        before, self._line_errors = self._line_errors, self._read_line_errors()
+    def _count_line_errors(self, before: tuple[int, ...], now: tuple[int, ...]) -> None:
+        """Add what the line and the driver lost between two looks at the kernel's counters."""
         for i, cause in LINE_ERRORS.items():
-            if self._line_errors[i] != before[i]:
-                self.counts[cause] += (self._line_errors[i] - before[i]) % 2**32
+            if now[i] != before[i]:
+                self.counts[cause] += (now[i] - before[i]) % 2**32
+
+
+def _line_errors_of(port: serial.Serial) -> tuple[int, ...]:
+    """The kernel's counters; raises OSError where the driver of the port has none."""
+    return ICOUNTER.unpack(fcntl.ioctl(port.fileno(), TIOCGICOUNT, bytes(ICOUNTER.size)))

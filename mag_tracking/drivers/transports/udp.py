@@ -21,7 +21,9 @@ import socket
 import struct
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 from mag_tracking.drivers.reading import Chunk
 from mag_tracking.drivers.transports.polled import Polled
@@ -37,6 +39,8 @@ SO_MEMINFO = 55
 MEMINFO = struct.Struct('9I')
 DROPS = 8
 TIMESPEC = struct.Struct('ll')
+Ancillary: TypeAlias = tuple[int, int, bytes]
+"""Level, type and data of what comes beside a datagram."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +64,7 @@ class UdpSettings:
     longest: int = param(65507, 'A longer datagram is dropped.', 'bytes', (1, 65507))
 
 
-def clock_difference():
+def clock_difference() -> int | None:
     """Wall clock less monotonic clock [ns], of three tries the one that took least.
 
     None where even that one took too long to tell anything.
@@ -73,7 +77,7 @@ def clock_difference():
     return difference if took < CLOCK_SET_NS else None
 
 
-class UdpSocket(Polled):
+class UdpSocket(Polled[socket.socket]):
     """Transport over UDP; see `reading.Transport`. One chunk per datagram, its source an address.
 
     Parameters
@@ -88,7 +92,7 @@ class UdpSocket(Polled):
     SETTINGS = UdpSettings
     whole = True
 
-    def __init__(self, settings, report=print):
+    def __init__(self, settings: UdpSettings, report: Callable[[str], object] = print) -> None:
         super().__init__()
         if settings.port == 0:
             raise SettingsError('port: the number of a UDP port is needed')
@@ -100,13 +104,18 @@ class UdpSocket(Polled):
             except ValueError:
                 raise SettingsError(
                     f'{name}: expected an IPv4 address, got {address!r}') from None
-        self.counts = Counter()
+        self.counts: Counter[str] = Counter()
         self._settings, self._report = settings, report
         self._any_source = '' in settings.sources
-        self._difference = None
+        self._difference: int | None = None
         self._drops = 0
 
-    def open(self):
+    @property
+    def settings(self) -> UdpSettings:
+        """As they were given."""
+        return self._settings
+
+    def open(self) -> None:
         """Bind, and join the group; raises DeviceError where the system refuses."""
         with self._lock:
             self._release()
@@ -119,7 +128,7 @@ class UdpSocket(Polled):
             self._drops, self._difference = 0, clock_difference()
             self._hold(opened)
 
-    def _set_up(self, opened):
+    def _set_up(self, opened: socket.socket) -> None:
         """Options first: from `bind` on datagrams come."""
         s = self._settings
         opened.setblocking(False)
@@ -137,12 +146,12 @@ class UdpSocket(Polled):
                               socket.inet_aton(s.group) + socket.inet_aton(s.address))
         opened.bind((s.group or s.address, s.port))
 
-    def _where(self):
+    def _where(self) -> str:
         """The end of the line, for messages."""
         s = self._settings
         return f'{s.address}:{s.port}' + (f', group {s.group}' if s.group else '')
 
-    def _obstacle(self, error):
+    def _obstacle(self, error: OSError) -> str:
         """What stands in the way, and what to do."""
         s = self._settings
         if error.errno == errno.EADDRINUSE:
@@ -156,7 +165,7 @@ class UdpSocket(Polled):
                     f'the group; see `ip address`')
         return f'cannot be opened: {error.strerror}'
 
-    def read(self, timeout_s):
+    def read(self, timeout_s: float) -> list[Chunk]:
         """The datagrams that are there, `AT_ONCE` at most, as soon as there is one.
 
         Returns [] where nothing comes in time, or where `close` is called meanwhile.
@@ -167,19 +176,20 @@ class UdpSocket(Polled):
                 raise DeviceError(f'UDP {self._where()}: is not open')
             try:
                 woken_ns = self._wait(timeout_s)
-                chunks = [] if woken_ns is None else self._drain(woken_ns)
-                self._count_drops()
+                chunks = [] if woken_ns is None else self._drain(self._handle, woken_ns)
+                self._count_drops(self._handle)
             except OSError as error:
                 raise DeviceError(f'UDP {self._where()}: {error}') from error
         return chunks
 
-    def _drain(self, woken_ns):
+    def _drain(self, opened: socket.socket, woken_ns: int) -> list[Chunk]:
         """Chunks of what is in the queue."""
-        came, empty = [], False
+        came: list[tuple[bytes, list[Ancillary], int, tuple[str, int]]] = []
+        empty = False
         room = socket.CMSG_SPACE(TIMESPEC.size)
         while len(came) < AT_ONCE and not empty:
             try:
-                came.append(self._handle.recvmsg(self._settings.longest, room))
+                came.append(opened.recvmsg(self._settings.longest, room))
             except BlockingIOError:
                 empty = True
         difference = clock_difference()
@@ -192,7 +202,7 @@ class UdpSocket(Polled):
                       f'{ip}:{port}' if self._settings.source_port else ip)
                 for data, ancillary, flags, (ip, port) in came if self._accept(data, flags, ip)]
 
-    def _accept(self, data, flags, ip):
+    def _accept(self, data: bytes, flags: int, ip: str) -> bool:
         """Whether a datagram is handed on; one that is not is counted."""
         if not self._any_source and ip not in self._sources:
             self.counts['datagrams from other sources'] += 1
@@ -204,20 +214,21 @@ class UdpSocket(Polled):
             return True
         return False
 
-    def _arrival(self, ancillary, difference, woken_ns):
+    def _arrival(self, ancillary: list[Ancillary], difference: int | None, woken_ns: int) -> int:
         """When a datagram came, by the monotonic clock [ns]."""
         if difference is not None:
             for level, kind, data in ancillary:
                 if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS):
                     seconds, ns = TIMESPEC.unpack(data)
-                    return seconds * 1_000_000_000 + ns - difference
+                    arrival_ns: int = seconds * 1_000_000_000 + ns - difference
+                    return arrival_ns
         self.counts['datagrams with the time of the wake-up instead of the kernel\'s'] += 1
         return woken_ns
 
-    def _count_drops(self):
+    def _count_drops(self, opened: socket.socket) -> None:
         """Add what the kernel has dropped since last time."""
         drops = MEMINFO.unpack(
-            self._handle.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size))[DROPS]
+            opened.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size))[DROPS]
         if drops != self._drops:
             self.counts['datagrams dropped by the kernel'] += (drops - self._drops) % 2**32
             self._drops = drops

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 from paho.mqtt import publish
+from paho.mqtt.client import Client
 
 from mag_tracking.drivers.transports import mqtt as mqtt_topics
 from mag_tracking.drivers.transports.mqtt import MqttSettings, MqttTopics
@@ -28,7 +29,7 @@ SETTINGS = MqttSettings(host='127.0.0.1', topics=('mag/#',))
 
 @pytest.fixture(scope='module')
 def broker(tmp_path_factory):
-    with Broker(tmp_path_factory.mktemp('broker')) as running:
+    with Broker(tmp_path_factory.mktemp('broker'), 'log_type all') as running:
         yield running
 
 
@@ -45,7 +46,12 @@ def topics(monkeypatch):
     yield make
     for transport in made:
         transport.close()
-    assert not [t for t in threading.enumerate() if t.name.startswith('mqtt ')]
+    assert not loops()
+
+
+def loops():
+    """The threads of all connections."""
+    return {t for t in threading.enumerate() if t.name.startswith('mqtt ')}
 
 
 def send(port, messages, **kwargs):
@@ -68,17 +74,22 @@ def wait_until(condition, seconds=5.0):
     assert condition()
 
 
+def wait_for_messages(broker, client_id, n):
+    """Until a reader with `qos` 1 has taken `n` messages, which nobody has read yet."""
+    wait_until(lambda: broker.log().count(f'Received PUBACK from {client_id} ') == n)
+
+
 def failure(transport):
     """What `open` says; it is done in time, and leaves no thread."""
-    start = time.monotonic()
+    before, start = loops(), time.monotonic()
     with pytest.raises(DeviceError) as caught:
         transport.open()
-    assert time.monotonic() - start < 2.0 * transport._settings.connect_timeout_s + 1.0
-    assert transport._thread is None
+    assert time.monotonic() - start < 2.0 * transport.settings.connect_timeout_s + 1.0
+    assert loops() <= before
     with pytest.raises(DeviceError, match='is not open'):
         transport.read(0.0)
     assert str(caught.value).startswith(
-        f'MQTT broker {transport._settings.host}:{transport._settings.port}: ')
+        f'MQTT broker {transport.settings.host}:{transport.settings.port}: ')
     return str(caught.value)
 
 
@@ -126,10 +137,11 @@ def test_read_waits_no_longer_than_it_is_told_and_no_longer_than_needed(broker, 
 
 
 def test_the_oldest_are_dropped_for_a_slow_reader_and_counted(broker, topics):
-    mqtt = topics(broker.port, queue=50)
+    mqtt = topics(broker.port, client_id='slow', queue=50, qos=1)
     mqtt.open()
-    send(broker.port, [('mag/a', str(i).encode()) for i in range(300)] + [('mag/end', b'end')])
-    wait_until(lambda: mqtt._queue and mqtt._queue[-1].source == 'mag/end')
+    send(broker.port, [('mag/a', str(i).encode()) for i in range(300)] + [('mag/end', b'end')],
+         qos=1)
+    wait_for_messages(broker, 'slow', 301)
     assert not mqtt.counts
     chunks = mqtt.read(1.0)
     assert [c.data for c in chunks] == [str(i).encode() for i in range(251, 300)] + [b'end']
@@ -139,10 +151,10 @@ def test_the_oldest_are_dropped_for_a_slow_reader_and_counted(broker, topics):
 
 
 def test_a_queue_that_is_just_full_loses_nothing(broker, topics):
-    mqtt = topics(broker.port, queue=50)
+    mqtt = topics(broker.port, client_id='full', queue=50, qos=1)
     mqtt.open()
-    send(broker.port, [('mag/a', str(i).encode()) for i in range(50)])
-    wait_until(lambda: len(mqtt._queue) == 50)
+    send(broker.port, [('mag/a', str(i).encode()) for i in range(50)], qos=1)
+    wait_for_messages(broker, 'full', 50)
     assert [c.data for c in mqtt.read(1.0)] == [str(i).encode() for i in range(50)]
     assert not mqtt.counts
 
@@ -189,10 +201,10 @@ def test_what_was_sent_while_nobody_listened_does_not_come_later(broker, topics)
 
 
 def test_what_was_not_read_before_closing_does_not_come_later(broker, topics):
-    mqtt = topics(broker.port)
+    mqtt = topics(broker.port, client_id='leaving', qos=1)
     mqtt.open()
-    send(broker.port, [('mag/a', b'meanwhile')])
-    wait_until(lambda: mqtt._queue)
+    send(broker.port, [('mag/a', b'meanwhile')], qos=1)
+    wait_for_messages(broker, 'leaving', 1)
     mqtt.close()
     with pytest.raises(DeviceError, match='is not open'):
         mqtt.read(1.0)
@@ -218,14 +230,14 @@ def test_an_identifier_belongs_to_one_connection(broker, topics):
 
 
 def test_a_broker_that_is_killed_is_told_after_what_came_before(tmp_path, topics):
-    with Broker(tmp_path) as broker:
-        mqtt = topics(broker.port)
+    with Broker(tmp_path, 'log_type all') as broker:
+        mqtt = topics(broker.port, client_id='reader', qos=1)
         mqtt.open()
-        send(broker.port, [('mag/a', b'1'), ('mag/a', b'2')])
-        wait_until(lambda: len(mqtt._queue) == 2)
+        send(broker.port, [('mag/a', b'1'), ('mag/a', b'2')], qos=1)
+        wait_for_messages(broker, 'reader', 2)
         broker.kill()
         killed = time.monotonic()
-        wait_until(lambda: mqtt._lost)
+        wait_until(lambda: not loops())
         assert [c.data for c in mqtt.read(5.0)] == [b'1', b'2']
         for _ in range(2):
             with pytest.raises(DeviceError, match=f'127.0.0.1:{broker.port}: .*lost'):
@@ -393,7 +405,7 @@ def test_what_was_counted_before_a_loss_is_not_forgotten(topics):
         mqtt = topics(server.port)
         mqtt.open()
         server.hang_up()
-        wait_until(lambda: mqtt._lost)
+        wait_until(lambda: not loops())
         assert not mqtt.counts
         assert 'nobody listens' in failure(mqtt)
         assert mqtt.counts == {'messages whose topic is no text': 1}
@@ -462,17 +474,17 @@ def test_leaving_is_said_to_the_broker(topics):
         assert server.heard[-1] == b'\xe0\x00'
 
 
-def test_closing_while_it_opens(topics):
+def test_closing_while_it_opens(topics, monkeypatch):
     """The broker is reached, but has not answered."""
     with ScriptedBroker() as server:
         mqtt = topics(server.port)
-        real = mqtt._connect
+        real = Client.connect
 
-        def connect(client):
-            real(client)
+        def connect(*args):
+            real(*args)
             mqtt.close()
 
-        mqtt._connect = connect
+        monkeypatch.setattr(Client, 'connect', connect)
         assert failure(mqtt).endswith('is not open')
 
 

@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import serial
 
 from mag_tracking.drivers.transports import serial_port
 from mag_tracking.drivers.transports.serial_port import SerialPort, SerialSettings
@@ -37,13 +38,13 @@ class Device:
         tty.setraw(slave)
         self.path = os.ttyname(slave)
         # One end stays open, as the device is there whether or not anybody reads.
-        self._slave = slave
+        self.slave = slave
         self.link.unlink(missing_ok=True)
         self.link.symlink_to(self.path)
 
     def unplug(self):
         """Pull it out."""
-        for end in (self.master, self._slave):
+        for end in (self.master, self.slave):
             with suppress(OSError):
                 os.close(end)
 
@@ -51,7 +52,7 @@ class Device:
         """Until the port holds `n` bytes."""
         end = time.monotonic() + 5.0
         while time.monotonic() < end:
-            if struct.unpack('i', fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4)))[0] == n:
+            if struct.unpack('i', fcntl.ioctl(self.slave, termios.FIONREAD, bytes(4)))[0] == n:
                 return
             time.sleep(0.001)
         raise AssertionError(f'{n} bytes have not come')
@@ -66,6 +67,20 @@ def device(tmp_path):
     made = Device(tmp_path)
     yield made
     made.unplug()
+
+
+@pytest.fixture
+def handles(monkeypatch):
+    """What pyserial opens from here on, in order."""
+    made = []
+
+    class Recorded(serial.Serial):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            made.append(self)
+
+    monkeypatch.setattr(serial, 'Serial', Recorded)
+    return made
 
 
 @pytest.fixture
@@ -250,14 +265,14 @@ def test_a_refused_open_leaves_nothing_open(device, port, tmp_path):
 @pytest.mark.parametrize('parity, flags', [
     ('N', 0), ('E', termios.PARENB), ('O', termios.PARENB | termios.PARODD)])
 @pytest.mark.parametrize('stop_bits', [1, 2])
-def test_the_line_is_set_up_as_asked(device, parity, flags, stop_bits):
+def test_the_line_is_set_up_as_asked(device, handles, parity, flags, stop_bits):
     port = SerialPort(SerialSettings(str(device.link), 57600, parity, stop_bits))
     port.open()
-    _, _, cflag, _, ispeed, ospeed, _ = termios.tcgetattr(device._slave)
+    _, _, cflag, _, ispeed, ospeed, _ = termios.tcgetattr(device.slave)
     assert ispeed == ospeed == termios.B57600
     # A pseudo-terminal knows no parity: the kernel clears it, and tells so.
     assert cflag & termios.CSTOPB == (termios.CSTOPB if stop_bits == 2 else 0)
-    assert port._handle.parity == parity and bool(flags) == (parity != 'N')
+    assert handles[-1].parity == parity and bool(flags) == (parity != 'N')
     assert cflag & termios.CSIZE == termios.CS8
     port.close()
 
@@ -322,21 +337,20 @@ def test_what_the_line_loses_is_counted_from_opening_on(device, monkeypatch):
     port.close()
 
 
-def test_closing(device):
+def test_closing(device, handles):
     port = SerialPort(SerialSettings(port=device.path))
     port.close()
     with pytest.raises(DeviceError, match=f'{device.path}: is not open'):
         port.read(0.0)
     for _ in range(2):
         port.open()
-        held = port._handle
         closer = threading.Timer(0.1, port.close)
         closer.start()
         start = time.monotonic()
         assert port.read(20.0) == []
         assert 0.05 < time.monotonic() - start < 1.0
         closer.join()
-        assert not held.is_open
+        assert not handles[-1].is_open
         port.close()
         port.close()
         with pytest.raises(DeviceError, match='is not open'):

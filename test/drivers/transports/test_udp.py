@@ -2,6 +2,7 @@
 
 import os
 import socket
+import sys
 import threading
 import time
 from contextlib import closing
@@ -34,6 +35,20 @@ def listen():
 
 
 @pytest.fixture
+def sockets(monkeypatch):
+    """Those that are made from here on, in order."""
+    made = []
+
+    class Recorded(socket.socket):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            made.append(self)
+
+    monkeypatch.setattr(socket, 'socket', Recorded)
+    return made
+
+
+@pytest.fixture
 def sender():
     """Sends datagrams to a `UdpSocket` at a loopback address."""
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as opened:
@@ -41,7 +56,7 @@ def sender():
 
         def send(udp, *datagrams, to=None):
             for data in datagrams:
-                opened.sendto(data, (to or '127.0.0.1', udp._settings.port))
+                opened.sendto(data, (to or '127.0.0.1', udp.settings.port))
 
         send.port = opened.getsockname()[1]
         yield send
@@ -226,10 +241,21 @@ def test_a_reader_that_keeps_up_loses_nothing(listen, sender):
 
 
 def test_the_counter_of_the_kernel_may_overflow(listen, monkeypatch):
+    class Dropping(socket.socket):
+        drops = 0
+
+        def getsockopt(self, level, kind, *size):
+            given = super().getsockopt(level, kind, *size)
+            if kind != udp_socket.SO_MEMINFO:
+                return given
+            return given[:-4] + self.drops.to_bytes(4, sys.byteorder)
+
+    monkeypatch.setattr(socket, 'socket', Dropping)
     udp = listen()
-    udp._drops = 2**32 - 5
-    assert udp.read(0.0) == []
-    assert udp.counts == {'datagrams dropped by the kernel': 5}
+    for drops, total in ((0, 0), (2**32 - 5, 2**32 - 5), (2, 2**32 + 2)):
+        Dropping.drops = drops
+        assert udp.read(0.0) == []
+        assert udp.counts['datagrams dropped by the kernel'] == total
 
 
 def test_drops_are_counted_anew_after_opening_again(listen, sender):
@@ -256,7 +282,7 @@ def test_only_the_sources_that_were_named(listen, sender):
     sender(udp, b'foreign', b'foreign too')
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as known:
         known.bind(('127.0.0.8', 0))
-        known.sendto(b'known', ('127.0.0.1', udp._settings.port))
+        known.sendto(b'known', ('127.0.0.1', udp.settings.port))
         chunks = udp.read(1.0)
     assert [(c.data, c.source) for c in chunks] == [(b'known', '127.0.0.8')]
     assert udp.counts == {'datagrams from other sources': 2}
@@ -271,7 +297,7 @@ def multicast(port, group, data):
 
 def test_a_group_and_nothing_but_the_group(listen, sender):
     first = listen(group='239.77.1.2')
-    port = first._settings.port
+    port = first.settings.port
     second = listen(group='239.77.1.2', port=port)
     other = listen(group='239.77.1.3', port=port)
     for group in ('239.77.1.2', '239.77.1.3'):
@@ -291,9 +317,9 @@ def test_all_addresses_of_this_machine(listen, sender):
 
 def test_a_port_that_is_in_use(listen):
     udp = listen()
-    other = UdpSocket(udp._settings)
+    other = UdpSocket(udp.settings)
     assert failure(other) == (
-        f'UDP 127.0.0.1:{udp._settings.port}: the port is in use by another program')
+        f'UDP 127.0.0.1:{udp.settings.port}: the port is in use by another program')
     udp.close()
     other.open()
     other.close()
@@ -325,42 +351,41 @@ def test_a_port_of_the_system(monkeypatch):
     assert 'ports below 1024 are the system' in failure(UdpSocket(replace(SETTINGS, port=514)))
 
 
-def test_a_buffer_that_the_kernel_does_not_give(listen):
+def test_a_buffer_that_the_kernel_does_not_give(sockets, listen):
     said = []
     udp = listen(said.append, receive_buffer=1 << 30)
-    given = udp._handle.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
-    assert said == [f'UDP 127.0.0.1:{udp._settings.port}: the kernel gave a receive buffer of '
+    given = sockets[-1].getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+    assert said == [f'UDP 127.0.0.1:{udp.settings.port}: the kernel gave a receive buffer of '
                     f'{given} bytes instead of {1 << 30}; raise net.core.rmem_max']
     said.clear()
-    udp = listen(said.append, receive_buffer=100_000)
-    assert udp._handle.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == 200_000
+    listen(said.append, receive_buffer=100_000)
+    assert sockets[-1].getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == 200_000
     assert not said
 
 
-def test_a_socket_that_fails(listen):
+def test_a_socket_that_fails(sockets, listen):
     udp = listen()
-    udp._handle.close()
+    sockets[-1].close()
     with pytest.raises(DeviceError, match='UDP 127.0.0.1'):
         udp.read(1.0)
 
 
-def test_closing(listen, sender):
+def test_closing(sockets):
     udp = UdpSocket(replace(SETTINGS, port=free_port(socket.SOCK_DGRAM)))
     udp.close()
-    with pytest.raises(DeviceError, match=f'UDP 127.0.0.1:{udp._settings.port}: is not open'):
+    with pytest.raises(DeviceError, match=f'UDP 127.0.0.1:{udp.settings.port}: is not open'):
         udp.read(0.0)
     before = len(os.listdir('/proc/self/fd'))
     for _ in range(2):
         udp.open()
         udp.open()
-        held = udp._handle
         closer = threading.Timer(0.1, udp.close)
         closer.start()
         start = time.monotonic()
         assert udp.read(20.0) == []
         assert 0.05 < time.monotonic() - start < 1.0
         closer.join()
-        assert held.fileno() == -1
+        assert [s.fileno() for s in sockets] == [-1] * len(sockets)
         udp.close()
         udp.close()
         with pytest.raises(DeviceError, match='is not open'):
