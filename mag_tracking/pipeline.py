@@ -1,9 +1,12 @@
 """The settings tree and the one chain of stages, for nodes and offline alike."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any, TypeAlias
 
 from mag_tracking.errors import SettingsError
-from mag_tracking.records import FieldFrame
+from mag_tracking.network import SensorNetwork
+from mag_tracking.records import Detection, FieldFrame, MagSample, SmoothedPose, Track
 from mag_tracking.settings import replace
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
@@ -11,7 +14,7 @@ from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
-from mag_tracking.stages.stage import rejected
+from mag_tracking.stages.stage import Stage, rejected
 from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.stages.track.manager import TrackStage
 from mag_tracking.stages.track.settings import TrackSettings
@@ -28,7 +31,7 @@ class Settings:
     survey: SurveySettings = field(default_factory=SurveySettings)
 
 
-TARGET_DEFAULTS = {
+TARGET_DEFAULTS: dict[str, dict[str, Any]] = {
     'vehicle': {},
     'magnet': {
         'calibrate.max_field': 0.1,
@@ -54,7 +57,7 @@ TARGET_DEFAULTS = {
 """What differs from the defaults for each target."""
 
 
-def settings_for(target, changes=None):
+def settings_for(target: str, changes: Mapping[str, Any] | None = None) -> Settings:
     """Settings of a target with `changes` ({dotted name: value}) on top; raises SettingsError.
 
     A `track.target` among the changes has to agree.
@@ -68,10 +71,14 @@ def settings_for(target, changes=None):
     return replace(replace(Settings(), TARGET_DEFAULTS[target]), changes)
 
 
+Output: TypeAlias = FieldFrame | Detection | Track | SmoothedPose
+"""What leaves the chain."""
+
+
 class Pipeline:
     """Raw samples in, frames, detections and tracks out; no ROS, no clock."""
 
-    def __init__(self, network, settings):
+    def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         self.network = network
         self.settings = settings
         self.calibrate = Calibrate(network, settings.calibrate)
@@ -79,23 +86,25 @@ class Pipeline:
         self.detect = Detect(network, settings.detect)
         self.track = TrackStage(network, settings.track)
 
-    def feed(self, sample):
+    def feed(self, sample: MagSample) -> list[Output]:
         """A raw `MagSample` gives the `FieldFrame | Detection | Track` records that follow."""
         return self._chain(1, self.calibrate.feed(sample))
 
-    def flush(self):
+    def flush(self) -> list[Output]:
         """The input has ended: what was still held back."""
-        out = []
-        for position, stage in enumerate((self.calibrate, self.align, self.detect, self.track)):
+        out: list[Output] = []
+        stages: tuple[Stage[Any, Any], ...] = (
+            self.calibrate, self.align, self.detect, self.track)
+        for position, stage in enumerate(stages):
             out += self._chain(position + 1, stage.flush())
         return out
 
-    def _chain(self, position, items):
+    def _chain(self, position: int, items: Sequence[Any]) -> list[Output]:
         """Push `items` through the stages from `position` on; collect what leaves the chain."""
         if position == 1:
             items = [f for s in items for f in self.align.feed(s)]
             position = 2
-        out = []
+        out: list[Output] = []
         if position == 2:
             items = [r for f in items for r in self.detect.feed(f)]
             position = 3
@@ -105,14 +114,14 @@ class Pipeline:
                 out += self.track.feed(item)
         return out
 
-    def counts(self):
+    def counts(self) -> dict[str, dict[str, int]]:
         """{stage: {what: number}}."""
         return {name: dict(sorted(getattr(self, name).counts.items()))
                 for name in ('calibrate', 'align', 'detect', 'track')}
 
-    def rejections(self):
+    def rejections(self) -> dict[str, int]:
         """{cause: number} over all stages."""
-        total = {}
+        total: dict[str, int] = {}
         for name in ('calibrate', 'align'):
             for cause, n in rejected(getattr(self, name).counts).items():
                 total[cause] = total.get(cause, 0) + n

@@ -1,20 +1,21 @@
 """mag-tracking info."""
 
+import argparse
 from pathlib import Path
 
-from mag_tracking.cli.options import add_command, add_network
+from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.network.file import read_network
 from mag_tracking.recording.reader import Recording
 
 
-def add(commands):
+def add(commands: Commands) -> None:
     """Register the command."""
     p = add_command(commands, 'info', _info, 'Tell what is in a recording.')
     p.add_argument('recording', type=Path, metavar='RECORDING')
     add_network(p, False, 'compare with its topics')
 
 
-def _info(args):
+def _info(args: argparse.Namespace) -> int:
     """mag-tracking info."""
     recording = Recording(args.recording)
     if not recording.message_counts:
