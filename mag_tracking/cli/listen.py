@@ -63,7 +63,8 @@ class _Ear:
 
     def _take(self, readings: Readings, accelerations: Iterable[AccelerationSample]) -> None:
         """Keep what was said."""
-        for sample in (*readings.samples(), *accelerations):
+        samples: list[Sample] = [*readings.samples(), *accelerations]
+        for sample in samples:
             self._heard[sample.sensor].append(sample)
 
     def stop(self) -> None:
