@@ -1,6 +1,6 @@
 """The settings tree and the one chain of stages, for nodes and offline alike."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -14,9 +14,9 @@ from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
-from mag_tracking.stages.stage import Stage, rejected
+from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.survey.settings import SurveySettings
-from mag_tracking.stages.track.manager import TrackStage
+from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.settings import TrackSettings
 
 
@@ -84,34 +84,33 @@ class Pipeline:
         self.calibrate = Calibrate(network, settings.calibrate)
         self.align = Align(network, settings.align)
         self.detect = Detect(network, settings.detect)
-        self.track = TrackStage(network, settings.track)
+        self.track = TrackManager(network, settings.track)
 
     def feed(self, sample: MagSample) -> list[Output]:
         """A raw `MagSample` gives the `FieldFrame | Detection | Track` records that follow."""
-        return self._chain(1, self.calibrate.feed(sample))
+        return self._after_calibrate(self.calibrate.feed(sample))
 
     def flush(self) -> list[Output]:
         """The input has ended: what was still held back."""
-        out: list[Output] = []
-        stages: tuple[Stage[Any, Any], ...] = (
-            self.calibrate, self.align, self.detect, self.track)
-        for position, stage in enumerate(stages):
-            out += self._chain(position + 1, stage.flush())
-        return out
+        return [*self._after_calibrate(self.calibrate.flush()),
+                *self._after_align(self.align.flush()),
+                *self._after_detect(self.detect.flush()), *self.track.flush()]
 
-    def _chain(self, position: int, items: Sequence[Any]) -> list[Output]:
-        """Push `items` through the stages from `position` on; collect what leaves the chain."""
-        if position == 1:
-            items = [f for s in items for f in self.align.feed(s)]
-            position = 2
+    def _after_calibrate(self, samples: Iterable[MagSample]) -> list[Output]:
+        """What follows from calibrated samples."""
+        return self._after_align([f for s in samples for f in self.align.feed(s)])
+
+    def _after_align(self, frames: Iterable[FieldFrame]) -> list[Output]:
+        """What follows from frames."""
+        return self._after_detect([r for f in frames for r in self.detect.feed(f)])
+
+    def _after_detect(self, records: Iterable[FieldFrame | Detection]) -> list[Output]:
+        """What follows from detections and frames with a verdict; they come first themselves."""
         out: list[Output] = []
-        if position == 2:
-            items = [r for f in items for r in self.detect.feed(f)]
-            position = 3
-        for item in items:
-            out.append(item)
-            if position == 3 and isinstance(item, FieldFrame):
-                out += self.track.feed(item)
+        for record in records:
+            out.append(record)
+            if isinstance(record, FieldFrame):
+                out += self.track.feed(record)
         return out
 
     def counts(self) -> dict[str, dict[str, int]]:

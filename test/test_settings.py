@@ -8,7 +8,7 @@ import yaml
 from mag_tracking.errors import SettingsError
 from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.settings import flatten, read_parameter_file, replace, to_yaml
-from mag_tracking.stages.track.manager import TrackStage
+from mag_tracking.stages.track.manager import TrackManager
 from support.bundled import ROOT
 
 
@@ -110,4 +110,4 @@ def test_the_default_file_is_plain_yaml_with_floats():
     ({'track.vehicle.difference_stds': [9.0, 30.0, 120.0]}, 'difference_stds: 9 for small')])
 def test_lists_that_belong_together_are_checked(road_network, changes, message):
     with pytest.raises(SettingsError, match=message):
-        TrackStage(road_network, settings_for('vehicle', changes).track)
+        TrackManager(road_network, settings_for('vehicle', changes).track)

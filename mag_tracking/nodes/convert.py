@@ -7,14 +7,17 @@ that read a recording: both have the same attributes.
 
 import functools
 import importlib
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.records import Hypothesis, Track
 
 
-def message_class(type_name):
+def message_class(type_name: str) -> Any:
     """The class of a type such as `std_msgs/msg/Header`; None where it is not installed."""
     package, _, name = type_name.split('/')
     try:
@@ -23,7 +26,7 @@ def message_class(type_name):
         return None
 
 
-def to_message(cls, content):
+def to_message(cls: Any, content: Mapping[str, Any]) -> Any:
     """A message of class `cls` with the `content` of nested dicts.
 
     Raises AttributeError for a field that the message does not have.
@@ -40,19 +43,19 @@ def to_message(cls, content):
 
 
 @functools.cache
-def _element_class(cls, name):
+def _element_class(cls: Any, name: str) -> Any:
     """The class of what is in the sequence `name` of a message."""
     element = cls.get_fields_and_field_types()[name].removeprefix('sequence<').removesuffix('>')
     package, leaf = element.split('/')
     return message_class(f'{package}/msg/{leaf}')
 
 
-def _vector(v):
+def _vector(v: Any) -> FloatArray:
     """(3,) of anything with x, y, z."""
     return np.array([v.x, v.y, v.z])
 
 
-def track_of(message, hypotheses=None):
+def track_of(message: Any, hypotheses: Any = None) -> Track:
     """`Track` of a mag_tracking_msgs/Track and, if given, its HypothesisArray."""
     pose = np.array(message.pose.covariance).reshape(6, 6)
     q = message.pose.pose.orientation

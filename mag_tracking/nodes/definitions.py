@@ -15,7 +15,7 @@ _FIELD = re.compile(r'\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[(?:<=)?\d*\])?\s+[A-Za-z
 
 
 @functools.cache
-def definition_of(type_name):
+def definition_of(type_name: str) -> str | None:
     """The text of a type with all that it needs, as a `ros2msg` schema has it.
 
     None where a type's .msg file is not installed.
@@ -38,7 +38,7 @@ def definition_of(type_name):
     return text
 
 
-def _own_text(type_name):
+def _own_text(type_name: str) -> str | None:
     """The text of the type's .msg file, or None."""
     package, kind, leaf = type_name.split('/')
     # The wheels leave AMENT_PREFIX_PATH unset and install below sys.prefix.
@@ -51,9 +51,9 @@ def _own_text(type_name):
     return None
 
 
-def _named_in(text, package):
+def _named_in(text: str, package: str) -> list[str]:
     """The types that a definition names, each once."""
-    out = []
+    out: list[str] = []
     for line in text.splitlines():
         field = _FIELD.match(line.partition('#')[0])
         if field and not field[2] and field[1] not in _BUILT_IN:

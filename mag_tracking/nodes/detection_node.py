@@ -37,9 +37,11 @@ class DetectionNode(StageNode):
         self.expect('tracker_node', '~/frame')
 
     def stages(self):
+        """{name: stage} whose counts are published."""
         return {'align': self._align, 'detect': self._detect}
 
     def queues(self):
+        """{name of a stage: how many records it holds}."""
         return {'align': self._align.n_held}
 
     def _take(self, sensor, message):

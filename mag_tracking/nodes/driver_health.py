@@ -1,6 +1,11 @@
 """The health of the drivers as diagnostics."""
 
+from collections.abc import Collection, Sequence
+
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+from mag_tracking.drivers.driver import Driver
 
 HARMLESS = ('samples: ', 'came late: ', 'other messages: ', 'lines that are comments',
             'lines without the prefix', 'lines that are empty', 'retained messages skipped',
@@ -11,15 +16,17 @@ HARMLESS = ('samples: ', 'came late: ', 'other messages: ', 'lines that are comm
 class DriverDiagnostics:
     """Says how each device is, and logs when that changes."""
 
-    def __init__(self, node):
+    def __init__(self, node: Node) -> None:
         self._node = node
-        self._reported, self._trouble = {}, {}
+        self._reported: dict[str, dict[str, int]] = {}
+        self._trouble: dict[str, str] = {}
 
-    def statuses(self, drivers, served, active):
+    def statuses(self, drivers: Sequence[Driver], served: Collection[str],
+                 active: bool) -> list[DiagnosticStatus]:
         """[DiagnosticStatus], one a device; `served` are the names of those with a thread."""
         return [self._status(driver, driver.name in served, active) for driver in drivers]
 
-    def _status(self, driver, served, active):
+    def _status(self, driver: Driver, served: bool, active: bool) -> DiagnosticStatus:
         """The DiagnosticStatus of one device."""
         counts = driver.counts()
         before = self._reported.get(driver.name, {})
@@ -46,7 +53,7 @@ class DriverDiagnostics:
             level=level, name=f'{self._node.get_name()}: {driver.name}', hardware_id=driver.name,
             message=message, values=[KeyValue(key=k, value=v) for k, v in values.items()])
 
-    def _log(self, name, level, message):
+    def _log(self, name: str, level: bytes, message: str) -> None:
         """Log what has changed: what is wrong, and that it is well again."""
         trouble = message if level == DiagnosticStatus.ERROR else ''
         if trouble and trouble != self._trouble.get(name):

@@ -1,6 +1,7 @@
 """What goes through a node: how much, how late, and whether somebody still sends and listens."""
 
 import time
+from collections.abc import Callable, Collection
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
@@ -16,16 +17,18 @@ MOST_NOTED = 10_000
 class Flow:
     """The messages that a node takes from `source`, another node."""
 
-    def __init__(self, source):
-        self.source, self.topics = source, []
-        self.heard = None
+    def __init__(self, source: str) -> None:
+        self.source = source
+        self.topics: list[str] = []
+        self.heard: float | None = None
         """`time.monotonic()` [s] of the latest message, or None."""
         self.n_lost = 0
         self._n, self._told_lost = 0, 0
-        self._ages, self._age_s = [], None
+        self._ages: list[float] = []
+        self._age_s: float | None = None
         self._busy_s, self._reported = 0.0, time.monotonic()
 
-    def note(self, stamp_ns, came_ns, began):
+    def note(self, stamp_ns: int, came_ns: int, began: float) -> None:
         """A message of `stamp_ns`, which came at `came_ns`, has been worked off since `began`.
 
         That is in seconds by the monotonic clock.
@@ -39,11 +42,16 @@ class Flow:
             self._ages.append(self._age_s)
 
     @property
-    def is_live(self):
+    def n_ages(self) -> int:
+        """How many messages the latency of the next report is of."""
+        return len(self._ages)
+
+    @property
+    def is_live(self) -> bool:
         """Whether the latest message was of the present, not of a recording."""
         return self._age_s is not None and abs(self._age_s) < REPLAYED_S
 
-    def status(self, node, is_there):
+    def status(self, node: str, is_there: Callable[[], bool]) -> DiagnosticStatus:
         """The DiagnosticStatus of what came since the last one.
 
         `is_there` is a function: whether somebody would still send.
@@ -78,11 +86,11 @@ class Flow:
 class Listener:
     """The node that is to listen to a topic; it is known by its name."""
 
-    def __init__(self, name, topic):
+    def __init__(self, name: str, topic: str) -> None:
         self.name, self.topic = name, topic
         self._seen = False
 
-    def status(self, node, names):
+    def status(self, node: str, names: Collection[str]) -> DiagnosticStatus:
         """The DiagnosticStatus; `names` are those of the nodes that listen now."""
         self._seen = self._seen or self.name in names
         gone = self._seen and self.name not in names

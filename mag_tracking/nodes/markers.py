@@ -1,9 +1,12 @@
 """What RViz shows of a track: the 90 % ellipsoid and an arrow along the moment."""
 
+from typing import Any
+
 import numpy as np
 
 from mag_tracking.geometry import quaternion_from_rotation
 from mag_tracking.messages.schema import header_dict
+from mag_tracking.records import Track
 
 _ELLIPSOID, _MOMENT = 0, 1
 _SPHERE, _ARROW = 2, 0
@@ -12,13 +15,13 @@ _SCALE_3D = 2.5003
 """Deviations to the surface of the 90 % region in space (chi-square, 3 degrees of freedom)."""
 
 
-def _marker(track, frame, kind, shape, **content):
+def _marker(track: Track, frame: str, kind: int, shape: int, **content: Any) -> dict[str, Any]:
     """A visualization_msgs/Marker as a dict; each track has its own name space."""
     return {'header': header_dict(track.stamp_ns, frame), 'ns': f'track_{track.id}', 'id': kind,
             'type': shape, **content}
 
 
-def track_markers(track, frame):
+def track_markers(track: Track, frame: str) -> dict[str, Any]:
     """visualization_msgs/MarkerArray of a `Track`, as a dict."""
     values, R = np.linalg.eigh(track.covariance[:3, :3])
     if np.linalg.det(R) < 0.0:
@@ -43,7 +46,7 @@ def track_markers(track, frame):
     return {'markers': [ellipsoid, arrow]}
 
 
-def delete_markers(track, frame):
+def delete_markers(track: Track, frame: str) -> dict[str, Any]:
     """Takes the markers of an ended `Track` away."""
     return {'markers': [_marker(track, frame, kind, shape, action=_DELETE)
                         for kind, shape in ((_ELLIPSOID, _SPHERE), (_MOMENT, _ARROW))]}

@@ -1,17 +1,23 @@
 """Settings as ROS parameters: descriptors, ranges, checks, live changes."""
 
+from collections.abc import Callable, Collection, Iterable
+from typing import Any
+
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
 
 from mag_tracking.errors import SettingsError
-from mag_tracking.settings import flatten, replace
+from mag_tracking.pipeline import Settings
+from mag_tracking.settings import Parameter, flatten, replace
 
 
-def _descriptor(p):
+def _descriptor(p: Parameter) -> ParameterDescriptor:
     """Description, unit and range of one setting."""
     d = ParameterDescriptor(description=p.doc, read_only=not p.live,
                             additional_constraints=f'unit: {p.unit}' if p.unit else '')
@@ -23,7 +29,8 @@ def _descriptor(p):
     return d
 
 
-def declare_settings(node, settings, group, own=()):
+def declare_settings(node: Node, settings: Settings, group: str,
+                     own: Collection[str] = ()) -> Settings:
     """Declare the settings of one group as parameters of `node`; returns the settings in force.
 
     Parameters
@@ -53,23 +60,23 @@ def declare_settings(node, settings, group, own=()):
     return in_force
 
 
-def _plain(value):
+def _plain(value: Any) -> Any:
     """A parameter's value with arrays as lists."""
     return list(value) if hasattr(value, '__iter__') and not isinstance(value, str) else value
 
 
-def follow_changes(node, settings, apply):
+def follow_changes(node: Node, settings: Settings, apply: Callable[[Settings], None]) -> None:
     """Check live changes of parameters and hand the new settings to `apply`."""
     state = {'settings': settings}
 
-    def check(parameters):
+    def check(parameters: list[RosParameter]) -> SetParametersResult:
         try:
             replace(state['settings'], _changes(parameters))
         except SettingsError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def take(parameters):
+    def take(parameters: list[RosParameter]) -> None:
         changes = _changes(parameters)
         if changes:
             state['settings'] = replace(state['settings'], changes)
@@ -77,7 +84,7 @@ def follow_changes(node, settings, apply):
 
     known = {p.name for p in flatten(settings)}
 
-    def _changes(parameters):
+    def _changes(parameters: Iterable[RosParameter]) -> dict[str, Any]:
         return {p.name: _plain(p.value) for p in parameters if p.name in known}
 
     node.add_on_set_parameters_callback(check)

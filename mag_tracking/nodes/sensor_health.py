@@ -5,11 +5,15 @@ import time
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from numpy.typing import ArrayLike
 
 from mag_tracking.apps.doctor import background_findings, network_findings
+from mag_tracking.network import SensorNetwork
 from mag_tracking.nodes.flow import SILENT_S
-from mag_tracking.records import plain
-from mag_tracking.stages.health.reading_buffer import Waiting
+from mag_tracking.pipeline import Settings
+from mag_tracking.records import Readings, plain
+from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.health.reading_buffer import ReadingBuffer
 from mag_tracking.stages.health.sensor_health import WINDOW, Finding, SensorHealth
 from mag_tracking.units import NS
 
@@ -24,56 +28,57 @@ PATIENCE = 3.0
 class HealthDiagnostics:
     """Looks at the raw readings of a network; `statuses` says how the sensors are."""
 
-    def __init__(self, network, settings):
+    def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         self._settings = settings
         self._index = {name: j for j, name in enumerate(network.names)}
         # When, by the monotonic clock [s]; NaN: never.
         self._heard = np.full(len(network), np.nan)
-        self._frozen_ns, self._compared = {}, {}
+        self._frozen_ns: dict[str, int] = {}
+        self._compared: dict[str, list[Finding]] = {}
         # How many backgrounds had been taken anew when the last term began, and this one.
-        self._relearnt = [dict.fromkeys(network.names, 0)] * 2
+        self._relearnt: list[dict[str, int]] = [dict.fromkeys(network.names, 0)] * 2
         self._begin(network)
 
-    def _begin(self, network):
+    def _begin(self, network: SensorNetwork) -> None:
         """Forget what was; `network` is the one from now on."""
         self._network = network
         self._clock_ns = np.array([round(s * NS) for s in network.clock_offset], dtype=np.int64)
         # Stamps of before are by other clocks.
-        self._waiting = Waiting(len(network), WINDOW // 2)
-        self._past = dict.fromkeys(network.names)
+        self._buffer = ReadingBuffer(len(network), WINDOW // 2)
+        self._past: dict[str, SensorHealth | None] = dict.fromkeys(network.names)
         self._present = self._new_term()
         self._began = time.monotonic()
         self._term_ends = self._began + TERM_S
 
-    def _new_term(self):
+    def _new_term(self) -> dict[str, SensorHealth]:
         """{name: SensorHealth} that has seen nothing."""
         return {name: SensorHealth() for name in self._network.names}
 
-    def renew(self, network):
+    def renew(self, network: SensorNetwork) -> None:
         """Go on with another calibration of the same sensors."""
         self._begin(network)
 
-    def add(self, readings, now_ns):
+    def add(self, readings: Readings, now_ns: int) -> None:
         """Raw `Readings` that came at `now_ns`; those of sensors of other networks are none."""
         rows = readings.rows(self._index)
         self._heard[rows[rows >= 0]] = time.monotonic()
         # A stamp of a row that is none is not used.
         stamps, field, i = readings.stamp_ns - self._clock_ns[rows], plain(readings.field), 0
-        while (i := self._waiting.add(rows, stamps, field, now_ns, i)) < len(rows):
+        while (i := self._buffer.add(rows, stamps, field, now_ns, i)) < len(rows):
             self.look(rows[i])
 
-    def look(self, j):
+    def look(self, j: int) -> None:
         """Look at what waits of sensor `j`: its `status` is as of then."""
-        self._present[self._network.names[j]].take(*self._waiting.take(j))
+        self._present[self._network.names[j]].take(*self._buffer.take(j))
 
-    def statuses(self, node, calibrate):
+    def statuses(self, node: str, calibrate: Calibrate) -> list[DiagnosticStatus]:
         """[DiagnosticStatus], one a sensor; `calibrate` is the `Calibrate` stage."""
         self.begin_round(calibrate)
         for j in range(len(self._network)):
             self.look(j)
         return [self.status(node, j, calibrate) for j in range(len(self._network))]
 
-    def begin_round(self, calibrate):
+    def begin_round(self, calibrate: Calibrate) -> None:
         """Compare the sensors, and begin a term where it is time to.
 
         Before the `status` of each of them, which may be asked for one at a time.
@@ -81,11 +86,11 @@ class HealthDiagnostics:
         self._compare(calibrate)
         if time.monotonic() > self._term_ends:
             self._term_ends = time.monotonic() + TERM_S
-            self._past, self._present = self._present, self._new_term()
+            self._past, self._present = {**self._present}, self._new_term()
             self._relearnt = [self._relearnt[1], {
                 name: b.n_relearnt for name, b in calibrate.backgrounds().items()}]
 
-    def _compare(self, calibrate):
+    def _compare(self, calibrate: Calibrate) -> None:
         """Compare the sensors with each other and with the Earth."""
         for name, background in calibrate.backgrounds().items():
             if not background.frozen:
@@ -98,12 +103,12 @@ class HealthDiagnostics:
             if finding.subject in self._compared:
                 self._compared[finding.subject].append(finding)
 
-    def _latest(self, name):
+    def _latest(self, name: str) -> SensorHealth:
         """The `SensorHealth` of this term, or of the one before where this has just begun."""
         past, present = self._past[name], self._present[name]
         return past if past is not None and present.counts['readings'] < FEW else present
 
-    def _findings(self, j, name, calibrate):
+    def _findings(self, j: int, name: str, calibrate: Calibrate) -> list[Finding]:
         """What is wrong with a sensor, the worst first."""
         silent_s = time.monotonic() - self._heard[j]
         if not silent_s <= SILENT_S:
@@ -123,7 +128,7 @@ class HealthDiagnostics:
                     found.setdefault(f.what, f)
         return sorted(found.values(), key=lambda f: not f.serious)
 
-    def status(self, node, j, calibrate):
+    def status(self, node: str, j: int, calibrate: Calibrate) -> DiagnosticStatus:
         """The DiagnosticStatus of sensor `j`, as of the latest `look` at it."""
         name = self._network.names[j]
         found = self._findings(j, name, calibrate)
@@ -152,11 +157,11 @@ class HealthDiagnostics:
             + [KeyValue(key='also', value=f.what) for f in found[1:]])
 
 
-def _number(value):
+def _number(value: float) -> str:
     """Short text of a number."""
     return '' if math.isnan(value) else f'{value:.4g}'
 
 
-def _numbers(values):
+def _numbers(values: ArrayLike) -> str:
     """Short text of numbers."""
     return ' '.join(_number(v) or '-' for v in np.asarray(values, dtype=float))

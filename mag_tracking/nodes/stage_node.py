@@ -3,6 +3,8 @@
 import gc
 import signal
 import time
+from collections import Counter
+from typing import Protocol
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -37,10 +39,16 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
+class Counted(Protocol):
+    """A stage whose counts are published."""
+
+    counts: 'Counter[str]'
+
+
 class StageNode(Node):
     """A node that knows the network and the settings of one group of stages."""
 
-    OWN_PARAMETERS = ('network', 'target', 'reliable_input', 'use_sim_time')
+    OWN_PARAMETERS: tuple[str, ...] = ('network', 'target', 'reliable_input', 'use_sim_time')
 
     def __init__(self, name, group, **node_arguments):
         """Raises SettingsError or NetworkError where parameters or network are unusable."""

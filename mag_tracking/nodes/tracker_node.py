@@ -35,7 +35,7 @@ from mag_tracking.nodes.markers import delete_markers, track_markers
 from mag_tracking.nodes.ros_params import follow_changes
 from mag_tracking.nodes.stage_node import LATCHED, RESULTS, SENT, STREAM, StageNode
 from mag_tracking.records import SmoothedPose
-from mag_tracking.stages.track.manager import TrackStage
+from mag_tracking.stages.track.manager import TrackManager
 
 SLACK_S = 1.0
 """[s] What the way of a frame may take on top of the longest gap."""
@@ -48,7 +48,7 @@ class TrackerNode(StageNode):
 
     def __init__(self, **node_arguments):
         super().__init__('tracker_node', 'track', **node_arguments)
-        self._stage = TrackStage(self.network, self.settings.track)
+        self._stage = TrackManager(self.network, self.settings.track)
         follow_changes(self, self.settings, lambda s: self._stage.configure(s.track))
         self._pose = self.publisher(PoseWithCovarianceStamped, '~/pose', SENT)
         self._odometry = self.publisher(Odometry, '~/odometry', RESULTS)
@@ -63,14 +63,15 @@ class TrackerNode(StageNode):
         self._path, self._is_silent = deque(maxlen=LONGEST_PATH), False
         self.subscription(NetworkFrame, '/detection_node/frame', self._take, STREAM,
                           source='detection_node')
-        self.create_timer(0.25, self._end_without_frames)
+        self.create_timer(0.25, self.end_without_frames)
         self.subscription(CalibrationState, '/calibration_node/calibration', self._calibrated,
                           LATCHED)
 
     def stages(self):
+        """{name: stage} whose counts are published."""
         return {'track': self._stage}
 
-    def _end_without_frames(self):
+    def end_without_frames(self):
         """Tell of a track that is lost because no frame comes any more.
 
         By when they came: a clock may be behind. A recording may be played as slowly as
@@ -108,7 +109,7 @@ class TrackerNode(StageNode):
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return
         self._publish_all(self._stage.feed(frame))
-        self._stage.settle()
+        self._stage.idle()
 
     def _publish_all(self, records):
         """`Track`s and `SmoothedPose`s, each where it belongs."""

@@ -20,7 +20,7 @@ from mag_tracking.physics.dipole import sensor_fields
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.initiation_vehicle import vehicle_model
-from mag_tracking.stages.track.manager import TrackStage
+from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.units import NS
 
 PERIOD, SIGMA, STEPS = 0.08, 1.2e-8 / np.sqrt(8.0), 26
@@ -87,7 +87,7 @@ def one_run(target, seed):
     model, rng = vehicle_model(settings.vehicle, NETWORK), np.random.default_rng(seed)
     n_t = len(model.state_names)
     states, F, Q = truths(model, settings, rng)
-    stage, errors, H = TrackStage(NETWORK, settings), [], []
+    stage, errors, H = TrackManager(NETWORK, settings), [], []
     for k, truth in enumerate(states):
         h, H_t, _ = sensor_fields(NETWORK.positions, NETWORK.R_sw,
                                   *model.dipoles(truth[None, :n_t]))

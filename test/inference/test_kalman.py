@@ -10,6 +10,7 @@ from mag_tracking.inference.time_update import predict
 from mag_tracking.physics.dipole import sensor_fields
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.simulation.scenario import Path, point_body, simulate
+from mag_tracking.stages.track.target import target_of
 from support.bundled import POINT
 from support.networks import line_network
 
@@ -67,7 +68,7 @@ def tracked(n_sensors, missing=False):
         y[0, 2] = np.nan
         y[1] = np.nan
     x, P = bank.x.copy(), bank.P.copy()
-    model = pipeline.track._model
+    model = target_of(pipeline.settings.track, network).model
     h, H, gradient = sensor_fields(network.positions, network.R_sw, *model.dipoles(x[:, :10]))
     C = np.repeat(1.44e-16 * np.array([[1.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 0.8]])[None],
                   n_sensors, axis=0)

@@ -9,7 +9,7 @@ from mag_tracking_msgs.msg import FieldReadings
 from mag_tracking.messages.schema import readings_dict
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.nodes.convert import to_message
-from mag_tracking.nodes.deferred import Later
+from mag_tracking.nodes.deferred import Deferred
 from mag_tracking.nodes.stage_node import RESULTS, STREAM
 from mag_tracking.records import Readings
 from support.bundled import NETWORK_FILE
@@ -21,11 +21,11 @@ EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
 def test_who_asks_twice_is_called_once(ros):
     node, spin_until = ros
     called, asked = [], []
-    later = Later(node, 0.05, lambda: called.append(time.monotonic()))
+    later = Deferred(node, 0.05, lambda: called.append(time.monotonic()))
 
     def ask():
         asked.append(time.monotonic())
-        later.ask()
+        later.request()
     for n in (1, 2):
         for _ in range(3):
             ask()
@@ -39,8 +39,8 @@ def test_what_waits_is_asked_for_all_the_time_and_done_all_the_same(ros):
     """Who asks while it waits does not put it off."""
     node, spin_until = ros
     called = []
-    later = Later(node, 0.05, lambda: called.append(0))
-    node.create_timer(0.01, later.ask)
+    later = Deferred(node, 0.05, lambda: called.append(0))
+    node.create_timer(0.01, later.request)
     assert spin_until(lambda: len(called) >= 5, 5.0)
 
 

@@ -106,7 +106,7 @@ def test_memory_is_bounded(clock):
     flow = Flow('a_node')
     for _ in range(MOST_NOTED + 50):
         flow.note(0, 0, clock[0])
-    assert len(flow._ages) == MOST_NOTED
+    assert flow.n_ages == MOST_NOTED
     assert values(status_of(flow))['messages'] == str(MOST_NOTED + 50)
 
 
@@ -139,7 +139,7 @@ class StandIn:
             self._clock[0] += 0.25
             if frames:
                 self.flows['detection_node'].note(0, 3600 * NS, self._clock[0])
-            TrackerNode._end_without_frames(self)
+            TrackerNode.end_without_frames(self)
 
 
 def test_a_track_ends_when_frames_stop_not_when_they_are_old(clock):
@@ -158,7 +158,7 @@ def test_what_waits_while_a_node_is_busy_is_no_silence(clock):
     node.ticks(1.0, frames=True)
     # The timer is the first to run again, and then what has waited.
     clock[0] += 100.0
-    TrackerNode._end_without_frames(node)
+    TrackerNode.end_without_frames(node)
     node.ticks(5.0, frames=True)
     assert not node.published
 

@@ -15,7 +15,7 @@ from mag_tracking.records import Track
 from mag_tracking.simulation.scenario import Path, simulate
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.detect.stage import Detect
-from mag_tracking.stages.track.manager import TrackStage
+from mag_tracking.stages.track.manager import TrackManager
 from support.bundled import POINT
 from support.node_world import BODY, NS, STEADY, TOPICS, is_wrong, network_file, world
 from support.roadside import FIRST, RATE_HZ, SPEED
@@ -206,7 +206,7 @@ def begin_anew(pipeline, name):
     if name == 'detection_node':
         pipeline.detect = Detect(network, settings.detect)
     if name == 'tracker_node':
-        pipeline.track = TrackStage(network, settings.track)
+        pipeline.track = TrackManager(network, settings.track)
 
 
 @pytest.mark.parametrize('name, x, gap_s', [

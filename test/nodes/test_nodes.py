@@ -243,10 +243,10 @@ def test_parameters_have_descriptors_and_are_checked(ros):
 def test_conversion_survives_the_message():
     """A track that went through a message is the same track."""
     from mag_tracking.messages.schema import hypotheses_dict, track_dict
-    from mag_tracking.stages.track.manager import TrackStage
+    from mag_tracking.stages.track.manager import TrackManager
     from support.track_runs import magnet_frames
     network, frames, _ = magnet_frames(3)
-    stage = TrackStage(network, settings_for('magnet').track)
+    stage = TrackManager(network, settings_for('magnet').track)
     track = dataclasses.replace(
         [t for f in frames for t in stage.feed(f)][-1],
         mounting=np.arange(27.0).reshape(9, 3),

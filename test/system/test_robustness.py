@@ -20,10 +20,12 @@ from mag_tracking.settings import replace
 from mag_tracking.simulation.scenario import Path, point_body
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
+from mag_tracking.stages.calibrate.settings import CalibrateSettings
+from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.stage import rejected
-from mag_tracking.stages.track.manager import TrackStage
+from mag_tracking.stages.track.manager import TrackManager
 from support.bundled import NETWORK_FILE, vehicle_path
 from support.calibration_runs import EARTH, SIGMA, feed, running, sample, stage
 from support.networks import line_network
@@ -119,9 +121,8 @@ def test_an_axis_that_is_missing_now_and_then_stays_known():
 
 def test_a_present_axis_never_has_an_unknown_covariance():
     """Two axes are learnt, then a third begins to report: it is held back and counted."""
-    s = stage(given=False)
     network = dataclasses.replace(line_network(2), noise_std=(None, None))
-    s = type(s)(network, s._settings)
+    s = Calibrate(network, CalibrateSettings())
     rng = np.random.default_rng(0)
     out = []
     for k in range(1000):
@@ -196,7 +197,7 @@ def test_a_summary_without_numbers_is_still_json(tmp_path):
 
 def test_existence_falls_on_noise():
     network = line_network(2)
-    stage_ = TrackStage(network, settings_for('vehicle').track)
+    stage_ = TrackManager(network, settings_for('vehicle').track)
     rng = np.random.default_rng(0)
     C = np.repeat(1.44e-16 * np.eye(3)[None] / 8, 2, axis=0)
     tracks = []
@@ -210,7 +211,7 @@ def test_existence_falls_on_noise():
 def test_pose_covariance_is_that_of_sampled_states():
     """Position, rotation and their cross terms against states drawn from the filter's Gaussian."""
     network, frames, _ = magnet_frames(4)
-    stage_ = TrackStage(network, settings_for('magnet').track)
+    stage_ = TrackManager(network, settings_for('magnet').track)
     track = [t for f in frames for t in stage_.feed(f)][-1]
     bank = stage_.bank
     rng = np.random.default_rng(1)

@@ -3,43 +3,53 @@
 Where stamps decide what is late, one clock that steps ahead would make all other sensors late.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
-from mag_tracking.stages.align.sample_buffer import NEVER
+from mag_tracking.calibration.ordinary import NEVER
+from mag_tracking.records import MagSample
+
+Passed = list[tuple[int, MagSample]]
 
 
-class Ahead:
+class ClockStepFilter:
     """Holds samples that jump ahead until it is known whether the other sensors jump, too.
 
     All others pass at once.
     """
 
-    def __init__(self, n_sensors, limit, most):
+    def __init__(self, n_sensors: int, limit: int, most: int) -> None:
         """`limit` [ns]: a longer jump is looked at, and samples are held for so long, by the stamps
         of the others or its own; `most` of a sensor are held."""
         self._limit = limit
         self._most = most
         # Of those that have passed: of each sensor, and of all.
         self.latest = np.full(n_sensors, NEVER)
-        self.newest = None
+        self.newest = NEVER
         # (sensor, sample, the newest stamp when it came), in the order in which they came.
-        self._held = []
+        self._held: list[tuple[int, MagSample, int]] = []
         # {sensor that is ahead: (the newest stamp, its own when that was first the newest)}
-        self._quiet_since = {}
+        self._quiet_since: dict[int, tuple[int, int]] = {}
 
     @property
-    def n_held(self):
+    def n_held(self) -> int:
         """How many samples are held."""
         return len(self._held)
 
     @property
-    def is_calm(self):
+    def held(self) -> list[tuple[int, MagSample, int]]:
+        """Sensor, sample and the newest timestamp [ns] when it came, of each that is held."""
+        return list(self._held)
+
+    @property
+    def is_calm(self) -> bool:
         """Whether nobody is ahead: what is no longer a jump than the limit passes."""
         # What is known of one whose samples are all gone holds for that newest stamp only.
         return not self._held and all(
             newest != self.newest for newest, _ in self._quiet_since.values())
 
-    def feed(self, i, sample):
+    def feed(self, i: int, sample: MagSample) -> tuple[Passed, Passed]:
         """What is known by now of a sample of sensor `i`, and of those that are held.
 
         Returns
@@ -52,7 +62,7 @@ class Ahead:
             passed = self._pass([(i, sample)])
         else:
             self._held.append((i, sample, self.newest))
-            if self._quiet_since.get(i, (None,))[0] != self.newest:
+            if self._quiet_since.get(i, (NEVER,))[0] != self.newest:
                 self._quiet_since[i] = self.newest, stamp
             if not (self._most_agree(stamp) or self._is_alone(i, stamp)):
                 return [], self._too_old(i, stamp)
@@ -66,47 +76,46 @@ class Ahead:
                 lambda j, _, newest: j == i or self.newest - newest > self._limit)
         return passed, []
 
-    def flush(self):
+    def flush(self) -> Passed:
         """[(i, sample)] of those that are held when nothing comes any more."""
         return self._pass(self._take_out(lambda *_: True))
 
-    def _jumps(self, i, stamp):
+    def _jumps(self, i: int, stamp: int) -> bool:
         """Whether a stamp is ahead of all that have passed."""
-        if self.newest is None or stamp <= self.newest + self._limit:
+        if self.newest == NEVER or stamp <= self.newest + self._limit:
             return False
         # Of two, who is heard for the first time may as well be right.
         return self.latest[i] != NEVER or bool(self._held) or len(self._alive()) > 1
 
-    def _pass(self, samples):
+    def _pass(self, samples: Passed) -> Passed:
         """Note that `samples` are as they should be."""
         for i, sample in samples:
             self.latest[i] = sample.stamp_ns
-            if self.newest is None or sample.stamp_ns > self.newest:
-                self.newest = sample.stamp_ns
+            self.newest = max(self.newest, sample.stamp_ns)
         return samples
 
-    def _alive(self):
+    def _alive(self) -> set[int]:
         """The sensors that have passed of late."""
         return {j for j, latest in enumerate(self.latest.tolist())
                 if latest != NEVER and latest >= self.newest - self._limit}
 
-    def _most_agree(self, stamp):
+    def _most_agree(self, stamp: int) -> bool:
         """Whether most of the living sensors have jumped to about this stamp."""
         agree = {j for j, s, _ in self._held if abs(s.stamp_ns - stamp) <= self._limit}
         return 2 * len(agree) > len(agree | self._alive())
 
-    def _is_alone(self, i, stamp):
+    def _is_alone(self, i: int, stamp: int) -> bool:
         """Whether sensor `i` has been ahead for a while and no other has said anything since."""
         return stamp - self._quiet_since[i][1] >= self._limit
 
-    def _too_old(self, i, stamp):
+    def _too_old(self, i: int, stamp: int) -> Passed:
         """What of sensor `i` has been held for too long, or is one too many."""
         mine = [s for j, s, _ in self._held if j == i]
         first = mine[0] if len(mine) > self._most else None
         return self._take_out(lambda j, s, _: j == i and (
             s.stamp_ns < stamp - self._limit or s is first))
 
-    def _take_out(self, is_meant):
+    def _take_out(self, is_meant: Callable[[int, MagSample, int], bool]) -> Passed:
         """[(i, sample)] of those held that `is_meant`; they are held no more."""
         if not self._held:
             return []

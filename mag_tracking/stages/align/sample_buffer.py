@@ -4,11 +4,12 @@ What `stages.align` does with a sample that nothing is odd about is here a secon
 time, for many at once; at the first that is odd it stops.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import boolean, float64, from_dtype, int64, njit, void
 
+from mag_tracking.arrays import FloatArray, IntArray, StructArray
 from mag_tracking.calibration.ordinary import NEVER
 
 ROOM = 32
@@ -30,40 +31,40 @@ _I, _II = int64[::1], int64[:, ::1]
 class Taken(NamedTuple):
     """Sums over the samples of each sensor."""
 
-    n: np.ndarray
+    n: IntArray
     """(n_sensors,) how many."""
-    n_axis: np.ndarray
+    n_axis: FloatArray
     """(n_sensors, 3) how many have the axis."""
-    field: np.ndarray
+    field: FloatArray
     """(n_sensors, 3) [T]"""
-    covariance: np.ndarray
+    covariance: FloatArray
     """(n_sensors, 3, 3) [T^2]"""
-    since: np.ndarray
+    since: IntArray
     """(n_sensors,) [ns] of the stamps, from the end that was asked for."""
-    last: np.ndarray
+    last: IntArray
     """(n_sensors,) [ns] the latest stamp; NEVER where there is none."""
 
 
-class Pending:
+class SampleBuffer:
     """Of each sensor its samples in the order of their stamps: stamp, field, covariance.
 
     There is room for as many of all as the one that has most needed.
     """
 
-    def __init__(self, n):
+    def __init__(self, n: int) -> None:
         self.first, self.count = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
         self.stamp, self.field = np.zeros((n, ROOM), dtype=np.int64), np.zeros((n, ROOM, 3))
         self.covariance = np.zeros((n, ROOM, 3, 3))
 
-    def __len__(self):
+    def __len__(self) -> int:
         return int(self.count.sum())
 
     @property
-    def room(self):
+    def room(self) -> int:
         """How many samples of a sensor there is room for."""
         return self.stamp.shape[1]
 
-    def append(self, i, stamp, field, covariance):
+    def append(self, i: int, stamp: int, field: FloatArray, covariance: FloatArray) -> None:
         """The newest sample of sensor `i`."""
         if self.count[i] == self.room:
             self._grow()
@@ -71,17 +72,17 @@ class Pending:
         self.stamp[i, k], self.field[i, k], self.covariance[i, k] = stamp, field, covariance
         self.count[i] += 1
 
-    def drop(self, i):
+    def drop(self, i: int) -> None:
         """Without the oldest sample of sensor `i`."""
         self.first[i] = (self.first[i] + 1) % self.room
         self.count[i] -= 1
 
-    def oldest(self):
+    def oldest(self) -> IntArray:
         """(n,) stamps; NEVER where there is no sample."""
         stamps = self.stamp[np.arange(len(self.count)), self.first]
         return np.where(self.count > 0, stamps, NEVER)
 
-    def take(self, end, one_each):
+    def take(self, end: int, one_each: bool) -> Taken:
         """The samples of before `end`, or with `one_each` the oldest of these; they wait no more.
 
         Returns
@@ -95,7 +96,7 @@ class Pending:
               *taken)
         return taken
 
-    def _grow(self):
+    def _grow(self) -> None:
         """Room for twice as many."""
         order = (self.first[:, None] + np.arange(self.room)) % self.room
         rows = np.arange(len(self.first))[:, None]
@@ -107,8 +108,10 @@ class Pending:
 
 @njit(void(int64, boolean, _I, _I, _II, float64[:, :, ::1], float64[:, :, :, ::1],
                  _I, float64[:, ::1], float64[:, ::1], float64[:, :, ::1], _I, _I), cache=True)
-def _take(end, one_each, first, count, stamp, field, covariance,
-          n, n_axis, total, total_covariance, since, last):
+def _take(end: int, one_each: bool, first: IntArray, count: IntArray, stamp: IntArray,
+          field: FloatArray, covariance: FloatArray, n: IntArray, n_axis: FloatArray,
+          total: FloatArray, total_covariance: FloatArray, since: IntArray,
+          last: IntArray) -> None:
     """Take samples out; `since` is the sum of their stamps from `end`."""
     room = stamp.shape[1]
     for i in range(len(first)):
@@ -127,15 +130,15 @@ def _take(end, one_each, first, count, stamp, field, covariance,
 
 
 @njit(cache=True)
-def _is_behind(c, latest):
+def _is_behind(c: Any, latest: int) -> bool:
     """Whether a sensor is alive, and may still give a sample of before the end of the frame."""
     if latest == NEVER:
-        return c.newest - c.first < c.wait
-    return c.newest - c.wait <= latest and latest < c.due
+        return bool(c.newest - c.first < c.wait)
+    return bool(c.newest - c.wait <= latest and latest < c.due)
 
 
 @njit(cache=True)
-def _is_one_behind(c, latest):
+def _is_one_behind(c: Any, latest: IntArray) -> bool:
     """Whether there is one; it is watched from now on, until it is behind no more."""
     if c.watch >= 0 and _is_behind(c, latest[c.watch]):
         return True
@@ -147,7 +150,7 @@ def _is_one_behind(c, latest):
 
 
 @njit(boolean(_CLOCK, _I), cache=True)
-def is_one_behind(clocks, latest):
+def is_one_behind(clocks: StructArray, latest: IntArray) -> bool:
     """Whether there is a sensor that the next frame has to wait for; it is watched then.
 
     As `hold_ordinary` has them.
@@ -157,8 +160,10 @@ def is_one_behind(clocks, latest):
 
 @njit(int64(_CLOCK, _I, _I, _I, _I, _II, float64[:, :, ::1], float64[:, :, :, ::1],
             _I, _I, float64[:, ::1], float64[:, :, ::1], int64), cache=True)
-def hold_ordinary(clocks, latest, passed, first, count, stamp, field, covariance,
-                  rows, stamps, fields, covariances, begin):
+def hold_ordinary(clocks: StructArray, latest: IntArray, passed: IntArray, first: IntArray,
+                  count: IntArray, stamp: IntArray, field: FloatArray, covariance: FloatArray,
+                  rows: IntArray, stamps: IntArray, fields: FloatArray, covariances: FloatArray,
+                  begin: int) -> int:
     """Hold samples from the one at `begin` on, as long as nothing is odd and the frame waits.
 
     Parameters
@@ -168,7 +173,7 @@ def hold_ordinary(clocks, latest, passed, first, count, stamp, field, covariance
     latest, passed : (n_sensors,) [ns]
         The latest stamp of each, also of those that were not ahead of all others.
     first, count, stamp, field, covariance
-        `Pending`.
+        `SampleBuffer`.
     rows, stamps, fields, covariances : (n,), (n,) [ns], (n, 3) [T], (n, 3, 3) [T^2]
         The samples; whose they are, negative = odd.
     begin : int

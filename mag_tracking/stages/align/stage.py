@@ -10,15 +10,18 @@ from math import isfinite, isinf, isnan
 
 import numpy as np
 
-from mag_tracking.records import FieldFrame, plain
-from mag_tracking.stages.align.clock_step import Ahead
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.calibration.ordinary import NEVER
+from mag_tracking.network import SensorNetwork
+from mag_tracking.records import FieldFrame, MagSample, Readings, plain
+from mag_tracking.stages.align.clock_step import ClockStepFilter
 from mag_tracking.stages.align.sample_buffer import (
     CLOCK,
-    NEVER,
-    Pending,
+    SampleBuffer,
     hold_ordinary,
     is_one_behind,
 )
+from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.units import NS
 
 FAR = np.iinfo(np.int64).max
@@ -35,8 +38,8 @@ class Align:
     that nothing is odd about take a way that is compiled (`stages.pending`).
     """
 
-    def __init__(self, network, settings):
-        self.counts = Counter()
+    def __init__(self, network: SensorNetwork, settings: AlignSettings) -> None:
+        self.counts: Counter[str] = Counter()
         self._n = len(network)
         self._noise = [None if std is None else np.diag(std ** 2) for std in network.noise_std]
         self._index = {name: i for i, name in enumerate(network.names)}
@@ -50,13 +53,15 @@ class Align:
         self._wait = int(round(settings.max_wait_s * NS))
         self._reset()
 
-    def _reset(self):
+    def _reset(self) -> None:
         """As new."""
-        self._pending = Pending(self._n)
+        self._pending = SampleBuffer(self._n)
         self._latest = np.full(self._n, NEVER)
         self._taken = np.full(self._n, NEVER)
-        self._stamp = self._last_taken = None
-        self._ahead = Ahead(self._n, self._longest_jump, min(self._most_pending, MOST_HELD))
+        self._stamp: int | None = None
+        self._last_taken: int | None = None
+        self._ahead = ClockStepFilter(self._n, self._longest_jump,
+                                      min(self._most_pending, MOST_HELD))
         self._clocks = np.zeros(1, CLOCK)
         self._clock = self._clocks[0]
         for name in ('first', 'newest', 'end', 'passed'):
@@ -67,11 +72,16 @@ class Align:
         self._look_ahead()
 
     @property
-    def n_held(self):
+    def n_held(self) -> int:
         """How many samples wait for their frame, or for the other sensors' clocks."""
         return len(self._pending) + self._ahead.n_held
 
-    def feed(self, sample):
+    @property
+    def n_held_ahead(self) -> int:
+        """How many of them are held because their timestamps jumped ahead."""
+        return self._ahead.n_held
+
+    def feed(self, sample: MagSample) -> list[FieldFrame]:
         """A calibrated `MagSample` gives the `FieldFrame`s that it completes."""
         i = self._index.get(sample.sensor, -1)
         C = self._noise[i] if sample.covariance is None else sample.covariance
@@ -81,9 +91,10 @@ class Align:
             return self._completed()
         return self._feed_any(sample)
 
-    def feed_many(self, readings):
+    def feed_many(self, readings: Readings) -> list[FieldFrame]:
         """Calibrated `Readings` give the `FieldFrame`s that they complete."""
-        out, k, n = [], 0, len(readings)
+        out: list[FieldFrame] = []
+        k, n = 0, len(readings)
         rows, C = readings.rows(self._index), readings.covariance
         if C is None:
             rows, C = np.full(n, -1), np.full((n, 3, 3), np.nan)
@@ -97,11 +108,12 @@ class Align:
                 k = odd + 1
         return out
 
-    def _hold_many(self, rows, stamps, fields, covariances, begin):
+    def _hold_many(self, rows: IntArray, stamps: IntArray, fields: FloatArray,
+                   covariances: FloatArray, begin: int) -> int:
         """`pending.hold_ordinary`, where nothing stands against it."""
         pending, ahead, clock = self._pending, self._ahead, self._clock
         clock['is_complete'] = 0
-        if self._burst or ahead.newest is None or not ahead.is_calm:
+        if self._burst or ahead.newest == NEVER or not ahead.is_calm:
             return begin
         clock['passed'] = ahead.newest
         end = hold_ordinary(self._clocks, self._latest, ahead.latest, pending.first,
@@ -110,37 +122,41 @@ class Align:
         ahead.newest = int(clock['passed'])
         return end
 
-    def _completed(self):
+    def _completed(self) -> list[FieldFrame]:
         """The frames that are complete, if it is not known that one has to wait."""
         if not self._clock['is_complete'] or self._waits():
             return []
         return self._frames()
 
-    def _feed_any(self, sample):
+    def _feed_any(self, sample: MagSample) -> list[FieldFrame]:
         """As `feed`, of a sample that may be odd."""
         i = self._index.get(sample.sensor)
         cause = self._fault(i, sample)
-        if cause:
-            return self._reject(cause)
+        if i is None or cause:
+            self._reject(cause or f'unknown sensor {sample.sensor}')
+            return []
         passed, refused = self._ahead.feed(i, sample)
         for j, _ in refused:
             self._reject(f'ahead of all others: {self._names[j]}')
         return [f for j, s in passed for f in self._take_in(j, s)]
 
-    def _take_in(self, i, sample):
+    def _take_in(self, i: int, sample: MagSample) -> list[FieldFrame]:
         """A sample whose stamp is not ahead of all others gives the frames that it completes."""
-        out, stamp, clock = [], sample.stamp_ns, self._clock
+        out: list[FieldFrame] = []
+        stamp, clock = sample.stamp_ns, self._clock
         last = int(self._latest[i])
         if stamp <= last:
             if last - stamp <= self._jump_back:
-                return self._reject('duplicate stamp' if stamp == last else 'out of order')
+                self._reject('duplicate stamp' if stamp == last else 'out of order')
+                return []
             out = self.flush()
             self._reset()
             clock = self._clock
             self.counts['time jumped back'] += 1
         self._latest[i] = stamp
         if stamp < clock['end']:
-            return self._reject('late')
+            self._reject('late')
+            return []
         if clock['newest'] == NEVER:
             clock['first'] = stamp
         clock['newest'] = max(int(clock['newest']), stamp)
@@ -148,12 +164,12 @@ class Align:
         self._hold(i, stamp, sample)
         return out if self._waits() else out + self._frames()
 
-    def flush(self):
+    def flush(self) -> list[FieldFrame]:
         """All frames that can be made of what is pending."""
         out = [f for i, s in self._ahead.flush() for f in self._take_in(i, s)]
         return out + self._frames(final=True)
 
-    def _fault(self, i, sample):
+    def _fault(self, i: int | None, sample: MagSample) -> str | None:
         """Why the sample of sensor `i` cannot be used, or None."""
         if i is None:
             return f'unknown sensor {sample.sensor}'
@@ -165,24 +181,24 @@ class Align:
             return 'covariance unknown, and no noise_std in the network'
         return None
 
-    def _reject(self, cause):
+    def _reject(self, cause: str) -> None:
         """Count the rejection."""
         self.counts[f'rejected: {cause}'] += 1
-        return []
 
-    def _hold(self, i, stamp, sample):
+    def _hold(self, i: int, stamp: int, sample: MagSample) -> None:
         """Put a sample of sensor `i` to those that are pending."""
         pending = self._pending
         if not pending.count[i]:
             self._bring_forward(stamp, int(self._taken[i]))
-        pending.append(i, stamp, sample.field,
-                       self._noise[i] if sample.covariance is None else sample.covariance)
+        C = self._noise[i] if sample.covariance is None else sample.covariance
+        assert C is not None
+        pending.append(i, stamp, sample.field, C)
         if pending.count[i] > self._most_pending:
             pending.drop(i)
             self._look_ahead()
             self._reject('too many pending')
 
-    def _look_ahead(self):
+    def _look_ahead(self) -> None:
         """Find the end of the next frame; any sensor may be one to wait for."""
         self._window = self._period
         self._clock['start'] = self._clock['due'] = FAR
@@ -194,7 +210,7 @@ class Align:
                                 NEVER)
         self._clock['watch'] = -1
 
-    def _bring_forward(self, stamp, taken):
+    def _bring_forward(self, stamp: int, taken: int) -> None:
         """Have the next frame end early enough for `stamp`, the oldest pending of a sensor.
 
         `taken` is the stamp of that sensor which was in a frame.
@@ -210,7 +226,7 @@ class Align:
         clock['start'] = min(int(clock['start']), stamp)
         clock['due'] = clock['start'] + self._window
 
-    def _waits(self):
+    def _waits(self) -> bool:
         """Whether there is a sensor that the next frame has to wait for."""
         clock, latest = self._clock, self._latest
         is_young = int(clock['newest']) - int(clock['first']) < self._wait
@@ -220,7 +236,7 @@ class Align:
         return is_one_behind(self._clocks, latest) and (
             not self._burst or self._is_one_missing(is_young))
 
-    def _is_one_missing(self, is_young):
+    def _is_one_missing(self, is_young: bool) -> bool:
         """Whether a sensor may still answer in this round, where its next is not of another."""
         oldest, latest = self._pending.oldest(), self._latest
         # It was heard and is not pending, so frames were taken. At the head of a new round the
@@ -229,36 +245,39 @@ class Align:
         return bool(np.where(oldest != NEVER, oldest >= self._clock['due'],
                              np.where(latest == NEVER, is_young, heard)).any())
 
-    def _frames(self, final=False):
+    def _frames(self, final: bool = False) -> list[FieldFrame]:
         """Frames that are complete, or all if what is pending is `final`."""
-        out = []
+        out: list[FieldFrame] = []
         while True:
             self._look_ahead()
             if self._clock['due'] == FAR or not final and self._waits():
                 return out
             out.append(self._frame(int(self._clock['due'])))
 
-    def _frame(self, end):
+    def _frame(self, end: int) -> FieldFrame:
         """Take the samples before `end` (in burst mode one each) and average them."""
         oldest = self._pending.oldest()
-        n, n_axis, total, total_covariance, since, last = self._pending.take(end, self._burst)
-        self._taken = np.where(n > 0, last, self._taken)
+        taken = self._pending.take(end, self._burst)
+        n, last = taken.n, taken.last
+        self._taken[n > 0] = last[n > 0]
         first, newest, n_all = int(oldest[n > 0].min()), int(last.max()), int(n.sum())
         self._last_taken = newest if self._last_taken is None else max(self._last_taken, newest)
         self._clock['end'] = newest + 1 if self._burst else end
         self.counts['frames'] += 1
         if not n.all():
             self.counts['frames with a sensor missing'] += 1
-        stamp = first + round((int(since.sum()) + n_all * (end - first)) / n_all)
+        stamp = first + round((int(taken.since.sum()) + n_all * (end - first)) / n_all)
         if self._stamp is not None:
             # Rounds of sensors with different rates overlap; the offsets keep their true times.
             stamp = max(stamp, self._stamp + 1)
         self._stamp = stamp
-        offset = (since + n * (end - stamp)) / np.maximum(n, 1) / NS
-        return FieldFrame(stamp, *_averages(n, n_axis, total, total_covariance), n, offset)
+        offset = (taken.since + n * (end - stamp)) / np.maximum(n, 1) / NS
+        field, covariance = _averages(n, taken.n_axis, taken.field, taken.covariance)
+        return FieldFrame(stamp, field, covariance, n, offset)
 
 
-def _averages(n, n_axis, total, total_covariance):
+def _averages(n: IntArray, n_axis: FloatArray, total: FloatArray,
+              total_covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(field, covariance) of the sums over the samples of each sensor."""
     field = np.divide(total, n_axis, out=np.full(total.shape, np.nan), where=n_axis > 0)
     # The fewest per axis counts for all: never better than it is.

@@ -293,7 +293,7 @@ class Calibrate:
         self.counts['calibrated'] += 1
         return [MagSample(sample.stamp_ns, sample.sensor, field, covariance)]
 
-    def settle(self):
+    def idle(self):
         """Learn from what is complete, which could wait until all was published.
 
         If nobody asks for it, the next reading of the sensor does.

@@ -7,7 +7,7 @@ import numpy as np
 from numba import float64, int64, njit
 
 
-class Waiting:
+class ReadingBuffer:
     """Of each of `n` sensors up to `room` readings, in the order in which they came."""
 
     def __init__(self, n, room):
@@ -51,7 +51,7 @@ _I, _II = int64[::1], int64[:, ::1]
 
 @njit(int64(_I, _I, float64[:, ::1], int64, int64, _I, _II, _II, float64[:, :, ::1]), cache=True)
 def _add(rows, stamps, fields, received_ns, first, count, stamp, received, field):
-    """`Waiting.add`."""
+    """`ReadingBuffer.add`."""
     for i in range(first, len(rows)):
         j = rows[i]
         if j < 0:

@@ -9,7 +9,7 @@ from mag_tracking.physics.mounting import turned_fields
 
 MOST_TURNED = np.deg2rad(15.0)
 """[rad] A sensor whose orientation is less certain is tracked as if it were as certain as this: the
-angles are of first order. `TrackStage` counts such sensors."""
+angles are of first order. `TrackManager` counts such sensors."""
 
 SAME_TIME_S = 1e-3
 """[s] Samples closer than this are taken together: at 20 m/s a target moves two centimetres."""

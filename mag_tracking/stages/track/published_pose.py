@@ -1,7 +1,10 @@
 """From a bank to what is published: the best hypothesis, its pose and its honest doubts."""
 
+from typing import Protocol
+
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.geometry import cross_matrix, quaternion_between, quaternion_from_yaw
 from mag_tracking.records import Hypotheses, SmoothedPose, Track
 
@@ -10,6 +13,14 @@ UNOBSERVED_VARIANCE = np.pi**2
 
 DOUBT = 0.05
 """Other places, or other arrivals, with more weight than this make a track ambiguous."""
+
+
+class Orientation(Protocol):
+    """How a target's orientation follows from its state; see `vehicle_orientation`."""
+
+    def __call__(self, x: FloatArray, P: FloatArray
+                 ) -> tuple[FloatArray, FloatArray, FloatArray, tuple[bool, bool, bool]]:
+        """Quaternion, derivative, unobserved variance and flags."""
 
 
 def vehicle_orientation(x, P):

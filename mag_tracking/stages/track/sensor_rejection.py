@@ -15,7 +15,7 @@ ONE_IN = 8
 are far from the target agree with everything."""
 
 
-class Contradiction:
+class SensorRejection:
     """Updates a bank with what of a frame can be believed."""
 
     def __init__(self, names):

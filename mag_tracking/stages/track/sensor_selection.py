@@ -8,7 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.network import SensorNetwork
+from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track.observation import angle_priors
+from mag_tracking.stages.track.settings import TrackSettings
 
 AHEAD_S = 0.5
 """[s] The sensors are chosen for where the target will be then."""
@@ -24,6 +28,35 @@ def part_of_frame(frame, rows):
     """The `FieldFrame` of some sensors alone."""
     return replace(frame, field=frame.field[rows], covariance=frame.covariance[rows],
                    n_samples=frame.n_samples[rows], time_offset=frame.time_offset[rows])
+
+
+class SensorSubset:
+    """The sensors that a track uses: all of a network, or some rows of a large one."""
+
+    def __init__(self, whole: SensorNetwork, rows: IntArray | None = None) -> None:
+        """`rows` ascending; None = all."""
+        self.whole = whole
+        self.is_part = rows is not None
+        self.rows: IntArray = np.arange(len(whole)) if rows is None else rows
+        self.network = whole if rows is None else whole.part(rows)
+
+    @classmethod
+    def near(cls, whole: SensorNetwork, place: FloatArray, n: int) -> 'SensorSubset':
+        """The `n` sensors nearest to a `place` (2,) [m]."""
+        return cls(whole, nearest(whole.positions, place, n))
+
+    def part_of(self, frame: FieldFrame) -> FieldFrame:
+        """What of a frame of the whole network these sensors measured."""
+        return part_of_frame(frame, self.rows) if self.is_part else frame
+
+    def serves(self, place: FloatArray, n: int) -> bool:
+        """Whether the nearer half of the `n` sensors nearest to a `place` (2,) [m] is among
+        these."""
+        return bool(np.isin(nearest(self.whole.positions, place, n // 2), self.rows).all())
+
+    def widened(self, track: Track, settings: TrackSettings) -> Track:
+        """A `Track` of these sensors as one of the whole network."""
+        return widened(track, self.rows, self.whole, settings) if self.is_part else track
 
 
 def hand_on(bank, n_own, before, after, own_covariance, background_std):

@@ -143,7 +143,7 @@ def test_memory_is_bounded():
     align = stage(2, max_wait_s=3600.0, most_pending=50)
     for k in range(1000):
         align.feed(sample(10.0 * k, 0))
-    assert len(align._pending) == 50
+    assert align.n_held == 50
     assert rejected(align.counts) == {'too many pending': 950}
 
 

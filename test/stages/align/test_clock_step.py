@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mag_tracking.stages.align.clock_step import Ahead
+from mag_tracking.stages.align.clock_step import ClockStepFilter
 from support.clock_steps import sample, stepped, stream, wild
 
 LIMIT = 500
@@ -26,12 +26,12 @@ def run(ahead, arrivals):
 
 def held(ahead):
     """[(sensor, stamp)] that wait."""
-    return [(h[0], h[1].stamp_ns) for h in ahead._held]
+    return [(h[0], h[1].stamp_ns) for h in ahead.held]
 
 
 def after(n, until=1000, most=10_000, **kwargs):
-    """An `Ahead` that has seen a quiet stream."""
-    ahead = Ahead(n, LIMIT, most)
+    """An `ClockStepFilter` that has seen a quiet stream."""
+    ahead = ClockStepFilter(n, LIMIT, most)
     run(ahead, stream(n, 0, until, **kwargs))
     return ahead
 
@@ -41,7 +41,7 @@ def after(n, until=1000, most=10_000, **kwargs):
 def test_quiet_streams_pass_at_once(seed):
     """Also late, twice, out of order, with gaps of one sensor and short ones of all."""
     rng = np.random.default_rng(seed)
-    n, ahead = int(rng.integers(1, 7)), Ahead(6, LIMIT, 10)
+    n, ahead = int(rng.integers(1, 7)), ClockStepFilter(6, LIMIT, 10)
     gap = 1000 + int(rng.integers(0, LIMIT - 60))
     for t in range(0, 3000, 10):
         for j in range(n):
@@ -57,7 +57,7 @@ def test_quiet_streams_pass_at_once(seed):
 @pytest.mark.parametrize('n', [2, 3, 6])
 def test_one_clock_steps_ahead_and_back(n, step):
     arrivals = stepped(stream(n, 0, 20_000, step), {1}, 5000, 12_000, by=1803)
-    ahead = Ahead(n, LIMIT, 10_000)
+    ahead = ClockStepFilter(n, LIMIT, 10_000)
     passed, refused = run(ahead, arrivals)
     wrong = [a for a, b in zip(arrivals, stream(n, 0, 20_000, step), strict=True) if a != b]
     if n == 2 and step == 1000:
@@ -74,7 +74,7 @@ def test_one_clock_steps_ahead_and_back(n, step):
     (1, 10, 0), (2, 10, 1), (3, 10, 1), (6, 10, 3), (6, 2000, 5)])
 def test_when_all_jump_together_nothing_is_refused(n, step, most_held):
     arrivals = stream(n, 0, 3 * step, step) + stream(n, 3 * step + 10_000, 6 * step + 10_000, step)
-    ahead, waiting, passed = Ahead(n, LIMIT, 10_000), 0, []
+    ahead, waiting, passed = ClockStepFilter(n, LIMIT, 10_000), 0, []
     for a in arrivals:
         ok, wrong = run(ahead, [a])
         passed += ok
@@ -115,7 +115,7 @@ def test_others_that_die_while_it_is_ahead_hold_it_up_for_so_long_only(most):
                                           ({0, 1, 3, 4}, True)])
 def test_the_majority_decides(which, right):
     arrivals = stepped(stream(6, 0, 4000), which, 1000, 9999, by=1000)
-    ahead = Ahead(6, LIMIT, 10_000)
+    ahead = ClockStepFilter(6, LIMIT, 10_000)
     passed, refused = run(ahead, arrivals)
     if right:
         assert not refused and passed != arrivals and sorted(passed) == sorted(arrivals)
@@ -137,15 +137,15 @@ def test_who_is_ahead_of_all_does_not_slip_through_when_the_others_jump():
 
 def test_a_clock_that_is_ahead_when_it_is_first_heard():
     """Of two nobody can tell who is right; of more it is the one that came alone."""
-    two = Ahead(2, LIMIT, 10)
+    two = ClockStepFilter(2, LIMIT, 10)
     assert run(two, [(0, 0), (1, 5000)]) == ([(0, 0), (1, 5000)], [])
-    three = Ahead(3, LIMIT, 10)
+    three = ClockStepFilter(3, LIMIT, 10)
     passed, refused = run(three, [(0, 0), (1, 1), (2, 5000), *stream(2, 10, 1000)])
     assert passed == [(0, 0), (1, 1), *stream(2, 10, 1000)] and refused == [(2, 5000)]
 
 
 def test_a_sensor_that_is_first_heard_confirms_a_jump():
-    ahead = Ahead(3, LIMIT, 10)
+    ahead = ClockStepFilter(3, LIMIT, 10)
     run(ahead, [(0, 0), (1, 900)])
     assert run(ahead, [(0, 1450)]) == ([], [])
     assert run(ahead, [(2, 1460)]) == ([(0, 1450), (2, 1460)], [])
@@ -168,10 +168,10 @@ def test_a_stamp_that_nobody_follows_waits_for_so_long_only():
 
 def test_jumps_just_up_to_the_limit_pass():
     for by, passes in ((LIMIT, True), (LIMIT + 1, False)):
-        ahead = Ahead(2, LIMIT, 10)
+        ahead = ClockStepFilter(2, LIMIT, 10)
         run(ahead, [(0, 0), (1, 0)])
         assert bool(run(ahead, [(0, by)])[0]) == passes
-    never = Ahead(2, inf, 10)
+    never = ClockStepFilter(2, inf, 10)
     assert run(never, [(0, 0), (1, 0), (0, 10**18)])[0][-1] == (0, 10**18)
 
 
@@ -195,7 +195,7 @@ def test_networks_of_slow_sensors_lose_nothing(seed):
         steps = [steps[0]] * n
     first = [int(rng.uniform(0, s)) for s in steps]
     arrivals = sorted((t, j) for j in range(n) for t in range(first[j], 40_000, steps[j]))
-    ahead = Ahead(n, LIMIT, 10)
+    ahead = ClockStepFilter(n, LIMIT, 10)
     for t, j in arrivals:
         _, refused = run(ahead, [(j, t)])
         assert not refused
@@ -205,9 +205,9 @@ def test_networks_of_slow_sensors_lose_nothing(seed):
 def test_a_slow_sensor_beside_fast_ones():
     fast, slow = stream(3, 0, 9000), [(3, t) for t in range(500, 9000, 1000)]
     arrivals = sorted(fast + slow, key=lambda a: a[1])
-    assert run(Ahead(4, LIMIT, 10), arrivals) == (arrivals, [])
+    assert run(ClockStepFilter(4, LIMIT, 10), arrivals) == (arrivals, [])
     wrong = stepped(arrivals, {3}, 3000, 6000, by=1100)
-    passed, refused = run(Ahead(4, LIMIT, 10), wrong)
+    passed, refused = run(ClockStepFilter(4, LIMIT, 10), wrong)
     assert refused == [(3, t) for t in (4600, 5600, 6600)]
     assert passed == [a for a in wrong if a not in refused]
 
@@ -217,7 +217,7 @@ def test_a_slow_sensor_beside_fast_ones():
 def test_every_sample_comes_out_once_and_in_order(seed):
     rng = np.random.default_rng(seed)
     n, most = int(rng.integers(1, 7)), int(rng.choice([2, 10_000]))
-    ahead = Ahead(n, LIMIT, most)
+    ahead = ClockStepFilter(n, LIMIT, most)
     came, passed, refused = [], [], []
     for j, t in wild(rng, n, 600):
         came.append((j, sample(t, j)))
@@ -229,7 +229,7 @@ def test_every_sample_comes_out_once_and_in_order(seed):
             assert len(mine) <= most
             # Nobody waits for longer than the limit by its own stamps, or by those of the others.
             assert not mine or min(mine) >= mine[-1] - LIMIT
-        assert all(newest - h[2] <= LIMIT for h in ahead._held)
+        assert all(newest - h[2] <= LIMIT for h in ahead.held)
     passed += ahead.flush()
     assert held(ahead) == []
     order = {id(s): k for k, (_, s) in enumerate(came)}

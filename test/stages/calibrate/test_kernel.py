@@ -19,21 +19,21 @@ class Slow(Calibrate):
         self._sensors[i]['is_ordinary'] = False
 
 
-class Settling(Calibrate):
+class Idling(Calibrate):
     """Learns behind what it gives out, now and then, as the node does; not when it is told to."""
 
     n_calls = 0
 
     def feed(self, sample):
-        return self._then_settle(super().feed(sample))
+        return self._then_idle(super().feed(sample))
 
     def feed_many(self, readings):
-        return self._then_settle(super().feed_many(readings))
+        return self._then_idle(super().feed_many(readings))
 
-    def _then_settle(self, out):
+    def _then_idle(self, out):
         self.n_calls += 1
         if self.n_calls % 3:
-            self.settle()
+            self.idle()
         return out
 
 
@@ -61,14 +61,14 @@ def batches(samples, size, rng):
 def calibrated_in_three_ways(network, samples, size=20, **settings):
     """(stage that went the slow way, one by one, in batches), which have given the same."""
     slow, single, many = (kind(network, CalibrateSettings(**settings))
-                          for kind in (Slow, Settling, Settling))
+                          for kind in (Slow, Idling, Idling))
     expected = [c for s in samples for c in slow.feed(s)] + slow.flush()
     samples_alike([c for s in samples for c in single.feed(s)] + single.flush(), expected)
     samples_alike([c for b in batches(samples, size, np.random.default_rng(0))
                    for c in many.feed_many(b).samples()] + many.flush(), expected)
-    slow.settle()
+    slow.idle()
     for stage in (single, many):
-        stage.settle()
+        stage.idle()
         assert stage.counts == slow.counts
         for name in (*KEPT, *(() if settings.get('spike_std') == 0.0 else SCREENED)):
             np.testing.assert_allclose(stage._sensors[name], slow._sensors[name], rtol=1e-9,

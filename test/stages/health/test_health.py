@@ -14,7 +14,7 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import MagSample
-from mag_tracking.stages.health.reading_buffer import Waiting
+from mag_tracking.stages.health.reading_buffer import ReadingBuffer
 from mag_tracking.stages.health.sensor_health import WINDOW, SensorHealth, quantiles
 from support.bundled import DATA, NETWORK_FILE, VEHICLES, vehicle_path
 from support.networks import line_network
@@ -360,7 +360,7 @@ def test_many_at_once_are_the_same_as_one_by_one():
 
 def test_what_waits_comes_out_as_it_came():
     """Of each sensor in its order; where there is no more room nothing is taken before there is."""
-    rng, waiting = np.random.default_rng(4), Waiting(5, 8)
+    rng, waiting = np.random.default_rng(4), ReadingBuffer(5, 8)
     rows, stamps = rng.integers(-1, 5, 300), np.arange(300)
     fields, found, i = rng.standard_normal((300, 3)), {j: [] for j in range(5)}, 0
     fields[7, 1] = np.nan

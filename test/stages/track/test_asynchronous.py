@@ -9,7 +9,9 @@ from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.simulation.scenario import Path, point_body, simulate
-from mag_tracking.stages.track.manager import TrackStage
+from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.manager import TrackManager
+from mag_tracking.stages.track.target import target_of
 from support.bundled import POINT
 from support.networks import line_network
 from support.track_runs import magnet_frames
@@ -18,15 +20,16 @@ from support.track_runs import magnet_frames
 @pytest.mark.parametrize('target', ['vehicle', 'magnet'])
 def test_derivatives_hold_at_every_sensors_own_time(target):
     network = line_network(3)
-    stage = TrackStage(network, settings_for(target, {
-        'track.mounting_std_deg': 3.0, 'track.model_error_time_s': 0.0}).track)
+    settings = settings_for(target, {
+        'track.mounting_std_deg': 3.0, 'track.model_error_time_s': 0.0}).track
+    model = target_of(settings, network).model
     rng = np.random.default_rng(1)
-    n_t = len(stage._model.state_names)
+    n_t = len(model.state_names)
     x = np.zeros((1, n_t + 18))
     x[0, :n_t] = rng.standard_normal(n_t)
     x[0, n_t:n_t + 9] = 0.05 * rng.standard_normal(9)
     offset = np.array([-0.03, 0.0, 0.05])
-    observation = stage._filter.observation
+    observation = BankFilter(network, model, settings).observation
 
     def fields(x):
         return observation.fields(x, offset, np.zeros(1), 0.0)
@@ -99,7 +102,7 @@ def turning_magnet(offset, rate=0.4, n=60, dt=0.27):
 
 def errors_of(network, frames, truth):
     """Position errors [m] and NEES of the tracks, ten frames after the start."""
-    stage = TrackStage(network, settings_for('magnet').track)
+    stage = TrackManager(network, settings_for('magnet').track)
     tracks = [t for f in frames for t in stage.feed(f)]
     e = (np.array([t.position for t in tracks]) - truth)[10:]
     nees = [a @ np.linalg.solve(t.covariance[:3, :3], a) / 3
@@ -124,7 +127,7 @@ def test_a_magnet_over_sensors_that_are_read_in_turn():
     assert np.median(error) < 0.3e-3
     assert nees.mean() < 1.5
     assert np.median(error) < 0.2 * np.median(as_one)
-    stage = TrackStage(network, settings_for('magnet').track)
+    stage = TrackManager(network, settings_for('magnet').track)
     for frame in frames:
         track = stage.feed(frame)[-1]
     # Each sensor's field is predicted at its own time.
@@ -137,7 +140,7 @@ def test_a_magnet_that_was_not_seen_for_long_is_found_again(gap_s):
     network, frames, truth = turning_magnet(np.zeros(9), n=40 + round(gap_s / 0.1), dt=0.1)
     keep = np.r_[0:20, -20:0]
     frames, truth = [frames[k] for k in keep], truth[keep]
-    stage = TrackStage(network, settings_for('magnet').track)
+    stage = TrackManager(network, settings_for('magnet').track)
     for k, (frame, r) in enumerate(zip(frames, truth, strict=True)):
         tracks = stage.feed(frame)
         live = [t for t in tracks if isinstance(t, Track) and not t.ended]
@@ -151,7 +154,7 @@ def test_a_magnet_that_was_not_seen_for_long_is_found_again(gap_s):
 
 def test_a_vehicle_that_the_field_contradicts_is_lost_and_not_started_anew():
     network = line_network(2)
-    stage = TrackStage(network, settings_for('vehicle').track)
+    stage = TrackManager(network, settings_for('vehicle').track)
     C = np.repeat(1e-16 * np.eye(3)[None], 2, axis=0)
     rng = np.random.default_rng(1)
     tracks = []

@@ -8,9 +8,11 @@ import pytest
 from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import FieldFrame, Track
+from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_magnet import start_magnet
 from mag_tracking.stages.track.initiation_vehicle import start_vehicle, vehicle_model
-from mag_tracking.stages.track.manager import TrackStage
+from mag_tracking.stages.track.manager import TrackManager
+from mag_tracking.stages.track.target import target_of
 from support.bundled import POINT
 from support.networks import line_network
 from support.track_runs import magnet_frames
@@ -139,7 +141,7 @@ def test_what_a_fit_leaves_over_widens_the_start():
 
 def test_a_magnet_may_have_turned_sensors_too():
     network, frames, truth = magnet_frames()
-    stage = TrackStage(network, settings_for('magnet', {'track.mounting_std_deg': 2.0}).track)
+    stage = TrackManager(network, settings_for('magnet', {'track.mounting_std_deg': 2.0}).track)
     tracks = [t for f in frames for t in stage.feed(f)]
     assert np.linalg.norm(tracks[-1].position - truth[-1, :3]) < 1e-3
     assert tracks[-1].mounting.shape == (9, 3)
@@ -150,8 +152,8 @@ def test_a_magnet_may_have_turned_sensors_too():
 def test_backgrounds_that_wander_are_no_target(road_network):
     """A frame said to hold a target, but the field only does what backgrounds do."""
     drift = 3e-8
-    stage = TrackStage(road_network, settings_for(
-        'vehicle', {'track.background_drift': drift}).track)
+    settings = settings_for('vehicle', {'track.background_drift': drift}).track
+    stage = TrackManager(road_network, settings)
     rng = np.random.default_rng(5)
     level, dt, noise, tracks = np.zeros((2, 3)), 0.08, 4e-9, []
     C = np.repeat(noise**2 * np.eye(3)[None], 2, axis=0)
@@ -166,12 +168,13 @@ def test_backgrounds_that_wander_are_no_target(road_network):
 
 def test_backgrounds_wander_between_frames_and_angles_do_not(road_network):
     drift, dt = 1e-8, 0.5
-    stage = TrackStage(road_network, settings_for(
-        'vehicle', {'track.background_drift': drift}).track)
+    settings = settings_for('vehicle', {'track.background_drift': drift}).track
+    stage = TrackManager(road_network, settings)
     C = np.repeat(1e-16 * np.eye(3)[None], 2, axis=0)
     stage.feed(FieldFrame(0, np.full((2, 3), 1e-7), C, np.full(2, 8), np.zeros(2), True, 1e3, 6))
     before = np.diagonal(stage.bank.P, axis1=1, axis2=2).copy()
-    stage._filter.predict(stage.bank, dt)
+    BankFilter(road_network, target_of(settings, road_network).model, settings).predict(
+        stage.bank, dt)
     after = np.diagonal(stage.bank.P, axis1=1, axis2=2)
     own, grown = before[:, 17:29].reshape(-1, 2, 6), after[:, 17:29].reshape(-1, 2, 6)
     np.testing.assert_array_equal(grown[:, :, :3], own[:, :, :3])

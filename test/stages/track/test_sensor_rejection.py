@@ -12,9 +12,10 @@ from mag_tracking.physics.dipole import MU0, dipole_field
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.evidence import LONGEST_SINGLE_SENSOR_S
 from mag_tracking.stages.track.initiation_vehicle import vehicle_model
-from mag_tracking.stages.track.manager import ALONE_S, TrackStage
-from mag_tracking.stages.track.sensor_rejection import ONE_IN, Contradiction
+from mag_tracking.stages.track.manager import TrackManager
+from mag_tracking.stages.track.sensor_rejection import ONE_IN, SensorRejection
 from support.bundled import POINT
 from support.faulty_streams import NS, stream
 from support.networks import line_network
@@ -96,7 +97,7 @@ def test_where_all_fits_nothing_changes_and_one_update_is_all_it_costs(n):
     bank_filter, bank, frame, names = situation(n)
     expected, after = plain(bank_filter, bank, frame)
     bank_filter.n = 0
-    got, used, counts = Contradiction(names).update(bank_filter, bank, frame, DT)
+    got, used, counts = SensorRejection(names).update(bank_filter, bank, frame, DT)
     assert bank_filter.n == 1
     assert used is frame and not counts
     assert got.tobytes() == expected.tobytes() and state(bank) == after
@@ -109,13 +110,13 @@ def test_one_that_is_wrong_is_left_out_as_if_it_were_missing(n, seed):
     for j in range(n) if n > 2 else ():
         mine = copy.deepcopy(bank)
         expected, after = plain(bank_filter, bank, without(frame, j))
-        got, used, counts = Contradiction(names).update(bank_filter, mine, spoilt(frame, j), DT)
+        got, used, counts = SensorRejection(names).update(bank_filter, mine, spoilt(frame, j), DT)
         assert counts == {f'frames that {names[j]} contradicted': 1}
         assert got.tobytes() == expected.tobytes() and state(mine) == after
         assert same_frame(used, without(frame, j))
     if n == 2:
         # Which of two it is cannot be told, but one is left out and the other used.
-        _, used, counts = Contradiction(names).update(bank_filter, bank, spoilt(frame, 1), DT)
+        _, used, counts = SensorRejection(names).update(bank_filter, bank, spoilt(frame, 1), DT)
         assert sum(counts.values()) == 1 and np.count_nonzero(used.n_samples) == 1
 
 
@@ -124,7 +125,7 @@ def test_the_frame_and_the_prior_are_not_written_into():
     wrong = spoilt(frame, 2)
     kept = copy.deepcopy(wrong)
     before, prior = (bank.x, bank.P), (bank.x.copy(), bank.P.copy())
-    Contradiction(names).update(bank_filter, bank, wrong, DT)
+    SensorRejection(names).update(bank_filter, bank, wrong, DT)
     assert same_frame(wrong, kept)
     assert all(np.array_equal(a, b) for a, b in zip(before, prior, strict=True))
 
@@ -138,7 +139,7 @@ def test_never_more_than_one_in_eight_but_always_one(n, most):
         near = np.argsort(np.linalg.norm(frame.field, axis=1))[-wrong:].tolist()
         bad = spoilt(frame, *near)
         whole, after = plain(bank_filter, bank, bad)
-        got, used, counts = Contradiction(names).update(bank_filter, bank, bad, DT)
+        got, used, counts = SensorRejection(names).update(bank_filter, bank, bad, DT)
         if wrong == most and n > 2:
             assert set(counts) == {f'frames that {names[j]} contradicted' for j in near}
             assert same_frame(used, without(frame, *near))
@@ -152,7 +153,7 @@ def test_all_wrong_is_a_track_that_is_lost():
     bank_filter, bank, frame, names = situation()
     lost = dataclasses.replace(frame, field=-3.0 * frame.field[::-1])
     expected, after = plain(bank_filter, bank, lost)
-    got, used, counts = Contradiction(names).update(bank_filter, bank, lost, DT)
+    got, used, counts = SensorRejection(names).update(bank_filter, bank, lost, DT)
     assert used is lost and not counts
     assert got.tobytes() == expected.tobytes() and state(bank) == after
     best = int(np.argmax(bank.log_w + got))
@@ -164,7 +165,7 @@ def test_one_sensor_alone_is_never_left_out():
         bank_filter, bank, frame, names = situation(n)
         alone = spoilt(without(frame, *range(1, n)), 0)
         bank_filter.n = 0
-        _, used, counts = Contradiction(names).update(bank_filter, bank, alone, DT)
+        _, used, counts = SensorRejection(names).update(bank_filter, bank, alone, DT)
         assert used is alone and not counts and bank_filter.n == 1
 
 
@@ -172,7 +173,7 @@ def test_of_how_many_counts_who_is_there():
     bank_filter, bank, frame, names = situation(16, n_hyp=2)
     near = np.argsort(np.linalg.norm(frame.field, axis=1)).tolist()
     bad = spoilt(without(frame, near[0]), *near[-2:])
-    _, used, counts = Contradiction(names).update(bank_filter, bank, bad, DT)
+    _, used, counts = SensorRejection(names).update(bank_filter, bank, bad, DT)
     assert used is bad and not counts
 
 
@@ -181,7 +182,7 @@ def test_an_axis_that_is_missing_leaves_a_sensor_there():
     field = frame.field.copy()
     field[:, 2] = np.nan
     bad = spoilt(dataclasses.replace(frame, field=field), 3)
-    _, used, counts = Contradiction(names).update(bank_filter, bank, bad, DT)
+    _, used, counts = SensorRejection(names).update(bank_filter, bank, bad, DT)
     assert counts == {f'frames that {names[3]} contradicted': 1}
     assert np.isnan(used.field[3]).all() and not np.isnan(used.field[2, :2]).any()
 
@@ -195,7 +196,7 @@ def cost(bank_filter, found, bank, frame):
 
 def test_the_one_of_the_frame_before_is_the_first_suspect():
     bank_filter, bank, frame, names = situation()
-    found = Contradiction(names)
+    found = SensorRejection(names)
     assert cost(bank_filter, found, bank, spoilt(frame, 2)) == (1 + 6 + 1, [2])
     assert cost(bank_filter, found, bank, spoilt(frame, 2)) == (2, [2])
     # Another one now.
@@ -215,7 +216,7 @@ def test_the_one_of_the_frame_before_is_the_first_suspect():
 def test_two_suspects_of_the_frame_before_are_too_many_when_fewer_are_there():
     bank_filter, bank, frame, names = situation(16, n_hyp=2)
     near = np.argsort(np.linalg.norm(frame.field, axis=1)).tolist()
-    found = Contradiction(names)
+    found = SensorRejection(names)
     assert cost(bank_filter, found, bank, spoilt(frame, *near[-2:]))[1] == sorted(near[-2:])
     fewer = spoilt(without(frame, near[0]), *near[-2:])
     assert cost(bank_filter, found, bank, fewer)[1] == [near[0]]
@@ -224,7 +225,7 @@ def test_two_suspects_of_the_frame_before_are_too_many_when_fewer_are_there():
 def test_of_two_that_are_wrong_the_second_is_sought_among_the_others():
     bank_filter, bank, frame, names = situation(16, n_hyp=2)
     near = np.argsort(np.linalg.norm(frame.field, axis=1)).tolist()[-2:]
-    assert cost(bank_filter, Contradiction(names), bank, spoilt(frame, *near)) == (
+    assert cost(bank_filter, SensorRejection(names), bank, spoilt(frame, *near)) == (
         1 + 16 + 1 + 15 + 1, sorted(near))
 
 
@@ -233,9 +234,9 @@ def test_it_has_to_fit_what_leads_by_its_weight():
     bank_filter, bank, frame, names = situation(n_hyp=2)
     bank.x[1, bank_filter.observation.n_target + 3 * 2:][:3] = OFF
     bad = spoilt(frame, 2)
-    assert cost(bank_filter, Contradiction(names), bank, bad) == (1, [])
+    assert cost(bank_filter, SensorRejection(names), bank, bad) == (1, [])
     bank.log_w = np.array([0.0, -1e9])
-    assert cost(bank_filter, Contradiction(names), bank, bad) == (8, [2])
+    assert cost(bank_filter, SensorRejection(names), bank, bad) == (8, [2])
 
 
 class Ruled(BankFilter):
@@ -255,7 +256,7 @@ def test_a_sensor_that_rules_out_every_hypothesis_is_left_out():
     network = line_network(6, spacing=4.0, tilt=0.2)
     ruled = Ruled(3, network, vehicle_model(SETTINGS.vehicle, network), SETTINGS)
     _, after = plain(plain_filter, bank, without(frame, 3))
-    got, _, counts = Contradiction(names).update(ruled, bank, frame, DT)
+    got, _, counts = SensorRejection(names).update(ruled, bank, frame, DT)
     assert counts == {f'frames that {names[3]} contradicted': 1}
     assert np.isfinite(got).all() and state(bank) == after
 
@@ -280,7 +281,8 @@ def test_of_two_sensors_the_track_is_flagged_from_then_on():
     flags = {}
     for fault in (None, 'swaps axes'):
         # So short that it is not for having been alone.
-        pipeline, tracks, (begin, _) = passing(2, fault, seed=1, lasting_s=ALONE_S - 0.2)
+        pipeline, tracks, (begin, _) = passing(
+            2, fault, seed=1, lasting_s=LONGEST_SINGLE_SENSOR_S - 0.2)
         flags[fault] = [t.ambiguous for t in tracks if t.stamp_ns / NS > begin + 0.5]
         contradicted = [what for what in pipeline.track.counts if 'contradicted' in what]
         assert bool(contradicted) == bool(fault)
@@ -314,10 +316,10 @@ def test_a_calibration_that_comes_while_one_is_left_out_waits_for_the_end_of_the
     _, expected, _ = passing(3, 'swaps axes')
     assert [(t.stamp_ns, t.position.tobytes(), t.ambiguous) for t in tracks] == [
         (t.stamp_ns, t.position.tobytes(), t.ambiguous) for t in expected]
-    assert pipeline.track._contradiction._left_out == ()
 
 
-@pytest.mark.parametrize('alone_s, flagged', [(ALONE_S - 0.1, False), (ALONE_S + 0.2, True)])
+@pytest.mark.parametrize('alone_s, flagged', [(LONGEST_SINGLE_SENSOR_S - 0.1, False),
+                                              (LONGEST_SINGLE_SENSOR_S + 0.2, True)])
 def test_one_that_carried_a_track_alone_leaves_it_flagged(alone_s, flagged):
     network, samples, _, (begin, end) = stream(2, 0)
     pipeline, tracks = Pipeline(network, settings_for('vehicle', POINT)), []
@@ -331,27 +333,34 @@ def test_one_that_carried_a_track_alone_leaves_it_flagged(alone_s, flagged):
     assert live and all(t.ambiguous for t in live) == flagged
 
 
-def first_tracks(n_quiet):
+def first_tracks(n_quiet, stage=None, begin_ns=NS, missing=(), n_present=1):
     """(stage, tracks) of a target that is there after so many frames without one."""
     network = line_network(2, tilt=0.0)
-    stage = TrackStage(network, SETTINGS)
-    stage._alone_s, stage._doubted = np.inf, True
+    stage = TrackManager(network, SETTINGS) if stage is None else stage
     B = dipole_field(network.positions - [-8.0, -1.2, 0.5], MOMENT)
     C, field = np.tile(SIGMA**2 * np.eye(3), (2, 1, 1)), np.einsum('jik,jk->ji', network.R_sw, B)
     for k in range(n_quiet):
-        assert not stage.feed(FieldFrame(NS + k * NS // 10, 0.0 * field, C, np.full(2, 8),
+        assert not stage.feed(FieldFrame(begin_ns + k * NS // 10, 0.0 * field, C, np.full(2, 8),
                                          np.zeros(2), False))
-    return stage, stage.feed(FieldFrame(NS + n_quiet * NS // 10, field, C, np.full(2, 8),
+    there = ~np.isin(np.arange(2), missing)
+    field, C = np.where(there[:, None], field, np.nan), np.where(there[:, None, None], C, np.nan)
+    tracks = []
+    for k in range(n_quiet, n_quiet + n_present):
+        tracks += stage.feed(FieldFrame(begin_ns + k * NS // 10, field, C, np.where(there, 8, 0),
                                         np.zeros(2), True))
+    return stage, tracks
 
 
 def test_the_next_track_begins_with_a_clean_slate():
     """What one was flagged for says nothing of the next."""
-    stage, tracks = first_tracks(8)
-    assert tracks and stage._alone_s == 0.0 and not stage._doubted
-    stage._contradiction._left_out = (1,)
+    stage, before = first_tracks(8, missing=(1,), n_present=8)
+    assert before and all(t.ambiguous for t in before)
     stage.flush()
-    assert stage._contradiction._left_out == ()
+    _, again = first_tracks(8, stage, 4 * NS, n_present=4)
+    _, fresh = first_tracks(8, begin_ns=4 * NS, n_present=4)
+    assert again and [(t.ambiguous, t.existence, t.weight) for t in again] == [
+        (t.ambiguous, t.existence, t.weight) for t in fresh]
+
 
 
 @pytest.mark.parametrize('n_quiet', [0, 4])

@@ -14,7 +14,7 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.simulation.scenario import Path, point_body, random_vehicle, simulate
 from mag_tracking.stages.track import smoothing as smooth_module
-from mag_tracking.stages.track.manager import TrackStage
+from mag_tracking.stages.track.manager import TrackManager
 from support.bundled import POINT
 from support.marks import studied
 from support.networks import line_network
@@ -290,7 +290,7 @@ def test_missing_frames_are_bridged():
     """Half a second without a measurement in the middle of a pass: smoothed from both sides."""
     network, samples, t, position = pass_of(point_body([250.0, -150.0, 80.0], 4.0, 0.5))
     pipeline = Pipeline(network, settings_for('vehicle', POINT))
-    stage = TrackStage(network, settings_for('vehicle', POINT).track)
+    stage = TrackManager(network, settings_for('vehicle', POINT).track)
     out = []
     for s in samples:
         for r in pipeline.feed(s):
@@ -332,7 +332,7 @@ def test_a_frame_that_contradicts_the_track_does_not_bend_it(size):
                         for f in frames]))
     paths = []
     for spike in (0.0, size):
-        stage = TrackStage(network, settings_for('vehicle').track)
+        stage = TrackManager(network, settings_for('vehicle').track)
         out = spiked(stage, frames, at, spike)
         poses = [r for r in out if isinstance(r, SmoothedPose) and r.id == 1]
         paths.append(np.array([p.position for p in poses if abs(np.interp(
@@ -348,7 +348,7 @@ def test_a_track_that_was_lost_is_smoothed_with_a_doubt():
     pipeline = Pipeline(network, settings_for('vehicle'))
     frames = [r for s in samples for r in pipeline.feed(s) if isinstance(r, FieldFrame)]
     first = next(k for k, f in enumerate(frames) if f.target_present)
-    stage = TrackStage(network, settings_for('vehicle').track)
+    stage = TrackManager(network, settings_for('vehicle').track)
     out = spiked(stage, frames, first + 25, 1e-4, n=2)
     assert stage.counts['tracks ended: lost its target'] == 1
     smoothed = [r for r in out if isinstance(r, SmoothedPose)]

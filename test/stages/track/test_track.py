@@ -17,7 +17,8 @@ from mag_tracking.simulation.scenario import (
     random_vehicle,
     simulate,
 )
-from mag_tracking.stages.track.manager import TrackStage
+from mag_tracking.stages.track.manager import TrackManager
+from mag_tracking.stages.track.target import target_of
 from support.bundled import POINT
 from support.marks import studied
 from support.networks import line_network
@@ -103,7 +104,7 @@ def test_noise_alone_makes_no_track():
 @pytest.mark.parametrize('lost', [None, [2, 5]])
 def test_a_magnet_is_found_anywhere_and_followed(lost):
     network, frames, truth = magnet_frames(lost=lost)
-    stage = TrackStage(network, settings_for('magnet').track)
+    stage = TrackManager(network, settings_for('magnet').track)
     tracks = [t for f in frames for t in stage.feed(f)]
     assert len(tracks) == len(frames)
     error = np.linalg.norm([t.position - x[:3] for t, x in zip(tracks, truth, strict=True)], axis=1)
@@ -116,7 +117,7 @@ def test_a_magnet_is_found_anywhere_and_followed(lost):
 
 def test_the_roll_of_a_dipole_is_flagged_and_not_invented():
     network, frames, _ = magnet_frames(5)
-    stage = TrackStage(network, settings_for('magnet').track)
+    stage = TrackManager(network, settings_for('magnet').track)
     track = [t for f in frames for t in stage.feed(f)][-1]
     assert track.unobservable == (False, False, False, False, False, True)
     u = track.moment / np.linalg.norm(track.moment)
@@ -150,7 +151,7 @@ def test_a_vehicle_has_a_heading_and_no_roll():
 def test_gaps_and_backward_jumps_end_a_track():
     network, frames, _ = magnet_frames(10)
     settings = dataclasses.replace(settings_for('magnet').track, end_gap_s=0.25)
-    stage = TrackStage(network, settings)
+    stage = TrackManager(network, settings)
     ids = [[(t.id, t.ended) for t in stage.feed(f) if isinstance(t, Track)]
            for f in (frames[0], frames[1], frames[6], frames[2])]
     assert ids == [[(1, False)], [(1, False)], [(1, True), (2, False)], [(2, True), (3, False)]]
@@ -160,7 +161,7 @@ def test_gaps_and_backward_jumps_end_a_track():
 
 def test_a_track_may_be_given_up_and_the_next_is_another():
     network, frames, _ = magnet_frames(4)
-    stage = TrackStage(network, settings_for('magnet').track)
+    stage = TrackManager(network, settings_for('magnet').track)
     assert stage.give_up('no frames came') == []
     stage.feed(frames[0])
     ended = [t for t in stage.give_up('no frames came') if isinstance(t, Track)]
@@ -171,7 +172,7 @@ def test_a_track_may_be_given_up_and_the_next_is_another():
 
 def test_a_frame_without_a_measurement_is_coasted_through():
     network, frames, _ = magnet_frames(10)
-    stage = TrackStage(network, settings_for('magnet').track)
+    stage = TrackManager(network, settings_for('magnet').track)
     for f in frames[:5]:
         before = stage.feed(f)[-1]
     after = stage.feed(dataclasses.replace(frames[5], field=np.full((9, 3), np.nan)))[-1]
@@ -184,14 +185,14 @@ def test_too_few_axes_start_no_magnet():
     network, frames, _ = magnet_frames(1)
     field = np.full((9, 3), np.nan)
     field[0] = frames[0].field[0]
-    stage = TrackStage(network, settings_for('magnet').track)
+    stage = TrackManager(network, settings_for('magnet').track)
     assert stage.feed(dataclasses.replace(frames[0], field=field)) == []
     assert stage.counts['frames without a start'] == 1
 
 
 def test_a_hypothesis_on_a_sensor_is_dropped_and_the_rest_go_on():
     network, frames, _ = magnet_frames(3)
-    stage = TrackStage(network, settings_for('magnet', {'track.iterations': 1}).track)
+    stage = TrackManager(network, settings_for('magnet', {'track.iterations': 1}).track)
     stage.feed(frames[0])
     bank = stage.bank
     bank.x, bank.P = np.vstack([bank.x, bank.x[:1]]), np.concatenate([bank.P, bank.P[:1]])
@@ -208,8 +209,8 @@ def test_a_hypothesis_on_a_sensor_is_dropped_and_the_rest_go_on():
 
 def test_without_an_earth_field_there_is_no_soft_iron():
     network = dataclasses.replace(line_network(2), earth_field=None)
-    stage = TrackStage(network, settings_for('vehicle').track)
-    assert not stage._model.earth_field.any()
+    model = target_of(settings_for('vehicle').track, network).model
+    assert not model.earth_field.any()
 
 
 def test_the_predicted_field_is_without_the_errors_of_the_model():

@@ -1,0 +1,222 @@
+"""One running track: its bank of filters, the frames that it keeps, and its evidence.
+
+Source: ICASSP11 section 2, T10 Alg. 2 and 3; PHD15 Paper A for the magnet.
+"""
+
+from collections import Counter
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from mag_tracking.arrays import FloatArray
+from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.records import FieldFrame, SmoothedPose, Track
+from mag_tracking.stages.track.bank_filter import BankFilter, NoTarget
+from mag_tracking.stages.track.evidence import LEAST_WATCHED, TrackEvidence
+from mag_tracking.stages.track.published_pose import (
+    is_ambiguous,
+    published_track,
+    smoothed_pose,
+)
+from mag_tracking.stages.track.relinearisation import Relinearisation
+from mag_tracking.stages.track.sensor_rejection import SensorRejection
+from mag_tracking.stages.track.sensor_selection import AHEAD_S, SensorSubset, hand_on
+from mag_tracking.stages.track.settings import TrackSettings
+from mag_tracking.stages.track.smoothing import FixedLag, WholeTrack
+from mag_tracking.stages.track.target import Target
+from mag_tracking.units import NS
+
+TrackRecord = Track | SmoothedPose
+TrackState = tuple[int, FloatArray, FloatArray]
+"""Timestamp [ns], state (n_x,) and covariance (n_x, n_x)."""
+
+
+class RunningTrack:
+    """A target that is being followed.
+
+    Attributes
+    ----------
+    id : int
+    bank : FilterBank
+        Its hypotheses.
+    ended : str or None
+        Why it is over; None while it runs.
+    is_lost : bool
+        It ended while the target was still detected.
+    """
+
+    def __init__(self, id: int, target: Target, settings: TrackSettings, sensors: SensorSubset,
+                 bank_filter: BankFilter, bank: FilterBank, counts: 'Counter[str]') -> None:
+        self.id, self.bank, self.counts = id, bank, counts
+        self.ended: str | None = None
+        self.is_lost = False
+        self._target, self._settings = target, settings
+        self._use(sensors, bank_filter)
+        self._relinearisation = Relinearisation(
+            settings.relinearise_interval_s, settings.relinearise_window_s,
+            settings.relinearise_most)
+        self._whole = WholeTrack(settings.smooth_longest_s)
+        self._lag = FixedLag(settings.smoothing_lag_s) if settings.smoothing_lag_s else None
+        self._evidence = TrackEvidence(doubted=False)
+        self._last: Track | None = None
+        self._handover_due: int | None = None
+
+    def _use(self, sensors: SensorSubset, bank_filter: BankFilter) -> None:
+        """From now on the track is of these sensors."""
+        self._sensors, self._filter = sensors, bank_filter
+        self._rejection = SensorRejection(sensors.network.names)
+        self._no_target = NoTarget(len(sensors.network), self._settings.background_std)
+
+    def configure(self, settings: TrackSettings) -> None:
+        """Apply new values of the live settings."""
+        self._settings = settings
+        self._filter.configure(settings)
+        self._relinearisation.begin_anew()
+
+    def begin(self, frame: FieldFrame, recent: list[FieldFrame]) -> list[TrackRecord]:
+        """Run through the `recent` frames before the detection, and publish the first one after.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+            Of the whole network, with the detection.
+        recent : list of FieldFrame
+            Those before it, oldest first.
+        """
+        frame, recent = self._sensors.part_of(frame), [self._sensors.part_of(f) for f in recent]
+        lookback_ns = self._settings.lookback_s * NS
+        # A target that was not seen approaching may already have passed.
+        watched_ns = frame.stamp_ns - recent[0].stamp_ns if recent else 0
+        self._evidence = TrackEvidence(
+            doubted=watched_ns < LEAST_WATCHED * lookback_ns and not self._target.starts_anywhere)
+        if recent:
+            self._filter.predict(self.bank, (recent[0].stamp_ns - frame.stamp_ns) / NS)
+        self._whole.begin(self.bank, self._filter)
+        if self._settings.relinearise_window_s:
+            self._relinearisation.begin(self.bank)
+        dt = 0.0
+        for before, after in pairwise([*recent, frame]):
+            self._step(before, dt, publish=False)
+            dt = (after.stamp_ns - before.stamp_ns) / NS
+        return self._step(frame, dt)
+
+    def step(self, frame: FieldFrame, dt: float) -> list[TrackRecord]:
+        """Records of a frame of the whole network, `dt` [s] after the one before."""
+        return self._step(self._sensors.part_of(frame), dt)
+
+    def _step(self, frame: FieldFrame, dt: float, publish: bool = True) -> list[TrackRecord]:
+        """Predict, update, weigh, publish; the records of the frame if it is to be published."""
+        if self.ended is not None:
+            return []
+        used = self._update(frame, dt, publish)
+        if used is None:
+            return self.end('no hypothesis explains the field')
+        if not publish and self._lag is None:
+            return []
+        best = self.bank.best()
+        late = [] if self._lag is None else self._smoothed(best, False, self._lag.smoothed(
+            self._filter, self.bank, best, used, dt, publish))
+        return [*self._publish(used, dt, best), *late, *self._end_if_over()] if publish else []
+
+    def _update(self, frame: FieldFrame, dt: float, publish: bool) -> FieldFrame | None:
+        """Move the bank through a frame; what was used of it, or None if nothing explains it."""
+        s, bank = self._settings, self.bank
+        if dt > 0.0:
+            self._filter.predict(bank, dt)
+        predicted = bank.x.copy()
+        log_likelihood, frame, rejected = self._rejection.update(self._filter, bank, frame, dt)
+        self.counts.update(rejected)
+        # Where no majority is left the track may as well be wrong.
+        if rejected and np.count_nonzero(frame.n_samples) <= len(rejected):
+            self._evidence.doubt()
+        evidence = bank.reweight(log_likelihood)
+        if not np.isfinite(evidence):
+            self.counts['banks lost'] += 1
+            return None
+        self._evidence.add(evidence - self._no_target.log_density(frame, dt, s.background_drift))
+        self._relinearisation.add(bank, predicted, log_likelihood, frame, dt)
+        self.counts['hypotheses dropped'] += bank.prune(
+            -np.log(s.prune_ratio),
+            s.most_hypotheses if publish else max(s.most_hypotheses, s.most_at_start))
+        self.counts.update(self._relinearisation.improve(self._filter, bank))
+        self._whole.add(bank, frame, dt, publish)
+        return frame
+
+    def _publish(self, frame: FieldFrame, dt: float, best: int) -> list[TrackRecord]:
+        """The `Track` of the hypothesis `best`."""
+        self._last = self._published(frame, dt, best)
+        self.counts['poses'] += 1
+        self._handover_due = best if self._sensors.is_part else None
+        return [self._last]
+
+    def _end_if_over(self) -> list[TrackRecord]:
+        """The closing records, if the latest pose says that the track is over."""
+        assert self._last is not None
+        reason = self._evidence.reason_to_end(self._last, self._settings)
+        if reason is None:
+            return []
+        self.is_lost = True
+        return self.end(reason)
+
+    def _published(self, frame: FieldFrame, dt: float, best: int) -> Track:
+        """The `Track` of the hypothesis `best`, with what it says of the sensors."""
+        bank, observation = self.bank, self._filter.observation
+        measured = ~np.isnan(frame.field)
+        alone = len(self._sensors.network) > 1 and np.count_nonzero(measured.any(axis=1)) == 1
+        self._evidence.support(alone, dt)
+        return self._sensors.widened(published_track(
+            bank, best, self._target.model, self._target.orientation, self._target.arrivals,
+            self._target.kinds, stamp_ns=frame.stamp_ns, id=self.id, ended=False,
+            existence=self._evidence.existence, degrees_of_freedom=int(np.count_nonzero(measured)),
+            strange=(self._filter.is_strange(bank, best, frame) or alone
+                     or self._evidence.doubted),
+            predicted=self._filter.predicted_field(bank, best, frame, dt),
+            mounting=observation.angles(bank.x[best]),
+            mounting_covariance=observation.angle_covariances(bank.P[best])), self._settings)
+
+    def _smoothed(self, best: int, complete: bool, states: list[TrackState],
+                  doubtful: bool = False) -> list[SmoothedPose]:
+        """The `SmoothedPose`s of states of the hypothesis `best`."""
+        ambiguous = doubtful or is_ambiguous(self.bank, best)
+        kind = self._target.kinds[self.bank.kind[best]]
+        return [smoothed_pose(
+            self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,
+            kind=kind, complete=complete, ambiguous=ambiguous) for stamp_ns, x, P in states]
+
+    def _smoothed_at_the_end(self) -> list[SmoothedPose]:
+        """What is left of a fixed lag, and the whole track."""
+        best, doubtful = self.bank.best(), self._evidence.is_doubtful
+        rest = [] if self._lag is None else self._smoothed(best, False, self._lag.rest(
+            self._filter, self.bank, best), doubtful)
+        states, left_out = self._whole.smoothed(self.bank, best)
+        self.counts['frames left out of smoothing'] += left_out
+        self.counts['tracks too long to smooth'] += self._whole.too_long
+        return rest + self._smoothed(best, True, states, doubtful)
+
+    def end(self, reason: str) -> list[TrackRecord]:
+        """End the track: its last record again, marked as ended, then the smoothed poses."""
+        self.ended = reason
+        self.counts[f'tracks ended: {reason}'] += 1
+        return [] if self._last is None else [replace(self._last, ended=True),
+                                              *self._smoothed_at_the_end()]
+
+    def hand_over(self) -> None:
+        """Switch to the sensors near where the target is going, if those used are others."""
+        best, self._handover_due = self._handover_due, None
+        if best is None or self.ended is not None:
+            return
+        x, n = self.bank.x[best], self._settings.most_sensors
+        place = x[:2] + AHEAD_S * x[3:5]
+        if self._sensors.serves(place, n):
+            return
+        before, sensors = self._sensors, SensorSubset.near(self._sensors.whole, place, n)
+        self._use(sensors, BankFilter(sensors.network, self._target.model, self._settings))
+        observation = self._filter.observation
+        hand_on(self.bank, observation.n_own, before.rows, sensors.rows,
+                observation.own_covariance, self._settings.background_std)
+        self._whole.give_up()
+        self._relinearisation.begin_anew()
+        if self._lag is not None:
+            self._lag.clear()
+        self.counts['tracks handed on to other sensors'] += 1

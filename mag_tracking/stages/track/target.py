@@ -1,0 +1,75 @@
+"""What is tracked: the source model of a target, how it is published and how its track begins."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from mag_tracking.arrays import FloatArray
+from mag_tracking.errors import SettingsError
+from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.network import SensorNetwork
+from mag_tracking.physics.sources import SourceModel
+from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track.initiation_magnet import magnet_model, start_magnet
+from mag_tracking.stages.track.initiation_vehicle import start_vehicle, vehicle_model
+from mag_tracking.stages.track.published_pose import (
+    Orientation,
+    magnet_orientation,
+    vehicle_orientation,
+)
+from mag_tracking.stages.track.settings import TrackSettings
+
+
+@dataclass(frozen=True)
+class Target:
+    """A kind of target that the tracker can follow."""
+
+    model: SourceModel
+    orientation: Orientation
+    arrivals: Sequence[str]
+    """Name of each arrival direction."""
+    kinds: Sequence[str]
+    """Name of each kind of target."""
+    starts_anywhere: bool
+    """A magnet that was lost is found anywhere; a vehicle starts on an arrival line."""
+    start: Callable[[TrackSettings, SensorNetwork, FieldFrame, FloatArray], FilterBank | None]
+    """First hypotheses from the settings, a network, a frame, and the covariances
+    (n_sensors, n_own, n_own) of the sensors' own states; None where the frame allows no start."""
+
+
+def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
+    """The target that the settings ask for.
+
+    Raises
+    ------
+    SettingsError
+        If the target is unknown, or its settings contradict each other.
+    """
+    if settings.target == 'vehicle':
+        vehicle = settings.vehicle
+        return Target(vehicle_model(vehicle, network), vehicle_orientation, vehicle.arrival_names,
+                      vehicle.kinds, False, _start_vehicle)
+    if settings.target == 'magnet':
+        magnet = settings.magnet
+        if not any(magnet.axis):
+            raise SettingsError('track.magnet.axis: the zero vector has no direction')
+        return Target(magnet_model(magnet),
+                      partial(magnet_orientation, axis=np.array(magnet.axis)),
+                      ('',), ('',), True, _start_magnet)
+    raise SettingsError(f'track.target: expected vehicle or magnet, got {settings.target!r}')
+
+
+def _start_vehicle(settings: TrackSettings, network: SensorNetwork, frame: FieldFrame,
+                   own_covariance: FloatArray) -> FilterBank | None:
+    """First hypotheses of a vehicle."""
+    return start_vehicle(settings.vehicle, network, frame, settings.background_std,
+                         own_covariance)
+
+
+def _start_magnet(settings: TrackSettings, network: SensorNetwork, frame: FieldFrame,
+                  own_covariance: FloatArray) -> FilterBank | None:
+    """First hypotheses of a magnet."""
+    return start_magnet(settings.magnet, network, frame, settings.background_std, own_covariance,
+                        settings.field_error)
