@@ -177,7 +177,8 @@ def _world_std(geometry: NetworkGeometry, j: int) -> FloatArray:
     # Its rotation is the third block of its ten numbers: bias, gain, rotation, position.
     turn = slice(10 * j + 4, 10 * j + 7)
     R = geometry.network.R_ws[j]
-    return np.sqrt(np.diagonal(R @ geometry.covariance[turn, turn] @ R.T))
+    std: FloatArray = np.sqrt(np.diagonal(R @ geometry.covariance[turn, turn] @ R.T))
+    return std
 
 
 def _with_noise(network: SensorNetwork, noise_std: float | None) -> SensorNetwork:

@@ -80,8 +80,9 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
             and not survey.disagreements:
         tracks, interrupted = _passes(recording, found, settings, progress, stopped)
         if tracks:
-            prior = [np.full(3, np.deg2rad(settings.track.mounting_std_deg)) if s is None else s
-                     for s in found.orientation_std]
+            prior = np.array([
+                np.full(3, np.deg2rad(settings.track.mounting_std_deg)) if s is None else s
+                for s in found.orientation_std])
             evidence = fold_mounting(found, prior, tracks)
             found = _marked(with_evidence(found, evidence), found, date, evidence.n_tracks)
     waiting = tuple(name for name in network.names if name not in levels)

@@ -111,7 +111,8 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
         yield Finding(False, name, f'a steady change was taken for its background '
                       f'{background.n_relearnt - n_known} times', 'a parked vehicle, or something '
                       'that was put beside it; calibrate.relearn_s: 0 would wait for ever')
-    if frozen_since_ns is not None and (last - frozen_since_ns) / NS > STEADY_S:
+    if last is not None and frozen_since_ns is not None \
+            and (last - frozen_since_ns) / NS > STEADY_S:
         yield Finding(False, name, f'its background has not been learnt for '
                       f'{(last - frozen_since_ns) / NS:.0f} s', 'a target stays near, or the field '
                       'has changed for good: call the service calibrate')

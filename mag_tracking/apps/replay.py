@@ -98,7 +98,8 @@ class RunCollector:
 
     def __init__(self, results: ResultFolder) -> None:
         self._results = results
-        self._frame: FieldFrame | None = None
+        # Set by the first frame; every track follows one.
+        self._frame: FieldFrame
         self.logs: dict[int, TrackLog] = {}
         self.smoothed: dict[int, SmoothedLog] = {}
 
@@ -130,8 +131,9 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
         sensors[name] = {'accepted': counts['accepted'], 'rejected': counts['rejected'],
                          'ready': background.ready, 'stuck': background.stuck,
                          'times_relearnt': background.n_relearnt}
-        if background.ready and counts['accepted']:
-            std = np.sqrt(np.diagonal(background.covariance))
+        covariance = background.covariance
+        if background.ready and covariance is not None and counts['accepted']:
+            std = np.sqrt(np.diagonal(covariance))
             sensors[name]['noise_std'] = [None if np.isnan(v) else float(v) for v in std]
             sensors[name]['background'] = [
                 None if np.isnan(v) else float(v) for v in pipeline.calibrate.background(name)]
@@ -172,17 +174,21 @@ def errors_against_truth(log: TrackLog | SmoothedLog, pipeline: Pipeline,
                          truth: Mapping[str, Truth]) -> dict[str, Any] | None:
     """Errors against the truth that fits best, or None."""
     best: tuple[float, dict[str, Any]] | None = None
-    errors: Mapping[str, Any] | None
     for name, arrays in truth.items():
-        if pipeline.settings.track.target == 'magnet':
-            size = 'position_mean'
-            errors = magnet_errors(log, arrays, pipeline.settings.track.magnet.axis)
-        else:
-            size = 'closest'
-            errors = pass_errors(log, arrays, pipeline.network.centre)
-        if errors and (best is None or errors[size] < best[0]):
-            best = errors[size], {'name': name, **errors}
+        found = _errors_of(log, pipeline, arrays)
+        if found is not None and (best is None or found[0] < best[0]):
+            best = found[0], {'name': name, **found[1]}
     return None if best is None else best[1]
+
+
+def _errors_of(log: TrackLog | SmoothedLog, pipeline: Pipeline,
+               truth: Truth) -> tuple[float, dict[str, Any]] | None:
+    """(error [m] by which truths are compared, all errors) against one truth, or None."""
+    if pipeline.settings.track.target == 'magnet':
+        magnet = magnet_errors(log, truth, pipeline.settings.track.magnet.axis)
+        return (magnet['position_mean'], {**magnet}) if magnet else None
+    vehicle = pass_errors(log, truth, pipeline.network.centre)
+    return (vehicle['closest'], {**vehicle}) if vehicle else None
 
 
 def _bound_ratio(log: TrackLog, pipeline: Pipeline, truth: Truth) -> float | None:

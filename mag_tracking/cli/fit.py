@@ -142,9 +142,9 @@ def _print_pass(one: FittedPass) -> None:
                   f'({", ".join(f"{v:.2f}" for v in path[:3])}) m'
                   + (f' with a length of {abs(path[6]):.1f} m' if len(path) > 6 else ''))
     if one.chosen is not None:
-        cost = one.chosen.normalised_cost
-        if cost > POOR:
-            print(f'  a row of dipoles describes it poorly (cost {cost:.1f}): '
+        least = one.chosen.normalised_cost
+        if least > POOR:
+            print(f'  a row of dipoles describes it poorly (cost {least:.1f}): '
                   'speed and position may be off by several of the deviations')
         centre = one.chosen.data.network.positions[one.chosen.data.sensors].mean(axis=0)
         time, std, distance, distance_std = one.chosen.closest_approach(centre)
