@@ -23,7 +23,7 @@ def _info(args: argparse.Namespace) -> int:
             recording.message_counts[message.topic] += 1
     print(f'{recording.path}: {recording.size / 1e6:.2f} MB, '
           f'{sum(recording.message_counts.values())} messages')
-    if recording.start_ns is not None:
+    if recording.start_ns is not None and recording.end_ns is not None:
         print(f'  {(recording.end_ns - recording.start_ns) / 1e9:.2f} s')
     for topic in sorted(recording.types):
         print(f'  {topic}  {recording.types[topic]}  {recording.message_counts[topic]}')
