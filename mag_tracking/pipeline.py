@@ -1,9 +1,12 @@
 """The settings tree and the one chain of stages, for nodes and offline alike."""
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any, TypeAlias
 
 from mag_tracking.errors import SettingsError
-from mag_tracking.records import FieldFrame
+from mag_tracking.network import SensorNetwork
+from mag_tracking.records import Detection, FieldFrame, MagSample, SmoothedPose, Track
 from mag_tracking.settings import replace
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
@@ -28,7 +31,7 @@ class Settings:
     survey: SurveySettings = field(default_factory=SurveySettings)
 
 
-TARGET_DEFAULTS = {
+TARGET_DEFAULTS: dict[str, dict[str, Any]] = {
     'vehicle': {},
     'magnet': {
         'calibrate.max_field': 0.1,
@@ -54,7 +57,7 @@ TARGET_DEFAULTS = {
 """What differs from the defaults for each target."""
 
 
-def settings_for(target, changes=None):
+def settings_for(target: str, changes: Mapping[str, Any] | None = None) -> Settings:
     """Settings of a target with `changes` ({dotted name: value}) on top; raises SettingsError.
 
     A `track.target` among the changes has to agree.
@@ -68,10 +71,14 @@ def settings_for(target, changes=None):
     return replace(replace(Settings(), TARGET_DEFAULTS[target]), changes)
 
 
+Output: TypeAlias = FieldFrame | Detection | Track | SmoothedPose
+"""What leaves the chain."""
+
+
 class Pipeline:
     """Raw samples in, frames, detections and tracks out; no ROS, no clock."""
 
-    def __init__(self, network, settings):
+    def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         self.network = network
         self.settings = settings
         self.calibrate = Calibrate(network, settings.calibrate)
@@ -79,41 +86,41 @@ class Pipeline:
         self.detect = Detect(network, settings.detect)
         self.track = TrackManager(network, settings.track)
 
-    def feed(self, sample):
+    def feed(self, sample: MagSample) -> list[Output]:
         """A raw `MagSample` gives the `FieldFrame | Detection | Track` records that follow."""
         return self._after_calibrate(self.calibrate.feed(sample))
 
-    def flush(self):
+    def flush(self) -> list[Output]:
         """The input has ended: what was still held back."""
         return [*self._after_calibrate(self.calibrate.flush()),
                 *self._after_align(self.align.flush()),
                 *self._after_detect(self.detect.flush()), *self.track.flush()]
 
-    def _after_calibrate(self, samples):
+    def _after_calibrate(self, samples: Iterable[MagSample]) -> list[Output]:
         """What follows from calibrated samples."""
         return self._after_align([f for s in samples for f in self.align.feed(s)])
 
-    def _after_align(self, frames):
+    def _after_align(self, frames: Iterable[FieldFrame]) -> list[Output]:
         """What follows from frames."""
         return self._after_detect([r for f in frames for r in self.detect.feed(f)])
 
-    def _after_detect(self, records):
+    def _after_detect(self, records: Iterable[FieldFrame | Detection]) -> list[Output]:
         """What follows from detections and frames with a verdict; they come first themselves."""
-        out = []
+        out: list[Output] = []
         for record in records:
             out.append(record)
             if isinstance(record, FieldFrame):
                 out += self.track.feed(record)
         return out
 
-    def counts(self):
+    def counts(self) -> dict[str, dict[str, int]]:
         """{stage: {what: number}}."""
         return {name: dict(sorted(getattr(self, name).counts.items()))
                 for name in ('calibrate', 'align', 'detect', 'track')}
 
-    def rejections(self):
+    def rejections(self) -> dict[str, int]:
         """{cause: number} over all stages."""
-        total = {}
+        total: dict[str, int] = {}
         for name in ('calibrate', 'align'):
             for cause, n in rejected(getattr(self, name).counts).items():
                 total[cause] = total.get(cause, 0) + n

@@ -1,11 +1,19 @@
 """Geometry of a board of sensors from a table of poses: what `mag-tracking board-geometry` does."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
+from typing import Any
 
 import numpy as np
 
 from mag_tracking.analysis.network_blind import calibrate_geometry_blind
-from mag_tracking.analysis.network_geometry import NetworkGeometry, calibrate_geometry
+from mag_tracking.analysis.network_geometry import (
+    GeometrySettings,
+    NetworkGeometry,
+    calibrate_geometry,
+)
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.errors import NetworkError, RecordingError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.pose_table import (
@@ -33,7 +41,7 @@ class GeometrySurvey:
     network: SensorNetwork
     """To be written; not to be used where the geometry has not converged."""
     geometry: NetworkGeometry
-    rows: np.ndarray
+    rows: IntArray
     """(K,) rows of the table, of the poses that were used."""
     suspect_rows: tuple[int, ...]
     n_poses: int
@@ -42,13 +50,13 @@ class GeometrySurvey:
     """(sensor, axes) that never reported, of sensors that did."""
 
     @property
-    def turned(self):
+    def turned(self) -> FloatArray:
         """(n,) [rad] from the stated orientations."""
-        trace = np.einsum('nij,nij->n', self.stated.R_ws, self.network.R_ws)
+        trace: FloatArray = np.einsum('nij,nij->n', self.stated.R_ws, self.network.R_ws)
         return np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
 
 
-def board_of(path):
+def board_of(path: str | PathLike[str]) -> SensorNetwork:
     """A network of untried sensors `mag_0`, `mag_1`, ... at the positions of a CSV, along x, y, z.
 
     Raises RecordingError and NetworkError.
@@ -62,7 +70,10 @@ def board_of(path):
         raise NetworkError(f'{path}: {error}') from error
 
 
-def survey_geometry(table, network, moment, settings, date, box=None, noise_std=None):
+def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: float,
+                    settings: GeometrySettings, date: str,
+                    box: tuple[Sequence[float], Sequence[float]] | None = None,
+                    noise_std: float | None = None) -> GeometrySurvey:
     """Geometry of a network from a table of a magnet's poses.
 
     Parameters
@@ -88,7 +99,10 @@ def survey_geometry(table, network, moment, settings, date, box=None, noise_std=
 
     Raises RecordingError for a table that cannot be read or used.
     """
-    readings, *poses = read_pose_table(table) if box is None else (read_readings(table),)
+    if box is None:
+        readings, positions, axes = read_pose_table(table)
+    else:
+        readings = read_readings(table)
     if readings.shape[1] != len(network):
         raise RecordingError(f'{table} has readings of {readings.shape[1]} sensors, but the '
                              f'network has {len(network)}')
@@ -100,10 +114,11 @@ def survey_geometry(table, network, moment, settings, date, box=None, noise_std=
         ~np.isnan(field).all(axis=(1, 2)))
     try:
         if box is not None:
-            found = calibrate_geometry_blind(stated, field, moment, *box, settings)
+            low, high = (np.asarray(corner, dtype=float) for corner in box)
+            found = calibrate_geometry_blind(stated, field, moment, low, high, settings)
         else:
-            found = calibrate_geometry(stated, field[given], *(v[given] for v in poses), moment,
-                                       settings)
+            found = calibrate_geometry(stated, field[given], positions[given], axes[given],
+                                       moment, settings)
     except ValueError as error:
         raise RecordingError(f'{table}: {error}') from error
     by = f'magnet, {len(found.rows)} {"unknown" if box is not None else "tracked"} poses'
@@ -113,7 +128,7 @@ def survey_geometry(table, network, moment, settings, date, box=None, noise_std=
         suspects, len(field), tuple(_silent_axes(stated, field)))
 
 
-def corrected(network, readings):
+def corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
     """Readings (K, n, 3) [T] as the stage Calibrate has them before it removes the background."""
     out = np.array(readings, dtype=float)
     for j, (offset, C) in enumerate(zip(network.offset, network.correction, strict=True)):
@@ -127,7 +142,8 @@ def corrected(network, readings):
     return out
 
 
-def calibrated_network(network, geometry, date, by):
+def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: str,
+                       by: str) -> SensorNetwork:
     """The network to be written: positions, orientations, gains and biases as found.
 
     A reading is gain * field + bias; the stage Calibrate corrects first and takes the background
@@ -152,19 +168,20 @@ def calibrated_network(network, geometry, date, by):
         before = network.calibrated[j]
         columns['calibrated'][j] = network.marked(
             j, date, by, np.nan if before is None else before.clock_offset_std)
-    return replace(network, positions=found.positions, R_ws=found.R_ws,
-                   **{name: tuple(column) for name, column in columns.items()})
+    changes: dict[str, Any] = {name: tuple(column) for name, column in columns.items()}
+    return replace(network, positions=found.positions, R_ws=found.R_ws, **changes)
 
 
-def _world_std(geometry, j):
+def _world_std(geometry: NetworkGeometry, j: int) -> FloatArray:
     """(3,) [rad] how far sensor `j` may be turned about the world's axes."""
     # Its rotation is the third block of its ten numbers: bias, gain, rotation, position.
     turn = slice(10 * j + 4, 10 * j + 7)
     R = geometry.network.R_ws[j]
-    return np.sqrt(np.diagonal(R @ geometry.covariance[turn, turn] @ R.T))
+    std: FloatArray = np.sqrt(np.diagonal(R @ geometry.covariance[turn, turn] @ R.T))
+    return std
 
 
-def _with_noise(network, noise_std):
+def _with_noise(network: SensorNetwork, noise_std: float | None) -> SensorNetwork:
     """The network, `noise_std` [T] where it says nothing; None changes nothing."""
     if noise_std is None:
         return network
@@ -172,9 +189,9 @@ def _with_noise(network, noise_std):
         np.full(3, float(noise_std)) if std is None else std for std in network.noise_std))
 
 
-def _silent_axes(network, field):
+def _silent_axes(network: SensorNetwork, field: FloatArray) -> Iterator[tuple[str, str]]:
     """(sensor, axes) of sensors of which some axes, but not all, never reported."""
-    silent = np.isnan(field).all(axis=0)
+    silent: BoolArray = np.all(np.isnan(field), axis=0)
     for name, axes in zip(network.names, silent, strict=True):
         if axes.any() and not axes.all():
             yield name, ' and '.join(a for a, s in zip('xyz', axes, strict=True) if s)

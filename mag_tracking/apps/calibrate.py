@@ -1,14 +1,17 @@
 """Calibration of a network from a recording: what `mag-tracking calibrate` does."""
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mag_tracking.analysis.pass_mounting import MountingEvidence, fold_mounting, with_evidence
+from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Pipeline
+from mag_tracking.pipeline import Pipeline, Settings
 from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
+from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import AccelerationSample, Track
 from mag_tracking.stages.calibrate.stage import Calibrate
@@ -29,15 +32,17 @@ class Calibration:
     """From accelerometers, compasses and knocks."""
     evidence: MountingEvidence | None
     """From the passes; None where they were not asked, or there was none."""
-    levels: dict
+    levels: dict[str, FloatArray]
     """{sensor: (3,) [T], sensor frame} the field without a target."""
-    rejected: dict
+    rejected: dict[str, int]
     """{cause: number}."""
     without_background: tuple[str, ...]
     interrupted: bool
 
 
-def calibrate(recording, network, settings, date, passes=True, progress=None, stopped=None):
+def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, date: str,
+              passes: bool = True, progress: Callable[[int], object] | None = None,
+              stopped: Callable[[], bool] | None = None) -> Calibration:
     """Orientations, clock offsets and noise of a network, from one recording of it.
 
     The recording begins without a target, and with knocks where clocks are to be compared.
@@ -75,8 +80,9 @@ def calibrate(recording, network, settings, date, passes=True, progress=None, st
             and not survey.disagreements:
         tracks, interrupted = _passes(recording, found, settings, progress, stopped)
         if tracks:
-            prior = [np.full(3, np.deg2rad(settings.track.mounting_std_deg)) if s is None else s
-                     for s in found.orientation_std]
+            prior = np.array([
+                np.full(3, np.deg2rad(settings.track.mounting_std_deg)) if s is None else s
+                for s in found.orientation_std])
             evidence = fold_mounting(found, prior, tracks)
             found = _marked(with_evidence(found, evidence), found, date, evidence.n_tracks)
     waiting = tuple(name for name in network.names if name not in levels)
@@ -84,13 +90,16 @@ def calibrate(recording, network, settings, date, passes=True, progress=None, st
                        interrupted)
 
 
-def _surveyed(recording, network, settings, date, progress, stopped):
+def _surveyed(recording: Recording, network: SensorNetwork, settings: Settings, date: str,
+              progress: Callable[[int], object] | None, stopped: Callable[[], bool] | None,
+              ) -> tuple[dict[str, FloatArray], NetworkSurvey, Calibrate, bool]:
     """First reading: (levels, NetworkSurvey, Calibrate, interrupted)."""
     reader = SampleReader(recording, network)
     # What the file says of backgrounds and noise is not what the sensors say now.
     untold = replace(network, background=(), noise_std=())
     stage, survey = Calibrate(untold, settings.calibrate), Survey(network, settings.survey)
-    levels, interrupted = {}, False
+    levels: dict[str, FloatArray] = {}
+    interrupted = False
     try:
         for sample in until_stopped(reader.samples_and_accelerations, progress, stopped):
             if isinstance(sample, AccelerationSample):
@@ -107,12 +116,15 @@ def _surveyed(recording, network, settings, date, progress, stopped):
     return levels, survey.solve(levels, date), stage, interrupted
 
 
-def _passes(recording, network, settings, progress, stopped):
+def _passes(recording: Recording, network: SensorNetwork, settings: Settings,
+            progress: Callable[[int], object] | None, stopped: Callable[[], bool] | None,
+            ) -> tuple[list[Track], bool]:
     """Second reading: (the last certain pose of each track, interrupted)."""
     reader, pipeline = SampleReader(recording, network), Pipeline(network, settings)
-    poses, interrupted = {}, False
+    poses: dict[int, tuple[int, Track]] = {}
+    interrupted = False
 
-    def take(records):
+    def take(records: Iterable[object]) -> None:
         for record in records:
             if isinstance(record, Track) and not record.ended and not record.ambiguous:
                 n = poses[record.id][0] + 1 if record.id in poses else 1
@@ -127,7 +139,8 @@ def _passes(recording, network, settings, progress, stopped):
     return [track for n, track in poses.values() if n >= LEAST_POSES], interrupted
 
 
-def _marked(network, surveyed, date, n_tracks):
+def _marked(network: SensorNetwork, surveyed: SensorNetwork, date: str,
+            n_tracks: int) -> SensorNetwork:
     """The `network` whose calibration says that passes are in it; before them it was `surveyed`."""
     passes = f'{n_tracks} pass{"es" if n_tracks > 1 else ""}'
     return replace(network, calibrated=tuple(

@@ -1,12 +1,20 @@
 """What is wrong with a network and its readings: what `mag-tracking doctor` finds."""
 
+from collections.abc import Callable, Iterator, Mapping
+
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.agreement import consensus, disagreements
+from mag_tracking.network import SensorNetwork
+from mag_tracking.pipeline import Settings
+from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.records import MagSample
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.sensor_health import Finding, SensorHealth
 from mag_tracking.stages.stage import rejected
+from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.units import NS
 
 STEADY_S = 30.0
@@ -30,7 +38,7 @@ LEVEL_STEP = 1e-8
 """[T] A fiftieth of what iron near a sensor adds."""
 
 
-def level_of(calibrate, name, health):
+def level_of(calibrate: Calibrate, name: str, health: SensorHealth) -> FloatArray:
     """(3,) [T] field of a sensor without a target, as well as it is known.
 
     Its background where that was learnt from readings, else the median of what it read last.
@@ -41,7 +49,8 @@ def level_of(calibrate, name, health):
     return health.field
 
 
-def network_findings(network, survey, calibrate, sensors):
+def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: Calibrate,
+                     sensors: Mapping[str, SensorHealth]) -> list[Finding]:
     """What is only seen by comparing sensors: list of `Finding`.
 
     Parameters
@@ -71,7 +80,8 @@ def network_findings(network, survey, calibrate, sensors):
                                survey.compass_bias_std)]
 
 
-def _clock_findings(network, sensors):
+def _clock_findings(network: SensorNetwork,
+                    sensors: Mapping[str, SensorHealth]) -> Iterator[Finding]:
     """Sensors whose clock is far from that of the others."""
     delays = {name: sensors[name].delay_s[0] for name in network.names}
     delays = {name: d for name, d in delays.items() if not np.isnan(d)}
@@ -86,7 +96,8 @@ def _clock_findings(network, sensors):
                           'within survey.longest_clock_offset_s')
 
 
-def background_findings(name, calibrate, frozen_since_ns, n_known=0):
+def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | None,
+                        n_known: int = 0) -> Iterator[Finding]:
     """What is wrong with the background of one sensor: iterator of `Finding`.
 
     `frozen_since_ns` is the stamp since which it has been frozen, or None; `n_known` of the
@@ -100,7 +111,8 @@ def background_findings(name, calibrate, frozen_since_ns, n_known=0):
         yield Finding(False, name, f'a steady change was taken for its background '
                       f'{background.n_relearnt - n_known} times', 'a parked vehicle, or something '
                       'that was put beside it; calibrate.relearn_s: 0 would wait for ever')
-    if frozen_since_ns is not None and (last - frozen_since_ns) / NS > STEADY_S:
+    if last is not None and frozen_since_ns is not None \
+            and (last - frozen_since_ns) / NS > STEADY_S:
         yield Finding(False, name, f'its background has not been learnt for '
                       f'{(last - frozen_since_ns) / NS:.0f} s', 'a target stays near, or the field '
                       'has changed for good: call the service calibrate')
@@ -109,15 +121,15 @@ def background_findings(name, calibrate, frozen_since_ns, n_known=0):
 class Doctor:
     """Looks at the readings of a network as they come, and says what is wrong."""
 
-    def __init__(self, network, settings):
+    def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         self.network, self._settings = network, settings
         self.sensors = {name: SensorHealth() for name in network.names}
         self.calibrate = Calibrate(network, settings.calibrate)
         self._clock_ns = {name: round(s * NS) for name, s in
                           zip(network.names, network.clock_offset, strict=True)}
-        self._frozen_ns = {}
+        self._frozen_ns: dict[str, int] = {}
 
-    def feed(self, sample, received_ns=None):
+    def feed(self, sample: MagSample, received_ns: int | None = None) -> None:
         """Look at a raw `MagSample` that was received at `received_ns`."""
         self.sensors[sample.sensor].add(sample.stamp_ns - self._clock_ns[sample.sensor],
                                         sample.field, received_ns)
@@ -127,9 +139,9 @@ class Doctor:
         else:
             self._frozen_ns.pop(sample.sensor, None)
 
-    def findings(self):
+    def findings(self) -> list[Finding]:
         """List of `Finding`, the serious ones first."""
-        found = []
+        found: list[Finding] = []
         for j, (name, health) in enumerate(self.sensors.items()):
             found += health.findings(name, self.network.noise_std[j],
                                      self._settings.calibrate.max_field)
@@ -142,7 +154,9 @@ class Doctor:
         return sorted(found, key=lambda f: not f.serious)
 
 
-def examine(recording, network, settings, progress=None, stopped=None):
+def examine(recording: Recording, network: SensorNetwork, settings: Settings,
+            progress: Callable[[int], object] | None = None,
+            stopped: Callable[[], bool] | None = None) -> tuple[Doctor, list[Finding]]:
     """A `Doctor` that has seen a whole recording, and what the reading itself lost.
 
     Parameters

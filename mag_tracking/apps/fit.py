@@ -1,6 +1,7 @@
 """The passes of a recording, cut out and fitted, offline."""
 
 from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,10 +10,14 @@ from mag_tracking.analysis.model_order import choose_order
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.saturation import cut_off
 from mag_tracking.inference.detection_theory import energy_threshold
+from mag_tracking.network import SensorNetwork
+from mag_tracking.pipeline import Settings
+from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.records import Detection
+from mag_tracking.records import Detection, FieldFrame, MagSample
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.stage import Detect
@@ -42,21 +47,22 @@ class FittedPass:
     """What was left out of the measurements, and why."""
 
     @property
-    def chosen(self):
+    def chosen(self) -> PassFit | None:
         """The fit of the order that the measurements are worth, or None."""
         return choose_order(self.fits)
 
     @property
-    def disagreement(self):
+    def disagreement(self) -> tuple[float, float]:
         """Largest difference [m], [m/s] to the chosen fit of those with nearly its cost.
 
         That is what the model leaves open. NaN where there is no other fit, and where the chosen
         one describes the measurements to the noise: then richer ones only fit noise.
         """
-        best, others = self.chosen, []
-        if best is not None and best.cost > energy_threshold(1e-3, best.degrees_of_freedom):
-            others = [f for f in self.fits if f is not best and not f.reason
-                      and f.normalised_cost <= NEARLY * best.normalised_cost]
+        best = self.chosen
+        if best is None or not best.cost > energy_threshold(1e-3, best.degrees_of_freedom):
+            return np.nan, np.nan
+        others = [f for f in self.fits if f is not best and not f.reason
+                  and f.normalised_cost <= NEARLY * best.normalised_cost]
         if not others:
             return np.nan, np.nan
         return (max(float(np.linalg.norm(f.position - best.position)) for f in others),
@@ -66,45 +72,46 @@ class FittedPass:
 class PassCollector:
     """Samples to passes: what the network measured from before a detection until it ended."""
 
-    def __init__(self, network, settings):
+    def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         self._network = network
         self._stages = (Calibrate(network, settings.calibrate), Align(network, settings.align),
                         Detect(network, settings.detect))
-        self._kept = deque()
-        self._onset_ns = None
-        self._last_ns = None
+        self._kept: deque[tuple[MagSample, FloatArray]] = deque()
+        self._onset_ns: int | None = None
+        self._last_ns: int | None = None
 
     @property
-    def rejected(self):
+    def rejected(self) -> dict[str, int]:
         """{cause: number} of samples that were not used."""
-        total = {}
+        total: dict[str, int] = {}
         for stage in self._stages[:2]:
             for cause, n in rejected(stage.counts).items():
                 total[cause] = total.get(cause, 0) + n
         return total
 
-    def waiting(self):
+    def waiting(self) -> list[str]:
         """Names of sensors whose background was never learnt."""
         return [n for n, b in self._stages[0].backgrounds().items() if not b.ready]
 
-    def feed(self, sample):
+    def feed(self, sample: MagSample) -> list[tuple[PassData, tuple[str, ...]]]:
         """A raw `MagSample` gives the passes that it completes: [(PassData, notes)]."""
         calibrate, align, _ = self._stages
-        out = []
+        out: list[tuple[PassData, tuple[str, ...]]] = []
         for calibrated in calibrate.feed(sample):
             self._kept.append((calibrated, sample.field))
             for frame in align.feed(calibrated):
                 out += self._judge(frame)
         return out
 
-    def flush(self):
+    def flush(self) -> list[tuple[PassData, tuple[str, ...]]]:
         """The recording has ended: the pass that was still going on."""
         out = [p for frame in self._stages[1].flush() for p in self._judge(frame)]
-        if self._onset_ns is not None:
-            out.append(self._cut(self._last_ns, 'the recording ends while it is still seen'))
+        if self._onset_ns is not None and self._last_ns is not None:
+            out.append(self._cut(self._onset_ns, self._last_ns,
+                                 'the recording ends while it is still seen'))
         return out
 
-    def _judge(self, frame):
+    def _judge(self, frame: FieldFrame) -> list[tuple[PassData, tuple[str, ...]]]:
         """Take a frame; the pass that has ended with it."""
         out = []
         for record in self._stages[2].feed(frame):
@@ -113,19 +120,21 @@ class PassCollector:
             if record.onset:
                 self._onset_ns = record.stamp_ns
             elif self._onset_ns is not None:
-                out.append(self._cut(record.stamp_ns))
+                out.append(self._cut(self._onset_ns, record.stamp_ns))
         if self._onset_ns is not None and frame.stamp_ns - self._onset_ns > LONGEST_S * NS:
-            out.append(self._cut(frame.stamp_ns, f'it is seen for more than {LONGEST_S:.0f} s: '
-                                 'what comes after, until it is gone, is left out'))
+            out.append(self._cut(self._onset_ns, frame.stamp_ns, 'it is seen for more than '
+                                 f'{LONGEST_S:.0f} s: what comes after, until it is gone, is '
+                                 'left out'))
         self._last_ns = frame.stamp_ns
         begin = (frame.stamp_ns if self._onset_ns is None else self._onset_ns) - PAD_S * NS
         while self._kept and self._kept[0][0].stamp_ns < begin:
             self._kept.popleft()
         return out
 
-    def _cut(self, end_ns, *notes):
-        """(PassData, notes) of what was kept up to a time; the pass is over."""
-        begin = self._onset_ns - int(PAD_S * NS)
+    def _cut(self, onset_ns: int, end_ns: int,
+             *remarks: str) -> tuple[PassData, tuple[str, ...]]:
+        """(PassData, notes) of what was kept from an onset to a time; the pass is over."""
+        begin = onset_ns - int(PAD_S * NS)
         rows = sorted(((self._network.index(s.sensor), s.stamp_ns, s, raw)
                        for s, raw in self._kept if begin <= s.stamp_ns <= end_ns),
                       key=lambda row: row[:2])
@@ -133,7 +142,7 @@ class PassCollector:
         field = np.array([row[2].field for row in rows]).reshape(-1, 3)
         raw = np.array([row[3] for row in rows]).reshape(-1, 3)
         covariance = np.full((len(self._network), 3, 3), np.nan)
-        notes = list(notes)
+        notes = list(remarks)
         for j in np.unique(sensor):
             mine = np.flatnonzero(sensor == j)
             covariance[j] = rows[mine[0]][2].covariance
@@ -165,7 +174,8 @@ class RecordingFit:
     Raises RecordingError where the recording does not fit the network.
     """
 
-    def __init__(self, recording, network, settings, orders, cpa_range=None):
+    def __init__(self, recording: Recording, network: SensorNetwork, settings: Settings,
+                 orders: Sequence[int], cpa_range: tuple[float, float] | None = None) -> None:
         self._name = recording.path.resolve().stem
         self._recording = recording
         self._reader = SampleReader(recording, network)
@@ -173,7 +183,8 @@ class RecordingFit:
         self._orders, self._cpa_range = tuple(orders), cpa_range
         self._n = 0
 
-    def passes(self, progress=None, stopped=None):
+    def passes(self, progress: Callable[[int], object] | None = None,
+               stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
         """Iterate over the `FittedPass`es, each as soon as it is done.
 
         `progress` and `stopped` are as for `offline.replay`.
@@ -184,7 +195,8 @@ class RecordingFit:
             yield from self._fitted(self._collector.feed(sample), stopped)
         yield from self._fitted(self._collector.flush(), stopped)
 
-    def _fitted(self, passes, stopped):
+    def _fitted(self, passes: Iterable[tuple[PassData, tuple[str, ...]]],
+                stopped: Callable[[], bool] | None) -> Iterator[FittedPass]:
         """The fits of what the collector gave; a pass that is stopped in the middle is left out."""
         for data, notes in passes:
             fits = []
@@ -195,7 +207,7 @@ class RecordingFit:
             self._n += 1
             yield FittedPass(self._name, self._n, tuple(fits), notes)
 
-    def warnings(self):
+    def warnings(self) -> list[str]:
         """What was lost or rejected, and which sensors were never heard; a list of lines."""
         lines = [f'nothing on {topic}' for topic in self._reader.missing_topics()]
         lines += [f'no background was learnt for {name}: the recording needs a target-free '

@@ -1,6 +1,8 @@
 """What an installer wants to know before the first hole is drilled."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -14,14 +16,19 @@ from mag_tracking.analysis.placement import (
     pass_fields,
     pass_information,
 )
-from mag_tracking.inference.crlb import observability, path_bound, snr_range
+from mag_tracking.arrays import FloatArray
+from mag_tracking.inference.crlb import Observability, observability, path_bound, snr_range
 from mag_tracking.inference.detection_theory import energy_threshold, missed_probability
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.motion import constant_velocity, integrator_noise
+from mag_tracking.pipeline import Settings
 from mag_tracking.stages.track.settings import acceleration_density
 
 MOST_FRAMES = 1000
 """Of a pass, when it is asked whether it is missed: slower ones are not missed more."""
+
+Area: TypeAlias = tuple[float, float, float, float]
+"""(x0, y0, x1, y1) [m]."""
 
 GOOD_PD = 0.9
 """A target is counted as seen where a frame detects it with this probability."""
@@ -34,15 +41,15 @@ class Lane:
     name: str
     heading: float
     """[rad]."""
-    along: np.ndarray
+    along: FloatArray
     """(n,) [m] from the point nearest to the middle of the sensors."""
-    points: np.ndarray
+    points: FloatArray
     """(n, 2) [m]."""
-    pass_std: np.ndarray
+    pass_std: FloatArray
     """(n, 3) position, velocity, moment, by the whole pass; median over the moment's directions."""
-    filter_std: np.ndarray
+    filter_std: FloatArray
     """(n,) [m] position, by what a filter has seen so far."""
-    detection: np.ndarray
+    detection: FloatArray
     """(n,) probability that a frame detects it, mean over the moment's directions."""
 
 
@@ -53,29 +60,30 @@ class Plan:
     network: SensorNetwork
     target: PlannedTarget
     sampling: Sampling
-    x: np.ndarray
-    y: np.ndarray
-    position_std: np.ndarray
+    x: FloatArray
+    y: FloatArray
+    position_std: FloatArray
     """[m] bound by a whole pass through the point, median over headings and directions."""
-    detection: np.ndarray
+    detection: FloatArray
     """Probability that one frame detects the target at the point."""
     lanes: tuple[Lane, ...]
-    with_one_more: np.ndarray
+    with_one_more: FloatArray
     """[m] median bound over the lanes, near the network, with one more sensor there; NaN where none
     may stand."""
     without: float
     """[m] the same as it is."""
     best_place: tuple[float, float]
-    observability: object
+    observability: Observability
     """Of the first lane's closest point, for one direction of the moment, without priors."""
-    blocks: dict
+    blocks: dict[str, FloatArray]
     """{'with prior', 'without prior': (3,)} bounds at the first lane's closest point."""
-    missed: np.ndarray
+    missed: FloatArray
     """(n, 2) [m] lateral distance of a pass on the first lane's heading, probability that it is
     not detected at all."""
 
 
-def detection_range(target, noise_std, n_axes, false_alarm):
+def detection_range(target: PlannedTarget, noise_std: float, n_axes: int,
+                    false_alarm: float) -> float:
     """[m] where a frame of one sensor detects half of such targets, about; T10 eq. (5.20).
 
     Over all directions of the moment the energy is twice that of a dipole abeam.
@@ -84,8 +92,10 @@ def detection_range(target, noise_std, n_axes, false_alarm):
                            energy_threshold(false_alarm, n_axes)))
 
 
-def plan(network, target, sampling, lanes, area, settings, clearance=0.0, n_grid=41,
-         progress=None):
+def plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
+         lanes: Sequence[tuple[str, float, float]], area: Area, settings: Settings,
+         clearance: float = 0.0, n_grid: int = 41,
+         progress: Callable[[int], object] | None = None) -> Plan:
     """Answer all of it.
 
     Parameters
@@ -146,7 +156,8 @@ def plan(network, target, sampling, lanes, area, settings, clearance=0.0, n_grid
         known, blocks, _missed(network, target, sampling, done[0], area, settings))
 
 
-def _at_closest(network, target, sampling, lane, reach):
+def _at_closest(network: SensorNetwork, target: PlannedTarget, sampling: Sampling, lane: Lane,
+                reach: float) -> tuple[Observability, dict[str, FloatArray]]:
     """`Plan.observability` and `Plan.blocks`; `reach` [m] is a typical distance."""
     closest = lane.points[np.argmin(np.abs(lane.along))][None]
     J = pass_information(network.positions, network.R_sw, target, sampling, closest,
@@ -157,27 +168,29 @@ def _at_closest(network, target, sampling, lane, reach):
              'without prior': np.median(bounds_of(J, np.zeros((9, 9))), axis=0)})
 
 
-def _distance(lane, places):
+def _distance(lane: Lane, places: FloatArray) -> FloatArray:
     """(n,) [m] of places (n, 2) from the line of a lane."""
     u = lane.points[-1] - lane.points[0]
     r = places - lane.points[0]
-    return np.abs(u[0] * r[:, 1] - u[1] * r[:, 0]) / np.hypot(*u)
+    distance: FloatArray = np.abs(u[0] * r[:, 1] - u[1] * r[:, 0]) / np.hypot(*u)
+    return distance
 
 
-def n_parts(lanes):
+def n_parts(lanes: Sequence[tuple[str, float, float]]) -> int:
     """How often `plan` calls its `progress`."""
     return len({heading % np.pi for _, heading, _ in lanes}) + 3
 
 
-def _grid(area, n):
+def _grid(area: Area, n: int) -> tuple[FloatArray, FloatArray]:
     """Coordinates of a map with square cells."""
     x0, y0, x1, y1 = area
     cell = max(x1 - x0, y1 - y0) / (n - 1)
-    return (np.linspace(x0, x1, max(2, int(round((x1 - x0) / cell)) + 1)),
-            np.linspace(y0, y1, max(2, int(round((y1 - y0) / cell)) + 1)))
+    return (np.linspace(x0, x1, max(2, int(round((x1 - x0) / cell)) + 1), dtype=float),
+            np.linspace(y0, y1, max(2, int(round((y1 - y0) / cell)) + 1), dtype=float))
 
 
-def _lane(network, target, sampling, name, heading, offset, area, settings):
+def _lane(network: SensorNetwork, target: PlannedTarget, sampling: Sampling, name: str,
+          heading: float, offset: float, area: Area, settings: Settings) -> Lane:
     """What is known along one lane, every frame."""
     u = np.array([np.cos(heading), np.sin(heading)])
     half = 0.5 * np.hypot(area[2] - area[0], area[3] - area[1])
@@ -195,7 +208,8 @@ def _lane(network, target, sampling, name, heading, offset, area, settings):
                 seen.mean(axis=1))
 
 
-def _filter_bound(network, target, sampling, points, heading, settings):
+def _filter_bound(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
+                  points: FloatArray, heading: float, settings: Settings) -> FloatArray:
     """(n,) [m] the path bound of a filter that follows a lane from its beginning.
 
     Its motion is the tracker's, the backgrounds are states as well; median over directions.
@@ -226,10 +240,13 @@ def _filter_bound(network, target, sampling, points, heading, settings):
         P = path_bound(F, Q, np.concatenate([H[:, d, 0], backgrounds], axis=-1),
                        variance[..., None, None] * np.eye(3), P0)
         std[:, d] = np.sqrt(P[:, 0, 0] + P[:, 1, 1])
-    return np.median(std, axis=1)
+    bound: FloatArray = np.median(std, axis=1)
+    return bound
 
 
-def _one_more(network, target, sampling, near, places):
+def _one_more(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
+              near: Sequence[tuple[float, FloatArray]],
+              places: FloatArray) -> tuple[float, FloatArray]:
     """(median bound as it is, (n_places,) with one more sensor at each of the places)."""
     height = network.positions[:, 2].mean()
     candidates = np.column_stack([places, np.full(len(places), height)])
@@ -250,7 +267,8 @@ def _one_more(network, target, sampling, near, places):
     return float(np.median(np.concatenate(base))), np.median(np.concatenate(more), axis=0)
 
 
-def _missed(network, target, sampling, lane, area, settings):
+def _missed(network: SensorNetwork, target: PlannedTarget, sampling: Sampling, lane: Lane,
+            area: Area, settings: Settings) -> FloatArray:
     """`Plan.missed`: no so many frames in a row detect the target as an onset needs."""
     half = 0.5 * max(area[2] - area[0], area[3] - area[1])
     offsets = np.linspace(0.0, 2.0 * half, 25)

@@ -1,24 +1,44 @@
 """Which topics `mag-tracking record` records, and what it reports."""
 
-from typing import NamedTuple
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple, Protocol
 
 from mag_tracking.messages.types import RAW_READINGS
 
 RESULTS_OF = ('/calibration_node/', '/detection_node/', '/tracker_node/')
 
 
+class Recorded(Protocol):
+    """What is asked of a recorder."""
+
+    counts: Counter[str]
+    """Messages written, per topic."""
+    dropped: Counter[str]
+    """Messages dropped while the disk was full, per topic."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the recording."""
+
+    @property
+    def size(self) -> int:
+        """Bytes written."""
+
+
 class Selection(NamedTuple):
     """Which topics to record."""
 
-    fields: tuple = ()
+    fields: tuple[str, ...] = ()
     """Magnetic fields of the network."""
-    imus: tuple = ()
+    imus: tuple[str, ...] = ()
     """Where its sensors may publish sensor_msgs/Imu."""
-    topics: tuple = ()
+    topics: tuple[str, ...] = ()
     results: bool = False
     everything: bool = False
 
-    def wants(self, topic):
+    def wants(self, topic: str) -> bool:
         """Whether to record a topic."""
         if topic == RAW_READINGS or topic in self.fields + self.imus + self.topics:
             return True
@@ -29,14 +49,15 @@ class Selection(NamedTuple):
                                  or topic.removesuffix('_calibrated') in self.fields)
 
 
-def progress_line(recorder, seconds):
+def progress_line(recorder: Recorded, seconds: float) -> str:
     """What there is so far, as a line."""
     dropped = recorder.dropped.total()
     return (f'{seconds:.0f} s: {recorder.counts.total()} messages, {recorder.size / 1e6:.1f} MB'
             + (f', dropped: {dropped}' if dropped else ''))
 
 
-def summary(recorder, selection, lost, refused):
+def summary(recorder: Recorded, selection: Selection, lost: Mapping[str, int],
+            refused: Mapping[str, str]) -> Iterator[str]:
     """Lines that say what is in a recording, and what is not."""
     yield f'{recorder.folder}: {recorder.counts.total()} messages, {recorder.size / 1e6:.2f} MB'
     for topic, n in sorted((+recorder.counts).items()):

@@ -1,16 +1,23 @@
 """One recording through the chain, offline: tables, summary, recording and figures."""
 
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from mag_tracking.analysis.consistency import error_over_bound
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import OutputError
-from mag_tracking.pipeline import Pipeline
+from mag_tracking.network import SensorNetwork
+from mag_tracking.pipeline import Pipeline, Settings
 from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
+from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.result_folder import ResultFolder
 from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.records import Detection, FieldFrame, SmoothedPose
+from mag_tracking.records import Detection, FieldFrame, SmoothedPose, Track
 from mag_tracking.report.metrics import (
     MAGNET_SKIP,
     interpolate_truth,
@@ -21,6 +28,9 @@ from mag_tracking.report.metrics import (
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.stages.track.settings import acceleration_density
 
+Truth: TypeAlias = tuple[IntArray, FloatArray, FloatArray]
+"""Stamps (n,) [ns], positions (n, 3) [m], quaternions (n, 4) xyzw."""
+
 SUSPICIOUS = 2.0
 """A sensor that seems to be turned by more prior deviations than this is reported."""
 
@@ -29,16 +39,18 @@ SUSPICIOUS = 2.0
 class Run:
     """What came of a recording."""
 
-    summary: dict
-    logs: dict = field(default_factory=dict)
+    summary: dict[str, Any]
+    logs: dict[int, TrackLog] = field(default_factory=dict)
     """{track id: TrackLog}."""
-    smoothed: dict = field(default_factory=dict)
+    smoothed: dict[int, SmoothedLog] = field(default_factory=dict)
     """{track id: SmoothedLog}, of the tracks that were smoothed."""
-    truth: dict = field(default_factory=dict)
+    truth: dict[str, Truth] = field(default_factory=dict)
     """{name: (stamps, positions, quaternions)}."""
 
 
-def replay(recording, network, settings, out, progress=None, stopped=None):
+def replay(recording: Recording, network: SensorNetwork, settings: Settings,
+           out: str | PathLike[str], progress: Callable[[int], object] | None = None,
+           stopped: Callable[[], bool] | None = None) -> Run:
     """Track everything in a recording and write the results.
 
     Parameters
@@ -84,12 +96,14 @@ def replay(recording, network, settings, out, progress=None, stopped=None):
 class RunCollector:
     """Writes what leaves the pipeline, and remembers it for the summary and the figures."""
 
-    def __init__(self, results):
+    def __init__(self, results: ResultFolder) -> None:
         self._results = results
-        self._frame = None
-        self.logs, self.smoothed = {}, {}
+        # Set by the first frame; every track follows one.
+        self._frame: FieldFrame
+        self.logs: dict[int, TrackLog] = {}
+        self.smoothed: dict[int, SmoothedLog] = {}
 
-    def take(self, records):
+    def take(self, records: Iterable[FieldFrame | Detection | SmoothedPose | Track]) -> None:
         """Take what one sample led to."""
         for record in records:
             if isinstance(record, FieldFrame):
@@ -105,19 +119,21 @@ class RunCollector:
                 self.logs.setdefault(record.id, TrackLog(record.id)).add(record, self._frame)
 
 
-def summarise(recording, reader, pipeline, taker, truth):
+def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
+              taker: RunCollector, truth: Mapping[str, Truth]) -> dict[str, Any]:
     """The content of `summary.json`."""
     rejections = dict(reader.rejected)
     for cause, n in pipeline.rejections().items():
         rejections[cause] = rejections.get(cause, 0) + n
-    sensors = {}
+    sensors: dict[str, dict[str, Any]] = {}
     for name, background in pipeline.calibrate.backgrounds().items():
         counts = pipeline.calibrate.counts_of(name)
         sensors[name] = {'accepted': counts['accepted'], 'rejected': counts['rejected'],
                          'ready': background.ready, 'stuck': background.stuck,
                          'times_relearnt': background.n_relearnt}
-        if background.ready and counts['accepted']:
-            std = np.sqrt(np.diagonal(background.covariance))
+        covariance = background.covariance
+        if background.ready and covariance is not None and counts['accepted']:
+            std = np.sqrt(np.diagonal(covariance))
             sensors[name]['noise_std'] = [None if np.isnan(v) else float(v) for v in std]
             sensors[name]['background'] = [
                 None if np.isnan(v) else float(v) for v in pipeline.calibrate.background(name)]
@@ -128,9 +144,10 @@ def summarise(recording, reader, pipeline, taker, truth):
             'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks}
 
 
-def _track_entry(log, smoothed, pipeline, truth):
+def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline,
+                 truth: Mapping[str, Truth]) -> dict[str, Any]:
     """One track in the summary; `smoothed` is its `SmoothedLog` or None."""
-    entry = log.summary()
+    entry: dict[str, Any] = log.summary()
     entry['nis_by_sensor'] = log.nis_of(pipeline.network.names)
     entry['mounting'] = _mounting(log, pipeline)
     errors = errors_against_truth(log, pipeline, truth)
@@ -145,7 +162,7 @@ def _track_entry(log, smoothed, pipeline, truth):
     return entry
 
 
-def _mounting(log, pipeline):
+def _mounting(log: TrackLog, pipeline: Pipeline) -> dict[str, dict[str, Any]]:
     """{sensor: how it seems to be turned} of a track; empty where that is not estimated."""
     allowed = SUSPICIOUS * pipeline.settings.track.mounting_std_deg
     return {name: {'angles_deg': angles.tolist(), 'std_deg': std.tolist(),
@@ -153,22 +170,28 @@ def _mounting(log, pipeline):
             for name, (angles, std) in log.mounting_of(pipeline.network.names).items()}
 
 
-def errors_against_truth(log, pipeline, truth):
+def errors_against_truth(log: TrackLog | SmoothedLog, pipeline: Pipeline,
+                         truth: Mapping[str, Truth]) -> dict[str, Any] | None:
     """Errors against the truth that fits best, or None."""
-    best = None
+    best: tuple[float, dict[str, Any]] | None = None
     for name, arrays in truth.items():
-        if pipeline.settings.track.target == 'magnet':
-            errors = magnet_errors(log, arrays, pipeline.settings.track.magnet.axis)
-            size = errors and errors['position_mean']
-        else:
-            errors = pass_errors(log, arrays, pipeline.network.centre)
-            size = errors and errors['closest']
-        if errors and (best is None or size < best[0]):
-            best = size, {'name': name, **errors}
-    return best and best[1]
+        found = _errors_of(log, pipeline, arrays)
+        if found is not None and (best is None or found[0] < best[0]):
+            best = found[0], {'name': name, **found[1]}
+    return None if best is None else best[1]
 
 
-def _bound_ratio(log, pipeline, truth):
+def _errors_of(log: TrackLog | SmoothedLog, pipeline: Pipeline,
+               truth: Truth) -> tuple[float, dict[str, Any]] | None:
+    """(error [m] by which truths are compared, all errors) against one truth, or None."""
+    if pipeline.settings.track.target == 'magnet':
+        magnet = magnet_errors(log, truth, pipeline.settings.track.magnet.axis)
+        return (magnet['position_mean'], {**magnet}) if magnet else None
+    vehicle = pass_errors(log, truth, pipeline.network.centre)
+    return (vehicle['closest'], {**vehicle}) if vehicle else None
+
+
+def _bound_ratio(log: TrackLog, pipeline: Pipeline, truth: Truth) -> float | None:
     """Error over the path bound of a track, over the poses that its errors are of, or None."""
     track = pipeline.settings.track
     if track.target == 'magnet':
@@ -182,7 +205,8 @@ def _bound_ratio(log, pipeline, truth):
                             rows, 2)
 
 
-def write_figures(run, network, out, most=6, stopped=None):
+def write_figures(run: Run, network: SensorNetwork, out: Path, most: int = 6,
+                  stopped: Callable[[], bool] | None = None) -> list[Path]:
     """Draw the figures of the first `most` tracks into folder `out`; returns their paths.
 
     `stopped` is asked before each track; when it is true no more are drawn.

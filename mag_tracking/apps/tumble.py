@@ -1,15 +1,23 @@
 """Hard and soft iron of tumbled sensors: what `mag-tracking tumble` does."""
 
+from collections.abc import Callable, Collection
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from mag_tracking.calibration.ellipsoid_fit import fit_ellipsoid
+from mag_tracking.arrays import FloatArray
+from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit, fit_ellipsoid
+from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
+from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 
 
-def tumble(recording, network, sensors, date, field_size=None, progress=None, stopped=None):
+def tumble(recording: Recording, network: SensorNetwork, sensors: Collection[str], date: str,
+           field_size: float | None = None, progress: Callable[[int], object] | None = None,
+           stopped: Callable[[], bool] | None = None,
+           ) -> tuple[SensorNetwork, dict[str, EllipsoidFit], dict[str, FloatArray], bool]:
     """Hard and soft iron of sensors that were turned about while a recording was made.
 
     Parameters
@@ -36,15 +44,17 @@ def tumble(recording, network, sensors, date, field_size=None, progress=None, st
     """
     wanted = tuple(sensors) or network.names
     rows = {name: network.index(name) for name in wanted}
-    readings, interrupted = {name: [] for name in wanted}, False
+    taken: dict[str, list[FloatArray]] = {name: [] for name in wanted}
+    interrupted = False
     reader = SampleReader(recording, network)
     try:
         for sample in until_stopped(reader.samples, progress, stopped):
-            if sample.sensor in readings and not np.isinf(sample.field).any():
-                readings[sample.sensor].append(sample.field)
+            if sample.sensor in taken and not np.isinf(sample.field).any():
+                taken[sample.sensor].append(sample.field)
     except ReadingStopped:
         interrupted = True
-    readings = {name: np.array(r).reshape(-1, 3) for name, r in readings.items()}
+    readings: dict[str, FloatArray] = {
+        name: np.array(r).reshape(-1, 3) for name, r in taken.items()}
     fits = {name: fit_ellipsoid(r, field_size) for name, r in readings.items()}
     columns = {key: list(getattr(network, key)) for key in (
         'offset', 'correction', 'background', 'noise_std', 'calibrated')}
@@ -60,5 +70,5 @@ def tumble(recording, network, sensors, date, field_size=None, progress=None, st
             j, date, f'{"as stated" if done is None else done.by}; tumbled to '
             f'{100 * fit.residual:.1f} % of the field', float('nan') if done is None
             else done.clock_offset_std)
-    return (replace(network, **{key: tuple(v) for key, v in columns.items()}), fits, readings,
-            interrupted)
+    changes: dict[str, Any] = {key: tuple(v) for key, v in columns.items()}
+    return replace(network, **changes), fits, readings, interrupted

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from collections.abc import Sequence
 
 from mag_tracking.cli import (
     board_geometry,
@@ -21,7 +22,7 @@ from mag_tracking.cli import (
 from mag_tracking.errors import MagTrackingError
 
 
-def _parser():
+def _parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(
         prog='mag-tracking', description='Track magnetic targets with stationary magnetometers.')
@@ -32,11 +33,12 @@ def _parser():
     return parser
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status (1 for an error that a message explains)."""
     args = _parser().parse_args(argv)
     try:
-        return args.run_command(args)
+        status: int = args.run_command(args)
+        return status
     except (MagTrackingError, OSError) as error:
         # An OSError here is a full disk or a lost drive; its text names the file.
         print(f'mag-tracking: {error}', file=sys.stderr)

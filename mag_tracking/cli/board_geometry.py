@@ -1,18 +1,26 @@
 """mag-tracking board-geometry."""
 
+import argparse
 import datetime
 import signal
 import sys
 import threading
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.analysis.network_geometry import GeometrySettings
-from mag_tracking.apps.board_geometry import ASSUMED_NOISE, board_of, survey_geometry
-from mag_tracking.cli.options import add_command, add_network
+from mag_tracking.analysis.network_geometry import GeometrySettings, NetworkGeometry
+from mag_tracking.apps.board_geometry import (
+    ASSUMED_NOISE,
+    GeometrySurvey,
+    board_of,
+    survey_geometry,
+)
+from mag_tracking.arrays import FloatArray
+from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.network.file import read_network, write_network
@@ -39,7 +47,7 @@ examples:
 '''
 
 
-def add(commands):
+def add(commands: Commands) -> None:
     """Register the command."""
     settings = '\n'.join(f'  {p.name}: {p.value}  # {p.doc}{f" [{p.unit}]" if p.unit else ""}'
                          for p in flatten(GeometrySettings()))
@@ -66,7 +74,7 @@ def add(commands):
     p.add_argument('--figure', type=Path, metavar='FILE', help='draw what was found (.png, .pdf)')
 
 
-def _geometry(args):
+def _geometry(args: argparse.Namespace) -> int:
     """mag-tracking board-geometry."""
     box = _checked(args)
     network = read_network(args.network) if args.sensors is None else board_of(args.sensors)
@@ -95,7 +103,7 @@ def _geometry(args):
     return 0
 
 
-def _checked(args):
+def _checked(args: argparse.Namespace) -> tuple[Sequence[float], Sequence[float]] | None:
     """The box, or None; raises SettingsError or OutputError for options that make no sense."""
     corners = args.low, args.high
     if args.unknown_poses and None in corners:
@@ -117,14 +125,14 @@ def _checked(args):
 
 
 @contextmanager
-def _time_passing(text):
+def _time_passing(text: str) -> Iterator[None]:
     """Says what is done, and on a terminal for how long; nobody knows how long it will take."""
     done = threading.Event()
     bar = tqdm(desc=text, bar_format='{desc}: {elapsed}', disable=None)
     if bar.disable:
         print(text, flush=True)
 
-    def tick():
+    def tick() -> None:
         while not done.wait(0.5):
             bar.refresh()
 
@@ -138,7 +146,7 @@ def _time_passing(text):
         bar.close()
 
 
-def _print(found, blind):
+def _print(found: GeometrySurvey, blind: bool) -> None:
     """What was found as a table, and what is wrong."""
     g = found.geometry
     if g.converged:
@@ -170,21 +178,23 @@ def _print(found, blind):
               f'{", ".join(map(str, found.suspect_rows))}')
 
 
-def _print_magnet(g, blind):
+def _print_magnet(g: NetworkGeometry, blind: bool) -> None:
     """Moment, and how the magnet sits in its tool."""
-    def listed(values, std, scale, digits):
+    def listed(values: FloatArray, std: FloatArray, scale: float, digits: int) -> str:
         return ' '.join(f'{scale * v:.{digits}f} ({scale * s:.{digits}f})'
                         for v, s in zip(values, std, strict=True))
 
     moment, std = g.moment
     print(f'moment {moment:.4f} ({std:.4f}) A m^2' if std else f'moment {moment:g} A m^2, as given')
     if not blind:
+        offset, offset_std = g.tool_offset
+        tilt, tilt_std = g.tool_tilt
         print(f'magnet from the tracked point, along the tool\'s x y z: '
-              f'{listed(*g.tool_offset, 1e3, 2)} mm; tilted by '
-              f'{listed(*g.tool_tilt, 180.0 / np.pi, 2)} deg')
+              f'{listed(offset, offset_std, 1e3, 2)} mm; tilted by '
+              f'{listed(tilt, tilt_std, 180.0 / np.pi, 2)} deg')
 
 
-def _row(found, j):
+def _row(found: GeometrySurvey, j: int) -> str:
     """One sensor of the table."""
     g = found.geometry
     moved = 1e3 * np.linalg.norm(found.network.positions[j] - found.stated.positions[j])

@@ -1,13 +1,15 @@
 """mag-tracking calibrate."""
 
+import argparse
 import signal
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.apps.calibrate import calibrate
+from mag_tracking.apps.calibrate import Calibration, calibrate
 from mag_tracking.cli.options import (
+    Commands,
     add_command,
     add_network,
     add_settings,
@@ -37,7 +39,8 @@ example:
   mag-tracking calibrate first_day.mcap --network site.yaml --out calibrated.yaml
 '''
 
-def add(commands):
+
+def add(commands: Commands) -> None:
     """Register the command."""
     p = add_command(commands, 'calibrate', _calibrate,
                     'Find how sensors are turned and their clocks are off.', _CALIBRATE)
@@ -50,7 +53,8 @@ def add(commands):
     p.add_argument('--no-passes', action='store_true', help='do not track what passes')
     p.add_argument('--figure', type=Path, metavar='FILE', help='draw what was found (.png, .pdf)')
 
-def _calibrate(args):
+
+def _calibrate(args: argparse.Namespace) -> int:
     """mag-tracking calibrate."""
     network, settings = read_network(args.network), settings_of(args)
     recording = Recording(args.recording)
@@ -76,7 +80,7 @@ def _calibrate(args):
     return 2 if found.survey.disagreements else 0
 
 
-def _print(found, recording):
+def _print(found: Calibration, recording: Recording) -> None:
     """The calibration as a table, and what is wrong."""
     survey = found.survey
     print('sensor      tilted   heads [deg]      clock [ms]          noise [nT]           by')
@@ -100,7 +104,7 @@ def _print(found, recording):
         print(f'  warning: {what}: {n}')
 
 
-def _row(found, j):
+def _row(found: Calibration, j: int) -> str:
     """One sensor of the table."""
     network = found.network
     R, std = network.R_ws[j], network.orientation_std[j]

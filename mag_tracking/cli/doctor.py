@@ -1,5 +1,6 @@
 """mag-tracking doctor."""
 
+import argparse
 import signal
 from pathlib import Path
 
@@ -7,11 +8,18 @@ import numpy as np
 from tqdm import tqdm
 
 from mag_tracking.apps.doctor import examine
-from mag_tracking.cli.options import add_command, add_network, add_settings, settings_of
+from mag_tracking.cli.options import (
+    Commands,
+    add_command,
+    add_network,
+    add_settings,
+    settings_of,
+)
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.network.file import read_network
 from mag_tracking.recording.reader import Recording
+from mag_tracking.stages.health.sensor_health import SensorHealth
 
 _DOCTOR = '''
 Reads a recording, or listens to what is published now, and says what is wrong with each
@@ -26,7 +34,7 @@ examples:
 '''
 
 
-def add(commands):
+def add(commands: Commands) -> None:
     """Register the command."""
     p = add_command(commands, 'doctor', _doctor, 'Say what is wrong with the sensors.', _DOCTOR)
     p.add_argument('recording', nargs='?', type=Path, metavar='RECORDING',
@@ -37,7 +45,7 @@ def add(commands):
     add_settings(p)
 
 
-def _doctor(args):
+def _doctor(args: argparse.Namespace) -> int:
     """mag-tracking doctor."""
     if (args.recording is None) == (args.live is None):
         raise SettingsError('doctor: either a RECORDING or --live SECONDS')
@@ -70,7 +78,7 @@ def _doctor(args):
     return 2 if any(f.serious for f in findings) else 0
 
 
-def _row(health):
+def _row(health: SensorHealth) -> str:
     """One sensor in a line."""
     c = health.counts
     if not c['readings']:

@@ -1,16 +1,22 @@
 """mag-tracking fit."""
 
+import argparse
 import signal
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.apps.fit import RecordingFit
-from mag_tracking.cli.options import add_command, add_network, distinct_names
+from mag_tracking.analysis.pass_result import Bearing, PassFit
+from mag_tracking.apps.fit import FittedPass, RecordingFit
+from mag_tracking.arrays import FloatArray
+from mag_tracking.cli.options import Commands, add_command, add_network, distinct_names
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.inference.iron import hard_and_soft_iron
 from mag_tracking.interrupts import noted_signals
+from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
 from mag_tracking.physics.dipole import MU0
 from mag_tracking.pipeline import settings_for
@@ -43,7 +49,7 @@ POOR = 2.0
 """A normalised cost beyond says that the model leaves out more than the noise covers."""
 
 
-def add(commands):
+def add(commands: Commands) -> None:
     """Register the command."""
     p = add_command(commands, 'fit', _fit, 'Fit whole passes at constant velocity, offline.', _FIT)
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
@@ -61,7 +67,7 @@ def add(commands):
     p.add_argument('--no-figures', action='store_true', help='leave the pictures out')
 
 
-def _fit(args):
+def _fit(args: argparse.Namespace) -> int:
     """mag-tracking fit."""
     network = read_network(args.network)
     settings = settings_for('vehicle', read_parameter_file(args.params) if args.params else {})
@@ -71,7 +77,7 @@ def _fit(args):
     if any(recording.lies_in(args.out) for recording in recordings):
         raise OutputError(f'{args.out} is the folder of a recording; the results would be in it')
     jobs = [RecordingFit(r, network, settings, args.orders, args.cpa_range) for r in recordings]
-    passes = []
+    passes: list[FittedPass] = []
     with noted_signals(signal.SIGINT) as seen, FitFolder(args.out) as folder:
         for path, recording, job in zip(args.recordings, recordings, jobs, strict=True):
             with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
@@ -97,7 +103,7 @@ def _fit(args):
     return 130 if seen else 0
 
 
-def _check(args, network):
+def _check(args: argparse.Namespace, network: SensorNetwork) -> None:
     """Raise SettingsError or OutputError for options that make no sense."""
     distinct_names(args.recordings)
     if min(args.orders) < 1 or max(args.orders) > 8 or len(set(args.orders)) < len(args.orders):
@@ -114,7 +120,7 @@ def _check(args, network):
                             'hard and soft iron cannot be told apart')
 
 
-def _print_pass(one):
+def _print_pass(one: FittedPass) -> None:
     """A table of the orders of one pass."""
     data = one.fits[0].data
     print(f'{one.recording}, pass {one.number}: {data.n_values} measurements, '
@@ -136,9 +142,9 @@ def _print_pass(one):
                   f'({", ".join(f"{v:.2f}" for v in path[:3])}) m'
                   + (f' with a length of {abs(path[6]):.1f} m' if len(path) > 6 else ''))
     if one.chosen is not None:
-        cost = one.chosen.normalised_cost
-        if cost > POOR:
-            print(f'  a row of dipoles describes it poorly (cost {cost:.1f}): '
+        least = one.chosen.normalised_cost
+        if least > POOR:
+            print(f'  a row of dipoles describes it poorly (cost {least:.1f}): '
                   'speed and position may be off by several of the deviations')
         centre = one.chosen.data.network.positions[one.chosen.data.sensors].mean(axis=0)
         time, std, distance, distance_std = one.chosen.closest_approach(centre)
@@ -150,7 +156,7 @@ def _print_pass(one):
                   'which the deviations (in brackets) do not know of')
 
 
-def _numbers(fit):
+def _numbers(fit: PassFit) -> str:
     """Position, speed, heading, length and moment, with deviations in brackets."""
     sd = np.sqrt(np.diagonal(fit.honest_covariance))[:3]
     place = ' '.join(f'{v:6.2f}({s:.2f})' for v, s in zip(fit.position, sd, strict=True))
@@ -163,9 +169,9 @@ def _numbers(fit):
             f'{size:.0f}({size_std:.0f}) A m^2')
 
 
-def _print_bearing(b):
+def _print_bearing(b: Bearing) -> None:
     """What one sensor tells."""
-    def text(k, direction):
+    def text(k: int, direction: FloatArray) -> str:
         if not np.isfinite(direction).all():
             return 'unknown'
         return (f'({" ".join(f"{v:.2f}" for v in direction)}) to '
@@ -178,12 +184,14 @@ def _print_bearing(b):
           f'speed over range {b.rate:.3f} ({b.rate_std:.3f}) 1/s')
 
 
-def _iron(passes, network):
+def _iron(passes: Sequence[FittedPass], network: SensorNetwork) -> dict[str, Any] | None:
     """Hard and soft iron from the chosen fits, JSON-ready, or None with a line that says why."""
     fits = [one.chosen for one in passes if one.chosen is not None]
     try:
         if not fits:
             raise ValueError('no pass has an answer')
+        if network.earth_field is None:
+            raise ValueError('the network file has no earth_field')
         moments, covariances = zip(*(f.moment for f in fits), strict=True)
         iron = hard_and_soft_iron(moments, [f.heading[0] for f in fits],
                                   network.earth_field / MU0, covariances)
@@ -198,7 +206,7 @@ def _iron(passes, network):
             'normalised_cost': iron.normalised_cost, 'passes': len(fits)}
 
 
-def _draw(one, out):
+def _draw(one: FittedPass, out: Path) -> None:
     """Draw the order chosen, or the richest that there is."""
     fit = one.chosen or next((f for f in reversed(one.fits) if len(f.x)), None)
     if fit is None:
@@ -211,7 +219,7 @@ def _draw(one, out):
         out / f'{one.recording}_pass_{one.number}.png', dpi=110)
 
 
-def _draw_orders(passes, out):
+def _draw_orders(passes: Sequence[FittedPass], out: Path) -> None:
     """The figure of all orders."""
     from mag_tracking.report.fit_figures import order_figure
 

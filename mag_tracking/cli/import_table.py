@@ -1,8 +1,9 @@
 """mag-tracking import."""
 
+import argparse
 from pathlib import Path
 
-from mag_tracking.cli.options import add_command
+from mag_tracking.cli.options import Commands, add_command
 
 _IMPORT = '''
 Turns a table of magnet poses (a row a sensor and pose: id, timestamp [s],
@@ -15,7 +16,7 @@ example:
 '''
 
 
-def add(commands):
+def add(commands: Commands) -> None:
     """Register the command."""
     p = add_command(commands, 'import', _import, 'Turn a table of magnet poses into a recording.',
                     _IMPORT)
@@ -26,7 +27,7 @@ def add(commands):
                    help='noise of one reading (default: 1e-6)')
 
 
-def _import(args):
+def _import(args: argparse.Namespace) -> int:
     """mag-tracking import."""
     # Only this command needs it.
     from mag_tracking.recording.importers import import_pose_table

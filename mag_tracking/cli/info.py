@@ -1,20 +1,21 @@
 """mag-tracking info."""
 
+import argparse
 from pathlib import Path
 
-from mag_tracking.cli.options import add_command, add_network
+from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.network.file import read_network
 from mag_tracking.recording.reader import Recording
 
 
-def add(commands):
+def add(commands: Commands) -> None:
     """Register the command."""
     p = add_command(commands, 'info', _info, 'Tell what is in a recording.')
     p.add_argument('recording', type=Path, metavar='RECORDING')
     add_network(p, False, 'compare with its topics')
 
 
-def _info(args):
+def _info(args: argparse.Namespace) -> int:
     """mag-tracking info."""
     recording = Recording(args.recording)
     if not recording.message_counts:
@@ -22,7 +23,7 @@ def _info(args):
             recording.message_counts[message.topic] += 1
     print(f'{recording.path}: {recording.size / 1e6:.2f} MB, '
           f'{sum(recording.message_counts.values())} messages')
-    if recording.start_ns is not None:
+    if recording.start_ns is not None and recording.end_ns is not None:
         print(f'  {(recording.end_ns - recording.start_ns) / 1e9:.2f} s')
     for topic in sorted(recording.types):
         print(f'  {topic}  {recording.types[topic]}  {recording.message_counts[topic]}')

@@ -1,21 +1,26 @@
 """mag-tracking listen."""
 
+import argparse
 import math
 import signal
 import threading
 import time
 from collections import deque
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
-from mag_tracking.cli.options import add_command, add_network
+from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.drivers.configuration import read_drivers
-from mag_tracking.drivers.driver import IGNORED, serve
+from mag_tracking.drivers.driver import IGNORED, Driver, serve
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.network.file import read_network
-from mag_tracking.records import MagSample
+from mag_tracking.records import AccelerationSample, MagSample, Readings
+
+Sample: TypeAlias = MagSample | AccelerationSample
 
 _LISTEN = '''
 Opens the devices of a drivers file and prints what they say, once a second:
@@ -32,7 +37,7 @@ LARGE = 1e-3
 """[T] Larger fields are those of magnets, or of a wrong unit."""
 
 
-def add(commands):
+def add(commands: Commands) -> None:
     """Register the command."""
     p = add_command(commands, 'listen', _listen, 'Print what the devices of a drivers file say.',
                     _LISTEN)
@@ -45,27 +50,29 @@ def add(commands):
 class _Ear:
     """Keeps one driver going in a thread, and what it said in the last second."""
 
-    def __init__(self, driver):
+    def __init__(self, driver: Driver) -> None:
         self.driver = driver
-        self._heard = {sensor: deque(maxlen=20_000) for sensor in driver.sensors.values()
-                       if sensor != IGNORED}
+        self._heard: dict[str, deque[Sample]] = {
+            sensor: deque(maxlen=20_000) for sensor in driver.sensors.values()
+            if sensor != IGNORED}
         self.silent = set(self._heard)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=serve, daemon=True, args=(
             driver, self._take, self._stop.is_set))
         self._thread.start()
 
-    def _take(self, readings, accelerations):
+    def _take(self, readings: Readings, accelerations: Iterable[AccelerationSample]) -> None:
         """Keep what was said."""
-        for sample in (*readings.samples(), *accelerations):
+        samples: list[Sample] = [*readings.samples(), *accelerations]
+        for sample in samples:
             self._heard[sample.sensor].append(sample)
 
-    def stop(self):
+    def stop(self) -> None:
         """Close the device."""
         self._stop.set()
         self._thread.join(10.0)
 
-    def lines(self, elapsed_s):
+    def lines(self, elapsed_s: float) -> list[str]:
         """What was said since the last time."""
         counts = self.driver.counts()
         odd = ', '.join(f'{what}: {n}' for what, n in sorted(counts.items())
@@ -83,7 +90,7 @@ class _Ear:
         return out
 
 
-def _said(samples, elapsed_s):
+def _said(samples: Sequence[Sample], elapsed_s: float) -> str:
     """What the samples of one sensor say, in a line."""
     fields = np.array([s.field for s in samples if isinstance(s, MagSample)])
     if not len(fields):
@@ -101,7 +108,7 @@ def _said(samples, elapsed_s):
     return text
 
 
-def _listen(args):
+def _listen(args: argparse.Namespace) -> int:
     """mag-tracking listen."""
     if not args.seconds > 0.0:
         raise SettingsError(f'--seconds: {args.seconds:g} is not a number above 0')

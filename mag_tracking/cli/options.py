@@ -2,16 +2,23 @@
 
 import argparse
 import datetime
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 from mag_tracking.errors import OutputError, SettingsError
-from mag_tracking.pipeline import TARGET_DEFAULTS, settings_for
+from mag_tracking.pipeline import TARGET_DEFAULTS, Settings, settings_for
 from mag_tracking.settings import read_parameter_file
+
+# Quoted: at run time the class takes no type arguments.
+Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
+"""The parser's commands, to which each module adds its own."""
 
 FIGURES = ('.png', '.pdf', '.svg')
 
 
-def add_command(commands, name, run, short, text='', aliases=()):
+def add_command(commands: Commands, name: str, run: Callable[[argparse.Namespace], int],
+                short: str, text: str = '', aliases: Sequence[str] = ()) -> argparse.ArgumentParser:
     """A command's parser; `run` takes the parsed arguments and returns the exit status."""
     parser = commands.add_parser(name, aliases=aliases, help=short, description=short, epilog=text,
                                  formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -19,20 +26,20 @@ def add_command(commands, name, run, short, text='', aliases=()):
     return parser
 
 
-def add_network(parser, required=True, text='positions and orientations of the sensors '
-                '(network.yaml)'):
+def add_network(parser: argparse._ActionsContainer, required: bool = True,
+                text: str = 'positions and orientations of the sensors (network.yaml)') -> None:
     """--network."""
     parser.add_argument('--network', required=required, type=Path, metavar='FILE', help=text)
 
 
-def add_settings(parser):
+def add_settings(parser: argparse.ArgumentParser) -> None:
     """--target and --params."""
     parser.add_argument('--params', type=Path, metavar='FILE', help='settings that differ')
     parser.add_argument('--target', choices=list(TARGET_DEFAULTS), default='vehicle',
                         help='what moves (default: vehicle)')
 
 
-def distinct_names(paths):
+def distinct_names(paths: Iterable[Path]) -> list[str]:
     """Stems of recordings; raises OutputError where results would overwrite each other."""
     names = [path.resolve().stem for path in paths]
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -42,18 +49,18 @@ def distinct_names(paths):
     return names
 
 
-def settings_of(args):
+def settings_of(args: argparse.Namespace) -> Settings:
     """Settings of the command line's target and parameter file."""
     changes = read_parameter_file(args.params) if args.params else {}
     return settings_for(args.target, changes)
 
 
-def now():
+def now() -> str:
     """The time, as a calibration is marked with it."""
     return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
 
 
-def check_outputs(args):
+def check_outputs(args: argparse.Namespace) -> None:
     """Raise OutputError where what is to be written has no folder to be in."""
     for path in (args.out, args.figure):
         if path is not None and not path.absolute().parent.is_dir():

@@ -1,7 +1,9 @@
 """mag-tracking plan."""
 
+import argparse
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,13 +11,17 @@ import numpy as np
 from tqdm import tqdm
 
 from mag_tracking.analysis.placement import PlannedTarget, Sampling
-from mag_tracking.apps.plan import GOOD_PD, detection_range, n_parts, plan
-from mag_tracking.cli.options import add_command, add_network
+from mag_tracking.apps.plan import GOOD_PD, Area, Plan, detection_range, n_parts, plan
+from mag_tracking.arrays import FloatArray
+from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.errors import OutputError, SettingsError
+from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
-from mag_tracking.pipeline import settings_for
+from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.recording.result_folder import without_nan
 from mag_tracking.settings import read_parameter_file
+from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
+from mag_tracking.stages.track.settings import TrackSettings
 
 _PLAN = '''
 Before the first hole is drilled: where is a position good to what, where is a target
@@ -39,7 +45,7 @@ examples:
 '''
 
 
-def add(commands):
+def add(commands: Commands) -> None:
     """Register the command."""
     p = add_command(commands, 'plan', _plan, 'What a network of sensors will be able to tell.',
                     _PLAN)
@@ -71,14 +77,14 @@ def add(commands):
     p.add_argument('--params', type=Path, metavar='FILE', help='settings that differ')
 
 
-def _within(name, value, low, high):
+def _within(name: str, value: float, low: float, high: float) -> float:
     """`value`, or a SettingsError."""
     if not low <= value <= high:
         raise SettingsError(f'{name}: expected {low:g} to {high:g}, got {value:g}')
     return value
 
 
-def _target(args, track):
+def _target(args: argparse.Namespace, track: TrackSettings) -> PlannedTarget:
     """The `PlannedTarget` of the command line."""
     vehicle = track.vehicle
     speed = _within('--speed', args.speed, 1e-4, 1e3)
@@ -102,8 +108,11 @@ def _target(args, track):
                          vehicle.climb_std)
 
 
-def _lanes(args, vehicle):
+def _lanes(args: argparse.Namespace,
+           vehicle: VehicleSettings) -> list[tuple[str, float, float]]:
     """[(name, heading, offset)] of the command line."""
+    names: Sequence[str]
+    headings: Sequence[float]
     if args.heading is None:
         names, headings = vehicle.arrival_names, vehicle.arrival_headings_deg
     else:
@@ -122,7 +131,7 @@ def _lanes(args, vehicle):
     return lanes
 
 
-def _sampling(args, network, settings):
+def _sampling(args: argparse.Namespace, network: SensorNetwork, settings: Settings) -> Sampling:
     """The `Sampling` of the command line, but for how long the target is followed.
 
     An error of the field that lasts tells as little in many frames as in one: it counts as so much
@@ -141,7 +150,7 @@ def _sampling(args, network, settings):
     return Sampling(period, noise / math.sqrt(max(1.0, rate * period)), error * math.sqrt(lasting))
 
 
-def _area(args, network, reach):
+def _area(args: argparse.Namespace, network: SensorNetwork, reach: float) -> Area:
     """(x0, y0, x1, y1) of the maps."""
     low, high = network.positions[:, :2].min(axis=0), network.positions[:, :2].max(axis=0)
     x0, y0, x1, y1 = args.area or [*(low - reach), *(high + reach)]
@@ -154,7 +163,7 @@ def _area(args, network, reach):
     return x0, y0, x1, y1
 
 
-def _plan(args):
+def _plan(args: argparse.Namespace) -> int:
     """mag-tracking plan."""
     network = read_network(args.network)
     kind = 'magnet' if args.target == 'magnet' else 'vehicle'
@@ -184,7 +193,7 @@ def _plan(args):
     return 0
 
 
-def _print(p, noise):
+def _print(p: Plan, noise: FloatArray | float) -> None:
     """The answers in a few lines."""
     from mag_tracking.report.plan_figures import f_text
 
@@ -220,7 +229,7 @@ def _print(p, noise):
               f'the sensors becomes {f_text(np.nanmin(p.with_one_more))}, now {f_text(p.without)}')
 
 
-def _write(p, out):
+def _write(p: Plan, out: Path) -> None:
     """The figures and `plan.json`."""
     content = {
         'x': p.x.tolist(), 'y': p.y.tolist(), 'position_std': p.position_std.tolist(),

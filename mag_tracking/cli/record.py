@@ -1,10 +1,11 @@
 """mag-tracking record."""
 
+import argparse
 import math
 from pathlib import Path
 
 from mag_tracking.apps.record import Selection
-from mag_tracking.cli.options import add_command, add_network
+from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.errors import SettingsError
 from mag_tracking.network.file import read_network
 
@@ -22,7 +23,8 @@ examples:
   mag-tracking record --network site.yaml --out night --topics /camera /gps/fix
 '''
 
-def add(commands):
+
+def add(commands: Commands) -> None:
     """Register the command."""
     p = add_command(commands, 'record', _record, 'Record the sensors (needs ROS 2).', _RECORD)
     add_network(p)
@@ -38,7 +40,7 @@ def add(commands):
                    help='time in a file in s (default: 3600)')
 
 
-def _record(args):
+def _record(args: argparse.Namespace) -> int:
     """mag-tracking record."""
     for option, value, least in (('--split-mb', args.split_mb, 0.1),
                                  ('--split-s', args.split_s, 1.0)):

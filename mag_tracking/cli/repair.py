@@ -1,8 +1,9 @@
 """mag-tracking repair."""
 
+import argparse
 from pathlib import Path
 
-from mag_tracking.cli.options import add_command
+from mag_tracking.cli.options import Commands, add_command
 from mag_tracking.recording.repair import repair
 
 _REPAIR = '''
@@ -15,7 +16,7 @@ example:
 '''
 
 
-def add(commands):
+def add(commands: Commands) -> None:
     """Register the command."""
     p = add_command(commands, 'repair', _repair, 'Make a recording whole that was cut off.',
                     _REPAIR)
@@ -23,7 +24,7 @@ def add(commands):
                    help='an .mcap file or a rosbag2 folder')
 
 
-def _repair(args):
+def _repair(args: argparse.Namespace) -> int:
     """mag-tracking repair."""
     n = repair(args.recording)
     print(f'{args.recording}: files that were not whole: {n}')

@@ -1,12 +1,16 @@
 """mag-tracking replay."""
 
+import argparse
 import signal
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
 from mag_tracking.apps.replay import replay, write_figures
 from mag_tracking.cli.options import (
+    Commands,
     add_command,
     add_network,
     add_settings,
@@ -14,7 +18,9 @@ from mag_tracking.cli.options import (
     settings_of,
 )
 from mag_tracking.interrupts import noted_signals
+from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
+from mag_tracking.pipeline import Settings
 from mag_tracking.recording.reader import Recording
 
 _REPLAY = '''
@@ -46,7 +52,7 @@ has them all, with their meaning):
 '''
 
 
-def add(commands):
+def add(commands: Commands) -> None:
     """Register the command."""
     p = add_command(commands, 'replay', _replay, 'Track what is in recordings, offline.', _REPLAY)
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
@@ -57,7 +63,7 @@ def add(commands):
     p.add_argument('--no-figures', action='store_true', help='leave the pictures out')
 
 
-def _replay(args):
+def _replay(args: argparse.Namespace) -> int:
     """mag-tracking replay."""
     network, settings = read_network(args.network), settings_of(args)
     names = distinct_names(args.recordings)
@@ -71,7 +77,8 @@ def _replay(args):
     return 0
 
 
-def _replay_one(path, network, settings, out, seen, figures):
+def _replay_one(path: Path, network: SensorNetwork, settings: Settings, out: Path,
+                seen: Sequence[int], figures: bool) -> None:
     """Replay one recording into one folder; what was done stays when it is interrupted."""
     recording = Recording(path)
     with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
@@ -84,7 +91,7 @@ def _replay_one(path, network, settings, out, seen, figures):
         print(f'results in {out}')
 
 
-def _print_summary(path, summary):
+def _print_summary(path: Path, summary: dict[str, Any]) -> None:
     """The run in a few lines."""
     print(f'{path.name}: {summary["counts"]["align"].get("frames", 0)} frames, '
           f'{summary["counts"]["detect"].get("onsets", 0)} detections, '

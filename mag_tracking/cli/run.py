@@ -1,8 +1,15 @@
 """mag-tracking run."""
 
+import argparse
 from pathlib import Path
 
-from mag_tracking.cli.options import add_command, add_network, add_settings, settings_of
+from mag_tracking.cli.options import (
+    Commands,
+    add_command,
+    add_network,
+    add_settings,
+    settings_of,
+)
 from mag_tracking.network.file import read_network
 from mag_tracking.recording.reader import Recording
 
@@ -18,7 +25,7 @@ examples:
 '''
 
 
-def add(commands):
+def add(commands: Commands) -> None:
     """Register the command."""
     p = add_command(commands, 'run', _run, 'Run the nodes in one process (needs ROS 2).', _RUN)
     add_network(p)
@@ -33,7 +40,7 @@ def add(commands):
     p.add_argument('--loop', action='store_true', help='begin again at the end')
 
 
-def _run(args):
+def _run(args: argparse.Namespace) -> int:
     """mag-tracking run."""
     # Only this command needs ROS.
     from mag_tracking.nodes.runner import run

@@ -1,12 +1,14 @@
 """mag-tracking tumble."""
 
+import argparse
 import signal
 from pathlib import Path
 
 from tqdm import tqdm
 
 from mag_tracking.apps.tumble import tumble
-from mag_tracking.cli.options import add_command, add_network, check_outputs, now
+from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit
+from mag_tracking.cli.options import Commands, add_command, add_network, check_outputs, now
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.network.file import read_network, write_network
@@ -24,7 +26,7 @@ example:
 '''
 
 
-def add(commands):
+def add(commands: Commands) -> None:
     """Register the command."""
     p = add_command(commands, 'tumble', _tumble,
                     'Find the hard and soft iron of sensors that were turned about.', _TUMBLE)
@@ -40,7 +42,7 @@ def add(commands):
     p.add_argument('--figure', type=Path, metavar='FILE', help='draw what was found (.png, .pdf)')
 
 
-def _tumble(args):
+def _tumble(args: argparse.Namespace) -> int:
     """mag-tracking tumble."""
     if args.field_size is not None and not 1e-6 <= args.field_size <= 1e-3:
         raise SettingsError(f'--field-size: {args.field_size:g} is not between 1e-6 and 1e-3 tesla')
@@ -69,7 +71,7 @@ def _tumble(args):
     return 0
 
 
-def _print_fit(name, fit):
+def _print_fit(name: str, fit: EllipsoidFit) -> None:
     """One ellipsoid."""
     if not fit.converged:
         print(f'{name}: refused: {fit.reason}')
