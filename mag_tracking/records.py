@@ -28,9 +28,15 @@ class MagSample:
 
 
 @overload
-def plain(values: ArrayLike) -> FloatArray: ...
+def plain(values: ArrayLike) -> FloatArray:
+    """Of float64."""
+
+
 @overload
-def plain(values: ArrayLike, dtype: type[_Number]) -> NDArray[_Number]: ...
+def plain(values: ArrayLike, dtype: type[_Number]) -> NDArray[_Number]:
+    """Of the type `dtype`."""
+
+
 def plain(values: ArrayLike, dtype: type[Any] = float) -> NDArray[Any]:
     """The array itself, or a copy where it is none that compiled code takes."""
     return np.require(values, dtype, ['C', 'W'])
