@@ -5,9 +5,6 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, TypeAlias
-
-_Handler: TypeAlias = Callable[[int, FrameType | None], Any] | int | None
 
 
 @contextmanager
@@ -21,7 +18,7 @@ def noted_signals(*signals: signal.Signals) -> Iterator[list[int]]:
     where no handler can be set, the list stays empty.
     """
     seen: list[int] = []
-    before: dict[signal.Signals, _Handler] = {}
+    before: dict[signal.Signals, Callable[[int, FrameType | None], object] | int | None] = {}
 
     def note(signum: int, _: FrameType | None) -> None:
         seen.append(signum)

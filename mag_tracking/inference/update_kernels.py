@@ -182,6 +182,27 @@ def _keep(p: int, j: int, T: FloatArray, z0: float, z1: float, z2: float, l10: f
     W[p, j, 3], W[p, j, 4], W[p, j, 5] = r2 * (l10 * l21 - l20), -r2 * l21, r2
 
 
+@njit(**_INLINE)
+def _shapes_fit(x: FloatArray, P: FloatArray, x_lin: FloatArray, y: FloatArray, C: FloatArray,
+                h: FloatArray, H: FloatArray, inflation: FloatArray, n_own: int, G: FloatArray,
+                z: FloatArray, W: FloatArray) -> bool:
+    """Whether the arrays of `update_bank` have the sizes that it reads."""
+    n_hyp, n_sensors, n_columns = H.shape[0], H.shape[1], H.shape[3]
+    n_x = n_columns - n_own + (n_own + 3) * n_sensors
+    # Sizes one by one: numba takes half a second to compile comparisons of tuples.
+    if (len(x) != n_hyp or len(P) != n_hyp or len(x_lin) != n_hyp or len(h) != n_hyp
+            or len(inflation) != n_hyp or x.shape[1] != n_x or x_lin.shape[1] != n_x
+            or P.shape[1] != n_x or P.shape[2] != n_x or len(y) != n_sensors
+            or len(C) != n_sensors or h.shape[1] != n_sensors or inflation.shape[1] != n_sensors
+            or y.shape[1] != 3 or C.shape[1] != 3 or C.shape[2] != 3 or h.shape[2] != 3
+            or H.shape[2] != 3):
+        return False
+    return len(G) == 0 or (
+        len(G) == n_hyp and len(z) == n_hyp and len(W) == n_hyp and G.shape[1] == n_sensors
+        and z.shape[1] == n_sensors and W.shape[1] == n_sensors and G.shape[2] == 3
+        and G.shape[3] == n_x and z.shape[2] == 3 and W.shape[2] == 6)
+
+
 @njit('int64(float64[:,::1], float64[:,:,::1], float64[:,::1], float64[:,::1], '
       'float64[:,:,::1], float64[:,:,::1], float64[:,:,:,::1], float64[:,::1], '
       'int64, float64[::1], float64[:,::1], '
@@ -195,21 +216,9 @@ def update_bank(x: FloatArray, P: FloatArray, x_lin: FloatArray, y: FloatArray, 
     -1: a noise is not positive definite; -2: shapes do not fit, it would read beyond an array.
     What a backward pass wants goes into G, z and W unless they are of length 0.
     """
-    n_hyp, n_sensors, n_columns = H.shape[0], H.shape[1], H.shape[3]
-    n_x = n_columns - n_own + (n_own + 3) * n_sensors
-    # Sizes one by one: numba takes half a second to compile comparisons of tuples.
-    if (len(x) != n_hyp or len(P) != n_hyp or len(x_lin) != n_hyp or len(h) != n_hyp
-            or len(inflation) != n_hyp or x.shape[1] != n_x or x_lin.shape[1] != n_x
-            or P.shape[1] != n_x or P.shape[2] != n_x or len(y) != n_sensors
-            or len(C) != n_sensors or h.shape[1] != n_sensors or inflation.shape[1] != n_sensors
-            or y.shape[1] != 3 or C.shape[1] != 3 or C.shape[2] != 3 or h.shape[2] != 3
-            or H.shape[2] != 3):
+    if not _shapes_fit(x, P, x_lin, y, C, h, H, inflation, n_own, G, z, W):
         return -2
-    keep = len(G) > 0
-    if keep and (len(G) != n_hyp or len(z) != n_hyp or len(W) != n_hyp or G.shape[1] != n_sensors
-                 or z.shape[1] != n_sensors or W.shape[1] != n_sensors or G.shape[2] != 3
-                 or G.shape[3] != n_x or z.shape[2] != 3 or W.shape[2] != 6):
-        return -2
+    n_hyp, n_sensors, keep = H.shape[0], H.shape[1], len(G) > 0
     n = _n_present(y, C)
     if n < 0:
         return -1
