@@ -1,6 +1,6 @@
-"""Types of arrays; their shapes and units stand in the docstrings."""
+"""Types of arrays, and of compiled functions on them; shapes and units stand in docstrings."""
 
-from typing import TypeAlias
+from typing import Literal, TypeAlias, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,3 +10,12 @@ IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 StructArray: TypeAlias = NDArray[np.void]
 """A structured array: one record an element."""
+
+
+class CompileOptions(TypedDict, total=False):
+    """Options of `numba.njit` that a module's kernels share."""
+
+    cache: bool
+    error_model: Literal['numpy']
+    fastmath: set[str]
+    forceinline: bool

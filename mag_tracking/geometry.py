@@ -1,9 +1,12 @@
 """Rotations and quaternions; quaternions are (x, y, z, w) and unit."""
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from mag_tracking.arrays import FloatArray
 
 
-def rotation_from_quaternion(q):
+def rotation_from_quaternion(q: ArrayLike) -> FloatArray:
     """Rotation matrices (..., 3, 3) of unit quaternions xyzw (..., 4).
 
     Raises ValueError where a norm is further than 1e-3 from one.
@@ -20,7 +23,7 @@ def rotation_from_quaternion(q):
     ], -2)
 
 
-def quaternion_from_rotation_vector(v):
+def quaternion_from_rotation_vector(v: ArrayLike) -> FloatArray:
     """Unit quaternions xyzw (..., 4) of rotation vectors (..., 3) [rad]."""
     v = np.asarray(v, dtype=float)
     half = 0.5 * np.linalg.norm(v, axis=-1, keepdims=True)
@@ -28,7 +31,7 @@ def quaternion_from_rotation_vector(v):
     return np.concatenate([0.5 * v * np.sinc(half / np.pi), np.cos(half)], axis=-1)
 
 
-def cross_matrix(a):
+def cross_matrix(a: ArrayLike) -> FloatArray:
     """Matrices [a]x with [a]x b = a x b; `a` (..., 3) gives (..., 3, 3)."""
     a = np.asarray(a, dtype=float)
     out = np.zeros(a.shape + (3,))
@@ -38,7 +41,7 @@ def cross_matrix(a):
     return out
 
 
-def left_jacobian(v):
+def left_jacobian(v: ArrayLike) -> FloatArray:
     """How a rotation changes with its rotation vector; `v` (..., 3) [rad] gives (..., 3, 3).
 
     To first order R(v + d) = R(J d) R(v): a change d of the vector turns what is
@@ -54,27 +57,28 @@ def left_jacobian(v):
     small = angle < 1e-2
     third = np.where(small, (1.0 - square / 20.0) / 6.0,
                      (1.0 - np.sinc(angle / np.pi)) / np.where(small, 1.0, square))
-    return np.eye(3) + 0.5 * half**2 * K + third * K @ K
+    J: FloatArray = np.eye(3) + 0.5 * half**2 * K + third * K @ K
+    return J
 
 
-def quaternion_from_yaw(yaw):
+def quaternion_from_yaw(yaw: float) -> FloatArray:
     """Quaternion xyzw (4,) of a rotation about z by `yaw` [rad]."""
     return np.array([0.0, 0.0, np.sin(0.5 * yaw), np.cos(0.5 * yaw)])
 
 
-def rotation_about_z(angle):
+def rotation_about_z(angle: float) -> FloatArray:
     """Matrix (3, 3) of a rotation about z by `angle` [rad]."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def yaw_between(R, other):
+def yaw_between(R: FloatArray, other: FloatArray) -> float:
     """[rad] Rotation about the world's z that takes orientation `R` (3, 3) nearest to `other`."""
     M = other @ R.T
     return float(np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1]))
 
 
-def quaternion_from_rotation(R):
+def quaternion_from_rotation(R: FloatArray) -> FloatArray:
     """Unit quaternion xyzw (4,) of a rotation matrix (3, 3), by its largest component."""
     w2 = np.array([1 + R[0, 0] - R[1, 1] - R[2, 2], 1 - R[0, 0] + R[1, 1] - R[2, 2],
                    1 - R[0, 0] - R[1, 1] + R[2, 2], 1 + R[0, 0] + R[1, 1] + R[2, 2]])
@@ -84,20 +88,22 @@ def quaternion_from_rotation(R):
         [R[0, 1] + R[1, 0], w2[1], R[1, 2] + R[2, 1], R[0, 2] - R[2, 0]],
         [R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], w2[2], R[1, 0] - R[0, 1]],
         [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], w2[3]]])
-    return symmetric[k] / np.linalg.norm(symmetric[k])
+    q: FloatArray = symmetric[k] / np.linalg.norm(symmetric[k])
+    return q
 
 
-def quaternion_between(a, b):
+def quaternion_between(a: ArrayLike, b: ArrayLike) -> FloatArray:
     """The shortest rotation, as quaternion xyzw (4,), that takes direction `a` to `b`.
 
     `a`, `b` : (3,), any length but zero. Where they are opposite, the turn is
     about any axis across them.
     """
-    a = np.asarray(a, dtype=float) / np.linalg.norm(a)
-    b = np.asarray(b, dtype=float) / np.linalg.norm(b)
-    w = 1.0 + a @ b
+    u: FloatArray = np.asarray(a, dtype=float) / np.linalg.norm(a)
+    v: FloatArray = np.asarray(b, dtype=float) / np.linalg.norm(b)
+    w = 1.0 + u @ v
     if w < 1e-12:
-        across = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
+        across = np.cross(u, np.eye(3)[np.argmin(np.abs(u))])
         return np.append(across / np.linalg.norm(across), 0.0)
-    q = np.append(np.cross(a, b), w)
-    return q / np.linalg.norm(q)
+    q: FloatArray = np.append(np.cross(u, v), w)
+    q /= np.linalg.norm(q)
+    return q

@@ -2,11 +2,13 @@
 
 import signal
 import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 
 
 @contextmanager
-def noted_signals(*signals):
+def noted_signals(*signals: signal.Signals) -> Iterator[list[int]]:
     """A list on which each of `signals` that comes is put, to be asked where it is safe to stop.
 
     Raised in the middle of an update or of a line of a table, it would leave half
@@ -15,9 +17,10 @@ def noted_signals(*signals):
     ignored (SIGINT in a background job) stays so, and outside the main thread,
     where no handler can be set, the list stays empty.
     """
-    seen, before = [], {}
+    seen: list[int] = []
+    before: dict[signal.Signals, Callable[[int, FrameType | None], object] | int | None] = {}
 
-    def note(signum, _):
+    def note(signum: int, _: FrameType | None) -> None:
         seen.append(signum)
         if len(seen) > 2:
             raise KeyboardInterrupt

@@ -3,10 +3,16 @@
 A missing axis or sensor is NaN. Arrays in a record are not to be changed.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any, TypeVar, overload
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+
+_Number = TypeVar('_Number', bound=np.generic)
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,13 +21,23 @@ class MagSample:
 
     stamp_ns: int
     sensor: str
-    field: np.ndarray
+    field: FloatArray
     """(3,) [T], sensor frame; after calibration the background is removed."""
-    covariance: np.ndarray | None = None
+    covariance: FloatArray | None = None
     """(3, 3) [T^2], sensor frame; None = unknown."""
 
 
-def plain(values, dtype=float):
+@overload
+def plain(values: ArrayLike) -> FloatArray:
+    """Of float64."""
+
+
+@overload
+def plain(values: ArrayLike, dtype: type[_Number]) -> NDArray[_Number]:
+    """Of the type `dtype`."""
+
+
+def plain(values: ArrayLike, dtype: type[Any] = float) -> NDArray[Any]:
     """The array itself, or a copy where it is none that compiled code takes."""
     return np.require(values, dtype, ['C', 'W'])
 
@@ -32,40 +48,40 @@ class Readings:
 
     names: tuple[str, ...]
     """Of sensors."""
-    sensor: np.ndarray
+    sensor: IntArray
     """(n,) int, which of `names`."""
-    stamp_ns: np.ndarray
+    stamp_ns: IntArray
     """(n,) int64."""
-    field: np.ndarray
+    field: FloatArray
     """(n, 3) [T]."""
-    covariance: np.ndarray | None = None
+    covariance: FloatArray | None = None
     """(n, 3, 3) [T^2]; a row of NaN, or None for all: unknown."""
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.sensor)
 
-    def sample(self, i):
+    def sample(self, i: int) -> MagSample:
         """Reading `i` as a `MagSample`."""
         C = None if self.covariance is None else self.covariance[i]
         return MagSample(int(self.stamp_ns[i]), self.names[self.sensor[i]], self.field[i],
                          None if C is None or np.isnan(C).all() else C)
 
-    def rows(self, index):
+    def rows(self, index: Mapping[str, int]) -> IntArray:
         """(n,) int: of each reading its sensor's place in `index`, {name: place}; -1: not in it."""
         return np.array([index.get(name, -1) for name in self.names], dtype=np.int64)[self.sensor]
 
-    def part(self, which):
+    def part(self, which: BoolArray) -> 'Readings':
         """Those of `which`, (n,) bool."""
         C = self.covariance
         return Readings(self.names, self.sensor[which], self.stamp_ns[which], self.field[which],
                         None if C is None else C[which])
 
-    def samples(self):
+    def samples(self) -> list[MagSample]:
         """All of them."""
         return [self.sample(i) for i in range(len(self))]
 
     @classmethod
-    def joined(cls, parts):
+    def joined(cls, parts: Iterable['Readings']) -> 'Readings':
         """One after the other, those of `parts`, [`Readings`]."""
         parts = [p for p in parts if len(p)]
         if len(parts) <= 1:
@@ -82,7 +98,7 @@ class Readings:
             covariance)
 
     @classmethod
-    def of(cls, samples):
+    def of(cls, samples: Sequence[MagSample]) -> 'Readings':
         """Of `MagSample`s."""
         covariance, unknown = None, np.full((3, 3), np.nan)
         if any(s.covariance is not None for s in samples):
@@ -93,7 +109,8 @@ class Readings:
                            covariance)
 
     @classmethod
-    def by_name(cls, sensors, stamps, field, covariance=None):
+    def by_name(cls, sensors: Sequence[str], stamps: Sequence[int] | IntArray, field: FloatArray,
+                covariance: FloatArray | None = None) -> 'Readings':
         """Of lists of each reading's sensor and stamp [ns], and its field (n, 3) [T]."""
         names = tuple(dict.fromkeys(sensors))
         rows = {name: j for j, name in enumerate(names)}
@@ -107,7 +124,7 @@ class AccelerationSample:
 
     stamp_ns: int
     sensor: str
-    acceleration: np.ndarray
+    acceleration: FloatArray
     """(3,) [m/s^2], sensor frame; at rest it points up."""
 
 
@@ -116,13 +133,13 @@ class FieldFrame:
     """One look of the whole network."""
 
     stamp_ns: int
-    field: np.ndarray
+    field: FloatArray
     """(n_sensors, 3) [T], sensor frames, background removed."""
-    covariance: np.ndarray
+    covariance: FloatArray
     """(n_sensors, 3, 3) [T^2] of `field`; rows of a missing sensor are NaN."""
-    n_samples: np.ndarray
+    n_samples: IntArray
     """(n_sensors,) samples averaged; 0 = missing."""
-    time_offset: np.ndarray
+    time_offset: FloatArray
     """(n_sensors,) [s] mean time of a sensor's samples, from `stamp_ns`; 0 where it is missing."""
     target_present: bool = False
     """The detector's verdict; false before detection."""
@@ -151,40 +168,46 @@ class Hypothesis:
 
     arrival: str
     weight: float
-    position: np.ndarray
+    position: FloatArray
     """(3,) [m], world."""
-    velocity: np.ndarray
+    velocity: FloatArray
     """(3,) [m/s], world."""
-    covariance: np.ndarray
+    covariance: FloatArray
     """(6, 6) of position and velocity."""
-    moment: np.ndarray
+    moment: FloatArray
     """(3,) [A m^2], world."""
     kind: str
     """The kind of target that it assumed; empty for a magnet."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Hypotheses(Sequence):
+class Hypotheses(Sequence[Hypothesis]):
     """Members of a bank as arrays; each is a `Hypothesis`, made when it is asked for.
 
     There may be hundreds in every frame, and hardly anybody looks at them.
     """
 
     arrivals: tuple[str, ...]
-    weights: np.ndarray
+    weights: FloatArray
     """(n,)"""
-    states: np.ndarray
+    states: FloatArray
     """(n, 6) position and velocity, world."""
-    covariances: np.ndarray
+    covariances: FloatArray
     """(n, 6, 6)"""
-    moments: np.ndarray
+    moments: FloatArray
     """(n, 3)"""
     kinds: tuple[str, ...]
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.weights)
 
-    def __getitem__(self, i):
+    @overload
+    def __getitem__(self, i: int) -> Hypothesis: ...
+
+    @overload
+    def __getitem__(self, i: slice) -> tuple[Hypothesis, ...]: ...
+
+    def __getitem__(self, i: int | slice) -> Hypothesis | tuple[Hypothesis, ...]:
         if isinstance(i, slice):
             return tuple(self[k] for k in range(*i.indices(len(self))))
         return Hypothesis(self.arrivals[i], float(self.weights[i]), self.states[i, :3],
@@ -198,21 +221,21 @@ class SmoothedPose:
     stamp_ns: int
     id: int
     """Of the track."""
-    position: np.ndarray
+    position: FloatArray
     """(3,) [m], world."""
-    velocity: np.ndarray
+    velocity: FloatArray
     """(3,) [m/s], world."""
-    covariance: np.ndarray
+    covariance: FloatArray
     """(6, 6) of position and velocity, world."""
-    orientation: np.ndarray
+    orientation: FloatArray
     """(4,) quaternion xyzw, body to world."""
-    orientation_covariance: np.ndarray
+    orientation_covariance: FloatArray
     """(3, 3) [rad^2], small rotations about the fixed world axes."""
-    position_orientation_covariance: np.ndarray
+    position_orientation_covariance: FloatArray
     """(3, 3) [m rad]."""
-    moment: np.ndarray
+    moment: FloatArray
     """(3,) [A m^2], world."""
-    moment_covariance: np.ndarray
+    moment_covariance: FloatArray
     """(3, 3)."""
     kind: str
     length: float
@@ -232,28 +255,28 @@ class Track:
     stamp_ns: int
     id: int
     ended: bool
-    position: np.ndarray
+    position: FloatArray
     """(3,) [m], world."""
-    velocity: np.ndarray
+    velocity: FloatArray
     """(3,) [m/s], world."""
-    covariance: np.ndarray
+    covariance: FloatArray
     """(6, 6) of position and velocity, world."""
-    orientation: np.ndarray
+    orientation: FloatArray
     """(4,) quaternion xyzw, body to world."""
-    orientation_covariance: np.ndarray
+    orientation_covariance: FloatArray
     """(3, 3) [rad^2], small rotations about the fixed world axes."""
-    position_orientation_covariance: np.ndarray
+    position_orientation_covariance: FloatArray
     """(3, 3) [m rad]."""
-    moment: np.ndarray
+    moment: FloatArray
     """(3,) [A m^2], world."""
-    moment_covariance: np.ndarray
+    moment_covariance: FloatArray
     """(3, 3)."""
     existence: float
     weight: float
     """Of the published hypothesis, 0..1."""
     nis: float
     """Normalised innovation squared of the published hypothesis; NaN without a measurement."""
-    nis_by_sensor: np.ndarray
+    nis_by_sensor: FloatArray
     """(n_sensors,) its parts, each given the sensors before it; NaN of a missing sensor."""
     degrees_of_freedom: int
     arrival: str
@@ -268,17 +291,18 @@ class Track:
     ambiguous: bool
     unobservable: tuple[bool, ...]
     """(6): x, y, z, and rotation about the body's x, y, z."""
-    predicted: np.ndarray
+    predicted: FloatArray
     """(n_sensors, 3) [T], sensor frames: the frame's field as the published hypothesis has it,
     without what it takes for errors of its model."""
-    mounting: np.ndarray
+    mounting: FloatArray
     """(n_sensors, 3) [rad] angles as in `physics.mounting`; (0, 3) where they are not estimated."""
-    mounting_covariance: np.ndarray
+    mounting_covariance: FloatArray
     """(n_sensors, 3, 3) [rad^2], or (0, 3, 3)."""
     hypotheses: Sequence[Hypothesis] = field(default=())
     """Heaviest first; the published one is among them."""
 
     @property
-    def mounting_std(self):
+    def mounting_std(self) -> FloatArray:
         """(n_sensors, 3) [rad], or (0, 3)."""
-        return np.sqrt(np.einsum('jii->ji', self.mounting_covariance))
+        std: FloatArray = np.sqrt(np.einsum('jii->ji', self.mounting_covariance))
+        return std

@@ -9,12 +9,26 @@ import difflib
 import math
 import typing
 from collections.abc import Mapping
+from os import PathLike
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, TypeVar
 
 from mag_tracking.errors import SettingsError
 from mag_tracking.yaml_file import read_yaml
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
-def param(default, doc, unit='', range=None, live=False, length=None):
+Scalar: TypeAlias = bool | int | float | str
+Value: TypeAlias = Scalar | tuple[Scalar, ...]
+"""What a setting can be."""
+
+_Class: TypeAlias = type[object]
+_Default = TypeVar('_Default')
+_Settings = TypeVar('_Settings', bound='DataclassInstance')
+
+
+def param(default: _Default, doc: str, unit: str = '', range: tuple[float, float] | None = None,
+          live: bool = False, length: int | None = None) -> _Default:
     """Declare one setting of a frozen dataclass.
 
     Parameters
@@ -39,30 +53,35 @@ class Parameter:
     """One setting, flattened: its dotted name, its value and its declaration."""
 
     name: str
-    value: object
-    type: type
-    element: type | None
+    value: Value
+    type: _Class
+    element: _Class | None
     doc: str
     unit: str
-    range: tuple | None
+    range: tuple[float, float] | None
     live: bool
     length: int | None
 
 
-def _kind(hint):
+def _kind(hint: Any) -> tuple[_Class, _Class | None]:
     """(type, element type) of an annotation such as float or tuple[float, ...]."""
     if typing.get_origin(hint) is tuple:
         return tuple, typing.get_args(hint)[0]
     return hint, None
 
 
-def flatten(settings, prefix=''):
+def _is_group(value: object) -> 'TypeGuard[DataclassInstance]':
+    """Whether a field of a settings dataclass holds settings of its own."""
+    return dataclasses.is_dataclass(value)
+
+
+def flatten(settings: 'DataclassInstance', prefix: str = '') -> list[Parameter]:
     """All settings below `settings` as a list of `Parameter`, in the order declared."""
     hints = typing.get_type_hints(type(settings))
-    out = []
+    out: list[Parameter] = []
     for f in dataclasses.fields(settings):
         name, value = prefix + f.name, getattr(settings, f.name)
-        if dataclasses.is_dataclass(value):
+        if _is_group(value):
             out += flatten(value, name + '.')
         else:
             kind, element = _kind(hints[f.name])
@@ -70,7 +89,7 @@ def flatten(settings, prefix=''):
     return out
 
 
-def _scalar(name, value, kind):
+def _scalar(name: str, value: object, kind: _Class) -> Scalar:
     """`value` as `kind`, or a SettingsError that names the setting."""
     if kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
         try:
@@ -84,31 +103,33 @@ def _scalar(name, value, kind):
     raise SettingsError(f'{name}: expected {kind.__name__}, got {value!r}')
 
 
-def _checked(p, value):
+def _checked(p: Parameter, value: object) -> Value:
     """`value` in the type of the declaration `p`, within its range and length."""
-    if p.type is tuple:
+    if p.element is not None:
         if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
             raise SettingsError(f'{p.name}: expected a list of {p.element.__name__}, '
                                 f'got {value!r}')
-        value = tuple(_scalar(p.name, v, p.element) for v in value)
-        if p.length is not None and len(value) != p.length:
-            raise SettingsError(f'{p.name}: expected {p.length} values, got {len(value)}')
-        if not value:
+        values = tuple(_scalar(p.name, v, p.element) for v in value)
+        if p.length is not None and len(values) != p.length:
+            raise SettingsError(f'{p.name}: expected {p.length} values, got {len(values)}')
+        if not values:
             raise SettingsError(f'{p.name}: expected at least one value, got none')
     else:
-        value = _scalar(p.name, value, p.type)
-    for v in value if isinstance(value, tuple) else (value,):
+        values = (_scalar(p.name, value, p.type),)
+    for v in values:
         if isinstance(v, float) and math.isnan(v):
             raise SettingsError(f'{p.name}: NaN is not a value')
-        if p.range is not None and not p.range[0] <= v <= p.range[1]:
+        if isinstance(v, str) or p.range is None:
+            continue
+        if not p.range[0] <= v <= p.range[1]:
             raise SettingsError(f'{p.name}: {v} is outside {p.range[0]} .. {p.range[1]}'
                                 f'{" " + p.unit if p.unit else ""}')
-    return value
+    return values if p.element is not None else values[0]
 
 
-def _dotted(mapping, prefix=''):
+def _dotted(mapping: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
     """Nested mappings as one flat dict with dotted names."""
-    out = {}
+    out: dict[str, Any] = {}
     for key, value in mapping.items():
         if isinstance(value, Mapping):
             _join(out, _dotted(value, f'{prefix}{key}.'))
@@ -117,14 +138,14 @@ def _dotted(mapping, prefix=''):
     return out
 
 
-def _join(out, more):
+def _join(out: dict[str, Any], more: Mapping[str, Any]) -> None:
     """Put `more` into `out`; raises SettingsError where the two disagree."""
     for name, value in more.items():
         if out.setdefault(name, value) is not value and out[name] != value:
             raise SettingsError(f'{name} is there twice, as {out[name]!r} and as {value!r}')
 
 
-def replace(settings, changes):
+def replace(settings: _Settings, changes: Mapping[str, Any]) -> _Settings:
     """A copy of `settings` with `changes`, a mapping of (dotted or nested) names to values.
 
     Raises SettingsError for an unknown name (with the nearest known one), a
@@ -141,19 +162,19 @@ def replace(settings, changes):
     return _rebuild(settings, checked, '')
 
 
-def _rebuild(settings, checked, prefix):
+def _rebuild(settings: _Settings, checked: Mapping[str, Value], prefix: str) -> _Settings:
     """Copy of the tree with the checked values put in."""
-    changes = {}
+    changes: dict[str, Any] = {}
     for f in dataclasses.fields(settings):
         name, value = prefix + f.name, getattr(settings, f.name)
-        if dataclasses.is_dataclass(value):
+        if _is_group(value):
             changes[f.name] = _rebuild(value, checked, name + '.')
         elif name in checked:
             changes[f.name] = checked[name]
     return dataclasses.replace(settings, **changes)
 
 
-def read_parameter_file(path):
+def read_parameter_file(path: str | PathLike[str]) -> dict[str, Any]:
     """The settings in a YAML file, as a flat dict of dotted names.
 
     Takes a plain mapping, or a ROS parameter file (`node: ros__parameters:`),
@@ -172,12 +193,12 @@ def read_parameter_file(path):
         raise SettingsError(f'{path}: a mapping that holds itself') from error
 
 
-def _joined_sections(content):
+def _joined_sections(content: Mapping[str, Any]) -> dict[str, Any]:
     """The settings of a plain mapping, or of all the nodes of a ROS parameter file."""
     nodes = [k for k, v in content.items() if isinstance(v, Mapping) and 'ros__parameters' in v]
     if not nodes:
         return _dotted(content)
-    joined = {}
+    joined: dict[str, Any] = {}
     for name, node in content.items():
         section = node.get('ros__parameters') if isinstance(node, Mapping) else None
         if name not in nodes or len(node) > 1 or not isinstance(section, Mapping | None):
@@ -187,7 +208,7 @@ def _joined_sections(content):
     return joined
 
 
-def _yaml_value(value):
+def _yaml_value(value: Value) -> str:
     """One value as YAML that reads back as the same value of the same type."""
     if isinstance(value, tuple):
         return '[' + ', '.join(_yaml_value(v) for v in value) + ']'
@@ -200,7 +221,7 @@ def _yaml_value(value):
     return str(value) if isinstance(value, int) else f"'{value}'"
 
 
-def to_yaml(settings, node='/**'):
+def to_yaml(settings: 'DataclassInstance', node: str = '/**') -> str:
     """The settings as a ROS parameter file with documentation."""
     lines = ['# Generated from the settings by `make config`; do not edit.',
              f'{node}:', '  ros__parameters:']
@@ -220,7 +241,7 @@ def to_yaml(settings, node='/**'):
     return '\n'.join(lines) + '\n'
 
 
-def to_reference(settings, live=True):
+def to_reference(settings: 'DataclassInstance', live: bool = True) -> str:
     """The parameter reference, as a Markdown table; without the column `live` if it is false."""
     head = ['parameter', 'default', 'unit', 'range', *(['live'] if live else []), 'what']
     lines = [f'| {" | ".join(head)} |', '|' + '---|' * len(head)]

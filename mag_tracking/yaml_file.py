@@ -1,6 +1,8 @@
 """Reading YAML that people write by hand."""
 
 from collections.abc import Hashable
+from os import PathLike
+from typing import Any
 
 import yaml
 
@@ -8,7 +10,8 @@ import yaml
 class _UniqueKeyLoader(yaml.SafeLoader):
     """YAML lets a key appear twice and keeps the last: a sensor would vanish without a word."""
 
-    def construct_mapping(self, node, deep=False):
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False
+                          ) -> dict[Hashable, Any]:
         seen = set()
         for key_node, _ in node.value:
             if key_node.tag == 'tag:yaml.org,2002:merge':
@@ -23,7 +26,7 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def read_yaml(path, error):
+def read_yaml(path: str | PathLike[str], error: type[Exception]) -> Any:
     """The content of a YAML file.
 
     Raises `error`, an exception class, with a message that names the file: where

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference import update_kernels
 from mag_tracking.records import plain
 
@@ -9,7 +10,7 @@ LEAST_PIVOT = 1e-12
 """A covariance with a smaller one of `smallest_pivots` is singular, but for rounding."""
 
 
-def whitened_energy(y, C):
+def whitened_energy(y: FloatArray, C: FloatArray) -> tuple[FloatArray, IntArray]:
     """Energy of a measurement in units of its noise: y' C^-1 y over the axes present.
 
     Parameters
@@ -36,7 +37,7 @@ def whitened_energy(y, C):
     return energy, axes
 
 
-def smallest_pivots(y, C):
+def smallest_pivots(y: FloatArray, C: FloatArray) -> FloatArray:
     """How far the covariance of each sensor is from singular, over the axes that are present.
 
     The arrays are as for `whitened_energy`. Returns (n,): of the covariance in units of its own
@@ -49,7 +50,7 @@ def smallest_pivots(y, C):
     return out
 
 
-def _checked(y, C):
+def _checked(y: FloatArray, C: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Both as compiled code takes them. Raises ValueError where the shapes do not fit."""
     if y.shape != (len(y), 3) or C.shape != (len(y), 3, 3):
         raise ValueError(f'covariances of shape {C.shape} for axes of shape {y.shape}')

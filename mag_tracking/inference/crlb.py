@@ -8,9 +8,20 @@ very sensor looks alike). Matrices that do not fit, are not finite, not symmetri
 or not positive (semi)definite raise ValueError.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from mag_tracking.arrays import BoolArray, FloatArray
+from mag_tracking.inference.matrices import (
+    leading_broadcast,
+    triangular_factor,
+    unit_diagonal,
+    whitened,
+)
 
 RANK_TOLERANCE = 1e-12
 """An eigenvalue below this share of the largest one counts as zero."""
@@ -22,7 +33,7 @@ _K_DIPOLE = 1e-7
 """mu0 / 4 pi [T m / A]; the one in `physics` is not for this room to import."""
 
 
-def information(H, C=None):
+def information(H: ArrayLike, C: ArrayLike | None = None) -> FloatArray:
     """Fisher information of independent measurements, summed over all of them.
 
     Parameters
@@ -36,7 +47,7 @@ def information(H, C=None):
     Returns (n_x, n_x); the unit of entry (i, j) is one over those of x_i and x_j.
     Source: TSP14 eq. (28), (40); T10 eq. (2.16), (5.7).
     """
-    A = _whitened(H, C)
+    A = whitened(H, C)
     A = A.reshape(-1, A.shape[-1])
     return A.T @ A
 
@@ -45,22 +56,23 @@ def information(H, C=None):
 class Observability:
     """What measurements do and do not say of the states near one point."""
 
-    eigenvalues: np.ndarray
+    eigenvalues: FloatArray
     """(n_x,), ascending, of the scaled information; zeros are rounding of either sign."""
     condition_number: float
     """Largest eigenvalue over smallest, T10 eq. (5.8); infinite where there is a kernel."""
-    kernel: np.ndarray
+    kernel: FloatArray
     """(n_x, k), in the states' own units; divided by the scale its columns are orthonormal."""
     unobservable: tuple[str, ...]
     """Names of the states that take part in the kernel."""
 
     @property
-    def kernel_dimension(self):
+    def kernel_dimension(self) -> int:
         """How many directions of the state nothing is known about; 0 = observable."""
         return self.kernel.shape[1]
 
 
-def observability(information, names, scale=None):
+def observability(information: ArrayLike, names: Sequence[str],
+                  scale: ArrayLike | None = None) -> Observability:
     """Local observability, from the eigenvalues of an information matrix.
 
     Parameters
@@ -78,7 +90,7 @@ def observability(information, names, scale=None):
     Source: T10 sections 5.1-5.3; TSP14 section IV.
     """
     J = np.asarray(information, dtype=float)
-    _unit_diagonal('information', J)
+    unit_diagonal('information', J)
     scale = np.ones(len(J)) if scale is None else np.asarray(scale, dtype=float)
     if len(names) != len(J) or scale.shape != (len(J),) or not np.all(scale > 0.0):
         raise ValueError(f'{len(J)} states need as many names and positive scales, '
@@ -89,7 +101,7 @@ def observability(information, names, scale=None):
                          tuple(names[i] for i in np.flatnonzero(_takes_part(V[:, zero]))))
 
 
-def bound(information, prior=None):
+def bound(information: ArrayLike, prior: ArrayLike | None = None) -> FloatArray:
     """Cramer-Rao bound on the covariance of an estimate.
 
     Parameters
@@ -111,11 +123,11 @@ def bound(information, prior=None):
     Source: TSP14 eq. (42); MITRE12 eq. (18), (28), (32).
     """
     J = np.asarray(information, dtype=float)
-    _unit_diagonal('information', J)
-    prior = _broadcast('prior', np.zeros(J.shape) if prior is None else prior, J.shape)
+    unit_diagonal('information', J)
+    prior = leading_broadcast('prior', np.zeros(J.shape) if prior is None else prior, J.shape)
     known = np.isposinf(np.diagonal(prior))
     free = np.ix_(~known, ~known)
-    _unit_diagonal('prior', prior[free])
+    unit_diagonal('prior', prior[free])
     scale, root, kernel = _inverse_root(J[free] + prior[free])
     P = root @ root.T / (scale[:, None] * scale)
     lost = _takes_part(kernel)
@@ -126,7 +138,7 @@ def bound(information, prior=None):
     return covariance
 
 
-def marginal(information, keep):
+def marginal(information: ArrayLike, keep: ArrayLike) -> FloatArray:
     """Information about some states when all the others are unknown as well.
 
     Parameters
@@ -159,12 +171,12 @@ def marginal(information, keep):
     U = U[:, np.count_nonzero(reach > _SHARE):]
     U = np.where(np.linalg.norm(U, axis=1, keepdims=True) > _SHARE, U, 0.0)
     # ... then the inverse of the bound in them, U (U'PU)^-1 U'.
-    R = np.linalg.qr((U.T @ root[kept]).T, mode='r')
+    R = triangular_factor((U.T @ root[kept]).T)
     W = scale[kept, None] * np.linalg.solve(R.T, U.T).T
     return W @ W.T
 
 
-def cpa_information(r0, v0, std):
+def cpa_information(r0: ArrayLike, v0: ArrayLike, std: float) -> FloatArray:
     """Information of a known range at the closest point of approach (CPA).
 
     Parameters
@@ -200,7 +212,8 @@ def cpa_information(r0, v0, std):
     return np.outer(gradient, gradient)
 
 
-def path_bound(F, Q, H, C, P0):
+def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
+               P0: ArrayLike) -> FloatArray:
     """Bound for filters along a given path: the covariance of the EKF linearised at the truth.
 
     Step k predicts with F[k], Q[k], then updates with H[k], C[k].
@@ -220,29 +233,29 @@ def path_bound(F, Q, H, C, P0):
     Returns the covariances (n_steps, n_x, n_x) after each update.
     Source: Tichavsky et al. 1998, without the mean over paths; T10 Alg. 2.
     """
-    A = _whitened(H, C)
+    A = whitened(H, C)
     if A.ndim < 3:
         raise ValueError(f'H needs a leading axis of steps, got {np.shape(H)}')
     n_steps, n_x = len(A), A.shape[-1]
-    F = _broadcast('F', F, (n_steps, n_x, n_x))
-    Q = _broadcast('Q', Q, (n_steps, n_x, n_x))
-    P = _broadcast('P0', P0, (n_x, n_x))
-    _unit_diagonal('P0', P)
-    _unit_diagonal('Q', Q)
+    F = leading_broadcast('F', F, (n_steps, n_x, n_x))
+    Q = leading_broadcast('Q', Q, (n_steps, n_x, n_x))
+    P = leading_broadcast('P0', P0, (n_x, n_x))
+    unit_diagonal('P0', P)
+    unit_diagonal('Q', Q)
     covariances = np.empty((n_steps, n_x, n_x))
     for k in range(n_steps):
         P = F[k] @ P @ F[k].T + Q[k]
-        _, w, V = _unit_diagonal(f'covariance of step {k}', P)
+        _, w, V = unit_diagonal(f'covariance of step {k}', P)
         # Not the scale, which is 1 where the variance is zero: what is known has to stay so.
         L = np.sqrt(np.diagonal(P))[:, None] * V * np.sqrt(np.maximum(w, 0.0))
         # P = L L' becomes L (I + L'A'A L)^-1 L'; by QR nothing is squared or subtracted.
-        R = np.linalg.qr(np.vstack([A[k].reshape(-1, n_x) @ L, np.eye(n_x)]), mode='r')
+        R = triangular_factor(np.vstack([A[k].reshape(-1, n_x) @ L, np.eye(n_x)]))
         G = np.linalg.solve(R.T, L.T)
         P = covariances[k] = G.T @ G
     return covariances
 
 
-def snr(h, C):
+def snr(h: ArrayLike, C: ArrayLike) -> FloatArray:
     """Signal-to-noise ratio (of energies) h' C^-1 h of a field.
 
     Parameters
@@ -255,11 +268,13 @@ def snr(h, C):
     Returns (...), the non-centrality in `detection_probability`; 0 without axes.
     Source: T10 eq. (5.14).
     """
-    A = _whitened(np.asarray(h, dtype=float)[..., None], C)
-    return np.einsum('...ij,...ij->...', A, A)
+    A = whitened(np.asarray(h, dtype=float)[..., None], C)
+    energy: FloatArray = np.einsum('...ij,...ij->...', A, A)
+    return energy
 
 
-def snr_at_distance(moment, noise_std, distance):
+def snr_at_distance(moment: float | FloatArray, noise_std: float | FloatArray,
+                    distance: float | FloatArray) -> FloatArray:
     """Signal-to-noise ratio of one sample of a dipole abeam; four times as much along its axis.
 
     Parameters
@@ -273,74 +288,27 @@ def snr_at_distance(moment, noise_std, distance):
     Source: T10 eq. (5.20), (5.21). Its (5.23) prints |R|^2 where |R| is meant;
     moment and noise of its (5.22) are both too small by about 450.
     """
-    return (_K_DIPOLE * moment / (noise_std * distance**3))**2
+    return cast(FloatArray, (_K_DIPOLE * moment / (noise_std * distance**3))**2)
 
 
-def snr_range(moment, noise_std, ratio):
+def snr_range(moment: float | FloatArray, noise_std: float | FloatArray,
+              ratio: float | FloatArray) -> FloatArray:
     """Distance [m] where `snr_at_distance` is `ratio`; 9.2 gives T10 eq. (5.24).
 
     Along the dipole's axis it is larger by 2^(1/3).
     """
-    return np.cbrt(_K_DIPOLE * moment / (noise_std * np.sqrt(ratio)))
+    distance: FloatArray = np.cbrt(_K_DIPOLE * moment / (noise_std * np.sqrt(ratio)))
+    return distance
 
 
-def _whitened(H, C):
-    """Rows of H in units of their noise (..., n_y, n_x); missing rows are zero."""
-    H = np.asarray(H, dtype=float)
-    if H.ndim < 2:
-        raise ValueError(f'H needs shape (..., n_y, n_x), got {H.shape}')
-    missing = np.isnan(H).all(axis=-1)
-    _refuse('row of H ', 'finite or wholly NaN', H, ~np.isfinite(H).all(axis=-1) & ~missing)
-    H = np.where(missing[..., None], 0.0, H)
-    if C is None:
-        return H
-    n_y = H.shape[-2]
-    C = _broadcast('C', C, H.shape[:-1] + (n_y,))
-    C = np.where(missing[..., :, None] | missing[..., None, :], np.eye(n_y), C)
-    scale, w, V = _unit_diagonal('C', C)
-    _refuse('C', 'positive definite', C, w[..., 0] <= n_y * np.finfo(float).eps)
-    return np.swapaxes(V, -1, -2) @ (H / scale[..., None]) / np.sqrt(w)[..., None]
-
-
-def _broadcast(name, A, shape):
-    """A as a float array of `shape`; only leading axes may be left out."""
-    A = np.asarray(A, dtype=float)
-    try:
-        if A.shape[-2:] == shape[-2:]:
-            return np.broadcast_to(A, shape)
-    except ValueError:
-        pass
-    raise ValueError(f'{name} has shape {A.shape}, needed is {shape}')
-
-
-def _refuse(name, fault, A, bad):
-    """Raise ValueError for the first matrix of A (..., n, n) that is `bad` (...)."""
-    for at in np.argwhere(bad).tolist():
-        raise ValueError(f'{name}{at or ""} is not {fault}: {A[tuple(at)].tolist()}')
-
-
-def _unit_diagonal(name, A):
-    """Scale, eigenvalues and vectors of A / (scale scale'), once A is fit for it."""
-    if A.ndim < 2 or A.shape[-1] != A.shape[-2]:
-        raise ValueError(f'{name} has to be square, got {A.shape}')
-    _refuse(name, 'finite', A, ~np.isfinite(A).all(axis=(-2, -1)))
-    diagonal = np.einsum('...ii->...i', A)
-    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    unit = A / (scale[..., :, None] * scale[..., None, :])
-    skew = np.abs(unit - np.swapaxes(unit, -1, -2))
-    _refuse(name, 'symmetric', A, (skew > 1e-9).any(axis=(-2, -1)))
-    w, V = np.linalg.eigh(unit)
-    _refuse(name, 'positive semidefinite', A, (w < -1e-9).any(-1) | (diagonal < 0.0).any(-1))
-    return scale, w, V
-
-
-def _inverse_root(J):
+def _inverse_root(J: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Scale, G with pseudo-inverse G G' and kernel basis, both of J at unit diagonal."""
-    scale, w, V = _unit_diagonal('information', J)
+    scale, w, V = unit_diagonal('information', J)
     zero = w <= RANK_TOLERANCE * w.max(initial=0.0)
     return scale, V[:, ~zero] / np.sqrt(w[~zero]), V[:, zero]
 
 
-def _takes_part(kernel):
+def _takes_part(kernel: FloatArray) -> BoolArray:
     """Which states (n,) an orthonormal kernel basis (n, k) reaches."""
-    return np.linalg.norm(kernel, axis=1) > _SHARE
+    reached: BoolArray = np.linalg.norm(kernel, axis=1) > _SHARE
+    return reached

@@ -3,26 +3,34 @@
 Source: T10 section 5.4, eq. (5.14)-(5.19).
 """
 
+from typing import cast
+
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import chdtrc, chdtri, chndtr
 
+from mag_tracking.arrays import FloatArray, IntArray
 
-def energy_threshold(false_alarm_probability, degrees_of_freedom):
+
+def energy_threshold(false_alarm_probability: float | FloatArray,
+                     degrees_of_freedom: int | IntArray) -> FloatArray:
     """Threshold h with P(chi2_n > h) = `false_alarm_probability`; T10 eq. (5.18)."""
-    return chdtri(degrees_of_freedom, false_alarm_probability)
+    return cast(FloatArray, chdtri(degrees_of_freedom, false_alarm_probability))
 
 
-def false_alarm_probability(threshold, degrees_of_freedom):
+def false_alarm_probability(threshold: float | FloatArray,
+                            degrees_of_freedom: int | IntArray) -> FloatArray:
     """P(chi2_n > threshold), the inverse of `energy_threshold`."""
-    return chdtrc(degrees_of_freedom, threshold)
+    return cast(FloatArray, chdtrc(degrees_of_freedom, threshold))
 
 
-def detection_probability(snr, threshold, degrees_of_freedom):
+def detection_probability(snr: float | FloatArray, threshold: float | FloatArray,
+                          degrees_of_freedom: int | IntArray) -> FloatArray:
     """P(chi2_n(snr) > threshold) with non-centrality `snr`; T10 eq. (5.19)."""
-    return 1.0 - chndtr(threshold, degrees_of_freedom, snr)
+    return cast(FloatArray, 1.0 - chndtr(threshold, degrees_of_freedom, snr))
 
 
-def missed_probability(probability, run):
+def missed_probability(probability: ArrayLike, run: int) -> FloatArray:
     """Probability that no `run` frames in a row detect.
 
     Parameters
@@ -40,4 +48,5 @@ def missed_probability(probability, run):
         # One more in a row, or none; the last one leaves: the target has been detected.
         waiting = np.concatenate([((1.0 - detected) * waiting.sum(axis=0))[None],
                                   detected * waiting[:-1]])
-    return waiting.sum(axis=0)
+    missed: FloatArray = waiting.sum(axis=0)
+    return missed

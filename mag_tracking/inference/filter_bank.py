@@ -7,6 +7,9 @@ hypotheses may be thousands of nats apart.
 from dataclasses import dataclass, fields
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 
 _NEGLIGIBLE = np.log(100.0)
 """Hypotheses lighter than the heaviest by more than this have no say in which is published."""
@@ -14,38 +17,41 @@ _SINGULAR = 1e-15
 """A variance that is less than this share of the largest is none, as in `numpy.linalg.pinv`."""
 
 
-def log_sum_exp(a, axis=None):
+def log_sum_exp(a: ArrayLike, axis: int | None = None) -> FloatArray:
     """log(sum(exp(a))) without overflow; -inf where all are -inf."""
     a = np.asarray(a, dtype=float)
     top = np.max(a, axis=axis, keepdims=True)
     top = np.where(np.isfinite(top), top, 0.0)
     with np.errstate(divide='ignore'):
         total = np.log(np.sum(np.exp(a - top), axis=axis, keepdims=True)) + top
-    return total.squeeze() if axis is None else np.squeeze(total, axis=axis)
+    out: FloatArray = total.squeeze() if axis is None else np.squeeze(total, axis=axis)
+    return out
 
 
 @dataclass
 class FilterBank:
     """Hypotheses of one target; every array has the hypothesis as first axis."""
 
-    x: np.ndarray
+    x: FloatArray
     """(n_hyp, n_x) states."""
-    P: np.ndarray
+    P: FloatArray
     """(n_hyp, n_x, n_x) covariances."""
-    log_w: np.ndarray
+    log_w: FloatArray
     """(n_hyp,) normalised log-weights."""
-    label: np.ndarray
+    label: IntArray
     """(n_hyp,) int: the arrival that each hypothesis assumes."""
-    kind: np.ndarray
+    kind: IntArray
     """(n_hyp,) int: the kind of target that each hypothesis assumes."""
-    origin: np.ndarray
+    origin: IntArray
     """(n_hyp,) int: the row that each hypothesis had when the bank was made."""
-    nis: np.ndarray
+    nis: FloatArray
     """(n_hyp, n_sensors) normalised innovation squared of the latest measurement; NaN before it,
     and of a sensor that is missing."""
 
     @classmethod
-    def of_targets(cls, x, P, label, n_sensors, background_std, own_covariance=None, kind=None):
+    def of_targets(cls, x: FloatArray, P: FloatArray, label: IntArray, n_sensors: int,
+                   background_std: float, own_covariance: FloatArray | None = None,
+                   kind: IntArray | None = None) -> 'FilterBank':
         """A bank with equal weights from target states alone.
 
         `x` (n_hyp, n_t), `P` (n_hyp, n_t, n_t). Behind them are put each sensor's own
@@ -68,10 +74,10 @@ class FilterBank:
                    np.zeros(n, dtype=int) if kind is None else kind, np.arange(n),
                    np.full((n, n_sensors), np.nan))
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.log_w)
 
-    def best(self):
+    def best(self) -> int:
         """Row of the hypothesis to publish.
 
         Of the heaviest label, and in it of the heaviest kind, the one at whose position
@@ -95,29 +101,30 @@ class FilterBank:
             np.einsum('jii->ji', root)).sum(axis=1))[:, None]
         return int(rows[np.argmax(log_sum_exp(log_density, axis=0))])
 
-    def copy(self):
+    def copy(self) -> 'FilterBank':
         """The same bank with arrays of its own."""
         return FilterBank(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
 
-    def rows(self, rows):
+    def rows(self, rows: IntArray) -> 'FilterBank':
         """A bank of the hypotheses `rows` (n,) int, weighted alike; its arrays are its own."""
         chosen = {f.name: np.ascontiguousarray(getattr(self, f.name)[rows]) for f in fields(self)}
         return FilterBank(**{**chosen, 'log_w': np.full(len(rows), -np.log(len(rows)))})
 
-    def alone(self, i):
+    def alone(self, i: int) -> 'FilterBank':
         """A bank of the hypothesis `i` alone; its arrays are its own."""
         return self.rows(np.array([i]))
 
-    def _heaviest(self, kind, rows):
+    def _heaviest(self, kind: IntArray, rows: IntArray) -> IntArray:
         """Those of `rows` that are of the kind (n_hyp,) which weighs most."""
         of_rows = kind[rows]
         if (of_rows == of_rows[0]).all():
             return rows
         kinds = np.unique(of_rows)
         totals = [log_sum_exp(self.log_w[rows[of_rows == k]]) for k in kinds]
-        return rows[of_rows == kinds[int(np.argmax(totals))]]
+        heaviest: IntArray = rows[of_rows == kinds[int(np.argmax(totals))]]
+        return heaviest
 
-    def separated_weight(self, i, distance=3.0):
+    def separated_weight(self, i: int, distance: float = 3.0) -> float:
         """Total weight of the hypotheses whose position is apart from that of row `i`.
 
         Apart: by more than `distance` deviations of the difference in some
@@ -132,7 +139,7 @@ class FilterBank:
         apart = z > distance**2
         return float(np.exp(log_sum_exp(self.log_w[apart]))) if apart.any() else 0.0
 
-    def reweight(self, log_likelihood):
+    def reweight(self, log_likelihood: FloatArray) -> float:
         """Bayes' rule on the weights; returns the log-evidence of the frame.
 
         A hypothesis whose likelihood is not finite loses all its weight.
@@ -145,7 +152,7 @@ class FilterBank:
             self.log_w = joint - evidence
         return evidence
 
-    def keep(self, mask):
+    def keep(self, mask: BoolArray) -> int:
         """Keep the hypotheses of `mask` and normalise; returns how many went."""
         gone = int(np.count_nonzero(~mask))
         if gone:
@@ -156,7 +163,7 @@ class FilterBank:
                 setattr(self, name, getattr(self, name)[mask])
         return gone
 
-    def prune(self, log_ratio, most):
+    def prune(self, log_ratio: float, most: int) -> int:
         """Drop what is below the best by more than `log_ratio`, and beyond the `most` best."""
         mask = self.log_w >= self.log_w.max() - log_ratio
         if np.count_nonzero(mask) > most:

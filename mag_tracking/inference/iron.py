@@ -3,26 +3,30 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from mag_tracking.arrays import FloatArray
 
 
 @dataclass(frozen=True)
 class Iron:
     """What a vehicle's moment is made of, and how well that is known."""
 
-    hard: np.ndarray
+    hard: FloatArray
     """(3,) [A m^2], m0 in the vehicle's frame, x forward and z up."""
     soft: float
     """[m^3], D."""
-    covariance: np.ndarray
+    covariance: FloatArray
     """(4, 4) of [m0, D]."""
-    residuals: np.ndarray
+    residuals: FloatArray
     """(n, 3) [A m^2], world: moment minus what the two make of it."""
     normalised_cost: float
     """Weighted sum of squared residuals over the degrees of freedom; about one where the model and
     the covariances are right. NaN without covariances."""
 
 
-def hard_and_soft_iron(moments, headings, induction, covariances=None):
+def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: ArrayLike,
+                       covariances: ArrayLike | None = None) -> Iron:
     """Least squares for m0 and D in m = Rz(heading) m0 + D induction.
 
     Parameters
@@ -81,7 +85,7 @@ def hard_and_soft_iron(moments, headings, induction, covariances=None):
     return Iron(theta[:3], float(theta[3]), covariance, moments - A @ theta, cost)
 
 
-def _whitening(covariances, n):
+def _whitening(covariances: ArrayLike | None, n: int) -> FloatArray:
     """(n, 3, 3) inverse Cholesky factors; identities without covariances."""
     if covariances is None:
         return np.tile(np.eye(3), (n, 1, 1))

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.update_kernels import update_bank
 
 
@@ -23,18 +24,18 @@ class Gains:
     P -= G' G, with G = W [H | I] P.
     """
 
-    H: np.ndarray
+    H: FloatArray
     """(n_hyp, n_sensors, 3, n_t + n_own) the derivative that was used."""
     n_own: int
-    G: np.ndarray
+    G: FloatArray
     """(n_hyp, n_sensors, 3, n_x); rows of missing axes are zero."""
-    z: np.ndarray
+    z: FloatArray
     """(n_hyp, n_sensors, 3)"""
-    W: np.ndarray
+    W: FloatArray
     """(n_hyp, n_sensors, 6) lower triangle, row by row."""
 
     @classmethod
-    def of(cls, H, n_own, n_x):
+    def of(cls, H: FloatArray, n_own: int, n_x: int) -> 'Gains':
         """To be filled by the update that has the derivative `H`, of `n_x` states."""
         n_hyp, n_sensors = H.shape[:2]
         return cls(H, n_own, np.empty((n_hyp, n_sensors, 3, n_x)), np.empty((n_hyp, n_sensors, 3)),
@@ -44,7 +45,9 @@ class Gains:
 _NO_GAINS = np.empty((0, 0, 3, 0)), np.empty((0, 0, 3)), np.empty((0, 0, 6))
 
 
-def update(x, P, y, h, H, C, inflation, x_lin=None, n_own=0, gains=None):
+def update(x: FloatArray, P: FloatArray, y: FloatArray, h: FloatArray, H: FloatArray,
+           C: FloatArray, inflation: FloatArray, x_lin: FloatArray | None = None, n_own: int = 0,
+           gains: Gains | None = None) -> tuple[FloatArray, FloatArray]:
     """Measurement update of every hypothesis, in place.
 
     Parameters

@@ -3,13 +3,21 @@
 The model comes in as a function or an object, so that this file is mathematics only.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from mag_tracking.arrays import BoolArray, FloatArray
+
+ResidualAndJacobian: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+"""Takes points (n, n_x), returns residuals (n, n_y) and Jacobians (n, n_y, n_x)."""
 
 
-def refine(residual_and_jacobian, x, n_iterations=40, tolerance=0.0):
+def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iterations: int = 40,
+           tolerance: float = 0.0) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
     """Levenberg-Marquardt on many starts at once, each with its own damping.
 
     Parameters
@@ -63,17 +71,20 @@ MOST_DAMPING = 1e12
 """Steps that are so small and still lead uphill lead nowhere."""
 
 
-def _damped_step(J, residual, damping):
+def _damped_step(J: FloatArray, residual: FloatArray, damping: FloatArray) -> FloatArray:
     """Steps (n, n_x) of Levenberg and Marquardt."""
     Jt = np.swapaxes(J, 1, 2)
     information = Jt @ J
     # Marquardt's scaling: damping is relative to each parameter's own information.
     diagonal = np.einsum('nii->ni', information)
     A = information + (damping[:, None] * diagonal)[:, :, None] * np.eye(J.shape[2])
-    return np.einsum('nij,nj->ni', _inverse(A), np.einsum('nij,nj->ni', Jt, residual))
+    step: FloatArray = np.einsum('nij,nj->ni', _inverse(A),
+                                 np.einsum('nij,nj->ni', Jt, residual))
+    return step
 
 
-def _evaluate(residual_and_jacobian, x):
+def _evaluate(residual_and_jacobian: ResidualAndJacobian, x: FloatArray
+              ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Residuals, Jacobians and costs; an unusable point costs infinity."""
     residual, J = residual_and_jacobian(x)
     cost = np.einsum('ni,ni->n', residual, residual)
@@ -82,7 +93,7 @@ def _evaluate(residual_and_jacobian, x):
     return residual, J, cost
 
 
-def _inverse(A, rank=1e-15):
+def _inverse(A: FloatArray, rank: float = 1e-15) -> FloatArray:
     """Pseudo-inverses (n, k, k), scaled to unit diagonal first: units differ by decades.
 
     Directions whose eigenvalue is then below the share `rank` of the largest are left out.
@@ -92,10 +103,12 @@ def _inverse(A, rank=1e-15):
     w, V = np.linalg.eigh(A / (scale[:, :, None] * scale[:, None, :]))
     w = np.where(w > rank * w[:, -1:], w, np.inf)
     V = V / scale[:, :, None]
-    return (V / w[:, None, :]) @ np.swapaxes(V, 1, 2)
+    inverse: FloatArray = (V / w[:, None, :]) @ np.swapaxes(V, 1, 2)
+    return inverse
 
 
-def project_out_linear(A, y):
+def project_out_linear(A: FloatArray, y: FloatArray
+                       ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Best linear parameters of many linear models y = A p + e, e ~ N(0, I).
 
     Parameters
@@ -122,7 +135,7 @@ LINEAR_RANK = 1e-11
 """Dipoles that are almost at one place would cancel each other with moments without bounds."""
 
 
-def correlated_scores(scores, lag):
+def correlated_scores(scores: FloatArray, lag: int) -> FloatArray:
     """Covariance of the sum of scores that are correlated over some neighbours.
 
     Parameters
@@ -149,10 +162,10 @@ def correlated_scores(scores, lag):
 class SeparableModel(Protocol):
     """Whitened measurements basis(theta) p: linear in p, not in the few theta."""
 
-    def basis(self, theta: np.ndarray) -> np.ndarray:
+    def basis(self, theta: FloatArray) -> FloatArray:
         """(n, n_y, k) for theta (n, n_theta)."""
 
-    def derivative(self, theta: np.ndarray, p: np.ndarray) -> np.ndarray:
+    def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
         """d(basis(theta) p)/d(theta), (n, n_y, n_theta)."""
 
 
@@ -170,7 +183,8 @@ class SeparableProblem:
     Source: variable projection with the Jacobian of Kaufman (1975); TSP14 eq. (46).
     """
 
-    def __init__(self, model, y, nuisance=None):
+    def __init__(self, model: SeparableModel, y: FloatArray,
+                 nuisance: FloatArray | None = None) -> None:
         self._model = model
         # The nuisance is projected out of everything, once.
         self._Q = np.zeros((len(y), 0)) if nuisance is None else np.linalg.qr(nuisance)[0]
@@ -178,11 +192,11 @@ class SeparableProblem:
         self.energy = float(self._y @ self._y)
         """Sum of squares of what the nuisance alone does not explain."""
 
-    def _without_nuisance(self, A):
+    def _without_nuisance(self, A: FloatArray) -> FloatArray:
         """A (n, n_y, k) without what the nuisance explains."""
         return A - self._Q @ (self._Q.T @ A)
 
-    def cost(self, theta):
+    def cost(self, theta: FloatArray) -> FloatArray:
         """(n,) least sum of squares for theta (n, n_theta); infinite where it is no number."""
         A = self._without_nuisance(self._model.basis(theta))
         p, _, _ = project_out_linear(A, self._y)
@@ -190,34 +204,37 @@ class SeparableProblem:
         cost = self.energy - np.einsum('ni,ni->n', p, self._y @ A)
         return np.where(np.isfinite(cost), cost, np.inf)
 
-    def residual_and_jacobian(self, theta):
+    def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals (n, n_y) and the Jacobians (n, n_y, n_theta) of what is predicted."""
         A = self._without_nuisance(self._model.basis(theta))
         p, residual, inverse = project_out_linear(A, self._y)
         D = self._without_nuisance(self._model.derivative(theta, p))
         return residual, D - A @ (inverse @ (np.swapaxes(A, 1, 2) @ D))
 
-    def linear(self, theta):
+    def linear(self, theta: FloatArray) -> FloatArray:
         """p (k,) at theta (n_theta,)."""
-        return project_out_linear(
+        p: FloatArray = project_out_linear(
             self._without_nuisance(self._model.basis(theta[None])), self._y)[0][0]
+        return p
 
 
 @dataclass(frozen=True)
 class Minimum:
     """The lowest minimum that a search found."""
 
-    theta: np.ndarray
+    theta: FloatArray
     """(n_theta,)."""
     cost: float
     """Sum of squared whitened residuals; infinite where no start was usable."""
     converged: bool
-    rivals: tuple = ()
+    rivals: tuple[tuple[FloatArray, float], ...] = ()
     """(theta, cost) of other minima that it ended in, best first."""
 
 
-def search(smooth, coarse, fine, starts, apart, companions=None, n_refined=60, n_steps=4,
-           n_distinct=8, n_best=4):
+def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparableProblem,
+           starts: FloatArray, apart: FloatArray,
+           companions: Callable[[FloatArray], FloatArray] | None = None, n_refined: int = 60,
+           n_steps: int = 4, n_distinct: int = 8, n_best: int = 4) -> Minimum:
     """The lowest minimum of a separable problem, from many starts.
 
     Parameters
@@ -251,7 +268,8 @@ def search(smooth, coarse, fine, starts, apart, companions=None, n_refined=60, n
     theta = _distinct(theta, cost, apart, n_best)
     theta, cost, _, converged = refine(fine.residual_and_jacobian, theta, 100, 1e-8)
     order = np.argsort(cost, kind='stable')
-    best, rivals = order[0], []
+    best = order[0]
+    rivals: list[tuple[FloatArray, float]] = []
     for k in order[1:]:
         if all((np.abs(theta[k] - x) > apart).any()
                for x in (theta[best], *(x for x, _ in rivals))):
@@ -259,9 +277,9 @@ def search(smooth, coarse, fine, starts, apart, companions=None, n_refined=60, n
     return Minimum(theta[best], float(cost[best]), bool(converged[best]), tuple(rivals))
 
 
-def _distinct(theta, cost, apart, most):
+def _distinct(theta: FloatArray, cost: FloatArray, apart: FloatArray, most: int) -> FloatArray:
     """The best `most` of theta (n, n_theta) of which no two are the same point."""
-    kept = []
+    kept: list[FloatArray] = []
     for x in theta[np.argsort(cost, kind='stable')]:
         if all((np.abs(x - other) > apart).any() for other in kept):
             kept.append(x)

@@ -9,14 +9,20 @@ ValueError with the value.
 Source: MITRE12 section 3 and appendix B.
 """
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import ndtr, ndtri
+
+from mag_tracking.arrays import BoolArray, FloatArray
 
 _EDGE = 1e-9
 """A frequency on the edge of a band belongs to it; it may be off by this share."""
 
 
-def noise_spectrum(frequency, background, resolution, bandwidth):
+def noise_spectrum(frequency: ArrayLike, background: float, resolution: float,
+                   bandwidth: float) -> FloatArray:
     """Density of geomagnetic 1/f noise and of a sensor's quantisation.
 
     Parameters
@@ -39,19 +45,21 @@ def noise_spectrum(frequency, background, resolution, bandwidth):
     said, is taken so, too. The frequency stands there in the denominator as a pure
     number, in Hz.
     """
-    frequency = np.abs(np.asarray(frequency, dtype=float))
-    _refuse('frequency', 'numbers', frequency, np.isnan(frequency))
+    f = np.abs(np.asarray(frequency, dtype=float))
+    _refuse('frequency', 'numbers', f, np.isnan(f))
     for name, value in (('background', background), ('resolution', resolution)):
         _refuse(name, 'at least 0 and finite', value, not 0.0 <= value < np.inf)
     _refuse('bandwidth', 'above 0 and finite', bandwidth, not 0.0 < bandwidth < np.inf)
     steps = resolution**2 / (24.0 * bandwidth)
     if background == 0.0:
-        return np.full(frequency.shape, steps)
+        return np.full(f.shape, steps)
     with np.errstate(divide='ignore'):
-        return background**2 / frequency + steps
+        density: FloatArray = background**2 / f + steps
+    return density
 
 
-def deflection(B, sampling_rate, spectrum, band):
+def deflection(B: ArrayLike, sampling_rate: float, spectrum: Callable[[FloatArray], ArrayLike],
+               band: Sequence[float]) -> FloatArray:
     """Deflection d of the matched filter: distance of its two means in standard deviations.
 
     Parameters
@@ -108,7 +116,8 @@ def deflection(B, sampling_rate, spectrum, band):
     return np.where(missing.all(axis=-1), np.nan, d)[()]
 
 
-def detection_probability(deflection, false_alarm_probability):
+def detection_probability(deflection: ArrayLike, false_alarm_probability: ArrayLike
+                          ) -> FloatArray:
     """Probability that the matched filter detects the signal it is made for.
 
     Parameters
@@ -127,7 +136,7 @@ def detection_probability(deflection, false_alarm_probability):
     return ndtr(deflection + ndtri(p_fa))
 
 
-def any_detects(probability, axis=None):
+def any_detects(probability: ArrayLike, axis: int | tuple[int, ...] | None = None) -> FloatArray:
     """Probability that at least one of several independent detectors detects.
 
     Parameters
@@ -146,13 +155,15 @@ def any_detects(probability, axis=None):
     p = np.asarray(probability, dtype=float)
     _refuse('probability', 'from 0 to 1', p, (p < 0.0) | (p > 1.0))
     with np.errstate(divide='ignore'):
-        return -np.expm1(np.sum(np.log1p(-np.where(np.isnan(p), 0.0, p)), axis=axis))
+        silent = np.sum(np.log1p(-np.where(np.isnan(p), 0.0, p)), axis=axis)
+    any_of_them: FloatArray = -np.expm1(silent)
+    return any_of_them
 
 
-def _refuse(name, needed, value, bad):
+def _refuse(name: str, needed: str, value: ArrayLike, bad: bool | BoolArray) -> None:
     """Raise ValueError for the first entry of `value` that is `bad`, one flag or its shape."""
     if np.any(bad):
-        at = np.argwhere(bad)[0] if np.ndim(bad) else ()
-        where = at.tolist() if len(at) else ''
+        at = np.argwhere(bad)[0].tolist() if np.ndim(bad) else []
+        where = at if at else ''
         got = np.asarray(value)[tuple(at)].tolist()
         raise ValueError(f'{name}{where} has to be {needed}, got {got}')

@@ -7,11 +7,13 @@ care. Source: Bierman 1973, Fixed interval smoothing with discrete measurements 
 Bryson-Frazier), here sensor by sensor as `kalman.update` goes.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.kalman import Gains
 
 
@@ -19,21 +21,21 @@ from mag_tracking.inference.kalman import Gains
 class Step:
     """What a filter did at one time."""
 
-    x: np.ndarray
+    x: FloatArray
     """(n_hyp, n_x) states after the update."""
-    P: np.ndarray
+    P: FloatArray
     """(n_hyp, n_x, n_x) their covariances."""
     gains: Gains | None
     """Of the update; None where there was none."""
-    F: np.ndarray | None = None
+    F: FloatArray | None = None
     """(n_t, n_t) or (n_hyp, n_t, n_t) Jacobian of the propagation to this time; None at the first
     one."""
-    decay: np.ndarray | None = None
+    decay: FloatArray | None = None
     """(n_x - n_t,) what the other states were multiplied by, each on its own; None at the first
     one."""
 
 
-def smoothed_states(steps):
+def smoothed_states(steps: Sequence[Step]) -> list[FloatArray]:
     """States at each time given the measurements of all times.
 
     Parameters
@@ -61,7 +63,7 @@ def smoothed_states(steps):
     return out[::-1]
 
 
-def smoothed_covariances(steps):
+def smoothed_covariances(steps: Sequence[Step]) -> list[FloatArray]:
     """[(n_hyp, n_x, n_x)] covariances at each of the `steps`; see `smoothed_states`."""
     after, out = np.zeros_like(steps[-1].P), []
     for step in reversed(steps):
@@ -74,14 +76,15 @@ def smoothed_covariances(steps):
     return out[::-1]
 
 
-def _before(step, after):
-    """Phi' `after` (n_hyp, n_x, m), where Phi is the propagation to `step`."""
+def _before(step: Step, after: FloatArray) -> FloatArray:
+    """Phi' `after` (n_hyp, n_x, m), where Phi is the propagation to `step`, which has one."""
+    assert step.F is not None and step.decay is not None
     n_t = step.F.shape[-1]
     return np.concatenate([np.swapaxes(step.F, -1, -2) @ after[:, :n_t],
                            step.decay[:, None] * after[:, n_t:]], axis=1)
 
 
-def _information_before_update(after, gains):
+def _information_before_update(after: FloatArray, gains: Gains) -> FloatArray:
     """(n_hyp, n_x, n_x): `after` carried back over an update, sensor by sensor."""
     n_sensors, n_t = gains.H.shape[1], gains.H.shape[3] - gains.n_own
     n_x = after.shape[1]
@@ -106,7 +109,8 @@ def _information_before_update(after, gains):
 
 @njit('void(float64[:,::1], float64[:,:,:,::1], int64, float64[:,:,:,::1], float64[:,:,::1], '
       'float64[:,:,::1])', cache=True, error_model='numpy')
-def _adjoint_of_update(after, H, n_own, G, z, W):
+def _adjoint_of_update(after: FloatArray, H: FloatArray, n_own: int, G: FloatArray, z: FloatArray,
+                       W: FloatArray) -> None:
     """`after` (n_hyp, n_x) carried back over an update, in place, sensor by sensor."""
     n_hyp, n_sensors, n_x = H.shape[0], H.shape[1], after.shape[1]
     n_t = H.shape[3] - n_own

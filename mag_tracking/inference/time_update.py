@@ -3,10 +3,12 @@
 import numpy as np
 from numba import njit
 
+from mag_tracking.arrays import BoolArray, CompileOptions, FloatArray
 from mag_tracking.records import plain
 
 
-def predict(x, P, x_target, F, Q, variance, decay=None):
+def predict(x: FloatArray, P: FloatArray, x_target: FloatArray, F: FloatArray, Q: FloatArray,
+            variance: float | FloatArray, decay: float | FloatArray | None = None) -> None:
     """Time update of every hypothesis, in place.
 
     Parameters
@@ -42,11 +44,11 @@ def predict(x, P, x_target, F, Q, variance, decay=None):
                   *(np.array(np.broadcast_to(v, n_rest), dtype=float) for v in (variance, decay)))
 
 
-_INLINE = {'error_model': 'numpy', 'fastmath': {'contract'}, 'forceinline': True}
+_INLINE: CompileOptions = {'error_model': 'numpy', 'fastmath': {'contract'}, 'forceinline': True}
 
 
 @njit(**_INLINE)
-def _find_what_moves(F, f, moves):
+def _find_what_moves(F: FloatArray, f: int, moves: BoolArray) -> None:
     """Note the rows in which Jacobian `f` is not that of what stays as it is."""
     for a in range(len(moves)):
         moves[a] = F[f, a, a] != 1.0
@@ -55,7 +57,7 @@ def _find_what_moves(F, f, moves):
 
 
 @njit(**_INLINE)
-def _fade(x, P, p, n_t, decay):
+def _fade(x: FloatArray, P: FloatArray, p: int, n_t: int, decay: FloatArray) -> None:
     """Multiply the states behind the target's by `decay`."""
     for i in range(n_t, x.shape[1]):
         x[p, i] *= decay[i - n_t]
@@ -67,7 +69,7 @@ def _fade(x, P, p, n_t, decay):
 
 
 @njit(**_INLINE)
-def _move(P, p, F, f, moves, T):
+def _move(P: FloatArray, p: int, F: FloatArray, f: int, moves: BoolArray, T: FloatArray) -> None:
     """P = F P F' for the target's states; most of F is zero, and most rows stay as they are."""
     n_t, n_x = len(moves), P.shape[1]
     for a in range(n_t):
@@ -99,7 +101,8 @@ def _move(P, p, F, f, moves, T):
 
 @njit('void(float64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[:,:,::1], '
       'float64[::1], float64[::1])', cache=True, error_model='numpy', fastmath={'contract'})
-def _predict_bank(x, P, F, Q, variance, decay):
+def _predict_bank(x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, variance: FloatArray,
+                  decay: FloatArray) -> None:
     """Loop over the hypotheses; what is behind the target's states only decays and grows.
 
     `F` and `Q` are one for each, or one for all.

@@ -6,25 +6,33 @@ A symmetric 3 x 3 is its lower triangle, row by row: as six scalars it needs no 
 """
 
 import math
+from typing import TypeAlias
 
 import numpy as np
 from numba import int64, njit
 
+from mag_tracking.arrays import CompileOptions, FloatArray, IntArray
+
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
-_COMPILE = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}
+_COMPILE: CompileOptions = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}
 """Fused multiply-add is allowed, nothing else that would change a result.
 
 The kernels take whole arrays and row numbers, and give back scalars: a slice
 or a small array passed on costs more than the arithmetic it saves writing.
 """
 
-_INLINE = {'error_model': 'numpy', 'fastmath': {'contract'}, 'forceinline': True}
+_INLINE: CompileOptions = {'error_model': 'numpy', 'fastmath': {'contract'}, 'forceinline': True}
+
+_Vector: TypeAlias = tuple[float, float, float]
+_Lower: TypeAlias = tuple[float, float, float, float, float, float]
+"""A lower triangle (3, 3), row by row."""
 
 
 @njit(**_INLINE)
-def _of_present_axes(y, j, s00, s10, s11, s20, s21, s22):
+def _of_present_axes(y: FloatArray, j: int, s00: float, s10: float, s11: float, s20: float,
+                     s21: float, s22: float) -> _Lower:
     """A covariance of sensor j with the rows and columns of missing axes as in identity."""
     if math.isnan(y[j, 0]):
         s00, s10, s20 = 1.0, 0.0, 0.0
@@ -36,14 +44,14 @@ def _of_present_axes(y, j, s00, s10, s11, s20, s21, s22):
 
 
 @njit(**_INLINE)
-def _covariance(y, C, j):
+def _covariance(y: FloatArray, C: FloatArray, j: int) -> _Lower:
     """That of sensor j among `C` (n, 3, 3), as `_of_present_axes`."""
     return _of_present_axes(
         y, j, C[j, 0, 0], C[j, 1, 0], C[j, 1, 1], C[j, 2, 0], C[j, 2, 1], C[j, 2, 2])
 
 
 @njit(**_INLINE)
-def _factor(s00, s10, s11, s20, s21, s22):
+def _factor(s00: float, s10: float, s11: float, s20: float, s21: float, s22: float) -> _Lower:
     """Unit lower factor l10, l20, l21 and pivots e0, e1, e2: S = L diag(e) L'."""
     l10, l20 = s10 / s00, s20 / s00
     e1 = s11 - l10 * s10
@@ -53,7 +61,8 @@ def _factor(s00, s10, s11, s20, s21, s22):
 
 
 @njit(**_INLINE)
-def _gain_rows(y, P, H, p, j, n_own, first, T):
+def _gain_rows(y: FloatArray, P: FloatArray, H: FloatArray, p: int, j: int, n_own: int,
+               first: int, T: FloatArray) -> None:
     """T = [H | I] P, the three rows of sensor j; rows of missing axes are zero.
 
     Five columns of H at a time, so that each entry of T is touched less often.
@@ -90,7 +99,7 @@ def _gain_rows(y, P, H, p, j, n_own, first, T):
 
 
 @njit(**_INLINE)
-def _n_present(y, C):
+def _n_present(y: FloatArray, C: FloatArray) -> int:
     """How many axes are not NaN; -1 if the noise of a sensor's is not positive definite."""
     n = 0
     for j in range(y.shape[0]):
@@ -103,7 +112,9 @@ def _n_present(y, C):
 
 
 @njit(**_INLINE)
-def _innovation(y, C, inflation, h, H, x, x_lin, p, j, n_own, first, T):
+def _innovation(y: FloatArray, C: FloatArray, inflation: FloatArray, h: FloatArray, H: FloatArray,
+                x: FloatArray, x_lin: FloatArray, p: int, j: int, n_own: int, first: int,
+                T: FloatArray) -> tuple[_Vector, _Lower]:
     """Innovation u and its covariance T [H | I]' + C + inflation; u is zero on missing axes."""
     u0 = y[j, 0] - h[p, j, 0] - x[p, first]
     u1 = y[j, 1] - h[p, j, 1] - x[p, first + 1]
@@ -134,7 +145,8 @@ def _innovation(y, C, inflation, h, H, x, x_lin, p, j, n_own, first, T):
 
 
 @njit(**_INLINE)
-def _apply(x, P, p, G, z0, z1, z2):
+def _apply(x: FloatArray, P: FloatArray, p: int, G: FloatArray, z0: float, z1: float,
+           z2: float) -> None:
     """x += G' z and P -= G' G; both halves get the same products, so P stays symmetric."""
     n_x = x.shape[1]
     for i in range(n_x):
@@ -145,7 +157,8 @@ def _apply(x, P, p, G, z0, z1, z2):
 
 
 @njit(**_INLINE)
-def _whiten(T, l10, l20, l21, r0, r1, r2):
+def _whiten(T: FloatArray, l10: float, l20: float, l21: float, r0: float, r1: float,
+            r2: float) -> None:
     """Rows of T to diag(r) L^-1 T, where r is one over the root of the pivots."""
     for i in range(T.shape[1]):
         t0 = T[0, i]
@@ -156,7 +169,9 @@ def _whiten(T, l10, l20, l21, r0, r1, r2):
 
 
 @njit(**_INLINE)
-def _keep(p, j, T, z0, z1, z2, l10, l20, l21, r0, r1, r2, G, z, W):
+def _keep(p: int, j: int, T: FloatArray, z0: float, z1: float, z2: float, l10: float, l20: float,
+          l21: float, r0: float, r1: float, r2: float, G: FloatArray, z: FloatArray,
+          W: FloatArray) -> None:
     """Store what `Gains` holds of hypothesis p and sensor j."""
     for a in range(3):
         for i in range(T.shape[1]):
@@ -167,16 +182,11 @@ def _keep(p, j, T, z0, z1, z2, l10, l20, l21, r0, r1, r2, G, z, W):
     W[p, j, 3], W[p, j, 4], W[p, j, 5] = r2 * (l10 * l21 - l20), -r2 * l21, r2
 
 
-@njit('int64(float64[:,::1], float64[:,:,::1], float64[:,::1], float64[:,::1], '
-      'float64[:,:,::1], float64[:,:,::1], float64[:,:,:,::1], float64[:,::1], '
-      'int64, float64[::1], float64[:,::1], '
-      'float64[:,:,:,::1], float64[:,:,::1], float64[:,:,::1])', **_COMPILE)
-def update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis, G, z, W):
-    """Loop of the update over hypotheses and sensors; nothing is changed where it is not 0.
-
-    -1: a noise is not positive definite; -2: shapes do not fit, it would read beyond an array.
-    What a backward pass wants goes into G, z and W unless they are of length 0.
-    """
+@njit(**_INLINE)
+def _shapes_fit(x: FloatArray, P: FloatArray, x_lin: FloatArray, y: FloatArray, C: FloatArray,
+                h: FloatArray, H: FloatArray, inflation: FloatArray, n_own: int, G: FloatArray,
+                z: FloatArray, W: FloatArray) -> bool:
+    """Whether the arrays of `update_bank` have the sizes that it reads."""
     n_hyp, n_sensors, n_columns = H.shape[0], H.shape[1], H.shape[3]
     n_x = n_columns - n_own + (n_own + 3) * n_sensors
     # Sizes one by one: numba takes half a second to compile comparisons of tuples.
@@ -186,12 +196,29 @@ def update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis, 
             or len(C) != n_sensors or h.shape[1] != n_sensors or inflation.shape[1] != n_sensors
             or y.shape[1] != 3 or C.shape[1] != 3 or C.shape[2] != 3 or h.shape[2] != 3
             or H.shape[2] != 3):
+        return False
+    return len(G) == 0 or (
+        len(G) == n_hyp and len(z) == n_hyp and len(W) == n_hyp and G.shape[1] == n_sensors
+        and z.shape[1] == n_sensors and W.shape[1] == n_sensors and G.shape[2] == 3
+        and G.shape[3] == n_x and z.shape[2] == 3 and W.shape[2] == 6)
+
+
+@njit('int64(float64[:,::1], float64[:,:,::1], float64[:,::1], float64[:,::1], '
+      'float64[:,:,::1], float64[:,:,::1], float64[:,:,:,::1], float64[:,::1], '
+      'int64, float64[::1], float64[:,::1], '
+      'float64[:,:,:,::1], float64[:,:,::1], float64[:,:,::1])', **_COMPILE)
+def update_bank(x: FloatArray, P: FloatArray, x_lin: FloatArray, y: FloatArray, C: FloatArray,
+                h: FloatArray, H: FloatArray, inflation: FloatArray, n_own: int,
+                log_likelihood: FloatArray, nis: FloatArray, G: FloatArray, z: FloatArray,
+                W: FloatArray) -> int:
+    """Loop of the update over hypotheses and sensors; nothing is changed where it is not 0.
+
+    -1: a noise is not positive definite; -2: shapes do not fit, it would read beyond an array.
+    What a backward pass wants goes into G, z and W unless they are of length 0.
+    """
+    if not _shapes_fit(x, P, x_lin, y, C, h, H, inflation, n_own, G, z, W):
         return -2
-    keep = len(G) > 0
-    if keep and (len(G) != n_hyp or len(z) != n_hyp or len(W) != n_hyp or G.shape[1] != n_sensors
-                 or z.shape[1] != n_sensors or W.shape[1] != n_sensors or G.shape[2] != 3
-                 or G.shape[3] != n_x or z.shape[2] != 3 or W.shape[2] != 6):
-        return -2
+    n_hyp, n_sensors, keep = H.shape[0], H.shape[1], len(G) > 0
     n = _n_present(y, C)
     if n < 0:
         return -1
@@ -219,7 +246,7 @@ def update_bank(x, P, x_lin, y, C, h, H, inflation, n_own, log_likelihood, nis, 
 
 @njit('boolean(float64[:,::1], float64[:,:,::1], float64[::1], int64[::1])', cache=True,
       error_model='numpy')
-def energies(y, C, energy, axes):
+def energies(y: FloatArray, C: FloatArray, energy: FloatArray, axes: IntArray) -> bool:
     """`axes.whitened_energy`; False where a covariance is not positive definite."""
     for j in range(len(y)):
         l10, l20, l21, e0, e1, e2 = _factor(*_covariance(y, C, j))
@@ -236,7 +263,7 @@ def energies(y, C, energy, axes):
 
 
 @njit('void(float64[:,::1], float64[:,:,::1], float64[::1])', cache=True, error_model='numpy')
-def smallest_pivots(y, C, out):
+def smallest_pivots(y: FloatArray, C: FloatArray, out: FloatArray) -> None:
     """`axes.smallest_pivots`."""
     for j in range(len(y)):
         s00, s10, s11, s20, s21, s22 = _covariance(y, C, j)

@@ -5,11 +5,13 @@ them. One pass at a time.
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.physics.dipole import K_DIPOLE
 
 
-def anderson_functions(tau):
+def anderson_functions(tau: ArrayLike) -> FloatArray:
     """The three Anderson functions tau^n / (tau^2 + 1)^(5/2), n = 0, 1, 2.
 
     Parameters
@@ -29,10 +31,11 @@ def anderson_functions(tau):
     # Powers of 1/(tau^2 + 1) and of tau/sqrt(tau^2 + 1), which cannot overflow.
     cosine = 1.0 / np.hypot(tau, 1.0)
     sine = tau * cosine
-    return cosine[..., None]**3 * np.stack([cosine**2, sine * cosine, sine**2], axis=-1)
+    f: FloatArray = cosine[..., None]**3 * np.stack([cosine**2, sine * cosine, sine**2], axis=-1)
+    return f
 
 
-def closest_approach(r0, v0):
+def closest_approach(r0: ArrayLike, v0: ArrayLike) -> tuple[float, float, FloatArray]:
     """Closest point of approach of a straight pass.
 
     Parameters
@@ -64,13 +67,13 @@ def closest_approach(r0, v0):
     r_cpa = r0 + path * direction
     # Once more, since the difference keeps a share along v0 of the rounding of r0.
     r_cpa -= (r_cpa @ direction) * direction
-    distance = np.linalg.norm(r_cpa)
+    distance = float(np.linalg.norm(r_cpa))
     if distance <= 1e-15 * np.linalg.norm(r0):
         distance, r_cpa = 0.0, np.zeros(3)
-    return float(path / speed), float(distance), r_cpa
+    return float(path / speed), distance, r_cpa
 
 
-def anderson_coefficients(r_cpa, v0, m):
+def anderson_coefficients(r_cpa: ArrayLike, v0: ArrayLike, m: ArrayLike) -> FloatArray:
     """Coefficients of the Anderson functions of a straight pass.
 
     Parameters
@@ -108,7 +111,7 @@ def anderson_coefficients(r_cpa, v0, m):
     return K_DIPOLE / distance**3 * np.stack([c1, c2, c3], axis=-1)
 
 
-def anderson_field(t, r0, v0, m):
+def anderson_field(t: ArrayLike, r0: ArrayLike, v0: ArrayLike, m: ArrayLike) -> FloatArray:
     """Flux density at the sensor of a dipole on a straight pass.
 
     Parameters
@@ -140,7 +143,7 @@ def anderson_field(t, r0, v0, m):
     return anderson_functions(tau) @ C.T
 
 
-def _vector(name, value):
+def _vector(name: str, value: ArrayLike) -> FloatArray:
     """The value as a vector of three."""
     value = np.asarray(value, dtype=float)
     if value.shape != (3,):

@@ -5,9 +5,13 @@ estimators call, and array functions over them for people.
 """
 
 import math
+from typing import TypeAlias
 
 import numpy as np
 from numba import njit
+from numpy.typing import ArrayLike
+
+from mag_tracking.arrays import CompileOptions, FloatArray
 
 MU0 = 4e-7 * math.pi
 """Vacuum permeability [T m / A], the value of the source documents."""
@@ -15,16 +19,21 @@ MU0 = 4e-7 * math.pi
 K_DIPOLE = 1e-7
 """mu0 / 4 pi [T m / A]."""
 
-_COMPILE = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}
+_COMPILE: CompileOptions = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}
 """Fused multiply-add is allowed, nothing else that would change a result."""
 
 
-_INLINE = {'error_model': 'numpy', 'fastmath': {'contract'}, 'forceinline': True}
+_INLINE: CompileOptions = {'error_model': 'numpy', 'fastmath': {'contract'}, 'forceinline': True}
 """For kernels that pass scalars: small arrays would cost more than the arithmetic."""
+
+Vector: TypeAlias = tuple[float, float, float]
+Symmetric: TypeAlias = tuple[float, float, float, float, float, float]
+"""The upper triangle of a symmetric (3, 3), row by row."""
 
 
 @njit(**_INLINE)
-def field_and_jacobians(d0, d1, d2, m0, m1, m2):
+def field_and_jacobians(d0: float, d1: float, d2: float, m0: float, m1: float, m2: float
+                        ) -> tuple[Vector, Symmetric, Symmetric]:
     """Field and both Jacobians of one dipole at one point, as scalars.
 
     `d` is sensor minus source [m], `m` the moment [A m^2]. Returns B (3) [T] and
@@ -50,7 +59,7 @@ def field_and_jacobians(d0, d1, d2, m0, m1, m2):
 
 
 @njit(**_INLINE)
-def _row_times_symmetric(a, b, c, S):
+def _row_times_symmetric(a: float, b: float, c: float, S: Symmetric) -> Vector:
     """[a b c] S of a symmetric S given as its upper triangle."""
     s00, s01, s02, s11, s12, s22 = S
     return a * s00 + b * s01 + c * s02, a * s01 + b * s11 + c * s12, a * s02 + b * s12 + c * s22
@@ -58,7 +67,8 @@ def _row_times_symmetric(a, b, c, S):
 
 @njit('void(float64[:,::1], float64[:,::1], float64[:,::1], float64[:,:,::1], '
       'float64[:,:,::1])', **_COMPILE)
-def _field_and_jacobians_rows(d, m, B, dB_dd, dB_dm):
+def _field_and_jacobians_rows(d: FloatArray, m: FloatArray, B: FloatArray, dB_dd: FloatArray,
+                              dB_dm: FloatArray) -> None:
     """Loop of `field_and_jacobians` over rows."""
     for i in range(d.shape[0]):
         b, dd, dm = field_and_jacobians(d[i, 0], d[i, 1], d[i, 2], m[i, 0], m[i, 1], m[i, 2])
@@ -72,7 +82,9 @@ def _field_and_jacobians_rows(d, m, B, dB_dd, dB_dm):
 @njit('void(float64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[:,:,::1], '
       'float64[:,:,:,::1], float64[:,:,:,::1], float64[:,:,::1], float64[:,:,:,::1], '
       'float64[:,::1])', **_COMPILE)
-def _sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx, h, H, gradient):
+def _sensor_fields(positions: FloatArray, R_sw: FloatArray, r: FloatArray, m: FloatArray,
+                   dr_dx: FloatArray, dm_dx: FloatArray, h: FloatArray, H: FloatArray,
+                   gradient: FloatArray) -> None:
     """Loop of `field_and_jacobians` over hypotheses, sensors, dipoles; adds to zeros but for H."""
     n_hyp, n_dip, n_t = dr_dx.shape[0], dr_dx.shape[1], dr_dx.shape[3]
     for p in range(n_hyp):
@@ -100,7 +112,9 @@ def _sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx, h, H, gradient):
                             - g1 * dr_dx[p, s, 1, c] - g2 * dr_dx[p, s, 2, c])
 
 
-def sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx):
+def sensor_fields(positions: FloatArray, R_sw: FloatArray, r: FloatArray, m: FloatArray,
+                  dr_dx: FloatArray, dm_dx: FloatArray
+                  ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Field of moving dipoles at fixed sensors, with its derivative by the state.
 
     Parameters
@@ -131,7 +145,7 @@ def sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx):
     return h, H, gradient
 
 
-def _evaluate(r, m):
+def _evaluate(r: ArrayLike, m: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Broadcast, flatten, run the kernel; field and Jacobians in the broadcast shape."""
     r, m = np.broadcast_arrays(np.asarray(r, dtype=float), np.asarray(m, dtype=float))
     if r.shape[-1:] != (3,):
@@ -146,7 +160,7 @@ def _evaluate(r, m):
     return B.reshape(shape), dB_dd.reshape(shape + (3,)), dB_dm.reshape(shape + (3,))
 
 
-def dipole_field(r, m):
+def dipole_field(r: ArrayLike, m: ArrayLike) -> FloatArray:
     """Flux density of a point dipole.
 
     Parameters
@@ -166,7 +180,7 @@ def dipole_field(r, m):
     return _evaluate(r, m)[0]
 
 
-def dipole_jacobians(r, m):
+def dipole_jacobians(r: ArrayLike, m: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Derivatives of the dipole field.
 
     Parameters

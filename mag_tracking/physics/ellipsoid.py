@@ -1,14 +1,17 @@
 """A permeable ellipsoid of revolution in the earth's field: a vehicle's induced moment."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import elliprd
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.physics.dipole import MU0
 
 
-def demagnetisation_factors(aspect):
+def demagnetisation_factors(aspect: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Demagnetisation factors of an ellipsoid of revolution.
 
     Parameters
@@ -38,7 +41,8 @@ def demagnetisation_factors(aspect):
     return aspect / 3 * elliprd(1.0, 1.0, square), aspect / 3 * elliprd(1.0, square, 1.0)
 
 
-def ellipsoid_moment(semi_axes, mu_r, heading, earth_field):
+def ellipsoid_moment(semi_axes: Sequence[float] | FloatArray, mu_r: float, heading: ArrayLike,
+                     earth_field: ArrayLike) -> FloatArray:
     """Moment that the earth's field induces in a permeable ellipsoid of revolution.
 
     The axis of revolution is horizontal and points along the heading.
@@ -80,4 +84,5 @@ def ellipsoid_moment(semi_axes, mu_r, heading, earth_field):
     p1, p2 = (volume * kappa / (1.0 + kappa * L) for L in demagnetisation_factors(a / b))
     axis = np.stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)], axis=-1)
     along = np.sum(axis * earth_field, axis=-1, keepdims=True)
-    return (p2 * earth_field + (p1 - p2) * along * axis) / MU0
+    moment: FloatArray = (p2 * earth_field + (p1 - p2) * along * axis) / MU0
+    return moment

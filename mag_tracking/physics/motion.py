@@ -6,11 +6,14 @@ hold it constant over a sample, and PHD15 Paper A eq. (18) is misprinted.)
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from mag_tracking.arrays import FloatArray
 
 _INTEGRAL, _RATE = np.arange(3), np.arange(3, 6)
 
 
-def integrator_noise(dt, density):
+def integrator_noise(dt: float, density: ArrayLike) -> FloatArray:
     """Process noise of a double integrator driven by white noise.
 
     Parameters
@@ -33,7 +36,7 @@ def integrator_noise(dt, density):
     return Q
 
 
-def constant_velocity(dt):
+def constant_velocity(dt: float) -> FloatArray:
     """Transition matrix (6, 6) of position and velocity over `dt` seconds."""
     F = np.eye(6)
     F[_INTEGRAL, _RATE] = dt

@@ -3,10 +3,13 @@
 import numpy as np
 from numba import njit
 
+from mag_tracking.arrays import FloatArray
+
 
 @njit('void(float64[:,:,::1], float64[:,:,:,::1], float64[:,:,:], float64[:,:,::1], '
       'float64[:,:,:,::1])', cache=True, error_model='numpy', fastmath={'contract'})
-def _turned_fields(h, H, angles, out_h, out_H):
+def _turned_fields(h: FloatArray, H: FloatArray, angles: FloatArray, out_h: FloatArray,
+                   out_H: FloatArray) -> None:
     """Loop of `turned_fields` over hypotheses and sensors."""
     n_hyp, n_sensors, _, n_t = H.shape
     for p in range(n_hyp):
@@ -27,7 +30,8 @@ def _turned_fields(h, H, angles, out_h, out_H):
             out_H[p, j, 2, n_t], out_H[p, j, 2, n_t + 1], out_H[p, j, 2, n_t + 2] = h1, -h0, 0.0
 
 
-def turned_fields(h, H, angles):
+def turned_fields(h: FloatArray, H: FloatArray, angles: FloatArray
+                  ) -> tuple[FloatArray, FloatArray]:
     """Fields as sensors see them that are turned by small angles.
 
     Parameters

@@ -19,19 +19,23 @@ contractions of the tensor with d, and P = d.grad(P)/l.
 """
 
 import math
+from collections.abc import Sequence
 from itertools import combinations_with_replacement
 
 import numpy as np
 from numba import njit
+from numpy.typing import ArrayLike
 
-from mag_tracking.physics.dipole import K_DIPOLE
+from mag_tracking.arrays import CompileOptions, FloatArray
+from mag_tracking.physics.dipole import K_DIPOLE, Symmetric, Vector
 
-_COMPILE = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}
-_INLINE = {'error_model': 'numpy', 'fastmath': {'contract'}, 'forceinline': True}
+_COMPILE: CompileOptions = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}
+_INLINE: CompileOptions = {'error_model': 'numpy', 'fastmath': {'contract'}, 'forceinline': True}
 
 
 @njit(**_INLINE)
-def _add_order(order, d, s, inv2, g, H, B, dB_dd):
+def _add_order(order: int, d: Vector, s: float, inv2: float, g: Vector, H: Symmetric,
+               B: FloatArray, dB_dd: FloatArray) -> None:
     """Add field and Jacobian of one order; g, H are grad P and grad grad P, s mu0/4pi/|d|^(2l+1).
 
     `H` is an upper triangle, row by row.
@@ -52,7 +56,8 @@ def _add_order(order, d, s, inv2, g, H, B, dB_dd):
 
 
 @njit(**_INLINE)
-def _set_columns(order, d, s, inv2, gradients, first, dB_dm):
+def _set_columns(order: int, d: Vector, s: float, inv2: float, gradients: Sequence[Vector],
+                 first: int, dB_dm: FloatArray) -> None:
     """Set the columns of `dB_dm` from `first` on: the fields of unit components of one order."""
     a = (2 * order + 1) * s * inv2 / order
     for c in range(len(gradients)):
@@ -63,7 +68,7 @@ def _set_columns(order, d, s, inv2, gradients, first, dB_dm):
 
 
 @njit(**_INLINE)
-def _times(H, d, scale):
+def _times(H: Symmetric, d: Vector, scale: float) -> Vector:
     """H d scale, of a symmetric H given as its upper triangle."""
     return (scale * (H[0] * d[0] + H[1] * d[1] + H[2] * d[2]),
             scale * (H[1] * d[0] + H[3] * d[1] + H[4] * d[2]),
@@ -71,7 +76,8 @@ def _times(H, d, scale):
 
 
 @njit(**_INLINE)
-def _add_quadrupole(d, m, s, inv2, B, dB_dd, dB_dm):
+def _add_quadrupole(d: Vector, m: FloatArray, s: float, inv2: float, B: FloatArray,
+                    dB_dd: FloatArray, dB_dm: FloatArray) -> None:
     """Order 2 of `field_and_jacobians`."""
     x, y, z = d
     H = (m[3], m[4], m[5], m[6], m[7], -m[3] - m[6])
@@ -81,7 +87,8 @@ def _add_quadrupole(d, m, s, inv2, B, dB_dd, dB_dm):
 
 
 @njit(**_INLINE)
-def _add_octupole(d, m, s, inv2, B, dB_dd, dB_dm):
+def _add_octupole(d: Vector, m: FloatArray, s: float, inv2: float, B: FloatArray,
+                  dB_dd: FloatArray, dB_dm: FloatArray) -> None:
     """Order 3 of `field_and_jacobians`."""
     x, y, z = d
     xxx, xxy, xxz, xyy, xyz, yyy, yyz = m[8], m[9], m[10], m[11], m[12], m[13], m[14]
@@ -97,7 +104,8 @@ def _add_octupole(d, m, s, inv2, B, dB_dd, dB_dm):
 
 
 @njit(**_INLINE)
-def field_and_jacobians(d0, d1, d2, m, B, dB_dd, dB_dm):
+def field_and_jacobians(d0: float, d1: float, d2: float, m: FloatArray, B: FloatArray,
+                        dB_dd: FloatArray, dB_dm: FloatArray) -> None:
     """Field and both Jacobians of one source at one point.
 
     `d` is sensor minus source [m], `m` (k,) holds 3, 8 or 15 moments. Overwrites
@@ -122,13 +130,14 @@ def field_and_jacobians(d0, d1, d2, m, B, dB_dd, dB_dm):
 
 @njit('void(float64[:,::1], float64[:,::1], float64[:,::1], float64[:,:,::1], '
       'float64[:,:,::1])', **_COMPILE)
-def _field_and_jacobians_rows(d, m, B, dB_dd, dB_dm):
+def _field_and_jacobians_rows(d: FloatArray, m: FloatArray, B: FloatArray, dB_dd: FloatArray,
+                              dB_dm: FloatArray) -> None:
     """Loop of `field_and_jacobians` over rows."""
     for i in range(d.shape[0]):
         field_and_jacobians(d[i, 0], d[i, 1], d[i, 2], m[i], B[i], dB_dd[i], dB_dm[i])
 
 
-def _evaluate(r, moments):
+def _evaluate(r: ArrayLike, moments: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Broadcast, flatten, run the kernel; field and Jacobians in the broadcast shape."""
     r, moments = np.asarray(r, dtype=float), np.asarray(moments, dtype=float)
     if r.shape[-1:] != (3,):
@@ -146,7 +155,7 @@ def _evaluate(r, moments):
             dB_dm.reshape(shape + (3, k)))
 
 
-def multipole_field(r, moments):
+def multipole_field(r: ArrayLike, moments: ArrayLike) -> FloatArray:
     """Flux density of a multipole expansion, the sum of its orders.
 
     Parameters
@@ -168,7 +177,7 @@ def multipole_field(r, moments):
     return _evaluate(r, moments)[0]
 
 
-def multipole_jacobians(r, moments):
+def multipole_jacobians(r: ArrayLike, moments: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Derivatives of the field of a multipole expansion.
 
     Parameters
@@ -191,7 +200,7 @@ def multipole_jacobians(r, moments):
     return _evaluate(r, moments)[1:]
 
 
-def multipole_moments(points, dipoles, order):
+def multipole_moments(points: ArrayLike, dipoles: ArrayLike, order: int) -> FloatArray:
     """Moments about the origin of a cloud of dipoles.
 
     Those of order 1 are the sum of the dipoles; those above depend on the origin.
@@ -229,9 +238,10 @@ def multipole_moments(points, dipoles, order):
         moments += [sum(15 * m[..., a] * x[..., b] * x[..., c] - delta[b, c] * u[..., a]
                         for a, b, c in ((i, j, k), (j, k, i), (k, i, j)))
                     for i, j, k in _independent(3)]
-    return np.sum(np.stack(moments, axis=-1), axis=-2)
+    total: FloatArray = np.sum(np.stack(moments, axis=-1), axis=-2)
+    return total
 
 
-def _independent(order):
+def _independent(order: int) -> list[tuple[int, ...]]:
     """Indices of the components that are kept: those with at most one z, sorted."""
     return [c for c in combinations_with_replacement(range(3), order) if c.count(2) < 2]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.physics.anderson import anderson_functions
 from mag_tracking.physics.multipole import multipole_jacobians
 
@@ -24,27 +25,27 @@ class MultipolePass:
     Source: T10 eq. (4.17), (4.18).
     """
 
-    t: np.ndarray
+    t: FloatArray
     """(n,) [s] of the samples."""
-    positions: np.ndarray
+    positions: FloatArray
     """(n, 3) [m], world, of the sensor that each is of."""
-    M: np.ndarray
+    M: FloatArray
     """(n, 3, 3) what the field of each is multiplied by: world to sensor, and whitening."""
     order: int = 2
 
     names = ('x', 'y', 'z', 'vx', 'vy', 'vz')
 
-    def _from_target(self, theta):
+    def _from_target(self, theta: FloatArray) -> FloatArray:
         """(n_paths, n, 3) [m] sensor minus target."""
         return (self.positions - theta[:, None, :3]
                 - self.t[:, None] * theta[:, None, 3:])
 
-    def basis(self, theta):
+    def basis(self, theta: FloatArray) -> FloatArray:
         """Fields of unit moments, (n_paths, 3 n, 3 | 8 | 15), for paths theta (n_paths, 6)."""
         _, A = multipole_jacobians(self._from_target(theta), np.zeros(_N_MOMENTS[self.order]))
         return (self.M @ A).reshape(len(theta), 3 * len(self.t), -1)
 
-    def derivative(self, theta, p):
+    def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
         """d(basis(theta) p)/d(theta), (n_paths, 3 n, 6); `p` (n_paths, 3 | 8 | 15)."""
         gradient, _ = multipole_jacobians(self._from_target(theta), p[:, None])
         D = -(self.M @ gradient)
@@ -64,23 +65,23 @@ class AndersonPass:
     Source: TSP14 eq. (22), (23), corrected as in `anderson`.
     """
 
-    t: np.ndarray
+    t: FloatArray
     """(n,) [s] of the samples."""
-    W: np.ndarray
+    W: FloatArray
     """(n, 3, 3) whitening."""
 
     names = ('t_cpa', 'rate')
 
-    def _spread(self, f):
+    def _spread(self, f: FloatArray) -> FloatArray:
         """(n_paths, 3 n, 9) of functions of time (n_paths, n, 3)."""
-        columns = np.einsum('nab,pnf->pnabf', self.W, f)
+        columns: FloatArray = np.einsum('nab,pnf->pnabf', self.W, f)
         return columns.reshape(len(f), 3 * len(self.t), 9)
 
-    def basis(self, theta):
+    def basis(self, theta: FloatArray) -> FloatArray:
         """Fields of unit coefficients, (n_paths, 3 n, 9), for paths theta (n_paths, 2)."""
         return self._spread(anderson_functions(theta[:, 1:] * (self.t - theta[:, :1])))
 
-    def derivative(self, theta, p):
+    def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
         """d(basis(theta) p)/d(theta), (n_paths, 3 n, 2); `p` (n_paths, 9)."""
         tau = theta[:, 1:] * (self.t - theta[:, :1])
         f0, f1, f2 = np.moveaxis(anderson_functions(tau), -1, 0)

@@ -10,14 +10,16 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 
+from mag_tracking.arrays import CompileOptions, FloatArray
 from mag_tracking.physics.dipole import field_and_jacobians
 
-_COMPILE = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}
+_COMPILE: CompileOptions = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}
 
 
 @njit('void(float64[:,:], float64[:], float64[:,::1], float64[::1], float64[:,:,::1], '
       'float64[:,:,::1])', **_COMPILE)
-def _row_basis(theta, places, positions, t, M, A):
+def _row_basis(theta: FloatArray, places: FloatArray, positions: FloatArray, t: FloatArray,
+               M: FloatArray, A: FloatArray) -> None:
     """Fields of unit moments: A (n, 3 n_samples, 3 d), each sample's turned by its M."""
     d = places.shape[0]
     for p in range(theta.shape[0]):
@@ -41,7 +43,8 @@ def _row_basis(theta, places, positions, t, M, A):
 
 @njit('void(float64[:,:], float64[:,:], float64[:], float64[:,::1], float64[::1], '
       'float64[:,:,::1], float64[:,:,::1])', **_COMPILE)
-def _row_derivative(theta, moments, places, positions, t, M, D):
+def _row_derivative(theta: FloatArray, moments: FloatArray, places: FloatArray,
+                    positions: FloatArray, t: FloatArray, M: FloatArray, D: FloatArray) -> None:
     """Derivatives by theta of the field of the moments: adds to D (n, 3 n_samples, 6 or 7)."""
     d = places.shape[0]
     for p in range(theta.shape[0]):
@@ -90,43 +93,43 @@ class RowPass:
     Source: TSP14 eq. (18)-(21).
     """
 
-    t: np.ndarray
+    t: FloatArray
     """(n,) [s] of the samples."""
-    positions: np.ndarray
+    positions: FloatArray
     """(n, 3) [m], world, of the sensor that each is of."""
-    M: np.ndarray
+    M: FloatArray
     """(n, 3, 3) what the field of each is multiplied by: world to sensor, and whitening."""
     n_dipoles: int = 1
 
     @cached_property
-    def names(self):
+    def names(self) -> tuple[str, ...]:
         """Names of the path's numbers."""
         return ('x', 'y', 'z', 'vx', 'vy', 'vz', *(('L',) if self.n_dipoles > 1 else ()))
 
     @cached_property
-    def moment_names(self):
+    def moment_names(self) -> tuple[str, ...]:
         """Names of the moments, from the tail to the head."""
         return tuple(f'm{i + 1}{axis}' for i in range(self.n_dipoles) for axis in 'xyz')
 
     @cached_property
-    def combinations(self):
+    def combinations(self) -> FloatArray:
         """(3 d, 3 d) orthogonal: moments of the row = combinations @ linear parameters."""
         powers = np.vander(self._places, increasing=True)
         return np.kron(np.linalg.qr(powers)[0], np.eye(3))
 
     @cached_property
-    def _places(self):
+    def _places(self) -> FloatArray:
         """(d,) of the dipoles, in lengths of the row."""
         d = self.n_dipoles
-        return np.linspace(-0.5, 0.5, d) if d > 1 else np.zeros(1)
+        return np.linspace(-0.5, 0.5, d, dtype=np.float64) if d > 1 else np.zeros(1)
 
-    def basis(self, theta):
+    def basis(self, theta: FloatArray) -> FloatArray:
         """Fields of unit combinations, (n_paths, 3 n, 3 d), for paths theta (n_paths, 6 or 7)."""
         A = np.empty((len(theta), 3 * len(self.t), 3 * self.n_dipoles))
         _row_basis(theta, self._places, self.positions, self.t, self.M, A)
         return A @ self.combinations if self.n_dipoles > 1 else A
 
-    def derivative(self, theta, p):
+    def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
         """d(basis(theta) p)/d(theta), (n_paths, 3 n, 6 or 7); `p` (n_paths, 3 d)."""
         D = np.zeros((len(theta), 3 * len(self.t), len(self.names)))
         _row_derivative(theta, p @ self.combinations.T, self._places, self.positions, self.t,

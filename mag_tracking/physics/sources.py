@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.geometry import (
     cross_matrix,
     left_jacobian,
@@ -22,26 +23,28 @@ from mag_tracking.physics.motion import constant_velocity, integrator_noise
 class Dipoles(NamedTuple):
     """Dipoles of every hypothesis, in the world, with derivatives by the target state."""
 
-    r: np.ndarray
+    r: FloatArray
     """(n_hyp, n_dipoles, 3) [m] positions."""
-    m: np.ndarray
+    m: FloatArray
     """(n_hyp, n_dipoles, 3) [A m^2] moments."""
-    dr_dx: np.ndarray
+    dr_dx: FloatArray
     """(n_hyp, n_dipoles, 3, n_t)."""
-    dm_dx: np.ndarray
+    dm_dx: FloatArray
     """(n_hyp, n_dipoles, 3, n_t)."""
 
 
 class SourceModel(Protocol):
     """What the tracker asks of a target. States begin with position and velocity."""
 
-    state_names: tuple[str, ...]
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states, in order."""
 
-    def dipoles(self, x: np.ndarray) -> Dipoles:
+    def dipoles(self, x: FloatArray) -> Dipoles:
         """Dipoles of the target states `x` (n_hyp, n_t)."""
 
-    def propagate(self, x: np.ndarray, dt: float, P: np.ndarray | None = None
-                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def propagate(self, x: FloatArray, dt: float, P: FloatArray | None = None
+                  ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """States after `dt` seconds, Jacobian (..., n_t, n_t), process noise (..., n_t, n_t).
 
         With the states' covariances `P` (n_hyp, n_t, n_t) the noise holds what the
@@ -59,14 +62,14 @@ class Magnet:
     Source: PHD15 Paper A section 3.1 and eq. (19)-(24).
     """
 
-    acceleration_density: np.ndarray
+    acceleration_density: FloatArray
     """(3,) [m^2/s^3], spectral density of the acceleration."""
     angular_density: float
     """[rad^2/s^3], spectral density of the angular acceleration."""
 
     state_names = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'mx', 'my', 'mz', 'wx', 'wy', 'wz')
 
-    def dipoles(self, x):
+    def dipoles(self, x: FloatArray) -> Dipoles:
         """One dipole a hypothesis; see `SourceModel.dipoles`."""
         dr_dx = np.zeros((len(x), 1, 3, 12))
         dr_dx[:, 0, [0, 1, 2], [0, 1, 2]] = 1.0
@@ -74,7 +77,8 @@ class Magnet:
         dm_dx[:, 0, [0, 1, 2], [6, 7, 8]] = 1.0
         return Dipoles(x[:, None, :3].copy(), x[:, None, 6:9].copy(), dr_dx, dm_dx)
 
-    def propagate(self, x, dt, P=None):
+    def propagate(self, x: FloatArray, dt: float, P: FloatArray | None = None
+                  ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Constant velocity and angular velocity; see `SourceModel.propagate`.
 
         The moment is turned by the whole angle w dt. Eq. (24) holds it constant
@@ -109,7 +113,7 @@ class Magnet:
         return moved, F, Q
 
 
-def _shortening(m, before, after):
+def _shortening(m: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
     """Second moment (n, 3, 3), along m, of what a turn by an uncertain angle takes from m.
 
     A moment `m` (n, 3) that is turned by a small (a, b) across itself ends
@@ -124,10 +128,13 @@ def _shortening(m, before, after):
     size2 = np.where(size2 > 0.0, size2, 1.0)
     across = np.eye(3) - along / size2[:, None, None]
 
-    def second_moment(P):
+    def second_moment(P: FloatArray) -> FloatArray:
         S = across @ P @ across / size2[:, None, None]
         # Of the two variances only their sum and the sum of their squares are needed.
-        return 0.25 * (2.0 * np.einsum('nij,nji->n', S, S) + np.trace(S, axis1=1, axis2=2) ** 2)
+        moment: FloatArray = 0.25 * (2.0 * np.einsum('nij,nji->n', S, S)
+                                     + np.trace(S, axis1=1, axis2=2) ** 2)
+        return moment
 
-    more = second_moment(after) - second_moment(before)
-    return np.clip(more, 0.0, 1.0)[:, None, None] * along
+    more = np.clip(second_moment(after) - second_moment(before), 0.0, 1.0)
+    taken: FloatArray = more[:, None, None] * along
+    return taken

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.physics.dipole import MU0
 from mag_tracking.physics.motion import constant_velocity, integrator_noise
 from mag_tracking.physics.sources import Dipoles
@@ -14,7 +15,8 @@ from mag_tracking.physics.sources import Dipoles
 
 @njit('void(float64[:,:], float64[:], float64[:], float64[:,:,::1], float64[:,:,::1], '
       'float64[:,:,:,::1], float64[:,:,:,::1])', cache=True, error_model='numpy')
-def _row_dipoles(x, places, induction, r, m, dr_dx, dm_dx):
+def _row_dipoles(x: FloatArray, places: FloatArray, induction: FloatArray, r: FloatArray,
+                 m: FloatArray, dr_dx: FloatArray, dm_dx: FloatArray) -> None:
     """TSP14 eq. (10b) and ICASSP11 eq. (8), a row a hypothesis; the derivatives come as zeros.
 
     `places` (d,) of the dipoles along the row, in lengths of it from its centre. With one
@@ -76,9 +78,9 @@ class RowVehicle:
     (3D/mu0) B0.
     """
 
-    earth_field: np.ndarray
+    earth_field: FloatArray
     """(3,) [T], world. Zeros: no soft iron can be modelled."""
-    acceleration_density: np.ndarray
+    acceleration_density: FloatArray
     """(3,) [m^2/s^3], spectral density of the acceleration, per axis."""
     moment_drift: float = 0.0
     """[1/s^0.5] random walk of the whole hard iron moment per axis, relative to the iron's size."""
@@ -87,32 +89,32 @@ class RowVehicle:
     n_dipoles: int = 3
 
     @cached_property
-    def state_names(self):
+    def state_names(self) -> tuple[str, ...]:
         """Names of the states, in order."""
         return ('x', 'y', 'z', 'vx', 'vy', 'vz',
                 *(f'm{i + 1}{axis}' for i in range(self.n_dipoles) for axis in 'xyz'), 'D',
                 *(('L',) if self.n_dipoles > 1 else ()))
 
     @cached_property
-    def _induction(self):
+    def _induction(self) -> FloatArray:
         """(3,) [A/m] B0/mu0."""
         return np.asarray(self.earth_field, dtype=float) / MU0
 
     @cached_property
-    def _places(self):
+    def _places(self) -> FloatArray:
         """(d,) of the dipoles, in lengths of the row."""
         d = self.n_dipoles
-        return np.linspace(-0.5, 0.5, d) if d > 1 else np.zeros(1)
+        return np.linspace(-0.5, 0.5, d, dtype=np.float64) if d > 1 else np.zeros(1)
 
     @cached_property
-    def _walk(self):
+    def _walk(self) -> FloatArray:
         """(3 d, 3 d) [1/s] random walk of the hard iron moments, relative to the iron's size."""
         d = self.n_dipoles
         mean = np.full((d, d), 1.0 / d)
         return np.kron(self.moment_drift**2 / d * mean
                        + self.difference_drift**2 * (np.eye(d) - mean), np.eye(3))
 
-    def dipoles(self, x):
+    def dipoles(self, x: FloatArray) -> Dipoles:
         """`n_dipoles` dipoles a hypothesis; see `SourceModel.dipoles`.
 
         Raises ValueError where the states are not as many as `state_names`.
@@ -126,7 +128,8 @@ class RowVehicle:
         _row_dipoles(np.asarray(x, dtype=float), self._places, self._induction, r, m, dr_dx, dm_dx)
         return Dipoles(r, m, dr_dx, dm_dx)
 
-    def propagate(self, x, dt, P=None):
+    def propagate(self, x: FloatArray, dt: float, P: FloatArray | None = None
+                  ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Constant velocity; the drifts grow with the size of the iron. See `SourceModel`."""
         n, d = x.shape[1], self.n_dipoles
         F = np.eye(n)

@@ -1,16 +1,73 @@
 """Figures of a calibration: one function a figure, each returns the figure."""
 
+from collections.abc import Mapping
+from typing import Protocol
+
 import matplotlib
 import numpy as np
 
 matplotlib.use('Agg')
-from matplotlib.figure import Figure  # noqa: E402  (the backend has to be chosen first)
+from matplotlib.axes import Axes  # noqa: E402  (the backend has to be chosen first)
+from matplotlib.figure import Figure  # noqa: E402
 
+from mag_tracking.arrays import FloatArray  # noqa: E402
 from mag_tracking.geometry import yaw_between  # noqa: E402
 from mag_tracking.report.figures import SCALE_1D  # noqa: E402
 
 
-def calibration_figure(found, stated, most=8):
+class _Network(Protocol):
+    """What the figures read of a `SensorNetwork`."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def R_ws(self) -> FloatArray: ...
+
+    @property
+    def orientation_std(self) -> tuple[FloatArray | None, ...]: ...
+
+    @property
+    def clock_offset(self) -> FloatArray: ...
+
+    def __len__(self) -> int: ...
+
+    def index(self, name: str) -> int: ...
+
+
+class _Survey(Protocol):
+    """What the figures read of a `NetworkSurvey`."""
+
+    @property
+    def network(self) -> _Network: ...
+
+    @property
+    def shocks(self) -> Mapping[str, tuple[FloatArray, FloatArray]]: ...
+
+
+class _Calibration(Protocol):
+    """What the figures read of a `Calibration`."""
+
+    @property
+    def network(self) -> _Network: ...
+
+    @property
+    def survey(self) -> _Survey: ...
+
+    @property
+    def evidence(self) -> object | None: ...
+
+
+class _EllipsoidFit(Protocol):
+    """What the figures read of an `EllipsoidFit`."""
+
+    @property
+    def coverage(self) -> float: ...
+
+    def correct(self, readings: FloatArray) -> FloatArray: ...
+
+
+def calibration_figure(found: _Calibration, stated: _Network, most: int = 8) -> Figure:
     """The knocks by the clocks as they were and as they are now, and the headings.
 
     Parameters
@@ -28,7 +85,7 @@ def calibration_figure(found, stated, most=8):
     return figure
 
 
-def _knocks(before, after, found, most):
+def _knocks(before: Axes, after: Axes, found: _Calibration, most: int) -> None:
     """The first loud second of each sensor."""
     shocks = {name: found.survey.shocks[name] for name in list(found.survey.shocks)[:most]}
     first = min((t[s > 0.3 * s.max()][0] for t, s in shocks.values() if len(s) and s.max() > 0.0),
@@ -48,7 +105,7 @@ def _knocks(before, after, found, most):
         after.legend(fontsize=8)
 
 
-def _headings(axes, found, stated):
+def _headings(axes: Axes, found: _Calibration, stated: _Network) -> None:
     """How far each sensor is turned from what was stated, by what is known when."""
     n = len(stated)
     steps = [('compass', found.survey.network, 'tab:orange', 0.12)]
@@ -68,7 +125,7 @@ def _headings(axes, found, stated):
     axes.legend(fontsize=8)
 
 
-def tumble_figure(fits, readings):
+def tumble_figure(fits: Mapping[str, _EllipsoidFit], readings: Mapping[str, FloatArray]) -> Figure:
     """Field sizes before and after, and the directions that the sensors were turned to.
 
     Parameters

@@ -3,12 +3,19 @@
 Uncertainty is drawn as 90 % regions throughout.
 """
 
+from collections.abc import Sequence
+from typing import Protocol
+
 import matplotlib
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 matplotlib.use('Agg')
 from matplotlib.figure import Figure  # noqa: E402  (the backend has to be chosen first)
+
+from mag_tracking.arrays import FloatArray  # noqa: E402
+from mag_tracking.report.track_log import TrackLog  # noqa: E402
 
 SCALE_2D = float(np.sqrt(chdtri(2, 0.1)))
 """Deviations to the edge of a 90 % ellipse in the plane."""
@@ -18,32 +25,44 @@ SCALE_1D = 1.645
 _COLOURS = ('tab:blue', 'tab:orange', 'tab:green', 'tab:purple', 'tab:brown', 'tab:cyan')
 
 
-def _ellipse(position, covariance, n=48):
+class _Network(Protocol):
+    """What the figures read of a `SensorNetwork`."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def positions(self) -> FloatArray: ...
+
+    def __len__(self) -> int: ...
+
+
+def _ellipse(position: FloatArray, covariance: FloatArray, n: int = 48) -> FloatArray:
     """Points (n, 2) on the edge of the 90 % region of a position in the plane."""
     values, vectors = np.linalg.eigh(covariance)
     angle = np.linspace(0.0, 2.0 * np.pi, n)
     circle = np.stack([np.cos(angle), np.sin(angle)])
-    return position[:2] + (vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * circle)).T \
-        * SCALE_2D
+    edge: FloatArray = (vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * circle)).T
+    return position[:2] + edge * SCALE_2D
 
 
-def _colours(log):
+def _colours(log: TrackLog) -> dict[str, str]:
     """{arrival: colour}, in a fixed order."""
     names = sorted({name for row in log.arrivals for name in row})
     return {name: _COLOURS[i % len(_COLOURS)] for i, name in enumerate(names)}
 
 
-def scale_of(extent):
+def scale_of(extent: float) -> tuple[float, str]:
     """(factor, unit) that makes a length of `extent` metres readable."""
     return (1.0, 'm') if extent > 1.0 else (1e3, 'mm')
 
 
-def field_unit(strongest):
+def field_unit(strongest: float) -> tuple[float, str]:
     """(factor, unit) that makes fields up to `strongest` [T] readable."""
     return (1e9, 'nT') if strongest < 1e-5 else (1e6, 'µT') if strongest < 1e-2 else (1e3, 'mT')
 
 
-def _without_switches(rows):
+def _without_switches(rows: Sequence[tuple[int, float, FloatArray, FloatArray]]) -> FloatArray:
     """Points (n, 2), with NaN where the best of an arrival is suddenly elsewhere: another one."""
     points = np.array([r[2][:2] for r in rows])
     certain = np.array([3.0 * np.sqrt(np.trace(r[3])) for r in rows])
@@ -53,7 +72,8 @@ def _without_switches(rows):
     return np.insert(points, switch, np.nan, axis=0)
 
 
-def map_figure(log, network, truth=None, smoothed=None):
+def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None,
+               smoothed: ArrayLike | None = None) -> Figure:
     """The map: trajectories of the hypotheses with 90 % ellipses, sensors and truth.
 
     Parameters
@@ -102,7 +122,7 @@ def map_figure(log, network, truth=None, smoothed=None):
     return figure
 
 
-def weights_figure(log):
+def weights_figure(log: TrackLog) -> Figure:
     """The weight of each arrival over time, linear and logarithmic.
 
     Parameters
@@ -128,7 +148,7 @@ def weights_figure(log):
     return figure
 
 
-def field_figure(log, network, most=8):
+def field_figure(log: TrackLog, network: _Network, most: int = 8) -> Figure:
     """Measured field against that of the best hypothesis, per sensor and axis.
 
     Parameters

@@ -1,17 +1,93 @@
 """Figures of fitted passes: one function a figure, each returns the figure."""
 
+from collections.abc import Sequence
+from typing import Protocol
+
 import matplotlib
 import numpy as np
 
 matplotlib.use('Agg')
 from matplotlib.figure import Figure  # noqa: E402  (the backend has to be chosen first)
 
+from mag_tracking.arrays import FloatArray, IntArray  # noqa: E402
 from mag_tracking.report.figures import SCALE_1D, field_unit  # noqa: E402
 
 _AXES = ('tab:red', 'tab:green', 'tab:blue')
 
 
-def pass_figure(fit, title, most=6):
+class _Network(Protocol):
+    """What the figures read of a `SensorNetwork`."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    def index(self, name: str) -> int: ...
+
+
+class _Data(Protocol):
+    """What the figures read of a `PassData`."""
+
+    @property
+    def network(self) -> _Network: ...
+
+    @property
+    def t(self) -> FloatArray: ...
+
+    @property
+    def sensor(self) -> IntArray: ...
+
+    @property
+    def field(self) -> FloatArray: ...
+
+    @property
+    def covariance(self) -> FloatArray: ...
+
+    @property
+    def sensors(self) -> IntArray: ...
+
+
+class _Fit(Protocol):
+    """What the figures read of a `PassFit`."""
+
+    @property
+    def n_dipoles(self) -> int: ...
+
+    @property
+    def data(self) -> _Data: ...
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def x(self) -> FloatArray: ...
+
+    @property
+    def predicted(self) -> FloatArray: ...
+
+    @property
+    def predicted_std(self) -> FloatArray: ...
+
+    @property
+    def normalised_cost(self) -> float: ...
+
+
+class _FittedPass(Protocol):
+    """What the figures read of a `FittedPass`."""
+
+    @property
+    def recording(self) -> str: ...
+
+    @property
+    def number(self) -> int: ...
+
+    @property
+    def fits(self) -> Sequence[_Fit]: ...
+
+    @property
+    def chosen(self) -> _Fit | None: ...
+
+
+def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
     """Measured and fitted field with the band that 90 % of the measurements should lie in.
 
     By noise and `PassFit.honest_covariance`; where the normalised cost is above one, what the model
@@ -56,7 +132,7 @@ def pass_figure(fit, title, most=6):
     return figure
 
 
-def _target_alone(fit):
+def _target_alone(fit: _Fit) -> FloatArray:
     """(n, 3) [T] the fitted field without the backgrounds, which are the last unknowns."""
     out = fit.predicted.copy()
     for name, value in zip(fit.names, fit.x, strict=True):
@@ -66,7 +142,7 @@ def _target_alone(fit):
     return out
 
 
-def order_figure(passes):
+def order_figure(passes: Sequence[_FittedPass]) -> Figure:
     """Normalised cost over the number of dipoles, a line a pass; filled = the order chosen.
 
     Parameters

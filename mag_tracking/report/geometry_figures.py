@@ -1,11 +1,15 @@
 """Figures of a board's geometry: one function a figure, each returns the figure."""
 
+from typing import Protocol
+
 import matplotlib
 import numpy as np
 
 matplotlib.use('Agg')
-from matplotlib.figure import Figure  # noqa: E402  (the backend has to be chosen first)
+from matplotlib.axes import Axes  # noqa: E402  (the backend has to be chosen first)
+from matplotlib.figure import Figure, SubFigure  # noqa: E402
 
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray  # noqa: E402
 from mag_tracking.report.figures import SCALE_1D  # noqa: E402
 
 _SUSPECT = 'tab:red'
@@ -13,7 +17,67 @@ _MOST_NAMES = 60
 """With more sensors only every second, third, ... is named."""
 
 
-def geometry_figure(found):
+class _Network(Protocol):
+    """What the figures read of a `SensorNetwork`."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def positions(self) -> FloatArray: ...
+
+
+class _Geometry(Protocol):
+    """What the figures read of a `NetworkGeometry`."""
+
+    @property
+    def position_std(self) -> FloatArray: ...
+
+    @property
+    def rotation_std(self) -> FloatArray: ...
+
+    @property
+    def gain(self) -> FloatArray: ...
+
+    @property
+    def gain_std(self) -> FloatArray: ...
+
+    @property
+    def sensor_residual(self) -> FloatArray: ...
+
+    @property
+    def pose_residual(self) -> FloatArray: ...
+
+    @property
+    def suspect_sensors(self) -> tuple[str, ...]: ...
+
+    @property
+    def poses(self) -> tuple[FloatArray, FloatArray]: ...
+
+
+class _Survey(Protocol):
+    """What the figures read of a `GeometrySurvey`."""
+
+    @property
+    def stated(self) -> _Network: ...
+
+    @property
+    def network(self) -> _Network: ...
+
+    @property
+    def geometry(self) -> _Geometry: ...
+
+    @property
+    def rows(self) -> IntArray: ...
+
+    @property
+    def suspect_rows(self) -> tuple[int, ...]: ...
+
+    @property
+    def turned(self) -> FloatArray: ...
+
+
+def geometry_figure(found: _Survey) -> Figure:
     """Where the sensors moved to, how they are turned, their gains, and what is left over.
 
     Parameters
@@ -46,7 +110,7 @@ def geometry_figure(found):
     return figure
 
 
-def _moves(figure, axes, found, suspect):
+def _moves(figure: SubFigure, axes: Axes, found: _Survey, suspect: BoolArray) -> None:
     """The board from its flattest side: arrows of the moves, much enlarged."""
     places = found.stated.positions
     a, b = _widest(places)
@@ -84,13 +148,13 @@ def _moves(figure, axes, found, suspect):
     figure.colorbar(arrows, ax=axes, shrink=0.7, label=f'moved along {"xyz"[c]} [mm]')
 
 
-def _widest(places):
+def _widest(places: FloatArray) -> tuple[int, int]:
     """The two axes along which the board is widest, in their order."""
     a, b = sorted(np.argsort(np.ptp(places, axis=0), kind='stable')[1:])
     return int(a), int(b)
 
 
-def _round_down(value):
+def _round_down(value: float) -> float:
     """The largest of 1, 2, 5, 10, ... that is not above; zero of zero."""
     if not value > 0.0:
         return 0.0
@@ -98,7 +162,7 @@ def _round_down(value):
     return float(power * max(m for m in (1.0, 2.0, 5.0) if m * power <= value * (1.0 + 1e-9)))
 
 
-def _spread(axes, along, size, std, title):
+def _spread(axes: Axes, along: IntArray, size: FloatArray, std: FloatArray, title: str) -> None:
     """Sizes of the corrections as dots, over what one axis of them is known to."""
     axes.bar(along, SCALE_1D * np.sqrt(np.square(std).mean(axis=1)), color='0.85', width=0.8,
              label='known to (90 %, per axis)')
@@ -108,7 +172,8 @@ def _spread(axes, along, size, std, title):
     axes.grid(alpha=0.3)
 
 
-def _bars(axes, along, residual, suspect, title):
+def _bars(axes: Axes, along: IntArray, residual: FloatArray, suspect: BoolArray,
+          title: str) -> None:
     """Residuals; what does not fit in red."""
     axes.bar(along, np.nan_to_num(residual), width=0.8,
              color=np.where(suspect, _SUSPECT, 'tab:blue').tolist())
@@ -117,7 +182,7 @@ def _bars(axes, along, residual, suspect, title):
     axes.grid(alpha=0.3)
 
 
-def _poses(axes, found):
+def _poses(axes: Axes, found: _Survey) -> None:
     """Residuals of the poses by their row of the table."""
     suspect = np.isin(found.rows, found.suspect_rows)
     residual = found.geometry.pose_residual

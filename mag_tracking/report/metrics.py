@@ -1,11 +1,39 @@
 """Tracks against truth: errors, and whether the covariance told the truth about them."""
 
+from typing import TypeAlias, TypedDict
+
 import numpy as np
+from numpy.typing import ArrayLike
 
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.geometry import rotation_from_quaternion
+from mag_tracking.report.track_log import SmoothedLog, TrackLog
+
+Truth: TypeAlias = tuple[IntArray, FloatArray, FloatArray]
+"""Stamps (n,) [ns], positions (n, 3) [m], quaternions (n, 4) xyzw."""
 
 
-def interpolate_truth(truth, stamps_ns):
+class PassErrors(TypedDict):
+    """What `pass_errors` returns."""
+
+    rms: float | None
+    closest: float
+    closest_distance: float
+    anees: float
+    n: int
+
+
+class MagnetErrors(TypedDict):
+    """What `magnet_errors` returns."""
+
+    position_mean: float
+    position_max: float
+    axis_median_deg: float
+    anees: float
+    n: int
+
+
+def interpolate_truth(truth: Truth, stamps_ns: ArrayLike) -> FloatArray:
     """Positions (n, 3) of `truth` (stamps, positions, quaternions) at `stamps_ns`; NaN outside."""
     t, position, _ = truth
     seconds = (t - t[0]) / 1e9
@@ -14,7 +42,8 @@ def interpolate_truth(truth, stamps_ns):
                      for k in range(3)], axis=1)
 
 
-def pass_errors(log, truth, centre, radius=5.0):
+def pass_errors(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
+                radius: float = 5.0) -> PassErrors | None:
     """Errors of a vehicle's track.
 
     Parameters
@@ -48,7 +77,8 @@ def pass_errors(log, truth, centre, radius=5.0):
             'anees': float(np.mean(nees)), 'n': int(near.sum())}
 
 
-def near_poses(log, truth, centre, radius=5.0):
+def near_poses(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
+               radius: float = 5.0) -> IntArray:
     """Indices (k,) of the poses whose truth is within `radius` [m] of `centre`.
 
     The closest one where it was never there; none without truth.
@@ -66,7 +96,8 @@ MAGNET_SKIP = 3
 """Poses at the start of a magnet's track that do not count."""
 
 
-def magnet_errors(log, truth, axis=(0.0, 0.0, 1.0), skip=MAGNET_SKIP):
+def magnet_errors(log: TrackLog | SmoothedLog, truth: Truth, axis: ArrayLike = (0.0, 0.0, 1.0),
+                  skip: int = MAGNET_SKIP) -> MagnetErrors | None:
     """Errors of a magnet's track, each pose against the truth nearest in time.
 
     Parameters

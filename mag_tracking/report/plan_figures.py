@@ -1,16 +1,84 @@
 """Figures of a plan: one function a figure, each returns the figure."""
 
+from collections.abc import Sequence
+from typing import Protocol
+
 import matplotlib
 import numpy as np
 
 matplotlib.use('Agg')
-from matplotlib.colors import LogNorm  # noqa: E402  (the backend has to be chosen first)
+from matplotlib.axes import Axes  # noqa: E402  (the backend has to be chosen first)
+from matplotlib.colors import LogNorm  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
+from mag_tracking.arrays import FloatArray  # noqa: E402
 from mag_tracking.report.figures import scale_of  # noqa: E402
 
 
-def _map(plan, title):
+class _Network(Protocol):
+    """What the figures read of a `SensorNetwork`."""
+
+    @property
+    def positions(self) -> FloatArray: ...
+
+
+class _Lane(Protocol):
+    """What the figures read of a `Lane`."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def along(self) -> FloatArray: ...
+
+    @property
+    def points(self) -> FloatArray: ...
+
+    @property
+    def pass_std(self) -> FloatArray: ...
+
+    @property
+    def filter_std(self) -> FloatArray: ...
+
+    @property
+    def detection(self) -> FloatArray: ...
+
+
+class _Plan(Protocol):
+    """What the figures read of a `Plan`."""
+
+    @property
+    def network(self) -> _Network: ...
+
+    @property
+    def x(self) -> FloatArray: ...
+
+    @property
+    def y(self) -> FloatArray: ...
+
+    @property
+    def position_std(self) -> FloatArray: ...
+
+    @property
+    def detection(self) -> FloatArray: ...
+
+    @property
+    def with_one_more(self) -> FloatArray: ...
+
+    @property
+    def missed(self) -> FloatArray: ...
+
+    @property
+    def lanes(self) -> Sequence[_Lane]: ...
+
+    @property
+    def without(self) -> float: ...
+
+    @property
+    def best_place(self) -> tuple[float, float]: ...
+
+
+def _map(plan: _Plan, title: str) -> tuple[Figure, Axes, float, str]:
     """(figure, axes, factor, unit) with the sensors and the lanes."""
     f, unit = scale_of(np.ptp(plan.x))
     figure = Figure(figsize=(8.0, 6.8), layout='constrained')
@@ -32,7 +100,7 @@ def _map(plan, title):
     return figure, axes, f, unit
 
 
-def _levels(values, factor):
+def _levels(values: FloatArray, factor: float) -> FloatArray:
     """Round contour levels, 1-2-5, within the values."""
     tens = 10.0 ** np.arange(-6, 7)
     levels = np.sort(np.concatenate([tens, 2.0 * tens, 5.0 * tens]))
@@ -41,7 +109,7 @@ def _levels(values, factor):
     return inside if len(inside) else np.array([np.sqrt(low * high)])
 
 
-def position_figure(plan):
+def position_figure(plan: _Plan) -> Figure:
     """Map of the position's bound by a whole pass through each point."""
     figure, axes, f, unit = _map(
         plan, 'How well a position can be known by a whole pass through it (standard deviation)')
@@ -55,7 +123,7 @@ def position_figure(plan):
     return figure
 
 
-def detection_figure(plan):
+def detection_figure(plan: _Plan) -> Figure:
     """Map of the probability that one frame detects the target."""
     figure, axes, f, _ = _map(plan, 'Probability that one frame detects the target there')
     mesh = axes.pcolormesh(f * plan.x, f * plan.y, plan.detection, vmin=0.0, vmax=1.0,
@@ -69,7 +137,7 @@ def detection_figure(plan):
     return figure
 
 
-def sensor_figure(plan):
+def sensor_figure(plan: _Plan) -> Figure:
     """Map of what one more sensor would bring; left white where none may stand."""
     gain = 1.0 - plan.with_one_more / plan.without
     possible = np.isfinite(gain).any()
@@ -91,12 +159,12 @@ def sensor_figure(plan):
     return figure
 
 
-def f_text(metres):
+def f_text(metres: float) -> str:
     """A length in a readable unit."""
     return f'{metres:.3g} m' if metres >= 0.01 else f'{1e3 * metres:.2g} mm'
 
 
-def lane_figure(plan):
+def lane_figure(plan: _Plan) -> Figure:
     """Bounds and detection along the lanes, and how many passes are missed by their distance."""
     figure = Figure(figsize=(8.5, 9.0), layout='constrained')
     top, middle, bottom = figure.subplots(3, 1)

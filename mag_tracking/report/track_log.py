@@ -1,8 +1,16 @@
 """What a report remembers of a run: per track the poses, the weights, the fields."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any, TypeAlias
 
 import numpy as np
+
+from mag_tracking.arrays import FloatArray
+from mag_tracking.records import FieldFrame, SmoothedPose, Track
+
+Arrival: TypeAlias = tuple[float, FloatArray, FloatArray]
+"""Weight of an arrival, position and covariance (2, 2) of its best hypothesis."""
 
 
 @dataclass
@@ -10,18 +18,18 @@ class SmoothedLog:
     """One smoothed track; lists grow together."""
 
     id: int
-    stamp_ns: list = field(default_factory=list)
-    position: list = field(default_factory=list)
-    velocity: list = field(default_factory=list)
-    covariance: list = field(default_factory=list)
-    moment: list = field(default_factory=list)
+    stamp_ns: list[int] = field(default_factory=list)
+    position: list[FloatArray] = field(default_factory=list)
+    velocity: list[FloatArray] = field(default_factory=list)
+    covariance: list[FloatArray] = field(default_factory=list)
+    moment: list[FloatArray] = field(default_factory=list)
 
-    def add(self, pose):
+    def add(self, pose: SmoothedPose) -> None:
         """Take a `SmoothedPose`."""
         for name in ('stamp_ns', 'position', 'velocity', 'covariance', 'moment'):
             getattr(self, name).append(getattr(pose, name))
 
-    def summary(self):
+    def summary(self) -> dict[str, float]:
         """Speed and moment where the position is most certain, JSON-ready."""
         sure = int(np.argmin([np.trace(C[:2, :2]) for C in self.covariance]))
         return {'speed': float(np.hypot(*self.velocity[sure][:2])),
@@ -34,31 +42,31 @@ class TrackLog:
     """One track, frame by frame; lists grow together."""
 
     id: int
-    stamp_ns: list = field(default_factory=list)
-    position: list = field(default_factory=list)
-    velocity: list = field(default_factory=list)
-    covariance: list = field(default_factory=list)
-    moment: list = field(default_factory=list)
-    orientation: list = field(default_factory=list)
-    nis: list = field(default_factory=list)
-    nis_by_sensor: list = field(default_factory=list)
-    degrees_of_freedom: list = field(default_factory=list)
-    ambiguous: list = field(default_factory=list)
-    arrivals: list = field(default_factory=list)
+    stamp_ns: list[int] = field(default_factory=list)
+    position: list[FloatArray] = field(default_factory=list)
+    velocity: list[FloatArray] = field(default_factory=list)
+    covariance: list[FloatArray] = field(default_factory=list)
+    moment: list[FloatArray] = field(default_factory=list)
+    orientation: list[FloatArray] = field(default_factory=list)
+    nis: list[float] = field(default_factory=list)
+    nis_by_sensor: list[FloatArray] = field(default_factory=list)
+    degrees_of_freedom: list[int] = field(default_factory=list)
+    ambiguous: list[bool] = field(default_factory=list)
+    arrivals: list[dict[str, Arrival]] = field(default_factory=list)
     """Per frame {arrival: (weight, position, covariance (2, 2) of its best hypothesis)}."""
-    kind: list = field(default_factory=list)
-    kind_weight: list = field(default_factory=list)
-    length: list = field(default_factory=list)
-    measured: list = field(default_factory=list)
-    noise: list = field(default_factory=list)
+    kind: list[str] = field(default_factory=list)
+    kind_weight: list[float] = field(default_factory=list)
+    length: list[float] = field(default_factory=list)
+    measured: list[FloatArray] = field(default_factory=list)
+    noise: list[FloatArray] = field(default_factory=list)
     """Per frame (n_sensors, 3, 3) [T^2] covariance of what was measured."""
-    predicted: list = field(default_factory=list)
-    mounting: list = field(default_factory=list)
-    mounting_std: list = field(default_factory=list)
+    predicted: list[FloatArray] = field(default_factory=list)
+    mounting: list[FloatArray] = field(default_factory=list)
+    mounting_std: list[FloatArray] = field(default_factory=list)
     existence: float = 0.0
     ended: bool = False
 
-    def add(self, track, frame):
+    def add(self, track: Track, frame: FieldFrame) -> None:
         """Take a `Track` and the `FieldFrame` that it came from."""
         if track.ended:
             self.ended = True
@@ -70,29 +78,30 @@ class TrackLog:
         self.measured.append(frame.field)
         self.noise.append(frame.covariance)
         self.existence = track.existence
-        best = {}
+        best: dict[str, Arrival] = {}
         for h in track.hypotheses:
             weight, position, covariance = best.get(
                 h.arrival, (0.0, h.position, h.covariance[:2, :2]))
             best[h.arrival] = weight + h.weight, position, covariance
         self.arrivals.append(best)
 
-    def seconds(self):
+    def seconds(self) -> FloatArray:
         """(n,) [s] since the first pose."""
         stamps = np.array(self.stamp_ns, dtype=np.int64)
-        return (stamps - stamps[0]) / 1e9
+        seconds: FloatArray = (stamps - stamps[0]) / 1e9
+        return seconds
 
-    def surest(self):
+    def surest(self) -> int:
         """Index of the pose whose horizontal position is most certain."""
         return int(np.argmin([np.trace(C[:2, :2]) for C in self.covariance]))
 
-    def mounting_of(self, names):
+    def mounting_of(self, names: Sequence[str]) -> dict[str, tuple[FloatArray, FloatArray]]:
         """{sensor: (angles (3,), their deviations (3,)) [deg]} at the surest pose; may be empty."""
         k = self.surest()
         return {name: (np.degrees(a), np.degrees(sd)) for name, a, sd in
                 zip(names, self.mounting[k], self.mounting_std[k], strict=False)}
 
-    def nis_of(self, names):
+    def nis_of(self, names: Sequence[str]) -> dict[str, float | None]:
         """{sensor: mean normalised innovation squared per axis}; None where it was never there.
 
         About one or less where the sensor agrees with the model and with the others.
@@ -102,7 +111,7 @@ class TrackLog:
         return {name: float(q / n) if n else None
                 for name, q, n in zip(names, total, axes, strict=True)}
 
-    def summary(self):
+    def summary(self) -> dict[str, Any]:
         """The track in a few JSON-ready numbers.
 
         Speed and moment are those of the most certain pose.

@@ -1,0 +1,65 @@
+"""Matrices that are checked, brought to unit diagonal, and whitened."""
+
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mag_tracking.arrays import BoolArray, FloatArray
+
+
+def whitened(H: ArrayLike, C: ArrayLike | None) -> FloatArray:
+    """Rows of H in units of their noise (..., n_y, n_x); missing rows are zero."""
+    H = np.asarray(H, dtype=float)
+    if H.ndim < 2:
+        raise ValueError(f'H needs shape (..., n_y, n_x), got {H.shape}')
+    missing = np.isnan(H).all(axis=-1)
+    refuse('row of H ', 'finite or wholly NaN', H, ~np.isfinite(H).all(axis=-1) & ~missing)
+    H = np.where(missing[..., None], 0.0, H)
+    if C is None:
+        return H
+    n_y = H.shape[-2]
+    C = leading_broadcast('C', C, H.shape[:-1] + (n_y,))
+    C = np.where(missing[..., :, None] | missing[..., None, :], np.eye(n_y), C)
+    scale, w, V = unit_diagonal('C', C)
+    refuse('C', 'positive definite', C, w[..., 0] <= n_y * np.finfo(float).eps)
+    out: FloatArray = np.swapaxes(V, -1, -2) @ (H / scale[..., None]) / np.sqrt(w)[..., None]
+    return out
+
+
+def leading_broadcast(name: str, A: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    """A as a float array of `shape`; only leading axes may be left out."""
+    A = np.asarray(A, dtype=float)
+    try:
+        if A.shape[-2:] == shape[-2:]:
+            return np.broadcast_to(A, shape)
+    except ValueError:
+        pass
+    raise ValueError(f'{name} has shape {A.shape}, needed is {shape}')
+
+
+def refuse(name: str, fault: str, A: FloatArray, bad: BoolArray | np.bool_) -> None:
+    """Raise ValueError for the first matrix of A (..., n, n) that is `bad` (...)."""
+    for at in np.argwhere(bad).tolist():
+        raise ValueError(f'{name}{at or ""} is not {fault}: {A[tuple(at)].tolist()}')
+
+
+def unit_diagonal(name: str, A: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Scale, eigenvalues and vectors of A / (scale scale'), once A is fit for it."""
+    if A.ndim < 2 or A.shape[-1] != A.shape[-2]:
+        raise ValueError(f'{name} has to be square, got {A.shape}')
+    refuse(name, 'finite', A, ~np.isfinite(A).all(axis=(-2, -1)))
+    diagonal = np.einsum('...ii->...i', A)
+    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    unit = A / (scale[..., :, None] * scale[..., None, :])
+    skew = np.abs(unit - np.swapaxes(unit, -1, -2))
+    refuse(name, 'symmetric', A, (skew > 1e-9).any(axis=(-2, -1)))
+    w, V = np.linalg.eigh(unit)
+    refuse(name, 'positive semidefinite', A, (w < -1e-9).any(-1) | (diagonal < 0.0).any(-1))
+    return scale, w, V
+
+
+def triangular_factor(A: FloatArray) -> FloatArray:
+    """R of A = Q R."""
+    # The stub of numpy knows only of the pair.
+    return cast(FloatArray, np.linalg.qr(A, mode='r'))
