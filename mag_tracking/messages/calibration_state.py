@@ -1,25 +1,51 @@
 """What the calibration knows of a network, to and from its message."""
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
 from mag_tracking.messages.schema import xyz
+from mag_tracking.messages.shapes import CalibrationState, MessageDict
+from mag_tracking.network import SensorNetwork
 
 
-def sensor_dict(calibrate, network, j):
+class _Background(Protocol):
+    """A `RunningBackground`."""
+
+    @property
+    def ready(self) -> bool: ...
+    @property
+    def frozen(self) -> bool: ...
+    @property
+    def n_relearnt(self) -> int: ...
+    @property
+    def covariance(self) -> FloatArray | None: ...
+
+
+class _Calibration(Protocol):
+    """The stage that calibrates; see `Calibrate`."""
+
+    def background(self, sensor: str) -> FloatArray: ...
+    def backgrounds(self) -> Mapping[str, _Background]: ...
+    def counts_of(self, sensor: str) -> Mapping[str, int]: ...
+    def last_stamp_ns(self, sensor: str) -> int | None: ...
+
+def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> MessageDict:
     """mag_tracking_msgs/SensorCalibration of sensor `j`."""
     name = network.names[j]
     background, counts = calibrate.backgrounds()[name], calibrate.counts_of(name)
     ready = background.ready and calibrate.last_stamp_ns(name) is not None
+    C = background.covariance if ready else None
     q, std = quaternion_from_rotation(network.R_ws[j]), network.orientation_std[j]
     done = network.calibrated[j]
     return {'sensor': name, 'ready': ready, 'frozen': background.frozen,
             'background': xyz(calibrate.background(name) if ready else np.full(3, np.nan)),
-            'covariance': (background.covariance if ready
-                           else np.full((3, 3), np.nan)).ravel().tolist(),
+            'covariance': (np.full((3, 3), np.nan) if C is None else C).ravel().tolist(),
             'n_samples': counts['accepted'], 'n_rejected': counts['rejected'],
             'n_relearnt': background.n_relearnt,
             'orientation': {**xyz(q), 'w': float(q[3])},
@@ -30,7 +56,7 @@ def sensor_dict(calibrate, network, j):
             'calibrated_by': '' if done is None else done.by}
 
 
-def with_orientations(network, message):
+def with_orientations(network: SensorNetwork, message: CalibrationState) -> SensorNetwork:
     """The `SensorNetwork` turned as a message-shaped CalibrationState says.
 
     Raises RecordingError where that is of other sensors, or turns one by no rotation.

@@ -5,13 +5,15 @@ import numpy as np
 from mag_tracking.errors import RecordingError
 from mag_tracking.inference.axes import LEAST_PIVOT, smallest_pivots
 from mag_tracking.messages.schema import doubles, header_dict, stamp_ns
+from mag_tracking.messages.shapes import MessageDict, NetworkFrame
+from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 
 LONGEST_OFFSET_S = 60.0
 """[s] The longest frame there can be (`align.period_s`)."""
 
 
-def frame_dict(frame, network):
+def frame_dict(frame: FieldFrame, network: SensorNetwork) -> MessageDict:
     """mag_tracking_msgs/NetworkFrame of a `FieldFrame`."""
     return {'header': header_dict(frame.stamp_ns, network.frame), 'sensors': list(network.names),
             'field': doubles(frame.field), 'covariance': doubles(frame.covariance),
@@ -20,7 +22,7 @@ def frame_dict(frame, network):
             'statistic': frame.statistic, 'degrees_of_freedom': frame.degrees_of_freedom}
 
 
-def frame_of(message, network):
+def frame_of(message: NetworkFrame, network: SensorNetwork) -> FieldFrame:
     """`FieldFrame` of a message-shaped NetworkFrame.
 
     Raises RecordingError where sensors or lengths are not those of the network.
@@ -44,7 +46,7 @@ def frame_of(message, network):
     return frame
 
 
-def _check_numbers(frame):
+def _check_numbers(frame: FieldFrame) -> None:
     """Raise RecordingError where a frame holds what no alignment gives."""
     if np.isinf(frame.field).any():
         raise RecordingError('a frame with an infinite field')

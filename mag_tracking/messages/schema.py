@@ -1,28 +1,39 @@
 """Records to and from messages, as nested dicts, without ROS."""
 
 from array import array
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.geometry import rotation_from_quaternion
-from mag_tracking.records import AccelerationSample, MagSample, Readings
+from mag_tracking.messages.shapes import FieldReadings, Imu, MagneticField, MessageDict, Time
+from mag_tracking.records import (
+    AccelerationSample,
+    Detection,
+    MagSample,
+    Readings,
+    SmoothedPose,
+    Track,
+)
 
 LATEST_NS = 2**31 * 1_000_000_000
 """[ns] Later than any stamp of a header."""
 
 
-def stamp_ns(stamp):
+def stamp_ns(stamp: Time) -> int:
     """Nanoseconds of a builtin_interfaces/Time."""
     return stamp.sec * 1_000_000_000 + stamp.nanosec
 
 
-def stamp_dict(ns):
+def stamp_dict(ns: int) -> MessageDict:
     """A builtin_interfaces/Time of nanoseconds."""
     return {'sec': ns // 1_000_000_000, 'nanosec': ns % 1_000_000_000}
 
 
-def sample_of(message, sensor):
+def sample_of(message: MagneticField, sensor: str) -> MagSample:
     """`MagSample` of a message-shaped sensor_msgs/MagneticField of `sensor`.
 
     A covariance that is all zero, or begins with -1, is unknown.
@@ -34,7 +45,7 @@ def sample_of(message, sensor):
                      None if unknown else C.reshape(3, 3))
 
 
-def acceleration_of(message, sensor):
+def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
     """`AccelerationSample` of a message-shaped sensor_msgs/Imu of `sensor`.
 
     NaN where the message says that it has none (its covariance begins with -1).
@@ -45,7 +56,7 @@ def acceleration_of(message, sensor):
                               np.array([a.x, a.y, a.z]) if there else np.full(3, np.nan))
 
 
-def doubles(values):
+def doubles(values: ArrayLike) -> 'array[float]':
     """Numbers for a float64[] of a message, which takes an array.array as it is.
 
     A list it would look at number by number.
@@ -53,24 +64,24 @@ def doubles(values):
     return array('d', np.ascontiguousarray(values, dtype=float).tobytes())
 
 
-def xyz(v):
+def xyz(v: Sequence[float] | FloatArray) -> dict[str, float]:
     """Vector as a dict."""
     return {'x': float(v[0]), 'y': float(v[1]), 'z': float(v[2])}
 
 
-def header_dict(ns, frame):
+def header_dict(ns: int, frame: str) -> MessageDict:
     """A std_msgs/Header."""
     return {'stamp': stamp_dict(ns), 'frame_id': frame}
 
 
-def sample_dict(sample, frame):
+def sample_dict(sample: MagSample, frame: str) -> MessageDict:
     """sensor_msgs/MagneticField of a `MagSample`; `frame` is the sensor's."""
     C = np.zeros(9) if sample.covariance is None else sample.covariance.ravel()
     return {'header': header_dict(sample.stamp_ns, frame), 'magnetic_field': xyz(sample.field),
             'magnetic_field_covariance': C.tolist()}
 
 
-def readings_dict(readings):
+def readings_dict(readings: Readings) -> MessageDict:
     """mag_tracking_msgs/FieldReadings of `Readings`, whose covariances are all known or none.
 
     Raises RecordingError where some are known, or there is no reading at all.
@@ -87,7 +98,7 @@ def readings_dict(readings):
             'covariance': doubles(np.zeros(0) if C is None else C)}
 
 
-def readings_of(message):
+def readings_of(message: FieldReadings) -> Readings:
     """`Readings` of a message-shaped FieldReadings; raises RecordingError where it is none."""
     n, names = len(message.sensor), tuple(message.sensors)
     sizes = len(message.stamp), len(message.field), len(message.covariance)
@@ -102,7 +113,7 @@ def readings_of(message):
     stamps = np.array(message.stamp, dtype=np.int64)
     if n and not -LATEST_NS <= stamps.min() <= stamps.max() <= LATEST_NS:
         raise RecordingError(f'readings of {stamps.min()} to {stamps.max()} ns')
-    C = None
+    C: FloatArray | None = None
     if len(message.covariance):
         C = np.array(message.covariance, dtype=float).reshape(n, 3, 3)
         known = (C[:, 0, 0] != -1.0) & C.any(axis=(1, 2))
@@ -110,12 +121,12 @@ def readings_of(message):
     return Readings(names, sensor, stamps, np.array(message.field, dtype=float).reshape(n, 3), C)
 
 
-def samples_of(message):
+def samples_of(message: FieldReadings) -> list[MagSample]:
     """[`MagSample`] of a message-shaped FieldReadings; raises RecordingError where it is none."""
     return readings_of(message).samples()
 
 
-def acceleration_dict(sample, frame):
+def acceleration_dict(sample: AccelerationSample, frame: str) -> MessageDict:
     """sensor_msgs/Imu of an `AccelerationSample`; `frame` is the sensor's.
 
     Its deviations are unknown, and of orientation and angular velocity there is nothing.
@@ -126,18 +137,18 @@ def acceleration_dict(sample, frame):
             'linear_acceleration': xyz(sample.acceleration)}
 
 
-def pose_dict(ns, frame, position, quaternion):
+def pose_dict(ns: int, frame: str, position: FloatArray, quaternion: FloatArray) -> MessageDict:
     """geometry_msgs/PoseStamped."""
     return {'header': header_dict(ns, frame), 'pose': _pose(position, quaternion)}
 
 
-def _pose(position, quaternion):
+def _pose(position: FloatArray, quaternion: FloatArray) -> MessageDict:
     """geometry_msgs/Pose."""
     return {'position': xyz(position),
             'orientation': {**xyz(quaternion), 'w': float(quaternion[3])}}
 
 
-def pose_covariance(track):
+def pose_covariance(track: Track | SmoothedPose) -> FloatArray:
     """(6, 6) of position and small rotations about fixed axes, as ROS orders them."""
     C = np.empty((6, 6))
     C[:3, :3] = track.covariance[:3, :3]
@@ -147,13 +158,13 @@ def pose_covariance(track):
     return C
 
 
-def pose_with_covariance_dict(track):
-    """geometry_msgs/PoseWithCovariance of a `Track`."""
+def pose_with_covariance_dict(track: Track | SmoothedPose) -> MessageDict:
+    """geometry_msgs/PoseWithCovariance of a `Track` or `SmoothedPose`."""
     return {'pose': _pose(track.position, track.orientation),
             'covariance': pose_covariance(track).ravel().tolist()}
 
 
-def track_dict(track, frame):
+def track_dict(track: Track, frame: str) -> MessageDict:
     """mag_tracking_msgs/Track of a `Track`."""
     return {'header': header_dict(track.stamp_ns, frame), 'id': track.id,
             'status': int(track.ended), 'pose': pose_with_covariance_dict(track),
@@ -171,7 +182,7 @@ def track_dict(track, frame):
             'mounting_covariance': doubles(track.mounting_covariance)}
 
 
-def hypotheses_dict(track, frame):
+def hypotheses_dict(track: Track, frame: str) -> MessageDict:
     """mag_tracking_msgs/HypothesisArray of a `Track`."""
     return {'header': header_dict(track.stamp_ns, frame), 'track_id': track.id,
             'hypotheses': [
@@ -181,12 +192,12 @@ def hypotheses_dict(track, frame):
                 for h in track.hypotheses]}
 
 
-def smoothed_pose_dict(pose, frame):
+def smoothed_pose_dict(pose: SmoothedPose, frame: str) -> MessageDict:
     """geometry_msgs/PoseWithCovarianceStamped of a `SmoothedPose`."""
     return {'header': header_dict(pose.stamp_ns, frame), 'pose': pose_with_covariance_dict(pose)}
 
 
-def smoothed_track_dict(poses, frame):
+def smoothed_track_dict(poses: Sequence[SmoothedPose], frame: str) -> MessageDict:
     """mag_tracking_msgs/SmoothedTrack of the `SmoothedPose`s of one track."""
     last = poses[-1]
     return {'header': header_dict(last.stamp_ns, frame), 'track_id': last.id, 'kind': last.kind,
@@ -195,7 +206,7 @@ def smoothed_track_dict(poses, frame):
             'velocities': [xyz(p.velocity) for p in poses]}
 
 
-def detection_dict(d, frame):
+def detection_dict(d: Detection, frame: str) -> MessageDict:
     """mag_tracking_msgs/Detection of a `Detection`."""
     return {'header': header_dict(d.stamp_ns, frame), 'id': d.id, 'kind': int(not d.onset),
             'statistic': d.statistic, 'degrees_of_freedom': d.degrees_of_freedom,
@@ -203,7 +214,7 @@ def detection_dict(d, frame):
             'strongest_sensor': d.strongest_sensor}
 
 
-def odometry_dict(track, frame, child_frame):
+def odometry_dict(track: Track, frame: str, child_frame: str) -> MessageDict:
     """nav_msgs/Odometry: the twist is in the child frame, as REP-105 has it.
 
     The angular velocity is not estimated here: zero, with variance pi^2.

@@ -6,12 +6,17 @@ here is what a recording carries, and a test compares the two.
 
 import functools
 import struct
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Protocol
 
 from mcap.exceptions import McapError
+from mcap.records import Schema
 from mcap_ros2 import _dynamic
 from mcap_ros2.decoder import DecoderFactory
 
 from mag_tracking.errors import RecordingError
+from mag_tracking.messages.shapes import MessageDict
 
 MAGNETIC_FIELD = 'sensor_msgs/msg/MagneticField'
 IMU = 'sensor_msgs/msg/Imu'
@@ -25,7 +30,7 @@ RAW_READINGS = '/driver_node/readings'
 CALIBRATED_READINGS = '/calibration_node/readings'
 """The same, calibrated."""
 
-DEFINITIONS = {
+DEFINITIONS: dict[str, tuple[tuple[str, ...], str]] = {
     'builtin_interfaces/msg/Time': ((), 'int32 sec\nuint32 nanosec\n'),
     'std_msgs/msg/Header': (('builtin_interfaces/msg/Time',),
                             'builtin_interfaces/Time stamp\nstring frame_id\n'),
@@ -68,9 +73,9 @@ DEFINITIONS = {
 """{type: (types that it names, text)}; Jazzy's definitions without comments."""
 
 
-def _closure(type_name):
+def _closure(type_name: str) -> list[str]:
     """The types below `type_name`, each once, in the order met."""
-    seen = []
+    seen: list[str] = []
     queue = list(DEFINITIONS[type_name][0])
     while queue:
         name = queue.pop(0)
@@ -80,7 +85,7 @@ def _closure(type_name):
     return seen
 
 
-def definition(type_name):
+def definition(type_name: str) -> str:
     """The text of a type with all that it needs, as a `ros2msg` schema has it.
 
     Raises RecordingError for a type that is not defined here.
@@ -95,18 +100,31 @@ def definition(type_name):
 
 
 @functools.cache
-def encoder(type_name):
+def encoder(type_name: str) -> Callable[[MessageDict], bytes]:
     """Function from nested dicts to CDR bytes."""
     # The library offers this function only through its own writer, which cannot
     # write channel metadata; the version is pinned, so this private name is safe.
     return _dynamic.serialize_dynamic(type_name, definition(type_name))[type_name]
 
 
-_decoders = {}
+class _Raw(Protocol):
+    """A `RawMessage`."""
+
+    @property
+    def topic(self) -> str: ...
+    @property
+    def type(self) -> str: ...
+    @property
+    def data(self) -> bytes: ...
+    @property
+    def schema(self) -> Schema: ...
+
+
+_decoders: dict[tuple[str, bytes], Callable[[bytes], SimpleNamespace] | None] = {}
 _DECODE_ERRORS = (ValueError, IndexError, KeyError, OverflowError, struct.error, McapError)
 
 
-def decode(message):
+def decode(message: _Raw) -> SimpleNamespace:
     """A `RawMessage` as an object with the fields of its type.
 
     Raises RecordingError where the bytes do not fit the type.
@@ -115,9 +133,10 @@ def decode(message):
     try:
         if key not in _decoders:
             _decoders[key] = DecoderFactory().decoder_for('cdr', message.schema)
-        if _decoders[key] is None:
+        decoder = _decoders[key]
+        if decoder is None:
             raise ValueError(f'its schema is in {message.schema.encoding}, not in ros2msg')
-        return _decoders[key](message.data)
+        return decoder(message.data)
     except _DECODE_ERRORS as error:
         raise RecordingError(f'a message on {message.topic} is not a {message.type}: '
                              f'{error}') from error

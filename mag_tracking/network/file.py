@@ -4,11 +4,15 @@ import datetime
 import json
 import os
 import re
+from collections.abc import Collection, Iterable
+from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import NetworkError, OutputError
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
 from mag_tracking.network import Calibrated, SensorNetwork
@@ -33,7 +37,7 @@ _LONGEST_OFFSET = 3600.0
 """[s] A clock that is off by more is to be set, not corrected."""
 
 
-def _vector(what, value, lengths):
+def _vector(what: str, value: object, lengths: tuple[int, ...]) -> FloatArray:
     """A list of finite numbers of one of `lengths`, as an array."""
     if not isinstance(value, list) or len(value) not in lengths:
         raise NetworkError(f'{what}: expected {" or ".join(map(str, lengths))} numbers, '
@@ -47,7 +51,7 @@ def _vector(what, value, lengths):
     return np.array(value, dtype=float)
 
 
-def _known(what, mapping, keys):
+def _known(what: str, mapping: object, keys: Collection[str]) -> None:
     """Raise NetworkError for a key that is not among `keys`."""
     if not isinstance(mapping, dict):
         raise NetworkError(f'{what}: expected a mapping, got {mapping!r}')
@@ -57,7 +61,7 @@ def _known(what, mapping, keys):
                                f'{", ".join(sorted(keys))}')
 
 
-def _sensor(name, entry):
+def _sensor(name: str, entry: Any) -> dict[str, Any]:
     """The values of one entry, by the names that `SensorNetwork` has for them."""
     what = f'sensor {name}'
     _known(what, entry, _SENSOR)
@@ -71,8 +75,9 @@ def _sensor(name, entry):
     topic = _topic(what, 'topic', entry.get('topic', f'/{name}/imu/mag'))
     # Where a driver puts a sensor's accelerometer, by REP-145, beside its magnetometer.
     beside = topic.removesuffix('/mag') + '/data_raw' if topic.endswith('/mag') else None
+    imu_topic = entry.get('imu_topic', beside)
     return {'positions': position, 'R_ws': R_ws, 'topics': topic,
-            'imu_topics': _topic(what, 'imu_topic', entry.get('imu_topic', beside)),
+            'imu_topics': None if imu_topic is None else _topic(what, 'imu_topic', imu_topic),
             'noise_std': _noise(what, entry.get('noise_std')),
             'background': _small_field(what, 'background', entry.get('background')),
             'offset': _small_field(what, 'offset', entry.get('offset')),
@@ -82,53 +87,53 @@ def _sensor(name, entry):
             'calibrated': _calibrated(what, entry.get('calibrated'))}
 
 
-def _noise(what, noise):
+def _noise(what: str, noise: object) -> FloatArray | None:
     """(3,) [T] of one number or three."""
     if noise is None:
         return None
-    noise = noise if isinstance(noise, list) else [noise]
-    noise = _vector(f'{what}: noise_std', noise, (1, 3)) * np.ones(3)
-    if not ((noise >= _QUIETEST) & (noise < 1e-3)).all():
+    numbers = noise if isinstance(noise, list) else [noise]
+    std = _vector(f'{what}: noise_std', numbers, (1, 3)) * np.ones(3)
+    if not ((std >= _QUIETEST) & (std < 1e-3)).all():
         raise NetworkError(f'{what}: noise_std must be above a femtotesla and below a '
-                           f'millitesla, got {noise.tolist()} T')
-    return noise
+                           f'millitesla, got {std.tolist()} T')
+    return std
 
 
-def _small_field(what, key, value):
+def _small_field(what: str, key: str, value: object) -> FloatArray | None:
     """(3,) [T] of three numbers."""
     if value is None:
         return None
-    value = _vector(f'{what}: {key}', value, (3,))
-    if np.abs(value).max() > 0.1:
-        raise NetworkError(f'{what}: {key}: {value.tolist()} T is more than 0.1 T; is it in '
+    B = _vector(f'{what}: {key}', value, (3,))
+    if np.abs(B).max() > 0.1:
+        raise NetworkError(f'{what}: {key}: {B.tolist()} T is more than 0.1 T; is it in '
                            'microtesla or gauss?')
-    return value
+    return B
 
 
-def _correction(what, value):
+def _correction(what: str, value: object) -> FloatArray | None:
     """(3, 3) of nine numbers."""
     if value is None:
         return None
-    value = _vector(f'{what}: correction', value, (9,)).reshape(3, 3)
-    singular = np.linalg.svd(value, compute_uv=False)
+    matrix = _vector(f'{what}: correction', value, (9,)).reshape(3, 3)
+    singular = np.linalg.svd(matrix, compute_uv=False)
     if not singular[-1] > 0.02 * singular[0]:
-        raise NetworkError(f'{what}: correction: {value.ravel().tolist()} takes away a direction')
-    return value
+        raise NetworkError(f'{what}: correction: {matrix.ravel().tolist()} takes away a direction')
+    return matrix
 
 
-def _orientation_std(what, value):
+def _orientation_std(what: str, value: object) -> FloatArray | None:
     """(3,) [rad] of one number or three [deg]."""
     if value is None:
         return None
-    value = value if isinstance(value, list) else [value]
-    value = _vector(f'{what}: orientation_std_deg', value, (1, 3)) * np.ones(3)
-    if not ((value > 0.0) & (value <= 180.0)).all():
+    numbers = value if isinstance(value, list) else [value]
+    std = _vector(f'{what}: orientation_std_deg', numbers, (1, 3)) * np.ones(3)
+    if not ((std > 0.0) & (std <= 180.0)).all():
         raise NetworkError(f'{what}: orientation_std_deg must be above 0 and at most 180 degrees, '
-                           f'got {value.tolist()}')
-    return np.deg2rad(value)
+                           f'got {std.tolist()}')
+    return np.deg2rad(std)
 
 
-def _clock_offset(what, value):
+def _clock_offset(what: str, value: object) -> float:
     """[s]."""
     offset = _vector(f'{what}: clock_offset', [value], (1,))[0]
     if abs(offset) > _LONGEST_OFFSET:
@@ -137,7 +142,7 @@ def _clock_offset(what, value):
     return float(offset)
 
 
-def _calibrated(what, value):
+def _calibrated(what: str, value: Any) -> Calibrated | None:
     """`Calibrated`."""
     if value is None:
         return None
@@ -159,7 +164,7 @@ def _calibrated(what, value):
                       None if spread is None else tuple(spread.tolist()))
 
 
-def _rotation(what, q):
+def _rotation(what: str, q: FloatArray) -> FloatArray:
     """(3, 3) of a quaternion."""
     try:
         return rotation_from_quaternion(q)
@@ -167,10 +172,8 @@ def _rotation(what, q):
         raise NetworkError(f'{what}: {error}') from error
 
 
-def _topic(what, key, topic):
-    """A topic's name, or None."""
-    if topic is None:
-        return None
+def _topic(what: str, key: str, topic: object) -> str:
+    """A topic's name."""
     if not isinstance(topic, str) or not topic.startswith('/'):
         raise NetworkError(f'{what}: {key} must begin with /, got {topic!r}')
     if not _TOPIC.fullmatch(topic):
@@ -179,7 +182,7 @@ def _topic(what, key, topic):
     return topic
 
 
-def read_network(path):
+def read_network(path: str | PathLike[str]) -> SensorNetwork:
     """The `SensorNetwork` in a file; raises NetworkError, which names file and key."""
     content = read_yaml(path, NetworkError)
     try:
@@ -188,7 +191,7 @@ def read_network(path):
         raise NetworkError(f'{path}: {error}') from error
 
 
-def _network(content):
+def _network(content: Any) -> SensorNetwork:
     """The network of the parsed file."""
     _known('the file', content, _TOP)
     sensors = content.get('sensors')
@@ -203,13 +206,13 @@ def _network(content):
         if not _NAME.fullmatch(name):
             raise NetworkError(f'{name!r} is no name for a sensor: letters, digits, _ . and -')
     entries = [_sensor(n, e) for n, e in zip(names, sensors.values(), strict=True)]
-    columns = {key: tuple(e[key] for e in entries) for key in entries[0]}
+    columns: dict[str, Any] = {key: tuple(e[key] for e in entries) for key in entries[0]}
     for key in ('positions', 'R_ws', 'clock_offset'):
         columns[key] = np.array(columns[key])
     return SensorNetwork(names, frame=frame, earth_field=earth, **columns)
 
 
-def _earth_field(content):
+def _earth_field(content: dict[str, Any]) -> FloatArray | None:
     """(3,) [T] as it is given, or by the World Magnetic Model at the site; None without both."""
     earth, site = content.get('earth_field'), content.get('site')
     if earth is not None and site is not None:
@@ -240,24 +243,24 @@ def _earth_field(content):
                            'or give earth_field instead') from error
 
 
-def _numbers(values):
+def _numbers(values: Iterable[float]) -> str:
     """A flow list that YAML reads back as floats."""
     return '[' + ', '.join(_number(v) for v in values) + ']'
 
 
-def _number(value):
+def _number(value: float) -> str:
     """A float with a point, which YAML 1.1 wants before an exponent."""
     text = repr(float(value))
     return text.replace('e', '.0e') if 'e' in text and '.' not in text else text
 
 
-def _sensor_lines(network, i):
+def _sensor_lines(network: SensorNetwork, i: int) -> list[str]:
     """The entry of sensor `i`."""
     lines = [f'  {_text(network.names[i])}:', f'    position: {_numbers(network.positions[i])}',
              f'    orientation: {_numbers(quaternion_from_rotation(network.R_ws[i]))}']
-    if network.orientation_std[i] is not None:
-        lines.append('    orientation_std_deg: '
-                     f'{_numbers(np.rad2deg(network.orientation_std[i]))}')
+    std = network.orientation_std[i]
+    if std is not None:
+        lines.append(f'    orientation_std_deg: {_numbers(np.rad2deg(std))}')
     if network.clock_offset[i]:
         lines.append(f'    clock_offset: {_number(network.clock_offset[i])}')
     for key in ('noise_std', 'background', 'offset', 'correction'):
@@ -279,12 +282,12 @@ def _sensor_lines(network, i):
     return lines
 
 
-def _text(text):
+def _text(text: str) -> str:
     """Text as YAML that reads back as the same text: 'no' and '01' would not."""
     return text if yaml.safe_load(text) == text else json.dumps(text)
 
 
-def write_network(path, network, comment=''):
+def write_network(path: str | PathLike[str], network: SensorNetwork, comment: str = '') -> None:
     """Write a network file; one that was there is replaced as a whole, or not at all.
 
     Parameters

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
+
 COEFFICIENTS = 'wmm/WMM_2025.COF'
 FIRST_YEAR, LAST_YEAR = 2025.0, 2030.0
 """The span of WMM2025."""
@@ -31,13 +33,13 @@ class Site:
     bearing of the road that x runs along."""
 
 
-def decimal_year(day):
+def decimal_year(day: datetime.date) -> float:
     """The year with its fraction of a `datetime.date`."""
     first = datetime.date(day.year, 1, 1)
     return day.year + (day - first).days / (datetime.date(day.year + 1, 1, 1) - first).days
 
 
-def earth_field(site):
+def earth_field(site: Site) -> FloatArray:
     """Flux density of the Earth at a `Site`.
 
     Returns

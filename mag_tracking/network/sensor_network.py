@@ -1,9 +1,11 @@
 """The sensor network: where each sensor is, how it is turned, what it was calibrated to."""
 
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import NetworkError
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
 
@@ -30,33 +32,34 @@ class SensorNetwork:
     """Stationary three-axis magnetometers; the order of `names` is that of every array."""
 
     names: tuple[str, ...]
-    positions: np.ndarray
+    positions: FloatArray
     """(n, 3) [m], world."""
-    R_ws: np.ndarray
+    R_ws: FloatArray
     """(n, 3, 3), sensor to world."""
     topics: tuple[str, ...]
     frame: str = 'map'
-    earth_field: np.ndarray | None = None
+    earth_field: FloatArray | None = None
     """(3,) [T], world; None = unknown."""
-    noise_std: tuple[np.ndarray | None, ...] = ()
+    noise_std: tuple[FloatArray | None, ...] = ()
     """Per sensor (3,) [T]; None = to be estimated."""
-    background: tuple[np.ndarray | None, ...] = ()
+    background: tuple[FloatArray | None, ...] = ()
     """Per sensor (3,) [T], sensor frame; None = to be learnt."""
-    orientation_std: tuple[np.ndarray | None, ...] = ()
+    orientation_std: tuple[FloatArray | None, ...] = ()
     """Per sensor (3,) [rad], how far it may be turned from `R_ws` about each of the world's
     axes; None = not known."""
-    clock_offset: np.ndarray | None = None
-    """(n,) [s] How far each sensor's clock is ahead; taken from its stamps. None = nothing."""
-    offset: tuple[np.ndarray | None, ...] = ()
+    # None only until `__post_init__`.
+    clock_offset: FloatArray = cast(FloatArray, None)
+    """(n,) [s] How far each sensor's clock is ahead; taken from its stamps. None = zeros."""
+    offset: tuple[FloatArray | None, ...] = ()
     """Per sensor (3,) [T], sensor frame: hard iron of the sensor itself, as a tumbling tells."""
-    correction: tuple[np.ndarray | None, ...] = ()
+    correction: tuple[FloatArray | None, ...] = ()
     """Per sensor (3, 3): B = correction @ (reading - offset)."""
     imu_topics: tuple[str | None, ...] = ()
     """Per sensor, of its accelerometer; None = it has none."""
     calibrated: tuple[Calibrated | None, ...] = ()
     """Per sensor; None = never."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         n = len(self.names)
         if n == 0:
             raise NetworkError('a network needs at least one sensor')
@@ -68,7 +71,7 @@ class SensorNetwork:
             raise NetworkError(f'topic {shared[0]} is that of two sensors')
         if self.positions.shape != (n, 3) or self.R_ws.shape != (n, 3, 3):
             raise NetworkError(f'{n} sensors need positions ({n}, 3) and orientations ({n}, 3, 3)')
-        places = {}
+        places: dict[tuple[float, ...], str] = {}
         for name, place in zip(self.names, map(tuple, self.positions.tolist()), strict=True):
             other = places.setdefault(place, name)
             if other != name:
@@ -80,29 +83,30 @@ class SensorNetwork:
         if self.clock_offset is None:
             object.__setattr__(self, 'clock_offset', np.zeros(n))
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.names)
 
     @property
-    def R_sw(self):
+    def R_sw(self) -> FloatArray:
         """(n, 3, 3), world to sensor."""
         return np.ascontiguousarray(np.swapaxes(self.R_ws, 1, 2))
 
     @property
-    def centre(self):
+    def centre(self) -> FloatArray:
         """(3,) [m], mean of the sensor positions."""
-        return self.positions.mean(axis=0)
+        centre: FloatArray = self.positions.mean(axis=0)
+        return centre
 
-    def part(self, rows):
+    def part(self, rows: IntArray) -> 'SensorNetwork':
         """The network of the sensors `rows` (n,) alone."""
-        per_sensor = ('names', 'topics', 'noise_std', 'background', 'orientation_std', 'offset',
-                      'correction', 'imu_topics', 'calibrated')
+        per_sensor: dict[str, Any] = {
+            name: tuple(getattr(self, name)[j] for j in rows)
+            for name in ('names', 'topics', 'noise_std', 'background', 'orientation_std', 'offset',
+                         'correction', 'imu_topics', 'calibrated')}
         return replace(self, positions=self.positions[rows], R_ws=self.R_ws[rows],
-                       clock_offset=self.clock_offset[rows],
-                       **{name: tuple(getattr(self, name)[j] for j in rows)
-                          for name in per_sensor})
+                       clock_offset=self.clock_offset[rows], **per_sensor)
 
-    def as_stated(self):
+    def as_stated(self) -> 'SensorNetwork':
         """The network with the orientations that were stated before any calibration."""
         R_ws, std = self.R_ws.copy(), list(self.orientation_std)
         for j, done in enumerate(self.calibrated):
@@ -111,7 +115,8 @@ class SensorNetwork:
                 std[j] = None if done.stated_std is None else np.array(done.stated_std)
         return replace(self, R_ws=R_ws, orientation_std=tuple(std))
 
-    def marked(self, j, date, by, clock_offset_std=float('nan')):
+    def marked(self, j: int, date: str, by: str,
+               clock_offset_std: float = float('nan')) -> Calibrated:
         """The `Calibrated` of sensor `j` from now on; what was stated by hand is kept in it."""
         done, std = self.calibrated[j], self.orientation_std[j]
         if done is not None and done.stated is not None:
@@ -120,7 +125,7 @@ class SensorNetwork:
                           tuple(quaternion_from_rotation(self.R_ws[j]).tolist()),
                           None if std is None else tuple(std.tolist()))
 
-    def index(self, name):
+    def index(self, name: str) -> int:
         """Row of sensor `name`; raises NetworkError if there is none."""
         try:
             return self.names.index(name)

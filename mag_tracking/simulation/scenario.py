@@ -5,10 +5,14 @@ point model meets the model error that it will meet on a road; a matched point
 target is a cloud of one part.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from mag_tracking.arrays import FloatArray
+from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import MU0, dipole_field
 from mag_tracking.records import MagSample
 
@@ -17,21 +21,23 @@ from mag_tracking.records import MagSample
 class MagneticBody:
     """Parts fixed in a body frame (x forward, z up), origin on the ground."""
 
-    parts: np.ndarray
+    parts: FloatArray
     """(n, 3) [m]."""
-    permanent: np.ndarray
+    permanent: FloatArray
     """(n, 3) [A m^2], hard iron of each part."""
-    susceptibility: np.ndarray
+    susceptibility: FloatArray
     """(n, 3, 3) [m^3]: induced moment = susceptibility @ B0 / mu0, body frame."""
 
 
-def point_body(hard_iron, soft_iron, height):
+def point_body(hard_iron: Sequence[float] | FloatArray, soft_iron: float,
+               height: float) -> MagneticBody:
     """A matched point target: m0 (3,) [A m^2], D [m^3], `height` [m] above the ground."""
     return MagneticBody(np.array([[0.0, 0.0, height]]), np.array([hard_iron], dtype=float),
                         soft_iron * np.eye(3)[None])
 
 
-def random_vehicle(rng, length=4.3, width=1.7, height=1.3, n_parts=60, moment=400.0):
+def random_vehicle(rng: np.random.Generator, length: float = 4.3, width: float = 1.7,
+                   height: float = 1.3, n_parts: int = 60, moment: float = 400.0) -> MagneticBody:
     """A vehicle-like cloud: parts in a box, most of the iron low and at the ends.
 
     The permanent and the induced moment are each about `moment` / 1.4 in
@@ -58,7 +64,7 @@ def random_vehicle(rng, length=4.3, width=1.7, height=1.3, n_parts=60, moment=40
 class Path:
     """A planar path at constant speed: straight, or straight - arc - straight."""
 
-    start: np.ndarray
+    start: FloatArray
     """(2,) [m]."""
     heading: float
     """[rad] at the start."""
@@ -71,7 +77,7 @@ class Path:
     radius: float = 1.0
     """[m]."""
 
-    def at(self, t):
+    def at(self, t: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Position (n, 2) and heading (n,) at times `t` (n,) [s]."""
         s = self.speed * np.asarray(t, dtype=float)
         arc = abs(self.turn) * self.radius
@@ -88,7 +94,8 @@ class Path:
         return position, self.heading + angle
 
 
-def body_field(body, earth_field, position, heading, points):
+def body_field(body: MagneticBody, earth_field: FloatArray, position: FloatArray,
+               heading: FloatArray, points: FloatArray) -> FloatArray:
     """Field of a body at `points`.
 
     Parameters
@@ -111,7 +118,8 @@ def body_field(body, earth_field, position, heading, points):
     B_body = np.einsum('nji,j->ni', R, earth_field)
     induced = np.einsum('pij,nj->npi', body.susceptibility, B_body) / MU0
     m = np.einsum('nij,npj->npi', R, body.permanent + induced)
-    return dipole_field(points[None, :, None] - r[:, None], m[:, None]).sum(axis=2)
+    B: FloatArray = dipole_field(points[None, :, None] - r[:, None], m[:, None]).sum(axis=2)
+    return B
 
 
 @dataclass(frozen=True)
@@ -130,7 +138,9 @@ class Imperfections:
     """[s], constant offset, not for the first sensor."""
 
 
-def simulate(network, body, path, rate, duration, rng, imperfections=None, start_s=0.0):
+def simulate(network: SensorNetwork, body: MagneticBody, path: Path, rate: float, duration: float,
+             rng: np.random.Generator, imperfections: Imperfections | None = None,
+             start_s: float = 0.0) -> tuple[list[MagSample], FloatArray, FloatArray, FloatArray]:
     """Raw samples of every sensor and the truth, for one vehicle.
 
     Parameters
@@ -151,15 +161,19 @@ def simulate(network, body, path, rate, duration, rng, imperfections=None, start
     samples : list of MagSample, in order of their stamps
     t : (n,) [s], position : (n, 2) [m], heading : (n,) [rad]
         The truth.
+
+    Raises ValueError for a network without an earth field.
     """
-    flaws = imperfections or Imperfections()
-    t = np.arange(0.0, duration, 1.0 / rate)
+    flaws, earth_field = imperfections or Imperfections(), network.earth_field
+    if earth_field is None:
+        raise ValueError('the network has no earth field to simulate in')
+    t = np.arange(0.0, duration, 1.0 / rate, dtype=float)
     samples = []
     for j, name in enumerate(network.names):
         offset = flaws.clock_std * rng.standard_normal() if j else 0.0
         position, heading = path.at(t + offset)
-        B = network.earth_field + body_field(body, network.earth_field, position, heading,
-                                             network.positions[j:j + 1])[:, 0]
+        B = earth_field + body_field(body, earth_field, position, heading,
+                                     network.positions[j:j + 1])[:, 0]
         a, b, c = flaws.tilt_std * rng.standard_normal(3)
         tilt = np.array([[1.0, -c, b], [c, 1.0, -a], [-b, a, 1.0]])
         y = B @ network.R_ws[j] @ tilt

@@ -157,6 +157,7 @@ def test_any_words_read_back(tmp_path):
     ('0.0, -0.01, 1.0]', '0.0, 0.0, 0.0]', 'takes away a direction'),
     ('imu_topic: /imu_of_c', 'imu_topic: imu', 'imu_topic must begin with /'),
     ('imu_topic: /imu_of_c', 'imu_topic: /imu of c', 'no ROS topic'),
+    ('topic: /b/field', 'topic: null', 'topic must begin with /, got None'),
     ("date: '2026-05-02'", 'date: 2026-05-02', 'date must be text'),
     (', by: as stated', '', 'by must be text'),
     ('by: as stated', 'by: as stated, who: me', "unknown key 'who'"),

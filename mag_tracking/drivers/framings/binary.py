@@ -2,7 +2,9 @@
 
 import struct
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
 
 from mag_tracking.drivers.framings.checksums import CHECKSUMS, Checksum
 from mag_tracking.drivers.framings.fields import (
@@ -15,12 +17,14 @@ from mag_tracking.drivers.framings.fields import (
     skipped,
     ticks_value,
 )
-from mag_tracking.drivers.reading import Parsed
+from mag_tracking.drivers.reading import Parsed, Reading
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
 
 _CODES = {'u8': 'B', 'i8': 'b', 'u16': 'H', 'i16': 'h', 'u24': '3s', 'i24': '3s', 'u32': 'I',
           'i32': 'i', 'u64': 'Q', 'i64': 'q', 'f32': 'f', 'f64': 'd'}
+_ByteOrder: TypeAlias = Literal['little', 'big']
+_Converter: TypeAlias = Callable[[Any], object]
 
 
 @dataclass(frozen=True)
@@ -65,13 +69,13 @@ class BinaryFraming:
 
     SETTINGS = BinarySettings
 
-    def __init__(self, settings):
+    def __init__(self, settings: BinarySettings) -> None:
         """Raises SettingsError."""
         self._sync = _hexadecimal('sync', settings.sync)
         if not self._sync:
             raise SettingsError('sync: a frame must begin with one byte at least')
         self._tail = _hexadecimal('tail', settings.tail)
-        self._order = chosen('byte_order', settings.byte_order, ('little', 'big'))
+        self._order: _ByteOrder = chosen('byte_order', settings.byte_order, ('little', 'big'))
         name = chosen('checksum', settings.checksum, ('none', *CHECKSUMS))
         self._checksum = CHECKSUMS.get(name, Checksum(0, _zero))
         since = chosen('checksum_from', settings.checksum_from, ('sync', 'payload'))
@@ -89,12 +93,14 @@ class BinaryFraming:
         self._checksum_end = self._payload_end + self._checksum.size
         self.size = self._checksum_end + len(self._tail)
         kinds = dict(fields)
-        self.CLOCK = {'wrap': _wrap(kinds['ticks'])} if 'ticks' in kinds else {}
-        self.DRIVER = ({'sequence_wrap': _wrap(kinds['sequence'])} if 'sequence' in kinds else {})
+        self.CLOCK: dict[str, float] = {'wrap': _wrap(kinds['ticks'])} if 'ticks' in kinds else {}
+        self.DRIVER: dict[str, int] = (
+            {'sequence_wrap': _wrap(kinds['sequence'])} if 'sequence' in kinds else {})
 
-    def parse(self, data, final=False):
+    def parse(self, data: bytes, final: bool = False) -> Parsed:
         """All readings in `data`; see `Framing.parse`."""
-        readings, rejected = [], Counter()
+        readings: list[Reading] = []
+        rejected: Counter[str] = Counter()
         at = frames = 0
         while True:
             start = data.find(self._sync, at)
@@ -121,14 +127,14 @@ class BinaryFraming:
             rejected['bytes between frames'] = between
         return Parsed(tuple(readings), consumed, rejected)
 
-    def _begun(self, data, at):
+    def _begun(self, data: bytes, at: int) -> int:
         """How many bytes at the end of `data`, from `at` on, may be the beginning of a sync."""
         for n in range(min(len(self._sync) - 1, len(data) - at), 0, -1):
             if data.endswith(self._sync[:n]):
                 return n
         return 0
 
-    def _fault(self, data, start):
+    def _fault(self, data: bytes, start: int) -> str:
         """Why there is no frame at `start`; empty = there is one."""
         # No exception: among bytes like the sync this is asked for each of them.
         if not data.startswith(self._tail, start + self._checksum_end):
@@ -139,19 +145,19 @@ class BinaryFraming:
             return 'with a wrong checksum'
         return ''
 
-    def _read(self, data, start):
+    def _read(self, data: bytes, start: int) -> list[Reading]:
         """The readings of the frame at `start`, or Rejected."""
         values = self._struct.unpack_from(data, start + self._payload)
         return self._layout.readings(
             [convert(value) for convert, value in zip(self._converters, values, strict=True)])
 
 
-def _zero(data):
+def _zero(data: bytes) -> int:
     """The checksum of no bytes."""
     return 0
 
 
-def _hexadecimal(setting, text):
+def _hexadecimal(setting: str, text: str) -> bytes:
     """The bytes of a hexadecimal text."""
     try:
         return bytes.fromhex(text)
@@ -159,7 +165,7 @@ def _hexadecimal(setting, text):
         raise SettingsError(f'{setting}: {text!r} is not hexadecimal, as in A5 5A') from None
 
 
-def _typed(setting, fields):
+def _typed(setting: str, fields: Sequence[str]) -> list[tuple[str, str]]:
     """[(name, type)] of fields such as x:i16."""
     out = []
     for text in fields:
@@ -173,16 +179,17 @@ def _typed(setting, fields):
     return out
 
 
-def _wrap(kind):
+def _wrap(kind: str) -> int:
     """Where a counter of this type goes back to 0; 0 = it will not live to see it."""
     bits = int(kind[1:])
-    return 0 if kind[0] == 'f' or bits == 64 else 2**bits
+    return 0 if kind[0] == 'f' or bits == 64 else 1 << bits
 
 
-def _converter(quantity, kind, order):
+def _converter(quantity: str, kind: str, order: _ByteOrder) -> _Converter:
     """From what `struct` gives to the value that `FieldLayout` takes."""
     if quantity == SKIP:
         return skipped
+    convert: _Converter
     if quantity in AXES or quantity == 'ticks':
         convert = float if kind[0] != 'f' else axis_value if quantity in AXES else ticks_value
     else:

@@ -21,17 +21,17 @@ class Checksum(NamedTuple):
     """From the bytes that it covers to the number that stands in the frame."""
 
 
-def sum8(data):
+def sum8(data: bytes) -> int:
     """Sum of the bytes modulo 256; check value 0xDD."""
     return sum(data) & 0xFF
 
 
-def xor8(data):
+def xor8(data: bytes) -> int:
     """All bytes joined by exclusive or, as NMEA 0183 has it; check value 0x31."""
     return reduce(xor, data, 0)
 
 
-def _forward_table(polynomial):
+def _forward_table(polynomial: int) -> tuple[int, ...]:
     """The 256 remainders of an 8-bit CRC, highest bit first."""
     table = []
     for byte in range(256):
@@ -41,7 +41,7 @@ def _forward_table(polynomial):
     return tuple(table)
 
 
-def _reflected_table(polynomial):
+def _reflected_table(polynomial: int) -> tuple[int, ...]:
     """The 256 remainders of a CRC, lowest bit first; `polynomial` reflected too."""
     table = []
     for byte in range(256):
@@ -55,7 +55,7 @@ _CRC8 = _forward_table(0x107)
 _MODBUS = _reflected_table(0xA001)
 
 
-def crc8(data):
+def crc8(data: bytes) -> int:
     """CRC-8/SMBUS: polynomial 0x07, start 0; check value 0xF4."""
     crc, table = 0, _CRC8
     for byte in data:
@@ -63,12 +63,12 @@ def crc8(data):
     return crc
 
 
-def crc16_ccitt(data):
+def crc16_ccitt(data: bytes) -> int:
     """CRC-16/CCITT-FALSE (IBM-3740): polynomial 0x1021, start 0xFFFF; check value 0x29B1."""
     return binascii.crc_hqx(data, 0xFFFF)
 
 
-def crc16_modbus(data):
+def crc16_modbus(data: bytes) -> int:
     """CRC-16/MODBUS: polynomial 0x8005 reflected, start 0xFFFF; check value 0x4B37."""
     crc, table = 0xFFFF, _MODBUS
     for byte in data:
@@ -76,7 +76,7 @@ def crc16_modbus(data):
     return crc
 
 
-def crc32(data):
+def crc32(data: bytes) -> int:
     """CRC-32 (ISO-HDLC), as in Ethernet and zip; check value 0xCBF43926."""
     return zlib.crc32(data)
 

@@ -8,7 +8,9 @@ first dot (`x.A`).
 
 import math
 import re
+from collections.abc import Callable, Mapping, Sequence
 from operator import itemgetter
+from typing import Any, TypeAlias, TypeVar
 
 from mag_tracking.drivers.reading import Reading
 from mag_tracking.errors import SettingsError
@@ -17,10 +19,13 @@ FIELD, ACCELERATION = ('x', 'y', 'z'), ('ax', 'ay', 'az')
 AXES = FIELD + ACCELERATION
 OF_THE_FRAME = ('sensor', 'ticks', 'sequence')
 SKIP = '-'
+Values: TypeAlias = Sequence[Any]
+"""Of one frame; the type of each follows from its field."""
 LONGEST_NAME = 64
 """Characters of a sensor's name at most."""
 _ESCAPE = re.compile(r'\\(x[0-9A-Fa-f]{2}|.?)', re.DOTALL)
 _ESCAPED = {'n': '\n', 'r': '\r', 't': '\t', '0': '\0', '\\': '\\'}
+_Choice = TypeVar('_Choice', bound=str)
 
 
 class Rejected(ValueError):
@@ -37,7 +42,7 @@ class FieldLayout:
         sensor. So many values has a frame.
     """
 
-    def __init__(self, fields, each=(), count=0):
+    def __init__(self, fields: Sequence[str], each: Sequence[str] = (), count: int = 0) -> None:
         """
         Parameters
         ----------
@@ -51,7 +56,8 @@ class FieldLayout:
         Raises SettingsError for an unknown field, a field twice, or no axis at all.
         """
         names = _expanded(tuple(fields), tuple(each), count)
-        index, sensors = {}, {}
+        index: dict[str, int] = {}
+        sensors: dict[str, dict[str, int]] = {}
         for i, name in enumerate(names):
             if name == SKIP:
                 continue
@@ -73,7 +79,7 @@ class FieldLayout:
         self._sensors = [(sensor, _triple(axes, FIELD), _triple(axes, ACCELERATION))
                          for sensor, axes in sensors.items()]
 
-    def readings(self, values):
+    def readings(self, values: Values) -> list[Reading]:
         """The readings of one frame, in the order in which the sensors first appear.
 
         Parameters
@@ -99,20 +105,20 @@ class FieldLayout:
                 for name, field, acceleration in self._sensors]
 
 
-def _parts(name):
+def _parts(name: str) -> tuple[str, str]:
     """(quantity, sensor) of a field's name."""
     quantity, _, sensor = name.partition('.')
     return quantity, sensor
 
 
-def _triple(axes, names):
+def _triple(axes: Mapping[str, int], names: Sequence[str]) -> Callable[[Values], Any]:
     """From the values of a frame to three axes, or to None where it holds none of them."""
     if not any(name in axes for name in names):
         return itemgetter(-1)
     return itemgetter(*(axes.get(name, -2) for name in names))
 
 
-def _expanded(fields, each, count):
+def _expanded(fields: tuple[str, ...], each: tuple[str, ...], count: int) -> tuple[str, ...]:
     """All names of a frame, checked one by one."""
     for name in fields:
         quantity, sensor = _parts(name)
@@ -131,12 +137,12 @@ def _expanded(fields, each, count):
                           for i in range(count) for name in each)
 
 
-def _usable(name):
+def _usable(name: str) -> bool:
     """Whether a sensor may have this name."""
     return 0 < len(name) <= LONGEST_NAME and name.isprintable()
 
 
-def axis_value(value):
+def axis_value(value: float | bytes) -> float:
     """`value` as a float; NaN = missing. Raises Rejected where it is infinite."""
     try:
         value = float(value)
@@ -147,7 +153,7 @@ def axis_value(value):
     return value
 
 
-def ticks_value(value):
+def ticks_value(value: float) -> float:
     """`value` as a float [ticks]. Raises Rejected where it is not finite."""
     value = axis_value(value)
     if math.isnan(value):
@@ -155,31 +161,31 @@ def ticks_value(value):
     return value
 
 
-def sequence_value(value):
+def sequence_value(value: int) -> int:
     """`value`, an int. Raises Rejected where no counter of 64 bits holds it."""
     if not -2**63 <= value < 2**64:
         raise Rejected('with a sequence of more than 64 bits')
     return value
 
 
-def sensor_name(text):
+def sensor_name(text: str) -> str:
     """`text` if a sensor may have this name. Raises Rejected."""
     if not _usable(text):
         raise Rejected('with an unusable sensor name')
     return text
 
 
-def skipped(value):
+def skipped(value: object) -> None:
     """Nothing, in the place of a value that is not asked for."""
     return None
 
 
-def unescaped(setting, text):
+def unescaped(setting: str, text: str) -> bytes:
     r"""The bytes (UTF-8) of a text in which \n \r \t \0 \\ and \xhh may stand for characters.
 
     So both quotes of YAML mean the same. Raises SettingsError that names `setting`.
     """
-    def character(match):
+    def character(match: re.Match[str]) -> str:
         code = match[1]
         if code in _ESCAPED:
             return _ESCAPED[code]
@@ -194,8 +200,8 @@ def unescaped(setting, text):
         raise SettingsError(f'{setting}: {text!r} has no UTF-8') from None
 
 
-def chosen(setting, value, choices):
+def chosen(setting: str, value: str, choices: Sequence[_Choice]) -> _Choice:
     """`value`, if it is one of `choices`. Raises SettingsError that names `setting`."""
     if value not in choices:
         raise SettingsError(f'{setting}: {value!r} is none of {", ".join(choices)}')
-    return value
+    return choices[choices.index(value)]

@@ -1,7 +1,9 @@
 """Framing of JSON objects, one a line or one a message."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 from mag_tracking.drivers.framings.fields import (
     ACCELERATION,
@@ -15,9 +17,12 @@ from mag_tracking.drivers.framings.fields import (
     ticks_value,
 )
 from mag_tracking.drivers.framings.text import Lines
+from mag_tracking.drivers.reading import Parsed, Reading
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
 
+_Keys: TypeAlias = tuple[tuple[str, int | None], ...]
+_Converter: TypeAlias = Callable[[object, str], object]
 
 @dataclass(frozen=True)
 class JsonSettings:
@@ -47,12 +52,13 @@ class JsonFraming:
 
     SETTINGS = JsonSettings
 
-    def __init__(self, settings):
+    def __init__(self, settings: JsonSettings) -> None:
         """Raises SettingsError."""
         self._lines = Lines(settings.end, settings.longest)
         self._decode = json.JSONDecoder(object_pairs_hook=_object).decode
-        self._lists, self._values = [], []
-        names = []
+        self._lists: list[tuple[str, _Keys]] = []
+        self._values: list[tuple[str, _Keys, _Converter]] = []
+        names: list[str] = []
         for name in OF_THE_FRAME:
             if path := getattr(settings, name):
                 names.append(name)
@@ -66,7 +72,7 @@ class JsonFraming:
             raise SettingsError('field: neither the field nor the acceleration has a path')
         self._layout = FieldLayout(names)
 
-    def _axes(self, name, paths):
+    def _axes(self, name: str, paths: tuple[str, ...]) -> tuple[str, ...]:
         """The paths of three axes."""
         if len(paths) == 1 and paths[0]:
             self._lists.append((paths[0], _keys(name, paths[0])))
@@ -76,13 +82,13 @@ class JsonFraming:
                                 f'{list(paths)}')
         return paths if any(paths) else ('', '', '')
 
-    def parse(self, data, final=False):
+    def parse(self, data: bytes, final: bool = False) -> Parsed:
         """All readings in `data`; see `Framing.parse`."""
         if final and self._is_one(data):
             return self._lines.read([data], len(data), self._read)
         return self._lines.parse(data, final, self._read)
 
-    def _is_one(self, data):
+    def _is_one(self, data: bytes) -> bool:
         """Whether all of a message is one piece of JSON, of several lines perhaps."""
         if self._lines.end not in data.strip() or len(data) > self._lines.longest:
             return False
@@ -92,7 +98,7 @@ class JsonFraming:
             return False
         return True
 
-    def _json(self, line):
+    def _json(self, line: bytes) -> Any:
         """What a line says, or Rejected."""
         try:
             return self._decode(line.decode())
@@ -104,7 +110,7 @@ class JsonFraming:
             # Also an integer of more digits than Python cares to read.
             raise Rejected('that are no JSON') from None
 
-    def _read(self, line):
+    def _read(self, line: bytes) -> list[Reading]:
         """The reading of one object, or Rejected."""
         content = self._json(line)
         if not isinstance(content, dict):
@@ -117,7 +123,7 @@ class JsonFraming:
                                       for path, keys, convert in self._values])
 
 
-def _object(pairs):
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """A JSON object as a dict."""
     content = dict(pairs)
     if len(content) != len(pairs):
@@ -125,7 +131,7 @@ def _object(pairs):
     return content
 
 
-def _keys(name, path):
+def _keys(name: str, path: str) -> _Keys:
     """The steps of a path: (key, index or None)."""
     keys = path.split('.')
     if not all(keys):
@@ -133,7 +139,7 @@ def _keys(name, path):
     return tuple((key, int(key) if key.isascii() and key.isdecimal() else None) for key in keys)
 
 
-def _at(value, path, keys):
+def _at(value: Any, path: str, keys: _Keys) -> Any:
     """What stands at a path, or Rejected."""
     for key, index in keys:
         if isinstance(value, dict) and key in value:
@@ -145,24 +151,24 @@ def _at(value, path, keys):
     return value
 
 
-def _number(value, path):
+def _number(value: object, path: str) -> int | float:
     """A number, which a bool is not in JSON."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise Rejected(f'whose {path} is no number')
     return value
 
 
-def _axis(value, path):
+def _axis(value: object, path: str) -> float:
     """An axis, NaN where it is null."""
     return float('nan') if value is None else axis_value(_number(value, path))
 
 
-def _ticks(value, path):
+def _ticks(value: object, path: str) -> float:
     """The device's clock, which must be there."""
     return ticks_value(_number(value, path))
 
 
-def _sequence(value, path):
+def _sequence(value: object, path: str) -> int:
     """The device's count; JSON does not tell 12 from 12.0."""
     value = _number(value, path)
     if isinstance(value, float):
@@ -172,7 +178,7 @@ def _sequence(value, path):
     return sequence_value(value)
 
 
-def _sensor(value, path):
+def _sensor(value: object, path: str) -> str:
     """The name of the sensor, which may be a number."""
     if isinstance(value, int) and not isinstance(value, bool):
         value = str(value)
@@ -181,4 +187,4 @@ def _sensor(value, path):
     return sensor_name(value)
 
 
-_CONVERTERS = {'sensor': _sensor, 'ticks': _ticks, 'sequence': _sequence}
+_CONVERTERS: dict[str, _Converter] = {'sensor': _sensor, 'ticks': _ticks, 'sequence': _sequence}

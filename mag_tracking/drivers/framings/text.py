@@ -2,6 +2,7 @@
 
 import re
 from collections import Counter
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from mag_tracking.drivers.framings.checksums import xor8
@@ -18,7 +19,7 @@ from mag_tracking.drivers.framings.fields import (
     ticks_value,
     unescaped,
 )
-from mag_tracking.drivers.reading import Parsed
+from mag_tracking.drivers.reading import Parsed, Reading
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
 
@@ -52,7 +53,7 @@ class TextSettings:
 class Lines:
     """Cuts bytes into lines and counts what cannot be read; as pure as a framing."""
 
-    def __init__(self, end, longest):
+    def __init__(self, end: str, longest: int) -> None:
         """
         Parameters
         ----------
@@ -65,7 +66,7 @@ class Lines:
             raise SettingsError('end: the end of a line is empty')
         self.longest = longest
 
-    def parse(self, data, final, read):
+    def parse(self, data: bytes, final: bool, read: Callable[[bytes], list[Reading]]) -> Parsed:
         """All lines of `data`, as `Framing.parse`.
 
         Parameters
@@ -85,9 +86,11 @@ class Lines:
         kept = min(len(rest), self.longest + len(self.end))
         return self.read(lines, len(data) - kept, read)
 
-    def read(self, lines, consumed, read):
+    def read(self, lines: Iterable[bytes], consumed: int,
+             read: Callable[[bytes], list[Reading]]) -> Parsed:
         """The `Parsed` of these lines; the other parameters as in `parse`."""
-        readings, rejected = [], Counter()
+        readings: list[Reading] = []
+        rejected: Counter[str] = Counter()
         for line in lines:
             try:
                 readings += read(self._checked(line))
@@ -95,7 +98,7 @@ class Lines:
                 rejected[f'lines {cause}'] += 1
         return Parsed(tuple(readings), consumed, rejected)
 
-    def _checked(self, line):
+    def _checked(self, line: bytes) -> bytes:
         """The line without its carriage return, or Rejected."""
         if len(line) > self.longest:
             raise Rejected('that are too long')
@@ -124,7 +127,7 @@ class TextFraming:
 
     SETTINGS = TextSettings
 
-    def __init__(self, settings):
+    def __init__(self, settings: TextSettings) -> None:
         """Raises SettingsError."""
         self._lines = Lines(settings.end, settings.longest)
         self._layout = FieldLayout(settings.fields, settings.each, settings.count)
@@ -136,7 +139,7 @@ class TextFraming:
         self._converters = [_converter(q) for q in self._layout.quantities]
         self._check(separator)
 
-    def _check(self, separator):
+    def _check(self, separator: bytes) -> None:
         """Raises SettingsError where no line could be read."""
         if not separator or re.search(rb'[0-9A-Za-z+.-]', separator):
             raise SettingsError(f'separator: {separator!r} is empty or may be part of a number')
@@ -149,11 +152,11 @@ class TextFraming:
             raise SettingsError(f'comment: every line with the prefix {self._prefix!r} begins '
                                 f'with {self._comment!r} and would be passed over')
 
-    def parse(self, data, final=False):
+    def parse(self, data: bytes, final: bool = False) -> Parsed:
         """All readings in `data`; see `Framing.parse`."""
         return self._lines.parse(data, final, self._read)
 
-    def _read(self, line):
+    def _read(self, line: bytes) -> list[Reading]:
         """The readings of one line, or Rejected."""
         if self._comment and line.startswith(self._comment):
             raise Rejected('that are comments')
@@ -168,7 +171,7 @@ class TextFraming:
             [convert(text) for convert, text in zip(self._converters, values, strict=True)])
 
 
-def _without_checksum(line):
+def _without_checksum(line: bytes) -> bytes:
     """What stands before `*hh`, or Rejected."""
     if line[-3:-2] != b'*':
         raise Rejected('without a checksum')
@@ -178,14 +181,16 @@ def _without_checksum(line):
     return line
 
 
-def _converter(quantity):
+def _converter(quantity: str) -> Callable[[bytes], object]:
     """From the bytes between two separators to the value that `FieldLayout` takes."""
     if quantity in AXES:
         return _axis
-    return {'ticks': _ticks, 'sequence': _sequence, 'sensor': _sensor, SKIP: skipped}[quantity]
+    others: dict[str, Callable[[bytes], object]] = {
+        'ticks': _ticks, 'sequence': _sequence, 'sensor': _sensor, SKIP: skipped}
+    return others[quantity]
 
 
-def _axis(text):
+def _axis(text: bytes) -> float:
     """An axis, NaN where there is nothing."""
     text = text.strip(b' \t')
     if _NUMBER(text):
@@ -196,12 +201,12 @@ def _axis(text):
                    else 'with something that is no number')
 
 
-def _ticks(text):
+def _ticks(text: bytes) -> float:
     """The device's clock, which must be there."""
     return ticks_value(_axis(text))
 
 
-def _sequence(text):
+def _sequence(text: bytes) -> int:
     """The device's count, which must be there."""
     text = text.strip(b' \t')
     if not _INTEGER(text):
@@ -209,6 +214,6 @@ def _sequence(text):
     return sequence_value(int(text))
 
 
-def _sensor(text):
+def _sensor(text: bytes) -> str:
     """The name of the sensor."""
     return sensor_name(text.strip(b' \t').decode())

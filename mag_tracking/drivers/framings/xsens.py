@@ -26,7 +26,12 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from mag_tracking.drivers.framings.xsens_data import TICK_S, MTDataLayout, read_mtdata2
+from mag_tracking.drivers.framings.xsens_data import (
+    TICK_S,
+    Content,
+    MTDataLayout,
+    read_mtdata2,
+)
 from mag_tracking.drivers.reading import Parsed, Reading
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
@@ -78,12 +83,12 @@ _WAIT = _Step(0, False)
 _REFUSE = _Step(1, False)
 
 
-def _is_from_device(mid):
+def _is_from_device(mid: int) -> bool:
     """Whether a device sends such messages."""
     return mid % 2 == 1 or mid in (_MTDATA, _MTDATA2, _WAKE_UP, _ERROR)
 
 
-def _message_at(window, place, longest):
+def _message_at(window: bytes, place: int, longest: int) -> _Message | None:
     """The message that may begin there, or None where none can.
 
     While its head is not whole, MID is -1 and the end is one byte behind the window.
@@ -103,7 +108,7 @@ def _message_at(window, place, longest):
     return _Message(head[2], begin, begin + size + 1)
 
 
-def _sum_is_right(window, place, message):
+def _sum_is_right(window: bytes, place: int, message: _Message) -> bool:
     """Whether all but the preamble adds up to a multiple of 256."""
     return sum(window[place + 1:message.end]) % 256 == 0
 
@@ -123,18 +128,20 @@ class XsensFraming:
     CLOCK = {'tick_s': TICK_S, 'wrap': 2**32}
     DRIVER = {'sequence_wrap': 2**16}
 
-    def __init__(self, settings):
+    def __init__(self, settings: XsensSettings) -> None:
         self._longest = settings.longest_message
-        self._layout = None
+        self._layout: MTDataLayout | None = None
         if tuple(settings.mtdata) != ('none',):
             self._layout = MTDataLayout(settings.mtdata, settings.mtdata_format)
         elif settings.mtdata_format != 'float':
             raise SettingsError(f'mtdata_format is {settings.mtdata_format!r}, but mtdata says '
                                 'that there is no MTData')
 
-    def parse(self, data, final=False):
+    def parse(self, data: bytes, final: bool = False) -> Parsed:
         """All readings in `data`, bytes; see `Framing.parse`."""
-        readings, rejected, position = [], Counter(), 0
+        readings: list[Reading] = []
+        rejected: Counter[str] = Counter()
+        position = 0
         longest = self._longest + _LONGEST_OVERHEAD
         while True:
             start = data.find(_START, position)
@@ -156,7 +163,7 @@ class XsensFraming:
                 readings.append(step.reading)
         return Parsed(tuple(readings), position, {c: n for c, n in rejected.items() if n})
 
-    def _step(self, window, more):
+    def _step(self, window: bytes, more: bool) -> _Step:
         """What becomes of the message at the beginning of `window`; `more` = more may come."""
         message = _message_at(window, 0, self._longest)
         if message is None:
@@ -175,7 +182,8 @@ class XsensFraming:
             return _Step(message.end, True, (self._cause(window, message),))
         return _Step(message.end, True, content.causes, content.reading)
 
-    def _step_inside(self, window, outer, outer_is_data, more):
+    def _step_inside(self, window: bytes, outer: _Message, outer_is_data: bool,
+                     more: bool) -> _Step | None:
         """The step if `outer` is not to be taken, or not yet, for what begins in it; else None."""
         refused = _REFUSE._replace(causes=('messages in which another begins',))
         place = 0
@@ -198,14 +206,14 @@ class XsensFraming:
                 return refused
 
     @staticmethod
-    def _next_inside(window, place, end, whole):
+    def _next_inside(window: bytes, place: int, end: int, whole: bool) -> int:
         """Where the next start begins before `end`, -1 = nowhere; `whole` = both its bytes."""
         found = window.find(_START, place, end if whole else end + 1)
         if found < 0 and not whole and end == len(window) and window.endswith(_PREAMBLE, place):
             return end - 1
         return found
 
-    def _data_content(self, window, message):
+    def _data_content(self, window: bytes, message: _Message) -> Content | None:
         """The `Content` of a data message that is made as it should be, else None."""
         data = window[message.begin:message.end - 1]
         if message.mid == _MTDATA2:
@@ -214,7 +222,7 @@ class XsensFraming:
             return self._layout.read(data)
         return None
 
-    def _cause(self, window, message):
+    def _cause(self, window: bytes, message: _Message) -> str:
         """How a message that gives nothing is counted."""
         if message.mid == _MTDATA:
             if self._layout is None:

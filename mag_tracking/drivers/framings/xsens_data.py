@@ -12,7 +12,8 @@ SetOutputSettings and MTData.
 """
 
 import struct
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 from mag_tracking.drivers.reading import Reading
 from mag_tracking.errors import SettingsError
@@ -44,6 +45,9 @@ _ORIENTATIONS = {'quaternion', 'euler', 'matrix'}
 _FORMATS = {'float': _FLOAT, 'fp12.20': _FIXED_12_20}
 
 
+_Triple: TypeAlias = tuple[float, float, float]
+
+
 class Content(NamedTuple):
     """What a data message says."""
 
@@ -53,7 +57,7 @@ class Content(NamedTuple):
     """Of what is not in the reading, one for each time."""
 
 
-def _three_reals(data, precision):
+def _three_reals(data: bytes, precision: int) -> _Triple | None:
     """Three reals, or None where `data` is not as long as they are."""
     layout = _THREE[precision]
     if len(data) != layout.size:
@@ -68,7 +72,7 @@ def _three_reals(data, precision):
     return values
 
 
-def _value(identifier, data):
+def _value(identifier: int, data: bytes) -> tuple[str, float | _Triple | None] | None:
     """(what of a reading it is, the value), or None for any other packet.
 
     The value is None where `data` is not as long as such a packet.
@@ -85,7 +89,7 @@ def _value(identifier, data):
     return None
 
 
-def read_mtdata2(data):
+def read_mtdata2(data: bytes) -> Content | None:
     """The content of the DATA of an MTData2 message.
 
     A packet is an identifier (u16), the size of its data (u8), and the data. From
@@ -102,7 +106,8 @@ def read_mtdata2(data):
         None where the packets do not fill `data`, or one of those that a reading is
         made of has another size than its kind.
     """
-    found, causes = {}, []
+    found: dict[str, Any] = {}
+    causes: list[str] = []
     position, end = 0, len(data)
     while position < end:
         begin = position + 3
@@ -127,7 +132,7 @@ def read_mtdata2(data):
     return _content(found, causes)
 
 
-def _content(found, causes):
+def _content(found: Mapping[str, Any], causes: Sequence[str]) -> Content:
     """The content, with a reading where there is something to read."""
     if 'field' in found or 'acceleration' in found:
         return Content(Reading(**found), tuple(causes))
@@ -143,7 +148,7 @@ class MTDataLayout:
         Bytes of DATA.
     """
 
-    def __init__(self, blocks, number_format):
+    def __init__(self, blocks: Sequence[str], number_format: str) -> None:
         """
         Parameters
         ----------
@@ -170,14 +175,15 @@ class MTDataLayout:
             raise SettingsError(f'mtdata_format: {number_format!r} is none of '
                                 f'{", ".join(_FORMATS)}')
         self._precision = _FORMATS[number_format]
-        self._begin, self.size = {}, 0
+        self._begin: dict[str, int] = {}
+        self.size = 0
         for name in blocks:
             self._begin[name] = self.size
             self.size += _BLOCKS[name]
 
-    def read(self, data):
+    def read(self, data: bytes) -> Content:
         """The `Content` of DATA of just this size, bytes."""
-        found = {}
+        found: dict[str, Any] = {}
         for block, name in (('mag', 'field'), ('acc', 'acceleration')):
             if block in self._begin:
                 begin = self._begin[block]
