@@ -2,17 +2,22 @@
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.crlb import path_bound
+from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import sensor_fields
 from mag_tracking.physics.motion import constant_velocity, integrator_noise
 from mag_tracking.report.metrics import interpolate_truth
+from mag_tracking.report.track_log import TrackLog
 
 LEAST_MOVE = 1e-9
 """[m/s] Slower is at rest, for the width of the prior."""
 
 
-def error_over_bound(network, log, truth, acceleration, moment_walk, field_error, background_std,
-                     rows, axes):
+def error_over_bound(network: SensorNetwork, log: TrackLog,
+                     truth: tuple[IntArray, FloatArray, FloatArray], acceleration: FloatArray,
+                     moment_walk: float, field_error: float, background_std: float,
+                     rows: IntArray, axes: int) -> float | None:
     """Ratio of a track's RMS error to the bound for filters along the true path.
 
     The bound is that of a point target with the track's own moment (nobody knows the true one),
@@ -24,7 +29,7 @@ def error_over_bound(network, log, truth, acceleration, moment_walk, field_error
     ----------
     network : SensorNetwork
     log : TrackLog
-    truth : (stamps, positions, quaternions)
+    truth : (stamps (n,) [ns], positions (n, 3) [m], quaternions (n, 4))
     acceleration : (3,) [m^2/s^3] spectral density
     moment_walk : float [1/s^0.5]
         Random walk of the moment relative to its size.
@@ -56,7 +61,8 @@ def error_over_bound(network, log, truth, acceleration, moment_walk, field_error
     return float(np.sqrt(np.mean(np.square(error[:, :axes]).sum(axis=1)) / np.mean(variance)))
 
 
-def _linearised(network, log, true, t, known, field_error):
+def _linearised(network: SensorNetwork, log: TrackLog, true: FloatArray, t: FloatArray,
+                known: IntArray, field_error: float) -> tuple[FloatArray, FloatArray]:
     """Jacobians (k, n_sensors, 3, n_x) by [r, v, m, backgrounds] at the truth, and noise."""
     n, n_sensors = len(known), len(network)
     dr_dx, dm_dx = np.zeros((2, n, 1, 3, 9))
@@ -74,7 +80,8 @@ def _linearised(network, log, true, t, known, field_error):
     return H, C
 
 
-def _motion(t, acceleration, moment_walk, log, known, n_x):
+def _motion(t: FloatArray, acceleration: FloatArray, moment_walk: float, log: TrackLog,
+            known: IntArray, n_x: int) -> tuple[FloatArray, FloatArray]:
     """F and Q (k, n_x, n_x) from pose to pose; the first is none."""
     F, Q = np.tile(np.eye(n_x), (len(t), 1, 1)), np.zeros((len(t), n_x, n_x))
     for k, dt in enumerate(np.diff(t), 1):
@@ -85,7 +92,8 @@ def _motion(t, acceleration, moment_walk, log, known, n_x):
     return F, Q
 
 
-def _prior(network, true, t, log, known, background_std):
+def _prior(network: SensorNetwork, true: FloatArray, t: FloatArray, log: TrackLog,
+           known: IntArray, background_std: float) -> FloatArray:
     """(n_x, n_x) before the first pose: as far as the way is long, as fast as it went."""
     way = max(np.ptp(true, axis=0).max(), np.ptp(network.positions, axis=0).max())
     speed = max(np.linalg.norm(np.diff(true, axis=0), axis=1).max()

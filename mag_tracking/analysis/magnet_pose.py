@@ -1,10 +1,15 @@
 """Where a magnet of known moment is, from one reading of a calibrated network."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.inference.least_squares import project_out_linear, refine
+from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import dipole_jacobians, sensor_fields
 from mag_tracking.settings import param
 
@@ -16,6 +21,9 @@ NOTHING = 1e-9
 
 MOST_COST = 100.0
 """A normalised cost beyond is none of one dipole of that moment."""
+
+_Problem: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+"""Of points (n, 9) the residuals (n, n_y) and their Jacobians (n, n_y, 9)."""
 
 
 @dataclass(frozen=True)
@@ -36,13 +44,13 @@ class PoseSettings:
 class MagnetPose:
     """A magnet's place and direction; where `reason` is not empty they are not to be used."""
 
-    position: np.ndarray
+    position: FloatArray
     """(3,) [m], world."""
-    axis: np.ndarray
+    axis: FloatArray
     """(3,) unit vector, world: the moment's direction."""
-    covariance: np.ndarray
+    covariance: FloatArray
     """(6, 6) of both, singular along the axis; made larger where the fit is worse than stated."""
-    ambient: np.ndarray
+    ambient: FloatArray
     """(3,) [T], world: change of the ambient field."""
     normalised_cost: float
     """About one where moment, noise and field error are right."""
@@ -50,7 +58,8 @@ class MagnetPose:
     reason: str
 
 
-def locate_magnet(network, field, moment, low, high, settings):
+def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low: ArrayLike,
+                  high: ArrayLike, settings: PoseSettings) -> MagnetPose:
     """Pose of a dipole of known moment from one reading of all sensors.
 
     Parameters
@@ -94,13 +103,14 @@ def locate_magnet(network, field, moment, low, high, settings):
                  converged[best] or cost[best] < NOTHING, low, high, settings)
 
 
-def _problem(network, field, std, present, moment, ambient_std):
+def _problem(network: SensorNetwork, field: FloatArray, std: FloatArray, present: BoolArray,
+             moment: float, ambient_std: float) -> _Problem:
     """Residuals and Jacobians of x = place, direction of any length, ambient field in its std."""
     y = (field / std)[present]
     uniform = (network.R_sw * ambient_std / std[:, :, None])[present]
     prior = np.hstack([np.zeros((3, 6)), np.eye(3)])
 
-    def residual_and_jacobian(x):
+    def residual_and_jacobian(x: FloatArray) -> tuple[FloatArray, FloatArray]:
         length = np.linalg.norm(x[:, 3:6], axis=1)[:, None]
         u = x[:, 3:6] / length
         dr_dx, dm_dx = np.zeros((2, len(x), 1, 3, 6))
@@ -118,7 +128,8 @@ def _problem(network, field, std, present, moment, ambient_std):
     return residual_and_jacobian
 
 
-def _starts(network, field, std, present, low, high, settings):
+def _starts(network: SensorNetwork, field: FloatArray, std: FloatArray, present: BoolArray,
+            low: FloatArray, high: FloatArray, settings: PoseSettings) -> FloatArray:
     """Best points (k, 9) of a grid, each with the direction of the moment that fits it best."""
     per_axis = max(2, int(round(settings.grid_points ** (1.0 / 3.0))))
     axes = [np.linspace(a, b, per_axis + 2)[1:-1] for a, b in zip(low, high, strict=True)]
@@ -133,7 +144,8 @@ def _starts(network, field, std, present, low, high, settings):
     return np.hstack([grid[usable][best], m, np.zeros((len(m), 3))])
 
 
-def _pose(x, covariance, cost, converged, low, high, settings):
+def _pose(x: FloatArray, covariance: FloatArray, cost: float, converged: bool, low: FloatArray,
+          high: FloatArray, settings: PoseSettings) -> MagnetPose:
     """The `MagnetPose` of a minimum."""
     length = np.linalg.norm(x[3:6])
     u = x[3:6] / length
@@ -152,7 +164,8 @@ def _pose(x, covariance, cost, converged, low, high, settings):
                       settings.ambient_std * x[6:], float(cost), not reason, reason)
 
 
-def _check(network, field, moment, low, high):
+def _check(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
+           high: FloatArray) -> None:
     """Raise ValueError for what cannot be used."""
     if field.shape != (len(network), 3) or low.shape != (3,) or high.shape != (3,):
         raise ValueError(f'expected field ({len(network)}, 3) and corners (3,), got '

@@ -1,9 +1,14 @@
 """How many dipoles a pass is worth."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.arrays import FloatArray
 
-def order_criteria(fits):
+
+def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
     """The criterion of each fit of one pass; the smallest one wins.
 
     Every unknown has to earn log(n) (Schwarz's criterion, BIC): an order that is too large fits
@@ -26,12 +31,13 @@ def order_criteria(fits):
         return np.full(len(fits), np.inf)
     richest = max(usable, key=lambda f: f.n_dipoles)
     excess = max(1.0, richest.normalised_cost)
-    criteria = np.array([f.cost / excess + len(f.x) * np.log(f.data.n_values)
+    criteria: FloatArray = np.array([f.cost / excess + len(f.x) * np.log(f.data.n_values)
                          if f.determined else np.inf for f in fits])
-    return criteria - criteria.min()
+    relative: FloatArray = criteria - criteria.min()
+    return relative
 
 
-def choose_order(fits):
+def choose_order(fits: Sequence[PassFit]) -> PassFit | None:
     """The fit with the smallest of `order_criteria`, or None where that one is no answer.
 
     A turn is not seen by a point that fits it badly: what the best fit contradicts holds for all.

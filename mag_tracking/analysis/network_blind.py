@@ -3,10 +3,18 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mag_tracking.analysis.magnet_pose import PoseSettings, locate_magnet
-from mag_tracking.analysis.network_geometry import LEAST_POSES, fitted_geometry
+from mag_tracking.analysis.network_geometry import (
+    LEAST_POSES,
+    GeometrySettings,
+    NetworkGeometry,
+    fitted_geometry,
+)
 from mag_tracking.analysis.network_readings import SHARED
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.network import SensorNetwork
 
 COARSE_ERROR = 0.1
 """What the field is taken to err by while poses are no better than their starts."""
@@ -15,7 +23,9 @@ FIRST = PoseSettings(field_error=COARSE_ERROR, ambient_std=1e-6)
 """How poses are looked for while the biases are hardly known."""
 
 
-def calibrate_geometry_blind(network, field, moment, low, high, settings):
+def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: float,
+                             low: ArrayLike, high: ArrayLike,
+                             settings: GeometrySettings) -> NetworkGeometry:
     """As `calibrate_geometry` where nothing tracks the magnet: its poses are unknown, too.
 
     Parameters
@@ -59,7 +69,8 @@ def calibrate_geometry_blind(network, field, moment, low, high, settings):
                    suspect_poses=tuple(int(used[k]) for k in geometry.suspect_poses))
 
 
-def _first_poses(network, field, moment, low, high):
+def _first_poses(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
+                 high: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
     """Rows (k,) of poses that are found, their positions and axes (k, 3)."""
     if field.ndim != 3 or field.shape[1:] != (len(network), 3):
         raise ValueError(f'expected field (K, {len(network)}, 3), got {field.shape}')
@@ -68,5 +79,6 @@ def _first_poses(network, field, moment, low, high):
         middle[j, a] = np.nanmedian(field[:, j, a])
     found = [locate_magnet(network, B - middle, moment, low, high, FIRST) for B in field]
     rows = np.flatnonzero([pose.converged for pose in found])
-    return (rows, *(np.array([getattr(found[k], name) for k in rows]).reshape(-1, 3)
-                    for name in ('position', 'axis')))
+    positions, axes = (np.array([getattr(found[k], name) for k in rows]).reshape(-1, 3)
+                       for name in ('position', 'axis'))
+    return rows, positions, axes

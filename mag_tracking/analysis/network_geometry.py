@@ -9,15 +9,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mag_tracking.analysis.network_fit import GeometryProblem, NormalEquations, solve, typical
+from mag_tracking.analysis.network_fit import (
+    GeometryProblem,
+    NormalEquations,
+    Numbers,
+    solve,
+    typical,
+)
 from mag_tracking.analysis.network_readings import (
     POSE,
     SENSOR,
     SHARED,
+    Prediction,
     TrackedMagnet,
     rotation,
     tool_rotations,
 )
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
 from mag_tracking.settings import param
 
@@ -65,36 +73,36 @@ class NetworkGeometry:
 
     network: SensorNetwork
     """As corrected: positions, orientations, and the biases as background."""
-    position_std: np.ndarray
+    position_std: FloatArray
     """(n, 3) [m]."""
-    rotation_std: np.ndarray
+    rotation_std: FloatArray
     """(n, 3) [rad], about the sensor's own axes."""
-    gain: np.ndarray
+    gain: FloatArray
     """(n,)."""
-    gain_std: np.ndarray
-    bias: np.ndarray
+    gain_std: FloatArray
+    bias: FloatArray
     """(n, 3) [T], sensor frame; NaN where an axis never reported."""
-    bias_std: np.ndarray
+    bias_std: FloatArray
     """(n, 3) [T]; infinite where an axis never reported."""
     magnet: TrackedMagnet
-    rows: np.ndarray
+    rows: IntArray
     """(K,) of the readings that were used."""
-    shared: np.ndarray
+    shared: FloatArray
     """(12,) as for `TrackedMagnet.poses`."""
-    shared_std: np.ndarray
+    shared_std: FloatArray
     """(12,)."""
-    pose: np.ndarray
+    pose: FloatArray
     """(K, 8) as for `TrackedMagnet.poses`."""
-    pose_covariance: np.ndarray
+    pose_covariance: FloatArray
     """(K, 8, 8)."""
-    covariance: np.ndarray
+    covariance: FloatArray
     """(10 n + 12,) squared, of all sensors' numbers (bias, gain, rotation, position), then of the
     shared ones."""
     normalised_cost: float
     """About one where model, noise and field error are right."""
-    sensor_residual: np.ndarray
+    sensor_residual: FloatArray
     """(n,) root mean square of what is left over, in its deviations; NaN without readings."""
-    pose_residual: np.ndarray
+    pose_residual: FloatArray
     """(K,) the middle of the sensors' residuals, over that of the noise."""
     suspect_sensors: tuple[str, ...]
     """Names of those that do not fit with the others, or only after corrections beyond
@@ -104,11 +112,13 @@ class NetworkGeometry:
     converged: bool
     reason: str
 
-    def signal(self, field):
+    def signal(self, field: FloatArray) -> FloatArray:
         """Readings (..., n, 3) [T], sensor frame, without biases and gains; NaN stays NaN."""
-        return (np.asarray(field, dtype=float) - self.bias) / self.gain[:, None]
+        signal: FloatArray = (np.asarray(field, dtype=float) - self.bias) / self.gain[:, None]
+        return signal
 
-    def magnet_poses(self, positions, axes):
+    def magnet_poses(self, positions: FloatArray,
+                     axes: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Where tracked poses have the magnet.
 
         `positions` (K, 3) [m] and unit `axes` (K, 3), tracker, as for `calibrate_geometry`.
@@ -119,28 +129,29 @@ class NetworkGeometry:
         return _places(magnet, self.shared, np.zeros((len(magnet.tool), POSE)))
 
     @property
-    def moment(self):
+    def moment(self) -> tuple[float, float]:
         """[A m^2]; and its deviation."""
         moment = self.magnet.moment * np.exp(self.shared[11])
         return moment, moment * self.shared_std[11]
 
     @property
-    def tool_offset(self):
+    def tool_offset(self) -> tuple[FloatArray, FloatArray]:
         """(3,) [m], tool: the magnet's centre from the tracked point; and its deviation."""
         return self.shared[6:9], self.shared_std[6:9]
 
     @property
-    def tool_tilt(self):
+    def tool_tilt(self) -> tuple[FloatArray, FloatArray]:
         """(2,) [slope], tool: the moment's x and y over its z; and its deviation."""
         return self.shared[9:11], self.shared_std[9:11]
 
     @property
-    def poses(self):
+    def poses(self) -> tuple[FloatArray, FloatArray]:
         """Positions (K, 3) [m] and axes (K, 3), world, of the magnet when it was calibrated."""
         return _places(self.magnet, self.shared, self.pose)
 
 
-def _places(magnet, shared, pose):
+def _places(magnet: TrackedMagnet, shared: FloatArray,
+            pose: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Positions and unit axes."""
     r, m, *_ = magnet.poses(shared, pose)
     return r, m / np.linalg.norm(m, axis=1)[:, None]
@@ -162,7 +173,9 @@ MOST_COST = 100.0
 """A normalised cost beyond is none of a dipole and these sensors."""
 
 
-def calibrate_geometry(network, field, positions, axes, moment, settings):
+def calibrate_geometry(network: SensorNetwork, field: FloatArray, positions: FloatArray,
+                       axes: FloatArray, moment: float,
+                       settings: GeometrySettings) -> NetworkGeometry:
     """Geometry of a network from readings of a magnet that is tracked.
 
     Parameters
@@ -201,7 +214,9 @@ def calibrate_geometry(network, field, positions, axes, moment, settings):
                            pose_unit)
 
 
-def fitted_geometry(network, field, positions, axes, moment, settings, shared_unit, pose_unit):
+def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatArray,
+                    axes: FloatArray, moment: float, settings: GeometrySettings,
+                    shared_unit: FloatArray, pose_unit: FloatArray) -> NetworkGeometry:
     """As `calibrate_geometry`, with prior deviations of one's own.
 
     `shared_unit` (12,) of what is shared and `pose_unit` (8,) of a pose, in the units of
@@ -223,7 +238,9 @@ def fitted_geometry(network, field, positions, axes, moment, settings, shared_un
     sensor_std, shared_std = std[:-SHARED].reshape(n, SENSOR), std[-SHARED:]
     sensor, shared, pose = problem.in_si(x)
     turn = rotation(sensor[:, 4:7])
-    residuals = _residuals(problem, predicted)
+    by_sensor, by_pose = _residuals(problem, predicted)
+    odd_sensors, odd_poses = _suspects(problem, x, by_sensor, by_pose)
+    reason = _doubt(problem, x, converged, cost)
     return NetworkGeometry(
         network=replace(network, positions=network.positions + sensor[:, 7:],
                         R_ws=network.R_ws @ turn, background=tuple(
@@ -236,12 +253,13 @@ def fitted_geometry(network, field, positions, axes, moment, settings, shared_un
         magnet=problem.magnet, rows=np.arange(len(pose)), shared=shared,
         shared_std=shared_std, pose=pose,
         pose_covariance=P_pose * np.outer(problem.pose_unit, problem.pose_unit),
-        covariance=covariance, normalised_cost=cost, sensor_residual=residuals[0],
-        pose_residual=residuals[1], **_strange(problem, x, residuals),
-        **_verdict(problem, x, converged, cost))
+        covariance=covariance, normalised_cost=cost, sensor_residual=by_sensor,
+        pose_residual=by_pose, suspect_sensors=odd_sensors, suspect_poses=odd_poses,
+        converged=not reason, reason=reason)
 
 
-def _normalised_cost(problem, x, predicted, W, trust, priors):
+def _normalised_cost(problem: GeometryProblem, x: Numbers, predicted: Prediction, W: FloatArray,
+                     trust: FloatArray, priors: Numbers) -> float:
     """Weighted sum of squares over the degrees of freedom that the priors leave; NaN if none."""
     P, P_pose = NormalEquations(problem, x, predicted, W, priors).covariance()
     e2, count, _ = problem.misfit(predicted[0], predicted[1])
@@ -252,7 +270,7 @@ def _normalised_cost(problem, x, predicted, W, trust, priors):
     return float((trust[:, :, None] * e2).sum() / freedom) if freedom >= 1.0 else np.nan
 
 
-def _residuals(problem, predicted):
+def _residuals(problem: GeometryProblem, predicted: Prediction) -> tuple[FloatArray, FloatArray]:
     """Of sensors (n,) their root mean square, of poses (K,) the middle of the sensors'."""
     e2, count, _ = problem.misfit(predicted[0], predicted[1])
     e2 = e2.sum(axis=2)
@@ -264,18 +282,18 @@ def _residuals(problem, predicted):
     return by_sensor, by_pose
 
 
-def _strange(problem, x, residuals):
-    """Which sensors and poses do not fit."""
-    by_sensor, by_pose = residuals
+def _suspects(problem: GeometryProblem, x: Numbers, by_sensor: FloatArray,
+              by_pose: FloatArray) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    """Names of the sensors and rows of the poses that do not fit."""
     sensors = by_sensor > MISFIT * np.nanmedian(by_sensor)
     sensors |= (np.abs(x[0][:, 3:]) > STRANGE).any(axis=1)
     poses = by_pose > MISFIT * np.median(by_pose)
     poses |= (np.abs(x[2]) > STRANGE).any(axis=1)
-    return {'suspect_sensors': tuple(problem.network.names[j] for j in np.flatnonzero(sensors)),
-            'suspect_poses': tuple(int(k) for k in np.flatnonzero(poses))}
+    return (tuple(problem.network.names[j] for j in np.flatnonzero(sensors)),
+            tuple(int(k) for k in np.flatnonzero(poses)))
 
 
-def _at_one_place(problem, x):
+def _at_one_place(problem: GeometryProblem, x: Numbers) -> bool:
     """Whether the magnet neither moved, compared with its distance, nor turned."""
     r, u = _places(problem.magnet, *problem.in_si(x)[1:])
     nearest = np.linalg.norm(problem.network.positions - r.mean(axis=0), axis=1).min()
@@ -283,8 +301,8 @@ def _at_one_place(problem, x):
                 and (np.ptp(u, axis=0) < LEAST_CHANGE).all())
 
 
-def _verdict(problem, x, converged, cost):
-    """Whether it is an answer, and why not."""
+def _doubt(problem: GeometryProblem, x: Numbers, converged: bool, cost: float) -> str:
+    """Why it is no answer; empty where it is one."""
     K, most = len(problem.magnet.tool), problem.settings.iterations
     if K < LEAST_POSES:
         reason = f'{K} poses, at least {LEAST_POSES} are needed to tell biases from the magnet'
@@ -299,10 +317,11 @@ def _verdict(problem, x, converged, cost):
                   'or moment, another network, or a noise_std that is too small)')
     else:
         reason = ''
-    return {'converged': not reason, 'reason': reason}
+    return reason
 
 
-def _check(network, field, positions, axes, moment):
+def _check(network: SensorNetwork, field: FloatArray, positions: FloatArray, axes: FloatArray,
+           moment: float) -> None:
     """Raise ValueError for what cannot be used."""
     K, n = len(positions), len(network)
     if field.shape != (K, n, 3) or positions.shape != (K, 3) or axes.shape != (K, 3):

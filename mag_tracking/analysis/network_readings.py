@@ -5,9 +5,11 @@ is the identity and a deviation of zero means fixed.
 """
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.geometry import (
     cross_matrix,
     left_jacobian,
@@ -15,6 +17,7 @@ from mag_tracking.geometry import (
     quaternion_from_rotation_vector,
     rotation_from_quaternion,
 )
+from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import dipole_field, dipole_jacobians
 
 SENSOR, SHARED, POSE = 10, 12, 8
@@ -22,10 +25,13 @@ SENSOR, SHARED, POSE = 10, 12, 8
 magnet's offset and tilt in the tool, log of the moment), and per pose (place, tilt, ambient
 field)."""
 
+Prediction: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+"""As `predicted_readings` returns it."""
+
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def tool_rotations(axes):
+def tool_rotations(axes: FloatArray) -> FloatArray:
     """Rotations tool to tracker (K, 3, 3) that take z to the unit vectors `axes` (K, 3).
 
     The shortest ones: a tracked axis has no roll, and a tool that is tilted by an arm keeps its
@@ -34,7 +40,7 @@ def tool_rotations(axes):
     return rotation_from_quaternion(np.array([quaternion_between(UP, a) for a in axes]))
 
 
-def rotation(v):
+def rotation(v: FloatArray) -> FloatArray:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
     return rotation_from_quaternion(quaternion_from_rotation_vector(v))
 
@@ -43,16 +49,17 @@ def rotation(v):
 class TrackedMagnet:
     """Where the magnet is, by a tracked tool and what is unknown between tool and board."""
 
-    tool: np.ndarray
+    tool: FloatArray
     """(K, 3) [m], tracker: the tracked points."""
-    R_tool: np.ndarray
+    R_tool: FloatArray
     """(K, 3, 3), tool to tracker; its z is the tool's axis."""
-    pivot: np.ndarray
+    pivot: FloatArray
     """(3,) [m]: the board turns about it, against the tracker."""
     moment: float
     """[A m^2] as stated."""
 
-    def poses(self, shared, pose):
+    def poses(self, shared: FloatArray, pose: FloatArray) -> tuple[
+            FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Magnet centres and moments.
 
         Parameters
@@ -93,7 +100,8 @@ class TrackedMagnet:
         return self.pivot + shared[:3] + arm + pose[:, :3], m, dr, dm, dr_pose, dm_pose
 
 
-def predicted_readings(network, magnet, sensor, shared, pose):
+def predicted_readings(network: SensorNetwork, magnet: TrackedMagnet, sensor: FloatArray,
+                       shared: FloatArray, pose: FloatArray) -> Prediction:
     """What every sensor reads of every pose.
 
     Parameters

@@ -1,12 +1,18 @@
 """What a network measured while something passed, as arrays that can be fitted."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 
-from mag_tracking.inference.least_squares import SeparableProblem
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.inference.least_squares import SeparableModel, SeparableProblem
 from mag_tracking.network import SensorNetwork
+
+ModelOf: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], SeparableModel]
+"""Of times (n,) [s], positions (n, 3) [m] and matrices (n, 3, 3) that a field is multiplied by."""
 
 
 @dataclass(frozen=True)
@@ -16,39 +22,39 @@ class PassData:
     network: SensorNetwork
     stamp_ns: int
     """Where `t` is zero."""
-    t: np.ndarray
+    t: FloatArray
     """(n,) [s], ascending for each sensor."""
-    sensor: np.ndarray
+    sensor: IntArray
     """(n,) int, rows of the network, ascending."""
-    field: np.ndarray
+    field: FloatArray
     """(n, 3) [T], sensor frame; NaN = axis not measured."""
-    covariance: np.ndarray
+    covariance: FloatArray
     """(n_sensors, 3, 3) [T^2] of one sample; not read where the axis is missing."""
-    count: np.ndarray | None = None
+    count: IntArray | None = None
     """(n,) of how many samples each is the mean; None = of one."""
 
     @property
-    def n_values(self):
+    def n_values(self) -> int:
         """How many numbers were measured."""
         return int(np.count_nonzero(~np.isnan(self.field)))
 
     @property
-    def sensors(self):
+    def sensors(self) -> IntArray:
         """(k,) rows of the network of which there are measurements."""
         return np.unique(self.sensor[~np.isnan(self.field).all(axis=1)])
 
     @property
-    def positions(self):
+    def positions(self) -> FloatArray:
         """(n, 3) [m], world, of each sample's sensor."""
         return self.network.positions[self.sensor]
 
-    def shifted(self, seconds):
+    def shifted(self, seconds: float) -> 'PassData':
         """The same with time zero `seconds` later."""
         return replace(self, stamp_ns=self.stamp_ns + int(round(1e9 * seconds)),
                        t=self.t - seconds)
 
     @cached_property
-    def whitening(self):
+    def whitening(self) -> FloatArray:
         """(n, 3, 3) W with W C W' = I over the axes measured; the other rows are zero."""
         W = np.zeros((len(self.t), 3, 3))
         present = ~np.isnan(self.field)
@@ -62,7 +68,7 @@ class PassData:
                     W[mine & (present == axes).all(axis=1)] = one
         return W if self.count is None else W * np.sqrt(self.count)[:, None, None]
 
-    def averaged(self, most):
+    def averaged(self, most: int) -> 'PassData':
         """The same with at most `most` means of neighbours for each sensor, of fewer where the
         field is strong."""
         size = np.sqrt(np.linalg.norm(self.departure, axis=1))
@@ -80,7 +86,7 @@ class PassData:
         return replace(self, t=t, sensor=sensor, field=field, count=n)
 
     @cached_property
-    def departure(self):
+    def departure(self) -> FloatArray:
         """(n, 3) [T], what departs from each sensor's median: the target, more or less."""
         out = np.zeros_like(self.field)
         for j in self.sensors:
@@ -92,7 +98,8 @@ class PassData:
         return out
 
 
-def separable_problem(data, model_of, relative_error=0.0):
+def separable_problem(data: PassData, model_of: ModelOf,
+                      relative_error: float = 0.0) -> SeparableProblem:
     """The fit of a pass as a `SeparableProblem`, the sensors' backgrounds being unknown.
 
     Parameters
@@ -116,9 +123,9 @@ def separable_problem(data, model_of, relative_error=0.0):
     return SeparableProblem(model, y, background_columns(data, W))
 
 
-def background_columns(data, W):
+def background_columns(data: PassData, W: FloatArray) -> FloatArray:
     """(3 n, q): the constant field of each axis of each sensor that was measured, whitened."""
     columns = np.zeros((len(data.t), 3, len(data.network), 3))
     columns[np.arange(len(data.t)), :, data.sensor] = W
-    columns = columns.reshape(3 * len(data.t), -1)
-    return columns[:, (columns != 0.0).any(axis=0)]
+    flat = columns.reshape(3 * len(data.t), -1)
+    return flat[:, (flat != 0.0).any(axis=0)]

@@ -1,16 +1,18 @@
 """Batch fit of a pass: where something went by, how fast, how long it is, and its moments."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from mag_tracking.analysis.bearing import bearing_of, scaled_to_range
-from mag_tracking.analysis.pass_data import background_columns, separable_problem
+from mag_tracking.analysis.pass_data import PassData, background_columns, separable_problem
 from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.crlb import bound, cpa_information, information
 from mag_tracking.inference.detection_theory import energy_threshold
-from mag_tracking.inference.least_squares import correlated_scores, search
+from mag_tracking.inference.least_squares import Minimum, correlated_scores, search
 from mag_tracking.physics.passes import RowPass
 
 N_COARSE = 24
@@ -47,7 +49,8 @@ EXACT = 1e-4
 """[m] Deviation of a CPA range that is only a unit of length."""
 
 
-def fit_pass(data, n_dipoles=3, cpa_range=None):
+def fit_pass(data: PassData, n_dipoles: int = 3,
+             cpa_range: tuple[float, float] | None = None) -> PassFit:
     """Fit a row of dipoles at constant velocity to what a network measured.
 
     Parameters
@@ -92,19 +95,19 @@ def fit_pass(data, n_dipoles=3, cpa_range=None):
     if n_dipoles > 1 and theta[6] < 0.0:
         # The same row from its other end.
         theta[6] = -theta[6]
-        T = model_of(data.t, data.positions, None).combinations
+        T = RowPass(data.t, data.positions, data.whitening, n_dipoles).combinations
         p = T.T @ (T @ p).reshape(-1, 3)[::-1].ravel()
     left = max(found.cost - n_free, 0.0) / (problem.energy - n_free)
     return _described(data, n_dipoles, theta, p, found, 1.0 - left, cpa_range)
 
 
-def _strongest(data):
+def _strongest(data: PassData) -> int:
     """Index of the sample with the strongest field beyond the background."""
     departure = data.departure
     return int(np.argmax(np.einsum('ni,ni->n', departure, departure)))
 
 
-def _unusable(data, n_dipoles):
+def _unusable(data: PassData, n_dipoles: int) -> str:
     """Why this cannot be fitted, before trying; or nothing."""
     if n_dipoles < 1:
         raise ValueError(f'a row needs at least one dipole, got {n_dipoles}')
@@ -118,7 +121,7 @@ def _unusable(data, n_dipoles):
     return ''
 
 
-def starting_paths(data, n_dipoles):
+def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
     """Paths (n, 6 or 7) to search from: all headings, past the sensor with the strongest field.
 
     How long that sensor sees the target says how fast it is for its distance.
@@ -143,7 +146,7 @@ def starting_paths(data, n_dipoles):
     return np.hstack([position, velocity, np.full((len(heading), int(n_dipoles > 1)), length)])
 
 
-def shorter_rows(path):
+def shorter_rows(path: FloatArray) -> FloatArray:
     """Paths (n, 7) of shorter rows that fit nearly as well as `path` (7,) does.
 
     A row with an empty end looks like a shorter one whose middle is elsewhere.
@@ -158,16 +161,18 @@ def shorter_rows(path):
     return np.array(rows)
 
 
-def _described(data, n_dipoles, theta, p, found, explained, cpa_range):
+def _described(data: PassData, n_dipoles: int, theta: FloatArray, p: FloatArray, found: Minimum,
+               explained: float, cpa_range: tuple[float, float] | None) -> PassFit:
     """The `PassFit` of a minimum."""
     one = len(data.sensors) == 1
     if one:
         place = data.network.positions[data.sensors[0]]
         # Nothing measures the scale: the CPA range is what it is said to be, or the unit.
-        theta, p = scaled_to_range(theta, p, place, cpa_range[0] if cpa_range else 1.0)
-        if theta is None:
+        scaled = scaled_to_range(theta, p, place, cpa_range[0] if cpa_range else 1.0)
+        if scaled is None:
             return PassFit(n_dipoles, data, 'the path goes through the sensor (r0 parallel to v0): '
                            'there is no closest point to scale by')
+        theta, p = scaled
     H, T, names, predicted, background = _linearised(data, n_dipoles, theta, p)
     W = data.whitening
     whitened = W @ H.reshape(len(W), 3, -1)
@@ -199,7 +204,8 @@ def _described(data, n_dipoles, theta, p, found, explained, cpa_range):
     return replace(fit, reason=_doubt(fit))
 
 
-def _unmodelled(data, whitened, left, covariance):
+def _unmodelled(data: PassData, whitened: FloatArray, left: FloatArray,
+                covariance: FloatArray) -> FloatArray:
     """What must be added to a covariance (n_x, n_x) for what the model leaves out.
 
     The residuals `left` (n, 3) then are no noise: they are alike for a while, and count for less
@@ -218,10 +224,12 @@ def _unmodelled(data, whitened, left, covariance):
         return np.full_like(covariance, np.nan)
     w, V = np.linalg.eigh(excess)
     root = (covariance / np.outer(scale, scale)) @ (V * np.sqrt(np.maximum(w, 0.0)))
-    return np.outer(scale, scale) * (root @ root.T)
+    missing: FloatArray = np.outer(scale, scale) * (root @ root.T)
+    return missing
 
 
-def _rivals(fit, minima):
+def _rivals(fit: PassFit, minima: Iterable[tuple[FloatArray, float]]) -> tuple[
+        tuple[float, FloatArray], ...]:
     """`PassFit.rivals` of the other minima (path, cost); a row seen from its other end is none."""
     rivals, excess = [], max(1.0, fit.normalised_cost)
     for path, cost in minima:
@@ -231,7 +239,7 @@ def _rivals(fit, minima):
     return tuple(rivals)
 
 
-def _seen_s(data):
+def _seen_s(data: PassData) -> float:
     """[s] in which nearly all of the target's energy came."""
     energy = np.square(np.linalg.norm(data.departure, axis=1))
     order = np.argsort(data.t)
@@ -240,7 +248,8 @@ def _seen_s(data):
     return float(last - first)
 
 
-def _velocity_change(data, whitened, left, theta, seen_s):
+def _velocity_change(data: PassData, whitened: FloatArray, left: FloatArray, theta: FloatArray,
+                     seen_s: float) -> tuple[float, float]:
     """Share of itself by which the velocity would like to change while the target is seen.
 
     One step of Gauss and Newton from the minimum, with a constant horizontal acceleration more
@@ -256,7 +265,8 @@ def _velocity_change(data, whitened, left, theta, seen_s):
     return float(np.linalg.norm(step[-2:]) * scale), float(np.linalg.norm(spread[-2:]) * scale)
 
 
-def _linearised(data, n_dipoles, theta, p):
+def _linearised(data: PassData, n_dipoles: int, theta: FloatArray, p: FloatArray) -> tuple[
+        FloatArray, FloatArray, tuple[str, ...], FloatArray, FloatArray]:
     """The fit about its minimum.
 
     Returns the derivatives (3 n, n_x) of the field in the sensors' frames by path, combinations
@@ -270,11 +280,12 @@ def _linearised(data, n_dipoles, theta, p):
     of_target = model.basis(theta[None])[0] @ p
     W = data.whitening
 
-    def whitened(A):
+    def whitened(A: FloatArray) -> FloatArray:
         return (W @ A.reshape(len(W), 3, -1)).reshape(len(A), -1)
 
     y = np.nan_to_num(data.field).ravel() - of_target
-    background, *_ = np.linalg.lstsq(whitened(columns), whitened(y[:, None])[:, 0], rcond=None)
+    background = np.asarray(np.linalg.lstsq(
+        whitened(columns), whitened(y[:, None])[:, 0], rcond=None)[0], dtype=np.float64)
     names = model.names + model.moment_names + tuple(
         f'B {network.names[j]} {"xyz"[a]}' for j in data.sensors
         for a in np.flatnonzero(measured[data.sensor == j].any(axis=0)))
@@ -286,7 +297,7 @@ def _linearised(data, n_dipoles, theta, p):
     return H, T, names, (of_target + columns @ background).reshape(-1, 3), background
 
 
-def _doubt(fit):
+def _doubt(fit: PassFit) -> str:
     """Why a minimum is no answer, or nothing."""
     if not fit.converged:
         return 'the fit did not converge'

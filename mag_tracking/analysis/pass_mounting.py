@@ -5,11 +5,15 @@ the prior is its own; of several tracks these add up. Weaker than a calibration 
 target: what the model leaves out of a vehicle is alike in all passes of one lane.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.geometry import quaternion_from_rotation_vector, rotation_from_quaternion
+from mag_tracking.network import SensorNetwork
+from mag_tracking.records import Track
 
 LEAST_SHARE = 0.05
 """A direction in which a track adds less than this share of what it adds in its best one is not
@@ -20,19 +24,20 @@ compared with what other tracks say."""
 class MountingEvidence:
     """What the tracks said."""
 
-    turn: np.ndarray
+    turn: FloatArray
     """(n_sensors, 3) [rad] small rotations about the world's axes that take the orientations of
     the network to the better ones."""
-    covariance: np.ndarray
+    covariance: FloatArray
     """(n_sensors, 3, 3) [rad^2] of `turn`, world's axes."""
-    scatter: np.ndarray
+    scatter: FloatArray
     """(n_sensors,) how far the tracks differ among each other, against what they claim: mean of
     the squares, one when they claim what is true; NaN with fewer than two. Where it is above one
     the covariance has been widened by it."""
     n_tracks: int
 
 
-def fold_mounting(network, prior_std, tracks):
+def fold_mounting(network: SensorNetwork, prior_std: FloatArray,
+                  tracks: Sequence[Track]) -> MountingEvidence:
     """Fold the last poses of tracks into one estimate of the sensors' orientations.
 
     Parameters
@@ -52,7 +57,8 @@ def fold_mounting(network, prior_std, tracks):
     """
     n = len(network)
     prior = np.array([np.diag(1.0 / np.square(std)) for std in prior_std])
-    gains, pulls = [], []
+    gains: list[FloatArray] = []
+    pulls: list[FloatArray] = []
     for track in tracks:
         if len(track.mounting) != n:
             raise ValueError(f'track {track.id} has the mounting angles of {len(track.mounting)} '
@@ -78,13 +84,15 @@ def fold_mounting(network, prior_std, tracks):
     return MountingEvidence(turn, covariance, scatter, len(tracks))
 
 
-def _nonnegative(information):
-    """Without what rounding and the linearisation of the mean made negative."""
+def _nonnegative(information: FloatArray) -> FloatArray:
+    """(n_sensors, 3, 3) without what rounding and the linearisation of the mean made negative."""
     values, vectors = np.linalg.eigh(information)
-    return np.einsum('jik,jk,jlk->jil', vectors, np.maximum(values, 0.0), vectors)
+    kept: FloatArray = np.einsum('jik,jk,jlk->jil', vectors, np.maximum(values, 0.0), vectors)
+    return kept
 
 
-def _scatter(gains, pulls, turn, covariance):
+def _scatter(gains: Sequence[FloatArray], pulls: Sequence[FloatArray], turn: FloatArray,
+             covariance: FloatArray) -> FloatArray:
     """(n_sensors,) mean square of what each track says against all, by what it claims."""
     squares, freedom = np.zeros(len(turn)), np.zeros(len(turn))
     for gain, pull in zip(gains, pulls, strict=True):
@@ -94,10 +102,12 @@ def _scatter(gains, pulls, turn, covariance):
         # What is compared, less what went into the answer that it is compared with.
         projection = inverse @ gain
         freedom += np.einsum('jii->j', projection - projection @ covariance @ gain)
-    return np.divide(squares, freedom, out=np.full(len(turn), np.nan), where=freedom > 1e-3)
+    scatter: FloatArray = np.divide(squares, freedom, out=np.full(len(turn), np.nan),
+                                    where=freedom > 1e-3)
+    return scatter
 
 
-def with_evidence(network, evidence):
+def with_evidence(network: SensorNetwork, evidence: MountingEvidence) -> SensorNetwork:
     """The `SensorNetwork` turned by `MountingEvidence`, with its deviations."""
     turns = rotation_from_quaternion(quaternion_from_rotation_vector(evidence.turn))
     std = np.sqrt(np.einsum('jii->ji', evidence.covariance))

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
+from mag_tracking.arrays import FloatArray
 from mag_tracking.physics.anderson import closest_approach
 
 RIVAL = 9.2
@@ -26,13 +27,13 @@ class Bearing:
     Seen from the sensor; target and motion may both be reversed, which gives the same field.
     """
 
-    cpa_direction: np.ndarray
+    cpa_direction: FloatArray
     """(3,) unit vector, world, to the target at its closest; the end that is not below."""
-    motion_direction: np.ndarray
+    motion_direction: FloatArray
     """(3,) unit vector, world."""
-    moment_direction: np.ndarray
+    moment_direction: FloatArray
     """(3,) unit vector, world, of the whole."""
-    direction_std: np.ndarray
+    direction_std: FloatArray
     """(3,) [rad], of the three: the largest deviation across each."""
     cpa_time: float
     """[s] after time zero."""
@@ -55,12 +56,12 @@ class PassFit:
     converged: bool = False
     names: tuple[str, ...] = ()
     """Of the unknowns: path, moments, backgrounds."""
-    x: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    x: FloatArray = field(default_factory=lambda: np.zeros(0))
     """(n_x,) their values: [m], [m/s], [A m^2], [T]."""
-    covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     """(n_x, n_x) TSP14 eq. (47), which takes model and noise for right; infinite variance = not
     observable."""
-    honest_covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    honest_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     """(n_x, n_x) the same and what the model leaves out: residuals that are alike for a while
     instead of noise. All deviations are of this one."""
     cost: float = np.nan
@@ -75,26 +76,26 @@ class PassFit:
     """By noise alone."""
     bearing: Bearing | None = None
     """With one sensor."""
-    rivals: tuple[tuple[float, np.ndarray], ...] = ()
+    rivals: tuple[tuple[float, FloatArray], ...] = ()
     """(d, path) of other minima, a likelihood ratio of exp(-d/2) behind this one: the covariance
     knows nothing of them. A row with an empty end is one, a shorter one further on."""
-    predicted: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    predicted: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     """(n, 3) [T], sensor frame, with the background."""
-    predicted_std: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    predicted_std: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     """(n, 3) [T], by the honest covariance, without noise."""
 
     @property
-    def degrees_of_freedom(self):
+    def degrees_of_freedom(self) -> int:
         """Measurements less unknowns."""
         return self.data.n_values - len(self.x)
 
     @property
-    def normalised_cost(self):
+    def normalised_cost(self) -> float:
         """About one where the model is right; TSP14 eq. (50)."""
         return self.cost / self.degrees_of_freedom
 
     @property
-    def determined(self):
+    def determined(self) -> bool:
         """Whether the measurements fix all unknowns, right or not."""
         if not (len(self.x) and self.converged):
             return False
@@ -108,7 +109,7 @@ class PassFit:
         return bool(length_std <= max(length, 1.0) and SHORTEST * way <= length <= way)
 
     @property
-    def ambiguous(self):
+    def ambiguous(self) -> bool:
         """Whether another path, elsewhere by its deviations, is possible at 1 %."""
         P = self.honest_covariance[:6, :6]
         for d, path in self.rivals:
@@ -118,38 +119,38 @@ class PassFit:
         return False
 
     @property
-    def position(self):
+    def position(self) -> FloatArray:
         """(3,) [m], world, of the middle at time zero."""
         return self.x[:3]
 
     @property
-    def velocity(self):
+    def velocity(self) -> FloatArray:
         """(3,) [m/s], world."""
         return self.x[3:6]
 
     @property
-    def speed(self):
+    def speed(self) -> tuple[float, float]:
         """[m/s] and its deviation."""
-        speed = np.linalg.norm(self.velocity)
+        speed = np.float64(np.linalg.norm(self.velocity))
         u = self.velocity / speed
-        return speed, np.sqrt(u @ self.honest_covariance[3:6, 3:6] @ u)
+        return speed, np.float64(np.sqrt(u @ self.honest_covariance[3:6, 3:6] @ u))
 
     @property
-    def heading(self):
+    def heading(self) -> tuple[float, float]:
         """[rad] anticlockwise from x, and its deviation."""
         vx, vy, _ = self.velocity
         g = np.array([-vy, vx]) / (vx * vx + vy * vy)
         return np.arctan2(vy, vx), np.sqrt(g @ self.honest_covariance[3:5, 3:5] @ g)
 
     @property
-    def length(self):
+    def length(self) -> tuple[float, float]:
         """[m] of the row and its deviation; zeros for a point."""
         if self.n_dipoles == 1:
             return 0.0, 0.0
         return self.x[6], np.sqrt(self.honest_covariance[6, 6])
 
     @property
-    def moment(self):
+    def moment(self) -> tuple[FloatArray, FloatArray]:
         """(3,) [A m^2], world, of the whole, and its covariance (3, 3); TSP14 (9)."""
         S = np.zeros((3, len(self.x)))
         first = 6 + int(self.n_dipoles > 1)
@@ -157,7 +158,7 @@ class PassFit:
             S[:, first + 3 * i:first + 3 * i + 3] = np.eye(3)
         return S @ self.x, S @ self.honest_covariance @ S.T
 
-    def closest_approach(self, point):
+    def closest_approach(self, point: FloatArray) -> tuple[float, float, float, float]:
         """CPA of the row's middle to a point.
 
         Parameters
@@ -177,4 +178,5 @@ class PassFit:
         P = self.honest_covariance[:6, :6]
         g_time = -np.concatenate([v, r + 2.0 * time * v]) / (v @ v)
         g_range = np.concatenate([u, time * u])
-        return (time, np.sqrt(g_time @ P @ g_time), distance, np.sqrt(g_range @ P @ g_range))
+        return (time, np.float64(np.sqrt(g_time @ P @ g_time)), distance,
+                np.float64(np.sqrt(g_range @ P @ g_range)))

@@ -5,10 +5,12 @@ direction is not known beforehand, so everything is taken over `DIRECTIONS`. The
 TSP14 section IV and MITRE12 section 4, with the backgrounds unknown as well.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.detection_theory import detection_probability, energy_threshold
 from mag_tracking.physics.dipole import sensor_fields
 
@@ -39,7 +41,7 @@ class PlannedTarget:
     moment_known: bool = True
     """Whether the moment's size is known beforehand, to the size itself; never its direction."""
 
-    def prior(self):
+    def prior(self) -> FloatArray:
         """(9, 9) information of what is known beforehand; MITRE12 eq. (28)."""
         std = np.full(9, np.inf)
         std[2], std[5] = self.height_std, self.climb_std
@@ -54,7 +56,7 @@ class Sampling:
 
     period: float
     """[s] between frames."""
-    noise_std: np.ndarray | float
+    noise_std: FloatArray | float
     """(n_sensors,) [T] of one axis of one frame, or one for all."""
     field_error: float = 0.0
     """Relative error of the field, by clocks, mountings and the model, as noise frame by frame; of
@@ -65,14 +67,17 @@ class Sampling:
     """[s] the target is followed so long before and after the point that is asked about."""
     most_frames: int = 60
 
-    def times(self):
+    def times(self) -> tuple[FloatArray, float]:
         """(k,) [s] of the frames, and how many real ones each stands for."""
         n = 2 * int(self.half_window / self.period) + 1
         k = min(n, self.most_frames // 2 * 2 + 1)
-        return np.linspace(-self.half_window, self.half_window, k), n / k
+        t = np.linspace(-self.half_window, self.half_window, k, dtype=np.float64)
+        return t, n / k
 
 
-def pass_fields(positions, R_sw, target, sampling, points, heading):
+def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
+                sampling: Sampling, points: FloatArray,
+                heading: float) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
     """Fields and Jacobians of passes through points, for every direction of the moment.
 
     Parameters
@@ -103,7 +108,7 @@ def pass_fields(positions, R_sw, target, sampling, points, heading):
         r0 = np.column_stack([some, np.full(n, target.height)])
         r = np.broadcast_to(r0[:, None, None] + t[:, None] * v, (n, *shape, 3))
 
-        def repeated(a, n=n):
+        def repeated(a: FloatArray, n: int = n) -> FloatArray:
             """The same for each of the points."""
             return np.tile(a.reshape(size, 1, *a.shape[2:]), (n, *[1] * (a.ndim - 1)))
 
@@ -116,7 +121,8 @@ def pass_fields(positions, R_sw, target, sampling, points, heading):
                H.reshape(n, *shape, len(positions), 3, 9))
 
 
-def pass_information(positions, R_sw, target, sampling, points, heading):
+def pass_information(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
+                     sampling: Sampling, points: FloatArray, heading: float) -> FloatArray:
     """Fisher information of each sensor about [r, v, m] at the moment the target is at a point.
 
     The backgrounds are eliminated: what is constant over the pass says nothing beyond their prior.
@@ -137,7 +143,7 @@ def pass_information(positions, R_sw, target, sampling, points, heading):
     return out
 
 
-def bounds_of(information, prior):
+def bounds_of(information: FloatArray, prior: FloatArray) -> FloatArray:
     """Standard deviations that no unbiased estimate beats, per block.
 
     Parameters
@@ -154,11 +160,15 @@ def bounds_of(information, prior):
     scale = np.sqrt(np.einsum('...ii->...i', J))
     P = np.linalg.inv(J / (scale[..., :, None] * scale[..., None, :]))
     variance = np.einsum('...ii->...i', P) / scale**2
-    return np.sqrt(np.stack([variance[..., :2].sum(axis=-1), variance[..., 3:5].sum(axis=-1),
-                             variance[..., 6:].sum(axis=-1)], axis=-1))
+    std: FloatArray = np.sqrt(np.stack([
+        variance[..., :2].sum(axis=-1), variance[..., 3:5].sum(axis=-1),
+        variance[..., 6:].sum(axis=-1)], axis=-1))
+    return std
 
 
-def detection_probabilities(positions, R_sw, target, sampling, points, false_alarm, allowance=0.0):
+def detection_probabilities(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
+                            sampling: Sampling, points: FloatArray, false_alarm: float,
+                            allowance: float = 0.0) -> FloatArray:
     """Probability that one frame exceeds the detection's threshold with the target at a point.
 
     Parameters

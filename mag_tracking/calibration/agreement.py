@@ -5,11 +5,15 @@ pair, another unit or two sensors in each other's place are seen at once, and to
 """
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import permutations, product
+from typing import TypeAlias
 
 import numpy as np
 from scipy.stats import chi2
+
+from mag_tracking.arrays import FloatArray
 
 IMPROBABLE = 1e-5
 """A sensor that is right disagrees with this probability."""
@@ -23,6 +27,9 @@ YAW_STEP = np.deg2rad(0.25)
 UNITS = (('gauss', 1e4), ('millitesla', 1e3), ('microtesla', 1e6), ('nanotesla', 1e9))
 _AXES = 'xyz'
 
+_Change: TypeAlias = tuple[str, tuple[int, ...], FloatArray]
+"""Text, order and signs (3,) of a signed permutation."""
+
 
 @dataclass(frozen=True)
 class Disagreement:
@@ -34,14 +41,14 @@ class Disagreement:
     explanations: tuple[str, ...]
     """What would explain it, the simplest only; empty where nothing that is known does."""
 
-    def __str__(self):
+    def __str__(self) -> str:
         because = ' or '.join(self.explanations) or (
             'no axis, unit or exchange of sensors explains it: iron or a magnet beside it, or '
             'another orientation than stated')
         return f'{self.sensor} is {self.size * 1e6:.3g} uT from the field of the Earth: {because}'
 
 
-def consensus(fields, R_ws):
+def consensus(fields: FloatArray, R_ws: FloatArray) -> FloatArray:
     """(3,) [T] the field, in the world, that most sensors of a network agree on.
 
     `fields` (n, 3) [T], sensor frames, NaN = not reported; `R_ws` (n, 3, 3). Raises
@@ -51,10 +58,13 @@ def consensus(fields, R_ws):
     if np.count_nonzero(whole) < 3:
         raise ValueError('without an earth_field three sensors with three axes are needed to '
                          f'compare, there are {np.count_nonzero(whole)}')
-    return np.median(np.einsum('jik,jk->ji', R_ws[whole], fields[whole]), axis=0)
+    field: FloatArray = np.median(np.einsum('jik,jk->ji', R_ws[whole], fields[whole]), axis=0)
+    return field
 
 
-def disagreements(names, fields, R_ws, orientation_std, earth_field, bias_std):
+def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
+                  orientation_std: FloatArray, earth_field: FloatArray,
+                  bias_std: float) -> list[Disagreement]:
     """The sensors that do not measure the field of the Earth.
 
     Parameters
@@ -84,15 +94,24 @@ def disagreements(names, fields, R_ws, orientation_std, earth_field, bias_std):
     return out
 
 
-def _fits(y, R_ws, std, B0, bias_std):
+def _fits(y: FloatArray, R_ws: FloatArray, std: FloatArray, B0: FloatArray,
+          bias_std: float) -> bool:
     """Whether a field is no less likely than IMPROBABLE, at the heading that suits it best."""
-    return _fits_numbers(*(tuple(np.ravel(a).tolist()) for a in (y, R_ws, std, B0)), bias_std)
+    return _fits_numbers(_numbers(y), _numbers(R_ws), _numbers(std), _numbers(B0), bias_std)
+
+
+def _numbers(a: FloatArray) -> tuple[float, ...]:
+    """The elements, as a key of a cache."""
+    return tuple(np.ravel(a).tolist())
 
 
 @functools.lru_cache(maxsize=4096)
-def _fits_numbers(y, R_ws, std, B0, bias_std):
+def _fits_numbers(field: tuple[float, ...], orientation: tuple[float, ...],
+                  orientation_std: tuple[float, ...], B0: tuple[float, ...],
+                  bias_std: float) -> bool:
     """`_fits` of tuples; a network that is watched is asked the same every second."""
-    y, R_ws, std = np.array(y), np.array(R_ws).reshape(3, 3), np.array(std)
+    y, R_ws, std = (np.array(field), np.array(orientation).reshape(3, 3),
+                    np.array(orientation_std))
     there = ~np.isnan(y)
     if not there.any():
         return True
@@ -108,9 +127,12 @@ def _fits_numbers(y, R_ws, std, B0, bias_std):
     return bool(energy.min() <= chi2.isf(IMPROBABLE, np.count_nonzero(there)))
 
 
-def _explanations(j, odd, names, fields, R_ws, orientation_std, B0, bias_std):
+def _explanations(j: int, odd: Sequence[int], names: Sequence[str], fields: FloatArray,
+                  R_ws: FloatArray, orientation_std: FloatArray, B0: FloatArray,
+                  bias_std: float) -> tuple[str, ...]:
     """The simplest of what makes the field of sensor `j` fit."""
-    def fits(y, R=R_ws[j], std=orientation_std[j]):
+    def fits(y: FloatArray, R: FloatArray = R_ws[j],
+             std: FloatArray = orientation_std[j]) -> bool:
         return _fits(y, R, std, B0, bias_std)
 
     y = fields[j]
@@ -128,9 +150,9 @@ def _explanations(j, odd, names, fields, R_ws, orientation_std, B0, bias_std):
     return ()
 
 
-def _changes():
+def _changes() -> list[list[_Change]]:
     """Signed permutations in groups, the simplest first: lists of (text, order, signs)."""
-    groups = {}
+    groups: dict[tuple[int, int], list[_Change]] = {}
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
             moved = sum(k != i for i, k in enumerate(order))

@@ -10,10 +10,19 @@ are this package's own.
 
 from collections import deque
 from math import inf, isnan
+from typing import TypeAlias
 
 import numpy as np
 
-from mag_tracking.calibration.blocks import BlockWindow, block_of, line_through, stacked
+from mag_tracking.arrays import FloatArray, StructArray
+from mag_tracking.calibration.blocks import (
+    Block,
+    Blocks,
+    BlockWindow,
+    block_of,
+    line_through,
+    stacked,
+)
 from mag_tracking.calibration.ordinary import add_to_block, new_sensors
 from mag_tracking.records import plain
 
@@ -26,6 +35,9 @@ RESUMED_RELEARN_S = 10.0
 
 LEAST_STD = 1e-11
 """[T] A block that scatters less teaches nothing: the sensor is stuck, or its steps are coarse."""
+
+_Line: TypeAlias = tuple[float, FloatArray, FloatArray, float]
+"""Centre [s], mean (3,) [T], slope (3,) [T/s] and horizon [s]."""
 
 
 class RunningBackground:
@@ -53,8 +65,10 @@ class RunningBackground:
         Where the block is that is being collected.
     """
 
-    def __init__(self, learn, memory, guard, block, freeze_std, relearn,
-                 background=None, noise_std=None, phase=None, sensors=None):
+    def __init__(self, learn: float, memory: float, guard: float, block: float,
+                 freeze_std: float, relearn: float, background: FloatArray | None = None,
+                 noise_std: FloatArray | None = None, phase: float | None = None,
+                 sensors: StructArray | None = None) -> None:
         self._learn, self._guard, self._length = learn, guard, block
         self._freeze_std, self._relearn = freeze_std, relearn
         self._sensors = new_sensors(1) if sensors is None else sensors
@@ -63,24 +77,29 @@ class RunningBackground:
         self._most = max(3, int(round(memory / block)))
         self._window = BlockWindow(self._most)
         self._given = None if background is None else np.asarray(background, dtype=float)
-        self._noise = None if noise_std is None else np.diag(np.asarray(noise_std, float) ** 2)
+        self._noise: FloatArray | None = \
+            None if noise_std is None else np.diag(np.asarray(noise_std, float) ** 2)
         self._noise_given = self._noise is not None
-        self._std, self._numbers = (None, None, False), (None,)
+        # What was made of the noise and of the line, each with what it was made of.
+        self._std: tuple[FloatArray | None, list[float] | None, bool] = (None, None, False)
+        self._numbers: tuple[_Line, float, list[float], list[float], float] | None = None
         self.n_relearnt = 0
         self.forget()
 
-    def forget(self):
+    def forget(self) -> None:
         """Drop what was learnt; what was given beforehand stays."""
         self._state['n'], self._state['end'], self._state['is_full'] = 0, np.nan, False
         self._window.clear()
-        self._pending, self._strange = deque(), deque()
+        self._pending: deque[Block] = deque()
+        self._strange: deque[Block] = deque()
         self.frozen = self._resumed = False
         if not self._noise_given:
             self._noise = None
-        self._line = None if self._given is None else (0.0, self._given, np.zeros(3), 0.0)
+        self._line: _Line | None = \
+            None if self._given is None else (0.0, self._given, np.zeros(3), 0.0)
         self.stuck = False
 
-    def resume(self, background, covariance):
+    def resume(self, background: FloatArray, covariance: FloatArray) -> None:
         """Go on from what was known a moment ago: (3,) [T] and (3, 3) [T^2], NaN as elsewhere.
 
         It is a line again when a stretch as long as at first has been quiet.
@@ -91,49 +110,50 @@ class RunningBackground:
         self._resumed = True
 
     @property
-    def ready(self):
+    def ready(self) -> bool:
         """Whether both background and noise are known."""
         return self._line is not None and self._noise is not None
 
     @property
-    def covariance(self):
+    def covariance(self) -> FloatArray | None:
         """(3, 3) [T^2] noise of one sample, or None; NaN for an axis not reported."""
         return self._noise
 
     @property
-    def noise_std(self):
+    def noise_std(self) -> list[float] | None:
         """[3 float] [T], or None; NaN for an axis not reported."""
         self._note_noise()
         return self._std[1]
 
     @property
-    def is_whole(self):
+    def is_whole(self) -> bool:
         """Whether the noise of all axes is known."""
         self._note_noise()
         return self._std[2]
 
-    def _note_noise(self):
+    def _note_noise(self) -> None:
         """Keep what is asked of every sample, and changes once a block."""
         if self._std[0] is not self._noise:
-            std = None if self._noise is None else np.sqrt(np.diagonal(self._noise)).tolist()
+            std: list[float] | None = \
+                None if self._noise is None else np.sqrt(np.diagonal(self._noise)).tolist()
             self._std = self._noise, std, std is not None and not isnan(sum(std))
 
     @property
-    def line(self):
+    def line(self) -> _Line | None:
         """(centre [s], (3,) mean [T], (3,) slope [T/s], horizon [s]) of `level`, or None."""
         return self._line
 
     @property
-    def measured(self):
+    def measured(self) -> bool:
         """Whether the background is from readings, not from what was given beforehand."""
         return bool(self._window) and self.ready
 
     @property
-    def drift(self):
+    def drift(self) -> FloatArray:
         """(3,) [T/s] of the background; NaN before it is ready, and of an axis not reported."""
         return np.full(3, np.nan) if self._line is None else self._line[2]
 
-    def level(self, time):
+    def level(self, time: float) -> FloatArray:
         """(3,) [T] background at `time` [s].
 
         The drift is carried on for at most twice the stretch that it was
@@ -145,14 +165,14 @@ class RunningBackground:
         centre, mean, slope, horizon = self._line
         return mean + slope * (min(time, horizon) - centre)
 
-    def departure(self, time, values):
+    def departure(self, time: float, values: list[float]) -> list[float]:
         """[3 float] [T]: `values`, a list, without the background at `time`; as fast as can be.
 
         Raises ValueError before it is ready.
         """
         if self._line is None:
             raise ValueError('the background has not been learnt yet')
-        if self._numbers[0] is not self._line:
+        if self._numbers is None or self._numbers[0] is not self._line:
             centre, mean, slope, horizon = self._line
             self._numbers = self._line, centre, mean.tolist(), slope.tolist(), horizon
         _, centre, (a, b, c), (u, v, w), horizon = self._numbers
@@ -160,14 +180,14 @@ class RunningBackground:
         since = min(time, horizon) - centre
         return [x - a - since * u, y - b - since * v, z - c - since * w]
 
-    def add(self, time, field):
+    def add(self, time: float, field: FloatArray) -> None:
         """Take a sample: `time` [s], `field` (3,) [T], sensor frame."""
         self.settle()
         add_to_block(self._sensors, 0, time, plain(field))
         if isnan(self._state['phase']):
             self.settle()
 
-    def settle(self):
+    def settle(self) -> None:
         """Judge the block that the latest sample has shown to be complete; else `add` does it."""
         if not self._state['is_full']:
             return
@@ -178,12 +198,13 @@ class RunningBackground:
                            < LEAST_STD**2 * (block.n[known] - 1)).any())
         if self.stuck:
             return
-        if self._line is not None and self._noise is not None:
-            self._follow(block)
+        noise_std = self.noise_std
+        if self._line is not None and noise_std is not None:
+            self._follow(block, noise_std)
         else:
             self._begin(block)
 
-    def _begin(self, block):
+    def _begin(self, block: Block) -> None:
         """Before it is ready: collect until a quiet stretch is long enough."""
         self._strange.append(block)
         # From centre to centre; the blocks of a slow sensor may be longer than `_length`.
@@ -193,12 +214,12 @@ class RunningBackground:
         if len(self._strange) >= 3 and block.time - self._strange[0].time >= enough:
             self._adopt_if_steady()
 
-    def _follow(self, block):
+    def _follow(self, block: Block, noise_std: list[float]) -> None:
         """Once ready: extend the quiet stretch, or freeze."""
         off = (block.mean - self.level(block.time)).tolist()
         # A comparison with NaN is false: an axis that is not reported freezes nothing.
         self.frozen = any(abs(d) > self._freeze_std * std
-                          for d, std in zip(off, self.noise_std, strict=True))
+                          for d, std in zip(off, noise_std, strict=True))
         if self.frozen:
             self._pending.clear()
             self._strange.append(block)
@@ -221,23 +242,22 @@ class RunningBackground:
             self._window.append(self._pending.popleft())
             self._fit()
 
-    def _adopt_if_steady(self):
+    def _adopt_if_steady(self) -> bool:
         """Take the collected blocks as the background if they lie on one line."""
         blocks = stacked(self._strange)
         if _one_is_loud(blocks):
             return False
-        noise = _pooled_covariance(blocks)
-        if noise is None and not self._noise_given:
+        noise = self._noise if self._noise_given else _pooled_covariance(blocks)
+        if noise is None:
             return False
-        std = np.sqrt(np.diagonal(self._noise if self._noise_given else noise))
+        std = np.sqrt(np.diagonal(noise))
         if np.isnan(std).all():
             return False
         centre, mean, slope = line_through(blocks)
         off = np.abs(blocks.mean - mean - slope * (blocks.time - centre)[:, None])
         if not np.nanmax(off / std) <= self._freeze_std:
             return False
-        if not self._noise_given:
-            self._noise = noise
+        self._noise = noise
         if self._given is not None and self._line is not None and not self.n_relearnt \
                 and not self.frozen:
             # The background was given and only the noise had to be learnt.
@@ -252,7 +272,7 @@ class RunningBackground:
         self._fit()
         return True
 
-    def _fit(self):
+    def _fit(self) -> None:
         """Line and noise from the present window."""
         blocks = self._window.blocks()
         first, last = float(blocks.time.min()), float(blocks.time.max())
@@ -266,7 +286,7 @@ class RunningBackground:
             self._noise = self._noise if noise is None else noise
 
 
-def _one_is_loud(blocks):
+def _one_is_loud(blocks: Blocks) -> bool:
     """Whether a block scatters far more than the others, on any axis."""
     n = blocks.n
     variance = np.where(n > 1, np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1, 1), np.nan)
@@ -274,10 +294,12 @@ def _one_is_loud(blocks):
     return bool((np.nanmax(known, axis=0) > LOUDEST * np.nanmin(known, axis=0)).any())
 
 
-def _pooled_covariance(blocks):
-    """Scatter within blocks, pooled; None with too few samples, NaN for an axis not reported."""
+def _pooled_covariance(blocks: Blocks) -> FloatArray | None:
+    """(3, 3) scatter within blocks, pooled; None = too few samples, NaN = axis not reported."""
     freedom = blocks.n.sum(axis=0) - np.count_nonzero(blocks.n, axis=0)
     if freedom.max() <= 3:
         return None
     freedom = np.where(freedom > 3, freedom, np.nan)
-    return blocks.scatter.sum(axis=0) / np.sqrt(freedom[:, None] * freedom[None, :])
+    covariance: FloatArray = \
+        blocks.scatter.sum(axis=0) / np.sqrt(freedom[:, None] * freedom[None, :])
+    return covariance

@@ -1,10 +1,13 @@
 """Summaries of short stretches of readings, which a background is fitted to."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numba import float64, njit, void
+
+from mag_tracking.arrays import FloatArray
 
 
 @dataclass(frozen=True)
@@ -13,15 +16,15 @@ class Block:
 
     time: float
     """[s], centre."""
-    mean: np.ndarray
+    mean: FloatArray
     """(3,) [T]; NaN = axis not reported."""
-    scatter: np.ndarray
+    scatter: FloatArray
     """(3, 3) [T^2], sum of squared deviations."""
-    n: np.ndarray
+    n: FloatArray
     """(3,) samples per axis."""
 
 
-def block_of(sensor):
+def block_of(sensor: np.void) -> Block:
     """`Block` of the sums of an `ordinary.SENSOR` over the readings of the one that is complete."""
     k, mean, scatter = 1 - sensor['now'], np.empty(3), np.empty((3, 3))
     count = sensor['count'][k]
@@ -32,7 +35,8 @@ def block_of(sensor):
 
 @njit(void(float64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1],
            float64[:, ::1]), cache=True)
-def _moments(origin, count, total, product, mean, scatter):
+def _moments(origin: FloatArray, count: FloatArray, total: FloatArray, product: FloatArray,
+             mean: FloatArray, scatter: FloatArray) -> None:
     """Mean and sum of squared deviations; an axis that is missing is so in its products only."""
     for a in range(3):
         mean[a] = total[a, a] / count[a, a] if count[a, a] else np.nan
@@ -47,42 +51,42 @@ def _moments(origin, count, total, product, mean, scatter):
 class Blocks(NamedTuple):
     """Many, as arrays: time (k,), mean (k, 3), scatter (k, 3, 3), n (k, 3); as in `Block`."""
 
-    time: np.ndarray
-    mean: np.ndarray
-    scatter: np.ndarray
-    n: np.ndarray
+    time: FloatArray
+    mean: FloatArray
+    scatter: FloatArray
+    n: FloatArray
 
 
 class BlockWindow:
     """The latest blocks, as arrays: a line is put through them as often as one comes."""
 
-    def __init__(self, most):
+    def __init__(self, most: int) -> None:
         """`most` are kept."""
         self._time, self._n = np.zeros(most), np.zeros((most, 3))
         self._mean, self._scatter = np.zeros((most, 3)), np.zeros((most, 3, 3))
         self.clear()
 
-    def __len__(self):
+    def __len__(self) -> int:
         return min(self._count, len(self._time))
 
-    def clear(self):
+    def clear(self) -> None:
         """Without any block."""
         self._count = 0
 
-    def append(self, block):
+    def append(self, block: Block) -> None:
         """The latest; it takes the place of the oldest."""
         i = self._count % len(self._time)
         self._time[i], self._mean[i], self._scatter[i] = block.time, block.mean, block.scatter
         self._n[i] = block.n
         self._count += 1
 
-    def blocks(self):
+    def blocks(self) -> Blocks:
         """The `Blocks`, in no order."""
         k = len(self)
         return Blocks(self._time[:k], self._mean[:k], self._scatter[:k], self._n[:k])
 
 
-def line_through(blocks):
+def line_through(blocks: Blocks) -> tuple[float, FloatArray, FloatArray]:
     """Weighted least-squares line per axis: centre [s], mean (3,) and slope (3,) there.
 
     NaN for an axis that no block reports.
@@ -94,7 +98,8 @@ def line_through(blocks):
 
 @njit(void(float64[::1], float64[:, ::1], float64[:, ::1], float64, float64[::1], float64[::1]),
       cache=True, error_model='numpy')
-def _line(time, n, y, centre, mean, slope):
+def _line(time: FloatArray, n: FloatArray, y: FloatArray, centre: float, mean: FloatArray,
+          slope: FloatArray) -> None:
     """`line_through`; `y` (k, 3) are the means of the blocks."""
     for a in range(3):
         total = mean_t = mean_y = 0.0
@@ -114,7 +119,7 @@ def _line(time, n, y, centre, mean, slope):
         mean[a] = mean_y + slope[a] * (centre - mean_t)
 
 
-def stacked(blocks):
-    """`Blocks` of a list of `Block`s."""
+def stacked(blocks: Iterable[Block]) -> Blocks:
+    """`Blocks` of `Block`s."""
     return Blocks(*(np.array(values, dtype=float) for values in zip(*(
         (b.time, b.mean, b.scatter, b.n) for b in blocks), strict=True)))

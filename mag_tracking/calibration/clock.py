@@ -5,11 +5,14 @@ least squares, which also says how well it is known.
 """
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate, find_peaks
+
+from mag_tracking.arrays import BoolArray, FloatArray
 
 LOUD = 10.0
 """A knock is above so many deviations of the rest."""
@@ -26,6 +29,9 @@ AROUND_S = 5.0
 MARGIN_S = 0.1
 """[s] What is compared before and after a knock."""
 
+_Series: TypeAlias = tuple[FloatArray, FloatArray]
+"""Times (n,) [s] and values (n,)."""
+
 
 @dataclass(frozen=True)
 class Lag:
@@ -41,22 +47,24 @@ class Lag:
     """Why there is none; empty where there is one."""
 
 
-def _none(reason, correlation=float('nan')):
+def _none(reason: str, correlation: float = float('nan')) -> Lag:
     """No lag."""
     return Lag(float('nan'), float('nan'), correlation, reason)
 
 
-def shock(acceleration):
+def shock(acceleration: FloatArray) -> FloatArray:
     """(n,) [m/s^2] how far each of the accelerations (n, 3) is from rest, in any direction.
 
     In any: how a sensor is turned need not be known.
     """
     a = np.asarray(acceleration, dtype=float)
     size = np.linalg.norm(a - np.nanmedian(a, axis=0), axis=1)
-    return size - np.nanmedian(size)
+    beyond_rest: FloatArray = size - np.nanmedian(size)
+    return beyond_rest
 
 
-def knock_lag(t_reference, reference, t, signal, longest):
+def knock_lag(t_reference: FloatArray, reference: FloatArray, t: FloatArray, signal: FloatArray,
+              longest: float) -> Lag:
     """How far the clock of one sensor is ahead of a reference's, by knocks that both felt.
 
     Parameters
@@ -98,7 +106,7 @@ def knock_lag(t_reference, reference, t, signal, longest):
     return Lag(offset, std, correlation, '')
 
 
-def _series(t, s, name):
+def _series(t: FloatArray, s: FloatArray, name: str) -> _Series:
     """(t, s) as arrays without NaN."""
     t, s = np.asarray(t, dtype=float), np.asarray(s, dtype=float)
     if t.shape != s.shape or t.ndim != 1:
@@ -110,7 +118,7 @@ def _series(t, s, name):
     return t, s
 
 
-def _whole(t, s):
+def _whole(t: FloatArray, s: FloatArray) -> _Series:
     """The series without a knock that it begins or ends in."""
     if len(s) < 8:
         return t, s
@@ -127,7 +135,7 @@ def _whole(t, s):
     return t, s
 
 
-def _apart(a, b, longest):
+def _apart(a: _Series, b: _Series, longest: float) -> float | None:
     """[s] between the knocks of two series where all are farther apart than `longest`, or None."""
     if not (len(a[1]) > 7 and len(b[1]) > 7 and _loud(a[1]).any() and _loud(b[1]).any()):
         return None
@@ -137,7 +145,7 @@ def _apart(a, b, longest):
     return float(distance) if distance > longest + MARGIN_S else None
 
 
-def _near(a, b, longest):
+def _near(a: _Series, b: _Series, longest: float) -> _Series:
     """Series `a` from a while before the other's first knock to a while after its last."""
     if len(b[1]) < 8 or not _loud(b[1]).any():
         return a
@@ -146,26 +154,27 @@ def _near(a, b, longest):
     return a[0][near], a[1][near]
 
 
-def _loud(s):
-    """Where a signal is above its rest."""
+def _loud(s: FloatArray) -> BoolArray:
+    """(n,) where a signal is above its rest."""
     rest = 1.4826 * np.median(np.abs(s - np.median(s)))
-    return s > LOUD * max(rest, 1e-3)
+    loud: BoolArray = s > LOUD * max(rest, 1e-3)
+    return loud
 
 
-def _event_times(t, s):
+def _event_times(t: FloatArray, s: FloatArray) -> tuple[float, float]:
     """(first, last) time of what is loud."""
     loud = t[_loud(s)]
     return loud[0], loud[-1]
 
 
-def _step(t, s):
+def _step(t: FloatArray, s: FloatArray) -> float:
     """[s] Sampling interval where it is loud."""
     first, last = _event_times(t, s)
     near = (t >= first - MARGIN_S) & (t <= last + MARGIN_S)
     return float(np.median(np.diff(t[near]))) if np.count_nonzero(near) > 2 else float('inf')
 
 
-def _coarse(a, b, longest):
+def _coarse(a: _Series, b: _Series, longest: float) -> tuple[float, float, str]:
     """(lag, correlation, reason) to a fraction of a sample."""
     step = 0.5 * min(_step(*a), _step(*b))
     if not np.isfinite(step):
@@ -191,7 +200,7 @@ def _coarse(a, b, longest):
     return float(lags[best]), float(c[best]), ''
 
 
-def _fine(a, b, lag):
+def _fine(a: _Series, b: _Series, lag: float) -> tuple[float, float]:
     """(offset, std) [s] where series `a`, interpolated, moved and scaled, fits `b` best."""
     offset, std = _fitted(a, b, lag, PchipInterpolator(*a, extrapolate=False))
     # What lies between two readings nobody knows: another curve through them says how much
@@ -200,7 +209,8 @@ def _fine(a, b, lag):
     return offset, float(np.hypot(std, other - offset))
 
 
-def _fitted(a, b, lag, curve):
+def _fitted(a: _Series, b: _Series, lag: float,
+            curve: PchipInterpolator | CubicSpline) -> tuple[float, float]:
     """(offset, std) [s] with `curve` as the interpolated series."""
     t, s = b
     step = max(_step(*a), _step(*b))
@@ -210,11 +220,11 @@ def _fitted(a, b, lag, curve):
     near &= (t >= a[0][0] + lag + 2.0 * step) & (t <= a[0][-1] + lag - 2.0 * step)
     t, s = t[near], s[near]
 
-    def residual(offset):
+    def residual(offset: float) -> FloatArray:
         u = curve(t - offset)
         return s - (u @ s) / (u @ u) * u
 
-    found = minimize_scalar(lambda d: np.sum(residual(d)**2), method='bounded',
+    found = minimize_scalar(lambda d: np.sum(residual(d)**2), method='bounded', args=(),
                             bounds=(lag - 2.0 * step, lag + 2.0 * step),
                             options={'xatol': 1e-6})
     u, slope = curve(t - found.x), curve.derivative()(t - found.x)

@@ -9,6 +9,8 @@ from collections import deque
 import numpy as np
 from scipy.signal import firwin, kaiserord
 
+from mag_tracking.arrays import FloatArray
+
 ATTENUATION_DB = 60.0
 """Of what would be folded into the pass band."""
 PASS_SHARE = 0.5
@@ -20,11 +22,12 @@ RATE_SAMPLES = 32
 """Samples that the rate is measured by; they are not lost."""
 
 
-def lowpass(factor):
+def lowpass(factor: int) -> FloatArray:
     """(n,) taps, n odd, that sum to one: what `factor` times fewer samples need."""
     width = 2.0 * (1.0 - PASS_SHARE) / factor
     n, beta = kaiserord(ATTENUATION_DB, width)
-    return firwin(n | 1, 1.0 / factor, window=('kaiser', beta))
+    taps: FloatArray = firwin(n | 1, 1.0 / factor, window=('kaiser', beta))
+    return taps
 
 
 class Decimator:
@@ -34,19 +37,20 @@ class Decimator:
     of the clock: a filter that runs across one would invent a field.
     """
 
-    def __init__(self, rate):
+    def __init__(self, rate: float) -> None:
         """`rate` [Hz] is what is wanted; the nearest whole share of the sensor's is made."""
         self._rate = rate
-        self.factor = None
-        self._taps = None
+        self.factor: int | None = None
+        self._taps: FloatArray | None = None
         self.reset()
 
-    def reset(self):
+    def reset(self) -> None:
         """Forget the samples; the rate stays."""
-        self._window = deque(maxlen=None if self._taps is None else len(self._taps))
+        self._window: deque[tuple[int, FloatArray]] = deque(
+            maxlen=None if self._taps is None else len(self._taps))
         self._until_next = 0
 
-    def feed(self, stamp_ns, field):
+    def feed(self, stamp_ns: int, field: FloatArray) -> list[tuple[int, FloatArray]]:
         """A sample gives [(stamp_ns, field (3,))], of the middle of the filter; mostly [].
 
         NaN where an axis is missing anywhere under the filter.
@@ -56,24 +60,24 @@ class Decimator:
         self._window.append((stamp_ns, field))
         if self.factor is None:
             return self._measure()
-        if self.factor == 1:
+        if self._taps is None:
             self._window = deque(list(self._window)[-2:])
             return [(stamp_ns, field)]
-        return self._step()
+        return self._step(self.factor, self._taps)
 
-    def noise_gain(self):
+    def noise_gain(self) -> float:
         """By what white noise's variance is multiplied; ValueError before the rate is known."""
         if self.factor is None:
             raise ValueError('the rate of the sensor is not known yet')
-        return 1.0 if self.factor == 1 else float(self._taps @ self._taps)
+        return 1.0 if self._taps is None else float(self._taps @ self._taps)
 
-    def _is_gap(self, stamp_ns):
+    def _is_gap(self, stamp_ns: int) -> bool:
         """Whether the regular row of samples is broken."""
         interval = stamp_ns - self._window[-1][0]
         return interval <= 0 or (self.factor is not None and abs(
             interval - self._interval) > IRREGULAR * self._interval)
 
-    def _measure(self):
+    def _measure(self) -> list[tuple[int, FloatArray]]:
         """The factor, once there are enough samples; those go through then."""
         if len(self._window) < RATE_SAMPLES:
             return []
@@ -85,14 +89,14 @@ class Decimator:
         self.reset()
         return [out for stamp, field in waiting for out in self.feed(stamp, field)]
 
-    def _step(self):
+    def _step(self, factor: int, taps: FloatArray) -> list[tuple[int, FloatArray]]:
         """The filter's output where one is due."""
-        if len(self._window) < len(self._taps):
+        if len(self._window) < len(taps):
             return []
         if self._until_next:
             self._until_next -= 1
             return []
-        self._until_next = self.factor - 1
+        self._until_next = factor - 1
         # The filter is symmetric: its output is of the middle sample.
-        middle = self._window[len(self._taps) // 2][0]
-        return [(middle, self._taps @ np.array([f for _, f in self._window]))]
+        middle = self._window[len(taps) // 2][0]
+        return [(middle, taps @ np.array([f for _, f in self._window]))]

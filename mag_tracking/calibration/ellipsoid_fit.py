@@ -4,19 +4,20 @@ In a uniform field the readings y of a turned sensor lie on an ellipsoid; B = C 
 a sphere. A rotation of B changes no size, so C is taken symmetric: which way the sensor's axes
 point cannot be told from sizes, and B keeps an unknown fixed rotation against the case.
 
-Source: the quadric fit and its change into offset and matrix as in Renaudin, Afzal and Lachapelle,
+Source: the change of the quadric into offset and matrix as in Renaudin, Afzal and Lachapelle,
 Complete triaxis magnetometer calibration in the magnetic domain (2010), and Kok and Schön,
-Magnetometer calibration using inertial sensors (2016), section V.A. Weights by direction, the
-robust loss, the measure of coverage and the refusals are this package's own.
+Magnetometer calibration using inertial sensors (2016), section V.A. The measure of coverage and the
+refusals are this package's own.
 """
 
 from dataclasses import dataclass
+from typing import TypedDict
 
 import numpy as np
-from scipy.optimize import least_squares
 
-from mag_tracking.calibration.directions import counted, coverage, empty_octants, even_weights
-from mag_tracking.calibration.quadric import DOUBT, OUTLIER, fit_quadric, robust_std
+from mag_tracking.arrays import BoolArray, FloatArray
+from mag_tracking.calibration.ellipsoid_refinement import BASIS, Quality, refine_ellipsoid
+from mag_tracking.calibration.quadric import DOUBT, fit_quadric
 from mag_tracking.calibration.saturation import cut_off
 
 LEAST_READINGS = 50
@@ -61,17 +62,6 @@ FEW_GLITCHES = 0.02
 """... if their share is no larger: where the sensor lay still most of the time, all others are far
 from the median."""
 
-SOFT = 2.0
-"""[std] Where the loss turns from square to linear; costs Gaussian noise little precision."""
-
-N_BLOCKS = 40
-"""Stretches of time that are left out in turn for the covariance; each must be long against the
-time over which residuals are correlated."""
-
-_UPPER = np.triu_indices(3)
-_BASIS = np.zeros((6, 3, 3))
-_BASIS[(range(6), *_UPPER)] = _BASIS[(range(6), *_UPPER[::-1])] = 1.0
-
 
 @dataclass(frozen=True)
 class EllipsoidFit:
@@ -80,9 +70,9 @@ class EllipsoidFit:
     What a refused fit could not compute is NaN.
     """
 
-    offset: np.ndarray
+    offset: FloatArray
     """(3,), unit of the readings, sensor frame: hard iron and bias."""
-    correction: np.ndarray
+    correction: FloatArray
     """(3, 3) symmetric positive definite, field unit per reading unit: soft iron, scale factors and
     skewness, up to a rotation."""
     field_size: float
@@ -92,9 +82,9 @@ class EllipsoidFit:
     """std/mean of |B| over all readings after correction, outliers and saturated ones included."""
     residual_before: float
     """std/mean of |y|."""
-    offset_std: np.ndarray
+    offset_std: FloatArray
     """(3,), unit of the readings."""
-    correction_std: np.ndarray
+    correction_std: FloatArray
     """(3, 3), of each entry of `correction`."""
     field_size_std: float
     """Zero where the field size was given."""
@@ -103,7 +93,7 @@ class EllipsoidFit:
     the nine spherical harmonics to degree two, which are what the nine parameters do to |B|. One
     for even coverage, 0.008 for half a sphere or a band of +-21 degrees, zero for a ring. Errors
     that neighbouring directions share enter up to 1/sqrt(coverage) times as large as with one."""
-    empty_octants: tuple
+    empty_octants: tuple[str, ...]
     """Names such as '+x-y+z', of corrected directions, sensor frame."""
     n_readings: int
     """Readings that the fit was made from."""
@@ -118,15 +108,37 @@ class EllipsoidFit:
     """Whether to use it."""
     reason: str
     """Why not; empty when converged."""
-    warnings: tuple
+    warnings: tuple[str, ...]
     """What to know before using it."""
 
-    def correct(self, readings):
+    def correct(self, readings: FloatArray) -> FloatArray:
         """(n, 3) corrected field of `readings` (n, 3)."""
-        return (np.asarray(readings, dtype=float) - self.offset) @ self.correction
+        field: FloatArray = (np.asarray(readings, dtype=float) - self.offset) @ self.correction
+        return field
 
 
-def fit_ellipsoid(readings, field_size=None):
+class _Counts(TypedDict):
+    """What is known of the readings alone; as in `EllipsoidFit`."""
+
+    n_readings: int
+    n_missing: int
+    n_saturated: int
+    n_outliers: int
+    residual_before: float
+
+
+class _Parameters(TypedDict):
+    """Parameters and deviations in the readings' units; as in `EllipsoidFit`."""
+
+    offset: FloatArray
+    correction: FloatArray
+    field_size: float
+    offset_std: FloatArray
+    correction_std: FloatArray
+    field_size_std: float
+
+
+def fit_ellipsoid(readings: FloatArray, field_size: float | None = None) -> EllipsoidFit:
     """Offset and symmetric correction that give all readings one size.
 
     A linear quadric fit starts a robust geometric least squares on |C (y - o)|. Readings count
@@ -152,14 +164,15 @@ def fit_ellipsoid(readings, field_size=None):
         Readings that are not (n, 3), one that is infinite, a field size that is not positive.
     """
     readings = _checked(readings, field_size)
-    present = ~np.isnan(readings).any(axis=1)
+    present: BoolArray = ~np.any(np.isnan(readings), axis=1)
     cut = np.stack([cut_off(axis) for axis in readings.T], axis=1) & present[:, None]
     used = readings[present & ~cut.any(axis=1)]
     glitches = _glitches(used)
     used = used[~glitches]
-    counts = {'n_readings': len(used), 'n_missing': int((~present).sum()),
-              'n_saturated': int(cut.any(axis=1).sum()), 'n_outliers': int(glitches.sum()),
-              'residual_before': _spread(np.linalg.norm(readings[present], axis=1))}
+    counts: _Counts = {
+        'n_readings': len(used), 'n_missing': int((~present).sum()),
+        'n_saturated': int(cut.any(axis=1).sum()), 'n_outliers': int(glitches.sum()),
+        'residual_before': _spread(np.linalg.norm(readings[present], axis=1))}
     notes = _notes_on_input(counts, cut)
     reason = _too_little(used)
     if reason:
@@ -169,7 +182,7 @@ def fit_ellipsoid(readings, field_size=None):
     o, C, reason = fit_quadric(z)
     if reason:
         return _refused(reason, counts, notes)
-    o, C, P, quality = _geometric(z, o, C)
+    o, C, P, quality = refine_ellipsoid(z, o, C)
     axes = np.linalg.eigvalsh(C)
     if not axes[0] * MOST_ELONGATED >= axes[2]:
         return _refused(f'axes of the ellipsoid are as {axes[0]:.2g} to {axes[2]:.2g}, at most 1 '
@@ -185,7 +198,7 @@ def fit_ellipsoid(readings, field_size=None):
                         warnings=notes + _notes_on_fit(residual, quality, share))
 
 
-def _checked(readings, field_size):
+def _checked(readings: FloatArray, field_size: float | None) -> FloatArray:
     """(n, 3) readings, or ValueError."""
     readings = np.asarray(readings, dtype=float)
     if readings.ndim != 2 or readings.shape[1] != 3:
@@ -198,31 +211,33 @@ def _checked(readings, field_size):
     return readings
 
 
-def _spread(sizes):
+def _spread(sizes: FloatArray) -> float:
     """std/mean; NaN without readings or with zeros only."""
     return float(sizes.std() / sizes.mean()) if sizes.any() else float('nan')
 
 
-def _notes_on_input(counts, cut):
+def _notes_on_input(counts: _Counts, cut: BoolArray) -> tuple[str, ...]:
     """Warnings about readings that are left out."""
-    notes = ()
+    notes: tuple[str, ...] = ()
     if counts['n_missing']:
         notes += (f'{counts["n_missing"]} readings with a missing axis are left out',)
     if counts['n_saturated']:
-        axes = ', '.join(name for name, any_ in zip('xyz', cut.any(axis=0), strict=True) if any_)
+        axes = ', '.join(name for name, is_cut in zip('xyz', np.any(cut, axis=0), strict=True)
+                         if is_cut)
         notes += (f'{counts["n_saturated"]} readings at the end of the range of {axes} '
                   'are left out',)
     return notes
 
 
-def _glitches(y):
+def _glitches(y: FloatArray) -> BoolArray:
     """(n,) bool, few readings far from all others."""
     distance = np.linalg.norm(y - np.median(y, axis=0), axis=1) if len(y) else np.zeros(0)
     far = distance > GLITCH * np.median(distance) if len(y) else np.zeros(0, dtype=bool)
-    return far & (far.sum() <= FEW_GLITCHES * len(y))
+    few: BoolArray = far & (far.sum() <= FEW_GLITCHES * len(y))
+    return few
 
 
-def _too_little(y):
+def _too_little(y: FloatArray) -> str:
     """Why no quadric can be fitted; empty where one can."""
     if len(y) < LEAST_READINGS:
         return f'{len(y)} readings, needs {LEAST_READINGS}'
@@ -237,79 +252,25 @@ def _too_little(y):
     return ''
 
 
-def _geometric(z, o, C):
-    """Offset, correction, covariance (9, 9) and quality of the robust fit of |C (z - o)| = 1."""
-    theta = np.concatenate([o, C[_UPPER]])
-    for _ in range(2):
-        w = even_weights(_model(theta, z)[0])
-        scale = SOFT * robust_std(_model(theta, z)[1], w)
-        fit = least_squares(lambda p, s=scale: _model(p, z)[1] / s, theta,
-                            jac=lambda p, s=scale: _model(p, z)[2] / s,
-                            loss=lambda square, w=w: _loss(square, w), max_nfev=100)
-        theta = fit.x
-    q, d, J = _model(theta, z)
-    fine = np.abs(d) <= OUTLIER * robust_std(d, w)
-    u, _, n = counted(q[fine])
-    quality = {'solved': fit.status > 0, 'directions': int((n > 0).sum()),
-               'coverage': coverage(u, w[fine]),
-               'scatter': float(np.sqrt(np.average(d[fine]**2, weights=w[fine]))),
-               'n_outliers': int((~fine).sum()),
-               'empty': empty_octants(u, w[fine])}
-    C = np.tensordot(theta[3:], _BASIS, 1)
-    return theta[:3], C, _covariance(d / scale, J / scale, w), quality
-
-
-def _model(theta, z):
-    """Corrected readings (n, 3), their sizes less one (n,), and its Jacobian (n, 9)."""
-    C = np.tensordot(theta[3:], _BASIS, 1)
-    y = z - theta[:3]
-    q = y @ C
-    r = np.linalg.norm(q, axis=1)
-    u = q / np.maximum(r, 1e-12)[:, None]
-    return q, r - 1.0, np.column_stack([-u @ C, np.einsum('ni,kij,nj->nk', u, _BASIS, y)])
-
-
-def _loss(square, w):
-    """Weighted soft L1 and its two derivatives, as scipy wants them."""
-    root = np.sqrt(1.0 + square)
-    return w * np.stack([2.0 * (root - 1.0), 1.0 / root, -0.5 / root**3])
-
-
-def _covariance(f, J, w):
-    """(9, 9) by leaving out stretches of time in turn, one Newton step each; inf if one is vital.
-
-    Residuals of a real sensor are correlated in time; what their number promises is not true.
-    """
-    n_blocks = min(N_BLOCKS, len(f))
-    starts = np.arange(n_blocks) * len(f) // n_blocks
-    scores = np.add.reduceat((w * f / np.sqrt(1.0 + f * f))[:, None] * J, starts)
-    K = np.sqrt(w * (1.0 + f * f)**-1.5)[:, None] * J
-    parts = np.stack([k.T @ k for k in np.split(K, starts[1:])])
-    try:
-        steps = np.linalg.solve(parts.sum(axis=0) - parts, scores[:, :, None])[:, :, 0]
-    except np.linalg.LinAlgError:
-        return np.full((9, 9), np.inf)
-    return (n_blocks - 1) / n_blocks * steps.T @ steps
-
-
-def _in_units(o, C, P, centre, scale, field_size):
+def _in_units(o: FloatArray, C: FloatArray, P: FloatArray, centre: FloatArray, scale: float,
+              field_size: float | None) -> _Parameters:
     """Parameters and deviations in the readings' units, by name."""
     volume = np.linalg.det(C)**(-1.0 / 3.0)
-    t = np.einsum('ij,kji->k', np.linalg.inv(C), _BASIS)
+    t = np.einsum('ij,kji->k', np.linalg.inv(C), BASIS)
     if field_size is None:
         k, size = volume, scale * volume
-        D = k * (_BASIS - C * t[:, None, None] / 3.0)
+        D = k * (BASIS - C * t[:, None, None] / 3.0)
         size_std = size / 3.0 * np.sqrt(t @ P[3:, 3:] @ t)
     else:
         k, size, size_std = field_size / scale, float(field_size), 0.0
-        D = k * _BASIS
+        D = k * BASIS
     return {'offset': centre + scale * o, 'correction': k * C, 'field_size': float(size),
             'offset_std': scale * np.sqrt(np.diagonal(P)[:3]),
             'correction_std': np.sqrt(np.einsum('kij,kl,lij->ij', D, P[3:, 3:], D)),
             'field_size_std': float(size_std)}
 
 
-def _why_refused(C, P, quality, outliers):
+def _why_refused(C: FloatArray, P: FloatArray, quality: Quality, outliers: float) -> str:
     """Why a fit is not to be used; empty where it is."""
     if quality['scatter'] > MOST_SCATTER:
         return (f'readings scatter {quality["scatter"]:.2g} of the radius about the ellipsoid, at '
@@ -327,7 +288,7 @@ def _why_refused(C, P, quality, outliers):
     return '' if quality['solved'] else 'least squares did not converge in 100 evaluations'
 
 
-def _notes_on_fit(residual, quality, outliers):
+def _notes_on_fit(residual: float, quality: Quality, outliers: float) -> tuple[str, ...]:
     """Warnings about coverage, residual and outliers."""
     checks = {
         f'coverage {quality["coverage"]:.2g}, good is {GOOD_COVERAGE}':
@@ -339,7 +300,7 @@ def _notes_on_fit(residual, quality, outliers):
     return tuple(note for note, holds in checks.items() if holds)
 
 
-def _refused(reason, counts, notes):
+def _refused(reason: str, counts: _Counts, notes: tuple[str, ...]) -> EllipsoidFit:
     """A fit of which nothing is known but why."""
     nan = float('nan')
     return EllipsoidFit(

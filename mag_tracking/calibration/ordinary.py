@@ -5,8 +5,12 @@ them nothing is odd. Those take the compiled way. At the first that is odd it
 stops, and Python, which knows all cases, goes on from the same arrays.
 """
 
+from typing import Any, TypeAlias
+
 import numpy as np
 from numba import float64, from_dtype, int64, njit, void
+
+from mag_tracking.arrays import FloatArray, IntArray, StructArray
 
 NEVER = np.iinfo(np.int64).min
 """[ns] Stamp of what has not been."""
@@ -46,10 +50,14 @@ LIMITS = np.dtype([('max_field', np.float64), ('longest_jump_ns', np.float64),
                    ('reject_stuck', np.int64), ('spike_std', np.float64)])
 """What is asked of each reading; as in `CalibrateSettings`."""
 
+_Record: TypeAlias = Any
+"""One SENSOR or LIMITS in compiled code, where its fields are attributes; NumPy's types know of no
+such."""
+
 _SENSORS, _LIMITS = from_dtype(SENSOR)[::1], from_dtype(LIMITS)[::1]
 
 
-def new_sensors(n):
+def new_sensors(n: int) -> StructArray:
     """(n,) SENSOR of which nothing has been heard."""
     sensors = np.zeros(n, SENSOR)
     for name in ('first_ns', 'last_ns', 'before_ns'):
@@ -60,13 +68,14 @@ def new_sensors(n):
 
 
 @njit(cache=True, inline='always')
-def _ends_block(s, time):
+def _ends_block(s: _Record, time: float) -> bool:
     """Whether a reading at `time` [s] is the first behind the block that is being collected."""
-    return time >= s.end and s.n[s.now] >= LEAST_SAMPLES
+    is_behind: bool = time >= s.end and s.n[s.now] >= LEAST_SAMPLES
+    return is_behind
 
 
 @njit(cache=True, inline='always')
-def _begin_block(s, time):
+def _begin_block(s: _Record, time: float) -> None:
     """Collect the next block, from a reading at `time` [s] on."""
     if np.isnan(s.end):
         s.end = time + s.length * (1.0 if np.isnan(s.phase) else 1.0 + s.phase)
@@ -82,12 +91,12 @@ def _begin_block(s, time):
 
 
 @njit(void(_SENSORS, int64, float64, float64[::1]), cache=True)
-def add_to_block(sensors, j, time, field):
+def add_to_block(sensors: StructArray, j: int, time: float, field: FloatArray) -> None:
     """Take a reading of sensor `j`, `field` (3,) [T] at `time` [s], into its block.
 
     What was complete before (`is_full`) has to have been used by now.
     """
-    s = sensors[j]
+    s: _Record = sensors[j]
     if np.isnan(s.end) or _ends_block(s, time):
         _begin_block(s, time)
     k = s.now
@@ -115,7 +124,8 @@ def add_to_block(sensors, j, time, field):
 
 
 @njit(cache=True, inline='always')
-def _without_iron(raw, offset, is_turned, correction, field):
+def _without_iron(raw: FloatArray, offset: FloatArray, is_turned: int, correction: FloatArray,
+                  field: FloatArray) -> None:
     """`without_iron`."""
     for a in range(3):
         field[a] = raw[a] - offset[a]
@@ -126,7 +136,8 @@ def _without_iron(raw, offset, is_turned, correction, field):
 
 
 @njit(void(float64[::1], float64[::1], int64, float64[:, ::1], float64[::1]), cache=True)
-def without_iron(raw, offset, is_turned, correction, field):
+def without_iron(raw: FloatArray, offset: FloatArray, is_turned: int, correction: FloatArray,
+                 field: FloatArray) -> None:
     """`raw` (3,) [T] without the sensor's own hard and soft iron, into `field`.
 
     To the last bit the same for all: readings that repeat themselves have to stay alike.
@@ -135,7 +146,8 @@ def without_iron(raw, offset, is_turned, correction, field):
 
 
 @njit(cache=True, inline='always')
-def _is_odd(s, limits, stamp, raw, field, time):
+def _is_odd(s: _Record, limits: _Record, stamp: int, raw: FloatArray, field: FloatArray,
+            time: float) -> bool:
     """Whether there is anything that Python has to look at."""
     for a in range(3):
         # A comparison with NaN is false: an axis that is missing is odd.
@@ -162,7 +174,9 @@ def _is_odd(s, limits, stamp, raw, field, time):
 
 @njit(int64(_SENSORS, _LIMITS, int64[::1], int64[::1], float64[:, ::1], int64, int64[::1],
             float64[:, ::1]), cache=True)
-def take_ordinary(sensors, limits, rows, stamps, fields, first, out_stamps, out_fields):
+def take_ordinary(sensors: StructArray, limits: StructArray, rows: IntArray, stamps: IntArray,
+                  fields: FloatArray, first: int, out_stamps: IntArray,
+                  out_fields: FloatArray) -> int:
     """Calibrate readings from the one at `first` on, as long as there is nothing odd about them.
 
     Parameters
@@ -185,11 +199,12 @@ def take_ordinary(sensors, limits, rows, stamps, fields, first, out_stamps, out_
     int
         The first reading that is odd, which nothing was done with; n if there is none.
     """
-    limit, field = limits[0], np.empty(3)
+    limit: _Record = limits[0]
+    field = np.empty(3)
     for i in range(first, len(rows)):
         if rows[i] < 0 or not sensors[rows[i]].is_ordinary:
             return i
-        s = sensors[rows[i]]
+        s: _Record = sensors[rows[i]]
         stamp = stamps[i] - s.clock_ns
         time = (stamp - s.first_ns) / 1e9
         _without_iron(fields[i], s.offset, s.is_turned, s.correction, field)

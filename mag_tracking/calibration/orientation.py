@@ -3,10 +3,13 @@
 Source: T10 section 6.3.1, eq. (6.2)-(6.9); how well each is known is this package's own.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.geometry import (
     quaternion_between,
     rotation_about_z,
@@ -32,12 +35,15 @@ ALIKE = 1.0
 UNKNOWN = np.deg2rad(60.0)
 """[rad] A heading that is less certain than this is none."""
 
+_Fit: TypeAlias = Callable[[float], tuple[FloatArray, FloatArray]]
+"""Of a yaw [rad] the residual and the field's derivative by it, both (n,)."""
+
 
 @dataclass(frozen=True)
 class Up:
     """Where up is for a sensor at rest."""
 
-    direction: np.ndarray
+    direction: FloatArray
     """(3,) unit vector, sensor frame."""
     size: float
     """[m/s^2] of gravity as the sensor measures it."""
@@ -49,7 +55,7 @@ class Up:
     """Readings that were knocks, or not finite."""
 
 
-def up_direction(acceleration, bias):
+def up_direction(acceleration: FloatArray, bias: float) -> Up:
     """Where up is, by a sensor at rest: what it measures then is the reaction to gravity.
 
     Parameters
@@ -90,18 +96,19 @@ def up_direction(acceleration, bias):
 class Orientation:
     """How a sensor is turned, and how well that is known."""
 
-    R_ws: np.ndarray
+    R_ws: FloatArray
     """(3, 3), sensor to world."""
-    std: np.ndarray
+    std: FloatArray
     """(3,) [rad] of small rotations about the world's axes."""
-    bias: np.ndarray
+    bias: FloatArray
     """(3,) [T], sensor frame: measured less the Earth's field; NaN of an axis not reported. Of it
     the part across the heading was taken for heading."""
     rival: float
     """[rad] Another heading that fits as well, from this one; NaN where there is none."""
 
 
-def compass_orientation(up, field, earth_field, bias_std, stated=None):
+def compass_orientation(up: Up, field: FloatArray, earth_field: FloatArray, bias_std: float,
+                        stated: FloatArray | None = None) -> Orientation:
     """The orientation of a sensor from where up is and the Earth's field.
 
     Parameters
@@ -129,7 +136,7 @@ def compass_orientation(up, field, earth_field, bias_std, stated=None):
     R_level = rotation_from_quaternion(quaternion_between(up.direction, [0.0, 0.0, 1.0]))
     across = np.cross([0.0, 0.0, 1.0], B0)
 
-    def fit(yaw):
+    def fit(yaw: float) -> tuple[FloatArray, FloatArray]:
         """Residual on the axes that are there, and the field's derivative by the yaw."""
         R_sw = (rotation_about_z(yaw) @ R_level).T
         return (y - R_sw @ B0)[there], -(R_sw @ across)[there]
@@ -155,21 +162,21 @@ def compass_orientation(up, field, earth_field, bias_std, stated=None):
                        min(rivals, key=abs) if rivals else float('nan'))
 
 
-def _refined(fit, yaw):
+def _refined(fit: _Fit, yaw: float) -> float:
     """The yaw where Gauss-Newton steps, none above half a radian, lead."""
     for _ in range(30):
         residual, slope = fit(yaw)
         square = slope @ slope
         if square == 0.0:
             break
-        step = np.clip(slope @ residual / square, -0.5, 0.5)
+        step = float(np.clip(slope @ residual / square, -0.5, 0.5))
         yaw += step
         if abs(step) < 1e-12:
             break
     return yaw
 
 
-def levelled(up, stated, stated_std):
+def levelled(up: Up | None, stated: FloatArray, stated_std: FloatArray) -> Orientation | None:
     """A stated orientation, tilted so that up is up.
 
     Parameters
@@ -189,7 +196,8 @@ def levelled(up, stated, stated_std):
                        np.full(3, np.nan), float('nan'))
 
 
-def pooled_bias_std(orientations, bias_std, weight=4.0):
+def pooled_bias_std(orientations: Sequence[Orientation], bias_std: float,
+                    weight: float = 4.0) -> float:
     """[T] How large the biases of a network's sensors are, by what can be seen of them.
 
     Parameters
@@ -207,7 +215,8 @@ def pooled_bias_std(orientations, bias_std, weight=4.0):
     return float(np.sqrt((weight * bias_std**2 + square) / (weight + seen)))
 
 
-def with_stated_heading(orientation, stated, stated_std, limit=3.0):
+def with_stated_heading(orientation: Orientation, stated: FloatArray, stated_std: float,
+                        limit: float = 3.0) -> Orientation | None:
     """Heading by the compass and by what an installer stated, each as good as it is.
 
     Parameters

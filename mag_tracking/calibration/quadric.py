@@ -6,6 +6,7 @@ domain (2010); the weights by direction and the outliers set aside are this pack
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.directions import even_weights
 
 OUTLIER = 4.0
@@ -17,11 +18,15 @@ LEAST_SCALE = 1e-9
 DOUBT = 'too few directions, a sensor that lay still, or a field that is not uniform'
 
 
-def fit_quadric(z):
-    """Offset, correction and reason of a linear fit to normalised readings, outliers set aside."""
+def fit_quadric(z: FloatArray) -> tuple[FloatArray, FloatArray, str]:
+    """Offset (3,), correction (3, 3) and reason of a linear fit to normalised readings (n, 3).
+
+    Outliers are set aside.
+    """
     # Half-way between the extremes is inside, however long the sensor lay still somewhere.
     w = even_weights(z - 0.5 * (z.min(axis=0) + z.max(axis=0)))
-    o, C = np.full(3, np.nan), np.full((3, 3), np.nan)
+    o: FloatArray = np.full(3, np.nan)
+    C: FloatArray = np.full((3, 3), np.nan)
     for _ in range(5):
         x, y, v = z.T
         # sqrt(2) makes the length of the vector of coefficients independent of the axes.
@@ -48,8 +53,8 @@ def fit_quadric(z):
     return o, C, ''
 
 
-def robust_std(d, w):
-    """Standard deviation from the weighted median of |d|."""
+def robust_std(d: FloatArray, w: FloatArray) -> float:
+    """Standard deviation from the weighted median of |d|; `d` and weights `w` are (n,)."""
     order = np.argsort(np.abs(d))
     total = np.cumsum(w[order])
     middle = np.abs(d)[order][np.searchsorted(total, 0.5 * total[-1])]

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from mag_tracking.arrays import BoolArray, FloatArray
+
 LEAST_RUN = 3
 """So many equal readings in a row at an extreme are cut off ..."""
 
@@ -14,7 +16,7 @@ MARGIN = 6
 their neighbours over the limit, and what is left of them is on one side of the truth."""
 
 
-def cut_off(values):
+def cut_off(values: FloatArray) -> BoolArray:
     """Which readings of one axis stand at the end of its range, or beside such.
 
     Noise makes equal neighbours rare, and where steps are coarse a curve comes to its extreme

@@ -4,8 +4,11 @@ Neither waits for more than what is odd: all other readings pass at once.
 """
 
 import math
+from collections.abc import Sequence
 from math import isnan
+from typing import Generic, TypeAlias, TypeVar
 
+from mag_tracking.arrays import StructArray
 from mag_tracking.calibration.ordinary import MEMORY, NEVER, RECENT, new_sensors
 
 LEAST_CHANGES = 50
@@ -31,6 +34,10 @@ BACK = 0.3
 STUCK, SPIKE = 'the same reading over and over', 'spike'
 """Why a reading is rejected."""
 
+Item = TypeVar('Item')
+"""Whatever a reading is to who feeds it."""
+_Steps: TypeAlias = tuple[float, float, float]
+
 
 class Repetition:
     """Tells when a sensor repeats itself longer than chance, or its coarse steps, would have it.
@@ -38,10 +45,10 @@ class Repetition:
     Its state is in `sensors`, (1,) `ordinary.SENSOR`.
     """
 
-    def __init__(self, sensors=None):
+    def __init__(self, sensors: StructArray | None = None) -> None:
         self._state = (new_sensors(1) if sensors is None else sensors)[0]
 
-    def is_stuck(self, field):
+    def is_stuck(self, field: list[float]) -> bool:
         """Whether the reading `field`, a list of three, is one of a sensor that is stuck."""
         s = self._state
         last, s['last'] = s['last'].tolist(), field
@@ -60,7 +67,7 @@ class Repetition:
         s['run'] += 1
         return self._too_long()
 
-    def _too_long(self):
+    def _too_long(self) -> bool:
         """Whether the run so far is longer than what is likely."""
         run, repeats, changes = (self._state[k] for k in ('run', 'repeats', 'changes'))
         if run < SHORTEST_RUN or changes < LEAST_CHANGES:
@@ -69,7 +76,7 @@ class Repetition:
         return bool(usual < COARSE and run * math.log(usual) < LIKELY)
 
 
-class SpikeFilter:
+class SpikeFilter(Generic[Item]):
     """Holds a reading that is steeply off until those behind it tell whether it was a spike.
 
     A reading is off where it differs from the one before by more than `threshold`
@@ -79,22 +86,23 @@ class SpikeFilter:
     not held is in `sensors`, (1,) `ordinary.SENSOR`.
     """
 
-    def __init__(self, threshold, sensors=None):
+    def __init__(self, threshold: float, sensors: StructArray | None = None) -> None:
         self._threshold = threshold
         self._state = (new_sensors(1) if sensors is None else sensors)[0]
         self.clear()
 
     @property
-    def n_held(self):
+    def n_held(self) -> int:
         """How many readings are held."""
         return len(self._held)
 
-    def clear(self):
+    def clear(self) -> None:
         """Forget what came before."""
-        self._held = []
+        self._held: list[tuple[Item, int, list[float], _Steps]] = []
         self._state['before_ns'], self._state['n_steps'] = NEVER, 0
 
-    def feed(self, item, stamp_ns, field, noise_std):
+    def feed(self, item: Item, stamp_ns: int, field: list[float],
+             noise_std: Sequence[float] | None) -> list[tuple[Item, bool]]:
         """What is known by now of `item`, a reading, and of those that are held.
 
         Parameters
@@ -119,14 +127,15 @@ class SpikeFilter:
             return self._settle(*new, steps, noise_std)
         return self._judge(*new, steps, noise_std)
 
-    def _judge(self, item, stamp_ns, field, steps, noise_std):
+    def _judge(self, item: Item, stamp_ns: int, field: list[float], steps: _Steps,
+               noise_std: Sequence[float]) -> list[tuple[Item, bool]]:
         """Hold a reading that may be a spike; else it passes."""
         if self._state['n_steps'] >= RECENT and self._is_off(stamp_ns, steps, noise_std):
             self._held.append((item, stamp_ns, field, steps))
             return []
         return self._release(item, stamp_ns, field, steps)
 
-    def _is_off(self, stamp_ns, steps, noise_std):
+    def _is_off(self, stamp_ns: int, steps: _Steps, noise_std: Sequence[float]) -> bool:
         """Whether `steps` from the reading before are steeper than what passes could make them."""
         # A comparison with NaN is false: an axis that is missing is no spike.
         (x, y, z), (a, b, c), most = steps, noise_std, self._threshold
@@ -142,7 +151,8 @@ class SpikeFilter:
                 return True
         return False
 
-    def _settle(self, item, stamp_ns, field, steps, noise_std):
+    def _settle(self, item: Item, stamp_ns: int, field: list[float], steps: _Steps,
+                noise_std: Sequence[float]) -> list[tuple[Item, bool]]:
         """Whether what is held was a spike, if `field` tells."""
         largest = [max((h[3][axis] for h in self._held if not isnan(h[3][axis])),
                        default=0.0)
@@ -162,7 +172,8 @@ class SpikeFilter:
         self._state['n_steps'] = 0
         return known + self._release(item, stamp_ns, field)
 
-    def _release(self, item, stamp_ns, field, steps=None):
+    def _release(self, item: Item, stamp_ns: int, field: list[float],
+                 steps: _Steps | None = None) -> list[tuple[Item, bool]]:
         """The reading passes."""
         s = self._state
         s['before'], s['before_ns'] = field, stamp_ns
@@ -171,7 +182,7 @@ class SpikeFilter:
             s['n_steps'] += 1
         return [(item, False)]
 
-    def flush(self):
+    def flush(self) -> list[tuple[Item, bool]]:
         """What is held when nothing comes any more: readings like others, as far as is known."""
         out = [(h[0], False) for h in self._held]
         self.clear()

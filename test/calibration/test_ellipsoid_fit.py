@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.stats import binom, special_ortho_group, t
 
-from mag_tracking.calibration import ellipsoid_fit
-from mag_tracking.calibration.ellipsoid_fit import N_BLOCKS, fit_ellipsoid
+from mag_tracking.calibration import ellipsoid_refinement
+from mag_tracking.calibration.ellipsoid_fit import fit_ellipsoid
+from mag_tracking.calibration.ellipsoid_refinement import N_BLOCKS
 from support.bundled import DATA
 
 CORRECTION = np.array([[1.1, 0.05, -0.02], [0.05, 0.9, 0.03], [-0.02, 0.03, 1.05]])
@@ -320,8 +321,8 @@ def test_an_offset_that_is_uncertain_is_refused():
 
 
 def test_least_squares_that_stop_early_are_refused(monkeypatch):
-    solve = ellipsoid_fit.least_squares
-    monkeypatch.setattr(ellipsoid_fit, 'least_squares',
+    solve = ellipsoid_refinement.least_squares
+    monkeypatch.setattr(ellipsoid_refinement, 'least_squares',
                         lambda *a, **k: solve(*a, **(k | {'max_nfev': 1})))
     fit = fit_ellipsoid(readings(EVEN))
     assert not fit.converged and 'least squares did not converge' in fit.reason
