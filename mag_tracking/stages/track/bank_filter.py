@@ -71,7 +71,8 @@ class BankFilter:
         """
         x = self.observation.without_errors(bank.x[i:i + 1])
         h, _, _ = self.fields(x, bank.kind[i:i + 1], frame, dt)
-        return h[0] + x[0, -3 * self._n_sensors:].reshape(-1, 3)
+        field: FloatArray = h[0] + x[0, -3 * self._n_sensors:].reshape(-1, 3)
+        return field
 
     def update(self, bank: FilterBank, frame: FieldFrame, dt: float,
                x_lin: FloatArray | None = None) -> FloatArray:

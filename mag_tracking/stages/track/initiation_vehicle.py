@@ -146,9 +146,10 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
         for label, heading in enumerate(np.deg2rad(settings.arrival_headings_deg)):
             R = rotation_about_z(heading)
             hard = (moments - settings.soft_iron * _earth_field(network) / MU0) @ R
+            velocities = np.array(settings.speeds)[:, None] * R[:, 0]
             starts = _matching_positions(settings, network, measured, R, moments,
                                          settings.heights[kind])
-            states.append(_states(settings, kind, starts, np.outer(settings.speeds, R[:, 0]), hard))
+            states.append(_states(settings, kind, starts, velocities, hard))
             by_speed = np.array([_covariance(settings, kind, R, v) for v in settings.speeds])
             covariances.append(np.tile(by_speed.repeat(len(moments), 0), (len(starts), 1, 1)))
             labels += [label] * len(states[-1])

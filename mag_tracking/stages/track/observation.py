@@ -26,7 +26,8 @@ def angle_priors(network: SensorNetwork, mounting_std: float) -> FloatArray:
     std = [np.full(3, mounting_std) if s is None else np.minimum(s, MOST_TURNED)
            for s in network.orientation_std]
     # The angles are about the sensor's axes, what is known of them about the world's.
-    return np.einsum('jik,jk,jlk->jil', network.R_sw, np.square(std), network.R_sw)
+    priors: FloatArray = np.einsum('jik,jk,jlk->jil', network.R_sw, np.square(std), network.R_sw)
+    return priors
 
 
 class Observation:

@@ -87,4 +87,5 @@ def acceleration_density(settings: TrackSettings) -> FloatArray:
     if settings.target == 'magnet':
         return np.full(3, settings.magnet.acceleration**2)
     v = settings.vehicle
-    return np.square(np.array([v.acceleration, v.acceleration, v.climb_acceleration]))
+    density: FloatArray = np.square([v.acceleration, v.acceleration, v.climb_acceleration])
+    return density
