@@ -1,10 +1,11 @@
 """What every step of the way has in common."""
 
 from collections import Counter
+from collections.abc import Mapping
 from typing import Protocol, TypeVar
 
 In = TypeVar('In', contravariant=True)
-Out = TypeVar('Out', covariant=True)
+Out = TypeVar('Out')
 
 
 class Stage(Protocol[In, Out]):
@@ -15,7 +16,7 @@ class Stage(Protocol[In, Out]):
     cause, so that nothing is lost without a word.
     """
 
-    counts: Counter
+    counts: Counter[str]
 
     def feed(self, item: In) -> list[Out]:
         """Take one record; return the records that follow from it."""
@@ -24,7 +25,7 @@ class Stage(Protocol[In, Out]):
         """The input has ended: return what was still held back."""
 
 
-def rejected(counts):
+def rejected(counts: Mapping[str, int]) -> dict[str, int]:
     """The rejections among `counts`: {cause: number}, without their prefix."""
     return {k.removeprefix('rejected: '): n for k, n in sorted(counts.items())
             if k.startswith('rejected: ')}

@@ -11,7 +11,9 @@ import numpy as np
 from mag_tracking.errors import SettingsError
 from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.detection_theory import energy_threshold
-from mag_tracking.records import Detection
+from mag_tracking.network import SensorNetwork
+from mag_tracking.records import Detection, FieldFrame
+from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.units import NS
 
 RECOVERY_S = 5.0
@@ -21,39 +23,41 @@ RECOVERY_S = 5.0
 class Detect:
     """Frames to frames with a verdict, and a `Detection` at onset and release."""
 
-    def __init__(self, network, settings):
+    def __init__(self, network: SensorNetwork, settings: DetectSettings) -> None:
         if settings.release_probability < settings.false_alarm_probability:
             raise SettingsError(
                 f'detect.release_probability: {settings.release_probability:g} is below '
                 f'false_alarm_probability ({settings.false_alarm_probability:g}): what is loud '
                 'enough to begin would be quiet enough to end')
-        self.counts = Counter()
+        self.counts: Counter[str] = Counter()
         self._names = network.names
         self._settings = settings
-        self._thresholds = {}
+        self._thresholds: dict[tuple[float, int], float] = {}
         self._next_id = 1
         self._reset()
 
-    def _reset(self):
+    def _reset(self) -> None:
         """No target."""
         self._present = False
         self._above = 0
-        self._last_ns = self._loud_ns = self._onset_ns = None
+        self._last_ns: int | None = None
+        self._loud_ns: int | None = None
+        self._onset_ns: int | None = None
         self._unlearnt_s = 0.0
 
-    def threshold(self, probability, degrees_of_freedom):
+    def threshold(self, probability: float, degrees_of_freedom: int) -> float:
         """Threshold of the energy, remembered."""
         key = probability, degrees_of_freedom
         if key not in self._thresholds:
             self._thresholds[key] = float(energy_threshold(probability, degrees_of_freedom))
         return self._thresholds[key]
 
-    def feed(self, frame):
+    def feed(self, frame: FieldFrame) -> list[FieldFrame | Detection]:
         """A `FieldFrame` gives itself with the verdict, after any `Detection`."""
-        out = []
+        out: list[FieldFrame | Detection] = []
         if self._last_ns is not None and frame.stamp_ns <= self._last_ns:
             self.counts['time jumped back'] += 1
-            out = self._release(self._last_ns, float('nan'), 0, '')
+            out += self._release(self._last_ns, float('nan'), 0, '')
             self._reset()
         self._last_ns = frame.stamp_ns
         try:
@@ -72,16 +76,16 @@ class Detect:
         return [*out, replace(frame, target_present=self._present, statistic=statistic,
                               degrees_of_freedom=n)]
 
-    def _allowance(self, stamp_ns):
+    def _allowance(self, stamp_ns: int) -> float:
         """[T^2] Variance of what the background may be off by."""
-        if self._present:
+        if self._present and self._onset_ns is not None:
             self._unlearnt_s = (stamp_ns - self._onset_ns) / NS
         elif self._loud_ns is not None and stamp_ns - self._loud_ns > RECOVERY_S * NS:
             self._unlearnt_s = 0.0
         s = self._settings
         return (s.background_std + s.background_drift * self._unlearnt_s) ** 2
 
-    def _judge(self, stamp_ns, statistic, n, strongest):
+    def _judge(self, stamp_ns: int, statistic: float, n: int, strongest: str) -> list[Detection]:
         """Onset, hold and release; the detections that follow."""
         s = self._settings
         if statistic > self.threshold(s.false_alarm_probability, n):
@@ -97,11 +101,12 @@ class Detect:
             self._onset_ns = stamp_ns - int(self._unlearnt_s * NS)
             self.counts['onsets'] += 1
             return [self._detection(stamp_ns, True, statistic, n, strongest)]
-        if self._present and stamp_ns - self._loud_ns > s.hold_s * NS:
+        if self._present and self._loud_ns is not None \
+                and stamp_ns - self._loud_ns > s.hold_s * NS:
             return self._release(stamp_ns, statistic, n, strongest)
         return []
 
-    def _release(self, stamp_ns, statistic, n, strongest):
+    def _release(self, stamp_ns: int, statistic: float, n: int, strongest: str) -> list[Detection]:
         """End the detection, if there is one."""
         if not self._present:
             return []
@@ -110,12 +115,13 @@ class Detect:
         self._next_id += 1
         return [detection]
 
-    def _detection(self, stamp_ns, onset, statistic, n, strongest):
+    def _detection(self, stamp_ns: int, onset: bool, statistic: float, n: int,
+                   strongest: str) -> Detection:
         """The record."""
         p = self._settings.false_alarm_probability
         return Detection(stamp_ns, self._next_id, onset, statistic, n,
                          self.threshold(p, n) if n else float('nan'), p, strongest)
 
-    def flush(self):
+    def flush(self) -> list[FieldFrame | Detection]:
         """Nothing is held back: []."""
         return []

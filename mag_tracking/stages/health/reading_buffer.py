@@ -6,16 +6,19 @@ Who looks at ten thousand readings a second one by one does nothing else.
 import numpy as np
 from numba import float64, int64, njit
 
+from mag_tracking.arrays import FloatArray, IntArray
+
 
 class ReadingBuffer:
     """Of each of `n` sensors up to `room` readings, in the order in which they came."""
 
-    def __init__(self, n, room):
+    def __init__(self, n: int, room: int) -> None:
         self._count = np.zeros(n, dtype=np.int64)
         self._stamp, self._received = np.zeros((2, n, room), dtype=np.int64)
         self._field = np.zeros((n, room, 3))
 
-    def add(self, rows, stamps, fields, received_ns, first):
+    def add(self, rows: IntArray, stamps: IntArray, fields: FloatArray, received_ns: int,
+            first: int) -> int:
         """Take readings from the one at `first` on, as long as there is room.
 
         Parameters
@@ -37,7 +40,7 @@ class ReadingBuffer:
         return _add(rows, stamps, fields, received_ns, first, self._count, self._stamp,
                     self._received, self._field)
 
-    def take(self, j):
+    def take(self, j: int) -> tuple[IntArray, FloatArray, IntArray]:
         """(stamps (k,) [ns], fields (k, 3) [T], received (k,) [ns]) of sensor `j`; no copies.
 
         They wait no more: another reading of the sensor takes their place.
@@ -50,7 +53,8 @@ _I, _II = int64[::1], int64[:, ::1]
 
 
 @njit(int64(_I, _I, float64[:, ::1], int64, int64, _I, _II, _II, float64[:, :, ::1]), cache=True)
-def _add(rows, stamps, fields, received_ns, first, count, stamp, received, field):
+def _add(rows: IntArray, stamps: IntArray, fields: FloatArray, received_ns: int, first: int,
+         count: IntArray, stamp: IntArray, received: IntArray, field: FloatArray) -> int:
     """`ReadingBuffer.add`."""
     for i in range(first, len(rows)):
         j = rows[i]

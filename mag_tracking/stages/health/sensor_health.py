@@ -4,10 +4,12 @@ It only looks: nothing is changed or held back. Memory is bounded by a window of
 """
 
 from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.calibration.saturation import cut_off
 from mag_tracking.units import NS
 
@@ -42,7 +44,7 @@ class Finding:
     what: str
     advice: str
 
-    def __str__(self):
+    def __str__(self) -> str:
         return f'{self.subject}: {self.what}; {self.advice}'
 
 
@@ -53,34 +55,37 @@ class SensorHealth:
     given at once.
     """
 
-    def __init__(self, every=EVERY):
+    def __init__(self, every: int = EVERY) -> None:
         self._every = every
-        self._counts = Counter()
+        self._counts: Counter[str] = Counter()
         self._largest_step_s = 0.0
-        self._new = []
-        self._stamps, self._received = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-        self._fields = np.zeros((0, 3))
+        self._new: list[tuple[int, FloatArray, int]] = []
+        self._stamps: IntArray = np.zeros(0, dtype=np.int64)
+        self._received: IntArray = np.zeros(0, dtype=np.int64)
+        self._fields: FloatArray = np.zeros((0, 3))
         self._interval_ns, self._spread = float('nan'), float('inf')
-        self._noise = np.full(3, np.nan)
+        self._noise: FloatArray = np.full(3, np.nan)
         # What was made of the window, until new readings are taken into it.
-        self._made = {}
+        self._made: dict[str, FloatArray] = {}
+        self._delays: list[float] | None = None
         # Since when the reading has been what it is, and how long ago one was stuck.
-        self._since_ns, self._stuck_ago = None, WINDOW
+        self._since_ns: int | None = None
+        self._stuck_ago = WINDOW
 
-    def add(self, stamp_ns, field, received_ns=None):
+    def add(self, stamp_ns: int, field: FloatArray, received_ns: int | None = None) -> None:
         """A reading: `field` (3,) [T] as the sensor gave it; `received_ns` by the host's clock."""
         self._new.append((stamp_ns, field, UNKNOWN if received_ns is None else received_ns))
         if len(self._new) == self._every:
             self.look()
 
     @property
-    def counts(self):
+    def counts(self) -> 'Counter[str]':
         """`readings`, `lost`, `duplicates`, `stamps that went back`, `clock steps`, `spikes`,
         `saturated`, `without any axis`, `stuck readings`; and `x`, `y`, `z` missing."""
         self.look()
         return self._counts
 
-    def look(self):
+    def look(self) -> None:
         """Take the new readings into the window."""
         if self._new:
             stamps, fields, received = zip(*self._new, strict=True)
@@ -88,13 +93,13 @@ class SensorHealth:
             self.take(np.array(stamps, dtype=np.int64), np.array(fields, dtype=float),
                       np.array(received, dtype=np.int64))
 
-    def take(self, stamps, fields, received):
+    def take(self, stamps: IntArray, fields: FloatArray, received: IntArray) -> None:
         """Take readings into the window: (n,) [ns], (n, 3) [T], and (n,) [ns] or `UNKNOWN`.
 
         No more than `WINDOW` at once; they may be changed later. Those of `add` are not waited
         for: it is either the one or the other.
         """
-        n, self._made = len(stamps), {}
+        n, self._made, self._delays = len(stamps), {}, None
         if not n:
             return
         self._stamps = np.append(self._stamps, stamps)[-WINDOW:]
@@ -104,7 +109,7 @@ class SensorHealth:
         self._in_time(n)
         self._values(n)
 
-    def _in_time(self, n):
+    def _in_time(self, n: int) -> None:
         """Count what is wrong with the stamps of the `n` latest."""
         # With the one before them, where there is one.
         intervals = np.diff(self._stamps[-n - 1:])
@@ -131,7 +136,7 @@ class SensorHealth:
             self._spread = quantiles(np.abs(forward - self._interval_ns), 0.5)[0] \
                 / self._interval_ns
 
-    def _values(self, n):
+    def _values(self, n: int) -> None:
         """Count what is wrong with the fields of the `n` latest."""
         missing = np.isnan(self._fields[-n:])
         for axis, count in zip('xyz', missing.sum(axis=0).tolist(), strict=True):
@@ -147,10 +152,10 @@ class SensorHealth:
         self._counts['spikes'] += int(alone.any(axis=1).sum())
         if self._stuck_ago >= WINDOW:
             self._noise = self._made['noise'] = _noise(self._fields)
-        cut = np.array([cut_off(axis) for axis in self._fields.T]).any(axis=0)
-        self._counts['saturated'] += int(np.count_nonzero(cut[-n:]))
+        cut = np.array([cut_off(axis) for axis in self._fields.T])[:, -n:]
+        self._counts['saturated'] += int(np.count_nonzero(cut.any(axis=0)))
 
-    def _stuck(self, n):
+    def _stuck(self, n: int) -> None:
         """Count those of the `n` latest that have been the same for too long."""
         stamps, fields = self._stamps[-n:], self._fields[-n - 1:]
         same = ((fields[1:] == fields[:-1]) | np.isnan(fields[1:]) & np.isnan(fields[:-1])).all(1)
@@ -165,22 +170,22 @@ class SensorHealth:
         self._stuck_ago = n - 1 - int(stuck[-1]) if len(stuck) else self._stuck_ago + n
 
     @property
-    def rate(self):
+    def rate(self) -> float:
         """[Hz] of the latest readings; NaN before there are enough."""
         self.look()
         return NS / self._interval_ns
 
     @property
-    def noise_std(self):
+    def noise_std(self) -> FloatArray:
         """(3,) [T] by differences of neighbours, so that a target that passes is not in it."""
         return self._once('noise', _noise)
 
     @property
-    def field(self):
+    def field(self) -> FloatArray:
         """(3,) [T] median of the latest readings; NaN of an axis that none has."""
         return self._once('median', _median)
 
-    def _once(self, name, make):
+    def _once(self, name: str, make: Callable[[FloatArray], FloatArray]) -> FloatArray:
         """`make` of the fields in the window; once, however often it is asked for."""
         self.look()
         if name not in self._made:
@@ -188,7 +193,7 @@ class SensorHealth:
         return self._made[name]
 
     @property
-    def dead_axes(self):
+    def dead_axes(self) -> str:
         """Such as 'xz': axes that have not changed in a window in which another one did."""
         self.look()
         if len(self._fields) < WINDOW:
@@ -198,16 +203,17 @@ class SensorHealth:
         return ''.join(np.array(list('xyz'))[still]) if still.sum() < there.sum() else ''
 
     @property
-    def delay_s(self):
+    def delay_s(self) -> list[float]:
         """(median, 5 %, 95 %) [s] from stamp to receipt; NaN where receipts are not known."""
         self.look()
-        if 'delay' not in self._made:
+        if self._delays is None:
             known = self._received != UNKNOWN
             delays = (self._received - self._stamps)[known] / NS
-            self._made['delay'] = quantiles(delays, 0.5, 0.05, 0.95)
-        return self._made['delay']
+            self._delays = quantiles(delays, 0.5, 0.05, 0.95)
+        return self._delays
 
-    def findings(self, name, noise_std=None, max_field=1e-3):
+    def findings(self, name: str, noise_std: FloatArray | None = None,
+                 max_field: float = 1e-3) -> list[Finding]:
         """What is wrong, the worst first: list of `Finding`.
 
         Parameters
@@ -233,7 +239,7 @@ class SensorHealth:
                                      'it (a motor, a cable), or calibrate anew'))
         return sorted(found, key=lambda f: not f.serious)
 
-    def _time_findings(self, name, n):
+    def _time_findings(self, name: str, n: int) -> Iterator[Finding]:
         """What is wrong with stamps."""
         c = self.counts
         middle, low, high = self.delay_s
@@ -260,7 +266,7 @@ class SensorHealth:
             yield Finding(False, name, f'stamps are {middle:.1f} s before they are received',
                           'the clocks of sensor and host disagree; calibrate with knocks')
 
-    def _value_findings(self, name, n, max_field):
+    def _value_findings(self, name: str, n: int, max_field: float) -> Iterator[Finding]:
         """What is wrong with fields."""
         c = self.counts
         size = float(np.sqrt(np.nansum(self.field**2)))
@@ -290,7 +296,7 @@ class SensorHealth:
                           'plugs, supply and checksums')
 
 
-def quantiles(values, *shares):
+def quantiles(values: Sequence[float] | FloatArray | IntArray, *shares: float) -> list[float]:
     """[float] quantiles of (n,) finite `values`, by linear interpolation; NaN of none.
 
     As `numpy.quantile`, whose checks take longer than the work where arrays are small.
@@ -306,12 +312,12 @@ def quantiles(values, *shares):
     return out
 
 
-def _median(fields):
+def _median(fields: FloatArray) -> FloatArray:
     """(3,) [T]; NaN of an axis that none has."""
     return np.array([quantiles(axis[~np.isnan(axis)], 0.5)[0] for axis in fields.T])
 
 
-def _noise(fields):
+def _noise(fields: FloatArray) -> FloatArray:
     """(3,) [T] deviation by second differences, without the largest; NaN of a missing axis.
 
     Of the second: a passing target has a slope, but hardly a curve from one reading to the next.

@@ -4,14 +4,19 @@ Source: T10 section 6.3: knocks that all sensors feel, accelerometer, compass.
 """
 
 from collections import Counter, deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.agreement import Disagreement, consensus, disagreements
+from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.clock import Lag, knock_lag, shock
 from mag_tracking.calibration.orientation import (
     Orientation,
+    Up,
     compass_orientation,
     levelled,
     pooled_bias_std,
@@ -20,6 +25,8 @@ from mag_tracking.calibration.orientation import (
 )
 from mag_tracking.geometry import yaw_between
 from mag_tracking.network import SensorNetwork
+from mag_tracking.records import AccelerationSample
+from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.units import NS
 
 LONGEST_GAP_S = 3600.0
@@ -56,11 +63,11 @@ class NetworkSurvey:
     """[T] that the compasses were counted with."""
     reference: str
     """The sensor whose clock is the network's; empty where none felt a knock with another."""
-    shocks: dict
+    shocks: dict[str, tuple[FloatArray, FloatArray]]
     """{sensor: (t (n,) [s], shock (n,) [m/s^2])} of those with accelerations; each by its own
     clock, from the first reading of all."""
 
-    def warnings(self):
+    def warnings(self) -> list[str]:
         """What somebody should know: list of text."""
         out = [str(d) for d in self.disagreements]
         reasons = {s.sensor: s.lag.reason for s in self.sensors if s.lag and s.lag.reason}
@@ -76,13 +83,14 @@ class NetworkSurvey:
 class Survey:
     """Collects accelerations; `solve` makes orientations and clock offsets of them."""
 
-    def __init__(self, network, settings):
-        self.counts = Counter()
+    def __init__(self, network: SensorNetwork, settings: SurveySettings) -> None:
+        self.counts: Counter[str] = Counter()
         # What an earlier survey found is no further evidence.
         self._network, self._settings = network.as_stated(), settings
-        self._kept = {name: deque(maxlen=settings.most_accelerations) for name in network.names}
+        self._kept: dict[str, deque[tuple[int, FloatArray]]] = {
+            name: deque(maxlen=settings.most_accelerations) for name in network.names}
 
-    def feed(self, sample):
+    def feed(self, sample: AccelerationSample) -> list[NetworkSurvey]:
         """Take an `AccelerationSample`: []."""
         kept = self._kept.get(sample.sensor)
         if kept is None:
@@ -101,11 +109,11 @@ class Survey:
             self.counts['accelerations'] += 1
         return []
 
-    def flush(self):
+    def flush(self) -> list[NetworkSurvey]:
         """Nothing is held back: []."""
         return []
 
-    def solve(self, fields, date):
+    def solve(self, fields: Mapping[str, FloatArray], date: str) -> NetworkSurvey:
         """What the accelerations so far and the sensors' fields say.
 
         Parameters
@@ -124,7 +132,7 @@ class Survey:
         stated_std = np.array([np.full(3, np.deg2rad(self._settings.stated_std_deg))
                                if s is None else np.maximum(s, SURE_STATED)
                                for s in network.orientation_std])
-        warnings = {name: [] for name in names}
+        warnings: dict[str, list[str]] = {name: [] for name in names}
         ups = [self._up(name, warnings[name]) for name in names]
         level = [levelled(up, R, std) for up, R, std in
                  zip(ups, network.R_ws, stated_std, strict=True)]
@@ -146,7 +154,7 @@ class Survey:
         return NetworkSurvey(self._surveyed(sensors, reference, date), tuple(sensors), tuple(odd),
                              bias_std, reference, shocks)
 
-    def _up(self, name, warnings):
+    def _up(self, name: str, warnings: list[str]) -> Up | None:
         """`Up` of a sensor, or None with a warning."""
         if not self._kept[name]:
             warnings.append('no accelerations: its orientation is not surveyed')
@@ -158,7 +166,8 @@ class Survey:
             warnings.append(f'{error}: its orientation stays as stated')
             return None
 
-    def _odd(self, field, level, stated_std, warnings):
+    def _odd(self, field: FloatArray, level: Sequence[Orientation | None], stated_std: FloatArray,
+             warnings: Mapping[str, list[str]]) -> list[Disagreement]:
         """The sensors that disagree with the Earth; [] where nothing is there to compare with."""
         network = self._network
         R = np.array([R if o is None else o.R_ws for o, R in zip(level, network.R_ws, strict=True)])
@@ -170,13 +179,16 @@ class Survey:
             return []
         return disagreements(network.names, field, R, std, earth, self._settings.compass_bias_std)
 
-    def _compass(self, ups, field, stated_std, warnings):
+    def _compass(self, ups: Mapping[int, Up], field: FloatArray, stated_std: FloatArray,
+                 warnings: Mapping[str, list[str]]
+                 ) -> tuple[float, dict[int, tuple[Orientation, str]]]:
         """(bias_std, {row: (Orientation, by)}) of the sensors that have what it takes."""
         network, bias_std = self._network, self._settings.compass_bias_std
         usable = {j: up for j, up in ups.items() if not np.isnan(field[j]).all()}
         if network.earth_field is None or not usable:
             return bias_std, {}
-        found, blind = {}, {}
+        found: dict[int, Orientation] = {}
+        blind: dict[int, str] = {}
         # Twice: how large biases are is seen when the headings are known.
         for _ in range(2):
             found = {}
@@ -204,7 +216,7 @@ class Survey:
                 out[j] = both, 'accelerometer, compass and stated heading'
         return bias_std, out
 
-    def _shocks(self):
+    def _shocks(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         """How each sensor was shaken."""
         kept = {name: readings for name, readings in self._kept.items() if readings}
         # From the first: seconds since 1970 leave a float few digits.
@@ -213,9 +225,11 @@ class Survey:
                        shock(np.array([a for _, a in readings])))
                 for name, readings in kept.items()}
 
-    def _lags(self, signals):
+    def _lags(self, signals: Mapping[str, tuple[FloatArray, FloatArray]]
+              ) -> tuple[str, dict[str, Lag]]:
         """(reference sensor, {sensor: Lag}) by the knocks."""
-        longest, first = self._settings.longest_clock_offset_s, {}
+        longest = self._settings.longest_clock_offset_s
+        first: dict[str, Lag] = {}
         for reference, (t, s) in signals.items():
             lags = {name: knock_lag(t, s, *signals[name], longest)
                     for name in signals if name != reference}
@@ -224,7 +238,8 @@ class Survey:
             first = first or lags
         return '', first
 
-    def _surveyed(self, sensors, reference, date):
+    def _surveyed(self, sensors: Sequence[SensorSurvey], reference: str,
+                  date: str) -> SensorNetwork:
         """The network with what was found."""
         network = self._network
         R_ws, clock = network.R_ws.copy(), network.clock_offset.copy()
@@ -232,19 +247,26 @@ class Survey:
         zero = clock[network.index(reference)] if reference else 0.0
         std, done = list(network.orientation_std), list(network.calibrated)
         for j, s in enumerate(sensors):
-            measured = s.lag is not None and not s.lag.reason
-            if measured:
-                clock[j] = zero + s.lag.offset
+            lag = None if s.lag is None or s.lag.reason else s.lag
+            if lag is not None:
+                clock[j] = zero + lag.offset
             if s.orientation is not None:
                 R_ws[j], std[j] = s.orientation.R_ws, s.orientation.std
-            if s.orientation is not None or measured or s.sensor == reference:
-                lag_std = s.lag.std if measured else 0.0 if s.sensor == reference else np.nan
+            if s.orientation is not None or lag is not None or s.sensor == reference:
+                lag_std = lag.std if lag is not None else 0.0 if s.sensor == reference else np.nan
                 done[j] = network.marked(j, date, s.by, lag_std)
         return replace(network, R_ws=R_ws, orientation_std=tuple(std), clock_offset=clock,
                        calibrated=tuple(done))
 
 
-def with_noise(network, calibrate):
+class NoiseSource(Protocol):
+    """What `with_noise` asks of a `Calibrate` stage."""
+
+    def backgrounds(self) -> Mapping[str, RunningBackground]:
+        """The background of each sensor of the network, in its order."""
+
+
+def with_noise(network: SensorNetwork, calibrate: NoiseSource) -> SensorNetwork:
     """The network with the noise that a `Calibrate` stage has found, where it has."""
     noise = list(network.noise_std)
     for j, background in enumerate(calibrate.backgrounds().values()):
@@ -255,7 +277,8 @@ def with_noise(network, calibrate):
     return replace(network, noise_std=tuple(noise))
 
 
-def _tilt_warning(stated, found, stated_std, found_std):
+def _tilt_warning(stated: FloatArray, found: FloatArray, stated_std: FloatArray,
+                  found_std: FloatArray) -> list[str]:
     """[text] where a sensor is tilted more than was stated, or []."""
     tilt = np.arccos(np.clip((stated.T @ [0.0, 0.0, 1.0]) @ (found.T @ [0.0, 0.0, 1.0]), -1.0, 1.0))
     allowed = 3.0 * np.hypot(stated_std[:2].max(), found_std[:2].max())

@@ -2,9 +2,15 @@
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference import kalman
+from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.inference.time_update import predict
+from mag_tracking.network import SensorNetwork
+from mag_tracking.physics.sources import SourceModel
+from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.observation import Observation
+from mag_tracking.stages.track.settings import TrackSettings
 
 ONE_TIME = 0.05
 """A frame that is shorter than this share of the time since the frame before is one time, and so
@@ -14,7 +20,8 @@ is the first of a track: velocities are better learnt from frame to frame than w
 class BankFilter:
     """Moves a `FilterBank` through frames; has no memory of its own."""
 
-    def __init__(self, network, model, settings):
+    def __init__(self, network: SensorNetwork, model: SourceModel,
+                 settings: TrackSettings) -> None:
         """`settings` is a `TrackSettings`; the live ones may be changed by `configure`."""
         self._n_sensors = len(network)
         self._model = model
@@ -22,14 +29,14 @@ class BankFilter:
                                        settings.model_error_time_s)
         self.configure(settings)
 
-    def configure(self, settings):
+    def configure(self, settings: TrackSettings) -> None:
         """Take new values of the live settings."""
         self._settings = settings
         group = settings.vehicle if settings.target == 'vehicle' else settings.magnet
-        self._near_field_lengths = np.atleast_1d(getattr(
+        self._near_field_lengths: FloatArray = np.atleast_1d(getattr(
             group, 'near_field_lengths' if settings.target == 'vehicle' else 'near_field_length'))
 
-    def predict(self, bank, dt):
+    def predict(self, bank: FilterBank, dt: float) -> tuple[FloatArray, FloatArray]:
         """Time update in place; backwards in time without process noise.
 
         Returns
@@ -45,7 +52,8 @@ class BankFilter:
         predict(bank.x, bank.P, x_target, F, Q if dt > 0.0 else 0.0 * Q, variance, decay)
         return F, decay
 
-    def fields(self, x, kind, frame, dt):
+    def fields(self, x: FloatArray, kind: IntArray, frame: FieldFrame, dt: float
+               ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Fields of the states `x` (n_hyp, n_x) of the kinds `kind`; see `Observation.fields`.
 
         `dt` [s] since the frame before says whether the frame is one time.
@@ -55,16 +63,19 @@ class BankFilter:
         return self.observation.fields(x, offset, self._near_field_lengths[kind],
                                        self._settings.field_error)
 
-    def predicted_field(self, bank, i, frame, dt):
+    def predicted_field(self, bank: FilterBank, i: int, frame: FieldFrame,
+                        dt: float) -> FloatArray:
         """(n_sensors, 3) [T] the field of the frame as hypothesis `i` has it, with backgrounds.
 
         Without what it takes for errors of its model: with them anything would seem to fit.
         """
         x = self.observation.without_errors(bank.x[i:i + 1])
         h, _, _ = self.fields(x, bank.kind[i:i + 1], frame, dt)
-        return h[0] + x[0, -3 * self._n_sensors:].reshape(-1, 3)
+        field: FloatArray = h[0] + x[0, -3 * self._n_sensors:].reshape(-1, 3)
+        return field
 
-    def update(self, bank, frame, dt, x_lin=None):
+    def update(self, bank: FilterBank, frame: FieldFrame, dt: float,
+               x_lin: FloatArray | None = None) -> FloatArray:
         """Measurement update in place; the arrays that `bank.x` and `bank.P` were stay as they are.
 
         It is linearised at `x_lin` (n_hyp, n_x), or if that is left out at the prediction and
@@ -72,11 +83,15 @@ class BankFilter:
         """
         return self._update(bank, frame, dt, x_lin)[0]
 
-    def update_with_gains(self, bank, frame, dt, x_lin=None):
+    def update_with_gains(self, bank: FilterBank, frame: FieldFrame, dt: float,
+                          x_lin: FloatArray | None = None) -> tuple[FloatArray, kalman.Gains]:
         """The same, for a backward pass: (log-likelihood (n_hyp,), `kalman.Gains`)."""
-        return self._update(bank, frame, dt, x_lin, wants_gains=True)
+        log_likelihood, gains = self._update(bank, frame, dt, x_lin, wants_gains=True)
+        assert gains is not None
+        return log_likelihood, gains
 
-    def _update(self, bank, frame, dt, x_lin, wants_gains=False):
+    def _update(self, bank: FilterBank, frame: FieldFrame, dt: float, x_lin: FloatArray | None,
+                wants_gains: bool = False) -> tuple[FloatArray, kalman.Gains | None]:
         """Log-likelihood (n_hyp,), and the `kalman.Gains` or None."""
         covariance = known_covariance(frame)
         x_prior, P_prior = bank.x, bank.P
@@ -99,7 +114,7 @@ class BankFilter:
         bank.nis[:, np.isnan(frame.field).all(axis=1)] = np.nan
         return log_likelihood, gains
 
-    def is_strange(self, bank, i, frame):
+    def is_strange(self, bank: FilterBank, i: int, frame: FieldFrame) -> bool:
         """Whether hypothesis `i`, just updated with the `frame`, is contradicted by it."""
         n_y = np.count_nonzero(~np.isnan(frame.field))
         return bool(np.nansum(bank.nis[i]) > self._settings.end_nis * n_y)
@@ -108,11 +123,11 @@ class BankFilter:
 class NoTarget:
     """The filter of no target at all, only backgrounds that wander: what evidence is against."""
 
-    def __init__(self, n_sensors, background_std):
+    def __init__(self, n_sensors: int, background_std: float) -> None:
         self._x = np.zeros((1, 3 * n_sensors))
         self._P = background_std**2 * np.eye(3 * n_sensors)[None]
 
-    def log_density(self, frame, dt, background_drift):
+    def log_density(self, frame: FieldFrame, dt: float, background_drift: float) -> float:
         """Log-density of the frame given those before; `dt` [s] since the last one."""
         n = len(frame.field)
         i = np.arange(3 * n)
@@ -123,7 +138,7 @@ class NoTarget:
         return float(log_likelihood[0])
 
 
-def known_covariance(frame):
+def known_covariance(frame: FieldFrame) -> FloatArray:
     """(n_sensors, 3, 3) [T^2]; identity where an axis is missing."""
     return np.where(np.isnan(frame.covariance), np.eye(3), frame.covariance)
 

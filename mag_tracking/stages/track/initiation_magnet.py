@@ -4,10 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.inference.least_squares import project_out_linear, refine
+from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import dipole_jacobians, sensor_fields
 from mag_tracking.physics.sources import Magnet
+from mag_tracking.records import FieldFrame
 from mag_tracking.settings import param
 
 
@@ -35,12 +38,14 @@ class MagnetSettings:
         '', (-1.0, 1.0), length=3)
 
 
-def magnet_model(settings):
+def magnet_model(settings: MagnetSettings) -> Magnet:
     """The `Magnet` of the settings."""
     return Magnet(np.full(3, settings.acceleration**2), settings.angular_acceleration**2)
 
 
-def start_magnet(settings, network, frame, background_std, own_covariance, relative_std):
+def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldFrame,
+                 background_std: float, own_covariance: FloatArray, relative_std: float
+                 ) -> FilterBank | None:
     """Hypotheses of a magnet at its first frame, wherever it is.
 
     On a coarse grid the moment is projected out; the best points are refined,
@@ -81,14 +86,16 @@ def start_magnet(settings, network, frame, background_std, own_covariance, relat
     return bank
 
 
-def _distinct_optima(settings, network, start, y, std, present):
+def _distinct_optima(settings: MagnetSettings, network: SensorNetwork, start: FloatArray,
+                     y: FloatArray, std: FloatArray, present: BoolArray
+                     ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Refine the starts; states, covariances and costs of the optima that differ, perhaps none."""
     identity = np.zeros((len(start), 1, 3, 6))
     dr_dx, dm_dx = identity.copy(), identity.copy()
     dr_dx[:, 0, :, :3] = np.eye(3)
     dm_dx[:, 0, :, 3:] = np.eye(3)
 
-    def residual_and_jacobian(x):
+    def residual_and_jacobian(x: FloatArray) -> tuple[FloatArray, FloatArray]:
         h, H, _ = sensor_fields(network.positions, network.R_sw,
                                 np.ascontiguousarray(x[:, None, :3]),
                                 np.ascontiguousarray(x[:, None, 3:]), dr_dx[:len(x)],
@@ -96,7 +103,7 @@ def _distinct_optima(settings, network, start, y, std, present):
         return y - (h / std)[:, present], (H / std[:, :, None])[:, present]
 
     x, cost, covariance, _ = refine(residual_and_jacobian, start)
-    keep = []
+    keep: list[int] = []
     for i in np.argsort(cost, kind='stable'):
         if not np.isfinite(cost[i]) or cost[i] - cost.min() > 60.0:
             break

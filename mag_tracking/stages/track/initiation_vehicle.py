@@ -4,12 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import SettingsError
 from mag_tracking.geometry import rotation_about_z
 from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import MU0, dipole_jacobians
 from mag_tracking.physics.vehicles import RowVehicle
+from mag_tracking.records import FieldFrame
 from mag_tracking.settings import param
 
 
@@ -81,7 +84,7 @@ PER_KIND = ('lengths', 'length_stds', 'moments', 'moment_stds', 'difference_stds
             'height_stds', 'near_field_lengths')
 
 
-def vehicle_model(settings, network):
+def vehicle_model(settings: VehicleSettings, network: SensorNetwork) -> RowVehicle:
     """The `RowVehicle` of the settings; without an earth field there is no soft iron.
 
     Raises SettingsError where lists that belong together differ in length.
@@ -106,24 +109,25 @@ def vehicle_model(settings, network):
                       _n_dipoles(settings))
 
 
-def _n_dipoles(settings):
+def _n_dipoles(settings: VehicleSettings) -> int:
     """Three, of which those of a point coincide; one where all kinds are points."""
     return 3 if any(settings.lengths) else 1
 
 
-def _earth_field(network):
+def _earth_field(network: SensorNetwork) -> FloatArray:
     """(3,) [T], zeros where it is not known."""
     return np.zeros(3) if network.earth_field is None else network.earth_field
 
 
-def moment_directions():
+def moment_directions() -> FloatArray:
     """Fourteen unit vectors (14, 3): the axes and the diagonals of a cube, both ways."""
     axes = np.vstack([np.eye(3), -np.eye(3)])
     diagonals = np.array([[a, b, c] for a in (1, -1) for b in (1, -1) for c in (1, -1)])
     return np.vstack([axes, diagonals / np.sqrt(3.0)])
 
 
-def start_vehicle(settings, network, frame, background_std, own_covariance):
+def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: FieldFrame,
+                  background_std: float, own_covariance: FloatArray) -> FilterBank:
     """Hypotheses of a vehicle at its first frame.
 
     Kinds x arrival lines x moment directions x lateral offsets x speeds, each at the
@@ -132,16 +136,20 @@ def start_vehicle(settings, network, frame, background_std, own_covariance):
     Returns a `FilterBank` whose labels index `settings.arrival_names`, its kinds `settings.kinds`.
     Source: ICASSP11 section 2.2, T10 Alg. 3 (there one hypothesis an arrival).
     """
-    states, covariances, labels, kinds = [], [], [], []
+    states: list[FloatArray] = []
+    covariances: list[FloatArray] = []
+    labels: list[int] = []
+    kinds: list[int] = []
     measured = _Measured(network, frame)
     for kind in range(len(settings.kinds)):
         moments = settings.moments[kind] * moment_directions()
         for label, heading in enumerate(np.deg2rad(settings.arrival_headings_deg)):
             R = rotation_about_z(heading)
             hard = (moments - settings.soft_iron * _earth_field(network) / MU0) @ R
+            velocities = np.array(settings.speeds)[:, None] * R[:, 0]
             starts = _matching_positions(settings, network, measured, R, moments,
                                          settings.heights[kind])
-            states.append(_states(settings, kind, starts, np.outer(settings.speeds, R[:, 0]), hard))
+            states.append(_states(settings, kind, starts, velocities, hard))
             by_speed = np.array([_covariance(settings, kind, R, v) for v in settings.speeds])
             covariances.append(np.tile(by_speed.repeat(len(moments), 0), (len(starts), 1, 1)))
             labels += [label] * len(states[-1])
@@ -153,7 +161,7 @@ def start_vehicle(settings, network, frame, background_std, own_covariance):
 class _Measured:
     """What a frame says of how near a target is."""
 
-    def __init__(self, network, frame):
+    def __init__(self, network: SensorNetwork, frame: FieldFrame) -> None:
         present = ~np.isnan(frame.field)
         energy = float(whitened_energy(frame.field, frame.covariance)[0].sum())
         # Noise alone brings one unit of energy an axis.
@@ -163,7 +171,8 @@ class _Measured:
         """(n_sensors, 3, 3) [1/T] from a field in the world to one in units of its noise."""
 
 
-def _matching_positions(settings, network, measured, R, moments, height):
+def _matching_positions(settings: VehicleSettings, network: SensorNetwork, measured: _Measured,
+                        R: FloatArray, moments: FloatArray, height: float) -> FloatArray:
     """Positions (n_offsets, n_moments, 3) where on each line a field first has the energy."""
     along = (network.positions - network.centre) @ R[:, 0]
     distance = np.linspace(settings.farthest, 0.0, 160) - along.min()
@@ -179,7 +188,8 @@ def _matching_positions(settings, network, measured, R, moments, height):
     return np.take_along_axis(points, first[:, :, None], axis=1)
 
 
-def _states(settings, kind, positions, velocities, hard):
+def _states(settings: VehicleSettings, kind: int, positions: FloatArray, velocities: FloatArray,
+            hard: FloatArray) -> FloatArray:
     """States (n_offsets n_speeds n_moments, n_t) of `RowVehicle`.
 
     `positions` (n_offsets, n_moments, 3), `velocities` (n_speeds, 3), whole hard iron moments
@@ -193,7 +203,7 @@ def _states(settings, kind, positions, velocities, hard):
     return x.reshape(-1, x.shape[-1])
 
 
-def _covariance(settings, kind, R, speed):
+def _covariance(settings: VehicleSettings, kind: int, R: FloatArray, speed: float) -> FloatArray:
     """Starting covariance (n_t, n_t) of one hypothesis."""
     d = _n_dipoles(settings)
     hard = 6 + 3 * d

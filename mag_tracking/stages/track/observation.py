@@ -4,8 +4,11 @@ import math
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
+from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import sensor_fields
 from mag_tracking.physics.mounting import turned_fields
+from mag_tracking.physics.sources import SourceModel
 
 MOST_TURNED = np.deg2rad(15.0)
 """[rad] A sensor whose orientation is less certain is tracked as if it were as certain as this: the
@@ -15,7 +18,7 @@ SAME_TIME_S = 1e-3
 """[s] Samples closer than this are taken together: at 20 m/s a target moves two centimetres."""
 
 
-def angle_priors(network, mounting_std):
+def angle_priors(network: SensorNetwork, mounting_std: float) -> FloatArray:
     """(n_sensors, 3, 3) [rad^2] of the mounting angles when a track begins.
 
     `mounting_std` [rad] is that of a sensor whose `orientation_std` is not known.
@@ -23,7 +26,8 @@ def angle_priors(network, mounting_std):
     std = [np.full(3, mounting_std) if s is None else np.minimum(s, MOST_TURNED)
            for s in network.orientation_std]
     # The angles are about the sensor's axes, what is known of them about the world's.
-    return np.einsum('jik,jk,jlk->jil', network.R_sw, np.square(std), network.R_sw)
+    priors: FloatArray = np.einsum('jik,jk,jlk->jil', network.R_sw, np.square(std), network.R_sw)
+    return priors
 
 
 class Observation:
@@ -36,9 +40,10 @@ class Observation:
     of them does not depend on the frame period. Without an `error_time` they are new every frame.
     """
 
-    def __init__(self, network, model, mounting_std, error_time):
+    def __init__(self, network: SensorNetwork, model: SourceModel, mounting_std: float,
+                 error_time: float) -> None:
         """`mounting_std` [rad] is that of a sensor whose `orientation_std` is not known."""
-        self._positions = np.ascontiguousarray(network.positions, dtype=float)
+        self._positions: FloatArray = np.ascontiguousarray(network.positions, dtype=float)
         self._R_sw = network.R_sw
         self._model = model
         self._error_time = error_time
@@ -53,33 +58,33 @@ class Observation:
             self.own_covariance[:, :3, :3] = angle_priors(network, mounting_std)
 
     @property
-    def n_own(self):
+    def n_own(self) -> int:
         """States of each sensor between the target's and the backgrounds."""
         return self.own_covariance.shape[1]
 
-    def own(self, x):
+    def own(self, x: FloatArray) -> FloatArray:
         """(..., n_sensors, n_own): the sensors' own states among those on the last axis of `x`."""
         n = len(self._positions)
         own = x[..., self.n_target:x.shape[-1] - 3 * n]
         return own.reshape(*own.shape[:-1], n, self.n_own)
 
-    def angles(self, x):
+    def angles(self, x: FloatArray) -> FloatArray:
         """(..., n_sensors, 3) [rad] mounting angles; (..., 0, 3) where they are not estimated."""
         return self.own(x)[..., :3] if self._n_angles else np.zeros((*x.shape[:-1], 0, 3))
 
-    def angle_covariances(self, P):
+    def angle_covariances(self, P: FloatArray) -> FloatArray:
         """(n_sensors, 3, 3) [rad^2] of the mounting angles, among `P` (n_x, n_x); or (0, 3, 3)."""
         first = self.n_target + self.n_own * np.arange(len(self._positions))
         rows = first[:, None] + np.arange(3)
         return P[rows[:, :, None], rows[:, None, :]] if self._n_angles else np.zeros((0, 3, 3))
 
-    def without_errors(self, x):
+    def without_errors(self, x: FloatArray) -> FloatArray:
         """The states `x` (n_hyp, n_x), copied, with model errors of zero."""
         x = x.copy()
         self.own(x)[..., self._n_angles:] = 0.0
         return x
 
-    def drift(self, dt, background_density):
+    def drift(self, dt: float, background_density: float) -> tuple[FloatArray, FloatArray]:
         """What becomes of the sensors' states over `dt` seconds.
 
         Returns
@@ -95,7 +100,8 @@ class Observation:
         variance[-3 * n:] = background_density**2 * max(dt, 0.0)
         return decay, variance
 
-    def target_fields(self, x, time_offset):
+    def target_fields(self, x: FloatArray, time_offset: FloatArray
+                      ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Field of the target alone, at each sensor's own time; see `sensor_fields`."""
         n_hyp, n, n_t = len(x), len(self._positions), self.n_target
         if not time_offset.any():
@@ -111,7 +117,8 @@ class Observation:
             H[:, j] = H_moved @ (F if F.ndim == 2 else F[:, None])
         return h, H, gradient
 
-    def fields(self, x, time_offset, near_field_length, field_error):
+    def fields(self, x: FloatArray, time_offset: FloatArray, near_field_length: FloatArray,
+               field_error: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Fields as the sensors see them, without the backgrounds.
 
         Parameters

@@ -1,11 +1,14 @@
 """From a bank to what is published: the best hypothesis, its pose and its honest doubts."""
 
-from typing import Protocol
+from collections.abc import Sequence
+from typing import Protocol, TypeAlias, TypedDict
 
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.geometry import cross_matrix, quaternion_between, quaternion_from_yaw
+from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.physics.sources import SourceModel
 from mag_tracking.records import Hypotheses, SmoothedPose, Track
 
 UNOBSERVED_VARIANCE = np.pi**2
@@ -15,15 +18,36 @@ DOUBT = 0.05
 """Other places, or other arrivals, with more weight than this make a track ambiguous."""
 
 
+Flags: TypeAlias = tuple[bool, bool, bool]
+"""Which rotations about the body's x, y, z are not observed."""
+
+OrientationEstimate: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, Flags]
+"""Quaternion, derivative, unobserved variance and flags; see `vehicle_orientation`."""
+
+
 class Orientation(Protocol):
     """How a target's orientation follows from its state; see `vehicle_orientation`."""
 
-    def __call__(self, x: FloatArray, P: FloatArray
-                 ) -> tuple[FloatArray, FloatArray, FloatArray, tuple[bool, bool, bool]]:
+    def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
         """Quaternion, derivative, unobserved variance and flags."""
 
 
-def vehicle_orientation(x, P):
+class PoseFields(TypedDict):
+    """The fields that a `Track` and a `SmoothedPose` have in common and a state determines."""
+
+    position: FloatArray
+    velocity: FloatArray
+    covariance: FloatArray
+    orientation: FloatArray
+    orientation_covariance: FloatArray
+    position_orientation_covariance: FloatArray
+    moment: FloatArray
+    moment_covariance: FloatArray
+    length: float
+    length_std: float
+
+
+def vehicle_orientation(x: FloatArray, P: FloatArray) -> OrientationEstimate:
     """Heading of the velocity; roll and pitch are not observed.
 
     Parameters
@@ -53,7 +77,7 @@ def vehicle_orientation(x, P):
             (True, True, not yaw_known))
 
 
-def magnet_orientation(x, P, axis):
+def magnet_orientation(x: FloatArray, P: FloatArray, axis: FloatArray) -> OrientationEstimate:
     """Direction of the moment; the roll about it is not observed.
 
     As `vehicle_orientation`; `axis` (3,) is the moment's direction in the
@@ -65,12 +89,16 @@ def magnet_orientation(x, P, axis):
     # dm = w x m gives the part of w across m: w = m x dm / |m|^2.
     T[:, 6:9] = cross_matrix(m) / size2
     along = np.outer(m, m) / size2
-    flags = [False] * 3
-    flags[int(np.argmax(np.abs(axis)))] = True
-    return quaternion_between(axis, m), T, UNOBSERVED_VARIANCE * along, tuple(flags)
+    nearest = int(np.argmax(np.abs(axis)))
+    return (quaternion_between(axis, m), T, UNOBSERVED_VARIANCE * along,
+            (nearest == 0, nearest == 1, nearest == 2))
 
 
-def published_track(bank, best, model, orientation, names, kinds, strange, **known):
+def published_track(bank: FilterBank, best: int, model: SourceModel, orientation: Orientation,
+                    names: Sequence[str], kinds: Sequence[str], strange: bool, *, stamp_ns: int,
+                    id: int, ended: bool, existence: float, degrees_of_freedom: int,
+                    predicted: FloatArray, mounting: FloatArray, mounting_covariance: FloatArray
+                    ) -> Track:
     """The `Track` of a bank's hypothesis `best`.
 
     Parameters
@@ -87,9 +115,8 @@ def published_track(bank, best, model, orientation, names, kinds, strange, **kno
         The name of each kind.
     strange : bool
         The measurement does not fit even the best hypothesis: ambiguous, too.
-    known : fields of `Track` that the bank does not know
-        stamp_ns, id, ended, existence, degrees_of_freedom, predicted, mounting,
-        mounting_covariance.
+    stamp_ns, id, ended, existence, degrees_of_freedom, predicted, mounting, mounting_covariance
+        Fields of `Track` that the bank does not know.
     """
     n_t = len(model.state_names)
     said, flags = _said_of(model, orientation, bank.x[best, :n_t], bank.P[best, :n_t, :n_t])
@@ -101,30 +128,38 @@ def published_track(bank, best, model, orientation, names, kinds, strange, **kno
         bank.P[order, :6, :6], moments[order], tuple(kinds[k] for k in bank.kind[order].tolist()))
     nis = bank.nis[best]
     return Track(
+        stamp_ns=stamp_ns, id=id, ended=ended, existence=existence,
+        degrees_of_freedom=degrees_of_freedom, predicted=predicted, mounting=mounting,
+        mounting_covariance=mounting_covariance,
         nis=float('nan') if np.isnan(nis).all() else float(np.nansum(nis)),
         nis_by_sensor=nis.copy(), weight=float(weights[best]), arrival=names[bank.label[best]],
         kind=kinds[bank.kind[best]],
         kind_weight=float(weights.sum(where=bank.kind == bank.kind[best])),
         ambiguous=bool(strange or is_ambiguous(bank, best)),
-        unobservable=(False, False, False, *flags), hypotheses=hypotheses, **said, **known)
+        unobservable=(False, False, False, *flags), hypotheses=hypotheses, **said)
 
 
-def is_ambiguous(bank, best):
+def is_ambiguous(bank: FilterBank, best: int) -> bool:
     """Whether another place, or another arrival, than that of hypothesis `best` is possible."""
     same_arrival = np.exp(bank.log_w).sum(where=bank.label == bank.label[best])
     return bool(bank.separated_weight(best) > DOUBT or 1.0 - same_arrival > DOUBT)
 
 
-def smoothed_pose(model, orientation, x, P, **known):
-    """The `SmoothedPose` of a state `x` (n_x,) with covariance `P`.
+def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray, *,
+                  stamp_ns: int, id: int, kind: str, ambiguous: bool, complete: bool
+                  ) -> SmoothedPose:
+    """The `SmoothedPose` of a state `x` (n_x,) with covariance `P` (n_x, n_x).
 
-    `known` are its stamp_ns, id, kind, ambiguous, complete; the others as for `published_track`.
+    The model and the orientation are as for `published_track`.
     """
     n_t = len(model.state_names)
-    return SmoothedPose(**_said_of(model, orientation, x[:n_t], P[:n_t, :n_t])[0], **known)
+    return SmoothedPose(stamp_ns=stamp_ns, id=id, kind=kind, ambiguous=ambiguous,
+                        complete=complete,
+                        **_said_of(model, orientation, x[:n_t], P[:n_t, :n_t])[0])
 
 
-def _said_of(model, orientation, x, P):
+def _said_of(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray
+             ) -> tuple[PoseFields, Flags]:
     """What a target state says, as fields of a record, and which rotations it does not."""
     dipoles = model.dipoles(x[None])
     dm_dx = dipoles.dm_dx[0].sum(axis=0)

@@ -11,11 +11,20 @@ Source: Bell 1994, The iterated Kalman smoother as a Gauss-Newton method.
 """
 
 from collections import Counter
+from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.inference.smoother import Step, smoothed_states
+from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.units import NS
+
+_Smoothed: TypeAlias = tuple[FloatArray, FloatArray]
+"""States (n_rows, n_x) at a frame, and the standard deviation (n_rows,) of their position."""
 
 LEADING = np.log(1e3)
 """A hypothesis leads that is not lighter than the heaviest by more than this."""
@@ -41,31 +50,35 @@ MOST_NUMBERS = 5_000_000
 class Relinearisation:
     """The latest frames of a running track, and the path of each hypothesis through them."""
 
-    def __init__(self, interval_s, window_s, most):
+    def __init__(self, interval_s: float, window_s: float, most: int) -> None:
         self._interval_ns, self._window_ns, self._most = interval_s * NS, window_s * NS, most
         self.clear()
 
-    def clear(self):
+    def clear(self) -> None:
         """Nothing is kept: no track is running."""
-        self._anchor = None
+        self._anchor: FilterBank | None = None
 
-    def begin(self, bank):
+    def begin(self, bank: FilterBank) -> None:
         """A track begins with the `FilterBank`, which is not yet updated with its first frame.
 
         A copy of it is the anchor: where the passes start from.
         """
         self._anchor, self._updated = bank.copy(), False
-        self._frames, self._intervals = [], []
+        self._frames: list[FieldFrame] = []
+        self._intervals: list[float] = []
         # At each frame, and of each hypothesis of the anchor: where it is linearised, and the
         # log-likelihood that the filter gave it.
-        self._paths, self._log_likelihoods = [], []
-        self._last_ns, self._stale = None, False
+        self._paths: list[FloatArray] = []
+        self._log_likelihoods: list[FloatArray] = []
+        self._last_ns: int | None = None
+        self._stale = False
 
-    def begin_anew(self):
+    def begin_anew(self) -> None:
         """The filter has changed: what it did before the next frame is not to be done again."""
         self._stale = self._anchor is not None
 
-    def add(self, bank, predicted, log_likelihood, frame, dt):
+    def add(self, bank: FilterBank, predicted: FloatArray, log_likelihood: FloatArray,
+            frame: FieldFrame, dt: float) -> None:
         """The `FilterBank` was updated with a `FieldFrame`, `dt` [s] after the one before.
 
         `log_likelihood` (n_hyp,) of it, linearised at the states `predicted` (n_hyp, n_x); where
@@ -77,8 +90,8 @@ class Relinearisation:
             self.begin(bank)
             self._updated = True
         if len(bank) < len(self._anchor) // 2:
-            self._keep(np.isin(self._anchor.origin, bank.origin))
-        rows = self._rows(bank)
+            self._keep(self._anchor, np.isin(self._anchor.origin, bank.origin))
+        rows = _rows(self._anchor, bank)
         path, of_frame = self._anchor.x.copy(), np.full(len(self._anchor), -np.inf)
         path[rows], of_frame[rows] = predicted, log_likelihood
         self._frames.append(frame)
@@ -88,33 +101,31 @@ class Relinearisation:
         if self._last_ns is None:
             self._last_ns = frame.stamp_ns
 
-    def _rows(self, bank):
-        """Rows of the anchor that the hypotheses of `bank` started from."""
-        return np.searchsorted(self._anchor.origin, bank.origin)
-
-    def _keep(self, mask):
-        """Keep the rows of `mask` of all that is kept for each hypothesis of the anchor."""
-        self._anchor.keep(mask)
+    def _keep(self, anchor: FilterBank, mask: BoolArray) -> None:
+        """Keep the rows of `mask` of all that is kept for each hypothesis of the `anchor`."""
+        anchor.keep(mask)
         self._paths = [path[mask] for path in self._paths]
         self._log_likelihoods = [of_frame[mask] for of_frame in self._log_likelihoods]
 
-    def improve(self, bank_filter, bank):
+    def improve(self, bank_filter: BankFilter, bank: FilterBank) -> 'Counter[str]':
         """Linearise the leading hypotheses of the `FilterBank` anew, in place, if it is time to.
 
         By the `BankFilter` that it is moved with. Returns a Counter of those it was tried for, and
         of those for which it was of no use: they stay as they were.
         """
-        if self._anchor is None or self._frames[-1].stamp_ns - self._last_ns < self._interval_ns:
+        anchor = self._anchor
+        if anchor is None or self._last_ns is None \
+                or self._frames[-1].stamp_ns - self._last_ns < self._interval_ns:
             return Counter()
         self._last_ns = self._frames[-1].stamp_ns
-        self._move_on(bank_filter, bank)
+        self._move_on(bank_filter, anchor, bank)
         if self._updated and len(self._frames) == 1:
             return Counter()
         leading = self._leading(bank)
-        rows = self._rows(bank)[leading]
+        rows = _rows(anchor, bank)[leading]
         paths = [path[rows] for path in self._paths]
         for _ in range(PASSES):
-            last, log_likelihood, new = self._pass(bank_filter, rows, paths)
+            last, log_likelihood, new = self._pass(bank_filter, anchor.rows(rows), paths)
             settled, paths = _settled(paths, new), [x for x, _ in new]
         finite = np.isfinite(log_likelihood) & np.isfinite(paths).all(axis=(0, 2))
         for path, improved in zip(self._paths, paths, strict=True):
@@ -124,28 +135,29 @@ class Relinearisation:
         bank.x[leading[taken]], bank.P[leading[taken]] = last.x[taken], last.P[taken]
         return Counter({TRIED: len(taken), IN_VAIN: int(np.count_nonzero(~taken))})
 
-    def _leading(self, bank):
+    def _leading(self, bank: FilterBank) -> IntArray:
         """Rows of the heaviest hypotheses, as many as it is done for."""
         affordable = MOST_NUMBERS // (len(self._frames) * bank.x.shape[1]**2)
         order = np.argsort(-bank.log_w, kind='stable')
-        leading = order[bank.log_w[order] >= bank.log_w.max() - LEADING]
+        leading: IntArray = order[bank.log_w[order] >= bank.log_w.max() - LEADING]
         return leading[:max(1, min(self._most, affordable))]
 
-    def _move_on(self, bank_filter, bank):
+    def _move_on(self, bank_filter: BankFilter, anchor: FilterBank, bank: FilterBank) -> None:
         """Once the frames are of twice the window, the anchor moves to where the window begins."""
         now, n_frames = self._frames[-1].stamp_ns, len(self._frames)
         if now - self._frames[0].stamp_ns <= 2 * self._window_ns and n_frames <= MOST_FRAMES:
             return
-        self._keep(np.isin(self._anchor.origin, bank.origin))
+        self._keep(anchor, np.isin(anchor.origin, bank.origin))
         n = next(k for k, f in enumerate(self._frames) if now - f.stamp_ns <= self._window_ns
                  and n_frames - k <= MOST_FRAMES // 2)
         for k in range(n + 1):
-            self._forward(bank_filter, self._anchor, k, self._paths[k])
+            self._forward(bank_filter, anchor, k, self._paths[k])
         self._frames, self._intervals = self._frames[n:], self._intervals[n:]
         self._paths, self._log_likelihoods = self._paths[n:], self._log_likelihoods[n:]
         self._updated = True
 
-    def _forward(self, bank_filter, bank, k, path):
+    def _forward(self, bank_filter: BankFilter, bank: FilterBank, k: int, path: FloatArray
+                 ) -> tuple[FloatArray | float, Step]:
         """`bank` through frame k, linearised at `path`; its log-likelihood and the `Step`."""
         F, decay = bank_filter.predict(bank, self._intervals[k]) if k else (None, None)
         if k == 0 and self._updated:
@@ -154,9 +166,14 @@ class Relinearisation:
             bank, self._frames[k], self._intervals[k], path)
         return log_likelihood, Step(bank.x.copy(), bank.P.copy(), gains, F, decay)
 
-    def _pass(self, bank_filter, rows, paths):
-        """Last `Step`, log-likelihood and [(smoothed states, deviation)] of rows of the anchor."""
-        bank, log_likelihood, steps = self._anchor.rows(rows), np.zeros(len(rows)), []
+    def _pass(self, bank_filter: BankFilter, bank: FilterBank, paths: Sequence[FloatArray]
+              ) -> tuple[Step, FloatArray, list[_Smoothed]]:
+        """Last `Step`, log-likelihood (n_rows,) and smoothed states of rows of the anchor.
+
+        `bank` are copies of those rows; they are moved.
+        """
+        log_likelihood: FloatArray = np.zeros(len(bank))
+        steps: list[Step] = []
         for k, path in enumerate(paths):
             of_frame, step = self._forward(bank_filter, bank, k, path)
             log_likelihood = log_likelihood + of_frame
@@ -165,7 +182,13 @@ class Relinearisation:
         return steps[-1], log_likelihood, list(zip(smoothed_states(steps), std, strict=True))
 
 
-def _settled(paths, new):
+def _rows(anchor: FilterBank, bank: FilterBank) -> IntArray:
+    """Rows of the `anchor` that the hypotheses of `bank` started from."""
+    return np.searchsorted(anchor.origin, bank.origin)
+
+
+def _settled(paths: Sequence[FloatArray], new: Sequence[_Smoothed]) -> BoolArray:
     """(n_rows,) whether the `new` [(states, deviation of the position)] are where `paths` are."""
-    return np.all([np.linalg.norm((x - path)[:, :3], axis=1) <= SETTLED * std
-                   for path, (x, std) in zip(paths, new, strict=True)], axis=0)
+    settled: BoolArray = np.all([np.linalg.norm((x - path)[:, :3], axis=1) <= SETTLED * std
+                                 for path, (x, std) in zip(paths, new, strict=True)], axis=0)
+    return settled

@@ -9,7 +9,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.track.bank_filter import BankFilter, NoTarget
@@ -23,13 +22,11 @@ from mag_tracking.stages.track.relinearisation import Relinearisation
 from mag_tracking.stages.track.sensor_rejection import SensorRejection
 from mag_tracking.stages.track.sensor_selection import AHEAD_S, SensorSubset, hand_on
 from mag_tracking.stages.track.settings import TrackSettings
-from mag_tracking.stages.track.smoothing import FixedLag, WholeTrack
+from mag_tracking.stages.track.smoothing import FixedLag, TrackState, WholeTrack
 from mag_tracking.stages.track.target import Target
 from mag_tracking.units import NS
 
 TrackRecord = Track | SmoothedPose
-TrackState = tuple[int, FloatArray, FloatArray]
-"""Timestamp [ns], state (n_x,) and covariance (n_x, n_x)."""
 
 
 class RunningTrack:

@@ -6,9 +6,19 @@ it once one sensor, or a few, are taken for missing, it is they that are wrong.
 """
 
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
+
+from mag_tracking.arrays import FloatArray
+from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track.bank_filter import BankFilter
+
+_States: TypeAlias = tuple[FloatArray, FloatArray]
+"""States and covariances of a bank."""
 
 ONE_IN = 8
 """No more than one sensor in so many can be wrong, but always one: else it is the track. Those that
@@ -18,15 +28,16 @@ are far from the target agree with everything."""
 class SensorRejection:
     """Updates a bank with what of a frame can be believed."""
 
-    def __init__(self, names):
+    def __init__(self, names: Sequence[str]) -> None:
         self._names = names
         self.clear()
 
-    def clear(self):
+    def clear(self) -> None:
         """No track is running."""
-        self._left_out = ()
+        self._left_out: tuple[int, ...] = ()
 
-    def update(self, bank_filter, bank, frame, dt):
+    def update(self, bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame, dt: float
+               ) -> 'tuple[FloatArray, FieldFrame, Counter[str]]':
         """Measurement update of the `FilterBank` in place, without sensors that contradict.
 
         Parameters
@@ -61,7 +72,8 @@ class SensorRejection:
         bank.x, bank.P, bank.nis, log_likelihood = whole
         return log_likelihood, frame, Counter()
 
-    def _suspicions(self, bank_filter, bank, before, frame, dt):
+    def _suspicions(self, bank_filter: BankFilter, bank: FilterBank, before: _States,
+                    frame: FieldFrame, dt: float) -> Iterator[tuple[int, ...]]:
         """Sets of sensors, as tuples of rows, to be left out, one after the other."""
         present = np.flatnonzero(~np.isnan(frame.field).all(axis=1)).tolist()
         most = max(1, len(present) // ONE_IN) if len(present) > 1 else 0
@@ -69,21 +81,22 @@ class SensorRejection:
         again = tuple(j for j in self._left_out if j in present)
         if again and len(again) <= most:
             yield again
-        found = ()
+        found: tuple[int, ...] = ()
         while len(found) < most:
             # The one without which the others fit best is the next.
-            misfit = {}
+            misfit: dict[tuple[int, ...], float] = {}
             for j in present:
                 if j not in found:
                     tried = (*found, j)
                     log_likelihood, less = self._without(
                         bank_filter, bank, before, frame, dt, tried)
                     misfit[tried] = _misfit(bank, less, log_likelihood)
-            found = min(misfit, key=misfit.get)
+            found = min(misfit, key=misfit.__getitem__)
             yield found
 
     @staticmethod
-    def _without(bank_filter, bank, before, frame, dt, left_out):
+    def _without(bank_filter: BankFilter, bank: FilterBank, before: _States, frame: FieldFrame,
+                 dt: float, left_out: tuple[int, ...]) -> tuple[FloatArray, FieldFrame]:
         """The update once more, as if some sensors were missing: (log-likelihood, frame)."""
         missing = np.isin(np.arange(len(frame.field)), left_out)
         less = replace(frame, field=np.where(missing[:, None], np.nan, frame.field),
@@ -94,20 +107,21 @@ class SensorRejection:
         return bank_filter.update(bank, less, dt), less
 
     @staticmethod
-    def _fits(bank_filter, bank, frame, log_likelihood):
+    def _fits(bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame,
+              log_likelihood: FloatArray) -> bool:
         """Whether the frame fits the hypothesis that leads after it."""
         leader = _leader(bank, log_likelihood)
         return leader is not None and not bank_filter.is_strange(bank, leader, frame)
 
 
-def _leader(bank, log_likelihood):
+def _leader(bank: FilterBank, log_likelihood: FloatArray) -> int | None:
     """Row of the hypothesis that weighs most after the frame; None where none explains it."""
     log_w = bank.log_w + log_likelihood
     leader = int(np.argmax(log_w))
     return leader if np.isfinite(log_w[leader]) else None
 
 
-def _misfit(bank, frame, log_likelihood):
+def _misfit(bank: FilterBank, frame: FieldFrame, log_likelihood: FloatArray) -> float:
     """Normalised innovation squared per axis of the leading hypothesis."""
     leader = _leader(bank, log_likelihood)
     n_axes = np.count_nonzero(~np.isnan(frame.field))

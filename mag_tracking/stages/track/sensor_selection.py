@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track.observation import angle_priors
@@ -18,13 +19,13 @@ AHEAD_S = 0.5
 """[s] The sensors are chosen for where the target will be then."""
 
 
-def nearest(positions, place, n):
+def nearest(positions: FloatArray, place: FloatArray, n: int) -> IntArray:
     """Rows (n,), ascending, of the sensors at `positions` (n_sensors, 3) nearest to a `place`."""
     distance = np.hypot(*(positions[:, :2] - place).T)
     return np.sort(np.argsort(distance, kind='stable')[:n])
 
 
-def part_of_frame(frame, rows):
+def part_of_frame(frame: FieldFrame, rows: IntArray) -> FieldFrame:
     """The `FieldFrame` of some sensors alone."""
     return replace(frame, field=frame.field[rows], covariance=frame.covariance[rows],
                    n_samples=frame.n_samples[rows], time_offset=frame.time_offset[rows])
@@ -59,7 +60,8 @@ class SensorSubset:
         return widened(track, self.rows, self.whole, settings) if self.is_part else track
 
 
-def hand_on(bank, n_own, before, after, own_covariance, background_std):
+def hand_on(bank: FilterBank, n_own: int, before: IntArray, after: IntArray,
+            own_covariance: FloatArray, background_std: float) -> None:
     """Give the hypotheses of a `FilterBank`, in place, the states of other sensors.
 
     Parameters
@@ -92,14 +94,14 @@ def hand_on(bank, n_own, before, after, own_covariance, background_std):
     bank.nis = np.full((len(bank), len(after)), np.nan)
 
 
-def _places(n_t, n_own, n_sensors):
+def _places(n_t: int, n_own: int, n_sensors: int) -> IntArray:
     """Of each sensor the places of its states: (n_sensors, n_own + 3)."""
     j = np.arange(n_sensors)[:, None]
     return np.hstack([n_t + n_own * j + np.arange(n_own),
                       n_t + n_own * n_sensors + 3 * j + np.arange(3)])
 
 
-def widened(track, rows, network, settings):
+def widened(track: Track, rows: IntArray, network: SensorNetwork, settings: TrackSettings) -> Track:
     """A `Track` of the sensors `rows` as one of the whole `network`.
 
     What it says nothing of is NaN, and a mounting is what was known of it before.

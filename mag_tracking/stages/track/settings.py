@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.settings import param
 from mag_tracking.stages.track.initiation_magnet import MagnetSettings
 from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
@@ -80,10 +81,11 @@ class TrackSettings:
     magnet: MagnetSettings = field(default_factory=MagnetSettings)
 
 
-def acceleration_density(settings):
+def acceleration_density(settings: TrackSettings) -> FloatArray:
     """(3,) [m^2/s^3] spectral density of the acceleration that the tracker of these
     `TrackSettings` assumes."""
     if settings.target == 'magnet':
         return np.full(3, settings.magnet.acceleration**2)
     v = settings.vehicle
-    return np.square([v.acceleration, v.acceleration, v.climb_acceleration])
+    density: FloatArray = np.square([v.acceleration, v.acceleration, v.climb_acceleration])
+    return density

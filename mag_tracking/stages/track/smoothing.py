@@ -7,12 +7,25 @@ need not be where the smoothed track ends: each was linearised elsewhere.
 """
 
 from collections import deque
+from collections.abc import Sequence
 from copy import copy
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.inference.smoother import Step, smoothed_covariances, smoothed_states
+from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.units import NS
+
+State: TypeAlias = tuple[FloatArray, FloatArray]
+"""State (n_x,) and covariance (n_x, n_x)."""
+
+TrackState: TypeAlias = tuple[int, FloatArray, FloatArray]
+"""Timestamp [ns], state (n_x,) and covariance (n_x, n_x)."""
 
 RELINEARISATIONS = 1
 """How often the whole is linearised anew, at what came of it before: far ahead of the sensors the
@@ -22,8 +35,9 @@ MOST_NUMBERS = 10_000_000
 """Frames times states squared that are smoothed at most: 80 MB, and a few seconds."""
 
 
-def smoothed_track(bank_filter, bank, frames, intervals, updated=False,
-                   relinearisations=RELINEARISATIONS):
+def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[FieldFrame],
+                   intervals: Sequence[float], updated: bool = False,
+                   relinearisations: int = RELINEARISATIONS) -> tuple[list[State], int]:
     """States of a hypothesis at each frame, given all of them.
 
     Parameters
@@ -44,7 +58,7 @@ def smoothed_track(bank_filter, bank, frames, intervals, updated=False,
     left_out : int
         Frames that the hypothesis contradicted; it coasted through them.
     """
-    x_lin = [None] * len(frames)
+    x_lin: list[FloatArray | None] = [None] * len(frames)
     for _ in range(relinearisations + 1):
         states, left_out = _forth_and_back(bank_filter, bank.alone(0), frames, intervals, updated,
                                            x_lin)
@@ -52,9 +66,12 @@ def smoothed_track(bank_filter, bank, frames, intervals, updated=False,
     return states, left_out
 
 
-def _forth_and_back(bank_filter, bank, frames, intervals, updated, x_lin):
+def _forth_and_back(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[FieldFrame],
+                    intervals: Sequence[float], updated: bool,
+                    x_lin: Sequence[FloatArray | None]) -> tuple[list[State], int]:
     """One pass of filter and smoother, linearised at `x_lin`; None = at the predictions."""
-    steps, left_out = [], 0
+    steps: list[Step] = []
+    left_out = 0
     for k, (frame, dt) in enumerate(zip(frames, intervals, strict=True)):
         F, decay = bank_filter.predict(bank, dt) if k else (None, None)
         gains = None
@@ -70,34 +87,52 @@ def _forth_and_back(bank_filter, bank, frames, intervals, updated, x_lin):
                                          strict=True)], left_out
 
 
+@dataclass
+class _Start:
+    """Where a track began, and the filter that it was moved with."""
+
+    bank_filter: BankFilter
+    x: FloatArray
+    """(n_hyp, n_x)"""
+    P: FloatArray
+    """(n_hyp, n_x, n_x)"""
+    origin: IntArray
+    """(n_hyp,) as in `FilterBank`."""
+
+    def keep(self, rows: BoolArray) -> None:
+        """Keep the hypotheses of the mask `rows` (n_hyp,)."""
+        self.x, self.P, self.origin = self.x[rows], self.P[rows], self.origin[rows]
+
+
 class WholeTrack:
     """The frames of a running track, to smooth it when it ends."""
 
-    def __init__(self, longest_s):
+    def __init__(self, longest_s: float) -> None:
         self._longest_s = longest_s
         self.clear()
 
-    def clear(self):
+    def clear(self) -> None:
         """Nothing is kept."""
-        self._filter = self._x = self._P = self._origin = None
-        self._frames, self._intervals, self._published = [], [], []
+        self._start: _Start | None = None
+        self._frames: list[FieldFrame] = []
+        self._intervals: list[float] = []
+        self._published: list[bool] = []
         self._length_s, self.too_long = 0.0, False
 
-    def begin(self, bank, bank_filter):
+    def begin(self, bank: FilterBank, bank_filter: BankFilter) -> None:
         """A track begins with `bank`, before its first frame; its settings stay those of now."""
         self.clear()
         if self._longest_s:
-            self._filter = copy(bank_filter)
-            self._x, self._P, self._origin = bank.x.copy(), bank.P.copy(), bank.origin
+            self._start = _Start(copy(bank_filter), bank.x.copy(), bank.P.copy(), bank.origin)
 
-    def give_up(self):
+    def give_up(self) -> None:
         """It cannot be smoothed as a whole."""
         self.clear()
         self.too_long = True
 
-    def add(self, bank, frame, dt, published):
+    def add(self, bank: FilterBank, frame: FieldFrame, dt: float, published: bool) -> None:
         """A frame was used, `dt` [s] after the one before."""
-        if self._filter is None:
+        if self._start is None:
             return
         self._length_s += dt
         n_numbers = (len(self._frames) + 1) * bank.x.shape[1]**2
@@ -107,62 +142,78 @@ class WholeTrack:
         self._frames.append(frame)
         self._intervals.append(dt)
         self._published.append(published)
-        if len(bank) < len(self._origin) // 2:
-            rows = np.isin(self._origin, bank.origin)
-            self._x, self._P, self._origin = self._x[rows], self._P[rows], self._origin[rows]
+        if len(bank) < len(self._start.origin) // 2:
+            self._start.keep(np.isin(self._start.origin, bank.origin))
 
-    def smoothed(self, bank, best):
+    def smoothed(self, bank: FilterBank, best: int) -> tuple[list[TrackState], int]:
         """[(stamp_ns, x, P)] of the published frames, and how many frames did not fit.
 
         By the hypothesis `best` of the `bank`.
         """
-        if not self._frames:
+        start = self._start
+        if start is None or not self._frames:
             return [], 0
-        one, row = bank.alone(best), np.flatnonzero(self._origin == bank.origin[best])
-        one.x, one.P = self._x[row].copy(), self._P[row].copy()
-        states, left_out = smoothed_track(self._filter, one, self._frames, self._intervals)
+        one, row = bank.alone(best), np.flatnonzero(start.origin == bank.origin[best])
+        one.x, one.P = start.x[row].copy(), start.P[row].copy()
+        states, left_out = smoothed_track(start.bank_filter, one, self._frames, self._intervals)
         return [(frame.stamp_ns, x, P) for frame, (x, P), published in zip(
             self._frames, states, self._published, strict=True) if published], left_out
+
+
+class _Kept(NamedTuple):
+    """A frame of a running track, and its bank after the update with it."""
+
+    frame: FieldFrame
+    dt: float
+    published: bool
+    origin: IntArray
+    x: FloatArray
+    P: FloatArray
+
+    def rows(self, mask: BoolArray) -> '_Kept':
+        """The hypotheses of the `mask` (n_hyp,) alone."""
+        return self._replace(origin=self.origin[mask], x=self.x[mask], P=self.P[mask])
 
 
 class FixedLag:
     """The latest frames of a running track and the bank at each, to smooth the oldest."""
 
-    def __init__(self, lag_s):
+    def __init__(self, lag_s: float) -> None:
         self._lag_s = lag_s
-        self._kept = deque()
+        self._kept: deque[_Kept] = deque()
 
-    def clear(self):
+    def clear(self) -> None:
         """Nothing is kept: a track has ended."""
         self._kept.clear()
 
-    def smoothed(self, bank_filter, bank, best, frame, dt, published):
+    def smoothed(self, bank_filter: BankFilter, bank: FilterBank, best: int, frame: FieldFrame,
+                 dt: float, published: bool) -> list[TrackState]:
         """[(stamp_ns, x, P)] of the frames that now lie `lag_s` back: none or one, rarely more.
 
         `bank` after the update with `frame`, which came `dt` [s] after the one before.
         """
-        self._kept.append((frame, dt, published, bank.origin, bank.x.copy(), bank.P.copy()))
-        if len(bank) < len(self._kept[0][3]) // 2:
-            self._kept = deque((f, d, p, origin[rows], x[rows], P[rows]) for f, d, p, origin, x, P
-                               in self._kept for rows in [np.isin(origin, bank.origin)])
-        out = []
-        while (frame.stamp_ns - self._kept[0][0].stamp_ns) / NS >= self._lag_s:
-            if self._kept[0][2]:
-                out.append((self._kept[0][0].stamp_ns, *self._states(bank_filter, bank, best)[0]))
+        self._kept.append(_Kept(frame, dt, published, bank.origin, bank.x.copy(), bank.P.copy()))
+        if len(bank) < len(self._kept[0].origin) // 2:
+            self._kept = deque(k.rows(np.isin(k.origin, bank.origin)) for k in self._kept)
+        out: list[TrackState] = []
+        while (frame.stamp_ns - self._kept[0].frame.stamp_ns) / NS >= self._lag_s:
+            if self._kept[0].published:
+                out.append((self._kept[0].frame.stamp_ns,
+                            *self._states(bank_filter, bank, best)[0]))
             self._kept.popleft()
         return out
 
-    def rest(self, bank_filter, bank, best):
+    def rest(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[TrackState]:
         """[(stamp_ns, x, P)] of all frames that are left: the track ends."""
         if not self._kept:
             return []
-        return [(kept[0].stamp_ns, *state) for kept, state in zip(
-            self._kept, self._states(bank_filter, bank, best), strict=True) if kept[2]]
+        return [(kept.frame.stamp_ns, *state) for kept, state in zip(
+            self._kept, self._states(bank_filter, bank, best), strict=True) if kept.published]
 
-    def _states(self, bank_filter, bank, best):
+    def _states(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[State]:
         """Smoothed states of the frames that are kept, linearised once: it is done every frame."""
-        _, _, _, origin, x, P = self._kept[0]
-        one, row = bank.alone(best), np.flatnonzero(origin == bank.origin[best])
-        one.x, one.P = x[row].copy(), P[row].copy()
-        return smoothed_track(bank_filter, one, [k[0] for k in self._kept],
-                              [k[1] for k in self._kept], updated=True, relinearisations=0)[0]
+        oldest = self._kept[0]
+        one, row = bank.alone(best), np.flatnonzero(oldest.origin == bank.origin[best])
+        one.x, one.P = oldest.x[row].copy(), oldest.P[row].copy()
+        return smoothed_track(bank_filter, one, [k.frame for k in self._kept],
+                              [k.dt for k in self._kept], updated=True, relinearisations=0)[0]
