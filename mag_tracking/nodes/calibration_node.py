@@ -1,7 +1,12 @@
 """calibration_node: raw magnetic fields in, calibrated ones out."""
 
+if __name__ == '__main__':
+    # Does not return: a signal during the imports below would end in a traceback.
+    from mag_tracking.nodes.start import calibration_node
+
+    calibration_node()
+
 import datetime
-import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -277,9 +282,5 @@ class CalibrationNode(StageNode):
 
 
 def main(arguments=None):
-    """Run the node."""
-    sys.exit(stage_node.main(CalibrationNode, arguments))
-
-
-if __name__ == '__main__':
-    main()
+    """Run the node; returns the exit status."""
+    return stage_node.main(CalibrationNode, arguments)
