@@ -161,9 +161,9 @@ class ReplayNode(Node):
         return response
 
     def resume(self):
-        """Go on from where it was paused."""
+        """Go on from where it was paused, without the rest of `start_delay`."""
         self._paused = False
-        self._start = 0.0
+        self._start = min(self._start, time.monotonic())
 
     def _seek_service(self, request, response):
         """Move to another place; a negative or too large offset is refused."""
