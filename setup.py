@@ -80,7 +80,7 @@ setup(
     entry_points={
         'console_scripts': [
             'mag-tracking = mag_tracking.cli:main',
-            *(f'{node} = mag_tracking.nodes.{node}:main' for node in NODES),
+            *(f'{node} = mag_tracking.nodes.start:{node}' for node in NODES),
         ],
     },
     zip_safe=False,

@@ -1,5 +1,9 @@
-"""Signals that end a program, taken note of instead of raised."""
+"""Signals that end a program, taken note of or obeyed at once instead of raised.
 
+Nothing is imported here that takes time: programs come here first.
+"""
+
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -18,20 +22,47 @@ def noted_signals(*signals: signal.Signals) -> Iterator[list[int]]:
     where no handler can be set, the list stays empty.
     """
     seen: list[int] = []
-    before: dict[signal.Signals, Callable[[int, FrameType | None], object] | int | None] = {}
 
     def note(signum: int, _: FrameType | None) -> None:
         seen.append(signum)
         if len(seen) > 2:
             raise KeyboardInterrupt
 
+    with _handled_by(note, signals):
+        yield seen
+
+
+@contextmanager
+def exit_on_signals(status, *signals, message=''):
+    """End the process at once, with `status` and a `message`, when one of `signals` comes.
+
+    For the imports at the start of a program, when there is nothing to clean up: an exception
+    raised in the middle of an import may be swallowed, or turned into another one. No buffer is
+    flushed and no `finally` runs. Signals that are ignored, and other threads: as `noted_signals`.
+    """
+    text = f'{message}\n'.encode() if message else b''
+
+    def leave(_signum, _frame):
+        try:
+            os.write(2, text)
+        finally:
+            os._exit(status)
+
+    with _handled_by(leave, signals):
+        yield
+
+
+@contextmanager
+def _handled_by(handler, signals):
+    """Have `handler` called with `signals`, but for those that are ignored."""
+    before = {}
     if threading.current_thread() is threading.main_thread():
         before = {s: signal.getsignal(s) for s in signals}
-        before = {s: handler for s, handler in before.items() if handler is not signal.SIG_IGN}
+        before = {s: known for s, known in before.items() if known is not signal.SIG_IGN}
     for s in before:
-        signal.signal(s, note)
+        signal.signal(s, handler)
     try:
-        yield seen
+        yield
     finally:
-        for s, handler in before.items():
-            signal.signal(s, handler)
+        for s, known in before.items():
+            signal.signal(s, known)

@@ -1,41 +1,37 @@
 """The command `mag-tracking`: one module a command."""
 
-import argparse
+import signal
 import sys
 from collections.abc import Sequence
 
-from mag_tracking.cli import (
-    board_geometry,
-    calibrate,
-    doctor,
-    fit,
-    import_table,
-    info,
-    listen,
-    plan,
-    record,
-    repair,
-    replay,
-    run,
-    tumble,
-)
 from mag_tracking.errors import MagTrackingError
+from mag_tracking.interrupts import exit_on_signals
 
-
-def _parser() -> argparse.ArgumentParser:
-    """The command line."""
-    parser = argparse.ArgumentParser(
-        prog='mag-tracking', description='Track magnetic targets with stationary magnetometers.')
-    commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
-    for module in (replay, calibrate, tumble, board_geometry, doctor, fit, plan, listen, record,
-                   repair, run, info, import_table):
-        module.add(commands)
-    return parser
+INTERRUPTED = 'mag-tracking: interrupted'
+"""What Ctrl-C has the command say."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status (1 for an error that a message explains)."""
-    args = _parser().parse_args(argv)
+    words = sys.argv[1:] if argv is None else argv
+    if words[:1] == ['run']:
+        # To end the nodes is no failure, neither before they are up.
+        with exit_on_signals(0, signal.SIGINT, signal.SIGTERM):
+            return _run(_parse(words))
+    with exit_on_signals(130, signal.SIGINT, message=INTERRUPTED):
+        args = _parse(words)
+    return _run(args)
+
+
+def _parse(words):
+    """The parsed command line; the imports for it take most of a second."""
+    from mag_tracking.cli.commands import parse
+
+    return parse(words)
+
+
+def _run(args):
+    """Run a command; returns its exit status."""
     try:
         status: int = args.run_command(args)
         return status
@@ -44,5 +40,5 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f'mag-tracking: {error}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print('mag-tracking: interrupted', file=sys.stderr)
+        print(INTERRUPTED, file=sys.stderr)
         return 130

@@ -1,6 +1,11 @@
 """calibration_node: raw magnetic fields in, calibrated ones out."""
 
-import sys
+if __name__ == '__main__':
+    # Does not return: a signal during the imports below would end in a traceback.
+    from mag_tracking.nodes.start import calibration_node
+
+    calibration_node()
+
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -181,10 +186,6 @@ class CalibrationNode(StageNode):
         return response
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Run the node."""
-    sys.exit(stage_node.main(CalibrationNode, arguments))
-
-
-if __name__ == '__main__':
-    main()
+def main(arguments: list[str] | None = None) -> int:
+    """Run the node; returns the exit status."""
+    return stage_node.main(CalibrationNode, arguments)

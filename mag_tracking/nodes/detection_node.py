@@ -1,6 +1,11 @@
 """detection_node: calibrated fields in, frames of the network and detections out."""
 
-import sys
+if __name__ == '__main__':
+    # Does not return: a signal during the imports below would end in a traceback.
+    from mag_tracking.nodes.start import detection_node
+
+    detection_node()
+
 from functools import partial
 
 from mag_tracking_msgs.msg import Detection as DetectionMessage
@@ -67,9 +72,5 @@ class DetectionNode(StageNode):
 
 
 def main(arguments=None):
-    """Run the node."""
-    sys.exit(stage_node.main(DetectionNode, arguments))
-
-
-if __name__ == '__main__':
-    main()
+    """Run the node; returns the exit status."""
+    return stage_node.main(DetectionNode, arguments)

@@ -4,7 +4,12 @@ A lifecycle node: configuring reads the drivers file, activating opens the
 devices. With `autostart` (the default) it does both by itself.
 """
 
-import sys
+if __name__ == '__main__':
+    # Does not return: a signal during the imports below would end in a traceback.
+    from mag_tracking.nodes.start import driver_node
+
+    driver_node()
+
 import threading
 import time
 
@@ -151,9 +156,5 @@ class DriverNode(LifecycleNode):
 
 
 def main(arguments=None):
-    """Run the node."""
-    sys.exit(stage_node.main(DriverNode, arguments))
-
-
-if __name__ == '__main__':
-    main()
+    """Run the node; returns the exit status."""
+    return stage_node.main(DriverNode, arguments)

@@ -1,6 +1,11 @@
 """replay_node: plays a recording over topics, with /clock, pause, resume and seek."""
 
-import sys
+if __name__ == '__main__':
+    # Does not return: a signal during the imports below would end in a traceback.
+    from mag_tracking.nodes.start import replay_node
+
+    replay_node()
+
 import time
 from collections import Counter
 
@@ -156,9 +161,9 @@ class ReplayNode(Node):
         return response
 
     def resume(self):
-        """Go on from where it was paused."""
+        """Go on from where it was paused, without the rest of `start_delay`."""
         self._paused = False
-        self._start = 0.0
+        self._start = min(self._start, time.monotonic())
 
     def _seek_service(self, request, response):
         """Move to another place; a negative or too large offset is refused."""
@@ -175,9 +180,5 @@ class ReplayNode(Node):
 
 
 def main(arguments=None):
-    """Run the node."""
-    sys.exit(stage_node.main(ReplayNode, arguments))
-
-
-if __name__ == '__main__':
-    main()
+    """Run the node; returns the exit status."""
+    return stage_node.main(ReplayNode, arguments)

@@ -1,6 +1,11 @@
 """tracker_node: frames of the network in, poses and tracks out."""
 
-import sys
+if __name__ == '__main__':
+    # Does not return: a signal during the imports below would end in a traceback.
+    from mag_tracking.nodes.start import tracker_node
+
+    tracker_node()
+
 import time
 from collections import deque
 
@@ -176,9 +181,5 @@ def _same_orientations(one, other):
 
 
 def main(arguments=None):
-    """Run the node."""
-    sys.exit(stage_node.main(TrackerNode, arguments))
-
-
-if __name__ == '__main__':
-    main()
+    """Run the node; returns the exit status."""
+    return stage_node.main(TrackerNode, arguments)

@@ -1,7 +1,6 @@
 """The command line: what it writes, what it says, how it fails."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -14,6 +13,7 @@ from mag_tracking.cli import main
 from mag_tracking.recording.fit_folder import FIT_COLUMNS
 from mag_tracking.recording.result_folder import DETECTION_COLUMNS, POSE_COLUMNS, SMOOTHED_COLUMNS
 from support.bundled import DATA, NETWORK_FILE, vehicle_path
+from support.permissions import as_files_say
 
 NAME = 'junction_left_to_right'
 
@@ -100,11 +100,14 @@ def test_failures_are_one_clear_line(tmp_path, capsys):
                                           '--out', tmp_path / 'out')
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason='root may write everywhere')
 def test_a_read_only_folder_is_named(tmp_path, capsys):
-    tmp_path.chmod(0o500)
-    assert 'cannot write' in fail(capsys, 'replay', vehicle_path(NAME), '--network', NETWORK_FILE,
-                                  '--out', tmp_path / 'out')
+    folder = tmp_path / 'theirs'
+    folder.mkdir(mode=0o500)
+    with as_files_say():
+        told = fail(capsys, 'replay', vehicle_path(NAME), '--network', NETWORK_FILE,
+                    '--out', folder / 'out')
+    assert f'cannot write to {folder / "out"}' in told and 'Permission denied' in told
+    assert list(folder.iterdir()) == []
 
 
 def test_a_recording_too_short_to_learn_says_so(tmp_path, capsys):

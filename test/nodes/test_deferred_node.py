@@ -29,7 +29,7 @@ def test_who_asks_twice_is_called_once(ros):
     for n in (1, 2):
         for _ in range(3):
             ask()
-        assert spin_until(lambda n=n: len(called) == n, 5.0)
+        assert spin_until(lambda n=n: len(called) == n)
         assert called[-1] - asked[-3] > 0.045
         spin_until(lambda: False, 0.2)
         assert len(called) == n
@@ -41,7 +41,7 @@ def test_what_waits_is_asked_for_all_the_time_and_done_all_the_same(ros):
     called = []
     later = Deferred(node, 0.05, lambda: called.append(0))
     node.create_timer(0.01, later.request)
-    assert spin_until(lambda: len(called) >= 5, 5.0)
+    assert spin_until(lambda: len(called) >= 5)
 
 
 def test_of_readings_that_come_together_each_is_looked_at(ros):

@@ -35,12 +35,12 @@ node, heard, began = Node('listener'), Future(), time.monotonic()
 node.create_subscription(MagneticField, '/field', heard.set_result, STREAM)
 executor = EventsExecutor()
 executor.add_node(node)
-executor.spin_until_future_complete(heard, 10.0)
+executor.spin_until_future_complete(heard, 60.0)
 waited = time.monotonic() - began
 partial = Path(sys.argv[1]).with_suffix('.partial')
 partial.write_text(str(waited))
 partial.rename(sys.argv[1])
-time.sleep(60.0)
+time.sleep(600.0)
 """
 
 
@@ -92,7 +92,7 @@ def test_a_node_that_is_killed_and_started_again_hears_at_once(ros, tmp_path):
         with subprocess.Popen([sys.executable, '-c', LISTENER, str(heard)],
                               env=environment()) as listener:
             try:
-                assert spin_until(heard.exists, 20.0)
+                assert spin_until(heard.exists)
             finally:
                 listener.kill()
         waits.append(float(heard.read_text()))

@@ -20,7 +20,7 @@ from support.bundled import POINT
 from support.node_world import BODY, NS, STEADY, TOPICS, is_wrong, network_file, world
 from support.roadside import FIRST, RATE_HZ, SPEED
 
-pytestmark = [pytest.mark.timeout(120), pytest.mark.single]
+pytestmark = [pytest.mark.timeout(600), pytest.mark.single]
 LIMIT_S = 2.0
 """[s] Everything has to go on within this."""
 
@@ -29,7 +29,6 @@ LIMIT_S = 2.0
 def here(tmp_path_factory):
     """The `World` of all tests: each leaves it as it found it, but for the link."""
     with world(tmp_path_factory.mktemp('world')) as it:
-        it.wrong_poses = {}
         yield it
 
 
@@ -46,10 +45,10 @@ def flows_again(world, sensor_back_ns):
     return (world.since(sensor_back_ns, 'driver_node')[0][0] - sensor_back_ns) / NS
 
 
-def check_the_end(world, began, track, fault, lost_ns, where):
+def check_the_end(world, began, track, lost_ns, where):
     """The driver has named `where` it lost its device, counts what it missed, and is well again.
 
-    The track goes on over a gap of less than `track.end_gap_s`; what is wrong in it is kept.
+    The track goes on over a gap of less than `track.end_gap_s`, and none of its poses is wrong.
     """
     name = f'driver_node: {world.link}'
     assert world.told(lost_ns, name)[0][1].level == DiagnosticStatus.ERROR
@@ -59,7 +58,7 @@ def check_the_end(world, began, track, fault, lost_ns, where):
     assert world.wait(lambda: ended(world, began), 10.0)
     assert {t.id for t in world.tracks(began)} == {track}
     assert world.tracks(began)[-1].stamp_ns > lost_ns + NS
-    world.wrong_poses[fault] = world.wrong(began)
+    assert world.wrong(began) == []
 
 
 def call_and_wait(world):
@@ -87,7 +86,7 @@ def test_the_broker_restarts(here):
     returned = time.time_ns()
     print(f'the broker is gone for {(returned - killed) / NS:.2f} s: readings '
           f'{flows_again(here, returned):.2f} s after its return')
-    check_the_end(here, began, track, 'broker', killed, f'127.0.0.1:{here.broker.port}')
+    check_the_end(here, began, track, killed, f'127.0.0.1:{here.broker.port}')
 
 
 @pytest.mark.parametrize('name', list(TOPICS))
@@ -101,7 +100,7 @@ def test_a_node_is_killed_and_started_again(here, name):
     print(f'{name}: up after {up:.2f} s, gives its own {recovery:.2f} s later')
     assert recovery <= LIMIT_S
     assert here.wait(here.roadside.is_gone, 10.0)
-    here.wrong_poses[name] = here.wrong(began)
+    assert here.wrong(began) == []
 
 
 @pytest.mark.parametrize('name, by, words', [
@@ -158,15 +157,7 @@ def test_the_port_vanishes(here):
     returned = time.time_ns()
     print(f'the port is gone for {(returned - pulled) / NS:.2f} s: readings '
           f'{flows_again(here, returned):.2f} s after its return')
-    check_the_end(here, began, track, 'port', pulled, str(here.line.path))
-
-
-@pytest.mark.parametrize('fault', ['broker', 'port', *TOPICS])
-def test_no_pose_was_wrong_without_a_word(here, fault):
-    """Of the passes of the tests above."""
-    if fault not in here.wrong_poses:
-        pytest.skip('the test of that fault has not run')
-    assert here.wrong_poses[fault] == []
+    check_the_end(here, began, track, pulled, str(here.line.path))
 
 
 def test_two_boards_of_one_name(here):

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -26,12 +27,13 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.repair import repair
 from support.bundled import NETWORK_FILE, vehicle_path
-from support.node_processes import call, start, stop
+from support.node_processes import LONGEST_S, call, start, stop
 from support.recorded_topics import FIELDS, IMUS
 
-pytestmark = pytest.mark.timeout(120)
+pytestmark = pytest.mark.timeout(600)
 S = 10**9
 COMMAND = ('import argparse, sys; from mag_tracking.cli import record; '
+           'from mag_tracking.nodes import record_node; record_node.LINE_S = 0.2; '
            'p = argparse.ArgumentParser(); record.add(p.add_subparsers()); '
            'a = p.parse_args(); sys.exit(a.run_command(a))')
 
@@ -44,6 +46,18 @@ def recording_process(out, *options):
     line = process.stdout.readline()
     assert f'recording into {out}' in line, line + process.stdout.read()
     return process
+
+
+def await_messages(process, n):
+    """Read what a recording process says until it has `n` messages, or no more for ten seconds."""
+    before, lines = None, 0
+    for line in process.stdout:
+        told = re.search(r' s: (\d+) messages', line)
+        if told:
+            lines = lines + 1 if told[1] == before else 0
+            before = told[1]
+            if int(before) >= n or lines > 50:
+                return
 
 
 def segments_of(pid):
@@ -88,21 +102,19 @@ def test_a_replay_that_is_recorded_is_the_same_recording(ros, tmp_path, road_net
     original, out = vehicle_path('straight_car_right'), tmp_path / 'night'
     process = recording_process(out)
     player = start('replay_node', '-p', f'recording:={original}', '-p', 'rate:=5.0',
-                   '-p', 'paused:=true', '-p', 'wait_for_subscribers:=30.0')
+                   '-p', 'paused:=true', '-p', 'wait_for_subscribers:=300.0')
     expected = {t: n for t, n in Recording(original).message_counts.items() if '/imu/' in t}
     assert set(expected) == {*FIELDS, *IMUS}
     try:
         assert any('4 of 4 topics' in line for line in process.stdout)
-        # What they have found has still to find them.
-        time.sleep(1.0)
         assert call(ros, Trigger, '/replay_node/resume', Trigger.Request()).success
         assert 'messages played' in player.stdout.readline()
-        time.sleep(0.2)
+        await_messages(process, sum(expected.values()))
         used = segments_of(process.pid) - before
     finally:
         stop([player])
         process.send_signal(signal.SIGTERM)
-        output = process.communicate(timeout=30)[0]
+        output = process.communicate(timeout=LONGEST_S)[0]
     assert process.returncode == 0 and 'warning' not in output, output
     for topic, n in expected.items():
         assert f'  {topic}  {n}\n' in output, output

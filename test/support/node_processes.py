@@ -8,6 +8,9 @@ import tempfile
 
 from mag_tracking.nodes.middleware import PROFILE_VARIABLE
 
+LONGEST_S = 120.0
+"""[s] Whatever a test waits for has come by then, also on a slow machine beside others."""
+
 
 def start(module, *arguments, home=None):
     """A node in a process of its own, with no memory but what it finds in `home`."""
@@ -26,7 +29,7 @@ def stop(processes):
     """End them as Ctrl-C does; (exit codes, outputs)."""
     for p in processes:
         p.send_signal(signal.SIGINT)
-    outputs = [p.communicate(timeout=30)[0] for p in processes]
+    outputs = [p.communicate(timeout=LONGEST_S)[0] for p in processes]
     return [p.returncode for p in processes], outputs
 
 
@@ -39,8 +42,8 @@ def call(ros, kind, name, request):
     node, spin_until = ros
     client = node.create_client(kind, name)
     assert spin_until(client.service_is_ready), f'there is no {name}'
-    for _ in range(6):
+    for _ in range(12):
         future = client.call_async(request)
-        if spin_until(future.done, 5.0):
+        if spin_until(future.done, 10.0):
             return future.result()
     raise AssertionError(f'{name} has not answered')

@@ -1,0 +1,30 @@
+"""The command line of `mag-tracking`: all commands, with all that they import."""
+
+import argparse
+
+from mag_tracking.cli import (
+    board_geometry,
+    calibrate,
+    doctor,
+    fit,
+    import_table,
+    info,
+    listen,
+    plan,
+    record,
+    repair,
+    replay,
+    run,
+    tumble,
+)
+
+
+def parse(words):
+    """The parsed command line; its `run_command` takes it and returns the exit status."""
+    parser = argparse.ArgumentParser(
+        prog='mag-tracking', description='Track magnetic targets with stationary magnetometers.')
+    commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
+    for module in (replay, calibrate, tumble, board_geometry, doctor, fit, plan, listen, record,
+                   repair, run, info, import_table):
+        module.add(commands)
+    return parser.parse_args(words)

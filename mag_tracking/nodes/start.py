@@ -1,0 +1,54 @@
+"""Entry points of the nodes: signals are handled before anything that takes time is imported.
+
+The imports of a node take a second, on a small computer several. From the first line here on,
+SIGINT and SIGTERM end the process with status 0: at once while modules are imported, and later by
+`stage_node.main`, which lets the node leave the middleware. What comes before, the start of Python
+itself, is out of reach.
+"""
+
+import signal
+import sys
+from importlib import import_module
+
+from mag_tracking.interrupts import exit_on_signals
+
+ENDING = (signal.SIGINT, signal.SIGTERM)
+"""The signals that end a node."""
+
+
+def run_node(name):
+    """Run the node of the module `name` as a process; does not return."""
+    try:
+        with exit_on_signals(0, *ENDING):
+            status = import_module(f'mag_tracking.nodes.{name}').main()
+    except KeyboardInterrupt:
+        status = 130
+    # The end of Python takes a while, too: a second signal is ignored.
+    for s in ENDING:
+        signal.signal(s, signal.SIG_IGN)
+    sys.exit(status)
+
+
+def driver_node():
+    """The command driver_node."""
+    run_node('driver_node')
+
+
+def replay_node():
+    """The command replay_node."""
+    run_node('replay_node')
+
+
+def calibration_node():
+    """The command calibration_node."""
+    run_node('calibration_node')
+
+
+def detection_node():
+    """The command detection_node."""
+    run_node('detection_node')
+
+
+def tracker_node():
+    """The command tracker_node."""
+    run_node('tracker_node')

@@ -1,0 +1,144 @@
+"""A process that is sent a signal at any moment of its start ends with status 0, and silently."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from support.bundled import NETWORK_FILE, ROOT, vehicle_path
+from support.node_processes import environment
+
+pytestmark = pytest.mark.timeout(600)
+
+LONGEST_START_S = 120.0
+GIVEN = {'driver_node': {'drivers': ROOT / 'config' / 'drivers.yaml', 'network': NETWORK_FILE},
+         'replay_node': {'recording': vehicle_path('straight_car_right')},
+         **{f'{name}_node': {'network': NETWORK_FILE}
+            for name in ('calibration', 'detection', 'tracker')}}
+COMMANDS = {name: ['-m', f'mag_tracking.nodes.{name}', '--ros-args',
+                   *(a for key, value in given.items() for a in ('-p', f'{key}:={value}'))]
+            for name, given in GIVEN.items()}
+COMMANDS['run'] = ['-m', 'mag_tracking.cli', 'run', '--network', str(NETWORK_FILE)]
+SCRIPTS = {name: ['-c', f'from mag_tracking.nodes.start import {name}; {name}()',
+                  *COMMANDS[name][2:]] for name in GIVEN}
+"""What pip's console scripts do."""
+STRUCK = """
+import os, runpy, sys
+how, module = int(sys.argv.pop(1)), sys.argv.pop(1)
+def strike(event, arguments):
+    if event == 'import' and arguments[0] == module:
+        os.kill(os.getpid(), how)
+sys.addaudithook(strike)
+kind, what = sys.argv.pop(1), sys.argv.pop(1)
+if kind == '-m':
+    runpy.run_module(what, run_name='__main__', alter_sys=True)
+else:
+    exec(what)
+"""
+"""Runs a command, and sends itself a signal when it begins to import a module."""
+LIBRARIES = ('librcl.so', 'libfastrtps.so')
+"""Loaded while a node starts, the second when it enters ROS."""
+
+
+def begun(words):
+    """A process with these arguments for Python."""
+    return subprocess.Popen(
+        [sys.executable, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        text=True, env=environment(),
+        # A background job, which these tests may be, passes on that it ignores SIGINT.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+
+
+def started(words):
+    """A process whose first line of the project's has run: it handles SIGTERM."""
+    process = begun(words)
+    wait_for(lambda: handles(process.pid, signal.SIGTERM), process)
+    return process
+
+
+def handles(pid, signum):
+    """Whether a process has a handler for a signal."""
+    with open(f'/proc/{pid}/status') as stream:
+        mask = next(line.split()[1] for line in stream if line.startswith('SigCgt:'))
+    return bool(int(mask, 16) >> (signum - 1) & 1)
+
+
+def has_loaded(pid, name):
+    """Whether a process has a library whose path has this in it."""
+    with open(f'/proc/{pid}/maps') as stream:
+        return name in stream.read()
+
+
+def wait_for(condition, process):
+    """Ask until it is so; a process that ends meanwhile or never gets there is an error."""
+    end = time.monotonic() + LONGEST_START_S
+    while not condition():
+        assert process.poll() is None and time.monotonic() < end, process.communicate()[0]
+        time.sleep(0.001)
+
+
+def end_of(process, how):
+    """(exit status, output) of a process that is sent a signal."""
+    process.send_signal(how)
+    output = process.communicate(timeout=LONGEST_START_S)[0]
+    return process.returncode, output
+
+
+@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('words', [
+    *(pytest.param(words, id=name) for name, words in COMMANDS.items()),
+    *(pytest.param(words, id=f'{name} script') for name, words in SCRIPTS.items())])
+def test_a_signal_during_the_imports_ends_it(words, how):
+    process = started(words)
+    assert end_of(process, how) == (0, '')
+    for module in ('numpy', 'rclpy', 'mag_tracking.nodes.middleware'):
+        process = begun(['-c', STRUCK, int(how), module, *words])
+        output = process.communicate(timeout=LONGEST_START_S)[0]
+        assert (process.returncode, output) == (0, ''), module
+
+
+@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('library', LIBRARIES)
+def test_a_signal_while_a_library_is_loaded_ends_it(library, how):
+    for name in ('tracker_node', 'run'):
+        process = started(COMMANDS[name])
+        wait_for(lambda process=process: has_loaded(process.pid, library), process)
+        assert end_of(process, how) == (0, '')
+
+
+def start_s(ros, words):
+    """Seconds from the first line until a node of the process is in the graph."""
+    node, spin_until = ros
+    known = sorted(node.get_node_names())
+    process = started(words)
+    began = time.monotonic()
+    assert spin_until(lambda: sorted(node.get_node_names()) != known, LONGEST_START_S)
+    took = time.monotonic() - began
+    assert end_of(process, signal.SIGINT) == (0, '')
+    assert spin_until(lambda: sorted(node.get_node_names()) == known, LONGEST_START_S)
+    return took
+
+
+@pytest.mark.parametrize('name, step_s', [
+    pytest.param('tracker_node', 0.25), pytest.param('run', 0.25),
+    *(pytest.param(name, 0.05, marks=pytest.mark.study) for name in COMMANDS)])
+def test_a_signal_at_any_moment_of_the_start_ends_it(ros, name, step_s):
+    """On a slow machine the steps are as many, and longer."""
+    took = start_s(ros, COMMANDS[name])
+    n = round(2.5 / step_s)
+    step_s, ends = max(step_s, 1.2 * took / n), {}
+    for k in range(1, 1 + int(1.2 * took / step_s)):
+        how = (signal.SIGINT, signal.SIGTERM)[k % 2]
+        process = started(COMMANDS[name])
+        time.sleep(k * step_s)
+        ends[round(k * step_s, 2), how.name] = end_of(process, how)
+    print(f'{name}: up after {took:.2f} s; {len(ends)} signals, {step_s:.2f} s apart')
+    assert {moment: end for moment, end in ends.items() if end != (0, '')} == {}
+
+
+def test_other_commands_say_that_they_were_interrupted():
+    process = begun(['-c', STRUCK, int(signal.SIGINT), 'numpy', '-m', 'mag_tracking.cli', 'info'])
+    output = process.communicate(timeout=LONGEST_START_S)[0]
+    assert (process.returncode, output) == (130, 'mag-tracking: interrupted\n')

@@ -1,0 +1,26 @@
+"""The permissions of files, also for root."""
+
+import ctypes
+from contextlib import contextmanager
+
+VERSION = 0x20080522
+"""_LINUX_CAPABILITY_VERSION_3."""
+OVERRIDING = 1 << 1 | 1 << 2
+"""CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH."""
+
+
+@contextmanager
+def as_files_say():
+    """Have this thread bound by the permissions of files, which root otherwise is not."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    # Version, thread (0 = this one); two rows of effective, permitted, inheritable.
+    header, rows = (ctypes.c_uint32 * 2)(VERSION, 0), (ctypes.c_uint32 * 6)()
+    assert libc.capget(header, rows) == 0
+    before = rows[0]
+    rows[0] &= ~OVERRIDING
+    assert libc.capset(header, rows) == 0
+    try:
+        yield
+    finally:
+        rows[0] = before
+        assert libc.capset(header, rows) == 0
