@@ -229,13 +229,22 @@ def test_threshold_and_ranges(observed):
     assert list(n['ranges'].values()) == pytest.approx([9.54, 12.02, 17.33], abs=0.01)
 
 
-def test_order_of_the_models_of_real_passes(tmp_path, capsys):
+def test_order_of_the_models_of_simulated_passes(tmp_path, capsys):
     """TSP14 Figure 7: the cost falls with every dipole, to nearly one for cars."""
     script = example('tsp14_model_order')
-    found = script.passes((1, 3))
-    point, three = ([one.fits[k].normalised_cost for one in found] for k in (0, 1))
-    assert len(found) == 4 and (np.array(three) < point).all() and max(three[:3]) < 1.2
-    script.passes = lambda: found
+    found = {rate: script.passes(rate, (1, 3)) for rate in script.RATES}
+    (cars, truck), (cars_3, truck_3) = (script.costs_of(found['12.5 Hz'], d) for d in (1, 3))
+    assert len(cars) == 3 and (np.array(cars_3) < cars).all() and truck_3 < truck
+    # As points below and above the published ranges at their rate, as the report says.
+    (least, _), _ = script.PUBLISHED['cars']
+    (_, most), _ = script.PUBLISHED['large']
+    assert max(cars) < least and truck > most and max(cars_3) < 3.0 < 20.0 < truck_3
+    # At eight times the rate the errors of the model weigh less.
+    for d, slow in ((1, [*cars, truck]), (3, [*cars_3, truck_3])):
+        fast, fast_truck = script.costs_of(found['100 Hz'], d)
+        assert (np.array([*fast, fast_truck]) < slow).all()
+    script.passes = lambda rate: found[rate]
     assert script.main(['--out', str(tmp_path)]) == 0
-    assert (tmp_path / 'figure_7.png').read_bytes().startswith(PNG)
+    for rate in ('12.5_Hz', '100_Hz'):
+        assert (tmp_path / f'figure_7_{rate}.png').read_bytes().startswith(PNG)
     assert 'differs' in capsys.readouterr().out
