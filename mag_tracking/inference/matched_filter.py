@@ -86,7 +86,9 @@ def deflection(B: ArrayLike, sampling_rate: float, spectrum: Callable[[FloatArra
     one, which is the DFT divided by the sampling rate; with the DFT itself, d would
     depend on the rate and be that many times too large. The sum is over both signs
     of the frequency, as the density is two-sided; the source, which does not say,
-    leaves the choice of a half, and with it d smaller by sqrt(2).
+    leaves the choice of a half, and with it d smaller by sqrt(2). The source's figures
+    come out with the DFT divided by n instead, so with a d that is larger by
+    `sampling_rate` / n [1/s]: see examples/mitre12.py.
     """
     B = np.asarray(B, dtype=float)
     if B.ndim < 2 or 0 in B.shape[-2:]:

@@ -58,9 +58,14 @@ def test_every_replay_with_truth_says_it(vehicle_replays, name):
     run, _ = vehicle_replays[name]
     found = run.summary['tracks'][0]['truth']['error_over_bound']
     print(f'{name}: error over path bound {found:.1f}')
+    # The aim is 1, the bound itself. These limits are no aim: they are only what was reached (0.9
+    # to 5.2, the truck 12.9) with a margin, so that a change for the worse is seen.
     assert 0.1 < found < (20.0 if 'truck' in name else 6.0)
 
 
 def test_magnets_too(magnet_replays):
+    """The aim is 1 here, too; 3 is only what was reached, with a margin."""
     for run, _ in magnet_replays.values():
-        assert 0.1 < run.summary['tracks'][0]['truth']['error_over_bound'] < 3.0
+        found = run.summary['tracks'][0]['truth']['error_over_bound']
+        print(f'magnet: error over path bound {found:.2f}')
+        assert 0.1 < found < 3.0

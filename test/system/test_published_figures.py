@@ -33,7 +33,12 @@ def t10():
 
 @pytest.fixture(scope='module')
 def detected(mitre12):
-    return mitre12.comparison()
+    return mitre12.compare_detection()
+
+
+@pytest.fixture(scope='module')
+def bounded(mitre12):
+    return mitre12.compare_bounds()
 
 
 @pytest.fixture(scope='module')
@@ -42,8 +47,8 @@ def observed(t10):
 
 
 @pytest.mark.parametrize('name, figures, said', [
-    ('mitre12', '23456', ['100 pT/sqrt(Hz)', 'published 59.3 %', 'published 90 %',
-                          'x0, y0, v, M1, M2 have none']),
+    ('mitre12', '23456', ['100 pT/sqrt(Hz)', 'DFT divided by N', '62.6%, published 59.3 %',
+                          '91.5%, published 90 %', 'x0, y0, v, M1, M2 have none']),
     ('t10_observability', '234', ['0, 0.2305 are', '0, 0, 0.7141', 'at [0, 2] is 2571',
                                   'truck 17.3 m']),
 ])
@@ -61,13 +66,17 @@ def test_the_example_draws_and_says_what_differs(name, figures, said, tmp_path, 
 
 
 def test_moment_and_field_of_the_car(mitre12):
-    """(A.1)-(A.6) written out for a car that drives east, and (1), (2)."""
+    """(A.1)-(A.6) written out for a car that drives north, and east, and (1), (2)."""
     L1, dip, declination = 0.17356, np.radians(59.0), np.radians(-11.0)
     H = 57e-6 / (4e-7 * np.pi) * np.cos(dip)
     volume = 4.0 / 3.0 * np.pi * 2.0
-    m1 = volume * 10.0 / (1.0 + 10.0 * L1) * H * np.sin(declination)
-    m2 = volume * 10.0 / (1.0 + 5.0 * (1.0 - L1)) * H * np.cos(declination)
+    along, across = (volume * 10.0 / (1.0 + 10.0 * L) for L in (L1, 0.5 * (1.0 - L1)))
+    sin, cos = H * np.sin(declination), H * np.cos(declination)
+    # Left of north is west, left of east is north.
+    east = mitre12.moment('car', np.pi / 2)
+    np.testing.assert_allclose(east[:2], [along * sin, across * cos], rtol=1e-4)
     m = mitre12.moment('car')
+    m1, m2 = along * cos, -across * sin
     np.testing.assert_allclose(m[:2], [m1, m2], rtol=1e-4)
     assert m[2] < 0.0  # the earth's field points down in the north
     x, y = -7.0, 25.0
@@ -82,8 +91,8 @@ def test_periods_follow_the_sources_equations_of_motion(mitre12):
     r = mitre12.places(3.0, -2.0, 10.0, theta)
     np.testing.assert_allclose(r[:, 0], 3.0 - k / 22.0 * 10.0 * np.sin(theta), rtol=1e-12)
     np.testing.assert_allclose(r[:, 1], -2.0 + k / 22.0 * 10.0 * np.cos(theta), rtol=1e-12)
-    # East is -90 degrees there.
-    assert mitre12.places(0.0, 25.0, 10.0, mitre12.EAST)[-1, 0] == pytest.approx(10.0 * 10 / 22)
+    # Along x is -90 degrees there.
+    assert mitre12.places(0.0, 25.0, 10.0, mitre12.ALONG)[-1, 0] == pytest.approx(10.0 * 10 / 22)
 
 
 @pytest.mark.parametrize('z', [[-20.0, 25.0, 11.0, -np.pi / 2, -137.0, 374.0],
@@ -101,58 +110,73 @@ def test_jacobian_is_that_of_the_field(mitre12, z):
     np.testing.assert_allclose(ours / size, numeric / size, atol=1e-6)
 
 
-def test_deflection_of_a_period_by_hand(mitre12):
-    """(B.8)-(B.13) as sums over the four frequencies in the band, for the car at 22 m."""
+@pytest.mark.parametrize('divisor, scale, cpa', [(11.0, {}, 29.0), (22.0, {'scale': 1.0}, 25.0)])
+def test_deflection_of_a_period_by_hand(mitre12, divisor, scale, cpa):
+    """(B.8)-(B.13) as sums over the four frequencies in the band: DFT over N, and over F_s."""
     k, t = np.arange(11), np.arange(11) / 22.0
-    r = np.stack([-3.0 + 25.0 * 0.44704 * t, np.full(11, 22.0), np.zeros(11)], axis=-1)
+    r = np.stack([-3.0 + 25.0 * 0.44704 * t, np.full(11, cpa), np.zeros(11)], axis=-1)
     B = dipole_field(-r, mitre12.moment('car'))[:, :2]
     square = 0.0
     for line in (2, 3, 4, 5):
         f = 2.0 * line
         S = (100e-12)**2 / f + (9e-10)**2 / (24.0 * 11.0)
-        transform = np.exp(-2j * np.pi * line * k / 11.0) @ B / 22.0
+        transform = np.exp(-2j * np.pi * line * k / 11.0) @ B / divisor
         square += 2.0 * 2.0 * np.sum(np.abs(transform)**2) / S
     expected = norm.sf(norm.isf(1e-6) - np.sqrt(square))
-    p = mitre12.detection(mitre12.moment('car'), 22.0, np.array([-3.0]), mitre12.ONE)
-    assert p[0, 0] == pytest.approx(expected, rel=1e-9) and 0.3 < expected < 0.9
+    p = mitre12.detection(mitre12.moment('car'), cpa, np.array([-3.0]), mitre12.ONE, **scale)
+    assert p[0, 0] == pytest.approx(expected, rel=1e-9) and 0.3 < expected < 0.95
 
 
 def test_detection_against_the_published_figures(mitre12, detected):
-    """The distance to MITRE12 is said, not tuned away: a car is lost near 25 m."""
+    """59.3 % and 90 % are reached to 3.3 and 1.5 points; what else differs is said."""
     n = detected
-    np.testing.assert_allclose(n['car ranges'], [21.5, 23.5, 28.0], atol=0.1)
-    np.testing.assert_allclose(n['ATV ranges'], [13.6, 15.0, 17.9], atol=0.1)
-    assert n['car most at 30'] < 0.001 < n['car once at 30'] < 0.01 < n['car five at 30'] < 0.02
-    # In shape: 59.3 % at most in a period goes with about 90 % at least once, and five are sure.
-    assert n['alike cpa'] == pytest.approx(22.1, abs=0.1)
-    assert np.all(np.abs(n['alike once'] - 0.933) < 0.001) and n['alike five'] > 0.9999
-    assert n['north range'] == pytest.approx(26.5, abs=0.1)
+    # Aim: the published numbers. The tolerances are the printed distances, rounded up.
+    assert n['most'] == pytest.approx(0.593, abs=0.034)
+    assert n['once'] == pytest.approx(0.900, abs=0.016)
+    # "nearly one", "almost always", "almost always fails", "a high probability", "nontrivial".
+    assert n['five'] > 0.999 and n['at 25'] > 0.999 and n['at 35'] < 0.1
+    assert n['ATV at 10'] > 0.999 and n['ATV five most'] > 0.2
+    # Neither the physical transform nor a road to the east reaches them.
+    assert n['once physical'] < n['once east'] < 0.2
+    assert n['range physical'] < n['range east'] < n['range']
     # Detection falls with the CPA, and grows with sensors.
     for vehicle in ('car', 'ATV'):
         m = mitre12.moment(vehicle)
         once = np.array([[mitre12.at_least_once(m, c, s) for s in (mitre12.ONE, mitre12.FIVE)]
-                         for c in range(5, 40)])
+                         for c in range(5, 45)])
         assert np.all(np.diff(once, axis=0) <= 1e-9) and np.all(once[:, 1] >= once[:, 0])
 
 
-def test_bounds_against_the_published_figures(mitre12, detected):
+def test_bounds_against_the_published_figures(mitre12, bounded):
     """One sensor does not see the scale, so that MITRE12's bounds without a prior do not exist."""
-    n = detected
+    n = bounded
     assert n['lost'] == ('x0', 'y0', 'v', 'M1', 'M2')
     m = mitre12.moment('car')
     lost = np.array([-20.0, 25.0, mitre12.SPEED, 0.0, 3 * m[0], 3 * m[1]]) / 25.0
     np.testing.assert_allclose(n['kernel'], lost, rtol=1e-6, atol=1e-6)
-    assert n['theta alone'].min() == pytest.approx(82.5, abs=1.0)
     prior = [30.0, 5.0, 10.0, 15.0, 100.0, 100.0]
     assert np.all(n['with prior'] <= np.array(prior) * (1.0 + 1e-9))
     assert np.all(n['with prior'].min(axis=0)[:4] < 0.55 * np.array(prior[:4]))
     assert np.isinf(n['at 0 mph'][0][3])
     assert n['at 0 mph'][1][3] == pytest.approx(15.0, rel=1e-9)
-    falling = [n[f'at {v} mph'][0][3] for v in (10, 25, 80)]
-    np.testing.assert_allclose(falling, [525.0, 92.2, 16.4], rtol=0.01)
+    assert n['at 10 mph'][0][3] > n['at 25 mph'][0][3] > n['at 80 mph'][0][3]
     # Two sensors do see it.
     J = mitre12.measured(-20.0) + mitre12.measured(0.0)
     assert np.all(np.isfinite(mitre12.deviations(J)))
+
+
+def test_printed_jacobian_and_prior_do_not_explain_the_published_bounds(mitre12, bounded):
+    """(20) concerns phi alone; with (26) up to four no bound becomes infinite at speed zero."""
+    x, y, h = -20.0, 25.0, 1e-5
+    phi = np.array([np.arctan2(y, x + h) - np.arctan2(y, x - h),
+                    np.arctan2(y + h, x) - np.arctan2(y - h, x)]) / (2.0 * h)
+    C = mitre12.bound(mitre12.measured(x), mitre12.PRIOR)[:2, :2]
+    printed, right = bounded['phi at -20 m']
+    assert right == pytest.approx(np.degrees(np.sqrt(phi @ C @ phi)), rel=1e-6)
+    assert printed < 0.8 * right
+    assert np.all(np.isfinite(bounded['at 0 mph'][2]))
+    assert np.all(bounded['prior on four'][:, :4] <= np.array([30.0, 5.0, 10.0, 15.0]) + 1e-9)
+    assert np.all(bounded['prior on four'][:, 4:].max(axis=0) > 500.0)
 
 
 def test_check_values_of_observability(observed):
@@ -205,13 +229,22 @@ def test_threshold_and_ranges(observed):
     assert list(n['ranges'].values()) == pytest.approx([9.54, 12.02, 17.33], abs=0.01)
 
 
-def test_order_of_the_models_of_real_passes(tmp_path, capsys):
+def test_order_of_the_models_of_simulated_passes(tmp_path, capsys):
     """TSP14 Figure 7: the cost falls with every dipole, to nearly one for cars."""
     script = example('tsp14_model_order')
-    found = script.passes((1, 3))
-    point, three = ([one.fits[k].normalised_cost for one in found] for k in (0, 1))
-    assert len(found) == 4 and (np.array(three) < point).all() and max(three[:3]) < 1.2
-    script.passes = lambda: found
+    found = {rate: script.passes(rate, (1, 3)) for rate in script.RATES}
+    (cars, truck), (cars_3, truck_3) = (script.costs_of(found['12.5 Hz'], d) for d in (1, 3))
+    assert len(cars) == 3 and (np.array(cars_3) < cars).all() and truck_3 < truck
+    # As points below and above the published ranges at their rate, as the report says.
+    (least, _), _ = script.PUBLISHED['cars']
+    (_, most), _ = script.PUBLISHED['large']
+    assert max(cars) < least and truck > most and max(cars_3) < 3.0 < 20.0 < truck_3
+    # At eight times the rate the errors of the model weigh less.
+    for d, slow in ((1, [*cars, truck]), (3, [*cars_3, truck_3])):
+        fast, fast_truck = script.costs_of(found['100 Hz'], d)
+        assert (np.array([*fast, fast_truck]) < slow).all()
+    script.passes = lambda rate: found[rate]
     assert script.main(['--out', str(tmp_path)]) == 0
-    assert (tmp_path / 'figure_7.png').read_bytes().startswith(PNG)
+    for rate in ('12.5_Hz', '100_Hz'):
+        assert (tmp_path / f'figure_7_{rate}.png').read_bytes().startswith(PNG)
     assert 'differs' in capsys.readouterr().out

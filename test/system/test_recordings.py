@@ -159,7 +159,9 @@ def test_a_car_is_followed_along_a_corridor(tmp_path):
         print(f'corridor, {name}: {along.sum()} poses, RMS {rms:.2f} m, ANEES {anees:.1f}')
         assert np.ptp(true[along, 0]) > 41.0
         assert rms <= 0.6
-        # It is steadily half a metre ahead along the road, and surer than that once smoothed.
+        # It is steadily half a metre ahead along the road, and surer than that once smoothed. The
+        # aim is that of the other cars: 3 filtered, 4 smoothed (1 = consistent). These limits are
+        # only what was reached (3.2 and 6.5), so that a change for the worse is seen.
         assert anees <= {'filtered': 4.0, 'smoothed': 8.0}[name]
 
 

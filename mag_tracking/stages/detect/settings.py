@@ -10,7 +10,8 @@ class DetectSettings:
     """Settings of the detection."""
 
     false_alarm_probability: float = param(
-        1e-3, 'Probability that a single frame of noise exceeds the threshold.',
+        1e-3, 'Probability that a single frame of noise exceeds the threshold; the actual one is '
+        'lower where background_std is not 0.',
         '', (1e-12, 0.5))
     onset_frames: int = param(
         3, 'So many frames in a row above the threshold are a target.', '', (1, 1000))
@@ -24,5 +25,8 @@ class DetectSettings:
         1e-9, 'How much more the background may be off for every second that a target has kept it '
         'from being learnt; forgotten a few seconds after the target.', 'T/s', (0.0, 1e-3))
     background_std: float = param(
-        4e-9, 'What the background may be off by (drift while frozen); added to the noise. '
-        '0 = the stated probability is exact where the background is.', 'T', (0.0, 1e-3))
+        4e-9, 'What the background may be off by (drift while frozen); its variance is added to '
+        'that of the noise, which lowers the false alarm probability where the background is '
+        'exact. At the defaults, two sensors with 12 nT of noise a sample: 3.5e-4 a frame of '
+        'one sample (12.5 Hz), 1.5e-7 of eight (100 Hz). 0 = the stated probability.',
+        'T', (0.0, 1e-3))

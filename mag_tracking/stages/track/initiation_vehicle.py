@@ -47,8 +47,9 @@ class VehicleSettings:
     length_stds: tuple[float, ...] = param(
         (0.0, 1.0, 3.0), 'Spread of the length; 0 for points.', 'm', (0.0, 1000.0))
     moments: tuple[float, ...] = param(
-        (120.0, 400.0, 1600.0), 'Starting size of the moment (a car: 300 to 600, a truck: 1800; '
-        'TSP14).', 'A m^2', (1e-6, 1e6))
+        (120.0, 400.0, 1600.0), 'Starting size of the moment; by default a truck starts at 1600. '
+        'TSP14 has cars of 300 to 600 and trucks of about 1800, within moment_stds of it.',
+        'A m^2', (1e-6, 1e6))
     moment_stds: tuple[float, ...] = param(
         (45.0, 150.0, 600.0), 'Spread of the whole hard iron moment, per axis.',
         'A m^2', (1e-6, 1e6))

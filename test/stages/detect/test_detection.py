@@ -1,5 +1,7 @@
 """Detection: thresholds, measured false alarms and detections, onset, hold and release."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2, ncx2
@@ -54,6 +56,33 @@ def test_measured_false_alarm_rate_is_the_stated_one(p):
     alarms = stage.counts['frames above the threshold']
     low, high = binom.ppf([0.005, 0.995], n, p)
     print(f'stated {p:g}: measured {alarms / n:.2e}, limits {low / n:.2e} .. {high / n:.2e}')
+    assert low <= alarms <= high
+
+
+@pytest.mark.parametrize('per_frame, said, counted', [
+    (1, '3.5e-4 a frame of one sample (12.5 Hz)', 1e-3), (8, '1.5e-7 of eight (100 Hz)', 0.05)])
+def test_false_alarm_probability_at_the_defaults_is_the_one_said(per_frame, said, counted):
+    """Noise of 12 nT a sample, `per_frame` samples a frame, and the allowance for backgrounds."""
+    settings, variance = DetectSettings(), SIGMA**2 / per_frame
+    wider = 1.0 + settings.background_std**2 / variance
+    p = chi2.sf(chi2.isf(settings.false_alarm_probability, 6) * wider, 6)
+    assert float(said.split()[0]) == pytest.approx(p, rel=0.05)
+    text, = (f.metadata['doc'] for f in fields(DetectSettings)
+             if f.name == 'background_std')
+    assert said in text
+    # The stage itself: at the default, or with eight samples at a level that can be counted.
+    network, rng, n = line_network(2), np.random.default_rng(12), 60_000
+    stage = Detect(network, replace(settings, {'false_alarm_probability': counted,
+                                               'release_probability': 0.05}))
+    p = chi2.sf(chi2.isf(counted, 6) * wider, 6)
+    C = np.repeat(variance * np.eye(3)[None], 2, axis=0)
+    std = np.sqrt(variance)
+    for k in range(n):
+        y = std * rng.standard_normal((2, 3))
+        stage.feed(FieldFrame(k * 80_000_000, y, C, np.full(2, per_frame), np.zeros(2)))
+    alarms = stage.counts['frames above the threshold']
+    low, high = binom.ppf([0.005, 0.995], n, p)
+    print(f'{per_frame} a frame: computed {p:.2e}, measured {alarms / n:.2e}')
     assert low <= alarms <= high
 
 

@@ -1,0 +1,71 @@
+"""`fit --same-vehicle` on simulated passes whose hard and soft iron are known."""
+
+import json
+
+import numpy as np
+import pytest
+
+from mag_tracking.cli import main
+from mag_tracking.messages.schema import sample_dict
+from mag_tracking.messages.types import MAGNETIC_FIELD
+from mag_tracking.network.file import read_network
+from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.simulation.scenario import Path, point_body, simulate
+from support.bundled import NETWORK_FILE
+
+HARD, SOFT = [240.0, -130.0, 90.0], 6.0
+"""m0 [A m^2] in the vehicle's frame and D [m^3] of the simulated vehicle."""
+HEADINGS = {'east': 0.0, 'west': 180.0, 'north_east': 50.0, 'south_east': -40.0}
+START_S, DURATION_S, SPEED = 1_000.0, 24.0, 10.0
+
+
+def recorded(folder, heading_deg, rng):
+    """A recording of one pass, half of it before the closest point; its path."""
+    network, heading = read_network(NETWORK_FILE), np.deg2rad(heading_deg)
+    way = np.array([np.cos(heading), np.sin(heading)])
+    start = np.array([0.3, 0.4]) - 0.5 * DURATION_S * SPEED * way
+    samples, *_ = simulate(network, point_body(HARD, SOFT, 0.5), Path(start, heading, SPEED),
+                           100.0, DURATION_S, rng, start_s=START_S)
+    path = folder / 'pass.mcap'
+    with RecordingWriter(path) as writer:
+        for s in samples:
+            writer.write(f'/{s.sensor}/imu/mag', MAGNETIC_FIELD, sample_dict(s, s.sensor),
+                         s.stamp_ns)
+    return path.rename(folder / f'{folder.name}.mcap')
+
+
+@pytest.fixture(scope='module')
+def passes(tmp_path_factory):
+    """{name: recording} of the vehicle at each of the headings."""
+    rng = np.random.default_rng(5)
+    folder = tmp_path_factory.mktemp('iron')
+    found = {}
+    for name, heading in HEADINGS.items():
+        (folder / name).mkdir()
+        found[name] = recorded(folder / name, heading, rng)
+    return found
+
+
+def iron_of(names, passes, out):
+    """`iron` of the fits of some passes."""
+    assert main(['fit', *(str(passes[n]) for n in names), '--network', str(NETWORK_FILE),
+                 '--orders', '1', '--same-vehicle', '--no-figures', '--out', str(out)]) == 0
+    return json.loads((out / 'fits.json').read_text())['iron']
+
+
+def test_passes_at_several_headings_tell_hard_and_soft_iron(passes, tmp_path, capsys):
+    iron = iron_of(HEADINGS, passes, tmp_path)
+    found = np.array([*iron['hard'], iron['soft']])
+    std, true = np.array(iron['std']), np.array([*HARD, SOFT])
+    said = capsys.readouterr().out
+    print(f'm0, D: {found.round(3)} ({std.round(3)}), simulated {true}')
+    # Truth inside four deviations, which are small beside what is told apart.
+    assert np.all(np.abs(found - true) < 4.0 * std)
+    assert np.all(std[:3] < 0.05 * np.linalg.norm(HARD)) and std[3] < 0.05 * SOFT
+    assert iron['passes'] == len(HEADINGS) and 0.1 < iron['normalised_cost'] < 5.0
+    assert 'hard iron m0 =' in said and '4 passes' in said
+
+
+def test_without_another_heading_they_are_not_told_apart(passes, tmp_path, capsys):
+    assert iron_of(['east'], passes, tmp_path) is None
+    assert 'cannot be told apart' in capsys.readouterr().out
