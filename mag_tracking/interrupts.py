@@ -6,7 +6,7 @@ Nothing is imported here that takes time: programs come here first.
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
