@@ -7,6 +7,7 @@ if __name__ == '__main__':
     detection_node()
 
 from functools import partial
+from typing import Any
 
 from mag_tracking_msgs.msg import Detection as DetectionMessage
 from mag_tracking_msgs.msg import FieldReadings, NetworkFrame
@@ -18,8 +19,8 @@ from mag_tracking.messages.types import CALIBRATED_READINGS
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
-from mag_tracking.nodes.stage_node import RESULTS, SENT, STREAM, StageNode
-from mag_tracking.records import Detection
+from mag_tracking.nodes.stage_node import RESULTS, SENT, STREAM, Counted, StageNode
+from mag_tracking.records import Detection, FieldFrame
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.detect.stage import Detect
 
@@ -27,7 +28,7 @@ from mag_tracking.stages.detect.stage import Detect
 class DetectionNode(StageNode):
     """Aligns the sensors to frames and tests each for a target."""
 
-    def __init__(self, **node_arguments):
+    def __init__(self, **node_arguments: Any) -> None:
         super().__init__('detection_node', 'align', **node_arguments)
         self.settings = declare_settings(self, self.settings, 'detect', self.OWN_PARAMETERS)
         self._align = Align(self.network, self.settings.align)
@@ -41,25 +42,25 @@ class DetectionNode(StageNode):
                           source='calibration_node')
         self.expect('tracker_node', '~/frame')
 
-    def stages(self):
+    def stages(self) -> dict[str, Counted]:
         """{name: stage} whose counts are published."""
         return {'align': self._align, 'detect': self._detect}
 
-    def queues(self):
+    def queues(self) -> dict[str, int]:
         """{name of a stage: how many records it holds}."""
         return {'align': self._align.n_held}
 
-    def _take(self, sensor, message):
+    def _take(self, sensor: str, message: MagneticField) -> None:
         """One calibrated reading."""
         self._publish(self._align.feed(sample_of(message, sensor)))
 
-    def _take_many(self, message):
+    def _take_many(self, message: FieldReadings) -> None:
         """Calibrated readings of many sensors."""
         readings = self.readings_of(message, self._align)
         if readings is not None:
             self._publish(self._align.feed_many(readings))
 
-    def _publish(self, frames):
+    def _publish(self, frames: list[FieldFrame]) -> None:
         """Frames that are complete, and what is detected in them."""
         for frame in frames:
             for record in self._detect.feed(frame):
@@ -71,6 +72,6 @@ class DetectionNode(StageNode):
                         NetworkFrame, frame_dict(record, self.network)))
 
 
-def main(arguments=None):
+def main(arguments: list[str] | None = None) -> int:
     """Run the node; returns the exit status."""
     return stage_node.main(DetectionNode, arguments)

@@ -2,6 +2,7 @@
 
 import time
 from collections import Counter
+from collections.abc import Callable
 from functools import partial
 
 import rclpy
@@ -13,27 +14,30 @@ from mag_tracking.apps.doctor import Doctor
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import sample_of, samples_of
 from mag_tracking.messages.types import RAW_READINGS
+from mag_tracking.network import SensorNetwork
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.stage_node import SENSORS, STREAM, make_executor, spin
+from mag_tracking.pipeline import Settings
 from mag_tracking.stages.health.sensor_health import Finding
 
 
 class DoctorNode(Node):
     """Hands the readings of a network to a `Doctor`, with the time at which they came."""
 
-    def __init__(self, network, settings):
+    def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         super().__init__('doctor')
         self.doctor = Doctor(network, settings)
         for sensor, topic in zip(network.names, network.topics, strict=True):
             self.create_subscription(MagneticField, topic, partial(self._take, sensor), SENSORS)
-        self._in_batches, self._bad = set(), Counter()
+        self._in_batches: set[str] = set()
+        self._bad: Counter[str] = Counter()
         self.create_subscription(FieldReadings, RAW_READINGS, self._take_many, STREAM)
 
-    def _take(self, sensor, message):
+    def _take(self, sensor: str, message: MagneticField) -> None:
         """One reading."""
         self.doctor.feed(sample_of(message, sensor), time.time_ns())
 
-    def _take_many(self, message):
+    def _take_many(self, message: FieldReadings) -> None:
         """Readings of many sensors; of those in the network."""
         try:
             samples = samples_of(message)
@@ -45,7 +49,7 @@ class DoctorNode(Node):
                 self._in_batches.add(sample.sensor)
                 self.doctor.feed(sample, time.time_ns())
 
-    def findings(self):
+    def findings(self) -> list[Finding]:
         """What only the graph tells: list of `Finding`."""
         found = [Finding(True, RAW_READINGS, f'{n} messages that are none: {error}', 'look at the '
                          'driver that publishes it') for error, n in self._bad.items()]
@@ -66,7 +70,8 @@ class DoctorNode(Node):
         return found
 
 
-def listen(network, settings, seconds, stopped):
+def listen(network: SensorNetwork, settings: Settings, seconds: float,
+           stopped: Callable[[], bool]) -> tuple[Doctor, list[Finding]]:
     """Listen for `seconds` or until `stopped()`: (Doctor, list of Finding of the graph)."""
     begin()
     executor = make_executor()

@@ -12,22 +12,26 @@ if __name__ == '__main__':
 
 import threading
 import time
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from mag_tracking_msgs.msg import FieldReadings
-from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import Imu, MagneticField
 
 from mag_tracking.drivers.configuration import read_drivers
-from mag_tracking.drivers.driver import IGNORED, serve
+from mag_tracking.drivers.driver import IGNORED, Driver, serve
 from mag_tracking.errors import MagTrackingError, SettingsError
 from mag_tracking.messages.schema import acceleration_dict, readings_dict, sample_dict
 from mag_tracking.messages.types import RAW_READINGS
+from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.driver_health import DriverDiagnostics
 from mag_tracking.nodes.stage_node import RESULTS, SENT
+from mag_tracking.records import AccelerationSample, Readings
 
 PATIENCE_S = 15.0
 """[s] Time that a driver has to stop; a broker that does not answer takes a while."""
@@ -36,19 +40,21 @@ PATIENCE_S = 15.0
 class DriverNode(LifecycleNode):
     """One thread a device, which publishes what the device says."""
 
-    def __init__(self, **node_arguments):
+    def __init__(self, **node_arguments: Any) -> None:
         """Raises MagTrackingError where `autostart` finds that the settings are unusable."""
         super().__init__('driver_node', **node_arguments)
         self._path = self.declare_parameter('drivers', '').value
         self._network_path = self.declare_parameter('network', '').value
         self._readings = self.create_publisher(FieldReadings, RAW_READINGS, SENT) \
             if self.declare_parameter('batches', False).value else None
-        self._drivers, self._threads, self._publishers_by_sensor = [], [], {}
-        self._stopping = None
+        self._drivers: list[Driver] = []
+        self._threads: list[threading.Thread] = []
+        self._publishers_by_sensor: dict[str, tuple[Publisher, Publisher]] = {}
+        self._stopping: threading.Event | None = None
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RESULTS)
         self._health = DriverDiagnostics(self)
         self.create_timer(1.0, self._publish_diagnostics)
-        self._refused = None
+        self._refused: MagTrackingError | None = None
         if self.declare_parameter('autostart', True).value:
             done = self.trigger_configure()
             if self._refused is not None:
@@ -56,7 +62,7 @@ class DriverNode(LifecycleNode):
             if done == TransitionCallbackReturn.SUCCESS:
                 self.trigger_activate()
 
-    def on_configure(self, state):
+    def on_configure(self, state: State) -> TransitionCallbackReturn:
         """Read the drivers file and advertise the sensors' topics."""
         try:
             if not self._path:
@@ -72,7 +78,7 @@ class DriverNode(LifecycleNode):
                 self._publishers_by_sensor[sensor] = self._advertise(sensor, network)
         return TransitionCallbackReturn.SUCCESS
 
-    def on_activate(self, state):
+    def on_activate(self, state: State) -> TransitionCallbackReturn:
         """Open the devices, each in a thread of its own."""
         if self._threads:
             self.get_logger().error(f'{self._threads[0].name} has not stopped yet')
@@ -86,28 +92,29 @@ class DriverNode(LifecycleNode):
             thread.start()
         return super().on_activate(state)
 
-    def on_deactivate(self, state):
+    def on_deactivate(self, state: State) -> TransitionCallbackReturn:
         """Close the devices."""
         self._stop()
         return super().on_deactivate(state)
 
-    def on_cleanup(self, state):
+    def on_cleanup(self, state: State) -> TransitionCallbackReturn:
         """Forget the drivers file."""
         self._forget()
         return TransitionCallbackReturn.SUCCESS
 
-    def on_shutdown(self, state):
+    def on_shutdown(self, state: State) -> TransitionCallbackReturn:
         """Close the devices for good."""
         self._stop()
         self._forget()
         return TransitionCallbackReturn.SUCCESS
 
-    def destroy_node(self):
+    def destroy_node(self) -> None:
         """Stop the threads first: they publish."""
         self._stop()
         super().destroy_node()
 
-    def _advertise(self, sensor, network):
+    def _advertise(self, sensor: str,
+                   network: SensorNetwork | None) -> tuple[Publisher, Publisher]:
         """Publishers (field, acceleration) of a sensor."""
         topic, imu_topic = f'/{sensor}/imu/mag', f'/{sensor}/imu/data_raw'
         if network is not None:
@@ -116,7 +123,7 @@ class DriverNode(LifecycleNode):
         return (self.create_publisher(MagneticField, topic, SENT),
                 self.create_publisher(Imu, imu_topic, SENT))
 
-    def _publish(self, readings, accelerations):
+    def _publish(self, readings: Readings, accelerations: list[AccelerationSample]) -> None:
         """Each reading on its sensor's topic, or with `batches` together."""
         if self._readings is None:
             for sample in readings.samples():
@@ -124,11 +131,11 @@ class DriverNode(LifecycleNode):
                     to_message(MagneticField, sample_dict(sample, sample.sensor)))
         elif len(readings):
             self._readings.publish(to_message(FieldReadings, readings_dict(readings)))
-        for sample in accelerations:
-            self._publishers_by_sensor[sample.sensor][1].publish(
-                to_message(Imu, acceleration_dict(sample, sample.sensor)))
+        for acceleration in accelerations:
+            self._publishers_by_sensor[acceleration.sensor][1].publish(
+                to_message(Imu, acceleration_dict(acceleration, acceleration.sensor)))
 
-    def _stop(self):
+    def _stop(self) -> None:
         """End the threads; they close their devices."""
         if self._stopping is not None:
             self._stopping.set()
@@ -139,14 +146,14 @@ class DriverNode(LifecycleNode):
                 self.get_logger().error(f'{thread.name} has not stopped within {PATIENCE_S:g} s')
         self._threads = [thread for thread in self._threads if thread.is_alive()]
 
-    def _forget(self):
+    def _forget(self) -> None:
         """Withdraw topics and drivers."""
         for pair in self._publishers_by_sensor.values():
             for publisher in pair:
                 self.destroy_publisher(publisher)
         self._drivers, self._publishers_by_sensor = [], {}
 
-    def _publish_diagnostics(self):
+    def _publish_diagnostics(self) -> None:
         """How the devices are."""
         array = DiagnosticArray(status=self._health.statuses(
             self._drivers, {thread.name for thread in self._threads if thread.is_alive()},
@@ -155,6 +162,6 @@ class DriverNode(LifecycleNode):
         self._diagnostics.publish(array)
 
 
-def main(arguments=None):
+def main(arguments: list[str] | None = None) -> int:
     """Run the node; returns the exit status."""
     return stage_node.main(DriverNode, arguments)

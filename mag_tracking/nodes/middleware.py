@@ -14,7 +14,7 @@ PROFILE_IN_FOLDER = 'DEFAULT_FASTRTPS_PROFILES.xml'
 """What it takes by itself, if there is one in the working folder."""
 
 
-def begin(arguments=None):
+def begin(arguments: list[str] | None = None) -> None:
     """`rclpy.init`, with the project's profile of the middleware unless the user has his own.
 
     Other middlewares do not look at it. Signals stay with the caller: rclpy's own handlers raise

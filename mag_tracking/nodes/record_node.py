@@ -4,14 +4,17 @@ import signal
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 
 import rclpy
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from tqdm import tqdm
 
-from mag_tracking.apps.record import progress_line, summary
+from mag_tracking.apps.record import Selection, progress_line, summary
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.messages.types import (
     FIELD_READINGS,
@@ -39,7 +42,7 @@ OTHER_DEPTH = 100
 class _Source:
     """A subscription that is asked for its messages, and what is known of its publishers."""
 
-    def __init__(self, node, topic, type_name, latched):
+    def __init__(self, node: Node, topic: str, type_name: str, latched: bool) -> None:
         self.node, self.type, self.latched = node, type_name, latched
         self.depth = DEPTHS.get(type_name, OTHER_DEPTH)
         # A best-effort reader matches every publisher, but is not given what was latched.
@@ -49,11 +52,14 @@ class _Source:
                 else ReliabilityPolicy.BEST_EFFORT,
                 durability=DurabilityPolicy.TRANSIENT_LOCAL if latched
                 else DurabilityPolicy.VOLATILE), raw=True)
-        self.publishers, self.last, self.lost = (), None, 0
+        self.publishers: tuple[tuple[int, ...], ...] = ()
+        self.last: int | None = None
+        self.lost = 0
 
-    def take(self):
+    def take(self) -> list[tuple[int, int, bytes]]:
         """The messages that wait: [(received_ns, sent_ns, data)]."""
-        out, handle = [], self.subscription.handle
+        out: list[tuple[int, int, bytes]] = []
+        handle = self.subscription.handle
         with handle:
             while len(out) < self.depth:
                 taken = handle.take_message(self.subscription.msg_type, True)
@@ -65,7 +71,7 @@ class _Source:
                 out.append((received, info.get('source_timestamp') or received, data))
         return out
 
-    def _count_lost(self, number):
+    def _count_lost(self, number: int | None) -> None:
         """Count the gap before a message, where one publisher numbers them."""
         if number is None or len(self.publishers) > 1:
             self.last = None
@@ -74,7 +80,7 @@ class _Source:
             self.lost += number - self.last - 1
         self.last = number
 
-    def set_publishers(self, infos):
+    def set_publishers(self, infos: list[TopicEndpointInfo]) -> None:
         """Who publishes now; another publisher counts anew."""
         publishers = tuple(sorted(tuple(i.endpoint_gid) for i in infos))
         if set(self.publishers) - set(publishers):
@@ -90,11 +96,14 @@ class RecordNode(Node):
     takes most of a core for twenty sensors.
     """
 
-    def __init__(self, recorder, selection, report=print):
+    def __init__(self, recorder: Recorder, selection: Selection,
+                 report: Callable[[str], None] = print) -> None:
         super().__init__('record_node', start_parameter_services=False)
         self.recorder, self.selection, self._report = recorder, selection, report
-        self._sources, self._refused, self._described = {}, {}, set()
-        self._lost_before = Counter()
+        self._sources: dict[str, _Source] = {}
+        self._refused: dict[str, str] = {}
+        self._described: set[str] = set()
+        self._lost_before: Counter[str] = Counter()
         # Their type is known: nothing is missed of a driver that starts later.
         for topic in selection.fields:
             self._subscribe(topic, MAGNETIC_FIELD, [])
@@ -102,22 +111,22 @@ class RecordNode(Node):
             self._subscribe(topic, IMU, [])
 
     @property
-    def lost(self):
+    def lost(self) -> 'Counter[str]':
         """{topic: messages that were published and never fetched}, where there were any."""
         now = Counter({topic: s.lost for topic, s in self._sources.items()})
         return +(now + self._lost_before)
 
     @property
-    def refused(self):
+    def refused(self) -> dict[str, str]:
         """{topic: why it is not recorded}."""
         return self._refused
 
-    def heard(self):
+    def heard(self) -> tuple[int, int]:
         """(topics that have a publisher, topics subscribed to)."""
         return (sum(s.subscription.get_publisher_count() > 0 for s in self._sources.values()),
                 len(self._sources))
 
-    def discover(self):
+    def discover(self) -> None:
         """Subscribe to wanted topics that are new, and follow changes of the known ones."""
         for topic, _ in self.get_topic_names_and_types():
             if topic in self._refused or not self.selection.wants(topic):
@@ -130,7 +139,7 @@ class RecordNode(Node):
             else:
                 self._subscribe(topic, infos[0].topic_type, infos)
 
-    def _subscribe(self, topic, type_name, infos):
+    def _subscribe(self, topic: str, type_name: str, infos: list[TopicEndpointInfo]) -> None:
         """Begin to record a topic."""
         if message_class(type_name) is None:
             self._refuse(topic, f'{type_name} is not installed')
@@ -139,7 +148,7 @@ class RecordNode(Node):
         self._sources[topic] = _Source(self, topic, type_name, latched)
         self._sources[topic].set_publishers(infos)
 
-    def _describe(self, topic, source):
+    def _describe(self, topic: str, source: _Source) -> None:
         """Tell the recorder about a topic, whose publishers are known at its first message."""
         text = definition_of(source.type)
         if text is None:
@@ -151,12 +160,12 @@ class RecordNode(Node):
                                 max(1, len(infos)) if source.latched else 0)
         self._described.add(topic)
 
-    def _refuse(self, topic, why):
+    def _refuse(self, topic: str, why: str) -> None:
         """Say once that a topic is not recorded."""
         self._refused[topic] = why
         self._report(f'{topic} is not recorded: {why}')
 
-    def _follow(self, topic, infos):
+    def _follow(self, topic: str, infos: list[TopicEndpointInfo]) -> None:
         """Keep up with a topic's publishers."""
         source = self._sources[topic]
         others = sorted({i.topic_type for i in infos} - {source.type})
@@ -172,7 +181,7 @@ class RecordNode(Node):
         elif source.latched and topic in self._described:
             self.recorder.add_topic(topic, source.type, latched=len(infos))
 
-    def poll(self):
+    def poll(self) -> int:
         """Record what has come; the number of messages."""
         found = []
         for topic, source in self._sources.items():
@@ -185,18 +194,19 @@ class RecordNode(Node):
         return len(found)
 
 
-def _latched(info):
+def _latched(info: TopicEndpointInfo) -> bool:
     """Whether a publisher keeps its messages for those who come later."""
-    return info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    return bool(info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def say(text):
+def say(text: str) -> None:
     """A line for the user, beside a progress bar; nobody may be there to read it."""
     with suppress(OSError):
         tqdm.write(f'record: {text}', file=sys.stderr)
 
 
-def run(selection, out, split_bytes=10**9, split_ns=3600 * 10**9):
+def run(selection: Selection, out: Path, split_bytes: int = 10**9,
+        split_ns: int = 3600 * 10**9) -> int:
     """Record until SIGINT, SIGTERM or SIGHUP; returns the exit status.
 
     Parameters
@@ -227,7 +237,7 @@ def run(selection, out, split_bytes=10**9, split_ns=3600 * 10**9):
     return 1 if recorder.unfinished else 0
 
 
-def _record(node, stopped):
+def _record(node: RecordNode, stopped: Callable[[], bool]) -> None:
     """Fetch and record until `stopped()`, and show it."""
     begin = time.monotonic()
     next_look, next_line, heard = begin, begin + LINE_S, None

@@ -8,10 +8,13 @@ if __name__ == '__main__':
 
 import time
 from collections import Counter
+from collections.abc import Sequence
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from mag_tracking_msgs.srv import Seek
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
@@ -33,7 +36,7 @@ MOST_AT_ONCE = 200
 class ReplayNode(Node):
     """Publishes a recording's messages as they were, at its pace or another."""
 
-    def __init__(self, **node_arguments):
+    def __init__(self, **node_arguments: Any) -> None:
         """Raises RecordingError or SettingsError where there is nothing to play."""
         super().__init__('replay_node', **node_arguments)
         path = self.declare_parameter('recording', '').value
@@ -49,7 +52,8 @@ class ReplayNode(Node):
         delay = self.declare_parameter('start_delay', 2.0).value
         self._paused = self.declare_parameter('paused', False).value
         self._recording = Recording(path)
-        self.counts, self._missing = Counter(), set()
+        self.counts: Counter[str] = Counter()
+        self._missing: set[str] = set()
         self._open(topics)
         self._clock_publisher = self.create_publisher(Clock, '/clock', STREAM)
         self.finished = False
@@ -66,28 +70,29 @@ class ReplayNode(Node):
         self.create_service(Seek, '~/seek', self._seek_service)
         self.create_timer(TICK_S, self._tick)
 
-    def _open(self, topics):
+    def _open(self, topics: Sequence[str]) -> None:
         """Publishers of what is to be played and can be."""
         recording = self._recording
-        self._begin = recording.start_ns
-        if self._begin is None:
+        begin_ns = recording.start_ns
+        if begin_ns is None:
             # A file without an end does not tell: read on until it does.
             first = next(recording.messages(), None)
             if first is None:
                 raise RecordingError(f'{recording.path} holds no message')
-            self._begin = first.log_time_ns
+            begin_ns = first.log_time_ns
+        self._begin = begin_ns
         wanted = [t for t in topics if t]
         unknown = [t for t in wanted if t not in recording.types]
         if unknown and recording.message_counts:
             raise RecordingError(f'{recording.path} has no topic {unknown[0]}; it has '
                                  f'{", ".join(sorted(recording.types))}')
         self._wanted = set(wanted) or None
-        self.publishers_by_topic = {}
+        self.publishers_by_topic: dict[str, Publisher] = {}
         for topic, kind in recording.types.items():
             if self._wanted is None or topic in self._wanted:
                 self._publisher_for(topic, kind)
 
-    def _publisher_for(self, topic, kind):
+    def _publisher_for(self, topic: str, kind: str) -> Publisher | None:
         """The publisher of a topic; None where its type is not installed."""
         if topic not in self.publishers_by_topic and topic not in self._missing:
             cls = message_class(kind)
@@ -98,14 +103,14 @@ class ReplayNode(Node):
                 self.publishers_by_topic[topic] = self.create_publisher(cls, topic, STREAM)
         return self.publishers_by_topic.get(topic)
 
-    def _seek(self, offset):
+    def _seek(self, offset: float) -> None:
         """Go on from `offset` seconds after the first message."""
         self._position = self._begin + int(offset * 1e9)
         self._messages = self._recording.messages(self._wanted, self._position)
         self._next = next(self._messages, None)
-        self._wall = None
+        self._wall: float | None = None
 
-    def _tick(self):
+    def _tick(self) -> None:
         """Publish what is due."""
         now = time.monotonic()
         if self._paused or self.finished or now < self._start or not self._heard(now):
@@ -131,14 +136,14 @@ class ReplayNode(Node):
         if self._next is None:
             self._end()
 
-    def _heard(self, now):
+    def _heard(self, now: float) -> bool:
         """Whether somebody listens to every magnetic field, or has been waited for long enough."""
         if now < self._start + self._patience:
             return all(p.get_subscription_count() for topic, p in self.publishers_by_topic.items()
                        if self._recording.types.get(topic) == MAGNETIC_FIELD)
         return True
 
-    def _end(self):
+    def _end(self) -> None:
         """The recording is over: begin again, or stay."""
         for what, n in self._recording.losses.items():
             self.get_logger().warning(f'{what}: {n}')
@@ -148,24 +153,24 @@ class ReplayNode(Node):
         self.finished = True
         self.get_logger().info(f'{self.counts["messages"]} messages played')
 
-    def _pause(self, _request, response):
+    def _pause(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Stop where it is."""
         self._paused, self._wall = True, None
         response.success, response.message = True, 'paused'
         return response
 
-    def _resume(self, _request, response):
+    def _resume(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Go on."""
         self.resume()
         response.success, response.message = True, 'playing'
         return response
 
-    def resume(self):
+    def resume(self) -> None:
         """Go on from where it was paused, without the rest of `start_delay`."""
         self._paused = False
         self._start = min(self._start, time.monotonic())
 
-    def _seek_service(self, request, response):
+    def _seek_service(self, request: Seek.Request, response: Seek.Response) -> Seek.Response:
         """Move to another place; a negative or too large offset is refused."""
         last = self._recording.end_ns
         if not request.offset >= 0.0 or (
@@ -179,6 +184,6 @@ class ReplayNode(Node):
         return response
 
 
-def main(arguments=None):
+def main(arguments: list[str] | None = None) -> int:
     """Run the node; returns the exit status."""
     return stage_node.main(ReplayNode, arguments)

@@ -55,7 +55,7 @@ def declare_settings(node: Node, settings: Settings, group: str,
     in_force = replace(settings, changes)
     for p in flatten(in_force):
         if p.name.startswith(f'{group}.'):
-            value = list(p.value) if p.type is tuple else p.value
+            value = list(p.value) if isinstance(p.value, tuple) else p.value
             node.declare_parameter(p.name, value, _descriptor(p))
     return in_force
 

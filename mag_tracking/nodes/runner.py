@@ -3,10 +3,14 @@
 import signal
 import sys
 import time
+from collections.abc import Callable, Sequence
 from functools import partial
+from os import PathLike as OsPathLike
+from typing import TextIO
 
 import rclpy
 from mag_tracking_msgs.msg import TrackArray
+from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -18,21 +22,25 @@ from mag_tracking.nodes.detection_node import DetectionNode
 from mag_tracking.nodes.driver_node import DriverNode
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.replay_node import ReplayNode
-from mag_tracking.nodes.stage_node import STREAM, make_executor, spin
+from mag_tracking.nodes.stage_node import STREAM, StageNode, make_executor, spin
 from mag_tracking.nodes.tracker_node import TrackerNode
+from mag_tracking.pipeline import Settings
+from mag_tracking.records import Track
 from mag_tracking.settings import flatten
+
+PathLike = str | OsPathLike[str]
 
 
 class TrackPrinter(Node):
     """Prints the track as it grows; subscribes like any other program."""
 
-    def __init__(self, every=1, out=sys.stdout):
+    def __init__(self, every: int = 1, out: TextIO = sys.stdout) -> None:
         super().__init__('track_printer')
         self._every, self._out = every, out
         self._n = 0
         self.create_subscription(TrackArray, '/tracker_node/tracks', self._take, STREAM)
 
-    def _take(self, message):
+    def _take(self, message: TrackArray) -> None:
         """One line a pose."""
         for track in map(track_of, message.tracks):
             if track.ended:
@@ -44,7 +52,7 @@ class TrackPrinter(Node):
             self._n += 1
 
 
-def line_of(track):
+def line_of(track: Track) -> str:
     """One pose as a line of text: position with 1-sigma, speed, moment, arrival, kind."""
     x, y, z = track.position
     sx, sy, sz = (float(v) ** 0.5 for v in track.covariance.diagonal()[:3])
@@ -58,29 +66,31 @@ def line_of(track):
             f'{"  ambiguous" if track.ambiguous else ""}')
 
 
-def parameters(network_path, settings, reliable):
+def parameters(network_path: PathLike, settings: Settings, reliable: bool) -> list[Parameter]:
     """ROS parameters that put `settings` in force in the nodes."""
     out = [Parameter('network', value=str(network_path)),
            Parameter('target', value=settings.track.target),
            Parameter('reliable_input', value=reliable)]
-    return out + [Parameter(p.name, value=list(p.value) if p.type is tuple else p.value)
+    return out + [Parameter(p.name, value=list(p.value) if isinstance(p.value, tuple) else p.value)
                   for p in flatten(settings)]
 
 
-def driver_node(drivers_path, network_path, batches):
+def driver_node(drivers_path: PathLike, network_path: PathLike, batches: bool) -> DriverNode:
     """The driver node; it begins at once."""
     return DriverNode(parameter_overrides=[
         Parameter('drivers', value=str(drivers_path)),
         Parameter('network', value=str(network_path)), Parameter('batches', value=batches)])
 
 
-def make_nodes(network_path, settings, recording=None, rate=1.0, loop=False):
+def make_nodes(network_path: PathLike, settings: Settings, recording: PathLike | None = None,
+               rate: float = 1.0, loop: bool = False
+               ) -> tuple[list[StageNode], ReplayNode | None]:
     """(stage nodes, replay node or None), ready to be added to an executor.
 
     The replay waits, paused, until `all_connected`.
     """
     overrides = parameters(network_path, settings, reliable=recording is not None)
-    stages = [cls(parameter_overrides=overrides)
+    stages: list[StageNode] = [cls(parameter_overrides=overrides)
               for cls in (CalibrationNode, DetectionNode, TrackerNode)]
     if recording is None:
         return stages, None
@@ -90,7 +100,7 @@ def make_nodes(network_path, settings, recording=None, rate=1.0, loop=False):
     return stages, replay
 
 
-def all_connected(stages, replay):
+def all_connected(stages: list[StageNode], replay: ReplayNode) -> bool:
     """Whether every topic of the way has found its subscriber."""
     network = stages[0].network
     raw = [replay.publishers_by_topic[t] for t in network.topics
@@ -100,8 +110,9 @@ def all_connected(stages, replay):
     return all(p.get_subscription_count() > 0 for p in raw + calibrated + frames)
 
 
-def run(network_path, settings, recording=None, rate=1.0, loop=False, observers=(), drivers=None,
-        batches=False):
+def run(network_path: PathLike, settings: Settings, recording: PathLike | None = None,
+        rate: float = 1.0, loop: bool = False, observers: Sequence[Callable[[], Node]] = (),
+        drivers: PathLike | None = None, batches: bool = False) -> int:
     """Run the nodes until Ctrl-C, or until the recording has been played and worked off.
 
     Parameters
@@ -128,13 +139,16 @@ def run(network_path, settings, recording=None, rate=1.0, loop=False, observers=
                           observers)
 
 
-def _run_until(stopped, network_path, settings, recording, rate, loop, observers):
+def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Settings,
+               recording: PathLike | None, rate: float, loop: bool,
+               observers: Sequence[Callable[[], Node]]) -> int:
     """As `run`, until `stopped()`."""
     begin()
-    executor, nodes = make_executor(), []
+    executor = make_executor()
+    nodes: list[Node] = []
     try:
         stages, replay = make_nodes(network_path, settings, recording, rate, loop)
-        nodes = stages + [make() for make in observers]
+        nodes = [*stages, *(make() for make in observers)]
         nodes += [replay] if replay else []
         for node in nodes:
             executor.add_node(node)
@@ -158,14 +172,15 @@ def _run_until(stopped, network_path, settings, recording, rate, loop, observers
         rclpy.try_shutdown()
 
 
-def _work_off(executor, stages, stopped, quiet_s=1.0):
+def _work_off(executor: Executor, stages: list[StageNode], stopped: Callable[[], bool],
+              quiet_s: float = 1.0) -> None:
     """Spin until nothing has moved for `quiet_s` seconds, or until `stopped()`."""
-    def moved():
+    def moved() -> list[int]:
         return [sum(s.counts.values()) for node in stages for s in node.stages().values()]
 
     last, since = moved(), time.monotonic()
 
-    def quiet():
+    def quiet() -> bool:
         nonlocal last, since
         now = moved()
         if now != last:

@@ -95,8 +95,8 @@ class HealthDiagnostics:
         for name, background in calibrate.backgrounds().items():
             if not background.frozen:
                 self._frozen_ns.pop(name, None)
-            elif calibrate.last_stamp_ns(name) is not None:
-                self._frozen_ns.setdefault(name, calibrate.last_stamp_ns(name))
+            elif (last := calibrate.last_stamp_ns(name)) is not None:
+                self._frozen_ns.setdefault(name, last)
         health = {name: self._latest(name) for name in self._network.names}
         self._compared = {name: [] for name in self._network.names}
         for finding in network_findings(self._network, self._settings.survey, calibrate, health):
@@ -138,7 +138,7 @@ class HealthDiagnostics:
         health = self._latest(name)
         background = calibrate.backgrounds()[name]
         c, n = health.counts, max(1, health.counts['readings'])
-        values = {
+        values: dict[str, str | float] = {
             'rate [Hz]': health.rate, 'lost': c['lost'],
             'delay [ms]': 1e3 * health.delay_s[0],
             'noise [nT]': _numbers(1e9 * health.noise_std),

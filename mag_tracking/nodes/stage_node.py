@@ -4,15 +4,20 @@ import gc
 import signal
 import time
 from collections import Counter
-from typing import Protocol
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Protocol
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from mag_tracking_msgs.msg import FieldReadings
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 from rclpy.task import Future
 
 from mag_tracking.errors import MagTrackingError, RecordingError, SettingsError
@@ -23,6 +28,7 @@ from mag_tracking.nodes.flow import Flow, Listener
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.pipeline import settings_for
+from mag_tracking.records import Readings
 
 RESULTS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 """For what people subscribe to."""
@@ -50,7 +56,7 @@ class StageNode(Node):
 
     OWN_PARAMETERS: tuple[str, ...] = ('network', 'target', 'reliable_input', 'use_sim_time')
 
-    def __init__(self, name, group, **node_arguments):
+    def __init__(self, name: str, group: str, **node_arguments: Any) -> None:
         """Raises SettingsError or NetworkError where parameters or network are unusable."""
         super().__init__(name, **node_arguments)
         path = self.declare_parameter('network', '').value
@@ -66,32 +72,37 @@ class StageNode(Node):
             raise SettingsError(f'{name}: track.target is {self.settings.track.target!r}, but '
                                 f'target is {target!r}')
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RESULTS)
-        self._reported = {}
-        self.flows, self._listeners = {}, []
+        self._reported: dict[tuple[str, str], int] = {}
+        self.flows: dict[str, Flow] = {}
+        self._listeners: list[Listener] = []
         # When the message came that is worked on, by the clock of ROS.
         self.now_ns = 0
         self.create_timer(1.0, self._publish_diagnostics)
 
-    def stages(self):
+    def stages(self) -> dict[str, Counted]:
         """{name: stage} whose counts are published."""
         raise NotImplementedError
 
-    def queues(self):
+    def queues(self) -> dict[str, int]:
         """{name of a stage: how many records it holds}."""
         return {}
 
-    def expect(self, listener, topic):
+    def expect(self, listener: str, topic: str) -> None:
         """Say so in diagnostics when the node named `listener` no longer listens to `topic`."""
         self._listeners.append(Listener(listener, topic))
 
-    def publisher(self, message_type, topic, qos):
+    def publisher(self, message_type: Any, topic: str, qos: QoSProfile) -> Publisher:
         """A publisher that logs a subscriber with unfit QoS."""
-        events = PublisherEventCallbacks(incompatible_qos=lambda e: self.get_logger().warning(
-            f'a subscriber of {topic} asks for another QoS (policy {e.last_policy_kind}): '
-            'it gets nothing'))
+        def unfit(event: Any) -> None:
+            self.get_logger().warning(
+                f'a subscriber of {topic} asks for another QoS (policy '
+                f'{event.last_policy_kind}): it gets nothing')
+
+        events = PublisherEventCallbacks(incompatible_qos=unfit)
         return self.create_publisher(message_type, topic, qos, event_callbacks=events)
 
-    def subscription(self, message_type, topic, callback, qos, source=''):
+    def subscription(self, message_type: Any, topic: str, callback: Callable[[Any], None],
+                     qos: QoSProfile, source: str = '') -> Subscription:
         """A subscription that logs a publisher with unfit QoS.
 
         With a `source`, the node that sends, diagnostics tell of what comes and how late.
@@ -100,16 +111,17 @@ class StageNode(Node):
         if flow is not None:
             flow.topics.append(topic)
 
-        def unfit(event):
+        def unfit(event: Any) -> None:
             self.get_logger().warning(
                 f'the publisher of {topic} offers another QoS (policy {event.last_policy_kind}): '
                 'nothing comes from it')
 
-        def lost(event):
+        def lost(event: Any) -> None:
             if flow is not None:
                 flow.n_lost += event.total_count_change
 
-        def take(message):
+        def take(message: Any) -> None:
+            assert flow is not None
             began = time.monotonic()
             self.now_ns = self.get_clock().now().nanoseconds
             callback(message)
@@ -119,7 +131,7 @@ class StageNode(Node):
             message_type, topic, callback if flow is None else take, qos,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=unfit, message_lost=lost))
 
-    def readings_of(self, message, stage):
+    def readings_of(self, message: FieldReadings, stage: Counted) -> Readings | None:
         """`Readings` of a FieldReadings; one that is none is a rejection of `stage`, and None."""
         try:
             return readings_of(message)
@@ -128,7 +140,7 @@ class StageNode(Node):
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return None
 
-    def _publish_diagnostics(self):
+    def _publish_diagnostics(self) -> None:
         """Counts of the stages; a warning where something was rejected since the last time."""
         statuses, queues = [], self.queues()
         for name, stage in self.stages().items():
@@ -144,15 +156,19 @@ class StageNode(Node):
                 values=[KeyValue(key=k, value=str(n)) for k, n in sorted(
                     {**stage.counts, **({'queue': queues[name]} if name in queues else {})}.items()
                 )]))
-        statuses += [flow.status(self.get_name(), lambda flow=flow: any(
-            map(self.count_publishers, flow.topics))) for flow in self.flows.values()]
+        statuses += [flow.status(self.get_name(), partial(self._has_publisher, flow))
+                     for flow in self.flows.values()]
         for listener in self._listeners:
             ends = self.get_subscriptions_info_by_topic(self.resolve_topic_name(listener.topic))
             statuses.append(listener.status(self.get_name(), {
                 e.node_name for e in ends if e.node_namespace == self.get_namespace()}))
         self.publish_statuses(statuses)
 
-    def publish_statuses(self, statuses):
+    def _has_publisher(self, flow: Flow) -> bool:
+        """Whether somebody would still publish what the flow is of."""
+        return any(map(self.count_publishers, flow.topics))
+
+    def publish_statuses(self, statuses: list[DiagnosticStatus]) -> None:
         """Publish [DiagnosticStatus], if there are any."""
         if statuses:
             array = DiagnosticArray(status=statuses)
@@ -160,7 +176,7 @@ class StageNode(Node):
             self._diagnostics.publish(array)
 
 
-def make_executor():
+def make_executor() -> Executor:
     """The events executor, a tenth of the cost of the others; else the single-threaded one."""
     try:
         from rclpy.experimental import EventsExecutor
@@ -169,7 +185,7 @@ def make_executor():
     return EventsExecutor()
 
 
-def spin(executor, until=lambda: False):
+def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:
     """Run `executor` until ROS shuts down or `until` is true (asked a few times a second)."""
     try:
         while rclpy.ok() and not until():
@@ -180,13 +196,14 @@ def spin(executor, until=lambda: False):
         pass
 
 
-def main(node_class, arguments=None):
+def main(node_class: Callable[[], Node], arguments: list[str] | None = None) -> int:
     """Run one node as a process until SIGINT or SIGTERM; returns the exit status."""
     with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
         return _run_until(seen, node_class, arguments)
 
 
-def _run_until(seen, node_class, arguments):
+def _run_until(seen: list[int], node_class: Callable[[], Node],
+               arguments: list[str] | None) -> int:
     """Run one node until there is something in `seen`."""
     begin(arguments)
     executor, node = make_executor(), None

@@ -9,6 +9,7 @@ itself, is out of reach.
 import signal
 import sys
 from importlib import import_module
+from typing import NoReturn
 
 from mag_tracking.interrupts import exit_on_signals
 
@@ -16,7 +17,7 @@ ENDING = (signal.SIGINT, signal.SIGTERM)
 """The signals that end a node."""
 
 
-def run_node(name):
+def run_node(name: str) -> NoReturn:
     """Run the node of the module `name` as a process; does not return."""
     try:
         with exit_on_signals(0, *ENDING):
@@ -29,26 +30,26 @@ def run_node(name):
     sys.exit(status)
 
 
-def driver_node():
+def driver_node() -> NoReturn:
     """The command driver_node."""
     run_node('driver_node')
 
 
-def replay_node():
+def replay_node() -> NoReturn:
     """The command replay_node."""
     run_node('replay_node')
 
 
-def calibration_node():
+def calibration_node() -> NoReturn:
     """The command calibration_node."""
     run_node('calibration_node')
 
 
-def detection_node():
+def detection_node() -> NoReturn:
     """The command detection_node."""
     run_node('detection_node')
 
 
-def tracker_node():
+def tracker_node() -> NoReturn:
     """The command tracker_node."""
     run_node('tracker_node')

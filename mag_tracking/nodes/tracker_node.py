@@ -8,6 +8,7 @@ if __name__ == '__main__':
 
 import time
 from collections import deque
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
@@ -19,6 +20,7 @@ from mag_tracking_msgs.msg import (
     TrackArray,
 )
 from nav_msgs.msg import Odometry, Path
+from rclpy.publisher import Publisher
 from visualization_msgs.msg import MarkerArray
 
 from mag_tracking.errors import RecordingError
@@ -34,13 +36,15 @@ from mag_tracking.messages.schema import (
     smoothed_track_dict,
     track_dict,
 )
+from mag_tracking.network import SensorNetwork
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.markers import delete_markers, track_markers
 from mag_tracking.nodes.ros_params import follow_changes
-from mag_tracking.nodes.stage_node import LATCHED, RESULTS, SENT, STREAM, StageNode
-from mag_tracking.records import SmoothedPose
+from mag_tracking.nodes.stage_node import LATCHED, RESULTS, SENT, STREAM, Counted, StageNode
+from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.stages.track.manager import TrackManager
+from mag_tracking.stages.track.running_track import TrackRecord
 
 SLACK_S = 1.0
 """[s] What the way of a frame may take on top of the longest gap."""
@@ -51,7 +55,7 @@ LONGEST_PATH = 2000
 class TrackerNode(StageNode):
     """The bank of filters behind a topic."""
 
-    def __init__(self, **node_arguments):
+    def __init__(self, **node_arguments: Any) -> None:
         super().__init__('tracker_node', 'track', **node_arguments)
         self._stage = TrackManager(self.network, self.settings.track)
         follow_changes(self, self.settings, lambda s: self._stage.configure(s.track))
@@ -65,18 +69,19 @@ class TrackerNode(StageNode):
         self._smoothed = self.publisher(SmoothedTrack, '~/smoothed', RESULTS)
         self._smoothed_path = self.publisher(Path, '~/path_smoothed', RESULTS)
         self._markers = self.publisher(MarkerArray, '~/markers', RESULTS)
-        self._path, self._is_silent = deque(maxlen=LONGEST_PATH), False
+        self._path: deque[PoseStamped] = deque(maxlen=LONGEST_PATH)
+        self._is_silent = False
         self.subscription(NetworkFrame, '/detection_node/frame', self._take, STREAM,
                           source='detection_node')
         self.create_timer(0.25, self.end_without_frames)
         self.subscription(CalibrationState, '/calibration_node/calibration', self._calibrated,
                           LATCHED)
 
-    def stages(self):
+    def stages(self) -> dict[str, Counted]:
         """{name: stage} whose counts are published."""
         return {'track': self._stage}
 
-    def end_without_frames(self):
+    def end_without_frames(self) -> None:
         """Tell of a track that is lost because no frame comes any more.
 
         By when they came: a clock may be behind. A recording may be played as slowly as
@@ -84,14 +89,16 @@ class TrackerNode(StageNode):
         """
         if self._stage.bank is None or self.is_replayed:
             return
-        silent_s = time.monotonic() - self.flows['detection_node'].heard
+        heard = self.flows['detection_node'].heard
+        assert heard is not None, 'a track without a frame'
+        silent_s = time.monotonic() - heard
         # Twice in a row: while the node was busy, frames may have come that wait.
         was_silent, self._is_silent = self._is_silent, \
             silent_s > self.settings.track.end_gap_s + SLACK_S
         if was_silent and self._is_silent:
             self._publish_all(self._stage.give_up('no frames came'))
 
-    def _calibrated(self, message):
+    def _calibrated(self, message: CalibrationState) -> None:
         """The sensors' orientations, which a survey may have changed."""
         try:
             network = with_orientations(self.network, message)
@@ -105,7 +112,7 @@ class TrackerNode(StageNode):
         self._stage.use_network(network)
         self.get_logger().info('the next track is of sensors as they were surveyed')
 
-    def _take(self, message):
+    def _take(self, message: NetworkFrame) -> None:
         """One frame."""
         try:
             frame = frame_of(message, self.network)
@@ -116,7 +123,7 @@ class TrackerNode(StageNode):
         self._publish_all(self._stage.feed(frame))
         self._stage.idle()
 
-    def _publish_all(self, records):
+    def _publish_all(self, records: list[TrackRecord]) -> None:
         """`Track`s and `SmoothedPose`s, each where it belongs."""
         whole = []
         for record in records:
@@ -132,13 +139,13 @@ class TrackerNode(StageNode):
                 SmoothedTrack, smoothed_track_dict(whole, self.network.frame)))
             self._smoothed_path.publish(self._path_of(whole))
 
-    def _path_of(self, poses):
+    def _path_of(self, poses: list[SmoothedPose]) -> Path:
         """nav_msgs/Path of `SmoothedPose`s, with the header of the latest."""
         steps = [to_message(PoseStamped, pose_dict(p.stamp_ns, self.network.frame, p.position,
                                                    p.orientation)) for p in poses]
         return Path(header=steps[-1].header, poses=steps)
 
-    def _publish(self, track):
+    def _publish(self, track: Track) -> None:
         """Everything about one track at one time."""
         frame = self.network.frame
         if not track.ended:
@@ -168,18 +175,18 @@ class TrackerNode(StageNode):
             self._markers.publish(to_message(MarkerArray, track_markers(track, frame)))
 
 
-def is_heard(publisher):
+def is_heard(publisher: Publisher) -> bool:
     """Whether somebody listens: what is large is made for nobody else."""
     return publisher.get_subscription_count() > 0
 
 
-def _same_orientations(one, other):
+def _same_orientations(one: SensorNetwork, other: SensorNetwork) -> bool:
     """Whether two networks are turned alike, but for the rounding of quaternions."""
-    known = [(a is None) == (b is None) and (a is None or np.allclose(a, b))
+    known = [a is b if a is None or b is None else np.allclose(a, b)
              for a, b in zip(one.orientation_std, other.orientation_std, strict=True)]
     return all(known) and bool(np.abs(one.R_ws - other.R_ws).max() < 1e-9)
 
 
-def main(arguments=None):
+def main(arguments: list[str] | None = None) -> int:
     """Run the node; returns the exit status."""
     return stage_node.main(TrackerNode, arguments)
