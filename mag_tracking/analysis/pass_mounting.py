@@ -5,7 +5,7 @@ the prior is its own; of several tracks these add up. Weaker than a calibration 
 target: what the model leaves out of a vehicle is alike in all passes of one lane.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,7 +36,7 @@ class MountingEvidence:
     n_tracks: int
 
 
-def fold_mounting(network: SensorNetwork, prior_std: FloatArray,
+def fold_mounting(network: SensorNetwork, prior_std: Iterable[FloatArray],
                   tracks: Sequence[Track]) -> MountingEvidence:
     """Fold the last poses of tracks into one estimate of the sensors' orientations.
 
