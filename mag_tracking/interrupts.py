@@ -6,7 +6,7 @@ Nothing is imported here that takes time: programs come here first.
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
@@ -33,7 +33,7 @@ def noted_signals(*signals: signal.Signals) -> Iterator[list[int]]:
 
 
 @contextmanager
-def exit_on_signals(status, *signals, message=''):
+def exit_on_signals(status: int, *signals: signal.Signals, message: str = '') -> Iterator[None]:
     """End the process at once, with `status` and a `message`, when one of `signals` comes.
 
     For the imports at the start of a program, when there is nothing to clean up: an exception
@@ -42,7 +42,7 @@ def exit_on_signals(status, *signals, message=''):
     """
     text = f'{message}\n'.encode() if message else b''
 
-    def leave(_signum, _frame):
+    def leave(_signum: int, _frame: FrameType | None) -> None:
         try:
             os.write(2, text)
         finally:
@@ -53,7 +53,8 @@ def exit_on_signals(status, *signals, message=''):
 
 
 @contextmanager
-def _handled_by(handler, signals):
+def _handled_by(handler: Callable[[int, FrameType | None], None],
+                signals: tuple[signal.Signals, ...]) -> Iterator[None]:
     """Have `handler` called with `signals`, but for those that are ignored."""
     before = {}
     if threading.current_thread() is threading.main_thread():

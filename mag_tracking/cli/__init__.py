@@ -1,5 +1,6 @@
 """The command `mag-tracking`: one module a command."""
 
+import argparse
 import signal
 import sys
 from collections.abc import Sequence
@@ -23,14 +24,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     return _run(args)
 
 
-def _parse(words):
+def _parse(words: Sequence[str]) -> argparse.Namespace:
     """The parsed command line; the imports for it take most of a second."""
     from mag_tracking.cli.commands import parse
 
     return parse(words)
 
 
-def _run(args):
+def _run(args: argparse.Namespace) -> int:
     """Run a command; returns its exit status."""
     try:
         status: int = args.run_command(args)

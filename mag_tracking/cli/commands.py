@@ -1,6 +1,7 @@
 """The command line of `mag-tracking`: all commands, with all that they import."""
 
 import argparse
+from collections.abc import Sequence
 
 from mag_tracking.cli import (
     board_geometry,
@@ -19,7 +20,7 @@ from mag_tracking.cli import (
 )
 
 
-def parse(words):
+def parse(words: Sequence[str]) -> argparse.Namespace:
     """The parsed command line; its `run_command` takes it and returns the exit status."""
     parser = argparse.ArgumentParser(
         prog='mag-tracking', description='Track magnetic targets with stationary magnetometers.')

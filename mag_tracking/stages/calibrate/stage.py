@@ -51,8 +51,8 @@ class Calibrate:
         self._clock_ns: list[int] = []
         self._background: dict[str, RunningBackground] = {}
         self._repetition = {name: Repetition(self._of(name)) for name in network.names}
-        self._spikes = {name: SpikeFilter(settings.spike_std, self._of(name))
-                        for name in network.names}
+        self._spikes: dict[str, SpikeFilter[MagSample]] = {
+            name: SpikeFilter(settings.spike_std, self._of(name)) for name in network.names}
         self._jumps_ahead = JumpAheadCheck(settings.jump_ahead_s * NS)
         self._restoration = BackgroundRestoration(settings.resume_s)
         self.renew(network)
@@ -104,13 +104,13 @@ class Calibrate:
         s, name = self._sensors[i], self._network.names[i]
         background, offset, C = (self._background[name], self._network.offset[i],
                                  self._network.correction[i])
+        line = background.line
         s['is_ordinary'] = (
-            background.ready and background.is_whole and s['last_ns'] != NEVER
-            and not np.isnan(background.line[1]).any()
-            and not self._settings.decimate_to_hz and not self._spikes[name].n_held
-            and name not in self._jumps_ahead and name not in self._restoration)
-        if s['is_ordinary']:
-            s['centre'], s['mean'], s['slope'], s['horizon'] = background.line
+            line is not None and background.ready and background.is_whole
+            and s['last_ns'] != NEVER and not np.isnan(line[1]).any() and not self._settings.decimate_to_hz
+            and not self._spikes[name].n_held and name not in self._jumps_ahead and name not in self._restoration)
+        if line is not None and s['is_ordinary']:
+            s['centre'], s['mean'], s['slope'], s['horizon'] = line
             s['noise_std'], self._noise[i] = background.noise_std, background.covariance
             s['clock_ns'], s['offset'] = self._clock_ns[i], 0.0 if offset is None else offset
             s['is_turned'] = C is not None
@@ -287,6 +287,7 @@ class Calibrate:
         if is_whole and not isnan(sum(departure)):
             self.counts['calibrated'] += 1
             return [MagSample(sample.stamp_ns, sample.sensor, field, covariance)]
+        assert covariance is not None
         unknown = ~np.isnan(field) & np.isnan(np.diagonal(covariance))
         if unknown.any() or (np.isnan(field) & ~np.isnan(sample.field)).any():
             # It has only just begun to report this axis: nothing is known of it yet.
