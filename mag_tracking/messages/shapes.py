@@ -89,3 +89,17 @@ class CalibrationState(Protocol):
 
     header: Header
     sensors: Sequence[SensorCalibration]
+
+
+class Pose(Protocol):
+    """geometry_msgs/Pose."""
+
+    position: Vector3
+    orientation: Quaternion
+
+
+class PoseStamped(Protocol):
+    """geometry_msgs/PoseStamped."""
+
+    header: Header
+    pose: Pose

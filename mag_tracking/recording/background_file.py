@@ -6,17 +6,22 @@ A network file says what holds for years; this is of the last minute, and goes w
 import hashlib
 import json
 import os
+from collections.abc import Mapping
+from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.network import SensorNetwork
 from mag_tracking.stages.calibrate.restoration import Kept
+from mag_tracking.stages.calibrate.settings import CalibrateSettings
 
 VERSION = 1
 
 
-def usual_path(network_path, node):
+def usual_path(network_path: str | PathLike[str], node: str) -> Path:
     """Where node `node` keeps the backgrounds of a network file: below $ROS_HOME, or ~/.ros."""
     path = Path(network_path).resolve()
     home = Path(os.environ.get('ROS_HOME') or Path.home() / '.ros')
@@ -24,7 +29,7 @@ def usual_path(network_path, node):
     return home / 'mag_tracking' / f'{path.stem}_{mark}.json'
 
 
-def _made_of(network, j, settings):
+def _made_of(network: SensorNetwork, j: int, settings: CalibrateSettings) -> list[Any]:
     """All that a background of sensor `j` rests on, as lists: where that differs, it is another."""
     arrays = (network.offset[j], network.correction[j], network.clock_offset[j],
               network.background[j], network.noise_std[j], network.positions[j], network.R_ws[j])
@@ -32,14 +37,15 @@ def _made_of(network, j, settings):
         + [settings.decimate_to_hz]
 
 
-def background_text(kept, network, j, settings):
+def background_text(kept: Kept, network: SensorNetwork, j: int,
+                    settings: CalibrateSettings) -> str:
     """JSON of the `Kept` background of sensor `j`; `settings` are `CalibrateSettings`."""
     return json.dumps({'stamp_ns': kept.stamp_ns, 'background': kept.background.tolist(),
                        'covariance': kept.covariance.tolist(),
                        'made_of': _made_of(network, j, settings)})
 
 
-def write_backgrounds(path, texts):
+def write_backgrounds(path: str | PathLike[str], texts: Mapping[str, str]) -> None:
     """Write {sensor: `background_text`}; what was there stays whole until the new is.
 
     Raises OutputError.
@@ -55,7 +61,8 @@ def write_backgrounds(path, texts):
         raise OutputError(f'{path}: {getattr(error, "strerror", None) or error}') from error
 
 
-def read_backgrounds(path, network, settings):
+def read_backgrounds(path: str | PathLike[str], network: SensorNetwork,
+                     settings: CalibrateSettings) -> tuple[dict[str, Kept], dict[str, str]]:
     """What was kept of the sensors of `network`, as far as it rests on the same.
 
     Returns
@@ -76,7 +83,8 @@ def read_backgrounds(path, network, settings):
     entries = content.get('sensors') if isinstance(content, dict) else None
     if not isinstance(entries, dict) or content.get('version') != VERSION:
         raise RecordingError(f'{path}: not what calibration_node keeps, version {VERSION}')
-    kept, refused = {}, {}
+    kept: dict[str, Kept] = {}
+    refused: dict[str, str] = {}
     for j, name in enumerate(network.names):
         try:
             if name in entries and entries[name]['made_of'] != _made_of(network, j, settings):
@@ -88,7 +96,7 @@ def read_backgrounds(path, network, settings):
     return kept, refused
 
 
-def _kept(entry):
+def _kept(entry: Any) -> Kept:
     """`Kept` of an entry; raises ValueError where its numbers are none."""
     background = np.array(entry['background'], dtype=float)
     covariance = np.array(entry['covariance'], dtype=float)

@@ -7,5 +7,6 @@ import zstandard
 from mcap.exceptions import McapError
 from mcap.stream_reader import CRCValidationError
 
-DAMAGE = (McapError, CRCValidationError, ValueError, KeyError, EOFError, struct.error,
-          zlib.error, zstandard.ZstdError, RuntimeError, UnicodeDecodeError, MemoryError)
+DAMAGE: tuple[type[Exception], ...] = (
+    McapError, CRCValidationError, ValueError, KeyError, EOFError, struct.error, zlib.error,
+    zstandard.ZstdError, RuntimeError, UnicodeDecodeError, MemoryError)

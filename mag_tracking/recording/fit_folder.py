@@ -3,10 +3,14 @@
 import csv
 import json
 import math
+from collections.abc import Iterable, Sequence
+from os import PathLike
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
+from mag_tracking.analysis.pass_result import Bearing, PassFit
 from mag_tracking.errors import OutputError
 from mag_tracking.recording.result_folder import without_nan
 
@@ -21,12 +25,27 @@ in seconds after `stamp_ns`. The rate is speed over CPA range, which one sensor 
 directions are in `fits.json`."""
 
 
-def fit_row(fit):
+class _FittedPass(Protocol):
+    """See `apps.fit.FittedPass`."""
+
+    @property
+    def recording(self) -> str: ...
+    @property
+    def number(self) -> int: ...
+    @property
+    def fits(self) -> Sequence[PassFit]: ...
+    @property
+    def notes(self) -> Sequence[str]: ...
+    @property
+    def chosen(self) -> PassFit | None: ...
+
+
+def fit_row(fit: PassFit) -> dict[str, Any]:
     """{column: number} of one `PassFit`, without those that say which pass it is.
 
     Where the fit has a reason not to be believed all numbers of the target are NaN.
     """
-    row = dict.fromkeys(FIT_COLUMNS[6:], math.nan)
+    row: dict[str, Any] = dict.fromkeys(FIT_COLUMNS[6:], math.nan)
     row |= {'ambiguous': '', 'n_dipoles': fit.n_dipoles, 'reason': fit.reason,
             'stamp_ns': fit.data.stamp_ns, 'n_values': fit.data.n_values, 'n_unknowns': len(fit.x)}
     if len(fit.x):
@@ -43,11 +62,12 @@ def fit_row(fit):
     moment, P = fit.moment
     heading = [math.degrees(v) for v in fit.heading]
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
-    groups = (('x y z', fit.position), ('vx vy vz', fit.velocity),
-              ('sd_x sd_y sd_z sd_vx sd_vy sd_vz', sd[:6]), ('speed sd_speed', fit.speed),
-              ('heading_deg sd_heading_deg', heading), ('length sd_length', fit.length),
-              ('mx my mz', moment), ('sd_mx sd_my sd_mz', np.sqrt(np.diagonal(P))),
-              ('cpa_time sd_cpa_time cpa_range sd_cpa_range', fit.closest_approach(centre)))
+    groups: tuple[tuple[str, Iterable[float]], ...] = (
+        ('x y z', fit.position), ('vx vy vz', fit.velocity),
+        ('sd_x sd_y sd_z sd_vx sd_vy sd_vz', sd[:6]), ('speed sd_speed', fit.speed),
+        ('heading_deg sd_heading_deg', heading), ('length sd_length', fit.length),
+        ('mx my mz', moment), ('sd_mx sd_my sd_mz', np.sqrt(np.diagonal(P))),
+        ('cpa_time sd_cpa_time cpa_range sd_cpa_range', fit.closest_approach(centre)))
     for names, values in groups:
         row |= dict(zip(names.split(), map(float, values), strict=True))
     return row
@@ -60,10 +80,11 @@ class FitFolder:
     `summary` is in it, too.
     """
 
-    def __init__(self, folder):
+    def __init__(self, folder: str | PathLike[str]) -> None:
         """Raises OutputError where the folder cannot be made or written."""
         self.folder = Path(folder)
-        self.rows, self.summary = [], {}
+        self.rows: list[dict[str, Any]] = []
+        self.summary: dict[str, Any] = {}
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._stream = open(self.folder / 'fits.csv', 'w', newline='', encoding='utf-8')
@@ -72,17 +93,17 @@ class FitFolder:
         self._writer = csv.writer(self._stream)
         self._writer.writerow(FIT_COLUMNS)
 
-    def __enter__(self):
+    def __enter__(self) -> 'FitFolder':
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self._stream.close()
         with open(self.folder / 'fits.json', 'w', encoding='utf-8') as stream:
             json.dump(without_nan({'fits': self.rows, **self.summary}), stream, indent=1,
                       allow_nan=False)
             stream.write('\n')
 
-    def add(self, one):
+    def add(self, one: _FittedPass) -> None:
         """Write the rows of a `FittedPass`."""
         for fit in one.fits:
             row = {'recording': one.recording, 'pass': one.number, **fit_row(fit),
@@ -93,7 +114,7 @@ class FitFolder:
         self._stream.flush()
 
 
-def _bearing(bearing):
+def _bearing(bearing: Bearing | None) -> dict[str, Any] | None:
     """A `Bearing` for JSON, or None."""
     if bearing is None:
         return None

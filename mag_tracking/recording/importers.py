@@ -1,10 +1,13 @@
 """Importers: other people's tables to recordings and network files."""
 
 import csv
+from os import PathLike
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.geometry import quaternion_from_rotation_vector, rotation_from_quaternion
 from mag_tracking.messages.schema import pose_dict, sample_dict
@@ -14,11 +17,13 @@ from mag_tracking.network.file import write_network
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import MagSample
 
+_Path: TypeAlias = str | PathLike[str]
 _COLUMNS = ('id', 'timestamp', 'Bx', 'By', 'Bz', 'sensor_x', 'sensor_y', 'sensor_z',
             'sensor_ox', 'sensor_oy', 'sensor_oz', 'm_x', 'm_y', 'm_z', 'm_ox', 'm_oy', 'm_oz')
 
 
-def import_pose_table(table, background, out, noise_std):
+def import_pose_table(table: _Path, background: _Path, out: _Path,
+                      noise_std: float) -> tuple[Path, Path, int]:
     """A table of magnet poses seen by fixed sensors, as recording and network file.
 
     Parameters
@@ -75,7 +80,7 @@ def import_pose_table(table, background, out, noise_std):
     return recording, out / 'network.yaml', len(order)
 
 
-def _read_table(path):
+def _read_table(path: _Path) -> dict[str, FloatArray]:
     """The columns of the table as arrays."""
     try:
         with open(path, newline='', encoding='utf-8') as stream:
@@ -100,7 +105,7 @@ def _read_table(path):
             'sensor_rotation': a[:, 8:11], 'magnet': a[:, 11:14], 'magnet_rotation': a[:, 14:17]}
 
 
-def _read_background(path):
+def _read_background(path: _Path) -> FloatArray:
     """(n_sensors, 3) [microtesla]."""
     try:
         values = np.loadtxt(path, delimiter=',', ndmin=2)

@@ -1,15 +1,21 @@
 """Tables of a magnet's poses over a board of sensors: a row a pose, all sensors in it."""
 
 import csv
+from os import PathLike
+from typing import TypeAlias
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
 
+_Path: TypeAlias = str | PathLike[str]
+_Lines: TypeAlias = list[tuple[int, list[str]]]
+"""Number of each line, and its cells."""
 _POSE = ('mag_x0', 'mag_y0', 'mag_z0', 'mag_mx0', 'mag_my0', 'mag_mz0')
 
 
-def read_pose_table(path):
+def read_pose_table(path: _Path) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Readings of fixed sensors and the tracked poses of a magnet.
 
     Parameters
@@ -37,7 +43,7 @@ def read_pose_table(path):
     return (values[:, :-6].reshape(len(rows), -1, 3), values[:, -6:-3], axes / length[:, None])
 
 
-def read_readings(path):
+def read_readings(path: _Path) -> FloatArray:
     """Readings (K, n, 3) [T, sensor frame] alone of such a table, which needs no poses.
 
     Raises RecordingError, which names file, row and column.
@@ -46,7 +52,7 @@ def read_readings(path):
     return values.reshape(len(rows), -1, 3)
 
 
-def read_sensor_positions(path):
+def read_sensor_positions(path: _Path) -> FloatArray:
     """Positions (n, 3) [m] of a CSV of x,y,z with comments after #.
 
     Raises RecordingError, which names file, row and column.
@@ -61,7 +67,7 @@ def read_sensor_positions(path):
                       for name, text in zip('xyz', row, strict=True)] for line, row in rows])
 
 
-def _values(path, pose):
+def _values(path: _Path, pose: tuple[str, ...]) -> tuple[_Lines, FloatArray]:
     """[(line, row)] and the numbers of all readings, then of the columns `pose`."""
     header, rows = _read(path)
     n = sum(name[:1] == 'x' and name[1:].isdigit() for name in header)
@@ -79,7 +85,7 @@ def _values(path, pose):
     return rows, values
 
 
-def _read(path):
+def _read(path: _Path) -> tuple[list[str], _Lines]:
     """Header and [(line, row)]."""
     lines = _lines(path)
     if len(lines) < 2:
@@ -92,7 +98,7 @@ def _read(path):
     return header, lines[1:]
 
 
-def _lines(path):
+def _lines(path: _Path) -> _Lines:
     """[(line, cells)] of the lines that are not empty."""
     try:
         with open(path, newline='', encoding='utf-8') as stream:
@@ -104,7 +110,7 @@ def _lines(path):
         raise RecordingError(f'{path}: {error}') from error
 
 
-def _number(path, line, column, text, finite):
+def _number(path: _Path, line: int, column: str, text: str, finite: bool) -> float:
     """One cell; empty = NaN, where that is allowed."""
     try:
         value = float(text) if text.strip() else np.nan

@@ -7,16 +7,19 @@ reported, a truncated file is read up to the cut. Memory stays at about one chun
 import heapq
 import os
 from collections import Counter
+from collections.abc import Collection, Iterator
+from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import yaml
 from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, Message, Schema
+from mcap.records import Channel, Chunk, ChunkIndex, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from mag_tracking.errors import RecordingError
 from mag_tracking.recording.damage import DAMAGE
+from mag_tracking.recording.interruptible import Progress
 
 
 class RawMessage(NamedTuple):
@@ -43,30 +46,32 @@ class Recording:
         {what: number}, grows while reading.
     """
 
-    def __init__(self, path):
+    def __init__(self, path: str | PathLike[str]) -> None:
         """Raises RecordingError where there is no readable recording at `path`."""
         self.path = Path(path)
-        self.types, self.message_counts = {}, Counter()
-        self.losses = Counter()
+        self.types: dict[str, str] = {}
+        self.message_counts: Counter[str] = Counter()
+        self.losses: Counter[str] = Counter()
         self._files = _files(self.path)
         empty = [f for f in self._files if f.stat().st_size == 0]
         if len(empty) < len(self._files):
             # A crash at a split leaves one; an only file is told by `_inspect`.
             self._files = [f for f in self._files if f not in empty]
             self.losses.update(f'{f.name} is empty (0 bytes)' for f in empty)
-        self.start_ns = self.end_ns = None
+        self.start_ns: int | None = None
+        self.end_ns: int | None = None
         self._indexes = [self._inspect(f) for f in self._files]
 
-    def lies_in(self, folder):
+    def lies_in(self, folder: str | PathLike[str]) -> bool:
         """Whether a file of this recording is in `folder` itself."""
         return any(f.resolve().parent == Path(folder).resolve() for f in self._files)
 
     @property
-    def size(self):
+    def size(self) -> int:
         """Bytes of all files."""
         return sum(f.stat().st_size for f in self._files)
 
-    def _inspect(self, file):
+    def _inspect(self, file: Path) -> list[ChunkIndex] | None:
         """Read topics, counts and times of one file; its chunk index, or None without one."""
         with open(file, 'rb') as stream:
             if stream.read(5) != b'\x89MCAP':
@@ -92,7 +97,8 @@ class Recording:
             self.start_ns, self.end_ns = min(starts), max(ends)
         return sorted(summary.chunk_indexes, key=lambda c: c.message_start_time)
 
-    def messages(self, topics=None, start_ns=None, progress=None):
+    def messages(self, topics: Collection[str] | None = None, start_ns: int | None = None,
+                 progress: Progress | None = None) -> Iterator[RawMessage]:
         """Iterate over the `RawMessage`s, in order of log time.
 
         Parameters
@@ -118,9 +124,12 @@ class Recording:
                             start_ns is None or m.log_time_ns >= start_ns):
                         yield m
 
-    def _from_index(self, stream, index, start_ns, progress):
+    def _from_index(self, stream: BinaryIO, index: list[ChunkIndex], start_ns: int | None,
+                    progress: Progress | None) -> Iterator[RawMessage]:
         """Messages of an intact file, in order of log time across chunks."""
-        heap, schemas, channels = [], {}, {}
+        heap: list[tuple[int, int, int, RawMessage]] = []
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
         for k, entry in enumerate(index):
             if start_ns is not None and entry.message_end_time < start_ns:
                 continue
@@ -142,16 +151,17 @@ class Recording:
             while heap and (horizon is None or heap[0][0] < horizon):
                 yield heapq.heappop(heap)[3]
 
-    def _lose_chunk(self, entry, error):
+    def _lose_chunk(self, entry: ChunkIndex, error: Exception) -> None:
         """Report a chunk that cannot be read."""
         seconds = (entry.message_end_time - entry.message_start_time) / 1e9
         after = (entry.message_start_time - (self.start_ns or entry.message_start_time)) / 1e9
         self.losses[f'a damaged stretch of {seconds:.1f} s at {after:.1f} s '
                     f'({type(error).__name__})'] += 1
 
-    def _from_stream(self, stream, progress):
+    def _from_stream(self, stream: BinaryIO, progress: Progress | None) -> Iterator[RawMessage]:
         """Messages in the order of the file, up to where it breaks off."""
-        schemas, channels = {}, {}
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
         done = 0
         try:
             for record in StreamReader(stream, emit_chunks=True).records:
@@ -176,7 +186,8 @@ class Recording:
                         f'({type(error).__name__})'] += 1
 
     @staticmethod
-    def _of_chunk(chunk, schemas, channels):
+    def _of_chunk(chunk: Chunk, schemas: dict[int, Schema],
+                  channels: dict[int, Channel]) -> list[RawMessage]:
         """The messages of one chunk, sorted by log time; raises where it is damaged."""
         messages = []
         for record in breakup_chunk(chunk, validate_crc=True):
@@ -189,19 +200,20 @@ class Recording:
         return sorted(messages, key=lambda m: m.log_time_ns)
 
 
-def _has_schema(message, channels):
+def _has_schema(message: Message, channels: dict[int, Channel]) -> bool:
     """Whether the message has a type at all; MCAP allows channels without (id 0), ROS does not."""
     return channels[message.channel_id].schema_id != 0
 
 
-def _raw(message, schemas, channels):
+def _raw(message: Message, schemas: dict[int, Schema],
+         channels: dict[int, Channel]) -> RawMessage:
     """The message with its topic and type."""
     channel = channels[message.channel_id]
     schema = schemas[channel.schema_id]
     return RawMessage(channel.topic, schema.name, message.log_time, message.data, schema)
 
 
-def _files(path):
+def _files(path: Path) -> list[Path]:
     """The MCAP files of a recording, in order."""
     if not path.exists():
         raise RecordingError(f'there is no {path}')

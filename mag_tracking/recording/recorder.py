@@ -10,17 +10,19 @@ import itertools
 import os
 import shutil
 from collections import Counter, deque
+from collections.abc import Callable
 from contextlib import suppress
+from os import PathLike
 from pathlib import Path
-
-from mcap.writer import CompressionType, Writer
+from typing import TypeAlias
 
 from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.recording.open_file import OpenFile
 from mag_tracking.recording.repair import finish_file
 from mag_tracking.recording.rosbag2_folder import (
     FileSummary,
+    Opener,
     Topic,
-    WholeStream,
     check_is_free,
     offered_qos,
     open_new,
@@ -33,91 +35,8 @@ ROOM = 4 << 20
 """A disk with less free than this is not tried again [bytes]."""
 
 
-class _OpenFile:
-    """One MCAP file in the making; whatever writes may raise OSError.
-
-    Attributes
-    ----------
-    counts, pending : Counter
-        Messages by topic: all, and those of them that no whole chunk holds yet.
-    """
-
-    def __init__(self, path, opener):
-        self.path = path
-        self._stream = WholeStream(opener(path))
-        self.counts, self.pending = Counter(), Counter()
-        self._times, self._span = [], (None, None)
-        self._schemas, self._channels = {}, {}
-        self._good = self._waiting = 0
-        self._writer = Writer(self._stream, chunk_size=1 << 20, compression=CompressionType.ZSTD)
-
-    def start(self):
-        """Write the header."""
-        self._writer.start(profile='ros2', library='mag_tracking')
-        self._mark()
-
-    @property
-    def size(self):
-        """Bytes, at most, if it were flushed now."""
-        return self._stream.offset + self._waiting
-
-    def add(self, name, topic, sequence, data, log_ns, publish_ns):
-        """Append a message."""
-        self.counts[name] += 1
-        self.pending[name] += 1
-        if name not in self._channels:
-            self._open_channel(name, topic)
-        self._waiting += len(data) + 31
-        before = self._stream.offset
-        self._writer.add_message(self._channels[name], log_ns, data, publish_ns,
-                                 sequence & 0xFFFFFFFF)
-        self._times.append(log_ns)
-        if self._stream.offset != before:
-            self._mark()
-
-    def _open_channel(self, name, topic):
-        """Register schema and channel."""
-        if topic.type not in self._schemas:
-            encoding = 'ros2msg' if topic.definition else ''
-            self._schemas[topic.type] = self._writer.register_schema(
-                topic.type, encoding, topic.definition.encode())
-        self._channels[name] = self._writer.register_channel(
-            name, 'cdr', self._schemas[topic.type], {'offered_qos_profiles': topic.qos})
-
-    def flush(self):
-        """Close the chunk; from here on a crash cannot take its messages."""
-        if self.pending:
-            self._writer.flush()
-            self._mark()
-        if os.fstat(self._stream.raw.fileno()).st_nlink == 0:
-            raise OSError(errno.ENOENT, 'the file was removed')
-
-    def _mark(self):
-        """All that is in the file so far is whole."""
-        self._good, self._waiting = self._stream.offset, 0
-        self.pending.clear()
-        if self._times:
-            self._times = [min(self._times), max(self._times)]
-            self._span = tuple(self._times)
-
-    def finish(self):
-        """Write the index and close."""
-        self.flush()
-        self._writer.finish()
-        os.fsync(self._stream.raw.fileno())
-        self._stream.raw.close()
-
-    def abandon(self):
-        """Close after a failure; what is whole stays, without an index."""
-        self.counts -= self.pending
-        with suppress(OSError):
-            self._stream.raw.truncate(self._good)
-        with suppress(OSError):
-            self._stream.raw.close()
-
-    def summary(self):
-        """What `metadata.yaml` is to say."""
-        return FileSummary(self.path.name, Counter(self.counts), *self._span)
+_Message: TypeAlias = tuple[int, bytes, int, int]
+"""Sequence number, CDR, log time, publish time."""
 
 
 class Recorder:
@@ -136,8 +55,9 @@ class Recorder:
         Files without an index.
     """
 
-    def __init__(self, folder, split_bytes=10**9, split_ns=3600 * 10**9, retry_ns=2 * 10**9,
-                 report=print, opener=open_new):
+    def __init__(self, folder: str | PathLike[str], split_bytes: int = 10**9,
+                 split_ns: int = 3600 * 10**9, retry_ns: int = 2 * 10**9,
+                 report: Callable[[str], object] = print, opener: Opener = open_new) -> None:
         """
         Parameters
         ----------
@@ -157,11 +77,17 @@ class Recorder:
         self.folder = Path(folder)
         self._split_bytes, self._split_ns, self._retry_ns = split_bytes, split_ns, retry_ns
         self._report, self._opener = report, opener
-        self.counts, self.dropped, self.repeated = Counter(), Counter(), 0
-        self.unfinished, self._done = [], []
-        self._topics, self._latched, self._sequence = {}, {}, Counter()
+        self.counts: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()
+        self.repeated = 0
+        self.unfinished: list[Path] = []
+        self._done: list[FileSummary] = []
+        self._topics: dict[str, Topic] = {}
+        self._latched: dict[str, deque[_Message]] = {}
+        self._sequence: Counter[str] = Counter()
         self._now = self._flushed = self._retry_at = self._metadata_at = self._done_bytes = 0
-        self._file = self._opened = None
+        self._file: OpenFile | None = None
+        self._opened: int | None = None
         self._failing = self._stale = False
         check_is_free(self.folder)
         try:
@@ -169,18 +95,19 @@ class Recorder:
         except OSError as error:
             raise OutputError(f'cannot record in {self.folder}: {error.strerror}') from error
 
-    def __enter__(self):
+    def __enter__(self) -> 'Recorder':
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @property
-    def size(self):
+    def size(self) -> int:
         """Bytes written so far."""
         return self._done_bytes + (self._file.size if self._file else 0)
 
-    def add_topic(self, name, type_name, definition='', qos=None, latched=0):
+    def add_topic(self, name: str, type_name: str, definition: str = '', qos: str | None = None,
+                  latched: int = 0) -> None:
         """Tell about a topic before its first message.
 
         Parameters
@@ -197,7 +124,7 @@ class Recorder:
         if latched:
             self._latched[name] = deque(self._latched.get(name, ()), latched)
 
-    def write(self, name, data, log_ns, publish_ns=None):
+    def write(self, name: str, data: bytes, log_ns: int, publish_ns: int | None = None) -> None:
         """Record a serialised message of a topic that was added.
 
         Parameters
@@ -210,32 +137,33 @@ class Recorder:
         message = (self._sequence[name], data, log_ns, publish_ns or log_ns)
         self._sequence[name] += 1
         if self._file and self._file.counts and self._file.size >= self._split_bytes:
-            self._finish()
-        if self._file is None and not self._reopen(log_ns):
+            self._finish(self._file)
+        file = self._file or self._reopened(log_ns)
+        if file is None:
             self.dropped[name] += 1
         else:
             self.counts[name] += 1
-            self._try(self._file.add, name, self._topics[name], *message)
+            self._try(file, file.add, name, self._topics[name], *message)
         if name in self._latched:
             self._latched[name].append(message)
 
-    def tick(self, now_ns):
+    def tick(self, now_ns: int) -> None:
         """To be called several times a second, with the time of a clock that never goes back."""
         self._now = now_ns
         self._opened = now_ns if self._opened is None else self._opened
         if self._file and now_ns - self._flushed >= FLUSH_NS:
             self._flushed = now_ns
-            self._try(self._file.flush)
+            self._try(self._file, self._file.flush)
             self._recovered()
         if self._file and self._file.counts and now_ns - self._opened >= self._split_ns:
-            self._finish()
+            self._finish(self._file)
         if self._stale and now_ns >= self._metadata_at:
             self._write_metadata()
 
-    def close(self):
+    def close(self) -> None:
         """Finish the file and `metadata.yaml`; what cannot be finished is in `unfinished`."""
         if self._file:
-            self._finish()
+            self._finish(self._file)
         for path in list(self.unfinished):
             with suppress(OSError, RecordingError):
                 finish_file(path)
@@ -245,31 +173,31 @@ class Recorder:
             self._report(f'{self.folder} could not be finished: when there is space again, run '
                          f'mag-tracking repair {self.folder}')
 
-    def _try(self, action, *arguments):
+    def _try(self, file: OpenFile, action: Callable[..., None], *arguments: object) -> bool:
         """Whether `action` of the open file went well; if not, the file is given up."""
         try:
             action(*arguments)
         except OSError as error:
-            self._give_up(error)
+            self._give_up(file, error)
             return False
         return True
 
-    def _finish(self):
+    def _finish(self, file: OpenFile) -> None:
         """Complete the open file."""
-        if self._try(self._file.finish):
+        if self._try(file, file.finish):
             self._recovered()
-            self._end_of(self._file)
+            self._end_of(file)
             self._file = None
             self._write_metadata()
 
-    def _end_of(self, file):
+    def _end_of(self, file: OpenFile) -> None:
         """Note a file that is not written to any more."""
         self._done.append(file.summary())
         self._done_bytes += file.size
 
-    def _give_up(self, error):
+    def _give_up(self, file: OpenFile, error: OSError) -> None:
         """Keep what is whole of the open file, count the rest as dropped, wait."""
-        file, self._file = self._file, None
+        self._file = None
         lost = file.pending if file.path.exists() else file.counts
         self.dropped += lost
         self.counts -= lost
@@ -281,7 +209,7 @@ class Recorder:
             file.path.unlink(missing_ok=True)
         self._wait(error)
 
-    def _wait(self, error):
+    def _wait(self, error: OSError) -> None:
         """No writing for a while; said once."""
         self._retry_at = self._now + self._retry_ns
         if not self._failing:
@@ -289,10 +217,10 @@ class Recorder:
                          'until it can be written again')
         self._failing = True
 
-    def _reopen(self, log_ns):
-        """Whether there is a file to write to again, with the latched messages in it."""
+    def _reopened(self, log_ns: int) -> OpenFile | None:
+        """A file to write to again, with the latched messages in it; None while there is none."""
         if self._failing and self._now < self._retry_at:
-            return False
+            return None
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             if self._failing and shutil.disk_usage(self.folder).free < ROOM:
@@ -300,21 +228,21 @@ class Recorder:
             self._open(log_ns)
         except OSError as error:
             self._wait(error)
-            return False
-        return True
+            return None
+        return self._file
 
-    def _recovered(self):
+    def _recovered(self) -> None:
         """Say that messages could be written again, when some have been."""
         if self._failing and self._file and self._file.counts:
             self._failing = False
             self._report(f'writing again; dropped so far: {self.dropped.total()}')
 
-    def _open(self, log_ns=0):
+    def _open(self, log_ns: int = 0) -> None:
         """Begin the next file; raises OSError, and leaves none behind then."""
         self.folder.mkdir(parents=True, exist_ok=True)
         names = (self.folder / f'{self.folder.resolve().name}_{n}.mcap'
                  for n in itertools.count(len(self._done)))
-        file = _OpenFile(next(p for p in names if not p.exists()), self._opener)
+        file = OpenFile(next(p for p in names if not p.exists()), self._opener)
         try:
             file.start()
             for name, messages in self._latched.items():
@@ -329,7 +257,7 @@ class Recorder:
         self._file, self._opened = file, None
         self._write_metadata()
 
-    def _write_metadata(self):
+    def _write_metadata(self) -> None:
         """Bring `metadata.yaml` up to date, now or some time later."""
         files = self._done + ([self._file.summary()] if self._file else [])
         try:

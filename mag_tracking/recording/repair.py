@@ -6,7 +6,10 @@ import shutil
 import struct
 import zlib
 from collections import Counter
+from collections.abc import Callable
+from os import PathLike
 from pathlib import Path
+from typing import BinaryIO
 
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
@@ -17,12 +20,14 @@ from mcap.records import (
     ChunkIndex,
     DataEnd,
     Footer,
+    McapRecord,
     Message,
     MessageIndex,
     Schema,
     Statistics,
 )
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.summary import Summary
 
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.recording.damage import DAMAGE
@@ -34,12 +39,16 @@ _MAGIC = b'\x89MCAP0\r\n'
 class _Scan:
     """What is whole in a file: where it ends, and all that its index is to say."""
 
-    def __init__(self, stream):
+    def __init__(self, stream: BinaryIO) -> None:
         """Read `stream` up to where it breaks off."""
-        self.schemas, self.channels, self.counts = {}, {}, Counter()
-        self.times, self.chunks, self.end, self.damaged = [], [], 0, 0
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.counts: Counter[int] = Counter()
+        self.times: list[int] = []
+        self.chunks: list[ChunkIndex] = []
+        self.end, self.damaged = 0, 0
         self.has_data_end = False
-        self._index = {}
+        self._index: dict[int, MessageIndex] = {}
         try:
             for record in StreamReader(stream, emit_chunks=True).records:
                 if isinstance(record, (DataEnd, Footer)):
@@ -53,7 +62,7 @@ class _Scan:
         if self._lacks_index():
             self._remake_index()
 
-    def _take(self, record, end):
+    def _take(self, record: McapRecord, end: int) -> None:
         """Note a record that ends at byte `end`."""
         if isinstance(record, Schema):
             self.schemas[record.id] = record
@@ -73,13 +82,13 @@ class _Scan:
             index.message_index_offsets[record.channel_id] = end - length
             index.message_index_length += length
 
-    def _count(self, channel, time_ns):
+    def _count(self, channel: int, time_ns: int) -> None:
         """Count a message."""
         self.counts[channel] += 1
         low, high = self.times or (time_ns, time_ns)
         self.times = [min(low, time_ns), max(high, time_ns)]
 
-    def _take_chunk(self, chunk, end):
+    def _take_chunk(self, chunk: Chunk, end: int) -> None:
         """Note a chunk and what is in it; raises where it is damaged."""
         stream, length = get_chunk_data_stream(chunk, validate_crc=True)
         data = stream.read(length)
@@ -93,7 +102,8 @@ class _Scan:
                 index.records.append((time_ns, offset - 9))
                 self._count(channel, time_ns)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                kind = Schema if opcode == Opcode.SCHEMA else Channel
+                kind: type[Schema] | type[Channel] = (
+                    Schema if opcode == Opcode.SCHEMA else Channel)
                 self._take(kind.read(ReadDataStream(io.BytesIO(data[offset:offset + size]))), end)
             offset += size
         whole = 9 + 40 + len(chunk.compression.encode()) + len(chunk.data)
@@ -101,16 +111,17 @@ class _Scan:
             whole, end - whole, chunk.compression, len(chunk.data), chunk.message_end_time, 0, {},
             chunk.message_start_time, chunk.uncompressed_size))
 
-    def _lacks_index(self):
+    def _lacks_index(self) -> bool:
         """Whether the last chunk has not an index of each of its channels."""
-        return self.chunks and set(self.chunks[-1].message_index_offsets) != set(self._index)
+        return bool(self.chunks) and (
+            set(self.chunks[-1].message_index_offsets) != set(self._index))
 
-    def _drop_index(self):
+    def _drop_index(self) -> None:
         """Forget the last chunk's indexes: a part of them would hide the other channels."""
         self.chunks[-1].message_index_offsets = {}
         self.chunks[-1].message_index_length = 0
 
-    def _remake_index(self):
+    def _remake_index(self) -> None:
         """Make the last chunk's indexes anew; they belong right behind it."""
         self._drop_index()
         chunk, builder = self.chunks[-1], RecordBuilder()
@@ -121,23 +132,25 @@ class _Scan:
         chunk.message_index_length = builder.count
         self._remade = builder.end()
 
-    def index(self):
+    def index(self) -> bytes:
         """All that a file ends with, as bytes that belong at `end`."""
         builder = RecordBuilder()
         DataEnd(0).write(builder)
-        data_end = self._remade + builder.end()
+        data_end: bytes = self._remade + builder.end()
         times = self.times or [0, 0]
         for record in (*self.schemas.values(), *self.channels.values(), Statistics(
                 0, len(self.channels), dict(self.counts), len(self.chunks), self.counts.total(),
                 times[1], times[0], 0, len(self.schemas)), *self.chunks):
             record.write(builder)
-        summary, start = builder.end(), self.end + len(data_end)
+        summary: bytes = builder.end()
+        start = self.end + len(data_end)
         crc = zlib.crc32(struct.pack('<BQQQ', Opcode.FOOTER, 20, start, 0), zlib.crc32(summary))
         Footer(start, 0, crc).write(builder)
-        return data_end + summary + builder.end() + _MAGIC
+        footer: bytes = builder.end()
+        return data_end + summary + footer + _MAGIC
 
 
-def _summary(stream):
+def _summary(stream: BinaryIO) -> Summary | None:
     """The index of a file that has one, else None."""
     stream.seek(0)
     try:
@@ -146,7 +159,7 @@ def _summary(stream):
         return None
 
 
-def finish_file(path):
+def finish_file(path: str | PathLike[str]) -> list[str]:
     """Give a file that was cut off its index, in place; a file that has one stays as it is.
 
     A torn record at the end, which nobody can read, goes to `<name>.cut`.
@@ -186,7 +199,7 @@ def finish_file(path):
     return lines
 
 
-def _replace_end(raw, end, index):
+def _replace_end(raw: io.FileIO, end: int, index: bytes) -> None:
     """Put the index where the whole records end; nothing, if there is no room for it."""
     raw.truncate(end)
     raw.seek(end)
@@ -197,7 +210,7 @@ def _replace_end(raw, end, index):
         raise
 
 
-def repair(path, report=print):
+def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -> int:
     """Make a recording whole that was cut off.
 
     Parameters
@@ -214,7 +227,8 @@ def repair(path, report=print):
     files = [path] if path.is_file() else sorted(path.glob('*.mcap'), key=_number)
     if not files:
         raise RecordingError(f'{path} holds no .mcap file')
-    n, summaries, topics = 0, [], {}
+    n, summaries = 0, []
+    topics: dict[str, Topic] = {}
     # A crash at a split leaves a file without a first byte.
     empty = [file for file in files if file.stat().st_size < len(_MAGIC)]
     if len(empty) == len(files):
@@ -238,17 +252,19 @@ def repair(path, report=print):
     return n
 
 
-def _number(file):
+def _number(file: Path) -> tuple[int, str]:
     """Sorts by the number at the end of the name, as recorders count."""
     number = file.stem.rpartition('_')[2]
     return (int(number) if number.isdigit() else -1, file.name)
 
 
-def _summary_of(file, topics):
+def _summary_of(file: Path, topics: dict[str, Topic]) -> FileSummary:
     """`FileSummary` of a whole file; its topics are added to `topics`."""
     with open(file, 'rb') as stream:
         summary = make_reader(stream).get_summary()
-    counts = Counter()
+    if summary is None or summary.statistics is None:
+        raise RecordingError(f'{file}: its index has no statistics')
+    counts: Counter[str] = Counter()
     for i, channel in summary.channels.items():
         schema = summary.schemas.get(channel.schema_id)
         qos = channel.metadata.get('offered_qos_profiles', '')

@@ -3,7 +3,10 @@
 import csv
 import json
 import math
+from collections.abc import Iterable, Mapping
+from os import PathLike
 from pathlib import Path
+from typing import Any, Protocol, TextIO
 
 import numpy as np
 
@@ -11,6 +14,7 @@ from mag_tracking.errors import OutputError
 from mag_tracking.messages.schema import header_dict, pose_with_covariance_dict, track_dict
 from mag_tracking.messages.types import POSE_WITH_COVARIANCE, TRACK_ARRAY
 from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.records import Detection, SmoothedPose, Track
 
 POSE_COLUMNS = ('stamp_ns', 'track_id', 'x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z',
                 'sd_vx', 'sd_vy', 'sd_vz', 'mx', 'my', 'mz', 'weight', 'ambiguous',
@@ -23,17 +27,23 @@ HYPOTHESIS_COLUMNS = ('stamp_ns', 'track_id', 'arrival', 'kind', 'weight', 'x', 
                       'mz')
 
 
+class _Table(Protocol):
+    """What `csv.writer` gives."""
+
+    def writerow(self, row: Iterable[object], /) -> object: ...
+
+
 class ResultFolder:
     """The tables and the recording of one run; a context manager.
 
     Rows are written as they come, so that an interrupted run keeps them.
     """
 
-    def __init__(self, folder, frame):
+    def __init__(self, folder: str | PathLike[str], frame: str) -> None:
         """Raises OutputError where the folder cannot be made or written."""
         self.folder = Path(folder)
         self._frame = frame
-        self._files = []
+        self._files: list[TextIO] = []
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._poses = self._table('poses.csv', POSE_COLUMNS)
@@ -45,7 +55,7 @@ class ResultFolder:
             raise OutputError(f'cannot write to {self.folder}: {error.strerror}') from error
         self._recording = RecordingWriter(self.folder / 'tracks.mcap')
 
-    def _table(self, name, columns):
+    def _table(self, name: str, columns: tuple[str, ...]) -> _Table:
         """Open one CSV file and write its head."""
         stream = open(self.folder / name, 'w', newline='', encoding='utf-8')
         self._files.append(stream)
@@ -53,26 +63,26 @@ class ResultFolder:
         writer.writerow(columns)
         return writer
 
-    def __enter__(self):
+    def __enter__(self) -> 'ResultFolder':
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self._close_tables()
         self._recording.close()
 
-    def _close_tables(self):
+    def _close_tables(self) -> None:
         """Close what is open."""
         for stream in self._files:
             stream.close()
 
-    def add_detection(self, d):
+    def add_detection(self, d: Detection) -> None:
         """One row for a `Detection`."""
         self._detections.writerow([
             d.stamp_ns, d.id, 'onset' if d.onset else 'release', repr(d.statistic),
             d.degrees_of_freedom, repr(d.threshold), repr(d.false_alarm_probability),
             d.strongest_sensor])
 
-    def add_track(self, track):
+    def add_track(self, track: Track) -> None:
         """One row a pose and one a hypothesis; the closing record of a track has no row."""
         message = track_dict(track, self._frame)
         self._recording.write('/tracker_node/tracks', TRACK_ARRAY, {
@@ -92,7 +102,7 @@ class ResultFolder:
             self._hypotheses.writerow([track.stamp_ns, track.id, h.arrival, h.kind, *_floats(
                 [h.weight], h.position, h.velocity, sd, h.moment)])
 
-    def add_smoothed(self, pose):
+    def add_smoothed(self, pose: SmoothedPose) -> None:
         """One row for a `SmoothedPose` of a whole track; those of a fixed lag have none."""
         if pose.complete:
             sd = np.sqrt(np.diagonal(pose.covariance))
@@ -100,14 +110,14 @@ class ResultFolder:
                 pose.stamp_ns, pose.id, *_floats(pose.position, pose.velocity, sd, pose.moment),
                 int(pose.ambiguous), pose.kind, *_floats([pose.length, pose.length_std])])
 
-    def write_summary(self, summary):
+    def write_summary(self, summary: Mapping[str, Any]) -> None:
         """`summary.json`."""
         with open(self.folder / 'summary.json', 'w', encoding='utf-8') as stream:
             json.dump(without_nan(summary), stream, indent=1, allow_nan=False)
             stream.write('\n')
 
 
-def without_nan(value):
+def without_nan(value: Any) -> Any:
     """NaN and infinity are no JSON: null instead."""
     if isinstance(value, dict):
         return {k: without_nan(v) for k, v in value.items()}
@@ -116,6 +126,6 @@ def without_nan(value):
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _floats(*groups):
+def _floats(*groups: Iterable[float]) -> list[str]:
     """The shortest texts that read back as the same numbers."""
     return [repr(float(v)) for group in groups for v in group]

@@ -1,15 +1,21 @@
 """What a rosbag2 folder of MCAP files consists of: new files, `metadata.yaml`."""
 
 import fcntl
+import io
 import os
 from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from typing import NamedTuple
+from pathlib import Path
+from typing import NamedTuple, TypeAlias
 
 import yaml
 
 from mag_tracking.errors import OutputError
 from mag_tracking.recording.writer import OFFERED_QOS
+
+Opener: TypeAlias = Callable[[Path], io.FileIO]
+"""From the path of a new file to a stream without a buffer."""
 
 
 class Topic(NamedTuple):
@@ -24,19 +30,19 @@ class FileSummary(NamedTuple):
     """What `metadata.yaml` says about one file."""
 
     name: str
-    counts: Counter
+    counts: Counter[str]
     first_ns: int | None = None
     last_ns: int | None = None
 
 
-def offered_qos(reliable=True, latched=False):
+def offered_qos(reliable: bool = True, latched: bool = False) -> str:
     """`offered_qos_profiles` of a topic, as rosbag2 writes it."""
     text = OFFERED_QOS if reliable else OFFERED_QOS.replace('reliability: reliable',
                                                             'reliability: best_effort')
     return text.replace('durability: volatile', 'durability: transient_local') if latched else text
 
 
-def open_new(path):
+def open_new(path: Path) -> io.FileIO:
     """A file of one's own to write to, without a buffer that a crash would lose."""
     stream = open(path, 'xb', buffering=0)
     # A repair of a file that is still written would spoil it. Some file systems know no locks.
@@ -48,10 +54,10 @@ def open_new(path):
 class WholeStream:
     """Writes all of what it is given, or raises: a full disk takes a part of it without a word."""
 
-    def __init__(self, raw):
+    def __init__(self, raw: io.FileIO) -> None:
         self.raw, self.offset = raw, 0
 
-    def write(self, data):
+    def write(self, data: bytes | bytearray | memoryview) -> None:
         """Append `data`."""
         rest = memoryview(data)
         while rest:
@@ -59,15 +65,15 @@ class WholeStream:
             self.offset += n
             rest = rest[n:]
 
-    def tell(self):
+    def tell(self) -> int:
         """Bytes written."""
         return self.offset
 
-    def flush(self):
+    def flush(self) -> None:
         """Nothing waits here."""
 
 
-def check_is_free(folder):
+def check_is_free(folder: Path) -> None:
     """Raise OutputError where `folder` is no place for a new recording."""
     if folder.exists() and not folder.is_dir():
         raise OutputError(f'{folder} is not a folder')
@@ -78,7 +84,8 @@ def check_is_free(folder):
                           f'folder (one that was cut off is made whole by mag-tracking repair)')
 
 
-def write_metadata(folder, files, topics, opener=open_new):
+def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[str, Topic],
+                   opener: Opener = open_new) -> None:
     """Write rosbag2's `metadata.yaml`, all or nothing.
 
     Parameters
@@ -86,7 +93,8 @@ def write_metadata(folder, files, topics, opener=open_new):
     files : list of FileSummary
     topics : {name: Topic}
     """
-    counts = sum((f.counts for f in files), Counter())
+    nothing: Counter[str] = Counter()
+    counts = sum((f.counts for f in files), nothing)
     firsts = [f.first_ns for f in files if f.first_ns is not None]
     lasts = [f.last_ns for f in files if f.last_ns is not None]
     content = {'rosbag2_bagfile_information': {
@@ -114,7 +122,7 @@ def write_metadata(folder, files, topics, opener=open_new):
         new.unlink(missing_ok=True)
 
 
-def _span(firsts, lasts):
+def _span(firsts: Sequence[int], lasts: Sequence[int]) -> dict[str, dict[str, int]]:
     """Start and duration, as rosbag2 has them."""
     first, last = min(firsts, default=0), max(lasts, default=0)
     return {'starting_time': {'nanoseconds_since_epoch': first},

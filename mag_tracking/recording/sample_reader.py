@@ -1,11 +1,15 @@
 """From a recording to samples and truth."""
 
 from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TypeAlias, cast
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import acceleration_of, sample_of, samples_of, stamp_ns
+from mag_tracking.messages.shapes import PoseStamped
 from mag_tracking.messages.types import (
     FIELD_READINGS,
     IMU,
@@ -14,9 +18,17 @@ from mag_tracking.messages.types import (
     RAW_READINGS,
     decode,
 )
+from mag_tracking.network import SensorNetwork
+from mag_tracking.recording.interruptible import Progress
+from mag_tracking.recording.reader import Recording
+from mag_tracking.records import AccelerationSample, MagSample
 
 TRUTH_PREFIX = '/ground_truth/'
 """Poses on topics below this are truth: for reports, never for tracking."""
+
+
+_Pose: TypeAlias = tuple[int, float, float, float, float, float, float, float]
+_Sample: TypeAlias = MagSample | AccelerationSample
 
 
 class SampleReader:
@@ -29,16 +41,16 @@ class SampleReader:
     truth : {topic: list of (stamp_ns, x, y, z, qx, qy, qz, qw)}
     """
 
-    def __init__(self, recording, network):
+    def __init__(self, recording: Recording, network: SensorNetwork) -> None:
         """Raises RecordingError where the recording has none of the network's topics."""
         self._recording = recording
         self._sensors = dict(zip(network.topics, network.names, strict=True))
-        self._imus = {}
+        self._imus: dict[str, list[str]] = {}
         for topic, name in zip(network.imu_topics, network.names, strict=True):
             if topic is not None:
                 self._imus.setdefault(topic, []).append(name)
-        self.rejected = Counter()
-        self.truth = {}
+        self.rejected: Counter[str] = Counter()
+        self.truth: dict[str, list[_Pose]] = {}
         self._together = recording.types.get(RAW_READINGS) == FIELD_READINGS
         if recording.types and not self._together \
                 and not any(t in recording.types for t in self._sensors):
@@ -52,25 +64,28 @@ class SampleReader:
                 raise RecordingError(f'{recording.path}: {topic} carries {kind}, '
                                      f'not {MAGNETIC_FIELD}')
 
-    def missing_topics(self):
+    def missing_topics(self) -> list[str]:
         """The network's topics that are not in the recording; none where readings came together."""
         if self._together:
             return []
         return [t for t in self._sensors if t not in self._recording.types]
 
-    def samples(self, progress=None):
+    def samples(self, progress: Progress | None = None) -> Iterator[MagSample]:
         """Iterate over `MagSample`s in order of log time; see `Recording.messages`."""
-        return (sample for sample, _ in self._records({}, progress))
+        return (sample for sample, _ in self.samples_as_received(progress))
 
-    def samples_as_received(self, progress=None):
+    def samples_as_received(self, progress: Progress | None = None
+                            ) -> Iterator[tuple[MagSample, int]]:
         """Iterate over (`MagSample`, log time [ns]) in order of the latter."""
-        return self._records({}, progress)
+        # Accelerations come only from the topics that the first argument names.
+        return cast(Iterator[tuple[MagSample, int]], self._records({}, progress))
 
-    def samples_and_accelerations(self, progress=None):
+    def samples_and_accelerations(self, progress: Progress | None = None) -> Iterator[_Sample]:
         """Iterate over `MagSample`s and `AccelerationSample`s in order of log time."""
         return (sample for sample, _ in self._records(self._imus, progress))
 
-    def _records(self, imus, progress):
+    def _records(self, imus: Mapping[str, Sequence[str]], progress: Progress | None
+                 ) -> Iterator[tuple[_Sample, int]]:
         """(sample, log time) of the sensors, and of the accelerometers {topic: sensors}."""
         for message in self._recording.messages(progress=progress):
             sensor = self._sensors.get(message.topic)
@@ -92,10 +107,10 @@ class SampleReader:
             elif shaken is not None:
                 for name in shaken:
                     yield acceleration_of(content, name), message.log_time_ns
-            else:
+            elif sensor is not None:
                 yield sample_of(content, sensor), message.log_time_ns
 
-    def _of_network(self, samples):
+    def _of_network(self, samples: Iterable[MagSample]) -> Iterator[MagSample]:
         """Those of the network's sensors; the others are counted."""
         known = set(self._sensors.values())
         for sample in samples:
@@ -104,13 +119,13 @@ class SampleReader:
             else:
                 self.rejected[f'reading of {sample.sensor}, which is not in the network'] += 1
 
-    def _add_truth(self, topic, content):
+    def _add_truth(self, topic: str, content: PoseStamped) -> None:
         """Keep a pose for the report."""
         p, q = content.pose.position, content.pose.orientation
         self.truth.setdefault(topic, []).append(
             (stamp_ns(content.header.stamp), p.x, p.y, p.z, q.x, q.y, q.z, q.w))
 
-    def truth_arrays(self):
+    def truth_arrays(self) -> dict[str, tuple[IntArray, FloatArray, FloatArray]]:
         """{name: (stamps_ns (n,), positions (n, 3), quaternions (n, 4))}."""
         out = {}
         for topic, rows in self.truth.items():

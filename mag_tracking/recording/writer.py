@@ -1,12 +1,14 @@
 """Writer of MCAP recordings that rosbag2 plays."""
 
 from collections import Counter
+from os import PathLike
 from pathlib import Path
 
 import yaml
 from mcap.writer import CompressionType, Writer
 
 from mag_tracking.errors import OutputError
+from mag_tracking.messages.shapes import MessageDict
 from mag_tracking.messages.types import definition, encoder
 
 
@@ -17,7 +19,7 @@ class RecordingWriter:
     recording. Chunks are small, so that a crash loses little.
     """
 
-    def __init__(self, path):
+    def __init__(self, path: str | PathLike[str]) -> None:
         """Raises OutputError where the file cannot be written."""
         self.path = Path(path)
         metadata = self.path.parent / 'metadata.yaml'
@@ -32,17 +34,20 @@ class RecordingWriter:
             raise OutputError(f'cannot write {self.path}: {error.strerror}') from error
         self._writer = Writer(self._stream, chunk_size=1 << 20, compression=CompressionType.ZSTD)
         self._writer.start(profile='ros2', library='mag_tracking')
-        self._schemas, self._channels, self._counts = {}, {}, Counter()
-        self._sequence = Counter()
-        self._first = self._last = None
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, tuple[int, str]] = {}
+        self._counts: Counter[str] = Counter()
+        self._sequence: Counter[str] = Counter()
+        self._first: int | None = None
+        self._last: int | None = None
 
-    def __enter__(self):
+    def __enter__(self) -> 'RecordingWriter':
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self.close()
 
-    def write(self, topic, type_name, message, time_ns):
+    def write(self, topic: str, type_name: str, message: MessageDict, time_ns: int) -> None:
         """Append a message, given as nested dicts, logged at `time_ns`.
 
         Raises RecordingError for a type that `schema` has no definition of.
@@ -57,7 +62,7 @@ class RecordingWriter:
         self._first = time_ns if self._first is None else min(self._first, time_ns)
         self._last = time_ns if self._last is None else max(self._last, time_ns)
 
-    def _open_channel(self, topic, type_name):
+    def _open_channel(self, topic: str, type_name: str) -> None:
         """Register schema and channel."""
         if type_name not in self._schemas:
             self._schemas[type_name] = self._writer.register_schema(
@@ -66,7 +71,7 @@ class RecordingWriter:
             topic, 'cdr', self._schemas[type_name], {'offered_qos_profiles': OFFERED_QOS})
         self._channels[topic] = channel, type_name
 
-    def close(self):
+    def close(self) -> None:
         """Finish the file and write `metadata.yaml`."""
         if self._stream.closed:
             return

@@ -107,8 +107,9 @@ class Calibrate:
         line = background.line
         s['is_ordinary'] = (
             line is not None and background.ready and background.is_whole
-            and s['last_ns'] != NEVER and not np.isnan(line[1]).any() and not self._settings.decimate_to_hz
-            and not self._spikes[name].n_held and name not in self._jumps_ahead and name not in self._restoration)
+            and s['last_ns'] != NEVER and not np.isnan(line[1]).any()
+            and not self._settings.decimate_to_hz and not self._spikes[name].n_held
+            and name not in self._jumps_ahead and name not in self._restoration)
         if line is not None and s['is_ordinary']:
             s['centre'], s['mean'], s['slope'], s['horizon'] = line
             s['noise_std'], self._noise[i] = background.noise_std, background.covariance
@@ -126,7 +127,7 @@ class Calibrate:
                                  sensors=self._sensors[i:i + 1])
 
     def counts_of(self, sensor: str) -> 'Counter[str]':
-        """Counter of what was `accepted` and `rejected` of a sensor, and why."""
+        """What was `accepted` and `rejected` of a sensor, and why."""
         return self._per_sensor[sensor] + Counter(accepted=int(self._of(sensor)[0]['accepted']))
 
     def feed(self, sample: MagSample) -> list[MagSample]:
