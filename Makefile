@@ -68,6 +68,7 @@ bench: $(STAMP)  ## measure times and accuracies
 	$(BIN)/python test/bench/bench.py
 	$(BIN)/python test/bench/matched.py
 	$(BIN)/python test/bench/extended_target.py
+	$(BIN)/python test/bench/junction_error.py
 	$(BIN)/python test/bench/pass_search.py
 	$(BIN)/python test/bench/load.py
 	$(BIN)/python test/bench/load.py --sensors 2 --lean --minutes 2

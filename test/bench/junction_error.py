@@ -1,0 +1,122 @@
+"""What the error of one car at its closest point depends on: junction_left_turns_to_rear.
+
+Prints the error with what the network file leaves out (mountings, clocks) made exact, with
+other settings, and where the magnetic centre lies: least squares for dipoles that move
+exactly as the truth does.
+"""
+
+import json
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from mag_tracking.apps.fit import PassCollector
+from mag_tracking.apps.replay import replay
+from mag_tracking.network.file import read_network
+from mag_tracking.physics.dipole import MU0, dipole_field
+from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from support.bundled import NETWORK_FILE, vehicle_path  # noqa: E402  (after the path is set)
+
+NAME = 'junction_left_turns_to_rear'
+NOISE = 1.2e-8
+POINT, ROW = (0.0,), (-1.0, 0.0, 1.0)
+"""Places of the dipoles along the body, in half lengths."""
+SETTINGS = {'iron three times as uneven': {'track.vehicle.difference_stds': [0.0, 90.0, 360.0]},
+            'speeds of 5 m/s only': {'track.vehicle.speeds': [5.0]},
+            'acceleration 0.3': {'track.vehicle.acceleration': 0.3},
+            'field error 0.01': {'track.field_error': 0.01}}
+
+
+def network_with(mountings, clocks):
+    """The network of the file, with exact orientations and clocks where they are asked for."""
+    network = read_network(NETWORK_FILE)
+    truth = json.loads(vehicle_path(NAME).with_suffix('.truth.json').read_text())['sensor_truth']
+    if mountings:
+        network = replace(network, R_ws=np.array(truth['mount_sensor_to_map']))
+    if clocks:
+        network = replace(network, clock_offset=1e-3 * np.array(truth['clock_offset_ms']))
+    return network
+
+
+def replayed(network, changes):
+    """`Run` of the recording, without files that stay."""
+    with tempfile.TemporaryDirectory() as out:
+        return replay(Recording(vehicle_path(NAME)), network, settings_for('vehicle', changes), out)
+
+
+def errors(network, changes):
+    """One line of the errors of the track."""
+    track, = replayed(network, changes).summary['tracks']
+    truth, smoothed = track['truth'], track['smoothed']['truth']
+    return (f'closest {truth["closest"]:.2f} m, ANEES {truth["anees"]:.1f}; '
+            f'smoothed {smoothed["closest"]:.2f} m')
+
+
+def true_motion(data, truth):
+    """Position (n, 3) and rotation (n, 3, 3) of the body at the samples of a `PassData`."""
+    stamps, position, _ = truth
+    t = (stamps - data.stamp_ns) / 1e9
+    place, v = (np.stack([np.interp(data.t, t, column) for column in table.T], axis=1)
+                for table in (position, np.gradient(position, t, axis=0)))
+    way = v / np.linalg.norm(v, axis=1, keepdims=True)
+    R = np.zeros((len(data.t), 3, 3))
+    R[:, :2, 0], R[:, 2, 2] = way[:, :2], 1.0
+    R[:, 0, 1], R[:, 1, 1] = -way[:, 1], way[:, 0]
+    return place, R
+
+
+def magnetic_centre(network, row):
+    """Middle (3,) [m] in the body frame, half length [m], whole moments and normalised cost."""
+    reader = SampleReader(Recording(vehicle_path(NAME)), network)
+    collector = PassCollector(network, settings_for('vehicle'))
+    passes = [p for s in reader.samples() for p in collector.feed(s)] + collector.flush()
+    (data, _), = passes
+    place, R = true_motion(data, next(iter(replayed(network, {}).truth.values())))
+    y = np.einsum('nij,nj->ni', network.R_ws[data.sensor], data.field).ravel() / NOISE
+    induction = network.earth_field / MU0
+    backgrounds = np.kron(np.eye(len(network))[data.sensor], np.eye(3))
+
+    def linear(p):
+        columns = []
+        for share in row:
+            r = data.positions - place - R @ (p[:3] + [share * p[3], 0.0, 0.0])
+            columns += [dipole_field(r, m).ravel() / NOISE for m in (
+                *np.moveaxis(R, 2, 0), np.broadcast_to(induction, r.shape))]
+        A = np.column_stack([*columns, backgrounds])
+        scale = np.linalg.norm(A, axis=0)
+        theta = np.linalg.lstsq(A / scale, y, rcond=None)[0]
+        return y - A / scale @ theta, theta / scale
+
+    found = least_squares(lambda p: linear(p)[0], [0.0, 0.0, 0.5, 1.3])
+    iron = linear(found.x)[1][:4 * len(row)].reshape(-1, 4)
+    moments = np.linalg.norm(iron[:, :3] + iron[:, 3:] * induction, axis=1)
+    unknowns = (4 if len(row) > 1 else 3) + 4 * len(row) + 3 * len(network)
+    return found.x[:3], found.x[3], moments, 2.0 * found.cost / (len(y) - unknowns)
+
+
+def main():
+    """Print the table."""
+    for name, exact in (('network file', (False, False)), ('exact clocks', (False, True)),
+                        ('exact mountings', (True, False)), ('both exact', (True, True))):
+        print(f'{name}: {errors(network_with(*exact), {})}', flush=True)
+    for name, changes in SETTINGS.items():
+        print(f'{name}: {errors(network_with(False, False), changes)}; '
+              f'both exact: {errors(network_with(True, True), changes)}', flush=True)
+    print('dipoles on the true path, both exact: forward, left, up of the origin of the truth')
+    for name, row in (('a point', POINT), ('a row of three', ROW)):
+        centre, half, moments, cost = magnetic_centre(network_with(True, True), row)
+        shape = f', half length {half:.2f} m' if len(row) > 1 else ''
+        print(f'  {name}: {centre.round(2)} m{shape}, moments {moments.round()} A m^2, rear first; '
+              f'normalised cost {cost:.2f}')
+
+
+if __name__ == '__main__':
+    main()
