@@ -52,10 +52,11 @@ demo: $(STAMP)  ## run the demonstration; results in out/demo
 config: $(STAMP)  ## write config/ and docs/parameters.md anew from the settings
 	$(BIN)/python tools/generate_config.py
 
-test: $(STAMP)  ## check style, floors and behaviour
+test: $(STAMP)  ## check style, floors, types and behaviour
 	@sh tools/check_broker.sh
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
+	$(BIN)/mypy
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not alone and not study'
 	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'alone and not single and not study'
 	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest -q -m 'single and not study'

@@ -111,7 +111,7 @@ class DriverNode(LifecycleNode):
     def destroy_node(self) -> None:
         """Stop the threads first: they publish."""
         self._stop()
-        super().destroy_node()
+        LifecycleNode.destroy_node(self)
 
     def _advertise(self, sensor: str,
                    network: SensorNetwork | None) -> tuple[Publisher, Publisher]:

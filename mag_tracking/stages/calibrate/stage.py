@@ -27,11 +27,9 @@ AT_ONCE = 16
 class Calibrate:
     """Raw samples to calibrated ones: background removed, covariance known.
 
-    What the network file knows of a sensor is applied first: its clock's offset is
-    taken from the stamp, its own hard and soft iron from the field. The field stays
-    in the sensor's own frame, where a missing axis is a missing axis. The covariance
-    is the sample's own if it carries one, else the configured one, else the
-    estimated one.
+    The clock offset and the hard and soft iron of the network file are applied first. The field
+    stays in the sensor's frame. The covariance is the sample's own if it has one, else the
+    configured one, else the estimated one.
 
     Valid readings pass through compiled code (`calibration.ordinary`), one or many at once.
     """
