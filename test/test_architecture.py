@@ -132,7 +132,7 @@ def files_of_tests():
             pytest.mark.xfail(reason='two paths', strict=True)] if name in TWO_PATHS else [])
 
 
-@pytest.mark.parametrize('path', files_of_tests())
+@pytest.mark.parametrize('path', list(files_of_tests()))
 def test_tests_reach_no_private_name(path):
     assert sorted(private_uses(ast.parse(path.read_text()))) == []
 
