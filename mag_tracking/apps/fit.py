@@ -187,7 +187,7 @@ class RecordingFit:
                stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
         """Iterate over the `FittedPass`es, each as soon as it is done.
 
-        `progress` and `stopped` are as for `offline.replay`.
+        `progress` and `stopped` are as for `apps.replay.replay`.
         """
         for sample in self._reader.samples(progress):
             if stopped is not None and stopped():
