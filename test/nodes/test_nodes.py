@@ -194,7 +194,8 @@ def test_services_of_the_replay(ros):
     fields = []
     node.create_subscription(MagneticField, '/mag_1/imu/mag', fields.append, STREAM)
     process = start('replay_node', '-p', f'recording:={vehicle_path("straight_car_right")}',
-                    '-p', 'topics:=[/mag_1/imu/mag]', '-p', 'start_offset:=4.0', '-p', 'loop:=true')
+                    '-p', 'topics:=[/mag_1/imu/mag]', '-p', 'start_offset:=4.0', '-p', 'loop:=true',
+                    '-p', 'wait_for_subscribers:=300.0')
     try:
         assert spin_until(lambda: len(fields) > 20)
         first = stamp_ns(fields[0].header.stamp)
