@@ -155,11 +155,11 @@ def test_an_interrupted_replay_keeps_what_is_done(tmp_path):
          str(NETWORK_FILE), '--out', str(out), '--no-figures'],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     table = out / f'{NAME}_0' / 'summary.json'
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 120
     while not table.exists() and time.monotonic() < deadline:
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
-    stdout, stderr = process.communicate(timeout=60)
+    stdout, stderr = process.communicate(timeout=120)
     assert process.returncode == 130, stderr
     assert 'Traceback' not in stderr
     assert json.loads(table.read_text())['recording'] == f'{NAME}_0.mcap'

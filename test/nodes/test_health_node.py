@@ -26,6 +26,7 @@ from support.node_processes import LONGEST_S, start, stop
 # They publish at a rate that is looked at.
 pytestmark = pytest.mark.single
 
+STEP_NS = 10_000_000
 EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
 STRANGER = """
 import time
@@ -42,24 +43,31 @@ time.sleep(600.0)
 def talking(ros):
     """Both sensors publish at 100 Hz, but those that are told to be `silent`, while it waits.
 
-    A `step` [T] is added to the field of mag_1.
+    They measure evenly: what is late on a busy machine has the time when it was due. A `step` [T]
+    is added to the field of mag_1.
     """
     node, spin_until = ros
     publishers = {}
     rng = np.random.default_rng(0)
-    now = {'silent': ('mag_1', 'mag_2'), 'mag_1': 0.0, 'mag_2': 0.0}
+    now = {'silent': ('mag_1', 'mag_2'), 'mag_1': 0.0, 'mag_2': 0.0, 'done': 0}
 
-    def publish():
+    def catch_up():
+        due = time.time_ns() // STEP_NS
+        for k in range(max(now['done'] + 1, due - 100), due + 1):
+            publish(k * STEP_NS)
+        now['done'] = due
+
+    def publish(stamp_ns):
         for name in ('mag_1', 'mag_2'):
             if name not in now['silent']:
                 publisher = publishers.setdefault(name, None) or node.create_publisher(
                     MagneticField, f'/{name}/imu/mag', STREAM)
                 publishers[name] = publisher
                 field = EARTH + now[name] + 1.2e-8 * rng.standard_normal(3)
-                sample = MagSample(time.time_ns(), name, field)
+                sample = MagSample(stamp_ns, name, field)
                 publisher.publish(to_message(MagneticField, sample_dict(sample, name)))
 
-    node.create_timer(0.01, publish)
+    node.create_timer(0.01, catch_up)
 
     def talk(condition, silent=(), step=0.0, seconds=LONGEST_S):
         now.update(silent=silent, mag_1=step)
@@ -147,7 +155,7 @@ def test_each_sensor_has_its_status(talking, statuses):
         assert status('mag_2').message == 'running' and status('mag_2').hardware_id == 'mag_2'
         assert float(values('mag_1')['rate [Hz]']) > 20.0
         assert [5.0 < float(v) < 30.0 for v in values('mag_2')['noise [nT]'].split()] == [True] * 3
-        assert float(values('mag_1')['delay [ms]']) < 100.0
+        assert 0.0 < float(values('mag_1')['delay [ms]']) < 2000.0
         assert talking(lambda: 'silent for' in status('mag_2').message, silent=('mag_2',))
         assert status('mag_2').level == DiagnosticStatus.ERROR
         assert status('mag_1').level != DiagnosticStatus.ERROR

@@ -36,6 +36,7 @@ from mag_tracking.recording.reader import Recording
 from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
 from support.marks import studied
 from support.node_processes import LONGEST_S, call, start, stop
+from support.shared_memory import left_behind, segments_of
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -193,7 +194,8 @@ def test_services_of_the_replay(ros):
     fields = []
     node.create_subscription(MagneticField, '/mag_1/imu/mag', fields.append, STREAM)
     process = start('replay_node', '-p', f'recording:={vehicle_path("straight_car_right")}',
-                    '-p', 'topics:=[/mag_1/imu/mag]', '-p', 'start_offset:=4.0', '-p', 'loop:=true')
+                    '-p', 'topics:=[/mag_1/imu/mag]', '-p', 'start_offset:=4.0', '-p', 'loop:=true',
+                    '-p', 'wait_for_subscribers:=300.0')
     try:
         assert spin_until(lambda: len(fields) > 20)
         first = stamp_ns(fields[0].header.stamp)
@@ -273,9 +275,9 @@ def test_nodes_leave_no_shared_memory_behind(ros, how):
     process = start('tracker_node', '-p', f'network:={NETWORK_FILE}')
     try:
         assert spin_until(lambda: node.count_publishers('/tracker_node/tracks'))
+        used = segments_of(process.pid) - before
     finally:
         process.send_signal(how)
         output, _ = process.communicate(timeout=LONGEST_S)
     assert (process.returncode, output) == (0, '')
-    left = {n for n in set(os.listdir('/dev/shm')) - before if not n.startswith('sem.')}
-    assert not left
+    assert used and not left_behind(used)

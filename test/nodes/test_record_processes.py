@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -29,6 +28,7 @@ from mag_tracking.recording.repair import repair
 from support.bundled import NETWORK_FILE, vehicle_path
 from support.node_processes import LONGEST_S, call, start, stop
 from support.recorded_topics import FIELDS, IMUS
+from support.shared_memory import left_behind, segments_of
 
 pytestmark = pytest.mark.timeout(600)
 S = 10**9
@@ -58,26 +58,6 @@ def await_messages(process, n):
             before = told[1]
             if int(before) >= n or lines > 50:
                 return
-
-
-def segments_of(pid):
-    """Names in /dev/shm that a process has open."""
-    files = [os.path.realpath(f'/proc/{pid}/fd/{n}') for n in os.listdir(f'/proc/{pid}/fd')]
-    with open(f'/proc/{pid}/maps') as stream:
-        files += [line.split()[-1] for line in stream]
-    return {f.removeprefix('/dev/shm/') for f in files if f.startswith('/dev/shm/')}
-
-
-def left_behind(names):
-    """Those of `names` that are in /dev/shm and that no living process has open.
-
-    A process also opens what belongs to others, such as those of another test.
-    """
-    left = {n for n in names & set(os.listdir('/dev/shm')) if not n.startswith('sem.')}
-    for pid in filter(str.isdigit, os.listdir('/proc') if left else ()):
-        with suppress(OSError):
-            left -= segments_of(pid)
-    return left
 
 
 def contents(path, topics):

@@ -135,7 +135,9 @@ def test_a_signal_at_any_moment_of_the_start_ends_it(ros, name, step_s):
         time.sleep(k * step_s)
         ends[round(k * step_s, 2), how.name] = end_of(process, how)
     print(f'{name}: up after {took:.2f} s; {len(ends)} signals, {step_s:.2f} s apart')
-    assert {moment: end for moment, end in ends.items() if end != (0, '')} == {}
+    # A node that is up may have said something of its own, as of a device that is missing.
+    assert {moment: (status, said) for moment, (status, said) in ends.items()
+            if status or 'Traceback' in said or said.count('\n') > 1} == {}
 
 
 def test_other_commands_say_that_they_were_interrupted():

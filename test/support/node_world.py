@@ -21,7 +21,7 @@ from mag_tracking.nodes.stage_node import RESULTS, STREAM, make_executor
 from mag_tracking.simulation.scenario import point_body
 from support.bundled import NETWORK_FILE, POINT
 from support.mqtt_broker import Broker, password_lines
-from support.node_processes import start, stop
+from support.node_processes import LONGEST_S, start, stop
 from support.roadside import NOISE, Roadside
 from support.serial_line import SerialLine
 
@@ -115,7 +115,7 @@ class World:
             self.node.destroy_node()
             self._executor.shutdown()
 
-    def wait(self, condition, seconds):
+    def wait(self, condition, seconds=LONGEST_S):
         """Listen until there is something in what `condition` gives: that, or what it gives last.
 
         It is asked a hundred times a second, and what it gives is worth as much in time.
@@ -143,7 +143,7 @@ class World:
         """End a node without a word."""
         process = self._processes.pop(name)
         process.send_signal(signal.SIGKILL)
-        process.communicate(timeout=10)
+        process.communicate(timeout=LONGEST_S)
         # What is still on its way is of the dead.
         self.pause(0.05)
 
@@ -161,7 +161,7 @@ class World:
         known, began_ns = self.publishers(), time.time_ns()
         self.start(name)
         up, first_ns = None, None
-        while first_ns is None and time.time_ns() < began_ns + 20 * NS:
+        while first_ns is None and time.time_ns() < began_ns + LONGEST_S * NS:
             self.pause(0.01)
             first_ns = self._first_ns(name, began_ns)
             if up is None and (first_ns or self.publishers() - known):
@@ -189,7 +189,7 @@ class World:
             assert codes == [0], outputs
         self.link, began_ns = link, time.time_ns()
         self.start('driver_node')
-        assert self.wait(lambda: self.since(began_ns, 'driver_node'), 20.0)
+        assert self.wait(lambda: self.since(began_ns, 'driver_node'))
 
     def since(self, came_ns, name):
         """[(came_ns, message)] of a node since then."""
@@ -211,13 +211,13 @@ class World:
 
     def call(self):
         """A vehicle comes, as soon as the one before is forgotten; returns the time [ns]."""
-        assert self.wait(self.is_quiet, 20.0)
+        assert self.wait(self.is_quiet)
         self.roadside.call()
         return time.time_ns()
 
     def drive_to(self, x):
         """Listen until the vehicle is at `x` [m]."""
-        assert self.wait(lambda: self.roadside.truth(time.time_ns())[0] >= x, 20.0)
+        assert self.wait(lambda: self.roadside.truth(time.time_ns())[0] >= x)
 
     def wrong(self, since_ns):
         """The poses that have come since then and are wrong."""
@@ -246,7 +246,7 @@ def world(folder):
             here.use('mqtt')
             for name in list(TOPICS)[1:]:
                 here.start(name)
-            assert here.wait(lambda: here.heard['detection_node'], 30.0)
+            assert here.wait(lambda: here.heard['detection_node'])
             yield here
         finally:
             codes, outputs = here.close()
