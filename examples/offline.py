@@ -15,8 +15,8 @@ def tracks(recording):
     """Every `Track` record of a recording of the junction."""
     network = read_network(ROOT / 'config' / 'network.yaml')
     pipeline = Pipeline(network, settings_for('vehicle'))
-    for sample in SampleReader(Recording(recording), network).samples():
-        yield from (r for r in pipeline.feed(sample) if isinstance(r, Track))
+    for readings in SampleReader(Recording(recording), network).readings():
+        yield from (r for r in pipeline.feed(readings) if isinstance(r, Track))
     yield from (r for r in pipeline.flush() if isinstance(r, Track))
 
 

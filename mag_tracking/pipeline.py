@@ -1,12 +1,13 @@
 """The settings tree and the one chain of stages, for nodes and offline alike."""
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.records import Detection, FieldFrame, MagSample, SmoothedPose, Track
+from mag_tracking.records import Detection, FieldFrame, Readings, SmoothedPose, Track
 from mag_tracking.settings import replace
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
@@ -14,7 +15,7 @@ from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
-from mag_tracking.stages.stage import rejected
+from mag_tracking.stages.stage import Stage, rejected
 from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.settings import TrackSettings
@@ -76,7 +77,7 @@ Output: TypeAlias = FieldFrame | Detection | Track | SmoothedPose
 
 
 class Pipeline:
-    """Raw samples in, frames, detections and tracks out; no ROS, no clock."""
+    """Raw readings in, frames, detections and tracks out; no ROS, no clock."""
 
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         self.network = network
@@ -85,24 +86,41 @@ class Pipeline:
         self.align = Align(network, settings.align)
         self.detect = Detect(network, settings.detect)
         self.track = TrackManager(network, settings.track)
+        self._calibrate: Stage[Readings, Readings] = self.calibrate
+        self._align: Stage[Readings, FieldFrame] = self.align
+        self._detect: Stage[FieldFrame, FieldFrame | Detection] = self.detect
+        self._track: Stage[FieldFrame, Track | SmoothedPose] = self.track
 
-    def feed(self, sample: MagSample) -> list[Output]:
-        """A raw `MagSample` gives the `FieldFrame | Detection | Track` records that follow."""
-        return self._after_calibrate(self.calibrate.feed(sample))
+    def feed(self, readings: Readings) -> list[Output]:
+        """Raw `Readings` give the `FieldFrame | Detection | Track` records that follow.
+
+        They do not depend on how the readings are split into batches.
+        """
+        return self._after_calibrate(self._calibrate.feed(readings))
+
+    def idle(self) -> None:
+        """Do what may wait until the outputs are used."""
+        for stage in self._stages().values():
+            stage.idle()
 
     def flush(self) -> list[Output]:
         """The input has ended: what was still held back."""
-        return [*self._after_calibrate(self.calibrate.flush()),
-                *self._after_align(self.align.flush()),
-                *self._after_detect(self.detect.flush()), *self.track.flush()]
+        return [*self._after_calibrate(self._calibrate.flush()),
+                *self._after_align(self._align.flush()),
+                *self._after_detect(self._detect.flush()), *self._track.flush()]
 
-    def _after_calibrate(self, samples: Iterable[MagSample]) -> list[Output]:
-        """What follows from calibrated samples."""
-        return self._after_align([f for s in samples for f in self.align.feed(s)])
+    def _stages(self) -> dict[str, Stage[Any, Any]]:
+        """{name: stage}, in the order of the way."""
+        return {'calibrate': self._calibrate, 'align': self._align, 'detect': self._detect,
+                'track': self._track}
+
+    def _after_calibrate(self, batches: Iterable[Readings]) -> list[Output]:
+        """What follows from calibrated readings."""
+        return self._after_align([f for b in batches for f in self._align.feed(b)])
 
     def _after_align(self, frames: Iterable[FieldFrame]) -> list[Output]:
         """What follows from frames."""
-        return self._after_detect([r for f in frames for r in self.detect.feed(f)])
+        return self._after_detect([r for f in frames for r in self._detect.feed(f)])
 
     def _after_detect(self, records: Iterable[FieldFrame | Detection]) -> list[Output]:
         """What follows from detections and frames with a verdict; they come first themselves."""
@@ -110,18 +128,16 @@ class Pipeline:
         for record in records:
             out.append(record)
             if isinstance(record, FieldFrame):
-                out += self.track.feed(record)
+                out += self._track.feed(record)
         return out
 
     def counts(self) -> dict[str, dict[str, int]]:
         """{stage: {what: number}}."""
-        return {name: dict(sorted(getattr(self, name).counts.items()))
-                for name in ('calibrate', 'align', 'detect', 'track')}
+        return {name: dict(sorted(stage.counts.items())) for name, stage in self._stages().items()}
 
     def rejections(self) -> dict[str, int]:
         """{cause: number} over all stages."""
-        total: dict[str, int] = {}
-        for name in ('calibrate', 'align'):
-            for cause, n in rejected(getattr(self, name).counts).items():
-                total[cause] = total.get(cause, 0) + n
-        return total
+        total: Counter[str] = Counter()
+        for stage in self._stages().values():
+            total.update(rejected(stage.counts))
+        return dict(total)

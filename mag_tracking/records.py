@@ -15,18 +15,6 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 _Number = TypeVar('_Number', bound=np.generic)
 
 
-@dataclass(frozen=True, slots=True)
-class MagSample:
-    """One reading of one sensor."""
-
-    stamp_ns: int
-    sensor: str
-    field: FloatArray
-    """(3,) [T], sensor frame; after calibration the background is removed."""
-    covariance: FloatArray | None = None
-    """(3, 3) [T^2], sensor frame; None = unknown."""
-
-
 @overload
 def plain(values: ArrayLike) -> FloatArray:
     """Of float64."""
@@ -44,74 +32,66 @@ def plain(values: ArrayLike, dtype: type[Any] = float) -> NDArray[Any]:
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """Readings of many sensors, in the order in which they came: `MagSample`s as arrays."""
+    """A batch of magnetometer readings of any sensors, in the order in which they came.
+
+    A single reading is a batch of one.
+    """
 
     names: tuple[str, ...]
-    """Of sensors."""
+    """Names of sensors."""
     sensor: IntArray
-    """(n,) int, which of `names`."""
+    """(n,) which of `names`."""
     stamp_ns: IntArray
     """(n,) int64."""
     field: FloatArray
-    """(n, 3) [T]."""
+    """(n, 3) [T], sensor frame; after calibration without the background."""
     covariance: FloatArray | None = None
-    """(n, 3, 3) [T^2]; a row of NaN, or None for all: unknown."""
+    """(n, 3, 3) [T^2], sensor frame; a row of NaN, or None for all: unknown."""
 
     def __len__(self) -> int:
         return len(self.sensor)
 
-    def sample(self, i: int) -> MagSample:
-        """Reading `i` as a `MagSample`."""
-        C = None if self.covariance is None else self.covariance[i]
-        return MagSample(int(self.stamp_ns[i]), self.names[self.sensor[i]], self.field[i],
-                         None if C is None or np.isnan(C).all() else C)
-
     def rows(self, index: Mapping[str, int]) -> IntArray:
-        """(n,) int: of each reading its sensor's place in `index`, {name: place}; -1: not in it."""
+        """(n,) row of each reading's sensor in `index`, {name: row}; -1: not in it."""
         return np.array([index.get(name, -1) for name in self.names], dtype=np.int64)[self.sensor]
 
-    def part(self, which: BoolArray) -> 'Readings':
-        """Those of `which`, (n,) bool."""
+    def sensor_names(self) -> list[str]:
+        """The name of each reading's sensor."""
+        return [self.names[j] for j in self.sensor.tolist()]
+
+    def part(self, which: BoolArray | IntArray | slice) -> 'Readings':
+        """The readings of `which`: (n,) bool, rows in any order, or a slice."""
         C = self.covariance
         return Readings(self.names, self.sensor[which], self.stamp_ns[which], self.field[which],
                         None if C is None else C[which])
-
-    def samples(self) -> list[MagSample]:
-        """All of them."""
-        return [self.sample(i) for i in range(len(self))]
 
     @classmethod
     def joined(cls, parts: Iterable['Readings']) -> 'Readings':
         """One after the other, those of `parts`, [`Readings`]."""
         parts = [p for p in parts if len(p)]
         if len(parts) <= 1:
-            return parts[0] if parts else cls.of([])
+            return parts[0] if parts else cls.by_name([], [], np.empty((0, 3)))
         names = tuple(dict.fromkeys(name for p in parts for name in p.names))
         rows = {name: j for j, name in enumerate(names)}
         covariance = None
         if any(p.covariance is not None for p in parts):
             covariance = np.concatenate([np.full((len(p), 3, 3), np.nan) if p.covariance is None
                                          else p.covariance for p in parts])
-        return cls(names, np.concatenate([
-            np.array([rows[name] for name in p.names])[p.sensor] for p in parts]),
-            np.concatenate([p.stamp_ns for p in parts]), np.concatenate([p.field for p in parts]),
-            covariance)
+        return cls(names, np.concatenate([p.rows(rows) for p in parts]),
+                   np.concatenate([p.stamp_ns for p in parts]),
+                   np.concatenate([p.field for p in parts]), covariance)
 
     @classmethod
-    def of(cls, samples: Sequence[MagSample]) -> 'Readings':
-        """Of `MagSample`s."""
-        covariance, unknown = None, np.full((3, 3), np.nan)
-        if any(s.covariance is not None for s in samples):
-            covariance = np.array([unknown if s.covariance is None else s.covariance
-                                   for s in samples])
-        return cls.by_name([s.sensor for s in samples], [s.stamp_ns for s in samples],
-                           np.array([s.field for s in samples], dtype=float).reshape(-1, 3),
-                           covariance)
+    def single(cls, sensor: str, stamp_ns: int, field: FloatArray,
+               covariance: FloatArray | None = None) -> 'Readings':
+        """One reading: (3,) [T], and (3, 3) [T^2] or None."""
+        return cls((sensor,), np.zeros(1, dtype=np.int64), np.array([stamp_ns], dtype=np.int64),
+                   field[None], None if covariance is None else covariance[None])
 
     @classmethod
     def by_name(cls, sensors: Sequence[str], stamps: Sequence[int] | IntArray, field: FloatArray,
                 covariance: FloatArray | None = None) -> 'Readings':
-        """Of lists of each reading's sensor and stamp [ns], and its field (n, 3) [T]."""
+        """Of lists of each reading's sensor and timestamp [ns], and its field (n, 3) [T]."""
         names = tuple(dict.fromkeys(sensors))
         rows = {name: j for j, name in enumerate(names)}
         return cls(names, np.array([rows[s] for s in sensors], dtype=np.int64),

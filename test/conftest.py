@@ -1,6 +1,7 @@
 """Fixtures that several tests share."""
 
 import os
+import signal
 import tempfile
 import time
 
@@ -12,10 +13,14 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.importers import import_pose_table
 from mag_tracking.recording.reader import Recording
 from support.bundled import DATA, NETWORK_FILE, ROOT, vehicle_path
+from support.ros_domain import RosDomain
 
 # Keep the middleware to this machine, and apart from other runs on it.
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
+DOMAIN = RosDomain()
+os.environ['ROS_DOMAIN_ID'] = str(DOMAIN.number)
+# A background job of a shell ignores SIGINT, and so would every process that a test interrupts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 # What nodes keep and log is no business of who runs the tests.
 _HOME = tempfile.TemporaryDirectory(prefix='mag_tracking_test_')
 os.environ['ROS_HOME'] = _HOME.name

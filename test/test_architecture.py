@@ -119,20 +119,8 @@ def private_uses(tree):
                 yield node.attr
 
 
-TWO_PATHS = ('stages/align/test_align_many.py', 'stages/calibrate/test_kernel.py')
-"""They force every reading off the compiled path, to compare it with the Python path. Cause: the
-rules of calibration and alignment stand twice; these entries go when they stand once."""
-
-
-def files_of_tests():
-    """Every file of the tests; those of `TWO_PATHS` are expected to fail."""
-    for path in sorted((ROOT / 'test').rglob('*.py')):
-        name = str(path.relative_to(ROOT / 'test'))
-        yield pytest.param(path, id=name, marks=[
-            pytest.mark.xfail(reason='two paths', strict=True)] if name in TWO_PATHS else [])
-
-
-@pytest.mark.parametrize('path', list(files_of_tests()))
+@pytest.mark.parametrize('path', sorted((ROOT / 'test').rglob('*.py')),
+                         ids=lambda p: str(p.relative_to(ROOT / 'test')))
 def test_tests_reach_no_private_name(path):
     assert sorted(private_uses(ast.parse(path.read_text()))) == []
 

@@ -61,7 +61,7 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
     progress : function, optional
         Called with the bytes done since the last call; with passes the recording is read twice.
     stopped : function, optional
-        Asked before every sample; when it is true, what was read so far counts.
+        Asked before every batch of readings; when it is true, what was read so far counts.
 
     Returns
     -------
@@ -101,14 +101,14 @@ def _surveyed(recording: Recording, network: SensorNetwork, settings: Settings, 
     levels: dict[str, FloatArray] = {}
     interrupted = False
     try:
-        for sample in until_stopped(reader.samples_and_accelerations, progress, stopped):
-            if isinstance(sample, AccelerationSample):
-                survey.feed(sample)
+        for record in until_stopped(reader.readings_and_accelerations, progress, stopped):
+            if isinstance(record, AccelerationSample):
+                survey.feed(record)
                 continue
-            stage.feed(sample)
+            stage.feed(record)
             # The first that is known: later a target may stand there.
-            if sample.sensor not in levels and stage.backgrounds()[sample.sensor].ready:
-                levels[sample.sensor] = stage.background(sample.sensor)
+            levels.update({name: stage.background(name) for name in record.names
+                           if name not in levels and stage.backgrounds()[name].ready})
     except ReadingStopped:
         interrupted = True
     stage.counts.update({f'rejected: {cause}': n for cause, n in reader.rejected.items()})
@@ -131,8 +131,8 @@ def _passes(recording: Recording, network: SensorNetwork, settings: Settings,
                 poses[record.id] = n, record
 
     try:
-        for sample in until_stopped(reader.samples, progress, stopped):
-            take(pipeline.feed(sample))
+        for readings in until_stopped(reader.readings, progress, stopped):
+            take(pipeline.feed(readings))
     except ReadingStopped:
         interrupted = True
     take(pipeline.flush())

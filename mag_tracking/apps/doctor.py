@@ -10,7 +10,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.records import MagSample
+from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.sensor_health import Finding, SensorHealth
 from mag_tracking.stages.stage import rejected
@@ -129,15 +129,18 @@ class Doctor:
                           zip(network.names, network.clock_offset, strict=True)}
         self._frozen_ns: dict[str, int] = {}
 
-    def feed(self, sample: MagSample, received_ns: int | None = None) -> None:
-        """Look at a raw `MagSample` that was received at `received_ns`."""
-        self.sensors[sample.sensor].add(sample.stamp_ns - self._clock_ns[sample.sensor],
-                                        sample.field, received_ns)
-        self.calibrate.feed(sample)
-        if self.calibrate.backgrounds()[sample.sensor].frozen:
-            self._frozen_ns.setdefault(sample.sensor, sample.stamp_ns)
-        else:
-            self._frozen_ns.pop(sample.sensor, None)
+    def feed(self, readings: Readings, received_ns: int | None = None) -> None:
+        """Look at raw `Readings` of the network that were received at `received_ns`."""
+        for name, stamp, field in zip(readings.sensor_names(), readings.stamp_ns.tolist(),
+                                      readings.field, strict=True):
+            self.sensors[name].add(stamp - self._clock_ns[name], field, received_ns)
+        self.calibrate.feed(readings)
+        backgrounds = self.calibrate.backgrounds()
+        for name, stamp in zip(readings.sensor_names(), readings.stamp_ns.tolist(), strict=True):
+            if backgrounds[name].frozen:
+                self._frozen_ns.setdefault(name, stamp)
+            else:
+                self._frozen_ns.pop(name, None)
 
     def findings(self) -> list[Finding]:
         """List of `Finding`, the serious ones first."""
@@ -167,7 +170,7 @@ def examine(recording: Recording, network: SensorNetwork, settings: Settings,
     progress : function, optional
         Called with the bytes done since the last call.
     stopped : function, optional
-        Asked before every sample; when it is true, what was read so far counts.
+        Asked before every message; when it is true, what was read so far counts.
 
     Returns
     -------
@@ -176,8 +179,8 @@ def examine(recording: Recording, network: SensorNetwork, settings: Settings,
     Raises RecordingError where the recording has none of the network's topics.
     """
     reader, doctor = SampleReader(recording, network), Doctor(network, settings)
-    for sample, received_ns in reader.samples_as_received(progress):
-        doctor.feed(sample, received_ns)
+    for readings, received_ns in reader.readings_as_received(progress):
+        doctor.feed(readings, received_ns)
         if stopped is not None and stopped():
             break
     lost = [Finding(True, recording.path.name, f'{what}: {n}', 'the recording is damaged: see '

@@ -17,7 +17,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.records import Detection, FieldFrame, MagSample
+from mag_tracking.records import Detection, FieldFrame, Readings
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.stage import Detect
@@ -70,13 +70,16 @@ class FittedPass:
 
 
 class PassCollector:
-    """Samples to passes: what the network measured from before a detection until it ended."""
+    """Readings to passes: what the network measured from before a detection until it ended."""
 
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         self._network = network
         self._stages = (Calibrate(network, settings.calibrate), Align(network, settings.align),
                         Detect(network, settings.detect))
-        self._kept: deque[tuple[MagSample, FloatArray]] = deque()
+        # Raw and calibrated readings by the network's clock, since before the latest onset.
+        self._raw: deque[Readings] = deque()
+        self._calibrated: deque[Readings] = deque()
+        self._clock_ns = np.array([round(s * NS) for s in network.clock_offset], dtype=np.int64)
         self._onset_ns: int | None = None
         self._last_ns: int | None = None
 
@@ -93,12 +96,17 @@ class PassCollector:
         """Names of sensors whose background was never learnt."""
         return [n for n, b in self._stages[0].backgrounds().items() if not b.ready]
 
-    def feed(self, sample: MagSample) -> list[tuple[PassData, tuple[str, ...]]]:
-        """A raw `MagSample` gives the passes that it completes: [(PassData, notes)]."""
+    def feed(self, readings: Readings) -> list[tuple[PassData, tuple[str, ...]]]:
+        """Raw `Readings` of the network give the passes that they complete: [(PassData, notes)]."""
         calibrate, align, _ = self._stages
+        if not len(readings):
+            return []
+        sensor = readings.rows({name: j for j, name in enumerate(self._network.names)})
+        self._raw.append(Readings(self._network.names, sensor,
+                                  readings.stamp_ns - self._clock_ns[sensor], readings.field))
         out: list[tuple[PassData, tuple[str, ...]]] = []
-        for calibrated in calibrate.feed(sample):
-            self._kept.append((calibrated, sample.field))
+        for calibrated in calibrate.feed(readings):
+            self._calibrated.append(calibrated)
             for frame in align.feed(calibrated):
                 out += self._judge(frame)
         return out
@@ -127,25 +135,25 @@ class PassCollector:
                                  'left out'))
         self._last_ns = frame.stamp_ns
         begin = (frame.stamp_ns if self._onset_ns is None else self._onset_ns) - PAD_S * NS
-        while self._kept and self._kept[0][0].stamp_ns < begin:
-            self._kept.popleft()
+        for kept in (self._raw, self._calibrated):
+            while kept and kept[0].stamp_ns.max() < begin:
+                kept.popleft()
         return out
 
     def _cut(self, onset_ns: int, end_ns: int,
              *remarks: str) -> tuple[PassData, tuple[str, ...]]:
         """(PassData, notes) of what was kept from an onset to a time; the pass is over."""
         begin = onset_ns - int(PAD_S * NS)
-        rows = sorted(((self._network.index(s.sensor), s.stamp_ns, s, raw)
-                       for s, raw in self._kept if begin <= s.stamp_ns <= end_ns),
-                      key=lambda row: row[:2])
-        sensor = np.array([row[0] for row in rows], dtype=int)
-        field = np.array([row[2].field for row in rows]).reshape(-1, 3)
-        raw = np.array([row[3] for row in rows]).reshape(-1, 3)
+        found = Readings.joined(self._calibrated)
+        found = found.part((begin <= found.stamp_ns) & (found.stamp_ns <= end_ns))
+        found = found.part(np.lexsort((found.stamp_ns, found.sensor)))
+        sensor, field, raw = found.sensor, found.field.copy(), self._raw_fields(found)
         covariance = np.full((len(self._network), 3, 3), np.nan)
         notes = list(remarks)
         for j in np.unique(sensor):
             mine = np.flatnonzero(sensor == j)
-            covariance[j] = rows[mine[0]][2].covariance
+            if found.covariance is not None:
+                covariance[j] = found.covariance[mine[0]]
             for a, axis in enumerate('xyz'):
                 bad = mine[cut_off(raw[mine, a])]
                 if len(bad):
@@ -153,8 +161,22 @@ class PassCollector:
                     notes.append(f'{self._network.names[j]}: {axis} was saturated in {len(bad)} '
                                  f'of {len(mine)} samples at {raw[bad[0], a]:.3g} T; left out')
         self._onset_ns = None
-        t = np.array([(row[1] - begin) / NS for row in rows])
+        t = (found.stamp_ns - begin) / NS
         return PassData(self._network, begin, t, sensor, field, covariance), tuple(notes)
+
+
+    def _raw_fields(self, calibrated: Readings) -> FloatArray:
+        """(n, 3) [T] the raw fields of calibrated readings; NaN where there is none."""
+        raw = Readings.joined(self._raw)
+        known: dict[tuple[int, int], int] = {}
+        for k, key in enumerate(zip(raw.sensor.tolist(), raw.stamp_ns.tolist(), strict=True)):
+            # Of two with the same timestamp the calibration accepts the first.
+            known.setdefault(key, k)
+        # Row -1 is NaN.
+        rows = [known.get(key, -1) for key in zip(
+            calibrated.sensor.tolist(), calibrated.stamp_ns.tolist(), strict=True)]
+        fields: FloatArray = np.concatenate([raw.field, np.full((1, 3), np.nan)])[rows]
+        return fields
 
 
 class RecordingFit:
@@ -189,10 +211,10 @@ class RecordingFit:
 
         `progress` and `stopped` are as for `apps.replay.replay`.
         """
-        for sample in self._reader.samples(progress):
+        for readings in self._reader.readings(progress):
             if stopped is not None and stopped():
                 return
-            yield from self._fitted(self._collector.feed(sample), stopped)
+            yield from self._fitted(self._collector.feed(readings), stopped)
         yield from self._fitted(self._collector.flush(), stopped)
 
     def _fitted(self, passes: Iterable[tuple[PassData, tuple[str, ...]]],

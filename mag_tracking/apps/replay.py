@@ -63,7 +63,7 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     progress : function, optional
         Called with the bytes done since the last call.
     stopped : function, optional
-        Asked before every sample and whenever the reading has got on. When it is
+        Asked before every batch of readings and whenever the reading has got on. When it is
         true the reading ends, what was done is written, and the summary says so.
 
     Returns
@@ -81,8 +81,8 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     with ResultFolder(out, network.frame) as results:
         taker = RunCollector(results)
         try:
-            for sample in until_stopped(reader.samples, progress, stopped):
-                taker.take(pipeline.feed(sample))
+            for readings in until_stopped(reader.readings, progress, stopped):
+                taker.take(pipeline.feed(readings))
         except ReadingStopped:
             interrupted = True
         taker.take(pipeline.flush())
@@ -104,7 +104,7 @@ class RunCollector:
         self.smoothed: dict[int, SmoothedLog] = {}
 
     def take(self, records: Iterable[FieldFrame | Detection | SmoothedPose | Track]) -> None:
-        """Take what one sample led to."""
+        """Take what a batch of readings led to."""
         for record in records:
             if isinstance(record, FieldFrame):
                 self._frame = record

@@ -48,13 +48,15 @@ def tumble(recording: Recording, network: SensorNetwork, sensors: Collection[str
     interrupted = False
     reader = SampleReader(recording, network)
     try:
-        for sample in until_stopped(reader.samples, progress, stopped):
-            if sample.sensor in taken and not np.isinf(sample.field).any():
-                taken[sample.sensor].append(sample.field)
+        for batch in until_stopped(reader.readings, progress, stopped):
+            of = batch.rows({name: k for k, name in enumerate(wanted)})
+            of[np.isinf(batch.field).any(axis=1)] = -1
+            for k, name in enumerate(wanted):
+                taken[name].append(batch.field[of == k])
     except ReadingStopped:
         interrupted = True
     readings: dict[str, FloatArray] = {
-        name: np.array(r).reshape(-1, 3) for name, r in taken.items()}
+        name: np.concatenate([np.empty((0, 3)), *r]) for name, r in taken.items()}
     fits = {name: fit_ellipsoid(r, field_size) for name, r in readings.items()}
     columns = {key: list(getattr(network, key)) for key in (
         'offset', 'correction', 'background', 'noise_std', 'calibrated')}

@@ -13,17 +13,19 @@ from math import inf, isnan
 from typing import TypeAlias
 
 import numpy as np
+from numba import float64, int64, njit, void
 
 from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.calibration.blocks import (
     Block,
     Blocks,
     BlockWindow,
+    add_to_block,
     block_of,
     line_through,
     stacked,
 )
-from mag_tracking.calibration.ordinary import add_to_block, new_sensors
+from mag_tracking.calibration.sensor_state import SENSORS, Record, new_sensors
 from mag_tracking.records import plain
 
 LOUDEST = 100.0
@@ -38,6 +40,25 @@ LEAST_STD = 1e-11
 
 _Line: TypeAlias = tuple[float, FloatArray, FloatArray, float]
 """Centre [s], mean (3,) [T], slope (3,) [T/s] and horizon [s]."""
+
+
+@njit(cache=True, inline='always')
+def subtract_background(s: Record, time: float, field: FloatArray, out: FloatArray) -> None:
+    """Field without the background at `time` [s]: from `field` (3,) [T] into `out` (3,).
+
+    The drift is extrapolated over at most twice the stretch that it was fitted to: a drift
+    learnt from three seconds does not hold for twenty.
+    """
+    since = min(time, s.horizon) - s.centre
+    for a in range(3):
+        out[a] = field[a] - s.mean[a] - since * s.slope[a]
+
+
+@njit(void(SENSORS, int64, float64, float64[::1], float64[::1]), cache=True)
+def _subtract(sensors: StructArray, j: int, time: float, field: FloatArray,
+              out: FloatArray) -> None:
+    """`subtract_background` of sensor `j`."""
+    subtract_background(sensors[j], time, field, out)
 
 
 class RunningBackground:
@@ -57,12 +78,12 @@ class RunningBackground:
     background, noise_std : (3,) [T], optional
         Known beforehand: with both it is ready at once.
     phase : float, optional
-        The first block is longer by this share, and the others follow it at even times: the
-        blocks of many sensors that began together are not all judged at once. They are judged
-        by `settle`, or before the next sample: the one that shows a block to be complete holds up
-        nobody. Else a block is judged at once, and the next is a whole one again.
-    sensors : (1,) ordinary.SENSOR, optional
-        Where the block is that is being collected.
+        Staggers the blocks of many sensors that began together: the first block is longer by
+        this share, and the others follow at even times. A complete block is judged by
+        `judge_block`, or before the next reading. Without a phase it is judged at once.
+    sensors : (1,) SENSOR, optional
+        State of the sensor; the block that is being collected, and line and noise for compiled
+        code.
     """
 
     def __init__(self, learn: float, memory: float, guard: float, block: float,
@@ -80,9 +101,6 @@ class RunningBackground:
         self._noise: FloatArray | None = \
             None if noise_std is None else np.diag(np.asarray(noise_std, float) ** 2)
         self._noise_given = self._noise is not None
-        # What was made of the noise and of the line, each with what it was made of.
-        self._std: tuple[FloatArray | None, list[float] | None, bool] = (None, None, False)
-        self._numbers: tuple[_Line, float, list[float], list[float], float] | None = None
         self.n_relearnt = 0
         self.forget()
 
@@ -93,20 +111,27 @@ class RunningBackground:
         self._pending: deque[Block] = deque()
         self._strange: deque[Block] = deque()
         self.frozen = self._resumed = False
-        if not self._noise_given:
-            self._noise = None
-        self._line: _Line | None = \
-            None if self._given is None else (0.0, self._given, np.zeros(3), 0.0)
+        self._set(None if self._given is None else (0.0, self._given, np.zeros(3), 0.0),
+                  self._noise if self._noise_given else None)
         self.stuck = False
+
+    def _set(self, line: _Line | None, noise: FloatArray | None) -> None:
+        """Line and noise from now on, also those that compiled code reads."""
+        s = self._state
+        self._line, self._noise = line, noise
+        s['is_ready'] = self.ready
+        if line is not None:
+            s['centre'], s['mean'], s['slope'], s['horizon'] = line
+        s['noise'] = np.nan if noise is None else noise
+        s['noise_std'] = np.sqrt(np.diagonal(s['noise']))
 
     def resume(self, background: FloatArray, covariance: FloatArray) -> None:
         """Go on from what was known a moment ago: (3,) [T] and (3, 3) [T^2], NaN as elsewhere.
 
         It is a line again when a stretch as long as at first has been quiet.
         """
-        if not self._noise_given:
-            self._noise = np.asarray(covariance, dtype=float)
-        self._line = (0.0, np.asarray(background, dtype=float), np.zeros(3), 0.0)
+        self._set((0.0, np.asarray(background, dtype=float), np.zeros(3), 0.0),
+                  self._noise if self._noise_given else np.asarray(covariance, dtype=float))
         self._resumed = True
 
     @property
@@ -120,30 +145,6 @@ class RunningBackground:
         return self._noise
 
     @property
-    def noise_std(self) -> list[float] | None:
-        """[3 float] [T], or None; NaN for an axis not reported."""
-        self._note_noise()
-        return self._std[1]
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether the noise of all axes is known."""
-        self._note_noise()
-        return self._std[2]
-
-    def _note_noise(self) -> None:
-        """Keep what is asked of every sample, and changes once a block."""
-        if self._std[0] is not self._noise:
-            std: list[float] | None = \
-                None if self._noise is None else np.sqrt(np.diagonal(self._noise)).tolist()
-            self._std = self._noise, std, std is not None and not isnan(sum(std))
-
-    @property
-    def line(self) -> _Line | None:
-        """(centre [s], (3,) mean [T], (3,) slope [T/s], horizon [s]) of `level`, or None."""
-        return self._line
-
-    @property
     def measured(self) -> bool:
         """Whether the background is from readings, not from what was given beforehand."""
         return bool(self._window) and self.ready
@@ -154,40 +155,25 @@ class RunningBackground:
         return np.full(3, np.nan) if self._line is None else self._line[2]
 
     def level(self, time: float) -> FloatArray:
-        """(3,) [T] background at `time` [s].
+        """(3,) [T] background at `time` [s]; raises ValueError before it is ready."""
+        return -self._departure(time, np.zeros(3))
 
-        The drift is carried on for at most twice the stretch that it was
-        learnt from: what is known of it from three seconds is not good for twenty.
-        Raises ValueError before it is ready.
-        """
+    def _departure(self, time: float, field: FloatArray) -> FloatArray:
+        """(3,) [T] `field` without the background at `time` [s]."""
         if self._line is None:
             raise ValueError('the background has not been learnt yet')
-        centre, mean, slope, horizon = self._line
-        return mean + slope * (min(time, horizon) - centre)
-
-    def departure(self, time: float, values: list[float]) -> list[float]:
-        """[3 float] [T]: `values`, a list, without the background at `time`; as fast as can be.
-
-        Raises ValueError before it is ready.
-        """
-        if self._line is None:
-            raise ValueError('the background has not been learnt yet')
-        if self._numbers is None or self._numbers[0] is not self._line:
-            centre, mean, slope, horizon = self._line
-            self._numbers = self._line, centre, mean.tolist(), slope.tolist(), horizon
-        _, centre, (a, b, c), (u, v, w), horizon = self._numbers
-        x, y, z = values
-        since = min(time, horizon) - centre
-        return [x - a - since * u, y - b - since * v, z - c - since * w]
+        out = np.empty(3)
+        _subtract(self._sensors, 0, time, field, out)
+        return out
 
     def add(self, time: float, field: FloatArray) -> None:
         """Take a sample: `time` [s], `field` (3,) [T], sensor frame."""
-        self.settle()
+        self.judge_block()
         add_to_block(self._sensors, 0, time, plain(field))
         if isnan(self._state['phase']):
-            self.settle()
+            self.judge_block()
 
-    def settle(self) -> None:
+    def judge_block(self) -> None:
         """Judge the block that the latest sample has shown to be complete; else `add` does it."""
         if not self._state['is_full']:
             return
@@ -198,9 +184,8 @@ class RunningBackground:
                            < LEAST_STD**2 * (block.n[known] - 1)).any())
         if self.stuck:
             return
-        noise_std = self.noise_std
-        if self._line is not None and noise_std is not None:
-            self._follow(block, noise_std)
+        if self.ready:
+            self._follow(block)
         else:
             self._begin(block)
 
@@ -214,12 +199,11 @@ class RunningBackground:
         if len(self._strange) >= 3 and block.time - self._strange[0].time >= enough:
             self._adopt_if_steady()
 
-    def _follow(self, block: Block, noise_std: list[float]) -> None:
+    def _follow(self, block: Block) -> None:
         """Once ready: extend the quiet stretch, or freeze."""
-        off = (block.mean - self.level(block.time)).tolist()
+        off = np.abs(self._departure(block.time, block.mean))
         # A comparison with NaN is false: an axis that is not reported freezes nothing.
-        self.frozen = any(abs(d) > self._freeze_std * std
-                          for d, std in zip(off, noise_std, strict=True))
+        self.frozen = bool((off > self._freeze_std * self._state['noise_std']).any())
         if self.frozen:
             self._pending.clear()
             self._strange.append(block)
@@ -257,7 +241,7 @@ class RunningBackground:
         off = np.abs(blocks.mean - mean - slope * (blocks.time - centre)[:, None])
         if not np.nanmax(off / std) <= self._freeze_std:
             return False
-        self._noise = noise
+        self._set(self._line, noise)
         if self._given is not None and self._line is not None and not self.n_relearnt \
                 and not self.frozen:
             # The background was given and only the noise had to be learnt.
@@ -280,10 +264,9 @@ class RunningBackground:
             return
         self._resumed = False
         centre, mean, slope = line_through(blocks)
-        self._line = (centre, mean, slope, last + 2.0 * (last - first))
-        if not self._noise_given:
-            noise = _pooled_covariance(blocks)
-            self._noise = self._noise if noise is None else noise
+        noise = None if self._noise_given else _pooled_covariance(blocks)
+        self._set((centre, mean, slope, last + 2.0 * (last - first)),
+                  self._noise if noise is None else noise)
 
 
 def _one_is_loud(blocks: Blocks) -> bool:

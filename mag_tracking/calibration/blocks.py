@@ -5,9 +5,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import float64, njit, void
+from numba import float64, int64, njit, void
 
-from mag_tracking.arrays import FloatArray
+from mag_tracking.arrays import FloatArray, StructArray
+from mag_tracking.calibration.sensor_state import SENSORS, Record
+
+LEAST_SAMPLES = 8
+"""A block has at least so many readings, however slow the sensor: fewer tell nothing of noise."""
 
 
 @dataclass(frozen=True)
@@ -25,12 +29,68 @@ class Block:
 
 
 def block_of(sensor: np.void) -> Block:
-    """`Block` of the sums of an `ordinary.SENSOR` over the readings of the one that is complete."""
+    """`Block` of the sums of a SENSOR over the readings of its complete block."""
     k, mean, scatter = 1 - sensor['now'], np.empty(3), np.empty((3, 3))
     count = sensor['count'][k]
     _moments(sensor['origin'][k], count, sensor['sum'][k], sensor['product'][k], mean, scatter)
     return Block(float(sensor['time'][k] / sensor['n'][k]), mean, scatter,
                  count.diagonal().copy())
+
+
+@njit(cache=True, inline='always')
+def begin_block_if_due(s: Record, time: float) -> None:
+    """Begin the next block where a reading at `time` [s] is the first after the present one.
+
+    What was complete before (`is_full`) must have been used by now.
+    """
+    if np.isnan(s.end):
+        s.end = time + s.length * (1.0 if np.isnan(s.phase) else 1.0 + s.phase)
+        return
+    if not (time >= s.end and s.n[s.now] >= LEAST_SAMPLES):
+        return
+    s.now, s.is_full = 1 - s.now, 1
+    s.n[s.now] = 0
+    if np.isnan(s.phase):
+        s.end = time + s.length
+    else:
+        # With jittering timestamps the blocks of all sensors would sooner or later end with the
+        # same reading, and from then on always.
+        s.end += ((time - s.end) // s.length + 1.0) * s.length
+
+
+@njit(cache=True, inline='always')
+def collect(s: Record, time: float, field: FloatArray) -> None:
+    """Add a reading, `field` (3,) [T] at `time` [s], to the present block."""
+    k = s.now
+    if s.n[k] == 0:
+        s.time[k] = 0.0
+        for a in range(3):
+            s.origin[k, a] = np.nan
+            for b in range(3):
+                s.count[k, a, b] = s.sum[k, a, b] = s.product[k, a, b] = 0.0
+    s.n[k] += 1
+    s.time[k] += time
+    for a in range(3):
+        if np.isnan(field[a]):
+            continue
+        if np.isnan(s.origin[k, a]):
+            s.origin[k, a] = field[a]
+        d = field[a] - s.origin[k, a]
+        for b in range(3):
+            if not np.isnan(field[b]):
+                # Where it has not been heard before, this reading is the origin of that axis.
+                e = 0.0 if np.isnan(s.origin[k, b]) else field[b] - s.origin[k, b]
+                s.count[k, a, b] += 1.0
+                s.sum[k, a, b] += d
+                s.product[k, a, b] += d * e
+
+
+@njit(void(SENSORS, int64, float64, float64[::1]), cache=True)
+def add_to_block(sensors: StructArray, j: int, time: float, field: FloatArray) -> None:
+    """Add a reading of sensor `j`, `field` (3,) [T] at `time` [s], to its block."""
+    s: Record = sensors[j]
+    begin_block_if_due(s, time)
+    collect(s, time, field)
 
 
 @njit(void(float64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1],

@@ -65,6 +65,11 @@ class Decimator:
             return [(stamp_ns, field)]
         return self._step(self.factor, self._taps)
 
+    @property
+    def n_waiting(self) -> int:
+        """How many samples it may give at once: those that wait until the rate is known."""
+        return len(self._window) if self.factor is None else 0
+
     def noise_gain(self) -> float:
         """By what white noise's variance is multiplied; ValueError before the rate is known."""
         if self.factor is None:

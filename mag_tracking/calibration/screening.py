@@ -1,189 +1,216 @@
-"""Readings of one sensor that cannot be: spikes, and a sensor that is stuck.
+"""Faulty readings of one sensor: spikes, and a sensor that is stuck; compiled.
 
-Neither waits for more than what is odd: all other readings pass at once.
+Only a suspect reading is held until the next ones decide; all others pass at once.
 """
 
 import math
-from collections.abc import Sequence
-from math import isnan
-from typing import Generic, TypeAlias, TypeVar
 
-from mag_tracking.arrays import StructArray
-from mag_tracking.calibration.ordinary import MEMORY, NEVER, RECENT, new_sensors
+import numpy as np
+from numba import boolean, float64, int64, njit
 
+from mag_tracking.arrays import FloatArray, StructArray
+from mag_tracking.calibration.sensor_state import MOST_HELD, NEVER, RECENT, SENSORS, Record
+
+MEMORY = 20_000
+"""Readings over which the usual share of repetitions is counted, about."""
 LEAST_CHANGES = 50
 """A sensor that has changed less often may have steps so coarse that it repeats itself for long."""
 LIKELY = math.log(1e-9)
-"""A run of the same reading is taken for a fault where chance makes it no oftener."""
+"""A run of equal readings is a fault where chance makes it no more often than this."""
 SHORTEST_RUN = 4
 COARSE = 0.05
-"""Of a sensor that repeats itself more often the steps are so coarse that at rest it may do so for
-ever; with a noise of one step or more, on three axes, it is below this."""
-MOST_HELD = 3
-"""A spike has at most so many readings; what stays for longer is a step."""
+"""A sensor that repeats itself more often has steps so coarse that at rest it may do so for ever;
+with a noise of one step or more, on three axes, the share is below this."""
 STEEPER = 8.0
-"""A spike is steeper than the steepest of those by so much, and by more where readings are rare."""
+"""A spike is steeper than the steepest recent difference by this factor, and by more where readings
+are rare."""
 FASTEST = 30.0
-"""[1/s] How fast what passes may be, in units of its distance: 30 m/s at one metre."""
+"""[1/s] Highest speed of a target, in units of its distance: 30 m/s at one metre."""
 STEEPEST = 130.0
-"""A dipole that passes by the share s of its distance from one reading to the next, s above 0.4, is
-steeper than before by less than this times s^3, in 99.9 of 100 cases (simulated)."""
+"""A dipole that moves by the share s of its distance between two readings, s above 0.4, makes a
+difference steeper than the ones before by less than this times s^3, in 99.9 % of the cases
+(simulated)."""
 BACK = 0.3
-"""Behind a spike the field is again where it was, to this share of the spike."""
+"""After a spike the field is again where it was, to this share of the spike."""
 
-STUCK, SPIKE = 'the same reading over and over', 'spike'
-"""Why a reading is rejected."""
-
-Item = TypeVar('Item')
-"""Whatever a reading is to who feeds it."""
-_Steps: TypeAlias = tuple[float, float, float]
+PASSES, HELD, SPIKE, RELEASED = range(4)
+"""Results of `screen_spike`: the reading passes; it is held; what was held is a spike (and
+`judge_spike` has to decide on the reading); the held readings and this one pass, in order."""
 
 
-class Repetition:
-    """Tells when a sensor repeats itself longer than chance, or its coarse steps, would have it.
-
-    Its state is in `sensors`, (1,) `ordinary.SENSOR`.
-    """
-
-    def __init__(self, sensors: StructArray | None = None) -> None:
-        self._state = (new_sensors(1) if sensors is None else sensors)[0]
-
-    def is_stuck(self, field: list[float]) -> bool:
-        """Whether the reading `field`, a list of three, is one of a sensor that is stuck."""
-        s = self._state
-        last, s['last'] = s['last'].tolist(), field
-        same = field == last or isnan(sum(field)) and all(
-            a == b or isnan(a) and isnan(b) for a, b in zip(field, last, strict=True))
-        if not same:
-            # A run that was taken for a fault says little about what is usual. But were it nothing,
-            # a sensor with coarse steps that began while a target passed would be stuck at rest.
-            if s['run']:
-                s['repeats'] += 1.0 if self._too_long() else s['run']
-                s['run'] = 0
-            s['changes'] += 1.0
-            if s['repeats'] + s['changes'] > MEMORY:
-                s['repeats'], s['changes'] = 0.5 * s['repeats'], 0.5 * s['changes']
-            return False
-        s['run'] += 1
-        return self._too_long()
-
-    def _too_long(self) -> bool:
-        """Whether the run so far is longer than what is likely."""
-        run, repeats, changes = (self._state[k] for k in ('run', 'repeats', 'changes'))
-        if run < SHORTEST_RUN or changes < LEAST_CHANGES:
-            return False
-        usual = (repeats + 1.0) / (repeats + changes + 2.0)
-        return bool(usual < COARSE and run * math.log(usual) < LIKELY)
-
-
-class SpikeFilter(Generic[Item]):
-    """Holds a reading that is steeply off until those behind it tell whether it was a spike.
-
-    A reading is off where it differs from the one before by more than `threshold`
-    noise deviations, and by `STEEPER` times more than readings did just now: a
-    vehicle comes nearer smoothly. Where readings are so rare that it may pass from
-    one to the next but a few, only what is steeper still can be told from it. What is
-    not held is in `sensors`, (1,) `ordinary.SENSOR`.
-    """
-
-    def __init__(self, threshold: float, sensors: StructArray | None = None) -> None:
-        self._threshold = threshold
-        self._state = (new_sensors(1) if sensors is None else sensors)[0]
-        self.clear()
-
-    @property
-    def n_held(self) -> int:
-        """How many readings are held."""
-        return len(self._held)
-
-    def clear(self) -> None:
-        """Forget what came before."""
-        self._held: list[tuple[Item, int, list[float], _Steps]] = []
-        self._state['before_ns'], self._state['n_steps'] = NEVER, 0
-
-    def feed(self, item: Item, stamp_ns: int, field: list[float],
-             noise_std: Sequence[float] | None) -> list[tuple[Item, bool]]:
-        """What is known by now of `item`, a reading, and of those that are held.
-
-        Parameters
-        ----------
-        item : anything
-        stamp_ns : int
-        field : list of 3 float [T]
-        noise_std : (3,) [T], or None where it is not known: then nothing is held
-
-        Returns
-        -------
-        list of (item, whether it is a spike), in the order in which they came
-        """
-        new = item, stamp_ns, field
-        if self._state['before_ns'] == NEVER or noise_std is None:
-            held = [(h[0], False) for h in self._held]
-            self._held = []
-            return held + self._release(*new)
-        (x, y, z), (a, b, c) = field, self._state['before'].tolist()
-        steps = abs(x - a), abs(y - b), abs(z - c)
-        if self._held:
-            return self._settle(*new, steps, noise_std)
-        return self._judge(*new, steps, noise_std)
-
-    def _judge(self, item: Item, stamp_ns: int, field: list[float], steps: _Steps,
-               noise_std: Sequence[float]) -> list[tuple[Item, bool]]:
-        """Hold a reading that may be a spike; else it passes."""
-        if self._state['n_steps'] >= RECENT and self._is_off(stamp_ns, steps, noise_std):
-            self._held.append((item, stamp_ns, field, steps))
-            return []
-        return self._release(item, stamp_ns, field, steps)
-
-    def _is_off(self, stamp_ns: int, steps: _Steps, noise_std: Sequence[float]) -> bool:
-        """Whether `steps` from the reading before are steeper than what passes could make them."""
-        # A comparison with NaN is false: an axis that is missing is no spike.
-        (x, y, z), (a, b, c), most = steps, noise_std, self._threshold
-        high = x > most * a, y > most * b, z > most * c
-        if True not in high:
-            return False
-        passed = FASTEST * (stamp_ns - int(self._state['before_ns'])) * 1e-9
-        steeper, recent = max(STEEPER, STEEPEST * passed**3), self._state['steps'].tolist()
-        for axis in range(3):
-            known = [s[axis] for s in recent if not isnan(s[axis])]
-            # A sensor with coarse steps did not move at all just now.
-            if high[axis] and known and steps[axis] > steeper * max(*known, noise_std[axis]):
-                return True
+@njit(cache=True)
+def _is_too_long(s: Record) -> bool:
+    """Whether the present run of equal readings is longer than chance makes it."""
+    if s.run < SHORTEST_RUN or s.changes < LEAST_CHANGES:
         return False
+    usual = (s.repeats + 1.0) / (s.repeats + s.changes + 2.0)
+    return bool(usual < COARSE and s.run * math.log(usual) < LIKELY)
 
-    def _settle(self, item: Item, stamp_ns: int, field: list[float], steps: _Steps,
-                noise_std: Sequence[float]) -> list[tuple[Item, bool]]:
-        """Whether what is held was a spike, if `field` tells."""
-        largest = [max((h[3][axis] for h in self._held if not isnan(h[3][axis])),
-                       default=0.0)
-                   for axis in range(3)]
-        # The axis in which it is the highest decides.
-        axis = max(range(3), key=largest.__getitem__)
-        is_back = steps[axis] <= BACK * largest[axis]
-        if not is_back and len(self._held) < MOST_HELD:
-            self._held.append((item, stamp_ns, field, steps))
-            return []
-        known = [(h[0], is_back) for h in self._held]
-        self._held = []
-        if is_back:
-            # It may be the next of several that differ.
-            return known + self._judge(item, stamp_ns, field, steps, noise_std)
-        # A step: what was before it is nothing to compare with.
-        self._state['n_steps'] = 0
-        return known + self._release(item, stamp_ns, field)
 
-    def _release(self, item: Item, stamp_ns: int, field: list[float],
-                 steps: _Steps | None = None) -> list[tuple[Item, bool]]:
-        """The reading passes."""
-        s = self._state
-        s['before'], s['before_ns'] = field, stamp_ns
-        if steps is not None:
-            s['steps'][s['n_steps'] % RECENT] = steps
-            s['n_steps'] += 1
-        return [(item, False)]
+@njit(cache=True)
+def is_stuck(s: Record, field: FloatArray) -> bool:
+    """Whether a reading repeats the one before for longer than chance, or coarse steps, allow.
 
-    def flush(self) -> list[tuple[Item, bool]]:
-        """What is held when nothing comes any more: readings like others, as far as is known."""
-        out = [(h[0], False) for h in self._held]
-        self.clear()
-        return out
+    Parameters
+    ----------
+    s : SENSOR
+        Changed.
+    field : (3,) array, T
+        NaN = missing axis.
+    """
+    is_same = True
+    for a in range(3):
+        if not (field[a] == s.last[a] or np.isnan(field[a]) and np.isnan(s.last[a])):
+            is_same = False
+        s.last[a] = field[a]
+    if is_same:
+        s.run += 1
+        return bool(_is_too_long(s))
+    # A run that is a fault says little about what is usual. But if it counted for nothing, a sensor
+    # with coarse steps that started while a target passed would be stuck at rest.
+    if s.run:
+        s.repeats += 1.0 if _is_too_long(s) else float(s.run)
+        s.run = 0
+    s.changes += 1.0
+    if s.repeats + s.changes > MEMORY:
+        s.repeats, s.changes = 0.5 * s.repeats, 0.5 * s.changes
+    return False
+
+
+@njit(cache=True)
+def _is_off(s: Record, threshold: float, stamp: int, steps: FloatArray) -> bool:
+    """Whether `steps` (3,) [T] from the reading before are steeper than any target makes them."""
+    # A comparison with NaN is false: a missing axis is no spike.
+    is_high = False
+    for a in range(3):
+        is_high |= steps[a] > threshold * s.noise_std[a]
+    if not is_high:
+        return False
+    passed = FASTEST * (stamp - s.before_ns) * 1e-9
+    steeper = max(STEEPER, STEEPEST * passed**3)
+    for a in range(3):
+        if not steps[a] > threshold * s.noise_std[a]:
+            continue
+        # A sensor with coarse steps may not have changed at all recently.
+        largest, is_known = s.noise_std[a], False
+        for k in range(RECENT):
+            if not np.isnan(s.steps[k, a]):
+                largest, is_known = max(largest, s.steps[k, a]), True
+        if is_known and steps[a] > steeper * largest:
+            return True
+    return False
+
+
+@njit(cache=True)
+def _hold(s: Record, stamp: int, field: FloatArray, steps: FloatArray, own: int,
+          covariance: FloatArray) -> None:
+    """Append a reading to those that are held."""
+    k = s.n_held
+    s.held_ns[k], s.held_own[k] = stamp, own
+    for a in range(3):
+        s.held_field[k, a], s.held_steps[k, a] = field[a], steps[a]
+        if own:
+            for b in range(3):
+                s.held_covariance[k, a, b] = covariance[a, b]
+    s.n_held += 1
+
+
+@njit(cache=True)
+def _pass(s: Record, stamp: int, field: FloatArray, steps: FloatArray, has_steps: bool) -> None:
+    """Note a reading that passes; the next one is compared with it."""
+    place = s.n_steps % RECENT
+    for a in range(3):
+        s.before[a] = field[a]
+        if has_steps:
+            s.steps[place, a] = steps[a]
+    s.before_ns = stamp
+    s.n_steps += has_steps
+
+
+@njit(cache=True)
+def _is_back(s: Record, steps: FloatArray) -> bool:
+    """Whether the field is again where it was before the held readings."""
+    # The axis in which they are highest decides.
+    axis, highest = 0, -1.0
+    for a in range(3):
+        largest = 0.0
+        for k in range(s.n_held):
+            if s.held_steps[k, a] > largest:
+                largest = s.held_steps[k, a]
+        if largest > highest:
+            axis, highest = a, largest
+    return bool(steps[axis] <= BACK * highest)
+
+
+@njit(cache=True)
+def screen_spike(s: Record, threshold: float, stamp: int, field: FloatArray, own: int,
+                 covariance: FloatArray, steps: FloatArray) -> int:
+    """Decide on a reading and on those that are held before it.
+
+    A reading is held where it differs from the one before by more than `threshold` noise
+    deviations and by `STEEPER` times more than readings did recently: a vehicle approaches
+    smoothly. Where readings are so rare that a target may pass between them, only a steeper
+    difference is suspect.
+
+    Parameters
+    ----------
+    s : SENSOR
+        Changed. Without a noise (not `is_ready`) nothing is held.
+    threshold : float
+        In noise deviations.
+    stamp : int, ns
+    field : (3,) array, T
+    own, covariance
+        Stored with a held reading: whether it has its own covariance (3, 3), T^2.
+    steps : (3,) array, T
+        Scratch memory.
+
+    Returns
+    -------
+    int
+        PASSES, HELD, SPIKE (the `n_held` readings are a spike: reject them and call again) or
+        RELEASED (`n_released` readings pass, this one is the last).
+    """
+    if s.before_ns == NEVER or not s.is_ready:
+        if s.n_held:
+            _hold(s, stamp, field, steps, own, covariance)
+            s.n_released = s.n_held
+        _pass(s, stamp, field, steps, False)
+        return RELEASED if s.n_held else PASSES
+    for a in range(3):
+        steps[a] = abs(field[a] - s.before[a])
+    if s.n_held:
+        if _is_back(s, steps):
+            return SPIKE
+        _hold(s, stamp, field, steps, own, covariance)
+        if s.n_held <= MOST_HELD:
+            return HELD
+        # A step: the differences before it say nothing of what is usual now.
+        s.n_steps, s.n_released = 0, s.n_held
+        _pass(s, stamp, field, steps, False)
+        return RELEASED
+    if s.n_steps >= RECENT and _is_off(s, threshold, stamp, steps):
+        _hold(s, stamp, field, steps, own, covariance)
+        return HELD
+    _pass(s, stamp, field, steps, True)
+    return PASSES
+
+
+def clear_spikes(sensor: Record) -> None:
+    """Forget the readings before, and those that are held."""
+    sensor['before_ns'], sensor['n_steps'] = NEVER, 0
+    sensor['n_held'] = sensor['n_released'] = 0
+
+
+@njit(boolean(SENSORS, int64, float64[::1]), cache=True)
+def find_repetition(sensors: StructArray, j: int, field: FloatArray) -> bool:
+    """`is_stuck` of sensor `j` of (n,) SENSOR, callable from Python."""
+    return bool(is_stuck(sensors[j], field))
+
+
+@njit(int64(SENSORS, int64, float64, int64, float64[::1]), cache=True)
+def find_spike(sensors: StructArray, j: int, threshold: float, stamp: int,
+               field: FloatArray) -> int:
+    """`screen_spike` of a reading without its own covariance, callable from Python."""
+    return int(screen_spike(sensors[j], threshold, stamp, field, 0, np.empty((3, 3)),
+                            np.empty(3)))

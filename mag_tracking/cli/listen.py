@@ -12,15 +12,17 @@ from typing import TypeAlias
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.drivers.configuration import read_drivers
 from mag_tracking.drivers.driver import IGNORED, Driver, serve
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.network.file import read_network
-from mag_tracking.records import AccelerationSample, MagSample, Readings
+from mag_tracking.records import AccelerationSample, Readings
 
-Sample: TypeAlias = MagSample | AccelerationSample
+Sample: TypeAlias = tuple[int, FloatArray | None]
+"""Timestamp [ns] and field (3,) [T], or None for an acceleration."""
 
 _LISTEN = '''
 Opens the devices of a drivers file and prints what they say, once a second:
@@ -63,9 +65,11 @@ class _Ear:
 
     def _take(self, readings: Readings, accelerations: Iterable[AccelerationSample]) -> None:
         """Keep what was said."""
-        samples: list[Sample] = [*readings.samples(), *accelerations]
-        for sample in samples:
-            self._heard[sample.sensor].append(sample)
+        for name, stamp, field in zip(readings.sensor_names(), readings.stamp_ns.tolist(),
+                                      readings.field, strict=True):
+            self._heard[name].append((stamp, field))
+        for a in accelerations:
+            self._heard[a.sensor].append((a.stamp_ns, None))
 
     def stop(self) -> None:
         """Close the device."""
@@ -85,14 +89,14 @@ class _Ear:
                 out.append(f'  {sensor:12s} nothing')
                 continue
             self.silent.discard(sensor)
-            behind_ms = (time.time_ns() - max(s.stamp_ns for s in samples)) / 1e6
+            behind_ms = (time.time_ns() - max(stamp for stamp, _ in samples)) / 1e6
             out.append(f'  {sensor:12s} {_said(samples, elapsed_s)}  latest {behind_ms:.0f} ms ago')
         return out
 
 
 def _said(samples: Sequence[Sample], elapsed_s: float) -> str:
     """What the samples of one sensor say, in a line."""
-    fields = np.array([s.field for s in samples if isinstance(s, MagSample)])
+    fields = np.array([field for _, field in samples if field is not None])
     if not len(fields):
         return f'{len(samples) / elapsed_s:7.1f} Hz of accelerations'
     there = ~np.isnan(fields)

@@ -38,7 +38,7 @@ MOST_SOURCES = 4096
 _AXES = struct.Struct('3d')
 Heard: TypeAlias = tuple[Readings, Sequence[AccelerationSample]]
 """What has come."""
-NOTHING: Heard = Readings.of([]), ()
+NOTHING: Heard = Readings.joined([]), ()
 """That has come."""
 STEP_NS = 10_000_000
 """[ns] The clock of this machine was set when it differs by more from one moment to the next."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference import update_kernels
 from mag_tracking.records import plain
 
@@ -48,6 +48,23 @@ def smallest_pivots(y: FloatArray, C: FloatArray) -> FloatArray:
     out = np.empty(len(y))
     update_kernels.smallest_pivots(y, C, out)
     return out
+
+
+def are_covariances(y: FloatArray, C: FloatArray) -> BoolArray:
+    """Whether covariances are finite, symmetric and positive definite, over the axes present.
+
+    The arrays are as for `whitened_energy`. Returns (n,).
+    """
+    y, C = _checked(y, C)
+    there = ~np.isnan(y)
+    finite = np.isfinite(C)
+    read = there[:, :, None] & there[:, None, :]
+    known = np.where(read & finite, C, 0.0)
+    largest = np.abs(known).max(axis=(1, 2), initial=0.0)
+    asymmetry = np.abs(known - np.swapaxes(known, 1, 2)).max(axis=(1, 2), initial=0.0)
+    valid: BoolArray = (finite | ~read).all(axis=(1, 2)) & (asymmetry <= 1e-6 * largest) \
+        & (smallest_pivots(y, C) > LEAST_PIVOT)
+    return valid
 
 
 def _checked(y: FloatArray, C: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,6 @@ from mag_tracking.messages.shapes import FieldReadings, Imu, MagneticField, Mess
 from mag_tracking.records import (
     AccelerationSample,
     Detection,
-    MagSample,
     Readings,
     SmoothedPose,
     Track,
@@ -33,16 +32,29 @@ def stamp_dict(ns: int) -> MessageDict:
     return {'sec': ns // 1_000_000_000, 'nanosec': ns % 1_000_000_000}
 
 
-def sample_of(message: MagneticField, sensor: str) -> MagSample:
-    """`MagSample` of a message-shaped sensor_msgs/MagneticField of `sensor`.
+def reading_of(message: MagneticField, sensor: str) -> Readings:
+    """`Readings` of a message-shaped sensor_msgs/MagneticField of `sensor`: a batch of one.
 
     A covariance that is all zero, or begins with -1, is unknown.
     """
     f = message.magnetic_field
-    C = np.array(message.magnetic_field_covariance, dtype=float)
-    unknown = C[0] == -1.0 or not C.any()
-    return MagSample(stamp_ns(message.header.stamp), sensor, np.array([f.x, f.y, f.z]),
-                     None if unknown else C.reshape(3, 3))
+    C = np.array(message.magnetic_field_covariance, dtype=float).reshape(1, 3, 3)
+    return Readings((sensor,), np.zeros(1, dtype=np.int64),
+                    np.array([stamp_ns(message.header.stamp)], dtype=np.int64),
+                    np.array([[f.x, f.y, f.z]]), _covariances(C))
+
+
+def _covariances(C: FloatArray) -> FloatArray | None:
+    """(n, 3, 3) covariances of `Readings` from those of messages; None: all are unknown.
+
+    NaN says "unknown" in `Readings` only. In a message it is a fault, and becomes a zero that the
+    calibration rejects.
+    """
+    known = (C[:, 0, 0] != -1.0) & C.any(axis=(1, 2))
+    if not known.any():
+        return None
+    C = np.where(np.isnan(C).all(axis=(1, 2), keepdims=True), 0.0, C)
+    return np.where(known[:, None, None], C, np.nan)
 
 
 def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
@@ -74,11 +86,20 @@ def header_dict(ns: int, frame: str) -> MessageDict:
     return {'stamp': stamp_dict(ns), 'frame_id': frame}
 
 
-def sample_dict(sample: MagSample, frame: str) -> MessageDict:
-    """sensor_msgs/MagneticField of a `MagSample`; `frame` is the sensor's."""
-    C = np.zeros(9) if sample.covariance is None else sample.covariance.ravel()
-    return {'header': header_dict(sample.stamp_ns, frame), 'magnetic_field': xyz(sample.field),
-            'magnetic_field_covariance': C.tolist()}
+def magnetic_field_dicts(readings: Readings, frame: str = '') -> list[tuple[str, MessageDict]]:
+    """[(sensor, sensor_msgs/MagneticField)] of `Readings`, in `frame`, or the sensor's name.
+
+    An unknown covariance is all zero.
+    """
+    C: FloatArray = np.zeros((len(readings), 9))
+    if readings.covariance is not None:
+        C = readings.covariance.reshape(-1, 9).copy()
+        C[np.all(np.isnan(C), axis=1)] = 0.0
+    return [(name, {'header': header_dict(stamp, frame or name), 'magnetic_field': xyz(field),
+                    'magnetic_field_covariance': covariance})
+            for name, stamp, field, covariance in zip(
+                readings.sensor_names(), readings.stamp_ns.tolist(), readings.field, C.tolist(),
+                strict=True)]
 
 
 def readings_dict(readings: Readings) -> MessageDict:
@@ -115,15 +136,8 @@ def readings_of(message: FieldReadings) -> Readings:
         raise RecordingError(f'readings of {stamps.min()} to {stamps.max()} ns')
     C: FloatArray | None = None
     if len(message.covariance):
-        C = np.array(message.covariance, dtype=float).reshape(n, 3, 3)
-        known = (C[:, 0, 0] != -1.0) & C.any(axis=(1, 2))
-        C = np.where(known[:, None, None], C, np.nan) if known.any() else None
+        C = _covariances(np.array(message.covariance, dtype=float).reshape(n, 3, 3))
     return Readings(names, sensor, stamps, np.array(message.field, dtype=float).reshape(n, 3), C)
-
-
-def samples_of(message: FieldReadings) -> list[MagSample]:
-    """[`MagSample`] of a message-shaped FieldReadings; raises RecordingError where it is none."""
-    return readings_of(message).samples()
 
 
 def acceleration_dict(sample: AccelerationSample, frame: str) -> MessageDict:

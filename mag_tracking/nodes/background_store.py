@@ -50,7 +50,7 @@ class BackgroundStore:
     def update(self, network: SensorNetwork, j: int) -> None:
         """Take the present background of sensor `j`, if it is known."""
         name = network.names[j]
-        kept = None if self._path is None else self._stage.kept(name)
+        kept = None if self._path is None else self._stage.stored(name)
         if kept is None:
             self._texts.pop(name, None)
         else:

@@ -19,9 +19,9 @@ from sensor_msgs.msg import Imu, MagneticField
 from mag_tracking.errors import NetworkError
 from mag_tracking.messages.schema import (
     acceleration_of,
+    magnetic_field_dicts,
+    reading_of,
     readings_dict,
-    sample_dict,
-    sample_of,
 )
 from mag_tracking.messages.types import CALIBRATED_READINGS, RAW_READINGS
 from mag_tracking.nodes import stage_node
@@ -119,11 +119,11 @@ class CalibrationNode(StageNode):
 
     def _take(self, sensor: str, message: MagneticField) -> None:
         """One raw reading."""
-        raw = sample_of(message, sensor)
-        for sample in self._stage.feed(raw):
-            self._publishers_by_sensor[sensor].publish(
-                to_message(MagneticField, sample_dict(sample, message.header.frame_id)))
-        self._unseen.append((Readings.of([raw]), self.now_ns))
+        raw = reading_of(message, sensor)
+        for calibrated in self._stage.feed(raw):
+            for _, content in magnetic_field_dicts(calibrated, message.header.frame_id):
+                self._publishers_by_sensor[sensor].publish(to_message(MagneticField, content))
+        self._unseen.append((raw, self.now_ns))
         self._do_deferred_work()
 
     def _take_many(self, message: FieldReadings) -> None:
@@ -131,8 +131,7 @@ class CalibrationNode(StageNode):
         raw = self.readings_of(message, self._stage)
         if raw is None:
             return
-        calibrated = self._stage.feed_many(raw)
-        if len(calibrated):
+        for calibrated in self._stage.feed(raw):
             self._readings.publish(to_message(FieldReadings, readings_dict(calibrated)))
         self._unseen.append((raw, self.now_ns))
         self._deferred.request()

@@ -14,7 +14,7 @@ from mag_tracking_msgs.msg import FieldReadings, NetworkFrame
 from sensor_msgs.msg import MagneticField
 
 from mag_tracking.messages.frame import frame_dict
-from mag_tracking.messages.schema import detection_dict, sample_of
+from mag_tracking.messages.schema import detection_dict, reading_of
 from mag_tracking.messages.types import CALIBRATED_READINGS
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
@@ -52,13 +52,13 @@ class DetectionNode(StageNode):
 
     def _take(self, sensor: str, message: MagneticField) -> None:
         """One calibrated reading."""
-        self._publish(self._align.feed(sample_of(message, sensor)))
+        self._publish(self._align.feed(reading_of(message, sensor)))
 
     def _take_many(self, message: FieldReadings) -> None:
         """Calibrated readings of many sensors."""
         readings = self.readings_of(message, self._align)
         if readings is not None:
-            self._publish(self._align.feed_many(readings))
+            self._publish(self._align.feed(readings))
 
     def _publish(self, frames: list[FieldFrame]) -> None:
         """Frames that are complete, and what is detected in them."""

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable
 from functools import partial
 
+import numpy as np
 import rclpy
 from mag_tracking_msgs.msg import FieldReadings
 from rclpy.node import Node
@@ -12,7 +13,7 @@ from sensor_msgs.msg import MagneticField
 
 from mag_tracking.apps.doctor import Doctor
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.schema import sample_of, samples_of
+from mag_tracking.messages.schema import reading_of, readings_of
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.network import SensorNetwork
 from mag_tracking.nodes.middleware import begin
@@ -35,19 +36,19 @@ class DoctorNode(Node):
 
     def _take(self, sensor: str, message: MagneticField) -> None:
         """One reading."""
-        self.doctor.feed(sample_of(message, sensor), time.time_ns())
+        self.doctor.feed(reading_of(message, sensor), time.time_ns())
 
     def _take_many(self, message: FieldReadings) -> None:
         """Readings of many sensors; of those in the network."""
         try:
-            samples = samples_of(message)
+            readings = readings_of(message)
         except RecordingError as error:
             self._bad[str(error)] += 1
             return
-        for sample in samples:
-            if sample.sensor in self.doctor.network.names:
-                self._in_batches.add(sample.sensor)
-                self.doctor.feed(sample, time.time_ns())
+        known = [name in self.doctor.network.names for name in readings.names]
+        readings = readings.part(np.array(known, dtype=bool)[readings.sensor])
+        self._in_batches.update(readings.sensor_names())
+        self.doctor.feed(readings, time.time_ns())
 
     def findings(self) -> list[Finding]:
         """What only the graph tells: list of `Finding`."""

@@ -23,7 +23,7 @@ from sensor_msgs.msg import Imu, MagneticField
 from mag_tracking.drivers.configuration import read_drivers
 from mag_tracking.drivers.driver import IGNORED, Driver, serve
 from mag_tracking.errors import MagTrackingError, SettingsError
-from mag_tracking.messages.schema import acceleration_dict, readings_dict, sample_dict
+from mag_tracking.messages.schema import acceleration_dict, magnetic_field_dicts, readings_dict
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
@@ -126,9 +126,8 @@ class DriverNode(LifecycleNode):
     def _publish(self, readings: Readings, accelerations: list[AccelerationSample]) -> None:
         """Each reading on its sensor's topic, or with `batches` together."""
         if self._readings is None:
-            for sample in readings.samples():
-                self._publishers_by_sensor[sample.sensor][0].publish(
-                    to_message(MagneticField, sample_dict(sample, sample.sensor)))
+            for sensor, content in magnetic_field_dicts(readings):
+                self._publishers_by_sensor[sensor][0].publish(to_message(MagneticField, content))
         elif len(readings):
             self._readings.publish(to_message(FieldReadings, readings_dict(readings)))
         for acceleration in accelerations:

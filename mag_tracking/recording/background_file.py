@@ -15,7 +15,7 @@ import numpy as np
 
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.stages.calibrate.restoration import Kept
+from mag_tracking.stages.calibrate.restoration import StoredBackground
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 
 VERSION = 1
@@ -37,11 +37,11 @@ def _made_of(network: SensorNetwork, j: int, settings: CalibrateSettings) -> lis
         + [settings.decimate_to_hz]
 
 
-def background_text(kept: Kept, network: SensorNetwork, j: int,
+def background_text(stored: StoredBackground, network: SensorNetwork, j: int,
                     settings: CalibrateSettings) -> str:
-    """JSON of the `Kept` background of sensor `j`; `settings` are `CalibrateSettings`."""
-    return json.dumps({'stamp_ns': kept.stamp_ns, 'background': kept.background.tolist(),
-                       'covariance': kept.covariance.tolist(),
+    """JSON of the background of sensor `j`; `settings` are `CalibrateSettings`."""
+    return json.dumps({'stamp_ns': stored.stamp_ns, 'background': stored.background.tolist(),
+                       'covariance': stored.covariance.tolist(),
                        'made_of': _made_of(network, j, settings)})
 
 
@@ -62,12 +62,13 @@ def write_backgrounds(path: str | PathLike[str], texts: Mapping[str, str]) -> No
 
 
 def read_backgrounds(path: str | PathLike[str], network: SensorNetwork,
-                     settings: CalibrateSettings) -> tuple[dict[str, Kept], dict[str, str]]:
+                     settings: CalibrateSettings
+                     ) -> tuple[dict[str, StoredBackground], dict[str, str]]:
     """What was kept of the sensors of `network`, as far as it rests on the same.
 
     Returns
     -------
-    kept : {sensor: `Kept`}
+    stored : {sensor: `StoredBackground`}
         {} where there is no file.
     refused : {sensor: why}
         Of what cannot be used.
@@ -83,21 +84,21 @@ def read_backgrounds(path: str | PathLike[str], network: SensorNetwork,
     entries = content.get('sensors') if isinstance(content, dict) else None
     if not isinstance(entries, dict) or content.get('version') != VERSION:
         raise RecordingError(f'{path}: not what calibration_node keeps, version {VERSION}')
-    kept: dict[str, Kept] = {}
+    stored: dict[str, StoredBackground] = {}
     refused: dict[str, str] = {}
     for j, name in enumerate(network.names):
         try:
             if name in entries and entries[name]['made_of'] != _made_of(network, j, settings):
                 refused[name] = 'it is of another network file or of other settings'
             elif name in entries:
-                kept[name] = _kept(entries[name])
+                stored[name] = _stored(entries[name])
         except (KeyError, TypeError, ValueError) as error:
             refused[name] = f'{type(error).__name__}: {error}'
-    return kept, refused
+    return stored, refused
 
 
-def _kept(entry: Any) -> Kept:
-    """`Kept` of an entry; raises ValueError where its numbers are none."""
+def _stored(entry: Any) -> StoredBackground:
+    """`StoredBackground` of an entry; raises ValueError where its numbers are none."""
     background = np.array(entry['background'], dtype=float)
     covariance = np.array(entry['covariance'], dtype=float)
     if background.shape != (3,) or covariance.shape != (3, 3) or np.isinf(background).any() \
@@ -107,4 +108,4 @@ def _kept(entry: Any) -> Kept:
     C = covariance[np.ix_(there, there)]
     if not there.any() or not np.isfinite(C).all() or np.linalg.eigvalsh(C)[0] <= 0.0:
         raise ValueError('a covariance that is not positive definite')
-    return Kept(entry['stamp_ns'], background, covariance)
+    return StoredBackground(entry['stamp_ns'], background, covariance)

@@ -10,12 +10,12 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.geometry import quaternion_from_rotation_vector, rotation_from_quaternion
-from mag_tracking.messages.schema import pose_dict, sample_dict
+from mag_tracking.messages.schema import magnetic_field_dicts, pose_dict
 from mag_tracking.messages.types import MAGNETIC_FIELD, POSE
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import write_network
 from mag_tracking.recording.writer import RecordingWriter
-from mag_tracking.records import MagSample
+from mag_tracking.records import Readings
 
 _Path: TypeAlias = str | PathLike[str]
 _COLUMNS = ('id', 'timestamp', 'Bx', 'By', 'Bz', 'sensor_x', 'sensor_y', 'sensor_z',
@@ -69,8 +69,9 @@ def import_pose_table(table: _Path, background: _Path, out: _Path,
         for k in order:
             stamp = int(round(rows['timestamp'][k] * 1e9))
             name = f'mag_{int(rows["id"][k])}'
-            sample = MagSample(stamp, name, rows['field'][k] * 1e-6)
-            writer.write(f'/{name}/imu/mag', MAGNETIC_FIELD, sample_dict(sample, name), stamp)
+            for _, content in magnetic_field_dicts(
+                    Readings.single(name, stamp, rows['field'][k] * 1e-6)):
+                writer.write(f'/{name}/imu/mag', MAGNETIC_FIELD, content, stamp)
             if rows['id'][k] == ids[0]:
                 q = quaternion_from_rotation_vector(rows['magnet_rotation'][k])
                 writer.write('/ground_truth/magnet/pose', POSE,

@@ -1,14 +1,14 @@
-"""From a recording to samples and truth."""
+"""From a recording to readings and truth."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TypeAlias, cast
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.schema import acceleration_of, sample_of, samples_of, stamp_ns
+from mag_tracking.messages.schema import acceleration_of, reading_of, readings_of, stamp_ns
 from mag_tracking.messages.shapes import PoseStamped
 from mag_tracking.messages.types import (
     FIELD_READINGS,
@@ -21,23 +21,23 @@ from mag_tracking.messages.types import (
 from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.reader import Recording
-from mag_tracking.records import AccelerationSample, MagSample
+from mag_tracking.records import AccelerationSample, Readings
 
 TRUTH_PREFIX = '/ground_truth/'
 """Poses on topics below this are truth: for reports, never for tracking."""
-
+GATHERED = 256
+"""Messages whose readings are gathered in one batch: each batch costs as much as a few readings."""
 
 _Pose: TypeAlias = tuple[int, float, float, float, float, float, float, float]
-_Sample: TypeAlias = MagSample | AccelerationSample
 
 
 class SampleReader:
-    """Iterates over the samples of a network in a recording; collects the truth beside them.
+    """Iterates over the readings of a network in a recording; collects the truth beside them.
 
     Attributes
     ----------
     rejected : Counter
-        {cause: number} of messages that are no samples.
+        {cause: number} of messages and readings that cannot be used.
     truth : {topic: list of (stamp_ns, x, y, z, qx, qy, qz, qw)}
     """
 
@@ -70,23 +70,32 @@ class SampleReader:
             return []
         return [t for t in self._sensors if t not in self._recording.types]
 
-    def samples(self, progress: Progress | None = None) -> Iterator[MagSample]:
-        """Iterate over `MagSample`s in order of log time; see `Recording.messages`."""
-        return (sample for sample, _ in self.samples_as_received(progress))
+    def readings(self, progress: Progress | None = None) -> Iterator[Readings]:
+        """Iterate over batches of `Readings` in order of log time; see `Recording.messages`."""
+        waiting: list[Readings] = []
+        for readings, _ in self.readings_as_received(progress):
+            waiting.append(readings)
+            if len(waiting) == GATHERED:
+                yield Readings.joined(waiting)
+                waiting = []
+        if waiting:
+            yield Readings.joined(waiting)
 
-    def samples_as_received(self, progress: Progress | None = None
-                            ) -> Iterator[tuple[MagSample, int]]:
-        """Iterate over (`MagSample`, log time [ns]) in order of the latter."""
-        # Accelerations come only from the topics that the first argument names.
-        return cast(Iterator[tuple[MagSample, int]], self._records({}, progress))
+    def readings_as_received(self, progress: Progress | None = None
+                             ) -> Iterator[tuple[Readings, int]]:
+        """Iterate over (`Readings` of one message, log time [ns]) in order of the latter."""
+        for record, log_time_ns in self._records({}, progress):
+            if isinstance(record, Readings):
+                yield record, log_time_ns
 
-    def samples_and_accelerations(self, progress: Progress | None = None) -> Iterator[_Sample]:
-        """Iterate over `MagSample`s and `AccelerationSample`s in order of log time."""
-        return (sample for sample, _ in self._records(self._imus, progress))
+    def readings_and_accelerations(self, progress: Progress | None = None
+                                   ) -> Iterator[Readings | AccelerationSample]:
+        """Iterate over `Readings` and `AccelerationSample`s, message by message."""
+        return (record for record, _ in self._records(self._imus, progress))
 
     def _records(self, imus: Mapping[str, Sequence[str]], progress: Progress | None
-                 ) -> Iterator[tuple[_Sample, int]]:
-        """(sample, log time) of the sensors, and of the accelerometers {topic: sensors}."""
+                 ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
+        """(record, log time) of the sensors, and of the accelerometers {topic: sensors}."""
         for message in self._recording.messages(progress=progress):
             sensor = self._sensors.get(message.topic)
             truth = message.topic.startswith(TRUTH_PREFIX) and message.type == POSE
@@ -96,28 +105,29 @@ class SampleReader:
                 continue
             try:
                 content = decode(message)
-                readings = samples_of(content) if many else ()
+                readings = readings_of(content) if many else None
             except RecordingError:
                 self.rejected[f'undecodable message on {message.topic}'] += 1
                 continue
             if truth:
                 self._add_truth(message.topic, content)
-            elif many:
-                yield from ((s, message.log_time_ns) for s in self._of_network(readings))
+            elif readings is not None:
+                yield self._of_network(readings), message.log_time_ns
             elif shaken is not None:
                 for name in shaken:
                     yield acceleration_of(content, name), message.log_time_ns
             elif sensor is not None:
-                yield sample_of(content, sensor), message.log_time_ns
+                yield reading_of(content, sensor), message.log_time_ns
 
-    def _of_network(self, samples: Iterable[MagSample]) -> Iterator[MagSample]:
+    def _of_network(self, readings: Readings) -> Readings:
         """Those of the network's sensors; the others are counted."""
         known = set(self._sensors.values())
-        for sample in samples:
-            if sample.sensor in known:
-                yield sample
-            else:
-                self.rejected[f'reading of {sample.sensor}, which is not in the network'] += 1
+        is_known = np.array([name in known for name in readings.names], dtype=bool)[readings.sensor]
+        if is_known.all():
+            return readings
+        self.rejected.update(f'reading of {name}, which is not in the network'
+                             for name in readings.part(~is_known).sensor_names())
+        return readings.part(is_known)
 
     def _add_truth(self, topic: str, content: PoseStamped) -> None:
         """Keep a pose for the report."""

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from mag_tracking.arrays import FloatArray
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import MU0, dipole_field
-from mag_tracking.records import MagSample
+from mag_tracking.records import Readings
 
 
 @dataclass(frozen=True)
@@ -140,8 +140,8 @@ class Imperfections:
 
 def simulate(network: SensorNetwork, body: MagneticBody, path: Path, rate: float, duration: float,
              rng: np.random.Generator, imperfections: Imperfections | None = None,
-             start_s: float = 0.0) -> tuple[list[MagSample], FloatArray, FloatArray, FloatArray]:
-    """Raw samples of every sensor and the truth, for one vehicle.
+             start_s: float = 0.0) -> tuple[Readings, FloatArray, FloatArray, FloatArray]:
+    """Raw readings of every sensor and the truth, for one vehicle.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ def simulate(network: SensorNetwork, body: MagneticBody, path: Path, rate: float
 
     Returns
     -------
-    samples : list of MagSample, in order of their stamps
+    readings : Readings, in order of their timestamps
     t : (n,) [s], position : (n, 2) [m], heading : (n,) [rad]
         The truth.
 
@@ -168,8 +168,8 @@ def simulate(network: SensorNetwork, body: MagneticBody, path: Path, rate: float
     if earth_field is None:
         raise ValueError('the network has no earth field to simulate in')
     t = np.arange(0.0, duration, 1.0 / rate, dtype=float)
-    samples = []
-    for j, name in enumerate(network.names):
+    fields = []
+    for j in range(len(network)):
         offset = flaws.clock_std * rng.standard_normal() if j else 0.0
         position, heading = path.at(t + offset)
         B = earth_field + body_field(body, earth_field, position, heading,
@@ -180,7 +180,9 @@ def simulate(network: SensorNetwork, body: MagneticBody, path: Path, rate: float
         y += flaws.bias_std * rng.standard_normal(3)
         y += flaws.drift_std * rng.standard_normal(3) * t[:, None]
         y += flaws.noise_std * rng.standard_normal(y.shape)
-        samples += [MagSample(int(round((start_s + s) * 1e9)), name, v)
-                    for s, v in zip(t, y, strict=True)]
-    samples.sort(key=lambda s: s.stamp_ns)
-    return samples, t, *path.at(t)
+        fields.append(y)
+    n = len(network)
+    stamps = np.array([int(round((start_s + s) * 1e9)) for s in t], dtype=np.int64)
+    readings = Readings(network.names, np.tile(np.arange(n), len(t)), np.repeat(stamps, n),
+                        np.stack(fields, axis=1).reshape(-1, 3))
+    return readings, t, *path.at(t)

@@ -9,7 +9,7 @@ Out = TypeVar('Out')
 
 
 class Stage(Protocol[In, Out]):
-    """Pushed one record at a time, it hands back what it has to say.
+    """It is fed one item at a time and returns the records that follow.
 
     It never pulls, never sleeps and never reads a clock: time is what the
     records carry. `counts` tells what was taken, held back and rejected, by
@@ -18,8 +18,11 @@ class Stage(Protocol[In, Out]):
 
     counts: Counter[str]
 
-    def feed(self, item: In) -> list[Out]:
-        """Take one record; return the records that follow from it."""
+    def feed(self, item: In, /) -> list[Out]:
+        """Take one item, a record or a batch of readings; return the records that follow."""
+
+    def idle(self) -> None:
+        """Do work that may wait until the outputs are published; results do not depend on it."""
 
     def flush(self) -> list[Out]:
         """The input has ended: return what was still held back."""

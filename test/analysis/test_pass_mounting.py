@@ -1,6 +1,6 @@
 """What tracks say of the sensors' angles: folded as one estimate of all of them would be."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,9 +12,10 @@ from mag_tracking.analysis.pass_mounting import MountingEvidence, fold_mounting,
 from mag_tracking.geometry import rotation_about_z
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
-from mag_tracking.simulation.scenario import Path, point_body, simulate
+from mag_tracking.simulation.scenario import Path, point_body
 from support.bundled import POINT
 from support.networks import line_network
+from support.samples import one, simulate
 from support.track_runs import drive
 
 NETWORK = line_network(3, tilt=0.6)
@@ -171,12 +172,11 @@ def turned_passes():
             ([-60.0, -1.2], 0.0, [600.0, -300.0, 160.0]),
             ([70.0, 1.2], np.pi, [-300.0, 500.0, -250.0]))):
         samples, *_ = simulate(
-            SimpleNamespace(names=stated.names, positions=stated.positions, R_ws=R_ws,
-                            earth_field=stated.earth_field),
+            replace(stated, R_ws=R_ws),
             point_body(hard, 5.0, 0.5), Path(np.array(start), heading, 10.0), 50.0, 12.0,
             np.random.default_rng(k))
         pipeline = Pipeline(stated, settings_for('vehicle', CHANGES))
-        records = [r for s in samples for r in pipeline.feed(s)]
+        records = [r for s in samples for r in pipeline.feed(one(s))]
         tracks.append([r for r in records if isinstance(r, Track) and not r.ended][-1])
     prior = np.full((4, 3), np.deg2rad(5.0))
     return stated, R_ws, fold_mounting(stated, prior, tracks)

@@ -22,7 +22,8 @@ from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.report.metrics import pass_errors
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
-from mag_tracking.simulation.scenario import Imperfections, Path, random_vehicle, simulate
+from mag_tracking.simulation.scenario import Imperfections, Path, random_vehicle
+from support.samples import one, recorded, simulate
 
 ROOT = FilePath(__file__).resolve().parents[2]
 NETWORK = ROOT / 'config' / 'network.yaml'
@@ -44,7 +45,7 @@ def longest_track(samples, network, changes):
     """(`TrackLog` of the track with most poses, its `SmoothedLog` or None), or None."""
     pipeline = Pipeline(network, settings_for('vehicle', changes))
     logs, smoothed, frame = {}, {}, None
-    for record in [r for s in samples for r in pipeline.feed(s)] + pipeline.flush():
+    for record in [r for s in samples for r in pipeline.feed(one(s))] + pipeline.flush():
         if isinstance(record, FieldFrame):
             frame = record
         elif isinstance(record, Track):
@@ -118,7 +119,7 @@ def grids(n=8, period=0.08):
     print(f'error at the closest point for {n} beginnings of the grid of frames')
     for path in sorted((ROOT / 'test' / 'data' / 'vehicles').glob('*.mcap')):
         reader = SampleReader(Recording(path), network)
-        samples = list(reader.samples())
+        samples = recorded(reader)
         truth = next(iter(reader.truth_arrays().values()))
         begin, closest = samples[0].stamp_ns, []
         for k in tqdm(range(n), desc=path.stem, disable=None, leave=False):

@@ -24,6 +24,7 @@ from mag_tracking.recording.sample_reader import SampleReader
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from support.bundled import NETWORK_FILE, vehicle_path  # noqa: E402  (after the path is set)
+from support.samples import one, recorded
 
 NAME = 'junction_left_turns_to_rear'
 NOISE = 1.2e-8
@@ -77,7 +78,7 @@ def magnetic_centre(network, row):
     """Middle (3,) [m] in the body frame, half length [m], whole moments and normalised cost."""
     reader = SampleReader(Recording(vehicle_path(NAME)), network)
     collector = PassCollector(network, settings_for('vehicle'))
-    passes = [p for s in reader.samples() for p in collector.feed(s)] + collector.flush()
+    passes = [p for s in recorded(reader) for p in collector.feed(one(s))] + collector.flush()
     (data, _), = passes
     place, R = true_motion(data, next(iter(replayed(network, {}).truth.values())))
     y = np.einsum('nij,nj->ni', network.R_ws[data.sensor], data.field).ravel() / NOISE

@@ -5,11 +5,11 @@ import pytest
 from scipy.signal import freqz
 
 from mag_tracking.calibration.decimation import Decimator, lowpass
-from mag_tracking.records import MagSample
 from mag_tracking.settings import replace
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from support.networks import line_network
+from support.samples import MagSample, fed
 
 NS = 10**9
 
@@ -102,9 +102,9 @@ def test_the_stage_thins_and_tells():
     C, out = 1e-16 * np.eye(3), []
     for k in range(2000):
         sample = MagSample(k * 5_000_000, 'mag_1', 1e-5 + 1e-8 * rng.standard_normal(3), C)
-        out += stage.feed(sample)
+        out += fed(stage, sample)
         if k % 3 == 0:
-            out += stage.feed(sample)
+            out += fed(stage, sample)
     assert stage.counts['rejected: duplicate stamp'] == 667
     assert stage.counts_of('mag_1')['accepted'] == 2000
     # Of 200 samples until the background is known none comes out.

@@ -7,8 +7,8 @@ from scipy.stats import chi2
 from mag_tracking.apps.fit import PassCollector
 from mag_tracking.calibration.saturation import MARGIN, cut_off
 from mag_tracking.pipeline import settings_for
-from mag_tracking.records import MagSample
 from support.passes import ROAD, measured, random_path, unknowns_at
+from support.samples import MagSample, one
 
 
 def curve(n=200):
@@ -55,8 +55,8 @@ def test_a_saturated_stretch_is_left_out_of_a_pass_and_named():
     field = np.where((data.sensor == 0)[:, None], np.clip(data.field, -limit, limit), data.field)
     collector, passes = PassCollector(ROAD, settings_for('vehicle')), []
     for k in np.argsort(data.t, kind='stable'):
-        passes += collector.feed(MagSample(int(round(1e9 * (20.0 + data.t[k]))),
-                                           ROAD.names[data.sensor[k]], field[k] + 4e-5))
+        passes += collector.feed(one(MagSample(int(round(1e9 * (20.0 + data.t[k]))),
+                                           ROAD.names[data.sensor[k]], field[k] + 4e-5)))
     passes += collector.flush()
     (cut, notes), = passes
     assert any('mag_1' in n and 'saturated' in n and 'left out' in n for n in notes)

@@ -9,9 +9,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mag_tracking.calibration.screening import MOST_HELD, Repetition, SpikeFilter
-from mag_tracking.simulation.scenario import Path, point_body, random_vehicle, simulate
+from mag_tracking.calibration.screening import (
+    HELD,
+    PASSES,
+    RELEASED,
+    SPIKE,
+    find_repetition,
+    find_spike,
+)
+from mag_tracking.calibration.sensor_state import MOST_HELD, new_sensors
+from mag_tracking.simulation.scenario import Path, point_body, random_vehicle
 from support.networks import line_network
+from support.samples import simulate
 from support.sensor_noise import EARTH, NS, SIGMA, noise
 
 
@@ -20,11 +29,38 @@ def in_steps(fields, step):
     return np.round(fields / (step * SIGMA)) * step * SIGMA if step else fields
 
 
+class SpikeScreen:
+    """Follows which readings `find_spike` holds and releases."""
+
+    def __init__(self, threshold, std=SIGMA):
+        self.sensors, self._threshold, self._held = new_sensors(1), threshold, []
+        self.sensors['is_ready'], self.sensors['noise_std'] = std is not None, std or np.nan
+
+    def feed(self, row, stamp, field):
+        """[(row, whether it is a spike)] of what is known by now."""
+        verdict, out = find_spike(self.sensors, 0, self._threshold, stamp, field), []
+        if verdict == SPIKE:
+            assert self.sensors['n_held'][0] == len(self._held)
+            out, self._held, self.sensors['n_held'] = [(r, True) for r in self._held], [], 0
+            verdict = find_spike(self.sensors, 0, self._threshold, stamp, field)
+        self._held.append(row)
+        if verdict == HELD:
+            return out
+        assert verdict in (PASSES, RELEASED)
+        return out + self.flush()
+
+    def flush(self):
+        """The readings that are held pass."""
+        out, self._held = [(r, False) for r in self._held], []
+        self.sensors['n_held'] = self.sensors['n_released'] = 0
+        return out
+
+
 def screened(fields, rate=100.0, std=SIGMA, threshold=30.0):
     """([row that was taken for a spike], most that waited at once, [rows that were given late])."""
-    spikes, most, late, out, f = [], 0, [], 0, SpikeFilter(threshold)
-    for k, field in enumerate(fields.tolist()):
-        got = f.feed(k, round(k * NS / rate), field, None if std is None else [std] * 3)
+    spikes, most, late, out, f = [], 0, [], 0, SpikeScreen(threshold, std)
+    for k, field in enumerate(fields):
+        got = f.feed(k, round(k * NS / rate), field)
         assert [row for row, _ in got] == list(range(out, out + len(got)))
         out += len(got)
         most = max(most, k + 1 - out)
@@ -38,8 +74,8 @@ def screened(fields, rate=100.0, std=SIGMA, threshold=30.0):
 
 def stuck(fields):
     """[row that was taken for a repetition]."""
-    r = Repetition()
-    return [k for k, field in enumerate(fields.tolist()) if r.is_stuck(field)]
+    sensors = new_sensors(1)
+    return [k for k, field in enumerate(fields) if find_repetition(sensors, 0, field)]
 
 
 # Nothing is found where nothing is.
@@ -143,12 +179,11 @@ def test_rare_readings_need_a_larger_spike(rate, size, found):
 
 
 def test_a_gap_counts_as_rare_readings():
-    f, spikes = SpikeFilter(30.0), []
+    f, spikes = SpikeScreen(30.0), []
     for k in range(40):
         stamp = k * NS // 100 + (NS if k >= 20 else 0)
         field = EARTH + (2e-6 if k == 20 else 0.0)
-        spikes += [row for row, is_spike in f.feed(k, stamp, field.tolist(), [SIGMA] * 3)
-                   if is_spike]
+        spikes += [row for row, is_spike in f.feed(k, stamp, field) if is_spike]
     assert spikes == []
 
 
@@ -218,11 +253,12 @@ def test_without_a_noise_nothing_waits():
     y = noise(60)
     y[30] += 5e-6
     assert screened(y, std=None) == ([], 0, [])
-    f = SpikeFilter(30.0)
+    f = SpikeScreen(30.0)
     for k in range(31):
-        f.feed(k, k * NS // 100, y[k].tolist(), [SIGMA] * 3)
+        f.feed(k, k * NS // 100, y[k])
     # What waited comes before what comes when the noise is not known any more.
-    assert f.feed(31, 31 * NS // 100, y[31].tolist(), None) == [(30, False), (31, False)]
+    f.sensors['is_ready'] = False
+    assert f.feed(31, 31 * NS // 100, y[31]) == [(30, False), (31, False)]
     assert f.flush() == []
 
 

@@ -166,15 +166,15 @@ def test_an_interrupted_replay_keeps_what_is_done(tmp_path):
 
 
 def interrupt_feed(monkeypatch, at):
-    """Let a signal come at one of the pipeline's samples; returns the list of samples fed."""
+    """Let a signal come at one of the pipeline's batches; returns the list of batches fed."""
     from mag_tracking.pipeline import Pipeline
     feed, calls = Pipeline.feed, []
 
-    def interrupted(self, sample):
-        calls.append(sample)
+    def interrupted(self, readings):
+        calls.append(readings)
         if len(calls) == at:
             signal.raise_signal(signal.SIGINT)
-        return feed(self, sample)
+        return feed(self, readings)
 
     monkeypatch.setattr(Pipeline, 'feed', interrupted)
     return calls
@@ -189,26 +189,26 @@ def summary_of(out):
     return json.loads((out / 'summary.json').read_text())
 
 
-def test_an_interruption_ends_the_reading_after_the_sample(tmp_path, monkeypatch):
-    calls = interrupt_feed(monkeypatch, 300)
+def test_an_interruption_ends_the_reading_after_the_batch(tmp_path, monkeypatch):
+    calls = interrupt_feed(monkeypatch, 3)
     before = signal.getsignal(signal.SIGINT)
     assert replay_one(tmp_path, '--no-figures') == 130
     assert signal.getsignal(signal.SIGINT) is before
-    assert len(calls) == 300
+    assert len(calls) == 3
     assert summary_of(tmp_path)['interrupted'] is True
 
 
-def test_an_interruption_need_not_wait_for_the_next_sample(tmp_path, monkeypatch):
+def test_an_interruption_need_not_wait_for_the_next_batch(tmp_path, monkeypatch):
     from mag_tracking.recording.sample_reader import SampleReader
     waited = []
 
-    def no_sample_for_long(self, progress):
+    def no_batch_for_long(self, progress):
         signal.raise_signal(signal.SIGINT)
         progress(1)
         waited.append(True)
         yield from ()
 
-    monkeypatch.setattr(SampleReader, 'samples', no_sample_for_long)
+    monkeypatch.setattr(SampleReader, 'readings', no_batch_for_long)
     assert replay_one(tmp_path, '--no-figures') == 130
     assert not waited and summary_of(tmp_path)['interrupted'] is True
 
@@ -250,7 +250,7 @@ def test_who_insists_is_obeyed(tmp_path, monkeypatch):
 def test_a_background_job_ignores_interruptions_as_it_was_told(tmp_path, monkeypatch):
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        interrupt_feed(monkeypatch, 300)
+        interrupt_feed(monkeypatch, 3)
         assert replay_one(tmp_path, '--no-figures') == 0
     finally:
         signal.signal(signal.SIGINT, before)

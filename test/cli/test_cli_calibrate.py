@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 
 from mag_tracking.cli import main
-from mag_tracking.messages.schema import sample_dict
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.network.file import read_network, write_network
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import RecordingWriter
-from mag_tracking.records import MagSample
 from support.bundled import DATA, NETWORK_FILE, vehicle_path
+from support.samples import MagSample, recorded, sample_dict
 
 ROAD = vehicle_path('straight_car_right')
 
@@ -108,7 +107,7 @@ def test_without_passes_it_says_less(tmp_path, capsys):
 def test_a_flipped_axis_is_named(tmp_path, capsys):
     network = read_network(NETWORK_FILE)
     with RecordingWriter(tmp_path / 'flipped.mcap') as writer:
-        for sample in SampleReader(Recording(ROAD), network).samples():
+        for sample in recorded(SampleReader(Recording(ROAD), network)):
             flipped = [1.0, 1.0, -1.0] if sample.sensor == 'mag_2' else np.ones(3)
             writer.write(f'/{sample.sensor}/imu/mag', MAGNETIC_FIELD, sample_dict(
                 replace(sample, field=sample.field * flipped), sample.sensor), sample.stamp_ns)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from mag_tracking.cli import main
-from mag_tracking.messages.schema import sample_dict
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.network.file import read_network
 from mag_tracking.recording.writer import RecordingWriter
-from mag_tracking.simulation.scenario import Path, point_body, simulate
+from mag_tracking.simulation.scenario import Path, point_body
 from support.bundled import NETWORK_FILE
+from support.samples import sample_dict, simulate
 
 HARD, SOFT = [240.0, -130.0, 90.0], 6.0
 """m0 [A m^2] in the vehicle's frame and D [m^3] of the simulated vehicle."""

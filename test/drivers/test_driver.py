@@ -13,7 +13,8 @@ from mag_tracking.drivers.reading import Arrival, Chunk, Parsed, Reading
 from mag_tracking.drivers.sequence import MEMORY, SequenceCheck
 from mag_tracking.drivers.settings import DriverSettings
 from mag_tracking.errors import DeviceError, SettingsError
-from mag_tracking.records import AccelerationSample, MagSample
+from mag_tracking.records import AccelerationSample
+from support.samples import MagSample, samples_of
 
 DAY_NS = 1_700_000_000_000_000_000
 CLOCK = ClockSettings(tick_s=1e-6, shortest_delay_s=0.0)
@@ -66,7 +67,7 @@ class ScriptedDevice:
 def said(driver, timeout_s):
     """What `driver` has, as samples."""
     readings, accelerations = driver.poll(timeout_s)
-    return [*readings.samples(), *accelerations]
+    return [*samples_of(readings), *accelerations]
 
 
 def driver_of(script, settings=None, sensors=None, clock=CLOCK):

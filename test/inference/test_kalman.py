@@ -9,10 +9,11 @@ from mag_tracking.inference import kalman
 from mag_tracking.inference.time_update import predict
 from mag_tracking.physics.dipole import sensor_fields
 from mag_tracking.pipeline import Pipeline, settings_for
-from mag_tracking.simulation.scenario import Path, point_body, simulate
+from mag_tracking.simulation.scenario import Path, point_body
 from mag_tracking.stages.track.target import target_of
 from support.bundled import POINT
 from support.networks import line_network
+from support.samples import one, simulate
 
 
 def dense_update(x, P, y, h, H, C, inflation, x_lin, n_own=0):
@@ -57,7 +58,7 @@ def tracked(n_sensors, missing=False):
         'track.vehicle.arrival_headings_deg': [0.0]}))
     frame = None
     for sample in samples:
-        for record in pipeline.feed(sample):
+        for record in pipeline.feed(one(sample)):
             if hasattr(record, 'target_present') and record.target_present:
                 frame = record
         if pipeline.track.counts['poses'] >= 25:

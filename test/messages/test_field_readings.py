@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.schema import readings_dict, sample_dict, samples_of
+from mag_tracking.messages.schema import readings_dict, readings_of
 from mag_tracking.messages.types import FIELD_READINGS, MAGNETIC_FIELD, RAW_READINGS
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import RecordingWriter
-from mag_tracking.records import MagSample, Readings
 from support.networks import line_network
+from support.samples import MagSample, batch, recorded, sample_dict, samples_of
 
 START = 1_700_000_000_123_456_789
 
@@ -51,8 +51,8 @@ def same(a, b):
 @given(st.integers(1, 40), st.booleans(), st.integers(0, 1000))
 def test_there_and_back_in_the_order_in_which_they_came(n, known, seed):
     samples = some(n, known, np.random.default_rng(seed))
-    content = readings_dict(Readings.of(samples))
-    back = samples_of(message(content))
+    content = readings_dict(batch(samples))
+    back = samples_of(readings_of(message(content)))
     assert same(back, samples)
     assert all(isinstance(s.stamp_ns, int) for s in back)
     assert sorted(content['sensors']) == sorted({s.sensor for s in samples})
@@ -67,16 +67,16 @@ def test_the_arrays_are_those_of_the_definition():
                MagSample(5, 'a', np.array([0.5, 1.5, 2.5], dtype=np.float32),
                          np.arange(9, dtype=np.float32).reshape(3, 3)),
                MagSample(6, 'b', np.array([4.0, 5.0, 6.0]), np.eye(3))]
-    content = readings_dict(Readings.of(samples))
+    content = readings_dict(batch(samples))
     assert (content['sensors'], content['sensor']) == (['b', 'a'], array('H', [0, 1, 0]))
     assert content['stamp'] == array('q', [7, 5, 6])
     assert content['field'] == array('d', [1, 2, 3, 0.5, 1.5, 2.5, 4, 5, 6])
     assert content['covariance'].tolist() == [
         1, 0, 0, 0, 2, 0, 0, 0, 3, *range(9), 1, 0, 0, 0, 1, 0, 0, 0, 1]
     whole = [MagSample(7, 'b', np.ones(3), np.eye(3, dtype=int))]
-    assert readings_dict(Readings.of(whole))['covariance'].tolist() == np.eye(3).ravel().tolist()
+    assert readings_dict(batch(whole))['covariance'].tolist() == np.eye(3).ravel().tolist()
     single = [MagSample(7, 'b', np.ones(3, dtype=np.float32), np.eye(3, dtype=np.float32))]
-    assert same(samples_of(message(readings_dict(Readings.of(single)))),
+    assert same(samples_of(readings_of(message(readings_dict(batch(single))))),
                 [MagSample(7, 'b', np.ones(3), np.eye(3))])
 
 
@@ -85,7 +85,7 @@ def test_some_covariances_known_or_no_sample_is_no_message():
     for samples in ([], some(2, True, rng) + some(1, False, rng),
                     some(1, False, rng) + some(2, True, rng)):
         with pytest.raises(RecordingError, match='covariance of all or of none'):
-            readings_dict(Readings.of(samples))
+            readings_dict(batch(samples))
 
 
 @pytest.mark.parametrize('changes, said', [
@@ -98,16 +98,16 @@ def test_some_covariances_known_or_no_sample_is_no_message():
     ({'stamp': array('q', [0, 2**63 - 1])}, 'readings of 0 to 9223372036854775807 ns'),
     ({'stamp': array('q', [-2**63, 0])}, 'readings of -9223372036854775808')])
 def test_what_does_not_fit_is_told(changes, said):
-    content = readings_dict(Readings.of(
+    content = readings_dict(batch(
         [MagSample(k, 'a', np.ones(3), np.eye(3)) for k in range(2)]))
-    assert len(samples_of(message(content))) == 2
+    assert len(readings_of(message(content))) == 2
     with pytest.raises(RecordingError, match=said):
-        samples_of(message(content | changes))
+        readings_of(message(content | changes))
 
 
 def test_a_message_of_nothing_is_no_reading():
     empty = {'sensors': [], 'sensor': [], 'stamp': [], 'field': [], 'covariance': []}
-    assert samples_of(message(empty)) == []
+    assert len(readings_of(message(empty))) == 0
 
 
 def recording(path, messages):
@@ -124,25 +124,25 @@ def test_a_recording_gives_the_same_samples(tmp_path, known):
     rng = np.random.default_rng(1)
     groups = [some(n, known, rng, ('mag_1', 'mag_2')) for n in (5, 1, 100)]
     reader = SampleReader(recording(tmp_path / 'a.mcap', [
-        (RAW_READINGS, FIELD_READINGS, readings_dict(Readings.of(g))) for g in groups]),
+        (RAW_READINGS, FIELD_READINGS, readings_dict(batch(g))) for g in groups]),
                           line_network(2))
     assert reader.missing_topics() == []
-    got = list(reader.samples_as_received())
-    assert same([s for s, _ in got], [s for g in groups for s in g])
-    assert [t for _, t in got] == [START + k * 10**9 for k, g in enumerate(groups) for _ in g]
-    assert same(list(reader.samples_and_accelerations()), list(reader.samples()))
+    got = list(reader.readings_as_received())
+    assert same(samples_of(*(r for r, _ in got)), [s for g in groups for s in g])
+    assert [t for _, t in got] == [START + k * 10**9 for k, g in enumerate(groups)]
+    assert same(samples_of(*reader.readings_and_accelerations()), recorded(reader))
     assert reader.rejected == Counter()
 
 
 def test_readings_of_others_and_messages_that_are_none_are_counted(tmp_path):
     rng = np.random.default_rng(2)
     mine, other = some(3, False, rng, ('mag_1',)), some(4, False, rng, ('elsewhere',))
-    broken = readings_dict(Readings.of(mine))
+    broken = readings_dict(batch(mine))
     broken['stamp'] = broken['stamp'][:2]
     reader = SampleReader(recording(tmp_path / 'a.mcap', [
-        (RAW_READINGS, FIELD_READINGS, readings_dict(Readings.of(other + mine))),
+        (RAW_READINGS, FIELD_READINGS, readings_dict(batch(other + mine))),
         (RAW_READINGS, FIELD_READINGS, broken)]), line_network(2))
-    assert same(list(reader.samples()), mine)
+    assert same(recorded(reader), mine)
     assert reader.rejected == {'reading of elsewhere, which is not in the network': 4,
                                f'undecodable message on {RAW_READINGS}': 1}
 
@@ -152,8 +152,8 @@ def test_both_kinds_of_topics_are_read(tmp_path):
     (one,), many = some(1, True, rng, ('mag_2',)), some(3, True, rng, ('mag_1',))
     reader = SampleReader(recording(tmp_path / 'a.mcap', [
         ('/mag_2/imu/mag', MAGNETIC_FIELD, sample_dict(one, 'mag_2')),
-        (RAW_READINGS, FIELD_READINGS, readings_dict(Readings.of(many)))]), line_network(2))
-    assert same(list(reader.samples()), [one, *many])
+        (RAW_READINGS, FIELD_READINGS, readings_dict(batch(many)))]), line_network(2))
+    assert same(recorded(reader), [one, *many])
 
 
 def test_a_topic_of_that_name_with_another_type_is_left_alone(tmp_path):
@@ -161,7 +161,7 @@ def test_a_topic_of_that_name_with_another_type_is_left_alone(tmp_path):
     reader = SampleReader(recording(tmp_path / 'a.mcap', [
         ('/mag_1/imu/mag', MAGNETIC_FIELD, sample_dict(one, 'mag_1')),
         (RAW_READINGS, MAGNETIC_FIELD, sample_dict(one, 'mag_1'))]), line_network(2))
-    assert same(list(reader.samples()), [one])
+    assert same(recorded(reader), [one])
     assert reader.missing_topics() == ['/mag_2/imu/mag']
     with pytest.raises(RecordingError, match="none of the network's topics"):
         SampleReader(recording(tmp_path / 'b' / 'b.mcap', [

@@ -10,10 +10,11 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from mag_tracking_msgs.msg import FieldReadings, NetworkFrame
 from sensor_msgs.msg import Imu, MagneticField
 
-from mag_tracking.messages.schema import samples_of, stamp_ns
+from mag_tracking.messages.schema import readings_of, stamp_ns
 from mag_tracking.nodes.stage_node import RESULTS, STREAM
 from support.bundled import NETWORK_FILE
 from support.node_processes import LONGEST_S, call, start, stop
+from support.samples import samples_of
 from support.serial_line import SerialLine
 
 BOARD = """
@@ -183,7 +184,7 @@ def test_readings_in_batches(board):
         codes, outputs = stop([process])
     assert codes == [0], outputs
     assert not fields
-    samples = [samples_of(m) for _, m in batches[5:15]]
+    samples = [samples_of(readings_of(m)) for _, m in batches[5:15]]
     assert np.mean([len(s) for s in samples]) > 8
     for sensor in ('mag_1', 'mag_2'):
         stamps = [s.stamp_ns for some in samples for s in some if s.sensor == sensor]

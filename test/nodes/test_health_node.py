@@ -10,7 +10,6 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sensor_msgs.msg import MagneticField
 
-from mag_tracking.messages.schema import sample_dict
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes import sensor_health
 from mag_tracking.nodes.convert import to_message
@@ -18,10 +17,11 @@ from mag_tracking.nodes.doctor_node import DoctorNode
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.stage_node import RESULTS, STREAM
 from mag_tracking.pipeline import settings_for
-from mag_tracking.records import MagSample, Readings
+from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from support.bundled import NETWORK_FILE
 from support.node_processes import LONGEST_S, start, stop
+from support.samples import MagSample, one, sample_dict
 
 # They publish at a rate that is looked at.
 pytestmark = pytest.mark.single
@@ -256,8 +256,8 @@ def test_what_was_wrong_is_forgotten_after_two_terms(monkeypatch):
             parked = 1e-6 * (name == 'mag_1' and now[0] > 20.0)
             sample = MagSample(k * 50_000_000, name,
                                EARTH + parked + 1.2e-8 * rng.standard_normal(3))
-            health.add(Readings.of([sample]), sample.stamp_ns)
-            stage.feed(sample)
+            health.add(one(sample), sample.stamp_ns)
+            stage.feed(one(sample))
         if k % 100 == 99:
             said.append((now[0], [s.message for s in health.statuses('node', stage)]))
     told = [t for t, messages in said if 'taken for its background 1 times' in messages[0]]

@@ -12,13 +12,14 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
-from mag_tracking.simulation.scenario import Path, simulate
+from mag_tracking.simulation.scenario import Path
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.track.manager import TrackManager
 from support.bundled import POINT
 from support.node_world import BODY, NS, STEADY, TOPICS, is_wrong, network_file, world
 from support.roadside import FIRST, RATE_HZ, SPEED
+from support.samples import one, simulate
 
 pytestmark = [pytest.mark.timeout(600), pytest.mark.single]
 LIMIT_S = 2.0
@@ -230,9 +231,9 @@ def test_a_gap_in_the_middle_of_a_pass(tmp_path, name, x, gap_s):
     begin = 1000.0 + (x - first[0]) / SPEED
     before = [s for s in samples if s.stamp_ns / NS < begin]
     after = [s for s in samples if s.stamp_ns / NS >= begin + gap_s]
-    records = [r for s in before for r in pipeline.feed(s)]
+    records = [r for s in before for r in pipeline.feed(one(s))]
     begin_anew(pipeline, name)
-    records += [r for s in after for r in pipeline.feed(s)] + pipeline.flush()
+    records += [r for s in after for r in pipeline.feed(one(s))] + pipeline.flush()
     poses = [t for t in records if isinstance(t, Track) and not t.ended]
     assert len(poses) > 10
     assert not [t for t in poses if is_wrong(t, first + [SPEED * (t.stamp_ns / NS - 1000.0), 0.0])]

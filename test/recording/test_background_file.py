@@ -15,10 +15,10 @@ from mag_tracking.recording.background_file import (
     usual_path,
     write_backgrounds,
 )
-from mag_tracking.records import MagSample
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from support.networks import line_network
+from support.samples import MagSample, fed
 
 NS = 1_000_000_000
 RATE, STD = 50.0, 1.2e-8
@@ -47,7 +47,7 @@ def learnt():
     assert network.names[0] == 'mag_1'
     stage = Calibrate(network, CalibrateSettings())
     for s in readings(1000.0, 10.0, 0):
-        stage.feed(s)
+        fed(stage, s)
     return network, stage
 
 
@@ -55,7 +55,7 @@ def kept_in(path):
     """(network, `read_backgrounds` of what was written to `path`)."""
     network, stage = learnt()
     write_backgrounds(path, {'mag_1': background_text(
-        stage.kept('mag_1'), network, 0, SETTINGS)})
+        stage.stored('mag_1'), network, 0, SETTINGS)})
     kept, refused = read_backgrounds(path, network, SETTINGS)
     assert not refused
     return network, kept
@@ -65,7 +65,7 @@ def test_what_is_kept_comes_back_as_it_was(tmp_path):
     path = tmp_path / 'a' / 'b.json'
     network, kept = kept_in(path)
     _, stage = learnt()
-    assert list(kept) == ['mag_1'] and stage.kept('mag_2') is None
+    assert list(kept) == ['mag_1'] and stage.stored('mag_2') is None
     np.testing.assert_array_equal(kept['mag_1'].background, stage.background('mag_1'))
     np.testing.assert_array_equal(kept['mag_1'].covariance,
                                   stage.backgrounds()['mag_1'].covariance)
@@ -78,14 +78,14 @@ def test_after_a_restart_the_first_reading_is_calibrated(tmp_path):
     network, kept = kept_in(tmp_path / 'kept.json')
     stage = Calibrate(network, CalibrateSettings())
     stage.resume(kept)
-    out = [c for s in readings(1012.0, 8.0, 1, STEP) for c in stage.feed(s)]
+    out = [c for s in readings(1012.0, 8.0, 1, STEP) for c in fed(stage, s)]
     assert len(out) == 8 * RATE and out[0].stamp_ns == 1012 * NS
     fields = np.array([c.field for c in out])
     np.testing.assert_allclose(fields.mean(axis=0), STEP, atol=6e-9)
     assert stage.backgrounds()['mag_1'].frozen and stage.counts['backgrounds resumed'] == 1
     # Then it is gone, and what is learnt is as if nothing had been.
     for s in readings(1020.0, 10.0, 2):
-        out += stage.feed(s)
+        out += fed(stage, s)
     assert not stage.backgrounds()['mag_1'].frozen
     # The end of a line through ten seconds is known to 2 nT.
     np.testing.assert_allclose(stage.background('mag_1'), EARTH, atol=6e-9)
@@ -97,9 +97,9 @@ def test_what_is_of_another_time_is_learnt_anew(tmp_path, begin_s, resume_s):
     network, kept = kept_in(tmp_path / 'kept.json')
     stage = Calibrate(network, CalibrateSettings(resume_s=resume_s))
     stage.resume(kept)
-    assert not [c for s in readings(begin_s, 2.0, 1) for c in stage.feed(s)]
+    assert not [c for s in readings(begin_s, 2.0, 1) for c in fed(stage, s)]
     assert stage.counts['backgrounds of another time not resumed'] == 1
-    assert stage.kept('mag_1') is None
+    assert stage.stored('mag_1') is None
 
 
 @pytest.mark.parametrize('has_begun', [False, True])
@@ -108,10 +108,10 @@ def test_forgetting_forgets_also_what_was_kept(tmp_path, has_begun):
     stage = Calibrate(network, SETTINGS)
     stage.resume(kept)
     if has_begun:
-        stage.feed(readings(1011.0, 1.0, 1)[0])
+        fed(stage, readings(1011.0, 1.0, 1)[0])
     stage.forget()
-    assert not [c for s in readings(1011.5, 2.0, 1, STEP) for c in stage.feed(s)]
-    out = [c for s in readings(1013.5, 8.0, 1, STEP) for c in stage.feed(s)]
+    assert not [c for s in readings(1011.5, 2.0, 1, STEP) for c in fed(stage, s)]
+    out = [c for s in readings(1013.5, 8.0, 1, STEP) for c in fed(stage, s)]
     assert np.abs(np.mean([c.field for c in out], axis=0)).max() < 6e-9
 
 
@@ -122,7 +122,7 @@ def test_another_calibration_that_comes_before_the_readings(tmp_path, change):
     stage = Calibrate(network, SETTINGS)
     stage.resume(kept)
     stage.renew(replace(network, **change))
-    assert not [c for s in readings(1011.0, 2.0, 1) for c in stage.feed(s)]
+    assert not [c for s in readings(1011.0, 2.0, 1) for c in fed(stage, s)]
 
 
 def test_a_sensor_that_was_moved_meanwhile_is_learnt_anew_soon(tmp_path):
@@ -130,12 +130,12 @@ def test_a_sensor_that_was_moved_meanwhile_is_learnt_anew_soon(tmp_path):
     network, kept = kept_in(tmp_path / 'kept.json')
     stage = Calibrate(network, CalibrateSettings(relearn_s=0.0))
     stage.resume(kept)
-    out = [c for s in readings(1040.0, 20.0, 1, 25.0 * STEP) for c in stage.feed(s)]
+    out = [c for s in readings(1040.0, 20.0, 1, 25.0 * STEP) for c in fed(stage, s)]
     late = np.array([c.field for c in out if c.stamp_ns > 1052 * NS])
     assert np.abs(late.mean(axis=0)).max() < 6e-9
     assert stage.backgrounds()['mag_1'].n_relearnt == 1
     # What comes from then on is a target, for ever if it stays.
-    out = [c for s in readings(1060.0, 60.0, 2, 26.0 * STEP) for c in stage.feed(s)]
+    out = [c for s in readings(1060.0, 60.0, 2, 26.0 * STEP) for c in fed(stage, s)]
     np.testing.assert_allclose(np.mean([c.field for c in out], axis=0), STEP, atol=1e-8)
 
 
@@ -145,8 +145,8 @@ def test_what_has_been_learnt_again_is_as_any_other(tmp_path):
     stage = Calibrate(network, CalibrateSettings(relearn_s=0.0))
     stage.resume(kept)
     for s in readings(1012.0, 10.0, 1):
-        stage.feed(s)
-    out = [c for s in readings(1022.0, 40.0, 2, STEP) for c in stage.feed(s)]
+        fed(stage, s)
+    out = [c for s in readings(1022.0, 40.0, 2, STEP) for c in fed(stage, s)]
     np.testing.assert_allclose(np.mean([c.field for c in out], axis=0), STEP, atol=1.5e-8)
     assert stage.backgrounds()['mag_1'].n_relearnt == 0
 
@@ -190,8 +190,8 @@ def test_one_bad_entry_costs_no_other(tmp_path, key, value, told):
     path = tmp_path / 'kept.json'
     network, stage = learnt()
     for s in readings(1000.0, 10.0, 1):
-        stage.feed(replace(s, sensor='mag_2'))
-    write_backgrounds(path, {name: background_text(stage.kept(name), network, j, SETTINGS)
+        fed(stage, replace(s, sensor='mag_2'))
+    write_backgrounds(path, {name: background_text(stage.stored(name), network, j, SETTINGS)
                              for j, name in enumerate(network.names)})
     content = json.loads(path.read_text())
     content['sensors']['mag_1'][key] = value
@@ -206,8 +206,8 @@ def test_an_axis_that_has_only_just_begun_is_not_kept(tmp_path):
     for k, s in enumerate(readings(1000.0, 10.0, 0)):
         field = s.field.copy()
         field[2] = field[2] if k in (400, 401) else np.nan
-        stage.feed(replace(s, field=field))
-    kept = stage.kept('mag_1')
+        fed(stage, replace(s, field=field))
+    kept = stage.stored('mag_1')
     assert np.isnan(kept.background).tolist() == [False, False, True]
     write_backgrounds(tmp_path / 'k', {'mag_1': background_text(kept, network, 0, SETTINGS)})
     again, refused = read_backgrounds(tmp_path / 'k', network, SETTINGS)

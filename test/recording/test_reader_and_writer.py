@@ -10,13 +10,13 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mag_tracking.errors import OutputError, RecordingError
-from mag_tracking.messages.schema import header_dict, sample_dict, sample_of, track_dict
+from mag_tracking.messages.schema import header_dict, reading_of, track_dict
 from mag_tracking.messages.types import DEFINITIONS, MAGNETIC_FIELD, TRACK_ARRAY, decode
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import RecordingWriter
-from mag_tracking.records import MagSample
 from support.bundled import ROOT, vehicle_path
+from support.samples import MagSample, recorded, sample_dict, samples_of
 
 JUNCTION = 'junction_left_to_right'
 
@@ -48,7 +48,7 @@ def test_what_is_written_reads_back(tmp_path):
         messages, recording = read(path)
         assert not recording.losses and sum(recording.message_counts.values()) == 400
         for m, s in zip(messages, samples, strict=True):
-            back = sample_of(decode(m), s.sensor)
+            (back,) = samples_of(reading_of(decode(m), s.sensor))
             assert back.stamp_ns == s.stamp_ns == m.log_time_ns
             np.testing.assert_array_equal(back.field, s.field)
             np.testing.assert_array_equal(back.covariance, s.covariance)
@@ -235,7 +235,7 @@ def test_a_recording_without_messages_gives_none(tmp_path, road_network):
     path = tmp_path / 'a.mcap'
     with RecordingWriter(path):
         pass
-    assert list(SampleReader(Recording(path), road_network).samples()) == []
+    assert recorded(SampleReader(Recording(path), road_network)) == []
 
 
 def test_an_unwritable_place_is_named(tmp_path):

@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 
 from mag_tracking.calibration.background import RunningBackground
-from mag_tracking.records import MagSample
 from mag_tracking.settings import replace
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from support.networks import line_network
+from support.samples import MagSample
 
 SIGMA = np.array([1.0e-8, 1.2e-8, 1.5e-8])
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mag_tracking.records import MagSample
+from support.samples import MagSample
 
 C = 1.44e-16 * np.eye(3)
 

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from mag_tracking.simulation.scenario import Path, point_body, simulate
+from mag_tracking.simulation.scenario import Path, point_body
 from support.networks import line_network
+from support.samples import simulate
 
 START_S = 1000.0
 SPEED = 10.0

@@ -6,9 +6,9 @@ import numpy as np
 
 from mag_tracking.cli import main
 from mag_tracking.pipeline import settings_for
-from mag_tracking.records import MagSample
 from mag_tracking.stages.calibrate.stage import Calibrate
 from support.magnet_boards import MOMENT
+from support.samples import MagSample, fed
 
 
 def write_table(path, field, positions, axes):
@@ -34,6 +34,6 @@ def through_calibrate(network, readings):
     out = np.full(readings.shape, np.nan)
     for k, frame in enumerate(readings):
         for j, (name, reading) in enumerate(zip(network.names, frame, strict=True)):
-            for sample in stage.feed(MagSample(10**18 + k * 10**9, name, reading)):
+            for sample in fed(stage, MagSample(10**18 + k * 10**9, name, reading)):
                 out[k, j] = sample.field
     return out

@@ -4,11 +4,11 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from mag_tracking.messages.schema import sample_dict, stamp_ns
+from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.messages.types import MAGNETIC_FIELD, decode, definition, encoder
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.recorder import Recorder
-from mag_tracking.records import MagSample
+from support.samples import MagSample, sample_dict
 
 TOPIC = '/mag_1/imu/mag'
 S = 10**9

@@ -7,10 +7,8 @@ import numpy as np
 from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
-from mag_tracking.simulation.scenario import (
-    simulate,
-)
 from support.networks import line_network
+from support.samples import one, simulate
 
 NOISE = 1.2e-8
 
@@ -20,7 +18,7 @@ def drive(network, body, path, changes=None, duration=12.0, flaws=None, seed=0):
     samples, t, position, _ = simulate(network, body, path, 100.0, duration,
                                        np.random.default_rng(seed), flaws)
     pipeline = Pipeline(network, settings_for('vehicle', changes))
-    records = [r for s in samples for r in pipeline.feed(s)] + pipeline.flush()
+    records = [r for s in samples for r in pipeline.feed(one(s))] + pipeline.flush()
     tracks = [r for r in records if isinstance(r, Track)]
     stamps = np.array([r.stamp_ns for r in tracks if not r.ended]) / 1e9
     truth = np.stack([np.interp(stamps, t, position[:, k]) for k in (0, 1)], axis=1)

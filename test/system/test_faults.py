@@ -10,6 +10,7 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
 from support.bundled import POINT
 from support.faulty_streams import FAULTS, NS, stream
+from support.samples import one
 
 WRONG = chi2.ppf(1.0 - 1e-4, 2)
 """A pose whose squared error is beyond this, in its own covariance, is wrong."""
@@ -20,7 +21,7 @@ def passed(n_sensors, seed, fault=None):
     """Pipeline, [(t, error [m], squared error in deviations, flagged)], (begin, end)."""
     network, samples, truth, times = stream(n_sensors, seed, fault)
     pipeline = Pipeline(network, settings_for('vehicle', POINT))
-    records = [r for s in samples for r in pipeline.feed(s)] + pipeline.flush()
+    records = [r for s in samples for r in pipeline.feed(one(s))] + pipeline.flush()
     rows = []
     for t in (r for r in records if isinstance(r, Track) and not r.ended):
         now = t.stamp_ns / NS

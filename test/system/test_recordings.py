@@ -18,6 +18,7 @@ from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Track
 from mag_tracking.report.metrics import interpolate_truth
 from support.bundled import DATA, VEHICLES, vehicle_path
+from support.samples import one, recorded
 
 ARRIVAL = {name: 'right' if '_left' in name and name.startswith('straight') else
            name.split('_')[1] if name.startswith('junction') else 'left' for name in VEHICLES}
@@ -200,10 +201,10 @@ def test_repetition_gives_the_same_bytes(vehicle_replays, road_network, tmp_path
 def test_the_interleaving_of_the_sensors_does_not_matter(vehicle_replays, road_network):
     """Sensor by sensor in blocks of 0.3 s instead of in turn."""
     name = 'straight_small_left'
-    samples = list(SampleReader(Recording(vehicle_path(name)), road_network).samples())
+    samples = recorded(SampleReader(Recording(vehicle_path(name)), road_network))
     samples.sort(key=lambda s: (s.stamp_ns // 300_000_000, s.sensor, s.stamp_ns))
     pipeline = Pipeline(road_network, settings_for('vehicle'))
-    tracks = [r for s in samples for r in pipeline.feed(s)] + pipeline.flush()
+    tracks = [r for s in samples for r in pipeline.feed(one(s))] + pipeline.flush()
     ours = [t for t in tracks if isinstance(t, Track) and not t.ended]
     log = next(iter(vehicle_replays[name][0].logs.values()))
     assert [t.stamp_ns for t in ours] == log.stamp_ns

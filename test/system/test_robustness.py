@@ -15,7 +15,7 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import RecordingWriter
-from mag_tracking.records import Detection, FieldFrame, MagSample, Track
+from mag_tracking.records import Detection, FieldFrame, Track
 from mag_tracking.settings import replace
 from mag_tracking.simulation.scenario import Path, point_body
 from mag_tracking.stages.align.settings import AlignSettings
@@ -29,6 +29,7 @@ from mag_tracking.stages.track.manager import TrackManager
 from support.bundled import NETWORK_FILE, vehicle_path
 from support.calibration_runs import EARTH, SIGMA, feed, running, sample, stage
 from support.networks import line_network
+from support.samples import MagSample, fed, one, recorded
 from support.track_runs import drive, magnet_frames
 
 NAME = 'straight_car_right'
@@ -56,11 +57,11 @@ def test_recordings_of_the_same_name_are_refused(tmp_path, capsys):
 
 
 def test_a_looped_recording_gives_the_same_track_again(road_network):
-    samples = list(SampleReader(Recording(vehicle_path(NAME)), road_network).samples())
+    samples = recorded(SampleReader(Recording(vehicle_path(NAME)), road_network))
     pipeline = Pipeline(road_network, settings_for('vehicle'))
     loops = []
     for _ in range(2):
-        tracks = [r for s in samples for r in pipeline.feed(s) if isinstance(r, Track)]
+        tracks = [r for s in samples for r in pipeline.feed(one(s)) if isinstance(r, Track)]
         loops.append([t for t in tracks if not t.ended])
     # Frames are cut anew at the restart: the same but for the grid's phase at its very end.
     assert abs(len(loops[0]) - len(loops[1])) <= 1
@@ -96,12 +97,12 @@ def test_a_sensor_that_gets_stuck_keeps_its_noise():
 
 def test_an_unknown_covariance_between_the_nodes_is_taken_from_the_network_or_rejected():
     align = Align(line_network(1), AlignSettings())
-    out = [f for k in range(30) for f in align.feed(
-        MagSample(k * 10_000_000, 'mag_1', np.zeros(3), None))]
+    out = [f for k in range(30) for f in align.feed(one(
+        MagSample(k * 10_000_000, 'mag_1', np.zeros(3), None)))]
     np.testing.assert_allclose(out[0].covariance[0], 1.44e-16 * np.eye(3) / 8)
     align = Align(dataclasses.replace(line_network(1), noise_std=(None,)), AlignSettings())
-    align.feed(MagSample(0, 'mag_1', np.zeros(3), None))
-    align.feed(MagSample(1, 'mag_1', np.full(3, np.inf), None))
+    align.feed(one(MagSample(0, 'mag_1', np.zeros(3), None)))
+    align.feed(one(MagSample(1, 'mag_1', np.full(3, np.inf), None)))
     assert sorted(rejected(align.counts)) == [
         'covariance unknown, and no noise_std in the network', 'no finite field']
 
@@ -129,7 +130,7 @@ def test_a_present_axis_never_has_an_unknown_covariance():
         field = EARTH + SIGMA * rng.standard_normal(3)
         if k < 800:
             field[2] = np.nan
-        out += s.feed(sample(0.01 * k, field))
+        out += fed(s, sample(0.01 * k, field))
     for r in out:
         there = ~np.isnan(r.field)
         assert there.any() and np.isfinite(r.covariance[np.ix_(there, there)]).all()
@@ -139,11 +140,11 @@ def test_a_present_axis_never_has_an_unknown_covariance():
 def test_one_corrupt_stamp_costs_one_sample():
     s = stage()
     for t in (1.0, 1.1, 3601.0, 1.2, 1.3):
-        s.feed(sample(t))
+        fed(s, sample(t))
     assert rejected(s.counts) == {'stamp too far ahead': 1}
     assert s.counts['calibrated'] == 4
     # A real gap is confirmed by the next sample.
-    assert s.feed(sample(7200.0)) == [] and len(s.feed(sample(7200.1))) == 1
+    assert fed(s, sample(7200.0)) == [] and len(fed(s, sample(7200.1))) == 1
 
 
 def test_a_slow_sensor_is_learnt():
@@ -246,7 +247,7 @@ def test_odometry_is_in_the_childs_frame():
 
 def test_detections_have_ids_that_count_the_onsets(road_network):
     pipeline = Pipeline(road_network, settings_for('vehicle'))
-    samples = list(SampleReader(Recording(vehicle_path(NAME)), road_network).samples())
-    events = [(r.id, r.onset) for s in samples for r in pipeline.feed(s)
+    samples = recorded(SampleReader(Recording(vehicle_path(NAME)), road_network))
+    events = [(r.id, r.onset) for s in samples for r in pipeline.feed(one(s))
               if isinstance(r, Detection)]
     assert events == [(1, True), (1, False)]

@@ -4,13 +4,25 @@ Where stamps decide what is late, one clock that steps ahead would make all othe
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
-from mag_tracking.calibration.ordinary import NEVER
-from mag_tracking.records import MagSample
+from mag_tracking.arrays import FloatArray
+from mag_tracking.calibration.sensor_state import NEVER
 
-Passed = list[tuple[int, MagSample]]
+
+class HeldSample(NamedTuple):
+    """A sample that waits for the clocks of the other sensors."""
+
+    stamp_ns: int
+    field: FloatArray
+    """(3,) [T]"""
+    covariance: FloatArray
+    """(3, 3) [T^2]"""
+
+
+Passed = list[tuple[int, HeldSample]]
 
 
 class ClockStepFilter:
@@ -28,7 +40,7 @@ class ClockStepFilter:
         self.latest = np.full(n_sensors, NEVER)
         self.newest = NEVER
         # (sensor, sample, the newest stamp when it came), in the order in which they came.
-        self._held: list[tuple[int, MagSample, int]] = []
+        self._held: list[tuple[int, HeldSample, int]] = []
         # {sensor that is ahead: (the newest stamp, its own when that was first the newest)}
         self._quiet_since: dict[int, tuple[int, int]] = {}
 
@@ -38,7 +50,7 @@ class ClockStepFilter:
         return len(self._held)
 
     @property
-    def held(self) -> list[tuple[int, MagSample, int]]:
+    def held(self) -> list[tuple[int, HeldSample, int]]:
         """Sensor, sample and the newest timestamp [ns] when it came, of each that is held."""
         return list(self._held)
 
@@ -49,7 +61,7 @@ class ClockStepFilter:
         return not self._held and all(
             newest != self.newest for newest, _ in self._quiet_since.values())
 
-    def feed(self, i: int, sample: MagSample) -> tuple[Passed, Passed]:
+    def feed(self, i: int, sample: HeldSample) -> tuple[Passed, Passed]:
         """What is known by now of a sample of sensor `i`, and of those that are held.
 
         Returns
@@ -115,7 +127,7 @@ class ClockStepFilter:
         return self._take_out(lambda j, s, _: j == i and (
             s.stamp_ns < stamp - self._limit or s is first))
 
-    def _take_out(self, is_meant: Callable[[int, MagSample, int], bool]) -> Passed:
+    def _take_out(self, is_meant: Callable[[int, HeldSample, int], bool]) -> Passed:
         """[(i, sample)] of those held that `is_meant`; they are held no more."""
         if not self._held:
             return []

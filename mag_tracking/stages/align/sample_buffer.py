@@ -1,30 +1,16 @@
-"""Samples of many sensors that wait for their frame: arrays, and what each of them costs, compiled.
+"""Samples of many sensors that wait for their frame, as arrays."""
 
-What `stages.align` does with a sample that nothing is odd about is here a second
-time, for many at once; at the first that is odd it stops.
-"""
-
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba import boolean, float64, from_dtype, int64, njit, void
+from numba import boolean, float64, int64, njit, void
 
-from mag_tracking.arrays import FloatArray, IntArray, StructArray
-from mag_tracking.calibration.ordinary import NEVER
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.calibration.sensor_state import NEVER
 
 ROOM = 32
 """Samples of a sensor that there is room for at first."""
 
-CLOCK = np.dtype([(name, np.int64) for name in (
-    'first', 'newest', 'end', 'start', 'due', 'period', 'wait', 'watch', 'passed', 'limit',
-    'most', 'is_complete')])
-"""[ns] The oldest stamp there was, and the newest; the end of the latest frame; where the next
-begins at the earliest, and before what it ends; its length; how long a sensor may be silent; a
-sensor that the next frame has to wait for, or -1; the newest stamp that was not ahead of all
-others, and how far ahead one may be. `most` samples of a sensor are held. `is_complete`: nobody is
-known any more for whom the frame would have to wait."""
-
-_CLOCK = from_dtype(CLOCK)[::1]
 _I, _II = int64[::1], int64[:, ::1]
 
 
@@ -64,14 +50,6 @@ class SampleBuffer:
         """How many samples of a sensor there is room for."""
         return self.stamp.shape[1]
 
-    def append(self, i: int, stamp: int, field: FloatArray, covariance: FloatArray) -> None:
-        """The newest sample of sensor `i`."""
-        if self.count[i] == self.room:
-            self._grow()
-        k = (self.first[i] + self.count[i]) % self.room
-        self.stamp[i, k], self.field[i, k], self.covariance[i, k] = stamp, field, covariance
-        self.count[i] += 1
-
     def drop(self, i: int) -> None:
         """Without the oldest sample of sensor `i`."""
         self.first[i] = (self.first[i] + 1) % self.room
@@ -96,7 +74,7 @@ class SampleBuffer:
               *taken)
         return taken
 
-    def _grow(self) -> None:
+    def grow(self) -> None:
         """Room for twice as many."""
         order = (self.first[:, None] + np.arange(self.room)) % self.room
         rows = np.arange(len(self.first))[:, None]
@@ -127,84 +105,3 @@ def _take(end: int, one_each: bool, first: IntArray, count: IntArray, stamp: Int
                     total[i, a] += field[i, k, a]
                 for b in range(3):
                     total_covariance[i, a, b] += covariance[i, k, a, b]
-
-
-@njit(cache=True)
-def _is_behind(c: Any, latest: int) -> bool:
-    """Whether a sensor is alive, and may still give a sample of before the end of the frame."""
-    if latest == NEVER:
-        return bool(c.newest - c.first < c.wait)
-    return bool(c.newest - c.wait <= latest and latest < c.due)
-
-
-@njit(cache=True)
-def _is_one_behind(c: Any, latest: IntArray) -> bool:
-    """Whether there is one; it is watched from now on, until it is behind no more."""
-    if c.watch >= 0 and _is_behind(c, latest[c.watch]):
-        return True
-    for j in range(len(latest)):
-        if _is_behind(c, latest[j]):
-            c.watch = j
-            return True
-    return False
-
-
-@njit(boolean(_CLOCK, _I), cache=True)
-def is_one_behind(clocks: StructArray, latest: IntArray) -> bool:
-    """Whether there is a sensor that the next frame has to wait for; it is watched then.
-
-    As `hold_ordinary` has them.
-    """
-    return _is_one_behind(clocks[0], latest)
-
-
-@njit(int64(_CLOCK, _I, _I, _I, _I, _II, float64[:, :, ::1], float64[:, :, :, ::1],
-            _I, _I, float64[:, ::1], float64[:, :, ::1], int64), cache=True)
-def hold_ordinary(clocks: StructArray, latest: IntArray, passed: IntArray, first: IntArray,
-                  count: IntArray, stamp: IntArray, field: FloatArray, covariance: FloatArray,
-                  rows: IntArray, stamps: IntArray, fields: FloatArray, covariances: FloatArray,
-                  begin: int) -> int:
-    """Hold samples from the one at `begin` on, as long as nothing is odd and the frame waits.
-
-    Parameters
-    ----------
-    clocks : (1,) CLOCK
-        Changed, as all of the next.
-    latest, passed : (n_sensors,) [ns]
-        The latest stamp of each, also of those that were not ahead of all others.
-    first, count, stamp, field, covariance
-        `SampleBuffer`.
-    rows, stamps, fields, covariances : (n,), (n,) [ns], (n, 3) [T], (n, 3, 3) [T^2]
-        The samples; whose they are, negative = odd.
-    begin : int
-
-    Returns
-    -------
-    int
-        The first sample that was not held; if `is_complete` because the frame may be complete,
-        else because it is odd.
-    """
-    c, room = clocks[0], stamp.shape[1]
-    c.is_complete = 0
-    for k in range(begin, len(rows)):
-        i, t = rows[k], stamps[k]
-        if i < 0 or latest[i] == NEVER or t <= latest[i] or t < c.end or t - c.passed > c.limit \
-                or count[i] == room or count[i] >= c.most or np.isnan(covariances[k, 0, 0]) \
-                or not np.isfinite(fields[k, 0] + fields[k, 1] + fields[k, 2]):
-            return k
-        latest[i] = passed[i] = t
-        c.newest, c.passed = max(c.newest, t), max(c.passed, t)
-        c.first = min(c.first, t)
-        if count[i] == 0:
-            start = c.end if c.end != NEVER and t < c.end + c.period else t
-            c.start = min(c.start, start)
-            c.due = c.start + c.period
-        place = (first[i] + count[i]) % room
-        stamp[i, place] = t
-        field[i, place] = fields[k]
-        covariance[i, place] = covariances[k]
-        count[i] += 1
-        if c.due < 0 or not _is_one_behind(c, latest):
-            c.is_complete = 1
-            return k + 1
-    return len(rows)

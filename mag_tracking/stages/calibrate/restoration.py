@@ -1,4 +1,4 @@
-"""Backgrounds that are kept for a restart, and taken up where the readings go on soon after."""
+"""Backgrounds that are stored for a restart, and restored where the readings go on soon after."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from mag_tracking.units import NS
 
 
 @dataclass(frozen=True)
-class Kept:
+class StoredBackground:
     """The background of one sensor, to go on from after a restart."""
 
     stamp_ns: int
@@ -21,8 +21,9 @@ class Kept:
     """(3, 3) [T^2] noise of one sample."""
 
 
-def to_keep(background: RunningBackground, stamp_ns: int, level: FloatArray) -> Kept | None:
-    """What is to be kept of a `RunningBackground` that is ready: `Kept`, or None.
+def stored_background(background: RunningBackground, stamp_ns: int,
+                      level: FloatArray) -> StoredBackground | None:
+    """`StoredBackground` of a `RunningBackground` that is ready, or None.
 
     `level` (3,) [T] is what it says of `stamp_ns`, the latest reading.
     """
@@ -30,35 +31,35 @@ def to_keep(background: RunningBackground, stamp_ns: int, level: FloatArray) -> 
     assert C is not None
     # An axis that has only just begun to report has a level, but no noise yet.
     level = np.where(np.isnan(np.diagonal(C)), np.nan, level)
-    return None if np.isnan(level).all() else Kept(stamp_ns, level, C)
+    return None if np.isnan(level).all() else StoredBackground(stamp_ns, level, C)
 
 
 class BackgroundRestoration:
-    """What was kept of sensors of which nothing has come yet."""
+    """What was stored of sensors of which nothing has come yet."""
 
     def __init__(self, longest_s: float) -> None:
         """`longest_s` [s]: a first reading that comes later is of another time."""
         self._longest_ns = longest_s * NS
-        self._kept: dict[str, Kept] = {}
+        self._stored: dict[str, StoredBackground] = {}
 
     def __contains__(self, sensor: str) -> bool:
-        return sensor in self._kept
+        return sensor in self._stored
 
-    def offer(self, kept: Mapping[str, Kept]) -> None:
-        """{sensor: `Kept`}, in place of what was offered before."""
-        self._kept = dict(kept)
+    def offer(self, stored: Mapping[str, StoredBackground]) -> None:
+        """{sensor: `StoredBackground`}, in place of what was offered before."""
+        self._stored = dict(stored)
 
     def forget(self, sensor: str) -> None:
-        """What was kept of `sensor` is of no use any more."""
-        self._kept.pop(sensor, None)
+        """What was stored of `sensor` is of no use any more."""
+        self._stored.pop(sensor, None)
 
     def take_up(self, sensor: str, stamp_ns: int, background: RunningBackground) -> str:
         """The first reading of `sensor` decides; what is to be counted of it.
 
-        Its `RunningBackground` goes on from what was kept, if that is of a moment before.
+        Its `RunningBackground` goes on from what was stored, if that is of a moment before.
         """
-        kept = self._kept.pop(sensor)
-        if 0 < stamp_ns - kept.stamp_ns <= self._longest_ns:
-            background.resume(kept.background, kept.covariance)
+        stored = self._stored.pop(sensor)
+        if 0 < stamp_ns - stored.stamp_ns <= self._longest_ns:
+            background.resume(stored.background, stored.covariance)
             return 'backgrounds resumed'
         return 'backgrounds of another time not resumed'

@@ -122,6 +122,9 @@ class Detect:
         return Detection(stamp_ns, self._next_id, onset, statistic, n,
                          self.threshold(p, n) if n else float('nan'), p, strongest)
 
+    def idle(self) -> None:
+        """Nothing waits."""
+
     def flush(self) -> list[FieldFrame | Detection]:
         """Nothing is held back: []."""
         return []

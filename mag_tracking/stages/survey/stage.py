@@ -109,6 +109,9 @@ class Survey:
             self.counts['accelerations'] += 1
         return []
 
+    def idle(self) -> None:
+        """Nothing waits."""
+
     def flush(self) -> list[NetworkSurvey]:
         """Nothing is held back: []."""
         return []

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mag_tracking.records import MagSample
 from mag_tracking.settings import replace
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.stage import rejected
 from support.disordered_samples import C, disorder
 from support.networks import line_network
+from support.samples import MagSample, one
 
 settings.register_profile('ci', derandomize=True, deadline=None, max_examples=60)
 settings.load_profile('ci')
@@ -29,7 +29,7 @@ def stage(n=2, **changes):
 
 
 def feed(align, samples, flush=True):
-    out = [f for s in samples for f in align.feed(s)]
+    out = [f for s in samples for f in align.feed(one(s))]
     return out + (align.flush() if flush else [])
 
 
@@ -93,7 +93,7 @@ def test_a_sensor_that_stops_becomes_a_nan_row_and_delays_nobody():
     align = stage(max_wait_s=0.5)
     delays, frames = [], []
     for s in samples:
-        for f in align.feed(s):
+        for f in align.feed(one(s)):
             frames.append(f)
             delays.append((s.stamp_ns - f.stamp_ns) / 1e9)
     late = [d for d, f in zip(delays, frames, strict=True) if f.stamp_ns > 2e9]
@@ -111,13 +111,13 @@ def test_late_duplicate_and_unordered_samples_are_counted():
     align = stage(1)
     feed(align, stream(1, 500), flush=False)
     for ms in (490, 485):
-        align.feed(sample(ms, 0))
-    align.feed(MagSample(0, 'mag_7', np.zeros(3), C))
+        align.feed(one(sample(ms, 0)))
+    align.feed(one(MagSample(0, 'mag_7', np.zeros(3), C)))
     assert rejected(align.counts) == {'duplicate stamp': 1, 'out of order': 1,
                                       'unknown sensor mag_7': 1}
     slow = stage(2, max_wait_s=0.2)
     feed(slow, [s for s in stream(2, 2000) if s.sensor == 'mag_1'], flush=False)
-    slow.feed(sample(100, 1))
+    slow.feed(one(sample(100, 1)))
     assert rejected(slow.counts) == {'late': 1}
 
 
@@ -142,7 +142,7 @@ def test_a_looped_recording_starts_anew_and_loses_nothing_before():
 def test_memory_is_bounded():
     align = stage(2, max_wait_s=3600.0, most_pending=50)
     for k in range(1000):
-        align.feed(sample(10.0 * k, 0))
+        align.feed(one(sample(10.0 * k, 0)))
     assert align.n_held == 50
     assert rejected(align.counts) == {'too many pending': 950}
 
@@ -151,7 +151,7 @@ def test_burst_mode_closes_a_round_at_its_last_sensor():
     align = stage(4, burst=True, period_s=0.5)
     for k in range(5):
         for j in range(4):
-            frames = align.feed(sample(5000.0 * k + 7.0 * j, j, k))
+            frames = align.feed(one(sample(5000.0 * k + 7.0 * j, j, k)))
             assert len(frames) == (1 if j == 3 else 0)
         np.testing.assert_allclose(frames[0].field, k)
 
@@ -170,7 +170,7 @@ def test_burst_mode_reckons_who_is_dead_from_the_newest_sample_taken_ever():
     """A sample of 10 ms makes a frame of its own, after one that reached to 150 ms."""
     align = stage(2, burst=True, period_s=1.0, max_wait_s=0.05)
     arrivals = [(0, 0), (10, 0), (150, 1), (155, 1)]
-    assert [len(align.feed(sample(ms, j))) for ms, j in arrivals] == [0, 0, 2, 1]
+    assert [len(align.feed(one(sample(ms, j)))) for ms, j in arrivals] == [0, 0, 2, 1]
 
 
 def test_burst_mode_takes_samples_a_nanosecond_apart():
@@ -298,7 +298,8 @@ def test_frames_and_counts_are_those_of_the_plain_rules_at_every_sample(seed):
     align, plain = Align(line_network(n), wanted), Plain(n, wanted)
     frames, rows = [], []
     for s in disorder(rng, n):
-        found, expected = [a.flush() if s is None else a.feed(s) for a in (align, plain)]
+        found = align.flush() if s is None else align.feed(one(s))
+        expected = plain.flush() if s is None else plain.feed(s)
         assert [f.stamp_ns for f in found] == [stamp for stamp, _ in expected]
         assert +align.counts == +plain.counts
         frames += found

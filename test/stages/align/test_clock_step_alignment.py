@@ -12,6 +12,7 @@ from mag_tracking.stages.align.stage import MOST_HELD, Align
 from mag_tracking.stages.stage import rejected
 from support.clock_steps import sample, stepped, stream, wild
 from support.networks import line_network
+from support.samples import one
 
 MS = 1_000_000
 
@@ -21,7 +22,7 @@ def align(n, **changes):
 
 
 def frames_of(stage, arrivals):
-    return [f for j, t in arrivals for f in stage.feed(sample(t * MS, j))]
+    return [f for j, t in arrivals for f in stage.feed(one(sample(t * MS, j)))]
 
 
 def waiting(stage):

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from mag_tracking.calibration.background import RunningBackground
-from mag_tracking.calibration.ordinary import new_sensors
+from mag_tracking.calibration.sensor_state import new_sensors
 from mag_tracking.errors import NetworkError
-from mag_tracking.records import MagSample
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.stage import rejected
 from support.calibration_runs import EARTH, SIGMA, feed, running, sample, stage
 from support.networks import line_network
+from support.samples import MagSample, fed
 
 
 def test_level_noise_and_drift_are_learnt():
@@ -117,23 +117,23 @@ def test_given_background_without_noise_learns_the_noise():
 ])
 def test_unusable_fields_are_counted_and_rejected(field, cause):
     s = stage()
-    assert s.feed(sample(1.0, field)) == []
+    assert fed(s, sample(1.0, field)) == []
     assert len(rejected(s.counts)) == 1 and cause in next(iter(rejected(s.counts)))
     assert s.counts_of('mag_1')['rejected'] == 1
 
 
 def test_millitesla_are_legitimate_where_the_setting_says_so():
-    assert len(stage(max_field=0.1).feed(sample(1.0, [0.01, 0.0, 0.0]))) == 1
+    assert len(fed(stage(max_field=0.1), sample(1.0, [0.01, 0.0, 0.0]))) == 1
 
 
 def test_unknown_sensor_is_counted():
     s = stage()
-    assert s.feed(sample(1.0, sensor='mag_9')) == []
+    assert fed(s, sample(1.0, sensor='mag_9')) == []
     assert rejected(s.counts) == {'unknown sensor mag_9': 1}
 
 
 def test_a_missing_axis_is_kept_missing():
-    out = stage().feed(sample(1.0, [EARTH[0], EARTH[1], np.nan]))
+    out = fed(stage(), sample(1.0, [EARTH[0], EARTH[1], np.nan]))
     np.testing.assert_allclose(out[0].field[:2], 0.0, atol=1e-20)
     assert np.isnan(out[0].field[2])
 
@@ -141,29 +141,30 @@ def test_a_missing_axis_is_kept_missing():
 def test_duplicate_and_late_stamps_are_counted_and_rejected():
     s = stage()
     for t in (1.0, 1.0, 0.5, 1.1):
-        s.feed(sample(t))
+        fed(s, sample(t))
     assert rejected(s.counts) == {'duplicate stamp': 1, 'out of order': 1}
 
 
 def test_a_restart_is_taken_and_counted():
     s = stage()
-    s.feed(sample(100.0))
-    assert len(s.feed(sample(1.0))) == 1
+    fed(s, sample(100.0))
+    assert len(fed(s, sample(1.0))) == 1
     assert s.counts['time jumped back'] == 1
 
 
 def test_covariances():
     own = np.diag([1e-16, 2e-16, 3e-16])
     s = stage()
-    np.testing.assert_array_equal(s.feed(sample(1.0, covariance=own))[0].covariance, own)
+    np.testing.assert_array_equal(fed(s, sample(1.0, covariance=own))[0].covariance, own)
     # Unknown: the configured one.
-    np.testing.assert_allclose(s.feed(sample(2.0))[0].covariance, 1.44e-16 * np.eye(3))
-    for bad in (-own, np.full((3, 3), np.nan), own + np.triu(np.ones((3, 3)), 1)):
-        assert s.feed(sample(3.0, covariance=bad)) == []
+    np.testing.assert_allclose(fed(s, sample(2.0))[0].covariance, 1.44e-16 * np.eye(3))
+    for bad in (-own, np.zeros((3, 3)), np.diag([1e-16, 2e-16, np.nan]),
+                own + np.triu(np.ones((3, 3)), 1)):
+        assert fed(s, sample(3.0, covariance=bad)) == []
     # By rounding, half of these have no eigenvalue that is not above zero.
     for v in np.random.default_rng(0).standard_normal((20, 3)):
-        assert s.feed(sample(3.0, covariance=1e-16 * np.outer(v, v))) == []
-    assert rejected(s.counts) == {'covariance is not positive definite': 23}
+        assert fed(s, sample(3.0, covariance=1e-16 * np.outer(v, v))) == []
+    assert rejected(s.counts) == {'covariance is not positive definite': 24}
 
 
 def test_forget_names_an_unknown_sensor():
@@ -186,29 +187,29 @@ def corrected(**known):
 
 def test_a_clock_that_is_ahead_is_put_back():
     s = corrected(clock_offset=0.0213)
-    (first,), (second,) = s.feed(sample(5.0)), s.feed(sample(5.0213, sensor='mag_2'))
+    (first,), (second,) = fed(s, sample(5.0)), fed(s, sample(5.0213, sensor='mag_2'))
     assert first.stamp_ns == second.stamp_ns == 5_000_000_000
     assert s.last_stamp_ns('mag_2') == 5_000_000_000
     # Of one sensor the order stays.
-    assert s.feed(sample(5.0213, sensor='mag_2')) == []
+    assert fed(s, sample(5.0213, sensor='mag_2')) == []
     assert rejected(s.counts) == {'duplicate stamp': 1}
 
 
 def test_a_sensors_own_iron_is_taken_away():
     s = corrected(offset=HARD, correction=SOFT)
     B = EARTH + [3e-7, -2e-7, 5e-7]
-    (out,) = s.feed(sample(1.0, np.linalg.solve(SOFT, B) + HARD, 'mag_2'))
+    (out,) = fed(s, sample(1.0, np.linalg.solve(SOFT, B) + HARD, 'mag_2'))
     np.testing.assert_allclose(out.field, B - EARTH, atol=1e-18)
     # The other sensor has none.
-    (out,) = s.feed(sample(1.0, B))
+    (out,) = fed(s, sample(1.0, B))
     np.testing.assert_allclose(out.field, B - EARTH, atol=1e-18)
-    (out,) = corrected(offset=HARD).feed(sample(1.0, B + HARD, 'mag_2'))
+    (out,) = fed(corrected(offset=HARD), sample(1.0, B + HARD, 'mag_2'))
     np.testing.assert_allclose(out.field, B - EARTH, atol=1e-18)
 
 
 def test_the_covariance_is_that_of_the_corrected_field():
     own = np.diag([1e-16, 2e-16, 3e-16])
-    (out,) = corrected(correction=SOFT).feed(sample(1.0, sensor='mag_2', covariance=own))
+    (out,) = fed(corrected(correction=SOFT), sample(1.0, sensor='mag_2', covariance=own))
     np.testing.assert_allclose(out.covariance, SOFT @ own @ SOFT.T)
     rng = np.random.default_rng(0)
     drawn = (rng.standard_normal((20000, 3)) * np.sqrt(np.diagonal(own))) @ SOFT.T
@@ -218,10 +219,10 @@ def test_the_covariance_is_that_of_the_corrected_field():
 def test_an_axis_that_a_correction_needs_is_missed():
     field = [EARTH[0], EARTH[1], np.nan]
     s = corrected(correction=SOFT + 0.01)
-    assert s.feed(sample(1.0, field, 'mag_2')) == []
+    assert fed(s, sample(1.0, field, 'mag_2')) == []
     assert rejected(s.counts) == {'an axis is missing that the correction needs': 1}
     # An offset needs no other axis.
-    (out,) = corrected(offset=HARD).feed(sample(1.0, field, 'mag_2'))
+    (out,) = fed(corrected(offset=HARD), sample(1.0, field, 'mag_2'))
     np.testing.assert_allclose(out.field[:2], -HARD[:2], atol=1e-18)
     assert np.isnan(out.field[2])
 
@@ -231,7 +232,7 @@ def test_an_axis_that_a_correction_needs_is_missed():
 def test_an_axis_that_a_correction_does_not_need_is_not_missed(C):
     """Scales of a sensor with two axes."""
     s, C = corrected(correction=np.array(C)), np.array(C)
-    (out,) = s.feed(sample(1.0, [EARTH[0], EARTH[1], np.nan], 'mag_2'))
+    (out,) = fed(s, sample(1.0, [EARTH[0], EARTH[1], np.nan], 'mag_2'))
     np.testing.assert_allclose(out.field[:2], (C[:2, :2] - np.eye(2)) @ EARTH[:2], atol=1e-18)
     assert np.isnan(out.field[2])
 
@@ -245,7 +246,7 @@ def test_another_calibration_keeps_a_background_that_a_target_stands_on():
     def feed(first, last, extra=0.0):
         out = []
         for k in range(first, last):
-            out += stage.feed(MagSample(k * 10**7, 'mag_1', EARTH + extra
+            out += fed(stage, MagSample(k * 10**7, 'mag_1', EARTH + extra
                                         + SIGMA * rng.standard_normal(3)))
         return out
 
@@ -267,7 +268,7 @@ def test_another_correction_is_learnt_anew():
     network = line_network(1)
     stage = Calibrate(network, CalibrateSettings())
     for k in range(500):
-        stage.feed(MagSample(k * 10**7, 'mag_1', EARTH + SIGMA * np.sin([k, 2 * k, 3 * k])))
+        fed(stage, MagSample(k * 10**7, 'mag_1', EARTH + SIGMA * np.sin([k, 2 * k, 3 * k])))
     assert stage.backgrounds()['mag_1'].ready
     stage.renew(dataclasses.replace(network, offset=(np.full(3, 1e-6),)))
     assert not stage.backgrounds()['mag_1'].measured
@@ -285,7 +286,7 @@ def ends_of_blocks(phase, times):
         assert state['is_full'][0] == (phase is not None and state['now'][0] != now)
         if state['now'][0] != now:
             ends.append(k)
-            background.settle()
+            background.judge_block()
         now = state['now'][0]
     return ends, background
 

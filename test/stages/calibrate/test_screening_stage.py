@@ -7,22 +7,22 @@ import pytest
 
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.records import MagSample
 from mag_tracking.settings import replace
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.stage import rejected
 from support.bundled import VEHICLES, vehicle_path
 from support.networks import line_network
+from support.samples import MagSample, fed, flushed, recorded
 from support.sensor_noise import EARTH, NS, SIGMA, noise
 
 
 @pytest.mark.parametrize('name', VEHICLES)
 def test_nothing_is_found_in_the_recordings(name, road_network):
     stage = Calibrate(road_network, CalibrateSettings())
-    for s in SampleReader(Recording(vehicle_path(name)), road_network).samples():
-        stage.feed(s)
-    stage.flush()
+    for s in recorded(SampleReader(Recording(vehicle_path(name)), road_network)):
+        fed(stage, s)
+    flushed(stage)
     assert sum(stage.counts_of(name)['accepted'] for name in road_network.names) > 1000
     assert not {'spike', 'the same reading over and over'} & set(rejected(stage.counts))
 
@@ -33,7 +33,7 @@ def calibrate(**changes):
 
 
 def feed(stage, y, first=0, rate=100.0):
-    return [c for k, field in enumerate(y) for c in stage.feed(
+    return [c for k, field in enumerate(y) for c in fed(stage,
         MagSample(round((first + k) * NS / rate), 'mag_1', field))]
 
 
@@ -72,8 +72,8 @@ def held_spike(stage):
 def test_what_is_held_at_the_end_passes_and_is_counted():
     stage, _ = calibrate()
     held_spike(stage)
-    assert [c.stamp_ns for c in stage.flush()] == [500_000_000, 510_000_000]
-    assert stage.counts_of('mag_1') == {'accepted': 52} and stage.flush() == []
+    assert [c.stamp_ns for c in flushed(stage)] == [500_000_000, 510_000_000]
+    assert stage.counts_of('mag_1') == {'accepted': 52} and flushed(stage) == []
 
 
 def test_what_is_held_when_time_jumps_back_is_counted():

@@ -12,7 +12,7 @@ from mag_tracking.inference.detection_theory import (
     energy_threshold,
     false_alarm_probability,
 )
-from mag_tracking.records import Detection, FieldFrame, MagSample
+from mag_tracking.records import Detection, FieldFrame
 from mag_tracking.settings import replace
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
@@ -22,6 +22,7 @@ from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
 from support.marks import studied
 from support.networks import line_network
+from support.samples import MagSample, one
 
 SIGMA = 1.2e-8
 
@@ -99,7 +100,7 @@ def test_false_alarm_rate_through_calibration_and_alignment(n):
     for k in range(n):
         for j, name in enumerate(network.names):
             sample = MagSample(k * 10_000_000, name, background[j] + noise[k, j])
-            for f in [f for s in calibrate.feed(sample) for f in align.feed(s)]:
+            for f in [f for r in calibrate.feed(one(sample)) for f in align.feed(r)]:
                 for stage in detectors.values():
                     stage.feed(f)
     for p, stage in detectors.items():

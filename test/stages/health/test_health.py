@@ -7,17 +7,16 @@ import pytest
 
 from mag_tracking.apps.doctor import Doctor, examine
 from mag_tracking.cli import main
-from mag_tracking.messages.schema import sample_dict
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.writer import RecordingWriter
-from mag_tracking.records import MagSample
 from mag_tracking.stages.health.reading_buffer import ReadingBuffer
 from mag_tracking.stages.health.sensor_health import WINDOW, SensorHealth, quantiles
 from support.bundled import DATA, NETWORK_FILE, VEHICLES, vehicle_path
 from support.networks import line_network
+from support.samples import MagSample, one, sample_dict
 
 NS = 10**9
 EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
@@ -203,7 +202,7 @@ def doctored(change=lambda k, field: field, seconds=10.0, **settings):
             field = network.R_sw[j] @ network.earth_field + SIGMA * rng.standard_normal(3)
             if j == 1:
                 field = change(k, field)
-            doctor.feed(MagSample(10**18 + k * 20_000_000, name, field))
+            doctor.feed(one(MagSample(10**18 + k * 20_000_000, name, field)))
     found = doctor.findings()
     # The serious ones first.
     assert found == sorted(found, key=lambda f: not f.serious)
@@ -238,7 +237,8 @@ def test_a_background_in_the_file_does_not_hide_what_the_sensor_says():
     for k in range(600):
         for j, name in enumerate(network.names):
             field = given[j] * ([1.0, 1.0, -1.0] if j == 2 else np.ones(3))
-            doctor.feed(MagSample(k * 20_000_000, name, field + SIGMA * rng.standard_normal(3)))
+            doctor.feed(one(MagSample(k * 20_000_000, name,
+                                      field + SIGMA * rng.standard_normal(3))))
     found = [str(f) for f in doctor.findings()]
     assert 'mag_3: is' in found[0] and 'z is flipped' in found[0]
 
@@ -251,8 +251,8 @@ def test_without_an_earth_field_sensors_are_compared_with_each_other():
         for k in range(400):
             for j, name in enumerate(network.names):
                 field = network.R_sw[j] @ EARTH * ([1.0, -1.0, 1.0] if j == 1 else np.ones(3))
-                doctor.feed(MagSample(k * 20_000_000, name,
-                                      field + SIGMA * rng.standard_normal(3)))
+                doctor.feed(one(MagSample(k * 20_000_000, name,
+                                      field + SIGMA * rng.standard_normal(3))))
         found = [str(f) for f in doctor.findings()]
         assert len(found) == 1 and found[0].startswith(said), found
 
@@ -268,7 +268,7 @@ def test_clocks_that_are_far_apart_are_named_but_not_those_of_a_replay():
                 field = network.R_sw[j] @ network.earth_field + SIGMA * rng.standard_normal(3)
                 # All of it years ago: a replay.
                 stamp = received - 10**17 - (late if j else 0)
-                doctor.feed(MagSample(stamp, name, field), received)
+                doctor.feed(one(MagSample(stamp, name, field)), received)
         found = [str(f) for f in doctor.findings()]
         assert len(found) == n, found
         assert not n or found[0].startswith('mag_2: its stamps are -120 s off those of other')

@@ -8,12 +8,13 @@ import pytest
 from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
-from mag_tracking.simulation.scenario import Path, point_body, simulate
+from mag_tracking.simulation.scenario import Path, point_body
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.target import target_of
 from support.bundled import POINT
 from support.networks import line_network
+from support.samples import one, simulate
 from support.track_runs import magnet_frames
 
 
@@ -60,7 +61,7 @@ def slow_passes(compensated):
         if not compensated:
             pipeline.track.feed = lambda f, feed=feed: feed(
                 replace(f, time_offset=0.0 * f.time_offset))
-        for track in (r for s in slow for r in pipeline.feed(s)):
+        for track in (r for s in slow for r in pipeline.feed(one(s))):
             if isinstance(track, Track) and not track.ended:
                 q = np.array([np.interp(track.stamp_ns / 1e9, t, position[:, k]) for k in (0, 1)])
                 if np.hypot(*q) < 8.0:

@@ -6,10 +6,11 @@ import pytest
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
 from mag_tracking.settings import read_parameter_file
-from mag_tracking.simulation.scenario import Path, random_vehicle, simulate
+from mag_tracking.simulation.scenario import Path, random_vehicle
 from support.bundled import ROOT
 from support.marks import studied
 from support.networks import line_network
+from support.samples import one, simulate
 
 SETTINGS = read_parameter_file(ROOT / 'config' / 'large_network.yaml')
 LOST = [8, 13, 15, 18, 63, 118]
@@ -30,7 +31,7 @@ def drive():
             recordings[seed] = simulate(network, random_vehicle(rng), Path(start, heading, speed),
                                         50.0, 130.0 / speed, rng)[0]
         pipeline = Pipeline(network, settings_for('vehicle', {**SETTINGS, **changes}))
-        records = [r for s in recordings[seed] for r in pipeline.feed(s)] + pipeline.flush()
+        records = [r for s in recordings[seed] for r in pipeline.feed(one(s))] + pipeline.flush()
         return [r for r in records if isinstance(r, Track) and not r.ended]
 
     return driven

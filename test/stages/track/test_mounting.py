@@ -12,12 +12,13 @@ from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.physics.mounting import turned_fields
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
-from mag_tracking.simulation.scenario import Imperfections, Path, point_body, simulate
+from mag_tracking.simulation.scenario import Imperfections, Path, point_body
 from mag_tracking.stages.track.initiation_vehicle import vehicle_model
 from mag_tracking.stages.track.observation import Observation
 from support.bundled import POINT
 from support.marks import studied
 from support.networks import line_network
+from support.samples import one, simulate
 from support.track_runs import NOISE, drive
 
 
@@ -83,7 +84,7 @@ def turned_pass():
     tracks, frames = [], {}
     for s in samples:
         turned = R[network.names.index(s.sensor)] @ s.field
-        for record in pipeline.feed(replace(s, field=turned)):
+        for record in pipeline.feed(one(replace(s, field=turned))):
             if isinstance(record, FieldFrame):
                 frames[record.stamp_ns] = record
             elif isinstance(record, Track) and not record.ended:

@@ -14,7 +14,7 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.inference.time_update import predict
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
-from mag_tracking.simulation.scenario import Path, random_vehicle, simulate
+from mag_tracking.simulation.scenario import Path, random_vehicle
 from mag_tracking.stages.track import relinearisation as relinearise
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_vehicle import vehicle_model
@@ -22,6 +22,7 @@ from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.relinearisation import Relinearisation
 from mag_tracking.units import NS
 from support.networks import line_network
+from support.samples import one, simulate
 
 N_T, PERIOD = 3, 0.08
 LATE = 22.5 * PERIOD
@@ -246,7 +247,7 @@ def test_settings_changed_in_mid_track_begin_it_anew():
         network, random_vehicle(np.random.default_rng(1), length=4.0),
         Path(np.array([-70.0, -1.2]), 0.0, 10.0), 100.0, 12.0, np.random.default_rng(1))
     pipeline = Pipeline(network, settings)
-    frames = [r for s in samples for r in pipeline.feed(s) if isinstance(r, FieldFrame)]
+    frames = [r for s in samples for r in pipeline.feed(one(s)) if isinstance(r, FieldFrame)]
     stage, errors, before = TrackManager(network, settings.track), [], None
     for frame in frames:
         for r in stage.feed(frame):
@@ -270,7 +271,7 @@ def test_it_is_told_the_time_between_the_frames(monkeypatch):
                            Path(np.array([-70.0, -1.2]), 0.0, 10.0), 100.0, 9.0,
                            np.random.default_rng(1))
     pipeline, stage = Pipeline(network, settings), TrackManager(network, settings.track)
-    frames = [r for s in samples for r in pipeline.feed(s) if isinstance(r, FieldFrame)]
+    frames = [r for s in samples for r in pipeline.feed(one(s)) if isinstance(r, FieldFrame)]
     for k, frame in enumerate(frames):
         if k % 7:
             stage.feed(frame)

@@ -19,6 +19,7 @@ from mag_tracking.stages.track.sensor_rejection import ONE_IN, SensorRejection
 from support.bundled import POINT
 from support.faulty_streams import NS, stream
 from support.networks import line_network
+from support.samples import one
 
 SETTINGS = settings_for('vehicle', {**POINT, 'track.mounting_std_deg': 0.0,
                                     'track.model_error_time_s': 0.0}).track
@@ -273,7 +274,7 @@ def passing(n_sensors, fault, seed=0, network_at=None, lasting_s=1.0):
         if network_at is not None and s.stamp_ns >= (times[0] + network_at) * NS:
             pipeline.track.use_network(dataclasses.replace(network, positions=-network.positions))
             network_at = None
-        tracks += [r for r in pipeline.feed(s) if isinstance(r, Track) and not r.ended]
+        tracks += [r for r in pipeline.feed(one(s)) if isinstance(r, Track) and not r.ended]
     return pipeline, tracks, times
 
 
@@ -326,7 +327,7 @@ def test_one_that_carried_a_track_alone_leaves_it_flagged(alone_s, flagged):
     for s in samples:
         if s.sensor == 'mag_2' and begin <= s.stamp_ns / NS < begin + alone_s:
             continue
-        tracks += [r for r in pipeline.feed(s) if isinstance(r, Track) and not r.ended]
+        tracks += [r for r in pipeline.feed(one(s)) if isinstance(r, Track) and not r.ended]
     live = [t for t in tracks if t.stamp_ns / NS > begin + alone_s + 0.1]
     alone = [t for t in tracks if np.isnan(t.nis_by_sensor).any()]
     assert len(alone) >= 4 and all(t.ambiguous for t in alone)

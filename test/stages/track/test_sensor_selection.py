@@ -8,10 +8,11 @@ import pytest
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
-from mag_tracking.simulation.scenario import Path, point_body, simulate
+from mag_tracking.simulation.scenario import Path, point_body
 from mag_tracking.stages.track.sensor_selection import hand_on, nearest, part_of_frame
 from support.bundled import POINT
 from support.networks import line_network
+from support.samples import one, simulate
 
 
 def bank_of(rng, n_hyp, n_t, n_own, n_sensors):
@@ -77,7 +78,7 @@ def driven(network, changes, speed=20.0, seed=1):
     samples, *_ = simulate(network, point_body([200.0, -150.0, 80.0], 5.0, 0.5), path, 50.0,
                            (farthest + 120.0) / speed, np.random.default_rng(seed))
     pipeline = Pipeline(network, settings_for('vehicle', {**POINT, **changes}))
-    records = [r for s in samples for r in pipeline.feed(s)] + pipeline.flush()
+    records = [r for s in samples for r in pipeline.feed(one(s))] + pipeline.flush()
     return records, pipeline, lambda t: path.start + [speed * t, 0.0]
 
 

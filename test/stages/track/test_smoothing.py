@@ -12,12 +12,13 @@ from mag_tracking.inference.smoother import Step, smoothed_covariances, smoothed
 from mag_tracking.inference.time_update import predict
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
-from mag_tracking.simulation.scenario import Path, point_body, random_vehicle, simulate
+from mag_tracking.simulation.scenario import Path, point_body, random_vehicle
 from mag_tracking.stages.track import smoothing as smooth_module
 from mag_tracking.stages.track.manager import TrackManager
 from support.bundled import POINT
 from support.marks import studied
 from support.networks import line_network
+from support.samples import one, simulate
 
 
 def stacked(F, Q, H, R, y, x0, P0, missing):
@@ -147,7 +148,7 @@ def run(body, changes, seed=0, speed=10.0):
     samples, t, position, _ = simulate(network, body, Path(np.array([-70.0, -1.2]), 0.0, speed),
                                        100.0, 12.0, np.random.default_rng(seed))
     pipeline = Pipeline(network, settings_for('vehicle', changes))
-    records = [r for s in samples for r in pipeline.feed(s)] + pipeline.flush()
+    records = [r for s in samples for r in pipeline.feed(one(s))] + pipeline.flush()
 
     def truth(stamps_ns):
         at = np.array(stamps_ns) / 1e9
@@ -280,7 +281,7 @@ def test_smoothing_can_be_left_out_and_what_is_too_long_is_counted():
     network, samples, _, _ = pass_of(body)
     pipeline = Pipeline(network, settings_for('vehicle', {
         **POINT, 'track.smooth_longest_s': 1.0}))
-    records = [r for s in samples for r in pipeline.feed(s)] + pipeline.flush()
+    records = [r for s in samples for r in pipeline.feed(one(s))] + pipeline.flush()
     assert [r for r in records if isinstance(r, Track)]
     assert not [r for r in records if isinstance(r, SmoothedPose)]
     assert pipeline.track.counts['tracks too long to smooth'] == 1
@@ -293,7 +294,7 @@ def test_missing_frames_are_bridged():
     stage = TrackManager(network, settings_for('vehicle', POINT).track)
     out = []
     for s in samples:
-        for r in pipeline.feed(s):
+        for r in pipeline.feed(one(s)):
             if hasattr(r, 'target_present'):
                 if 6.8 < r.stamp_ns / 1e9 < 7.3:
                     r = replace(r, field=np.full((2, 3), np.nan))
@@ -327,7 +328,7 @@ def test_a_frame_that_contradicts_the_track_does_not_bend_it(size):
     network, samples, t, position = pass_of(
         random_vehicle(np.random.default_rng(1), length=4.0), seed=1)
     pipeline = Pipeline(network, settings_for('vehicle'))
-    frames = [r for s in samples for r in pipeline.feed(s) if isinstance(r, FieldFrame)]
+    frames = [r for s in samples for r in pipeline.feed(one(s)) if isinstance(r, FieldFrame)]
     at = int(np.argmin([abs(np.interp(f.stamp_ns / 1e9, t, position[:, 0]) - 12.0)
                         for f in frames]))
     paths = []
@@ -346,7 +347,7 @@ def test_a_frame_that_contradicts_the_track_does_not_bend_it(size):
 def test_a_track_that_was_lost_is_smoothed_with_a_doubt():
     network, samples, _, _ = pass_of(point_body([250.0, -150.0, 80.0], 4.0, 0.5), seed=1)
     pipeline = Pipeline(network, settings_for('vehicle'))
-    frames = [r for s in samples for r in pipeline.feed(s) if isinstance(r, FieldFrame)]
+    frames = [r for s in samples for r in pipeline.feed(one(s)) if isinstance(r, FieldFrame)]
     first = next(k for k, f in enumerate(frames) if f.target_present)
     stage = TrackManager(network, settings_for('vehicle').track)
     out = spiked(stage, frames, first + 25, 1e-4, n=2)

@@ -10,18 +10,13 @@ from mag_tracking.geometry import rotation_from_quaternion
 from mag_tracking.messages.schema import pose_covariance
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
-from mag_tracking.simulation.scenario import (
-    Imperfections,
-    Path,
-    point_body,
-    random_vehicle,
-    simulate,
-)
+from mag_tracking.simulation.scenario import Imperfections, Path, point_body, random_vehicle
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.target import target_of
 from support.bundled import POINT
 from support.marks import studied
 from support.networks import line_network
+from support.samples import one, simulate
 from support.track_runs import drive, magnet_frames
 
 
@@ -225,7 +220,7 @@ def test_the_predicted_field_is_without_the_errors_of_the_model():
                                Path(np.array([-80.0, -1.2]), 0.0, 12.0), 100.0, 12.0,
                                np.random.default_rng(0))
         again = Pipeline(network, settings_for('vehicle', changes))
-        fields = {r.stamp_ns: r.field for s in samples for r in again.feed(s)
+        fields = {r.stamp_ns: r.field for s in samples for r in again.feed(one(s))
                   if hasattr(r, 'target_present')}
         left[name] = max(np.abs(t.predicted - fields[t.stamp_ns]).max()
                          for t in tracks if not t.ended)

@@ -1,0 +1,26 @@
+"""A ROS domain that no other test run on this machine uses."""
+
+import fcntl
+import os
+import tempfile
+from pathlib import Path
+
+N_DOMAINS = 100
+"""Domains 1 to 101 are safe from the ports that Linux gives to anybody."""
+
+
+class RosDomain:
+    """The first free domain from one on that depends on the process; free again when it ends."""
+
+    def __init__(self):
+        folder = Path(tempfile.gettempdir()) / f'mag_tracking_domains_{os.getuid()}'
+        folder.mkdir(exist_ok=True)
+        for k in range(N_DOMAINS):
+            self.number = 1 + (os.getpid() + k) % N_DOMAINS
+            self._lock = open(folder / str(self.number), 'w')
+            try:
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+            except BlockingIOError:
+                self._lock.close()
+        raise RuntimeError(f'all {N_DOMAINS} ROS domains are in use by test runs')
