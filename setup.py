@@ -54,6 +54,7 @@ setup(
             # rclpy's wheel does not ask for a middleware and cannot be imported without one.
             'ros-jazzy-rmw-fastrtps-cpp',
         ],
+        'pandas': ['pandas'],
         # `colcon test` runs pytest only where the extra "test" names it.
         'test': [
             # Drivers for CircuitPython, as users have them.

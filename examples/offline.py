@@ -1,25 +1,20 @@
-"""The same code without ROS: samples in, tracks out, in ten lines."""
+"""Track a recording from Python, without ROS: poses as arrays, errors against the truth."""
 
 from pathlib import Path
 
-from mag_tracking.network.file import read_network
-from mag_tracking.pipeline import Pipeline, settings_for
-from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.records import Track
+import mag_tracking as mt
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def tracks(recording):
-    """Every `Track` record of a recording of the junction."""
-    network = read_network(ROOT / 'config' / 'network.yaml')
-    pipeline = Pipeline(network, settings_for('vehicle'))
-    for readings in SampleReader(Recording(recording), network).readings():
-        yield from (r for r in pipeline.feed(readings) if isinstance(r, Track))
-    yield from (r for r in pipeline.flush() if isinstance(r, Track))
-
-
 if __name__ == '__main__':
-    for track in tracks(ROOT / 'test' / 'data' / 'vehicles' / 'straight_car_right.mcap'):
-        print(track.stamp_ns, track.id, track.position.round(2), track.arrival, track.ambiguous)
+    network = mt.read_network(ROOT / 'config' / 'network.yaml')
+    recording = ROOT / 'test' / 'data' / 'vehicles' / 'straight_car_right.mcap'
+    result = mt.track(recording, network)
+    for pose in result.poses:
+        print(pose['stamp_ns'], pose['track_id'], pose['position'].round(2), pose['arrival'],
+              pose['ambiguous'])
+    for track_id in result.tracks:
+        print(f'track {track_id}, error at the closest point [m]:',
+              result.errors(track_id)['closest'])
+    print(result)

@@ -1,3 +1,77 @@
-"""Tracks and poses of magnetic targets from a network of stationary magnetometers."""
+"""Tracks and poses of magnetic targets from a network of stationary magnetometers.
+
+The names below are the public interface for Python; docs/api.md shows them at work:
+
+    import mag_tracking as mt
+
+    result = mt.track('recording.mcap', 'network.yaml')
+    result.poses['position'], result.poses['covariance']
+    result.poses_dataframe()
+    result.map_figure()
+"""
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mag_tracking.analysis.placement import PlannedTarget, Sampling
+    from mag_tracking.apps.fit import FitResult, FittedPass, fit
+    from mag_tracking.apps.plan import Plan
+    from mag_tracking.apps.plan_inputs import plan_network as plan
+    from mag_tracking.apps.readings import RecordedReadings, read_recording, readings_from_arrays
+    from mag_tracking.apps.track import TrackingResult, track
+    from mag_tracking.errors import (
+        MagTrackingError,
+        MissingDependencyError,
+        NetworkError,
+        ReadingsError,
+        RecordingError,
+        SettingsError,
+        UnknownTrackError,
+    )
+    from mag_tracking.network import SensorNetwork
+    from mag_tracking.network.file import read_network
+    from mag_tracking.records import Readings
+    from mag_tracking.settings import read_parameter_file
 
 __version__ = '0.1.0'
+
+__all__ = [
+    'FitResult', 'FittedPass', 'MagTrackingError', 'MissingDependencyError', 'NetworkError',
+    'Plan', 'PlannedTarget', 'Readings', 'ReadingsError', 'RecordedReadings', 'RecordingError',
+    'Sampling', 'SensorNetwork', 'SettingsError', 'TrackingResult', 'UnknownTrackError', 'fit',
+    'plan', 'read_network', 'read_parameter_file', 'read_recording', 'readings_from_arrays',
+    'track']
+
+# The modules of the names above, imported on first use: `import mag_tracking` is done by every
+# command and node at once, and compiled code and the figures take seconds.
+_MODULES = {
+    'analysis.placement': ('PlannedTarget', 'Sampling'),
+    'apps.fit': ('FitResult', 'FittedPass', 'fit'),
+    'apps.plan': ('Plan',),
+    'apps.plan_inputs': ('plan',),
+    'apps.readings': ('RecordedReadings', 'read_recording', 'readings_from_arrays'),
+    'apps.track': ('TrackingResult', 'track'),
+    'errors': ('MagTrackingError', 'MissingDependencyError', 'NetworkError', 'ReadingsError',
+               'RecordingError', 'SettingsError', 'UnknownTrackError'),
+    'network': ('SensorNetwork',),
+    'network.file': ('read_network',),
+    'records': ('Readings',),
+    'settings': ('read_parameter_file',)}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+_NAMES_THERE = {'plan': 'plan_network'}
+
+
+if not TYPE_CHECKING:  # A type checker knows the names above, and reports all others.
+    def __getattr__(name: str) -> object:
+        """A public name, imported on first use (PEP 562)."""
+        if name not in _MODULE_OF:
+            raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+        module = importlib.import_module(f'{__name__}.{_MODULE_OF[name]}')
+        value = globals()[name] = getattr(module, _NAMES_THERE.get(name, name))
+        return value
+
+
+def __dir__() -> list[str]:
+    """The public names, imported or not."""
+    return sorted({*globals(), *__all__})

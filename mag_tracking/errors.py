@@ -23,3 +23,15 @@ class OutputError(MagTrackingError):
 
 class DeviceError(MagTrackingError):
     """A device cannot be opened or read: a port, a socket, a broker or a bus."""
+
+
+class ReadingsError(MagTrackingError, ValueError):
+    """Arrays of readings have a wrong shape, type or order."""
+
+
+class UnknownTrackError(MagTrackingError, LookupError):
+    """A result has no track with this number."""
+
+
+class MissingDependencyError(MagTrackingError, ImportError):
+    """An optional package is not installed."""

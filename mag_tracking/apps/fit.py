@@ -1,8 +1,10 @@
 """The passes of a recording, cut out and fitted, offline."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from os import PathLike
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -10,19 +12,26 @@ from mag_tracking.analysis.model_order import choose_order
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.apps.readings import network_of
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.saturation import cut_off
+from mag_tracking.errors import SettingsError
 from mag_tracking.inference.detection_theory import energy_threshold
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Settings
+from mag_tracking.pipeline import Settings, settings_for
+from mag_tracking.recording.fit_folder import FIT_COLUMNS, pass_rows
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Detection, FieldFrame, Readings
+from mag_tracking.report.dataframes import STATE_UNITS, dataframe
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.stage import rejected
 from mag_tracking.units import NS
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 PAD_S = 1.0
 """[s] What is taken before a detection begins: there the background is seen alone."""
@@ -34,6 +43,16 @@ LONGEST_S = 60.0
 
 NEARLY = 1.25
 """A fit whose cost is not larger than this times that of the best describes the pass as well."""
+
+
+FIT_UNITS = {
+    **STATE_UNITS, **dict.fromkeys(('sd_mx', 'sd_my', 'sd_mz'), 'A m^2'),
+    **dict.fromkeys(('speed', 'sd_speed'), 'm/s'),
+    **dict.fromkeys(('heading_deg', 'sd_heading_deg'), 'deg'),
+    **dict.fromkeys(('cpa_time', 'sd_cpa_time'), 's'),
+    **dict.fromkeys(('cpa_range', 'sd_cpa_range'), 'm'),
+    **dict.fromkeys(('rate', 'sd_rate'), '1/s')}
+"""Units of the columns of `fits.csv`."""
 
 
 @dataclass(frozen=True)
@@ -238,3 +257,85 @@ class RecordingFit:
         for counts in (self._reader.rejected, self._collector.rejected, self._recording.losses):
             lines += [f'{cause}: {n}' for cause, n in counts.items()]
         return lines
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """The fitted passes of a recording."""
+
+    passes: tuple[FittedPass, ...]
+    warnings: tuple[str, ...]
+    """What was lost or rejected, and which sensors were not used."""
+
+    def __repr__(self) -> str:
+        return (f'FitResult({len(self.passes)} passes'
+                + (f'; warnings: {"; ".join(self.warnings)}' if self.warnings else '') + ')')
+
+    def to_dataframe(self) -> 'pd.DataFrame':
+        """One row a pass and number of dipoles, with the columns of `fits.csv`.
+
+        Raises
+        ------
+        MissingDependencyError
+        """
+        rows = [row for one in self.passes for row in pass_rows(one)]
+        # A fit without an answer has no number there.
+        columns = {c: [np.nan if c == 'ambiguous' and row[c] == '' else row[c] for row in rows]
+                   for c in FIT_COLUMNS}
+        return dataframe(columns, FIT_UNITS)
+
+
+def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[str],
+        settings: Mapping[str, Any] | None = None, orders: Sequence[int] = (1, 2, 3, 4),
+        cpa_range: tuple[float, float] | None = None) -> FitResult:
+    """Fit every pass of a recording as a row of dipoles at constant velocity.
+
+    Parameters
+    ----------
+    recording : path
+        An .mcap file or a rosbag2 folder.
+    network : SensorNetwork or path of a network file
+    settings : {name: value}, optional
+        What differs from the defaults for a vehicle.
+    orders : sequence of int
+        Numbers of dipoles to try, 1 to 8.
+    cpa_range : (range, std) [m], optional
+        For a network of one sensor; see `analysis.pass_fit.fit_pass`.
+
+    Returns
+    -------
+    FitResult
+
+    Raises
+    ------
+    RecordingError
+        If the recording cannot be read, or has none of the network's topics.
+    NetworkError
+        If the network file is not valid.
+    SettingsError
+        If a setting or an argument is not valid.
+    """
+    network = network_of(network)
+    check_orders('orders', orders)
+    check_cpa_range('cpa_range', cpa_range, network)
+    job = RecordingFit(Recording(recording), network, settings_for('vehicle', settings), orders,
+                       cpa_range)
+    passes = tuple(job.passes())
+    return FitResult(passes, tuple(job.warnings()))
+
+
+def check_orders(name: str, orders: Sequence[int]) -> None:
+    """Raise SettingsError, which begins with `name`, unless `orders` are different, 1 to 8."""
+    if not len(orders) or min(orders) < 1 or max(orders) > 8 or len(set(orders)) < len(orders):
+        raise SettingsError(f'{name}: expected different numbers from 1 to 8, got {list(orders)}')
+
+
+def check_cpa_range(name: str, cpa_range: Sequence[float] | None, network: SensorNetwork) -> None:
+    """Raise SettingsError, which begins with `name`, for a range that is not valid."""
+    if cpa_range is None:
+        return
+    if len(network) > 1:
+        raise SettingsError(f'{name} is for one sensor; the network has {len(network)}, '
+                            'which tell the scale themselves')
+    if len(cpa_range) != 2 or not (np.isfinite(cpa_range).all() and min(cpa_range) > 0.0):
+        raise SettingsError(f'{name}: expected two positive numbers, got {list(cpa_range)}')

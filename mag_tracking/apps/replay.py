@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
@@ -33,6 +33,18 @@ Truth: TypeAlias = tuple[IntArray, FloatArray, FloatArray]
 
 SUSPICIOUS = 2.0
 """A sensor that seems to be turned by more prior deviations than this is reported."""
+
+
+class Configured(Protocol):
+    """A network and the settings that it is tracked with, such as a `Pipeline`."""
+
+    @property
+    def network(self) -> SensorNetwork:
+        """Of all sensors."""
+
+    @property
+    def settings(self) -> Settings:
+        """Of all stages."""
 
 
 @dataclass
@@ -170,7 +182,7 @@ def _mounting(log: TrackLog, pipeline: Pipeline) -> dict[str, dict[str, Any]]:
             for name, (angles, std) in log.mounting_of(pipeline.network.names).items()}
 
 
-def errors_against_truth(log: TrackLog | SmoothedLog, pipeline: Pipeline,
+def errors_against_truth(log: TrackLog | SmoothedLog, pipeline: Configured,
                          truth: Mapping[str, Truth]) -> dict[str, Any] | None:
     """Errors against the truth that fits best, or None."""
     best: tuple[float, dict[str, Any]] | None = None
@@ -181,7 +193,7 @@ def errors_against_truth(log: TrackLog | SmoothedLog, pipeline: Pipeline,
     return None if best is None else best[1]
 
 
-def _errors_of(log: TrackLog | SmoothedLog, pipeline: Pipeline,
+def _errors_of(log: TrackLog | SmoothedLog, pipeline: Configured,
                truth: Truth) -> tuple[float, dict[str, Any]] | None:
     """(error [m] by which truths are compared, all errors) against one truth, or None."""
     if pipeline.settings.track.target == 'magnet':

@@ -10,7 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from mag_tracking.analysis.pass_result import Bearing, PassFit
-from mag_tracking.apps.fit import FittedPass, RecordingFit
+from mag_tracking.apps.fit import FittedPass, RecordingFit, check_cpa_range, check_orders
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import Commands, add_command, add_network, distinct_names
 from mag_tracking.errors import OutputError, SettingsError
@@ -106,15 +106,8 @@ def _fit(args: argparse.Namespace) -> int:
 def _check(args: argparse.Namespace, network: SensorNetwork) -> None:
     """Raise SettingsError or OutputError for options that make no sense."""
     distinct_names(args.recordings)
-    if min(args.orders) < 1 or max(args.orders) > 8 or len(set(args.orders)) < len(args.orders):
-        raise SettingsError(f'--orders: expected different numbers from 1 to 8, got {args.orders}')
-    if args.cpa_range is not None:
-        if len(network) > 1:
-            raise SettingsError(f'--cpa-range is for one sensor; the network has {len(network)}, '
-                                'which tell the scale themselves')
-        if not (np.isfinite(args.cpa_range).all() and min(args.cpa_range) > 0.0):
-            raise SettingsError('--cpa-range: expected two positive numbers, got '
-                                f'{args.cpa_range}')
+    check_orders('--orders', args.orders)
+    check_cpa_range('--cpa-range', args.cpa_range, network)
     if args.same_vehicle and not (network.earth_field is not None and network.earth_field.any()):
         raise SettingsError('--same-vehicle: the network file has no earth_field, without which '
                             'hard and soft iron cannot be told apart')

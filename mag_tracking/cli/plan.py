@@ -2,16 +2,13 @@
 
 import argparse
 import json
-import math
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.analysis.placement import PlannedTarget, Sampling
-from mag_tracking.apps.plan import GOOD_PD, Area, Plan, detection_range, n_parts, plan
+from mag_tracking.apps.plan import GOOD_PD, Plan
+from mag_tracking.apps.plan_inputs import PlanInputs, plan_inputs
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.errors import OutputError, SettingsError
@@ -20,8 +17,6 @@ from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.recording.result_folder import without_nan
 from mag_tracking.settings import read_parameter_file
-from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
-from mag_tracking.stages.track.settings import TrackSettings
 
 _PLAN = '''
 Before the first hole is drilled: where is a position good to what, where is a target
@@ -77,90 +72,17 @@ def add(commands: Commands) -> None:
     p.add_argument('--params', type=Path, metavar='FILE', help='settings that differ')
 
 
-def _within(name: str, value: float, low: float, high: float) -> float:
-    """`value`, or a SettingsError."""
-    if not low <= value <= high:
-        raise SettingsError(f'{name}: expected {low:g} to {high:g}, got {value:g}')
-    return value
-
-
-def _target(args: argparse.Namespace, track: TrackSettings) -> PlannedTarget:
-    """The `PlannedTarget` of the command line."""
-    vehicle = track.vehicle
-    speed = _within('--speed', args.speed, 1e-4, 1e3)
-    if args.height is not None:
-        _within('--height', args.height, -1e3, 1e3)
-    if args.moment is not None:
-        if args.target not in (None, 'magnet'):
-            raise SettingsError('--target and --moment: give one of them')
-        if args.height is None:
-            raise SettingsError('--height: needed with --moment')
-        return PlannedTarget(_within('--moment', args.moment, 1e-6, 1e6), args.height, speed)
-    if args.target == 'magnet':
-        raise SettingsError('--moment and --height: needed for a magnet')
-    kind = args.target or 'car'
-    if kind not in vehicle.kinds:
-        raise SettingsError(f'--target: expected one of {", ".join(vehicle.kinds)}, magnet; got '
-                            f'{kind!r}')
-    k = vehicle.kinds.index(kind)
-    height = vehicle.heights[k] if args.height is None else args.height
-    return PlannedTarget(vehicle.moments[k], height, speed, vehicle.height_stds[k],
-                         vehicle.climb_std)
-
-
-def _lanes(args: argparse.Namespace,
-           vehicle: VehicleSettings) -> list[tuple[str, float, float]]:
-    """[(name, heading, offset)] of the command line."""
-    names: Sequence[str]
-    headings: Sequence[float]
-    if args.heading is None:
-        names, headings = vehicle.arrival_names, vehicle.arrival_headings_deg
-    else:
-        names, headings = [f'{heading:g} deg' for heading in args.heading], args.heading
-    offsets = args.offset or [0.0] * len(headings)
-    if len(offsets) != len(headings):
-        raise SettingsError(f'--offset: expected {len(headings)} numbers, one a lane '
-                            f'({", ".join(names)}), got {len(offsets)}')
-    for value in (*headings, *offsets):
-        _within('--heading, --offset', value, -1e5, 1e5)
-    if args.offset:
-        names = [f'{name}, {offset:+g} m' for name, offset in zip(names, offsets, strict=True)]
-    lanes = list(zip(names, map(math.radians, headings), offsets, strict=True))
-    if len(set(lanes)) < len(lanes):
-        raise SettingsError('--heading: a lane is there twice; give each its --offset')
-    return lanes
-
-
-def _sampling(args: argparse.Namespace, network: SensorNetwork, settings: Settings) -> Sampling:
-    """The `Sampling` of the command line, but for how long the target is followed.
-
-    An error of the field that lasts tells as little in many frames as in one: it counts as so much
-    more noise in each (the architecture page says why the tracker has it as a state).
-    """
-    rate, track = _within('--rate', args.rate, 1e-2, 1e5), settings.track
-    period = max(settings.align.period_s, 1.0 / rate)
-    given = args.noise_std
-    if given is not None:
-        _within('--noise-std', given, 1e-15, 1e-3)
-    noise = np.array([given or 1.2e-8 if std is None or given
-                      else float(np.sqrt(np.mean(np.square(std)))) for std in network.noise_std])
-    error = track.field_error if args.field_error is None else args.field_error
-    _within('--field-error', error, 0.0, 0.9)
-    lasting = max(1.0, 2.0 * track.model_error_time_s / period)
-    return Sampling(period, noise / math.sqrt(max(1.0, rate * period)), error * math.sqrt(lasting))
-
-
-def _area(args: argparse.Namespace, network: SensorNetwork, reach: float) -> Area:
-    """(x0, y0, x1, y1) of the maps."""
-    low, high = network.positions[:, :2].min(axis=0), network.positions[:, :2].max(axis=0)
-    x0, y0, x1, y1 = args.area or [*(low - reach), *(high + reach)]
-    if not (x1 > x0 and y1 > y0):
-        raise SettingsError(f'--area: expected X0 < X1 and Y0 < Y1, got {args.area}')
-    for side in (x1 - x0, y1 - y0):
-        _within('--area: a side', side, 1e-3, 1e5)
-    _within('--area: its longer side over the other', max((x1 - x0) / (y1 - y0),
-                                                          (y1 - y0) / (x1 - x0)), 1.0, 50.0)
-    return x0, y0, x1, y1
+def _inputs(args: argparse.Namespace, network: SensorNetwork, settings: Settings) -> PlanInputs:
+    """The inputs of the command line; raises SettingsError, which names the option."""
+    try:
+        return plan_inputs(
+            network, settings, args.target, moment=args.moment, height=args.height,
+            speed=args.speed, heading=args.heading, offset=args.offset, noise_std=args.noise_std,
+            rate=args.rate, field_error=args.field_error, area=args.area,
+            clearance=args.clearance, grid=args.grid)
+    except SettingsError as error:
+        name, _, text = str(error).partition(':')
+        raise SettingsError(f'--{name.replace("_", "-")}:{text}') from error
 
 
 def _plan(args: argparse.Namespace) -> int:
@@ -168,26 +90,14 @@ def _plan(args: argparse.Namespace) -> int:
     network = read_network(args.network)
     kind = 'magnet' if args.target == 'magnet' else 'vehicle'
     settings = settings_for(kind, read_parameter_file(args.params) if args.params else {})
-    target, lanes = _target(args, settings.track), _lanes(args, settings.track.vehicle)
-    _within('--grid', args.grid, 5, 200)
-    sampling = _sampling(args, network, settings)
-    noise = sampling.noise_std
-    reach = detection_range(target, float(np.median(noise)), 3,
-                            settings.detect.false_alarm_probability)
-    sampling = replace(sampling, half_window=1.2 * reach / target.speed)
-    area = _area(args, network, reach)
-    clearance = args.clearance
-    if clearance is None:
-        clearance = 2.0 if args.moment is None else 0.0
-    _within('--clearance', clearance, 0.0, 1e6)
+    inputs = _inputs(args, network, settings)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f'cannot write to {args.out}: {error.strerror}') from error
-    with tqdm(total=n_parts(lanes), desc='plan', disable=None) as bar:
-        result = plan(network, target, sampling, lanes, area, settings, clearance, args.grid,
-                      bar.update)
-    _print(result, noise)
+    with tqdm(total=inputs.n_parts, desc='plan', disable=None) as bar:
+        result = inputs.run(network, settings, bar.update)
+    _print(result, inputs.sampling.noise_std)
     _write(result, args.out)
     print(f'results in {args.out}')
     return 0

@@ -73,6 +73,12 @@ def fit_row(fit: PassFit) -> dict[str, Any]:
     return row
 
 
+def pass_rows(one: _FittedPass) -> list[dict[str, Any]]:
+    """[{column: value}] of a `FittedPass`, one for each of its fits: `FIT_COLUMNS`."""
+    return [{'recording': one.recording, 'pass': one.number, **fit_row(fit),
+             'chosen': int(fit is one.chosen)} for fit in one.fits]
+
+
 class FitFolder:
     """`fits.csv` and `fits.json` in a folder; a context manager.
 
@@ -105,9 +111,7 @@ class FitFolder:
 
     def add(self, one: _FittedPass) -> None:
         """Write the rows of a `FittedPass`."""
-        for fit in one.fits:
-            row = {'recording': one.recording, 'pass': one.number, **fit_row(fit),
-                   'chosen': int(fit is one.chosen)}
+        for fit, row in zip(one.fits, pass_rows(one), strict=True):
             self.rows.append(row | {'notes': list(one.notes), 'bearing': _bearing(fit.bearing)})
             self._writer.writerow([repr(v) if isinstance(v, float) else v
                                    for v in (row[c] for c in FIT_COLUMNS)])

@@ -3,16 +3,13 @@
 from collections.abc import Mapping
 from typing import Protocol
 
-import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-matplotlib.use('Agg')
-from matplotlib.axes import Axes  # noqa: E402  (the backend has to be chosen first)
-from matplotlib.figure import Figure  # noqa: E402
-
-from mag_tracking.arrays import FloatArray  # noqa: E402
-from mag_tracking.geometry import yaw_between  # noqa: E402
-from mag_tracking.report.figures import SCALE_1D  # noqa: E402
+from mag_tracking.arrays import FloatArray
+from mag_tracking.geometry import yaw_between
+from mag_tracking.report.figures import SCALE_1D
 
 
 class _Network(Protocol):

@@ -6,16 +6,13 @@ Uncertainty is drawn as 90 % regions throughout.
 from collections.abc import Sequence
 from typing import Protocol
 
-import matplotlib
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-matplotlib.use('Agg')
-from matplotlib.figure import Figure  # noqa: E402  (the backend has to be chosen first)
-
-from mag_tracking.arrays import FloatArray  # noqa: E402
-from mag_tracking.report.track_log import TrackLog  # noqa: E402
+from mag_tracking.arrays import FloatArray
+from mag_tracking.report.track_log import TrackLog
 
 SCALE_2D = float(np.sqrt(chdtri(2, 0.1)))
 """Deviations to the edge of a 90 % ellipse in the plane."""

@@ -3,14 +3,11 @@
 from collections.abc import Sequence
 from typing import Protocol
 
-import matplotlib
 import numpy as np
+from matplotlib.figure import Figure
 
-matplotlib.use('Agg')
-from matplotlib.figure import Figure  # noqa: E402  (the backend has to be chosen first)
-
-from mag_tracking.arrays import FloatArray, IntArray  # noqa: E402
-from mag_tracking.report.figures import SCALE_1D, field_unit  # noqa: E402
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.report.figures import SCALE_1D, field_unit
 
 _AXES = ('tab:red', 'tab:green', 'tab:blue')
 

@@ -2,15 +2,12 @@
 
 from typing import Protocol
 
-import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 
-matplotlib.use('Agg')
-from matplotlib.axes import Axes  # noqa: E402  (the backend has to be chosen first)
-from matplotlib.figure import Figure, SubFigure  # noqa: E402
-
-from mag_tracking.arrays import BoolArray, FloatArray, IntArray  # noqa: E402
-from mag_tracking.report.figures import SCALE_1D  # noqa: E402
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.report.figures import SCALE_1D
 
 _SUSPECT = 'tab:red'
 _MOST_NAMES = 60

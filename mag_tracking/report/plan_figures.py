@@ -3,16 +3,13 @@
 from collections.abc import Sequence
 from typing import Protocol
 
-import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 
-matplotlib.use('Agg')
-from matplotlib.axes import Axes  # noqa: E402  (the backend has to be chosen first)
-from matplotlib.colors import LogNorm  # noqa: E402
-from matplotlib.figure import Figure  # noqa: E402
-
-from mag_tracking.arrays import FloatArray  # noqa: E402
-from mag_tracking.report.figures import scale_of  # noqa: E402
+from mag_tracking.arrays import FloatArray
+from mag_tracking.report.figures import scale_of
 
 
 class _Network(Protocol):

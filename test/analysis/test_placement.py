@@ -166,8 +166,8 @@ def test_plan_writes_all_that_it_promises(tmp_path, capsys):
 
 @pytest.mark.parametrize('options, text', [
     (['--target', 'tank'], '--target: expected one of small, car, truck, magnet'),
-    (['--target', 'car', '--moment', '3'], 'give one of them'),
-    (['--moment', '3'], '--height: needed with --moment'),
+    (['--target', 'car', '--moment', '3'], '--target: give one of'),
+    (['--moment', '3'], '--height: needed with a moment'),
     (['--moment', '-3', '--height', '1'], '--moment: expected 1e-06 to 1e+06, got -3'),
     (['--speed', '0'], '--speed: expected 0.0001 to 1000, got 0'),
     (['--rate', 'nan'], '--rate'),
@@ -181,7 +181,7 @@ def test_plan_writes_all_that_it_promises(tmp_path, capsys):
     (['--area', '0', '0', '1e9', '1e9'], '--area: a side'),
     (['--area', '0', '0', '1', '1000'], '--area: its longer side'),
     (['--heading', '0', '0'], 'a lane is there twice'),
-    (['--target', 'magnet'], '--moment and --height: needed for a magnet'),
+    (['--target', 'magnet'], '--moment: needed for a magnet, and height'),
 ])
 def test_plan_refuses_what_makes_no_sense(tmp_path, capsys, options, text):
     assert main(['plan', '--network', str(NETWORK_FILE), *options,

@@ -1,0 +1,94 @@
+"""Poses, smoothed poses and detections as structured arrays: one element a record."""
+
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
+
+import numpy as np
+
+from mag_tracking.arrays import StructArray
+from mag_tracking.records import Detection, SmoothedPose, Track
+
+_Fields: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
+"""{name: (type, shape of one element)}."""
+
+_TEXT_WIDTH = 16
+"""Characters of a text field; it is wider where a name is longer."""
+
+_STATE_FIELDS: _Fields = {
+    'stamp_ns': ('i8', ()), 'track_id': ('i8', ()),
+    'position': ('f8', (3,)), 'velocity': ('f8', (3,)), 'covariance': ('f8', (6, 6)),
+    'orientation': ('f8', (4,)), 'orientation_covariance': ('f8', (3, 3)),
+    'position_orientation_covariance': ('f8', (3, 3)),
+    'moment': ('f8', (3,)), 'moment_covariance': ('f8', (3, 3)),
+    'kind': ('U', ()), 'length': ('f8', ()), 'length_std': ('f8', ()), 'ambiguous': ('?', ())}
+"""Fields that `Track` and `SmoothedPose` share; their documentation has the units."""
+
+_POSE_FIELDS: _Fields = {
+    **_STATE_FIELDS, 'arrival': ('U', ()), 'weight': ('f8', ()), 'kind_weight': ('f8', ()),
+    'existence': ('f8', ()), 'nis': ('f8', ()), 'degrees_of_freedom': ('i8', ()),
+    'unobservable': ('?', (6,))}
+
+_SMOOTHED_FIELDS: _Fields = {**_STATE_FIELDS, 'complete': ('?', ())}
+
+_DETECTION_FIELDS: _Fields = {
+    'stamp_ns': ('i8', ()), 'id': ('i8', ()), 'onset': ('?', ()), 'statistic': ('f8', ()),
+    'degrees_of_freedom': ('i8', ()), 'threshold': ('f8', ()),
+    'false_alarm_probability': ('f8', ()), 'strongest_sensor': ('U', ())}
+
+
+def pose_array(tracks: Sequence[Track]) -> StructArray:
+    """Poses of tracks.
+
+    Parameters
+    ----------
+    tracks : sequence of Track
+        The closing record of a track (`ended`) is skipped; it repeats the last pose.
+
+    Returns
+    -------
+    (n,) structured array
+        Fields of `Track` in SI units; `id` is named `track_id`.
+    """
+    return _array([t for t in tracks if not t.ended], _POSE_FIELDS)
+
+
+def smoothed_array(poses: Sequence[SmoothedPose]) -> StructArray:
+    """Smoothed poses.
+
+    Parameters
+    ----------
+    poses : sequence of SmoothedPose
+
+    Returns
+    -------
+    (n,) structured array
+        Fields of `SmoothedPose` in SI units; `id` is named `track_id`.
+    """
+    return _array(poses, _SMOOTHED_FIELDS)
+
+
+def detection_array(detections: Sequence[Detection]) -> StructArray:
+    """Onsets and releases of the detector.
+
+    Parameters
+    ----------
+    detections : sequence of Detection
+
+    Returns
+    -------
+    (n,) structured array
+        Fields of `Detection`.
+    """
+    return _array(detections, _DETECTION_FIELDS)
+
+
+def _array(records: Sequence[Track | SmoothedPose | Detection], fields: _Fields) -> StructArray:
+    """(n,) structured array with the attributes of `records` that `fields` names."""
+    columns = {name: [getattr(r, 'id' if name == 'track_id' else name) for r in records]
+               for name in fields}
+    dtype = [(name, f'U{max(_TEXT_WIDTH, *map(len, columns[name]), 1)}' if kind == 'U' else kind,
+              shape) for name, (kind, shape) in fields.items()]
+    out = np.zeros(len(records), dtype=dtype)
+    for name, (_, shape) in fields.items():
+        out[name] = np.array(columns[name], dtype=out[name].dtype).reshape(len(records), *shape)
+    return out

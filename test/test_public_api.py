@@ -1,0 +1,377 @@
+"""The public interface of the package: what `import mag_tracking` offers to a notebook."""
+
+import ast
+import importlib
+import inspect
+import io
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import mag_tracking as mt
+from mag_tracking.cli import main
+from mag_tracking.recording.fit_folder import FIT_COLUMNS, FitFolder
+from mag_tracking.recording.result_folder import DETECTION_COLUMNS, POSE_COLUMNS, SMOOTHED_COLUMNS
+from support.bundled import NETWORK_FILE, ROOT, vehicle_path
+
+NAME = 'straight_car_fast_left'
+HEAVY = {'matplotlib', 'mcap', 'numba', 'numpy', 'pandas', 'rclpy', 'scipy', 'yaml'}
+
+
+@pytest.fixture(scope='module')
+def recorded():
+    return mt.read_recording(vehicle_path(NAME), NETWORK_FILE)
+
+
+@pytest.fixture(scope='module')
+def result():
+    return mt.track(vehicle_path(NAME), NETWORK_FILE)
+
+
+@pytest.fixture(scope='module')
+def readings():
+    """Three readings of each of two sensors."""
+    return mt.readings_from_arrays(['mag_1', 'mag_2'] * 3, np.arange(6) * 10_000_000,
+                                   np.full((6, 3), 1e-6))
+
+
+def python(code):
+    """What another interpreter prints."""
+    return subprocess.run([sys.executable, '-c', code], check=True, capture_output=True, text=True,
+                          cwd=ROOT).stdout.strip()
+
+
+def same(a, b):
+    """Whether two results have the same arrays, to the last bit."""
+    return all(getattr(a, name).dtype == getattr(b, name).dtype
+               and getattr(a, name).tobytes() == getattr(b, name).tobytes()
+               for name in ('poses', 'smoothed', 'detections'))
+
+
+def read_csv(path):
+    return pd.read_csv(path, float_precision='round_trip', keep_default_na=False)
+
+
+@pytest.mark.parametrize('name', mt.__all__)
+def test_a_public_name_resolves_and_is_documented(name):
+    assert name in dir(mt) and inspect.getdoc(getattr(mt, name))
+
+
+def test_type_checkers_see_the_public_names():
+    """The imports for type checkers are those that are done on first use."""
+    tree = ast.parse((ROOT / 'mag_tracking' / '__init__.py').read_text())
+    block = next(n for n in tree.body if isinstance(n, ast.If) and n.test.id == 'TYPE_CHECKING')
+    seen = {alias.asname or alias.name: (node.module, alias.name)
+            for node in block.body for alias in node.names}
+    assert sorted(seen) == sorted(mt.__all__) and len(set(mt.__all__)) == len(mt.__all__)
+    for name, (module, there) in seen.items():
+        assert getattr(mt, name) is getattr(importlib.import_module(module), there)
+
+
+def test_a_public_name_is_not_that_of_a_module():
+    """Importing the module would replace it."""
+    assert not set(mt.__all__) & {p.stem for p in (ROOT / 'mag_tracking').iterdir()}
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="module 'mag_tracking' has no attribute 'trakc'"):
+        mt.trakc  # noqa: B018
+
+
+def test_importing_the_package_imports_nothing_else():
+    loaded = python('import sys, mag_tracking; dir(mag_tracking); print(*sys.modules)').split()
+    assert 'mag_tracking' in loaded
+    assert not HEAVY & {name.partition('.')[0] for name in loaded}
+    assert not [name for name in loaded if name.startswith('mag_tracking.')]
+
+
+def test_tracking_does_not_import_figures_and_pandas():
+    loaded = python('import sys, mag_tracking; mag_tracking.track; print(*sys.modules)').split()
+    assert 'mag_tracking.apps.track' in loaded
+    assert not {'matplotlib', 'pandas', 'rclpy'} & {n.partition('.')[0] for n in loaded}
+
+
+def test_figures_leave_the_backend_alone():
+    modules = [f'mag_tracking.report.{p.stem}'
+               for p in (ROOT / 'mag_tracking' / 'report').glob('*figures.py')]
+    assert len(modules) == 5
+    assert python('import matplotlib; matplotlib.use("svg"); import '
+                  f'{", ".join(modules)}; print(matplotlib.get_backend())') == 'svg'
+
+
+def test_a_recording_is_read_into_arrays(recorded):
+    readings = recorded.readings
+    n = len(readings)
+    assert readings.names == mt.read_network(NETWORK_FILE).names == ('mag_1', 'mag_2')
+    assert readings.stamp_ns.shape == readings.sensor.shape == (n,) and n == 2800
+    assert readings.stamp_ns.dtype == np.int64 and readings.field.shape == (n, 3)
+    # Of the order of the Earth's field, in tesla.
+    assert 1e-6 < np.median(np.linalg.norm(readings.field, axis=1)) < 1e-4
+    (name, (stamps, positions, quaternions)), = recorded.truth.items()
+    assert name == 'vehicle_00' and (np.diff(stamps) > 0).all()
+    assert positions.shape == (len(stamps), 3) and quaternions.shape == (len(stamps), 4)
+    assert recorded.rejected == recorded.lost == {} and recorded.missing_topics == ()
+    assert repr(recorded) == 'RecordedReadings(2800 readings of mag_1, mag_2; truth: vehicle_00)'
+
+
+def test_tracking_a_recording_equals_a_replay(result, vehicle_replays):
+    run, folder = vehicle_replays[NAME]
+    pd.testing.assert_frame_equal(
+        result.poses_dataframe().astype({'ambiguous': int}), read_csv(folder / 'poses.csv'),
+        check_exact=True)
+    pd.testing.assert_frame_equal(
+        result.smoothed_dataframe().drop(columns='complete').astype({'ambiguous': int}),
+        read_csv(folder / 'poses_smoothed.csv'), check_exact=True)
+    pd.testing.assert_frame_equal(
+        result.detections_dataframe(), read_csv(folder / 'detections.csv'), check_exact=True)
+    assert len(result.poses) == len(result.smoothed) > 20 and result.smoothed['complete'].all()
+    assert result.counts == run.summary['counts']
+    assert result.rejections == run.summary['rejected']
+    entry, = run.summary['tracks']
+    assert result.tracks[1].summary() == {k: entry[k] for k in result.tracks[1].summary()}
+    errors = result.errors()
+    assert errors and errors == {k: entry['truth'][k] for k in errors}
+
+
+def test_arrays_give_the_same_as_the_recording(result, recorded):
+    assert same(mt.track(recorded, mt.read_network(NETWORK_FILE)), result)
+    r = recorded.readings
+    mine = mt.readings_from_arrays(np.array(r.names)[r.sensor], r.stamp_ns, r.field, r.covariance)
+    from_arrays = mt.track(mine, NETWORK_FILE)
+    assert same(from_arrays, result)
+    assert from_arrays.truth == {} and from_arrays.errors() is None
+
+
+def test_a_magnet_in_arrays_equals_a_replay(magnet_runs, magnet_replays):
+    recording, network = magnet_runs[1]
+    run, folder = magnet_replays[1]
+    found = mt.track(mt.read_recording(recording, network).readings, network, 'magnet')
+    pd.testing.assert_frame_equal(
+        found.poses_dataframe().astype({'ambiguous': int}), read_csv(folder / 'poses.csv'),
+        check_exact=True)
+    assert len(found.poses) > 10 and found.counts == run.summary['counts']
+
+
+def test_settings_differ_from_the_defaults(recorded, result):
+    found = mt.track(recorded, NETWORK_FILE, settings={'align.period_s': 0.2})
+    assert found.settings.align.period_s == 0.2 and 0 < len(found.poses) < len(result.poses)
+    with pytest.raises(mt.SettingsError, match='did you mean track.iterations'):
+        mt.track(recorded, NETWORK_FILE, settings={'track.iteration': 2})
+    with pytest.raises(mt.SettingsError, match='expected vehicle or magnet'):
+        mt.track(recorded, NETWORK_FILE, 'tank')
+
+
+def test_dataframes_have_units(result):
+    for frame, columns, extra in (
+            (result.poses_dataframe(), POSE_COLUMNS, ()),
+            (result.smoothed_dataframe(), SMOOTHED_COLUMNS, ('complete',)),
+            (result.detections_dataframe(), DETECTION_COLUMNS, ())):
+        assert tuple(frame.columns) == (*columns, *extra)
+        assert set(frame.attrs['units']) <= set(frame.columns)
+    units = result.poses_dataframe().attrs['units']
+    assert units['stamp_ns'] == 'ns' and units['sd_y'] == 'm' and units['vx'] == 'm/s'
+    assert units['mz'] == 'A m^2'
+    without = {'track_id', 'weight', 'ambiguous', 'kind', 'kind_weight'}
+    assert set(units) == set(POSE_COLUMNS) - without
+
+
+def test_arrays_have_the_fields_of_the_records(result):
+    n = len(result.poses)
+    assert result.poses['covariance'].shape == (n, 6, 6)
+    assert set(result.poses['kind']) <= {'small', 'car', 'truck'}
+    assert result.poses['ambiguous'].dtype == bool
+    assert result.detections['onset'].tolist() == [True, False]
+    seconds = np.diff(result.poses['stamp_ns']) / 1e9
+    np.testing.assert_allclose(seconds, result.settings.align.period_s, atol=1e-6)
+
+
+def test_a_long_name_is_not_cut(recorded):
+    long = 'from the right, where the road comes over the bridge'
+    found = mt.track(recorded, NETWORK_FILE, settings={
+        'track.vehicle.arrival_names': ['left', long, 'rear']})
+    assert long in found.poses['arrival'] and found.smoothed['complete'].all()
+
+
+@pytest.mark.parametrize('source', ['nothing', 'noise'])
+def test_no_target_gives_empty_arrays(recorded, result, source):
+    r = recorded.readings
+    # The car comes after four seconds.
+    quiet = r.part(r.stamp_ns < r.stamp_ns[0] + (0 if source == 'nothing' else 4_000_000_000))
+    found = mt.track(quiet, NETWORK_FILE)
+    for name in ('poses', 'smoothed', 'detections'):
+        assert getattr(found, name).shape == (0,)
+        assert getattr(found, name).dtype == getattr(result, name).dtype
+        frame = getattr(found, f'{name}_dataframe')()
+        assert len(frame) == 0
+        assert list(frame.columns) == list(getattr(result, f'{name}_dataframe')().columns)
+    assert found.tracks == {} and found.rejections == {}
+    assert found.sensors_without_background == (() if source == 'noise' else ('mag_1', 'mag_2'))
+    assert ('no background of mag_1' in repr(found)) is (source == 'nothing')
+    with pytest.raises(mt.UnknownTrackError, match='the result has none'):
+        found.map_figure()
+
+
+def test_rejected_readings_are_counted(recorded):
+    r = recorded.readings
+    field = r.field.copy()
+    field[100:110] *= 1e4
+    names = np.array(r.names)[r.sensor].astype('U8')
+    names[500:520] = 'mag_9'
+    found = mt.track(mt.readings_from_arrays(names, r.stamp_ns, field), NETWORK_FILE)
+    assert sum(found.rejections.values()) == 30
+    assert '20 unknown sensor' in repr(found) and 'not used' in repr(found)
+
+
+def test_what_a_damaged_recording_lost_is_told(tmp_path):
+    cut = tmp_path / 'cut.mcap'
+    content = vehicle_path(NAME).read_bytes()
+    cut.write_bytes(content[:len(content) // 2])
+    assert mt.track(cut, NETWORK_FILE).lost and mt.read_recording(cut, NETWORK_FILE).lost
+
+
+FIELD, STAMPS = np.zeros((3, 3)), np.arange(3)
+
+
+@pytest.mark.parametrize('sensor, stamp_ns, field, covariance, text', [
+    (['a'] * 3, STAMPS, np.zeros((3, 2)), None, r'field: expected shape \(3, 3\).*got \(3, 2\)'),
+    (['a'] * 3, STAMPS, np.zeros(9), None, r'field: expected shape \(3, 3\)'),
+    (['a'] * 2, STAMPS, FIELD, None, r'sensor: expected shape \(3,\).*got \(2,\)'),
+    (['a'] * 3, 0.01 * STAMPS, FIELD, None, 'stamp_ns: expected integers, nanoseconds; got float'),
+    (['a'] * 3, 5, FIELD, None, 'stamp_ns'),
+    (['a'] * 3, STAMPS, FIELD.astype(str), None, 'field: expected floats; got <U'),
+    (['a'] * 3, STAMPS, FIELD, np.eye(3), r'covariance: expected shape \(3, 3, 3\)'),
+    (['a', 'b', 'a'], [5, 3, 7], FIELD, None, r'reading 1 \(b\) is 2e-09 s older .* sort'),
+])
+def test_bad_arrays_are_refused(sensor, stamp_ns, field, covariance, text):
+    with pytest.raises(mt.ReadingsError, match=text) as caught:
+        mt.readings_from_arrays(sensor, stamp_ns, field, covariance)
+    assert isinstance(caught.value, ValueError) and isinstance(caught.value, mt.MagTrackingError)
+
+
+@pytest.mark.parametrize('changes, text', [
+    ({'sensor': np.array([0, 1, 2, 0, 1, 2])}, r'0 \.\. 2 is outside 0 \.\. 1'),
+    ({'sensor': np.array([0, 1, -1, 0, 1, 0])}, r'-1 \.\. 1 is outside'),
+    ({'field': np.zeros((5, 3))}, r'field: expected shape \(6, 3\)'),
+    ({'stamp_ns': np.arange(6.0)}, 'stamp_ns: expected integers, nanoseconds'),
+    ({'names': ('left', 'right')}, 'readings of left, right, but the network has mag_1, mag_2'),
+    ({'stamp_ns': np.array([0, 60, 120, 1, 61, 121]) * 1_000_000_000},
+     r'reading 3 \(mag_2\) is 119 s older'),
+])
+def test_bad_readings_are_refused(readings, changes, text):
+    with pytest.raises(mt.ReadingsError, match=text):
+        mt.track(replace(readings, **changes), NETWORK_FILE)
+
+
+def test_readings_that_are_late_by_little_are_tracked(recorded):
+    """A recording holds its readings as they arrived: they need not be sorted."""
+    r = recorded.readings
+    later = replace(r, stamp_ns=r.stamp_ns + np.where(r.sensor == 1, -30_000_000, 0))
+    assert (np.diff(later.stamp_ns) < 0).any()
+    assert len(mt.track(later, NETWORK_FILE).tracks) == 1
+
+
+def test_bad_files_are_refused(tmp_path):
+    with pytest.raises(mt.RecordingError, match='there is no'):
+        mt.track(tmp_path / 'none.mcap', NETWORK_FILE)
+    with pytest.raises(mt.NetworkError):
+        mt.read_recording(vehicle_path(NAME), tmp_path / 'none.yaml')
+
+
+@pytest.mark.parametrize('name', ['poses', 'smoothed', 'detections'])
+def test_without_pandas_the_extra_is_named(monkeypatch, result, name):
+    monkeypatch.setitem(sys.modules, 'pandas', None)
+    with pytest.raises(mt.MissingDependencyError, match=r'pip install mag_tracking\[pandas\]'):
+        getattr(result, f'{name}_dataframe')()
+    assert len(getattr(result, name))
+
+
+def test_figures_of_a_track(result):
+    from matplotlib.figure import Figure
+    titles = set()
+    for name in ('map', 'weights', 'field'):
+        figure = getattr(result, f'{name}_figure')()
+        assert isinstance(figure, Figure)
+        stream = io.BytesIO()
+        figure.savefig(stream)
+        assert stream.getvalue().startswith(b'\x89PNG')
+        titles.add(figure.get_suptitle() or figure.axes[0].get_title())
+    assert len(titles) == 3 and all('Track 1' in title for title in titles)
+    labels = [line.get_label() for line in result.map_figure(1).axes[0].lines]
+    assert {'truth', 'smoothed', 'magnetometers'} <= set(labels)
+    with pytest.raises(mt.UnknownTrackError, match='track 7: the result has 1'):
+        result.map_figure(7)
+
+
+def test_fits_as_a_dataframe_are_those_of_the_command(tmp_path):
+    found = mt.fit(vehicle_path(NAME), NETWORK_FILE, orders=[1, 3])
+    one, = found.passes
+    assert found.warnings == () and one.chosen.n_dipoles == 3
+    frame = found.to_dataframe()
+    assert tuple(frame.columns) == FIT_COLUMNS and len(frame) == 2
+    assert frame.attrs['units']['sd_mx'] == 'A m^2' and frame.attrs['units']['cpa_time'] == 's'
+    with FitFolder(tmp_path) as folder:
+        folder.add(one)
+    written = pd.read_csv(tmp_path / 'fits.csv', float_precision='round_trip',
+                          keep_default_na=False, na_values=['nan'])
+    pd.testing.assert_frame_equal(frame, written, check_exact=True, check_dtype=False)
+
+
+def test_a_recording_without_a_pass_gives_an_empty_fit(tmp_path):
+    cut = tmp_path / 'cut.mcap'
+    content = vehicle_path(NAME).read_bytes()
+    cut.write_bytes(content[:len(content) // 8])
+    found = mt.fit(cut, NETWORK_FILE)
+    assert found.passes == () and found.warnings and 'warnings' in repr(found)
+    assert tuple(found.to_dataframe().columns) == FIT_COLUMNS and len(found.to_dataframe()) == 0
+
+
+@pytest.mark.parametrize('named, text', [
+    ({'orders': [0]}, r'orders: expected different numbers from 1 to 8, got \[0\]'),
+    ({'orders': []}, 'orders'),
+    ({'cpa_range': (4.0, 0.3)}, 'cpa_range is for one sensor'),
+])
+def test_fit_refuses_bad_arguments(named, text):
+    with pytest.raises(mt.SettingsError, match=text):
+        mt.fit(vehicle_path(NAME), NETWORK_FILE, **named)
+
+
+def test_a_plan_is_that_of_the_command(tmp_path):
+    assert main(['plan', '--network', str(NETWORK_FILE), '--target', 'truck', '--heading', '0',
+                 '--grid', '9', '--out', str(tmp_path)]) == 0
+    written = json.loads((tmp_path / 'plan.json').read_text())
+    found = mt.plan(NETWORK_FILE, 'truck', heading=np.array([0.0]), grid=9)
+    assert found.position_std.tolist() == written['position_std']
+    assert list(found.best_place) == written['best_place']
+    with pytest.raises(mt.SettingsError, match='^moment: needed for a magnet'):
+        mt.plan(NETWORK_FILE, 'magnet')
+
+
+def test_the_documentation_names_what_is_there():
+    text = (ROOT / 'docs' / 'api.md').read_text()
+    for name in ('track', 'fit', 'plan', 'read_network', 'read_recording', 'readings_from_arrays',
+                 'read_parameter_file'):
+        assert f'`{name}(' in text
+    attributes = {*mt.TrackingResult.__dataclass_fields__, *dir(mt.TrackingResult)}
+    for word in ('poses_dataframe', 'map_figure', 'errors', 'rejections', 'lost',
+                 'missing_topics', 'sensors_without_background'):
+        assert word in text and word in attributes
+
+
+def test_the_code_of_the_documentation_runs(tmp_path, monkeypatch):
+    """With the names of its files replaced by those of files that exist."""
+    text = (ROOT / 'docs' / 'api.md').read_text()
+    code = '\n'.join(line.strip() for line in text.splitlines() if line.startswith('    '))
+    code = code.replace("'recording.mcap'", repr(str(vehicle_path(NAME))))
+    code = code.replace("'network.yaml'", repr(str(NETWORK_FILE)))
+    # Drawing by pandas takes a display's backend.
+    code = code.replace(".plot(x='x', y='y')", "[['x', 'y']]")
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(code, names)
+    assert Path('map.png').stat().st_size > 1000 and len(names['readings']) == 2
