@@ -13,6 +13,7 @@ from mag_tracking.calibration import ellipsoid_refinement
 from mag_tracking.calibration.ellipsoid_fit import fit_ellipsoid
 from mag_tracking.calibration.ellipsoid_refinement import N_BLOCKS
 from support.bundled import DATA
+from support.marks import studied
 
 CORRECTION = np.array([[1.1, 0.05, -0.02], [0.05, 0.9, 0.03], [-0.02, 0.03, 1.05]])
 CORRECTION /= np.cbrt(np.linalg.det(CORRECTION))
@@ -169,7 +170,7 @@ def test_the_optimum_is_that_of_a_general_solver():
             < 0.02 * fit.correction_std[rows, columns]).all()
 
 
-@pytest.mark.parametrize('correlation', [0.0, 0.8])
+@pytest.mark.parametrize('correlation', studied([0.0, 0.8], [0.0]))
 def test_the_stated_deviations_cover_the_truth(correlation):
     """Also where noise is correlated in time, as that of real sensors is. It is small: the radius
     is too large by its square."""

@@ -120,11 +120,14 @@ def test_a_recording_too_short_to_learn_says_so(tmp_path, capsys):
     assert json.loads((tmp_path / 'out/summary.json').read_text())['tracks'] == []
 
 
-def test_help_teaches():
-    for command in ('replay', 'run', 'import'):
-        text = subprocess.run([sys.executable, '-m', 'mag_tracking.cli', command, '--help'],
-                              capture_output=True, text=True, check=True).stdout
-        assert 'example' in text
+def test_help_teaches(capsys):
+    text = subprocess.run([sys.executable, '-m', 'mag_tracking.cli', 'replay', '--help'],
+                          capture_output=True, text=True, check=True).stdout
+    assert 'example' in text
+    for command in ('run', 'import'):
+        with pytest.raises(SystemExit, match='0'):
+            main([command, '--help'])
+        assert 'example' in capsys.readouterr().out
 
 
 def test_a_sensor_on_its_head_is_named(tmp_path, capsys):

@@ -24,7 +24,6 @@ from support.node_processes import LONGEST_S, start, stop
 from support.samples import MagSample, one, sample_dict
 
 # They publish at a rate that is looked at.
-pytestmark = pytest.mark.single
 
 STEP_NS = 10_000_000
 EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])

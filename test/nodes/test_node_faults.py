@@ -21,7 +21,7 @@ from support.node_world import BODY, NS, STEADY, TOPICS, is_wrong, network_file,
 from support.roadside import FIRST, RATE_HZ, SPEED
 from support.samples import one, simulate
 
-pytestmark = [pytest.mark.timeout(600), pytest.mark.single]
+pytestmark = pytest.mark.timeout(600)
 LIMIT_S = 2.0
 """[s] Everything has to go on within this."""
 MOST_VEHICLES = 5

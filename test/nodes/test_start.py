@@ -122,7 +122,7 @@ def start_s(ros, words):
 
 
 @pytest.mark.parametrize('name, step_s', [
-    pytest.param('tracker_node', 0.25), pytest.param('run', 0.25),
+    pytest.param('tracker_node', 0.25), pytest.param('run', 0.25, marks=pytest.mark.study),
     *(pytest.param(name, 0.05, marks=pytest.mark.study) for name in COMMANDS)])
 def test_a_signal_at_any_moment_of_the_start_ends_it(ros, name, step_s):
     """On a slow machine the steps are as many, and longer."""

@@ -237,6 +237,7 @@ def turned_noise(std_w, std_m, dt, density=0.0):
     return np.mean((left @ u) ** 2), u @ extra @ u
 
 
+@pytest.mark.study
 def test_the_second_order_of_an_uncertain_turn_is_in_its_noise():
     """By sampling: how far turned moments end from the plane that the Jacobian moves them in."""
     std_w = np.array([0.10, 0.25, 0.15])

@@ -160,6 +160,7 @@ def test_random_damage_never_crashes(tmp_path, seed):
     assert len(messages) == intact or recording.losses
 
 
+@pytest.mark.study
 def test_memory_is_flat(tmp_path):
     peaks = []
     for n in (10_000, 40_000):

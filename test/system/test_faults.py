@@ -48,7 +48,7 @@ NAMED = {
 
 
 @pytest.mark.parametrize('fault', list(FAULTS))
-@pytest.mark.parametrize('n_sensors, n', [(2, 2), (6, 1)])
+@pytest.mark.parametrize('n_sensors, n', [(2, 2), pytest.param(6, 1, marks=pytest.mark.study)])
 def test_a_fault_while_a_target_passes(n_sensors, n, fault):
     for seed in range(n):
         _, whole, _ = passed(n_sensors, seed)

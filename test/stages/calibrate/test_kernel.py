@@ -57,14 +57,12 @@ def calibrated_alike(network, samples, size=20, **settings):
     return many
 
 
-@pytest.mark.parametrize('is_large', [False, True])
-@pytest.mark.parametrize('is_corrected', [False, True])
+@pytest.mark.parametrize('is_large_and_corrected', [False, True])
 @pytest.mark.parametrize('fault', [None, *FAULTS])
-def test_a_pass_with_a_fault(monkeypatch, fault, is_corrected, is_large):
-    if is_large:
+def test_a_pass_with_a_fault(monkeypatch, fault, is_large_and_corrected):
+    network, samples, *_ = stream(2, 3, fault)
+    if is_large_and_corrected:
         monkeypatch.setattr(calibrate, 'AT_ONCE', 1)
-    network, samples, *_ = stream(4, 3, fault)
-    if is_corrected:
         network = corrected(network)
     assert calibrated_alike(network, samples).counts['calibrated'] > 1000
 

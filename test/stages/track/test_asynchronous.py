@@ -72,6 +72,7 @@ def slow_passes(compensated):
     return np.mean(nees), np.sqrt(np.mean(squares))
 
 
+@pytest.mark.study
 def test_slow_sensors_out_of_step_are_tracked_honestly():
     with_offsets, without = slow_passes(True), slow_passes(False)
     print(f'with their times: NEES {with_offsets[0]:.2f}, RMS {with_offsets[1]:.2f} m; '
