@@ -1,6 +1,6 @@
 """The only conversions between records and ROS messages.
 
-What a message holds is said once, in `io.schema`, as nested dicts; here dicts
+What a message holds is said once, in `messages.schema`, as nested dicts; here dicts
 become message objects. Messages read as records through the same functions
 that read a recording: both have the same attributes.
 """
