@@ -31,11 +31,12 @@ from mag_tracking.nodes.deferred import Deferred
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.sensor_rounds import SensorRounds
-from mag_tracking.nodes.stage_node import LATCHED, SENT, STREAM, Counted, StageNode
+from mag_tracking.nodes.stage_node import LATCHED, SENT, STREAM, StageNode
 from mag_tracking.nodes.survey_service import SurveyService
 from mag_tracking.recording.background_file import usual_path
 from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.stage import Stage
 from mag_tracking.stages.survey.stage import Survey
 
 SHORTEST_STEP_S = 0.01
@@ -105,7 +106,7 @@ class CalibrationNode(StageNode):
         path = Path(self.get_parameter('network').value)
         return Path(save_as) if save_as else path.with_name(f'{path.stem}_calibrated.yaml')
 
-    def stages(self) -> dict[str, Counted]:
+    def stages(self) -> dict[str, Stage[Any, Any]]:
         """{name: stage} whose counts are published."""
         return {'calibrate': self._stage, 'survey': self._survey}
 

@@ -19,10 +19,11 @@ from mag_tracking.messages.types import CALIBRATED_READINGS
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
-from mag_tracking.nodes.stage_node import RESULTS, SENT, STREAM, Counted, StageNode
+from mag_tracking.nodes.stage_node import RESULTS, SENT, STREAM, StageNode
 from mag_tracking.records import Detection, FieldFrame
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.detect.stage import Detect
+from mag_tracking.stages.stage import Stage
 
 
 class DetectionNode(StageNode):
@@ -42,7 +43,7 @@ class DetectionNode(StageNode):
                           source='calibration_node')
         self.expect('tracker_node', '~/frame')
 
-    def stages(self) -> dict[str, Counted]:
+    def stages(self) -> dict[str, Stage[Any, Any]]:
         """{name: stage} whose counts are published."""
         return {'align': self._align, 'detect': self._detect}
 

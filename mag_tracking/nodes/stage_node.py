@@ -3,10 +3,9 @@
 import gc
 import signal
 import time
-from collections import Counter
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -29,6 +28,7 @@ from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import Readings
+from mag_tracking.stages.stage import Stage
 
 RESULTS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 """For what people subscribe to."""
@@ -43,12 +43,6 @@ SENSORS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Best effort matches reliable and best-effort drivers alike."""
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-class Counted(Protocol):
-    """A stage whose counts are published."""
-
-    counts: 'Counter[str]'
 
 
 class StageNode(Node):
@@ -79,7 +73,7 @@ class StageNode(Node):
         self.now_ns = 0
         self.create_timer(1.0, self._publish_diagnostics)
 
-    def stages(self) -> dict[str, Counted]:
+    def stages(self) -> dict[str, Stage[Any, Any]]:
         """{name: stage} whose counts are published."""
         raise NotImplementedError
 
@@ -131,7 +125,7 @@ class StageNode(Node):
             message_type, topic, callback if flow is None else take, qos,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=unfit, message_lost=lost))
 
-    def readings_of(self, message: FieldReadings, stage: Counted) -> Readings | None:
+    def readings_of(self, message: FieldReadings, stage: Stage[Any, Any]) -> Readings | None:
         """`Readings` of a FieldReadings; one that is none is a rejection of `stage`, and None."""
         try:
             return readings_of(message)

@@ -41,8 +41,9 @@ from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.markers import delete_markers, track_markers
 from mag_tracking.nodes.ros_params import follow_changes
-from mag_tracking.nodes.stage_node import LATCHED, RESULTS, SENT, STREAM, Counted, StageNode
+from mag_tracking.nodes.stage_node import LATCHED, RESULTS, SENT, STREAM, StageNode
 from mag_tracking.records import SmoothedPose, Track
+from mag_tracking.stages.stage import Stage
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.running_track import TrackRecord
 
@@ -77,7 +78,7 @@ class TrackerNode(StageNode):
         self.subscription(CalibrationState, '/calibration_node/calibration', self._calibrated,
                           LATCHED)
 
-    def stages(self) -> dict[str, Counted]:
+    def stages(self) -> dict[str, Stage[Any, Any]]:
         """{name: stage} whose counts are published."""
         return {'track': self._stage}
 
