@@ -57,6 +57,8 @@ class ClockStepFilter:
     @property
     def is_calm(self) -> bool:
         """Whether nobody is ahead: what is no longer a jump than the limit passes."""
+        if not self._held and not self._quiet_since:
+            return True
         # What is known of one whose samples are all gone holds for that newest stamp only.
         return not self._held and all(
             newest != self.newest for newest, _ in self._quiet_since.values())

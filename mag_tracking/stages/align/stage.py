@@ -94,7 +94,7 @@ class Align:
         if C is None:
             C = self._noise[rows]
         else:
-            unknown = np.all(np.isnan(C), axis=(1, 2))
+            unknown = readings.without_covariance()
             if unknown.any():
                 C = np.where(unknown[:, None, None], self._noise[rows], C)
         return self._hold(rows, plain(readings.stamp_ns, np.int64), plain(readings.field),

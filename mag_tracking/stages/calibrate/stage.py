@@ -296,7 +296,7 @@ def _own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
         return np.zeros(len(readings), dtype=np.int64), np.empty((0, 3, 3))
     C = plain(readings.covariance)
     valid = np.where(are_covariances(plain(readings.field), C), kernel.VALID, kernel.INVALID)
-    return np.where(np.isnan(C).all(axis=(1, 2)), kernel.NONE, valid), C
+    return np.where(readings.without_covariance(), kernel.NONE, valid), C
 
 
 def _same(a: FloatArray | None, b: FloatArray | None) -> bool:

@@ -1,10 +1,14 @@
 """Frames do not depend on how samples are split into batches."""
 
+from collections import Counter
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mag_tracking.records import Readings
 from mag_tracking.settings import replace
+from mag_tracking.stages.align import kernel
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
 from support.disordered_samples import disorder
@@ -36,3 +40,40 @@ def test_batches_give_the_frames_of_single_samples(seed):
     for name in ('stamp_ns', 'field', 'covariance', 'n_samples', 'time_offset'):
         a, b = ([getattr(f, name) for f in some] for some in frames)
         np.testing.assert_array_equal(a, b)
+
+
+def steady(n, n_readings, start=0, without=()):
+    """`Readings`, each of all sensors but those in `without`, every 10 ms."""
+    names = tuple(f'mag_{j + 1}' for j in range(n))
+    there = np.array([j for j in range(n) if j not in without])
+    return [Readings(names, there, np.full(len(there), 10**18 + k * 10**7),
+                     np.ones((len(there), 3)), np.tile(np.eye(3), (len(there), 1, 1)))
+            for k in range(start, start + n_readings)]
+
+
+def reasons_of(stage, readings, monkeypatch):
+    """How often the kernel gave which reason."""
+    reasons, compiled = [], kernel.hold_samples
+    monkeypatch.setattr(kernel, 'hold_samples',
+                        lambda *a: reasons.append(compiled(*a)) or reasons[-1])
+    for r in readings:
+        stage.feed(r)
+    monkeypatch.undo()
+    return Counter(reasons)
+
+
+def test_a_clock_that_stepped_is_asked_about_for_a_while_only(monkeypatch):
+    """A sensor whose clock steps ahead and which then dies; later it comes back."""
+    stage = Align(line_network(4), replace(AlignSettings(), {'most_pending': 40,
+                                                             'max_wait_s': 2.0}))
+    known = {kernel.DONE, kernel.COMPLETE}
+    assert set(reasons_of(stage, steady(4, 100), monkeypatch)) == known
+    ahead = [Readings(('mag_4',), np.array([0]), np.array([10**18 + 10**10 + k]), np.ones((1, 3)),
+                      np.eye(3)[None]) for k in range(3)]
+    assert reasons_of(stage, ahead, monkeypatch)[kernel.CLOCK_STEP] == 3
+    for r in steady(4, 300, 100, without=(3,)):
+        stage.feed(r)
+    assert set(reasons_of(stage, steady(4, 100, 400, without=(3,)), monkeypatch)) == known
+    for r in steady(4, 200, 500):
+        stage.feed(r)
+    assert set(reasons_of(stage, steady(4, 100, 700), monkeypatch)) == known

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mag_tracking.records import Readings
+from mag_tracking.stages.calibrate import kernel
 from mag_tracking.stages.calibrate import stage as calibrate
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
@@ -126,6 +127,20 @@ def test_outputs_do_not_change_later():
     for g, (field, C) in zip(given, kept, strict=True):
         np.testing.assert_array_equal(g.field, field)
         np.testing.assert_array_equal(g.covariance, C)
+
+
+def test_clean_readings_need_python_once_a_block(monkeypatch):
+    """A block has 25 readings at 100 Hz; only its end needs Python."""
+    network, samples, *_ = stream(2, 3)
+    stage, reasons, compiled = Calibrate(network, CalibrateSettings()), [], \
+        kernel.calibrate_readings
+    monkeypatch.setattr(kernel, 'calibrate_readings',
+                        lambda *a: reasons.append(compiled(*a)) or reasons[-1])
+    parts = batches(samples, 100, np.random.default_rng(0))
+    for b in parts:
+        stage.feed(b)
+    assert reasons.count(kernel.DONE) == len(parts)
+    assert len(reasons) - len(parts) <= len(samples) / 25
 
 
 @pytest.mark.parametrize('seed', range(4))
