@@ -1,6 +1,6 @@
 """Types of arrays, and of compiled functions on them; shapes and units stand in docstrings."""
 
-from typing import Literal, TypeAlias, TypedDict
+from typing import Any, Literal, TypeAlias, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,9 @@ IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 StructArray: TypeAlias = NDArray[np.void]
 """A structured array: one record an element."""
+Record: TypeAlias = Any
+"""One element of a structured array. In compiled code its fields are attributes; NumPy's types know
+of no such."""
 
 
 class CompileOptions(TypedDict, total=False):

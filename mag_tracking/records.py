@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.errors import ReadingsError
 
 _Number = TypeVar('_Number', bound=np.generic)
 
@@ -50,6 +51,16 @@ class Readings:
     """(n, 3) [T], sensor frame; after calibration without the background."""
     covariance: FloatArray | None = None
     """(n, 3, 3) [T^2], sensor frame; a row of NaN, or None for all: unknown."""
+
+    def __post_init__(self) -> None:
+        """Compiled code does not look at shapes. Raises ReadingsError."""
+        n = len(self.sensor)
+        for name, values, shape in (
+                ('sensor', self.sensor, (n,)), ('stamp_ns', self.stamp_ns, (n,)),
+                ('field', self.field, (n, 3)), ('covariance', self.covariance, (n, 3, 3))):
+            if values is not None and np.shape(values) != shape:
+                raise ReadingsError(f'{name}: expected shape {shape} for {n} readings; '
+                                    f'got {np.shape(values)}')
 
     def __len__(self) -> int:
         return len(self.sensor)

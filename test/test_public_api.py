@@ -241,17 +241,36 @@ FIELD, STAMPS = np.zeros((3, 3)), np.arange(3)
 @pytest.mark.parametrize('sensor, stamp_ns, field, covariance, text', [
     (['a'] * 3, STAMPS, np.zeros((3, 2)), None, r'field: expected shape \(3, 3\).*got \(3, 2\)'),
     (['a'] * 3, STAMPS, np.zeros(9), None, r'field: expected shape \(3, 3\)'),
-    (['a'] * 2, STAMPS, FIELD, None, r'sensor: expected shape \(3,\).*got \(2,\)'),
+    (['a'] * 2, STAMPS, FIELD, None, r'stamp_ns: expected shape \(2,\).*got \(3,\)'),
     (['a'] * 3, 0.01 * STAMPS, FIELD, None, 'stamp_ns: expected integers, nanoseconds; got float'),
     (['a'] * 3, 5, FIELD, None, 'stamp_ns'),
     (['a'] * 3, STAMPS, FIELD.astype(str), None, 'field: expected floats; got <U'),
     (['a'] * 3, STAMPS, FIELD, np.eye(3), r'covariance: expected shape \(3, 3, 3\)'),
     (['a', 'b', 'a'], [5, 3, 7], FIELD, None, r'reading 1 \(b\) is 2e-09 s older .* sort'),
+    ('abc', STAMPS, FIELD, None, "a name for each reading; got the text 'abc'"),
+    (['a'] * 3, np.arange(3, dtype=np.uint64) + 2**63, FIELD, None, 'nanoseconds since 1970'),
+    (['a'] * 3, np.full(3, -2**63), FIELD, None, 'nanoseconds since 1970'),
 ])
 def test_bad_arrays_are_refused(sensor, stamp_ns, field, covariance, text):
     with pytest.raises(mt.ReadingsError, match=text) as caught:
         mt.readings_from_arrays(sensor, stamp_ns, field, covariance)
     assert isinstance(caught.value, ValueError) and isinstance(caught.value, mt.MagTrackingError)
+
+
+def test_what_is_masked_is_missing():
+    field = np.ma.masked_greater(np.arange(9.0).reshape(3, 3), 6.0)
+    found = mt.readings_from_arrays(['a'] * 3, STAMPS, field).field
+    np.testing.assert_array_equal(np.isnan(found), np.arange(9.0).reshape(3, 3) > 6.0)
+    assert len(mt.readings_from_arrays([], [], [])) == 0
+
+
+@pytest.mark.parametrize('of_recording', [False, True])
+def test_masked_stamps_are_refused_also_where_the_order_is_that_of_a_recording(
+        recorded, of_recording):
+    r = recorded.readings
+    broken = replace(r, stamp_ns=np.ma.masked_equal(r.stamp_ns, r.stamp_ns[5]))
+    with pytest.raises(mt.ReadingsError, match='stamp_ns: a masked array'):
+        mt.track(replace(recorded, readings=broken) if of_recording else broken, NETWORK_FILE)
 
 
 @pytest.mark.parametrize('changes, text', [

@@ -61,7 +61,7 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
     progress : function, optional
         Called with the bytes done since the last call; with passes the recording is read twice.
     stopped : function, optional
-        Asked before every batch of readings; when it is true, what was read so far counts.
+        Asked after every batch of readings; when it is true, what was read so far counts.
 
     Returns
     -------

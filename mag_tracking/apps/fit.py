@@ -92,7 +92,7 @@ class PassCollector:
     """Readings to passes: what the network measured from before a detection until it ended."""
 
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
-        self._network = network
+        self._network, self._max_field = network, settings.calibrate.max_field
         self._stages = (Calibrate(network, settings.calibrate), Align(network, settings.align),
                         Detect(network, settings.detect))
         # Raw and calibrated readings by the network's clock, since before the latest onset.
@@ -132,7 +132,12 @@ class PassCollector:
 
     def flush(self) -> list[tuple[PassData, tuple[str, ...]]]:
         """The recording has ended: the pass that was still going on."""
-        out = [p for frame in self._stages[1].flush() for p in self._judge(frame)]
+        calibrate, align, _ = self._stages
+        out: list[tuple[PassData, tuple[str, ...]]] = []
+        for calibrated in calibrate.flush():
+            self._calibrated.append(calibrated)
+            out += [p for frame in align.feed(calibrated) for p in self._judge(frame)]
+        out += [p for frame in align.flush() for p in self._judge(frame)]
         if self._onset_ns is not None and self._last_ns is not None:
             out.append(self._cut(self._onset_ns, self._last_ns,
                                  'the recording ends while it is still seen'))
@@ -189,8 +194,9 @@ class PassCollector:
         raw = Readings.joined(self._raw)
         known: dict[tuple[int, int], int] = {}
         for k, key in enumerate(zip(raw.sensor.tolist(), raw.stamp_ns.tolist(), strict=True)):
-            # Of two with the same timestamp the calibration accepts the first.
-            known.setdefault(key, k)
+            # Of two with the same timestamp the calibration accepts the first usable one.
+            if np.nanmax(np.abs(raw.field[k]), initial=0.0) <= self._max_field:
+                known.setdefault(key, k)
         # Row -1 is NaN.
         rows = [known.get(key, -1) for key in zip(
             calibrated.sensor.tolist(), calibrated.stamp_ns.tolist(), strict=True)]

@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from mag_tracking.arrays import BoolArray
 from mag_tracking.errors import ReadingsError
@@ -15,7 +16,7 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Readings
 from mag_tracking.report.metrics import Truth
-from mag_tracking.units import NS
+from mag_tracking.units import LATEST_NS, NS
 
 LONGEST_DELAY_S = 10.0
 """[s] Readings that are further behind are taken for unsorted, not for delayed."""
@@ -107,14 +108,23 @@ def readings_from_arrays(sensor: Sequence[str], stamp_ns: ArrayLike, field: Arra
     ReadingsError
         If shapes or types are wrong, or the timestamps are not sorted.
     """
+    if isinstance(sensor, str):
+        raise ReadingsError(f'sensor: expected a name for each reading; got the text {sensor!r}')
     names = tuple(dict.fromkeys(str(name) for name in sensor))
     rows = {name: i for i, name in enumerate(names)}
+    fields, C = _filled(field), None if covariance is None else _filled(covariance)
     readings = _checked(Readings(
         names, np.array([rows[str(name)] for name in sensor], dtype=np.int64),
-        np.asarray(stamp_ns), np.asarray(field),
-        None if covariance is None else np.asarray(covariance)))
-    _check_order(readings, 0.0)
+        np.asarray(stamp_ns), fields if fields.size else fields.reshape(0, 3), C))
+    check_order(readings, 0.0)
     return readings
+
+
+def _filled(values: ArrayLike) -> NDArray[Any]:
+    """The array, with NaN where it is masked."""
+    if isinstance(values, np.ma.MaskedArray):
+        return np.where(values.mask, np.nan, values.data)
+    return np.asarray(values)
 
 
 def checked_readings(readings: Readings, network: SensorNetwork) -> Readings:
@@ -132,11 +142,9 @@ def checked_readings(readings: Readings, network: SensorNetwork) -> Readings:
     Raises
     ------
     ReadingsError
-        If shapes or types are wrong, the readings are not in order of time, or all are of sensors
-        that the network does not have.
+        If shapes or types are wrong, or all readings are of sensors that the network does not have.
     """
     readings = _checked(readings)
-    _check_order(readings, LONGEST_DELAY_S)
     if len(readings) and not set(readings.names) & set(network.names):
         raise ReadingsError(f'readings of {", ".join(readings.names)}, but the network has '
                             f'{", ".join(network.names)}')
@@ -145,22 +153,24 @@ def checked_readings(readings: Readings, network: SensorNetwork) -> Readings:
 
 def _checked(readings: Readings) -> Readings:
     """The readings in int64 and float64; raises ReadingsError for another shape or type."""
-    n = len(readings.stamp_ns) if np.ndim(readings.stamp_ns) else 0
-    arrays = {'sensor': ((n,), 'iu'), 'stamp_ns': ((n,), 'iu'), 'field': ((n, 3), 'iuf'),
-              'covariance': ((n, 3, 3), 'iuf')}
-    for name, (shape, kinds) in arrays.items():
+    n, kinds = len(readings), {'sensor': 'iu', 'stamp_ns': 'iu', 'field': 'iuf',
+                               'covariance': 'iuf'}
+    for name, allowed in kinds.items():
         values = getattr(readings, name)
-        if values is None and name == 'covariance':
+        if values is None:
             continue
+        if isinstance(values, np.ma.MaskedArray):
+            raise ReadingsError(f'{name}: a masked array; use NaN for what is missing')
         values = np.asarray(values)
         # An empty list has no integers.
-        if values.dtype.kind not in kinds and values.size:
-            wanted = 'floats' if 'f' in kinds else (
+        if values.dtype.kind not in allowed and values.size:
+            wanted = 'floats' if 'f' in allowed else (
                 'integers, nanoseconds' if name == 'stamp_ns' else 'integers, rows of names')
             raise ReadingsError(f'{name}: expected {wanted}; got {values.dtype}')
-        if values.shape != shape:
-            raise ReadingsError(f'{name}: expected shape {shape}, as stamp_ns has {n} elements; '
-                                f'got {values.shape}')
+    stamps = np.asarray(readings.stamp_ns)
+    if n and not -LATEST_NS <= int(stamps.min()) <= int(stamps.max()) <= LATEST_NS:
+        raise ReadingsError(f'stamp_ns: {stamps.min()} .. {stamps.max()} is outside '
+                            f'{-LATEST_NS} .. {LATEST_NS}: nanoseconds since 1970?')
     sensor = np.asarray(readings.sensor, dtype=np.int64)
     if n and not 0 <= sensor.min() <= sensor.max() < len(readings.names):
         raise ReadingsError(f'sensor: {sensor.min()} .. {sensor.max()} is outside 0 .. '
@@ -171,7 +181,7 @@ def _checked(readings: Readings) -> Readings:
                     None if C is None else np.asarray(C, dtype=float))
 
 
-def _check_order(readings: Readings, tolerance: float) -> None:
+def check_order(readings: Readings, tolerance: float = LONGEST_DELAY_S) -> None:
     """Raise ReadingsError where a reading is `tolerance` [s] older than one before it."""
     if not len(readings):
         return

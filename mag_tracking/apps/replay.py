@@ -75,7 +75,7 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     progress : function, optional
         Called with the bytes done since the last call.
     stopped : function, optional
-        Asked before every batch of readings and whenever the reading has got on. When it is
+        Asked after every batch of readings and whenever the reading has got on. When it is
         true the reading ends, what was done is written, and the summary says so.
 
     Returns

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from mag_tracking.apps.readings import (
     RecordedReadings,
+    check_order,
     checked_readings,
     network_of,
     recorded,
@@ -194,8 +195,10 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
     pipeline = Pipeline(network, settings_for(target, settings))
     results = _Results()
     if isinstance(source, Readings):
-        source = RecordedReadings(checked_readings(source, network), {}, {}, {}, ())
+        check_order(source)
+        source = RecordedReadings(source, {}, {}, {}, ())
     if isinstance(source, RecordedReadings):
+        source = replace(source, readings=checked_readings(source.readings, network))
         for i in range(0, len(source.readings), _BATCH):
             results.take(pipeline.feed(source.readings.part(slice(i, i + _BATCH))))
         info = source

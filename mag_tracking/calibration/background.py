@@ -9,24 +9,22 @@ are this package's own.
 """
 
 from collections import deque
-from math import inf, isnan
+from math import inf
 from typing import TypeAlias
 
 import numpy as np
 from numba import float64, int64, njit, void
 
-from mag_tracking.arrays import FloatArray, StructArray
+from mag_tracking.arrays import FloatArray, Record, StructArray
 from mag_tracking.calibration.blocks import (
     Block,
     Blocks,
     BlockWindow,
-    add_to_block,
     block_of,
     line_through,
     stacked,
 )
-from mag_tracking.calibration.sensor_state import SENSORS, Record, new_sensors
-from mag_tracking.records import plain
+from mag_tracking.calibration.sensor_state import SENSORS
 
 LOUDEST = 100.0
 """A block whose variance is so many times that of the quietest is no noise: a target passed within
@@ -81,18 +79,18 @@ class RunningBackground:
         Staggers the blocks of many sensors that began together: the first block is longer by
         this share, and the others follow at even times. A complete block is judged by
         `judge_block`, or before the next reading. Without a phase it is judged at once.
-    sensors : (1,) SENSOR, optional
+    sensors : (1,) SENSOR
         State of the sensor; the block that is being collected, and line and noise for compiled
         code.
     """
 
     def __init__(self, learn: float, memory: float, guard: float, block: float,
                  freeze_std: float, relearn: float, background: FloatArray | None = None,
-                 noise_std: FloatArray | None = None, phase: float | None = None,
-                 sensors: StructArray | None = None) -> None:
+                 noise_std: FloatArray | None = None, phase: float | None = None, *,
+                 sensors: StructArray) -> None:
         self._learn, self._guard, self._length = learn, guard, block
         self._freeze_std, self._relearn = freeze_std, relearn
-        self._sensors = new_sensors(1) if sensors is None else sensors
+        self._sensors = sensors
         self._state = self._sensors[0]
         self._state['length'], self._state['phase'] = block, np.nan if phase is None else phase
         self._most = max(3, int(round(memory / block)))
@@ -166,15 +164,8 @@ class RunningBackground:
         _subtract(self._sensors, 0, time, field, out)
         return out
 
-    def add(self, time: float, field: FloatArray) -> None:
-        """Take a sample: `time` [s], `field` (3,) [T], sensor frame."""
-        self.judge_block()
-        add_to_block(self._sensors, 0, time, plain(field))
-        if isnan(self._state['phase']):
-            self.judge_block()
-
     def judge_block(self) -> None:
-        """Judge the block that the latest sample has shown to be complete; else `add` does it."""
+        """Judge the block that the latest sample has shown to be complete."""
         if not self._state['is_full']:
             return
         block = block_of(self._state)

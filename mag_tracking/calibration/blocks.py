@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import float64, int64, njit, void
+from numba import float64, njit, void
 
-from mag_tracking.arrays import FloatArray, StructArray
-from mag_tracking.calibration.sensor_state import SENSORS, Record
+from mag_tracking.arrays import FloatArray, Record
 
 LEAST_SAMPLES = 8
 """A block has at least so many readings, however slow the sensor: fewer tell nothing of noise."""
@@ -83,14 +82,6 @@ def collect(s: Record, time: float, field: FloatArray) -> None:
                 s.count[k, a, b] += 1.0
                 s.sum[k, a, b] += d
                 s.product[k, a, b] += d * e
-
-
-@njit(void(SENSORS, int64, float64, float64[::1]), cache=True)
-def add_to_block(sensors: StructArray, j: int, time: float, field: FloatArray) -> None:
-    """Add a reading of sensor `j`, `field` (3,) [T] at `time` [s], to its block."""
-    s: Record = sensors[j]
-    begin_block_if_due(s, time)
-    collect(s, time, field)
 
 
 @njit(void(float64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1],

@@ -6,10 +6,11 @@ Only a suspect reading is held until the next ones decide; all others pass at on
 import math
 
 import numpy as np
-from numba import boolean, float64, int64, njit
+from numba import njit
 
-from mag_tracking.arrays import FloatArray, StructArray
-from mag_tracking.calibration.sensor_state import MOST_HELD, NEVER, RECENT, SENSORS, Record
+from mag_tracking.arrays import FloatArray, Record
+from mag_tracking.calibration.sensor_state import MOST_HELD, RECENT
+from mag_tracking.units import NEVER
 
 MEMORY = 20_000
 """Readings over which the usual share of repetitions is counted, about."""
@@ -34,8 +35,8 @@ BACK = 0.3
 """After a spike the field is again where it was, to this share of the spike."""
 
 PASSES, HELD, SPIKE, RELEASED = range(4)
-"""Results of `screen_spike`: the reading passes; it is held; what was held is a spike (and
-`judge_spike` has to decide on the reading); the held readings and this one pass, in order."""
+"""Results of `screen_spike`: the reading passes; it is held; what was held is a spike (call
+again for the reading itself); the held readings and this one pass, in order."""
 
 
 @njit(cache=True)
@@ -200,17 +201,3 @@ def clear_spikes(sensor: Record) -> None:
     """Forget the readings before, and those that are held."""
     sensor['before_ns'], sensor['n_steps'] = NEVER, 0
     sensor['n_held'] = sensor['n_released'] = 0
-
-
-@njit(boolean(SENSORS, int64, float64[::1]), cache=True)
-def find_repetition(sensors: StructArray, j: int, field: FloatArray) -> bool:
-    """`is_stuck` of sensor `j` of (n,) SENSOR, callable from Python."""
-    return bool(is_stuck(sensors[j], field))
-
-
-@njit(int64(SENSORS, int64, float64, int64, float64[::1]), cache=True)
-def find_spike(sensors: StructArray, j: int, threshold: float, stamp: int,
-               field: FloatArray) -> int:
-    """`screen_spike` of a reading without its own covariance, callable from Python."""
-    return int(screen_spike(sensors[j], threshold, stamp, field, 0, np.empty((3, 3)),
-                            np.empty(3)))

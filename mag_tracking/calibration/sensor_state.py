@@ -3,15 +3,12 @@
 Compiled code reads and writes it reading by reading, Python block by block.
 """
 
-from typing import Any, TypeAlias
-
 import numpy as np
 from numba import from_dtype
 
 from mag_tracking.arrays import StructArray
+from mag_tracking.units import NEVER
 
-NEVER = np.iinfo(np.int64).min
-"""[ns] Timestamp of an event that has not happened."""
 RECENT = 8
 """Differences between consecutive readings that a spike is compared with."""
 MOST_HELD = 3
@@ -51,10 +48,6 @@ SENSOR = np.dtype([
     ('product', np.float64, (2, 3, 3)),
 ])
 """State of one sensor, in [T] and [s], or [ns] where the name says so."""
-
-Record: TypeAlias = Any
-"""One element of a structured array in compiled code, where its fields are attributes; NumPy's
-types do not know that."""
 
 SENSORS = from_dtype(SENSOR)[::1]
 """numba's type of a (n,) array of SENSOR."""

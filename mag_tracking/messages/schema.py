@@ -17,9 +17,7 @@ from mag_tracking.records import (
     SmoothedPose,
     Track,
 )
-
-LATEST_NS = 2**31 * 1_000_000_000
-"""[ns] Later than any stamp of a header."""
+from mag_tracking.units import LATEST_NS
 
 
 def stamp_ns(stamp: Time) -> int:

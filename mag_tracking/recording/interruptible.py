@@ -23,7 +23,7 @@ def until_stopped(read: Callable[[Progress], Iterator[_Item]], progress: Progres
     progress : function, optional
         Called with the bytes done since the last call.
     stopped : function, optional
-        Asked before every item, and whenever the reading has advanced.
+        Asked after every item, and whenever the reading has advanced.
 
     Raises
     ------
@@ -40,5 +40,5 @@ def until_stopped(read: Callable[[Progress], Iterator[_Item]], progress: Progres
             raise ReadingStopped
 
     for item in read(advance):
-        check()
         yield item
+        check()

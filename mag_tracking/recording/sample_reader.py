@@ -19,7 +19,7 @@ from mag_tracking.messages.types import (
     decode,
 )
 from mag_tracking.network import SensorNetwork
-from mag_tracking.recording.interruptible import Progress
+from mag_tracking.recording.interruptible import Progress, ReadingStopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.records import AccelerationSample, Readings
 
@@ -73,11 +73,16 @@ class SampleReader:
     def readings(self, progress: Progress | None = None) -> Iterator[Readings]:
         """Iterate over batches of `Readings` in order of log time; see `Recording.messages`."""
         waiting: list[Readings] = []
-        for readings, _ in self.readings_as_received(progress):
-            waiting.append(readings)
-            if len(waiting) == GATHERED:
-                yield Readings.joined(waiting)
-                waiting = []
+        try:
+            for readings, _ in self.readings_as_received(progress):
+                waiting.append(readings)
+                if len(waiting) == GATHERED:
+                    yield Readings.joined(waiting)
+                    waiting = []
+        except ReadingStopped:
+            # What was read counts.
+            yield Readings.joined(waiting)
+            raise
         if waiting:
             yield Readings.joined(waiting)
 

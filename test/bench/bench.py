@@ -216,8 +216,8 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
 network = read_network(sys.argv[2])
 pipeline = Pipeline(network, settings_for('vehicle'))
-for sample in recorded(SampleReader(Recording(sys.argv[3]), network)):
-    if any(isinstance(r, Track) for r in pipeline.feed(one(sample))):
+for readings in SampleReader(Recording(sys.argv[3]), network).readings():
+    if any(isinstance(r, Track) for r in pipeline.feed(readings)):
         print(time.time() - start)
         break
 '''

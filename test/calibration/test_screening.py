@@ -14,13 +14,12 @@ from mag_tracking.calibration.screening import (
     PASSES,
     RELEASED,
     SPIKE,
-    find_repetition,
-    find_spike,
 )
 from mag_tracking.calibration.sensor_state import MOST_HELD, new_sensors
 from mag_tracking.simulation.scenario import Path, point_body, random_vehicle
 from support.networks import line_network
 from support.samples import simulate
+from support.sensor_kernels import find_repetition, find_spike
 from support.sensor_noise import EARTH, NS, SIGMA, noise
 
 

@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 
-from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.settings import replace
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from support.networks import line_network
 from support.samples import MagSample
+from support.sensor_kernels import FedBackground
 
 SIGMA = np.array([1.0e-8, 1.2e-8, 1.5e-8])
 
@@ -18,7 +18,7 @@ EARTH = np.array([2e-6, 1.5e-5, -4.9e-5])
 
 
 def running(**changes):
-    return RunningBackground(**{'learn': 3.0, 'memory': 20.0, 'guard': 1.5, 'block': 0.25,
+    return FedBackground(**{'learn': 3.0, 'memory': 20.0, 'guard': 1.5, 'block': 0.25,
                                 'freeze_std': 2.0, 'relearn': 60.0, **changes})
 
 

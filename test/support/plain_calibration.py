@@ -7,10 +7,10 @@ from collections import Counter
 
 import numpy as np
 
-from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.decimation import Decimator
 from mag_tracking.stages.calibrate import stage as calibrate
 from support.samples import MagSample
+from support.sensor_kernels import FedBackground
 
 NS = 1_000_000_000
 
@@ -104,7 +104,7 @@ class PlainCalibration:
         self.spikes = {n: Spikes(settings.spike_std) for n in network.names}
         self.decimators = {n: Decimator(settings.decimate_to_hz) for n in network.names}
         s, n = settings, len(network)
-        self.backgrounds = {name: RunningBackground(
+        self.backgrounds = {name: FedBackground(
             s.learn_s, s.memory_s, s.guard_s, s.block_s, s.freeze_std, s.relearn_s,
             network.background[i], network.noise_std[i],
             phase=i / n if n > calibrate.AT_ONCE else None)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.calibration.sensor_state import NEVER
+from mag_tracking.units import NEVER
 
 
 class HeldSample(NamedTuple):

@@ -7,8 +7,8 @@ clock that stepped, a frame that may be complete, ...) is returned as a reason c
 import numpy as np
 from numba import boolean, float64, from_dtype, int64, njit, void
 
-from mag_tracking.arrays import FloatArray, IntArray, StructArray
-from mag_tracking.calibration.sensor_state import NEVER, Record
+from mag_tracking.arrays import FloatArray, IntArray, Record, StructArray
+from mag_tracking.units import NEVER
 
 (DONE, UNKNOWN_SENSOR, NO_FIELD, NO_COVARIANCE, DUPLICATE, OUT_OF_ORDER, LATE) = range(7)
 """The batch is finished, or the sample is rejected."""

@@ -6,7 +6,7 @@ import numpy as np
 from numba import boolean, float64, int64, njit, void
 
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.calibration.sensor_state import NEVER
+from mag_tracking.units import NEVER
 
 ROOM = 32
 """Samples of a sensor that there is room for at first."""

@@ -10,14 +10,13 @@ from collections import Counter
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.calibration.sensor_state import NEVER
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame, Readings, plain
 from mag_tracking.stages.align import kernel
 from mag_tracking.stages.align.clock_step import ClockStepFilter, HeldSample
 from mag_tracking.stages.align.sample_buffer import SampleBuffer
 from mag_tracking.stages.align.settings import AlignSettings
-from mag_tracking.units import NS
+from mag_tracking.units import NEVER, NS
 
 FAR = np.iinfo(np.int64).max
 """[ns] Later than anything."""

@@ -8,7 +8,7 @@ continues where it stopped.
 import numpy as np
 from numba import boolean, float64, from_dtype, int64, njit
 
-from mag_tracking.arrays import FloatArray, IntArray, StructArray
+from mag_tracking.arrays import FloatArray, IntArray, Record, StructArray
 from mag_tracking.calibration.background import subtract_background
 from mag_tracking.calibration.blocks import begin_block_if_due, collect
 from mag_tracking.calibration.screening import (
@@ -18,7 +18,8 @@ from mag_tracking.calibration.screening import (
     is_stuck,
     screen_spike,
 )
-from mag_tracking.calibration.sensor_state import NEVER, SENSORS, Record
+from mag_tracking.calibration.sensor_state import SENSORS
+from mag_tracking.units import NEVER
 
 (DONE, UNKNOWN_SENSOR, NO_AXIS, INFINITE, TOO_LARGE, BAD_COVARIANCE, AXIS_MISSING, TOO_FAR_AHEAD,
  DUPLICATE, OUT_OF_ORDER, STUCK) = range(11)
@@ -92,8 +93,9 @@ def _misplaced(s: Record, limits: Record, stamp: int) -> int:
     """Why a timestamp cannot be used, or DONE."""
     if s.last_ns != NEVER:
         if stamp - s.last_ns > limits.longest_jump_ns:
-            before, s.unconfirmed_ns = s.unconfirmed_ns, stamp
+            before = s.unconfirmed_ns
             if before == NEVER or not 0 < stamp - before <= limits.longest_jump_ns:
+                s.unconfirmed_ns = stamp
                 return TOO_FAR_AHEAD
         else:
             s.unconfirmed_ns = NEVER
@@ -165,6 +167,8 @@ def _use(s: Record, batch: Record, row: int, stamp: int, field: FloatArray, own:
         batch.n_learning += 1
         return True
     k = batch.n_out
+    if k >= len(out_rows):
+        raise IndexError('no room for the calibrated readings')
     out, C = out_fields[k], out_covariances[k]
     subtract_background(s, time, field, out)
     n_missing, is_new = 0, False
@@ -195,7 +199,10 @@ def _correct_covariance(s: Record, C: FloatArray, out: FloatArray) -> None:
             out[a, b] = 0.0
             for c in range(3):
                 for d in range(3):
-                    out[a, b] += s.correction[a, c] * C[c, d] * s.correction[b, d]
+                    # A coefficient of zero needs no axis, as in `_remove_iron`.
+                    weight = s.correction[a, c] * s.correction[b, d]
+                    if weight != 0.0:
+                        out[a, b] += weight * C[c, d]
 
 
 @njit(int64(SENSORS, _LIMITS, _I, _I, _V, _I, _M, _BATCH, _I, _I, _V, _M), cache=True)

@@ -5,11 +5,11 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.arrays import FloatArray, IntArray, Record
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.decimation import Decimator
 from mag_tracking.calibration.screening import clear_spikes
-from mag_tracking.calibration.sensor_state import NEVER, Record, new_sensors
+from mag_tracking.calibration.sensor_state import new_sensors
 from mag_tracking.errors import NetworkError
 from mag_tracking.inference.axes import are_covariances
 from mag_tracking.network import SensorNetwork
@@ -22,7 +22,7 @@ from mag_tracking.stages.calibrate.restoration import (
     stored_background,
 )
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
-from mag_tracking.units import NS
+from mag_tracking.units import NEVER, NS
 
 AT_ONCE = 16
 """The blocks of so many sensors may end at once; those of more would hold up the readings."""
@@ -254,6 +254,7 @@ class Calibrate:
             s['n_released'] = s['n_held']
             s['accepted'] += s['n_held']
             self._use_passed(int(i), out)
+        for s in self._sensors:
             clear_spikes(s)
         return self._finished(out)
 

@@ -111,3 +111,13 @@ def test_counts_name_each_sensor():
     frames_of(stage, stepped(stream(6, 0, 4000), {0, 5}, 1000, 2000, by=5000))
     assert Counter(rejected(stage.counts)) == {
         'ahead of all others: mag_1': 100, 'ahead of all others: mag_6': 100}
+
+
+def test_what_is_ahead_is_so_of_the_newest_not_of_the_latest():
+    """A sensor whose samples come 0.45 s late; those of the other are 0.1 s apart."""
+    stage = align(2, period_s=0.1, ahead_s=0.5, max_wait_s=2.0)
+    for k in range(50):
+        stage.feed(one(sample((1000 + 100 * k) * MS, 0)))
+        stage.feed(one(sample((550 + 100 * k) * MS, 1)))
+        assert stage.n_held_ahead == 0
+    assert not rejected(stage.counts)

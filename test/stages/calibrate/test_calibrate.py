@@ -5,8 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mag_tracking.calibration.background import RunningBackground
-from mag_tracking.calibration.sensor_state import new_sensors
 from mag_tracking.errors import NetworkError
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
@@ -14,6 +12,7 @@ from mag_tracking.stages.stage import rejected
 from support.calibration_runs import EARTH, SIGMA, feed, running, sample, stage
 from support.networks import line_network
 from support.samples import MagSample, fed
+from support.sensor_kernels import FedBackground
 
 
 def test_level_noise_and_drift_are_learnt():
@@ -278,8 +277,8 @@ def test_another_correction_is_learnt_anew():
 
 def ends_of_blocks(phase, times):
     """(readings, by number, that showed a block to be complete, the background) of `times` [s]."""
-    state = new_sensors(1)
-    background = RunningBackground(3.0, 20.0, 1.5, 0.25, 2.0, 60.0, phase=phase, sensors=state)
+    background = FedBackground(3.0, 20.0, 1.5, 0.25, 2.0, 60.0, phase=phase)
+    state = background.sensors
     rng, ends, now = np.random.default_rng(0), [], 0
     for k, t in enumerate(times):
         background.add(t, 1e-8 * rng.standard_normal(3))

@@ -186,3 +186,70 @@ def test_coarse_steps_repeat_themselves():
     assert np.count_nonzero((np.diff(fields, axis=0) == 0.0).all(axis=1)) > 50
     calibrated_alike(network, [MagSample(10**18 + k * 10**7, 'mag_1', f)
                                for k, f in enumerate(fields)])
+
+
+@pytest.mark.parametrize('is_renewed', [False, True])
+def test_many_thinned_samples_come_at_once(is_renewed):
+    """A decimator measures the rate by 32 samples, and all of them come with the last."""
+    network = dataclasses.replace(line_network(2), background=(np.zeros(3),) * 2,
+                                  noise_std=(np.full(3, 1e-8),) * 2)
+    rng = np.random.default_rng(0)
+    samples = [MagSample(10**18 + k * 5 * 10**7, f'mag_{j}', 1e-8 * rng.standard_normal(3))
+               for k in range(200) for j in (1, 2)]
+    found = []
+    for size in (1, 7, 400):
+        stage, out = Calibrate(network, CalibrateSettings(decimate_to_hz=20.0)), []
+        for i in range(0, 400, size):
+            if is_renewed and i <= 40 < i + size:
+                stage.renew(dataclasses.replace(network, clock_offset=np.zeros(2)))
+            out.append(sum(map(len, stage.feed(batch(samples[i:i + size])))))
+        found.append((sum(out), stage.counts['calibrated']))
+        assert size > 1 or max(out) == 32
+    assert len(set(found)) == 1 or is_renewed
+
+
+def test_corrupt_timestamps_do_not_confirm_each_other():
+    """Each jumps ahead of good ones; two in a row would be a step of the clock."""
+    stage = Calibrate(dataclasses.replace(line_network(1), background=(np.zeros(3),)),
+                      CalibrateSettings())
+    at_s = [1, 2, 1000, 3, 1001, 4, 1000.5, 5]
+    for k, t in enumerate(at_s):
+        stage.feed(one(MagSample(int(t * 1e9), 'mag_1', np.full(3, 1e-8 * (k + 1)))))
+    assert stage.counts['rejected: stamp too far ahead'] == 3
+    assert stage.counts['calibrated'] == 5
+
+
+def test_a_step_of_the_clock_is_confirmed_once_also_where_a_background_is_offered():
+    network = dataclasses.replace(line_network(1), background=(np.zeros(3),))
+    first = Calibrate(network, CalibrateSettings())
+    first.feed(one(MagSample(10**9, 'mag_1', np.full(3, 1e-8))))
+    stored = first.stored('mag_1')
+    stage = Calibrate(network, CalibrateSettings())
+    for k, t in enumerate((0.0, 100.0, 100.1, 100.2)):
+        if k == 1:
+            stage.resume({'mag_1': stored})
+        stage.feed(one(MagSample(int((t + 1.0) * 1e9), 'mag_1', np.full(3, 1e-8 * (k + 1)))))
+    assert stage.counts['rejected: stamp too far ahead'] == 1
+
+
+def test_a_flush_forgets_what_all_sensors_were_compared_with():
+    network = dataclasses.replace(line_network(1), background=(np.zeros(3),))
+    stage, rng = Calibrate(network, CalibrateSettings()), np.random.default_rng(0)
+
+    def feed(k, offset=0.0):
+        return len(samples_of(*stage.feed(one(MagSample(
+            10**18 + k * 10**7, 'mag_1', offset + 1e-8 * rng.standard_normal(3))))))
+
+    assert all(feed(k) for k in range(20))
+    assert stage.flush() == []
+    assert feed(20, 5e-6)
+
+
+def test_an_own_covariance_needs_no_axis_that_the_correction_does_not_need():
+    C = np.array([[1.02, 0.03, 0.0], [-0.01, 0.97, 0.0], [0.0, 0.0, 1.0]])
+    network = dataclasses.replace(line_network(1), background=(np.zeros(3),), correction=(C,))
+    own = np.diag([1e-16, 2e-16, np.nan])
+    (out,) = samples_of(*Calibrate(network, CalibrateSettings()).feed(one(
+        MagSample(10**18, 'mag_1', np.array([1e-8, 2e-8, np.nan]), own))))
+    np.testing.assert_allclose(out.covariance[:2, :2], C[:2, :2] @ own[:2, :2] @ C[:2, :2].T)
+    assert np.isnan(out.field[2]) and not np.isnan(out.field[:2]).any()
