@@ -132,3 +132,18 @@ def test_the_tests_mirror_the_package():
                if p.is_dir() and not set(p.relative_to(ROOT / 'test').parts) & apart]
     assert [str(f) for f in folders if not (PACKAGE / f).is_dir()] == []
     assert Path('stages/track') in folders
+
+
+def paths_in_documents():
+    """(document, path of a file or folder that it names in backticks)."""
+    for document in [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]:
+        for name in re.findall(r'`([\w./-]+(?:/|\.py|\.md|/[\w.-]+\.(?:yaml|xml|toml)))`',
+                               document.read_text()):
+            yield document.name, name
+
+
+def test_documents_name_files_that_exist():
+    """Below the project, the package, a room of it, or the results of a command."""
+    rooms = [ROOT, PACKAGE, *(p for p in PACKAGE.rglob('*') if p.is_dir()), ROOT / 'test']
+    assert [(d, name) for d, name in paths_in_documents()
+            if not any((room / name).exists() for room in rooms)] == []

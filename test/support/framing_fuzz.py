@@ -1,6 +1,6 @@
 """Sends frames between garbage through the framings; finds what is lost or invented.
 
-python test/framing_fuzz.py --frames 1000000
+PYTHONPATH=test python -m support.framing_fuzz --frames 1000000
 
 prints per framing the frames sent and found, the bytes of garbage and the seconds
 of parsing, and exits with 1 on any loss. A framing joins by an entry in `CASES`.

@@ -1,7 +1,7 @@
 """An Xsens device for tests: its messages, written from the protocol and not from the parser.
 
 `encode_random_frame` and `garbage` make endless streams; the long run is
-`python test/xsens_messages.py --frames 1000000`.
+`PYTHONPATH=test python -m support.xsens_messages --frames 1000000`.
 """
 
 import argparse
