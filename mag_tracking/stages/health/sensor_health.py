@@ -22,7 +22,7 @@ UNKNOWN = np.iinfo(np.int64).min
 STEP_S = 0.25
 """[s] A clock has stepped where a stamp is off by more while the reading came in time."""
 REPLAYED_S = 86400.0
-"""[s] Stamps that are older are of a replay (or of another clock: `apps.doctor` compares sensors)."""
+"""[s] Older stamps are of a replay (or of another clock: `apps.doctor` compares sensors)."""
 LOST = 1.5
 """An interval longer than so many usual ones has lost readings in it."""
 IRREGULAR = 0.3
