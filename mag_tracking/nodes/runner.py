@@ -31,6 +31,10 @@ from mag_tracking.settings import flatten
 PathLike = str | OsPathLike[str]
 
 
+LONGEST_DISCOVERY_S = 60.0
+"""[s] Nodes that have not found each other by then never will; a busy machine takes several."""
+
+
 class TrackPrinter(Node):
     """Prints the track as it grows; subscribes like any other program."""
 
@@ -155,11 +159,12 @@ def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Se
         if replay is None:
             spin(executor, stopped)
             return 0
-        deadline = time.monotonic() + 10.0
+        deadline = time.monotonic() + LONGEST_DISCOVERY_S
         spin(executor, lambda: all_connected(stages, replay) or stopped()
              or time.monotonic() > deadline)
         if not all_connected(stages, replay) and not stopped():
-            raise MagTrackingError('the nodes did not find each other within 10 s')
+            raise MagTrackingError('the nodes did not find each other within '
+                                   f'{LONGEST_DISCOVERY_S:g} s')
         replay.resume()
         spin(executor, lambda: replay.finished or stopped())
         _work_off(executor, stages, stopped)
