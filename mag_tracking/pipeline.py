@@ -86,6 +86,7 @@ class Pipeline:
         self.align = Align(network, settings.align)
         self.detect = Detect(network, settings.detect)
         self.track = TrackManager(network, settings.track)
+        # The same as links of the chain: a type checker compares them with the protocol.
         self._calibrate: Stage[Readings, Readings] = self.calibrate
         self._align: Stage[Readings, FieldFrame] = self.align
         self._detect: Stage[FieldFrame, FieldFrame | Detection] = self.detect
@@ -97,11 +98,6 @@ class Pipeline:
         They do not depend on how the readings are split into batches.
         """
         return self._after_calibrate(self._calibrate.feed(readings))
-
-    def idle(self) -> None:
-        """Do what may wait until the outputs are used."""
-        for stage in self._stages().values():
-            stage.idle()
 
     def flush(self) -> list[Output]:
         """The input has ended: what was still held back."""
