@@ -80,8 +80,7 @@ class RunningBackground:
         this share, and the others follow at even times. A complete block is judged by
         `judge_block`, or before the next reading. Without a phase it is judged at once.
     sensors : (1,) SENSOR
-        State of the sensor; the block that is being collected, and line and noise for compiled
-        code.
+        State of the sensor: holds the present block, and line and noise for compiled code.
     """
 
     def __init__(self, learn: float, memory: float, guard: float, block: float,

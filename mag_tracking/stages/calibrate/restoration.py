@@ -1,4 +1,4 @@
-"""Backgrounds that are stored for a restart, and restored where the readings go on soon after."""
+"""Backgrounds that are restored after a restart if the readings continue soon after."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from mag_tracking.units import NS
 
 @dataclass(frozen=True)
 class StoredBackground:
-    """The background of one sensor, to go on from after a restart."""
+    """The background of one sensor, as it is restored after a restart."""
 
     stamp_ns: int
     background: FloatArray
@@ -25,7 +25,7 @@ def stored_background(background: RunningBackground, stamp_ns: int,
                       level: FloatArray) -> StoredBackground | None:
     """`StoredBackground` of a `RunningBackground` that is ready, or None.
 
-    `level` (3,) [T] is what it says of `stamp_ns`, the latest reading.
+    `level` (3,) [T] is the background at `stamp_ns`, the sensor's latest reading.
     """
     C = background.covariance
     assert C is not None
@@ -35,10 +35,10 @@ def stored_background(background: RunningBackground, stamp_ns: int,
 
 
 class BackgroundRestoration:
-    """What was stored of sensors of which nothing has come yet."""
+    """Stored backgrounds of sensors without a reading so far."""
 
     def __init__(self, longest_s: float) -> None:
-        """`longest_s` [s]: a first reading that comes later is of another time."""
+        """`longest_s` [s]: maximum age of a stored background at the sensor's first reading."""
         self._longest_ns = longest_s * NS
         self._stored: dict[str, StoredBackground] = {}
 
@@ -46,17 +46,17 @@ class BackgroundRestoration:
         return sensor in self._stored
 
     def offer(self, stored: Mapping[str, StoredBackground]) -> None:
-        """{sensor: `StoredBackground`}, in place of what was offered before."""
+        """Replace the stored backgrounds by {sensor: `StoredBackground`}."""
         self._stored = dict(stored)
 
     def forget(self, sensor: str) -> None:
-        """What was stored of `sensor` is of no use any more."""
+        """Drop the stored background of `sensor`."""
         self._stored.pop(sensor, None)
 
-    def take_up(self, sensor: str, stamp_ns: int, background: RunningBackground) -> str:
-        """The first reading of `sensor` decides; what is to be counted of it.
+    def restore(self, sensor: str, stamp_ns: int, background: RunningBackground) -> str:
+        """Restore a background at the sensor's first reading if it is recent.
 
-        Its `RunningBackground` goes on from what was stored, if that is of a moment before.
+        Returns the event to be counted.
         """
         stored = self._stored.pop(sensor)
         if 0 < stamp_ns - stored.stamp_ns <= self._longest_ns:

@@ -166,7 +166,7 @@ class Calibrate:
             self.counts['time jumped back'] += 1
             self._sensors[i]['first_ns'] = self._sensors[i]['last_ns'] = NEVER
         elif reason == kernel.RESTORABLE:
-            self.counts[self._restoration.take_up(name, int(batch['stamp_ns']),
+            self.counts[self._restoration.restore(name, int(batch['stamp_ns']),
                                                   self._background[name])] += 1
             self._sensors[i]['is_restorable'] = False
         elif reason == kernel.PASSED:
