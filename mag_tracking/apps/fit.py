@@ -118,13 +118,13 @@ class PassCollector:
     def feed(self, readings: Readings) -> list[tuple[PassData, tuple[str, ...]]]:
         """Raw `Readings` of the network give the passes that they complete: [(PassData, notes)]."""
         calibrate, align, _ = self._stages
-        if not len(readings):
-            return []
-        sensor = readings.rows({name: j for j, name in enumerate(self._network.names)})
-        self._raw.append(Readings(self._network.names, sensor,
-                                  readings.stamp_ns - self._clock_ns[sensor], readings.field))
         out: list[tuple[PassData, tuple[str, ...]]] = []
-        for calibrated in calibrate.feed(readings):
+        batches = calibrate.feed(readings)
+        if batches or calibrate.n_held:
+            sensor = readings.rows({name: j for j, name in enumerate(self._network.names)})
+            self._raw.append(Readings(self._network.names, sensor,
+                                      readings.stamp_ns - self._clock_ns[sensor], readings.field))
+        for calibrated in batches:
             self._calibrated.append(calibrated)
             for frame in align.feed(calibrated):
                 out += self._judge(frame)
