@@ -70,7 +70,7 @@ bench: $(STAMP)  ## measure times and accuracies
 		load.py 'load.py --sensors 2 --lean --minutes 2' \
 		'load.py --sensors 2 --lean --minutes 2 --one-process --batches' chain.py; do \
 		echo "$(BIN)/python test/bench/$$figures"; \
-		$(BIN)/python test/bench/$$figures || status=1; \
+		PYTHONPATH=test $(BIN)/python test/bench/$$figures || status=1; \
 	done; exit $$status
 
 fuzz: $(STAMP)  ## a million frames between garbage through every parser of the drivers

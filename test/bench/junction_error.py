@@ -6,10 +6,8 @@ exactly as the truth does.
 """
 
 import json
-import sys
 import tempfile
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -21,9 +19,7 @@ from mag_tracking.physics.dipole import MU0, dipole_field
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from support.bundled import NETWORK_FILE, vehicle_path  # noqa: E402  (after the path is set)
+from support.bundled import NETWORK_FILE, vehicle_path
 from support.samples import one, recorded
 
 NAME = 'junction_left_turns_to_rear'

@@ -9,18 +9,16 @@ somebody would take who knows the road, and from the best of the 432 starts of t
 
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
 from tqdm import tqdm
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from mag_tracking.analysis.pass_data import background_columns, separable_problem  # noqa: E402
-from mag_tracking.analysis.pass_fit import fit_pass, starting_paths  # noqa: E402
-from mag_tracking.inference.least_squares import refine  # noqa: E402
-from mag_tracking.physics.passes import RowPass  # noqa: E402
-from support.passes import NOISE, ROAD, measured, random_path  # noqa: E402
+from mag_tracking.analysis.pass_data import background_columns, separable_problem
+from mag_tracking.analysis.pass_fit import fit_pass, starting_paths
+from mag_tracking.inference.least_squares import refine
+from mag_tracking.physics.passes import RowPass
+from support.passes import NOISE, ROAD, measured, random_path
 
 
 def timed(function, *args, **kwargs):
