@@ -17,13 +17,14 @@ from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.track.manager import TrackManager
 from support.bundled import POINT
+from support.node_processes import scaled
 from support.node_world import BODY, NS, STEADY, TOPICS, is_wrong, network_file, world
 from support.roadside import FIRST, RATE_HZ, SPEED
 from support.samples import one, simulate
 
 pytestmark = pytest.mark.timeout(600)
 LIMIT_S = 2.0
-"""[s] Everything has to go on within this."""
+"""[s] Everything has to go on within this, on a free machine."""
 MOST_VEHICLES = 5
 """On a busy machine a vehicle may be by before it is tracked; another one is."""
 
@@ -116,7 +117,7 @@ def test_a_node_is_killed_and_started_again(here, name):
     here.kill(name)
     up, recovery = here.recovery(name)
     print(f'{name}: up after {up:.2f} s, gives its own {recovery:.2f} s later')
-    assert recovery <= LIMIT_S
+    assert recovery <= scaled(LIMIT_S, up)
     assert here.wait(here.roadside.is_gone)
     assert here.wrong(began) == []
 
@@ -139,8 +140,8 @@ def test_a_dead_node_is_named_by_its_neighbour(here, name, by, words):
         assert here.wait(lambda: ended(here, began))
         [last] = ended(here, began)
         assert last.stamp_ns < killed + NS
-    _, recovery = here.recovery(name)
-    assert recovery <= LIMIT_S
+    up, recovery = here.recovery(name)
+    assert recovery <= scaled(LIMIT_S, up)
     restarted = time.time_ns()
     assert here.wait(lambda: [s for _, s in here.told(restarted, by, 'running')])
 
@@ -157,8 +158,8 @@ def test_a_dead_driver_is_named_by_the_calibration(here):
     print(f'a dead driver: named after {(came - killed) / NS:.1f} s')
     # What was there before is not taken for news when it comes back.
     here.link = 'serial'
-    _, recovery = here.recovery('driver_node')
-    assert recovery <= LIMIT_S
+    up, recovery = here.recovery('driver_node')
+    assert recovery <= scaled(LIMIT_S, up)
     assert here.wait(lambda: 'silent' not in here.told(
         killed, 'calibration_node: mag_1')[-1][1].message)
 

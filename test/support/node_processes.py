@@ -12,6 +12,15 @@ LONGEST_S = 120.0
 """[s] Whatever a test waits for has come by then, also on a slow machine beside others."""
 
 
+USUAL_START_S = 1.8
+"""[s] From the start of a node's process until it is up, on a free machine."""
+
+
+def scaled(limit_s, start_s):
+    """A limit of a free machine, longer in proportion where a node takes `start_s` to start."""
+    return limit_s * max(1.0, start_s / USUAL_START_S)
+
+
 def start(module, *arguments, home=None):
     """A node in a process of its own, with no memory but what it finds in `home`."""
     return subprocess.Popen(
