@@ -103,4 +103,4 @@ lock:  ## write constraints.txt anew, with the newest that there is (needs LOCK_
 
 clean:  ## remove .venv and everything else that was made
 	rm -rf $(VENV) build install log out *.egg-info msg_defs/build msg_defs/*.egg-info
-	rm -rf .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf .pytest_cache .ruff_cache .mypy_cache .import_linter_cache .hypothesis
