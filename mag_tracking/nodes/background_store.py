@@ -28,6 +28,7 @@ class BackgroundStore:
         self._path, self._stage, self._settings = path, stage, settings
         self._logger = logger
         self._texts: dict[str, str] = {}
+        self._written: frozenset[str] = frozenset()
         self._next_write = 0.0
 
     def restore(self, network: SensorNetwork) -> None:
@@ -57,13 +58,18 @@ class BackgroundStore:
             self._texts[name] = background_text(kept, network, j, self._settings)
 
     def write_if_due(self, is_live: bool) -> None:
-        """Write the file if it is time to, and the readings are live, not of a recording."""
+        """Write the file if it is time to, and the readings are live, not of a recording.
+
+        A background that has only now become known is not left to the next interval.
+        """
         now = time.monotonic()
-        if self._path is None or now < self._next_write or not is_live:
+        is_new = not self._texts.keys() <= self._written
+        if self._path is None or not is_live or now < self._next_write and not is_new:
             return
         self._next_write = now + min(WRITE_EVERY_S, self._settings.resume_s / 4.0)
         try:
             write_backgrounds(self._path, self._texts)
+            self._written = frozenset(self._texts)
         except OutputError as error:
             self._logger.warning(f'backgrounds are not kept for a restart: {error}',
                                  throttle_duration_sec=60.0)
