@@ -125,18 +125,17 @@ class Doctor:
         self.network, self._settings = network, settings
         self.sensors = {name: SensorHealth() for name in network.names}
         self.calibrate = Calibrate(network, settings.calibrate)
-        self._clock_ns = {name: round(s * NS) for name, s in
-                          zip(network.names, network.clock_offset, strict=True)}
+        self._clock_ns = dict(zip(network.names, network.clock_offset_ns.tolist(), strict=True))
         self._frozen_ns: dict[str, int] = {}
 
     def feed(self, readings: Readings, received_ns: int | None = None) -> None:
         """Look at raw `Readings` of the network that were received at `received_ns`."""
-        for name, stamp, field in zip(readings.sensor_names(), readings.stamp_ns.tolist(),
-                                      readings.field, strict=True):
+        names, stamps = readings.sensor_names(), readings.stamp_ns.tolist()
+        for name, stamp, field in zip(names, stamps, readings.field, strict=True):
             self.sensors[name].add(stamp - self._clock_ns[name], field, received_ns)
         self.calibrate.feed(readings)
         backgrounds = self.calibrate.backgrounds()
-        for name, stamp in zip(readings.sensor_names(), readings.stamp_ns.tolist(), strict=True):
+        for name, stamp in zip(names, stamps, strict=True):
             if backgrounds[name].frozen:
                 self._frozen_ns.setdefault(name, stamp)
             else:

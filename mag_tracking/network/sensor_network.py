@@ -8,6 +8,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import NetworkError
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
+from mag_tracking.units import NS
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,12 @@ class SensorNetwork:
     def R_sw(self) -> FloatArray:
         """(n, 3, 3), world to sensor."""
         return np.ascontiguousarray(np.swapaxes(self.R_ws, 1, 2))
+
+    @property
+    def clock_offset_ns(self) -> IntArray:
+        """(n,) [ns] `clock_offset`, rounded."""
+        offset: IntArray = np.rint(np.multiply(self.clock_offset, NS)).astype(np.int64)
+        return offset
 
     @property
     def centre(self) -> FloatArray:

@@ -15,7 +15,6 @@ from mag_tracking.records import Readings, plain
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.reading_buffer import ReadingBuffer
 from mag_tracking.stages.health.sensor_health import WINDOW, Finding, SensorHealth
-from mag_tracking.units import NS
 
 TERM_S = 60.0
 """[s] What was wrong is forgotten after one to two of these."""
@@ -42,7 +41,7 @@ class HealthDiagnostics:
     def _begin(self, network: SensorNetwork) -> None:
         """Forget what was; `network` is the one from now on."""
         self._network = network
-        self._clock_ns = np.array([round(s * NS) for s in network.clock_offset], dtype=np.int64)
+        self._clock_ns = network.clock_offset_ns
         # Stamps of before are by other clocks.
         self._buffer = ReadingBuffer(len(network), WINDOW // 2)
         self._past: dict[str, SensorHealth | None] = dict.fromkeys(network.names)

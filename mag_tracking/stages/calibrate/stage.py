@@ -85,7 +85,7 @@ class Calibrate:
         for i, name in enumerate(network.names):
             same = before is not None and _same(before.offset[i], network.offset[i]) \
                 and _same(before.correction[i], network.correction[i])
-            shift = int(self._sensors[i]['clock_offset_ns']) - round(network.clock_offset[i] * NS)
+            shift = int(self._sensors[i]['clock_offset_ns'] - network.clock_offset_ns[i])
             if before is not None and (not same or shift):
                 self._restoration.forget(name)
             if not same or shift:
@@ -96,13 +96,13 @@ class Calibrate:
         self._note_restorable()
 
     def _configure(self, i: int, shift: int) -> None:
-        """What the network file says of sensor `i`; its timestamps are later by `shift` [ns]."""
+        """Apply the network file to sensor `i`, and `shift` [ns] to its earlier timestamps."""
         s, network = self._sensors[i], self._network
         for name in ('first_ns', 'last_ns', 'unconfirmed_ns'):
             if s[name] != NEVER:
                 s[name] += shift
         offset, correction = network.offset[i], network.correction[i]
-        s['clock_offset_ns'] = round(network.clock_offset[i] * NS)
+        s['clock_offset_ns'] = network.clock_offset_ns[i]
         s['offset'] = 0.0 if offset is None else offset
         s['has_correction'] = correction is not None
         s['correction'] = np.eye(3) if correction is None else correction
@@ -114,6 +114,10 @@ class Calibrate:
                                  s.relearn_s, network.background[i], network.noise_std[i],
                                  phase=i / len(network) if len(network) > AT_ONCE else None,
                                  sensors=self._sensors[i:i + 1])
+
+    def unready(self) -> list[str]:
+        """Names of the sensors whose background is not known."""
+        return [name for name, b in self._background.items() if not b.ready]
 
     def counts_of(self, sensor: str) -> 'Counter[str]':
         """What was `accepted` and `rejected` of a sensor, and why."""
@@ -230,7 +234,7 @@ class Calibrate:
         self._sensors['is_restorable'] = [name in self._restoration for name in self._index]
 
     def stored(self, sensor: str) -> StoredBackground | None:
-        """What `resume` needs of a sensor; None before its background is known."""
+        """Background of a sensor for `resume`; None before it is known."""
         background = self._background[sensor]
         last = self.last_stamp_ns(sensor)
         if not background.ready or last is None:
