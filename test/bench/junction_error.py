@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from mag_tracking.apps.fit import PassCollector
+from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.apps.replay import replay
 from mag_tracking.network.file import read_network
 from mag_tracking.physics.dipole import MU0, dipole_field

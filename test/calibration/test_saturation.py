@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mag_tracking.apps.fit import PassCollector
+from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.calibration.saturation import MARGIN, cut_off
 from mag_tracking.pipeline import settings_for
 from support.passes import ROAD, measured, random_path, unknowns_at
