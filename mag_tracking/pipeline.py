@@ -111,7 +111,7 @@ class Pipeline:
                 'track': self._track}
 
     def _after_calibrate(self, batches: Iterable[Readings]) -> list[Output]:
-        """What follows from calibrated readings."""
+        """The outputs that follow from calibrated readings."""
         return self._after_align([f for b in batches for f in self._align.feed(b)])
 
     def _after_align(self, frames: Iterable[FieldFrame]) -> list[Output]:

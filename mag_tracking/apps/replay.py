@@ -1,18 +1,18 @@
 """One recording through the chain, offline: tables, summary, recording and figures."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol
 
 import numpy as np
 
 from mag_tracking.analysis.consistency import error_over_bound
-from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import OutputError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Pipeline, Settings
+from mag_tracking.pipeline import Output, Pipeline, Settings
 from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.result_folder import ResultFolder
@@ -20,6 +20,7 @@ from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Detection, FieldFrame, SmoothedPose, Track
 from mag_tracking.report.metrics import (
     MAGNET_SKIP,
+    Truth,
     interpolate_truth,
     magnet_errors,
     near_poses,
@@ -27,9 +28,6 @@ from mag_tracking.report.metrics import (
 )
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.stages.track.settings import acceleration_density
-
-Truth: TypeAlias = tuple[IntArray, FloatArray, FloatArray]
-"""Stamps (n,) [ns], positions (n, 3) [m], quaternions (n, 4) xyzw."""
 
 SUSPICIOUS = 2.0
 """A sensor that seems to be turned by more prior deviations than this is reported."""
@@ -40,11 +38,11 @@ class Configured(Protocol):
 
     @property
     def network(self) -> SensorNetwork:
-        """Of all sensors."""
+        """The sensors."""
 
     @property
     def settings(self) -> Settings:
-        """Of all stages."""
+        """The settings of all stages."""
 
 
 @dataclass
@@ -105,18 +103,31 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     return Run(summary, taker.logs, taker.smoothed, truth)
 
 
-class RunCollector:
-    """Writes what leaves the pipeline, and remembers it for the summary and the figures."""
+class Results(Protocol):
+    """Takes detections and poses, such as a `ResultFolder`."""
 
-    def __init__(self, results: ResultFolder) -> None:
+    def add_detection(self, detection: Detection, /) -> None:
+        """Take an onset or a release."""
+
+    def add_smoothed(self, pose: SmoothedPose, /) -> None:
+        """Take a smoothed pose."""
+
+    def add_track(self, track: Track, /) -> None:
+        """Take a pose, or the closing record of a track."""
+
+
+class RunCollector:
+    """Passes the pipeline's outputs on to the results, and keeps the history of each track."""
+
+    def __init__(self, results: Results) -> None:
         self._results = results
         # Set by the first frame; every track follows one.
         self._frame: FieldFrame
         self.logs: dict[int, TrackLog] = {}
         self.smoothed: dict[int, SmoothedLog] = {}
 
-    def take(self, records: Iterable[FieldFrame | Detection | SmoothedPose | Track]) -> None:
-        """Take what a batch of readings led to."""
+    def take(self, records: Iterable[Output]) -> None:
+        """Take the outputs of a batch of readings."""
         for record in records:
             if isinstance(record, FieldFrame):
                 self._frame = record
@@ -134,9 +145,7 @@ class RunCollector:
 def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
               taker: RunCollector, truth: Mapping[str, Truth]) -> dict[str, Any]:
     """The content of `summary.json`."""
-    rejections = dict(reader.rejected)
-    for cause, n in pipeline.rejections().items():
-        rejections[cause] = rejections.get(cause, 0) + n
+    rejections = dict(reader.rejected + Counter(pipeline.rejections()))
     sensors: dict[str, dict[str, Any]] = {}
     for name, background in pipeline.calibrate.backgrounds().items():
         counts = pipeline.calibrate.counts_of(name)

@@ -1,7 +1,7 @@
 """Targets tracked in a recording or in arrays of readings; results as arrays."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any
@@ -13,14 +13,14 @@ from mag_tracking.apps.readings import (
     network_of,
     recorded,
 )
-from mag_tracking.apps.replay import errors_against_truth
+from mag_tracking.apps.replay import RunCollector, errors_against_truth
 from mag_tracking.arrays import StructArray
 from mag_tracking.errors import UnknownTrackError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Output, Pipeline, Settings, settings_for
+from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.records import Detection, FieldFrame, Readings, SmoothedPose, Track
+from mag_tracking.records import Detection, Readings, SmoothedPose, Track
 from mag_tracking.report.dataframes import (
     detections_dataframe,
     poses_dataframe,
@@ -41,8 +41,8 @@ _BATCH = 4096
 
 @dataclass(frozen=True, eq=False)
 class TrackingResult:
-    """What was tracked. Arrays are structured, in SI units, in order of time; empty if there was
-    no target.
+    """Tracks, poses and detections. Arrays are structured, in SI units and in order of time; they
+    are empty if there was no target.
     """
 
     network: SensorNetwork
@@ -57,8 +57,8 @@ class TrackingResult:
     tracks: dict[int, TrackLog]
     """{track id: its history with hypotheses, measured and predicted fields}."""
     truth: dict[str, Truth]
-    """{target: (stamps (n,) [ns], positions (n, 3) [m], quaternions (n, 4) xyzw)}; empty where
-    there is none."""
+    """{target: (stamps (n,) [ns], positions (n, 3) [m], quaternions (n, 4) xyzw)}; empty without
+    ground truth."""
     rejections: dict[str, int]
     """{cause: number} of readings that were not used."""
     counts: dict[str, dict[str, int]]
@@ -194,56 +194,52 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
     network = network_of(network)
     pipeline = Pipeline(network, settings_for(target, settings))
     results = _Results()
+    collector = RunCollector(results)
     if isinstance(source, Readings):
         check_order(source)
         source = RecordedReadings(source, {}, {}, {}, ())
     if isinstance(source, RecordedReadings):
         source = replace(source, readings=checked_readings(source.readings, network))
         for i in range(0, len(source.readings), _BATCH):
-            results.take(pipeline.feed(source.readings.part(slice(i, i + _BATCH))))
+            collector.take(pipeline.feed(source.readings.part(slice(i, i + _BATCH))))
         info = source
     else:
         recording = Recording(source)
         reader = SampleReader(recording, network)
         for readings in reader.readings():
-            results.take(pipeline.feed(readings))
+            collector.take(pipeline.feed(readings))
         info = recorded(recording, reader, Readings.joined([]))
-    results.take(pipeline.flush())
-    return results.arrays(pipeline, info)
+    collector.take(pipeline.flush())
+    return _result(pipeline, results, collector.logs, info)
 
 
 class _Results:
-    """Keeps what leaves the pipeline."""
+    """Keeps detections and poses in lists."""
 
     def __init__(self) -> None:
-        # Set by the first frame; every track follows one.
-        self._frame: FieldFrame
         self.poses: list[Track] = []
         self.smoothed: list[SmoothedPose] = []
         self.detections: list[Detection] = []
-        self.tracks: dict[int, TrackLog] = {}
 
-    def take(self, outputs: Iterable[Output]) -> None:
-        """Take what some readings led to."""
-        for output in outputs:
-            if isinstance(output, FieldFrame):
-                self._frame = output
-            elif isinstance(output, Detection):
-                self.detections.append(output)
-            elif isinstance(output, SmoothedPose):
-                self.smoothed.append(output)
-            else:
-                # The history keeps what is needed of the hypotheses; together they are large.
-                self.poses.append(replace(output, hypotheses=()))
-                self.tracks.setdefault(output.id, TrackLog(output.id)).add(output, self._frame)
+    def add_detection(self, detection: Detection) -> None:
+        """Take an onset or a release."""
+        self.detections.append(detection)
 
-    def arrays(self, pipeline: Pipeline, recording: RecordedReadings) -> TrackingResult:
-        """All of it; `recording` is asked for everything but its readings."""
-        rejections = dict(Counter(recording.rejected) + Counter(pipeline.rejections()))
-        unready = tuple(name for name, background in pipeline.calibrate.backgrounds().items()
-                        if not background.ready)
-        return TrackingResult(
-            pipeline.network, pipeline.settings, pose_array(self.poses),
-            smoothed_array(self.smoothed), detection_array(self.detections), self.tracks,
-            recording.truth, rejections, pipeline.counts(), recording.lost,
-            recording.missing_topics, unready)
+    def add_smoothed(self, pose: SmoothedPose) -> None:
+        """Take a smoothed pose."""
+        self.smoothed.append(pose)
+
+    def add_track(self, track: Track) -> None:
+        """Take a pose; its hypotheses are in the history of the track, and together are large."""
+        self.poses.append(replace(track, hypotheses=()))
+
+
+def _result(pipeline: Pipeline, results: _Results, tracks: dict[int, TrackLog],
+            recording: RecordedReadings) -> TrackingResult:
+    """The results as arrays; the readings of `recording` are not used."""
+    rejections = dict(Counter(recording.rejected) + Counter(pipeline.rejections()))
+    return TrackingResult(
+        pipeline.network, pipeline.settings, pose_array(results.poses),
+        smoothed_array(results.smoothed), detection_array(results.detections), tracks,
+        recording.truth, rejections, pipeline.counts(), recording.lost,
+        recording.missing_topics, tuple(pipeline.calibrate.unready()))
