@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mag_tracking.analysis.placement import PlannedTarget, Sampling
     from mag_tracking.apps.fit import FitResult, FittedPass, fit
     from mag_tracking.apps.plan import Plan
-    from mag_tracking.apps.plan_inputs import plan_network as plan
+    from mag_tracking.apps.plan_inputs import plan
     from mag_tracking.apps.readings import RecordedReadings, read_recording, readings_from_arrays
     from mag_tracking.apps.track import TrackingResult, track
     from mag_tracking.errors import (
@@ -59,7 +59,6 @@ _MODULES = {
     'records': ('Readings',),
     'settings': ('read_parameter_file',)}
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
-_NAMES_THERE = {'plan': 'plan_network'}
 
 
 if not TYPE_CHECKING:  # A type checker knows the names above, and reports all others.
@@ -68,7 +67,7 @@ if not TYPE_CHECKING:  # A type checker knows the names above, and reports all o
         if name not in _MODULE_OF:
             raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
         module = importlib.import_module(f'{__name__}.{_MODULE_OF[name]}')
-        value = globals()[name] = getattr(module, _NAMES_THERE.get(name, name))
+        value = globals()[name] = getattr(module, name)
         return value
 
 

@@ -92,11 +92,11 @@ def detection_range(target: PlannedTarget, noise_std: float, n_axes: int,
                            energy_threshold(false_alarm, n_axes)))
 
 
-def plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
-         lanes: Sequence[tuple[str, float, float]], area: Area, settings: Settings,
-         clearance: float = 0.0, n_grid: int = 41,
-         progress: Callable[[int], object] | None = None) -> Plan:
-    """Answer all of it.
+def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
+                 lanes: Sequence[tuple[str, float, float]], area: Area, settings: Settings,
+                 clearance: float = 0.0, n_grid: int = 41,
+                 progress: Callable[[int], object] | None = None) -> Plan:
+    """Bounds, detection and the best place for one more sensor.
 
     Parameters
     ----------

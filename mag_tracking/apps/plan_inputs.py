@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mag_tracking.analysis.placement import PlannedTarget, Sampling
-from mag_tracking.apps.plan import Area, Plan, detection_range, n_parts, plan
+from mag_tracking.apps.plan import Area, Plan, compute_plan, detection_range, n_parts
 from mag_tracking.apps.readings import network_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
@@ -26,7 +26,7 @@ CLEARANCE = 2.0
 
 @dataclass(frozen=True)
 class PlanInputs:
-    """Arguments of `plan`, checked."""
+    """Checked arguments of `compute_plan`."""
 
     target: PlannedTarget
     sampling: Sampling
@@ -45,8 +45,8 @@ class PlanInputs:
     def run(self, network: SensorNetwork, settings: Settings,
             progress: Callable[[int], object] | None = None) -> Plan:
         """The plan; `progress` is called with 1 whenever a part is done."""
-        return plan(network, self.target, self.sampling, self.lanes, self.area, settings,
-                    self.clearance, self.n_grid, progress)
+        return compute_plan(network, self.target, self.sampling, self.lanes, self.area, settings,
+                            self.clearance, self.n_grid, progress)
 
 
 def plan_inputs(network: SensorNetwork, settings: Settings, target: str | None = None, *,
@@ -55,7 +55,7 @@ def plan_inputs(network: SensorNetwork, settings: Settings, target: str | None =
                 noise_std: float | None = None, rate: float = 100.0,
                 field_error: float | None = None, area: Sequence[float] | None = None,
                 clearance: float | None = None, grid: int = 41) -> PlanInputs:
-    """Check and complete the inputs of a plan; see `plan_network`, which takes the same."""
+    """Check and complete the inputs of a plan; see `plan`, which takes the same."""
     planned = _target(settings.track, target, moment, height, speed)
     lanes = _lanes(settings.track.vehicle, _floats(heading), _floats(offset))
     _within('grid', grid, 5, 200)
@@ -69,13 +69,12 @@ def plan_inputs(network: SensorNetwork, settings: Settings, target: str | None =
                       _within('clearance', clearance, 0.0, 1e6), grid)
 
 
-def plan_network(network: SensorNetwork | str | PathLike[str], target: str | None = None, *,
-                 moment: float | None = None, height: float | None = None, speed: float = 10.0,
-                 heading: Sequence[float] | None = None, offset: Sequence[float] | None = None,
-                 noise_std: float | None = None, rate: float = 100.0,
-                 field_error: float | None = None, area: Sequence[float] | None = None,
-                 clearance: float | None = None, grid: int = 41,
-                 settings: Mapping[str, Any] | None = None) -> Plan:
+def plan(network: SensorNetwork | str | PathLike[str], target: str | None = None, *,
+         moment: float | None = None, height: float | None = None, speed: float = 10.0,
+         heading: Sequence[float] | None = None, offset: Sequence[float] | None = None,
+         noise_std: float | None = None, rate: float = 100.0, field_error: float | None = None,
+         area: Sequence[float] | None = None, clearance: float | None = None, grid: int = 41,
+         settings: Mapping[str, Any] | None = None) -> Plan:
     """Bounds and detection for a target that passes a network; one more sensor.
 
     Parameters

@@ -15,7 +15,7 @@ from mag_tracking.analysis.placement import (
     detection_probabilities,
     pass_information,
 )
-from mag_tracking.apps.plan import plan
+from mag_tracking.apps.plan import compute_plan
 from mag_tracking.cli import main
 from mag_tracking.inference.crlb import bound, information
 from mag_tracking.inference.detection_theory import missed_probability
@@ -130,9 +130,10 @@ def test_detection_is_that_of_the_energy_test():
 
 @pytest.fixture(scope='module')
 def road_plan():
-    return plan(ROAD, PlannedTarget(400.0, 0.5, 10.0, 0.2, 0.1), Sampling(0.08, 4e-9, 0.04, 1e-8),
-                [('right', 0.0, 0.0)], (-12.0, -12.0, 12.0, 12.0), settings_for('vehicle'),
-                clearance=2.0, n_grid=13)
+    return compute_plan(
+        ROAD, PlannedTarget(400.0, 0.5, 10.0, 0.2, 0.1), Sampling(0.08, 4e-9, 0.04, 1e-8),
+        [('right', 0.0, 0.0)], (-12.0, -12.0, 12.0, 12.0), settings_for('vehicle'),
+        clearance=2.0, n_grid=13)
 
 
 def test_a_plan_is_consistent(road_plan):
@@ -208,8 +209,9 @@ def test_plan_bears_what_is_odd(tmp_path, capsys, options):
 
 
 def test_lanes_keep_a_further_sensor_away_from_each_of_them():
-    p = plan(ROAD, CAR, Sampling(0.08, 4e-9, 0.04, 1e-8), [('a', 0.0, 2.0), ('b', 0.0, -3.0)],
-             (-12.0, -12.0, 12.0, 12.0), settings_for('vehicle'), clearance=1.5, n_grid=13)
+    p = compute_plan(ROAD, CAR, Sampling(0.08, 4e-9, 0.04, 1e-8),
+                     [('a', 0.0, 2.0), ('b', 0.0, -3.0)], (-12.0, -12.0, 12.0, 12.0),
+                     settings_for('vehicle'), clearance=1.5, n_grid=13)
     y = np.linspace(-12.0, 12.0, p.with_one_more.shape[0])
     free = (np.abs(y - 2.0) >= 1.5) & (np.abs(y + 3.0) >= 1.5)
     assert np.array_equal(np.isfinite(p.with_one_more).all(axis=1), free)
@@ -229,9 +231,10 @@ def test_a_pass_is_missed_as_often_as_no_run_of_frames_detects():
 def test_a_lane_counts_every_frame_once():
     """A third of the frames with a third of the variance are the same, step by step."""
     slow = PlannedTarget(400.0, 0.5, 0.8, 0.2, 0.1)
-    lanes = [plan(ROAD, slow, Sampling(0.08 * k, 4e-9 / np.sqrt(k), 0.04 / np.sqrt(k), 1e-8, 20.0),
-                  [('a', 0.0, 1.0)], (-12.0, -12.0, 12.0, 12.0), settings_for('vehicle'),
-                  n_grid=5).lanes[0] for k in (1, 3)]
+    lanes = [compute_plan(
+        ROAD, slow, Sampling(0.08 * k, 4e-9 / np.sqrt(k), 0.04 / np.sqrt(k), 1e-8, 20.0),
+        [('a', 0.0, 1.0)], (-12.0, -12.0, 12.0, 12.0), settings_for('vehicle'), n_grid=5).lanes[0]
+        for k in (1, 3)]
     assert len(lanes[0].along) == len(lanes[1].along) == 121
     np.testing.assert_allclose(lanes[0].filter_std, lanes[1].filter_std, rtol=1e-6)
 
