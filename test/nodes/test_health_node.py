@@ -4,6 +4,7 @@ import dataclasses
 import subprocess
 import sys
 import time
+from collections import deque
 
 import numpy as np
 import pytest
@@ -22,8 +23,6 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from support.bundled import NETWORK_FILE
 from support.node_processes import LONGEST_S, scaled, start, stop
 from support.samples import MagSample, one, sample_dict
-
-# They publish at a rate that is looked at.
 
 STEP_NS = 10_000_000
 EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
@@ -48,7 +47,8 @@ def talking(ros):
     node, spin_until = ros
     publishers = {}
     rng = np.random.default_rng(0)
-    now = {'silent': ('mag_1', 'mag_2'), 'mag_1': 0.0, 'mag_2': 0.0, 'done': 0}
+    now = {'silent': ('mag_1', 'mag_2'), 'mag_1': 0.0, 'mag_2': 0.0, 'done': 0,
+           'late_ms': deque(maxlen=512)}
 
     def catch_up():
         due = time.time_ns() // STEP_NS
@@ -57,6 +57,7 @@ def talking(ros):
         now['done'] = due
 
     def publish(stamp_ns):
+        now['late_ms'].append((time.time_ns() - stamp_ns) / 1e6)
         for name in ('mag_1', 'mag_2'):
             if name not in now['silent']:
                 publisher = publishers.setdefault(name, None) or node.create_publisher(
@@ -72,6 +73,7 @@ def talking(ros):
         now.update(silent=silent, mag_1=step)
         return spin_until(condition, seconds)
 
+    talk.late_ms = now['late_ms']
     return talk
 
 
@@ -135,6 +137,7 @@ def test_a_flipped_axis_is_an_error_for_as_long_as_it_is_there(talking, statuses
 
 
 def test_each_sensor_has_its_status(talking, statuses):
+    began = time.monotonic()
     process = start('calibration_node', '-p', f'network:={NETWORK_FILE}')
 
     def status(name):
@@ -145,6 +148,8 @@ def test_each_sensor_has_its_status(talking, statuses):
 
     try:
         assert talking(lambda: status('mag_1') and status('mag_2'), silent=('mag_1', 'mag_2'))
+        # It says so once a second.
+        up = time.monotonic() - began
         assert status('mag_1').level == DiagnosticStatus.ERROR
         assert status('mag_1').message.startswith('nothing has come; look at its cable')
         # Long, for one stall of the machine that loses readings counts until so many have come.
@@ -154,7 +159,11 @@ def test_each_sensor_has_its_status(talking, statuses):
         assert status('mag_2').message == 'running' and status('mag_2').hardware_id == 'mag_2'
         assert float(values('mag_1')['rate [Hz]']) > 20.0
         assert [5.0 < float(v) < 30.0 for v in values('mag_2')['noise [nT]'].split()] == [True] * 3
-        assert 0.0 < float(values('mag_1')['delay [ms]']) < 2000.0
+        # The rest is the middleware's, and the machine's, which may be busy.
+        delay = float(values('mag_1')['delay [ms]'])
+        late = np.median(talking.late_ms)
+        print(f'delay {delay:.1f} ms, of which it was published late by {late:.1f} ms')
+        assert delay > 0.0 and abs(delay - late) < scaled(100.0, up - 1.0)
         assert talking(lambda: 'silent for' in status('mag_2').message, silent=('mag_2',))
         assert status('mag_2').level == DiagnosticStatus.ERROR
         assert status('mag_1').level != DiagnosticStatus.ERROR
