@@ -113,7 +113,7 @@ class Readings:
     @classmethod
     def by_name(cls, sensors: Sequence[str], stamps: Sequence[int] | IntArray, field: FloatArray,
                 covariance: FloatArray | None = None) -> 'Readings':
-        """Of lists of each reading's sensor and timestamp [ns], and its field (n, 3) [T]."""
+        """Readings from lists of sensor names and timestamps [ns], and fields (n, 3) [T]."""
         names = tuple(dict.fromkeys(sensors))
         rows = {name: j for j, name in enumerate(names)}
         return cls(names, np.array([rows[s] for s in sensors], dtype=np.int64),

@@ -36,10 +36,9 @@ def reading_of(message: MagneticField, sensor: str) -> Readings:
     A covariance that is all zero, or begins with -1, is unknown.
     """
     f = message.magnetic_field
-    C = np.array(message.magnetic_field_covariance, dtype=float).reshape(1, 3, 3)
-    return Readings((sensor,), np.zeros(1, dtype=np.int64),
-                    np.array([stamp_ns(message.header.stamp)], dtype=np.int64),
-                    np.array([[f.x, f.y, f.z]]), _covariances(C))
+    C = _covariances(np.array(message.magnetic_field_covariance, dtype=float).reshape(1, 3, 3))
+    return Readings.single(sensor, stamp_ns(message.header.stamp), np.array([f.x, f.y, f.z]),
+                           None if C is None else C[0])
 
 
 def _covariances(C: FloatArray) -> FloatArray | None:

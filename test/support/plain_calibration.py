@@ -87,7 +87,7 @@ class Spikes:
         return False
 
     def step(self, sample):
-        """What is held passes, and the sample without a comparison."""
+        """The held samples pass, and this one without a comparison."""
         known = [(h, False) for h, _ in self.held] + [(sample, False)]
         self.held, self.before = [], sample
         return known

@@ -1,4 +1,4 @@
-"""What processes leave in /dev/shm."""
+"""Segments of shared memory that processes leave in /dev/shm."""
 
 import os
 from contextlib import suppress

@@ -11,14 +11,12 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.calibration.saturation import cut_off
-from mag_tracking.units import NS
+from mag_tracking.units import NEVER, NS
 
 WINDOW = 512
 """Readings that rates, noise and delays are of; the latest."""
 EVERY = 64
 """So often they are looked at as a whole."""
-UNKNOWN = np.iinfo(np.int64).min
-"""Of a reading whose receipt is not known."""
 STEP_S = 0.25
 """[s] A clock has stepped where a stamp is off by more while the reading came in time."""
 REPLAYED_S = 86400.0
@@ -74,7 +72,7 @@ class SensorHealth:
 
     def add(self, stamp_ns: int, field: FloatArray, received_ns: int | None = None) -> None:
         """A reading: `field` (3,) [T] as the sensor gave it; `received_ns` by the host's clock."""
-        self._new.append((stamp_ns, field, UNKNOWN if received_ns is None else received_ns))
+        self._new.append((stamp_ns, field, NEVER if received_ns is None else received_ns))
         if len(self._new) == self._every:
             self.look()
 
@@ -94,7 +92,7 @@ class SensorHealth:
                       np.array(received, dtype=np.int64))
 
     def take(self, stamps: IntArray, fields: FloatArray, received: IntArray) -> None:
-        """Take readings into the window: (n,) [ns], (n, 3) [T], and (n,) [ns] or `UNKNOWN`.
+        """Take readings into the window: (n,) [ns], (n, 3) [T], and (n,) [ns] or `NEVER`.
 
         No more than `WINDOW` at once; they may be changed later. Those of `add` are not waited
         for: it is either the one or the other.
@@ -113,7 +111,7 @@ class SensorHealth:
         """Count what is wrong with the stamps of the `n` latest."""
         # With the one before them, where there is one.
         intervals = np.diff(self._stamps[-n - 1:])
-        known = self._received[-n - 1:] != UNKNOWN
+        known = self._received[-n - 1:] != NEVER
         receipts = np.diff(np.where(known, self._received[-n - 1:], 0)) / NS
         steps = receipts - intervals / NS
         usual = 0.0 if np.isnan(self._interval_ns) else self._interval_ns / NS
@@ -207,7 +205,7 @@ class SensorHealth:
         """(median, 5 %, 95 %) [s] from stamp to receipt; NaN where receipts are not known."""
         self.look()
         if self._delays is None:
-            known = self._received != UNKNOWN
+            known = self._received != NEVER
             delays = (self._received - self._stamps)[known] / NS
             self._delays = quantiles(delays, 0.5, 0.05, 0.95)
         return self._delays
