@@ -25,6 +25,8 @@ from support.samples import one, simulate
 pytestmark = pytest.mark.timeout(600)
 LIMIT_S = 2.0
 """[s] Everything has to go on within this, on a free machine."""
+LONGEST_UNNAMED_S = 6.0
+"""[s] A dead node is named within this, on a free machine: 3 s of lease, a report each second."""
 MOST_VEHICLES = 5
 """On a busy machine a vehicle may be by before it is tracked; another one is."""
 
@@ -135,13 +137,14 @@ def test_a_dead_node_is_named_by_its_neighbour(here, name, by, words):
     assert here.wait(lambda: here.told(killed, by, words, 'does it still run?'))
     [(came, status), *_] = here.told(killed, by, words, 'does it still run?')
     assert status.level == DiagnosticStatus.ERROR
-    print(f'a dead {name}: named after {(came - killed) / NS:.1f} s')
+    named_s = (came - killed) / NS
+    print(f'a dead {name}: named after {named_s:.1f} s')
     if name != 'tracker_node':
         assert here.wait(lambda: ended(here, began))
         [last] = ended(here, began)
         assert last.stamp_ns < killed + NS
     up, recovery = here.recovery(name)
-    assert recovery <= scaled(LIMIT_S, up)
+    assert recovery <= scaled(LIMIT_S, up) and named_s <= scaled(LONGEST_UNNAMED_S, up)
     restarted = time.time_ns()
     assert here.wait(lambda: [s for _, s in here.told(restarted, by, 'running')])
 
@@ -155,11 +158,12 @@ def test_a_dead_driver_is_named_by_the_calibration(here):
         assert here.wait(lambda name=name: here.told(killed, name, 'silent', 'driver'))
         [*_, (came, status)] = here.told(killed, name, 'silent')
         assert status.level == DiagnosticStatus.ERROR
-    print(f'a dead driver: named after {(came - killed) / NS:.1f} s')
+    named_s = (came - killed) / NS
+    print(f'a dead driver: named after {named_s:.1f} s')
     # What was there before is not taken for news when it comes back.
     here.link = 'serial'
     up, recovery = here.recovery('driver_node')
-    assert recovery <= scaled(LIMIT_S, up)
+    assert recovery <= scaled(LIMIT_S, up) and named_s <= scaled(5.0, up)
     assert here.wait(lambda: 'silent' not in here.told(
         killed, 'calibration_node: mag_1')[-1][1].message)
 
