@@ -63,7 +63,7 @@ def play(role):
         source = {'last': 'c', 'second': 'b', 'first': 'a'}[role]
         node.create_subscription(FieldReadings, f'/chain/{source}', hand_on, STREAM)
     executor.add_node(node)
-    with noted_signals(signal.SIGINT) as seen:
+    with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
         spin(executor, lambda: bool(seen))
 
 
@@ -92,7 +92,7 @@ def main():
         spin(executor, lambda: time.monotonic() > end)
     finally:
         for process in processes:
-            process.send_signal(2)
+            process.terminate()
             process.wait(30.0)
     late = 1e3 * np.array(late[60:])
     print(f'{len(late)} poses of four bare nodes, after their readings were sent: median '
