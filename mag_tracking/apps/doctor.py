@@ -4,6 +4,8 @@ from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
+from mag_tracking.apps.doctor_covariances import covariance_findings
+from mag_tracking.apps.first_pass import first_pass_of
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.agreement import consensus, disagreements
 from mag_tracking.network import SensorNetwork
@@ -148,6 +150,7 @@ class Doctor:
             found += health.findings(name, self.network.noise_std[j],
                                      self._settings.calibrate.max_field)
             found += background_findings(name, self.calibrate, self._frozen_ns.get(name))
+            found += covariance_findings(name, self.network.topics[j], self.calibrate)
         found += network_findings(self.network, self._settings.survey, self.calibrate,
                                   self.sensors)
         for cause, n in rejected(self.calibrate.counts).items():
@@ -178,6 +181,7 @@ def examine(recording: Recording, network: SensorNetwork, settings: Settings,
     Raises RecordingError where the recording has none of the network's topics.
     """
     reader, doctor = SampleReader(recording, network), Doctor(network, settings)
+    first_pass_of(recording, network, settings.calibrate, stopped).apply(doctor.calibrate)
     for readings, received_ns in reader.readings_as_received(progress):
         doctor.feed(readings, received_ns)
         if stopped is not None and stopped():

@@ -11,6 +11,7 @@ from mag_tracking.analysis.model_order import choose_order
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.apps.first_pass import first_pass_of
 from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.apps.readings import network_of
 from mag_tracking.errors import SettingsError
@@ -94,6 +95,7 @@ class RecordingFit:
         self._name = recording.path.resolve().stem
         self._recording = recording
         self._reader = SampleReader(recording, network)
+        self._network, self._settings = network, settings.calibrate
         self._collector = PassCollector(network, settings)
         self._orders, self._cpa_range = tuple(orders), cpa_range
         self._n = 0
@@ -104,6 +106,8 @@ class RecordingFit:
 
         `progress` and `stopped` are as for `apps.replay.replay`.
         """
+        first_pass_of(self._recording, self._network, self._settings,
+                      stopped).apply(self._collector.calibrate)
         for readings in self._reader.readings(progress):
             if stopped is not None and stopped():
                 return

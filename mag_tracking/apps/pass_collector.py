@@ -36,6 +36,11 @@ class PassCollector:
         self._last_ns: int | None = None
 
     @property
+    def calibrate(self) -> Calibrate:
+        """The first stage."""
+        return self._stages[0]
+
+    @property
     def rejected(self) -> dict[str, int]:
         """{cause: number} of samples that were not used."""
         total: dict[str, int] = {}
@@ -112,7 +117,7 @@ class PassCollector:
         for j in np.unique(sensor):
             mine = np.flatnonzero(sensor == j)
             if found.covariance is not None:
-                covariance[j] = found.covariance[mine[0]]
+                covariance[j] = _typical(found.covariance[mine])
             for a, axis in enumerate('xyz'):
                 bad = mine[cut_off(raw[mine, a])]
                 if len(bad):
@@ -136,3 +141,10 @@ class PassCollector:
             calibrated.sensor.tolist(), calibrated.stamp_ns.tolist(), strict=True)]
         fields: FloatArray = np.concatenate([raw.field, np.full((1, 3), np.nan)])[rows]
         return fields
+
+
+def _typical(covariances: FloatArray) -> FloatArray:
+    """The one of (n, 3, 3) covariances with the median trace: coarse steps add more at rest."""
+    size = np.nansum(np.einsum('kii->ki', covariances), axis=1)
+    typical: FloatArray = covariances[np.argsort(size, kind='stable')[len(size) // 2]]
+    return typical

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from mag_tracking.analysis.consistency import error_over_bound
+from mag_tracking.apps.first_pass import first_pass_of
 from mag_tracking.errors import OutputError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Output, Pipeline, Settings
@@ -86,6 +87,8 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
         raise OutputError(f'{out} is the folder of the recording; the results would overwrite it')
     reader = SampleReader(recording, network)
     pipeline = Pipeline(network, settings)
+    found = first_pass_of(recording, network, settings.calibrate, stopped)
+    found.apply(pipeline.calibrate)
     interrupted = False
 
     with ResultFolder(out, network.frame) as results:
@@ -98,6 +101,8 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
         taker.take(pipeline.flush())
         truth = reader.truth_arrays()
         summary = summarise(recording, reader, pipeline, taker, truth)
+        for name, entry in summary['sensors'].items():
+            entry['quiet_stretch_s'] = found.stretch_of(name)
         summary['interrupted'] = interrupted
         results.write_summary(summary)
     return Run(summary, taker.logs, taker.smoothed, truth)

@@ -1,11 +1,12 @@
 """Targets tracked in a recording or in arrays of readings; results as arrays."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
+from mag_tracking.apps.first_pass import first_pass, first_pass_of
 from mag_tracking.apps.readings import (
     RecordedReadings,
     check_order,
@@ -200,17 +201,25 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
         source = RecordedReadings(source, {}, {}, {}, ())
     if isinstance(source, RecordedReadings):
         source = replace(source, readings=checked_readings(source.readings, network))
-        for i in range(0, len(source.readings), _BATCH):
-            collector.take(pipeline.feed(source.readings.part(slice(i, i + _BATCH))))
+        first_pass(_parts(source.readings), network,
+                   pipeline.settings.calibrate).apply(pipeline.calibrate)
+        for readings in _parts(source.readings):
+            collector.take(pipeline.feed(readings))
         info = source
     else:
         recording = Recording(source)
         reader = SampleReader(recording, network)
+        first_pass_of(recording, network, pipeline.settings.calibrate).apply(pipeline.calibrate)
         for readings in reader.readings():
             collector.take(pipeline.feed(readings))
         info = recorded(recording, reader, Readings.joined([]))
     collector.take(pipeline.flush())
     return _result(pipeline, results, collector.logs, info)
+
+
+def _parts(readings: Readings) -> Iterator[Readings]:
+    """The readings in batches of at most `_BATCH`."""
+    return (readings.part(slice(i, i + _BATCH)) for i in range(0, len(readings), _BATCH))
 
 
 class _Results:

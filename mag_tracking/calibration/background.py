@@ -24,17 +24,21 @@ from mag_tracking.calibration.blocks import (
     line_through,
     stacked,
 )
+from mag_tracking.calibration.resolution import common_step, completed_steps, resting
 from mag_tracking.calibration.sensor_state import SENSORS
 
 LOUDEST = 100.0
 """A block whose variance is so many times that of the quietest is no noise: a target passed within
 it, as it can within the long blocks of a slow sensor. Noise and coarse steps stay well below."""
 
+TOGGLE = 1.2
+"""[steps] An axis that rests on one value may rest on the next one a moment later."""
+
 RESUMED_RELEARN_S = 10.0
 """[s] What was resumed gives way to another steady level after so long, whatever `relearn` is."""
 
 LEAST_STD = 1e-11
-"""[T] A block that scatters less teaches nothing: the sensor is stuck, or its steps are coarse."""
+"""[T] An axis that scatters less has not changed at all."""
 
 _Line: TypeAlias = tuple[float, FloatArray, FloatArray, float]
 """Centre [s], mean (3,) [T], slope (3,) [T/s] and horizon [s]."""
@@ -107,7 +111,8 @@ class RunningBackground:
         self._window.clear()
         self._pending: deque[Block] = deque()
         self._strange: deque[Block] = deque()
-        self.frozen = self._resumed = False
+        self._rested: deque[Block] = deque(maxlen=self._most)
+        self.frozen = self._resumed = self._relearns_soon = False
         self._set(None if self._given is None else (0.0, self._given, np.zeros(3), 0.0),
                   self._noise if self._noise_given else None)
         self.stuck = False
@@ -120,7 +125,34 @@ class RunningBackground:
         if line is not None:
             s['centre'], s['mean'], s['slope'], s['horizon'] = line
         s['noise'] = np.nan if noise is None else noise
-        s['noise_std'] = np.sqrt(np.diagonal(s['noise']))
+        self._apply_steps()
+
+    def _apply_steps(self) -> None:
+        """Add what the sensor's steps do to the noise; its steps may have been found meanwhile."""
+        s, steps = self._state, self._steps()
+        variance = s['noise'].diagonal()
+        steps = completed_steps(variance, steps)
+        rests = resting(variance, steps) & np.isfinite(steps)
+        s['step_variance'] = np.where(rests, np.square(steps) / 12.0, 0.0)
+        s['noise_std'] = np.sqrt(variance + s['step_variance'])
+        self._limits = np.maximum(self._freeze_std * s['noise_std'],
+                                  np.where(rests, TOGGLE * steps, 0.0))
+
+    def _without_dead_axes(self, noise: FloatArray) -> FloatArray:
+        """(3, 3) [T^2] `noise` with NaN for an axis that has never changed and does not rest."""
+        steps = completed_steps(noise.diagonal(), self._steps())
+        dead = ~np.isfinite(steps)
+        return np.where(dead[:, None] | dead, np.nan, noise)
+
+    def _steps(self) -> FloatArray:
+        """(3,) [T] smallest changes of the sensor's axes, corrected as its readings are."""
+        s = self._state
+        steps: FloatArray = s['step'].copy()
+        if not s['has_correction']:
+            return steps
+        weight = np.abs(s['correction'])
+        moved = np.where(weight > 0.0, weight * np.where(np.isinf(steps), 0.0, steps), 0.0)
+        return np.where(np.isinf(steps), np.inf, np.sqrt(np.square(moved).sum(axis=1)))
 
     def resume(self, background: FloatArray, covariance: FloatArray) -> None:
         """Go on from what was known a moment ago: (3,) [T] and (3, 3) [T^2], NaN as elsewhere.
@@ -129,7 +161,15 @@ class RunningBackground:
         """
         self._set((0.0, np.asarray(background, dtype=float), np.zeros(3), 0.0),
                   self._noise if self._noise_given else np.asarray(covariance, dtype=float))
-        self._resumed = True
+        self._resumed = self._relearns_soon = True
+
+    def begin_with(self, level: FloatArray, covariance: FloatArray) -> None:
+        """Begin with a level that later readings have: (3,) [T] and (3, 3) [T^2].
+
+        As after `resume`, but another level has to last as long as it always has to.
+        """
+        self.resume(level, covariance)
+        self._relearns_soon = False
 
     @property
     def ready(self) -> bool:
@@ -138,8 +178,11 @@ class RunningBackground:
 
     @property
     def covariance(self) -> FloatArray | None:
-        """(3, 3) [T^2] noise of one sample, or None; NaN for an axis not reported."""
-        return self._noise
+        """(3, 3) [T^2] noise of one sample and its steps, or None; NaN for an axis not reported."""
+        if self._noise is None:
+            return None
+        covariance: FloatArray = self._noise + np.diag(self._state['step_variance'])
+        return covariance
 
     @property
     def measured(self) -> bool:
@@ -169,40 +212,51 @@ class RunningBackground:
             return
         block = block_of(self._state)
         self._state['is_full'] = False
-        known = block.n > 1
-        self.stuck = bool((block.scatter.diagonal()[known]
-                           < LEAST_STD**2 * (block.n[known] - 1)).any())
-        if self.stuck:
-            return
+        still = (block.n > 1) & (block.scatter.diagonal() < LEAST_STD**2 * (block.n - 1))
         if self.ready:
-            self._follow(block)
+            self._apply_steps()
+            # An axis with coarse steps rests; one with fine steps is stuck.
+            self.stuck = bool((still & (self._state['step_variance'] == 0.0)
+                               & ~np.isnan(self._state['noise_std'])).any())
+            if not self.stuck:
+                self._follow(block)
         else:
+            self.stuck = bool(np.isinf(self._state['step'][block.n > 1]).all())
             self._begin(block)
 
     def _begin(self, block: Block) -> None:
         """Before it is ready: collect until a quiet stretch is long enough."""
         self._strange.append(block)
+        if self.stuck:
+            # Without a change the values themselves say what the steps may be. Where they do not,
+            # the first change does: it comes with a target.
+            self._rested.append(block)
+            self._state['step'] = common_step(self._state['raw'])
+            self.stuck = bool(np.isinf(self._state['step']).all())
+        elif self._rested and self._rested[-1].time - self._rested[0].time \
+                >= self._learn - 1.5 * self._length and self._adopt_if_steady(self._rested):
+            return
         # From centre to centre; the blocks of a slow sensor may be longer than `_length`.
         enough = self._learn - 1.5 * self._length
         while len(self._strange) > 3 and block.time - self._strange[1].time >= enough:
             self._strange.popleft()
         if len(self._strange) >= 3 and block.time - self._strange[0].time >= enough:
-            self._adopt_if_steady()
+            self._adopt_if_steady(self._strange)
 
     def _follow(self, block: Block) -> None:
         """Once ready: extend the quiet stretch, or freeze."""
         off = np.abs(self._departure(block.time, block.mean))
         # A comparison with NaN is false: an axis that is not reported freezes nothing.
-        self.frozen = bool((off > self._freeze_std * self._state['noise_std']).any())
+        self.frozen = bool((off > self._limits).any())
         if self.frozen:
             self._pending.clear()
             self._strange.append(block)
             relearn = self._relearn
-            if self._resumed:
+            if self._resumed and self._relearns_soon:
                 # It may be that the sensor was moved, or its surroundings changed, meanwhile.
                 relearn = min(relearn or inf, max(self._learn, RESUMED_RELEARN_S))
             if relearn and block.time - self._strange[0].time >= relearn:
-                if self._adopt_if_steady():
+                if self._adopt_if_steady(self._strange):
                     self.n_relearnt += 1
                     self.frozen = False
                 else:
@@ -216,22 +270,23 @@ class RunningBackground:
             self._window.append(self._pending.popleft())
             self._fit()
 
-    def _adopt_if_steady(self) -> bool:
+    def _adopt_if_steady(self, collected: deque[Block]) -> bool:
         """Take the collected blocks as the background if they lie on one line."""
-        blocks = stacked(self._strange)
-        if _one_is_loud(blocks):
-            return False
-        noise = self._noise if self._noise_given else _pooled_covariance(blocks)
+        blocks = stacked(collected)
+        noise = self._noise if self._noise_given else pooled_covariance(blocks)
         if noise is None:
             return False
-        std = np.sqrt(np.diagonal(noise))
-        if np.isnan(std).all():
+        noise = self._without_dead_axes(noise)
+        if np.isnan(noise).all():
             return False
+        before = self._noise
+        self._set(self._line, noise)
         centre, mean, slope = line_through(blocks)
         off = np.abs(blocks.mean - mean - slope * (blocks.time - centre)[:, None])
-        if not np.nanmax(off / std) <= self._freeze_std:
+        if _one_is_loud(blocks, self._state['step_variance']) \
+                or not np.nanmax(off / self._limits) <= 1.0:
+            self._set(self._line, before)
             return False
-        self._set(self._line, noise)
         if self._given is not None and self._line is not None and not self.n_relearnt \
                 and not self.frozen:
             # The background was given and only the noise had to be learnt.
@@ -240,9 +295,10 @@ class RunningBackground:
         # A steady stretch was asked for its own length; it need not be as long as at first.
         self._resumed = False
         self._window.clear()
-        for block in list(self._strange)[-self._most:]:
+        for block in list(collected)[-self._most:]:
             self._window.append(block)
         self._strange.clear()
+        self._rested.clear()
         self._fit()
         return True
 
@@ -254,20 +310,24 @@ class RunningBackground:
             return
         self._resumed = False
         centre, mean, slope = line_through(blocks)
-        noise = None if self._noise_given else _pooled_covariance(blocks)
+        noise = None if self._noise_given else pooled_covariance(blocks)
         self._set((centre, mean, slope, last + 2.0 * (last - first)),
-                  self._noise if noise is None else noise)
+                  self._noise if noise is None else self._without_dead_axes(noise))
 
 
-def _one_is_loud(blocks: Blocks) -> bool:
-    """Whether a block scatters far more than the others, on any axis."""
+def _one_is_loud(blocks: Blocks, step_variance: FloatArray) -> bool:
+    """Whether a block scatters far more than the others, on any axis.
+
+    `step_variance` (3,) [T^2] is what the sensor's steps add.
+    """
     n = blocks.n
     variance = np.where(n > 1, np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1, 1), np.nan)
+    variance = np.maximum(variance, step_variance)
     known = variance[:, ~np.isnan(variance).all(axis=0)]
     return bool((np.nanmax(known, axis=0) > LOUDEST * np.nanmin(known, axis=0)).any())
 
 
-def _pooled_covariance(blocks: Blocks) -> FloatArray | None:
+def pooled_covariance(blocks: Blocks) -> FloatArray | None:
     """(3, 3) scatter within blocks, pooled; None = too few samples, NaN = axis not reported."""
     freedom = blocks.n.sum(axis=0) - np.count_nonzero(blocks.n, axis=0)
     if freedom.max() <= 3:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mag_tracking.arrays import BoolArray, FloatArray
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 
 LEAST_RUN = 3
 """So many equal readings in a row at an extreme are cut off ..."""
@@ -14,6 +14,40 @@ top of a gentle curve in coarse steps is reached by one."""
 MARGIN = 6
 """Readings so near in time to one that is cut off are not to be trusted either: noise took some of
 their neighbours over the limit, and what is left of them is on one side of the truth."""
+
+
+COARSE = 0.05
+"""An axis that repeats itself more often, apart from the extreme, has coarse steps."""
+
+ISOLATED = 10.0
+"""A reading that differs from both its neighbours by so many times what they differ from each
+other, and from theirs, is an error of the bus."""
+
+
+def isolated(values: FloatArray) -> IntArray:
+    """Readings of one axis that are far off both their neighbours, which agree.
+
+    Parameters
+    ----------
+    values : (n,) array
+        In order of time, without NaN.
+
+    Returns
+    -------
+    (k,) int array
+        Their places.
+    """
+    if len(values) < 5:
+        return np.zeros(0, dtype=np.int64)
+    change = np.diff(values)
+    before, after = change[1:-2], change[2:-1]
+    around = np.maximum(np.abs(change[:-3]), np.abs(change[3:]))
+    around = np.maximum(around, np.abs(before + after))
+    height = np.minimum(np.abs(before), np.abs(after))
+    least = np.min(np.abs(change[change != 0.0]), initial=np.inf)
+    found: IntArray = 2 + np.flatnonzero((before * after < 0.0) & (
+        height > ISOLATED * np.maximum(around, least)))
+    return found
 
 
 def cut_off(values: FloatArray) -> BoolArray:
@@ -35,6 +69,9 @@ def cut_off(values: FloatArray) -> BoolArray:
     out = np.zeros(len(values), dtype=bool)
     present = np.flatnonzero(~np.isnan(values))
     v = values[present]
+    v = v.copy()
+    outliers = isolated(v)
+    v[outliers] = v[outliers - 1]
     if max(np.count_nonzero(v == v.min(initial=np.inf)),
            np.count_nonzero(v == v.max(initial=-np.inf))) < LEAST_RUN:
         return out
@@ -42,8 +79,12 @@ def cut_off(values: FloatArray) -> BoolArray:
     if not (jumps > 0.0).any():
         return out
     step = jumps[jumps > 0.0].min()
+    level = float(np.median(v))
     for extreme in (v.min(), v.max()):
         at = v == extreme
+        if extreme == level and np.mean(jumps[~(at[1:] & at[:-1])] == 0.0) >= COARSE:
+            # An axis with coarse steps rests there.
+            continue
         edges = np.flatnonzero(np.diff(np.concatenate([[False], at, [False]])))
         for first, end in edges.reshape(-1, 2):
             sides = [jumps[i] for i in (first - 1, end - 1) if 0 <= i < len(jumps)]

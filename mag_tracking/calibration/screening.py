@@ -27,6 +27,9 @@ STEEPER = 8.0
 are rare."""
 FASTEST = 30.0
 """[1/s] Highest speed of a target, in units of its distance: 30 m/s at one metre."""
+LARGEST_OF_RECENT = 2.4
+"""Largest of `RECENT` differences between readings of white noise, in its standard deviations; the
+mean."""
 STEEPEST = 130.0
 """A dipole that moves by the share s of its distance between two readings, s above 0.4, makes a
 difference steeper than the ones before by less than this times s^3, in 99.9 % of the cases
@@ -79,25 +82,40 @@ def is_stuck(s: Record, field: FloatArray) -> bool:
 
 
 @njit(cache=True)
+def _largest_recent(s: Record, a: int) -> float:
+    """Largest recent difference [T] of axis `a` between readings; NaN if none is known."""
+    largest, is_known = 0.0, False
+    for k in range(RECENT):
+        if not np.isnan(s.steps[k, a]):
+            largest, is_known = max(largest, s.steps[k, a]), True
+    return largest if is_known else np.nan
+
+
+@njit(cache=True)
+def _usual_noise(s: Record, a: int) -> float:
+    """Standard deviation [T] of axis `a`; before the noise is known, from recent differences."""
+    if s.is_ready:
+        return float(s.noise_std[a])
+    return float(max(_largest_recent(s, a) / LARGEST_OF_RECENT, s.step[a] / math.sqrt(12.0)))
+
+
+@njit(cache=True)
 def _is_off(s: Record, threshold: float, stamp: int, steps: FloatArray) -> bool:
     """Whether `steps` (3,) [T] from the reading before are steeper than any target makes them."""
     # A comparison with NaN is false: a missing axis is no spike.
     is_high = False
     for a in range(3):
-        is_high |= steps[a] > threshold * s.noise_std[a]
+        is_high |= steps[a] > threshold * _usual_noise(s, a)
     if not is_high:
         return False
     passed = FASTEST * (stamp - s.before_ns) * 1e-9
     steeper = max(STEEPER, STEEPEST * passed**3)
     for a in range(3):
-        if not steps[a] > threshold * s.noise_std[a]:
-            continue
-        # A sensor with coarse steps may not have changed at all recently.
-        largest, is_known = s.noise_std[a], False
-        for k in range(RECENT):
-            if not np.isnan(s.steps[k, a]):
-                largest, is_known = max(largest, s.steps[k, a]), True
-        if is_known and steps[a] > steeper * largest:
+        noise, largest = _usual_noise(s, a), _largest_recent(s, a)
+        # A sensor with coarse steps may not have changed at all recently. A comparison with NaN is
+        # false: of an axis without recent differences nothing is known.
+        if largest >= 0.0 and steps[a] > threshold * noise and steps[a] > steeper * noise \
+                and steps[a] > steeper * largest:
             return True
     return False
 
@@ -156,7 +174,7 @@ def screen_spike(s: Record, threshold: float, stamp: int, field: FloatArray, own
     Parameters
     ----------
     s : SENSOR
-        Changed. Without a noise (not `is_ready`) nothing is held.
+        Changed. Before the noise is known (not `is_ready`), recent differences are its measure.
     threshold : float
         In noise deviations.
     stamp : int, ns
@@ -172,7 +190,7 @@ def screen_spike(s: Record, threshold: float, stamp: int, field: FloatArray, own
         PASSES, HELD, SPIKE (the `n_held` readings are a spike: reject them and call again) or
         RELEASED (`n_released` readings pass, this one is the last).
     """
-    if s.before_ns == NEVER or not s.is_ready:
+    if s.before_ns == NEVER:
         if s.n_held:
             _hold(s, stamp, field, steps, own, covariance)
             s.n_released = s.n_held

@@ -29,6 +29,12 @@ SENSOR = np.dtype([
     # Repetition: the latest reading, the length of the present run of equal ones, and how often a
     # reading was equal to the one before, or was not.
     ('last', np.float64, 3), ('run', np.int64), ('repeats', np.float64), ('changes', np.float64),
+    # Resolution (`resolution`): the latest value of each raw axis, since when it rests on it and
+    # for how many readings, its smallest change, and the variance of what the steps add.
+    ('raw', np.float64, 3), ('rest_since_ns', np.int64, 3), ('n_rest', np.int64, 3),
+    ('step', np.float64, 3), ('step_variance', np.float64, 3),
+    # Covariances of the messages: the latest standard deviations, and how many were overruled.
+    ('stated_std', np.float64, 3), ('n_overruled', np.int64),
     # Spikes: the latest reading that passed, the differences before it, and the readings that are
     # held; of those `n_released` have passed and wait for their use.
     ('before_ns', np.int64), ('before', np.float64, 3), ('n_steps', np.int64),
@@ -58,6 +64,7 @@ def new_sensors(n: int) -> StructArray:
     sensors = np.zeros(n, SENSOR)
     for name in ('first_ns', 'last_ns', 'unconfirmed_ns', 'before_ns'):
         sensors[name] = NEVER
-    for name in ('last', 'before', 'end', 'noise_std', 'noise'):
+    for name in ('last', 'before', 'end', 'noise_std', 'noise', 'raw', 'stated_std'):
         sensors[name] = np.nan
+    sensors['step'] = np.inf
     return sensors

@@ -5,7 +5,8 @@ from collections.abc import Callable, Collection
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-from mag_tracking.stages.health.sensor_health import REPLAYED_S, quantiles
+from mag_tracking.stages.health.sensor_health import REPLAYED_S
+from mag_tracking.stages.health.window import quantiles
 from mag_tracking.units import NS
 
 SILENT_S = 2.0

@@ -8,6 +8,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from numpy.typing import ArrayLike
 
 from mag_tracking.apps.doctor import background_findings, network_findings
+from mag_tracking.apps.doctor_covariances import covariance_findings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.nodes.flow import SILENT_S
 from mag_tracking.pipeline import Settings
@@ -120,6 +121,8 @@ class HealthDiagnostics:
         if time.monotonic() - self._began > patience:
             found.update({f.what: f for f in background_findings(
                 name, calibrate, self._frozen_ns.get(name), self._relearnt[0][name])})
+        found.update({f.what: f for f in covariance_findings(
+            name, self._network.topics[j], calibrate)})
         for health in (self._past[name], self._present[name]):
             if health is not None and health.counts['readings']:
                 for f in health.findings(name, self._network.noise_std[j],

@@ -31,8 +31,9 @@ def in_steps(fields, step):
 class SpikeScreen:
     """Follows which readings `find_spike` holds and releases."""
 
-    def __init__(self, threshold, std=SIGMA):
+    def __init__(self, threshold, std=SIGMA, step=np.inf):
         self.sensors, self._threshold, self._held = new_sensors(1), threshold, []
+        self.sensors['step'] = step
         self.sensors['is_ready'], self.sensors['noise_std'] = std is not None, std or np.nan
 
     def feed(self, row, stamp, field):
@@ -55,9 +56,9 @@ class SpikeScreen:
         return out
 
 
-def screened(fields, rate=100.0, std=SIGMA, threshold=30.0):
+def screened(fields, rate=100.0, std=SIGMA, threshold=30.0, step=np.inf):
     """([row that was taken for a spike], most that waited at once, [rows that were given late])."""
-    spikes, most, late, out, f = [], 0, [], 0, SpikeScreen(threshold, std)
+    spikes, most, late, out, f = [], 0, [], 0, SpikeScreen(threshold, std, step)
     for k, field in enumerate(fields):
         got = f.feed(k, round(k * NS / rate), field)
         assert [row for row, _ in got] == list(range(out, out + len(got)))
@@ -248,17 +249,17 @@ def test_a_missing_axis_is_no_spike_and_hides_none():
     assert screened(np.full((30, 3), np.nan)) == ([], 0, [])
 
 
-def test_without_a_noise_nothing_waits():
-    y = noise(60)
-    y[30] += 5e-6
+def test_before_the_noise_is_known_recent_differences_are_its_measure():
+    y = noise(3000)
+    y[300:2900:100] += 5e-6
+    rows, most, _ = screened(y, std=None, step=1e-11)
+    assert rows == list(range(300, 2900, 100)) and most == 1
+    # Without a known step a change may be the first one of a sensor that rests.
     assert screened(y, std=None) == ([], 0, [])
-    f = SpikeScreen(30.0)
-    for k in range(31):
-        f.feed(k, k * NS // 100, y[k])
-    # What waited comes before what comes when the noise is not known any more.
-    f.sensors['is_ready'] = False
-    assert f.feed(31, 31 * NS // 100, y[31]) == [(30, False), (31, False)]
-    assert f.flush() == []
+    coarse = 2e-7 * np.round(y / 2e-7)
+    assert screened(coarse, std=None, step=2e-7)[0] == rows
+    coarse = 2e-6 * np.round(y / 2e-6)
+    assert screened(coarse, std=None, step=2e-6) == ([], 0, [])
 
 
 @settings(derandomize=True, deadline=None, max_examples=40)

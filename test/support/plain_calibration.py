@@ -50,11 +50,14 @@ class Spikes:
     def clear(self):
         self.held, self.before, self.steps = [], None, []
 
-    def feed(self, sample, noise_std):
+    def feed(self, sample, noise_std, step):
         """[(sample, whether it is a spike)] of what is known by now."""
-        if self.before is None or noise_std is None:
+        if self.before is None:
             return self.step(sample)
         steps = np.abs(sample.field - self.before.field)
+        if noise_std is None and self.steps:
+            recent = np.nan_to_num(self.steps[-8:])
+            noise_std = np.fmax(recent.max(axis=0) / 2.4, step / np.sqrt(12.0))
         if self.held:
             largest = np.nan_to_num(np.array([s for _, s in self.held])).max(axis=0)
             axis = int(np.argmax(largest))
@@ -118,19 +121,21 @@ class PlainCalibration:
         cause = self.fault(sample)
         if cause:
             return self.reject(cause)
-        sample = self.corrected(sample)
+        raw, sample = sample.field, self.corrected(sample)
         if np.isnan(sample.field).all():
             return self.reject('an axis is missing that the correction needs')
         cause = self.misplaced(sample)
         if cause:
             return self.reject(cause)
+        self.backgrounds[name].note(sample.stamp_ns, raw)
         if self.settings.reject_stuck and self.repetition[name].is_stuck(sample.field):
             return self.reject('the same reading over and over')
         known = [(sample, False)]
         if self.settings.spike_std:
             background = self.backgrounds[name]
-            known = self.spikes[name].feed(sample, np.sqrt(np.diagonal(background.covariance))
-                                           if background.ready else None)
+            known = self.spikes[name].feed(
+                sample, np.sqrt(np.diagonal(background.covariance)) if background.ready else None,
+                background.sensors[0]['step'])
         for _, is_spike in known:
             if is_spike:
                 self.reject('spike')
@@ -208,11 +213,11 @@ class PlainCalibration:
     def calibrated(self, sample):
         background = self.backgrounds[sample.sensor]
         time = (sample.stamp_ns - self.first_ns[sample.sensor]) / NS
-        background.add(time, sample.field)
+        background.collect(time, sample.field)
         if not background.ready:
             self.counts['held back while learning'] += 1
             return []
-        C = background.covariance if sample.covariance is None else sample.covariance
+        C = self.covariance(background, sample.covariance)
         field = sample.field - background.level(time)
         unknown = ~np.isnan(sample.field) & (np.isnan(field) | np.isnan(np.diagonal(C)))
         self.counts['axes held back while learning'] += bool(unknown.any())
@@ -221,6 +226,18 @@ class PlainCalibration:
             return []
         self.counts['calibrated'] += 1
         return [MagSample(sample.stamp_ns, sample.sensor, field, C)]
+
+    def covariance(self, background, own):
+        noise, s = background.covariance, background.sensors[0]
+        if self.settings.trust_covariances and own is not None:
+            return own
+        if own is not None:
+            ratio = own.diagonal() / noise.diagonal()
+            if (ratio > 25.0).any() or (ratio < 1.0 / 25.0).any():
+                self.counts['covariances of messages overruled by the measured noise'] += 1
+                own = None
+        C = noise - np.diag(s['step_variance']) if own is None else own
+        return C + np.diag(s['step_variance'] * s['n_rest'])
 
     def flush(self):
         held = [h for s in self.spikes.values() for h, _ in s.held]

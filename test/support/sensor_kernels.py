@@ -5,6 +5,7 @@ from numba import njit
 
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.blocks import begin_block_if_due, collect
+from mag_tracking.calibration.resolution import LONGEST_REST_NS
 from mag_tracking.calibration.screening import is_stuck, screen_spike
 from mag_tracking.calibration.sensor_state import new_sensors
 
@@ -37,6 +38,23 @@ class FedBackground(RunningBackground):
     def add(self, time, field):
         """Take a reading: `time` [s], `field` (3,) [T]."""
         self.judge_block()
+        self.note(round(time * 1e9), field)
+        self.collect(time, field)
+
+    def collect(self, time, field):
+        """Take a reading whose steps are noted."""
+        self.judge_block()
         _add(self.sensors, time, np.array(field, dtype=float))
         if np.isnan(self.sensors[0]['phase']):
             self.judge_block()
+
+    def note(self, stamp, raw):
+        """`resolution.note_step` in plain Python."""
+        s = self.sensors[0]
+        for a in np.flatnonzero(~np.isnan(raw)):
+            change = abs(raw[a] - s['raw'][a])
+            if change <= 3e-7 * abs(raw[a]) and stamp >= s['rest_since_ns'][a]:
+                s['n_rest'][a] += stamp - s['rest_since_ns'][a] <= LONGEST_REST_NS
+                continue
+            s['step'][a] = np.fmin(s['step'][a], change)
+            s['raw'][a], s['rest_since_ns'][a], s['n_rest'][a] = raw[a], stamp, 1

@@ -11,6 +11,7 @@ from numba import boolean, float64, from_dtype, int64, njit
 from mag_tracking.arrays import FloatArray, IntArray, Record, StructArray
 from mag_tracking.calibration.background import subtract_background
 from mag_tracking.calibration.blocks import begin_block_if_due, collect
+from mag_tracking.calibration.resolution import note_step
 from mag_tracking.calibration.screening import (
     HELD,
     PASSES,
@@ -34,15 +35,20 @@ NONE, VALID, INVALID = range(3)
 
 LIMITS = np.dtype([('max_field', np.float64), ('longest_jump_ns', np.float64),
                    ('jump_back_ns', np.float64), ('reject_stuck', np.int64),
-                   ('spike_std', np.float64), ('is_decimated', np.int64)])
+                   ('spike_std', np.float64), ('is_decimated', np.int64),
+                   ('trust_covariances', np.int64)])
 """As in `CalibrateSettings`."""
 
+CREDIBLE = 25.0
+"""The variance that a message states is used where it differs from the measured one by less than
+this factor."""
+
 BATCH = np.dtype([(name, np.int64) for name in (
-    'next', 'row', 'n_out', 'n_spikes', 'n_learning', 'n_partly_learning')] + [
+    'next', 'row', 'n_out', 'n_spikes', 'n_learning', 'n_partly_learning', 'n_overruled')] + [
     ('stamp_ns', np.int64)])
 """Progress within a batch: the next reading; sensor and timestamp of the one that a reason is
 about; how many calibrated readings there are; how many were spikes; of how many the background, or
-that of one axis, is not known yet."""
+that of one axis, is not known yet; of how many the covariance was overruled."""
 
 _LIMITS, _BATCH = from_dtype(LIMITS)[::1], from_dtype(BATCH)[::1]
 _I, _V, _M = int64[::1], float64[:, ::1], float64[:, :, ::1]
@@ -125,6 +131,7 @@ def _check(s: Record, limits: Record, stamp: int, raw: FloatArray, own: int,
     reason = _misplaced(s, limits, stamp)
     if reason != DONE:
         return reason
+    note_step(s, stamp, raw)
     return STUCK if limits.reject_stuck and is_stuck(s, field) else DONE
 
 
@@ -154,9 +161,36 @@ def _queue(s: Record, stamp: int, field: FloatArray, own: int, covariance: Float
 
 
 @njit(cache=True)
-def _use(s: Record, batch: Record, row: int, stamp: int, field: FloatArray, own: int,
-         covariance: FloatArray, out_rows: IntArray, out_stamps: IntArray, out_fields: FloatArray,
-         out_covariances: FloatArray) -> bool:
+def _is_credible(s: Record, covariance: FloatArray) -> bool:
+    """Whether the covariance of a message agrees with the noise of the sensor."""
+    is_credible = True
+    for a in range(3):
+        stated, known = covariance[a, a], s.noise[a, a] + s.step_variance[a]
+        s.stated_std[a] = np.sqrt(stated)
+        # A comparison with NaN is false: an axis that is missing contradicts nothing.
+        is_credible &= not (stated > CREDIBLE * known or known > CREDIBLE * stated)
+    return is_credible
+
+
+@njit(cache=True)
+def _attach_covariance(s: Record, limits: Record, batch: Record, own: int,
+                       covariance: FloatArray, out: FloatArray) -> None:
+    """Covariance of a reading: its own where that is credible, else that of the sensor."""
+    if own and not limits.trust_covariances and not _is_credible(s, covariance):
+        own = NONE
+        s.n_overruled += 1
+        batch.n_overruled += 1
+    for a in range(3):
+        for b in range(3):
+            out[a, b] = covariance[a, b] if own else s.noise[a, b]
+        if not (own and limits.trust_covariances):
+            out[a, a] += s.step_variance[a] * s.n_rest[a]
+
+
+@njit(cache=True)
+def _use(s: Record, limits: Record, batch: Record, row: int, stamp: int, field: FloatArray,
+         own: int, covariance: FloatArray, out_rows: IntArray, out_stamps: IntArray,
+         out_fields: FloatArray, out_covariances: FloatArray) -> bool:
     """Calibrate a reading; False if a block has to be judged first."""
     time = (stamp - s.first_ns) / 1e9
     begin_block_if_due(s, time)
@@ -171,10 +205,9 @@ def _use(s: Record, batch: Record, row: int, stamp: int, field: FloatArray, own:
         raise IndexError('no room for the calibrated readings')
     out, C = out_fields[k], out_covariances[k]
     subtract_background(s, time, field, out)
+    _attach_covariance(s, limits, batch, own, covariance, C)
     n_missing, is_new = 0, False
     for a in range(3):
-        for b in range(3):
-            C[a, b] = covariance[a, b] if own else s.noise[a, b]
         # An axis that has only just begun to report: nothing is known of it yet.
         is_unknown = not np.isnan(field[a]) and (np.isnan(out[a]) or np.isnan(C[a, a]))
         is_new |= is_unknown
@@ -251,7 +284,7 @@ def calibrate_readings(sensors: StructArray, limits: StructArray, rows: IntArray
         verdict = _screen(s, limit, batch, stamp, field, own[i], C, steps)
         if verdict == PASSES:
             s.accepted += 1
-            if not limit.is_decimated and _use(s, batch, rows[i], stamp, field, own[i], C,
+            if not limit.is_decimated and _use(s, limit, batch, rows[i], stamp, field, own[i], C,
                                                out_rows, out_stamps, out_fields, out_covariances):
                 if batch.n_spikes:
                     return SPIKES
@@ -266,15 +299,15 @@ def calibrate_readings(sensors: StructArray, limits: StructArray, rows: IntArray
     return DONE
 
 
-@njit(boolean(SENSORS, _BATCH, int64, int64, float64[::1], int64, float64[:, ::1], _I, _I, _V, _M),
-      cache=True)
-def use_reading(sensors: StructArray, batches: StructArray, row: int, stamp: int,
-                field: FloatArray, own: int, covariance: FloatArray, out_rows: IntArray,
+@njit(boolean(SENSORS, _LIMITS, _BATCH, int64, int64, float64[::1], int64, float64[:, ::1], _I, _I,
+              _V, _M), cache=True)
+def use_reading(sensors: StructArray, limits: StructArray, batches: StructArray, row: int,
+                stamp: int, field: FloatArray, own: int, covariance: FloatArray, out_rows: IntArray,
                 out_stamps: IntArray, out_fields: FloatArray,
                 out_covariances: FloatArray) -> bool:
     """Calibrate a reading of sensor `row` that has passed; False: a block has to be judged first.
 
     The arguments are as for `calibrate_readings`.
     """
-    return bool(_use(sensors[row], batches[0], row, stamp, field, own, covariance, out_rows,
-                     out_stamps, out_fields, out_covariances))
+    return bool(_use(sensors[row], limits[0], batches[0], row, stamp, field, own, covariance,
+                     out_rows, out_stamps, out_fields, out_covariances))

@@ -12,6 +12,9 @@ class CalibrateSettings:
     learn_s: float = param(
         3.0, 'Quiet time needed before a sensor is used, unless its calibration is given.',
         's', (0.1, 3600.0))
+    look_ahead_s: float = param(
+        300.0, 'Offline: how much of a recording is searched for the most frequent level of a '
+        'sensor that has no quiet beginning; 0 = none.', 's', (0.0, 86400.0))
     memory_s: float = param(
         20.0, 'Length of the quiet stretch that level, drift and noise are fitted to.',
         's', (1.0, 36000.0))
@@ -40,6 +43,10 @@ class CalibrateSettings:
     reject_stuck: bool = param(
         True, 'Readings that stay the same, from a sensor that does not repeat itself otherwise, '
         'are rejected. Simulated sensors without noise need this to be false.')
+    trust_covariances: bool = param(
+        False, 'Use the covariances of the messages as they are. By default the noise that the '
+        'quiet readings show is used where a message states a standard deviation that differs by '
+        'more than a factor of five: many drivers publish a placeholder, or another unit.')
     decimate_to_hz: float = param(
         0.0, 'Samples of a faster sensor are low-pass filtered and thinned to about this rate '
         '(a whole share of its own; 60 dB against folding, four intervals late). 0 = no: frames '

@@ -8,6 +8,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray, IntArray, Record
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.decimation import Decimator
+from mag_tracking.calibration.quiet_level import QuietLevel
 from mag_tracking.calibration.screening import clear_spikes
 from mag_tracking.calibration.sensor_state import new_sensors
 from mag_tracking.errors import NetworkError
@@ -26,6 +27,8 @@ from mag_tracking.units import NEVER, NS
 
 AT_ONCE = 16
 """The blocks of so many sensors may end at once; those of more would hold up the readings."""
+
+OVERRULED = 'covariances of messages overruled by the measured noise'
 
 CAUSES = {
     kernel.NO_AXIS: 'no axis reported (all NaN)',
@@ -50,7 +53,9 @@ class Calibrate:
     `kernel.calibrate_readings` has the rules; here is what it reports.
     """
 
-    def __init__(self, network: SensorNetwork, settings: CalibrateSettings) -> None:
+    def __init__(self, network: SensorNetwork, settings: CalibrateSettings,
+                 background_type: type[RunningBackground] = RunningBackground) -> None:
+        """`background_type` estimates the background of each sensor."""
         self.counts: Counter[str] = Counter()
         self._per_sensor: dict[str, Counter[str]] = {name: Counter() for name in network.names}
         self._settings = settings
@@ -58,10 +63,12 @@ class Calibrate:
         self._batches = np.zeros(1, kernel.BATCH)
         self._limits = np.array([(
             settings.max_field, settings.jump_ahead_s * NS, settings.jump_back_s * NS,
-            settings.reject_stuck, settings.spike_std, settings.decimate_to_hz > 0.0)],
+            settings.reject_stuck, settings.spike_std, settings.decimate_to_hz > 0.0,
+            settings.trust_covariances)],
             kernel.LIMITS)
         self._causes = {**CAUSES, kernel.TOO_LARGE: f'above {settings.max_field:g} T (gauss or '
                         'microtesla as tesla?)'}
+        self._background_type = background_type
         self._index = {name: i for i, name in enumerate(network.names)}
         self._network = network
         self._background: dict[str, RunningBackground] = {}
@@ -110,10 +117,11 @@ class Calibrate:
     def _new_background(self, i: int) -> RunningBackground:
         """Of sensor `i`, from what the network file says of it."""
         s, network = self._settings, self._network
-        return RunningBackground(s.learn_s, s.memory_s, s.guard_s, s.block_s, s.freeze_std,
-                                 s.relearn_s, network.background[i], network.noise_std[i],
-                                 phase=i / len(network) if len(network) > AT_ONCE else None,
-                                 sensors=self._sensors[i:i + 1])
+        return self._background_type(
+            s.learn_s, s.memory_s, s.guard_s, s.block_s, s.freeze_std, s.relearn_s,
+            network.background[i], network.noise_std[i],
+            phase=i / len(network) if len(network) > AT_ONCE else None,
+            sensors=self._sensors[i:i + 1])
 
     def unready(self) -> list[str]:
         """Names of the sensors whose background is not known."""
@@ -152,7 +160,7 @@ class Calibrate:
         room = n + int(self._sensors['n_held'].sum())
         if self._settings.decimate_to_hz:
             room += sum(d.n_waiting for d in self._decimators.values())
-        for name in ('n_out', 'n_learning', 'n_partly_learning'):
+        for name in ('n_out', 'n_learning', 'n_partly_learning', 'n_overruled'):
             self._batches[0][name] = 0
         return OutputBuffer(self._network.names, room)
 
@@ -199,15 +207,16 @@ class Calibrate:
         """Calibrate a reading of sensor `i` that has passed."""
         background = self._background[self._network.names[i]]
         background.judge_block()
-        while not kernel.use_reading(self._sensors, self._batches, i, stamp, plain(field), own,
-                                     plain(covariance), *out.arrays):
+        while not kernel.use_reading(self._sensors, self._limits, self._batches, i, stamp,
+                                     plain(field), own, plain(covariance), *out.arrays):
             background.judge_block()
 
     def _finished(self, out: OutputBuffer) -> list[Readings]:
         """The calibrated readings of a batch, counted."""
         batch = self._batches[0]
         for what, name in (('calibrated', 'n_out'), ('held back while learning', 'n_learning'),
-                           ('axes held back while learning', 'n_partly_learning')):
+                           ('axes held back while learning', 'n_partly_learning'),
+                           (OVERRULED, 'n_overruled')):
             if batch[name]:
                 self.counts[what] += int(batch[name])
         return out.readings(int(batch['n_out']))
@@ -222,6 +231,21 @@ class Calibrate:
         self._reject(self._network.names[i], f'may have been a spike when {why}',
                      int(self._sensors[i]['n_held']))
         clear_spikes(self._sensors[i])
+
+    def begin_with(self, levels: Mapping[str, QuietLevel], steps: Mapping[str, FloatArray]) -> None:
+        """Begin with what a first pass over the readings has found.
+
+        Parameters
+        ----------
+        levels : {sensor: QuietLevel}
+            The backgrounds of sensors whose beginning is not quiet.
+        steps : {sensor: (3,) [T]}
+            Smallest changes of their axes.
+        """
+        for name, step in steps.items():
+            self._of(name)['step'] = step
+        for name, found in levels.items():
+            self._background[name].begin_with(found.level, found.covariance)
 
     def resume(self, stored: Mapping[str, StoredBackground]) -> None:
         """Restore {sensor: `StoredBackground`} where the sensor's first reading comes soon after.
@@ -289,6 +313,19 @@ class Calibrate:
         """(3,) [T] background of `sensor` at its latest reading; ValueError before it is ready."""
         state = self._of(sensor)
         return self._background[sensor].level(int(state['last_ns'] - state['first_ns']) / NS)
+
+    def overruled(self, sensor: str) -> tuple[int, FloatArray, FloatArray]:
+        """Covariances of the messages of `sensor` that contradict its noise.
+
+        Returns
+        -------
+        n : int
+            How many were overruled.
+        stated, measured : (3,) array, T
+            Standard deviations: of the latest message, and of the sensor; NaN = unknown.
+        """
+        s = self._of(sensor)
+        return int(s['n_overruled']), s['stated_std'].copy(), s['noise_std'].copy()
 
     def backgrounds(self) -> dict[str, RunningBackground]:
         """{sensor: RunningBackground}, to look at."""

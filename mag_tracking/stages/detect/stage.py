@@ -8,11 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import SettingsError
 from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.detection_theory import energy_threshold
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Detection, FieldFrame
+from mag_tracking.stages.detect.resting_axes import RestingAxes
 from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.units import NS
 
@@ -34,6 +36,7 @@ class Detect:
         self._settings = settings
         self._thresholds: dict[tuple[float, int], float] = {}
         self._next_id = 1
+        self._resting = RestingAxes(len(network))
         self._reset()
 
     def _reset(self) -> None:
@@ -61,8 +64,7 @@ class Detect:
             self._reset()
         self._last_ns = frame.stamp_ns
         try:
-            energy, axes = whitened_energy(
-                frame.field, frame.covariance + self._allowance(frame.stamp_ns) * np.eye(3))
+            energy, axes = whitened_energy(frame.field, self._covariance(frame))
         except np.linalg.LinAlgError:
             self.counts['rejected: frame with a covariance that is not positive definite'] += 1
             return out
@@ -73,8 +75,16 @@ class Detect:
             out += self._judge(frame.stamp_ns, statistic, n, self._names[int(per_axis.argmax())])
         else:
             self.counts['frames without a measurement'] += 1
+        if not self._present and not self._above:
+            self._resting.learn(frame.field)
         return [*out, replace(frame, target_present=self._present, statistic=statistic,
                               degrees_of_freedom=n)]
+
+    def _covariance(self, frame: FieldFrame) -> FloatArray:
+        """(n_sensors, 3, 3) [T^2] covariance of the fields of a frame without a target."""
+        std = self._resting.scale(frame.covariance)
+        return frame.covariance * (std[:, :, None] * std[:, None, :]) \
+            + self._allowance(frame.stamp_ns) * np.eye(3)
 
     def _allowance(self, stamp_ns: int) -> float:
         """[T^2] Variance of what the background may be off by."""

@@ -4,13 +4,16 @@ It only looks: nothing is changed or held back. Memory is bounded by a window of
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.calibration.resolution import smallest_steps
 from mag_tracking.calibration.saturation import cut_off
+from mag_tracking.calibration.screening import COARSE, LEAST_CHANGES
+from mag_tracking.stages.health.window import median_field, noise_of, quantiles
 from mag_tracking.units import NEVER, NS
 
 WINDOW = 512
@@ -27,6 +30,8 @@ IRREGULAR = 0.3
 """Where intervals scatter by more than this share, nobody can count what is lost."""
 STUCK_S = 1.0
 """[s] Readings that stay the same for longer are of a sensor that is stuck."""
+MOVED = 10.0
+"""[steps] A target that moves one axis by so many moves the others by one at least."""
 SPIKE = 30.0
 """A reading that is off both its neighbours, the same way, by so many noise deviations."""
 
@@ -69,6 +74,11 @@ class SensorHealth:
         # Since when the reading has been what it is, and how long ago one was stuck.
         self._since_ns: int | None = None
         self._stuck_ago = WINDOW
+        # Length of the present run of equal readings, and how often readings were equal to the one
+        # before, or were not; of each axis whether it has ever changed.
+        self._run, self._repeats, self._changes = 0, 0, 0
+        self._has_changed = np.zeros(3, dtype=bool)
+        self._steps: FloatArray = np.full(3, np.inf)
 
     def add(self, stamp_ns: int, field: FloatArray, received_ns: int | None = None) -> None:
         """A reading: `field` (3,) [T] as the sensor gave it; `received_ns` by the host's clock."""
@@ -144,19 +154,22 @@ class SensorHealth:
         # With the two before them; the last one's neighbour is still to come.
         fields = self._fields[-n - 2:]
         before, after = np.diff(fields, axis=0)[:-1], -np.diff(fields, axis=0)[1:]
+        self._steps = np.minimum(self._steps, smallest_steps(fields))
         # A comparison with NaN is false: without a known noise there is no spike.
-        alone = (np.minimum(np.abs(before), np.abs(after)) > SPIKE * self._noise) \
-            & (before * after > 0.0)
+        noise = np.maximum(self._noise, self._steps / np.sqrt(12.0))
+        alone = (np.minimum(np.abs(before), np.abs(after)) > SPIKE * noise) & (before * after > 0.0)
         self._counts['spikes'] += int(alone.any(axis=1).sum())
         if self._stuck_ago >= WINDOW:
-            self._noise = self._made['noise'] = _noise(self._fields)
+            self._noise = self._made['noise'] = noise_of(self._fields)
         cut = np.array([cut_off(axis) for axis in self._fields.T])[:, -n:]
         self._counts['saturated'] += int(np.count_nonzero(cut.any(axis=0)))
 
     def _stuck(self, n: int) -> None:
         """Count those of the `n` latest that have been the same for too long."""
         stamps, fields = self._stamps[-n:], self._fields[-n - 1:]
-        same = ((fields[1:] == fields[:-1]) | np.isnan(fields[1:]) & np.isnan(fields[:-1])).all(1)
+        equal = (fields[1:] == fields[:-1]) | np.isnan(fields[1:]) & np.isnan(fields[:-1])
+        self._has_changed |= (~equal & ~np.isnan(fields[1:]) & ~np.isnan(fields[:-1])).any(axis=0)
+        same = equal.all(axis=1)
         if len(same) < n:
             same = np.append(False, same)
         # Of each reading the place of the one that it repeats; -1: from before these.
@@ -164,8 +177,32 @@ class SensorHealth:
         since = np.where(origin < 0, self._since_ns or 0, stamps[origin])
         stuck = np.flatnonzero(stamps - since > STUCK_S * NS)
         self._since_ns = int(since[-1])
-        self._counts['stuck readings'] += len(stuck)
+        self._count_runs(same, since, stamps)
+        if not self.is_coarse:
+            self._counts['stuck readings'] += len(stuck)
         self._stuck_ago = n - 1 - int(stuck[-1]) if len(stuck) else self._stuck_ago + n
+
+    def _count_runs(self, same: BoolArray, since: IntArray, stamps: IntArray) -> None:
+        """Count repetitions: (n,) whether a reading equals the one before, since when [ns]."""
+        changed = np.flatnonzero(~same)
+        if not len(changed):
+            self._run += len(same)
+            return
+        lengths = np.diff(changed) - 1
+        lasting = stamps[changed[1:] - 1] - since[changed[1:] - 1] > STUCK_S * NS
+        # A run that is a fault says little about what is usual.
+        self._repeats += int(np.where(lasting, 1, lengths).sum())
+        first = self._run + int(changed[0])
+        usual = STUCK_S * NS / self._interval_ns if self._interval_ns > 0 else np.inf
+        self._repeats += 1 if first > usual else first
+        self._changes += len(changed)
+        self._run = len(same) - 1 - int(changed[-1])
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether the sensor repeats itself at rest, or has not changed often enough to tell."""
+        return self._changes < LEAST_CHANGES \
+            or self._repeats >= COARSE * (self._repeats + self._changes)
 
     @property
     def rate(self) -> float:
@@ -176,12 +213,12 @@ class SensorHealth:
     @property
     def noise_std(self) -> FloatArray:
         """(3,) [T] by differences of neighbours, so that a target that passes is not in it."""
-        return self._once('noise', _noise)
+        return self._once('noise', noise_of)
 
     @property
     def field(self) -> FloatArray:
         """(3,) [T] median of the latest readings; NaN of an axis that none has."""
-        return self._once('median', _median)
+        return self._once('median', median_field)
 
     def _once(self, name: str, make: Callable[[FloatArray], FloatArray]) -> FloatArray:
         """`make` of the fields in the window; once, however often it is asked for."""
@@ -192,12 +229,19 @@ class SensorHealth:
 
     @property
     def dead_axes(self) -> str:
-        """Such as 'xz': axes that have not changed in a window in which another one did."""
+        """Such as 'xz': axes that have not changed in a window in which another one did.
+
+        Of a sensor with coarse steps those that have never changed, while another one moved by
+        more than `MOVED` of its steps.
+        """
         self.look()
         if len(self._fields) < WINDOW:
             return ''
         there = ~np.isnan(self._fields).any(axis=0)
         still = there & (self._fields == self._fields[0]).all(axis=0)
+        if self.is_coarse:
+            moved = np.ptp(self._fields, axis=0) > MOVED * smallest_steps(self._fields)
+            still &= ~self._has_changed & (moved & there).any()
         return ''.join(np.array(list('xyz'))[still]) if still.sum() < there.sum() else ''
 
     @property
@@ -276,8 +320,8 @@ class SensorHealth:
             yield Finding(True, name, f'{c["without any axis"]} of {n} readings have no axis at '
                           'all', 'look at the sensor and its driver')
         for axis in self.dead_axes:
-            yield Finding(True, name, f'{axis} does not change', 'the axis is dead, or its steps '
-                          'are coarser than its noise: then give noise_std in the network file')
+            yield Finding(True, name, f'{axis} does not change', 'the axis is dead: look at the '
+                          'sensor and its driver')
         for axis in 'xyz':
             if 0.01 * n < c[axis] - c['without any axis'] and c[axis] < 0.99 * n:
                 yield Finding(False, name, f'{axis} is missing in {c[axis]} of {n} readings',
@@ -292,42 +336,3 @@ class SensorHealth:
         if c['spikes'] > 0.001 * n:
             yield Finding(False, name, f'{c["spikes"]} of {n} readings are spikes', 'look at '
                           'plugs, supply and checksums')
-
-
-def quantiles(values: Sequence[float] | FloatArray | IntArray, *shares: float) -> list[float]:
-    """[float] quantiles of (n,) finite `values`, by linear interpolation; NaN of none.
-
-    As `numpy.quantile`, whose checks take longer than the work where arrays are small.
-    """
-    if not len(values):
-        return [float('nan')] * len(shares)
-    ordered, out = np.sort(values), []
-    for share in shares:
-        place = share * (len(ordered) - 1)
-        low = int(place)
-        a, b = float(ordered[low]), float(ordered[min(low + 1, len(ordered) - 1)])
-        out.append(a + (place - low) * (b - a))
-    return out
-
-
-def _median(fields: FloatArray) -> FloatArray:
-    """(3,) [T]; NaN of an axis that none has."""
-    return np.array([quantiles(axis[~np.isnan(axis)], 0.5)[0] for axis in fields.T])
-
-
-def _noise(fields: FloatArray) -> FloatArray:
-    """(3,) [T] deviation by second differences, without the largest; NaN of a missing axis.
-
-    Of the second: a passing target has a slope, but hardly a curve from one reading to the next.
-    """
-    out = np.full(3, np.nan)
-    for axis, d in enumerate(np.abs(np.diff(fields, n=2, axis=0)).T):
-        d = d[~np.isnan(d)]
-        if len(d) >= 8:
-            # A sensor with coarse steps is no better than those.
-            step = d[d > 0.0].min(initial=np.inf)
-            least = step / np.sqrt(12.0) if np.isfinite(step) else 0.0
-            # Their mean, not their median: of coarse steps the median is one.
-            usual = d[d <= max(8.0 * quantiles(d, 0.6)[0], least)]
-            out[axis] = max(np.sqrt(np.pi / 12.0) * usual.mean(), least)
-    return out

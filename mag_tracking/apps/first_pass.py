@@ -1,0 +1,120 @@
+"""A first pass over a recording: the quiet stretches of sensors that have no quiet beginning."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+from mag_tracking.arrays import FloatArray
+from mag_tracking.calibration.quiet_level import BlockRecorder, QuietLevel
+from mag_tracking.network import SensorNetwork
+from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.records import Readings
+from mag_tracking.stages.calibrate.settings import CalibrateSettings
+from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.units import NS
+
+PATIENCE_S = 1.0
+"""[s] A beginning is quiet where the background is known so long after the shortest time."""
+
+LEAST = 1.0 / 3.0
+"""A level is a background where it was seen for this share of the usual time, in all."""
+
+FEW = 32
+"""Readings that are fed at once while the beginning is learnt."""
+
+
+@dataclass(frozen=True)
+class FirstPass:
+    """What a first pass over a recording found."""
+
+    levels: dict[str, QuietLevel]
+    """{sensor: most frequent level}; empty where the beginning is quiet."""
+    steps: dict[str, FloatArray]
+    """{sensor: (3,) [T] smallest change of each axis}."""
+
+    def stretch_of(self, sensor: str) -> list[float] | None:
+        """[begin, end] of the stretch of its background, in s after its first reading, or None."""
+        level = self.levels.get(sensor)
+        return None if level is None else [level.begin, level.end]
+
+    def apply(self, calibrate: Calibrate) -> None:
+        """Begin a calibration with what was found."""
+        calibrate.begin_with(self.levels, self.steps)
+
+
+def first_pass(batches: Iterable[Readings], network: SensorNetwork,
+               settings: CalibrateSettings) -> FirstPass:
+    """Find the backgrounds of sensors whose recording begins with a target.
+
+    Parameters
+    ----------
+    batches : iterable of Readings
+        Raw, from the beginning of the recording; read up to `look_ahead_s`.
+    network : SensorNetwork
+    settings : CalibrateSettings
+
+    Returns
+    -------
+    FirstPass
+        Empty where the network file has all backgrounds, or `look_ahead_s` is 0.
+    """
+    wanted = [name for name, level in zip(network.names, network.background, strict=True)
+              if level is None]
+    if not wanted or not settings.look_ahead_s:
+        return FirstPass({}, {})
+    recorder, beginning = Calibrate(network, settings, BlockRecorder), Calibrate(network, settings)
+    learnt: dict[str, FloatArray] = {}
+    first_ns: int | None = None
+    for readings in batches:
+        if not len(readings):
+            continue
+        first_ns = int(readings.stamp_ns[0]) if first_ns is None else first_ns
+        recorder.feed(readings)
+        _learn(beginning, readings, first_ns + (settings.learn_s + PATIENCE_S) * NS, learnt)
+        if int(readings.stamp_ns[-1]) - first_ns > settings.look_ahead_s * NS:
+            break
+    found, steps, is_quiet = {}, {}, True
+    for name, background in recorder.backgrounds().items():
+        assert isinstance(background, BlockRecorder)
+        steps[name] = background.steps
+        level = background.quiet_level() if name in wanted else None
+        if level is not None and level.n_blocks * settings.block_s >= LEAST * settings.learn_s:
+            found[name] = level
+            is_quiet &= name in learnt and background.is_usual(learnt[name], level)
+    # A target that one sensor feels at the beginning may be in the background of all.
+    return FirstPass({} if is_quiet else found, steps)
+
+
+def _learn(beginning: Calibrate, readings: Readings, until_ns: float,
+           learnt: dict[str, FloatArray]) -> None:
+    """Put the backgrounds that are known before a time into `learnt`, {sensor: (3,) [T]}."""
+    for i in range(0, len(readings), FEW):
+        part = readings.part(slice(i, i + FEW))
+        if part.stamp_ns[0] > until_ns:
+            return
+        beginning.feed(part)
+        for name, background in beginning.backgrounds().items():
+            if background.ready and name not in learnt:
+                learnt[name] = beginning.background(name)
+
+
+def first_pass_of(recording: Recording, network: SensorNetwork, settings: CalibrateSettings,
+                  stopped: Callable[[], bool] | None = None) -> FirstPass:
+    """`first_pass` over a recording; when `stopped` returns true it ends with what it has.
+
+    Raises
+    ------
+    RecordingError
+        If the recording has none of the network's topics.
+    """
+    # What is lost or rejected is counted when the recording is read for its readings.
+    reader = SampleReader(Recording(recording.path), network)
+
+    def batches() -> Iterator[Readings]:
+        try:
+            yield from until_stopped(reader.readings, None, stopped)
+        except ReadingStopped:
+            return
+
+    return first_pass(batches(), network, settings)

@@ -1,0 +1,51 @@
+"""Axes whose steps are larger than their noise: how quiet they are without a target.
+
+The covariance of a resting axis says how well it measures a field: within a step. Without a target
+it does not move at all, so that two axes that move by one step each are no noise.
+"""
+
+import numpy as np
+
+from mag_tracking.arrays import FloatArray
+
+MEMORY_FRAMES = 100
+"""Frames without a target that the usual variance of each axis is of, about."""
+
+RESTS = 25.0
+"""An axis rests where its fields vary by less than their covariance states, by this factor."""
+
+MOST = 20.0
+"""The variance of a resting axis is taken to be smaller by this factor. One axis of two sensors
+that moves by one step, as it does while its background drifts, stays below the threshold."""
+
+
+class RestingAxes:
+    """Usual variance of each axis of a network, in frames without a target."""
+
+    def __init__(self, n_sensors: int) -> None:
+        self._n: FloatArray = np.zeros((n_sensors, 3))
+        self._square: FloatArray = np.zeros((n_sensors, 3))
+
+    def learn(self, field: FloatArray) -> None:
+        """Take the `field` (n_sensors, 3) [T] of a frame without a target; NaN = missing."""
+        there = ~np.isnan(field)
+        self._n = np.minimum(self._n + there, MEMORY_FRAMES)
+        share = np.divide(there, self._n, out=np.zeros_like(self._n), where=self._n > 0.0)
+        self._square += share * (np.where(there, field, 0.0) ** 2 - self._square)
+
+    def scale(self, covariance: FloatArray) -> FloatArray:
+        """Factors of the standard deviations of a frame without a target.
+
+        Parameters
+        ----------
+        covariance : (n_sensors, 3, 3) array, T^2
+
+        Returns
+        -------
+        (n_sensors, 3) array
+            1 where the axis does not rest.
+        """
+        variance = np.einsum('jii->ji', covariance)
+        with np.errstate(invalid='ignore'):
+            rests = (self._n >= MEMORY_FRAMES / 4) & (RESTS * self._square < variance)
+        return np.where(rests, np.sqrt(1.0 / MOST), 1.0)

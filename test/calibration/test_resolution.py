@@ -1,0 +1,131 @@
+"""Steps of a sensor: found in what it measures, and what they add to its noise."""
+
+import numpy as np
+import pytest
+from numba import njit
+
+from mag_tracking.calibration.resolution import (
+    LONGEST_REST_NS,
+    common_step,
+    completed_steps,
+    note_step,
+    resting,
+    smallest_steps,
+)
+from mag_tracking.calibration.sensor_state import new_sensors
+from support.sensor_kernels import FedBackground
+
+MS = 1_000_000
+
+
+@njit
+def _note(sensors, stamp, raw):
+    note_step(sensors[0], stamp, raw)
+
+
+def noted(fields, interval=10 * MS):
+    """The state of a sensor after `fields` (n, 3)."""
+    sensors = new_sensors(1)
+    for k, field in enumerate(fields):
+        _note(sensors, k * interval, np.array(field, dtype=float))
+    return sensors[0]
+
+
+def coarse(sigma, step, n=600, offset=0.3, seed=0):
+    y = sigma * np.random.default_rng(seed).standard_normal((n, 3)) + offset * step
+    return step * np.round(y / step)
+
+
+@pytest.mark.parametrize('sigma, step', [(1e-8, 1e-7), (4e-8, 1e-7), (1e-7, 1e-7), (1e-8, 1e-10)])
+def test_the_smallest_change_is_the_step(sigma, step):
+    y = 5e-5 + coarse(sigma, step, offset=0.45, n=6000)
+    np.testing.assert_allclose(noted(y)['step'], step, rtol=1e-6)
+    np.testing.assert_allclose(smallest_steps(y), step, rtol=1e-6)
+    # Single precision does not hide it.
+    y = y.astype(np.float32).astype(float)
+    np.testing.assert_allclose(smallest_steps(y), step, rtol=1e-3 if step > 1e-9 else 10.0)
+
+
+def test_missing_axes_and_spikes_do_not_change_the_step():
+    y = coarse(5e-8, 1e-7)
+    y[::7, 1] = np.nan
+    y[::50, 0] += 2e-5
+    y[:, 2] = np.nan
+    for step in (noted(y)['step'], smallest_steps(y)):
+        np.testing.assert_allclose(step, [1e-7, 1e-7, np.inf])
+
+
+def test_the_compiled_rule_agrees_with_the_plain_one():
+    background = FedBackground(3.0, 20.0, 1.5, 0.25, 2.0, 60.0)
+    y = coarse(4e-8, 1e-7, seed=3)
+    y[::11, 0] = np.nan
+    stamps = np.cumsum(np.random.default_rng(1).integers(1, 100 * MS, len(y)))
+    sensors = new_sensors(1)
+    for stamp, field in zip(stamps.tolist(), y, strict=True):
+        background.note(stamp, field)
+        _note(sensors, stamp, field)
+        for name in ('step', 'raw', 'rest_since_ns', 'n_rest'):
+            np.testing.assert_array_equal(sensors[0][name], background.sensors[0][name], name)
+
+
+def test_a_rest_counts_as_one_measurement_for_a_while():
+    n = LONGEST_REST_NS // (10 * MS)
+    assert noted(np.ones((3, 3)))['n_rest'].tolist() == [3, 3, 3]
+    assert noted(np.ones((10 * n, 3)))['n_rest'].tolist() == [n + 1] * 3
+    assert noted([*np.ones((10 * n, 3)), [1.0, 1.0, 2.0]])['n_rest'].tolist() == [n + 1, n + 1, 1]
+
+
+@pytest.mark.parametrize('sigma', [0.01, 0.1, 0.2, 0.4, 0.5, 1.0, 3.0])
+def test_an_average_is_as_good_as_stated(sigma):
+    """Over all levels: of `n` readings at rest the error is within what noise and steps state."""
+    rng, n, errors, stated = np.random.default_rng(0), 8, [], []
+    for level in rng.uniform(-0.5, 0.5, 4000):
+        y = np.round(level + sigma * rng.standard_normal((n, 1)))
+        variance = np.array([np.var(np.round(level + sigma * rng.standard_normal(200)))])
+        rests = resting(variance, np.ones(1))[0]
+        runs, run = [], 0
+        for k in range(n):
+            run = run + 1 if k and y[k] == y[k - 1] else 1
+            runs.append(run)
+        errors.append(y.mean() - level)
+        stated.append(np.sum(variance[0] + rests * np.array(runs) / 12.0) / n**2)
+    ratio = np.mean(np.square(errors)) / np.mean(stated)
+    # Stated too large where noise carries it over the edge of a step; hardly ever too small.
+    assert 0.2 < ratio < 1.8, ratio
+
+
+def test_an_axis_that_never_changed_rests_or_is_dead():
+    v, inf = np.array([0.0, 0.01, 0.0]), np.inf
+    np.testing.assert_array_equal(completed_steps(v, np.array([inf, 1.0, inf])), [1.0, 1.0, 1.0])
+    fine = np.array([0.0, 4.0, 0.0])
+    np.testing.assert_array_equal(completed_steps(fine, np.array([inf, 1.0, inf])),
+                                  [np.nan, 1.0, np.nan])
+    never = np.full(3, inf)
+    np.testing.assert_array_equal(completed_steps(np.zeros(3), never), never)
+    one = np.array([np.nan, 0.0, np.nan])
+    np.testing.assert_array_equal(completed_steps(one, np.array([inf, 2.0, inf])), [inf, 2.0, inf])
+
+
+@pytest.mark.parametrize('step', [7.3e-8, 1.5e-7, 3e-7, 1e-6])
+def test_values_tell_their_common_step(step):
+    rng = np.random.default_rng(0)
+    hits = found = 0
+    for _ in range(200):
+        counts = rng.integers(-400, 400, 3)
+        values = step * counts.astype(float)
+        expected = step * np.gcd.reduce(counts)
+        if np.count_nonzero(counts) > 1:
+            np.testing.assert_allclose(common_step(values), expected, rtol=1e-6)
+            hits += np.gcd.reduce(counts) == 1
+            # Single precision may hide it, but gives no wrong one.
+            single = common_step(values.astype(np.float32).astype(float))
+            assert single == np.inf or abs(single / expected - 1.0) < 1e-3
+            found += single < np.inf
+    assert hits > 140 and found > 50
+
+
+def test_values_without_a_common_step():
+    rng = np.random.default_rng(1)
+    assert all(common_step(rng.uniform(-5e-5, 5e-5, 3)) == np.inf for _ in range(200))
+    assert common_step(np.array([4e-5, np.nan, np.nan])) == np.inf
+    assert common_step(np.zeros(3)) == common_step(np.full(3, np.nan)) == np.inf
