@@ -1,0 +1,173 @@
+"""Faults and poor sensors, applied to any recording: each function takes `Readings` and returns
+spoilt ones.
+
+    readings = apply(readings, steps(1e-7), covariance(1e-2), beginning_cut(5.0))
+"""
+
+import dataclasses
+
+import numpy as np
+
+from mag_tracking.units import NS
+
+
+def apply(readings, *faults):
+    """The readings with one fault after the other."""
+    for fault in faults:
+        readings = fault(readings)
+    return readings
+
+
+def _with(readings, field):
+    return dataclasses.replace(readings, field=field)
+
+
+def _seconds(readings):
+    """(n,) [s] since the first reading."""
+    return (readings.stamp_ns - readings.stamp_ns.min()) / NS
+
+
+def _of(readings, sensor):
+    """(n,) whether a reading is of `sensor`; of all for None."""
+    if sensor is None:
+        return np.ones(len(readings), dtype=bool)
+    return np.array(readings.sensor_names()) == sensor
+
+
+def covariance(variance):
+    """Every message states this variance [T^2]; 0 and -1: unknown, as the messages have it."""
+    def spoil(readings):
+        if variance in (0.0, -1.0):
+            return dataclasses.replace(readings, covariance=None)
+        C = np.repeat(variance * np.eye(3)[None], len(readings), axis=0)
+        return dataclasses.replace(readings, covariance=C)
+    return spoil
+
+
+def steps(size, sensor=None):
+    """Readings in steps of `size` [T]."""
+    def spoil(readings):
+        coarse = size * np.round(readings.field / size)
+        return _with(readings, np.where(_of(readings, sensor)[:, None], coarse, readings.field))
+    return spoil
+
+
+def glitches(share, size, seed=0):
+    """A `share` of the readings has one axis off by up to `size` [T]: errors on a bus."""
+    def spoil(readings):
+        rng, field = np.random.default_rng(seed), readings.field.copy()
+        hit = np.flatnonzero(rng.random(len(readings)) < share)
+        field[hit, rng.integers(0, 3, len(hit))] += \
+            size * rng.uniform(0.3, 1.0, len(hit)) * rng.choice([-1.0, 1.0], len(hit))
+        return _with(readings, field)
+    return spoil
+
+
+def clipped(share):
+    """Each axis of each sensor is cut off at `share` of its largest excursion."""
+    def spoil(readings):
+        field = readings.field.copy()
+        for j in range(len(readings.names)):
+            mine = readings.sensor == j
+            level = np.nanmedian(field[mine], axis=0)
+            reach = share * np.nanmax(np.abs(field[mine] - level), axis=0)
+            field[mine] = np.clip(field[mine], level - reach, level + reach)
+        return _with(readings, field)
+    return spoil
+
+
+def only_axes(axes):
+    """Other axes than e.g. 'xz' are missing."""
+    def spoil(readings):
+        field = readings.field.copy()
+        field[:, [k for k, a in enumerate('xyz') if a not in axes]] = np.nan
+        return _with(readings, field)
+    return spoil
+
+
+def only_sensor(sensor):
+    """The other sensors are missing."""
+    return lambda readings: readings.part(_of(readings, sensor))
+
+
+def dropped(share, seed=0):
+    """A `share` of the readings is lost."""
+    def spoil(readings):
+        return readings.part(np.random.default_rng(seed).random(len(readings)) >= share)
+    return spoil
+
+
+def thinned(every):
+    """Only one in `every` readings of each sensor is left."""
+    def spoil(readings):
+        keep = np.zeros(len(readings), dtype=bool)
+        for j in range(len(readings.names)):
+            keep[np.flatnonzero(readings.sensor == j)[::every]] = True
+        return readings.part(keep)
+    return spoil
+
+
+def delayed(sensor, seconds):
+    """The clock of a sensor is late."""
+    def spoil(readings):
+        stamp = readings.stamp_ns + np.where(_of(readings, sensor), int(seconds * NS), 0)
+        order = np.argsort(stamp, kind='stable')
+        return dataclasses.replace(readings, stamp_ns=stamp).part(order)
+    return spoil
+
+
+def beginning_cut(seconds):
+    """The recording begins later."""
+    return lambda readings: readings.part(_seconds(readings) >= seconds)
+
+
+def vehicle_at_start(source, begin, seconds):
+    """What `source` recorded from `begin` [s] on, for `seconds`, happens also at the start.
+
+    A second vehicle: what it adds to the median field of each sensor is added here.
+    """
+    def spoil(readings):
+        field, t, t_source = readings.field.copy(), _seconds(readings), _seconds(source)
+        for j, name in enumerate(readings.names):
+            mine = (readings.sensor == j) & (t < seconds)
+            of_source = _of(source, name)
+            level = np.median(source.field[of_source], axis=0)
+            for a in range(3):
+                field[mine, a] += np.interp(t[mine] + begin, t_source[of_source],
+                                            source.field[of_source, a] - level[a])
+        return _with(readings, field)
+    return spoil
+
+
+def wrong_sign(sensor, axis):
+    """An axis of a sensor is flipped."""
+    def spoil(readings):
+        field = readings.field.copy()
+        field[_of(readings, sensor), 'xyz'.index(axis)] *= -1.0
+        return _with(readings, field)
+    return spoil
+
+
+def hum(amplitude, frequency=50.0):
+    """A power line: `amplitude` (3,) [T] at `frequency` [Hz]."""
+    def spoil(readings):
+        phase = 2.0 * np.pi * frequency * _seconds(readings)
+        return _with(readings, readings.field + np.sin(phase)[:, None] * np.asarray(amplitude))
+    return spoil
+
+
+def drift(rate, sensor=None):
+    """The background drifts by `rate` [T/s] on all axes."""
+    def spoil(readings):
+        added = rate * _seconds(readings) * _of(readings, sensor)
+        return _with(readings, readings.field + added[:, None])
+    return spoil
+
+
+def temperature_step(size, at, time_constant=3.0, sensor=None):
+    """From `at` [s] on the field of a sensor moves by `size` [T] as its temperature settles."""
+    def spoil(readings):
+        since = np.maximum(_seconds(readings) - at, 0.0)
+        added = size * -np.expm1(-since / time_constant) * _of(readings, sensor)
+        return _with(readings, readings.field + added[:, None])
+    return spoil

@@ -1,0 +1,73 @@
+"""A bundled vehicle recording, spoilt, through the tracker and the doctor."""
+
+import dataclasses
+import functools
+
+import numpy as np
+
+import mag_tracking as mt
+from mag_tracking.apps.doctor import Doctor
+from mag_tracking.apps.first_pass import first_pass
+from mag_tracking.pipeline import settings_for
+from mag_tracking.report.metrics import interpolate_truth
+from support.bundled import NETWORK_FILE, vehicle_path
+from support.spoiler import apply
+
+HEADING = np.cos(np.deg2rad(45.0))
+"""Cosine of the largest angle between the velocity at the closest point and the true one."""
+
+
+@functools.cache
+def recorded(name):
+    """`RecordedReadings` of a bundled vehicle recording."""
+    return mt.read_recording(vehicle_path(name), NETWORK_FILE)
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What the tracker made of a spoilt recording: of the track that is nearest to the truth."""
+
+    result: mt.TrackingResult
+    detected: int
+    tracked: bool
+    heading: float
+    """Cosine of the angle between true and tracked velocity at the closest point."""
+    ambiguous: bool
+    """At the closest point."""
+    closest: float
+    nees: float
+    """Per axis."""
+
+    @property
+    def direction_is_right(self):
+        return self.tracked and self.heading > HEADING
+
+
+def outcome(name, *faults, network=NETWORK_FILE):
+    """`Outcome` of the bundled recording `name` with `faults`."""
+    source = recorded(name)
+    readings = apply(source.readings, *faults)
+    result = mt.track(dataclasses.replace(source, readings=readings), network)
+    detected = int(result.detections['onset'].sum())
+    errors = {k: e for k in result.tracks if (e := result.errors(k)) is not None}
+    if not errors:
+        return Outcome(result, detected, False, np.nan, True, np.nan, np.nan)
+    best = min(errors, key=lambda k: errors[k]['closest'])
+    poses = result.poses[result.poses['track_id'] == best]
+    truth = result.truth[errors[best]['name']]
+    true = interpolate_truth(truth, poses['stamp_ns'])[:, :2]
+    before = interpolate_truth(truth, poses['stamp_ns'] - 100_000_000)[:, :2]
+    k = int(np.nanargmin(np.hypot(*true.T)))
+    v, w = true[k] - before[k], poses['velocity'][k, :2]
+    return Outcome(result, detected, True, float(v @ w / np.linalg.norm(v) / np.linalg.norm(w)),
+                   bool(poses['ambiguous'][k]), errors[best]['closest'], errors[best]['anees'])
+
+
+def findings(name, *faults):
+    """[str] that the doctor says of the bundled recording `name` with `faults`."""
+    network, settings = mt.read_network(NETWORK_FILE), settings_for('vehicle')
+    readings = apply(recorded(name).readings, *faults)
+    doctor = Doctor(network, settings)
+    first_pass([readings], network, settings.calibrate).apply(doctor.calibrate)
+    doctor.feed(readings)
+    return [str(f) for f in doctor.findings()]
