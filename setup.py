@@ -34,6 +34,7 @@ setup(
     install_requires=[
         'matplotlib',
         'mcap',
+        'mcap-protobuf-support',
         'mcap-ros2-support',
         'numba',
         'numpy',
@@ -41,6 +42,7 @@ setup(
         'pygeomag',
         'pyserial',
         'PyYAML',
+        'rosbags',
         'scipy',
         'smbus2',
         'tqdm',
@@ -70,7 +72,6 @@ setup(
             'pytest',
             'pytest-timeout',
             'pytest-xdist',
-            'rosbags',
             'ruff',
             'scipy-stubs',
             'types-PyYAML',

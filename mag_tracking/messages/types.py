@@ -16,9 +16,10 @@ from mcap_ros2 import _dynamic
 from mcap_ros2.decoder import DecoderFactory
 
 from mag_tracking.errors import RecordingError
+from mag_tracking.messages import self_described
 from mag_tracking.messages.shapes import MessageDict
 
-MAGNETIC_FIELD = 'sensor_msgs/msg/MagneticField'
+MAGNETIC_FIELD = self_described.MAGNETIC_FIELD
 IMU = 'sensor_msgs/msg/Imu'
 POSE = 'geometry_msgs/msg/PoseStamped'
 POSE_WITH_COVARIANCE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
@@ -121,7 +122,8 @@ class _Raw(Protocol):
 
 
 _decoders: dict[tuple[str, bytes], Callable[[bytes], SimpleNamespace] | None] = {}
-_DECODE_ERRORS = (ValueError, IndexError, KeyError, OverflowError, struct.error, McapError)
+_DECODE_ERRORS = (ValueError, TypeError, IndexError, KeyError, OverflowError, struct.error,
+                  McapError)
 
 
 def decode(message: _Raw) -> SimpleNamespace:
@@ -131,11 +133,14 @@ def decode(message: _Raw) -> SimpleNamespace:
     """
     key = message.schema.name, message.schema.data
     try:
-        if key not in _decoders:
+        if key not in _decoders and message.schema.encoding in self_described.SCHEMAS:
+            _decoders[key] = self_described.decoder_for(message.schema)
+        elif key not in _decoders:
             _decoders[key] = DecoderFactory().decoder_for('cdr', message.schema)
         decoder = _decoders[key]
         if decoder is None:
-            raise ValueError(f'its schema is in {message.schema.encoding}, not in ros2msg')
+            raise ValueError(f'its schema is in {message.schema.encoding or "no language"}, not '
+                             'in ros2msg')
         return decoder(message.data)
     except _DECODE_ERRORS as error:
         raise RecordingError(f'a message on {message.topic} is not a {message.type}: '

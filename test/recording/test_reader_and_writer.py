@@ -206,8 +206,8 @@ def test_unusable_recordings_are_named(tmp_path, road_network):
     folder = tmp_path / 'folder'
     folder.mkdir()
     for path, message in ((tmp_path / 'nowhere.mcap', 'there is no'), (empty, 'is empty'),
-                          (text, 'not an MCAP file'), (sqlite, 'ros2 bag convert'),
-                          (folder, 'holds no .mcap')):
+                          (text, 'not an MCAP file'), (sqlite, 'cannot be read as a bag'),
+                          (folder, 'holds no recording')):
         with pytest.raises(RecordingError, match=message):
             Recording(path)
     (folder / 'metadata.yaml').write_text('a: 1')

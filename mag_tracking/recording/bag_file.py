@@ -1,0 +1,152 @@
+"""One SQLite bag (`.db3`) or ROS 1 bag (`.bag`), read by `rosbags`."""
+
+import dataclasses
+import functools
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from mcap.records import Schema
+
+from mag_tracking.errors import RecordingError
+from mag_tracking.messages.types import DEFINITIONS, definition, encoder
+from mag_tracking.recording.damage import DAMAGE
+from mag_tracking.recording.interruptible import Progress
+from mag_tracking.recording.raw_message import RawMessage
+
+if TYPE_CHECKING:
+    from rosbags.rosbag1 import Reader as Ros1Reader
+    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+    from rosbags.typesys.store import Typestore
+
+ROS1_SUFFIX = '.bag'
+BAG_SUFFIXES = ('.db3', ROS1_SUFFIX)
+
+
+class BagFile:
+    """One bag of a recording.
+
+    Attributes
+    ----------
+    types : {topic: message type}
+    message_counts : {topic: int}
+    start_ns, end_ns : int or None
+        Log times; None without a message.
+    """
+
+    def __init__(self, path: Path, losses: 'Counter[str]') -> None:
+        """`losses` {what: number} grows with what cannot be read. Raises RecordingError."""
+        self._path, self._is_ros1, self._losses = path, path.suffix == ROS1_SUFFIX, losses
+        self.types: dict[str, str] = {}
+        self.message_counts: Counter[str] = Counter()
+        self.start_ns: int | None = None
+        self.end_ns: int | None = None
+        with self._reading() as reader:
+            for connection in reader.connections:
+                self.types[connection.topic] = connection.msgtype
+                self.message_counts[connection.topic] += connection.msgcount
+            times = reader if self._is_ros1 else reader.metadata
+            if self.message_counts.total():
+                # The library's end is a nanosecond after the last message.
+                self.start_ns, self.end_ns = times.start_time, times.end_time - 1
+
+    def _reading(self) -> AbstractContextManager[Any]:
+        """The library's reader, open; raises RecordingError."""
+        try:
+            reader = self._reader()
+            reader.open()
+        except bag_errors() as error:
+            raise RecordingError(f'{self._path} cannot be read as a bag: {error}') from error
+        return closing(reader)
+
+    def _reader(self) -> 'Ros1Reader | Sqlite3Reader':
+        """The library's reader of this bag."""
+        # Most recordings are MCAP, and should not wait for another library.
+        if self._is_ros1:
+            from rosbags.rosbag1 import Reader
+
+            return Reader(self._path)
+        from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+        return Sqlite3Reader(self._path)
+
+    def messages(self, start_ns: int | None = None,
+                 progress: Progress | None = None) -> Iterator[RawMessage]:
+        """Iterate over the `RawMessage`s, CDR, in order of log time.
+
+        Parameters
+        ----------
+        start_ns : int, optional
+            Leave out what was logged before.
+        progress : function, optional
+            Called with the bytes done since the last call.
+        """
+        size, total, done, n = self._path.stat().st_size, self.message_counts.total(), 0, 0
+        for topic, kind, log_time_ns, data in self._raw(start_ns):
+            yield RawMessage(topic, kind, log_time_ns,
+                             cdr_of_ros1(data, kind) if self._is_ros1 else data, schema_of(kind))
+            n += 1
+            if progress and (here := size * n // total) > done:
+                progress(here - done)
+                done = here
+
+    def _raw(self, start_ns: int | None) -> Iterator[tuple[str, str, int, bytes]]:
+        """Iterate over (topic, type, log time, bytes); damage ends it and is counted."""
+        n = 0
+        with self._reading() as reader:
+            try:
+                for connection, log_time_ns, data in reader.messages(reader.connections, start_ns):
+                    n += 1
+                    yield connection.topic, connection.msgtype, log_time_ns, bytes(data)
+            except bag_errors() as error:
+                self._losses[f'{self._path.name}: nothing readable after message {n} of '
+                             f'{self.message_counts.total()} ({type(error).__name__})'] += 1
+
+
+@functools.cache
+def bag_errors() -> tuple[type[Exception], ...]:
+    """What the library raises on bags that are damaged, or are none."""
+    import apsw
+    from rosbags.rosbag1 import ReaderError as Ros1Error
+    from rosbags.rosbag2 import ReaderError
+    from rosbags.serde import SerdeError
+
+    return (Ros1Error, ReaderError, SerdeError, apsw.Error, OSError, *DAMAGE)
+
+
+@functools.cache
+def schema_of(type_name: str) -> Schema:
+    """The schema of a message type; empty where this package does not use the type."""
+    known = type_name in DEFINITIONS
+    return Schema(1, definition(type_name).encode() if known else b'',
+                  'ros2msg' if known else '', type_name)
+
+
+def cdr_of_ros1(data: bytes, type_name: str) -> bytes:
+    """CDR bytes of a ROS 1 message; b'' where it is damaged, or of a type that is not used here."""
+    if type_name not in DEFINITIONS:
+        return b''
+    try:
+        message = _ros1_types().deserialize_ros1(data, type_name)
+    except bag_errors():
+        return b''
+    return encoder(type_name)(_plain(message))
+
+
+@functools.cache
+def _ros1_types() -> 'Typestore':
+    """The message types of ROS 1."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS1_NOETIC)
+
+
+def _plain(value: Any) -> Any:
+    """A message as nested dicts."""
+    if dataclasses.is_dataclass(value):
+        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)
+                if not f.name.startswith('__')}
+    return value.tolist() if isinstance(value, np.ndarray) else value

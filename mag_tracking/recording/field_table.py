@@ -1,0 +1,184 @@
+"""Tables of magnetometer readings (CSV) to recordings; columns and units are given."""
+
+import csv
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from mag_tracking.arrays import FloatArray
+from mag_tracking.errors import RecordingError
+from mag_tracking.messages.schema import magnetic_field_dicts
+from mag_tracking.messages.types import MAGNETIC_FIELD
+from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.records import Readings
+from mag_tracking.units import LATEST_NS
+
+FIELD_UNITS = {'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'gauss': 1e-4, 'mgauss': 1e-7}
+"""{unit: T}."""
+TIME_UNITS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
+"""{unit: ns}."""
+
+_Path: TypeAlias = str | PathLike[str]
+_Axes: TypeAlias = dict[str, dict[str, str]]
+"""{sensor, or '' where a column tells: {axis: column}}."""
+
+
+def parse_columns(texts: Sequence[str]) -> tuple[str, str | None, _Axes]:
+    """The columns of a table.
+
+    Parameters
+    ----------
+    texts : sequence of str
+        `time=COLUMN`, and either `sensor=COLUMN` with `x=COLUMN` and so on (a row a reading), or
+        `NAME.x=COLUMN` (a row for all sensors). Axes that are not measured are left out.
+
+    Returns
+    -------
+    time, sensor : str, str or None
+        Names of columns.
+    axes : {sensor: {axis: column}}
+
+    Raises
+    ------
+    RecordingError
+        If a text cannot be read, or something is missing.
+    """
+    found: dict[str, str] = {}
+    for text in texts:
+        key, equals, column = text.partition('=')
+        if not (equals and column) or key in found:
+            raise RecordingError(f'columns: {text!r} is given twice' if key in found else
+                                 f'columns: expected e.g. time=t, got {text!r}')
+        found[key] = column
+    time, sensor = found.pop('time', None), found.pop('sensor', None)
+    axes: _Axes = {}
+    for key, column in found.items():
+        name, _, axis = key.rpartition('.')
+        if axis not in ('x', 'y', 'z') or bool(name) == (sensor is not None):
+            raise RecordingError(f'columns: {key!r} is none of time, sensor, x, y, z (with sensor) '
+                                 'or NAME.x, NAME.y, NAME.z (without)')
+        axes.setdefault(name, {})[axis] = column
+    if time is None or not axes:
+        raise RecordingError('columns: time and at least one axis are needed, such as time=t '
+                             'mag_1.x=bx mag_1.y=by mag_1.z=bz')
+    return time, sensor, axes
+
+
+def import_field_table(table: _Path, columns: Sequence[str], unit: str, out: _Path,
+                       time_unit: str = 's') -> tuple[Path, dict[str, int]]:
+    """A table of readings as a recording.
+
+    Parameters
+    ----------
+    table : path
+        CSV with a header.
+    columns : sequence of str
+        As for `parse_columns`. An empty field is not measured.
+    unit : str
+        Of the fields, one of `FIELD_UNITS`.
+    out : path
+        Folder for `<table>.mcap` and `metadata.yaml`.
+    time_unit : str
+        Of the times, one of `TIME_UNITS`.
+
+    Returns
+    -------
+    recording : Path
+        The readings are on `/NAME/imu/mag`.
+    counts : {sensor: number of readings}
+
+    Raises
+    ------
+    RecordingError
+        If the table does not fit.
+    OutputError
+        If `out` cannot be written.
+    """
+    for name, value, known in (('unit', unit, FIELD_UNITS), ('time unit', time_unit, TIME_UNITS)):
+        if value not in known:
+            raise RecordingError(f'{name}: expected one of {", ".join(known)}, got {value!r}')
+    readings = _readings(Path(table), parse_columns(columns), FIELD_UNITS[unit],
+                         TIME_UNITS[time_unit])
+    recording = Path(out) / f'{Path(table).stem}.mcap'
+    counts = dict.fromkeys(readings.names, 0)
+    with RecordingWriter(recording) as writer:
+        for k, (name, content) in enumerate(magnetic_field_dicts(readings)):
+            writer.write(f'/{name}/imu/mag', MAGNETIC_FIELD, content, int(readings.stamp_ns[k]))
+            counts[name] += 1
+    return recording, counts
+
+
+def _readings(table: Path, columns: tuple[str, str | None, _Axes], scale: float,
+              time_scale: int) -> Readings:
+    """The readings of a table in order of time."""
+    time, sensor, axes = columns
+    names: list[str] = []
+    stamps: list[int] = []
+    fields: list[FloatArray] = []
+    wanted = [time, *([sensor] if sensor else []), *(c for a in axes.values() for c in a.values())]
+    for number, row in _rows(table, wanted):
+        stamp = _stamp(row[time], time_scale, f'{table}: row {number}: {time}')
+        for name, columns_of in axes.items():
+            field = np.full(3, np.nan)
+            for axis, column in columns_of.items():
+                field['xyz'.index(axis)] = scale * _number(
+                    row[column], f'{table}: row {number}: {column}')
+            if not np.isnan(field).all():
+                names.append(_sensor_name(row[sensor]) if sensor else name)
+                stamps.append(stamp)
+                fields.append(field)
+    if not names:
+        raise RecordingError(f'{table} has no readings')
+    order = np.argsort(stamps, kind='stable')
+    return Readings.by_name(names, stamps, np.array(fields)).part(order)
+
+
+def _rows(table: Path, wanted: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
+    """[(row, {column: text})] of a CSV file; raises RecordingError."""
+    try:
+        with open(table, newline='', encoding='utf-8-sig') as stream:
+            reader = csv.DictReader(stream, skipinitialspace=True)
+            missing = [c for c in wanted if c not in (reader.fieldnames or ())]
+            if missing:
+                raise RecordingError(f'{table}: there is no column {missing[0]}; it has '
+                                     f'{", ".join(reader.fieldnames or ["none"])}')
+            rows = [(reader.line_num, row) for row in reader]
+    except OSError as error:
+        raise RecordingError(f'cannot read {table}: {error.strerror}') from error
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise RecordingError(f'{table} is not a CSV file: {error}') from error
+    for number, row in rows:
+        if any(row[c] is None for c in wanted):
+            raise RecordingError(f'{table}: row {number} has too few columns')
+    return rows
+
+
+def _number(text: str, where: str) -> float:
+    """A number; NaN of an empty field. Raises RecordingError."""
+    if not text.strip():
+        return float('nan')
+    try:
+        value = float(text)
+    except ValueError:
+        raise RecordingError(f'{where}: expected a number, got {text!r}') from None
+    if np.isinf(value):
+        raise RecordingError(f'{where} is infinite')
+    return value
+
+
+def _stamp(text: str, scale: int, where: str) -> int:
+    """[ns] of a time; whole numbers keep every digit. Raises RecordingError."""
+    text = text.strip()
+    value = int(text) * scale if text.lstrip('+-').isdigit() else _number(text, where) * scale
+    if not 0 <= value <= LATEST_NS:
+        raise RecordingError(f'{where}: {text or "nothing"} is no time from 1970 on')
+    return round(value)
+
+
+def _sensor_name(text: str) -> str:
+    """A sensor's name, as in a topic: a number n is `mag_n`."""
+    text = text.strip()
+    return f'mag_{text}' if text.isdigit() else text

@@ -1,0 +1,268 @@
+"""SQLite and ROS 1 bags, JSON and protobuf messages, and tables: read as the MCAP recording is."""
+
+import json
+
+import numpy as np
+import pytest
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+from mcap.writer import Writer
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Ros2Writer
+from rosbags.typesys import Stores, get_typestore
+
+import mag_tracking as mt
+from mag_tracking.cli import main
+from mag_tracking.errors import RecordingError
+from mag_tracking.messages.types import MAGNETIC_FIELD
+from mag_tracking.recording.field_table import import_field_table
+from mag_tracking.recording.reader import Recording
+from support.bundled import NETWORK_FILE, vehicle_path
+
+NAME = 'straight_car_right'
+HEADER = 'std_msgs/msg/Header'
+
+
+@pytest.fixture(scope='module')
+def source():
+    return Recording(vehicle_path(NAME))
+
+
+@pytest.fixture(scope='module')
+def expected():
+    return mt.track(vehicle_path(NAME), NETWORK_FILE)
+
+
+def written_db3(source, folder):
+    """An SQLite bag of a recording, by `rosbags`."""
+    types = get_typestore(Stores.ROS2_JAZZY)
+    with Ros2Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connections = {topic: writer.add_connection(topic, kind, typestore=types)
+                       for topic, kind in source.types.items()}
+        for m in source.messages():
+            writer.write(connections[m.topic], m.log_time_ns, m.data)
+    return folder
+
+
+def written_ros1(source, path):
+    """A ROS 1 bag of a recording, by `rosbags`."""
+    ros2, ros1 = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
+    with Ros1Writer(path) as writer:
+        connections = {topic: writer.add_connection(topic, kind, typestore=ros1)
+                       for topic, kind in source.types.items()}
+        for k, m in enumerate(source.messages()):
+            message = ros2.deserialize_cdr(m.data, m.type)
+            fields = {name: getattr(message, name) for name in message.__dataclass_fields__
+                      if not name.startswith('__')}
+            fields['header'] = ros1.types[HEADER](
+                seq=k, stamp=message.header.stamp, frame_id=message.header.frame_id)
+            writer.write(connections[m.topic], m.log_time_ns,
+                         ros1.serialize_ros1(ros1.types[m.type](**fields), m.type))
+    return path
+
+
+def compare(result, expected):
+    for table in ('poses', 'smoothed', 'detections'):
+        np.testing.assert_array_equal(getattr(result, table), getattr(expected, table), table)
+    assert result.errors() == expected.errors() and result.rejections == expected.rejections
+
+
+@pytest.mark.parametrize('kind', ['folder', 'db3', 'bag'])
+def test_a_bag_gives_what_the_mcap_gives(kind, source, expected, tmp_path):
+    if kind == 'bag':
+        path = written_ros1(source, tmp_path / 'one.bag')
+    else:
+        path = written_db3(source, tmp_path / 'two')
+        path = path if kind == 'folder' else path / 'two.db3'
+    found = Recording(path)
+    assert found.types == source.types and found.message_counts == source.message_counts
+    assert (found.start_ns, found.end_ns) == (source.start_ns, source.end_ns)
+    done = []
+    n = sum(1 for _ in found.messages(progress=done.append))
+    assert n == source.message_counts.total() and sum(done) == found.size
+    compare(mt.track(path, NETWORK_FILE), expected)
+
+
+@pytest.mark.parametrize('kind', ['db3', 'bag'])
+@pytest.mark.parametrize('share', [0.0, 0.1, 0.5, 0.9])
+def test_a_damaged_bag_is_named_or_read_as_far_as_it_goes(kind, share, source, tmp_path):
+    path = written_ros1(source, tmp_path / 'one.bag') if kind == 'bag' \
+        else written_db3(source, tmp_path / 'two') / 'two.db3'
+    data = bytearray(path.read_bytes())
+    path.write_bytes(data[:int(share * len(data))])
+    try:
+        recording = Recording(path)
+        n = sum(1 for _ in recording.messages())
+    except RecordingError as error:
+        assert str(path) in str(error)
+    else:
+        assert n < source.message_counts.total() and recording.losses
+
+
+def test_bytes_that_were_changed_end_nothing(source, tmp_path):
+    path = written_db3(source, tmp_path / 'two') / 'two.db3'
+    data, rng = bytearray(path.read_bytes()), np.random.default_rng(0)
+    for k in rng.integers(4096, len(data), 300):
+        data[k] ^= 0xFF
+    path.write_bytes(data)
+    try:
+        read = mt.read_recording(path, NETWORK_FILE)
+    except RecordingError as error:
+        assert 'cannot be read as a bag' in str(error)
+    else:
+        assert len(read.readings) <= 2800
+
+
+def mcap_of(path, encoding, schema, messages):
+    """An MCAP file of (topic, time, bytes)."""
+    with open(path, 'wb') as stream:
+        writer = Writer(stream)
+        writer.start()
+        name, schema_encoding, content = schema
+        schema = writer.register_schema(name, schema_encoding, content)
+        channels = {}
+        for topic, time_ns, data in messages:
+            if topic not in channels:
+                channels[topic] = writer.register_channel(topic, encoding, schema)
+            writer.add_message(channels[topic], time_ns, data, time_ns)
+        writer.finish()
+    return path
+
+
+def fields_of(source):
+    """[(topic, time [ns], field (3,))] of a recording."""
+    read = mt.read_recording(source.path, NETWORK_FILE).readings
+    return [(f'/{name}/imu/mag', stamp, field) for name, stamp, field in zip(
+        read.sensor_names(), read.stamp_ns.tolist(), read.field, strict=True)]
+
+
+SCHEMA = json.dumps({'type': 'object', 'properties': {
+    'header': {'type': 'object'}, 'magnetic_field': {'type': 'object'}}}).encode()
+
+
+@pytest.mark.parametrize('seconds, nanoseconds', [('sec', 'nanosec'), ('sec', 'nsec')])
+def test_json_messages_of_a_magnetic_field_are_read(seconds, nanoseconds, source, expected,
+                                                    tmp_path):
+    messages = [(topic, t, json.dumps({
+        'header': {'stamp': {seconds: t // 10**9, nanoseconds: t % 10**9}, 'frame_id': ''},
+        'magnetic_field': dict(zip('xyz', b.tolist(), strict=True))}).encode())
+        for topic, t, b in fields_of(source)]
+    path = mcap_of(tmp_path / 'json.mcap', 'json', ('Magnetic', 'jsonschema', SCHEMA), messages)
+    assert set(Recording(path).types.values()) == {MAGNETIC_FIELD}
+    np.testing.assert_array_equal(mt.track(path, NETWORK_FILE).poses, expected.poses)
+
+
+@pytest.mark.parametrize('change, cause', [
+    (lambda m: m.pop('magnetic_field'), 'no magnetic_field'),
+    (lambda m: m.pop('header'), 'no time'),
+    (lambda m: m['header'].update(stamp={'sec': 'x'}), 'no sec'),
+    (lambda m: m['magnetic_field'].pop('z'), 'no z'),
+    (lambda m: m['magnetic_field'].update(z='1'), "is '1'"),
+    (lambda m: m.update(magnetic_field_covariance=[1.0]), 'covariance'),
+    (lambda m: m.update(magnetic_field=3.0), 'no x')])
+def test_other_json_messages_are_rejected(change, cause, tmp_path):
+    from mag_tracking.messages.types import decode
+
+    message = {'header': {'stamp': {'sec': 1, 'nanosec': 2}},
+               'magnetic_field': {'x': 1e-5, 'y': None, 'z': 2}}
+    path = mcap_of(tmp_path / 'a.mcap', 'json', ('M', 'jsonschema', SCHEMA),
+                   [('/mag_1/imu/mag', 5, json.dumps(message).encode())])
+    (raw,) = Recording(path).messages()
+    good = decode(raw)
+    assert np.isnan(good.magnetic_field.y) and good.header.stamp.nanosec == 2
+    change(message)
+    with pytest.raises(RecordingError, match=cause):
+        decode(raw._replace(data=json.dumps(message).encode()))
+    with pytest.raises(RecordingError, match='is not a'):
+        decode(raw._replace(data=b'\xff{'))
+
+
+def protobuf_class():
+    """(class of a message with timestamp and magnetic_field, its serialised descriptors)."""
+    double, whole, message = (FieldDescriptorProto.TYPE_DOUBLE, FieldDescriptorProto.TYPE_INT64,
+                              FieldDescriptorProto.TYPE_MESSAGE)
+    file = FileDescriptorProto(name='m.proto', package='lab', syntax='proto3')
+    for name, fields in (('Time', (('seconds', whole, ''), ('nanos', whole, ''))),
+                         ('Vector', tuple((a, double, '') for a in 'xyz')),
+                         ('Magnetic', (('timestamp', message, '.lab.Time'),
+                                       ('magnetic_field', message, '.lab.Vector')))):
+        kind = file.message_type.add(name=name)
+        for k, (field, type_, type_name) in enumerate(fields):
+            kind.field.add(name=field, number=k + 1, type=type_, type_name=type_name or None,
+                           label=FieldDescriptorProto.LABEL_OPTIONAL)
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+
+    pool = DescriptorPool()
+    pool.Add(file)
+    return (GetMessageClass(pool.FindMessageTypeByName('lab.Magnetic')),
+            FileDescriptorSet(file=[file]).SerializeToString())
+
+
+def test_protobuf_messages_of_a_magnetic_field_are_read(source, expected, tmp_path):
+    Magnetic, descriptors = protobuf_class()
+    messages = []
+    for topic, t, b in fields_of(source):
+        m = Magnetic()
+        m.timestamp.seconds, m.timestamp.nanos = divmod(t, 10**9)
+        m.magnetic_field.x, m.magnetic_field.y, m.magnetic_field.z = b.tolist()
+        messages.append((topic, t, m.SerializeToString()))
+    path = mcap_of(tmp_path / 'p.mcap', 'protobuf', ('lab.Magnetic', 'protobuf', descriptors),
+                   messages)
+    np.testing.assert_array_equal(mt.track(path, NETWORK_FILE).poses, expected.poses)
+
+
+def test_a_table_of_readings_becomes_a_recording(source, expected, tmp_path, capsys):
+    rows = fields_of(source)
+    table = tmp_path / 'long.csv'
+    table.write_text('t;id'.replace(';', ', ') + ', bx, by, bz\n' + '\n'.join(
+        f'{t}, {topic[5]}, ' + ', '.join(repr(float(v) / 1e-6) for v in b)
+        for topic, t, b in rows[::-1]))
+    assert main(['import', str(table), '--columns', 'time=t', 'sensor=id', 'x=bx', 'y=by', 'z=bz',
+                 '--unit', 'uT', '--time-unit', 'ns', '--out', str(tmp_path / 'out')]) == 0
+    assert '/mag_1/imu/mag  1400' in capsys.readouterr().out
+    result = mt.track(tmp_path / 'out', NETWORK_FILE)
+    np.testing.assert_allclose(result.poses['position'], expected.poses['position'], rtol=1e-6)
+
+
+def test_a_row_may_have_all_sensors(tmp_path):
+    table = tmp_path / 'wide.csv'
+    table.write_text('ms,a,b,c\n1,0.5,,2\n2,,,\n3,1.5,0.25,-2\n')
+    recording, counts = import_field_table(
+        table, ['time=ms', 'left.x=a', 'left.y=b', 'right.z=c'], 'gauss', tmp_path / 'o', 'ms')
+    assert counts == {'left': 2, 'right': 2}
+    found = [(m.topic, m.log_time_ns) for m in Recording(recording).messages()]
+    assert found == [('/left/imu/mag', 10**6), ('/right/imu/mag', 10**6),
+                     ('/left/imu/mag', 3 * 10**6), ('/right/imu/mag', 3 * 10**6)]
+
+
+@pytest.mark.parametrize('columns, unit, text, message', [
+    (['time=t', 'a.x=x'], 'tesla', 't,x\n1,2\n', 'unit: expected one of T, mT'),
+    (['time=t', 'a.x=x'], 'T', 't,y\n1,2\n', 'there is no column x; it has t, y'),
+    (['time=t', 'a.x=x'], 'T', 't,x\n1,b\n', "row 2: x: expected a number, got 'b'"),
+    (['time=t', 'a.x=x'], 'T', 't,x\n1,inf\n', 'row 2: x is infinite'),
+    (['time=t', 'a.x=x'], 'T', 't,x\n-1,2\n', 'row 2: t: -1 is no time'),
+    (['time=t', 'a.x=x'], 'T', 't,x\n,2\n', 'row 2: t: nothing is no time|nan is no time'),
+    (['time=t', 'a.x=x'], 'T', 't,x\n1\n', 'row 2 has too few columns'),
+    (['time=t', 'a.x=x'], 'T', 't,x\n1,\n', 'has no readings'),
+    (['time=t', 'x=x'], 'T', 't,x\n1,2\n', "'x' is none of"),
+    (['time=t', 'sensor=s', 'a.x=x'], 'T', 't,x\n1,2\n', "'a.x' is none of"),
+    (['a.x=x'], 'T', 't,x\n1,2\n', 'time and at least one axis'),
+    (['time=t', 'time=u', 'a.x=x'], 'T', 't,x\n1,2\n', 'is given twice'),
+    (['time'], 'T', 't,x\n1,2\n', 'expected e.g. time=t')])
+def test_a_table_that_does_not_fit_is_named(columns, unit, text, message, tmp_path):
+    table = tmp_path / 'a.csv'
+    table.write_text(text)
+    with pytest.raises(RecordingError, match=message):
+        import_field_table(table, columns, unit, tmp_path / 'o')
+
+
+def test_the_command_asks_for_columns_and_a_unit(tmp_path, capsys):
+    table = tmp_path / 'a.csv'
+    table.write_text('t,x\n1,2\n')
+    assert main(['import', str(table), '--out', str(tmp_path / 'o')]) == 1
+    assert 'either --columns' in capsys.readouterr().err
+    assert main(['import', str(table), '--columns', 'time=t', 'a.x=x', '--out',
+                 str(tmp_path / 'o')]) == 1
+    assert '--unit is needed' in capsys.readouterr().err
