@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from mag_tracking.analysis.placement import PlannedTarget, Sampling
+    from mag_tracking.apps.events import EventsResult, events
     from mag_tracking.apps.fit import FitResult, FittedPass, fit
     from mag_tracking.apps.plan import Plan
     from mag_tracking.apps.plan_inputs import plan
@@ -37,16 +38,17 @@ if TYPE_CHECKING:
 __version__ = '0.1.0'
 
 __all__ = [
-    'FitResult', 'FittedPass', 'MagTrackingError', 'MissingDependencyError', 'NetworkError',
-    'Plan', 'PlannedTarget', 'Readings', 'ReadingsError', 'RecordedReadings', 'RecordingError',
-    'Sampling', 'SensorNetwork', 'SettingsError', 'TrackingResult', 'UnknownTrackError', 'fit',
-    'plan', 'read_network', 'read_parameter_file', 'read_recording', 'readings_from_arrays',
-    'track']
+    'EventsResult', 'FitResult', 'FittedPass', 'MagTrackingError', 'MissingDependencyError',
+    'NetworkError', 'Plan', 'PlannedTarget', 'Readings', 'ReadingsError', 'RecordedReadings',
+    'RecordingError', 'Sampling', 'SensorNetwork', 'SettingsError', 'TrackingResult',
+    'UnknownTrackError', 'events', 'fit', 'plan', 'read_network', 'read_parameter_file',
+    'read_recording', 'readings_from_arrays', 'track']
 
 # The modules of the names above, imported on first use: `import mag_tracking` is done by every
 # command and node at once, and compiled code and the figures take seconds.
 _MODULES = {
     'analysis.placement': ('PlannedTarget', 'Sampling'),
+    'apps.events': ('EventsResult', 'events'),
     'apps.fit': ('FitResult', 'FittedPass', 'fit'),
     'apps.plan': ('Plan',),
     'apps.plan_inputs': ('plan',),

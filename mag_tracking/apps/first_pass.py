@@ -3,6 +3,8 @@
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
+import numpy as np
+
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.quiet_level import BlockRecorder, QuietLevel
 from mag_tracking.network import SensorNetwork
@@ -15,7 +17,12 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.units import NS
 
 PATIENCE_S = 1.0
-"""[s] A beginning is quiet where the background is known so long after the shortest time."""
+PATIENCE_BLOCKS = 2.0
+"""A beginning is quiet where the background is known so long after the shortest time: so many
+seconds, and so many blocks, which are longer for a slow sensor."""
+
+LONGEST = 10.0
+"""A background that is not known after so many times the shortest time is not waited for."""
 
 LEAST = 1.0 / 3.0
 """A level is a background where it was seen for this share of the usual time, in all."""
@@ -64,14 +71,14 @@ def first_pass(batches: Iterable[Readings], network: SensorNetwork,
     if not wanted or not settings.look_ahead_s:
         return FirstPass({}, {})
     recorder, beginning = Calibrate(network, settings, BlockRecorder), Calibrate(network, settings)
-    learnt: dict[str, FloatArray] = {}
+    learnt: dict[str, tuple[float, FloatArray]] = {}
     first_ns: int | None = None
     for readings in batches:
         if not len(readings):
             continue
         first_ns = int(readings.stamp_ns[0]) if first_ns is None else first_ns
         recorder.feed(readings)
-        _learn(beginning, readings, first_ns + (settings.learn_s + PATIENCE_S) * NS, learnt)
+        _learn(beginning, readings, first_ns, settings, learnt)
         if int(readings.stamp_ns[-1]) - first_ns > settings.look_ahead_s * NS:
             break
     found, steps, is_quiet = {}, {}, True
@@ -81,22 +88,25 @@ def first_pass(batches: Iterable[Readings], network: SensorNetwork,
         level = background.quiet_level() if name in wanted else None
         if level is not None and level.n_blocks * settings.block_s >= LEAST * settings.learn_s:
             found[name] = level
-            is_quiet &= name in learnt and background.is_usual(learnt[name], level)
+            since, at_first = learnt.get(name, (np.inf, level.level))
+            is_early = since <= settings.learn_s + PATIENCE_S + PATIENCE_BLOCKS * level.block_s
+            is_quiet &= is_early and background.is_usual(at_first, level)
     # A target that one sensor feels at the beginning may be in the background of all.
     return FirstPass({} if is_quiet else found, steps)
 
 
-def _learn(beginning: Calibrate, readings: Readings, until_ns: float,
-           learnt: dict[str, FloatArray]) -> None:
-    """Put the backgrounds that are known before a time into `learnt`, {sensor: (3,) [T]}."""
+def _learn(beginning: Calibrate, readings: Readings, first_ns: int, settings: CalibrateSettings,
+           learnt: dict[str, tuple[float, FloatArray]]) -> None:
+    """Put into `learnt`, {sensor: (seconds, (3,) [T])}, when a background is known, and which."""
     for i in range(0, len(readings), FEW):
         part = readings.part(slice(i, i + FEW))
-        if part.stamp_ns[0] > until_ns:
+        since = (int(part.stamp_ns[-1]) - first_ns) / NS
+        if since > LONGEST * settings.learn_s or len(learnt) == len(beginning.backgrounds()):
             return
         beginning.feed(part)
         for name, background in beginning.backgrounds().items():
             if background.ready and name not in learnt:
-                learnt[name] = beginning.background(name)
+                learnt[name] = since, beginning.background(name)
 
 
 def first_pass_of(recording: Recording, network: SensorNetwork, settings: CalibrateSettings,

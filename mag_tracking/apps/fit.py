@@ -129,9 +129,11 @@ class RecordingFit:
     def warnings(self) -> list[str]:
         """What was lost or rejected, and which sensors were never heard; a list of lines."""
         lines = [f'nothing on {topic}' for topic in self._reader.missing_topics()]
-        lines += [f'no background was learnt for {name}: the recording needs a target-free '
-                  'beginning, or the network file a background and a noise_std'
+        lines += [f'no background was learnt for {name}: the field was not steady for long enough; '
+                  'give background and noise_std in the network file'
                   for name in self._collector.waiting()]
+        why = self._collector.why_no_detection(self._reader.missing_topics())
+        lines += [f'nothing was detected: {why}'] if why else []
         for counts in (self._reader.rejected, self._collector.rejected, self._recording.losses):
             lines += [f'{cause}: {n}' for cause, n in counts.items()]
         return lines

@@ -1,10 +1,12 @@
 """Cut the passes out of a recording: what the network measured around each detection."""
 
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
+from mag_tracking.apps.no_detection import why_no_detection
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.saturation import cut_off
 from mag_tracking.network import SensorNetwork
@@ -26,7 +28,8 @@ class PassCollector:
     """Readings to passes: what the network measured from before a detection until it ended."""
 
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
-        self._network, self._max_field = network, settings.calibrate.max_field
+        self._network, self._settings = network, settings
+        self._max_field = settings.calibrate.max_field
         self._stages = (Calibrate(network, settings.calibrate), Align(network, settings.align),
                         Detect(network, settings.detect))
         # Raw and calibrated readings by the network's clock, since before the latest onset.
@@ -48,6 +51,12 @@ class PassCollector:
             for cause, n in rejected(stage.counts).items():
                 total[cause] = total.get(cause, 0) + n
         return total
+
+    def why_no_detection(self, missing_topics: Sequence[str]) -> str | None:
+        """One sentence, or None where something was detected; see `why_no_detection`."""
+        calibrate, _, detect = self._stages
+        return why_no_detection(self._network, self._settings, calibrate, detect, missing_topics,
+                                self.rejected)
 
     def waiting(self) -> list[str]:
         """Names of sensors whose background was never learnt."""

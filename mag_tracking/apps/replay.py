@@ -11,6 +11,7 @@ import numpy as np
 
 from mag_tracking.analysis.consistency import error_over_bound
 from mag_tracking.apps.first_pass import first_pass_of
+from mag_tracking.apps.no_detection import why_no_detection
 from mag_tracking.errors import OutputError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Output, Pipeline, Settings
@@ -165,8 +166,11 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
                 None if np.isnan(v) else float(v) for v in pipeline.calibrate.background(name)]
     tracks = [_track_entry(log, taker.smoothed.get(log.id), pipeline, truth)
               for log in taker.logs.values()]
+    why = why_no_detection(pipeline.network, pipeline.settings, pipeline.calibrate,
+                           pipeline.detect, reader.missing_topics(), rejections)
     return {'recording': recording.path.name, 'target': pipeline.settings.track.target,
             'counts': pipeline.counts(), 'rejected': rejections, 'lost': dict(recording.losses),
+            'why_no_detection': why,
             'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks}
 
 

@@ -7,6 +7,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 from mag_tracking.apps.first_pass import first_pass, first_pass_of
+from mag_tracking.apps.no_detection import why_no_detection
 from mag_tracking.apps.readings import (
     RecordedReadings,
     check_order,
@@ -68,17 +69,21 @@ class TrackingResult:
     """{damage: number} of what could not be read from the recording."""
     missing_topics: tuple[str, ...]
     """Topics of the network that are not in the recording."""
+    why_no_detection: str | None
+    """One sentence where nothing was detected; else None."""
     sensors_without_background: tuple[str, ...]
     """Sensors that were not used because their background was never learnt: the readings need a
     target-free beginning, or the network file a `background` and a `noise_std`."""
 
     def __repr__(self) -> str:
-        notes = [*(f'{n} {cause}' for cause, n in {**self.rejections, **self.lost}.items()),
+        notes = [*(f'not used: {n} {cause}' for cause, n in {**self.rejections, **self.lost}.items()),
                  *(f'nothing on {topic}' for topic in self.missing_topics),
                  *(f'no background of {name}' for name in self.sensors_without_background)]
+        if self.why_no_detection:
+            notes.append(f'nothing was detected: {self.why_no_detection}')
         return (f'TrackingResult({len(self.tracks)} tracks, {len(self.poses)} poses, '
                 f'{len(self.smoothed)} smoothed poses, {len(self.detections)} detections'
-                + (f'; not used: {"; ".join(notes)}' if notes else '') + ')')
+                + (f'; {"; ".join(notes)}' if notes else '') + ')')
 
     def poses_dataframe(self) -> 'pd.DataFrame':
         """`poses` with the columns of `poses.csv`; raises MissingDependencyError."""
@@ -247,8 +252,10 @@ def _result(pipeline: Pipeline, results: _Results, tracks: dict[int, TrackLog],
             recording: RecordedReadings) -> TrackingResult:
     """The results as arrays; the readings of `recording` are not used."""
     rejections = dict(Counter(recording.rejected) + Counter(pipeline.rejections()))
+    why = why_no_detection(pipeline.network, pipeline.settings, pipeline.calibrate,
+                           pipeline.detect, recording.missing_topics, rejections)
     return TrackingResult(
         pipeline.network, pipeline.settings, pose_array(results.poses),
         smoothed_array(results.smoothed), detection_array(results.detections), tracks,
         recording.truth, rejections, pipeline.counts(), recording.lost,
-        recording.missing_topics, tuple(pipeline.calibrate.unready()))
+        recording.missing_topics, why, tuple(pipeline.calibrate.unready()))

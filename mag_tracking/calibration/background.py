@@ -185,6 +185,12 @@ class RunningBackground:
         return covariance
 
     @property
+    def scatter_std(self) -> FloatArray:
+        """(3,) [T] scatter of the quiet readings, whatever noise was given; NaN = unknown."""
+        found = pooled_covariance(self._window.blocks()) if self._window else None
+        return np.full(3, np.nan) if found is None else np.sqrt(found.diagonal())
+
+    @property
     def measured(self) -> bool:
         """Whether the background is from readings, not from what was given beforehand."""
         return bool(self._window) and self.ready

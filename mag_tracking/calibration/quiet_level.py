@@ -49,6 +49,8 @@ class QuietLevel:
     """(3,) [T] in its earliest stretch; NaN = axis not reported."""
     covariance: FloatArray
     """(3, 3) [T^2] scatter of its readings; NaN = axis not reported."""
+    block_s: float
+    """[s] Usual length of a block."""
     width: FloatArray
     """(3,) [T] Blocks whose means differ by less are of one level."""
 
@@ -141,7 +143,8 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, most: int) -> QuietLe
     if covariance is None:
         return None
     _, mean, _ = line_through(early)
-    return QuietLevel(len(chosen), float(time[0]), float(time[-1]), mean, covariance, width)
+    return QuietLevel(len(chosen), float(time[0]), float(time[-1]), mean, covariance,
+                      float(np.median(np.diff(blocks.time))), width)
 
 
 def _densest(means: FloatArray, width: FloatArray) -> IntArray:

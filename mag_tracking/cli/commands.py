@@ -7,6 +7,7 @@ from mag_tracking.cli import (
     board_geometry,
     calibrate,
     doctor,
+    events,
     fit,
     import_table,
     info,
@@ -25,7 +26,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog='mag-tracking', description='Track magnetic targets with stationary magnetometers.')
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
-    for module in (replay, calibrate, tumble, board_geometry, doctor, fit, plan, listen, record,
-                   repair, run, info, import_table):
+    for module in (replay, events, calibrate, tumble, board_geometry, doctor, fit, plan, listen,
+                   record, repair, run, info, import_table):
         module.add(commands)
     return parser.parse_args(words)

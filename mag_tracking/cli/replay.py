@@ -22,6 +22,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.reader import Recording
+from mag_tracking.stages.track.manager import NO_SCALE
 
 _REPLAY = '''
 Reads the magnetic fields of the network's topics, learns each sensor's
@@ -98,26 +99,24 @@ def _print_summary(path: Path, summary: dict[str, Any]) -> None:
           f'{len(summary["tracks"])} tracks')
     for topic in summary['missing_topics']:
         print(f'  warning: nothing on {topic}')
-    if not summary['counts']['detect'].get('onsets', 0):
-        print(f'  nothing was detected with the settings for a {summary["target"]}')
+    if summary['why_no_detection']:
+        print(f'  nothing was detected with the settings for a {summary["target"]}: '
+              f'{summary["why_no_detection"]}')
     for what, n in {**summary['rejected'], **summary['lost']}.items():
         print(f'  warning: {what}: {n}')
     stuck = [name for name, s in summary['sensors'].items() if s['stuck']]
     if stuck:
-        print(f'  warning: {", ".join(stuck)}: an axis does not vary (a stuck sensor, or one with '
-              'coarse steps: give it a noise_std in the network file)')
+        print(f'  warning: {", ".join(stuck)}: an axis does not vary (see mag-tracking doctor)')
     waiting = [name for name, s in summary['sensors'].items() if not s['ready'] and not s['stuck']]
     if waiting:
-        print(f'  warning: no background was learnt for {", ".join(waiting)}: the recording needs '
-              'a target-free beginning, or the network file a background and a noise_std')
-    hardly = summary['counts']['track'].get('sensors whose orientation is hardly known', 0)
-    if hardly:
-        print(f'  warning: {hardly} sensors may be turned by more than 15 degrees, as the network '
-              'file says: calibrate them')
-    too_long = summary['counts']['track'].get('tracks too long to smooth', 0)
-    if too_long:
-        print(f'  warning: {too_long} tracks were too long to smooth (track.smooth_longest_s, or '
-              'too many frames for so many sensors)')
+        print(f'  warning: no background was learnt for {", ".join(waiting)}: the field was not '
+              'steady for long enough; give background and noise_std in the network file')
+    for name, s in summary['sensors'].items():
+        if s['quiet_stretch_s'] is not None:
+            begin, end = s['quiet_stretch_s']
+            print(f'  the recording does not begin quietly: the background of {name} is its most '
+                  f'frequent level, at {begin:.1f} to {end:.1f} s')
+    _print_limits(summary)
     for t in summary['tracks']:
         print(f'  track {t["id"]}: {t["poses"]} poses'
               + (f', from {t["arrival"]} ({t["arrival_weights"][t["arrival"]]:.0%})'
@@ -132,3 +131,23 @@ def _print_summary(path: Path, summary: dict[str, Any]) -> None:
         for name, value in t.get('truth', {}).items():
             if isinstance(value, float):
                 print(f'    against truth: {name} {value:.4g}')
+
+
+def _print_limits(summary: dict[str, Any]) -> None:
+    """What the tracks do not tell, and why."""
+    counts = summary['counts']['track']
+    if counts.get(NO_SCALE, 0):
+        print('  no track: one sensor does not tell the scale. `mag-tracking events` describes '
+              'what passes without it; where the settings are true of the vehicles here, '
+              'track.single_sensor_prior: true takes the scale from them')
+    elif len(summary['sensors']) == 1 and summary['tracks']:
+        print('  range and size are those of the settings (track.single_sensor_prior): one sensor '
+              'does not tell the scale')
+    hardly = counts.get('sensors whose orientation is hardly known', 0)
+    if hardly:
+        print(f'  warning: {hardly} sensors may be turned by more than 15 degrees, as the network '
+              'file says: calibrate them')
+    too_long = counts.get('tracks too long to smooth', 0)
+    if too_long:
+        print(f'  warning: {too_long} tracks were too long to smooth (track.smooth_longest_s, or '
+              'too many frames for so many sensors)')

@@ -13,6 +13,7 @@ from mag_tracking.messages.shapes import FieldReadings, Imu, MagneticField, Mess
 from mag_tracking.records import (
     AccelerationSample,
     Detection,
+    PassEvent,
     Readings,
     SmoothedPose,
     Track,
@@ -223,6 +224,17 @@ def detection_dict(d: Detection, frame: str) -> MessageDict:
             'statistic': d.statistic, 'degrees_of_freedom': d.degrees_of_freedom,
             'threshold': d.threshold, 'false_alarm_probability': d.false_alarm_probability,
             'strongest_sensor': d.strongest_sensor}
+
+
+def pass_event_dict(e: PassEvent) -> MessageDict:
+    """mag_tracking_msgs/PassEvent of a `PassEvent`."""
+    return {'header': header_dict(e.release_ns, e.sensor), 'sensor': e.sensor, 'number': e.number,
+            'ended': e.ended, 'onset': stamp_dict(e.onset_ns),
+            'release': stamp_dict(e.release_ns), 'peak_time': stamp_dict(e.peak_ns),
+            'peak': xyz(e.peak), 'energy': e.energy, 'axes': e.axes,
+            'closest_time': stamp_dict(e.closest_ns), 'closest_std': e.closest_std,
+            'time_scale': e.time_scale, 'left_to_right': e.left_to_right,
+            'signature': doubles(e.signature.ravel())}
 
 
 def odometry_dict(track: Track, frame: str, child_frame: str) -> MessageDict:

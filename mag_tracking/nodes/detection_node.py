@@ -11,18 +11,20 @@ from typing import Any
 
 from mag_tracking_msgs.msg import Detection as DetectionMessage
 from mag_tracking_msgs.msg import FieldReadings, NetworkFrame
+from mag_tracking_msgs.msg import PassEvent as PassEventMessage
 from sensor_msgs.msg import MagneticField
 
 from mag_tracking.messages.frame import frame_dict
-from mag_tracking.messages.schema import detection_dict, reading_of
+from mag_tracking.messages.schema import detection_dict, pass_event_dict, reading_of
 from mag_tracking.messages.types import CALIBRATED_READINGS
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.nodes.stage_node import RESULTS, SENT, STREAM, StageNode
-from mag_tracking.records import Detection, FieldFrame
+from mag_tracking.records import Detection, FieldFrame, Readings
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.detect.stage import Detect
+from mag_tracking.stages.events.stage import Events
 from mag_tracking.stages.stage import Stage
 
 
@@ -32,7 +34,11 @@ class DetectionNode(StageNode):
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__('detection_node', 'align', **node_arguments)
         self.settings = declare_settings(self, self.settings, 'detect', self.OWN_PARAMETERS)
+        self.settings = declare_settings(self, self.settings, 'events', self.OWN_PARAMETERS)
         self._align = Align(self.network, self.settings.align)
+        self._events = Events(self.network, self.settings.align, self.settings.detect) \
+            if len(self.network) <= self.settings.events.most_sensors else None
+        self._described = self.publisher(PassEventMessage, '~/events', RESULTS)
         self._detect = Detect(self.network, self.settings.detect)
         self._frames = self.publisher(NetworkFrame, '~/frame', SENT)
         self._detections = self.publisher(DetectionMessage, '~/detections', RESULTS)
@@ -45,7 +51,9 @@ class DetectionNode(StageNode):
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
         """{name: stage} whose counts are published."""
-        return {'align': self._align, 'detect': self._detect}
+        events: dict[str, Stage[Any, Any]] = \
+            {} if self._events is None else {'events': self._events}
+        return {'align': self._align, 'detect': self._detect, **events}
 
     def queues(self) -> dict[str, int]:
         """{name of a stage: how many records it holds}."""
@@ -53,13 +61,19 @@ class DetectionNode(StageNode):
 
     def _take(self, sensor: str, message: MagneticField) -> None:
         """One calibrated reading."""
-        self._publish(self._align.feed(reading_of(message, sensor)))
+        self._feed(reading_of(message, sensor))
 
     def _take_many(self, message: FieldReadings) -> None:
         """Calibrated readings of many sensors."""
         readings = self.readings_of(message, self._align)
         if readings is not None:
-            self._publish(self._align.feed(readings))
+            self._feed(readings)
+
+    def _feed(self, readings: Readings) -> None:
+        """Calibrated readings: the frames and events that they complete."""
+        self._publish(self._align.feed(readings))
+        for event in [] if self._events is None else self._events.feed(readings):
+            self._described.publish(to_message(PassEventMessage, pass_event_dict(event)))
 
     def _publish(self, frames: list[FieldFrame]) -> None:
         """Frames that are complete, and what is detected in them."""

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import SettingsError
 from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.detection_theory import energy_threshold
@@ -36,6 +36,13 @@ class Detect:
         self._settings = settings
         self._thresholds: dict[tuple[float, int], float] = {}
         self._next_id = 1
+        self._largest: FloatArray = np.zeros(len(network))
+        self.largest_excursion = 0.0
+        """Of the whole network, in units of the threshold."""
+        self.most_above = 0
+        """Consecutive frames above the threshold, at most."""
+        self.smallest_noise = np.inf
+        """[T] standard deviation of a frame."""
         self._resting = RestingAxes(len(network))
         self._reset()
 
@@ -71,6 +78,7 @@ class Detect:
         statistic, n = float(energy.sum()), int(axes.sum())
         self.counts['frames'] += 1
         if n:
+            self._note(frame, energy, axes, statistic, n)
             per_axis = np.divide(energy, axes, out=np.zeros(len(energy)), where=axes > 0)
             out += self._judge(frame.stamp_ns, statistic, n, self._names[int(per_axis.argmax())])
         else:
@@ -79,6 +87,22 @@ class Detect:
             self._resting.learn(frame.field)
         return [*out, replace(frame, target_present=self._present, statistic=statistic,
                               degrees_of_freedom=n)]
+
+    def _note(self, frame: FieldFrame, energy: FloatArray, axes: IntArray, statistic: float,
+              n: int) -> None:
+        """Note the largest excursions."""
+        p = self._settings.false_alarm_probability
+        if not self._present:
+            self.largest_excursion = max(self.largest_excursion, float(np.sqrt(
+                statistic / self.threshold(p, n))))
+            limits = np.array([self.threshold(p, k) if k else np.inf for k in axes.tolist()])
+            self._largest = np.maximum(self._largest, np.sqrt(energy / limits))
+            variance = np.nanmin(np.einsum('jii->ji', frame.covariance))
+            self.smallest_noise = min(self.smallest_noise, float(np.sqrt(variance)))
+
+    def largest_excursions(self) -> FloatArray:
+        """(n_sensors,) of each sensor, in units of the threshold of that sensor alone."""
+        return self._largest.copy()
 
     def _covariance(self, frame: FieldFrame) -> FloatArray:
         """(n_sensors, 3, 3) [T^2] covariance of the fields of a frame without a target."""
@@ -101,6 +125,7 @@ class Detect:
         if statistic > self.threshold(s.false_alarm_probability, n):
             self.counts['frames above the threshold'] += 1
             self._above += 1
+            self.most_above = max(self.most_above, self._above)
         else:
             self._above = 0
         if statistic > self.threshold(s.release_probability, n):

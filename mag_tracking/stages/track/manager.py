@@ -21,6 +21,8 @@ from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.target import target_of
 from mag_tracking.units import NS
 
+NO_SCALE = 'detections not tracked (one sensor does not tell the scale)'
+
 
 class TrackManager:
     """Frames with a verdict to `Track`s, one a frame while a target is present.
@@ -145,6 +147,10 @@ class TrackManager:
 
     def _initiate(self, frame: FieldFrame) -> list[TrackRecord]:
         """Start a track and run it through the frames before the detection."""
+        if len(self._network) == 1 and not self._settings.single_sensor_prior:
+            self.counts[NO_SCALE] += 1
+            self._tail_of_detection = True
+            return []
         s, sensors = self._settings, self._sensors_at(frame)
         bank_filter = BankFilter(sensors.network, self._target.model, s)
         bank = self._target.start(s, sensors.network, sensors.part_of(frame),

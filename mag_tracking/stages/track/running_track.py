@@ -85,8 +85,9 @@ class RunningTrack:
         lookback_ns = self._settings.lookback_s * NS
         # A target that was not seen approaching may already have passed.
         watched_ns = frame.stamp_ns - recent[0].stamp_ns if recent else 0
-        self._evidence = TrackEvidence(
-            doubted=watched_ns < LEAST_WATCHED * lookback_ns and not self._target.starts_anywhere)
+        is_late = watched_ns < LEAST_WATCHED * lookback_ns and not self._target.starts_anywhere
+        # The range of a single sensor's target is what the settings say.
+        self._evidence = TrackEvidence(doubted=is_late or len(self._sensors.whole) == 1)
         if recent:
             self._filter.predict(self.bank, (recent[0].stamp_ns - frame.stamp_ns) / NS)
         self._whole.begin(self.bank, self._filter)

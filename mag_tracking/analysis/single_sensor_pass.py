@@ -1,0 +1,156 @@
+"""What one sensor tells of a pass without any scale: when, how quickly, and which way."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import log_ndtr, ndtr
+
+from mag_tracking.arrays import FloatArray
+from mag_tracking.physics.anderson import anderson_functions
+
+MOST_SAMPLES = 200
+"""A pass is averaged to so many samples before the closest point is sought."""
+
+MOST_STARTS = 5
+"""The best points of a grid from which the closest point is sought: one axis has several optima."""
+
+CORRELATED = 2.0
+"""[time scales] What a dipole leaves over of a vehicle stays alike for so long."""
+
+OFF_CENTRE = 0.15
+"""[time scales] The magnetic centre of a vehicle is so far from the middle of its body."""
+
+LAG = 0.35
+"""Lag of the correlation, in widths of the energy at half its height: near the best one for
+passes at constant speed (PHD15 Paper B eq. (19))."""
+
+MOST_SURE = 0.98
+"""The sign of the correlation is exact for a target at the height of the sensor only. Half its
+lateral distance above it 0.6 % of random moments turn the other way, the whole distance 2.2 %."""
+
+
+class ClosestPoint(NamedTuple):
+    """The closest point of a pass, seen by one sensor."""
+
+    time: float
+    """[s]"""
+    time_std: float
+    """[s] inf where the pass does not tell."""
+    time_scale: float
+    """[s] Range at the closest point over the speed."""
+
+
+def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> ClosestPoint:
+    """Fit the Anderson functions of a dipole on a straight line to the field of one sensor.
+
+    Any axis is enough. The linear part, three coefficients and a constant an axis, is solved for
+    each time and time scale.
+
+    Parameters
+    ----------
+    t : (n,) array, s
+        In order.
+    field : (n, 3) array, T
+        NaN = missing axis.
+    noise_std : (3,) array, T
+
+    Returns
+    -------
+    ClosestPoint
+
+    References
+    ----------
+    [TSP14]_ eq. (22), (23), with the exponent 5/2.
+    """
+    there = ~np.isnan(field).all(axis=0) & ~np.isnan(noise_std)
+    whole = ~np.isnan(field[:, there]).any(axis=1)
+    t, y = t[whole], field[whole][:, there] / noise_std[there]
+    if len(t):
+        t, y = _averaged(t, y)
+    span = float(t[-1] - t[0]) if len(t) else 0.0
+    if len(t) < 8 or not span > 0.0:
+        return ClosestPoint(float(t.mean()) if len(t) else np.nan, np.inf, np.nan)
+    interval = span / (len(t) - 1)
+    starts = sorted((_cost(t, y, time, scale), time, scale)
+                    for scale in np.geomspace(1.5 * interval, span, 24).tolist()
+                    for time in np.arange(t[0], t[-1], max(0.3 * scale, interval)).tolist())
+
+    def cost(x: FloatArray) -> float:
+        return _cost(t, y, float(x[0]), float(np.exp(x[1])))
+
+    found = min((minimize(cost, np.array([time, np.log(scale)]), method='Nelder-Mead', options={
+        'xatol': 1e-4 * interval, 'fatol': 1e-9 * (1.0 + at_start), 'maxiter': 200})
+        for at_start, time, scale in starts[:MOST_STARTS]), key=lambda result: float(result.fun))
+    time, scale = float(found.x[0]), float(np.exp(found.x[1]))
+    # Variance of the samples by what is left over; a vehicle leaves more than noise.
+    left = max(found.fun / max(y.size - 4 * y.shape[1] - 2, 1), 0.0)
+    alike = max(1.0, CORRELATED * scale / interval)
+    step = 0.05 * scale
+    curvature = (_cost(t, y, time + step, scale) + _cost(t, y, time - step, scale)
+                 - 2.0 * found.fun) / step**2
+    std = np.sqrt(2.0 * left * alike / curvature) if curvature > 0.0 else np.inf
+    if not t[0] <= time <= t[-1]:
+        std = np.inf
+    return ClosestPoint(time, float(np.hypot(std, OFF_CENTRE * scale)), scale)
+
+
+def _averaged(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Means of neighbours, at most `MOST_SAMPLES`, each of the same number of samples."""
+    n = -(-len(t) // MOST_SAMPLES) or 1
+    k = len(t) // n
+    return t[:k * n].reshape(k, n).mean(axis=1), y[:k * n].reshape(k, n, -1).mean(axis=1)
+
+
+def _cost(t: FloatArray, y: FloatArray, time: float, scale: float) -> float:
+    """Sum of squares of (n, k) `y` that a pass with this time and time scale leaves over."""
+    basis = np.column_stack([anderson_functions((t - time) / scale), np.ones(len(t))])
+    q, _ = np.linalg.qr(basis)
+    return float(np.sum(y**2) - np.sum((q.T @ y)**2))
+
+
+def turning(field: FloatArray, noise_std: float, n_quiet: int) -> tuple[float, float]:
+    """Which way the horizontal field of a pass turns.
+
+    Seen from the sensor towards the target, a target that moves from left to right turns the
+    horizontal field one way, from right to left the other way, whatever its moment.
+
+    Parameters
+    ----------
+    field : (n, 2) array, T
+        Horizontal field, x and y of a frame whose z points up.
+    noise_std : float, T
+        Of one sample on each axis.
+    n_quiet : int
+        Samples at both ends that are without the target.
+
+    Returns
+    -------
+    correlation : float, T^2
+        Negative from left to right.
+    probability : float
+        Of left to right; 0.5 where the field does not tell. Every size of the correlation is taken
+        for equally likely beforehand, so that it is too sure where the target is below the noise.
+
+    References
+    ----------
+    [PHD15]_ Paper B eq. (5), (11), (16), (18); the floor of the variance is (2N/p^2) sigma^4.
+    """
+    if len(field) < 8:
+        return 0.0, 0.5
+    around = 1 + len(field) // 20
+    energy = np.convolve(np.sum(field**2, axis=1) - 2.0 * noise_std**2, np.ones(around), 'same')
+    above = np.flatnonzero(energy > 0.5 * energy.max())
+    if not len(above):
+        return 0.0, 0.5
+    p = int(np.clip(round(LAG * (above[-1] - above[0] + 1)), 1, max(1, min(n_quiet,
+                                                                          len(field) // 4))))
+    now, later = field[:-p], field[p:]
+    f = float(np.sum(now[:, 0] * later[:, 1] - now[:, 1] * later[:, 0])) / p
+    across = field[2 * p:] - field[:-2 * p]
+    floor = 2.0 * len(now) / p**2 * noise_std**4
+    variance = max(noise_std**2 / p**2 * float(np.sum(across**2)) - floor, floor)
+    # In logarithms: ndtr alone is 0 or 1 where it is sure.
+    probability = float(np.exp(log_ndtr(-f / np.sqrt(variance)))) if f > 0.0 \
+        else float(ndtr(-f / np.sqrt(variance)))
+    return f, float(np.clip(probability, 1.0 - MOST_SURE, MOST_SURE))

@@ -1,0 +1,90 @@
+"""mag-tracking events."""
+
+import argparse
+import signal
+from datetime import datetime, timezone
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from mag_tracking.apps.events import EventsResult, find_events
+from mag_tracking.cli.options import Commands, add_command, add_network, add_settings, settings_of
+from mag_tracking.errors import OutputError
+from mag_tracking.interrupts import noted_signals
+from mag_tracking.network.file import read_network
+from mag_tracking.recording.event_tables import write_events
+from mag_tracking.recording.reader import Recording
+from mag_tracking.records import PassEvent
+from mag_tracking.units import NS
+
+_EVENTS = '''
+Counts what passes each sensor and describes it without tracking: onset and release, peak, energy,
+the time of the closest point, which way it went (with two horizontal axes), and the signature of
+the field. One sensor with one axis is enough. A single sensor does not tell how far or how fast:
+nothing is in metres.
+
+With --out DIR: events.csv and signatures.csv.
+
+examples:
+  mag-tracking events road.mcap --network network.yaml
+  mag-tracking events road.bag --network one_sensor.yaml --out events
+'''
+
+
+def add(commands: Commands) -> None:
+    """Register the command."""
+    p = add_command(commands, 'events', _events, 'Count and describe passes, sensor by sensor.',
+                    _EVENTS)
+    p.add_argument('recording', type=Path, metavar='RECORDING',
+                   help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
+    add_network(p)
+    p.add_argument('--out', type=Path, metavar='DIR', help='folder for tables')
+    add_settings(p)
+
+
+def _events(args: argparse.Namespace) -> int:
+    """mag-tracking events."""
+    network, settings = read_network(args.network), settings_of(args)
+    recording = Recording(args.recording)
+    if args.out is not None and recording.lies_in(args.out):
+        raise OutputError(f'{args.out} is the folder of the recording; the tables would be in it')
+    with noted_signals(signal.SIGINT) as seen, \
+            tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
+                 disable=None) as bar:
+        result = find_events(recording, network, settings, bar.update, lambda: bool(seen))
+    _print(result, network.names)
+    for what, n in {**result.rejections, **recording.losses}.items():
+        print(f'  warning: {what}: {n}')
+    if args.out is not None:
+        write_events(args.out, result.events)
+        print(f'tables in {args.out}')
+    if seen:
+        print('interrupted: this is of what was read until then')
+        return 130
+    return 0
+
+
+def _print(result: EventsResult, names: tuple[str, ...]) -> None:
+    """The events, a line each, and their counts."""
+    for event in result.events:
+        print(line_of(event))
+    counts = result.counts()
+    print(', '.join(f'{name}: {counts.get(name, 0)} events' for name in names))
+    for topic in result.missing_topics:
+        print(f'  warning: nothing on {topic}')
+    for name in result.sensors_without_background:
+        print(f'  warning: no background was learnt for {name}: it was quiet for too short a time')
+
+
+def line_of(event: PassEvent) -> str:
+    """An event in one line."""
+    at = datetime.fromtimestamp(event.closest_ns / NS, tz=timezone.utc)
+    p = event.left_to_right
+    way = f'left to right ({p:.0%})' if p > 0.9 else f'right to left ({1.0 - p:.0%})' \
+        if p < 0.1 else 'direction unknown'
+    sure = f' ± {event.closest_std:.2f} s' if np.isfinite(event.closest_std) else ''
+    return (f'{event.sensor} {event.number}: closest {at:%H:%M:%S}.{at.microsecond // 10000:02d}'
+            f'{sure}, {(event.release_ns - event.onset_ns) / NS:.2f} s, peak '
+            f'{1e9 * np.sqrt(np.nansum(event.peak**2)):.0f} nT on {event.axes}, {way}'
+            + ('' if event.ended else ', not ended'))

@@ -1,0 +1,1 @@
+"""Events: what each sensor alone tells of a target that passes."""

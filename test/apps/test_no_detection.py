@@ -1,0 +1,75 @@
+"""Where nothing is detected, one sentence says what stands in the way."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import mag_tracking as mt
+from mag_tracking.cli import main
+from support import spoiler
+from support.bundled import NETWORK_FILE, vehicle_path
+from support.spoilt_runs import recorded
+
+NETWORK = mt.read_network(NETWORK_FILE)
+QUIET = recorded('straight_car_right').readings
+QUIET = QUIET.part(QUIET.stamp_ns < QUIET.stamp_ns[0] + 5_000_000_000)
+
+
+def why(*faults, network=NETWORK, readings=None, **settings):
+    readings = recorded('straight_small_left').readings if readings is None else readings
+    return mt.track(spoiler.apply(readings, *faults), network, settings={
+        name.replace('__', '.'): value for name, value in settings.items()}).why_no_detection
+
+
+def test_after_a_detection_nothing_is_to_be_explained():
+    assert why() is None
+
+
+@pytest.mark.parametrize('expected, arguments', [
+    (r'excursion was 0\.\d+ of the threshold \(mag_1 0\.\d+, mag_2 0\.\d+\); nothing louder',
+     {'readings': QUIET}),
+    ('noise_std of mag_1 in the network file is',
+     {'network': dataclasses.replace(NETWORK, noise_std=(np.full(3, 3e-6),) * 2)}),
+    (r'detect.background_std \(1e-05 T\) is larger than the noise',
+     {'detect__background_std': 1e-5}),
+    (r'it lasted for \d+ consecutive frames, and detect.onset_frames is 100',
+     {'detect__onset_frames': 100}),
+    ('no background was learnt for mag_1, mag_2: .*calibrate.learn_s',
+     {'readings': QUIET.part(slice(0, 200))}),
+    ('there were no readings on /mag_1/imu/mag, /mag_2/imu/mag',
+     {'readings': QUIET.part(slice(0, 0))})])
+def test_the_obstacle_is_named(expected, arguments):
+    import re
+
+    assert re.search(expected, why(**arguments)), why(**arguments)
+
+
+def test_covariances_that_are_taken_as_they_are_stand_in_the_way():
+    said = why(spoiler.covariance(1e-2), calibrate__trust_covariances=True)
+    assert 'calibrate.trust_covariances' in said
+    assert why(spoiler.covariance(1e-2)) is None
+
+
+def test_another_unit_is_named():
+    readings = recorded('straight_small_left').readings
+    said = why(readings=dataclasses.replace(readings, field=1e6 * readings.field))
+    assert 'no reading could be used: 2800 were rejected (above 0.001 T' in said
+
+
+def test_one_sensor_without_a_background_is_named():
+    readings = recorded('straight_small_left').readings
+    t = (readings.stamp_ns - readings.stamp_ns[0]) / 1e9
+    keep = np.array(readings.sensor_names()) == 'mag_1'
+    said = why(readings=readings.part((keep & (t < 5.0)) | (~keep & (t < 1.0))))
+    assert 'mag_2 had no background' in said
+
+
+def test_the_commands_say_it(tmp_path, capsys):
+    params = tmp_path / 'p.yaml'
+    params.write_text('detect: {onset_frames: 500}')
+    for command in ('replay', 'fit'):
+        assert main([command, str(vehicle_path('straight_car_right')), '--network',
+                     str(NETWORK_FILE), '--params', str(params), '--no-figures', '--out',
+                     str(tmp_path / command)]) == 0
+        assert 'detect.onset_frames is 500' in capsys.readouterr().out

@@ -1,0 +1,203 @@
+"""What one sensor tells of a pass: when, which way, how sure; never in metres."""
+
+import csv
+import dataclasses
+
+import numpy as np
+import pytest
+
+import mag_tracking as mt
+from mag_tracking.analysis.single_sensor_pass import MOST_SURE, closest_point, turning
+from mag_tracking.cli import main
+from mag_tracking.messages.schema import pass_event_dict
+from mag_tracking.physics.dipole import dipole_field
+from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.event_tables import EVENT_COLUMNS
+from mag_tracking.records import PassEvent
+from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.events.stage import Events
+from support import spoiler
+from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
+from support.marks import studied
+from support.spoilt_runs import recorded
+
+NETWORK = mt.read_network(NETWORK_FILE)
+ONE_AXIS = 'mag_1'
+
+
+def passing(rng, noise=0.0, height=0.0, left_to_right=True, n=200):
+    """(t (n,), field (n, 3), time of the closest point, time scale) of a dipole on a line.
+
+    The target is north of the sensor and x points east, in units of its lateral distance.
+    """
+    speed, when = rng.uniform(0.5, 3.0), rng.uniform(-1.0, 1.0)
+    span = 6.0 * np.hypot(1.0, height) / speed
+    t = np.linspace(when - span, when + span, n)
+    along = speed * (t - when) * (1.0 if left_to_right else -1.0)
+    r = np.column_stack([along, np.ones(n), np.full(n, height)])
+    field = dipole_field(-r, rng.standard_normal(3))
+    field /= np.abs(field).max()
+    return t, field + noise * rng.standard_normal((n, 3)), when, np.hypot(1.0, height) / speed
+
+
+@pytest.mark.parametrize('axes', ['xyz', 'xy', 'x', 'z'])
+@pytest.mark.parametrize('noise', [1e-4, 0.03, 0.1])
+def test_the_closest_point_of_a_dipole_is_found(axes, noise):
+    rng, ratios, errors = np.random.default_rng(0), [], []
+    for _ in range(40):
+        t, field, when, scale = passing(rng, noise, rng.uniform(0.0, 0.5))
+        field[:, [k for k, a in enumerate('xyz') if a not in axes]] = np.nan
+        if np.nanmax(np.abs(field)) < 5.0 * noise:
+            continue
+        found = closest_point(t, field, np.full(3, noise))
+        if np.isfinite(found.time_std):
+            ratios.append((found.time - when) / found.time_std)
+            errors.append(abs(found.time - when) / scale)
+    # A dipole has its magnetic centre in its middle: the deviation is larger than the errors.
+    assert len(ratios) > 20 and np.mean(np.abs(ratios) < 3.0) > 0.95
+    assert noise > 1e-3 or np.median(errors) < 0.02, np.median(errors)
+
+
+@pytest.mark.parametrize('left_to_right', [True, False])
+def test_the_field_turns_with_the_direction_whatever_the_moment(left_to_right):
+    rng = np.random.default_rng(1)
+    for _ in range(200):
+        _, field, _, _ = passing(rng, 1e-6, 0.0, left_to_right)
+        f, p = turning(field[:, :2], 1e-6, 50)
+        assert (f < 0.0) == left_to_right
+        assert p == pytest.approx(MOST_SURE if left_to_right else 1.0 - MOST_SURE)
+
+
+@pytest.mark.parametrize('noise', [0.1, 0.3, 0.5])
+def test_the_probability_of_the_direction_is_calibrated(noise):
+    """Among those of the same stated probability, that share is right (PHD15 Paper B)."""
+    rng, said, right = np.random.default_rng(2), [], []
+    for _ in range(600):
+        way = bool(rng.integers(2))
+        _, field, _, _ = passing(rng, noise, 0.0, way)
+        p = turning(field[:, :2], noise, 50)[1]
+        said.append(max(p, 1.0 - p))
+        right.append((p > 0.5) == way)
+    # 0.05 is the aim of the specification; three standard deviations of the count come on top.
+    assert abs(np.mean(said) - np.mean(right)) < 0.05 + 3.0 * 0.5 / np.sqrt(600)
+
+
+def test_the_direction_does_not_depend_on_how_the_sensor_is_turned():
+    rng = np.random.default_rng(3)
+    _, field, _, _ = passing(rng, 1e-3)
+    c, s = np.cos(1.1), np.sin(1.1)
+    turned = field[:, :2] @ np.array([[c, -s], [s, c]])
+    assert turning(turned, 1e-3, 50)[0] == pytest.approx(turning(field[:, :2], 1e-3, 50)[0])
+
+
+def test_nothing_is_said_of_too_few_readings():
+    assert turning(np.zeros((3, 2)), 1.0, 1) == (0.0, 0.5)
+    assert turning(np.zeros((50, 2)), 1.0, 10)[1] == pytest.approx(0.5)
+    assert closest_point(np.arange(5.0), np.ones((5, 3)), np.ones(3)).time_std == np.inf
+    assert np.isnan(closest_point(np.zeros(0), np.zeros((0, 3)), np.ones(3)).time)
+
+
+def events_of(readings, network=NETWORK, batch=None):
+    """[PassEvent] of raw readings."""
+    settings = settings_for('vehicle')
+    calibrate, stage = Calibrate(network, settings.calibrate), Events(
+        network, settings.align, settings.detect)
+    size, out = batch or len(readings), []
+    for i in range(0, len(readings), size):
+        for calibrated in calibrate.feed(readings.part(slice(i, i + size))):
+            out += stage.feed(calibrated)
+    for calibrated in calibrate.flush():
+        out += stage.feed(calibrated)
+    return out + stage.flush()
+
+
+def truth_of(name, sensor):
+    """(time of the closest point [ns], whether it went from left to right)."""
+    ((stamps, position, _),) = recorded(name).truth.values()
+    r = position - NETWORK.positions[NETWORK.index(sensor)]
+    k = int(np.linalg.norm(r, axis=1).argmin())
+    v = position[k] - position[k - 1]
+    return stamps[k], r[k, 0] * v[1] - r[k, 1] * v[0] < 0.0
+
+
+@pytest.mark.parametrize('name', studied(VEHICLES, kept=('straight_car_right',)))
+@pytest.mark.parametrize('sensor', ['mag_1', 'mag_2'])
+def test_one_sensor_tells_when_and_which_way(name, sensor):
+    one = NETWORK.part(np.array([NETWORK.index(sensor)]))
+    (event,) = events_of(spoiler.only_sensor(sensor)(recorded(name).readings), one)
+    closest, left_to_right = truth_of(name, sensor)
+    assert event.ended and event.number == 1 and event.axes == 'xyz'
+    assert abs(event.closest_ns - closest) / 1e9 < 3.0 * event.closest_std
+    assert (event.left_to_right > 0.9) if left_to_right else (event.left_to_right < 0.1)
+    assert event.onset_ns <= event.peak_ns <= event.release_ns and event.energy > 0.0
+    assert event.signature.shape == (33, 3)
+
+
+@pytest.mark.parametrize('name', studied(VEHICLES, kept=('straight_truck_right',)))
+@pytest.mark.parametrize('axis', ['x', 'z'])
+def test_one_axis_of_one_sensor_gives_an_event_without_a_direction(name, axis):
+    """Of the sensor that is nearer to the vehicle; the other may feel nothing on that axis."""
+    size = {s: np.abs(f - np.median(f, axis=0)).max() for s in NETWORK.names for f in [
+        recorded(name).readings.field[np.array(recorded(name).readings.sensor_names()) == s]]}
+    sensor = max(size, key=size.get)
+    one = NETWORK.part(np.array([NETWORK.index(sensor)]))
+    readings = spoiler.apply(recorded(name).readings, spoiler.only_sensor(sensor),
+                             spoiler.only_axes(axis))
+    events = events_of(readings, one)
+    event = max(events, key=lambda e: e.energy)
+    assert len(events) <= 2 and event.axes == axis and event.left_to_right == 0.5
+    assert np.isnan(event.peak).sum() == 2
+    # One axis alone places a long or turning vehicle less well.
+    assert abs(event.closest_ns - truth_of(name, sensor)[0]) / 1e9 < 4.0 * event.closest_std
+    result = mt.track(readings, one)
+    assert len(result.poses) == 0 and len(result.detections)
+
+
+def test_a_single_sensor_is_tracked_with_a_stated_prior_only_and_never_unique():
+    one = NETWORK.part(np.array([0]))
+    readings = spoiler.only_sensor('mag_1')(recorded('straight_car_right').readings)
+    result = mt.track(readings, one)
+    assert not len(result.poses)
+    assert result.counts['track']['detections not tracked (one sensor does not tell the scale)'] > 0
+    result = mt.track(readings, one, settings={'track.single_sensor_prior': True})
+    assert len(result.poses) and result.poses['ambiguous'].all()
+    assert result.smoothed['ambiguous'].all()
+
+
+def test_the_events_do_not_depend_on_the_batches():
+    readings = recorded('straight_car_right').readings
+    whole = events_of(readings)
+    for size in (1, 37, 1000):
+        parts = events_of(readings, batch=size)
+        for a, b in zip(whole, sorted(parts, key=lambda e: e.release_ns), strict=True):
+            for field in dataclasses.fields(PassEvent):
+                np.testing.assert_array_equal(getattr(a, field.name), getattr(b, field.name))
+
+
+def test_a_target_that_stays_is_an_event_that_has_not_ended():
+    readings = recorded('straight_car_right').readings
+    t = (readings.stamp_ns - readings.stamp_ns[0]) / 1e9
+    events = events_of(readings.part(t < 8.6))
+    assert len(events) == 2 and not any(e.ended for e in events)
+
+
+def test_the_command_counts_and_writes_tables(tmp_path, capsys):
+    assert main(['events', str(vehicle_path('straight_car_right')), '--network', str(NETWORK_FILE),
+                 '--out', str(tmp_path / 'out')]) == 0
+    out = capsys.readouterr().out
+    assert 'mag_1: 1 events, mag_2: 1 events' in out and 'left to right (98%)' in out
+    assert ' m/s' not in out and 'unique' not in out
+    with open(tmp_path / 'out' / 'events.csv', newline='') as stream:
+        rows = list(csv.DictReader(stream))
+    assert tuple(rows[0]) == EVENT_COLUMNS and {r['sensor'] for r in rows} == {'mag_1', 'mag_2'}
+    with open(tmp_path / 'out' / 'signatures.csv', newline='') as stream:
+        assert len(list(csv.DictReader(stream))) == 66
+    assert main(['events', str(vehicle_path('straight_car_right')), '--network', str(NETWORK_FILE),
+                 '--out', str(vehicle_path('straight_car_right').parent)]) == 1
+
+
+def test_events_from_python_are_those_of_the_command():
+    result = mt.events(vehicle_path('straight_car_right'), NETWORK_FILE)
+    assert result.counts() == {'mag_1': 1, 'mag_2': 1} and 'EventsResult(2 events' in repr(result)
+    content = pass_event_dict(result.events[0])
+    assert content['sensor'] == result.events[0].sensor and len(content['signature']) == 99
