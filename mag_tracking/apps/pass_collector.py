@@ -153,7 +153,10 @@ class PassCollector:
 
 
 def _typical(covariances: FloatArray) -> FloatArray:
-    """The one of (n, 3, 3) covariances with the median trace: coarse steps add more at rest."""
+    """The first of (n, 3, 3) covariances, or the one in the middle where coarse steps make the
+    first ones, of readings at rest, much larger than others.
+    """
     size = np.nansum(np.einsum('kii->ki', covariances), axis=1)
-    typical: FloatArray = covariances[np.argsort(size, kind='stable')[len(size) // 2]]
+    k = int(np.argsort(size, kind='stable')[len(size) // 2])
+    typical: FloatArray = covariances[k if size.max() > 2.0 * size.min() else 0]
     return typical

@@ -73,10 +73,11 @@ class TrackingResult:
     """One sentence where nothing was detected; else None."""
     sensors_without_background: tuple[str, ...]
     """Sensors that were not used because their background was never learnt: the readings need a
-    target-free beginning, or the network file a `background` and a `noise_std`."""
+    quiet stretch, or the network file a `background` and a `noise_std`."""
 
     def __repr__(self) -> str:
-        notes = [*(f'not used: {n} {cause}' for cause, n in {**self.rejections, **self.lost}.items()),
+        unused = {**self.rejections, **self.lost}
+        notes = [*(f'not used: {n} {cause}' for cause, n in unused.items()),
                  *(f'nothing on {topic}' for topic in self.missing_topics),
                  *(f'no background of {name}' for name in self.sensors_without_background)]
         if self.why_no_detection:
