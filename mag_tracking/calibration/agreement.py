@@ -24,6 +24,12 @@ FARTHEST = 5.0
 YAW_STEP = np.deg2rad(0.25)
 """Headings are tried so far apart: of 20 uT across the vertical a tenth of a microtesla."""
 
+MOST = 0.3
+"""A change of axes explains most of a disagreement where it leaves less than this share ..."""
+
+CLEARLY = 0.5
+"""... and less than this share of what the next one as simple leaves."""
+
 UNITS = (('gauss', 1e4), ('millitesla', 1e3), ('microtesla', 1e6), ('nanotesla', 1e9))
 _AXES = 'xyz'
 
@@ -116,10 +122,7 @@ def _fits_numbers(field: tuple[float, ...], orientation: tuple[float, ...],
     if not there.any():
         return True
     # A heading may be far off, and is tried; a tilt is small, and its effect is its slope.
-    most = min(np.pi, FARTHEST * std[2])
-    yaw = np.linspace(-most, most, 1 + 2 * max(1, round(most / YAW_STEP)))
-    B = np.stack([B0[0] * np.cos(yaw) + B0[1] * np.sin(yaw),
-                  B0[1] * np.cos(yaw) - B0[0] * np.sin(yaw), np.full(len(yaw), B0[2])], axis=1)
+    yaw, B = _headings(std, np.array(B0))
     turn = (R_ws.T @ np.cross(np.eye(3), np.array(B0)).T * std)[:, :2]
     S = (bias_std**2 * np.eye(3) + turn @ turn.T)[np.ix_(there, there)]
     r = (y - B @ R_ws)[:, there]
@@ -147,7 +150,38 @@ def _explanations(j: int, odd: Sequence[int], names: Sequence[str], fields: Floa
         found = [text for text, order, signs in others if fits(signs * y[list(order)])]
         if found:
             return tuple(found)
+    return _most_likely(y, R_ws[j], orientation_std[j], B0)
+
+
+def _most_likely(y: FloatArray, R_ws: FloatArray, std: FloatArray,
+                 B0: FloatArray) -> tuple[str, ...]:
+    """The simplest change of axes that explains most of the disagreement of a field, if any."""
+    before = _remaining(y, R_ws, std, B0)
+    for others in _changes():
+        left = sorted((_remaining(signs * y[list(order)], R_ws, std, B0), text)
+                      for text, order, signs in others)
+        # Two that explain it as well are no explanation.
+        if left[0][0] < MOST * before and not (
+                len(left) > 1 and left[1][0] < left[0][0] / CLEARLY):
+            return (f'{left[0][1]}, which leaves {left[0][0] * 1e6:.2g} uT (iron beside it, or its '
+                    'own bias)',)
     return ()
+
+
+def _remaining(y: FloatArray, R_ws: FloatArray, std: FloatArray, B0: FloatArray) -> float:
+    """[T] What a field differs from the Earth's at the heading that suits it best."""
+    there = ~np.isnan(y)
+    _, B = _headings(std, B0)
+    return float(np.linalg.norm((y - B @ R_ws)[:, there], axis=1).min())
+
+
+def _headings(std: FloatArray, B0: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Headings (n,) [rad] that a sensor may have, and the Earth's field (n, 3) for each."""
+    most = min(np.pi, FARTHEST * std[2])
+    yaw = np.linspace(-most, most, 1 + 2 * max(1, round(most / YAW_STEP)))
+    return yaw, np.stack([B0[0] * np.cos(yaw) + B0[1] * np.sin(yaw),
+                          B0[1] * np.cos(yaw) - B0[0] * np.sin(yaw), np.full(len(yaw), B0[2])],
+                         axis=1)
 
 
 def _changes() -> list[list[_Change]]:

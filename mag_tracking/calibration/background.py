@@ -24,7 +24,7 @@ from mag_tracking.calibration.blocks import (
     line_through,
     stacked,
 )
-from mag_tracking.calibration.resolution import common_step, completed_steps, resting
+from mag_tracking.calibration.resolution import common_step, completed_steps, resting, seen_steps
 from mag_tracking.calibration.sensor_state import SENSORS
 
 LOUDEST = 100.0
@@ -147,7 +147,7 @@ class RunningBackground:
     def _steps(self) -> FloatArray:
         """(3,) [T] smallest changes of the sensor's axes, corrected as its readings are."""
         s = self._state
-        steps: FloatArray = s['step'].copy()
+        steps = seen_steps(s)
         if not s['has_correction']:
             return steps
         weight = np.abs(s['correction'])

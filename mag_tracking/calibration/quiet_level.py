@@ -7,6 +7,7 @@ import numpy as np
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.background import TOGGLE, RunningBackground, pooled_covariance
 from mag_tracking.calibration.blocks import Block, Blocks, block_of, line_through, stacked
+from mag_tracking.calibration.resolution import seen_steps
 
 CALM = 3.0
 """A block is calm where its standard deviation is at most this many times that of the quietest
@@ -97,9 +98,9 @@ class BlockRecorder(RunningBackground):
 
     @property
     def steps(self) -> FloatArray:
-        """(3,) [T] smallest change of each raw axis; inf of one that has never changed."""
-        steps: FloatArray = self._state['step'].copy()
-        return steps
+        """(3,) [T] steps of each raw axis; inf where they were not seen."""
+        steps = seen_steps(self._state)
+        return np.where(steps > 0.0, steps, np.inf)
 
 
 def most_frequent_level(blocks: Blocks, steps: FloatArray, most: int) -> QuietLevel | None:

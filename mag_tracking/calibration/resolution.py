@@ -16,6 +16,10 @@ DITHERED = 0.3
 """Noise of a larger variance, in squared steps, carries a reading over several steps, and averaging
 works. A reading that toggles between two steps has a variance of 0.25 at most."""
 
+REPEATS = 0.2
+"""An axis whose steps are larger than its noise stays the same more often than this, for each
+change."""
+
 ROUNDING = 1e-6
 """Share of the largest value that single precision and the arithmetic of a driver may add."""
 
@@ -49,11 +53,23 @@ def note_step(s: Record, stamp: int, raw: FloatArray) -> None:
         if change <= SAME * abs(value) and stamp >= s.rest_since_ns[a]:
             if stamp - s.rest_since_ns[a] <= LONGEST_REST_NS:
                 s.n_rest[a] += 1
+            s.n_same[a] += 1
             continue
         # A comparison with NaN is false: the first reading changes nothing.
-        if change < s.step[a]:
-            s.step[a] = change
+        if change >= 0.0:
+            s.n_changed[a] += 1
+            s.step[a] = min(s.step[a], change)
         s.raw[a], s.rest_since_ns[a], s.n_rest[a] = value, stamp, 1
+
+
+def seen_steps(sensor: np.void) -> FloatArray:
+    """(3,) [T] steps of the raw axes of a SENSOR; 0 where they are too fine to be seen.
+
+    The smallest change is the step of an axis that repeats itself. A field that moves with every
+    reading has a smallest change, too.
+    """
+    is_seen = sensor['n_same'] >= REPEATS * sensor['n_changed']
+    return np.where(is_seen, sensor['step'], 0.0)
 
 
 def resting(variance: FloatArray, step: FloatArray) -> BoolArray:

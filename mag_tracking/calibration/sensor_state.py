@@ -30,8 +30,10 @@ SENSOR = np.dtype([
     # reading was equal to the one before, or was not.
     ('last', np.float64, 3), ('run', np.int64), ('repeats', np.float64), ('changes', np.float64),
     # Resolution (`resolution`): the latest value of each raw axis, since when it rests on it and
-    # for how many readings, its smallest change, and the variance of what the steps add.
+    # for how many readings, how often it stayed the same or changed, its smallest change, and the
+    # variance of what the steps add.
     ('raw', np.float64, 3), ('rest_since_ns', np.int64, 3), ('n_rest', np.int64, 3),
+    ('n_same', np.int64, 3), ('n_changed', np.int64, 3),
     ('step', np.float64, 3), ('step_variance', np.float64, 3),
     # Covariances of the messages: the latest standard deviations, and how many were overruled.
     ('stated_std', np.float64, 3), ('n_overruled', np.int64),

@@ -208,3 +208,28 @@ def test_two_faults_are_told_apart():
     fields[0, 2] *= -1.0
     fields[3] *= 1e4
     assert told(fields) == {'a': ('z is flipped',), 'd': ('its unit is gauss',)}
+
+
+@pytest.mark.parametrize('axis', [0, 1, 2])
+def test_a_flipped_axis_is_named_also_where_iron_is_beside_it(axis):
+    said = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        fields = right(rng)
+        iron = rng.standard_normal(3)
+        fields[1] += 5e-6 * iron / np.linalg.norm(iron)
+        fields[1, axis] *= -1.0
+        said += [told(fields)['b']]
+    named = [texts for texts in said if texts and texts[0].startswith(f'{"xyz"[axis]} is flipped')]
+    # Where the axis carries little of the field, flipping it explains little.
+    if abs(right()[1, axis]) > 2e-5:
+        assert len(named) == 20 and sum(' uT' in texts[0] for texts in named) > 10
+
+
+def test_iron_alone_is_not_called_a_flipped_axis():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        fields = right(rng)
+        iron = rng.standard_normal(3)
+        fields[1] += 1e-5 * iron / np.linalg.norm(iron)
+        assert not any(' uT' in text for text in told(fields).get('b', ()))

@@ -10,6 +10,7 @@ from mag_tracking.calibration.resolution import (
     completed_steps,
     note_step,
     resting,
+    seen_steps,
     smallest_steps,
 )
 from mag_tracking.calibration.sensor_state import new_sensors
@@ -55,6 +56,14 @@ def test_missing_axes_and_spikes_do_not_change_the_step():
         np.testing.assert_allclose(step, [1e-7, 1e-7, np.inf])
 
 
+def test_a_field_that_moves_with_every_reading_shows_no_steps():
+    y = np.cumsum(np.random.default_rng(0).uniform(1e-6, 3e-6, (60, 3)), axis=0)
+    state = noted(y)
+    assert (state['step'] > 1e-6).all() and (seen_steps(state) == 0.0).all()
+    assert (seen_steps(noted(coarse(1e-8, 1e-7, offset=0.45))) > 0.0).all()
+    assert np.isinf(seen_steps(noted(np.ones((5, 3))))).all()
+
+
 def test_the_compiled_rule_agrees_with_the_plain_one():
     background = FedBackground(3.0, 20.0, 1.5, 0.25, 2.0, 60.0)
     y = coarse(4e-8, 1e-7, seed=3)
@@ -64,7 +73,7 @@ def test_the_compiled_rule_agrees_with_the_plain_one():
     for stamp, field in zip(stamps.tolist(), y, strict=True):
         background.note(stamp, field)
         _note(sensors, stamp, field)
-        for name in ('step', 'raw', 'rest_since_ns', 'n_rest'):
+        for name in ('step', 'raw', 'rest_since_ns', 'n_rest', 'n_same', 'n_changed'):
             np.testing.assert_array_equal(sensors[0][name], background.sensors[0][name], name)
 
 

@@ -12,6 +12,7 @@ from mag_tracking_msgs.msg import (
     CalibrationState,
     HypothesisArray,
     NetworkFrame,
+    PassEvent,
     SmoothedTrack,
     TrackArray,
 )
@@ -25,8 +26,9 @@ from sensor_msgs.msg import MagneticField
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
+import mag_tracking as mt
 from mag_tracking.apps.replay import replay
-from mag_tracking.messages.schema import stamp_ns
+from mag_tracking.messages.schema import pass_event_dict, stamp_ns
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.convert import to_message, track_of
 from mag_tracking.nodes.runner import run
@@ -157,10 +159,12 @@ def test_four_processes_over_the_middleware(ros, tmp_path, road_network):
     """Each node a process, as on a robot; poses equal the offline ones, and all leave cleanly."""
     node, spin_until = ros
     name = 'straight_car_right'
-    received = {kind: [] for kind in (NetworkFrame, TrackArray, Odometry, MarkerArray, Clock)}
+    received = {kind: [] for kind in (NetworkFrame, TrackArray, Odometry, MarkerArray, Clock,
+                                      PassEvent)}
     for kind, topic in ((NetworkFrame, '/detection_node/frame'),
                         (TrackArray, '/tracker_node/tracks'), (Clock, '/clock'),
                         (Odometry, '/tracker_node/odometry'),
+                        (PassEvent, '/detection_node/events'),
                         (MarkerArray, '/tracker_node/markers')):
         node.create_subscription(kind, topic, received[kind].append, STREAM)
     state = []
@@ -181,6 +185,7 @@ def test_four_processes_over_the_middleware(ros, tmp_path, road_network):
                                '-p', 'wait_for_subscribers:=300.0'))
         assert spin_until(lambda: any(t.status == t.ENDED for m in received[TrackArray]
                                       for t in m.tracks))
+        assert spin_until(lambda: len(received[PassEvent]) == 2)
     finally:
         codes, outputs = stop(processes)
     assert codes == [0, 0, 0, 0], outputs
@@ -197,6 +202,13 @@ def test_four_processes_over_the_middleware(ros, tmp_path, road_network):
     # DELETE at the end of the track.
     assert {m.action for m in received[MarkerArray][-1].markers} == {2}
     assert state and all(s.ready for s in state[-1].sensors)
+    offline = {e.sensor: pass_event_dict(e) for e in mt.events(
+        vehicle_path(name), road_network, PATIENT).events}
+    for event in received[PassEvent]:
+        expected = offline[event.sensor]
+        assert event.left_to_right == expected['left_to_right']
+        assert event.closest_std == pytest.approx(expected['closest_std'])
+        np.testing.assert_array_equal(event.signature, expected['signature'])
 
 
 def test_services_of_the_replay(ros):
