@@ -36,6 +36,9 @@ _ADVICE = (
     ('covariance', 'publish zeros where the noise is not known'),
     ('undecodable', 'the recording is damaged, or its type is another'))
 
+MISSED = 3
+"""Targets that other sensors felt while a reading stayed the same."""
+
 LEVEL_STEP = 1e-8
 """[T] A fiftieth of what iron near a sensor adds."""
 
@@ -120,6 +123,36 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
                       'has changed for good: call the service calibrate')
 
 
+class MissedTargets:
+    """Sensors whose readings stay the same while others feel targets."""
+
+    def __init__(self, names: tuple[str, ...]) -> None:
+        self._missed = dict.fromkeys(names, 0)
+        self._since_ns: dict[str, int] = {}
+
+    def take(self, name: str, is_frozen: bool, stamp_ns: int,
+             sensors: Mapping[str, SensorHealth]) -> None:
+        """Note whether sensor `name` feels a target; when that ends, look at the others."""
+        if is_frozen:
+            self._since_ns.setdefault(name, stamp_ns)
+            return
+        begin_ns = self._since_ns.pop(name, None)
+        if begin_ns is None:
+            return
+        for other, health in sensors.items():
+            since_ns = health.unchanged_since_ns
+            is_same = since_ns is not None and since_ns < begin_ns
+            self._missed[other] = self._missed[other] + 1 if is_same else 0
+
+    def findings(self) -> Iterator[Finding]:
+        """`Finding` of each sensor that missed several targets in succession."""
+        for name, n in self._missed.items():
+            if n >= MISSED:
+                yield Finding(True, name, f'its readings did not change while other sensors felt '
+                              f'{n} targets', 'it hangs, is too far away, or its steps are too '
+                              'coarse: move something of iron beside it')
+
+
 class Doctor:
     """Looks at the readings of a network as they come, and says what is wrong."""
 
@@ -129,6 +162,7 @@ class Doctor:
         self.calibrate = Calibrate(network, settings.calibrate)
         self._clock_ns = dict(zip(network.names, network.clock_offset_ns.tolist(), strict=True))
         self._frozen_ns: dict[str, int] = {}
+        self._missed = MissedTargets(network.names)
 
     def feed(self, readings: Readings, received_ns: int | None = None) -> None:
         """Look at raw `Readings` of the network that were received at `received_ns`."""
@@ -138,6 +172,7 @@ class Doctor:
         self.calibrate.feed(readings)
         backgrounds = self.calibrate.backgrounds()
         for name, stamp in zip(names, stamps, strict=True):
+            self._missed.take(name, backgrounds[name].frozen, stamp, self.sensors)
             if backgrounds[name].frozen:
                 self._frozen_ns.setdefault(name, stamp)
             else:
@@ -151,6 +186,7 @@ class Doctor:
                                      self._settings.calibrate.max_field)
             found += background_findings(name, self.calibrate, self._frozen_ns.get(name))
             found += covariance_findings(name, self.network.topics[j], self.calibrate)
+        found += self._missed.findings()
         found += network_findings(self.network, self._settings.survey, self.calibrate,
                                   self.sensors)
         for cause, n in rejected(self.calibrate.counts).items():

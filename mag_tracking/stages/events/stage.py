@@ -4,7 +4,6 @@ from collections import Counter, deque
 
 import numpy as np
 
-from mag_tracking.analysis.single_sensor_pass import closest_point, turning
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import SIGNATURE_SPAN, Detection, PassEvent, Readings
@@ -12,6 +11,7 @@ from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
+from mag_tracking.stages.events.single_sensor_pass import closest_point, turning
 from mag_tracking.units import NS
 
 PAD_S = 1.0

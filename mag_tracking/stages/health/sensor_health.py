@@ -205,6 +205,12 @@ class SensorHealth:
             or self._repeats >= COARSE * (self._repeats + self._changes)
 
     @property
+    def unchanged_since_ns(self) -> int | None:
+        """Timestamp since which the reading has been what it is; None without a reading."""
+        self.look()
+        return self._since_ns
+
+    @property
     def rate(self) -> float:
         """[Hz] of the latest readings; NaN before there are enough."""
         self.look()

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import mag_tracking as mt
-from mag_tracking.analysis.single_sensor_pass import MOST_SURE, closest_point, turning
 from mag_tracking.cli import main
 from mag_tracking.messages.schema import pass_event_dict
 from mag_tracking.physics.dipole import dipole_field
@@ -15,6 +14,7 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.event_tables import EVENT_COLUMNS
 from mag_tracking.records import PassEvent
 from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.events.single_sensor_pass import MOST_SURE, closest_point, turning
 from mag_tracking.stages.events.stage import Events
 from support import spoiler
 from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path

@@ -1,0 +1,50 @@
+"""A sensor that hangs is told from a quiet one by what the others feel."""
+
+import numpy as np
+import pytest
+
+from mag_tracking.apps.doctor import Doctor
+from mag_tracking.pipeline import settings_for
+from support.calibration_runs import EARTH
+from support.networks import line_network
+from support.samples import MagSample, batch
+
+STEP = 2e-7
+
+
+def said(last_felt, hangs_from, n_targets=4):
+    """Findings on three coarse sensors; the third one feels targets of `last_felt` [T], and
+    repeats its reading from `hangs_from` [s] on.
+    """
+    network, samples = line_network(3), []
+    rng = np.random.default_rng(0)
+    t = np.arange(0.0, 10.0 * (n_targets + 1), 0.02)
+    held = None
+    for s in t:
+        pulse = sum(np.exp(-((s - 10.0 * k - 8.0) / 0.7)**2) for k in range(n_targets))
+        for j, size in enumerate((3e-6, 2e-6, last_felt)):
+            field = EARTH + size * pulse + 3e-8 * rng.standard_normal(3)
+            field = STEP * np.round(field / STEP)
+            if j == 2 and s >= hangs_from:
+                held = field = field if held is None else held
+            samples.append(MagSample(int(1e9 * s), f'mag_{j + 1}', field))
+    doctor = Doctor(network, settings_for('vehicle'))
+    for k in range(0, len(samples), 60):
+        doctor.feed(batch(samples[k:k + 60]))
+    return [str(f) for f in doctor.findings()]
+
+
+@pytest.mark.parametrize('last_felt, hangs_from, missed', [
+    (2e-6, np.inf, None), (5e-7, np.inf, None), (2e-6, 5.0, True), (2e-6, 12.0, True),
+    (2e-6, 0.0, True), (2e-6, 36.0, None)])
+def test_a_sensor_that_hangs_misses_what_the_others_feel(last_felt, hangs_from, missed):
+    found = [f for f in said(last_felt, hangs_from) if 'did not change while' in f]
+    if missed is None:
+        assert found == []
+    else:
+        # A target that two others feel ends twice.
+        assert len(found) == 1 and 'mag_3: its readings did not change while other sens' in found[0]
+
+
+def test_quiet_sensors_miss_nothing():
+    assert not any('did not change' in f for f in said(2e-6, np.inf, n_targets=0))
