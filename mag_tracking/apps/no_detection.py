@@ -66,8 +66,10 @@ def _obstacle(network: SensorNetwork, settings: Settings, calibrate: Calibrate,
     if settings.calibrate.trust_covariances:
         return ('the covariances of the messages are taken as they are '
                 '(calibrate.trust_covariances)')
-    if settings.detect.background_std > TOO_LARGE * detect.smallest_noise:
+    quietest = min(float(np.nanmin(b.scatter_std)) for b in calibrate.backgrounds().values()
+                   if not np.isnan(b.scatter_std).all())
+    if settings.detect.background_std > TOO_LARGE * quietest:
         return (f'detect.background_std ({settings.detect.background_std:.2g} T) is larger than '
-                f'the noise of a frame ({detect.smallest_noise:.2g} T)')
+                f'the noise of a reading ({quietest:.2g} T)')
     return ('nothing louder came within reach, or detect.false_alarm_probability '
             f'({settings.detect.false_alarm_probability:g}) is too strict')

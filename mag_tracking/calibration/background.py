@@ -24,15 +24,17 @@ from mag_tracking.calibration.blocks import (
     line_through,
     stacked,
 )
-from mag_tracking.calibration.resolution import common_step, completed_steps, resting, seen_steps
+from mag_tracking.calibration.resolution import (
+    apply_steps,
+    common_step,
+    completed_steps,
+    corrected_steps,
+)
 from mag_tracking.calibration.sensor_state import SENSORS
 
 LOUDEST = 100.0
 """A block whose variance is so many times that of the quietest is no noise: a target passed within
 it, as it can within the long blocks of a slow sensor. Noise and coarse steps stay well below."""
-
-TOGGLE = 1.2
-"""[steps] An axis that rests on one value may rest on the next one a moment later."""
 
 RESUMED_RELEARN_S = 10.0
 """[s] What was resumed gives way to another steady level after so long, whatever `relearn` is."""
@@ -94,6 +96,7 @@ class RunningBackground:
         self._learn, self._guard, self._length = learn, guard, block
         self._freeze_std, self._relearn = freeze_std, relearn
         self._sensors = sensors
+        self._limits = np.full(3, np.nan)
         self._state = self._sensors[0]
         self._state['length'], self._state['phase'] = block, np.nan if phase is None else phase
         self._most = max(3, int(round(memory / block)))
@@ -129,30 +132,15 @@ class RunningBackground:
 
     def _apply_steps(self) -> None:
         """Add what the sensor's steps do to the noise; its steps may have been found meanwhile."""
-        s, steps = self._state, self._steps()
-        variance = s['noise'].diagonal()
-        steps = completed_steps(variance, steps)
-        rests = resting(variance, steps) & np.isfinite(steps)
-        s['step_variance'] = np.where(rests, np.square(steps) / 12.0, 0.0)
-        s['noise_std'] = np.sqrt(variance + s['step_variance'])
-        self._limits = np.maximum(self._freeze_std * s['noise_std'],
-                                  np.where(rests, TOGGLE * steps, 0.0))
+        apply_steps(self._sensors, self._freeze_std, self._limits)
 
     def _without_dead_axes(self, noise: FloatArray) -> FloatArray:
         """(3, 3) [T^2] `noise` with NaN for an axis that has never changed and does not rest."""
-        steps = completed_steps(noise.diagonal(), self._steps())
-        dead = ~np.isfinite(steps)
+        steps = corrected_steps(self._sensors)
+        if np.isfinite(steps).all():
+            return noise
+        dead = ~np.isfinite(completed_steps(noise.diagonal(), steps))
         return np.where(dead[:, None] | dead, np.nan, noise)
-
-    def _steps(self) -> FloatArray:
-        """(3,) [T] smallest changes of the sensor's axes, corrected as its readings are."""
-        s = self._state
-        steps = seen_steps(s)
-        if not s['has_correction']:
-            return steps
-        weight = np.abs(s['correction'])
-        moved = np.where(weight > 0.0, weight * np.where(np.isinf(steps), 0.0, steps), 0.0)
-        return np.where(np.isinf(steps), np.inf, np.sqrt(np.square(moved).sum(axis=1)))
 
     def resume(self, background: FloatArray, covariance: FloatArray) -> None:
         """Go on from what was known a moment ago: (3,) [T] and (3, 3) [T^2], NaN as elsewhere.

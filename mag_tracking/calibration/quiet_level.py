@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.calibration.background import TOGGLE, RunningBackground, pooled_covariance
+from mag_tracking.calibration.background import RunningBackground, pooled_covariance
 from mag_tracking.calibration.blocks import Block, Blocks, block_of, line_through, stacked
-from mag_tracking.calibration.resolution import seen_steps
+from mag_tracking.calibration.resolution import TOGGLE, corrected_steps, raw_steps
 
 CALM = 3.0
 """A block is calm where its standard deviation is at most this many times that of the quietest
@@ -75,7 +75,7 @@ class BlockRecorder(RunningBackground):
         if len(self._blocks) < LEAST_BLOCKS:
             return None
         every = 1 + len(self._blocks) // MOST_BLOCKS
-        steps = self._steps()
+        steps = corrected_steps(self._sensors)
         return most_frequent_level(stacked(self._blocks[::every]),
                                    np.where(np.isfinite(steps), steps, 0.0), self._most)
 
@@ -99,7 +99,7 @@ class BlockRecorder(RunningBackground):
     @property
     def steps(self) -> FloatArray:
         """(3,) [T] steps of each raw axis; inf where they were not seen."""
-        steps = seen_steps(self._state)
+        steps = raw_steps(self._sensors)
         return np.where(steps > 0.0, steps, np.inf)
 
 

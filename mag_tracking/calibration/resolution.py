@@ -5,9 +5,11 @@ step. Averaging does not remove that error, and a reading that repeats the one b
 """
 
 import numpy as np
-from numba import njit
+from numba import boolean, float64, njit, void
 
-from mag_tracking.arrays import BoolArray, FloatArray, Record
+from mag_tracking.arrays import FloatArray, Record, StructArray
+from mag_tracking.calibration.sensor_state import SENSORS
+from mag_tracking.records import plain
 
 SAME = 3e-7
 """Values that differ by a smaller share than this differ by rounding only: single precision."""
@@ -15,6 +17,9 @@ SAME = 3e-7
 DITHERED = 0.3
 """Noise of a larger variance, in squared steps, carries a reading over several steps, and averaging
 works. A reading that toggles between two steps has a variance of 0.25 at most."""
+
+TOGGLE = 1.2
+"""[steps] An axis that rests on one value may rest on the next one a moment later."""
 
 REPEATS = 0.2
 """An axis whose steps are larger than its noise stays the same more often than this, for each
@@ -62,44 +67,126 @@ def note_step(s: Record, stamp: int, raw: FloatArray) -> None:
         s.raw[a], s.rest_since_ns[a], s.n_rest[a] = value, stamp, 1
 
 
-def seen_steps(sensor: np.void) -> FloatArray:
-    """(3,) [T] steps of the raw axes of a SENSOR; 0 where they are too fine to be seen.
+@njit(cache=True)
+def _seen_step(s: Record, a: int) -> float:
+    """Step [T] of raw axis `a`; 0 where it is too fine to be seen.
 
     The smallest change is the step of an axis that repeats itself. A field that moves with every
     reading has a smallest change, too.
     """
-    is_seen = sensor['n_same'] >= REPEATS * sensor['n_changed']
-    return np.where(is_seen, sensor['step'], 0.0)
+    return s.step[a] if s.n_same[a] >= REPEATS * s.n_changed[a] else 0.0
 
 
-def resting(variance: FloatArray, step: FloatArray) -> BoolArray:
-    """Whether the steps of each axis are larger than its noise, so that it rests on one value.
+@njit(cache=True)
+def _corrected_steps(s: Record, out: FloatArray) -> None:
+    """Steps of the axes after the soft-iron correction, into `out` (3,)."""
+    for a in range(3):
+        out[a] = _seen_step(s, a)
+        if s.has_correction and np.isfinite(out[a]):
+            total = 0.0
+            for b in range(3):
+                step = _seen_step(s, b)
+                if s.correction[a, b] != 0.0 and np.isfinite(step):
+                    total += (s.correction[a, b] * step)**2
+            out[a] = np.sqrt(total)
+
+
+@njit(float64[::1](SENSORS), cache=True)
+def corrected_steps(sensors: StructArray) -> FloatArray:
+    """Steps of a sensor's axes after the soft-iron correction.
+
+    Parameters
+    ----------
+    sensors : (1,) SENSOR
+
+    Returns
+    -------
+    (3,) array, T
+        0 where they are too fine to be seen, inf where the axis has never changed.
+    """
+    out = np.empty(3)
+    _corrected_steps(sensors[0], out)
+    return out
+
+
+@njit(float64[::1](SENSORS), cache=True)
+def raw_steps(sensors: StructArray) -> FloatArray:
+    """As `corrected_steps`, before the correction."""
+    out = np.empty(3)
+    for a in range(3):
+        out[a] = _seen_step(sensors[0], a)
+    return out
+
+
+@njit(boolean(float64, float64), cache=True)
+def _rests(variance: float, step: float) -> bool:
+    """Whether a step [T] is larger than a noise of this variance [T^2], which may be NaN."""
+    return bool(variance <= DITHERED * step**2)
+
+
+@njit(void(float64[::1], float64[::1]), cache=True)
+def _complete(variance: FloatArray, steps: FloatArray) -> None:
+    """`completed_steps`, in place."""
+    largest, is_known = 0.0, False
+    for a in range(3):
+        if np.isfinite(steps[a]) and not np.isnan(variance[a]):
+            is_known = True
+            if _rests(variance[a], steps[a]):
+                largest = max(largest, steps[a])
+    for a in range(3):
+        if is_known and np.isinf(steps[a]) and not np.isnan(variance[a]):
+            steps[a] = largest if largest > 0.0 else np.nan
+
+
+def completed_steps(variance: FloatArray, steps: FloatArray) -> FloatArray:
+    """Steps of all axes; one that is not known yet is that of the others if those rest, too.
+
+    An axis that has never changed is dead where another one of the same sensor changes with every
+    reading. It may rest where none has changed so far.
 
     Parameters
     ----------
     variance : (3,) array, T^2
         Scatter of quiet readings; NaN = missing axis.
-    step : (3,) array, T
-        inf = the axis has never changed.
+    steps : (3,) array, T
+        As of `corrected_steps`.
+
+    Returns
+    -------
+    (3,) array, T
+        NaN of a dead axis; inf where none has changed.
     """
-    with np.errstate(invalid='ignore'):
-        return np.asarray(variance <= DITHERED * np.square(step))
+    out = plain(steps).copy()
+    _complete(plain(variance), out)
+    return out
 
 
-def completed_steps(variance: FloatArray, step: FloatArray) -> FloatArray:
-    """(3,) [T] steps; one that is not known yet is that of the other axes if those rest, too.
+@njit(void(SENSORS, float64, float64[::1]), cache=True)
+def apply_steps(sensors: StructArray, freeze_std: float, limits: FloatArray) -> None:
+    """Add what the steps of a sensor do to its noise.
 
-    An axis that has never changed is dead (NaN) where another one of the same sensor changes with
-    every reading. It may rest (inf) where none has changed so far.
-
-    The parameters are as for `resting`.
+    Parameters
+    ----------
+    sensors : (1,) SENSOR
+        `noise` is read, `step_variance` and `noise_std` are written.
+    freeze_std : float
+        A block departs from the background if its mean is this many standard deviations off.
+    limits : (3,) array, T
+        Written: how far the mean of a block may be off.
     """
-    known = np.isfinite(step) & ~np.isnan(variance)
-    unknown = np.isinf(step) & ~np.isnan(variance)
-    if not unknown.any() or not known.any():
-        return step
-    rests = known & resting(variance, step)
-    return np.where(unknown, step[rests].max() if rests.any() else np.nan, step)
+    s = sensors[0]
+    steps, variance = np.empty(3), np.empty(3)
+    for a in range(3):
+        variance[a] = s.noise[a, a]
+    _corrected_steps(s, steps)
+    _complete(variance, steps)
+    for a in range(3):
+        rests = np.isfinite(steps[a]) and _rests(variance[a], steps[a])
+        s.step_variance[a] = steps[a]**2 / 12.0 if rests else 0.0
+        s.noise_std[a] = np.sqrt(variance[a] + s.step_variance[a])
+        limits[a] = freeze_std * s.noise_std[a]
+        if rests:
+            limits[a] = max(limits[a], TOGGLE * steps[a])
 
 
 def common_step(values: FloatArray) -> float:

@@ -5,12 +5,12 @@ import pytest
 from numba import njit
 
 from mag_tracking.calibration.resolution import (
+    DITHERED,
     LONGEST_REST_NS,
     common_step,
     completed_steps,
     note_step,
-    resting,
-    seen_steps,
+    raw_steps,
     smallest_steps,
 )
 from mag_tracking.calibration.sensor_state import new_sensors
@@ -25,11 +25,11 @@ def _note(sensors, stamp, raw):
 
 
 def noted(fields, interval=10 * MS):
-    """The state of a sensor after `fields` (n, 3)."""
+    """(1,) SENSOR after `fields` (n, 3)."""
     sensors = new_sensors(1)
     for k, field in enumerate(fields):
         _note(sensors, k * interval, np.array(field, dtype=float))
-    return sensors[0]
+    return sensors
 
 
 def coarse(sigma, step, n=600, offset=0.3, seed=0):
@@ -40,7 +40,7 @@ def coarse(sigma, step, n=600, offset=0.3, seed=0):
 @pytest.mark.parametrize('sigma, step', [(1e-8, 1e-7), (4e-8, 1e-7), (1e-7, 1e-7), (1e-8, 1e-10)])
 def test_the_smallest_change_is_the_step(sigma, step):
     y = 5e-5 + coarse(sigma, step, offset=0.45, n=6000)
-    np.testing.assert_allclose(noted(y)['step'], step, rtol=1e-6)
+    np.testing.assert_allclose(noted(y)[0]['step'], step, rtol=1e-6)
     np.testing.assert_allclose(smallest_steps(y), step, rtol=1e-6)
     # Single precision does not hide it.
     y = y.astype(np.float32).astype(float)
@@ -52,16 +52,16 @@ def test_missing_axes_and_spikes_do_not_change_the_step():
     y[::7, 1] = np.nan
     y[::50, 0] += 2e-5
     y[:, 2] = np.nan
-    for step in (noted(y)['step'], smallest_steps(y)):
+    for step in (noted(y)[0]['step'], smallest_steps(y)):
         np.testing.assert_allclose(step, [1e-7, 1e-7, np.inf])
 
 
 def test_a_field_that_moves_with_every_reading_shows_no_steps():
     y = np.cumsum(np.random.default_rng(0).uniform(1e-6, 3e-6, (60, 3)), axis=0)
     state = noted(y)
-    assert (state['step'] > 1e-6).all() and (seen_steps(state) == 0.0).all()
-    assert (seen_steps(noted(coarse(1e-8, 1e-7, offset=0.45))) > 0.0).all()
-    assert np.isinf(seen_steps(noted(np.ones((5, 3))))).all()
+    assert (state[0]['step'] > 1e-6).all() and (raw_steps(state) == 0.0).all()
+    assert (raw_steps(noted(coarse(1e-8, 1e-7, offset=0.45))) > 0.0).all()
+    assert np.isinf(raw_steps(noted(np.ones((5, 3))))).all()
 
 
 def test_the_compiled_rule_agrees_with_the_plain_one():
@@ -79,9 +79,10 @@ def test_the_compiled_rule_agrees_with_the_plain_one():
 
 def test_a_rest_counts_as_one_measurement_for_a_while():
     n = LONGEST_REST_NS // (10 * MS)
-    assert noted(np.ones((3, 3)))['n_rest'].tolist() == [3, 3, 3]
-    assert noted(np.ones((10 * n, 3)))['n_rest'].tolist() == [n + 1] * 3
-    assert noted([*np.ones((10 * n, 3)), [1.0, 1.0, 2.0]])['n_rest'].tolist() == [n + 1, n + 1, 1]
+    assert noted(np.ones((3, 3)))[0]['n_rest'].tolist() == [3, 3, 3]
+    assert noted(np.ones((10 * n, 3)))[0]['n_rest'].tolist() == [n + 1] * 3
+    one_moves = noted([*np.ones((10 * n, 3)), [1.0, 1.0, 2.0]])
+    assert one_moves[0]['n_rest'].tolist() == [n + 1, n + 1, 1]
 
 
 @pytest.mark.parametrize('sigma', [0.01, 0.1, 0.2, 0.4, 0.5, 1.0, 3.0])
@@ -91,7 +92,7 @@ def test_an_average_is_as_good_as_stated(sigma):
     for level in rng.uniform(-0.5, 0.5, 4000):
         y = np.round(level + sigma * rng.standard_normal((n, 1)))
         variance = np.array([np.var(np.round(level + sigma * rng.standard_normal(200)))])
-        rests = resting(variance, np.ones(1))[0]
+        rests = variance[0] <= DITHERED
         runs, run = [], 0
         for k in range(n):
             run = run + 1 if k and y[k] == y[k - 1] else 1

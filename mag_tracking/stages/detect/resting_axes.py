@@ -5,8 +5,10 @@ it does not move at all, so that two axes that move by one step each are no nois
 """
 
 import numpy as np
+from numba import float64, njit, void
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.records import plain
 
 MEMORY_FRAMES = 100
 """Frames without a target that the usual variance of each axis is of, about."""
@@ -18,6 +20,8 @@ MOST = 20.0
 """The variance of a resting axis is taken to be smaller by this factor. One axis of two sensors
 that moves by one step, as it does while its background drifts, stays below the threshold."""
 
+_V, _M = float64[:, ::1], float64[:, :, ::1]
+
 
 class RestingAxes:
     """Usual variance of each axis of a network, in frames without a target."""
@@ -28,24 +32,48 @@ class RestingAxes:
 
     def learn(self, field: FloatArray) -> None:
         """Take the `field` (n_sensors, 3) [T] of a frame without a target; NaN = missing."""
-        there = ~np.isnan(field)
-        self._n = np.minimum(self._n + there, MEMORY_FRAMES)
-        share = np.divide(there, self._n, out=np.zeros_like(self._n), where=self._n > 0.0)
-        self._square += share * (np.where(there, field, 0.0) ** 2 - self._square)
+        _learn(plain(field), self._n, self._square)
 
-    def scale(self, covariance: FloatArray) -> FloatArray:
-        """Factors of the standard deviations of a frame without a target.
+    def covariance(self, covariance: FloatArray, allowance: float) -> FloatArray:
+        """Covariance of the fields of a frame without a target.
 
         Parameters
         ----------
         covariance : (n_sensors, 3, 3) array, T^2
+            Of the frame.
+        allowance : float, T^2
+            Variance of what each background may be off by.
 
         Returns
         -------
-        (n_sensors, 3) array
-            1 where the axis does not rest.
+        (n_sensors, 3, 3) array, T^2
         """
-        variance = np.einsum('jii->ji', covariance)
-        with np.errstate(invalid='ignore'):
-            rests = (self._n >= MEMORY_FRAMES / 4) & (RESTS * self._square < variance)
-        return np.where(rests, np.sqrt(1.0 / MOST), 1.0)
+        out = np.empty_like(covariance)
+        _scale(plain(covariance), self._n, self._square, allowance, out)
+        return out
+
+
+@njit(void(_V, _V, _V), cache=True)
+def _learn(field: FloatArray, n: FloatArray, square: FloatArray) -> None:
+    """`RestingAxes.learn`."""
+    for j in range(len(field)):
+        for a in range(3):
+            if not np.isnan(field[j, a]):
+                n[j, a] = min(n[j, a] + 1.0, MEMORY_FRAMES)
+                square[j, a] += (field[j, a]**2 - square[j, a]) / n[j, a]
+
+
+@njit(void(_M, _V, _V, float64, _M), cache=True)
+def _scale(covariance: FloatArray, n: FloatArray, square: FloatArray, allowance: float,
+           out: FloatArray) -> None:
+    """`RestingAxes.covariance`."""
+    std = np.ones(3)
+    for j in range(len(covariance)):
+        for a in range(3):
+            # A comparison with NaN is false: a missing axis does not rest.
+            rests = n[j, a] >= MEMORY_FRAMES / 4 and RESTS * square[j, a] < covariance[j, a, a]
+            std[a] = np.sqrt(1.0 / MOST) if rests else 1.0
+        for a in range(3):
+            for b in range(3):
+                out[j, a, b] = covariance[j, a, b] * std[a] * std[b]
+            out[j, a, a] += allowance

@@ -36,13 +36,12 @@ class Detect:
         self._settings = settings
         self._thresholds: dict[tuple[float, int], float] = {}
         self._next_id = 1
-        self._largest: FloatArray = np.zeros(len(network))
-        self.largest_excursion = 0.0
-        """Of the whole network, in units of the threshold."""
+        self._largest_share, self._largest_shares = 0.0, np.zeros(len(network))
+        # Thresholds of one sensor by its number of axes.
+        self._single = np.array([np.inf, *(self.threshold(settings.false_alarm_probability, k)
+                                           for k in (1, 2, 3))])
         self.most_above = 0
         """Consecutive frames above the threshold, at most."""
-        self.smallest_noise = np.inf
-        """[T] standard deviation of a frame."""
         self._resting = RestingAxes(len(network))
         self._reset()
 
@@ -71,14 +70,15 @@ class Detect:
             self._reset()
         self._last_ns = frame.stamp_ns
         try:
-            energy, axes = whitened_energy(frame.field, self._covariance(frame))
+            energy, axes = whitened_energy(frame.field, self._resting.covariance(
+                frame.covariance, self._allowance(frame.stamp_ns)))
         except np.linalg.LinAlgError:
             self.counts['rejected: frame with a covariance that is not positive definite'] += 1
             return out
         statistic, n = float(energy.sum()), int(axes.sum())
         self.counts['frames'] += 1
         if n:
-            self._note(frame, energy, axes, statistic, n)
+            self._note(energy, axes, statistic, n)
             per_axis = np.divide(energy, axes, out=np.zeros(len(energy)), where=axes > 0)
             out += self._judge(frame.stamp_ns, statistic, n, self._names[int(per_axis.argmax())])
         else:
@@ -88,27 +88,21 @@ class Detect:
         return [*out, replace(frame, target_present=self._present, statistic=statistic,
                               degrees_of_freedom=n)]
 
-    def _note(self, frame: FieldFrame, energy: FloatArray, axes: IntArray, statistic: float,
-              n: int) -> None:
-        """Note the largest excursions."""
-        p = self._settings.false_alarm_probability
+    def _note(self, energy: FloatArray, axes: IntArray, statistic: float, n: int) -> None:
+        """Note the largest excursions in frames without a target."""
         if not self._present:
-            self.largest_excursion = max(self.largest_excursion, float(np.sqrt(
-                statistic / self.threshold(p, n))))
-            limits = np.array([self.threshold(p, k) if k else np.inf for k in axes.tolist()])
-            self._largest = np.maximum(self._largest, np.sqrt(energy / limits))
-            variance = np.nanmin(np.einsum('jii->ji', frame.covariance))
-            self.smallest_noise = min(self.smallest_noise, float(np.sqrt(variance)))
+            share = statistic / self.threshold(self._settings.false_alarm_probability, n)
+            self._largest_share = max(self._largest_share, share)
+            np.maximum(self._largest_shares, energy / self._single[axes], out=self._largest_shares)
+
+    @property
+    def largest_excursion(self) -> float:
+        """Of the whole network, in units of the threshold."""
+        return float(np.sqrt(self._largest_share))
 
     def largest_excursions(self) -> FloatArray:
         """(n_sensors,) of each sensor, in units of the threshold of that sensor alone."""
-        return self._largest.copy()
-
-    def _covariance(self, frame: FieldFrame) -> FloatArray:
-        """(n_sensors, 3, 3) [T^2] covariance of the fields of a frame without a target."""
-        std = self._resting.scale(frame.covariance)
-        return frame.covariance * (std[:, :, None] * std[:, None, :]) \
-            + self._allowance(frame.stamp_ns) * np.eye(3)
+        return np.sqrt(self._largest_shares)
 
     def _allowance(self, stamp_ns: int) -> float:
         """[T^2] Variance of what the background may be off by."""
