@@ -69,9 +69,11 @@ def clipped(share):
         field = readings.field.copy()
         for j in range(len(readings.names)):
             mine = readings.sensor == j
-            level = np.nanmedian(field[mine], axis=0)
-            reach = share * np.nanmax(np.abs(field[mine] - level), axis=0)
-            field[mine] = np.clip(field[mine], level - reach, level + reach)
+            for a in range(3):
+                y = field[mine, a]
+                level = np.median(y[~np.isnan(y)]) if not np.isnan(y).all() else 0.0
+                reach = share * np.max(np.abs(y - level), where=~np.isnan(y), initial=0.0)
+                field[mine, a] = np.clip(y, level - reach, level + reach)
         return _with(readings, field)
     return spoil
 

@@ -10,16 +10,24 @@ from mag_tracking.apps.doctor import Doctor
 from mag_tracking.apps.first_pass import first_pass
 from mag_tracking.pipeline import settings_for
 from mag_tracking.report.metrics import interpolate_truth
-from support.bundled import NETWORK_FILE, vehicle_path
+from support.bundled import DATA, NETWORK_FILE, vehicle_path
 from support.spoiler import apply
 
 HEADING = np.cos(np.deg2rad(45.0))
 """Cosine of the largest angle between the velocity at the closest point and the true one."""
 
 
+ROADS = {'two_way_road_start': (DATA / 'two_way_road', NETWORK_FILE),
+         'corridor_8_sensors': (DATA / 'corridor', DATA / 'corridor' / 'network.yaml')}
+"""{name: (folder, network file)} of the recordings with other networks than those of `VEHICLES`."""
+
+
 @functools.cache
 def recorded(name):
-    """`RecordedReadings` of a bundled vehicle recording."""
+    """`RecordedReadings` of a bundled recording of vehicles."""
+    if name in ROADS:
+        folder, network = ROADS[name]
+        return mt.read_recording(folder / f'{name}.mcap', network)
     return mt.read_recording(vehicle_path(name), NETWORK_FILE)
 
 
@@ -65,7 +73,8 @@ def outcome(name, *faults, network=NETWORK_FILE):
 
 def findings(name, *faults):
     """[str] that the doctor says of the bundled recording `name` with `faults`."""
-    network, settings = mt.read_network(NETWORK_FILE), settings_for('vehicle')
+    network = mt.read_network(ROADS[name][1] if name in ROADS else NETWORK_FILE)
+    settings = settings_for('vehicle')
     readings = apply(recorded(name).readings, *faults)
     doctor = Doctor(network, settings)
     first_pass([readings], network, settings.calibrate).apply(doctor.calibrate)

@@ -9,7 +9,7 @@ import pytest
 from support import spoiler
 from support.bundled import VEHICLES
 from support.marks import studied
-from support.spoilt_runs import findings, outcome, recorded
+from support.spoilt_runs import ROADS, findings, outcome, recorded
 
 CAR, TURN = 'straight_car_right', 'junction_left_turns_to_rear'
 MADE_UP = (2.75e-6, 1e-2, 1e-18, -1.0, 0.0)
@@ -84,14 +84,15 @@ def test_directions_without_a_quiet_beginning():
     assert all(r or o.ambiguous for o, r in zip(found, right, strict=True))
 
 
-@pytest.mark.parametrize('name', studied(VEHICLES, kept=(CAR, TURN)))
+@pytest.mark.parametrize('name', studied([*VEHICLES, *ROADS], kept=(CAR, *ROADS)))
 def test_glitches_and_the_end_of_the_range_are_told_apart(name):
     glitches, clipped = spoiler.glitches(0.003, 2e-5), spoiler.clipped(0.5)
     plain, said = findings(name), findings(name, glitches)
-    assert sum('are spikes' in f for f in said) == 2
+    # Each sensor in which more than one reading in a thousand was hit.
+    assert sum('are spikes' in f for f in said) >= (1 if name in ROADS else 2)
     # The truck saturates a sensor by itself.
     assert sum('end of the range' in f for f in said) == sum('end of the range' in f for f in plain)
     said = findings(name, clipped)
-    assert sum('end of the range' in f for f in said) == 2
+    assert sum('end of the range' in f for f in said) == len(recorded(name).readings.names)
     assert not any('are spikes' in f for f in said), said
-    assert outcome(name, glitches).direction_is_right
+    assert name in ROADS or outcome(name, glitches).direction_is_right
