@@ -34,14 +34,22 @@ def likely_cause(stated: float, measured: float) -> str:
 def covariance_findings(name: str, topic: str, calibrate: Calibrate) -> Iterator[Finding]:
     """`Finding` of a sensor whose messages state another noise than its readings show."""
     n, stated, measured = calibrate.overruled(name)
-    known = ~np.isnan(stated) & ~np.isnan(measured)
-    if not n or not known.any():
+    if not n:
         return
-    ratio = np.where(known, np.abs(np.log(stated / measured)), -1.0)
+    advice = (f'the measured noise was used {n} times; have the driver publish the variance in '
+              'T^2, or zeros where it is unknown (calibrate.trust_covariances: true uses it '
+              'unchecked)')
+    known = (stated > 0.0) & (measured > 0.0)
+    if not known.any() or np.abs(np.log(stated[known] / measured[known])).max() < np.log(2.0):
+        yield Finding(False, name, f'the covariances on {topic} are not those of the quiet '
+                      'readings (not positive definite, or axes that are said to err together)',
+                      advice)
+        return
+    ratio = np.full(3, -1.0)
+    ratio[known] = np.abs(np.log(stated[known] / measured[known]))
     axis = int(np.argmax(ratio))
     yield Finding(
         False, name, f'the messages on {topic} state a noise of {1e9 * stated[axis]:.3g} nT, '
         f'the quiet readings show {1e9 * measured[axis]:.3g} nT '
         f'({likely_cause(float(stated[axis]), float(measured[axis]))})',
-        f'the measured noise was used {n} times; have the driver publish the variance in T^2, or '
-        'zeros where it is unknown (calibrate.trust_covariances: true takes it as it is)')
+        advice)

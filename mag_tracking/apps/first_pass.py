@@ -3,8 +3,6 @@
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.quiet_level import BlockRecorder, QuietLevel
 from mag_tracking.network import SensorNetwork
@@ -17,17 +15,15 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.units import NS
 
 PATIENCE_S = 1.0
-PATIENCE_BLOCKS = 2.0
-"""A beginning is quiet where the background is known so long after the shortest time: so many
-seconds, and so many blocks, which are longer for a slow sensor."""
+"""[s] A beginning is quiet where the background is known so long after the shortest time."""
 
-LONGEST = 10.0
-"""A background that is not known after so many times the shortest time is not waited for."""
+FEWEST_BLOCKS = 6.0
+"""The shortest time of a slow sensor, whose blocks are longer."""
 
 LEAST = 1.0 / 3.0
 """A level is a background where it was seen for this share of the usual time, in all."""
 
-FEW = 32
+FEW = 8
 """Readings that are fed at once while the beginning is learnt."""
 
 
@@ -71,42 +67,54 @@ def first_pass(batches: Iterable[Readings], network: SensorNetwork,
     if not wanted or not settings.look_ahead_s:
         return FirstPass({}, {})
     recorder, beginning = Calibrate(network, settings, BlockRecorder), Calibrate(network, settings)
+    first_ns: dict[str, int] = {}
     learnt: dict[str, tuple[float, FloatArray]] = {}
-    first_ns: int | None = None
     for readings in batches:
-        if not len(readings):
-            continue
-        first_ns = int(readings.stamp_ns[0]) if first_ns is None else first_ns
         recorder.feed(readings)
-        _learn(beginning, readings, first_ns, settings, learnt)
-        if int(readings.stamp_ns[-1]) - first_ns > settings.look_ahead_s * NS:
+        _learn(beginning, readings, first_ns, learnt)
+        start_ns = min(first_ns.values(), default=0)
+        if len(readings) and int(readings.stamp_ns[-1]) - start_ns > settings.look_ahead_s * NS:
             break
     found, steps, is_quiet = {}, {}, True
     for name, background in recorder.backgrounds().items():
         assert isinstance(background, BlockRecorder)
         steps[name] = background.steps
         level = background.quiet_level() if name in wanted else None
-        if level is not None and level.n_blocks * settings.block_s >= LEAST * settings.learn_s:
+        if level is not None and level.n_blocks * level.block_s >= LEAST * settings.learn_s:
             found[name] = level
-            since, at_first = learnt.get(name, (np.inf, level.level))
-            is_early = since <= settings.learn_s + PATIENCE_S + PATIENCE_BLOCKS * level.block_s
-            is_quiet &= is_early and background.is_usual(at_first, level)
+            is_quiet &= _begins_quietly(learnt.get(name), level, background, settings)
     # A target that one sensor feels at the beginning may be in the background of all.
     return FirstPass({} if is_quiet else found, steps)
 
 
-def _learn(beginning: Calibrate, readings: Readings, first_ns: int, settings: CalibrateSettings,
+def _learn(beginning: Calibrate, readings: Readings, first_ns: dict[str, int],
            learnt: dict[str, tuple[float, FloatArray]]) -> None:
-    """Put into `learnt`, {sensor: (seconds, (3,) [T])}, when a background is known, and which."""
+    """Note the first reading of each sensor, and when its background is known.
+
+    `learnt` {sensor: (seconds after its first reading, (3,) [T])} and `first_ns` {sensor: [ns]}
+    are changed.
+    """
     for i in range(0, len(readings), FEW):
         part = readings.part(slice(i, i + FEW))
-        since = (int(part.stamp_ns[-1]) - first_ns) / NS
-        if since > LONGEST * settings.learn_s or len(learnt) == len(beginning.backgrounds()):
+        for name, stamp_ns in zip(part.sensor_names(), part.stamp_ns.tolist(), strict=True):
+            first_ns.setdefault(name, stamp_ns)
+        if len(learnt) == len(beginning.backgrounds()):
             return
         beginning.feed(part)
         for name, background in beginning.backgrounds().items():
-            if background.ready and name not in learnt:
+            if background.ready and name not in learnt and name in first_ns:
+                since = (int(part.stamp_ns[-1]) - first_ns[name]) / NS
                 learnt[name] = since, beginning.background(name)
+
+
+def _begins_quietly(learnt: tuple[float, FloatArray] | None, found: QuietLevel,
+                    recorder: BlockRecorder, settings: CalibrateSettings) -> bool:
+    """Whether a sensor's background was known early, and is the one that it has."""
+    longest = PATIENCE_S + max(settings.learn_s, FEWEST_BLOCKS * found.block_s)
+    if learnt is None or learnt[0] > longest:
+        return False
+    # Without relearning, a level stays the background whatever else lasts.
+    return not settings.relearn_s or recorder.is_usual(learnt[1], found)
 
 
 def first_pass_of(recording: Recording, network: SensorNetwork, settings: CalibrateSettings,

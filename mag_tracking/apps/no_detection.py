@@ -57,9 +57,10 @@ def _obstacle(network: SensorNetwork, settings: Settings, calibrate: Calibrate,
         return f'{", ".join(unready)} had no background and could not be used'
     for name, noise in zip(network.names, network.noise_std, strict=True):
         scatter = calibrate.backgrounds()[name].scatter_std
-        if noise is not None and np.nanmax(noise / scatter, initial=0.0) > TOO_LARGE:
+        known = ~np.isnan(scatter)
+        if noise is not None and known.any() and (noise / scatter)[known].max() > TOO_LARGE:
             return (f'noise_std of {name} in the network file is '
-                    f'{np.nanmax(noise / scatter):.2g} times what its readings scatter')
+                    f'{(noise / scatter)[known].max():.2g} times what its readings scatter')
     if detect.largest_excursion > 1.0:
         return (f'it lasted for {detect.most_above} consecutive frames, and detect.onset_frames is '
                 f'{settings.detect.onset_frames}')

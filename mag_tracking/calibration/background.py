@@ -26,7 +26,6 @@ from mag_tracking.calibration.blocks import (
 )
 from mag_tracking.calibration.resolution import (
     apply_steps,
-    common_step,
     completed_steps,
     corrected_steps,
 )
@@ -135,11 +134,12 @@ class RunningBackground:
         apply_steps(self._sensors, self._freeze_std, self._limits)
 
     def _without_dead_axes(self, noise: FloatArray) -> FloatArray:
-        """(3, 3) [T^2] `noise` with NaN for an axis that has never changed and does not rest."""
-        steps = corrected_steps(self._sensors)
-        if np.isfinite(steps).all():
+        """(3, 3) [T^2] `noise` with NaN for an axis that has not changed and does not rest."""
+        steps, variance = corrected_steps(self._sensors), noise.diagonal()
+        if np.isfinite(steps).all() and (variance > LEAST_STD**2).all():
             return noise
-        dead = ~np.isfinite(completed_steps(noise.diagonal(), steps))
+        steps = completed_steps(variance, steps)
+        dead = ~np.isfinite(steps) | (steps == 0.0) & (variance <= LEAST_STD**2)
         return np.where(dead[:, None] | dead, np.nan, noise)
 
     def resume(self, background: FloatArray, covariance: FloatArray) -> None:
@@ -154,8 +154,14 @@ class RunningBackground:
     def begin_with(self, level: FloatArray, covariance: FloatArray) -> None:
         """Begin with a level that later readings have: (3,) [T] and (3, 3) [T^2].
 
-        As after `resume`, but another level has to last as long as it always has to.
+        As after `resume`, but another level has to last as long as it always has to. Nothing is
+        begun where no axis changes.
         """
+        steps = corrected_steps(self._sensors)
+        dead = (covariance.diagonal() <= LEAST_STD**2) & ~(np.isfinite(steps) & (steps > 0.0))
+        covariance = np.where(dead[:, None] | dead, np.nan, covariance)
+        if np.isnan(covariance).all():
+            return
         self.resume(level, covariance)
         self._relearns_soon = False
 
@@ -174,9 +180,14 @@ class RunningBackground:
 
     @property
     def scatter_std(self) -> FloatArray:
-        """(3,) [T] scatter of the quiet readings, whatever noise was given; NaN = unknown."""
+        """(3,) [T] scatter of the quiet readings and their steps, whatever noise was given; NaN =
+        unknown.
+        """
         found = pooled_covariance(self._window.blocks()) if self._window else None
-        return np.full(3, np.nan) if found is None else np.sqrt(found.diagonal())
+        if found is None:
+            return np.full(3, np.nan)
+        variance = found.diagonal() + self._state['step_variance']
+        return np.where(variance > 0.0, np.sqrt(variance), np.nan)
 
     @property
     def measured(self) -> bool:
@@ -215,18 +226,15 @@ class RunningBackground:
             if not self.stuck:
                 self._follow(block)
         else:
-            self.stuck = bool(np.isinf(self._state['step'][block.n > 1]).all())
+            self.stuck = bool(still[block.n > 1].all())
             self._begin(block)
 
     def _begin(self, block: Block) -> None:
         """Before it is ready: collect until a quiet stretch is long enough."""
         self._strange.append(block)
         if self.stuck:
-            # Without a change the values themselves say what the steps may be. Where they do not,
-            # the first change does: it comes with a target.
+            # Without a change nothing is known of the steps. The first one comes with a target.
             self._rested.append(block)
-            self._state['step'] = common_step(self._state['raw'])
-            self.stuck = bool(np.isinf(self._state['step']).all())
         elif self._rested and self._rested[-1].time - self._rested[0].time \
                 >= self._learn - 1.5 * self._length and self._adopt_if_steady(self._rested):
             return

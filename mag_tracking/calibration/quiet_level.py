@@ -23,8 +23,14 @@ LEAST_WIDTH = 5e-9
 LEAST_BLOCKS = 4
 """Fewer blocks of one level are no background."""
 
-MORE = 1.5
-"""The most frequent level replaces that of the beginning where it lasts longer by this factor."""
+MORE = 4.0
+"""The level of the beginning is replaced by one that lasts longer by this factor: what stood there
+at first has left."""
+
+NEAR = 8.0
+MORE_NEAR = 1.5
+"""A level that differs by less than so many standard deviations of a reading may be that of the
+beginning with a target that came near: there this factor is enough."""
 
 DRIFT = 3e-9
 """[T/s] of a background."""
@@ -80,21 +86,26 @@ class BlockRecorder(RunningBackground):
                                    np.where(np.isfinite(steps), steps, 0.0), self._most)
 
     def is_usual(self, beginning: FloatArray, found: QuietLevel) -> bool:
-        """Whether the level of the beginning, (3,) [T], is also found later, or lasts as long.
+        """Whether the level of the beginning, (3,) [T], is that of the background.
 
-        It may drift from there to the most frequent level.
+        So it is where the field drifts from there to the most frequent level, or has that other
+        level for hardly longer.
         """
         level, since, n = beginning, 0.0, 0
         for block in self._blocks:
             width = found.width + DRIFT * (block.time - since)
             # A comparison with NaN is false: an axis that is not reported differs from nothing.
-            if not (np.abs(block.mean - level) > width).any():
-                level = level + FOLLOWING * np.where(np.isnan(level), 0.0, block.mean - level)
-                since, n = block.time, n + 1
-            if n and found.begin <= block.time <= found.end \
+            if (np.abs(block.mean - level) > width).any():
+                continue
+            level = level + FOLLOWING * np.where(np.isnan(level), 0.0, block.mean - level)
+            since, n = block.time, n + 1
+            if found.begin <= block.time <= found.end \
                     and not (np.abs(level - found.level) > found.width).any():
                 return True
-        return MORE * n > found.n_blocks
+        # A target that comes near slowly moves the level by little; one that stands there, by more.
+        noise = np.sqrt(found.covariance.diagonal() + (found.width / WIDTH)**2)
+        is_near = not (np.abs(beginning - found.level) > NEAR * noise).any()
+        return (MORE_NEAR if is_near else MORE) * n > found.n_blocks
 
     @property
     def steps(self) -> FloatArray:

@@ -25,15 +25,6 @@ REPEATS = 0.2
 """An axis whose steps are larger than its noise stays the same more often than this, for each
 change."""
 
-ROUNDING = 1e-6
-"""Share of the largest value that single precision and the arithmetic of a driver may add."""
-
-REMAINDER = 2e-5
-"""The same of a remainder: each division multiplies it."""
-
-FINEST = 1e-8
-"""[T] Finer steps are below the noise of every sensor that rests."""
-
 LONGEST_REST_NS = 300_000_000
 """Readings that stay the same for longer count as several measurements, one in each such time."""
 
@@ -58,10 +49,11 @@ def note_step(s: Record, stamp: int, raw: FloatArray) -> None:
         if change <= SAME * abs(value) and stamp >= s.rest_since_ns[a]:
             if stamp - s.rest_since_ns[a] <= LONGEST_REST_NS:
                 s.n_rest[a] += 1
-            s.n_same[a] += 1
             continue
-        # A comparison with NaN is false: the first reading changes nothing.
+        # A comparison with NaN is false: the first reading changes nothing. Only a rest that has
+        # ended counts: an axis that hangs rests for ever.
         if change >= 0.0:
+            s.n_same[a] += s.n_rest[a] - 1
             s.n_changed[a] += 1
             s.step[a] = min(s.step[a], change)
         s.raw[a], s.rest_since_ns[a], s.n_rest[a] = value, stamp, 1
@@ -81,14 +73,32 @@ def _seen_step(s: Record, a: int) -> float:
 def _corrected_steps(s: Record, out: FloatArray) -> None:
     """Steps of the axes after the soft-iron correction, into `out` (3,)."""
     for a in range(3):
-        out[a] = _seen_step(s, a)
-        if s.has_correction and np.isfinite(out[a]):
-            total = 0.0
-            for b in range(3):
-                step = _seen_step(s, b)
-                if s.correction[a, b] != 0.0 and np.isfinite(step):
-                    total += (s.correction[a, b] * step)**2
-            out[a] = np.sqrt(total)
+        if not s.has_correction:
+            out[a] = _seen_step(s, a)
+            continue
+        total, is_known = 0.0, False
+        for b in range(3):
+            step = _seen_step(s, b)
+            if s.correction[a, b] != 0.0 and np.isfinite(step):
+                total += (s.correction[a, b] * step)**2
+                is_known = True
+        out[a] = np.sqrt(total) if is_known else np.inf
+
+
+@njit(cache=True)
+def rest_of(s: Record, a: int) -> float:
+    """For how many readings axis `a` rests, after the correction: the raw axes count by what their
+    steps add.
+    """
+    if not s.has_correction:
+        return float(s.n_rest[a])
+    total = weighted = 0.0
+    for b in range(3):
+        if np.isfinite(s.step[b]):
+            weight = (s.correction[a, b] * s.step[b])**2
+            total += weight
+            weighted += weight * s.n_rest[b]
+    return weighted / total if total > 0.0 else 1.0
 
 
 @njit(float64[::1](SENSORS), cache=True)
@@ -187,33 +197,6 @@ def apply_steps(sensors: StructArray, freeze_std: float, limits: FloatArray) -> 
         limits[a] = freeze_std * s.noise_std[a]
         if rests:
             limits[a] = max(limits[a], TOGGLE * steps[a])
-
-
-def common_step(values: FloatArray) -> float:
-    """Largest step of which all values are whole multiples.
-
-    Parameters
-    ----------
-    values : (n,) array, T
-        Of the axes of one sensor at one time; NaN = missing.
-
-    Returns
-    -------
-    float, T
-        The step of the sensor, or a multiple of it. inf with fewer than two values, or where they
-        have no common step above `FINEST`: the driver has corrected them.
-    """
-    sizes = np.sort(np.abs(values[np.isfinite(values) & (values != 0.0)]))
-    if len(sizes) < 2:
-        return float('inf')
-    step, largest = float(sizes[0]), float(sizes[-1])
-    for size in sizes[1:].tolist():
-        while size > REMAINDER * largest:
-            # The nearest multiple: the remainder of one just below the next would be all of a step.
-            step, size = size, abs(step - round(step / size) * size)
-    step = largest / round(largest / step)
-    off = np.abs(sizes - step * np.round(sizes / step))
-    return step if step >= FINEST and off.max() <= ROUNDING * largest else float('inf')
 
 
 def smallest_steps(fields: FloatArray) -> FloatArray:

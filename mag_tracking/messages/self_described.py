@@ -5,14 +5,18 @@ field where it has `magnetic_field` with x, y and z [T], and a time in `header.s
 `timestamp`.
 """
 
+import functools
 import json
+import struct
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
 from mcap.records import Schema
 
-MAGNETIC_FIELD = 'sensor_msgs/msg/MagneticField'
+from mag_tracking.messages.shapes import MessageDict
+from mag_tracking.messages.types import MAGNETIC_FIELD, encoder
+
 _STAMPS = ('stamp', 'timestamp')
 _SECONDS = ('sec', 'secs', 'seconds')
 _NANOSECONDS = ('nanosec', 'nsec', 'nsecs', 'nanos')
@@ -27,22 +31,49 @@ def type_of(schema: Schema) -> str:
     return MAGNETIC_FIELD if is_field else schema.name
 
 
-def decoder_for(schema: Schema) -> Callable[[bytes], SimpleNamespace]:
-    """Function from the bytes of a message to an object shaped like sensor_msgs/MagneticField.
+def cdr_of(schema: Schema, data: bytes) -> bytes:
+    """CDR bytes of sensor_msgs/MagneticField; b'' of a message that is no magnetic field."""
+    try:
+        return encoder(MAGNETIC_FIELD)(reader_of(schema.encoding, schema.name, schema.data)(data))
+    except bad_bytes():
+        return b''
 
-    It raises ValueError where the message is none.
+
+@functools.cache
+def bad_bytes() -> tuple[type[Exception], ...]:
+    """What bytes that are no such message lead to."""
+    # Most recordings are CDR, and should not wait for another library.
+    from google.protobuf.message import DecodeError
+
+    return (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError,
+            struct.error, DecodeError)
+
+
+@functools.cache
+def reader_of(encoding: str, name: str, content: bytes) -> Callable[[bytes], MessageDict]:
+    """Function from the bytes of a message to sensor_msgs/MagneticField as nested dicts.
+
+    Parameters
+    ----------
+    encoding, name, content : str, str, bytes
+        Of the schema.
+
+    Returns
+    -------
+    function
+        It raises ValueError where the message is no magnetic field.
     """
-    if schema.encoding == 'jsonschema':
+    if encoding == 'jsonschema':
         return lambda data: _field(json.loads(data, object_hook=lambda d: SimpleNamespace(**d)))
     from mcap_protobuf.decoder import DecoderFactory
 
-    decode = DecoderFactory().decoder_for('protobuf', schema)
+    decode = DecoderFactory().decoder_for('protobuf', Schema(1, content, encoding, name))
     if decode is None:
         raise ValueError('its protobuf schema cannot be read')
     return lambda data: _field(decode(data))
 
 
-def _field(message: Any) -> SimpleNamespace:
+def _field(message: Any) -> MessageDict:
     """The message as sensor_msgs/MagneticField; raises ValueError."""
     field = getattr(message, 'magnetic_field', None)
     header = getattr(message, 'header', message)
@@ -54,19 +85,21 @@ def _field(message: Any) -> SimpleNamespace:
     covariance = [float(v) for v in getattr(message, 'magnetic_field_covariance', ())]
     if len(covariance) not in (0, 9):
         raise ValueError(f'its covariance has {len(covariance)} elements, not 9')
-    return SimpleNamespace(
-        header=SimpleNamespace(
-            stamp=SimpleNamespace(sec=_whole(stamp, _SECONDS), nanosec=_whole(stamp, _NANOSECONDS)),
-            frame_id=str(getattr(header, 'frame_id', ''))),
-        magnetic_field=SimpleNamespace(**{axis: _number(field, axis) for axis in 'xyz'}),
-        magnetic_field_covariance=covariance or [0.0] * 9)
+    return {
+        'header': {'stamp': {'sec': _whole(stamp, _SECONDS, 2**31),
+                             'nanosec': _whole(stamp, _NANOSECONDS, 10**9)},
+                   'frame_id': str(getattr(header, 'frame_id', ''))},
+        'magnetic_field': {axis: _number(field, axis) for axis in 'xyz'},
+        'magnetic_field_covariance': covariance or [0.0] * 9}
 
 
-def _whole(stamp: Any, names: tuple[str, ...]) -> int:
-    """The first of the fields `names` of a time."""
+def _whole(stamp: Any, names: tuple[str, ...], limit: int) -> int:
+    """The first of the fields `names` of a time, below `limit`. Raises ValueError."""
     for name in names:
         value = getattr(stamp, name, None)
-        if isinstance(value, int) or isinstance(value, str) and value.isdigit():
+        if isinstance(value, int) and not isinstance(value, bool):
+            if not 0 <= value < limit:
+                raise ValueError(f'its time has {name} = {str(value)[:20]}')
             return int(value)
     raise ValueError(f'its time has no {names[0]}')
 

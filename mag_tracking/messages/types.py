@@ -16,10 +16,9 @@ from mcap_ros2 import _dynamic
 from mcap_ros2.decoder import DecoderFactory
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages import self_described
 from mag_tracking.messages.shapes import MessageDict
 
-MAGNETIC_FIELD = self_described.MAGNETIC_FIELD
+MAGNETIC_FIELD = 'sensor_msgs/msg/MagneticField'
 IMU = 'sensor_msgs/msg/Imu'
 POSE = 'geometry_msgs/msg/PoseStamped'
 POSE_WITH_COVARIANCE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
@@ -101,6 +100,14 @@ def definition(type_name: str) -> str:
 
 
 @functools.cache
+def schema_of(type_name: str) -> Schema:
+    """The schema of a message type; empty where this package does not use the type."""
+    known = type_name in DEFINITIONS
+    return Schema(1, definition(type_name).encode() if known else b'',
+                  'ros2msg' if known else '', type_name)
+
+
+@functools.cache
 def encoder(type_name: str) -> Callable[[MessageDict], bytes]:
     """Function from nested dicts to CDR bytes."""
     # The library offers this function only through its own writer, which cannot
@@ -133,9 +140,7 @@ def decode(message: _Raw) -> SimpleNamespace:
     """
     key = message.schema.name, message.schema.data
     try:
-        if key not in _decoders and message.schema.encoding in self_described.SCHEMAS:
-            _decoders[key] = self_described.decoder_for(message.schema)
-        elif key not in _decoders:
+        if key not in _decoders:
             _decoders[key] = DecoderFactory().decoder_for('cdr', message.schema)
         decoder = _decoders[key]
         if decoder is None:

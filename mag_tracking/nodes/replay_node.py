@@ -129,7 +129,10 @@ class ReplayNode(Node):
                 return
             room -= 1
             publisher = self._publisher_for(self._next.topic, self._next.type)
-            if publisher is not None:
+            if publisher is not None and not self._next.data:
+                # Damaged, or of a ROS 1 type that is not converted.
+                self.counts['rejected: undecodable message'] += 1
+            elif publisher is not None:
                 publisher.publish(self._next.data)
                 self.counts['messages'] += 1
             self._next = next(self._messages, None)

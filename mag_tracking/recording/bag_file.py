@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from mcap.records import Schema
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.types import DEFINITIONS, definition, encoder
+from mag_tracking.messages.types import DEFINITIONS, encoder, schema_of
 from mag_tracking.recording.damage import DAMAGE
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.raw_message import RawMessage
@@ -114,15 +113,9 @@ def bag_errors() -> tuple[type[Exception], ...]:
     from rosbags.rosbag2 import ReaderError
     from rosbags.serde import SerdeError
 
-    return (Ros1Error, ReaderError, SerdeError, apsw.Error, OSError, *DAMAGE)
-
-
-@functools.cache
-def schema_of(type_name: str) -> Schema:
-    """The schema of a message type; empty where this package does not use the type."""
-    known = type_name in DEFINITIONS
-    return Schema(1, definition(type_name).encode() if known else b'',
-                  'ros2msg' if known else '', type_name)
+    # On damaged bytes the library's own assertions fail, too.
+    return (Ros1Error, ReaderError, SerdeError, apsw.Error, OSError, AssertionError, IndexError,
+            TypeError, OverflowError, *DAMAGE)
 
 
 def cdr_of_ros1(data: bytes, type_name: str) -> bytes:

@@ -1,6 +1,7 @@
 """Tables of magnetometer readings (CSV) to recordings; columns and units are given."""
 
 import csv
+import re
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
@@ -60,7 +61,7 @@ def parse_columns(texts: Sequence[str]) -> tuple[str, str | None, _Axes]:
         if axis not in ('x', 'y', 'z') or bool(name) == (sensor is not None):
             raise RecordingError(f'columns: {key!r} is none of time, sensor, x, y, z (with sensor) '
                                  'or NAME.x, NAME.y, NAME.z (without)')
-        axes.setdefault(name, {})[axis] = column
+        axes.setdefault(_sensor_name(name, 'columns') if name else '', {})[axis] = column
     if time is None or not axes:
         raise RecordingError('columns: time and at least one axis are needed, such as time=t '
                              'mag_1.x=bx mag_1.y=by mag_1.z=bz')
@@ -89,6 +90,7 @@ def import_field_table(table: _Path, columns: Sequence[str], unit: str, out: _Pa
     recording : Path
         The readings are on `/NAME/imu/mag`.
     counts : {sensor: number of readings}
+        A row in which a sensor has no axis at all gives none.
 
     Raises
     ------
@@ -127,7 +129,8 @@ def _readings(table: Path, columns: tuple[str, str | None, _Axes], scale: float,
                 field['xyz'.index(axis)] = scale * _number(
                     row[column], f'{table}: row {number}: {column}')
             if not np.isnan(field).all():
-                names.append(_sensor_name(row[sensor]) if sensor else name)
+                names.append(_sensor_name(row[sensor], f'{table}: row {number}: {sensor}')
+                             if sensor else name)
                 stamps.append(stamp)
                 fields.append(field)
     if not names:
@@ -153,6 +156,8 @@ def _rows(table: Path, wanted: Sequence[str]) -> list[tuple[int, dict[str, str]]
     for number, row in rows:
         if any(row[c] is None for c in wanted):
             raise RecordingError(f'{table}: row {number} has too few columns')
+        if None in row:
+            raise RecordingError(f'{table}: row {number} has too many columns (a decimal comma?)')
     return rows
 
 
@@ -172,13 +177,17 @@ def _number(text: str, where: str) -> float:
 def _stamp(text: str, scale: int, where: str) -> int:
     """[ns] of a time; whole numbers keep every digit. Raises RecordingError."""
     text = text.strip()
-    value = int(text) * scale if text.lstrip('+-').isdigit() else _number(text, where) * scale
+    is_whole = re.fullmatch(r'[+-]?[0-9]{1,20}', text)
+    value = int(text) * scale if is_whole else _number(text, where) * scale
     if not 0 <= value <= LATEST_NS:
-        raise RecordingError(f'{where}: {text or "nothing"} is no time from 1970 on')
+        raise RecordingError(f'{where}: {text[:30] or "an empty field"} is not a time after 1970')
     return round(value)
 
 
-def _sensor_name(text: str) -> str:
-    """A sensor's name, as in a topic: a number n is `mag_n`."""
-    text = text.strip()
-    return f'mag_{text}' if text.isdigit() else text
+def _sensor_name(text: str, where: str) -> str:
+    """A sensor's name, as in a topic: a number n is `mag_n`. Raises RecordingError."""
+    name = f'mag_{text.strip()}' if re.fullmatch('[0-9]+', text.strip()) else text.strip()
+    if not re.fullmatch('[A-Za-z_][A-Za-z0-9_]*', name):
+        raise RecordingError(f'{where}: {text!r} cannot be the name of a sensor: letters, digits '
+                             'and _ only')
+    return name

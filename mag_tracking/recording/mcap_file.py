@@ -12,7 +12,8 @@ from mcap.records import Channel, Chunk, ChunkIndex, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.self_described import type_of
+from mag_tracking.messages.self_described import cdr_of, type_of
+from mag_tracking.messages.types import schema_of
 from mag_tracking.recording.damage import DAMAGE
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.raw_message import RawMessage
@@ -163,7 +164,10 @@ def _has_schema(message: Message, channels: dict[int, Channel]) -> bool:
 
 def _raw(message: Message, schemas: dict[int, Schema],
          channels: dict[int, Channel]) -> RawMessage:
-    """The message with its topic and type."""
+    """The message with its topic and type; a magnetic field in JSON or protobuf as CDR."""
     channel = channels[message.channel_id]
     schema = schemas[channel.schema_id]
-    return RawMessage(channel.topic, type_of(schema), message.log_time, message.data, schema)
+    kind, data = type_of(schema), message.data
+    if kind != schema.name:
+        data, schema = cdr_of(schema, data), schema_of(kind)
+    return RawMessage(channel.topic, kind, message.log_time, data, schema)

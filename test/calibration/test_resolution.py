@@ -7,7 +7,6 @@ from numba import njit
 from mag_tracking.calibration.resolution import (
     DITHERED,
     LONGEST_REST_NS,
-    common_step,
     completed_steps,
     note_step,
     raw_steps,
@@ -114,28 +113,3 @@ def test_an_axis_that_never_changed_rests_or_is_dead():
     np.testing.assert_array_equal(completed_steps(np.zeros(3), never), never)
     one = np.array([np.nan, 0.0, np.nan])
     np.testing.assert_array_equal(completed_steps(one, np.array([inf, 2.0, inf])), [inf, 2.0, inf])
-
-
-@pytest.mark.parametrize('step', [7.3e-8, 1.5e-7, 3e-7, 1e-6])
-def test_values_tell_their_common_step(step):
-    rng = np.random.default_rng(0)
-    hits = found = 0
-    for _ in range(200):
-        counts = rng.integers(-400, 400, 3)
-        values = step * counts.astype(float)
-        expected = step * np.gcd.reduce(counts)
-        if np.count_nonzero(counts) > 1:
-            np.testing.assert_allclose(common_step(values), expected, rtol=1e-6)
-            hits += np.gcd.reduce(counts) == 1
-            # Single precision may hide it, but gives no wrong one.
-            single = common_step(values.astype(np.float32).astype(float))
-            assert single == np.inf or abs(single / expected - 1.0) < 1e-3
-            found += single < np.inf
-    assert hits > 140 and found > 50
-
-
-def test_values_without_a_common_step():
-    rng = np.random.default_rng(1)
-    assert all(common_step(rng.uniform(-5e-5, 5e-5, 3)) == np.inf for _ in range(200))
-    assert common_step(np.array([4e-5, np.nan, np.nan])) == np.inf
-    assert common_step(np.zeros(3)) == common_step(np.full(3, np.nan)) == np.inf

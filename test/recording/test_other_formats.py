@@ -16,6 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 import mag_tracking as mt
 from mag_tracking.cli import main
 from mag_tracking.errors import RecordingError
+from mag_tracking.messages.self_described import reader_of
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.recording.field_table import import_field_table
 from mag_tracking.recording.reader import Recording
@@ -101,10 +102,12 @@ def test_a_damaged_bag_is_named_or_read_as_far_as_it_goes(kind, share, source, t
         assert n < source.message_counts.total() and recording.losses
 
 
-def test_bytes_that_were_changed_end_nothing(source, tmp_path):
-    path = written_db3(source, tmp_path / 'two') / 'two.db3'
-    data, rng = bytearray(path.read_bytes()), np.random.default_rng(0)
-    for k in rng.integers(4096, len(data), 300):
+@pytest.mark.parametrize('kind, seed', [('db3', 0), *(('bag', seed) for seed in range(6))])
+def test_bytes_that_were_changed_end_nothing(kind, seed, source, tmp_path):
+    path = written_ros1(source, tmp_path / 'one.bag') if kind == 'bag' \
+        else written_db3(source, tmp_path / 'two') / 'two.db3'
+    data, rng = bytearray(path.read_bytes()), np.random.default_rng(seed)
+    for k in rng.integers(4096, len(data), 300 if kind == 'db3' else 20):
         data[k] ^= 0xFF
     path.write_bytes(data)
     try:
@@ -158,25 +161,28 @@ def test_json_messages_of_a_magnetic_field_are_read(seconds, nanoseconds, source
     (lambda m: m.pop('magnetic_field'), 'no magnetic_field'),
     (lambda m: m.pop('header'), 'no time'),
     (lambda m: m['header'].update(stamp={'sec': 'x'}), 'no sec'),
+    (lambda m: m['header'].update(stamp={'sec': True, 'nanosec': 0}), 'no sec'),
+    (lambda m: m['header']['stamp'].update(sec=10**10), 'sec = 1'),
+    (lambda m: m['header']['stamp'].update(nanosec=10**25), 'nanosec = 1'),
     (lambda m: m['magnetic_field'].pop('z'), 'no z'),
     (lambda m: m['magnetic_field'].update(z='1'), "is '1'"),
     (lambda m: m.update(magnetic_field_covariance=[1.0]), 'covariance'),
     (lambda m: m.update(magnetic_field=3.0), 'no x')])
 def test_other_json_messages_are_rejected(change, cause, tmp_path):
-    from mag_tracking.messages.types import decode
-
     message = {'header': {'stamp': {'sec': 1, 'nanosec': 2}},
                'magnetic_field': {'x': 1e-5, 'y': None, 'z': 2}}
-    path = mcap_of(tmp_path / 'a.mcap', 'json', ('M', 'jsonschema', SCHEMA),
-                   [('/mag_1/imu/mag', 5, json.dumps(message).encode())])
-    (raw,) = Recording(path).messages()
-    good = decode(raw)
-    assert np.isnan(good.magnetic_field.y) and good.header.stamp.nanosec == 2
+    read = reader_of('jsonschema', 'M', SCHEMA)
+    good = read(json.dumps(message).encode())
+    assert np.isnan(good['magnetic_field']['y']) and good['header']['stamp']['nanosec'] == 2
     change(message)
-    with pytest.raises(RecordingError, match=cause):
-        decode(raw._replace(data=json.dumps(message).encode()))
-    with pytest.raises(RecordingError, match='is not a'):
-        decode(raw._replace(data=b'\xff{'))
+    bad = json.dumps(message).encode()
+    with pytest.raises(ValueError, match=cause):
+        read(bad)
+    path = mcap_of(tmp_path / 'a.mcap', 'json', ('M', 'jsonschema', SCHEMA), [
+        ('/mag_1/imu/mag', k, data) for k, data in enumerate((bad, b'\xff{', b'[' * 100_000, b''))])
+    found = mt.read_recording(path, NETWORK_FILE)
+    assert len(found.readings) == 0
+    assert found.rejected == {'undecodable message on /mag_1/imu/mag': 4}
 
 
 def protobuf_class():
@@ -242,9 +248,16 @@ def test_a_row_may_have_all_sensors(tmp_path):
     (['time=t', 'a.x=x'], 'T', 't,y\n1,2\n', 'there is no column x; it has t, y'),
     (['time=t', 'a.x=x'], 'T', 't,x\n1,b\n', "row 2: x: expected a number, got 'b'"),
     (['time=t', 'a.x=x'], 'T', 't,x\n1,inf\n', 'row 2: x is infinite'),
-    (['time=t', 'a.x=x'], 'T', 't,x\n-1,2\n', 'row 2: t: -1 is no time'),
-    (['time=t', 'a.x=x'], 'T', 't,x\n,2\n', 'row 2: t: nothing is no time|nan is no time'),
+    (['time=t', 'a.x=x'], 'T', 't,x\n-1,2\n', 'row 2: t: -1 is not a time'),
+    (['time=t', 'a.x=x'], 'T', 't,x\n,2\n', 'row 2: t: an empty field is not a time'),
     (['time=t', 'a.x=x'], 'T', 't,x\n1\n', 'row 2 has too few columns'),
+    (['time=t', 'a.x=x'], 'T', 't,x\n0,1,5\n', 'row 2 has too many columns'),
+    (['time=t', 'a.x=x'], 'T', 't,x\n--5,1\n', "row 2: t: expected a number, got '--5'"),
+    (['time=t', 'a.x=x'], 'T', 't,x\n\u00b2,1\n', 'row 2: t: expected a number'),
+    (['time=t', 'a.x=x'], 'T', f't,x\n{"9" * 5000},1\n', 'is infinite|is not a time'),
+    (['time=t', 'sensor=s', 'x=x'], 'T', 't,s,x\n1,,2\n', "'' cannot be the name of a sensor"),
+    (['time=t', 'sensor=s', 'x=x'], 'T', 't,s,x\n1,a b,2\n', "'a b' cannot be the name"),
+    (['time=t', 'a/b.x=x'], 'T', 't,x\n1,2\n', "'a/b' cannot be the name"),
     (['time=t', 'a.x=x'], 'T', 't,x\n1,\n', 'has no readings'),
     (['time=t', 'x=x'], 'T', 't,x\n1,2\n', "'x' is none of"),
     (['time=t', 'sensor=s', 'a.x=x'], 'T', 't,x\n1,2\n', "'a.x' is none of"),

@@ -153,7 +153,7 @@ class PlainCalibration:
             return 'infinite value'
         if values.max() > most:
             return f'above {most:g} T (gauss or microtesla as tesla?)'
-        if sample.covariance is not None:
+        if sample.covariance is not None and self.settings.trust_covariances:
             there = ~np.isnan(sample.field)
             C = sample.covariance[np.ix_(there, there)]
             if not np.isfinite(C).all() or not np.allclose(C, C.T, atol=1e-6 * np.abs(C).max()) \
@@ -227,13 +227,25 @@ class PlainCalibration:
         self.counts['calibrated'] += 1
         return [MagSample(sample.stamp_ns, sample.sensor, field, C)]
 
+    def is_credible(self, own, noise):
+        """Positive definite over the known axes, a variance within 25 times, alike correlations."""
+        there = ~np.isnan(noise.diagonal())
+        own, noise = own[np.ix_(there, there)], noise[np.ix_(there, there)]
+        if not np.isfinite(own).all() \
+                or not np.allclose(own, own.T, atol=1e-6 * np.abs(own).max()) \
+                or not np.linalg.eigvalsh(own).min() > 0.0:
+            return False
+        s, k = np.sqrt(own.diagonal()), np.sqrt(noise.diagonal())
+        ratio = np.square(s / k)
+        return (ratio <= 25.0).all() and (ratio >= 1.0 / 25.0).all() and np.abs(
+            own / np.outer(s, s) - noise / np.outer(k, k)).max() <= 0.7
+
     def covariance(self, background, own):
         noise, s = background.covariance, background.sensors[0]
         if self.settings.trust_covariances and own is not None:
             return own
         if own is not None:
-            ratio = own.diagonal() / noise.diagonal()
-            if (ratio > 25.0).any() or (ratio < 1.0 / 25.0).any():
+            if not self.is_credible(own, noise):
                 self.counts['covariances of messages overruled by the measured noise'] += 1
                 own = None
         C = noise - np.diag(s['step_variance']) if own is None else own

@@ -55,9 +55,9 @@ class FedBackground(RunningBackground):
             change = abs(raw[a] - s['raw'][a])
             if change <= 3e-7 * abs(raw[a]) and stamp >= s['rest_since_ns'][a]:
                 s['n_rest'][a] += stamp - s['rest_since_ns'][a] <= LONGEST_REST_NS
-                s['n_same'][a] += 1
                 continue
             if change >= 0.0:
+                s['n_same'][a] += s['n_rest'][a] - 1
                 s['n_changed'][a] += 1
                 s['step'][a] = min(s['step'][a], change)
             s['raw'][a], s['rest_since_ns'][a], s['n_rest'][a] = raw[a], stamp, 1

@@ -11,7 +11,7 @@ from numba import boolean, float64, from_dtype, int64, njit
 from mag_tracking.arrays import FloatArray, IntArray, Record, StructArray
 from mag_tracking.calibration.background import subtract_background
 from mag_tracking.calibration.blocks import begin_block_if_due, collect
-from mag_tracking.calibration.resolution import note_step
+from mag_tracking.calibration.resolution import note_step, rest_of
 from mag_tracking.calibration.screening import (
     HELD,
     PASSES,
@@ -29,6 +29,9 @@ BLOCK_COMPLETE, JUMPED_BACK, RESTORABLE = range(20, 23)
 """To be handled before the same reading is taken again."""
 SPIKES, PASSED = range(30, 32)
 """The `n_spikes` readings before are rejected, or the `n_released` held readings are to be used."""
+
+MOST_ALIKE = 0.7
+"""The correlation of two axes that a message states may differ by this from the measured one."""
 
 NONE, VALID, INVALID = range(3)
 """Whether a reading has its own covariance."""
@@ -67,7 +70,7 @@ def _fault(limits: Record, raw: FloatArray, own: int) -> int:
         return INFINITE
     if largest > limits.max_field:
         return TOO_LARGE
-    return BAD_COVARIANCE if own == INVALID else DONE
+    return BAD_COVARIANCE if own == INVALID and limits.trust_covariances else DONE
 
 
 @njit(cache=True)
@@ -163,28 +166,36 @@ def _queue(s: Record, stamp: int, field: FloatArray, own: int, covariance: Float
 @njit(cache=True)
 def _is_credible(s: Record, covariance: FloatArray) -> bool:
     """Whether the covariance of a message agrees with the noise of the sensor."""
-    is_credible = True
     for a in range(3):
         stated, known = covariance[a, a], s.noise[a, a] + s.step_variance[a]
-        s.stated_std[a] = np.sqrt(stated)
         # A comparison with NaN is false: an axis that is missing contradicts nothing.
-        is_credible &= not (stated > CREDIBLE * known or known > CREDIBLE * stated)
-    return is_credible
+        if stated > CREDIBLE * known or known > CREDIBLE * stated:
+            return False
+        for b in range(a):
+            # Axes that are said to err together, and do not.
+            both = np.sqrt(stated * covariance[b, b])
+            if abs(covariance[a, b] / both - s.noise[a, b] / np.sqrt(
+                    known * (s.noise[b, b] + s.step_variance[b]))) > MOST_ALIKE:
+                return False
+    return True
 
 
 @njit(cache=True)
 def _attach_covariance(s: Record, limits: Record, batch: Record, own: int,
                        covariance: FloatArray, out: FloatArray) -> None:
     """Covariance of a reading: its own where that is credible, else that of the sensor."""
-    if own and not limits.trust_covariances and not _is_credible(s, covariance):
+    if own and not limits.trust_covariances and (
+            own == INVALID or not _is_credible(s, covariance)):
         own = NONE
         s.n_overruled += 1
         batch.n_overruled += 1
+        for a in range(3):
+            s.stated_std[a] = np.sqrt(covariance[a, a]) if covariance[a, a] >= 0.0 else np.nan
     for a in range(3):
         for b in range(3):
             out[a, b] = covariance[a, b] if own else s.noise[a, b]
         if not (own and limits.trust_covariances):
-            out[a, a] += s.step_variance[a] * s.n_rest[a]
+            out[a, a] += s.step_variance[a] * rest_of(s, a)
 
 
 @njit(cache=True)

@@ -7,7 +7,7 @@ import pytest
 
 from mag_tracking.errors import NetworkError
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
-from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.calibrate.stage import OVERRULED, Calibrate
 from mag_tracking.stages.stage import rejected
 from support.calibration_runs import EARTH, SIGMA, feed, running, sample, stage
 from support.networks import line_network
@@ -157,12 +157,21 @@ def test_covariances():
     np.testing.assert_array_equal(fed(s, sample(1.0, covariance=own))[0].covariance, own)
     # Unknown: the configured one.
     np.testing.assert_allclose(fed(s, sample(2.0))[0].covariance, 1.44e-16 * np.eye(3))
-    for bad in (-own, np.zeros((3, 3)), np.diag([1e-16, 2e-16, np.nan]),
-                own + np.triu(np.ones((3, 3)), 1)):
-        assert fed(s, sample(3.0, covariance=bad)) == []
-    # By rounding, half of these have no eigenvalue that is not above zero.
-    for v in np.random.default_rng(0).standard_normal((20, 3)):
-        assert fed(s, sample(3.0, covariance=1e-16 * np.outer(v, v))) == []
+    # By rounding, half of the products have no eigenvalue that is not above zero.
+    bad = [-own, np.zeros((3, 3)), np.diag([1e-16, 2e-16, np.nan]),
+           own + np.triu(np.ones((3, 3)), 1), 100.0 * own, 0.01 * own,
+           *(1e-16 * np.outer(v, v) for v in np.random.default_rng(0).standard_normal((20, 3)))]
+    made_up = own.copy()
+    made_up[0, 1] = made_up[1, 0] = 0.99 * np.sqrt(2.0) * 1e-16
+    for k, C in enumerate([*bad, made_up]):
+        (out,) = fed(s, sample(3.0 + k, covariance=C))
+        np.testing.assert_allclose(out.covariance, 1.44e-16 * np.eye(3))
+    assert s.counts[OVERRULED] == 27 and not rejected(s.counts)
+    s = stage(trust_covariances=True)
+    for k, C in enumerate(bad):
+        (out,) = fed(s, sample(3.0 + k, covariance=C)) if 4 <= k <= 5 else (None,)
+        assert out is None or np.array_equal(out.covariance, C)
+        assert 4 <= k <= 5 or fed(s, sample(3.0 + k, covariance=C)) == []
     assert rejected(s.counts) == {'covariance is not positive definite': 24}
 
 

@@ -9,7 +9,7 @@ from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate import kernel
 from mag_tracking.stages.calibrate import stage as calibrate
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
-from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.calibrate.stage import OVERRULED, Calibrate
 from support.faulty_streams import FAULTS, stream
 from support.networks import line_network
 from support.plain_calibration import PlainCalibration
@@ -92,12 +92,15 @@ def suspect_ones(samples, rng):
 
 
 @pytest.mark.parametrize('settings', [
-    {}, {'reject_stuck': False, 'spike_std': 0.0}, {'decimate_to_hz': 20.0}])
+    {}, {'reject_stuck': False, 'spike_std': 0.0}, {'decimate_to_hz': 20.0},
+    {'trust_covariances': True}])
 def test_corrected_sensors_and_suspect_readings(settings):
     network, samples, *_ = stream(4, 7)
     samples = list(suspect_ones(samples, np.random.default_rng(1)))
     stage = calibrated_alike(corrected(network), samples, **settings)
-    assert stage.counts['rejected: covariance is not positive definite'] > 50
+    n = stage.counts['rejected: covariance is not positive definite']
+    assert n > 50 if 'trust_covariances' in settings else n == 0
+    assert (stage.counts[OVERRULED] > 0) == ('trust_covariances' not in settings)
 
 
 def test_another_calibration_and_learning_again_in_the_middle():
