@@ -170,7 +170,7 @@ SIGNATURE_SPAN = 4.0
 
 @dataclass(frozen=True, slots=True)
 class PassEvent:
-    """What one sensor alone tells of a target that passed; it does not tell the scale."""
+    """A pass described by one sensor alone, which cannot observe the scale."""
 
     sensor: str
     number: int

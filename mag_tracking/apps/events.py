@@ -1,4 +1,4 @@
-"""What each sensor of a network tells of passing targets, without tracking and without metres."""
+"""Passes described by each sensor of a network, without tracking and without metres."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -24,7 +24,7 @@ class EventsResult:
     """The events of a recording."""
 
     events: tuple[PassEvent, ...]
-    """In order of release."""
+    """In the order in which they ended."""
     rejections: dict[str, int]
     """{cause: number} of readings that were not used."""
     sensors_without_background: tuple[str, ...]
@@ -41,7 +41,7 @@ class EventsResult:
 
 def events(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[str],
            settings: Mapping[str, Any] | None = None) -> EventsResult:
-    """Find what each sensor of a network tells of passing targets.
+    """Describe the passes that each sensor of a network detects.
 
     Parameters
     ----------

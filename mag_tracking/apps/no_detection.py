@@ -38,6 +38,9 @@ def why_no_detection(network: SensorNetwork, settings: Settings, calibrate: Cali
     if not n_accepted:
         return 'there were no readings on ' + ', '.join(missing_topics or network.topics)
     if not detect.counts['frames']:
+        hung = [name for name in calibrate.unready() if calibrate.backgrounds()[name].stuck]
+        if hung:
+            return f'the readings of {", ".join(hung)} do not change (see mag-tracking doctor)'
         waiting = ', '.join(calibrate.unready())
         return (f'no background was learnt for {waiting}: the field was never steady for '
                 f'{settings.calibrate.learn_s:g} s (calibrate.learn_s); give background and '

@@ -25,6 +25,7 @@ from mag_tracking.calibration.blocks import (
     stacked,
 )
 from mag_tracking.calibration.resolution import (
+    LEAST_STD,
     apply_steps,
     completed_steps,
     corrected_steps,
@@ -37,9 +38,6 @@ it, as it can within the long blocks of a slow sensor. Noise and coarse steps st
 
 RESUMED_RELEARN_S = 10.0
 """[s] What was resumed gives way to another steady level after so long, whatever `relearn` is."""
-
-LEAST_STD = 1e-11
-"""[T] An axis that scatters less has not changed at all."""
 
 _Line: TypeAlias = tuple[float, FloatArray, FloatArray, float]
 """Centre [s], mean (3,) [T], slope (3,) [T/s] and horizon [s]."""

@@ -18,6 +18,9 @@ DITHERED = 0.3
 """Noise of a larger variance, in squared steps, carries a reading over several steps, and averaging
 works. A reading that toggles between two steps has a variance of 0.25 at most."""
 
+LEAST_STD = 1e-11
+"""[T] An axis that scatters less has not changed at all."""
+
 TOGGLE = 1.2
 """[steps] An axis that rests on one value may rest on the next one a moment later."""
 
@@ -189,6 +192,10 @@ def apply_steps(sensors: StructArray, freeze_std: float, limits: FloatArray) -> 
     for a in range(3):
         variance[a] = s.noise[a, a]
     _corrected_steps(s, steps)
+    for a in range(3):
+        # An axis without any noise rests, also where it has moved with a target since.
+        if steps[a] == 0.0 and variance[a] <= LEAST_STD**2:
+            steps[a] = max(s.step[0], s.step[1], s.step[2])
     _complete(variance, steps)
     for a in range(3):
         rests = np.isfinite(steps[a]) and _rests(variance[a], steps[a])

@@ -83,8 +83,10 @@ def line_of(event: PassEvent) -> str:
     p = event.left_to_right
     way = f'left to right ({p:.0%})' if p > 0.9 else f'right to left ({1.0 - p:.0%})' \
         if p < 0.1 else 'direction unknown'
-    sure = f' ± {event.closest_std:.2f} s' if np.isfinite(event.closest_std) else ''
-    return (f'{event.sensor} {event.number}: closest {at:%H:%M:%S}.{at.microsecond // 10000:02d}'
-            f'{sure}, {(event.release_ns - event.onset_ns) / NS:.2f} s, peak '
+    time = f'{at:%H:%M:%S}.{at.microsecond // 10000:02d}'
+    closest = f'closest {time} ± {event.closest_std:.2f} s' if np.isfinite(event.closest_std) \
+        else f'loudest {time}, closest point unknown'
+    lasted = (event.release_ns - event.onset_ns) / NS
+    return (f'{event.sensor} {event.number}: {closest}, lasted {lasted:.2f} s, peak '
             f'{1e9 * np.sqrt(np.nansum(event.peak**2)):.0f} nT on {event.axes}, {way}'
             + ('' if event.ended else ', not ended'))

@@ -144,8 +144,8 @@ def decode(message: _Raw) -> SimpleNamespace:
             _decoders[key] = DecoderFactory().decoder_for('cdr', message.schema)
         decoder = _decoders[key]
         if decoder is None:
-            raise ValueError(f'its schema is in {message.schema.encoding or "no language"}, not '
-                             'in ros2msg')
+            raise ValueError(f'it has no ros2msg schema (encoding '
+                             f'{message.schema.encoding!r})')
         return decoder(message.data)
     except _DECODE_ERRORS as error:
         raise RecordingError(f'a message on {message.topic} is not a {message.type}: '

@@ -111,6 +111,6 @@ def _files(path: Path) -> list[Path]:
         if not file.exists():
             raise RecordingError(f'{file}, which metadata.yaml names, is not there')
         if file.suffix not in SUFFIXES:
-            raise RecordingError(f'{file} is none of {", ".join(SUFFIXES)}: decompress it first, '
-                                 'or convert it with `ros2 bag convert`')
+            raise RecordingError(f'{file} has none of the suffixes {", ".join(SUFFIXES)}: '
+                                 'decompress it, or convert it with `ros2 bag convert`')
     return files

@@ -1,1 +1,1 @@
-"""Events: what each sensor alone tells of a target that passes."""
+"""Events: passes described by each sensor alone."""

@@ -10,5 +10,5 @@ class EventsSettings:
     """Settings of the events."""
 
     most_sensors: int = param(
-        16, 'Nodes: in networks of at most so many sensors detection_node describes what passes '
+        4, 'Nodes: in networks of at most so many sensors detection_node describes what passes '
         'each sensor on ~/events; 0 = never.', '', (0, 1000))

@@ -1,13 +1,14 @@
-"""What one sensor tells of a pass without any scale: when, how quickly, and which way."""
+"""Closest point and direction of a pass from one sensor, without any scale."""
 
 from typing import NamedTuple
 
 import numpy as np
+from numba import float64, njit
 from scipy.optimize import minimize
 from scipy.special import log_ndtr, ndtr
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.physics.anderson import anderson_functions
+from mag_tracking.records import plain
 
 MOST_SAMPLES = 200
 """A pass is averaged to so many samples before the closest point is sought."""
@@ -34,11 +35,11 @@ class ClosestPoint(NamedTuple):
     """The closest point of a pass, seen by one sensor."""
 
     time: float
-    """[s]"""
+    """[s] that of the largest field where the pass does not tell."""
     time_std: float
     """[s] inf where the pass does not tell."""
     time_scale: float
-    """[s] Range at the closest point over the speed."""
+    """[s] Range at the closest point over the speed; NaN where the pass does not tell."""
 
 
 def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> ClosestPoint:
@@ -68,9 +69,11 @@ def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> Cl
     t, y = t[whole], field[whole][:, there] / noise_std[there]
     if len(t):
         t, y = _averaged(t, y)
+    t, y = plain(t), plain(y)
     span = float(t[-1] - t[0]) if len(t) else 0.0
     if len(t) < 8 or not span > 0.0:
         return ClosestPoint(float(t.mean()) if len(t) else np.nan, np.inf, np.nan)
+    loudest = float(t[np.argmax(np.sum(y**2, axis=1))])
     interval = span / (len(t) - 1)
     starts = sorted((_cost(t, y, time, scale), time, scale)
                     for scale in np.geomspace(1.5 * interval, span, 24).tolist()
@@ -90,8 +93,8 @@ def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> Cl
     curvature = (_cost(t, y, time + step, scale) + _cost(t, y, time - step, scale)
                  - 2.0 * found.fun) / step**2
     std = np.sqrt(2.0 * left * alike / curvature) if curvature > 0.0 else np.inf
-    if not t[0] <= time <= t[-1]:
-        std = np.inf
+    if not (t[0] <= time <= t[-1] and scale <= span and np.isfinite(std)):
+        return ClosestPoint(loudest, np.inf, np.nan)
     return ClosestPoint(time, float(np.hypot(std, OFF_CENTRE * scale)), scale)
 
 
@@ -102,11 +105,52 @@ def _averaged(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return t[:k * n].reshape(k, n).mean(axis=1), y[:k * n].reshape(k, n, -1).mean(axis=1)
 
 
+@njit(float64(float64[::1], float64[:, ::1], float64, float64), cache=True)
 def _cost(t: FloatArray, y: FloatArray, time: float, scale: float) -> float:
-    """Sum of squares of (n, k) `y` that a pass with this time and time scale leaves over."""
-    basis = np.column_stack([anderson_functions((t - time) / scale), np.ones(len(t))])
-    q, _ = np.linalg.qr(basis)
-    return float(np.sum(y**2) - np.sum((q.T @ y)**2))
+    """Sum of squares of (n, k) `y` that a pass with this time and time scale leaves over.
+
+    `physics.anderson` has the functions; here they are made orthogonal one after the other, with a
+    constant.
+    """
+    n = len(t)
+    basis = np.empty((4, n))
+    for i in range(n):
+        tau = (t[i] - time) / scale
+        cosine = 1.0 / np.sqrt(tau * tau + 1.0)
+        sine = tau * cosine
+        basis[0, i] = 1.0
+        basis[1, i] = cosine**5
+        basis[2, i] = sine * cosine**4
+        basis[3, i] = sine**2 * cosine**3
+    left = 0.0
+    for i in range(n):
+        for k in range(y.shape[1]):
+            left += y[i, k]**2
+    for m in range(4):
+        size = 0.0
+        for i in range(n):
+            size += basis[m, i]**2
+        # Twice: once leaves what rounding adds.
+        for _ in range(2):
+            for earlier in range(m):
+                along = 0.0
+                for i in range(n):
+                    along += basis[m, i] * basis[earlier, i]
+                for i in range(n):
+                    basis[m, i] -= along * basis[earlier, i]
+        rest = 0.0
+        for i in range(n):
+            rest += basis[m, i]**2
+        # A function that the others make up adds nothing.
+        factor = 1.0 / np.sqrt(rest) if rest > 1e-20 * size else 0.0
+        for i in range(n):
+            basis[m, i] *= factor
+        for k in range(y.shape[1]):
+            along = 0.0
+            for i in range(n):
+                along += basis[m, i] * y[i, k]
+            left -= along**2
+    return left
 
 
 def turning(field: FloatArray, noise_std: float, n_quiet: int) -> tuple[float, float]:

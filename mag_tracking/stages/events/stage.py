@@ -1,4 +1,4 @@
-"""Events: calibrated readings to what each sensor alone tells of a target that passes."""
+"""Events: passes described by each sensor alone, from its calibrated readings."""
 
 from collections import Counter, deque
 
@@ -17,6 +17,9 @@ from mag_tracking.units import NS
 PAD_S = 1.0
 """[s] Before an onset and after the last loud frame, where the sensor is without the target."""
 
+UPRIGHT = 0.2
+"""Share of the vertical field that a tilted horizontal axis may miss."""
+
 LONGEST_S = 120.0
 """[s] Of a longer detection, the latest readings are described."""
 
@@ -27,7 +30,8 @@ SIGNATURE_POINTS = 33
 class Events:
     """Calibrated `Readings` to `PassEvent`s, one for each detection by each sensor.
 
-    Nothing is said in metres: one sensor does not tell the scale.
+    Those that one batch completes come sensor by sensor. Nothing is in metres: a single sensor
+    cannot observe the scale.
     """
 
     def __init__(self, network: SensorNetwork, align: AlignSettings,
@@ -43,15 +47,14 @@ class Events:
         out: list[PassEvent] = []
         for j in np.unique(rows[rows >= 0]).tolist():
             out += self._sensors[j].feed(readings.part(rows == j))
-        return sorted(out, key=lambda event: event.release_ns)
+        return out
 
     def idle(self) -> None:
         """Nothing waits."""
 
     def flush(self) -> list[PassEvent]:
         """The events that have not ended."""
-        return sorted((event for s in self._sensors for event in s.flush()),
-                      key=lambda event: event.release_ns)
+        return [event for s in self._sensors for event in s.flush()]
 
 
 class _SensorEvents:
@@ -60,14 +63,34 @@ class _SensorEvents:
     def __init__(self, network: SensorNetwork, align: AlignSettings, detect: DetectSettings,
                  counts: 'Counter[str]') -> None:
         self._name, self._R_ws = network.names[0], network.R_ws[0]
-        self._align, self._detect = Align(network, align), Detect(network, detect)
+        self._network, self._settings = network, (align, detect)
         self._hold_ns, self._counts = int(detect.hold_s * NS), counts
+        self._n = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        """Without any reading."""
+        self._align = Align(self._network, self._settings[0])
+        self._detect = Detect(self._network, self._settings[1])
         self._kept: deque[Readings] = deque()
         self._onset_ns: int | None = None
-        self._n = 0
 
     def feed(self, readings: Readings) -> list[PassEvent]:
         """Readings of this sensor give the events that they complete."""
+        last = self._kept[-1].stamp_ns[-1:] if self._kept else readings.stamp_ns[:0]
+        back = np.flatnonzero(np.diff(np.concatenate([last, readings.stamp_ns])) < 0)
+        first, out = 0, []
+        for k in (back + 1 - len(last)).tolist():
+            # A looped recording: what was kept is of another time.
+            out += [*self._feed(readings.part(slice(first, k))), *self.flush()]
+            self._begin()
+            first = k
+        return out + self._feed(readings.part(slice(first, None)))
+
+    def _feed(self, readings: Readings) -> list[PassEvent]:
+        """`feed` of readings in order of time."""
+        if not len(readings):
+            return []
         self._kept.append(readings)
         out: list[PassEvent] = []
         for frame in self._align.feed(readings):
@@ -76,7 +99,7 @@ class _SensorEvents:
                     out += self._at(record)
             begin = frame.stamp_ns if self._onset_ns is None else \
                 max(self._onset_ns, frame.stamp_ns - int(LONGEST_S * NS))
-            while self._kept[0].stamp_ns[-1] < begin - 2 * PAD_S * NS:
+            while self._kept[0].stamp_ns[-1] < begin - (2 * PAD_S * NS + self._hold_ns):
                 self._kept.popleft()
         return out
 
@@ -105,7 +128,8 @@ class _SensorEvents:
         assert onset_ns is not None
         readings = Readings.joined(self._kept)
         pad = int(PAD_S * NS)
-        readings = readings.part((onset_ns - pad <= readings.stamp_ns)
+        begin_ns = max(onset_ns, release_ns - int(LONGEST_S * NS)) - pad
+        readings = readings.part((begin_ns <= readings.stamp_ns)
                                  & (readings.stamp_ns <= release_ns + pad))
         if not len(readings) or np.isnan(readings.field).all():
             return []
@@ -124,7 +148,7 @@ class _SensorEvents:
         inside = (onset_ns <= stamp) & (stamp <= release_ns)
         there = ~np.all(np.isnan(field), axis=0)
         closest = closest_point(t, field, noise)
-        horizontal = (field @ self._R_ws.T)[:, :2]
+        horizontal = _horizontal(field, self._R_ws)
         known = ~np.isnan(horizontal).any(axis=1)
         _, left = turning(horizontal[known], float(np.nanmean(noise)) if known.any() else 0.0,
                           int(np.count_nonzero(stamp < onset_ns)))
@@ -134,6 +158,20 @@ class _SensorEvents:
             ''.join(np.array(list('xyz'))[there]), noise,
             onset_ns + int(round(closest.time * NS)), closest.time_std, closest.time_scale, left,
             _signature(t, field, closest.time, closest.time_scale))
+
+
+def _horizontal(field: FloatArray, R_ws: FloatArray) -> FloatArray:
+    """(n, 2) [T] horizontal parts in the world of `field` (n, 3) [T]; NaN where they are not known.
+
+    A missing axis that is nearly vertical matters little.
+    """
+    out: FloatArray = np.zeros((len(field), 2))
+    for a in range(3):
+        missing = np.isnan(field[:, a])
+        for b in range(2):
+            part = R_ws[b, a] * field[:, a]
+            out[:, b] += np.where(missing, 0.0 if abs(R_ws[b, a]) < UPRIGHT else np.nan, part)
+    return out
 
 
 def _noise_of(readings: Readings) -> FloatArray:

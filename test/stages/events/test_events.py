@@ -12,7 +12,7 @@ from mag_tracking.messages.schema import pass_event_dict
 from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.event_tables import EVENT_COLUMNS
-from mag_tracking.records import PassEvent
+from mag_tracking.records import PassEvent, Readings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.events.single_sensor_pass import MOST_SURE, closest_point, turning
 from mag_tracking.stages.events.stage import Events
@@ -169,9 +169,66 @@ def test_the_events_do_not_depend_on_the_batches():
     whole = events_of(readings)
     for size in (1, 37, 1000):
         parts = events_of(readings, batch=size)
-        for a, b in zip(whole, sorted(parts, key=lambda e: e.release_ns), strict=True):
+        for a, b in zip(*(sorted(events, key=lambda e: e.sensor) for events in (whole, parts)),
+                        strict=True):
             for field in dataclasses.fields(PassEvent):
                 np.testing.assert_array_equal(getattr(a, field.name), getattr(b, field.name))
+
+
+@pytest.mark.parametrize('size', [1, 256, 10**6])
+def test_a_looped_recording_gives_each_event_again(size):
+    readings = recorded('straight_car_right').readings
+    whole = {e.sensor: e for e in events_of(readings)}
+    # The loop is cut while the car is there.
+    t = (readings.stamp_ns - readings.stamp_ns[0]) / 1e9
+    joined = Readings.joined([readings, readings.part(t < 8.6), readings])
+    events = events_of(joined, batch=size)
+    for name, event in whole.items():
+        mine = [e for e in events if e.sensor == name]
+        assert [e.ended for e in mine] == [True, False, True]
+        assert mine[0].left_to_right == event.left_to_right
+        assert mine[0].energy == pytest.approx(event.energy)
+        assert mine[2].left_to_right == event.left_to_right
+        assert mine[1].release_ns > mine[1].onset_ns and mine[1].energy > 0.0
+
+
+@pytest.mark.parametrize('name', studied(VEHICLES, kept=('straight_car_right',)))
+def test_two_horizontal_axes_tell_the_direction(name):
+    events = events_of(spoiler.only_axes('xy')(recorded(name).readings))
+    for event in events:
+        assert event.axes == 'xy'
+        if event.number == 1:
+            assert (event.left_to_right > 0.5) == truth_of(name, event.sensor)[1]
+    assert {e.sensor for e in events} == {'mag_1', 'mag_2'}
+    assert any(abs(e.left_to_right - 0.5) > 0.4 for e in events)
+
+
+def test_a_long_event_does_not_depend_on_the_batches():
+    """A target that stands there for 170 s."""
+    rng, n = np.random.default_rng(0), 20 * 220
+    t = np.arange(n) / 20.0
+    size = 1e-6 / ((1.0 + np.exp(-np.clip((t - 20.0) / 0.3, -50, 50))) * (
+        1.0 + np.exp(np.clip((t - 190.0) / 0.3, -50, 50))))
+    field = np.array([2e-6, 1.5e-5, -4.9e-5]) + size[:, None] + 1e-8 * rng.standard_normal((n, 3))
+    readings = mt.readings_from_arrays(['mag_1'] * n, (t * 1e9).astype(np.int64), field)
+    one = NETWORK.part(np.array([0]))
+    found = [events_of(readings, one, batch) for batch in (1, 100, n)]
+    for events in found[1:]:
+        assert len(events) == len(found[0])
+        for a, b in zip(events, found[0], strict=True):
+            assert a.energy == b.energy and a.closest_ns == b.closest_ns
+
+
+def test_what_is_no_pass_has_no_closest_point():
+    """A step of the field; and noise."""
+    t = np.linspace(0.0, 10.0, 200)
+    step = 1e-6 * (t > 5.0)[:, None] * np.ones(3)
+    for field in (step, 1e-8 * np.random.default_rng(0).standard_normal((200, 3))):
+        found = closest_point(t, field + 1e-9 * np.random.default_rng(1).standard_normal((200, 3)),
+                              np.full(3, 1e-9))
+        assert t[0] <= found.time <= t[-1]
+        assert np.isinf(found.time_std) == np.isnan(found.time_scale)
+        assert np.isnan(found.time_scale) or found.time_scale <= 10.0
 
 
 def test_a_target_that_stays_is_an_event_that_has_not_ended():
