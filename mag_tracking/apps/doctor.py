@@ -109,7 +109,11 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
     backgrounds that were taken anew are no news.
     """
     background, last = calibrate.backgrounds()[name], calibrate.last_stamp_ns(name)
-    if last is not None and not background.ready:
+    if last is not None and not background.ready and background.stuck:
+        yield Finding(True, name, 'its readings do not change, and it is not used', 'it hangs, or '
+                      'its steps are coarser than all that it felt: move something of iron beside '
+                      'it; with background and noise_std in the network file it is used')
+    elif last is not None and not background.ready:
         yield Finding(True, name, 'no background was learnt', 'begin without a target for a few '
                       'seconds, or give background and noise_std in the network file')
     if background.n_relearnt > n_known:
