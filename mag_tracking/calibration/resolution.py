@@ -5,7 +5,7 @@ step. Averaging does not remove that error, and a reading that repeats the one b
 """
 
 import numpy as np
-from numba import boolean, float64, njit, void
+from numba import float64, njit, void
 
 from mag_tracking.arrays import FloatArray, Record, StructArray
 from mag_tracking.calibration.sensor_state import SENSORS
@@ -122,7 +122,7 @@ def corrected_steps(sensors: StructArray) -> FloatArray:
     return out
 
 
-@njit(float64[::1](SENSORS), cache=True)
+@njit(cache=True)
 def raw_steps(sensors: StructArray) -> FloatArray:
     """As `corrected_steps`, before the correction."""
     out = np.empty(3)
@@ -131,13 +131,13 @@ def raw_steps(sensors: StructArray) -> FloatArray:
     return out
 
 
-@njit(boolean(float64, float64), cache=True)
+@njit(cache=True)
 def _rests(variance: float, step: float) -> bool:
     """Whether a step [T] is larger than a noise of this variance [T^2], which may be NaN."""
     return bool(variance <= DITHERED * step**2)
 
 
-@njit(void(float64[::1], float64[::1]), cache=True)
+@njit(cache=True)
 def _complete(variance: FloatArray, steps: FloatArray) -> None:
     """`completed_steps`, in place."""
     largest, is_known = 0.0, False
