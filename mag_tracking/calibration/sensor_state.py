@@ -31,10 +31,11 @@ SENSOR = np.dtype([
     ('last', np.float64, 3), ('run', np.int64), ('repeats', np.float64), ('changes', np.float64),
     # Resolution (`resolution`): the latest value of each raw axis, since when it rests on it and
     # for how many readings, how often it stayed the same or changed, its smallest change, and the
-    # variance of what the steps add.
+    # variance of what the steps add; how many readings a decimated one is of.
     ('raw', np.float64, 3), ('rest_since_ns', np.int64, 3), ('n_rest', np.int64, 3),
     ('n_same', np.int64, 3), ('n_changed', np.int64, 3),
     ('step', np.float64, 3), ('step_variance', np.float64, 3),
+    ('n_averaged', np.float64),
     # Covariances of the messages: the latest standard deviations, and how many were overruled.
     ('stated_std', np.float64, 3), ('n_overruled', np.int64),
     # Spikes: the latest reading that passed, the differences before it, and the readings that are
@@ -68,5 +69,5 @@ def new_sensors(n: int) -> StructArray:
         sensors[name] = NEVER
     for name in ('last', 'before', 'end', 'noise_std', 'noise', 'raw', 'stated_std'):
         sensors[name] = np.nan
-    sensors['step'] = np.inf
+    sensors['step'], sensors['n_averaged'] = np.inf, 1.0
     return sensors

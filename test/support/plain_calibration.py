@@ -207,6 +207,7 @@ class PlainCalibration:
                                    else s.covariance * decimator.noise_gain())
                          for stamp, field in decimator.feed(s.stamp_ns, s.field)]
                 self.counts['thinned out'] += 1 - len(found)
+                self.backgrounds[s.sensor].sensors[0]['n_averaged'] = decimator.factor or 1
             out += [c for f in found for c in self.calibrated(f)]
         return out
 
@@ -249,7 +250,7 @@ class PlainCalibration:
                 self.counts['covariances of messages overruled by the measured noise'] += 1
                 own = None
         C = noise - np.diag(s['step_variance']) if own is None else own
-        return C + np.diag(s['step_variance'] * s['n_rest'])
+        return C + np.diag(s['step_variance'] * s['n_rest'] / s['n_averaged'])
 
     def flush(self):
         held = [h for s in self.spikes.values() for h, _ in s.held]

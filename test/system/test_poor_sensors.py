@@ -3,6 +3,8 @@
 The table of every recording is a study; `make test` has one or two of each kind. Limits are aims.
 """
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -81,6 +83,13 @@ def test_the_direction_is_right_through_coarse_steps(step, directions, request):
     print(f'steps of {1e6 * step:g} uT: direction right {right} of {len(found)}, median NEES an '
           f'axis {nees:.2f}')
     assert right >= directions and nees <= 3.0
+
+
+@pytest.mark.parametrize('changes', [{}, {'calibrate.decimate_to_hz': 20.0}])
+def test_the_covariance_is_honest_through_coarse_steps(changes):
+    readings = spoiler.steps(1e-7)(recorded(CAR).readings)
+    source = dataclasses.replace(recorded(CAR), readings=readings)
+    assert mt.track(source, NETWORK_FILE, settings=changes).errors()['anees'] <= 3.0
 
 
 @pytest.mark.parametrize('name', studied(VEHICLES, kept=(CAR, TURN)))

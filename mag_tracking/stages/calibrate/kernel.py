@@ -195,7 +195,7 @@ def _attach_covariance(s: Record, limits: Record, batch: Record, own: int,
         for b in range(3):
             out[a, b] = covariance[a, b] if own else s.noise[a, b]
         if not (own and limits.trust_covariances):
-            out[a, a] += s.step_variance[a] * rest_of(s, a)
+            out[a, a] += s.step_variance[a] * rest_of(s, a) / s.n_averaged
 
 
 @njit(cache=True)

@@ -198,6 +198,7 @@ class Calibrate:
             decimator = self._decimators[name]
             found = decimator.feed(stamp, field)
             self.counts['thinned out'] += 1 - len(found)
+            s['n_averaged'] = decimator.factor or 1
             for stamp, field in found:
                 self._use(i, stamp, field, own, covariance * decimator.noise_gain(), out)
         s['n_held'] = s['n_released'] = 0
