@@ -174,7 +174,7 @@ class PassEvent:
 
     sensor: str
     number: int
-    """Of the events of this sensor, from 1."""
+    """Counts the events of this sensor, from 1."""
     ended: bool
     """The target was gone again; else the readings ended before."""
     onset_ns: int

@@ -1,5 +1,6 @@
 """What is wrong with a network and its readings: what `mag-tracking doctor` finds."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
@@ -37,7 +38,7 @@ _ADVICE = (
     ('undecodable', 'the recording is damaged, or its type is another'))
 
 MISSED = 3
-"""Targets that other sensors felt while a reading stayed the same."""
+"""Targets that another sensor felt while a reading stayed the same, at least."""
 
 LEVEL_STEP = 1e-8
 """[T] A fiftieth of what iron near a sensor adds."""
@@ -128,33 +129,29 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
 
 
 class MissedTargets:
-    """Sensors whose readings stay the same while others feel targets."""
+    """Counts, for each sensor, the targets of another one during which its reading stays the same.
+    """
 
     def __init__(self, names: tuple[str, ...]) -> None:
-        self._missed = dict.fromkeys(names, 0)
-        self._since_ns: dict[str, int] = {}
+        self._missed: dict[str, Counter[str]] = {name: Counter() for name in names}
 
-    def take(self, name: str, is_frozen: bool, stamp_ns: int,
-             sensors: Mapping[str, SensorHealth]) -> None:
-        """Note whether sensor `name` feels a target; when that ends, look at the others."""
-        if is_frozen:
-            self._since_ns.setdefault(name, stamp_ns)
-            return
-        begin_ns = self._since_ns.pop(name, None)
-        if begin_ns is None:
-            return
+    def end(self, name: str, begin_ns: int, sensors: Mapping[str, SensorHealth]) -> None:
+        """Take a target that sensor `name` felt from `begin_ns` until now."""
         for other, health in sensors.items():
             since_ns = health.unchanged_since_ns
-            is_same = since_ns is not None and since_ns < begin_ns
-            self._missed[other] = self._missed[other] + 1 if is_same else 0
+            if since_ns is not None and since_ns < begin_ns:
+                self._missed[other][name] += 1
+            else:
+                self._missed[other].clear()
 
     def findings(self) -> Iterator[Finding]:
         """`Finding` of each sensor that missed several targets in succession."""
-        for name, n in self._missed.items():
-            if n >= MISSED:
-                yield Finding(True, name, f'its readings did not change while other sensors felt '
-                              f'{n} targets', 'it hangs, is too far away, or its steps are too '
-                              'coarse: move something of iron beside it')
+        for name, missed in self._missed.items():
+            for other, n in missed.most_common(1):
+                if n >= MISSED:
+                    yield Finding(True, name, f'its readings did not change while {other} felt {n} '
+                                  'targets', 'it hangs, is too far away, or its steps are too '
+                                  'coarse: move something of iron beside it')
 
 
 class Doctor:
@@ -176,11 +173,10 @@ class Doctor:
         self.calibrate.feed(readings)
         backgrounds = self.calibrate.backgrounds()
         for name, stamp in zip(names, stamps, strict=True):
-            self._missed.take(name, backgrounds[name].frozen, stamp, self.sensors)
             if backgrounds[name].frozen:
                 self._frozen_ns.setdefault(name, stamp)
-            else:
-                self._frozen_ns.pop(name, None)
+            elif (begin_ns := self._frozen_ns.pop(name, None)) is not None:
+                self._missed.end(name, begin_ns, self.sensors)
 
     def findings(self) -> list[Finding]:
         """List of `Finding`, the serious ones first."""

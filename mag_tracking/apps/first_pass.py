@@ -29,7 +29,7 @@ FEW = 8
 
 @dataclass(frozen=True)
 class FirstPass:
-    """What a first pass over a recording found."""
+    """Backgrounds and steps that a first pass over a recording found."""
 
     levels: dict[str, QuietLevel]
     """{sensor: most frequent level}; empty where the beginning is quiet."""

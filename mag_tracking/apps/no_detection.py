@@ -70,8 +70,8 @@ def _obstacle(network: SensorNetwork, settings: Settings, calibrate: Calibrate,
     if settings.calibrate.trust_covariances:
         return ('the covariances of the messages are taken as they are '
                 '(calibrate.trust_covariances)')
-    quietest = min(float(np.nanmin(b.scatter_std)) for b in calibrate.backgrounds().values()
-                   if not np.isnan(b.scatter_std).all())
+    scatters = np.concatenate([b.scatter_std for b in calibrate.backgrounds().values()])
+    quietest = float(np.min(scatters, where=~np.isnan(scatters), initial=np.inf))
     if settings.detect.background_std > TOO_LARGE * quietest:
         return (f'detect.background_std ({settings.detect.background_std:.2g} T) is larger than '
                 f'the noise of a reading ({quietest:.2g} T)')

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from mag_tracking.analysis.consistency import error_over_bound
-from mag_tracking.apps.first_pass import first_pass_of
+from mag_tracking.apps.first_pass import FirstPass, first_pass_of
 from mag_tracking.apps.no_detection import why_no_detection
 from mag_tracking.errors import OutputError
 from mag_tracking.network import SensorNetwork
@@ -101,9 +101,7 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
             interrupted = True
         taker.take(pipeline.flush())
         truth = reader.truth_arrays()
-        summary = summarise(recording, reader, pipeline, taker, truth)
-        for name, entry in summary['sensors'].items():
-            entry['quiet_stretch_s'] = found.stretch_of(name)
+        summary = summarise(recording, reader, pipeline, taker, truth, found)
         summary['interrupted'] = interrupted
         results.write_summary(summary)
     return Run(summary, taker.logs, taker.smoothed, truth)
@@ -149,7 +147,8 @@ class RunCollector:
 
 
 def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
-              taker: RunCollector, truth: Mapping[str, Truth]) -> dict[str, Any]:
+              taker: RunCollector, truth: Mapping[str, Truth],
+              found: FirstPass) -> dict[str, Any]:
     """The content of `summary.json`."""
     rejections = dict(reader.rejected + Counter(pipeline.rejections()))
     sensors: dict[str, dict[str, Any]] = {}
@@ -157,7 +156,8 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
         counts = pipeline.calibrate.counts_of(name)
         sensors[name] = {'accepted': counts['accepted'], 'rejected': counts['rejected'],
                          'ready': background.ready, 'stuck': background.stuck,
-                         'times_relearnt': background.n_relearnt}
+                         'times_relearnt': background.n_relearnt,
+                         'quiet_stretch_s': found.stretch_of(name)}
         covariance = background.covariance
         if background.ready and covariance is not None and counts['accepted']:
             std = np.sqrt(np.diagonal(covariance))

@@ -39,7 +39,7 @@ FOLLOWING = 0.3
 """A level that drifts is that of the latest blocks, each with this share."""
 
 MOST_BLOCKS = 4000
-"""Of a longer recording an even selection of blocks is compared."""
+"""In a longer recording, an even selection of blocks is compared."""
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.calibration.screening import COARSE
 
 LEAST_RUN = 3
 """So many equal readings in a row at an extreme are cut off ..."""
@@ -15,9 +16,6 @@ MARGIN = 6
 """Readings so near in time to one that is cut off are not to be trusted either: noise took some of
 their neighbours over the limit, and what is left of them is on one side of the truth."""
 
-
-COARSE = 0.05
-"""An axis that repeats itself more often, apart from the extreme, has coarse steps."""
 
 ISOLATED = 10.0
 """A reading that differs from both its neighbours by so many times what they differ from each

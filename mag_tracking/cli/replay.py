@@ -134,7 +134,7 @@ def _print_summary(path: Path, summary: dict[str, Any]) -> None:
 
 
 def _print_limits(summary: dict[str, Any]) -> None:
-    """What the tracks do not tell, and why."""
+    """Print the limits of the tracks and their causes."""
     counts = summary['counts']['track']
     if counts.get(NO_SCALE, 0):
         print('  no track: one sensor does not tell the scale. `mag-tracking events` describes '

@@ -1,4 +1,4 @@
-"""Magnetic fields in JSON or protobuf messages, whose schema says what is in them.
+"""Magnetic fields in JSON or protobuf messages, which their schema describes.
 
 Such messages come from Foxglove's tools and from programs without ROS. A message is a magnetic
 field where it has `magnetic_field` with x, y and z [T], and a time in `header.stamp`, `stamp` or
@@ -41,7 +41,7 @@ def cdr_of(schema: Schema, data: bytes) -> bytes:
 
 @functools.cache
 def bad_bytes() -> tuple[type[Exception], ...]:
-    """What bytes that are no such message lead to."""
+    """Exceptions that invalid message bytes cause."""
     # Most recordings are CDR, and should not wait for another library.
     from google.protobuf.message import DecodeError
 

@@ -107,7 +107,7 @@ class BagFile:
 
 @functools.cache
 def bag_errors() -> tuple[type[Exception], ...]:
-    """What the library raises on bags that are damaged, or are none."""
+    """Exceptions that the library raises on damaged or invalid bags."""
     import apsw
     from rosbags.rosbag1 import ReaderError as Ros1Error
     from rosbags.rosbag2 import ReaderError

@@ -59,8 +59,8 @@ def parse_columns(texts: Sequence[str]) -> tuple[str, str | None, _Axes]:
     for key, column in found.items():
         name, _, axis = key.rpartition('.')
         if axis not in ('x', 'y', 'z') or bool(name) == (sensor is not None):
-            raise RecordingError(f'columns: {key!r} is none of time, sensor, x, y, z (with sensor) '
-                                 'or NAME.x, NAME.y, NAME.z (without)')
+            raise RecordingError('columns: expected time, sensor, x, y, z, or without sensor '
+                                 f'time, NAME.x, NAME.y, NAME.z; got {key!r}')
         axes.setdefault(_sensor_name(name, 'columns') if name else '', {})[axis] = column
     if time is None or not axes:
         raise RecordingError('columns: time and at least one axis are needed, such as time=t '

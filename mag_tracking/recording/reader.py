@@ -18,7 +18,7 @@ from mag_tracking.recording.mcap_file import McapFile
 from mag_tracking.recording.raw_message import RawMessage
 
 SUFFIXES = ('.mcap', *BAG_SUFFIXES)
-"""Of the files that can be read."""
+"""Suffixes of readable files."""
 
 
 class Recording:

@@ -57,6 +57,14 @@ def test_another_unit_is_named():
     assert 'no reading could be used: 2800 were rejected (above 0.001 T' in said
 
 
+def test_given_backgrounds_that_were_not_compared_with_readings():
+    """Too few readings for the scatter of any sensor."""
+    given = dataclasses.replace(NETWORK, noise_std=(np.full(3, 1e-8),) * 2, background=tuple(
+        np.median(QUIET.field[np.array(QUIET.sensor_names()) == name], axis=0)
+        for name in NETWORK.names))
+    assert 'of the threshold' in why(network=given, readings=QUIET.part(slice(0, 40)))
+
+
 def test_one_sensor_without_a_background_is_named():
     readings = recorded('straight_small_left').readings
     t = (readings.stamp_ns - readings.stamp_ns[0]) / 1e9

@@ -18,7 +18,7 @@ NETWORK, SETTINGS = line_network(1), CalibrateSettings()
 
 
 def readings(signal, seconds=60.0, rate=50.0, seed=0, step=0.0):
-    """Of one sensor: noise about the Earth's field and `signal(t)` (3,) or a number [T]."""
+    """Readings of one sensor: noise, the Earth's field, and `signal(t)` (3,) or a number [T]."""
     rng, t = np.random.default_rng(seed), np.arange(0.0, seconds, 1.0 / rate)
     fields = [EARTH + signal(s) + SIGMA * rng.standard_normal(3) for s in t]
     if step:

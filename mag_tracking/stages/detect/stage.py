@@ -97,7 +97,7 @@ class Detect:
 
     @property
     def largest_excursion(self) -> float:
-        """Of the whole network, in units of the threshold."""
+        """Largest excursion of the whole network, in units of the threshold."""
         return float(np.sqrt(self._largest_share))
 
     def largest_excursions(self) -> FloatArray:

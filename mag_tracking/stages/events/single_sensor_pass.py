@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import float64, njit
 from scipy.optimize import minimize
-from scipy.special import log_ndtr, ndtr
+from scipy.special import ndtr
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.records import plain
@@ -17,7 +17,7 @@ MOST_STARTS = 5
 """The best points of a grid from which the closest point is sought: one axis has several optima."""
 
 CORRELATED = 2.0
-"""[time scales] What a dipole leaves over of a vehicle stays alike for so long."""
+"""[time scales] Correlation time of the residual of a vehicle that is fitted by a dipole."""
 
 OFF_CENTRE = 0.15
 """[time scales] The magnetic centre of a vehicle is so far from the middle of its body."""
@@ -35,11 +35,11 @@ class ClosestPoint(NamedTuple):
     """The closest point of a pass, seen by one sensor."""
 
     time: float
-    """[s] that of the largest field where the pass does not tell."""
+    """[s]; time of the largest field where the closest point is not determined."""
     time_std: float
-    """[s] inf where the pass does not tell."""
+    """[s]; inf where the closest point is not determined."""
     time_scale: float
-    """[s] Range at the closest point over the speed; NaN where the pass does not tell."""
+    """[s] Range at the closest point over the speed; NaN where it is not determined."""
 
 
 def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> ClosestPoint:
@@ -194,7 +194,5 @@ def turning(field: FloatArray, noise_std: float, n_quiet: int) -> tuple[float, f
     across = field[2 * p:] - field[:-2 * p]
     floor = 2.0 * len(now) / p**2 * noise_std**4
     variance = max(noise_std**2 / p**2 * float(np.sum(across**2)) - floor, floor)
-    # In logarithms: ndtr alone is 0 or 1 where it is sure.
-    probability = float(np.exp(log_ndtr(-f / np.sqrt(variance)))) if f > 0.0 \
-        else float(ndtr(-f / np.sqrt(variance)))
+    probability = float(ndtr(-f / np.sqrt(variance)))
     return f, float(np.clip(probability, 1.0 - MOST_SURE, MOST_SURE))

@@ -69,7 +69,7 @@ class _SensorEvents:
         self._begin()
 
     def _begin(self) -> None:
-        """Without any reading."""
+        """Start without any reading."""
         self._align = Align(self._network, self._settings[0])
         self._detect = Detect(self._network, self._settings[1])
         self._kept: deque[Readings] = deque()

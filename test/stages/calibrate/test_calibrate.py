@@ -168,10 +168,10 @@ def test_covariances():
         np.testing.assert_allclose(out.covariance, 1.44e-16 * np.eye(3))
     assert s.counts[OVERRULED] == 27 and not rejected(s.counts)
     s = stage(trust_covariances=True)
-    for k, C in enumerate(bad):
-        (out,) = fed(s, sample(3.0 + k, covariance=C)) if 4 <= k <= 5 else (None,)
-        assert out is None or np.array_equal(out.covariance, C)
-        assert 4 <= k <= 5 or fed(s, sample(3.0 + k, covariance=C)) == []
+    for k, C in enumerate((100.0 * own, 0.01 * own, made_up)):
+        np.testing.assert_array_equal(fed(s, sample(1.0 + k, covariance=C))[0].covariance, C)
+    for C in (*bad[:4], *bad[6:]):
+        assert fed(s, sample(9.0, covariance=C)) == []
     assert rejected(s.counts) == {'covariance is not positive definite': 24}
 
 
