@@ -32,9 +32,9 @@ board:
 """
 
 
-def line_of(sensor, k, field):
-    """A line of the board: reading k of a sensor [nT], at 100 Hz, lying flat."""
-    body = f'{sensor},{k},{10_000 * k},{field[0]},{field[1]},{field[2]},0,0,1'
+def line_of(sensor, k, tick):
+    """Line k of a sensor, lying flat, at a tick of 10 ms; x [nT] says which tick."""
+    body = f'{sensor},{k},{10_000 * tick},{2000 + tick},15500,-49000,0,0,1'
     checksum = 0
     for c in body.encode():
         checksum ^= c
@@ -43,20 +43,27 @@ def line_of(sensor, k, field):
 
 @pytest.fixture
 def board(ros, tmp_path):
-    """(node, talk, files): a board that speaks at 100 Hz while `talk` waits for a condition."""
+    """(node, talk, files): a board that speaks at 100 Hz while `talk` waits for a condition.
+
+    Its clock goes on while the test's process gets no time to speak.
+    """
     node, spin_until = ros
     line = SerialLine(tmp_path / 'port')
     line.plug_in()
     drivers = tmp_path / 'drivers.yaml'
     drivers.write_text(BOARD.replace('PORT', str(line.path)))
-    state = {'k': 0, 'plugged': True, 'garbage': b'', 'skip': 0}
+    state = {'k': 0, 'tick': 0, 'plugged': True, 'garbage': b'', 'skip': 0}
+    began = time.monotonic()
 
     def speak():
+        tick = int((time.monotonic() - began) / 0.01)
+        if tick == state['tick']:
+            return
         state['k'] += 1 + state['skip']
-        state['skip'] = 0
+        state['tick'], state['skip'] = tick, 0
         if state['plugged']:
             line.send(state['garbage'] + b''.join(
-                line_of(s, state['k'], (2000 + state['k'], 15500, -49000)) for s in 'AB'))
+                line_of(s, state['k'], tick) for s in 'AB'))
             state['garbage'] = b''
 
     node.create_timer(0.01, speak)
@@ -103,12 +110,13 @@ def test_a_board_on_a_serial_line(board):
         _, shaken = accelerations[-1]
         assert shaken.linear_acceleration.z == pytest.approx(9.80665)
         assert shaken.orientation_covariance[0] == -1.0
-        # Stamped by the board's clock: evenly, however late they came; and close to now.
+        # Stamped by the board's clock: evenly, however late they came; and close to now. The
+        # least delay counts, for on a loaded machine readings wait for this process.
         stamps = np.array([stamp_ns(m.header.stamp) for _, m in fields[-80:]])
         steps = np.array([round(1e9 * m.magnetic_field.x) for _, m in fields[-80:]])
         late = np.array([came for came, _ in fields[-80:]]) - stamps
         assert np.abs(np.diff(stamps) / np.diff(steps) - 1e7).max() < 1e6
-        assert 0 <= np.median(late) < 50_000_000
+        assert 0 <= late.min() < 50_000_000
 
         # What is lost or garbled is counted and told.
         state['skip'], state['garbage'] = 7, b'A,1,2,3*00\nA,half a li'
