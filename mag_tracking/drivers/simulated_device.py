@@ -18,7 +18,7 @@ from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.network.file import read_network
 from mag_tracking.network.sensor_network import SensorNetwork
 from mag_tracking.settings import param
-from mag_tracking.simulation.scenario import Path, body_field, random_vehicle
+from mag_tracking.simulation.scenario import Path, random_vehicle
 
 TICK_S = 1e-6
 SHORTEST_WAIT_S = 1e-3
@@ -145,7 +145,7 @@ class SimulatedDevice:
         B = np.zeros((len(t) + 1, len(network), 3))
         for j, shift_s in enumerate(self._shift_s):
             position, heading = self._path.at(t + shift_s)
-            B[:-1, j] = body_field(body, self._earth_field, position, heading,
+            B[:-1, j] = body.field(self._earth_field, position, heading,
                                    network.positions[j:j + 1])[:, 0]
         B_s: FloatArray = np.einsum('njw,jws->njs', B + self._earth_field, network.R_ws)
         return B_s

@@ -7,6 +7,7 @@ target is a cloud of one part.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +16,46 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import MU0, dipole_field
 from mag_tracking.records import Readings
+
+
+class Body(Protocol):
+    """Something magnetic that moves upright over the ground."""
+
+    def field(self, earth_field: FloatArray, position: FloatArray, heading: FloatArray,
+              points: FloatArray) -> FloatArray:
+        """Its field at `points`.
+
+        Parameters
+        ----------
+        earth_field : (3,) [T], world
+        position : (n, 2) [m], heading : (n,) [rad]
+        points : (n_sensors, 3) [m], world
+
+        Returns
+        -------
+        (n, n_sensors, 3) [T], world
+        """
+        ...
+
+
+class Course(Protocol):
+    """Where a body is at any time."""
+
+    def at(self, t: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Position (n, 2) [m] and heading (n,) [rad] at times `t` (n,) [s]."""
+        ...
+
+
+def body_axes(position: FloatArray, heading: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotations (n, 3, 3), body to world, and origins (n, 3) [m] of a body on the ground.
+
+    `position` (n, 2) [m] and `heading` (n,) [rad].
+    """
+    R = np.zeros((len(heading), 3, 3))
+    R[:, 0, 0], R[:, 0, 1] = np.cos(heading), -np.sin(heading)
+    R[:, 1, 0], R[:, 1, 1] = np.sin(heading), np.cos(heading)
+    R[:, 2, 2] = 1.0
+    return R, np.concatenate([position, np.zeros((len(heading), 1))], axis=1)
 
 
 @dataclass(frozen=True)
@@ -27,6 +68,17 @@ class MagneticBody:
     """(n, 3) [A m^2], hard iron of each part."""
     susceptibility: FloatArray
     """(n, 3, 3) [m^3]: induced moment = susceptibility @ B0 / mu0, body frame."""
+
+    def field(self, earth_field: FloatArray, position: FloatArray, heading: FloatArray,
+              points: FloatArray) -> FloatArray:
+        """See `Body.field`."""
+        R, origin = body_axes(position, heading)
+        r = origin[:, None] + np.einsum('nij,pj->npi', R, self.parts)
+        B_body = np.einsum('nji,j->ni', R, earth_field)
+        induced = np.einsum('pij,nj->npi', self.susceptibility, B_body) / MU0
+        m = np.einsum('nij,npj->npi', R, self.permanent + induced)
+        B: FloatArray = dipole_field(points[None, :, None] - r[:, None], m[:, None]).sum(axis=2)
+        return B
 
 
 def point_body(hard_iron: Sequence[float] | FloatArray, soft_iron: float,
@@ -94,34 +146,6 @@ class Path:
         return position, self.heading + angle
 
 
-def body_field(body: MagneticBody, earth_field: FloatArray, position: FloatArray,
-               heading: FloatArray, points: FloatArray) -> FloatArray:
-    """Field of a body at `points`.
-
-    Parameters
-    ----------
-    body : MagneticBody
-    earth_field : (3,) [T], world
-    position : (n, 2) [m], heading : (n,) [rad]
-    points : (n_sensors, 3) [m], world
-
-    Returns
-    -------
-    (n, n_sensors, 3) [T], world
-    """
-    R = np.zeros((len(heading), 3, 3))
-    R[:, 0, 0], R[:, 0, 1] = np.cos(heading), -np.sin(heading)
-    R[:, 1, 0], R[:, 1, 1] = np.sin(heading), np.cos(heading)
-    R[:, 2, 2] = 1.0
-    origin = np.concatenate([position, np.zeros((len(heading), 1))], axis=1)
-    r = origin[:, None] + np.einsum('nij,pj->npi', R, body.parts)
-    B_body = np.einsum('nji,j->ni', R, earth_field)
-    induced = np.einsum('pij,nj->npi', body.susceptibility, B_body) / MU0
-    m = np.einsum('nij,npj->npi', R, body.permanent + induced)
-    B: FloatArray = dipole_field(points[None, :, None] - r[:, None], m[:, None]).sum(axis=2)
-    return B
-
-
 @dataclass(frozen=True)
 class Imperfections:
     """What real sensors add; zeros are perfect sensors."""
@@ -136,9 +160,11 @@ class Imperfections:
     """[rad], per axis: the mounting is off from what the network says."""
     clock_std: float = 0.0
     """[s], constant offset, not for the first sensor."""
+    gain_std: float = 0.0
+    """Of each axis, as a share of 1."""
 
 
-def simulate(network: SensorNetwork, body: MagneticBody, path: Path, rate: float, duration: float,
+def simulate(network: SensorNetwork, body: Body, path: Course, rate: float, duration: float,
              rng: np.random.Generator, imperfections: Imperfections | None = None,
              start_s: float = 0.0) -> tuple[Readings, FloatArray, FloatArray, FloatArray]:
     """Raw readings of every sensor and the truth, for one vehicle.
@@ -147,8 +173,8 @@ def simulate(network: SensorNetwork, body: MagneticBody, path: Path, rate: float
     ----------
     network : SensorNetwork
         With an earth field.
-    body : MagneticBody
-    path : Path
+    body : Body
+    path : Course
     rate : float [Hz]
     duration : float [s]
     rng : numpy.random.Generator
@@ -172,11 +198,13 @@ def simulate(network: SensorNetwork, body: MagneticBody, path: Path, rate: float
     for j in range(len(network)):
         offset = flaws.clock_std * rng.standard_normal() if j else 0.0
         position, heading = path.at(t + offset)
-        B = earth_field + body_field(body, earth_field, position, heading,
+        B = earth_field + body.field(earth_field, position, heading,
                                      network.positions[j:j + 1])[:, 0]
         a, b, c = flaws.tilt_std * rng.standard_normal(3)
         tilt = np.array([[1.0, -c, b], [c, 1.0, -a], [-b, a, 1.0]])
         y = B @ network.R_ws[j] @ tilt
+        if flaws.gain_std:
+            y *= 1.0 + flaws.gain_std * rng.standard_normal(3)
         y += flaws.bias_std * rng.standard_normal(3)
         y += flaws.drift_std * rng.standard_normal(3) * t[:, None]
         y += flaws.noise_std * rng.standard_normal(y.shape)

@@ -15,7 +15,7 @@ from mag_tracking.drivers.simulated_device import (
 )
 from mag_tracking.errors import DeviceError, NetworkError, SettingsError
 from mag_tracking.network.file import read_network
-from mag_tracking.simulation.scenario import Path, body_field, random_vehicle
+from mag_tracking.simulation.scenario import Path, random_vehicle
 from support.bundled import NETWORK_FILE
 
 QUIET = SimulatorSettings(network=str(NETWORK_FILE), rate_hz=50.0, noise=0.0, period_s=12.0,
@@ -55,7 +55,7 @@ def true_field(network, t):
     body = random_vehicle(np.random.default_rng(QUIET.seed), length=QUIET.length,
                           moment=QUIET.moment)
     position, heading = path.at(np.array([t]))
-    return network.earth_field + body_field(body, network.earth_field, position, heading,
+    return network.earth_field + body.field(network.earth_field, position, heading,
                                             network.positions)[0]
 
 

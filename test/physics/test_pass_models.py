@@ -13,7 +13,7 @@ from mag_tracking.physics.anderson import anderson_field
 from mag_tracking.physics.multipole import multipole_moments
 from mag_tracking.physics.pass_expansions import AndersonPass, MultipolePass
 from mag_tracking.physics.passes import RowPass
-from mag_tracking.simulation.scenario import body_field, random_vehicle
+from mag_tracking.simulation.scenario import random_vehicle
 from support.passes import NOISE, measured, network_of
 
 RNG = np.random.default_rng(4)
@@ -66,7 +66,7 @@ def test_multipoles_describe_a_vehicle_better_with_every_order():
     path = np.array([0.0, 0.0, 0.5, 9.0, 0.0, 0.0])
     data = measured(network, path, np.zeros((1, 3)), rng)
     t = data.t[data.sensor == 0]
-    B = body_field(random_vehicle(rng), network.earth_field, np.outer(t, [9.0, 0.0]),
+    B = random_vehicle(rng).field(network.earth_field, np.outer(t, [9.0, 0.0]),
                    np.zeros(len(t)), network.positions)
     data.field[:] += np.concatenate([B[:, 0], B[:, 1]])
     costs = []

@@ -13,7 +13,7 @@ from functools import reduce
 
 import numpy as np
 
-from mag_tracking.simulation.scenario import Path, body_field
+from mag_tracking.simulation.scenario import Path
 from support.mqtt_broker import publish_packet
 
 RATE_HZ = 100.0
@@ -90,8 +90,8 @@ class Roadside:
         self._path = Path(FIRST, 0.0, SPEED)
         self._still = np.einsum('w,jws->js', network.earth_field, network.R_ws)
         position, heading = self._path.at(np.arange(0.0, PASSING_S, 1.0 / RATE_HZ))
-        self._table = self._still + np.einsum('njw,jws->njs', body_field(
-            body, network.earth_field, position, heading, network.positions), network.R_ws)
+        self._table = self._still + np.einsum('njw,jws->njs', body.field(
+            network.earth_field, position, heading, network.positions), network.R_ws)
         self._rng = np.random.default_rng(1)
         self._called, self._start_ns = None, None
         self.plugged, self.twin = True, False

@@ -1,0 +1,173 @@
+"""The second vehicle simulator: uniformly magnetised boxes and plates, by magpylib.
+
+Where the first one scatters magnetised points, this one builds a body of sheets, an engine,
+axles and frame rails, each a cuboid with a permanent magnetisation and an induced one that
+depends on its shape: a sheet is magnetised in its plane, an axle along itself. Its driver brakes
+and swerves, and its sensors have errors of gain. Nothing of it was tuned to what our models can
+describe.
+"""
+
+from dataclasses import dataclass
+
+import magpylib
+import numpy as np
+
+from mag_tracking.physics.dipole import MU0
+from mag_tracking.simulation.scenario import Imperfections, Path, body_axes
+from support.passes import EARTH
+
+BOUGHT = Imperfections(noise_std=1.2e-8, tilt_std=np.deg2rad(1.0), gain_std=0.01)
+"""Sensors as they are bought, mounted with care."""
+
+SHEET = 0.01
+"""[m], thickness of a sheet; the field outside hardly depends on it."""
+
+CHI = 60.0
+"""Apparent susceptibility of iron that no shape demagnetises: parts are not of one piece."""
+
+
+@dataclass(frozen=True)
+class BoxVehicle:
+    """Cuboids in a body frame (x forward, z up), origin on the ground below the middle."""
+
+    centres: np.ndarray
+    """(n, 3) [m]."""
+    sides: np.ndarray
+    """(n, 3) [m]."""
+    permanent: np.ndarray
+    """(n, 3) [A m^2]."""
+    induced: np.ndarray
+    """(n, 3) [m^3]: induced moment = induced * B0 / mu0, body frame."""
+    length: float
+    """[m]."""
+
+    def moments(self, B_body):
+        """(k, n, 3) [A m^2] in ambient fields (k, 3) [T] of the body frame."""
+        return self.permanent + self.induced * B_body[:, None] / MU0
+
+    def field(self, earth_field, position, heading, points):
+        """See `mag_tracking.simulation.scenario.Body`."""
+        R, origin = body_axes(position, heading)
+        m = self.moments(np.einsum('nji,j->ni', R, earth_field))
+        J = MU0 * m / self.sides.prod(axis=1)[:, None]
+        seen = np.einsum('nji,nsj->nsi', R, points[None] - origin[:, None])
+        k, n_points, n = len(heading), len(points), len(self.sides)
+        observers = seen[:, :, None] - self.centres
+        shape = (k, n_points, n, 3)
+        B = magpylib.getB(
+            'Cuboid', observers.reshape(-1, 3),
+            dimension=np.broadcast_to(self.sides, shape).reshape(-1, 3),
+            polarization=np.broadcast_to(J[:, None], shape).reshape(-1, 3))
+        return np.einsum('nij,nsj->nsi', R, B.reshape(shape).sum(axis=2))
+
+
+def _magnetised(rng, parts, length, moment):
+    """A `BoxVehicle` of [(centre, sides, weight)] with a whole moment of `moment` [A m^2].
+
+    That is what real ones were found to have (TSP14 Table V), heading along x in the field of
+    `support.passes.EARTH`; the permanent and the induced part are about `moment` / 1.4 each.
+    """
+    centres, sides, weights = (np.array(column, dtype=float) for column in zip(*parts, strict=True))
+    share = weights * rng.lognormal(0.0, 0.4, len(weights))
+    share /= share.sum()
+    # Roughly: the longer a side, the less the poles at its ends are felt.
+    N = (1.0 / sides) / (1.0 / sides).sum(axis=1, keepdims=True)
+    easy = 1.0 / (N + 1.0 / CHI)
+    easy *= share[:, None] / easy.mean(axis=1, keepdims=True)
+    induced = easy * moment / 1.4 * MU0 / 50e-6
+    while True:
+        common = rng.standard_normal(3)
+        along = common / np.linalg.norm(common) + 0.6 * rng.standard_normal((len(share), 3))
+        permanent = share[:, None] * along * moment / 1.4
+        whole = np.linalg.norm((permanent + induced * EARTH / MU0).sum(axis=0))
+        # Where the two parts nearly cancel each other, scaling them up would not be a vehicle.
+        if whole > 0.6 * moment:
+            return BoxVehicle(centres, sides, permanent * moment / whole,
+                              induced * moment / whole, length)
+
+
+def box_car(rng, length=None, moment=None):
+    """A car: floor, roof, bonnet, boot, sides, engine, two axles."""
+    length = rng.uniform(3.6, 4.8) if length is None else length
+    width, height = rng.uniform(1.55, 1.85), rng.uniform(1.35, 1.7)
+    rear = 1.0 if rng.random() < 0.85 else -1.0
+    parts = [((0.0, 0.0, 0.25), (0.9 * length, 0.9 * width, SHEET), 2.5),
+             ((-0.05 * length, 0.0, height), (0.4 * length, 0.8 * width, SHEET), 1.0),
+             ((0.36 * length, 0.0, 0.85), (0.24 * length, 0.85 * width, SHEET), 0.8),
+             ((-0.4 * length, 0.0, 0.9), (0.16 * length, 0.85 * width, SHEET), 0.6)]
+    parts += [((0.0, 0.5 * side * width, 0.6), (0.8 * length, SHEET, 0.6), 1.2) for side in (-1, 1)]
+    parts += [((0.33 * rear * length, 0.0, 0.55), (0.6, 0.6, 0.45), 2.5)]
+    parts += [((0.3 * end * length, 0.0, 0.3), (0.08, 0.9 * width, 0.08), 0.7) for end in (-1, 1)]
+    return _magnetised(rng, parts, length, rng.uniform(300.0, 600.0) if moment is None else moment)
+
+
+def box_truck(rng, length=None, moment=None):
+    """A truck: frame rails, cab, engine, axles; a bed, a steel box or a load somewhere on it."""
+    length = rng.uniform(7.0, 16.0) if length is None else length
+    width, front = rng.uniform(2.3, 2.55), 0.5 * length
+    parts = [((0.0, side * 0.4, 0.85), (0.95 * length, 0.08, 0.25), 2.0) for side in (-1, 1)]
+    parts += [((front - 1.1, 0.0, 2.7), (1.8, 0.9 * width, SHEET), 0.5),
+              ((front - 1.1, 0.0, 1.0), (1.8, 0.9 * width, SHEET), 0.8),
+              ((front - 1.2, 0.0, 0.9), (1.1, 0.8, 0.8), 2.5)]
+    parts += [((front - 1.1, 0.5 * side * width, 1.7), (1.8, SHEET, 1.4), 0.5) for side in (-1, 1)]
+    rear = [-front + 1.0 + 1.3 * k for k in range(int(rng.integers(1, 4)))]
+    parts += [((x, 0.0, 0.5), (0.14, 0.9 * width, 0.14), 1.0) for x in [front - 1.4, *rear]]
+    bed, middle = length - 2.6, -1.3
+    kind = rng.integers(3)
+    if kind != 2:
+        parts += [((middle, 0.0, 1.15), (bed, 0.95 * width, SHEET), 2.0)]
+    if kind == 1:
+        parts += [((middle, 0.5 * side * width, 2.4), (bed, SHEET, 2.4), 1.5) for side in (-1, 1)]
+    if kind == 2:
+        at = rng.uniform(-front + 1.5, front - 4.0)
+        parts += [((at, 0.0, 1.6), (2.0, 1.8, 0.9), 3.0)]
+    return _magnetised(rng, parts, length,
+                       rng.uniform(1200.0, 2200.0) if moment is None else moment)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A course along a `Path` whose driver changes speed once and swerves once."""
+
+    path: Path
+    change: float = 0.0
+    """Of the speed, as a share; negative = brakes."""
+    change_at: float = 0.0
+    """[s], the middle of the change."""
+    change_s: float = 2.0
+    """[s] that the change lasts, roughly."""
+    aside: float = 0.0
+    """[m] to the left that the vehicle swerves and comes back."""
+    aside_at: float = 0.0
+    """[s]."""
+    aside_s: float = 2.0
+    """[s] that it lasts, roughly."""
+
+    def _on_path(self, t):
+        """Time (n,) on the `Path`: the way over the speed at the beginning."""
+        width = self.change_s / 4.0
+        z, z0 = (t - self.change_at) / width, -self.change_at / width
+        # The integral of a logistic step.
+        return t + self.change * width * (np.logaddexp(0.0, z) - np.logaddexp(0.0, z0))
+
+    def speed(self, t):
+        """[m/s] along the path at times (n,)."""
+        z = (np.asarray(t, dtype=float) - self.change_at) / (self.change_s / 4.0)
+        return self.path.speed * (1.0 + self.change / (1.0 + np.exp(-z)))
+
+    def at(self, t):
+        """See `mag_tracking.simulation.scenario.Course`."""
+        t = np.asarray(t, dtype=float)
+        position, heading = self.path.at(self._on_path(t))
+        z = (t - self.aside_at) / (self.aside_s / 2.0)
+        offset = self.aside * np.exp(-0.5 * z * z)
+        slope = -offset * z / (self.aside_s / 2.0) / self.speed(t)
+        left = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
+        return position + offset[:, None] * left, heading + np.arctan(slope)
+
+
+def random_drive(rng, path, at):
+    """A `Drive`: up to a fifth slower or a tenth faster, up to 0.4 m aside, around a time [s]."""
+    return Drive(path, change=rng.uniform(-0.2, 0.1), change_at=at + rng.uniform(-2.0, 2.0),
+                 change_s=rng.uniform(1.5, 4.0), aside=rng.uniform(-0.4, 0.4),
+                 aside_at=at + rng.uniform(-2.0, 2.0), aside_s=rng.uniform(1.5, 4.0))

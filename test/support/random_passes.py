@@ -1,0 +1,101 @@
+"""Passes of random vehicles of both simulators, and what the tracker makes of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mag_tracking.network.file import read_network
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.records import Track
+from mag_tracking.simulation.scenario import Imperfections, Path, random_vehicle
+from support.box_vehicles import BOUGHT, box_car, box_truck, random_drive
+from support.bundled import NETWORK_FILE
+from support.samples import scenario
+
+SIMULATORS = ('clouds', 'boxes')
+KINDS = ('truck', 'car', 'turning')
+WRONG_M, WRONG_SD = 2.0, 3.0
+"""A pose that is off by more than both, and not flagged, is sure and wrong."""
+
+
+def random_course(rng, turns):
+    """(`Path`, duration [s], time of the closest point [s], roughly) past sensors at the origin.
+
+    A turn takes 2 to 5 m/s^2 across, as a tight one at a junction does.
+    """
+    lane, radius = rng.uniform(0.8, 1.6), rng.uniform(4.5, 8.0)
+    speed = np.sqrt(radius * rng.uniform(2.0, 5.0)) if turns else rng.uniform(7.0, 20.0)
+    away = 6.0 * speed + (15.0 if turns else 25.0)
+    start = np.array([-away, -lane])
+    if not turns:
+        return Path(start, 0.0, speed), 8.0 + 50.0 / speed, away / speed
+    before = away + rng.uniform(3.5, 5.5) - radius
+    return (Path(start, 0.0, speed, before, -0.5 * np.pi, radius), 8.0 + 40.0 / speed,
+            away / speed)
+
+
+def random_pass(simulator, kind, seed):
+    """(body, course, duration [s], `Imperfections`) of one pass of a kind of `KINDS`."""
+    rng = np.random.default_rng([seed, KINDS.index(kind), SIMULATORS.index(simulator)])
+    path, duration, closest_s = random_course(rng, kind == 'turning')
+    if simulator == 'clouds':
+        body = (random_vehicle(rng, rng.uniform(7.0, 16.0), 2.4, 2.8,
+                               moment=rng.uniform(1200.0, 2200.0)) if kind == 'truck' else
+                random_vehicle(rng, rng.uniform(3.6, 4.8), moment=rng.uniform(300.0, 600.0)))
+        return body, path, duration, Imperfections()
+    body = (box_truck if kind == 'truck' else box_car)(rng)
+    return body, random_drive(rng, path, closest_s), duration + 3.0, BOUGHT
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What the tracker said of one pass; the arrays are over its poses."""
+
+    error: np.ndarray
+    """(n,) [m], horizontal."""
+    deviation: np.ndarray
+    """(n,) [m], as stated, along the error."""
+    nees: np.ndarray
+    """(n,), an axis."""
+    distance: np.ndarray
+    """(n,) [m] of the truth from the sensors' middle."""
+    ambiguous: np.ndarray
+    """(n,)"""
+    speed_ratio: float
+    """Stated over true speed at the closest point; NaN without a pose."""
+
+    @property
+    def sure_and_wrong(self):
+        """(n,)"""
+        return (~self.ambiguous & (self.error > WRONG_M)
+                & (self.error > WRONG_SD * self.deviation))
+
+
+def tracked(network, body, course, duration, flaws, seed, changes=None):
+    """`Tracked` of a simulated pass."""
+    readings, t, position, _ = scenario.simulate(network, body, course, 100.0, duration,
+                                                 np.random.default_rng(seed), flaws)
+    pipeline = Pipeline(network, settings_for('vehicle', changes))
+    tracks = [r for r in pipeline.feed(readings) + pipeline.flush()
+              if isinstance(r, Track) and not r.ended]
+    stamps = np.array([r.stamp_ns for r in tracks]) / 1e9
+    true = np.stack([np.interp(stamps, t, position[:, k]) for k in (0, 1)], axis=1)
+    velocity = np.gradient(position, t, axis=0)
+    error = np.array([r.position[:2] for r in tracks]).reshape(-1, 2) - true
+    P = np.array([r.covariance[:2, :2] for r in tracks]).reshape(-1, 2, 2)
+    size = np.hypot(*error.T)
+    distance = np.hypot(*(true - network.centre[:2]).T)
+    ratio = np.nan
+    if len(tracks):
+        k = int(np.argmin(distance))
+        ratio = (np.hypot(*tracks[k].velocity[:2])
+                 / np.hypot(*[np.interp(stamps[k], t, v) for v in velocity.T]))
+    along = np.sqrt(np.einsum('ni,nij,nj->n', error, P, error)) / np.maximum(size, 1e-9)
+    return Tracked(size, along,
+                   np.einsum('ni,ni->n', error, np.linalg.solve(P, error[:, :, None])[:, :, 0]) / 2,
+                   distance, np.array([r.ambiguous for r in tracks], dtype=bool), float(ratio))
+
+
+def one_random_pass(simulator, kind, seed, changes=None):
+    """`Tracked` of a random pass through the bundled network."""
+    return tracked(read_network(NETWORK_FILE), *random_pass(simulator, kind, seed), seed, changes)
