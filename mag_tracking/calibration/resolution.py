@@ -199,6 +199,9 @@ def apply_steps(sensors: StructArray, freeze_std: float, limits: FloatArray) -> 
     _complete(variance, steps)
     for a in range(3):
         rests = np.isfinite(steps[a]) and _rests(variance[a], steps[a])
+        if not rests and variance[a] <= LEAST_STD**2 and s.step_variance[a] > 0.0:
+            # Another axis is louder now. This one rests as before.
+            continue
         s.step_variance[a] = steps[a]**2 / 12.0 if rests else 0.0
         s.noise_std[a] = np.sqrt(variance[a] + s.step_variance[a])
         limits[a] = freeze_std * s.noise_std[a]

@@ -34,6 +34,9 @@ STEEPEST = 130.0
 """A dipole that moves by the share s of its distance between two readings, s above 0.4, makes a
 difference steeper than the ones before by less than this times s^3, in 99.9 % of the cases
 (simulated)."""
+COARSEST = 1.5e-6
+"""[T] Steps of magnetometers are hardly larger than this; the coarsest known, of 5.9e-6 T
+(MLX90393, z, lowest gain and resolution), do not make a spike by it with the usual threshold."""
 BACK = 0.3
 """After a spike the field is again where it was, to this share of the spike."""
 
@@ -96,7 +99,9 @@ def _usual_noise(s: Record, a: int) -> float:
     """Standard deviation [T] of axis `a`; before the noise is known, from recent differences."""
     if s.is_ready:
         return float(s.noise_std[a])
-    return float(max(_largest_recent(s, a) / LARGEST_OF_RECENT, s.step[a] / math.sqrt(12.0)))
+    # An axis that has only rested so far has steps like the others.
+    step = s.step[a] if s.step[a] < math.inf else min(s.step[0], s.step[1], s.step[2], COARSEST)
+    return float(max(_largest_recent(s, a) / LARGEST_OF_RECENT, step / math.sqrt(12.0)))
 
 
 @njit(cache=True)

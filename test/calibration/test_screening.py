@@ -262,6 +262,14 @@ def test_before_the_noise_is_known_recent_differences_are_its_measure():
     assert screened(coarse, std=None, step=2e-6) == ([], 0, [])
 
 
+@pytest.mark.parametrize('size, found', [(4e-5, True), (6e-6, False)])
+def test_an_axis_that_has_only_rested_may_have_a_glitch(size, found):
+    """No step of a magnetometer is as large as 13 microtesla; one of 6 may be."""
+    y = np.tile([2e-6, 1.6e-5, -4.8e-5], (200, 1))
+    y[100, 1] += size
+    assert screened(y, std=None)[0] == ([100] if found else [])
+
+
 @settings(derandomize=True, deadline=None, max_examples=40)
 @given(st.integers(0, 10_000))
 def test_every_reading_comes_out_once_in_order_and_at_most_three_wait(seed):

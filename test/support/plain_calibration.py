@@ -57,6 +57,7 @@ class Spikes:
         steps = np.abs(sample.field - self.before.field)
         if noise_std is None and self.steps:
             recent = np.nan_to_num(self.steps[-8:])
+            step = np.where(np.isfinite(step), step, min(*step, 1.5e-6))
             noise_std = np.fmax(recent.max(axis=0) / 2.4, step / np.sqrt(12.0))
         if self.held:
             largest = np.nan_to_num(np.array([s for _, s in self.held])).max(axis=0)
@@ -127,7 +128,6 @@ class PlainCalibration:
         cause = self.misplaced(sample)
         if cause:
             return self.reject(cause)
-        self.backgrounds[name].note(sample.stamp_ns, raw)
         if self.settings.reject_stuck and self.repetition[name].is_stuck(sample.field):
             return self.reject('the same reading over and over')
         known = [(sample, False)]
@@ -136,6 +136,8 @@ class PlainCalibration:
             known = self.spikes[name].feed(
                 sample, np.sqrt(np.diagonal(background.covariance)) if background.ready else None,
                 background.sensors[0]['step'])
+        if known and not known[-1][1]:
+            self.backgrounds[name].note(sample.stamp_ns, raw)
         for _, is_spike in known:
             if is_spike:
                 self.reject('spike')

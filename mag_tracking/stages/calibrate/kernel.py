@@ -15,6 +15,7 @@ from mag_tracking.calibration.resolution import note_step, rest_of
 from mag_tracking.calibration.screening import (
     HELD,
     PASSES,
+    RELEASED,
     SPIKE,
     is_stuck,
     screen_spike,
@@ -134,7 +135,6 @@ def _check(s: Record, limits: Record, stamp: int, raw: FloatArray, own: int,
     reason = _misplaced(s, limits, stamp)
     if reason != DONE:
         return reason
-    note_step(s, stamp, raw)
     return STUCK if limits.reject_stuck and is_stuck(s, field) else DONE
 
 
@@ -220,10 +220,11 @@ def _use(s: Record, limits: Record, batch: Record, row: int, stamp: int, field: 
     n_missing, is_new = 0, False
     for a in range(3):
         # An axis that has only just begun to report: nothing is known of it yet.
-        is_unknown = not np.isnan(field[a]) and (np.isnan(out[a]) or np.isnan(C[a, a]))
+        is_unknown = not np.isnan(field[a]) and (np.isnan(out[a]) or not C[a, a] > 0.0)
         is_new |= is_unknown
         if is_unknown:
             out[a] = np.nan
+            C[a, :] = C[:, a] = np.nan
         n_missing += np.isnan(out[a])
     batch.n_partly_learning += is_new
     if n_missing < 3:
@@ -293,6 +294,9 @@ def calibrate_readings(sensors: StructArray, limits: StructArray, rows: IntArray
         if own[i]:
             _correct_covariance(s, covariances[i], C)
         verdict = _screen(s, limit, batch, stamp, field, own[i], C, steps)
+        if verdict == PASSES or verdict == RELEASED:
+            # A spike is no step of the sensor.
+            note_step(s, stamp, fields[i])
         if verdict == PASSES:
             s.accepted += 1
             if not limit.is_decimated and _use(s, limit, batch, rows[i], stamp, field, own[i], C,
