@@ -188,7 +188,7 @@ def test_arrays_have_the_fields_of_the_records(result):
     assert result.poses['ambiguous'].dtype == bool
     assert result.detections['onset'].tolist() == [True, False]
     seconds = np.diff(result.poses['stamp_ns']) / 1e9
-    np.testing.assert_allclose(seconds, result.settings.align.period_s, atol=1e-6)
+    np.testing.assert_allclose(seconds, 0.08, atol=1e-6)
 
 
 def test_a_long_name_is_not_cut(recorded):

@@ -14,6 +14,7 @@ from mag_tracking.apps.readings import network_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings, settings_for
+from mag_tracking.stages.align.frame_period import frame_period
 from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
 from mag_tracking.stages.track.settings import TrackSettings
 
@@ -192,7 +193,7 @@ def _sampling(network: SensorNetwork, settings: Settings, noise_std: float | Non
     more noise in each (the architecture page says why the tracker has it as a state).
     """
     track = settings.track
-    period = max(settings.align.period_s, 1.0 / _within('rate', rate, 1e-2, 1e5))
+    period = max(frame_period(settings.align, network), 1.0 / _within('rate', rate, 1e-2, 1e5))
     if noise_std is not None:
         _within('noise_std', noise_std, 1e-15, 1e-3)
     noise = np.array([noise_std or NOISE_STD if std is None or noise_std

@@ -22,6 +22,7 @@ from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.nodes.stage_node import RESULTS, SENT, STREAM, StageNode
 from mag_tracking.records import Detection, FieldFrame, Readings
+from mag_tracking.stages.align.frame_period import too_long
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.events.stage import Events
@@ -36,6 +37,9 @@ class DetectionNode(StageNode):
         self.settings = declare_settings(self, self.settings, 'detect', self.OWN_PARAMETERS)
         self.settings = declare_settings(self, self.settings, 'events', self.OWN_PARAMETERS)
         self._align = Align(self.network, self.settings.align)
+        warning = too_long(self.settings.align, self.network)
+        if warning:
+            self.get_logger().warning(warning)
         self._events = Events(self.network, self.settings.align, self.settings.detect) \
             if len(self.network) <= self.settings.events.most_sensors else None
         self._described = self.publisher(PassEventMessage, '~/events', RESULTS)

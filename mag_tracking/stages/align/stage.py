@@ -14,6 +14,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame, Readings, plain
 from mag_tracking.stages.align import kernel
 from mag_tracking.stages.align.clock_step import ClockStepFilter, HeldSample
+from mag_tracking.stages.align.frame_period import frame_period
 from mag_tracking.stages.align.sample_buffer import SampleBuffer
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.units import NEVER, NS
@@ -51,7 +52,7 @@ class Align:
         self._burst = settings.burst
         self._names = network.names
         self._settings = settings
-        self._period = int(round(settings.period_s * NS))
+        self._period = int(round(frame_period(settings, network) * NS))
         self._wait = int(round(settings.max_wait_s * NS))
         self._reset()
 

@@ -1,0 +1,66 @@
+"""How long a frame is, where the setting leaves that to the geometry."""
+
+import numpy as np
+
+from mag_tracking.errors import SettingsError
+from mag_tracking.network import SensorNetwork
+from mag_tracking.stages.align.settings import AlignSettings
+
+USUAL_S = 0.08
+"""[s] T10 section 6.3 decimates to 12.5 Hz, with sensors nine metres apart."""
+SHORTEST_S = 0.02
+"""[s] Shorter frames cost more than they tell: tracking takes a core at 100 of them a second."""
+LEAST_S = 1e-4
+"""[s] No sensor is read more often."""
+FASTEST = 20.0
+"""[m/s] Frames are made for targets up to this speed."""
+ONE_PLACE = 0.1
+"""[m] Sensors closer than this do not tell a delay."""
+
+
+def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
+    """(delay [s], one sensor, the other), of the two that a fast target passes the soonest.
+
+    None where there are no two places.
+    """
+    shortest, found = np.inf, None
+    for j, place in enumerate(network.positions):
+        distance = np.linalg.norm(network.positions[:j] - place, axis=1)
+        distance[distance <= ONE_PLACE] = np.inf
+        if distance.min(initial=np.inf) < shortest:
+            i = int(np.argmin(distance))
+            shortest, found = float(distance[i]), (network.names[i], network.names[j])
+    return None if found is None else (shortest / FASTEST, *found)
+
+
+def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
+    """[s] Length of a frame: as set, or by the geometry where it is set to 0.
+
+    A frame that is longer than the delay between two sensors mixes what both felt. Then it is half
+    as long as the delay.
+
+    Raises SettingsError for a frame that is shorter than any reading.
+    """
+    if 0.0 < settings.period_s < LEAST_S:
+        raise SettingsError(f'align.period_s: {settings.period_s:g} s is shorter than {LEAST_S:g} '
+                            's; 0 = by the geometry')
+    if settings.period_s:
+        return settings.period_s
+    shortest = shortest_delay(network)
+    if shortest is None or shortest[0] >= USUAL_S:
+        return USUAL_S
+    return max(SHORTEST_S, 0.5 * shortest[0])
+
+
+def too_long(settings: AlignSettings, network: SensorNetwork) -> str | None:
+    """A sentence where a frame is longer than a target needs from one sensor to another; or None.
+
+    Where the sensors are read in turn a frame is one round of them, whatever it takes.
+    """
+    shortest, period = shortest_delay(network), frame_period(settings, network)
+    if settings.burst or shortest is None or period <= shortest[0]:
+        return None
+    delay, one, other = shortest
+    return (f'a frame of {1e3 * period:.0f} ms is longer than the {1e3 * delay:.0f} ms that a '
+            f'target of {FASTEST:.0f} m/s needs from {one} to {other}: speed and direction suffer '
+            '(align.period_s; 0 = by the geometry)')
