@@ -54,8 +54,8 @@ class VehicleSettings:
         (45.0, 150.0, 600.0), 'Spread of the whole hard iron moment, per axis.',
         'A m^2', (1e-6, 1e6))
     difference_stds: tuple[float, ...] = param(
-        (0.0, 30.0, 120.0), 'Spread of what each dipole of a row differs from their mean, per '
-        'axis: iron that is not spread evenly.', 'A m^2', (0.0, 1e6))
+        (0.0, 45.0, 240.0), 'Spread of what each dipole of a row differs from their mean, per '
+        'axis: engine and axles are not spread evenly.', 'A m^2', (0.0, 1e6))
     heights: tuple[float, ...] = param(
         (0.5, 0.5, 1.0), 'Height of the magnetic centre above the sensors\' plane z = 0.',
         'm', (-100.0, 100.0))

@@ -14,6 +14,14 @@ from mag_tracking.records import Hypotheses, SmoothedPose, Track
 UNOBSERVED_VARIANCE = np.pi**2
 """[rad^2] of an angle that the field does not determine."""
 
+CAR_ROW = 4.0
+"""[m] A row of dipoles up to this length is that of a car, whose iron is about in its middle."""
+
+OFF_MIDDLE = 0.2
+"""The iron of a long vehicle is where its engine, axles and load are. What a row is longer than
+that of a car, times this, is the deviation of the vehicle's middle from that of the row, along the
+heading: the load may be at either end. No field tells it."""
+
 DOUBT = 0.05
 """Other places, or other arrivals, with more weight than this make a track ambiguous."""
 
@@ -158,6 +166,17 @@ def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P
                         **_said_of(model, orientation, x[:n_t], P[:n_t, :n_t])[0])
 
 
+def _of_middle(x: FloatArray) -> FloatArray:
+    """(2, 2) [m^2] how far the middle of the iron may be from that of a long vehicle."""
+    speed = np.hypot(x[3], x[4])
+    longer = abs(x[-1]) - CAR_ROW
+    if longer <= 0.0 or speed <= 0.0:
+        return np.zeros((2, 2))
+    forward = x[3:5] / speed
+    variance: FloatArray = (OFF_MIDDLE * longer)**2 * np.outer(forward, forward)
+    return variance
+
+
 def _said_of(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray
              ) -> tuple[PoseFields, Flags]:
     """What a target state says, as fields of a record, and which rotations it does not."""
@@ -166,7 +185,10 @@ def _said_of(model: SourceModel, orientation: Orientation, x: FloatArray, P: Flo
     q, T, unobserved, flags = orientation(x, P)
     # A row has a length, as its last state; from its other end it is the same row.
     row = model.state_names[-1] == 'L'
-    return {'position': x[:3].copy(), 'velocity': x[3:6].copy(), 'covariance': P[:6, :6].copy(),
+    covariance = P[:6, :6].copy()
+    if row:
+        covariance[:2, :2] += _of_middle(x)
+    return {'position': x[:3].copy(), 'velocity': x[3:6].copy(), 'covariance': covariance,
             'orientation': q, 'orientation_covariance': T @ P @ T.T + unobserved,
             'position_orientation_covariance': P[:3] @ T.T,
             'moment': dipoles.m[0].sum(axis=0), 'moment_covariance': dm_dx @ P @ dm_dx.T,
