@@ -29,7 +29,8 @@ class PassData:
     field: FloatArray
     """(n, 3) [T], sensor frame; NaN = axis not measured."""
     covariance: FloatArray
-    """(n_sensors, 3, 3) [T^2] of one sample; not read where the axis is missing."""
+    """(n, 3, 3) [T^2] of each sample (of one of those that it is the mean of); not read where the
+    axis is missing."""
     count: IntArray | None = None
     """(n,) of how many samples each is the mean; None = of one."""
 
@@ -37,6 +38,24 @@ class PassData:
     def n_values(self) -> int:
         """How many numbers were measured."""
         return int(np.count_nonzero(~np.isnan(self.field)))
+
+    @cached_property
+    def n_independent(self) -> float:
+        """How many of these numbers are independent.
+
+        A coarse sensor at rest says the same again and again, with a variance that says so
+        (`calibration.resolution`): its readings count by the smallest variance of their axis.
+        """
+        total = 0.0
+        for j in self.sensors:
+            mine = self.sensor == j
+            variance = np.where(np.isnan(self.field[mine]), np.nan,
+                                np.einsum('nii->ni', self.covariance[mine]))
+            variance = variance[:, ~np.isnan(variance).all(axis=0)]
+            share = np.nanmin(variance, axis=0) / variance
+            # Noise that is learnt along the way varies a little; a rest is of dozens of readings.
+            total += float(np.nansum(np.where(share > 0.5, 1.0, share)))
+        return total
 
     @property
     def sensors(self) -> IntArray:
@@ -58,14 +77,11 @@ class PassData:
         """(n, 3, 3) W with W C W' = I over the axes measured; the other rows are zero."""
         W = np.zeros((len(self.t), 3, 3))
         present = ~np.isnan(self.field)
-        for j in np.unique(self.sensor):
-            mine = self.sensor == j
-            for axes in np.unique(present[mine], axis=0):
-                if axes.any():
-                    block = np.ix_(axes, axes)
-                    one = np.zeros((3, 3))
-                    one[block] = np.linalg.inv(np.linalg.cholesky(self.covariance[j][block]))
-                    W[mine & (present == axes).all(axis=1)] = one
+        for axes in np.unique(present, axis=0):
+            rows = (present == axes).all(axis=1)
+            if axes.any():
+                block = np.ix_(rows, axes, axes)
+                W[block] = np.linalg.inv(np.linalg.cholesky(self.covariance[block]))
         return W if self.count is None else W * np.sqrt(self.count)[:, None, None]
 
     def averaged(self, most: int) -> 'PassData':
@@ -81,9 +97,10 @@ class PassData:
             n = np.diff(first, append=len(mine))
             # The mean of an axis that is missing in part would belong to another time: NaN.
             rows.append((np.add.reduceat(self.t[mine], first) / n, np.full(len(n), j),
-                         np.add.reduceat(self.field[mine], first) / n[:, None], n))
-        t, sensor, field, n = (np.concatenate(c) for c in zip(*rows, strict=True))
-        return replace(self, t=t, sensor=sensor, field=field, count=n)
+                         np.add.reduceat(self.field[mine], first) / n[:, None],
+                         np.add.reduceat(self.covariance[mine], first) / n[:, None, None], n))
+        t, sensor, field, covariance, n = (np.concatenate(c) for c in zip(*rows, strict=True))
+        return replace(self, t=t, sensor=sensor, field=field, covariance=covariance, count=n)
 
     @cached_property
     def departure(self) -> FloatArray:

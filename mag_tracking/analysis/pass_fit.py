@@ -8,11 +8,17 @@ import numpy as np
 
 from mag_tracking.analysis.bearing import bearing_of, scaled_to_range
 from mag_tracking.analysis.pass_data import PassData, background_columns, separable_problem
+from mag_tracking.analysis.pass_deviation import (
+    SensorErrors,
+    honest_covariance,
+    velocity_change,
+)
 from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.analysis.pass_trust import doubt, left_elsewhere, trusted
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.crlb import bound, cpa_information, information
 from mag_tracking.inference.detection_theory import energy_threshold
-from mag_tracking.inference.least_squares import Minimum, correlated_scores, search
+from mag_tracking.inference.least_squares import Minimum, search
 from mag_tracking.physics.passes import RowPass
 
 N_COARSE = 24
@@ -27,30 +33,16 @@ APART = np.array([0.1, 0.1, 0.1, 0.2, 0.2, 0.2, 0.3])
 FALSE_ALARM = 1e-6
 """A field that noise exceeds with this probability is none."""
 
-LEAST_EXPLAINED = 0.98
-"""Share of the field's energy that has to be that of one target on a straight line. Rows of three
-dipoles explain 99 % of vehicles and more, of two vehicles in one window mostly less than 97 %."""
-
-MOST_COST = 100.0
-"""A normalised cost beyond is no pass of a row of dipoles; trucks come to ten, and with a single
-dipole to a hundred."""
-
-LEAST_WAY = 0.3
-"""Share of the distance of the nearest sensor that a target has to move while it is seen."""
-
-MOST_CHANGE = 0.3
-"""Share of itself by which the velocity may seem to change while the target is seen: 17 degrees of
-a turn. Vehicles that are no rows of dipoles seem to change it by up to 0.2."""
-
-CORRELATED_S = 0.2
-"""[s] What the model leaves out is alike for so long: a car's length at 20 m/s."""
+AS_BOUGHT = SensorErrors()
+"""What is assumed of the sensors of a network."""
 
 EXACT = 1e-4
 """[m] Deviation of a CPA range that is only a unit of length."""
 
 
 def fit_pass(data: PassData, n_dipoles: int = 3,
-             cpa_range: tuple[float, float] | None = None) -> PassFit:
+             cpa_range: tuple[float, float] | None = None,
+             errors: SensorErrors = AS_BOUGHT) -> PassFit:
     """Fit a row of dipoles at constant velocity to what a network measured.
 
     Parameters
@@ -61,6 +53,8 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
     cpa_range : (range, std) [m], optional
         For one sensor, which cannot tell the scale: the range at the closest point is known
         beforehand (TSP14 section IV.B).
+    errors : SensorErrors
+        Of the sensors, for the honest covariance.
 
     Returns
     -------
@@ -80,7 +74,7 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
     data, rough = data.shifted(seconds), rough.shifted(seconds)
     model_of = partial(RowPass, n_dipoles=n_dipoles)
     problem = separable_problem(data, model_of)
-    n_free = data.n_values - background_columns(data, data.whitening).shape[1]
+    n_free = data.n_independent - background_columns(data, data.whitening).shape[1]
     limit = energy_threshold(FALSE_ALARM, n_free)
     if problem.energy <= limit:
         return PassFit(n_dipoles, data, 'out of range: the field is no stronger than noise '
@@ -98,7 +92,8 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
         T = RowPass(data.t, data.positions, data.whitening, n_dipoles).combinations
         p = T.T @ (T @ p).reshape(-1, 3)[::-1].ravel()
     left = max(found.cost - n_free, 0.0) / (problem.energy - n_free)
-    return _described(data, n_dipoles, theta, p, found, 1.0 - left, cpa_range)
+    return _described(data, n_dipoles, theta, p, found, 1.0 - left, cpa_range,
+                      errors)
 
 
 def _strongest(data: PassData) -> int:
@@ -162,7 +157,8 @@ def shorter_rows(path: FloatArray) -> FloatArray:
 
 
 def _described(data: PassData, n_dipoles: int, theta: FloatArray, p: FloatArray, found: Minimum,
-               explained: float, cpa_range: tuple[float, float] | None) -> PassFit:
+               explained: float, cpa_range: tuple[float, float] | None,
+               errors: SensorErrors) -> PassFit:
     """The `PassFit` of a minimum."""
     one = len(data.sensors) == 1
     if one:
@@ -184,48 +180,26 @@ def _described(data: PassData, n_dipoles: int, theta: FloatArray, p: FloatArray,
     covariance = bound(J)
     x = T @ np.concatenate([theta, p, background])
     seen_s = _seen_s(data)
-    change, change_std = _velocity_change(data, whitened, left, theta, seen_s)
+    change, change_std = velocity_change(data, whitened, left, theta[3:6], seen_s)
+    target = (H[:, len(theta):len(theta) + len(p)] @ p).reshape(-1, 3)
     # An unobservable state has an infinite variance; what it is combined to has none.
     with np.errstate(invalid='ignore'):
-        honest = covariance + _unmodelled(data, whitened, left, covariance)
+        honest = honest_covariance(data, whitened, left, target, covariance, errors)
         spread = np.sqrt(np.einsum('yi,ij,yj->y', H, honest, H)).reshape(-1, 3)
         covariance, honest = (T @ P @ T.T for P in (covariance, honest))
     fit = PassFit(n_dipoles, data, '', found.converged, names, x, covariance, honest, found.cost,
-                  explained, seen_s, change, change_std, predicted=predicted,
+                  explained, seen_s, change, change_std,
+                  left_elsewhere(data, n_dipoles, theta, target, left), predicted=predicted,
                   predicted_std=spread)
-    if one:
-        # Seen from the other end of space everything looks the same.
-        mirrored = np.concatenate([2.0 * place - theta[:3], -theta[3:6], theta[6:]])
-        fit = replace(fit, rivals=((0.0, mirrored),))
-    else:
-        fit = replace(fit, rivals=_rivals(fit, found.rivals))
+    fit = replace(fit, rivals=_mirrored(theta, place) if one else _rivals(fit, found.rivals))
     if one and cpa_range is None:
         fit = replace(fit, bearing=bearing_of(fit, place))
-    return replace(fit, reason=_doubt(fit))
+    return replace(fit, reason=doubt(fit), trusted=trusted(fit))
 
 
-def _unmodelled(data: PassData, whitened: FloatArray, left: FloatArray,
-                covariance: FloatArray) -> FloatArray:
-    """What must be added to a covariance (n_x, n_x) for what the model leaves out.
-
-    The residuals `left` (n, 3) then are no noise: they are alike for a while, and count for less
-    than their number. Nothing is taken away where chance made them look less than noise.
-    `whitened` (n, 3, n_x) are the derivatives.
-    """
-    scale = np.sqrt(np.diagonal(covariance))
-    columns = whitened * scale
-    excess = -np.einsum('nai,naj->ij', columns, columns)
-    for j in data.sensors:
-        mine = data.sensor == j
-        step = np.median(np.diff(data.t[mine])) if mine.sum() > 1 else CORRELATED_S
-        excess += correlated_scores(np.einsum('nai,na->ni', columns[mine], left[mine]),
-                                    int(CORRELATED_S / max(step, 1e-9)))
-    if not np.isfinite(excess).all():
-        return np.full_like(covariance, np.nan)
-    w, V = np.linalg.eigh(excess)
-    root = (covariance / np.outer(scale, scale)) @ (V * np.sqrt(np.maximum(w, 0.0)))
-    missing: FloatArray = np.outer(scale, scale) * (root @ root.T)
-    return missing
+def _mirrored(theta: FloatArray, place: FloatArray) -> tuple[tuple[float, FloatArray], ...]:
+    """`PassFit.rivals` for one sensor: seen from the other end of space all looks the same."""
+    return ((0.0, np.concatenate([2.0 * place - theta[:3], -theta[3:6], theta[6:]])),)
 
 
 def _rivals(fit: PassFit, minima: Iterable[tuple[FloatArray, float]]) -> tuple[
@@ -246,23 +220,6 @@ def _seen_s(data: PassData) -> float:
     part = np.cumsum(energy[order]) / energy.sum()
     first, last = data.t[order][np.searchsorted(part, (0.02, 0.98))]
     return float(last - first)
-
-
-def _velocity_change(data: PassData, whitened: FloatArray, left: FloatArray, theta: FloatArray,
-                     seen_s: float) -> tuple[float, float]:
-    """Share of itself by which the velocity would like to change while the target is seen.
-
-    One step of Gauss and Newton from the minimum, with a constant horizontal acceleration more
-    among the unknowns: it moves the target by t^2/2, as its start moves it by 1. Returns the share
-    and its deviation (by noise alone).
-    """
-    moved = 0.5 * np.square(data.t)[:, None, None] * whitened[:, :, :2]
-    wider = np.concatenate([whitened, moved], axis=2).reshape(left.size, -1)
-    size = np.linalg.norm(wider, axis=0)
-    inverse = np.linalg.pinv(wider / size, rcond=1e-8) / size[:, None]
-    step, spread = inverse @ left.ravel(), np.linalg.norm(inverse, axis=1)
-    scale = seen_s / np.linalg.norm(theta[3:6])
-    return float(np.linalg.norm(step[-2:]) * scale), float(np.linalg.norm(spread[-2:]) * scale)
 
 
 def _linearised(data: PassData, n_dipoles: int, theta: FloatArray, p: FloatArray) -> tuple[
@@ -296,38 +253,3 @@ def _linearised(data: PassData, n_dipoles: int, theta: FloatArray, p: FloatArray
     T[first:first + len(p), first:first + len(p)] = model.combinations
     return H, T, names, (of_target + columns @ background).reshape(-1, 3), background
 
-
-def _doubt(fit: PassFit) -> str:
-    """Why a minimum is no answer, or nothing."""
-    if not fit.converged:
-        return 'the fit did not converge'
-    if fit.explained < LEAST_EXPLAINED:
-        return (f'not one target at constant velocity: {1.0 - fit.explained:.1%} of the field is '
-                'left over (two vehicles in the window, a turn, or a target much longer than far)')
-    doubtful = 2.0 * fit.velocity_change_std * np.sqrt(max(1.0, fit.normalised_cost))
-    if fit.velocity_change - doubtful > MOST_CHANGE:
-        return ('not at constant velocity: while it was seen it changed by '
-                f'{fit.velocity_change:.0%} of itself (a turn, braking)')
-    nearest = min(fit.closest_approach(place)[2]
-                  for place in fit.data.network.positions[fit.data.sensors])
-    if np.linalg.norm(fit.velocity) * fit.seen_s < LEAST_WAY * nearest:
-        return 'no pass: while it was seen it hardly moved'
-    if fit.normalised_cost > MOST_COST:
-        return (f'not what the model describes: the normalised cost is {fit.normalised_cost:.0f} '
-                '(not a vehicle, a wrong network file, or a noise_std that is too small)')
-    if fit.bearing is not None:
-        return ('one sensor: the scale is not observable, only directions and the time of the '
-                'closest approach are (TSP14 Proposition 1)')
-    lost = [name for name, variance in zip(fit.names, np.diagonal(fit.covariance), strict=True)
-            if not np.isfinite(variance)]
-    if lost:
-        return f'not observable: {", ".join(lost)}'
-    if not fit.determined:
-        length, length_std = fit.length
-        return (f'not determined: a length of {length:.1f} m, known to {length_std:.1f} m; '
-                'take fewer dipoles')
-    std = np.sqrt(np.trace(fit.honest_covariance[:3, :3]))
-    if std > nearest:
-        return (f'out of range: the position is known to {std:.1f} m only, and no sensor is nearer '
-                f'than {nearest:.1f} m')
-    return ''

@@ -47,7 +47,7 @@ class Bearing:
 class PassFit:
     """A pass at constant velocity, as weighted least squares has it.
 
-    Where `reason` is not empty there is no answer: the numbers that it concerns are NaN.
+    Where `reason` is not empty the fit as a whole is no answer; what is `trusted` is one.
     """
 
     n_dipoles: int
@@ -73,7 +73,12 @@ class PassFit:
     velocity_change: float = np.nan
     """Share of itself by which the velocity seems to change while the target is seen."""
     velocity_change_std: float = np.nan
-    """By noise alone."""
+    """By noise, and by what the model leaves out."""
+    left_elsewhere: float = np.nan
+    """Share of the energy that is left over where no vehicle leaves any; see `pass_trust`."""
+    trusted: tuple[str, ...] = ()
+    """Of speed, direction and time (of the closest point), what is determined, also where the
+    whole has a reason not to be believed; see `pass_trust`."""
     bearing: Bearing | None = None
     """With one sensor."""
     rivals: tuple[tuple[float, FloatArray], ...] = ()
@@ -85,9 +90,9 @@ class PassFit:
     """(n, 3) [T], by the honest covariance, without noise."""
 
     @property
-    def degrees_of_freedom(self) -> int:
-        """Measurements less unknowns."""
-        return self.data.n_values - len(self.x)
+    def degrees_of_freedom(self) -> float:
+        """Independent measurements less unknowns."""
+        return self.data.n_independent - len(self.x)
 
     @property
     def normalised_cost(self) -> float:

@@ -1,12 +1,13 @@
 """Fit the passes of a recording, offline."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mag_tracking.analysis.correlated_motion import CorrelatedMotion, correlated_motion
 from mag_tracking.analysis.model_order import choose_order
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_fit import fit_pass
@@ -36,7 +37,8 @@ FIT_UNITS = {
     **dict.fromkeys(('heading_deg', 'sd_heading_deg'), 'deg'),
     **dict.fromkeys(('cpa_time', 'sd_cpa_time'), 's'),
     **dict.fromkeys(('cpa_range', 'sd_cpa_range'), 'm'),
-    **dict.fromkeys(('rate', 'sd_rate'), '1/s')}
+    **dict.fromkeys(('rate', 'sd_rate'), '1/s'),
+    **dict.fromkeys(('delay_speed', 'sd_delay_speed'), 'm/s'), 'delay_heading_deg': 'deg'}
 """Units of the columns of `fits.csv`."""
 
 
@@ -49,6 +51,8 @@ class FittedPass:
     fits: tuple[PassFit, ...]
     notes: tuple[str, ...]
     """What was left out of the measurements, and why."""
+    correlated: CorrelatedMotion = field(default_factory=CorrelatedMotion)
+    """The velocity by the delays between the sensors, which needs no model."""
 
     @property
     def chosen(self) -> PassFit | None:
@@ -124,7 +128,7 @@ class RecordingFit:
                     return
                 fits.append(fit_pass(data, n_dipoles, self._cpa_range))
             self._n += 1
-            yield FittedPass(self._name, self._n, tuple(fits), notes)
+            yield FittedPass(self._name, self._n, tuple(fits), notes, correlated_motion(data))
 
     def warnings(self) -> list[str]:
         """What was lost or rejected, and which sensors were never heard; a list of lines."""

@@ -121,12 +121,12 @@ class PassCollector:
         found = found.part((begin <= found.stamp_ns) & (found.stamp_ns <= end_ns))
         found = found.part(np.lexsort((found.stamp_ns, found.sensor)))
         sensor, field, raw = found.sensor, found.field.copy(), self._raw_fields(found)
-        covariance = np.full((len(self._network), 3, 3), np.nan)
+        covariance = np.full((len(sensor), 3, 3), np.nan)
         notes = list(remarks)
         for j in np.unique(sensor):
             mine = np.flatnonzero(sensor == j)
             if found.covariance is not None:
-                covariance[j] = _typical(found.covariance[mine])
+                covariance[mine] = _settled(found.covariance[mine])
             for a, axis in enumerate('xyz'):
                 bad = mine[cut_off(raw[mine, a])]
                 if len(bad):
@@ -152,11 +152,14 @@ class PassCollector:
         return fields
 
 
-def _typical(covariances: FloatArray) -> FloatArray:
-    """The first of (n, 3, 3) covariances, or the one in the middle where coarse steps make the
-    first ones, of readings at rest, much larger than others.
+def _settled(covariances: FloatArray) -> FloatArray:
+    """(n, 3, 3) covariances of readings; the first for all where they are about the same.
+
+    Noise that is still being learnt differs a little from reading to reading, and the sensor's
+    does not. That of a coarse sensor at rest is many times that of one that moves.
     """
     size = np.nansum(np.einsum('kii->ki', covariances), axis=1)
-    k = int(np.argsort(size, kind='stable')[len(size) // 2])
-    typical: FloatArray = covariances[k if size.max() > 2.0 * size.min() else 0]
-    return typical
+    if size.max() > 2.0 * size.min():
+        return covariances
+    settled: FloatArray = np.broadcast_to(covariances[0], covariances.shape)
+    return settled

@@ -10,6 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from mag_tracking.analysis.consistency import error_over_bound
+from mag_tracking.analysis.correlated_motion import correlated_motion, disagree
+from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.first_pass import FirstPass, first_pass_of
 from mag_tracking.apps.no_detection import why_no_detection
 from mag_tracking.errors import OutputError
@@ -29,6 +31,7 @@ from mag_tracking.report.metrics import (
     pass_errors,
 )
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
+from mag_tracking.stages.align.frame_period import too_long
 from mag_tracking.stages.track.settings import acceleration_density
 
 SUSPICIOUS = 2.0
@@ -171,6 +174,7 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
     return {'recording': recording.path.name, 'target': pipeline.settings.track.target,
             'counts': pipeline.counts(), 'rejected': rejections, 'lost': dict(recording.losses),
             'why_no_detection': why,
+            'frames_too_long': too_long(pipeline.settings.align, pipeline.network),
             'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks}
 
 
@@ -180,6 +184,8 @@ def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline
     entry: dict[str, Any] = log.summary()
     entry['nis_by_sensor'] = log.nis_of(pipeline.network.names)
     entry['mounting'] = _mounting(log, pipeline)
+    if pipeline.settings.track.target == 'vehicle':
+        entry['delay'] = _delay_entry(log, pipeline.network)
     errors = errors_against_truth(log, pipeline, truth)
     if errors:
         entry['truth'] = errors
@@ -190,6 +196,30 @@ def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline
         if errors:
             entry['smoothed']['truth'] = errors
     return entry
+
+
+def _delay_entry(log: TrackLog, network: SensorNetwork) -> dict[str, Any]:
+    """Speed and heading by the delays between the sensors, JSON-ready; or why there are none."""
+    found = correlated_motion(_pass_of(log, network))
+    if found.reason:
+        return {'reason': found.reason}
+    k = log.surest()
+    vx, vy = log.velocity[k][:2]
+    speed = float(np.hypot(vx, vy))
+    u = np.array([vx, vy]) / speed
+    std = float(np.sqrt(u @ log.covariance[k][3:5, 3:5] @ u))
+    return {'speed': found.speed, 'speed_sd': found.speed_std,
+            'heading_deg': float(np.degrees(found.heading)),
+            'contradicts': disagree((speed, std), float(np.arctan2(vy, vx)), found)}
+
+
+def _pass_of(log: TrackLog, network: SensorNetwork) -> PassData:
+    """What was measured while a track ran."""
+    n, n_sensors = len(log.stamp_ns), len(network)
+    return PassData(network, log.stamp_ns[0], np.tile(log.seconds(), n_sensors),
+                    np.repeat(np.arange(n_sensors), n),
+                    np.array(log.measured).transpose(1, 0, 2).reshape(-1, 3),
+                    np.array(log.noise).transpose(1, 0, 2, 3).reshape(-1, 3, 3))
 
 
 def _mounting(log: TrackLog, pipeline: Pipeline) -> dict[str, dict[str, Any]]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from mag_tracking.analysis.correlated_motion import disagree
 from mag_tracking.analysis.pass_result import Bearing, PassFit
 from mag_tracking.apps.fit import FittedPass, RecordingFit, check_cpa_range, check_orders
 from mag_tracking.arrays import FloatArray
@@ -31,7 +32,10 @@ vehicle on a straight road this is the most accurate that there is, and the norm
 cost says whether to believe it: 1 = the model is right.
 
 A pass that this cannot describe (a turn, two vehicles at once, nothing but noise, one
-sensor alone, ...) gets a reason instead of numbers.
+sensor alone, ...) gets a reason instead of numbers. Speed, direction and time of the closest
+point are judged each for itself, and given where they are determined. Where one sensor is
+behind another on the way, the delay between them gives speed and direction once more,
+without any model.
 
 Writes to DIR:
   fits.csv, fits.json   a row a pass and order
@@ -129,11 +133,15 @@ def _print_pass(one: FittedPass) -> None:
         print(f' {mark}   {fit.n_dipoles}  {cost}  {fit.reason or _numbers(fit)}')
         if fit.bearing is not None:
             _print_bearing(fit.bearing)
+        if fit.reason and fit.trusted:
+            print(f'        known all the same: {_known(fit)}')
         if not fit.reason and fit.ambiguous:
             behind, path = min(fit.rivals, key=lambda rival: rival[0])
             print(f'        ambiguous: {np.exp(-0.5 * behind):.2f} times as likely is '
                   f'({", ".join(f"{v:.2f}" for v in path[:3])}) m'
                   + (f' with a length of {abs(path[6]):.1f} m' if len(path) > 6 else ''))
+    if not one.correlated.reason:
+        _print_delay(one)
     if one.chosen is not None:
         least = one.chosen.normalised_cost
         if least > POOR:
@@ -147,6 +155,31 @@ def _print_pass(one: FittedPass) -> None:
         if np.isfinite(far):
             print(f'  orders with nearly this cost differ by up to {far:.2f} m and {fast:.2f} m/s, '
                   'which the deviations (in brackets) do not know of')
+
+
+def _known(fit: PassFit) -> str:
+    """What is trusted of a fit that is no answer as a whole."""
+    speed, speed_std = fit.speed
+    heading, heading_std = np.degrees(fit.heading)
+    centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
+    time, time_std, _, _ = fit.closest_approach(centre)
+    texts = {'speed': f'{speed:.2f}({speed_std:.2f}) m/s',
+             'direction': f'{heading:.1f}({heading_std:.1f}) deg',
+             'time': f'closest to the middle of the sensors {time:+.2f}({time_std:.2f}) s after '
+                     'the strongest field'}
+    return ', '.join(texts[name] for name in fit.trusted)
+
+
+def _print_delay(one: FittedPass) -> None:
+    """The velocity by the delays between sensors, and whether the fit agrees."""
+    c = one.correlated
+    line = ', along the line of the sensors' if np.isnan(c.heading_std) else ''
+    print(f'  by the delay between sensors: {c.speed:.2f}({c.speed_std:.2f}) m/s, '
+          f'{np.degrees(c.heading):.0f} deg{line}')
+    best = one.chosen
+    if best is not None and disagree(best.speed, best.heading[0], c):
+        print('  warning: fit and delay contradict each other; believe neither (a clock, a '
+              'position in the network file, a turn)')
 
 
 def _numbers(fit: PassFit) -> str:

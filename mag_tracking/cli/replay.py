@@ -118,19 +118,31 @@ def _print_summary(path: Path, summary: dict[str, Any]) -> None:
                   f'frequent level, at {begin:.1f} to {end:.1f} s')
     _print_limits(summary)
     for t in summary['tracks']:
-        print(f'  track {t["id"]}: {t["poses"]} poses'
-              + (f', from {t["arrival"]} ({t["arrival_weights"][t["arrival"]]:.0%})'
-                 if t['arrival'] else '')
-              + (f', a {t["kind"]} ({t["kind_weight"]:.0%})' if t['kind'] else '')
-              + f', {t["speed"]:.2f} m/s, {t["moment_size"]:.3g} A m^2, {t["verdict"]}')
-        for name, m in t['mounting'].items():
-            if m['suspicious']:
-                print(f'    warning: {name} fits best if turned by '
-                      f'{max(m["angles_deg"], key=abs):+.0f} degrees about one axis: its '
-                      'orientation in the network file is wrong, or the target is not as modelled')
-        for name, value in t.get('truth', {}).items():
-            if isinstance(value, float):
-                print(f'    against truth: {name} {value:.4g}')
+        _print_track(t)
+
+
+def _print_track(t: dict[str, Any]) -> None:
+    """A track in a few lines."""
+    print(f'  track {t["id"]}: {t["poses"]} poses'
+          + (f', from {t["arrival"]} ({t["arrival_weights"][t["arrival"]]:.0%})'
+             if t['arrival'] else '')
+          + (f', a {t["kind"]} ({t["kind_weight"]:.0%})' if t['kind'] else '')
+          + f', {t["speed"]:.2f} m/s, {t["moment_size"]:.3g} A m^2, {t["verdict"]}')
+    delay = t.get('delay', {})
+    if 'speed' in delay:
+        print(f'    by the delay between sensors: {delay["speed"]:.2f} '
+              f'({delay["speed_sd"]:.2f}) m/s, {delay["heading_deg"]:.0f} deg')
+    if delay.get('contradicts'):
+        print('    warning: track and delay contradict each other; believe neither (a clock, '
+              'a position in the network file, a turn, frames that are too long)')
+    for name, m in t['mounting'].items():
+        if m['suspicious']:
+            print(f'    warning: {name} fits best if turned by '
+                  f'{max(m["angles_deg"], key=abs):+.0f} degrees about one axis: its '
+                  'orientation in the network file is wrong, or the target is not as modelled')
+    for name, value in t.get('truth', {}).items():
+        if isinstance(value, float):
+            print(f'    against truth: {name} {value:.4g}')
 
 
 def _print_limits(summary: dict[str, Any]) -> None:
@@ -143,6 +155,8 @@ def _print_limits(summary: dict[str, Any]) -> None:
     elif len(summary['sensors']) == 1 and summary['tracks']:
         print('  range and size are those of the settings (track.single_sensor_prior): one sensor '
               'does not tell the scale')
+    if summary['frames_too_long']:
+        print(f'  warning: {summary["frames_too_long"]}')
     hardly = counts.get('sensors whose orientation is hardly known', 0)
     if hardly:
         print(f'  warning: {hardly} sensors may be turned by more than 15 degrees, as the network '

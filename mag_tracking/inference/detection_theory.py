@@ -13,7 +13,7 @@ from mag_tracking.arrays import FloatArray, IntArray
 
 
 def energy_threshold(false_alarm_probability: float | FloatArray,
-                     degrees_of_freedom: int | IntArray) -> FloatArray:
+                     degrees_of_freedom: float | IntArray) -> FloatArray:
     """Threshold h with P(chi2_n > h) = `false_alarm_probability`; T10 eq. (5.18)."""
     return cast(FloatArray, chdtri(degrees_of_freedom, false_alarm_probability))
 

@@ -3,7 +3,7 @@
 The model comes in as a function or an object, so that this file is mathematics only.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
@@ -14,6 +14,9 @@ from mag_tracking.arrays import BoolArray, FloatArray
 
 ResidualAndJacobian: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Takes points (n, n_x), returns residuals (n, n_y) and Jacobians (n, n_y, n_x)."""
+
+CORRELATED_S = 0.2
+"""[s] What a model leaves out of a vehicle is alike for so long: a car's length at 20 m/s."""
 
 
 def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iterations: int = 40,
@@ -157,6 +160,41 @@ def correlated_scores(scores: FloatArray, lag: int) -> FloatArray:
         pairs = scores[k:].T @ scores[:-k]
         S += (1.0 - k / (lag + 1.0)) * (pairs + pairs.T)
     return S
+
+
+def left_out_covariance(t: Sequence[FloatArray], derivatives: Sequence[FloatArray],
+                        left: Sequence[FloatArray], covariance: FloatArray) -> FloatArray:
+    """What must be added to a covariance for what a model leaves out.
+
+    The residuals then are no noise: they are alike for a while, and count for less than their
+    number. Nothing is taken away where chance made them look less than noise.
+
+    Parameters
+    ----------
+    t, derivatives, left : of each sensor (n,) [s], (n, k, n_x), (n, k)
+        Times in order; whitened derivatives and residuals.
+    covariance : (n_x, n_x)
+        By noise alone.
+
+    Returns
+    -------
+    (n_x, n_x)
+        NaN where a variance is infinite.
+    """
+    scale = np.sqrt(np.diagonal(covariance))
+    excess = np.zeros_like(covariance)
+    for times, H, r in zip(t, derivatives, left, strict=True):
+        columns = H * scale
+        step = np.median(np.diff(times)) if len(times) > 1 else CORRELATED_S
+        excess += correlated_scores(np.einsum('nai,na->ni', columns, r),
+                                    int(CORRELATED_S / max(step, 1e-9)))
+        excess -= np.einsum('nai,naj->ij', columns, columns)
+    if not np.isfinite(excess).all():
+        return np.full_like(covariance, np.nan)
+    w, V = np.linalg.eigh(excess)
+    root = (covariance / np.outer(scale, scale)) @ (V * np.sqrt(np.maximum(w, 0.0)))
+    missing: FloatArray = np.outer(scale, scale) * (root @ root.T)
+    return missing
 
 
 class SeparableModel(Protocol):

@@ -10,19 +10,25 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from mag_tracking.analysis.correlated_motion import CorrelatedMotion
 from mag_tracking.analysis.pass_result import Bearing, PassFit
+from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import OutputError
 from mag_tracking.recording.result_folder import without_nan
 
 FIT_COLUMNS = (
     'recording', 'pass', 'n_dipoles', 'chosen', 'reason', 'stamp_ns', 'n_values', 'n_unknowns',
-    'normalised_cost', 'explained', 'velocity_change', 'ambiguous', 'x', 'y', 'z', 'vx', 'vy',
-    'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz', 'speed', 'sd_speed', 'heading_deg',
-    'sd_heading_deg', 'length', 'sd_length', 'mx', 'my', 'mz', 'sd_mx', 'sd_my', 'sd_mz',
-    'cpa_time', 'sd_cpa_time', 'cpa_range', 'sd_cpa_range', 'rate', 'sd_rate')
+    'normalised_cost', 'explained', 'left_elsewhere', 'velocity_change', 'trusted', 'ambiguous',
+    'x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz',
+    'speed', 'sd_speed', 'heading_deg', 'sd_heading_deg', 'length', 'sd_length',
+    'mx', 'my', 'mz', 'sd_mx', 'sd_my', 'sd_mz', 'cpa_time', 'sd_cpa_time',
+    'cpa_range', 'sd_cpa_range', 'rate', 'sd_rate',
+    'delay_speed', 'sd_delay_speed', 'delay_heading_deg')
 """Deviations are of `PassFit.honest_covariance`; the CPA is to the middle of the sensors, its time
 in seconds after `stamp_ns`. The rate is speed over CPA range, which one sensor alone tells; its
-directions are in `fits.json`."""
+directions are in `fits.json`. Where there is a reason not to believe a fit as a whole, there are
+the numbers that are trusted: of speed, direction (heading) and time (of the CPA). The delay's
+columns are the same for all fits of a pass: they need no model."""
 
 
 class _FittedPass(Protocol):
@@ -37,31 +43,35 @@ class _FittedPass(Protocol):
     @property
     def notes(self) -> Sequence[str]: ...
     @property
+    def correlated(self) -> CorrelatedMotion: ...
+    @property
     def chosen(self) -> PassFit | None: ...
 
 
 def fit_row(fit: PassFit) -> dict[str, Any]:
     """{column: number} of one `PassFit`, without those that say which pass it is.
 
-    Where the fit has a reason not to be believed all numbers of the target are NaN.
+    Where the fit has a reason not to be believed the target's numbers are NaN but for those that
+    are trusted.
     """
     row: dict[str, Any] = dict.fromkeys(FIT_COLUMNS[6:], math.nan)
-    row |= {'ambiguous': '', 'n_dipoles': fit.n_dipoles, 'reason': fit.reason,
+    row |= {'ambiguous': '', 'trusted': '', 'n_dipoles': fit.n_dipoles, 'reason': fit.reason,
             'stamp_ns': fit.data.stamp_ns, 'n_values': fit.data.n_values, 'n_unknowns': len(fit.x)}
     if len(fit.x):
         row |= {'normalised_cost': fit.normalised_cost, 'explained': fit.explained,
-                'velocity_change': fit.velocity_change}
+                'left_elsewhere': fit.left_elsewhere, 'velocity_change': fit.velocity_change,
+                'trusted': ' '.join(fit.trusted)}
     if fit.bearing is not None:
         b = fit.bearing
         row |= {'cpa_time': b.cpa_time, 'sd_cpa_time': b.cpa_time_std, 'rate': b.rate,
                 'sd_rate': b.rate_std}
+    centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
     if fit.reason:
-        return row
+        return row | _trusted(fit, centre)
     row['ambiguous'] = int(fit.ambiguous)
     sd = np.sqrt(np.diagonal(fit.honest_covariance))
     moment, P = fit.moment
     heading = [math.degrees(v) for v in fit.heading]
-    centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
     groups: tuple[tuple[str, Iterable[float]], ...] = (
         ('x y z', fit.position), ('vx vy vz', fit.velocity),
         ('sd_x sd_y sd_z sd_vx sd_vy sd_vz', sd[:6]), ('speed sd_speed', fit.speed),
@@ -73,10 +83,25 @@ def fit_row(fit: PassFit) -> dict[str, Any]:
     return row
 
 
+def _trusted(fit: PassFit, centre: FloatArray) -> dict[str, float]:
+    """{column: number} of what is trusted."""
+    found: dict[str, Iterable[float]] = {}
+    if 'speed' in fit.trusted:
+        found['speed sd_speed'] = fit.speed
+    if 'direction' in fit.trusted:
+        found['heading_deg sd_heading_deg'] = np.degrees(fit.heading)
+    if 'time' in fit.trusted:
+        found['cpa_time sd_cpa_time'] = fit.closest_approach(centre)[:2]
+    return {name: float(value) for names, values in found.items()
+            for name, value in zip(names.split(), values, strict=True)}
+
+
 def pass_rows(one: _FittedPass) -> list[dict[str, Any]]:
     """[{column: value}] of a `FittedPass`, one for each of its fits: `FIT_COLUMNS`."""
     return [{'recording': one.recording, 'pass': one.number, **fit_row(fit),
-             'chosen': int(fit is one.chosen)} for fit in one.fits]
+             'chosen': int(fit is one.chosen), 'delay_speed': one.correlated.speed,
+             'sd_delay_speed': one.correlated.speed_std,
+             'delay_heading_deg': math.degrees(one.correlated.heading)} for fit in one.fits]
 
 
 class FitFolder:
@@ -112,7 +137,8 @@ class FitFolder:
     def add(self, one: _FittedPass) -> None:
         """Write the rows of a `FittedPass`."""
         for fit, row in zip(one.fits, pass_rows(one), strict=True):
-            self.rows.append(row | {'notes': list(one.notes), 'bearing': _bearing(fit.bearing)})
+            self.rows.append(row | {'notes': list(one.notes), 'bearing': _bearing(fit.bearing),
+                                    'no_delay': one.correlated.reason})
             self._writer.writerow([repr(v) if isinstance(v, float) else v
                                    for v in (row[c] for c in FIT_COLUMNS)])
         self._stream.flush()

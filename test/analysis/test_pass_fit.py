@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 from mag_tracking.analysis.model_order import choose_order, order_criteria
 from mag_tracking.analysis.pass_data import separable_problem
+from mag_tracking.analysis.pass_deviation import SensorErrors
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.apps.fit import RecordingFit
@@ -161,7 +162,8 @@ def test_the_honest_covariance_is_never_smaller_and_no_larger_where_all_is_right
     ratios = []
     for seed in range(6):
         rng = np.random.default_rng([seed, n_dipoles, 9])
-        fit = fit_pass(measured(ROAD, *random_path(rng, n_dipoles, True), rng), n_dipoles)
+        fit = fit_pass(measured(ROAD, *random_path(rng, n_dipoles, True), rng), n_dipoles,
+                       errors=SensorErrors(0.0, 0.0))
         excess = fit.honest_covariance - fit.covariance
         scale = np.sqrt(np.diagonal(fit.covariance))
         assert np.linalg.eigvalsh(excess / np.outer(scale, scale)).min() > -1e-6

@@ -50,7 +50,7 @@ def measured(network, path, moments, rng, rate=100.0, seconds=4.0, noise=NOISE):
     model = RowPass(t, network.positions[sensor], network.R_sw[sensor], len(moments))
     B = (model.basis(path[None])[0] @ (model.combinations.T @ moments.ravel())).reshape(-1, 3)
     return PassData(network, 0, t, sensor, B + noise * rng.standard_normal(B.shape),
-                    np.tile(noise**2 * np.eye(3), (len(network), 1, 1)))
+                    np.tile(noise**2 * np.eye(3), (len(t), 1, 1)))
 
 
 def together(first, second):

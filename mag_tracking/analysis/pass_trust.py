@@ -1,0 +1,159 @@
+"""What a fitted pass knows, and what it only seems to know.
+
+No row of dipoles is a vehicle: near it some of the field is left over, and what is left over says
+little against the fit as long as it is where, and as much as, real vehicles leave. Speed,
+direction and time of the closest point then have deviations of their own, and each is trusted or
+not by those. The whole fit is refused only where something is not determined.
+"""
+
+import numpy as np
+
+from mag_tracking.analysis.pass_data import PassData
+from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.arrays import FloatArray
+
+POINT_REACH = 3.7
+"""[m] How far the iron of a car reaches from a single dipole: at the distance r this over r, as a
+share of its size, is wrong about the field. Six real vehicles at 4.5 m had normalised costs of 10
+to 51 (the cars; T10 Table 6.1, TSP14 Table I), the signal having 1200 times the energy of the
+noise at the closest point (T10 (6.1)): 87 times a value, on average over the pass. So 10 to 57 %
+of the energy was left over."""
+
+ROW_REACH = 0.45
+"""The same of a row, in distances of its dipoles: costs of 1.3 to 1.6 (cars) and 77 to 303 (trucks,
+of twenty times the energy) with three dipoles (T10 Table 6.5, TSP14 Table II) are 0.15 to 0.45."""
+
+LEAST_ROW_REACH = 0.4
+"""[m] However close the dipoles of a row: the cars of those tables."""
+
+NOISE_ENERGY = 16.3
+"""Whitened energy of three axes that noise exceeds once in a thousand samples."""
+
+LEAST_ELSEWHERE, MOST_ELSEWHERE = 0.003, 0.1
+"""What may be left over elsewhere: this share of the field in any case (gains, a swerve), and this
+share of what is left over."""
+
+LEAST_WAY = 0.3
+"""Share of the distance of the nearest sensor that a target has to move while it is seen."""
+
+MOST_CHANGE = 0.3
+"""Share of itself by which the velocity may seem to change while the target is seen: 17 degrees of
+a turn. Vehicles that are no rows of dipoles seem to change it by up to 0.2."""
+
+MOST_SPEED_STD = 0.25
+"""A speed is trusted whose deviation is no larger than this share of it: it is not zero."""
+
+MOST_HEADING_STD = np.pi / 6.0
+"""[rad] A direction is trusted that three deviations do not turn to the side."""
+
+MOST_TIME_STD = 0.25
+"""A time of the closest point is trusted that is known to this share of the time in which the
+target moves by its distance."""
+
+
+def reach(n_dipoles: int, length: float) -> float:
+    """[m] How far iron reaches beyond a row of `n_dipoles` over `length` [m]."""
+    if n_dipoles == 1:
+        return POINT_REACH
+    return max(LEAST_ROW_REACH, ROW_REACH * abs(length) / (n_dipoles - 1))
+
+
+def left_elsewhere(data: PassData, n_dipoles: int, theta: FloatArray, target: FloatArray,
+                   left: FloatArray) -> float:
+    """Share of the whitened energy of the target's field left over where no vehicle leaves it.
+
+    A vehicle leaves something over in proportion to its field, and the more the nearer it is; a
+    second vehicle does so at another time.
+
+    Parameters
+    ----------
+    data : PassData
+    n_dipoles : int
+    theta : (6 or 7,)
+        The path: position at time zero, velocity, length.
+    target : (n, 3) [T]
+        The target's field, sensor frame.
+    left : (n, 3)
+        Whitened residuals.
+
+    Returns
+    -------
+    float
+        What is beyond ICASSP11 eq. (9), with `reach` for lambda, and beyond noise.
+    """
+    v = theta[3:6]
+    ahead = np.linspace(-0.5, 0.5, n_dipoles) * theta[6] if n_dipoles > 1 else np.zeros(1)
+    forward = v / np.linalg.norm(v)
+    place = theta[:3] + data.t[:, None] * v - data.positions
+    distance = np.linalg.norm(place[:, None] + ahead[:, None] * forward, axis=2).min(axis=1)
+    energy = np.square(np.einsum('nij,nj->ni', data.whitening, target)).sum(axis=1)
+    length = float(theta[6]) if n_dipoles > 1 else 0.0
+    share = np.minimum(1.0, np.square(reach(n_dipoles, length) / np.maximum(distance, 1e-9)))
+    beyond = np.square(left).sum(axis=1) - share * energy - NOISE_ENERGY
+    return float(np.maximum(beyond, 0.0).sum() / energy.sum())
+
+
+def doubt(fit: PassFit) -> str:
+    """Why a minimum is no answer as a whole, or nothing."""
+    if not fit.converged:
+        return 'the fit did not converge'
+    if not _describes(fit):
+        return (f'not one target at constant velocity: {1.0 - fit.explained:.1%} of the field is '
+                f'left over, {fit.left_elsewhere:.1%} where a vehicle at that distance leaves none '
+                '(two vehicles in the window, a turn, a wrong network file)')
+    if fit.velocity_change - 2.0 * fit.velocity_change_std > MOST_CHANGE:
+        return ('not at constant velocity: while it was seen it changed by '
+                f'{fit.velocity_change:.0%} of itself (a turn, braking)')
+    nearest = _nearest(fit)
+    if np.linalg.norm(fit.velocity) * fit.seen_s < LEAST_WAY * nearest:
+        return 'no pass: while it was seen it hardly moved'
+    if fit.bearing is not None:
+        return ('one sensor: the scale is not observable, only directions and the time of the '
+                'closest approach are (TSP14 Proposition 1)')
+    lost = [name for name, variance in zip(fit.names, np.diagonal(fit.covariance), strict=True)
+            if not np.isfinite(variance)]
+    if lost:
+        return f'not observable: {", ".join(lost)}'
+    if not fit.determined:
+        length, length_std = fit.length
+        return (f'not determined: a length of {length:.1f} m, known to {length_std:.1f} m; '
+                'take fewer dipoles')
+    std = np.sqrt(np.trace(fit.honest_covariance[:3, :3]))
+    if std > nearest:
+        return (f'out of range: the position is known to {std:.1f} m only, and no sensor is nearer '
+                f'than {nearest:.1f} m')
+    return ''
+
+
+def trusted(fit: PassFit) -> tuple[str, ...]:
+    """Which of speed, direction and time a minimum determines, whatever else it does not.
+
+    Nothing of a target that the model does not describe, or that did not pass.
+    """
+    if not fit.converged or not _describes(fit) or fit.bearing is not None \
+            or fit.velocity_change - 2.0 * fit.velocity_change_std > MOST_CHANGE:
+        return ()
+    speed, speed_std = fit.speed
+    _, heading_std = fit.heading
+    nearest = _nearest(fit)
+    if speed * fit.seen_s < LEAST_WAY * nearest:
+        return ()
+    centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
+    _, time_std, _, _ = fit.closest_approach(centre)
+    # A comparison with NaN, where a variance is not known, is false.
+    known = {'speed': speed_std <= MOST_SPEED_STD * speed,
+             'direction': heading_std <= MOST_HEADING_STD,
+             'time': time_std * speed <= MOST_TIME_STD * nearest}
+    return tuple(name for name, is_known in known.items() if is_known)
+
+
+def _describes(fit: PassFit) -> bool:
+    """Whether what is left over is where real vehicles leave it."""
+    limit = max(LEAST_ELSEWHERE, MOST_ELSEWHERE * (1.0 - fit.explained))
+    return fit.left_elsewhere <= limit
+
+
+def _nearest(fit: PassFit) -> float:
+    """[m] How near the middle of the target comes to a sensor."""
+    return min(fit.closest_approach(place)[2]
+               for place in fit.data.network.positions[fit.data.sensors])

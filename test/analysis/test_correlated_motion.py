@@ -1,0 +1,101 @@
+"""Speed and direction by the delay between sensors: laws, and what it refuses."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mag_tracking.analysis.correlated_motion import CorrelatedMotion, correlated_motion, disagree
+from mag_tracking.geometry import quaternion_from_rotation_vector, rotation_from_quaternion
+from support.passes import NOISE, measured, network_of
+
+HEIGHT = 0.5
+
+
+def along_x(speed, aside=2.0, seed=0, places=((-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)), heading=0.0,
+            noise=NOISE, n_dipoles=3):
+    """`PassData` of a row of dipoles that passes the sensors at some distance."""
+    rng = np.random.default_rng(seed)
+    u = np.array([np.cos(heading), np.sin(heading), 0.0])
+    path = np.concatenate([[-aside * u[1], aside * u[0], HEIGHT], speed * u, [3.0]])
+    moments = 130.0 * rng.standard_normal((n_dipoles, 3))
+    return measured(network_of(places), path, moments, rng, rate=200.0, seconds=6.0, noise=noise)
+
+
+@pytest.mark.parametrize('speed', [2.0, 8.0, 25.0])
+@pytest.mark.parametrize('heading', [0.0, np.pi])
+def test_the_delay_is_distance_over_speed(speed, heading):
+    found = correlated_motion(along_x(speed, heading=heading))
+    assert not found.reason and found.alike > 0.99 and np.isnan(found.heading_std)
+    assert abs(found.speed - speed) < max(3.0 * found.speed_std, 1e-3 * speed)
+    assert found.speed_std < 0.05 * speed
+    assert np.cos(found.heading - heading) > 0.999
+    (pair,) = found.pairs
+    assert pair.delay == pytest.approx(2.0 / speed * np.cos(heading), rel=0.02)
+
+
+def test_sensors_need_not_be_turned_alike():
+    data = along_x(7.0)
+    turns = rotation_from_quaternion(quaternion_from_rotation_vector(
+        np.array([[0.3, 1.0, -0.5], [2.0, 0.1, 0.4]])))
+    field = np.einsum('nji,nj->ni', turns[data.sensor], data.field)
+    turned = dataclasses.replace(data, network=dataclasses.replace(data.network, R_ws=turns),
+                                 field=field)
+    assert correlated_motion(turned).speed == pytest.approx(7.0, rel=0.01)
+
+
+def test_a_turn_and_a_gain_that_nobody_knows_cost_little():
+    data = along_x(7.0)
+    turn = rotation_from_quaternion(quaternion_from_rotation_vector(np.radians([1.5, -1.0, 2.0])))
+    second = (data.sensor == 1)[:, None]
+    field = np.where(second, 1.02 * data.field @ turn, data.field)
+    found = correlated_motion(dataclasses.replace(data, field=field))
+    assert abs(found.speed - 7.0) < max(3.0 * found.speed_std, 0.05)
+
+
+def test_three_sensors_off_a_line_tell_the_heading():
+    """Only pairs that feel the same count: here all do, for the target is far away."""
+    places = ((-2.0, 0.0, 0.0), (2.0, 0.0, 0.0), (0.0, 0.6, 0.0))
+    found = correlated_motion(along_x(6.0, aside=25.0, places=places, noise=1e-12))
+    assert not found.reason and len(found.pairs) == 3 and np.isfinite(found.heading_std)
+
+
+def test_other_sides_of_a_road_have_no_delay():
+    places = ((0.0, -4.5, 0.0), (0.0, 4.5, 0.0))
+    found = correlated_motion(along_x(9.0, aside=1.5, places=places))
+    assert 'different fields' in found.reason and np.isnan(found.speed)
+
+
+def test_side_by_side_is_no_delay():
+    """A target between the two, far from both, reaches them at once."""
+    places = ((0.0, -0.25, 0.0), (0.0, 0.25, 0.0))
+    found = correlated_motion(along_x(9.0, aside=20.0, places=places, noise=1e-11))
+    assert 'at the same time' in found.reason
+
+
+def test_one_sensor_and_no_axis_in_common():
+    data = along_x(9.0)
+    field = data.field.copy()
+    field[data.sensor == 0] = np.nan
+    assert correlated_motion(dataclasses.replace(data, field=field)).reason.startswith('one sensor')
+    field = data.field.copy()
+    field[data.sensor == 0, 0] = field[data.sensor == 1, 1:] = np.nan
+    found = correlated_motion(dataclasses.replace(data, field=field))
+    assert 'same axes' in found.reason
+
+
+def test_one_axis_is_enough():
+    data = along_x(9.0)
+    field = data.field.copy()
+    field[:, :2] = np.nan
+    assert correlated_motion(dataclasses.replace(data, field=field)).speed == pytest.approx(
+        9.0, rel=0.02)
+
+
+def test_what_contradicts():
+    c = CorrelatedMotion('', 10.0, 0.2, 0.0, np.nan, 1.0)
+    assert not disagree((10.4, 0.1), 0.2, c) and disagree((14.0, 0.3), 0.2, c)
+    assert disagree((10.0, 0.1), np.pi, c)
+    # Either a large deviation or a small difference is no contradiction.
+    assert not disagree((14.0, 2.0), 0.0, c) and not disagree((10.9, 0.01), 0.0, c)
+    assert not disagree((14.0, 0.1), 0.0, CorrelatedMotion('one sensor'))
