@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray, IntArray
@@ -105,8 +104,8 @@ def correlated_motion(data: PassData) -> CorrelatedMotion:
     best = max(d.alike for d in found)
     alike = tuple(d for d in found if d.alike >= LEAST_ALIKE)
     if not alike:
-        return CorrelatedMotion(f'the sensors feel different fields ({best:.0%} alike): none is '
-                                'behind another on the way', alike=best)
+        return CorrelatedMotion(f'the sensors feel different fields ({max(best, 0.0):.0%} alike): '
+                                'none is behind another on the way', alike=best)
     if all(abs(d.delay) < LEAST_DELAY * d.delay_std for d in alike):
         return CorrelatedMotion('the sensors feel the same at the same time', alike=best,
                                 pairs=alike)
@@ -171,6 +170,9 @@ class _Series:
 
     def smoothed(self, t: FloatArray, width: float) -> FloatArray:
         """(n, k) at even times `t` (n,), by a normal curve of a `width` [s]."""
+        # The first use of scipy.ndimage takes a tenth of a second, which no other command has.
+        from scipy.ndimage import gaussian_filter1d
+
         even = np.stack([np.interp(t, self.t, v) for v in self.field.T], axis=1)
         smooth: FloatArray = gaussian_filter1d(even, width / (t[1] - t[0]), axis=0)
         return smooth
