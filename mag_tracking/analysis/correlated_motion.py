@@ -20,7 +20,7 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.least_squares import left_out_covariance
 
-LEAST_ALIKE = 0.9
+LEAST_ALIKE = 0.97
 """Fields are the same where this share of one's energy is that of the other, delayed."""
 
 LEAST_PEAK = 0.7
@@ -49,8 +49,20 @@ thousand."""
 DISAGREE, SAME_SPEED = 3.0, 0.1
 """Speeds contradict each other that are apart by more deviations, and by more than this share."""
 
+LEAST_ALONG = 0.3
+"""Cosine of the angle to the line of the sensors below which a target goes across it."""
+
+LEAST_APART = 0.1
+"""[m] Sensors nearer than this, seen from above, tell no delay."""
+
+MOST_READINGS = 1_000_000
+"""A pass of more even times is not looked at: its timestamps are no even ones."""
+
 MOST_PAIRS = 12
 """Pairs that are compared; the closest ones."""
+
+FEWEST = 10
+"""Readings that a sensor needs."""
 
 _STEPS = 20
 
@@ -72,7 +84,7 @@ class PairDelay:
 class CorrelatedMotion:
     """Velocity by the delays between sensors; where `reason` is not empty there is none."""
 
-    reason: str = ''
+    reason: str = 'not looked for'
     speed: float = np.nan
     """[m/s]"""
     speed_std: float = np.nan
@@ -101,7 +113,8 @@ def correlated_motion(data: PassData) -> CorrelatedMotion:
         return CorrelatedMotion('one sensor: there is no delay')
     found = [d for d in (_pair_delay(data, i, j) for i, j in _pairs(data)) if d is not None]
     if not found:
-        return CorrelatedMotion('the sensors do not measure the same axes')
+        return CorrelatedMotion('no two sensors beside each other have readings of a field, and an '
+                                'axis, in common')
     best = max(d.alike for d in found)
     alike = tuple(d for d in found if d.alike >= LEAST_ALIKE)
     if not alike:
@@ -113,22 +126,35 @@ def correlated_motion(data: PassData) -> CorrelatedMotion:
     return _motion(data, alike, best)
 
 
-def disagree(speed: tuple[float, float], heading: float, delay: CorrelatedMotion) -> bool:
-    """Whether a `speed` (with its deviation [m/s]) and `heading` [rad] contradict the delays."""
-    if delay.reason:
+def disagree(speed: tuple[float, float], heading: tuple[float, float],
+             delay: CorrelatedMotion) -> bool:
+    """Whether a speed [m/s] and a heading [rad], with their deviations, contradict the delays.
+
+    Across the line of the sensors a target that goes obliquely has a shorter delay. Where it goes
+    nearly at right angles to it, or something is not known, nothing is contradicted.
+    """
+    if delay.reason or not np.isfinite([*speed, *heading]).all():
         return False
-    apart = abs(speed[0] - delay.speed)
-    turned = np.cos(heading - delay.heading) < 0.0
-    return bool(turned or apart > DISAGREE * np.hypot(speed[1], delay.speed_std)
+    off = abs(np.angle(np.exp(1j * (heading[0] - delay.heading))))
+    if off > 0.5 * np.pi:
+        return bool(off - 0.5 * np.pi > DISAGREE * heading[1])
+    along = np.cos(off) if np.isnan(delay.heading_std) else 1.0
+    if along < LEAST_ALONG:
+        return False
+    # What the delay would be as a speed, and how far the heading makes that uncertain.
+    std = np.hypot(speed[1], speed[0] * np.tan(off) * heading[1]) / along
+    apart = abs(speed[0] / along - delay.speed)
+    return bool(apart > DISAGREE * np.hypot(std, delay.speed_std)
                 and apart > SAME_SPEED * delay.speed)
 
 
 def _pairs(data: PassData) -> list[tuple[int, int]]:
     """The closest pairs of sensors."""
-    place = data.network.positions
+    place = data.network.positions[:, :2]
     pairs = list(combinations(data.sensors.tolist(), 2))
-    apart = [float(np.linalg.norm(place[i] - place[j])) for i, j in pairs]
-    return [pairs[k] for k in np.argsort(apart, kind='stable')[:MOST_PAIRS]]
+    apart = np.array([np.linalg.norm(place[i] - place[j]) for i, j in pairs])
+    nearest = [k for k in np.argsort(apart, kind='stable') if apart[k] > LEAST_APART]
+    return [pairs[k] for k in nearest[:MOST_PAIRS]]
 
 
 def _motion(data: PassData, pairs: Sequence[PairDelay], alike: float) -> CorrelatedMotion:
@@ -163,7 +189,7 @@ class _Series:
     def __init__(self, data: PassData, j: int, R: FloatArray, axes: IntArray) -> None:
         mine = data.sensor == j
         field = data.field[mine]
-        whole = ~np.isnan(field[:, axes]).any(axis=1)
+        whole = np.isfinite(field[:, axes]).all(axis=1)
         self.t = data.t[mine][whole]
         self.field = (field[whole] @ R.T if len(axes) == 3 else field[whole])[:, axes]
         variance = np.einsum('nii->ni', data.covariance[mine])[:, axes]
@@ -205,14 +231,16 @@ def _pair_of(data: PassData, i: int, j: int) -> _Pair | None:
     if not len(axes) or len(axes) < 3 and not np.allclose(R[i], R[j], atol=TURN_STD):
         return None
     first, second = _Series(data, i, R[i], axes), _Series(data, j, R[j], axes)
-    if min(len(first.t), len(second.t)) < 10:
+    if min(len(first.t), len(second.t)) < FEWEST or not min(first.noise, second.noise) > 0.0:
         return None
     begin, end = max(first.t[0], second.t[0]), min(first.t[-1], second.t[-1])
     step = min(float(np.median(np.diff(s.t))) for s in (first, second))
-    t = np.arange(begin, end, step)
-    if len(t) < 10:
+    if not 0.0 < step * FEWEST < end - begin < step * MOST_READINGS:
         return None
+    t = np.arange(begin, end, step)
     energy = np.square(first.smoothed(t, step) - np.median(first.field, axis=0)).sum(axis=1)
+    if not energy.max() > 0.0:
+        return None
     # The quiet part of a long window is not what is seen.
     energy = np.where(energy > 0.1 * energy.max(), energy, 0.0)
     energy /= energy.sum()
@@ -226,7 +254,12 @@ def _pair_delay(data: PassData, i: int, j: int) -> PairDelay | None:
     pair = _pair_of(data, i, j)
     if pair is None:
         return None
-    delay, std, alike = max((_refined(pair, tau) for tau in _maxima(pair)), key=lambda fit: fit[2])
+    try:
+        fits = [_refined(pair, tau) for tau in _maxima(pair)]
+    except np.linalg.LinAlgError:
+        # Where the first one does not change the delay is arbitrary.
+        return None
+    delay, std, alike = max(fits, key=lambda fit: fit[2])
     return PairDelay(i, j, delay, std, alike)
 
 
@@ -259,7 +292,7 @@ def _refined(pair: _Pair, tau: float) -> tuple[float, float, float]:
     freedom = y.size - len(theta)
     size = np.sqrt(np.square(y - np.median(pair.second, axis=0)).sum())
     whole = np.sqrt(np.square((pair.second - np.median(pair.second, axis=0))[::every]).sum())
-    if freedom <= 0 or size < LEAST_ALIKE * whole:
+    if freedom <= 0 or not size > 0.0 or size < LEAST_ALIKE * whole:
         # So late that hardly anything of the one is left to compare with the other.
         return tau, np.inf, 0.0
     std = size / np.sqrt(y.size)
@@ -276,12 +309,17 @@ def _refined(pair: _Pair, tau: float) -> tuple[float, float, float]:
     if abs(theta[0] - tau) > STRAYED * pair.width or theta @ prior @ theta > MOST_CHANGED:
         return tau, np.inf, 0.0
     left, J = _left(pair, t, y, theta)
-    covariance = np.linalg.inv(J.T @ J / std**2 + prior)
-    shape = len(t), k
-    covariance += left_out_covariance([t], [J.reshape(*shape, -1) / std],
-                                      [left.reshape(shape) / std], covariance)
-    return (float(theta[0]), float(np.sqrt(covariance[0, 0])),
+    return (float(theta[0]), _delay_std(t, J / std, left / std, prior),
             1.0 - max(0.0, float(left @ left) - freedom * pair.noise**2) / float(size**2))
+
+
+def _delay_std(t: FloatArray, J: FloatArray, left: FloatArray, prior: FloatArray) -> float:
+    """[s] Deviation of the delay, with what the two fields do not have in common."""
+    covariance: FloatArray = np.linalg.inv(J.T @ J + prior).astype(np.float64)
+    shape = len(t), len(left) // len(t)
+    covariance += left_out_covariance([t], [J.reshape(*shape, -1)], [left.reshape(shape)],
+                                      covariance)
+    return float(np.sqrt(covariance[0, 0]))
 
 
 def _left(pair: _Pair, t: FloatArray, y: FloatArray,

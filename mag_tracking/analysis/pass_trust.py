@@ -1,4 +1,4 @@
-"""What a fitted pass knows, and what it only seems to know.
+"""How far a fitted pass is to be trusted.
 
 No row of dipoles is a vehicle: near it some of the field is left over, and what is left over says
 little against the fit as long as it is where, and as much as, real vehicles leave. Speed,
@@ -12,12 +12,12 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.arrays import FloatArray
 
-POINT_REACH = 3.7
+POINT_REACH = 2.1
 """[m] How far the iron of a car reaches from a single dipole: at the distance r this over r, as a
-share of its size, is wrong about the field. Six real vehicles at 4.5 m had normalised costs of 10
-to 51 (the cars; T10 Table 6.1, TSP14 Table I), the signal having 1200 times the energy of the
-noise at the closest point (T10 (6.1)): 87 times a value, on average over the pass. So 10 to 57 %
-of the energy was left over."""
+share of its size, is wrong about the field. Four real cars at 4.5 m had normalised costs of 10,
+14, 17 and 51 (T10 Table 6.1, TSP14 Table I), the signal having 1200 times the energy of the noise
+at the closest point (T10 (6.1)): 87 times a value, on average over the pass. So three of them left
+over 10 to 18 % of the energy; the fourth, 57 %, is no pass of a point."""
 
 ROW_REACH = 0.45
 """The same of a row, in distances of its dipoles: costs of 1.3 to 1.6 (cars) and 77 to 303 (trucks,
@@ -39,6 +39,9 @@ LEAST_WAY = 0.3
 MOST_CHANGE = 0.3
 """Share of itself by which the velocity may seem to change while the target is seen: 17 degrees of
 a turn. Vehicles that are no rows of dipoles seem to change it by up to 0.2."""
+
+SIGNIFICANT = 2.5
+"""A change of the velocity that is larger than so many deviations is one."""
 
 MOST_SPEED_STD = 0.25
 """A speed is trusted whose deviation is no larger than this share of it: it is not zero."""
@@ -101,7 +104,7 @@ def doubt(fit: PassFit) -> str:
         return (f'not one target at constant velocity: {1.0 - fit.explained:.1%} of the field is '
                 f'left over, {fit.left_elsewhere:.1%} where a vehicle at that distance leaves none '
                 '(two vehicles in the window, a turn, a wrong network file)')
-    if fit.velocity_change - 2.0 * fit.velocity_change_std > MOST_CHANGE:
+    if turns(fit):
         return ('not at constant velocity: while it was seen it changed by '
                 f'{fit.velocity_change:.0%} of itself (a turn, braking)')
     nearest = _nearest(fit)
@@ -126,12 +129,12 @@ def doubt(fit: PassFit) -> str:
 
 
 def trusted(fit: PassFit) -> tuple[str, ...]:
-    """Which of speed, direction and time a minimum determines, whatever else it does not.
+    """Speed, direction and time: those that a minimum determines, whatever else it does not.
 
-    Nothing of a target that the model does not describe, or that did not pass.
+    None of a target that the model does not describe, or that turned or did not pass.
     """
     if not fit.converged or not _describes(fit) or fit.bearing is not None \
-            or fit.velocity_change - 2.0 * fit.velocity_change_std > MOST_CHANGE:
+            or turns(fit):
         return ()
     speed, speed_std = fit.speed
     _, heading_std = fit.heading
@@ -142,7 +145,7 @@ def trusted(fit: PassFit) -> tuple[str, ...]:
     _, time_std, _, _ = fit.closest_approach(centre)
     # A comparison with NaN, where a variance is not known, is false.
     known = {'speed': speed_std <= MOST_SPEED_STD * speed,
-             'direction': heading_std <= MOST_HEADING_STD,
+             'direction': heading_std <= MOST_HEADING_STD and speed_std <= 0.5 * speed,
              'time': time_std * speed <= MOST_TIME_STD * nearest}
     return tuple(name for name, is_known in known.items() if is_known)
 
@@ -151,6 +154,16 @@ def _describes(fit: PassFit) -> bool:
     """Whether what is left over is where real vehicles leave it."""
     limit = max(LEAST_ELSEWHERE, MOST_ELSEWHERE * (1.0 - fit.explained))
     return fit.left_elsewhere <= limit
+
+
+def turns(fit: PassFit) -> bool:
+    """Whether the velocity changes by much, and by more than errors of the model make it seem."""
+    return bool(fit.velocity_change > max(MOST_CHANGE, SIGNIFICANT * fit.velocity_change_std))
+
+
+def contradicted(fit: PassFit) -> bool:
+    """Whether a fit says that there was not one target on a straight line, whatever the order."""
+    return fit.n_dipoles > 1 and (turns(fit) or not _describes(fit))
 
 
 def _nearest(fit: PassFit) -> float:

@@ -1,7 +1,7 @@
 """Fit the passes of a recording, offline."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ from mag_tracking.analysis.model_order import choose_order
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.analysis.pass_trust import contradicted
 from mag_tracking.apps.first_pass import first_pass_of
 from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.apps.readings import network_of
@@ -38,7 +39,8 @@ FIT_UNITS = {
     **dict.fromkeys(('cpa_time', 'sd_cpa_time'), 's'),
     **dict.fromkeys(('cpa_range', 'sd_cpa_range'), 'm'),
     **dict.fromkeys(('rate', 'sd_rate'), '1/s'),
-    **dict.fromkeys(('delay_speed', 'sd_delay_speed'), 'm/s'), 'delay_heading_deg': 'deg'}
+    **dict.fromkeys(('delay_speed', 'sd_delay_speed'), 'm/s'),
+    **dict.fromkeys(('delay_heading_deg', 'sd_delay_heading_deg'), 'deg')}
 """Units of the columns of `fits.csv`."""
 
 
@@ -51,13 +53,26 @@ class FittedPass:
     fits: tuple[PassFit, ...]
     notes: tuple[str, ...]
     """What was left out of the measurements, and why."""
-    correlated: CorrelatedMotion = field(default_factory=CorrelatedMotion)
+    correlated: CorrelatedMotion = CorrelatedMotion()
     """The velocity by the delays between the sensors, which needs no model."""
 
     @property
     def chosen(self) -> PassFit | None:
         """The fit of the order that the measurements are worth, or None."""
         return choose_order(self.fits)
+
+    @property
+    def known(self) -> PassFit | None:
+        """The fit whose trusted numbers count: the chosen one, else the one that fits best.
+
+        None where any fit says that the target turned or was not one: that holds for all.
+        """
+        if self.chosen is not None:
+            return self.chosen
+        usable = [f for f in self.fits if f.converged and f.trusted]
+        if not usable or any(contradicted(f) for f in self.fits if f.converged):
+            return None
+        return min(usable, key=lambda f: f.normalised_cost)
 
     @property
     def disagreement(self) -> tuple[float, float]:

@@ -174,6 +174,7 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
     return {'recording': recording.path.name, 'target': pipeline.settings.track.target,
             'counts': pipeline.counts(), 'rejected': rejections, 'lost': dict(recording.losses),
             'why_no_detection': why,
+            'close_network': len(pipeline.network) > 1 and pipeline.network.is_close,
             'frames_too_long': too_long(pipeline.settings.align, pipeline.network),
             'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks}
 
@@ -208,9 +209,14 @@ def _delay_entry(log: TrackLog, network: SensorNetwork) -> dict[str, Any]:
     speed = float(np.hypot(vx, vy))
     u = np.array([vx, vy]) / speed
     std = float(np.sqrt(u @ log.covariance[k][3:5, 3:5] @ u))
+    across = np.array([-u[1], u[0]])
+    heading_std = float(np.sqrt(across @ log.covariance[k][3:5, 3:5] @ across)) / speed
+    heading = float(np.arctan2(vy, vx)), heading_std
     return {'speed': found.speed, 'speed_sd': found.speed_std,
             'heading_deg': float(np.degrees(found.heading)),
-            'contradicts': disagree((speed, std), float(np.arctan2(vy, vx)), found)}
+            'heading_sd_deg': None if np.isnan(found.heading_std)
+            else float(np.degrees(found.heading_std)),
+            'contradicts': disagree((speed, std), heading, found)}
 
 
 def _pass_of(log: TrackLog, network: SensorNetwork) -> PassData:

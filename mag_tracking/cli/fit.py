@@ -133,15 +133,14 @@ def _print_pass(one: FittedPass) -> None:
         print(f' {mark}   {fit.n_dipoles}  {cost}  {fit.reason or _numbers(fit)}')
         if fit.bearing is not None:
             _print_bearing(fit.bearing)
-        if fit.reason and fit.trusted:
-            print(f'        known all the same: {_known(fit)}')
+        if fit.reason and fit is one.known:
+            print(f'        determined: {_known(fit)}')
         if not fit.reason and fit.ambiguous:
             behind, path = min(fit.rivals, key=lambda rival: rival[0])
             print(f'        ambiguous: {np.exp(-0.5 * behind):.2f} times as likely is '
                   f'({", ".join(f"{v:.2f}" for v in path[:3])}) m'
                   + (f' with a length of {abs(path[6]):.1f} m' if len(path) > 6 else ''))
-    if not one.correlated.reason:
-        _print_delay(one)
+    _print_delay(one)
     if one.chosen is not None:
         least = one.chosen.normalised_cost
         if least > POOR:
@@ -173,11 +172,14 @@ def _known(fit: PassFit) -> str:
 def _print_delay(one: FittedPass) -> None:
     """The velocity by the delays between sensors, and whether the fit agrees."""
     c = one.correlated
+    if c.reason:
+        print(f'  no speed by the delay between sensors: {c.reason}')
+        return
     line = ', along the line of the sensors' if np.isnan(c.heading_std) else ''
     print(f'  by the delay between sensors: {c.speed:.2f}({c.speed_std:.2f}) m/s, '
           f'{np.degrees(c.heading):.0f} deg{line}')
     best = one.chosen
-    if best is not None and disagree(best.speed, best.heading[0], c):
+    if best is not None and disagree(best.speed, best.heading, c):
         print('  warning: fit and delay contradict each other; believe neither (a clock, a '
               'position in the network file, a turn)')
 

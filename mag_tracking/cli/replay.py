@@ -131,7 +131,8 @@ def _print_track(t: dict[str, Any]) -> None:
     delay = t.get('delay', {})
     if 'speed' in delay:
         print(f'    by the delay between sensors: {delay["speed"]:.2f} '
-              f'({delay["speed_sd"]:.2f}) m/s, {delay["heading_deg"]:.0f} deg')
+              f'({delay["speed_sd"]:.2f}) m/s, {delay["heading_deg"]:.0f} deg'
+              + (', along the line of the sensors' if delay['heading_sd_deg'] is None else ''))
     if delay.get('contradicts'):
         print('    warning: track and delay contradict each other; believe neither (a clock, '
               'a position in the network file, a turn, frames that are too long)')
@@ -155,6 +156,9 @@ def _print_limits(summary: dict[str, Any]) -> None:
     elif len(summary['sensors']) == 1 and summary['tracks']:
         print('  range and size are those of the settings (track.single_sensor_prior): one sensor '
               'does not tell the scale')
+    if summary['close_network'] and summary['target'] == 'vehicle' and summary['tracks']:
+        print('  all sensors are within two metres: they hardly tell range and size, so the tracks '
+              'are always ambiguous; speed and direction are those of the delay')
     if summary['frames_too_long']:
         print(f'  warning: {summary["frames_too_long"]}')
     hardly = counts.get('sensors whose orientation is hardly known', 0)

@@ -10,6 +10,9 @@ from mag_tracking.errors import NetworkError
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
 from mag_tracking.units import NS
 
+CLOSE = 2.0
+"""[m] Half a car."""
+
 
 @dataclass(frozen=True)
 class Calibrated:
@@ -103,6 +106,15 @@ class SensorNetwork:
         """(3,) [m], mean of the sensor positions."""
         centre: FloatArray = self.positions.mean(axis=0)
         return centre
+
+    @property
+    def is_close(self) -> bool:
+        """Whether all sensors are within `CLOSE` of each other; one alone is.
+
+        What a model leaves out of a vehicle is then about the same at all of them, and together
+        they tell hardly more of range and size than one sensor does.
+        """
+        return bool(np.hypot(*np.ptp(self.positions[:, :2], axis=0)) < CLOSE)
 
     def part(self, rows: IntArray) -> 'SensorNetwork':
         """The network of the sensors `rows` (n,) alone."""

@@ -23,12 +23,13 @@ FIT_COLUMNS = (
     'speed', 'sd_speed', 'heading_deg', 'sd_heading_deg', 'length', 'sd_length',
     'mx', 'my', 'mz', 'sd_mx', 'sd_my', 'sd_mz', 'cpa_time', 'sd_cpa_time',
     'cpa_range', 'sd_cpa_range', 'rate', 'sd_rate',
-    'delay_speed', 'sd_delay_speed', 'delay_heading_deg')
+    'delay_speed', 'sd_delay_speed', 'delay_heading_deg', 'sd_delay_heading_deg', 'no_delay')
 """Deviations are of `PassFit.honest_covariance`; the CPA is to the middle of the sensors, its time
 in seconds after `stamp_ns`. The rate is speed over CPA range, which one sensor alone tells; its
 directions are in `fits.json`. Where there is a reason not to believe a fit as a whole, there are
-the numbers that are trusted: of speed, direction (heading) and time (of the CPA). The delay's
-columns are the same for all fits of a pass: they need no model."""
+the numbers that are trusted, if it is the fit of the pass that counts: speed, direction (heading)
+and time (of the CPA). The delay's columns are the same for all fits of a pass: they need no
+model."""
 
 
 class _FittedPass(Protocol):
@@ -43,16 +44,18 @@ class _FittedPass(Protocol):
     @property
     def notes(self) -> Sequence[str]: ...
     @property
+    def known(self) -> PassFit | None: ...
+    @property
     def correlated(self) -> CorrelatedMotion: ...
     @property
     def chosen(self) -> PassFit | None: ...
 
 
-def fit_row(fit: PassFit) -> dict[str, Any]:
+def fit_row(fit: PassFit, is_known: bool = True) -> dict[str, Any]:
     """{column: number} of one `PassFit`, without those that say which pass it is.
 
     Where the fit has a reason not to be believed the target's numbers are NaN but for those that
-    are trusted.
+    are trusted, if `is_known`: it is the fit of its pass that counts.
     """
     row: dict[str, Any] = dict.fromkeys(FIT_COLUMNS[6:], math.nan)
     row |= {'ambiguous': '', 'trusted': '', 'n_dipoles': fit.n_dipoles, 'reason': fit.reason,
@@ -60,14 +63,14 @@ def fit_row(fit: PassFit) -> dict[str, Any]:
     if len(fit.x):
         row |= {'normalised_cost': fit.normalised_cost, 'explained': fit.explained,
                 'left_elsewhere': fit.left_elsewhere, 'velocity_change': fit.velocity_change,
-                'trusted': ' '.join(fit.trusted)}
+                'trusted': ' '.join(fit.trusted) if is_known else ''}
     if fit.bearing is not None:
         b = fit.bearing
         row |= {'cpa_time': b.cpa_time, 'sd_cpa_time': b.cpa_time_std, 'rate': b.rate,
                 'sd_rate': b.rate_std}
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
     if fit.reason:
-        return row | _trusted(fit, centre)
+        return row | (_trusted(fit, centre) if is_known else {})
     row['ambiguous'] = int(fit.ambiguous)
     sd = np.sqrt(np.diagonal(fit.honest_covariance))
     moment, P = fit.moment
@@ -98,10 +101,12 @@ def _trusted(fit: PassFit, centre: FloatArray) -> dict[str, float]:
 
 def pass_rows(one: _FittedPass) -> list[dict[str, Any]]:
     """[{column: value}] of a `FittedPass`, one for each of its fits: `FIT_COLUMNS`."""
-    return [{'recording': one.recording, 'pass': one.number, **fit_row(fit),
-             'chosen': int(fit is one.chosen), 'delay_speed': one.correlated.speed,
-             'sd_delay_speed': one.correlated.speed_std,
-             'delay_heading_deg': math.degrees(one.correlated.heading)} for fit in one.fits]
+    chosen, known, c = one.chosen, one.known, one.correlated
+    delay = {'delay_speed': c.speed, 'sd_delay_speed': c.speed_std,
+             'delay_heading_deg': math.degrees(c.heading),
+             'sd_delay_heading_deg': math.degrees(c.heading_std), 'no_delay': c.reason}
+    return [{'recording': one.recording, 'pass': one.number, **fit_row(fit, fit is known),
+             'chosen': int(fit is chosen), **delay} for fit in one.fits]
 
 
 class FitFolder:
@@ -137,8 +142,7 @@ class FitFolder:
     def add(self, one: _FittedPass) -> None:
         """Write the rows of a `FittedPass`."""
         for fit, row in zip(one.fits, pass_rows(one), strict=True):
-            self.rows.append(row | {'notes': list(one.notes), 'bearing': _bearing(fit.bearing),
-                                    'no_delay': one.correlated.reason})
+            self.rows.append(row | {'notes': list(one.notes), 'bearing': _bearing(fit.bearing)})
             self._writer.writerow([repr(v) if isinstance(v, float) else v
                                    for v in (row[c] for c in FIT_COLUMNS)])
         self._stream.flush()

@@ -7,8 +7,13 @@ import pytest
 
 from mag_tracking.analysis.pass_deviation import SensorErrors
 from mag_tracking.analysis.pass_fit import fit_pass
-from mag_tracking.analysis.pass_trust import left_elsewhere, reach
+from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.analysis.pass_trust import left_elsewhere, reach, trusted
+from mag_tracking.apps.fit import RecordingFit
+from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.fit_folder import fit_row
+from mag_tracking.recording.reader import Recording
+from support.bundled import VEHICLES, vehicle_path
 from support.close_pairs import answers, pass_of, readings_of
 from support.passes import NOISE, ROAD, measured, random_path, together
 
@@ -17,9 +22,9 @@ PATH = np.array([0.0, -2.0, 0.5, 10.0, 0.0, 0.0, 3.0])
 
 def test_how_far_iron_reaches():
     """TSP14 Tables I and II as shares of the energy: cost less one over 87, at 4.5 m."""
-    cars, trucks = (10, 14, 17, 51), ((302.6, 9.09), (76.7, 11.25))
+    cars, trucks = (10, 14, 17), ((302.6, 9.09), (76.7, 11.25))
     for cost in cars:
-        assert 1.0 < 4.5 * np.sqrt((cost - 1.0) / 87.0) <= reach(1, 0.0) * 1.1
+        assert 1.0 < 4.5 * np.sqrt((cost - 1.0) / 87.0) <= reach(1, 0.0)
     for cost, length in ((1.6, 3.95), (1.5, 3.56), (1.5, 4.98), (1.3, 2.07)):
         assert 4.5 * np.sqrt((cost - 1.0) / 87.0) <= reach(3, length)
     for cost, length in trucks:
@@ -124,3 +129,34 @@ def test_rests_of_a_coarse_sensor_count_once():
     # Learning noise differs by some percent, and each reading counts.
     slightly = data.covariance * np.linspace(1.0, 1.3, len(data.t))[:, None, None]
     assert replace(data, covariance=slightly).n_independent == data.n_values
+
+
+def fitted(std_speed, std_heading, change=0.0):
+    """A `PassFit` of a point with given deviations of speed [m/s] and heading [rad]."""
+    data, _ = field_and_data()
+    x = np.concatenate([[0.0, -2.0, 0.5], [10.0, 0.0, 0.0], np.ones(9)])
+    P = 1e-4 * np.eye(len(x))
+    P[3, 3], P[4, 4] = std_speed**2, (10.0 * std_heading)**2
+    return PassFit(1, data, '', True, tuple('u' * len(x)), x, P, P, 1.0, 1.0, 1.0,
+                   velocity_change=change, velocity_change_std=0.05, left_elsewhere=0.0)
+
+
+def test_each_answer_is_trusted_by_its_own_deviation():
+    assert trusted(fitted(0.5, 0.1)) == ('speed', 'direction', 'time')
+    assert 'speed' not in trusted(fitted(2.6, 0.1))
+    # Without a speed that differs from zero there is no direction.
+    assert 'direction' not in trusted(fitted(5.1, 0.1))
+    assert 'direction' not in trusted(fitted(0.5, 0.6)) and 'speed' in trusted(fitted(0.5, 0.6))
+    late = fitted(0.5, 0.1)
+    late.honest_covariance[0, 0] = 4.0
+    assert trusted(late) == ('speed', 'direction')
+    assert trusted(fitted(0.5, 0.1, change=0.5)) == ()
+    assert trusted(replace(fitted(0.5, 0.1), left_elsewhere=0.01)) == ()
+
+
+@pytest.mark.parametrize('name', [n for n in VEHICLES if 'turns' in n])
+def test_no_fit_of_a_turn_is_trusted(name, road_network):
+    job = RecordingFit(Recording(vehicle_path(name)), road_network, settings_for('vehicle'),
+                       (1, 2, 3, 4))
+    (one,) = job.passes()
+    assert one.chosen is None and one.known is None

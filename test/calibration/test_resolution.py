@@ -7,6 +7,7 @@ from numba import njit
 from mag_tracking.calibration.resolution import (
     DITHERED,
     LONGEST_REST_NS,
+    apply_steps,
     completed_steps,
     note_step,
     raw_steps,
@@ -113,3 +114,16 @@ def test_an_axis_that_never_changed_rests_or_is_dead():
     np.testing.assert_array_equal(completed_steps(np.zeros(3), never), never)
     one = np.array([np.nan, 0.0, np.nan])
     np.testing.assert_array_equal(completed_steps(one, np.array([inf, 2.0, inf])), [inf, 2.0, inf])
+
+
+def test_an_axis_that_rests_keeps_its_steps_when_another_gets_loud():
+    """Else its readings would have no noise at all."""
+    sensors = new_sensors(1)
+    sensors['noise'], sensors['step'] = np.zeros((3, 3)), [np.inf, 1e-6, np.inf]
+    limits = np.empty(3)
+    apply_steps(sensors, 5.0, limits)
+    np.testing.assert_allclose(sensors[0]['step_variance'], 1e-12 / 12.0)
+    sensors['noise'][0, 1, 1] = 9e-12
+    apply_steps(sensors, 5.0, limits)
+    np.testing.assert_allclose(sensors[0]['step_variance'][[0, 2]], 1e-12 / 12.0)
+    assert sensors[0]['step_variance'][1] == 0.0

@@ -46,6 +46,7 @@ def test_fit_says_speed_and_direction_twice(pair, tmp_path, capsys):
         assert float(chosen[f'sd_{name}']) < 0.25 * abs(velocity)
     assert chosen['trusted'] == 'speed direction time'
     assert abs(abs(float(chosen['delay_heading_deg'])) - (180.0 if velocity < 0.0 else 0.0)) < 1e-9
+    assert chosen['no_delay'] == '' and chosen['sd_delay_heading_deg'] == 'nan'
     assert json.loads((tmp_path / 'fits.json').read_text())['fits'][0]['no_delay'] == ''
 
 

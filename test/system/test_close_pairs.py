@@ -35,8 +35,6 @@ def test_speed_and_direction_of_forty_passes():
     rows = {'fit': [(a.truth, a.fit) for a in all_of if a.fit is not None],
             'delay': [(a.truth, delay_of(a)) for a in all_of if not a.delay.reason],
             'track': [(a.truth, a.track) for a in all_of if a.track is not None],
-            'track, not flagged': [(a.truth, a.track) for a in all_of
-                                   if a.track is not None and not a.ambiguous],
             'smoothed': [(a.truth, a.smoothed) for a in all_of if a.smoothed is not None]}
     found = {name: counts(row) for name, row in rows.items()}
     for name, (n, right, near, honest) in found.items():
@@ -44,9 +42,9 @@ def test_speed_and_direction_of_forty_passes():
               f'{near}, within three deviations {honest}')
     for name in ('fit', 'delay'):
         n, right, _, honest = found[name]
-        assert right == n and honest >= 0.95 * n
-    assert found['fit'][0] == 40 and found['delay'][0] >= 36
-    assert found['fit'][2] >= 36 and found['track'][1] == 40
+        assert n >= 36 and right == n and honest >= 0.95 * n
+    # Two sensors at one place hardly tell range and size.
+    assert all(a.ambiguous for a in all_of if a.track is not None)
 
 
 @pytest.mark.study

@@ -21,11 +21,11 @@ ONE_PLACE = 0.1
 def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
     """(delay [s], one sensor, the other), of the two that a fast target passes the soonest.
 
-    None where there are no two places.
+    None where there are no two places; one above another is one place.
     """
     shortest, found = np.inf, None
     for j, place in enumerate(network.positions):
-        distance = np.linalg.norm(network.positions[:j] - place, axis=1)
+        distance = np.linalg.norm((network.positions[:j] - place)[:, :2], axis=1)
         distance[distance <= ONE_PLACE] = np.inf
         if distance.min(initial=np.inf) < shortest:
             i = int(np.argmin(distance))
@@ -36,8 +36,9 @@ def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
 def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
     """[s] Length of a frame: as set, or by the geometry where it is set to 0.
 
-    A frame that is longer than the delay between two sensors mixes what both felt. Then it is half
-    as long as the delay.
+    A frame that is longer than the delay between two sensors mixes what both felt. With a close
+    network it is half as long as the delay; a larger one does not live on that delay, and short
+    frames cost time. Where the sensors are read in turn the period is the longest of a round.
 
     Raises SettingsError for a frame that is shorter than any reading.
     """
@@ -47,18 +48,18 @@ def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
     if settings.period_s:
         return settings.period_s
     shortest = shortest_delay(network)
-    if shortest is None or shortest[0] >= USUAL_S:
+    if settings.burst or shortest is None or not network.is_close:
         return USUAL_S
-    return max(SHORTEST_S, 0.5 * shortest[0])
+    return min(USUAL_S, max(SHORTEST_S, 0.5 * shortest[0]))
 
 
 def too_long(settings: AlignSettings, network: SensorNetwork) -> str | None:
-    """A sentence where a frame is longer than a target needs from one sensor to another; or None.
+    """A sentence where a frame was set longer than a target needs between two sensors; or None.
 
     Where the sensors are read in turn a frame is one round of them, whatever it takes.
     """
     shortest, period = shortest_delay(network), frame_period(settings, network)
-    if settings.burst or shortest is None or period <= shortest[0]:
+    if not settings.period_s or settings.burst or shortest is None or period <= shortest[0]:
         return None
     delay, one, other = shortest
     return (f'a frame of {1e3 * period:.0f} ms is longer than the {1e3 * delay:.0f} ms that a '

@@ -10,9 +10,9 @@ class AlignSettings:
     """Settings of the alignment."""
 
     period_s: float = param(
-        0.0, 'Length of a frame: the samples of each sensor in it are averaged. 0 = auto: 0.08, or '
-        'half of what a target of 20 m/s needs between the closest sensors, but not below 0.02, '
-        'where that is less than 0.08.', 's', (0.0, 60.0))
+        0.0, 'Length of a frame: the samples of each sensor in it are averaged. 0 = auto: 0.08; '
+        'with sensors that are all within two metres half of what a target of 20 m/s needs between '
+        'the closest, but not below 0.02.', 's', (0.0, 60.0))
     burst: bool = param(
         False, 'The sensors are read in turn, one sample each: a frame is closed as soon as '
         'every sensor has given one, and period_s is the longest that a round may take.')

@@ -86,8 +86,11 @@ class RunningTrack:
         # A target that was not seen approaching may already have passed.
         watched_ns = frame.stamp_ns - recent[0].stamp_ns if recent else 0
         is_late = watched_ns < LEAST_WATCHED * lookback_ns and not self._target.starts_anywhere
-        # The range of a single sensor's target is what the settings say.
-        self._evidence = TrackEvidence(doubted=is_late or len(self._sensors.whole) == 1)
+        # The range of a single sensor's target is what the settings say, and that of a vehicle near
+        # a few sensors at one place what the model leaves out of its field.
+        whole = self._sensors.whole
+        at_one_place = len(whole) == 1 or whole.is_close and not self._target.starts_anywhere
+        self._evidence = TrackEvidence(doubted=is_late or at_one_place)
         if recent:
             self._filter.predict(self.bank, (recent[0].stamp_ns - frame.stamp_ns) / NS)
         self._whole.begin(self.bank, self._filter)
