@@ -110,12 +110,13 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
                        strict=True):
         mine = data.sensor == j
         t = data.t[mine]
-        noise = np.einsum('nii->ni', data.covariance[mine])
+        # A coarse sensor at rest has a larger one, so that all its readings count as one.
+        noise = np.nanmin(np.einsum('nii->ni', data.covariance[mine]), axis=0, initial=np.inf)
         for a, colour in enumerate(_AXES):
             if np.isnan(data.field[mine, a]).all():
                 continue
             middle = f * (fit.predicted - level)[mine, a]
-            half = f * SCALE_1D * np.sqrt(fit.predicted_std[mine, a]**2 + more * noise[:, a])
+            half = f * SCALE_1D * np.sqrt(fit.predicted_std[mine, a]**2 + more * noise[a])
             axes.fill_between(t, middle - half, middle + half, color=colour, alpha=0.25, lw=0)
             axes.plot(t, f * (data.field - level)[mine, a], '.', ms=2.5, color=colour,
                       label=f'{"xyz"[a]}')
