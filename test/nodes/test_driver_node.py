@@ -224,7 +224,10 @@ def test_readings_in_batches_reach_the_tracker(ros, tmp_path):
         codes, outputs = stop(processes)
     assert codes == [0] * 3, outputs
     n = np.array([m.n_samples for _, m in frames[5:30]])
-    assert n.shape == (25, 20) and (n == 8).mean() > 0.95 and n.min() >= 7
+    # Where the estimate of the device's clock moves, a reading may fall into the frame beside: that
+    # of all sensors, which have one clock.
+    assert n.shape == (25, 20) and n.min() >= 7 and np.ptp(n, axis=1).max() <= 1
+    assert abs(n.mean() - 8.0) < 0.25
     assert np.nanmax(np.abs([m.field for _, m in frames[5:30]])) < 1e-7
 
 
