@@ -1,4 +1,4 @@
-"""Rotations and quaternions; quaternions are (x, y, z, w) and unit."""
+"""Rotations, quaternions (x, y, z, w; unit), speed and heading."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -107,3 +107,20 @@ def quaternion_between(a: ArrayLike, b: ArrayLike) -> FloatArray:
     q: FloatArray = np.append(np.cross(u, v), w)
     q /= np.linalg.norm(q)
     return q
+
+
+def speed_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float]:
+    """[m/s] Speed and its deviation, of a velocity (d,) with a covariance (d, d)."""
+    speed = float(np.linalg.norm(velocity))
+    u = velocity / speed
+    return speed, float(np.sqrt(u @ covariance @ u))
+
+
+def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float]:
+    """[rad] Heading, anticlockwise from x, and its deviation.
+
+    Of a velocity (2 or 3,) with a covariance of as many rows; seen from above.
+    """
+    vx, vy = velocity[:2]
+    g = np.array([-vy, vx]) / (vx * vx + vy * vy)
+    return float(np.arctan2(vy, vx)), float(np.sqrt(g @ covariance[:2, :2] @ g))

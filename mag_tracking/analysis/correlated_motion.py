@@ -19,6 +19,7 @@ from scipy.ndimage import gaussian_filter1d
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.least_squares import left_out_covariance
+from mag_tracking.network.sensor_network import ONE_PLACE
 
 LEAST_ALIKE = 0.97
 """Fields are the same where this share of one's energy is that of the other, delayed."""
@@ -34,7 +35,7 @@ SCALE_STD, GAIN_STD, TURN_STD = 0.05, 0.02, np.deg2rad(2.0)
 target), of each axis (gains), and about each axis (mounting, by a careful installer)."""
 
 LEAST_DELAY = 3.0
-"""In its deviations; a smaller delay is none."""
+"""A delay that is less than so many of its deviations may as well be zero."""
 
 SMOOTHING = 0.3
 """Width of the smoothing, as a share of the time (root mean square) in which the field is seen."""
@@ -44,16 +45,13 @@ STRAYED = 4.0
 
 MOST_CHANGED = 22.5
 """Chi-square of turn, scale and gains together beyond which it is another field: one in
-thousand."""
+a thousand."""
 
 DISAGREE, SAME_SPEED = 3.0, 0.1
 """Speeds contradict each other that are apart by more deviations, and by more than this share."""
 
 LEAST_ALONG = 0.3
 """Cosine of the angle to the line of the sensors below which a target goes across it."""
-
-LEAST_APART = 0.1
-"""[m] Sensors nearer than this, seen from above, tell no delay."""
 
 MOST_READINGS = 1_000_000
 """A pass of more even times is not looked at: its timestamps are no even ones."""
@@ -82,7 +80,7 @@ class PairDelay:
 
 @dataclass(frozen=True)
 class CorrelatedMotion:
-    """Velocity by the delays between sensors; where `reason` is not empty there is none."""
+    """The velocity that the delays between sensors tell, or the reason why they tell none."""
 
     reason: str = 'not looked for'
     speed: float = np.nan
@@ -93,7 +91,7 @@ class CorrelatedMotion:
     heading_std: float = np.nan
     """NaN: the sensors are on one line, and the target is taken to go along it."""
     alike: float = np.nan
-    """Of the pair that is most alike."""
+    """The largest `alike` of all pairs that were compared."""
     pairs: tuple[PairDelay, ...] = ()
 
 
@@ -153,7 +151,7 @@ def _pairs(data: PassData) -> list[tuple[int, int]]:
     place = data.network.positions[:, :2]
     pairs = list(combinations(data.sensors.tolist(), 2))
     apart = np.array([np.linalg.norm(place[i] - place[j]) for i, j in pairs])
-    nearest = [k for k in np.argsort(apart, kind='stable') if apart[k] > LEAST_APART]
+    nearest = [k for k in np.argsort(apart, kind='stable') if apart[k] > ONE_PLACE]
     return [pairs[k] for k in nearest[:MOST_PAIRS]]
 
 
@@ -184,7 +182,7 @@ def _motion(data: PassData, pairs: Sequence[PairDelay], alike: float) -> Correla
 
 
 class _Series:
-    """What one sensor measured, smoothed, in the axes of the world (or its own)."""
+    """The readings of one sensor, smoothed, in the axes of the world (or its own)."""
 
     def __init__(self, data: PassData, j: int, R: FloatArray, axes: IntArray) -> None:
         mine = data.sensor == j
@@ -192,8 +190,9 @@ class _Series:
         whole = np.isfinite(field[:, axes]).all(axis=1)
         self.t = data.t[mine][whole]
         self.field = (field[whole] @ R.T if len(axes) == 3 else field[whole])[:, axes]
-        variance = np.einsum('nii->ni', data.covariance[mine])[:, axes]
-        self.noise = float(np.sqrt(variance.min(axis=0).mean()))
+        # A frame that is missing has no noise either.
+        variance = np.einsum('nii->ni', data.covariance[mine][whole])[:, axes]
+        self.noise = float(np.sqrt(variance.min(axis=0).mean())) if whole.any() else 0.0
 
     def smoothed(self, t: FloatArray, width: float) -> FloatArray:
         """(n, k) at even times `t` (n,), by a normal curve of a `width` [s]."""
@@ -209,6 +208,8 @@ class _Pair:
     t: FloatArray
     first: FloatArray
     """(n, k) [T]"""
+    slope: FloatArray
+    """(n, k) [T/s] of the first."""
     second: FloatArray
     width: float
     """[s] of the smoothing."""
@@ -217,9 +218,8 @@ class _Pair:
 
     def at(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Field and slope (n, k) of the first one at times `t` (n,)."""
-        slope = np.gradient(self.first, self.t, axis=0)
         field, slope = (np.stack([np.interp(t, self.t, v) for v in values.T], axis=1)
-                        for values in (self.first, slope))
+                        for values in (self.first, self.slope))
         return field, slope
 
 
@@ -245,7 +245,8 @@ def _pair_of(data: PassData, i: int, j: int) -> _Pair | None:
     energy = np.where(energy > 0.1 * energy.max(), energy, 0.0)
     energy /= energy.sum()
     width = max(step, SMOOTHING * float(np.sqrt(energy @ np.square(t - energy @ t))))
-    return _Pair(t, first.smoothed(t, width), second.smoothed(t, width), width,
+    smooth = first.smoothed(t, width)
+    return _Pair(t, smooth, np.gradient(smooth, t, axis=0), second.smoothed(t, width), width,
                  float(np.hypot(first.noise, second.noise)))
 
 
@@ -290,8 +291,9 @@ def _refined(pair: _Pair, tau: float) -> tuple[float, float, float]:
     here = (pair.t > pair.t[0] + max(tau, 0.0)) & (pair.t < pair.t[-1] + min(tau, 0.0))
     t, y = pair.t[here][::every], pair.second[here][::every]
     freedom = y.size - len(theta)
-    size = np.sqrt(np.square(y - np.median(pair.second, axis=0)).sum())
-    whole = np.sqrt(np.square((pair.second - np.median(pair.second, axis=0))[::every]).sum())
+    rest = np.median(pair.second, axis=0)
+    size = np.linalg.norm(y - rest)
+    whole = np.linalg.norm(pair.second[::every] - rest)
     if freedom <= 0 or not size > 0.0 or size < LEAST_ALIKE * whole:
         # So late that hardly anything of the one is left to compare with the other.
         return tau, np.inf, 0.0

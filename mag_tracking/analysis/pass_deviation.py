@@ -11,14 +11,14 @@ from mag_tracking.inference.least_squares import left_out_covariance
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """What is not known of the sensors; no fit finds it from one pass."""
+    """Errors of the sensors that no fit finds from one pass."""
 
     turn_std: float = float(np.deg2rad(2.0))
     """[rad] about each axis, of a sensor whose `orientation_std` the network does not say: set up
     by hand, with a level. Between two sensors that are half a metre apart that is a delay of
     milliseconds."""
     gain_std: float = 0.01
-    """Of each axis; data sheets say 1 to 3 %."""
+    """Deviation of the gain of each axis; data sheets say 1 to 3 %."""
 
 
 def honest_covariance(data: PassData, whitened: FloatArray, left: FloatArray, target: FloatArray,
@@ -55,7 +55,7 @@ def _by_sensor(data: PassData, whitened: FloatArray, left: FloatArray) -> tuple[
 
 def _of_sensors(data: PassData, whitened: FloatArray, target: FloatArray, covariance: FloatArray,
                 errors: SensorErrors) -> FloatArray:
-    """What turns and gains of the sensors add: they move the minimum with the fields."""
+    """The covariance that turned sensors and gains add: they move the minimum with the fields."""
     total = np.zeros_like(covariance)
     R_sw = data.network.R_sw
     for j in data.sensors:

@@ -34,7 +34,7 @@ FALSE_ALARM = 1e-6
 """A field that noise exceeds with this probability is none."""
 
 AS_BOUGHT = SensorErrors()
-"""What is assumed of the sensors of a network."""
+"""Errors of sensors that were bought and set up by hand."""
 
 EXACT = 1e-4
 """[m] Deviation of a CPA range that is only a unit of length."""

@@ -6,6 +6,7 @@ import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray
+from mag_tracking.geometry import heading_of, speed_of
 from mag_tracking.physics.anderson import closest_approach
 
 RIVAL = 9.2
@@ -77,8 +78,8 @@ class PassFit:
     left_elsewhere: float = np.nan
     """Share of the energy that is left over where no vehicle leaves any; see `pass_trust`."""
     trusted: tuple[str, ...] = ()
-    """Of speed, direction and time (of the closest point), what is determined, also where the
-    whole has a reason not to be believed; see `pass_trust`."""
+    """The names of those among speed, direction and time (of the closest point) that are
+    determined, also where the whole has a reason not to be believed; see `pass_trust`."""
     bearing: Bearing | None = None
     """With one sensor."""
     rivals: tuple[tuple[float, FloatArray], ...] = ()
@@ -136,16 +137,12 @@ class PassFit:
     @property
     def speed(self) -> tuple[float, float]:
         """[m/s] and its deviation."""
-        speed = np.float64(np.linalg.norm(self.velocity))
-        u = self.velocity / speed
-        return speed, np.float64(np.sqrt(u @ self.honest_covariance[3:6, 3:6] @ u))
+        return speed_of(self.velocity, self.honest_covariance[3:6, 3:6])
 
     @property
     def heading(self) -> tuple[float, float]:
         """[rad] anticlockwise from x, and its deviation."""
-        vx, vy, _ = self.velocity
-        g = np.array([-vy, vx]) / (vx * vx + vy * vy)
-        return np.arctan2(vy, vx), np.sqrt(g @ self.honest_covariance[3:5, 3:5] @ g)
+        return heading_of(self.velocity, self.honest_covariance[3:6, 3:6])
 
     @property
     def length(self) -> tuple[float, float]:

@@ -30,8 +30,8 @@ NOISE_ENERGY = 16.3
 """Whitened energy of three axes that noise exceeds once in a thousand samples."""
 
 LEAST_ELSEWHERE, MOST_ELSEWHERE = 0.003, 0.1
-"""What may be left over elsewhere: this share of the field in any case (gains, a swerve), and this
-share of what is left over."""
+"""A vehicle leaves over up to this share of its field elsewhere (gains, a swerve), and up to this
+share of all that it leaves over."""
 
 LEAST_WAY = 0.3
 """Share of the distance of the nearest sensor that a target has to move while it is seen."""
@@ -98,18 +98,8 @@ def left_elsewhere(data: PassData, n_dipoles: int, theta: FloatArray, target: Fl
 
 def doubt(fit: PassFit) -> str:
     """Why a minimum is no answer as a whole, or nothing."""
-    if not fit.converged:
-        return 'the fit did not converge'
-    if not _describes(fit):
-        return (f'not one target at constant velocity: {1.0 - fit.explained:.1%} of the field is '
-                f'left over, {fit.left_elsewhere:.1%} where a vehicle at that distance leaves none '
-                '(two vehicles in the window, a turn, a wrong network file)')
-    if turns(fit):
-        return ('not at constant velocity: while it was seen it changed by '
-                f'{fit.velocity_change:.0%} of itself (a turn, braking)')
-    nearest = _nearest(fit)
-    if np.linalg.norm(fit.velocity) * fit.seen_s < LEAST_WAY * nearest:
-        return 'no pass: while it was seen it hardly moved'
+    if reason := _no_pass(fit):
+        return reason
     if fit.bearing is not None:
         return ('one sensor: the scale is not observable, only directions and the time of the '
                 'closest approach are (TSP14 Proposition 1)')
@@ -121,7 +111,7 @@ def doubt(fit: PassFit) -> str:
         length, length_std = fit.length
         return (f'not determined: a length of {length:.1f} m, known to {length_std:.1f} m; '
                 'take fewer dipoles')
-    std = np.sqrt(np.trace(fit.honest_covariance[:3, :3]))
+    std, nearest = np.sqrt(np.trace(fit.honest_covariance[:3, :3])), _nearest(fit)
     if std > nearest:
         return (f'out of range: the position is known to {std:.1f} m only, and no sensor is nearer '
                 f'than {nearest:.1f} m')
@@ -133,14 +123,11 @@ def trusted(fit: PassFit) -> tuple[str, ...]:
 
     None of a target that the model does not describe, or that turned or did not pass.
     """
-    if not fit.converged or not _describes(fit) or fit.bearing is not None \
-            or turns(fit):
+    if _no_pass(fit) or fit.bearing is not None:
         return ()
     speed, speed_std = fit.speed
     _, heading_std = fit.heading
     nearest = _nearest(fit)
-    if speed * fit.seen_s < LEAST_WAY * nearest:
-        return ()
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
     _, time_std, _, _ = fit.closest_approach(centre)
     # A comparison with NaN, where a variance is not known, is false.
@@ -148,6 +135,22 @@ def trusted(fit: PassFit) -> tuple[str, ...]:
              'direction': heading_std <= MOST_HEADING_STD and speed_std <= 0.5 * speed,
              'time': time_std * speed <= MOST_TIME_STD * nearest}
     return tuple(name for name, is_known in known.items() if is_known)
+
+
+def _no_pass(fit: PassFit) -> str:
+    """Why a minimum is no pass of one target at constant velocity, or nothing."""
+    if not fit.converged:
+        return 'the fit did not converge'
+    if not _describes(fit):
+        return (f'not one target at constant velocity: {1.0 - fit.explained:.1%} of the field is '
+                f'left over, {fit.left_elsewhere:.1%} where a vehicle at that distance leaves none '
+                '(two vehicles in the window, a turn, a wrong network file)')
+    if turns(fit):
+        return ('not at constant velocity: while it was seen it changed by '
+                f'{fit.velocity_change:.0%} of itself (a turn, braking)')
+    if np.linalg.norm(fit.velocity) * fit.seen_s < LEAST_WAY * _nearest(fit):
+        return 'no pass: while it was seen it hardly moved'
+    return ''
 
 
 def _describes(fit: PassFit) -> bool:

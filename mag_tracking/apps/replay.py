@@ -15,6 +15,7 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.first_pass import FirstPass, first_pass_of
 from mag_tracking.apps.no_detection import why_no_detection
 from mag_tracking.errors import OutputError
+from mag_tracking.geometry import heading_of, speed_of
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Output, Pipeline, Settings
 from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
@@ -205,22 +206,16 @@ def _delay_entry(log: TrackLog, network: SensorNetwork) -> dict[str, Any]:
     if found.reason:
         return {'reason': found.reason}
     k = log.surest()
-    vx, vy = log.velocity[k][:2]
-    speed = float(np.hypot(vx, vy))
-    u = np.array([vx, vy]) / speed
-    std = float(np.sqrt(u @ log.covariance[k][3:5, 3:5] @ u))
-    across = np.array([-u[1], u[0]])
-    heading_std = float(np.sqrt(across @ log.covariance[k][3:5, 3:5] @ across)) / speed
-    heading = float(np.arctan2(vy, vx)), heading_std
+    moving = log.velocity[k][:2], log.covariance[k][3:5, 3:5]
     return {'speed': found.speed, 'speed_sd': found.speed_std,
             'heading_deg': float(np.degrees(found.heading)),
             'heading_sd_deg': None if np.isnan(found.heading_std)
             else float(np.degrees(found.heading_std)),
-            'contradicts': disagree((speed, std), heading, found)}
+            'contradicts': disagree(speed_of(*moving), heading_of(*moving), found)}
 
 
 def _pass_of(log: TrackLog, network: SensorNetwork) -> PassData:
-    """What was measured while a track ran."""
+    """The readings of all sensors while a track ran."""
     n, n_sensors = len(log.stamp_ns), len(network)
     return PassData(network, log.stamp_ns[0], np.tile(log.seconds(), n_sensors),
                     np.repeat(np.arange(n_sensors), n),

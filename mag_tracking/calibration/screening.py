@@ -35,8 +35,8 @@ STEEPEST = 130.0
 difference steeper than the ones before by less than this times s^3, in 99.9 % of the cases
 (simulated)."""
 COARSEST = 1.5e-6
-"""[T] Steps of magnetometers are hardly larger than this; the coarsest known, of 5.9e-6 T
-(MLX90393, z, lowest gain and resolution), do not make a spike by it with the usual threshold."""
+"""[T] Steps of magnetometers are hardly larger than this. With the usual threshold steps of up to
+1.3e-5 T do not make a spike by it."""
 BACK = 0.3
 """After a spike the field is again where it was, to this share of the spike."""
 

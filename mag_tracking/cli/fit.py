@@ -157,7 +157,8 @@ def _print_pass(one: FittedPass) -> None:
 
 
 def _known(fit: PassFit) -> str:
-    """What is trusted of a fit that is no answer as a whole."""
+    """Speed, direction and time, as far as they are trusted, of a fit that is no answer as a
+    whole."""
     speed, speed_std = fit.speed
     heading, heading_std = np.degrees(fit.heading)
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)

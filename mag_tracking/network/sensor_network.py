@@ -12,6 +12,8 @@ from mag_tracking.units import NS
 
 CLOSE = 2.0
 """[m] Half a car."""
+ONE_PLACE = 0.1
+"""[m] Sensors closer than this, seen from above, do not tell a delay."""
 
 
 @dataclass(frozen=True)

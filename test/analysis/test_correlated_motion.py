@@ -147,11 +147,20 @@ def test_odd_readings_have_a_reason_or_an_answer(spoilt):
     assert c.reason if spoilt != 'one infinite' else abs(c.speed - 9.0) < 0.3
 
 
-def test_opposite_vehicles_at_once_are_no_delay():
+@pytest.mark.parametrize('share', [0.9, 0.5, 0.2])
+def test_opposite_vehicles_at_once_are_no_delay(share):
     one, other = along_x(10.0, seed=1), along_x(14.0, seed=2, heading=np.pi)
-    both = dataclasses.replace(one, field=one.field + 0.9 * other.field)
-    found = correlated_motion(both)
-    assert found.reason or found.alike < 0.999
+    both = dataclasses.replace(one, field=one.field + share * other.field)
+    assert 'different fields' in correlated_motion(both).reason
+
+
+def test_a_missing_frame_costs_nothing():
+    """A track's log has a reading that is missing as NaN, and its covariance too."""
+    data = along_x(7.0)
+    field, covariance = data.field.copy(), data.covariance.copy()
+    field[[5, 1500]] = covariance[[5, 1500]] = np.nan
+    found = correlated_motion(dataclasses.replace(data, field=field, covariance=covariance))
+    assert found.speed == pytest.approx(7.0, rel=0.01)
 
 
 def test_a_scaled_or_turned_field_is_another_one():

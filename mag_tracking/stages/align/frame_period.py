@@ -4,6 +4,7 @@ import numpy as np
 
 from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
+from mag_tracking.network.sensor_network import ONE_PLACE
 from mag_tracking.stages.align.settings import AlignSettings
 
 USUAL_S = 0.08
@@ -14,8 +15,6 @@ LEAST_S = 1e-4
 """[s] No sensor is read more often."""
 FASTEST = 20.0
 """[m/s] Frames are made for targets up to this speed."""
-ONE_PLACE = 0.1
-"""[m] Sensors closer than this do not tell a delay."""
 
 
 def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
