@@ -22,6 +22,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.reader import Recording
+from mag_tracking.stages.track.evidence import LOST
 from mag_tracking.stages.track.manager import NO_SCALE
 
 _REPLAY = '''
@@ -161,6 +162,11 @@ def _print_limits(summary: dict[str, Any]) -> None:
               'are always ambiguous; speed and direction are those of the delay')
     if summary['frames_too_long']:
         print(f'  warning: {summary["frames_too_long"]}')
+    lost = counts.get(f'tracks ended: {LOST}', 0)
+    if lost:
+        print(f'  warning: {lost} of the tracks lost their target: an orientation in the network '
+              'file is wrong, there were two targets at once, or it was none of the kinds that '
+              'the settings know')
     hardly = counts.get('sensors whose orientation is hardly known', 0)
     if hardly:
         print(f'  warning: {hardly} sensors may be turned by more than 15 degrees, as the network '

@@ -125,10 +125,15 @@ class FilterBank:
         return heaviest
 
     def separated_weight(self, i: int, distance: float = 3.0) -> float:
-        """Total weight of the hypotheses whose position is apart from that of row `i`.
+        """Total weight of the hypotheses that are `apart` from row `i`."""
+        apart = self.apart(i, distance)
+        return float(np.exp(log_sum_exp(self.log_w[apart]))) if apart.any() else 0.0
 
-        Apart: by more than `distance` deviations of the difference in some
-        direction (both covariances), so neither explains the other.
+    def apart(self, i: int, distance: float = 3.0) -> BoolArray:
+        """(n_hyp,) whether the position of a hypothesis is another one than that of row `i`.
+
+        By more than `distance` deviations of the difference in some direction (both
+        covariances), so neither explains the other.
         """
         difference = self.x[:, :3] - self.x[i, :3]
         variance, axes = np.linalg.eigh(self.P[:, :3, :3] + self.P[i, :3, :3])
@@ -136,8 +141,8 @@ class FilterBank:
         # Where nothing varies there is nothing to be apart by.
         varies = variance > _SINGULAR * variance[:, -1:]
         z = (along**2 / np.where(varies, variance, np.inf)).sum(axis=1)
-        apart = z > distance**2
-        return float(np.exp(log_sum_exp(self.log_w[apart]))) if apart.any() else 0.0
+        apart: BoolArray = z > distance**2
+        return apart
 
     def reweight(self, log_likelihood: FloatArray) -> float:
         """Bayes' rule on the weights; returns the log-evidence of the frame.

@@ -10,6 +10,9 @@ from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import FloatArray
 
+SMALL = 1e-4
+"""[rad] Below it the slope of a chord is taken from its series."""
+
 _INTEGRAL, _RATE = np.arange(3), np.arange(3, 6)
 
 
@@ -41,3 +44,50 @@ def constant_velocity(dt: float) -> FloatArray:
     F = np.eye(6)
     F[_INTEGRAL, _RATE] = dt
     return F
+
+
+def coordinated_turn(x: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
+    """Turn the horizontal velocity at a constant rate, and move along the arc.
+
+    Parameters
+    ----------
+    x : (n, n_x)
+        States that begin with position [m] and velocity [m/s] and end with the rate [rad/s],
+        anticlockwise seen from above.
+    dt : float [s]
+
+    Returns
+    -------
+    moved : (n, n_x)
+    F : (n, n_x, n_x)
+        Its derivative.
+
+    Source: Bar-Shalom, Li and Kirubarajan 2001, Estimation with Applications to Tracking and
+    Navigation, section 11.7.
+    """
+    v, half = x[:, 3:5], 0.5 * dt * x[:, -1]
+    # The chord of the arc: half the angle off the velocity, and a little shorter than the way.
+    chord, slope = np.sinc(half / np.pi), np.where(
+        np.abs(half) > SMALL, (np.cos(half) - np.sinc(half / np.pi)) / np.where(half, half, 1.0),
+        -half / 3.0)
+    R_half, R = _turns(half), _turns(2.0 * half)
+    quarter = np.array([[0.0, -1.0], [1.0, 0.0]])
+    F = np.zeros((*x.shape, x.shape[1]))
+    F[:] = np.eye(x.shape[1])
+    F[:, 2, 5] = dt
+    F[:, :2, 3:5] = (dt * chord)[:, None, None] * R_half
+    F[:, 3:5, 3:5] = R
+    along = np.einsum('nij,nj->ni', R_half, v)
+    F[:, :2, -1] = 0.5 * dt**2 * (slope[:, None] * along + chord[:, None] * along @ quarter.T)
+    F[:, 3:5, -1] = dt * np.einsum('nij,nj->ni', R, v) @ quarter.T
+    moved = x.copy()
+    moved[:, :2] += (dt * chord)[:, None] * along
+    moved[:, 2] += dt * x[:, 5]
+    moved[:, 3:5] = np.einsum('nij,nj->ni', R, v)
+    return moved, F
+
+
+def _turns(angle: FloatArray) -> FloatArray:
+    """(n, 2, 2) rotations by `angle` (n,) [rad], anticlockwise."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)

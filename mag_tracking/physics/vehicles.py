@@ -9,8 +9,11 @@ from numba import njit
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.physics.dipole import MU0
-from mag_tracking.physics.motion import constant_velocity, integrator_noise
+from mag_tracking.physics.motion import constant_velocity, coordinated_turn, integrator_noise
 from mag_tracking.physics.sources import Dipoles
+
+FASTEST_TURN = 1.0
+"""[rad/s] Deviation of the turn rate of a vehicle that is slow; no car turns much faster."""
 
 
 @njit('void(float64[:,:], float64[:], float64[:], float64[:,:,::1], float64[:,:,::1], '
@@ -65,7 +68,8 @@ class RowVehicle:
 
     State (6 + 3 d + 2; with one dipole 10, without a length): position r of the row's middle,
     velocity v, hard iron moment of each dipole in the vehicle's frame (x forward, z up; from the
-    tail to the head), soft iron scalar D [m^3] of the whole, length L [m].
+    tail to the head), soft iron scalar D [m^3] of the whole, length L [m], turn rate w [rad/s]
+    if any vehicle may turn.
 
         m_i = Rz(heading) m0_i + D/(d mu0) B0,    r_i = r + (i - (d+1)/2) L/(d-1) heading
 
@@ -87,13 +91,19 @@ class RowVehicle:
     difference_drift: float = 0.0
     """[1/s^0.5] the same of what each dipole differs from the mean of the row."""
     n_dipoles: int = 3
+    turn_acceleration: float = 0.0
+    """[m/s^2] standard deviation of the lateral acceleration of those that turn; 0: none does, and
+    the state has no turn rate."""
+    turn_time: float = 1.5
+    """[s] for which a turn goes on (first-order Gauss-Markov)."""
 
     @cached_property
     def state_names(self) -> tuple[str, ...]:
         """Names of the states, in order."""
         return ('x', 'y', 'z', 'vx', 'vy', 'vz',
                 *(f'm{i + 1}{axis}' for i in range(self.n_dipoles) for axis in 'xyz'), 'D',
-                *(('L',) if self.n_dipoles > 1 else ()))
+                *(('L',) if self.n_dipoles > 1 else ()),
+                *(('w',) if self.turn_acceleration else ()))
 
     @cached_property
     def _induction(self) -> FloatArray:
@@ -130,14 +140,32 @@ class RowVehicle:
 
     def propagate(self, x: FloatArray, dt: float, P: FloatArray | None = None
                   ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Constant velocity; the drifts grow with the size of the iron. See `SourceModel`."""
+        """Constant velocity, or a turn; the drifts grow with the size of the iron.
+
+        A turn rate whose variance is zero stays as it is: such a vehicle goes straight on. See
+        `SourceModel`.
+        """
         n, d = x.shape[1], self.n_dipoles
-        F = np.eye(n)
-        F[:6, :6] = constant_velocity(dt)
         Q = np.zeros((len(x), n, n))
         Q[:, :6, :6] = integrator_noise(dt, self.acceleration_density)
         hard = slice(6, 6 + 3 * d)
         size2 = (np.square(x[:, hard].reshape(-1, d, 3).sum(axis=1)).sum(axis=1)
                  + np.square(x[:, hard.stop]) * (self._induction @ self._induction))
         Q[:, hard, hard] = size2[:, None, None] * (abs(dt) * self._walk)
-        return x @ F.T, F, Q
+        if not self.turn_acceleration:
+            F = np.eye(n)
+            F[:6, :6] = constant_velocity(dt)
+            return x @ F.T, F, Q
+        moved, turned = coordinated_turn(x, dt)
+        fading = math.exp(-abs(dt) / self.turn_time)
+        moved[:, -1] *= fading
+        turned[:, -1, -1] = fading
+        turns = np.ones(len(x)) if P is None else P[:, -1, -1] > 0.0
+        Q[:, -1, -1] = turns * (1.0 - fading**2) * self.turn_variance(np.hypot(x[:, 3], x[:, 4]))
+        return moved, turned, Q
+
+    def turn_variance(self, speed: FloatArray) -> FloatArray:
+        """(...) [rad^2/s^2] of the turn rate at a horizontal `speed` (...) [m/s]."""
+        slowest = self.turn_acceleration / FASTEST_TURN
+        variance: FloatArray = np.square(self.turn_acceleration / np.maximum(speed, slowest))
+        return variance

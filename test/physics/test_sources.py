@@ -9,15 +9,16 @@ from scipy.linalg import expm
 from mag_tracking.geometry import cross_matrix, left_jacobian
 from mag_tracking.physics import sources, vehicles
 from mag_tracking.physics.dipole import MU0, sensor_fields
-from mag_tracking.physics.motion import constant_velocity, integrator_noise
+from mag_tracking.physics.motion import constant_velocity, coordinated_turn, integrator_noise
 from mag_tracking.physics.sources import Magnet
-from mag_tracking.physics.vehicles import RowVehicle
+from mag_tracking.physics.vehicles import FASTEST_TURN, RowVehicle
 
 EARTH, ACCELERATION = np.array([2e-6, 1.5e-5, -4.9e-5]), np.array([1.0, 1.0, 0.1])
 EXAMPLES = {
     'RowVehicle': RowVehicle(EARTH, ACCELERATION, 0.1, 0.02),
     'RowVehicle of one': RowVehicle(EARTH, ACCELERATION, 0.1, n_dipoles=1),
     'RowVehicle of four': RowVehicle(EARTH, ACCELERATION, 0.1, 0.02, 4),
+    'RowVehicle that turns': RowVehicle(EARTH, ACCELERATION, 0.1, 0.02, 3, 3.0, 1.5),
     'Magnet': Magnet(np.array([0.1, 0.2, 0.3]), 0.5),
 }
 
@@ -88,6 +89,52 @@ def test_constant_velocity_noise_is_the_exact_integral():
     np.testing.assert_allclose(integrator_noise(dt, density), big[6:, 6:].T @ big[:6, 6:],
                                rtol=1e-12)
     np.testing.assert_allclose(constant_velocity(dt), expm(A * dt), rtol=1e-14)
+
+
+@pytest.mark.parametrize('rate', [-0.8, -1e-9, 0.0, 1e-5, 0.4])
+def test_a_turn_is_an_arc(rate):
+    """The exponential of the motion as the oracle; there and back is where it began."""
+    x, dt = np.array([[1.0, 2.0, 0.5, 6.0, -3.0, 0.2, rate]]), 1.7
+    A = np.zeros((6, 6))
+    A[:3, 3:] = np.eye(3)
+    A[3, 4], A[4, 3] = -rate, rate
+    moved, _ = coordinated_turn(x, dt)
+    np.testing.assert_allclose(moved[0, :6], expm(A * dt) @ x[0, :6], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(coordinated_turn(moved, -dt)[0], x, atol=1e-12)
+    if rate:
+        centre = x[0, :2] + np.array([3.0, 6.0]) / rate
+        np.testing.assert_allclose(np.hypot(*(moved[0, :2] - centre)), np.hypot(6.0, 3.0)
+                                   / abs(rate), rtol=1e-6)
+
+
+def test_the_turn_rate_is_a_gauss_markov_process_of_its_size():
+    model, dt = EXAMPLES['RowVehicle that turns'], 0.4
+    rng = np.random.default_rng(0)
+    x = states(model, 200_000)
+    x[:, 3:6] = [6.0, 0.0, 0.0]
+    x[:, -1] = 0.5 * rng.standard_normal(len(x))
+    later, _, Q = model.propagate(x, dt)
+    later = later[:, -1] + np.sqrt(Q[0, -1, -1]) * rng.standard_normal(len(x))
+    assert later.std() == pytest.approx(0.5, rel=0.01)
+    assert np.corrcoef(x[:, -1], later)[0, 1] == pytest.approx(np.exp(-dt / 1.5), abs=0.01)
+    assert model.turn_variance(np.array([0.0, 1.0, 12.0])).tolist() == [
+        FASTEST_TURN**2, FASTEST_TURN**2, 0.25**2]
+
+
+def test_a_turn_rate_that_is_known_goes_straight_on():
+    straight, turning = EXAMPLES['RowVehicle'], EXAMPLES['RowVehicle that turns']
+    x = states(turning)
+    x[:, -1] = 0.0
+    P = np.tile(np.eye(x.shape[1]), (len(x), 1, 1))
+    P[:, -1], P[:, :, -1] = 0.0, 0.0
+    moved, F, Q = turning.propagate(x, 0.3, P)
+    expected, F_straight, Q_straight = straight.propagate(x[:, :-1], 0.3)
+    np.testing.assert_allclose(moved[:, :-1], expected, atol=1e-12)
+    np.testing.assert_allclose(F[0, :-1, :-1], F_straight, atol=1e-12)
+    np.testing.assert_allclose(Q[:, :-1, :-1], Q_straight, atol=1e-15)
+    # Exactly zero, for ever: by that it is told from those that turn.
+    after = F @ P @ np.swapaxes(F, 1, 2) + Q
+    assert not moved[:, -1].any() and not after[:, -1].any() and not after[:, :, -1].any()
 
 
 def test_vehicle_moment_is_hard_iron_turned_plus_soft_iron():

@@ -1,12 +1,20 @@
 """Whether a running track is to be believed, and whether it is still there."""
 
 import numpy as np
+from scipy.special import chdtri
 
 from mag_tracking.records import Track
 from mag_tracking.stages.track.settings import TrackSettings
 
 LONGEST_SINGLE_SENSOR_S = 0.5
 """[s] A track that one sensor of several has supported alone for longer stays ambiguous."""
+
+LOST = 'lost its target'
+"""Reason for the end of a track."""
+
+CONTRADICTION = 1e-5
+"""A field that is as far from the predicted one as one in so many contradicts the track. The filter
+takes it in, and may afterwards be wrong and agree with all that comes."""
 
 LEAST_WATCHED = 0.5
 """A track that begins with less than this share of its lookback is ambiguous."""
@@ -31,6 +39,11 @@ class TrackEvidence:
         """From now on all of the track may be wrong."""
         self.doubted = True
 
+    def check(self, nis: float, degrees_of_freedom: int) -> None:
+        """Doubt all of the track from a normalised innovation that no target of ours makes."""
+        if nis > chdtri(degrees_of_freedom, CONTRADICTION):
+            self.doubt()
+
     def support(self, by_one_sensor: bool, dt: float) -> None:
         """Count `dt` [s] for which one sensor of several supported the track, or more did.
 
@@ -50,14 +63,19 @@ class TrackEvidence:
         """Whether the field contradicted the track at its end, or all of it may be wrong."""
         return self._n_misfits > 0 or self.doubted
 
-    def reason_to_end(self, track: Track, settings: TrackSettings) -> str | None:
-        """Why the track is over after its pose `track`; None while it goes on."""
+    def reason_to_end(self, track: Track, spread: float, is_coming: bool,
+                      settings: TrackSettings) -> str | None:
+        """Why the track is over after its pose `track`; None while it goes on.
+
+        `spread` [m] is the deviation of the horizontal position of its hypothesis alone: while
+        several explain the field, what they differ by says nothing about how far away it is. A
+        target that `is_coming` nearer to the sensors is not out of reach, however uncertain.
+        """
         misfit = track.nis > settings.end_nis * track.degrees_of_freedom
         self._n_misfits = self._n_misfits + 1 if misfit else 0
         if self._n_misfits > 1:
-            return 'lost its target'
-        spread = float(np.trace(track.covariance[:2, :2])) ** 0.5
-        if spread > settings.end_std > self._best_spread:
-            return 'out of reach'
+            return LOST
+        if spread > settings.end_std > self._best_spread and not is_coming:
+            return LOST if misfit else 'out of reach'
         self._best_spread = min(self._best_spread, spread)
         return None

@@ -71,6 +71,13 @@ class VehicleSettings:
                                  'm^3', (0.0, 1e4))
     acceleration: float = param(
         1.0, 'Root spectral density of the horizontal acceleration.', 'm/s^1.5', (0.0, 1000.0))
+    turn_acceleration: float = param(
+        3.0, 'Beside each hypothesis that goes straight on is one that turns, by a lateral '
+        'acceleration of this deviation. 0 = nothing turns, which is up to twice as fast.',
+        'm/s^2', (0.0, 100.0))
+    turn_time: float = param(1.5, 'For how long a turn goes on.', 's', (0.01, 1000.0))
+    turn_share: float = param(
+        0.5, 'Share of the vehicles that turn near the sensors.', '', (1e-6, 0.999999))
     climb_acceleration: float = param(
         0.1, 'Root spectral density of the vertical acceleration.', 'm/s^1.5', (0.0, 1000.0))
     moment_drift: float = param(
@@ -107,7 +114,7 @@ def vehicle_model(settings: VehicleSettings, network: SensorNetwork) -> RowVehic
     horizontal, vertical = settings.acceleration**2, settings.climb_acceleration**2
     return RowVehicle(_earth_field(network), np.array([horizontal, horizontal, vertical]),
                       settings.moment_drift, settings.difference_drift,
-                      _n_dipoles(settings))
+                      _n_dipoles(settings), settings.turn_acceleration, settings.turn_time)
 
 
 def _n_dipoles(settings: VehicleSettings) -> int:
@@ -155,8 +162,21 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
             covariances.append(np.tile(by_speed.repeat(len(moments), 0), (len(starts), 1, 1)))
             labels += [label] * len(states[-1])
             kinds += [kind] * len(states[-1])
-    return FilterBank.of_targets(np.vstack(states), np.vstack(covariances), np.array(labels),
+    bank = FilterBank.of_targets(np.vstack(states), np.vstack(covariances), np.array(labels),
                                  len(network), background_std, own_covariance, np.array(kinds))
+    return _with_turns(bank, vehicle_model(settings, network), settings.turn_share)
+
+
+def _with_turns(bank: FilterBank, model: RowVehicle, share: float) -> FilterBank:
+    """Each hypothesis twice, going straight on and turning; or as they are if nothing turns."""
+    if not model.turn_acceleration:
+        return bank
+    n, w = len(bank), len(model.state_names) - 1
+    both = bank.rows(np.tile(np.arange(n), 2))
+    both.origin = np.arange(2 * n)
+    both.log_w = np.log(np.repeat([1.0 - share, share], n) / n)
+    both.P[n:, w, w] = model.turn_variance(np.hypot(bank.x[:, 3], bank.x[:, 4]))
+    return both
 
 
 class _Measured:
@@ -197,10 +217,11 @@ def _states(settings: VehicleSettings, kind: int, positions: FloatArray, velocit
     `hard` (n_moments, 3).
     """
     d = _n_dipoles(settings)
-    x = np.empty((len(positions), len(velocities), len(hard), 6 + 3 * d + min(d, 2)))
+    turns = int(settings.turn_acceleration > 0.0)
+    x = np.empty((len(positions), len(velocities), len(hard), 6 + 3 * d + min(d, 2) + turns))
     x[..., :3], x[..., 3:6] = positions[:, None], velocities[:, None]
     x[..., 6:6 + 3 * d] = np.tile(hard / d, d)
-    x[..., 6 + 3 * d:] = [settings.soft_iron] + ([settings.lengths[kind]] if d > 1 else [])
+    x[..., 6 + 3 * d:] = [settings.soft_iron, *[settings.lengths[kind]] * (d > 1), *[0.0] * turns]
     return x.reshape(-1, x.shape[-1])
 
 
@@ -208,7 +229,8 @@ def _covariance(settings: VehicleSettings, kind: int, R: FloatArray, speed: floa
     """Starting covariance (n_t, n_t) of one hypothesis."""
     d = _n_dipoles(settings)
     hard = 6 + 3 * d
-    P = np.zeros((hard + min(d, 2), hard + min(d, 2)))
+    n_t = hard + min(d, 2) + int(settings.turn_acceleration > 0.0)
+    P = np.zeros((n_t, n_t))
     P[:3, :3] = R @ np.diag([settings.along_std**2, settings.lateral_std**2,
                              settings.height_stds[kind]**2]) @ R.T
     P[3:6, 3:6] = R @ np.diag([(settings.speed_std * speed) ** 2,

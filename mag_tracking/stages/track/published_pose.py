@@ -10,17 +10,13 @@ from mag_tracking.geometry import cross_matrix, quaternion_between, quaternion_f
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.physics.sources import SourceModel
 from mag_tracking.records import Hypotheses, SmoothedPose, Track
+from mag_tracking.stages.track.unseen_length import UnseenLength
 
 UNOBSERVED_VARIANCE = np.pi**2
 """[rad^2] of an angle that the field does not determine."""
 
-CAR_ROW = 4.0
-"""[m] A row of dipoles up to this length is that of a car, whose iron is about in its middle."""
-
-OFF_MIDDLE = 0.2
-"""The iron of a long vehicle is where its engine, axles and load are. What a row is longer than
-that of a car, times this, is the deviation of the vehicle's middle from that of the row, along the
-heading: the load may be at either end. No field tells it."""
+NO_WEIGHT = 1e-6
+"""Hypotheses lighter than the heaviest by this ratio add nothing to a covariance."""
 
 DOUBT = 0.05
 """Other places, or other arrivals, with more weight than this make a track ambiguous."""
@@ -103,10 +99,10 @@ def magnet_orientation(x: FloatArray, P: FloatArray, axis: FloatArray) -> Orient
 
 
 def published_track(bank: FilterBank, best: int, model: SourceModel, orientation: Orientation,
-                    names: Sequence[str], kinds: Sequence[str], strange: bool, *, stamp_ns: int,
-                    id: int, ended: bool, existence: float, degrees_of_freedom: int,
-                    predicted: FloatArray, mounting: FloatArray, mounting_covariance: FloatArray
-                    ) -> Track:
+                    names: Sequence[str], kinds: Sequence[str], strange: bool,
+                    unseen: UnseenLength | None, *, stamp_ns: int, id: int, ended: bool,
+                    existence: float, degrees_of_freedom: int, predicted: FloatArray,
+                    mounting: FloatArray, mounting_covariance: FloatArray) -> Track:
     """The `Track` of a bank's hypothesis `best`.
 
     Parameters
@@ -123,11 +119,14 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
         The name of each kind.
     strange : bool
         The measurement does not fit even the best hypothesis: ambiguous, too.
+    unseen : UnseenLength, optional
+        Of vehicles.
     stamp_ns, id, ended, existence, degrees_of_freedom, predicted, mounting, mounting_covariance
         Fields of `Track` that the bank does not know.
     """
     n_t = len(model.state_names)
-    said, flags = _said_of(model, orientation, bank.x[best, :n_t], bank.P[best, :n_t, :n_t])
+    said, flags = _said_of(model, orientation, bank.x[best, :n_t],
+                           covariance_about(bank, best, model), unseen)
     weights = np.exp(bank.log_w)
     moments = model.dipoles(bank.x[:, :n_t]).m.sum(axis=1)
     order = np.argsort(-bank.log_w, kind='stable')
@@ -147,6 +146,26 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
         unobservable=(False, False, False, *flags), hypotheses=hypotheses, **said)
 
 
+def covariance_about(bank: FilterBank, best: int, model: SourceModel) -> FloatArray:
+    """Covariance (n_t, n_t) about the state of hypothesis `best`, of all at its place.
+
+    Hypotheses that are not apart differ by where each was linearised, by the kind of target and by
+    its motion; that they do is part of the error. Those that are apart make the track ambiguous.
+    """
+    n_t = len(model.state_names)
+    weight = np.where(bank.apart(best), 0.0, np.exp(bank.log_w - bank.log_w[best]))
+    here = np.flatnonzero(weight >= NO_WEIGHT * weight.max())
+    x, weight = bank.x[here, :n_t], weight[here] / weight[here].sum()
+    difference = x - bank.x[best, :n_t]
+    if 'L' in model.state_names:
+        # From its other end it is the same row.
+        L = model.state_names.index('L')
+        difference[:, L] = np.abs(x[:, L]) - abs(bank.x[best, L])
+    covariance: FloatArray = (np.einsum('n,nij->ij', weight, bank.P[here, :n_t, :n_t])
+                              + np.einsum('n,ni,nj->ij', weight, difference, difference))
+    return covariance
+
+
 def is_ambiguous(bank: FilterBank, best: int) -> bool:
     """Whether another place, or another arrival, than that of hypothesis `best` is possible."""
     same_arrival = np.exp(bank.log_w).sum(where=bank.label == bank.label[best])
@@ -154,8 +173,8 @@ def is_ambiguous(bank: FilterBank, best: int) -> bool:
 
 
 def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray, *,
-                  stamp_ns: int, id: int, kind: str, ambiguous: bool, complete: bool
-                  ) -> SmoothedPose:
+                  unseen: UnseenLength | None, stamp_ns: int, id: int, kind: str, ambiguous: bool,
+                  complete: bool) -> SmoothedPose:
     """The `SmoothedPose` of a state `x` (n_x,) with covariance `P` (n_x, n_x).
 
     The model and the orientation are as for `published_track`.
@@ -163,34 +182,25 @@ def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P
     n_t = len(model.state_names)
     return SmoothedPose(stamp_ns=stamp_ns, id=id, kind=kind, ambiguous=ambiguous,
                         complete=complete,
-                        **_said_of(model, orientation, x[:n_t], P[:n_t, :n_t])[0])
+                        **_said_of(model, orientation, x[:n_t], P[:n_t, :n_t], unseen, True)[0])
 
 
-def _of_middle(x: FloatArray) -> FloatArray:
-    """(2, 2) [m^2] how far the middle of the iron may be from that of a long vehicle."""
-    speed = np.hypot(x[3], x[4])
-    longer = abs(x[-1]) - CAR_ROW
-    if longer <= 0.0 or speed <= 0.0:
-        return np.zeros((2, 2))
-    forward = x[3:5] / speed
-    variance: FloatArray = (OFF_MIDDLE * longer)**2 * np.outer(forward, forward)
-    return variance
-
-
-def _said_of(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray
-             ) -> tuple[PoseFields, Flags]:
+def _said_of(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray,
+             unseen: UnseenLength | None, complete: bool = False) -> tuple[PoseFields, Flags]:
     """What a target state says, as fields of a record, and which rotations it does not."""
     dipoles = model.dipoles(x[None])
     dm_dx = dipoles.dm_dx[0].sum(axis=0)
     q, T, unobserved, flags = orientation(x, P)
-    # A row has a length, as its last state; from its other end it is the same row.
-    row = model.state_names[-1] == 'L'
+    length, length_std = 0.0, 0.0
     covariance = P[:6, :6].copy()
-    if row:
-        covariance[:2, :2] += _of_middle(x)
+    if 'L' in model.state_names:
+        L = model.state_names.index('L')
+        # From its other end it is the same row.
+        length, length_std = abs(float(x[L])), float(np.sqrt(max(P[L, L], 0.0)))
+    if unseen is not None:
+        covariance[:2, :2] += unseen.covariance(x, length, complete)
     return {'position': x[:3].copy(), 'velocity': x[3:6].copy(), 'covariance': covariance,
             'orientation': q, 'orientation_covariance': T @ P @ T.T + unobserved,
             'position_orientation_covariance': P[:3] @ T.T,
             'moment': dipoles.m[0].sum(axis=0), 'moment_covariance': dm_dx @ P @ dm_dx.T,
-            'length': abs(float(x[-1])) if row else 0.0,
-            'length_std': float(np.sqrt(max(P[-1, -1], 0.0))) if row else 0.0}, flags
+            'length': length, 'length_std': length_std}, flags

@@ -5,6 +5,9 @@ of the sensors that is metres off, and what it wrongly took for known there it n
 the latest frames are filtered and smoothed again, linearised along the smoothed path of each
 leading hypothesis: Gauss-Newton steps on its path. Where they have settled, and the path explains
 the frames no worse than the filter did, its state and covariance take the place of the filter's.
+Where they have not, the filter is surer than it may be: linearised at one place and then at another
+it learns of directions that no single path learns of (Julier and Uhlmann 2001, of maps). There its
+state stays, and a wider covariance of the path is taken.
 Its weight stays: those of hypotheses that are done again and of others could not be compared.
 
 Source: Bell 1994, The iterated Kalman smoother as a Gauss-Newton method.
@@ -133,6 +136,7 @@ class Relinearisation:
         filtered = np.sum(self._log_likelihoods[int(self._updated):], axis=0)[rows]
         taken = finite & settled & (log_likelihood >= filtered)
         bank.x[leading[taken]], bank.P[leading[taken]] = last.x[taken], last.P[taken]
+        _widen(bank, leading[finite & ~taken], last.x[finite & ~taken], last.P[finite & ~taken])
         return Counter({TRIED: len(taken), IN_VAIN: int(np.count_nonzero(~taken))})
 
     def _leading(self, bank: FilterBank) -> IntArray:
@@ -180,6 +184,15 @@ class Relinearisation:
             steps.append(step)
         std = [np.sqrt(np.einsum('pii->p', step.P[:, :3, :3])) for step in steps]
         return steps[-1], log_likelihood, list(zip(smoothed_states(steps), std, strict=True))
+
+
+def _widen(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray) -> None:
+    """Take the covariances `P` (n, n_x, n_x) of paths that lead to `x` (n, n_x) where they are
+    wider than those of the `rows` (n,) of the bank, in place, with how far the two are apart.
+    """
+    wider = (np.einsum('nii->n', P[:, :3, :3]) > np.einsum('nii->n', bank.P[rows, :3, :3]))
+    rows, difference = rows[wider], x[wider] - bank.x[rows[wider]]
+    bank.P[rows] = P[wider] + difference[:, :, None] * difference[:, None]
 
 
 def _rows(anchor: FilterBank, bank: FilterBank) -> IntArray:

@@ -57,6 +57,7 @@ class RunningTrack:
         self._lag = FixedLag(settings.smoothing_lag_s) if settings.smoothing_lag_s else None
         self._evidence = TrackEvidence(doubted=False)
         self._last: Track | None = None
+        self._spread = np.inf
         self._handover_due: int | None = None
 
     def _use(self, sensors: SensorSubset, bank_filter: BankFilter) -> None:
@@ -147,6 +148,7 @@ class RunningTrack:
     def _publish(self, frame: FieldFrame, dt: float, best: int) -> list[TrackRecord]:
         """The `Track` of the hypothesis `best`."""
         self._last = self._published(frame, dt, best)
+        self._spread = float(np.sqrt(np.trace(self.bank.P[best, :2, :2])))
         self.counts['poses'] += 1
         self._handover_due = best if self._sensors.is_part else None
         return [self._last]
@@ -154,24 +156,35 @@ class RunningTrack:
     def _end_if_over(self) -> list[TrackRecord]:
         """The closing records, if the latest pose says that the track is over."""
         assert self._last is not None
-        reason = self._evidence.reason_to_end(self._last, self._settings)
+        reason = self._evidence.reason_to_end(self._last, self._spread, self._is_coming(),
+                                              self._settings)
         if reason is None:
             return []
         self.is_lost = True
         return self.end(reason)
+
+    def _is_coming(self) -> bool:
+        """Whether a vehicle moves towards the sensor that it is nearest to."""
+        assert self._last is not None
+        away = self._last.position[:2] - self._sensors.network.positions[:, :2]
+        nearest = away[np.argmin(np.square(away).sum(axis=1))]
+        return not self._target.starts_anywhere and bool(nearest @ self._last.velocity[:2] < 0.0)
 
     def _published(self, frame: FieldFrame, dt: float, best: int) -> Track:
         """The `Track` of the hypothesis `best`, with what it says of the sensors."""
         bank, observation = self.bank, self._filter.observation
         measured = ~np.isnan(frame.field)
         alone = len(self._sensors.network) > 1 and np.count_nonzero(measured.any(axis=1)) == 1
+        n_measured = int(np.count_nonzero(measured))
         self._evidence.support(alone, dt)
+        self._evidence.check(float(np.nansum(bank.nis[best])), n_measured)
         return self._sensors.widened(published_track(
             bank, best, self._target.model, self._target.orientation, self._target.arrivals,
             self._target.kinds, stamp_ns=frame.stamp_ns, id=self.id, ended=False,
-            existence=self._evidence.existence, degrees_of_freedom=int(np.count_nonzero(measured)),
+            existence=self._evidence.existence, degrees_of_freedom=n_measured,
             strange=(self._filter.is_strange(bank, best, frame) or alone
                      or self._evidence.doubted),
+            unseen=self._target.unseen,
             predicted=self._filter.predicted_field(bank, best, frame, dt),
             mounting=observation.angles(bank.x[best]),
             mounting_covariance=observation.angle_covariances(bank.P[best])), self._settings)
@@ -183,7 +196,8 @@ class RunningTrack:
         kind = self._target.kinds[self.bank.kind[best]]
         return [smoothed_pose(
             self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,
-            kind=kind, complete=complete, ambiguous=ambiguous) for stamp_ns, x, P in states]
+            kind=kind, unseen=self._target.unseen, complete=complete, ambiguous=ambiguous)
+            for stamp_ns, x, P in states]
 
     def _smoothed_at_the_end(self) -> list[SmoothedPose]:
         """What is left of a fixed lag, and the whole track."""

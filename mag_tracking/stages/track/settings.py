@@ -47,9 +47,9 @@ class TrackSettings:
         1e-12, 'A hypothesis lighter than the heaviest by this ratio is dropped (T10 Alg. 3).',
         '', (1e-300, 0.5), live=True)
     most_hypotheses: int = param(
-        600, 'No more than the heaviest so many are kept.', '', (1, 100000), live=True)
+        1200, 'No more than the heaviest so many are kept.', '', (1, 100000), live=True)
     most_at_start: int = param(
-        600, 'In the frames before the detection so many are, if that is more: they say so '
+        1200, 'In the frames before the detection so many are, if that is more: they say so '
         'little of where a target comes from that of few the right one is often lost.', '',
         (1, 100000), live=True)
     relinearise_window_s: float = param(

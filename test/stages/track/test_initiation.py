@@ -47,11 +47,18 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
     frame = FieldFrame(0, np.full((2, 3), 1e-7), np.repeat(1e-16 * np.eye(3)[None], 2, axis=0),
                        np.full(2, 8), np.zeros(2))
     bank = start_vehicle(vehicle, road_network, frame, 2e-8, None)
-    m = vehicle_model(vehicle, road_network).dipoles(bank.x[:, :17]).m.sum(axis=1)
+    m = vehicle_model(vehicle, road_network).dipoles(bank.x[:, :18]).m.sum(axis=1)
     np.testing.assert_allclose(np.linalg.norm(m, axis=1), np.take(vehicle.moments, bank.kind),
                                rtol=1e-9)
     np.testing.assert_array_equal(bank.x[:, 16], np.take(vehicle.lengths, bank.kind))
-    assert len(bank) == 3 * 3 * 14 * 3 * 3
+    assert len(bank) == 3 * 3 * 14 * 3 * 3 * 2
+    # Half of them turn, about as fast as the settings say; nobody knows which way.
+    turns = bank.P[:, 17, 17] > 0.0
+    assert np.count_nonzero(turns) == len(bank) // 2 and not bank.x[:, 17].any()
+    speed = np.hypot(*bank.x[:, 3:5].T)[turns]
+    np.testing.assert_allclose(bank.P[turns, 17, 17], (vehicle.turn_acceleration / speed)**2)
+    assert np.exp(bank.log_w[turns]).sum() == pytest.approx(vehicle.turn_share)
+    assert len(set(bank.origin)) == len(bank)
     # What is called a point is one: neither a length nor differences.
     points = bank.P[bank.kind == 0]
     assert not points[:, 16, 16].any()
@@ -176,10 +183,10 @@ def test_backgrounds_wander_between_frames_and_angles_do_not(road_network):
     BankFilter(road_network, target_of(settings, road_network).model, settings).predict(
         stage.bank, dt)
     after = np.diagonal(stage.bank.P, axis1=1, axis2=2)
-    own, grown = before[:, 17:29].reshape(-1, 2, 6), after[:, 17:29].reshape(-1, 2, 6)
+    own, grown = before[:, 18:30].reshape(-1, 2, 6), after[:, 18:30].reshape(-1, 2, 6)
     np.testing.assert_array_equal(grown[:, :, :3], own[:, :, :3])
     # A model error forgets what was learnt of it, with its time of 0.3 s, and stays of size one.
     np.testing.assert_allclose(1.0 - grown[:, :, 3:],
                                np.exp(-2.0 * dt / 0.3) * (1.0 - own[:, :, 3:]), atol=1e-12)
     assert (own[:, :, 3:] < 1.0 - 1e-6).any()
-    np.testing.assert_allclose(after[:, 29:] - before[:, 29:], drift**2 * dt, rtol=1e-6)
+    np.testing.assert_allclose(after[:, 30:] - before[:, 30:], drift**2 * dt, rtol=1e-6)

@@ -113,6 +113,40 @@ def test_what_explains_the_frames_worse_is_not_taken():
     np.testing.assert_array_equal(bank.x, plain.x)
 
 
+class LessSure(LinearFilter):
+    """Along a path it learns less, or more, of the first state than it does by itself."""
+
+    better, more = -1e-6, 0.0
+
+    def update_with_gains(self, bank, frame, dt, x_lin=None):
+        found = super().update_with_gains(bank, frame, dt, x_lin)
+        if x_lin is not None:
+            bank.P[:, 0, 0] += self.more
+            bank.x[:, 1] += 0.1
+        return found
+
+
+@pytest.mark.parametrize('more, is_wider', [(0.5, True), (-1e-3, False)])
+def test_of_a_path_that_is_less_sure_the_covariance_is_taken(more, is_wider):
+    filter_, rng = LessSure(), np.random.default_rng(0)
+    filter_.more = more
+    bank = FilterBank.of_targets(np.zeros((1, N_T)), np.eye(N_T)[None], np.zeros(1, int), 1, 1.0)
+    anew = Relinearisation(0.0, 60.0, 1)
+    anew.begin(bank)
+    frame = FieldFrame(0, rng.standard_normal((1, 3)), np.eye(3)[None], np.full(1, 8), np.zeros(1),
+                       True)
+    predicted = bank.x.copy()
+    log_likelihood, _ = filter_.update_with_gains(bank, frame, 0.0)
+    anew.add(bank, predicted, log_likelihood, frame, 0.0)
+    x, P = bank.x.copy(), bank.P.copy()
+    assert anew.improve(filter_, bank)[relinearise.IN_VAIN] == 1
+    np.testing.assert_array_equal(bank.x, x)
+    # With how far apart the two are: that, too, nobody knows.
+    expected = P[0] + is_wider * (more * np.eye(6)[0] * np.eye(6)[0][:, None]
+                                  + 0.01 * np.eye(6)[1] * np.eye(6)[1][:, None])
+    np.testing.assert_allclose(bank.P[0], expected, atol=1e-9)
+
+
 @pytest.mark.parametrize('window_s, most_frames', [(0.5, 64), (60.0, 10)])
 def test_it_is_done_over_twice_the_window_at_most(monkeypatch, window_s, most_frames):
     """Frames are 0.05 s apart or more; beside the passes the anchor moves over half of them."""

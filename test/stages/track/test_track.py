@@ -8,17 +8,10 @@ from scipy.stats import binom
 
 from mag_tracking.geometry import rotation_from_quaternion
 from mag_tracking.messages.schema import pose_covariance
-from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
 from mag_tracking.simulation.scenario import Imperfections, Path, point_body, random_vehicle
 from mag_tracking.stages.track.manager import TrackManager
-from mag_tracking.stages.track.published_pose import (
-    CAR_ROW,
-    OFF_MIDDLE,
-    smoothed_pose,
-    vehicle_orientation,
-)
 from mag_tracking.stages.track.target import target_of
 from support.bundled import POINT
 from support.marks import studied
@@ -233,22 +226,3 @@ def test_the_predicted_field_is_without_the_errors_of_the_model():
                          for t in tracks if not t.ended)
     assert left['point'] > 2.0 * left['row']
     assert left['point'] > 5e-8
-
-
-def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron():
-    """Along the heading, by a share of what it is longer than a car; a car as the filter says."""
-    model = RowVehicle(np.zeros(3), np.ones(3))
-    x = np.zeros((1, len(model.state_names)))
-    x[0, 3:5], x[0, 6:9] = [0.0, 8.0], [0.0, 300.0, 0.0]
-    P = 0.04 * np.eye(x.shape[1])
-    said = {}
-    for length in (3.0, -3.0, 12.0):
-        x[0, -1] = length
-        said[length] = smoothed_pose(model, vehicle_orientation, x[0], P, stamp_ns=0, id=1, kind='',
-                                     ambiguous=False, complete=True).covariance
-    np.testing.assert_array_equal(said[3.0], P[:6, :6])
-    np.testing.assert_array_equal(said[-3.0], P[:6, :6])
-    added = said[12.0] - P[:6, :6]
-    expected = np.zeros((6, 6))
-    expected[1, 1] = (OFF_MIDDLE * (12.0 - CAR_ROW))**2
-    np.testing.assert_allclose(added, expected, atol=1e-12)

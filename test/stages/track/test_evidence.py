@@ -1,0 +1,76 @@
+"""What ends a track, what makes it doubtful, and how wide the published covariance is."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.physics.vehicles import RowVehicle
+from mag_tracking.pipeline import settings_for
+from mag_tracking.stages.track.evidence import CONTRADICTION, LOST, TrackEvidence
+from mag_tracking.stages.track.published_pose import covariance_about
+
+SETTINGS = settings_for('vehicle').track
+
+
+def pose(nis=6.0):
+    return SimpleNamespace(nis=nis, degrees_of_freedom=6)
+
+
+def test_noise_contradicts_a_track_as_often_as_said():
+    rng = np.random.default_rng(0)
+    nis = rng.chisquare(6, 3_000_000)
+    doubted = 0
+    for value in nis[nis > 25.0]:
+        evidence = TrackEvidence(doubted=False)
+        evidence.check(value, 6)
+        doubted += evidence.doubted
+    # A Poisson number with the mean 30.
+    assert 10 < doubted < 60 and len(nis) * CONTRADICTION == pytest.approx(30.0)
+
+
+def test_a_track_that_was_contradicted_once_stays_doubted():
+    evidence = TrackEvidence(doubted=False)
+    for nis in (6.0, 60.0, 6.0):
+        evidence.check(nis, 6)
+    assert evidence.is_doubtful
+
+
+@pytest.mark.parametrize('nis, is_coming, reason', [
+    (6.0, False, 'out of reach'), (6.0, True, None), (1e4, False, LOST)])
+def test_a_vehicle_that_comes_is_not_out_of_reach(nis, is_coming, reason):
+    evidence = TrackEvidence(doubted=False)
+    assert evidence.reason_to_end(pose(), 2.0, is_coming, SETTINGS) is None
+    assert evidence.reason_to_end(pose(nis), 7.0, is_coming, SETTINGS) == reason
+
+
+def bank_of(places, weights, std=0.5, lengths=3.0):
+    n, model = len(places), RowVehicle(np.zeros(3), np.ones(3))
+    x = np.zeros((n, 17))
+    x[:, 0], x[:, 3], x[:, 16] = places, 8.0, lengths
+    bank = FilterBank.of_targets(x, np.tile(std**2 * np.eye(17), (n, 1, 1)), np.zeros(n, int), 2,
+                                 1e-8)
+    bank.log_w = np.log(weights)
+    return bank, model
+
+
+def test_hypotheses_at_one_place_are_one_distribution():
+    """Samples of their mixture, about the one that is published."""
+    bank, model = bank_of([0.0, 1.0, -0.5], [0.5, 0.3, 0.2])
+    rng = np.random.default_rng(1)
+    which = rng.choice(3, 400_000, p=[0.5, 0.3, 0.2])
+    samples = bank.x[which, 0] + 0.5 * rng.standard_normal(len(which))
+    assert covariance_about(bank, 0, model)[0, 0] == pytest.approx(np.square(samples).mean(),
+                                                                   rel=0.01)
+
+
+def test_other_places_make_a_track_ambiguous_but_its_covariance_no_wider():
+    bank, model = bank_of([0.0, 40.0], [0.9, 0.1])
+    np.testing.assert_allclose(covariance_about(bank, 0, model), 0.25 * np.eye(17))
+    assert bank.separated_weight(0) == pytest.approx(0.1)
+
+
+def test_the_same_row_from_its_other_end_is_as_long():
+    bank, model = bank_of([0.0, 0.0], [0.5, 0.5], lengths=np.array([3.0, -3.0]))
+    assert covariance_about(bank, 0, model)[16, 16] == pytest.approx(0.25)
