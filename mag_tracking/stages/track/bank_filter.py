@@ -12,6 +12,10 @@ from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.settings import TrackSettings
 
+LINEAR = 0.25
+"""A field is about linear in the position over this share of the distance to the nearest sensor:
+the cube of that distance changes by a factor of two."""
+
 ONE_TIME = 0.05
 """A frame that is shorter than this share of the time since the frame before is one time, and so
 is the first of a track: velocities are better learnt from frame to frame than within one."""
@@ -113,6 +117,11 @@ class BankFilter:
             x_lin = bank.x.copy()
         bank.nis[:, np.isnan(frame.field).all(axis=1)] = np.nan
         return log_likelihood, gains
+
+    def nearly_linear(self, x: FloatArray) -> FloatArray:
+        """(n_hyp,) [m] how far the position of the states `x` (n_hyp, n_x) may be off for the field
+        to be about linear in it."""
+        return LINEAR * self.observation.nearest(x)
 
     def is_strange(self, bank: FilterBank, i: int, frame: FieldFrame) -> bool:
         """Whether hypothesis `i`, just updated with the `frame`, is contradicted by it."""

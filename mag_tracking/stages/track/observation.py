@@ -84,6 +84,12 @@ class Observation:
         self.own(x)[..., self._n_angles:] = 0.0
         return x
 
+    def nearest(self, x: FloatArray) -> FloatArray:
+        """(n_hyp,) [m] from the positions of the states `x` (n_hyp, n_x) to the nearest sensor."""
+        away = np.linalg.norm(x[:, None, :3] - self._positions, axis=2)
+        nearest: FloatArray = away.min(axis=1)
+        return nearest
+
     def drift(self, dt: float, background_density: float) -> tuple[FloatArray, FloatArray]:
         """What becomes of the sensors' states over `dt` seconds.
 

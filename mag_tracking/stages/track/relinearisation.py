@@ -14,7 +14,7 @@ Source: Bell 1994, The iterated Kalman smoother as a Gauss-Newton method.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -136,7 +136,8 @@ class Relinearisation:
         filtered = np.sum(self._log_likelihoods[int(self._updated):], axis=0)[rows]
         taken = finite & settled & (log_likelihood >= filtered)
         bank.x[leading[taken]], bank.P[leading[taken]] = last.x[taken], last.P[taken]
-        _widen(bank, leading[finite & ~taken], last.x[finite & ~taken], last.P[finite & ~taken])
+        rest = finite & ~taken
+        _widen(bank, leading[rest], last.x[rest], last.P[rest], bank_filter.nearly_linear)
         return Counter({TRIED: len(taken), IN_VAIN: int(np.count_nonzero(~taken))})
 
     def _leading(self, bank: FilterBank) -> IntArray:
@@ -186,13 +187,18 @@ class Relinearisation:
         return steps[-1], log_likelihood, list(zip(smoothed_states(steps), std, strict=True))
 
 
-def _widen(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray) -> None:
+def _widen(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,
+           nearly_linear: Callable[[FloatArray], FloatArray]) -> None:
     """Take the covariances `P` (n, n_x, n_x) of paths that lead to `x` (n, n_x) where they are
     wider than those of the `rows` (n,) of the bank, in place, with how far the two are apart.
+
+    Not where they are so wide that the next update, linearised at one place, would lead astray.
     """
-    wider = (np.einsum('nii->n', P[:, :3, :3]) > np.einsum('nii->n', bank.P[rows, :3, :3]))
-    rows, difference = rows[wider], x[wider] - bank.x[rows[wider]]
-    bank.P[rows] = P[wider] + difference[:, :, None] * difference[:, None]
+    difference = x - bank.x[rows]
+    apart = P + difference[:, :, None] * difference[:, None]
+    own, path, both = (np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P, apart))
+    wider = (path > own) & (both < np.square(nearly_linear(bank.x[rows])))
+    bank.P[rows[wider]] = apart[wider]
 
 
 def _rows(anchor: FilterBank, bank: FilterBank) -> IntArray:

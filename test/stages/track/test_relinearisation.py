@@ -32,12 +32,16 @@ LATE = 22.5 * PERIOD
 class LinearFilter:
     """As a `BankFilter`, of a target whose field is linear in its states; one sensor."""
 
+    linear = np.inf
     better = 0.0
     """What is added to the log-likelihood where it is told where to linearise."""
 
     def __init__(self):
         self.lengths = [0]
         self.origins = set()
+
+    def nearly_linear(self, x):
+        return np.full(len(x), self.linear)
 
     def predict(self, bank, dt):
         F = np.array([[1.0, dt, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -126,10 +130,11 @@ class LessSure(LinearFilter):
         return found
 
 
-@pytest.mark.parametrize('more, is_wider', [(0.5, True), (-1e-3, False)])
-def test_of_a_path_that_is_less_sure_the_covariance_is_taken(more, is_wider):
+@pytest.mark.parametrize('more, linear, is_wider', [
+    (0.5, np.inf, True), (0.5, 2.0, True), (0.5, 0.5, False), (-1e-3, np.inf, False)])
+def test_of_a_path_that_is_less_sure_the_covariance_is_taken(more, linear, is_wider):
     filter_, rng = LessSure(), np.random.default_rng(0)
-    filter_.more = more
+    filter_.more, filter_.linear = more, linear
     bank = FilterBank.of_targets(np.zeros((1, N_T)), np.eye(N_T)[None], np.zeros(1, int), 1, 1.0)
     anew = Relinearisation(0.0, 60.0, 1)
     anew.begin(bank)
