@@ -110,17 +110,25 @@ def quaternion_between(a: ArrayLike, b: ArrayLike) -> FloatArray:
 
 
 def speed_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float]:
-    """[m/s] Speed and its deviation, of a velocity (d,) with a covariance (d, d)."""
+    """[m/s] The speed and its deviation, from a velocity (d,) and its covariance (d, d).
+
+    At rest the deviation is the largest of any direction.
+    """
     speed = float(np.linalg.norm(velocity))
+    if speed == 0.0:
+        return 0.0, float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
     u = velocity / speed
     return speed, float(np.sqrt(u @ covariance @ u))
 
 
 def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float]:
-    """[rad] Heading, anticlockwise from x, and its deviation.
+    """[rad] The heading, anticlockwise from x, and its deviation.
 
-    Of a velocity (2 or 3,) with a covariance of as many rows; seen from above.
+    From a velocity (2 or 3,) and its covariance, seen from above. At rest the deviation is
+    infinite.
     """
     vx, vy = velocity[:2]
+    if vx == vy == 0.0:
+        return 0.0, float('inf')
     g = np.array([-vy, vx]) / (vx * vx + vy * vy)
     return float(np.arctan2(vy, vx)), float(np.sqrt(g @ covariance[:2, :2] @ g))

@@ -300,11 +300,13 @@ class Track:
     velocity: FloatArray
     """(3,) [m/s], world."""
     covariance: FloatArray
-    """(6, 6) of position and velocity, world."""
+    """(6, 6) of position and velocity, world: about this pose, of all hypotheses at this place.
+    That of a vehicle's position holds what of its length is not yet seen, too."""
     orientation: FloatArray
     """(4,) quaternion xyzw, body to world."""
     orientation_covariance: FloatArray
-    """(3, 3) [rad^2], small rotations about the fixed world axes."""
+    """(3, 3) [rad^2], small rotations about the fixed world axes; it and those below are also of
+    all hypotheses at this place."""
     position_orientation_covariance: FloatArray
     """(3, 3) [m rad]."""
     moment: FloatArray

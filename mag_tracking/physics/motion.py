@@ -1,4 +1,4 @@
-"""Motion models, exactly discretised.
+"""Motion models, exactly discretised; a turn at a rate that stays as it is.
 
 Only the exact form of the process noise is supported: white noise drives the
 highest derivative in continuous time. (T10 eq. (4.2) and ICASSP11 eq. (2)

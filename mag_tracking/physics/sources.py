@@ -48,7 +48,7 @@ class SourceModel(Protocol):
         """States after `dt` seconds, Jacobian (..., n_t, n_t), process noise (..., n_t, n_t).
 
         With the states' covariances `P` (n_hyp, n_t, n_t) the noise holds what the
-        Jacobian leaves out, too.
+        Jacobian leaves out, too, and a state of zero variance may be taken for fixed.
         """
 
 

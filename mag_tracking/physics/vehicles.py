@@ -66,10 +66,10 @@ def _row_dipoles(x: FloatArray, places: FloatArray, induction: FloatArray, r: Fl
 class RowVehicle:
     """A row of equidistant dipoles along the heading, of unknown length; one dipole is a point.
 
-    State (6 + 3 d + 2; with one dipole 10, without a length): position r of the row's middle,
-    velocity v, hard iron moment of each dipole in the vehicle's frame (x forward, z up; from the
-    tail to the head), soft iron scalar D [m^3] of the whole, length L [m], turn rate w [rad/s]
-    if any vehicle may turn.
+    State (6 + 3 d + 2, with one dipole 10, without a length; one more if any vehicle may turn):
+    position r of the row's middle, velocity v, hard iron moment of each dipole in the vehicle's
+    frame (x forward, z up; from the tail to the head), soft iron scalar D [m^3] of the whole,
+    length L [m], turn rate w [rad/s].
 
         m_i = Rz(heading) m0_i + D/(d mu0) B0,    r_i = r + (i - (d+1)/2) L/(d-1) heading
 
@@ -142,8 +142,9 @@ class RowVehicle:
                   ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Constant velocity, or a turn; the drifts grow with the size of the iron.
 
-        A turn rate whose variance is zero stays as it is: such a vehicle goes straight on. See
-        `SourceModel`.
+        A turn rate whose variance in `P` is zero gets no noise: such a vehicle goes straight on.
+        Over `dt` the rate is taken as its mean; what its noise does to place and velocity within
+        that time is left out. See `SourceModel`.
         """
         n, d = x.shape[1], self.n_dipoles
         Q = np.zeros((len(x), n, n))
@@ -156,9 +157,14 @@ class RowVehicle:
             F = np.eye(n)
             F[:6, :6] = constant_velocity(dt)
             return x @ F.T, F, Q
-        moved, turned = coordinated_turn(x, dt)
-        fading = math.exp(-abs(dt) / self.turn_time)
-        moved[:, -1] *= fading
+        # Backwards, without noise, nothing may become surer than it is.
+        fading = math.exp(-max(dt, 0.0) / self.turn_time)
+        mean = (1.0 - fading) * self.turn_time / dt if dt > 0.0 else 1.0
+        turning = x.copy()
+        turning[:, -1] *= mean
+        moved, turned = coordinated_turn(turning, dt)
+        moved[:, -1] = fading * x[:, -1]
+        turned[:, :-1, -1] *= mean
         turned[:, -1, -1] = fading
         turns = np.ones(len(x)) if P is None else P[:, -1, -1] > 0.0
         Q[:, -1, -1] = turns * (1.0 - fading**2) * self.turn_variance(np.hypot(x[:, 3], x[:, 4]))

@@ -92,8 +92,12 @@ class TrackLog:
         return seconds
 
     def surest(self) -> int:
-        """Index of the pose whose horizontal position is most certain."""
-        return int(np.argmin([np.trace(C[:2, :2]) for C in self.covariance]))
+        """Index of the pose whose horizontal velocity is most certain.
+
+        What is said of a pass as a whole is read there: the position of a vehicle may become more
+        certain later, once all of its length has passed, but not the speed.
+        """
+        return int(np.argmin([np.trace(C[3:5, 3:5]) for C in self.covariance]))
 
     def mounting_of(self, names: Sequence[str]) -> dict[str, tuple[FloatArray, FloatArray]]:
         """{sensor: (angles (3,), their deviations (3,)) [deg]} at the surest pose; may be empty."""
@@ -114,7 +118,7 @@ class TrackLog:
     def summary(self) -> dict[str, Any]:
         """The track in a few JSON-ready numbers.
 
-        Speed and moment are those of the most certain pose.
+        Speed and moment are those of the `surest` pose.
         """
         sure = self.surest()
         final = self.arrivals[-1]
@@ -135,6 +139,6 @@ class TrackLog:
                                                        self.velocity[sure][0]))),
             'moment': [float(v) for v in self.moment[sure]],
             'moment_size': float(np.linalg.norm(self.moment[sure])),
-            'smallest_sd': float(np.sqrt(np.trace(self.covariance[sure][:2, :2]))),
+            'smallest_sd': float(np.sqrt(min(np.trace(C[:2, :2]) for C in self.covariance))),
             'nis_per_axis': float(nis[known].mean()) if known.any() else None,
         }

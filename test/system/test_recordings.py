@@ -93,7 +93,7 @@ def test_error_at_the_closest_point(vehicle_replays, name):
 
 
 def speed_error(vehicle_replays, name):
-    """Relative error of the speed where the position is most certain."""
+    """Relative error of the speed where it is most certain."""
     run, _ = vehicle_replays[name]
     log = run.logs[pass_of(vehicle_replays, name)['id']]
     stamps, positions, _ = next(iter(run.truth.values()))

@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.special import chdtri
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.records import Track
 from mag_tracking.stages.track.settings import TrackSettings
 
@@ -13,8 +14,8 @@ LOST = 'lost its target'
 """Reason for the end of a track."""
 
 CONTRADICTION = 1e-5
-"""A field that is as far from the predicted one as one in so many contradicts the track. The filter
-takes it in, and may afterwards be wrong and agree with all that comes."""
+"""A field that is less probable than this contradicts the track of a vehicle. The filter takes it
+in, and may afterwards be wrong and agree with all that comes."""
 
 LEAST_WATCHED = 0.5
 """A track that begins with less than this share of its lookback is ambiguous."""
@@ -39,10 +40,16 @@ class TrackEvidence:
         """From now on all of the track may be wrong."""
         self.doubted = True
 
-    def check(self, nis: float, degrees_of_freedom: int) -> None:
-        """Doubt all of the track from a normalised innovation that no target of ours makes."""
-        if nis > chdtri(degrees_of_freedom, CONTRADICTION):
+    def contradicts(self, nis: FloatArray, degrees_of_freedom: int) -> bool:
+        """Whether a normalised innovation is one that no target of ours makes.
+
+        `nis` (n_sensors,) of each sensor, NaN where it is missing. Two sensors agree with many
+        paths: all of the track is then doubted. More of them correct it.
+        """
+        contradicted = bool(np.nansum(nis) > chdtri(degrees_of_freedom, CONTRADICTION))
+        if contradicted and len(nis) <= 2:
             self.doubt()
+        return contradicted
 
     def support(self, by_one_sensor: bool, dt: float) -> None:
         """Count `dt` [s] for which one sensor of several supported the track, or more did.

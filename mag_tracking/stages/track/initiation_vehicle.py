@@ -15,6 +15,9 @@ from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.records import FieldFrame
 from mag_tracking.settings import param
 
+TURNS_AT_START = 0.5
+"""A vehicle comes along a line: its turn rate is then smaller than that of one that turns."""
+
 
 @dataclass(frozen=True)
 class VehicleSettings:
@@ -72,10 +75,10 @@ class VehicleSettings:
     acceleration: float = param(
         1.0, 'Root spectral density of the horizontal acceleration.', 'm/s^1.5', (0.0, 1000.0))
     turn_acceleration: float = param(
-        3.0, 'Beside each hypothesis that goes straight on is one that turns, by a lateral '
-        'acceleration of this deviation. 0 = nothing turns, which is up to twice as fast.',
+        3.0, 'Standard deviation of the lateral acceleration of turning hypotheses, one beside '
+        'each that goes straight on. 0 = nothing turns, which is up to twice as fast.',
         'm/s^2', (0.0, 100.0))
-    turn_time: float = param(1.5, 'For how long a turn goes on.', 's', (0.01, 1000.0))
+    turn_time: float = param(1.5, 'Correlation time of the turn rate.', 's', (0.01, 1000.0))
     turn_share: float = param(
         0.5, 'Share of the vehicles that turn near the sensors.', '', (1e-6, 0.999999))
     climb_acceleration: float = param(
@@ -175,7 +178,8 @@ def _with_turns(bank: FilterBank, model: RowVehicle, share: float) -> FilterBank
     both = bank.rows(np.tile(np.arange(n), 2))
     both.origin = np.arange(2 * n)
     both.log_w = np.log(np.repeat([1.0 - share, share], n) / n)
-    both.P[n:, w, w] = model.turn_variance(np.hypot(bank.x[:, 3], bank.x[:, 4]))
+    both.P[n:, w, w] = TURNS_AT_START**2 * model.turn_variance(np.hypot(bank.x[:, 3],
+                                                                        bank.x[:, 4]))
     return both
 
 

@@ -120,13 +120,13 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
     strange : bool
         The measurement does not fit even the best hypothesis: ambiguous, too.
     unseen : UnseenLength, optional
-        Of vehicles.
+        How the length of a vehicle moves its middle; None for a small target.
     stamp_ns, id, ended, existence, degrees_of_freedom, predicted, mounting, mounting_covariance
         Fields of `Track` that the bank does not know.
     """
     n_t = len(model.state_names)
     said, flags = _said_of(model, orientation, bank.x[best, :n_t],
-                           covariance_about(bank, best, model), unseen)
+                           covariance_about(bank, best, model), int(bank.kind[best]), unseen)
     weights = np.exp(bank.log_w)
     moments = model.dipoles(bank.x[:, :n_t]).m.sum(axis=1)
     order = np.argsort(-bank.log_w, kind='stable')
@@ -173,20 +173,21 @@ def is_ambiguous(bank: FilterBank, best: int) -> bool:
 
 
 def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray, *,
-                  unseen: UnseenLength | None, stamp_ns: int, id: int, kind: str, ambiguous: bool,
-                  complete: bool) -> SmoothedPose:
+                  unseen: UnseenLength | None, stamp_ns: int, id: int, kind: int,
+                  kinds: Sequence[str], ambiguous: bool, complete: bool) -> SmoothedPose:
     """The `SmoothedPose` of a state `x` (n_x,) with covariance `P` (n_x, n_x).
 
     The model and the orientation are as for `published_track`.
     """
     n_t = len(model.state_names)
-    return SmoothedPose(stamp_ns=stamp_ns, id=id, kind=kind, ambiguous=ambiguous,
+    return SmoothedPose(stamp_ns=stamp_ns, id=id, kind=kinds[kind], ambiguous=ambiguous,
                         complete=complete,
-                        **_said_of(model, orientation, x[:n_t], P[:n_t, :n_t], unseen, True)[0])
+                        **_said_of(model, orientation, x[:n_t], P[:n_t, :n_t], kind,
+                                   unseen)[0])
 
 
 def _said_of(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray,
-             unseen: UnseenLength | None, complete: bool = False) -> tuple[PoseFields, Flags]:
+             kind: int, unseen: UnseenLength | None) -> tuple[PoseFields, Flags]:
     """What a target state says, as fields of a record, and which rotations it does not."""
     dipoles = model.dipoles(x[None])
     dm_dx = dipoles.dm_dx[0].sum(axis=0)
@@ -198,7 +199,7 @@ def _said_of(model: SourceModel, orientation: Orientation, x: FloatArray, P: Flo
         # From its other end it is the same row.
         length, length_std = abs(float(x[L])), float(np.sqrt(max(P[L, L], 0.0)))
     if unseen is not None:
-        covariance[:2, :2] += unseen.covariance(x, length, complete)
+        covariance[:2, :2] += unseen.covariance(x, P, length, kind)
     return {'position': x[:3].copy(), 'velocity': x[3:6].copy(), 'covariance': covariance,
             'orientation': q, 'orientation_covariance': T @ P @ T.T + unobserved,
             'position_orientation_covariance': P[:3] @ T.T,

@@ -5,9 +5,9 @@ of the sensors that is metres off, and what it wrongly took for known there it n
 the latest frames are filtered and smoothed again, linearised along the smoothed path of each
 leading hypothesis: Gauss-Newton steps on its path. Where they have settled, and the path explains
 the frames no worse than the filter did, its state and covariance take the place of the filter's.
-Where they have not, the filter is surer than it may be: linearised at one place and then at another
-it learns of directions that no single path learns of (Julier and Uhlmann 2001, of maps). There its
-state stays, and a wider covariance of the path is taken.
+Otherwise the state stays, but the filter may be surer than it should be: linearised at one place
+and then at another it learns of directions that no single path learns of (Julier and Uhlmann 2001
+saw it in maps). So a wider covariance of the path is taken.
 Its weight stays: those of hypotheses that are done again and of others could not be compared.
 
 Source: Bell 1994, The iterated Kalman smoother as a Gauss-Newton method.
@@ -114,7 +114,7 @@ class Relinearisation:
         """Linearise the leading hypotheses of the `FilterBank` anew, in place, if it is time to.
 
         By the `BankFilter` that it is moved with. Returns a Counter of those it was tried for, and
-        of those for which it was of no use: they stay as they were.
+        of those for which it was of no use: they keep their states.
         """
         anchor = self._anchor
         if anchor is None or self._last_ns is None \

@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from mag_tracking.arrays import BoolArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.track.bank_filter import BankFilter, NoTarget
@@ -58,6 +59,7 @@ class RunningTrack:
         self._evidence = TrackEvidence(doubted=False)
         self._last: Track | None = None
         self._spread = np.inf
+        self._unseen = target.unseen()
         self._handover_due: int | None = None
 
     def _use(self, sensors: SensorSubset, bank_filter: BankFilter) -> None:
@@ -170,21 +172,30 @@ class RunningTrack:
         nearest = away[np.argmin(np.square(away).sum(axis=1))]
         return not self._target.starts_anywhere and bool(nearest @ self._last.velocity[:2] < 0.0)
 
+    def _look(self, best: int, measured: IntArray) -> None:
+        """Note how far a vehicle has come, by the sensors (rows) that measured."""
+        if self._unseen is not None:
+            self._unseen.look(
+                self.bank.x[best], self.bank.P[best], self._sensors.network.positions[measured],
+                self._last is not None and (self._evidence.doubted or not self._last.ambiguous))
+
     def _published(self, frame: FieldFrame, dt: float, best: int) -> Track:
         """The `Track` of the hypothesis `best`, with what it says of the sensors."""
         bank, observation = self.bank, self._filter.observation
-        measured = ~np.isnan(frame.field)
+        measured: BoolArray = ~np.isnan(frame.field)
         alone = len(self._sensors.network) > 1 and np.count_nonzero(measured.any(axis=1)) == 1
         n_measured = int(np.count_nonzero(measured))
         self._evidence.support(alone, dt)
-        self._evidence.check(float(np.nansum(bank.nis[best])), n_measured)
+        self._look(best, np.flatnonzero(measured.any(axis=1)))
+        contradicted = not self._target.starts_anywhere \
+            and self._evidence.contradicts(bank.nis[best], n_measured)
         return self._sensors.widened(published_track(
             bank, best, self._target.model, self._target.orientation, self._target.arrivals,
             self._target.kinds, stamp_ns=frame.stamp_ns, id=self.id, ended=False,
             existence=self._evidence.existence, degrees_of_freedom=n_measured,
-            strange=(self._filter.is_strange(bank, best, frame) or alone
+            strange=(self._filter.is_strange(bank, best, frame) or alone or contradicted
                      or self._evidence.doubted),
-            unseen=self._target.unseen,
+            unseen=self._unseen,
             predicted=self._filter.predicted_field(bank, best, frame, dt),
             mounting=observation.angles(bank.x[best]),
             mounting_covariance=observation.angle_covariances(bank.P[best])), self._settings)
@@ -193,10 +204,11 @@ class RunningTrack:
                   doubtful: bool = False) -> list[SmoothedPose]:
         """The `SmoothedPose`s of states of the hypothesis `best`."""
         ambiguous = doubtful or is_ambiguous(self.bank, best)
-        kind = self._target.kinds[self.bank.kind[best]]
+        kind = int(self.bank.kind[best])
         return [smoothed_pose(
             self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,
-            kind=kind, unseen=self._target.unseen, complete=complete, ambiguous=ambiguous)
+            kind=kind, kinds=self._target.kinds, unseen=self._unseen, complete=complete,
+            ambiguous=ambiguous)
             for stamp_ns, x, P in states]
 
     def _smoothed_at_the_end(self) -> list[SmoothedPose]:

@@ -66,11 +66,14 @@ class TrackSettings:
         1.0, 'A track begins so long before its detection, with the frames kept since: what is '
         'too weak to detect still tells where the target came from.', 's', (0.0, 60.0))
     end_std: float = param(
-        5.0, 'A track ends when its horizontal position is less certain than this (one standard '
-        'deviation): the target is out of reach.', 'm', (1e-6, 1e6), live=True)
+        5.0, 'A track ends when the horizontal position of its best hypothesis is less certain '
+        'than this (one standard deviation) and no longer comes nearer: the target is out of '
+        'reach.', 'm', (1e-6, 1e6), live=True)
     end_nis: float = param(
         25.0, 'A track ends when its normalised innovation is larger than this per axis, twice '
-        'running: it has lost its target. Once makes it ambiguous.', '', (1.0, 1e12), live=True)
+        'running: it has lost its target. Once makes it ambiguous; a vehicle is so already where '
+        'the innovation is less probable than 1e-5, with two sensors for good.',
+        '', (1.0, 1e12), live=True)
     end_gap_s: float = param(
         2.0, 'A track ends where the frames have a longer gap than this.', 's', (1e-3, 86400.0))
     smooth_longest_s: float = param(

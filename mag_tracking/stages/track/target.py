@@ -33,8 +33,8 @@ class Target:
     """Name of each arrival direction."""
     kinds: Sequence[str]
     """Name of each kind of target."""
-    unseen: UnseenLength | None
-    """How its length moves its middle; None of a small target."""
+    unseen: Callable[[], UnseenLength | None]
+    """For each track: how its length moves its middle; None for a small target."""
     starts_anywhere: bool
     """A magnet that was lost is found anywhere; a vehicle starts on an arrival line."""
     start: Callable[[TrackSettings, SensorNetwork, FieldFrame, FloatArray], FilterBank | None]
@@ -53,15 +53,15 @@ def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
     if settings.target == 'vehicle':
         vehicle = settings.vehicle
         return Target(vehicle_model(vehicle, network), vehicle_orientation, vehicle.arrival_names,
-                      vehicle.kinds, UnseenLength(vehicle.lengths, vehicle.length_stds,
-                                                  network.positions), False, _start_vehicle)
+                      vehicle.kinds, partial(UnseenLength, vehicle.lengths, vehicle.length_stds),
+                      False, _start_vehicle)
     if settings.target == 'magnet':
         magnet = settings.magnet
         if not any(magnet.axis):
             raise SettingsError('track.magnet.axis: the zero vector has no direction')
         return Target(magnet_model(magnet),
                       partial(magnet_orientation, axis=np.array(magnet.axis)),
-                      ('',), ('',), None, True, _start_magnet)
+                      ('',), ('',), lambda: None, True, _start_magnet)
     raise SettingsError(f'track.target: expected vehicle or magnet, got {settings.target!r}')
 
 

@@ -14,46 +14,71 @@ OFF_MIDDLE = 0.2
 that of a car, times this, is the deviation of the vehicle's middle from that of the row, along the
 heading: the load may be at either end. No field tells it."""
 
+MOVES = 3.0
+"""A vehicle has a heading while its speed is larger than so many of its deviations."""
+
 
 class UnseenLength:
-    """The part of a vehicle that no sensor has felt yet, and how it moves the middle.
+    """The part of a vehicle that no sensor has felt yet, and how it moves the middle; of a track.
 
     Until its rear has come near a sensor a car may be the engine of a truck: a row of dipoles
     explains either, and the evidence of the two is that of models which are both wrong.
     """
 
-    def __init__(self, lengths: Sequence[float], length_stds: Sequence[float],
-                 positions: FloatArray) -> None:
-        """`lengths` and `length_stds` [m] of the kinds of vehicle, which are equally frequent, and
-        the `positions` (n_sensors, 3) [m] of the sensors."""
+    def __init__(self, lengths: Sequence[float], length_stds: Sequence[float]) -> None:
+        """`lengths` and `length_stds` [m] of the kinds of vehicle, taken as equally frequent."""
         self._lengths, self._stds = np.array(lengths), np.array(length_stds)
-        self._positions = positions
+        self._forward: FloatArray = np.zeros(2)
+        self._beyond = -np.inf
+        self._place: FloatArray = np.zeros(2)
 
-    def covariance(self, x: FloatArray, length: float, complete: bool = False) -> FloatArray:
+    def look(self, x: FloatArray, P: FloatArray, positions: FloatArray, is_sure: bool) -> None:
+        """Note which way a target goes and, if the place `is_sure`, how far it has come.
+
+        Parameters
+        ----------
+        x, P : (n_t,), (n_t, n_t)
+            A state that begins with position and velocity, and its covariance.
+        positions : (n_sensors, 3) [m]
+            The places of those sensors that measured.
+        is_sure : bool
+        """
+        self._forward = self._forward_of(x, P)
+        if not is_sure or not len(positions):
+            return
+        if self._beyond > 0.0:
+            # From then on it is the way that counts: round a corner, too.
+            self._beyond += float(np.linalg.norm(x[:2] - self._place))
+        else:
+            away = x[:2] - positions[:, :2]
+            nearest = away[np.argmin(np.square(away).sum(axis=1))]
+            self._beyond = float(nearest @ self._forward)
+        self._place = x[:2].copy()
+
+    def covariance(self, x: FloatArray, P: FloatArray, length: float, kind: int) -> FloatArray:
         """(2, 2) [m^2] to be added to that of the horizontal position.
 
         Parameters
         ----------
-        x : (n_t,)
-            A state that begins with position and velocity.
+        x, P : (n_t,), (n_t, n_t)
+            As for `look`.
         length : float [m]
-            Of the row of dipoles that it says.
-        complete : bool
-            The whole pass is known, and with it the length.
+            The row of dipoles is so long.
+        kind : int
+            Row of the kind of vehicle among the lengths.
         """
-        speed = np.hypot(x[3], x[4])
-        if speed <= 0.0:
-            return np.zeros((2, 2))
-        forward = x[3:5] / speed
-        variance = (OFF_MIDDLE * max(0.0, length - CAR_ROW))**2
-        if not complete:
-            variance += self._of_longer_kinds(float(((x[:2] - self._positions[:, :2])
-                                                     @ forward).max()), length)
-        return variance * np.outer(forward, forward)
-
-    def _of_longer_kinds(self, beyond: float, length: float) -> float:
-        """[m^2] of the middle along the heading, `beyond` [m] the first sensor on its way."""
         behind = 0.5 * (self._lengths - length)
         # Once its middle would have passed a sensor, a longer vehicle has been felt.
-        possible = (behind > 0.0) & (beyond < behind)
-        return float((behind**2 + 0.25 * self._stds**2)[possible].sum() / len(self._lengths))
+        possible = ((self._lengths > self._lengths[kind]) & (behind > 0.0)
+                    & (self._beyond < behind))
+        longer = (behind**2 + 0.25 * self._stds**2)[possible].sum() / len(self._lengths)
+        off_middle = OFF_MIDDLE * max(0.0, length - CAR_ROW)
+        forward = self._forward_of(x, P)
+        covariance: FloatArray = (longer + off_middle**2) * np.outer(forward, forward)
+        return covariance
+
+    def _forward_of(self, x: FloatArray, P: FloatArray) -> FloatArray:
+        """(2,) unit vector: the way that a state goes; where it hardly moves, that of before."""
+        speed = float(np.hypot(x[3], x[4]))
+        moves = speed > MOVES * np.sqrt(max(0.0, P[3, 3] + P[4, 4]))
+        return x[3:5] / speed if moves else self._forward

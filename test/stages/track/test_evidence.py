@@ -24,7 +24,7 @@ def test_noise_contradicts_a_track_as_often_as_said():
     doubted = 0
     for value in nis[nis > 25.0]:
         evidence = TrackEvidence(doubted=False)
-        evidence.check(value, 6)
+        evidence.contradicts(value * np.array([0.3, 0.7]), 6)
         doubted += evidence.doubted
     # A Poisson number with the mean 30.
     assert 10 < doubted < 60 and len(nis) * CONTRADICTION == pytest.approx(30.0)
@@ -33,8 +33,16 @@ def test_noise_contradicts_a_track_as_often_as_said():
 def test_a_track_that_was_contradicted_once_stays_doubted():
     evidence = TrackEvidence(doubted=False)
     for nis in (6.0, 60.0, 6.0):
-        evidence.check(nis, 6)
+        assert evidence.contradicts(np.array([nis, 0.0]), 6) == (nis > 50.0)
     assert evidence.is_doubtful
+
+
+@pytest.mark.parametrize('nis, doubted', [
+    ([60.0, 1.0], True), ([60.0, 2.0, 1.0], False), ([60.0, np.nan, 1.0], False)])
+def test_three_sensors_correct_a_track(nis, doubted):
+    evidence = TrackEvidence(doubted=False)
+    assert evidence.contradicts(np.array(nis), 3 * np.count_nonzero(~np.isnan(nis)))
+    assert evidence.doubted == doubted
 
 
 @pytest.mark.parametrize('nis, is_coming, reason', [

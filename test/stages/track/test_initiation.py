@@ -52,11 +52,11 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
                                rtol=1e-9)
     np.testing.assert_array_equal(bank.x[:, 16], np.take(vehicle.lengths, bank.kind))
     assert len(bank) == 3 * 3 * 14 * 3 * 3 * 2
-    # Half of them turn, about as fast as the settings say; nobody knows which way.
+    # Half of them turn, at first half as fast as the settings say; nobody knows which way.
     turns = bank.P[:, 17, 17] > 0.0
     assert np.count_nonzero(turns) == len(bank) // 2 and not bank.x[:, 17].any()
     speed = np.hypot(*bank.x[:, 3:5].T)[turns]
-    np.testing.assert_allclose(bank.P[turns, 17, 17], (vehicle.turn_acceleration / speed)**2)
+    np.testing.assert_allclose(bank.P[turns, 17, 17], (0.5 * vehicle.turn_acceleration / speed)**2)
     assert np.exp(bank.log_w[turns]).sum() == pytest.approx(vehicle.turn_share)
     assert len(set(bank.origin)) == len(bank)
     # What is called a point is one: neither a length nor differences.

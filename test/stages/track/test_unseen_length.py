@@ -8,6 +8,12 @@ from mag_tracking.stages.track.published_pose import smoothed_pose, vehicle_orie
 from mag_tracking.stages.track.unseen_length import CAR_ROW, OFF_MIDDLE, UnseenLength
 
 SENSORS = np.array([[0.0, 4.0, 0.0], [1.0, -4.0, 0.0]])
+P = 0.04 * np.eye(17)
+SMALL, CAR, TRUCK = range(3)
+
+
+def of_vehicles():
+    return UnseenLength([0.0, 3.0, 9.0], [0.0, 1.0, 3.0])
 
 
 def at(place, heading=0.0, speed=8.0):
@@ -16,16 +22,16 @@ def at(place, heading=0.0, speed=8.0):
     return x
 
 
-def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron():
+@pytest.mark.parametrize('complete', [True, False])
+def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(complete):
     """Along the heading, by a share of what it is longer than a car; a car as the filter says."""
-    model, unseen = RowVehicle(np.zeros(3), np.ones(3)), UnseenLength([3.0], [1.0], SENSORS)
-    x, P = at([0.0, 0.0], 0.5 * np.pi), 0.04 * np.eye(17)
-    said = {}
+    model, unseen = RowVehicle(np.zeros(3), np.ones(3)), UnseenLength([3.0], [1.0])
+    x, said = at([0.0, 0.0], 0.5 * np.pi), {}
     for length in (3.0, -3.0, 12.0):
         x[16] = length
         said[length] = smoothed_pose(
-            model, vehicle_orientation, x, P, unseen=unseen, stamp_ns=0, id=1, kind='',
-            ambiguous=False, complete=True).covariance
+            model, vehicle_orientation, x, P, unseen=unseen, stamp_ns=0, id=1, kind=0,
+            kinds=('car',), ambiguous=False, complete=complete).covariance
     np.testing.assert_array_equal(said[3.0], P[:6, :6])
     np.testing.assert_array_equal(said[-3.0], P[:6, :6])
     expected = np.zeros((6, 6))
@@ -35,8 +41,7 @@ def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron():
 
 def test_a_car_that_comes_may_be_the_head_of_a_truck():
     """The law of a mixture: a third of the vehicles have their middle three metres behind."""
-    unseen = UnseenLength([0.0, 3.0, 9.0], [0.0, 1.0, 3.0], SENSORS)
-    added = unseen.covariance(at([-20.0, 0.0]), 3.0)
+    added = of_vehicles().covariance(at([-20.0, 0.0]), P, 3.0, CAR)
     rng = np.random.default_rng(0)
     is_truck = rng.random(400_000) < 1.0 / 3.0
     behind = is_truck * 0.5 * (9.0 + 3.0 * rng.standard_normal(len(is_truck)) - 3.0)
@@ -46,19 +51,45 @@ def test_a_car_that_comes_may_be_the_head_of_a_truck():
 
 @pytest.mark.parametrize('heading', [0.0, 2.0, np.pi])
 def test_once_a_truck_would_have_been_felt_a_car_is_one(heading):
-    unseen = UnseenLength([3.0, 9.0], [1.0, 3.0], np.zeros((1, 3)))
-    forward = np.array([np.cos(heading), np.sin(heading)])
-    assert unseen.covariance(at(2.9 * forward, heading), 3.0).any()
-    assert not unseen.covariance(at(3.1 * forward, heading), 3.0).any()
+    unseen, forward = of_vehicles(), np.array([np.cos(heading), np.sin(heading)])
+    for beyond, is_open in ((-9.0, True), (2.9, True), (3.1, False), (8.0, False)):
+        x = at(beyond * forward, heading)
+        unseen.look(x, P, np.zeros((1, 3)), True)
+        assert unseen.covariance(x, P, 3.0, CAR).any() == is_open
 
 
-def test_what_nothing_is_longer_than_has_been_seen():
-    long_one = UnseenLength([3.0, 9.0], [1.0, 3.0], SENSORS)
-    only_cars = UnseenLength([3.0], [1.0], SENSORS)
-    coming = at([-20.0, 0.0])
-    assert not only_cars.covariance(coming, 3.0).any()
-    np.testing.assert_allclose(long_one.covariance(coming, 9.0),
-                               long_one.covariance(coming, 9.0, complete=True))
-    assert not long_one.covariance(coming, 3.0, complete=True).any()
-    # At rest it has no heading to be long along.
-    assert not long_one.covariance(at([-20.0, 0.0], speed=0.0), 3.0).any()
+def test_round_a_corner_the_way_counts():
+    unseen = of_vehicles()
+    for place, heading, is_open in (([-4.0, 1.0], 0.0, True), ([1.0, 1.0], 0.0, True),
+                                    ([2.0, 0.0], -1.5, True), ([2.0, -2.0], -1.5, False)):
+        x = at(place, heading)
+        unseen.look(x, P, np.zeros((1, 3)), True)
+        assert unseen.covariance(x, P, 3.0, CAR).any() == is_open
+
+
+def test_only_a_sensor_that_it_came_near_to_has_felt_it():
+    unseen, far = of_vehicles(), np.array([[-100.0, 500.0, 0.0], [0.0, 3.0, 0.0]])
+    unseen.look(at([-20.0, 0.0]), P, far, True)
+    assert unseen.covariance(at([-20.0, 0.0]), P, 3.0, CAR).any()
+    for places, is_sure in ((np.zeros((0, 3)), True), (far, False)):
+        # None measured; or it may as well be elsewhere.
+        unseen.look(at([20.0, 0.0]), P, places, is_sure)
+        assert unseen.covariance(at([20.0, 0.0]), P, 3.0, CAR).any()
+
+
+def test_one_that_stops_keeps_its_heading():
+    unseen = of_vehicles()
+    unseen.look(at([-5.0, 0.0]), P, SENSORS, True)
+    moving = unseen.covariance(at([-4.0, 0.0]), P, 3.0, CAR)
+    for heading in (0.0, 2.0, 4.0):
+        standing = at([-4.0, 0.0], heading, 0.1)
+        unseen.look(standing, P, SENSORS, True)
+        np.testing.assert_allclose(unseen.covariance(standing, P, 3.0, CAR), moving)
+
+
+def test_nothing_is_longer_than_the_longest_kind():
+    coming, cars = at([-20.0, 0.0]), UnseenLength([3.0], [1.0])
+    for length in (2.0, 3.0, 4.0):
+        assert not cars.covariance(coming, P, length, 0).any()
+    truck = of_vehicles().covariance(coming, P, 8.9, TRUCK)
+    assert truck[0, 0] == pytest.approx((OFF_MIDDLE * (8.9 - CAR_ROW))**2)
