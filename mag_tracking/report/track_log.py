@@ -92,12 +92,14 @@ class TrackLog:
         return seconds
 
     def surest(self) -> int:
-        """Index of the pose whose horizontal velocity is most certain.
+        """Index of the pose at which most is known: what is said of the whole is read there.
 
-        What is said of a pass as a whole is read there: the position of a vehicle may become more
-        certain later, once all of its length has passed, but not the speed.
+        By the horizontal position of a magnet, and the velocity of a vehicle: its position may
+        become more certain later, once all of its length has passed.
         """
-        return int(np.argmin([np.trace(C[3:5, 3:5]) for C in self.covariance]))
+        first = 3 if self.kind[-1] else 0
+        return int(np.argmin([np.trace(C[first:first + 2, first:first + 2])
+                              for C in self.covariance]))
 
     def mounting_of(self, names: Sequence[str]) -> dict[str, tuple[FloatArray, FloatArray]]:
         """{sensor: (angles (3,), their deviations (3,)) [deg]} at the surest pose; may be empty."""
