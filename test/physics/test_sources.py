@@ -121,6 +121,28 @@ def test_the_turn_rate_is_a_gauss_markov_process_of_its_size():
         FASTEST_TURN**2, FASTEST_TURN**2, 0.25**2]
 
 
+def test_a_turn_is_as_large_in_one_step_as_in_many():
+    model = EXAMPLES['RowVehicle that turns']
+    x = np.zeros((1, len(model.state_names)))
+    x[0, 3], x[0, -1] = 6.0, 1.0
+    steps = x.copy()
+    for _ in range(100):
+        steps = model.propagate(steps, 0.02)[0]
+    at_once = model.propagate(x, 2.0)[0]
+    # The integral of a rate that fades with 1.5 s.
+    expected = 1.5 * -np.expm1(-2.0 / 1.5)
+    for moved in (steps, at_once):
+        assert np.arctan2(moved[0, 4], moved[0, 3]) == pytest.approx(expected, rel=1e-9)
+        assert moved[0, -1] == pytest.approx(np.exp(-2.0 / 1.5), rel=1e-9)
+
+
+def test_backwards_a_turn_rate_is_as_uncertain_as_it_is():
+    """There the process noise is left out, so nothing may fade either."""
+    model = EXAMPLES['RowVehicle that turns']
+    moved, F, _ = model.propagate(states(model), -3.0)
+    assert np.array_equal(moved[:, -1], states(model)[:, -1]) and (F[:, -1, -1] == 1.0).all()
+
+
 def test_a_turn_rate_that_is_known_goes_straight_on():
     straight, turning = EXAMPLES['RowVehicle'], EXAMPLES['RowVehicle that turns']
     x = states(turning)
