@@ -12,9 +12,9 @@ from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.settings import TrackSettings
 
-LINEAR = 0.2
+LINEAR = 0.25
 """A field is about linear in the position over this share of the distance to the nearest sensor:
-the cube of that distance changes by three quarters."""
+the cube of that distance changes by a factor of two."""
 
 ONE_TIME = 0.05
 """A frame that is shorter than this share of the time since the frame before is one time, and so
