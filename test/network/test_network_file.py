@@ -93,8 +93,8 @@ def test_the_site_tells_the_field(tmp_path):
         n.earth_field, earth_field(Site(58.4, 15.6, 60.0, 2026.0 + 120 / 365, 90.0)))
 
 
-def agree(a, b):
-    """Whether two networks say the same."""
+def assert_agree(a, b):
+    """Fail unless two networks say the same."""
     assert (a.names, a.topics, a.frame, a.imu_topics) == (b.names, b.topics, b.frame, b.imu_topics)
     for name in ('positions', 'earth_field', 'clock_offset'):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
@@ -117,7 +117,7 @@ def test_what_is_written_reads_back(tmp_path, text):
     n = replace(n, R_ws=n.R_ws @ Rotation.random(len(n), random_state=1).as_matrix())
     write_network(tmp_path / 'copy.yaml', n, 'A copy.\nOf two lines.')
     assert (tmp_path / 'copy.yaml').read_text().startswith('# A copy.\n# Of two lines.\n')
-    agree(read_network(tmp_path / 'copy.yaml'), n)
+    assert_agree(read_network(tmp_path / 'copy.yaml'), n)
     with pytest.raises(OutputError, match='cannot write'):
         write_network(tmp_path / 'no' / 'such' / 'folder.yaml', n)
 
@@ -128,21 +128,21 @@ def test_any_deviation_that_a_survey_may_find_reads_back(tmp_path, deg):
     n = read(tmp_path, GOOD)
     n = replace(n, orientation_std=(np.deg2rad([0.3, 0.3, deg]), None))
     write_network(tmp_path / 'copy.yaml', n)
-    agree(read_network(tmp_path / 'copy.yaml'), n)
+    assert_agree(read_network(tmp_path / 'copy.yaml'), n)
 
 
 def test_a_sensor_without_an_accelerometer_stays_so(tmp_path):
     n = read(tmp_path, GOOD.replace('topic: /other', 'imu_topic: null\n    topic: /other'))
     assert n.imu_topics == ('/a/imu/data_raw', None)
     write_network(tmp_path / 'copy.yaml', n)
-    agree(read_network(tmp_path / 'copy.yaml'), n)
+    assert_agree(read_network(tmp_path / 'copy.yaml'), n)
 
 
 def test_any_words_read_back(tmp_path):
     n = read(tmp_path, GOOD)
     n = replace(n, calibrated=(Calibrated('2026-05-01', "the installer's eye: # 1", np.nan), None))
     write_network(tmp_path / 'copy.yaml', n)
-    agree(read_network(tmp_path / 'copy.yaml'), n)
+    assert_agree(read_network(tmp_path / 'copy.yaml'), n)
 
 
 @pytest.mark.parametrize('old, new, message', [

@@ -76,7 +76,7 @@ class VehicleSettings:
         1.0, 'Root spectral density of the horizontal acceleration.', 'm/s^1.5', (0.0, 1000.0))
     turn_acceleration: float = param(
         3.0, 'Standard deviation of the lateral acceleration of turning hypotheses, one beside '
-        'each that goes straight on. 0 = nothing turns, which is up to twice as fast.',
+        'each that goes straight on. 0 = nothing turns: half as many hypotheses.',
         'm/s^2', (0.0, 100.0))
     turn_time: float = param(1.5, 'Correlation time of the turn rate.', 's', (0.01, 1000.0))
     turn_share: float = param(

@@ -21,7 +21,7 @@ from mag_tracking.stages.track.published_pose import (
 )
 from mag_tracking.stages.track.relinearisation import Relinearisation
 from mag_tracking.stages.track.sensor_rejection import SensorRejection
-from mag_tracking.stages.track.sensor_selection import AHEAD_S, SensorSubset, hand_on
+from mag_tracking.stages.track.sensor_selection import AHEAD_S, SensorSubset, from_nearest, hand_on
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import FixedLag, TrackState, WholeTrack
 from mag_tracking.stages.track.target import Target
@@ -168,9 +168,8 @@ class RunningTrack:
     def _is_coming(self) -> bool:
         """Whether a vehicle moves towards the sensor that it is nearest to."""
         assert self._last is not None
-        away = self._last.position[:2] - self._sensors.network.positions[:, :2]
-        nearest = away[np.argmin(np.square(away).sum(axis=1))]
-        return not self._target.starts_anywhere and bool(nearest @ self._last.velocity[:2] < 0.0)
+        away = from_nearest(self._last.position[:2], self._sensors.network.positions)
+        return not self._target.starts_anywhere and bool(away @ self._last.velocity[:2] < 0.0)
 
     def _look(self, best: int, measured: IntArray) -> None:
         """Note how far a vehicle has come, by the sensors (rows) that measured."""
@@ -208,8 +207,7 @@ class RunningTrack:
         return [smoothed_pose(
             self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,
             kind=kind, kinds=self._target.kinds, unseen=self._unseen, complete=complete,
-            ambiguous=ambiguous)
-            for stamp_ns, x, P in states]
+            ambiguous=ambiguous) for stamp_ns, x, P in states]
 
     def _smoothed_at_the_end(self) -> list[SmoothedPose]:
         """What is left of a fixed lag, and the whole track."""

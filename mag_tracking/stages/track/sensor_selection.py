@@ -25,6 +25,12 @@ def nearest(positions: FloatArray, place: FloatArray, n: int) -> IntArray:
     return np.sort(np.argsort(distance, kind='stable')[:n])
 
 
+def from_nearest(place: FloatArray, positions: FloatArray) -> FloatArray:
+    """(2,) [m] to a `place` (2,) from the nearest sensor of `positions` (n_sensors, 3)."""
+    away: FloatArray = place - positions[nearest(positions, place, 1)[0], :2]
+    return away
+
+
 def part_of_frame(frame: FieldFrame, rows: IntArray) -> FieldFrame:
     """The `FieldFrame` of some sensors alone."""
     return replace(frame, field=frame.field[rows], covariance=frame.covariance[rows],

@@ -57,9 +57,8 @@ class TrackSettings:
         'known of their path, over the latest frames (64 at most) of once to twice so much time. '
         '0 = never, which is two to three times faster.', 's', (0.0, 60.0))
     relinearise_interval_s: float = param(
-        0.15, 'How often that is done. With two sensors and frames of 12.5 Hz tracking then takes '
-        'a quarter of a core, of 100 Hz a whole one: there rather choose 0.5. It grows with the '
-        'number of sensors.', 's', (0.0, 60.0))
+        0.15, 'How often that is done. It takes most of the time of tracking, and grows with the '
+        'number of sensors; with frames of 100 Hz rather choose 0.5.', 's', (0.0, 60.0))
     relinearise_most: int = param(
         20, 'For how many hypotheses it is done at most.', '', (1, 100000))
     lookback_s: float = param(

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.stages.track.sensor_selection import from_nearest
 
 CAR_ROW = 4.0
 """[m] A row of dipoles up to this length is that of a car, whose iron is about in its middle."""
@@ -19,7 +20,7 @@ MOVES = 3.0
 
 
 class UnseenLength:
-    """The part of a vehicle that no sensor has felt yet, and how it moves the middle; of a track.
+    """For one track: the part of a vehicle that no sensor has felt yet, which moves its middle.
 
     Until its rear has come near a sensor a car may be the engine of a truck: a row of dipoles
     explains either, and the evidence of the two is that of models which are both wrong.
@@ -50,9 +51,7 @@ class UnseenLength:
             # From then on it is the way that counts: round a corner, too.
             self._beyond += float(np.linalg.norm(x[:2] - self._place))
         else:
-            away = x[:2] - positions[:, :2]
-            nearest = away[np.argmin(np.square(away).sum(axis=1))]
-            self._beyond = float(nearest @ self._forward)
+            self._beyond = float(from_nearest(x[:2], positions) @ self._forward)
         self._place = x[:2].copy()
 
     def covariance(self, x: FloatArray, P: FloatArray, length: float, kind: int) -> FloatArray:
@@ -63,7 +62,7 @@ class UnseenLength:
         x, P : (n_t,), (n_t, n_t)
             As for `look`.
         length : float [m]
-            The row of dipoles is so long.
+            Length of the row of dipoles.
         kind : int
             Row of the kind of vehicle among the lengths.
         """

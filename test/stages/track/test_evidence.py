@@ -1,4 +1,4 @@
-"""What ends a track, what makes it doubtful, and how wide the published covariance is."""
+"""A track's end, doubts about it, and the covariance that is published."""
 
 from types import SimpleNamespace
 

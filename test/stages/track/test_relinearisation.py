@@ -136,15 +136,15 @@ def test_of_a_path_that_is_less_sure_the_covariance_is_taken(more, linear, is_wi
     filter_, rng = LessSure(), np.random.default_rng(0)
     filter_.more, filter_.linear = more, linear
     bank = FilterBank.of_targets(np.zeros((1, N_T)), np.eye(N_T)[None], np.zeros(1, int), 1, 1.0)
-    anew = Relinearisation(0.0, 60.0, 1)
-    anew.begin(bank)
+    relinearisation = Relinearisation(0.0, 60.0, 1)
+    relinearisation.begin(bank)
     frame = FieldFrame(0, rng.standard_normal((1, 3)), np.eye(3)[None], np.full(1, 8), np.zeros(1),
                        True)
     predicted = bank.x.copy()
     log_likelihood, _ = filter_.update_with_gains(bank, frame, 0.0)
-    anew.add(bank, predicted, log_likelihood, frame, 0.0)
+    relinearisation.add(bank, predicted, log_likelihood, frame, 0.0)
     x, P = bank.x.copy(), bank.P.copy()
-    assert anew.improve(filter_, bank)[relinearise.IN_VAIN] == 1
+    assert relinearisation.improve(filter_, bank)[relinearise.IN_VAIN] == 1
     np.testing.assert_array_equal(bank.x, x)
     # With how far apart the two are: that, too, nobody knows.
     expected = P[0] + is_wider * (more * np.eye(6)[0] * np.eye(6)[0][:, None]
