@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference import kalman
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.inference.time_update import predict
@@ -11,6 +11,7 @@ from mag_tracking.physics.sources import SourceModel
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.settings import TrackSettings
+from mag_tracking.stages.track.unseen_length import CAR_ROW
 
 LINEAR = 0.25
 """A field is about linear in the position over this share of the distance to the nearest sensor:
@@ -36,12 +37,18 @@ class BankFilter:
     def configure(self, settings: TrackSettings) -> None:
         """Take new values of the live settings."""
         self._settings = settings
-        group = settings.vehicle if settings.target == 'vehicle' else settings.magnet
-        self._near_field_lengths: FloatArray = np.atleast_1d(getattr(
-            group, 'near_field_lengths' if settings.target == 'vehicle' else 'near_field_length'))
+        is_vehicle = settings.target == 'vehicle'
+        self._near_field_lengths: FloatArray = np.atleast_1d(
+            settings.vehicle.near_field_lengths if is_vehicle
+            else settings.magnet.near_field_length)
+        self._are_long: BoolArray = np.array(
+            settings.vehicle.lengths if is_vehicle else [0.0]) > CAR_ROW
 
-    def predict(self, bank: FilterBank, dt: float) -> tuple[FloatArray, FloatArray]:
+    def predict(self, bank: FilterBank, dt: float, x_lin: FloatArray | None = None
+                ) -> tuple[FloatArray, FloatArray]:
         """Time update in place; backwards in time without process noise.
+
+        It is linearised at `x_lin` (n_hyp, n_x), states before it, or at those of the bank.
 
         Returns
         -------
@@ -51,7 +58,10 @@ class BankFilter:
             What the other states were multiplied by.
         """
         n_t = self.observation.n_target
-        x_target, F, Q = self._model.propagate(bank.x[:, :n_t], dt, bank.P[:, :n_t, :n_t])
+        at = (bank.x if x_lin is None else x_lin)[:, :n_t]
+        x_target, F, Q = self._model.propagate(at, dt, bank.P[:, :n_t, :n_t])
+        if x_lin is not None:
+            x_target = x_target + (F @ (bank.x[:, :n_t] - at)[:, :, None])[:, :, 0]
         decay, variance = self.observation.drift(dt, self._settings.background_drift)
         predict(bank.x, bank.P, x_target, F, Q if dt > 0.0 else 0.0 * Q, variance, decay)
         return F, decay
@@ -117,6 +127,10 @@ class BankFilter:
             x_lin = bank.x.copy()
         bank.nis[:, np.isnan(frame.field).all(axis=1)] = np.nan
         return log_likelihood, gains
+
+    def are_long(self, kind: IntArray) -> BoolArray:
+        """(n,) whether targets of the kinds `kind` (n,) are longer than a car."""
+        return self._are_long[kind]
 
     def nearly_linear(self, x: FloatArray) -> FloatArray:
         """(n_hyp,) [m] how far the position of the states `x` (n_hyp, n_x) may be off for the field

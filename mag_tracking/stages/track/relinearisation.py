@@ -2,13 +2,19 @@
 
 An extended Kalman filter linearises each frame where it then believed the target to be. Far ahead
 of the sensors that is metres off, and what it wrongly took for known there it never unlearns. So
-the latest frames are filtered and smoothed again, linearised along the smoothed path of each
-leading hypothesis: Gauss-Newton steps on its path. Where they have settled, and the path explains
-the frames no worse than the filter did, its state and covariance take the place of the filter's.
-Otherwise the state stays, but the filter may be surer than it should be: linearised at one place
+the latest frames are filtered and smoothed again, motion and field linearised along the smoothed
+path of each leading hypothesis: damped Gauss-Newton steps on its path. Where they have settled, the
+state at its end takes the place of the filter's, with the wider of both covariances. Where they
+have not, the state stays, but the filter may be surer than it should be: linearised at one place
 and then at another it learns of directions that no single path learns of (Julier and Uhlmann 2001
-saw it in maps). So a wider covariance of the path is taken.
-Its weight stays: those of hypotheses that are done again and of others could not be compared.
+saw it in maps). So a wider covariance of the path is taken there, too.
+
+How probable the frames are along the path is no measure of it: what a model leaves out of the
+field, and how a moment wanders, is in proportion to the moment, so that the steps minimise
+something else. For the same reason a path may run away to moments that explain everything. That of
+a long vehicle, whose model leaves out most, is taken only where it explains the frames no worse
+than the filter did. Weights stay: those of hypotheses that are done again and of others could not
+be compared.
 
 Source: Bell 1994, The iterated Kalman smoother as a Gauss-Newton method.
 """
@@ -32,8 +38,11 @@ _Smoothed: TypeAlias = tuple[FloatArray, FloatArray]
 LEADING = np.log(1e3)
 """A hypothesis leads that is not lighter than the heaviest by more than this."""
 
-PASSES = 3
+PASSES = 5
 """Gauss-Newton steps each time; the next time goes on from where they led."""
+
+STEP = 0.5
+"""Each goes so far. Whole ones overshoot where the field is far from linear, and run away."""
 
 SETTLED = 0.3
 """In deviations of the position: a path has settled that the last step moved no more than this
@@ -129,13 +138,15 @@ class Relinearisation:
         paths = [path[rows] for path in self._paths]
         for _ in range(PASSES):
             last, log_likelihood, new = self._pass(bank_filter, anchor.rows(rows), paths)
-            settled, paths = _settled(paths, new), [x for x, _ in new]
+            settled = _settled(paths, new)
+            paths = [path + STEP * (x - path) for path, (x, _) in zip(paths, new, strict=True)]
         finite = np.isfinite(log_likelihood) & np.isfinite(paths).all(axis=(0, 2))
         for path, improved in zip(self._paths, paths, strict=True):
             path[rows[finite]] = improved[finite]
         filtered = np.sum(self._log_likelihoods[int(self._updated):], axis=0)[rows]
-        taken = finite & settled & (log_likelihood >= filtered)
-        bank.x[leading[taken]], bank.P[leading[taken]] = last.x[taken], last.P[taken]
+        taken = finite & settled & ((log_likelihood >= filtered)
+                                    | ~bank_filter.are_long(bank.kind[leading]))
+        _take(bank, leading[taken], last.x[taken], last.P[taken])
         rest = finite & ~taken
         _widen(bank, leading[rest], last.x[rest], last.P[rest], bank_filter.nearly_linear)
         return Counter({TRIED: len(taken), IN_VAIN: int(np.count_nonzero(~taken))})
@@ -156,19 +167,21 @@ class Relinearisation:
         n = next(k for k, f in enumerate(self._frames) if now - f.stamp_ns <= self._window_ns
                  and n_frames - k <= MOST_FRAMES // 2)
         for k in range(n + 1):
-            self._forward(bank_filter, anchor, k, self._paths[k])
+            self._forward(bank_filter, anchor, k, self._paths)
         self._frames, self._intervals = self._frames[n:], self._intervals[n:]
         self._paths, self._log_likelihoods = self._paths[n:], self._log_likelihoods[n:]
         self._updated = True
 
-    def _forward(self, bank_filter: BankFilter, bank: FilterBank, k: int, path: FloatArray
-                 ) -> tuple[FloatArray | float, Step]:
-        """`bank` through frame k, linearised at `path`; its log-likelihood and the `Step`."""
-        F, decay = bank_filter.predict(bank, self._intervals[k]) if k else (None, None)
+    def _forward(self, bank_filter: BankFilter, bank: FilterBank, k: int,
+                 paths: Sequence[FloatArray]) -> tuple[FloatArray | float, Step]:
+        """`bank` through frame k, linearised at `paths`; its log-likelihood and the `Step`."""
+        F, decay = None, None
+        if k:
+            F, decay = bank_filter.predict(bank, self._intervals[k], paths[k - 1])
         if k == 0 and self._updated:
             return 0.0, Step(bank.x.copy(), bank.P.copy(), None)
         log_likelihood, gains = bank_filter.update_with_gains(
-            bank, self._frames[k], self._intervals[k], path)
+            bank, self._frames[k], self._intervals[k], paths[k])
         return log_likelihood, Step(bank.x.copy(), bank.P.copy(), gains, F, decay)
 
     def _pass(self, bank_filter: BankFilter, bank: FilterBank, paths: Sequence[FloatArray]
@@ -179,12 +192,21 @@ class Relinearisation:
         """
         log_likelihood: FloatArray = np.zeros(len(bank))
         steps: list[Step] = []
-        for k, path in enumerate(paths):
-            of_frame, step = self._forward(bank_filter, bank, k, path)
+        for k in range(len(paths)):
+            of_frame, step = self._forward(bank_filter, bank, k, paths)
             log_likelihood = log_likelihood + of_frame
             steps.append(step)
         std = [np.sqrt(np.einsum('pii->p', step.P[:, :3, :3])) for step in steps]
         return steps[-1], log_likelihood, list(zip(smoothed_states(steps), std, strict=True))
+
+
+def _take(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray) -> None:
+    """Take states `x` (n, n_x) for the `rows` (n,) of the bank, and the wider covariances of
+    theirs and of `P` (n, n_x, n_x), in place.
+    """
+    own, path = (np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P))
+    bank.x[rows] = x
+    bank.P[rows[path > own]] = P[path > own]
 
 
 def _widen(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,

@@ -35,15 +35,19 @@ class LinearFilter:
     linear = np.inf
     better = 0.0
     """What is added to the log-likelihood where it is told where to linearise."""
+    long = False
 
     def __init__(self):
         self.lengths = [0]
         self.origins = set()
 
+    def are_long(self, kind):
+        return np.full(len(kind), self.long)
+
     def nearly_linear(self, x):
         return np.full(len(x), self.linear)
 
-    def predict(self, bank, dt):
+    def predict(self, bank, dt, x_lin=None):
         F = np.array([[1.0, dt, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
         predict(bank.x, bank.P, bank.x[:, :N_T] @ F.T, F, np.diag([0.1, 0.2, 0.3]) * dt,
                        0.1 * dt)
@@ -102,25 +106,26 @@ def followed_beside_plain(filter_, anew, n=40, anew_at=(), prune=True):
 def test_where_all_is_linear_nothing_changes(window_s, interval_s, anew_at):
     """However often and over however many frames it is done, and while hypotheses go."""
     filter_ = LinearFilter()
-    filter_.better = 1e-6  # or rounding decides what is taken
     _, _, counts = followed_beside_plain(
         filter_, Relinearisation(interval_s, window_s, 5), anew_at=anew_at)
     if window_s > 0.1:
         assert counts[relinearise.TRIED] > counts[relinearise.IN_VAIN] == 0
 
 
-def test_what_explains_the_frames_worse_is_not_taken():
+@pytest.mark.parametrize('long, better, is_taken', [
+    (True, -1e-6, False), (True, 1e-6, True), (False, -1e-6, True)])
+def test_a_long_vehicle_is_taken_only_where_it_explains_the_frames_no_worse(long, better, is_taken):
     filter_ = LinearFilter()
-    filter_.better = -1e-6
-    bank, plain, counts = followed_beside_plain(filter_, Relinearisation(0.0, 0.5, 5))
-    assert counts[relinearise.TRIED] == counts[relinearise.IN_VAIN] > 50
-    np.testing.assert_array_equal(bank.x, plain.x)
+    filter_.long, filter_.better = long, better
+    _, _, counts = followed_beside_plain(filter_, Relinearisation(0.0, 0.5, 5))
+    assert counts[relinearise.TRIED] > 50
+    assert counts[relinearise.IN_VAIN] == (0 if is_taken else counts[relinearise.TRIED])
 
 
 class LessSure(LinearFilter):
     """Along a path it learns less, or more, of the first state than it does by itself."""
 
-    better, more = -1e-6, 0.0
+    more = 0.0
 
     def update_with_gains(self, bank, frame, dt, x_lin=None):
         found = super().update_with_gains(bank, frame, dt, x_lin)
@@ -130,9 +135,8 @@ class LessSure(LinearFilter):
         return found
 
 
-@pytest.mark.parametrize('more, linear, is_wider', [
-    (0.5, np.inf, True), (0.5, 2.0, True), (0.5, 0.5, False), (-1e-3, np.inf, False)])
-def test_of_a_path_that_is_less_sure_the_covariance_is_taken(more, linear, is_wider):
+def less_sure(more, linear):
+    """(filter, bank, Relinearisation) after one frame."""
     filter_, rng = LessSure(), np.random.default_rng(0)
     filter_.more, filter_.linear = more, linear
     bank = FilterBank.of_targets(np.zeros((1, N_T)), np.eye(N_T)[None], np.zeros(1, int), 1, 1.0)
@@ -143,6 +147,25 @@ def test_of_a_path_that_is_less_sure_the_covariance_is_taken(more, linear, is_wi
     predicted = bank.x.copy()
     log_likelihood, _ = filter_.update_with_gains(bank, frame, 0.0)
     relinearisation.add(bank, predicted, log_likelihood, frame, 0.0)
+    return filter_, bank, relinearisation
+
+
+@pytest.mark.parametrize('more, is_wider', [(0.5, True), (-1e-3, False)])
+def test_of_a_settled_path_the_state_and_the_wider_covariance_are_taken(more, is_wider):
+    filter_, bank, relinearisation = less_sure(more, np.inf)
+    x, P = bank.x.copy(), bank.P.copy()
+    assert relinearisation.improve(filter_, bank)[relinearise.IN_VAIN] == 0
+    np.testing.assert_allclose(bank.x[0], x[0] + 0.1 * np.eye(6)[1], atol=1e-9)
+    np.testing.assert_allclose(
+        bank.P[0], P[0] + is_wider * more * np.eye(6)[0] * np.eye(6)[0][:, None], atol=1e-9)
+
+
+@pytest.mark.parametrize('more, linear, is_wider', [
+    (0.5, np.inf, True), (0.5, 2.0, True), (0.5, 0.5, False), (-1e-3, np.inf, False)])
+def test_of_a_path_that_is_less_sure_the_covariance_is_taken(monkeypatch, more, linear, is_wider):
+    """Where it has not settled, as far as here anything ever does."""
+    monkeypatch.setattr(relinearise, 'SETTLED', -1.0)
+    filter_, bank, relinearisation = less_sure(more, linear)
     x, P = bank.x.copy(), bank.P.copy()
     assert relinearisation.improve(filter_, bank)[relinearise.IN_VAIN] == 1
     np.testing.assert_array_equal(bank.x, x)
@@ -210,12 +233,20 @@ def followed(filter_, bank, y, anew):
     return counts[relinearise.TRIED], counts[relinearise.IN_VAIN]
 
 
-def still_target(n):
+TURNS = {**STILL, 'track.vehicle.turn_acceleration': 1e-4, 'track.vehicle.turn_time': 1e3}
+"""A turn rate that stays as it is."""
+
+
+def still_target(n, turns=False):
     """Filter, function that makes a bank, measurements (n, 2, 3) and what scipy makes of them."""
-    settings, rng = settings_for('vehicle', STILL).track, np.random.default_rng(4)
-    model = vehicle_model(settings.vehicle, matched.NETWORK)
+    settings = settings_for('vehicle', TURNS if turns else STILL).track
+    rng, model = np.random.default_rng(4), vehicle_model(settings.vehicle, matched.NETWORK)
     n_t = len(model.state_names)
-    mean, P0 = matched.prior_of(settings, n_t)
+    mean, P0 = matched.prior_of(settings, n_t - turns)
+    if turns:
+        mean, P0 = (np.insert(a, n_t - 1, 0.0, axis=0) for a in (mean, P0))
+        P0 = np.insert(P0, n_t - 1, 0.0, axis=1)
+        P0[n_t - 1, n_t - 1] = 0.3**2
     mean[6:9], P0[6:9, 6:9] = [200.0, -250.0, 100.0], 100.0**2 * np.eye(3)
     std = np.sqrt(np.diagonal(P0))
     truth = mean + 0.7 * std * rng.standard_normal(len(std))
@@ -232,9 +263,10 @@ def still_target(n):
                 np.zeros(rows, dtype=int), 2, settings.background_std), y, last)
 
 
-def test_it_settles_where_a_batch_fit_does():
+@pytest.mark.parametrize('turns', [False, True])
+def test_it_settles_where_a_batch_fit_does(turns):
     """Without process noise the path is its first state: scipy, from the same prior."""
-    filter_, bank_of, y, expected = still_target(24)
+    filter_, bank_of, y, expected = still_target(24, turns)
     bank, plain = bank_of(1), bank_of(1)
     assert followed(filter_, bank, y, Relinearisation(0.0, 60.0, 1)) == (1, 0)
     std = np.sqrt(np.diagonal(bank.P[0]))
