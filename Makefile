@@ -66,7 +66,7 @@ studies: $(STAMP)  ## the tests that take many runs or all of the recordings
 
 # All of them run, also where one misses an aim.
 bench: $(STAMP)  ## measure times and accuracies
-	@status=0; for figures in bench.py matched.py extended_target.py two_simulators.py junction_error.py pass_search.py \
+	@status=0; for figures in bench.py matched.py extended_target.py two_simulators.py spoilt_passes.py junction_error.py pass_search.py \
 		load.py 'load.py --sensors 2 --lean --minutes 2' \
 		'load.py --sensors 2 --lean --minutes 2 --one-process --batches' chain.py; do \
 		echo "$(BIN)/python test/bench/$$figures"; \

@@ -11,6 +11,7 @@ from mag_tracking.simulation.scenario import Imperfections, Path, random_vehicle
 from support.box_vehicles import BOUGHT, box_car, box_truck, random_drive
 from support.bundled import NETWORK_FILE
 from support.samples import scenario
+from support.spoiler import apply
 
 SIMULATORS = ('clouds', 'boxes')
 KINDS = ('truck', 'car', 'turning')
@@ -63,6 +64,9 @@ class Tracked:
     """(n,)"""
     speed_ratio: float
     """Stated over true speed at the closest point; NaN without a pose."""
+    heading: float
+    """Cosine of the angle between the two velocities there; NaN without a pose."""
+    detected: bool
 
     @property
     def sure_and_wrong(self):
@@ -71,10 +75,11 @@ class Tracked:
                 & (self.error > WRONG_SD * self.deviation))
 
 
-def tracked(network, body, course, duration, flaws, seed, changes=None):
-    """`Tracked` of a simulated pass."""
+def tracked(network, body, course, duration, flaws, seed, changes=None, faults=()):
+    """`Tracked` of a simulated pass, with `faults` of `support.spoiler`."""
     readings, t, position, _ = scenario.simulate(network, body, course, 100.0, duration,
                                                  np.random.default_rng(seed), flaws)
+    readings = apply(readings, *faults)
     pipeline = Pipeline(network, settings_for('vehicle', changes))
     tracks = [r for r in pipeline.feed(readings) + pipeline.flush()
               if isinstance(r, Track) and not r.ended]
@@ -85,17 +90,21 @@ def tracked(network, body, course, duration, flaws, seed, changes=None):
     P = np.array([r.covariance[:2, :2] for r in tracks]).reshape(-1, 2, 2)
     size = np.hypot(*error.T)
     distance = np.hypot(*(true - network.centre[:2]).T)
-    ratio = np.nan
+    ratio = heading = np.nan
     if len(tracks):
         k = int(np.argmin(distance))
-        ratio = (np.hypot(*tracks[k].velocity[:2])
-                 / np.hypot(*[np.interp(stamps[k], t, v) for v in velocity.T]))
+        v = np.array([np.interp(stamps[k], t, v) for v in velocity.T[:2]])
+        stated = tracks[k].velocity[:2]
+        ratio = np.hypot(*stated) / np.hypot(*v)
+        heading = stated @ v / np.hypot(*stated) / np.hypot(*v)
     along = np.sqrt(np.einsum('ni,nij,nj->n', error, P, error)) / np.maximum(size, 1e-9)
     return Tracked(size, along,
                    np.einsum('ni,ni->n', error, np.linalg.solve(P, error[:, :, None])[:, :, 0]) / 2,
-                   distance, np.array([r.ambiguous for r in tracks], dtype=bool), float(ratio))
+                   distance, np.array([r.ambiguous for r in tracks], dtype=bool), float(ratio),
+                   float(heading), pipeline.detect.counts['onsets'] > 0)
 
 
-def one_random_pass(simulator, kind, seed, changes=None):
-    """`Tracked` of a random pass through the bundled network."""
-    return tracked(read_network(NETWORK_FILE), *random_pass(simulator, kind, seed), seed, changes)
+def one_random_pass(simulator, kind, seed, changes=None, faults=()):
+    """`Tracked` of a random pass through the bundled network; {setting: value} and faults."""
+    return tracked(read_network(NETWORK_FILE), *random_pass(simulator, kind, seed), seed, changes,
+                   faults)

@@ -1,0 +1,95 @@
+"""`make bench`: random passes of both simulators, spoilt by each fault of a poor sensor.
+
+Whether they are detected and tracked, and the share of poses that are sure and wrong. Live: no
+first pass looks for a quiet stretch. A flagged or missing track is no error here; a wrong one is.
+"""
+
+import argparse
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+
+import numpy as np
+from tqdm import tqdm
+
+from support import spoiler
+from support.dense_traffic import dense_traffic
+from support.random_passes import KINDS, SIMULATORS, one_random_pass
+
+MOST_WRONG = 0.01
+HEADING = np.cos(np.deg2rad(45.0))
+"""Cosine of the largest angle of a direction that is right."""
+
+FAULTS = {
+    'none': (),
+    'steps of 0.1 uT': (spoiler.steps, 1e-7),
+    'steps of 0.3 uT': (spoiler.steps, 3e-7),
+    'stated noise of 0.1 T': (spoiler.covariance, 1e-2),
+    'glitches of 50 uT, 0.2 %': (spoiler.glitches, 2e-3, 5e-5),
+    'clipped at half its peak': (spoiler.clipped, 0.5),
+    'axes x and z only': (spoiler.only_axes, 'xz'),
+    '30 % lost': (spoiler.dropped, 0.3),
+    'one in four (25 Hz)': (spoiler.thinned, 4),
+    'one clock 50 ms late': (spoiler.delayed, 'mag_2', 0.05),
+    'one axis flipped': (spoiler.wrong_sign, 'mag_2', 'y'),
+    'hum of 0.2 uT': (spoiler.hum, (2e-7, 2e-7, 2e-7)),
+    'drift of 10 nT/s': (spoiler.drift, 1e-8),
+    'temperature step of 0.3 uT': (spoiler.temperature_step, 3e-7, 4.0),
+    'beginning cut by 5 s': (spoiler.beginning_cut, 5.0),
+    'dense traffic for 5 s': (dense_traffic, 5.0),
+}
+"""{what: (what makes the fault, its arguments)}."""
+
+
+def spoil_with(what):
+    """[function of `Readings`] of the fault `what` of `FAULTS`."""
+    if not FAULTS[what]:
+        return []
+    fault, *arguments = FAULTS[what]
+    return [fault(*arguments)]
+
+
+def spoilt_pass(what, simulator, kind, seed):
+    """`Tracked` of a random pass with the fault `what` of `FAULTS`."""
+    return one_random_pass(simulator, kind, seed, faults=spoil_with(what))
+
+
+def summary(what, simulator, kind, found):
+    """(line, whether the aim is met) of the `Tracked` of one product."""
+    n_sure = sum(int((~f.ambiguous).sum()) for f in found)
+    wrong = sum(int(f.sure_and_wrong.sum()) for f in found)
+    share = wrong / max(n_sure, 1)
+    n_tracked = sum(len(f.error) > 0 for f in found)
+    right = sum(bool(f.heading > HEADING) for f in found)
+    met = share <= MOST_WRONG
+    return (f'  {what:27s} {simulator}, {kind}: {sum(f.detected for f in found):2d} of '
+            f'{len(found)} detected, {n_tracked:2d} tracked, {right:2d} in the right direction; '
+            f'{sum((~f.ambiguous).any() for f in found):2d} somewhere sure, sure and wrong '
+            f'{share:5.1%} in {sum(f.sure_and_wrong.any() for f in found)} passes'
+            f'{"" if met else "  MISSED"}', met)
+
+
+def main():
+    """Print a line for each product; returns 1 where more than 1 % are sure and wrong."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument('--passes', type=int, default=8)
+    parser.add_argument('--kinds', nargs='+', choices=KINDS, default=['car'])
+    given = parser.parse_args()
+    print(f'{given.passes} random passes of each product, two sensors, 100 Hz; the aim is at most '
+          f'{MOST_WRONG:.0%} sure and wrong')
+    met = True
+    with ProcessPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
+        jobs = {(w, s, k): [pool.submit(spoilt_pass, w, s, k, seed)
+                            for seed in range(given.passes)]
+                for w in FAULTS for s in SIMULATORS for k in given.kinds}
+        for product, some in jobs.items():
+            found = [job.result() for job in tqdm(some, desc=', '.join(product), disable=None,
+                                                  leave=False)]
+            line, good = summary(*product, found)
+            print(line, flush=True)
+            met &= good
+    return 0 if met else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,36 @@
+"""The products of simulators and faults that `make bench` counts over."""
+
+import numpy as np
+import pytest
+
+from bench.spoilt_passes import FAULTS, spoil_with, spoilt_pass
+from support.spoilt_runs import recorded
+
+SPOILT = [what for what, fault in FAULTS.items() if fault]
+
+
+@pytest.mark.parametrize('what', SPOILT)
+def test_every_fault_spoils(what):
+    readings = recorded('straight_car_right').readings
+    for fault in spoil_with(what):
+        spoilt = fault(readings)
+        if len(spoilt) == len(readings):
+            changed = ~np.isclose(spoilt.field, readings.field, rtol=0.0, atol=1e-12).all()
+            changed |= bool((spoilt.stamp_ns != readings.stamp_ns).any())
+            assert changed or spoilt.covariance is not None
+        else:
+            assert 0 < len(spoilt) < len(readings)
+
+
+@pytest.mark.parametrize('simulator', ['clouds', 'boxes'])
+def test_a_made_up_covariance_changes_nothing_of_a_random_pass(simulator):
+    plain, spoilt = (spoilt_pass(what, simulator, 'car', 3)
+                     for what in ('none', 'stated noise of 0.1 T'))
+    assert plain.detected and len(plain.error) > 10
+    np.testing.assert_array_equal(plain.error, spoilt.error)
+
+
+@pytest.mark.parametrize('simulator', ['clouds', 'boxes'])
+def test_after_dense_traffic_nothing_of_a_random_pass_is_sure(simulator):
+    found = spoilt_pass('dense traffic for 5 s', simulator, 'car', 3)
+    assert len(found.error) > 10 and found.ambiguous.all()
