@@ -99,7 +99,9 @@ class Pipeline:
 
         They do not depend on how the readings are split into batches.
         """
-        return self._after_calibrate(self._calibrate.feed(readings))
+        calibrated = self._calibrate.feed(readings)
+        self.track.doubt(self.calibrate.doubtful_stretches())
+        return self._after_calibrate(calibrated)
 
     def flush(self) -> list[Output]:
         """The input has ended: what was still held back."""

@@ -108,7 +108,7 @@ def _surveyed(recording: Recording, network: SensorNetwork, settings: Settings, 
             stage.feed(record)
             # The first that is known: later a target may stand there.
             levels.update({name: stage.background(name) for name in record.names
-                           if name not in levels and stage.backgrounds()[name].ready})
+                           if name not in levels and stage.backgrounds()[name].certain})
     except ReadingStopped:
         interrupted = True
     stage.counts.update({f'rejected: {cause}': n for cause, n in reader.rejected.items()})

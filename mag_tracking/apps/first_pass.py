@@ -4,7 +4,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.calibration.quiet_level import BlockRecorder, QuietLevel
+from mag_tracking.calibration.frequent_level import QuietLevel
+from mag_tracking.calibration.quiet_level import BlockRecorder
 from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording

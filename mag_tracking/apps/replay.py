@@ -161,6 +161,7 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
         sensors[name] = {'accepted': counts['accepted'], 'rejected': counts['rejected'],
                          'ready': background.ready, 'stuck': background.stuck,
                          'times_relearnt': background.n_relearnt,
+                         'doubtful_ns': [list(stretch) for stretch in background.doubtful_times],
                          'quiet_stretch_s': found.stretch_of(name)}
         covariance = background.covariance
         if background.ready and covariance is not None and counts['accepted']:

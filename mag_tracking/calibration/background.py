@@ -3,63 +3,36 @@
 The background is a straight line in time (level and drift) through the means
 of short quiet blocks; the noise is their pooled scatter. A block that departs
 from the line freezes the learning, and takes with it what was learnt shortly
-before: a target comes near gradually. Source: TSP14 section VI, T10 section
+before: a target comes near gradually. Without a quiet stretch the most frequent
+level is a provisional background. Source: TSP14 section VI, T10 section
 6.3 (mean and covariance of a target-free stretch); the line and the freezing
 are this package's own.
 """
 
 from collections import deque
 from math import inf
-from typing import TypeAlias
 
 import numpy as np
-from numba import float64, int64, njit, void
 
-from mag_tracking.arrays import FloatArray, Record, StructArray
+from mag_tracking.arrays import FloatArray, StructArray
+from mag_tracking.calibration.background_level import BackgroundLevel
 from mag_tracking.calibration.blocks import (
     Block,
-    Blocks,
     BlockWindow,
     block_of,
     line_through,
+    pooled_covariance,
     stacked,
 )
-from mag_tracking.calibration.resolution import (
-    LEAST_STD,
-    apply_steps,
-    completed_steps,
-    corrected_steps,
-)
-from mag_tracking.calibration.sensor_state import SENSORS
+from mag_tracking.calibration.doubtful_times import DoubtfulTimes, noted
+from mag_tracking.calibration.drift import DRIFT, is_steep
+from mag_tracking.calibration.frequent_level import MORE
+from mag_tracking.calibration.provisional import ProvisionalLevel
+from mag_tracking.calibration.resolution import LEAST_STD, corrected_steps
 
-LOUDEST = 100.0
-"""A block whose variance is so many times that of the quietest is no noise: a target passed within
-it, as it can within the long blocks of a slow sensor. Noise and coarse steps stay well below."""
-
-RESUMED_RELEARN_S = 10.0
-"""[s] What was resumed gives way to another steady level after so long, whatever `relearn` is."""
-
-_Line: TypeAlias = tuple[float, FloatArray, FloatArray, float]
-"""Centre [s], mean (3,) [T], slope (3,) [T/s] and horizon [s]."""
-
-
-@njit(cache=True, inline='always')
-def subtract_background(s: Record, time: float, field: FloatArray, out: FloatArray) -> None:
-    """Field without the background at `time` [s]: from `field` (3,) [T] into `out` (3,).
-
-    The drift is extrapolated over at most twice the stretch that it was fitted to: a drift
-    learnt from three seconds does not hold for twenty.
-    """
-    since = min(time, s.horizon) - s.centre
-    for a in range(3):
-        out[a] = field[a] - s.mean[a] - since * s.slope[a]
-
-
-@njit(void(SENSORS, int64, float64, float64[::1], float64[::1]), cache=True)
-def _subtract(sensors: StructArray, j: int, time: float, field: FloatArray,
-              out: FloatArray) -> None:
-    """`subtract_background` of sensor `j`."""
-    subtract_background(sensors[j], time, field, out)
+LEAST_RELEARN_S = 10.0
+"""[s] What was resumed, or was seen for a moment only, gives way to another steady level after so
+long, whatever `relearn` is."""
 
 
 class RunningBackground:
@@ -84,6 +57,15 @@ class RunningBackground:
         `judge_block`, or before the next reading. Without a phase it is judged at once.
     sensors : (1,) SENSOR
         State of the sensor: holds the present block, and line and noise for compiled code.
+
+    Attributes
+    ----------
+    frozen, stuck : bool
+        Whether a target is near; whether the readings do not change.
+    n_relearnt : int
+        How often another steady level was taken for the background.
+    doubtful_times : DoubtfulTimes
+        When it was `doubtful`.
     """
 
     def __init__(self, learn: float, memory: float, guard: float, block: float,
@@ -91,18 +73,17 @@ class RunningBackground:
                  noise_std: FloatArray | None = None, phase: float | None = None, *,
                  sensors: StructArray) -> None:
         self._learn, self._guard, self._length = learn, guard, block
-        self._freeze_std, self._relearn = freeze_std, relearn
-        self._sensors = sensors
-        self._limits = np.full(3, np.nan)
+        self._relearn, self._sensors = relearn, sensors
         self._state = self._sensors[0]
         self._state['length'], self._state['phase'] = block, np.nan if phase is None else phase
         self._most = max(3, int(round(memory / block)))
         self._window = BlockWindow(self._most)
         self._given = None if background is None else np.asarray(background, dtype=float)
-        self._noise: FloatArray | None = \
+        self._given_noise: FloatArray | None = \
             None if noise_std is None else np.diag(np.asarray(noise_std, float) ** 2)
-        self._noise_given = self._noise is not None
+        self._level = BackgroundLevel(sensors, freeze_std)
         self.n_relearnt = 0
+        self._provisional = ProvisionalLevel(learn)
         self.forget()
 
     def forget(self) -> None:
@@ -112,42 +93,28 @@ class RunningBackground:
         self._pending: deque[Block] = deque()
         self._strange: deque[Block] = deque()
         self._rested: deque[Block] = deque(maxlen=self._most)
-        self.frozen = self._resumed = self._relearns_soon = False
-        self._set(None if self._given is None else (0.0, self._given, np.zeros(3), 0.0),
-                  self._noise if self._noise_given else None)
+        self.frozen = self._resumed = self._relearns_soon = self._contested = self._steep = False
+        self._provisional.clear()
+        self.doubtful_times: DoubtfulTimes = ()
+        # For how long the level was seen, until when, and which one it has replaced since when.
+        self._seen_s, self._seen_until = (0.0 if self._given is None else inf), np.nan
+        self._former: tuple[float, FloatArray] | None = None
+        self._level.rely()
+        self._level.set(None if self._given is None else (0.0, self._given, np.zeros(3), 0.0),
+                        self._given_noise)
         self.stuck = False
-
-    def _set(self, line: _Line | None, noise: FloatArray | None) -> None:
-        """Line and noise from now on, also those that compiled code reads."""
-        s = self._state
-        self._line, self._noise = line, noise
-        s['is_ready'] = self.ready
-        if line is not None:
-            s['centre'], s['mean'], s['slope'], s['horizon'] = line
-        s['noise'] = np.nan if noise is None else noise
-        self._apply_steps()
-
-    def _apply_steps(self) -> None:
-        """Add what the sensor's steps do to the noise; its steps may have been found meanwhile."""
-        apply_steps(self._sensors, self._freeze_std, self._limits)
-
-    def _without_dead_axes(self, noise: FloatArray) -> FloatArray:
-        """(3, 3) [T^2] `noise` with NaN for an axis that has not changed and does not rest."""
-        steps, variance = corrected_steps(self._sensors), noise.diagonal()
-        if np.isfinite(steps).all() and (variance > LEAST_STD**2).all():
-            return noise
-        steps = completed_steps(variance, steps)
-        dead = ~np.isfinite(steps) | (steps == 0.0) & (variance <= LEAST_STD**2)
-        return np.where(dead[:, None] | dead, np.nan, noise)
 
     def resume(self, background: FloatArray, covariance: FloatArray) -> None:
         """Go on from what was known a moment ago: (3,) [T] and (3, 3) [T^2], NaN as elsewhere.
 
         It is a line again when a stretch as long as at first has been quiet.
         """
-        self._set((0.0, np.asarray(background, dtype=float), np.zeros(3), 0.0),
-                  self._noise if self._noise_given else np.asarray(covariance, dtype=float))
+        noise = np.asarray(covariance, dtype=float)
+        self._level.set((0.0, np.asarray(background, dtype=float), np.zeros(3), 0.0),
+                        noise if self._given_noise is None else self._given_noise)
         self._resumed = self._relearns_soon = True
+        self._seen_s, self._steep = inf, False
+        self._level.rely()
 
     def begin_with(self, level: FloatArray, covariance: FloatArray) -> None:
         """Begin with a level that later readings have: (3,) [T] and (3, 3) [T^2].
@@ -165,16 +132,37 @@ class RunningBackground:
 
     @property
     def ready(self) -> bool:
-        """Whether both background and noise are known."""
-        return self._line is not None and self._noise is not None
+        """Whether both background and noise are known, if only provisionally."""
+        return self._level.is_ready
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether it is provisional, or that of a target that has left since, or comes near."""
+        return self._level.is_provisional or self._contested or self._steep
+
+    @property
+    def _is_young(self) -> bool:
+        """Whether it was seen for so short that another steady level takes its place early."""
+        return MORE * self._seen_s < self._relearn
+
+    @property
+    def certain(self) -> bool:
+        """Whether it is ready and not doubtful."""
+        return self.ready and not self.doubtful
 
     @property
     def covariance(self) -> FloatArray | None:
         """(3, 3) [T^2] noise of one sample and its steps, or None; NaN for an axis not reported."""
-        if self._noise is None:
-            return None
-        covariance: FloatArray = self._noise + np.diag(self._state['step_variance'])
-        return covariance
+        return self._level.covariance
+
+    @property
+    def drift(self) -> FloatArray:
+        """(3,) [T/s] of the background; NaN before it is ready, and of an axis not reported."""
+        return self._level.drift
+
+    def level(self, time: float) -> FloatArray:
+        """(3,) [T] background at `time` [s]; raises ValueError before it is ready."""
+        return self._level.at(time)
 
     @property
     def scatter_std(self) -> FloatArray:
@@ -192,23 +180,6 @@ class RunningBackground:
         """Whether the background is from readings, not from what was given beforehand."""
         return bool(self._window) and self.ready
 
-    @property
-    def drift(self) -> FloatArray:
-        """(3,) [T/s] of the background; NaN before it is ready, and of an axis not reported."""
-        return np.full(3, np.nan) if self._line is None else self._line[2]
-
-    def level(self, time: float) -> FloatArray:
-        """(3,) [T] background at `time` [s]; raises ValueError before it is ready."""
-        return -self._departure(time, np.zeros(3))
-
-    def _departure(self, time: float, field: FloatArray) -> FloatArray:
-        """(3,) [T] `field` without the background at `time` [s]."""
-        if self._line is None:
-            raise ValueError('the background has not been learnt yet')
-        out = np.empty(3)
-        _subtract(self._sensors, 0, time, field, out)
-        return out
-
     def judge_block(self) -> None:
         """Judge the block that the latest sample has shown to be complete."""
         if not self._state['is_full']:
@@ -216,8 +187,8 @@ class RunningBackground:
         block = block_of(self._state)
         self._state['is_full'] = False
         still = (block.n > 1) & (block.scatter.diagonal() < LEAST_STD**2 * (block.n - 1))
-        if self.ready:
-            self._apply_steps()
+        if self.ready and not self._level.is_provisional:
+            self._level.apply_steps()
             # An axis with coarse steps rests; one with fine steps is stuck.
             self.stuck = bool((still & (self._state['step_variance'] == 0.0)
                                & ~np.isnan(self._state['noise_std'])).any())
@@ -226,6 +197,8 @@ class RunningBackground:
         else:
             self.stuck = bool(still[block.n > 1].all())
             self._begin(block)
+        self.doubtful_times = noted(
+            self.doubtful_times, int(self._state['last_ns']), self.doubtful)
 
     def _begin(self, block: Block) -> None:
         """Before it is ready: collect until a quiet stretch is long enough."""
@@ -240,60 +213,118 @@ class RunningBackground:
         enough = self._learn - 1.5 * self._length
         while len(self._strange) > 3 and block.time - self._strange[1].time >= enough:
             self._strange.popleft()
-        if len(self._strange) >= 3 and block.time - self._strange[0].time >= enough:
-            self._adopt_if_steady(self._strange)
+        is_adopted = len(self._strange) >= 3 and block.time - self._strange[0].time >= enough \
+            and self._adopt_if_steady(self._strange)
+        if not is_adopted and not self.stuck:
+            self._provide(block)
+
+    def _provide(self, block: Block) -> None:
+        """Without a quiet stretch: begin with the most frequent level."""
+        found = self._provisional.add(block, corrected_steps(self._sensors))
+        if found is None:
+            return
+        level, deviation, is_certain = found
+        if is_certain or self._given is not None:
+            self.begin_with(level.level if self._given is None else self._given, level.covariance)
+            self._strange.clear()
+            return
+        noise = self._level.without_dead_axes(level.covariance)
+        if not np.isnan(noise).all():
+            noise = noise if self._given_noise is None else self._given_noise
+            self._level.set((0.0, level.level, np.zeros(3), 0.0), noise)
+            self._level.rely(deviation, is_provisional=True)
 
     def _follow(self, block: Block) -> None:
         """Once ready: extend the quiet stretch, or freeze."""
-        off = np.abs(self._departure(block.time, block.mean))
+        off = np.abs(self._level.departure(block.time, block.mean))
         # A comparison with NaN is false: an axis that is not reported freezes nothing.
-        self.frozen = bool((off > self._limits).any())
+        self.frozen = bool((off > self._level.limits).any())
         if self.frozen:
             self._pending.clear()
             self._strange.append(block)
-            relearn = self._relearn
-            if self._resumed and self._relearns_soon:
-                # It may be that the sensor was moved, or its surroundings changed, meanwhile.
-                relearn = min(relearn or inf, max(self._learn, RESUMED_RELEARN_S))
-            if relearn and block.time - self._strange[0].time >= relearn:
-                if self._adopt_if_steady(self._strange):
-                    self.n_relearnt += 1
-                    self.frozen = False
-                else:
-                    self._strange.popleft()
-            elif not relearn:
-                self._strange.clear()
+            self._change_if_steady(block)
             return
+        self._contested = False
+        if not np.isnan(self._seen_until):
+            self._seen_s += block.time - self._seen_until
+        self._seen_until = block.time
         self._strange.clear()
         self._pending.append(block)
         while self._pending and self._pending[0].time <= block.time - self._guard:
             self._window.append(self._pending.popleft())
             self._fit()
 
+    def _change_if_steady(self, block: Block) -> None:
+        """While frozen: take another level that lasts, or that was the background before."""
+        self._seen_until = np.nan
+        since = block.time - self._strange[0].time
+        longest = self._relearn
+        if self._resumed and self._relearns_soon:
+            # It may be that the sensor was moved, or its surroundings changed, meanwhile.
+            longest = min(longest or inf, max(self._learn, LEAST_RELEARN_S))
+        elif longest:
+            # What stood there in the beginning may have left.
+            longest = min(longest, max(self._learn, LEAST_RELEARN_S, MORE * self._seen_s))
+        if not longest:
+            self._strange.clear()
+            return
+        latest = self._steady() if self._is_young or self._is_former(block) else None
+        # Seen for as long, the one may be the background as well as the other.
+        self._contested = self._is_young and (
+            self._contested or latest is not None and since >= min(self._seen_s, longest))
+        if latest is not None and self._is_former(block):
+            self._strange = latest
+        elif since < longest:
+            return
+        if self._adopt_if_steady(self._strange):
+            self.n_relearnt += 1
+            self.frozen = self._contested = False
+        else:
+            self._strange.popleft()
+
+    def _steady(self) -> deque[Block] | None:
+        """The latest strange blocks, as long as a quiet stretch has to be, if they are steady."""
+        blocks = list(self._strange)
+        since = blocks[-1].time - self._learn
+        latest = blocks[-max(3, sum(b.time > since for b in blocks)):]
+        is_long = len(blocks) >= 3 and blocks[0].time <= since
+        return deque(latest) if is_long and self._level.holds(stacked(latest)) else None
+
+    def _is_former(self, block: Block) -> bool:
+        """Whether a block has the level that was the background before the present one."""
+        if self._former is None:
+            return False
+        since, level = self._former
+        return not bool((np.abs(block.mean - level)
+                         > self._level.limits + DRIFT * (block.time - since)).any())
+
     def _adopt_if_steady(self, collected: deque[Block]) -> bool:
         """Take the collected blocks as the background if they lie on one line."""
         blocks = stacked(collected)
-        noise = self._noise if self._noise_given else pooled_covariance(blocks)
+        noise = pooled_covariance(blocks) if self._given_noise is None else self._given_noise
         if noise is None:
             return False
-        noise = self._without_dead_axes(noise)
+        noise = self._level.without_dead_axes(noise)
         if np.isnan(noise).all():
             return False
-        before = self._noise
-        self._set(self._line, noise)
-        centre, mean, slope = line_through(blocks)
-        off = np.abs(blocks.mean - mean - slope * (blocks.time - centre)[:, None])
-        if _one_is_loud(blocks, self._state['step_variance']) \
-                or not np.nanmax(off / self._limits) <= 1.0:
-            self._set(self._line, before)
+        before = self._level.noise
+        self._level.set(self._level.line, noise)
+        if not self._level.holds(blocks):
+            self._level.set(self._level.line, before)
             return False
-        if self._given is not None and self._line is not None and not self.n_relearnt \
+        if self._given is not None and self._level.line is not None and not self.n_relearnt \
                 and not self.frozen:
             # The background was given and only the noise had to be learnt.
             self._strange.clear()
             return True
+        if self.frozen and self._level.line is not None:
+            self._former = float(blocks.time[0]), self._level.at(float(blocks.time[0]))
         # A steady stretch was asked for its own length; it need not be as long as at first.
         self._resumed = False
+        self._seen_s = float(blocks.time[-1] - blocks.time[0]) + self._length
+        self._seen_until = float(blocks.time[-1])
+        self._level.rely()
+        self._provisional.clear()
         self._window.clear()
         for block in list(collected)[-self._most:]:
             self._window.append(block)
@@ -310,29 +341,10 @@ class RunningBackground:
             return
         self._resumed = False
         centre, mean, slope = line_through(blocks)
-        noise = None if self._noise_given else pooled_covariance(blocks)
-        self._set((centre, mean, slope, last + 2.0 * (last - first)),
-                  self._noise if noise is None else self._without_dead_axes(noise))
-
-
-def _one_is_loud(blocks: Blocks, step_variance: FloatArray) -> bool:
-    """Whether a block scatters far more than the others, on any axis.
-
-    `step_variance` (3,) [T^2] is what the sensor's steps add.
-    """
-    n = blocks.n
-    variance = np.where(n > 1, np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1, 1), np.nan)
-    variance = np.maximum(variance, step_variance)
-    known = variance[:, ~np.isnan(variance).all(axis=0)]
-    return bool((np.nanmax(known, axis=0) > LOUDEST * np.nanmin(known, axis=0)).any())
-
-
-def pooled_covariance(blocks: Blocks) -> FloatArray | None:
-    """(3, 3) scatter within blocks, pooled; None = too few samples, NaN = axis not reported."""
-    freedom = blocks.n.sum(axis=0) - np.count_nonzero(blocks.n, axis=0)
-    if freedom.max() <= 3:
-        return None
-    freedom = np.where(freedom > 3, freedom, np.nan)
-    covariance: FloatArray = \
-        blocks.scatter.sum(axis=0) / np.sqrt(freedom[:, None] * freedom[None, :])
-    return covariance
+        assert self._level.noise is not None
+        self._steep = self._is_young and is_steep(
+            blocks, slope, self._level.noise.diagonal() + self._state['step_variance'])
+        self._level.rely(np.abs(slope) * self._learn if self._steep else 0.0)
+        noise = pooled_covariance(blocks) if self._given_noise is None else None
+        self._level.set((centre, mean, slope, last + 2.0 * (last - first)),
+                  self._level.noise if noise is None else self._level.without_dead_axes(noise))

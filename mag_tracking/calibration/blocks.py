@@ -13,6 +13,11 @@ LEAST_SAMPLES = 8
 """A block has at least so many readings, however slow the sensor: fewer tell nothing of noise."""
 
 
+LOUDEST = 100.0
+"""A block whose variance is so many times that of the quietest is no noise: a target passed within
+it, as it can within the long blocks of a slow sensor. Noise and coarse steps stay well below."""
+
+
 @dataclass(frozen=True)
 class Block:
     """Summary of one short stretch."""
@@ -174,3 +179,26 @@ def stacked(blocks: Iterable[Block]) -> Blocks:
     """`Blocks` of `Block`s."""
     return Blocks(*(np.array(values, dtype=float) for values in zip(*(
         (b.time, b.mean, b.scatter, b.n) for b in blocks), strict=True)))
+
+
+def one_is_loud(blocks: Blocks, step_variance: FloatArray) -> bool:
+    """Whether a block scatters far more than the others, on any axis.
+
+    `step_variance` (3,) [T^2] is what the sensor's steps add.
+    """
+    n = blocks.n
+    variance = np.where(n > 1, np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1, 1), np.nan)
+    variance = np.maximum(variance, step_variance)
+    known = variance[:, ~np.isnan(variance).all(axis=0)]
+    return bool((np.nanmax(known, axis=0) > LOUDEST * np.nanmin(known, axis=0)).any())
+
+
+def pooled_covariance(blocks: Blocks) -> FloatArray | None:
+    """(3, 3) scatter within blocks, pooled; None = too few samples, NaN = axis not reported."""
+    freedom = blocks.n.sum(axis=0) - np.count_nonzero(blocks.n, axis=0)
+    if freedom.max() <= 3:
+        return None
+    freedom = np.where(freedom > 3, freedom, np.nan)
+    covariance: FloatArray = \
+        blocks.scatter.sum(axis=0) / np.sqrt(freedom[:, None] * freedom[None, :])
+    return covariance

@@ -22,6 +22,8 @@ SENSOR = np.dtype([
     ('is_ready', np.int64), ('centre', np.float64), ('mean', np.float64, 3),
     ('slope', np.float64, 3), ('horizon', np.float64), ('noise', np.float64, (3, 3)),
     ('noise_std', np.float64, 3),
+    # Variance of that line while it is provisional, else 0.
+    ('level_variance', np.float64, 3),
     # First and latest timestamp; one that is too far ahead and not confirmed yet; whether a stored
     # background may be restored at the next reading.
     ('first_ns', np.int64), ('last_ns', np.int64), ('unconfirmed_ns', np.int64),

@@ -7,9 +7,10 @@ from typing import Protocol
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.calibration.doubtful_times import DoubtfulTimes
 from mag_tracking.errors import RecordingError
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
-from mag_tracking.messages.schema import xyz
+from mag_tracking.messages.schema import stamp_dict, stamp_ns, xyz
 from mag_tracking.messages.shapes import CalibrationState, MessageDict
 from mag_tracking.network import SensorNetwork
 
@@ -21,6 +22,10 @@ class _Background(Protocol):
     def ready(self) -> bool: ...
     @property
     def frozen(self) -> bool: ...
+    @property
+    def doubtful(self) -> bool: ...
+    @property
+    def doubtful_times(self) -> DoubtfulTimes: ...
     @property
     def n_relearnt(self) -> int: ...
     @property
@@ -43,7 +48,10 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
     C = background.covariance if ready else None
     q, std = quaternion_from_rotation(network.R_ws[j]), network.orientation_std[j]
     done = network.calibrated[j]
+    since, until = background.doubtful_times[-1] if background.doubtful_times else (None, None)
     return {'sensor': name, 'ready': ready, 'frozen': background.frozen,
+            'doubtful': background.doubtful,
+            'doubtful_since': stamp_dict(since or 0), 'doubtful_until': stamp_dict(until or 0),
             'background': xyz(calibrate.background(name) if ready else np.full(3, np.nan)),
             'covariance': (np.full((3, 3), np.nan) if C is None else C).ravel().tolist(),
             'n_samples': counts['accepted'], 'n_rejected': counts['rejected'],
@@ -54,6 +62,15 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
             'clock_offset_std': float('nan') if done is None else done.clock_offset_std,
             'calibrated_at': '' if done is None else done.date,
             'calibrated_by': '' if done is None else done.by}
+
+
+def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
+    """{sensor: when its background was last doubtful} of a message-shaped CalibrationState."""
+    times: dict[str, DoubtfulTimes] = {}
+    for s in message.sensors:
+        if since := stamp_ns(s.doubtful_since):
+            times[s.sensor] = ((since, None if s.doubtful else stamp_ns(s.doubtful_until)),)
+    return times
 
 
 def with_orientations(network: SensorNetwork, message: CalibrationState) -> SensorNetwork:

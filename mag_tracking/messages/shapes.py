@@ -77,9 +77,12 @@ class NetworkFrame(Protocol):
 
 
 class SensorCalibration(Protocol):
-    """mag_tracking_msgs/SensorCalibration, of which only the orientation is read."""
+    """mag_tracking_msgs/SensorCalibration, of which only this is read."""
 
     sensor: str
+    doubtful: bool
+    doubtful_since: Time
+    doubtful_until: Time
     orientation: Quaternion
     orientation_std: Sequence[float]
 

@@ -144,6 +144,7 @@ class CalibrationNode(StageNode):
         for raw, now_ns in unseen:
             self._health.add(raw, now_ns)
         self._rounds.step_if_due()
+        self._rounds.report_doubts()
 
     def _take_acceleration(self, sensor: str, message: Imu) -> None:
         """One acceleration."""

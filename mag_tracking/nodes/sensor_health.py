@@ -147,7 +147,8 @@ class HealthDiagnostics:
             'field [uT]': _numbers(1e6 * health.field),
             'saturated': c['saturated'], 'spikes': c['spikes'],
             'share of missing axes': (c['x'] + c['y'] + c['z']) / (3 * n),
-            'background': 'frozen' if background.frozen else
+            'background': 'doubtful' if background.doubtful else
+                          'frozen' if background.frozen else
                           'ready' if background.ready else 'learning',
             'background drift [nT/s]': _numbers(1e9 * background.drift),
             'backgrounds taken anew': background.n_relearnt}

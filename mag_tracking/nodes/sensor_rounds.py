@@ -39,7 +39,7 @@ class SensorRounds:
         self._node, self._stage, self._health, self._store = node, stage, health, store
         self._is_live = is_live
         self._publish_status, self._publish_states = publish_status, publish_states
-        self._is_due = False
+        self._is_due, self._doubtful = False, frozenset[str]()
         self.begin(network)
 
     def begin(self, network: SensorNetwork) -> None:
@@ -57,6 +57,13 @@ class SensorRounds:
         """Do the step that is due."""
         if self._is_due:
             self._step()
+
+    def report_doubts(self) -> None:
+        """Publish at once where a background has become doubtful or certain: tracks wait for it."""
+        doubtful = frozenset(n for n, b in self._stage.backgrounds().items() if b.doubtful)
+        if doubtful != self._doubtful:
+            self._doubtful = doubtful
+            self._publish_states(self.states())
 
     def _step(self) -> None:
         """Go on with the round."""

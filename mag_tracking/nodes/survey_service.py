@@ -24,7 +24,7 @@ class SurveyService:
         # Of a sensor with a target nearby, the background from before it came.
         fields = {name: self._stage.background(name)
                   for name, background in self._stage.backgrounds().items()
-                  if background.ready and self._stage.last_stamp_ns(name) is not None}
+                  if background.certain and self._stage.last_stamp_ns(name) is not None}
         if not fields or not self._survey.counts['accelerations']:
             response.message = 'no background has been learnt yet' if not fields else \
                 f'no acceleration has come on {", ".join(filter(None, network.imu_topics))}'

@@ -24,7 +24,7 @@ from rclpy.publisher import Publisher
 from visualization_msgs.msg import MarkerArray
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.calibration_state import with_orientations
+from mag_tracking.messages.calibration_state import doubtful_times, with_orientations
 from mag_tracking.messages.frame import frame_of
 from mag_tracking.messages.schema import (
     header_dict,
@@ -100,13 +100,14 @@ class TrackerNode(StageNode):
             self._publish_all(self._stage.give_up('no frames came'))
 
     def _calibrated(self, message: CalibrationState) -> None:
-        """The sensors' orientations, which a survey may have changed."""
+        """The sensors' orientations, which a survey may have changed, and doubtful backgrounds."""
         try:
             network = with_orientations(self.network, message)
         except RecordingError as error:
             self._stage.counts['rejected: bad calibration'] += 1
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return
+        self._stage.doubt(doubtful_times(message))
         if _same_orientations(network, self.network):
             return
         self.network = network

@@ -9,7 +9,7 @@ import numpy as np
 from numba import boolean, float64, from_dtype, int64, njit
 
 from mag_tracking.arrays import FloatArray, IntArray, Record, StructArray
-from mag_tracking.calibration.background import subtract_background
+from mag_tracking.calibration.background_level import subtract_background
 from mag_tracking.calibration.blocks import begin_block_if_due, collect
 from mag_tracking.calibration.resolution import note_step, rest_of
 from mag_tracking.calibration.screening import (
@@ -183,7 +183,10 @@ def _is_credible(s: Record, covariance: FloatArray) -> bool:
 @njit(cache=True)
 def _attach_covariance(s: Record, limits: Record, batch: Record, own: int,
                        covariance: FloatArray, out: FloatArray) -> None:
-    """Covariance of a reading: its own where that is credible, else that of the sensor."""
+    """Covariance of a reading: its own where that is credible, else that of the sensor.
+
+    Either with that of a provisional background.
+    """
     if own and not limits.trust_covariances and (
             own == INVALID or not _is_credible(s, covariance)):
         own = NONE
@@ -196,6 +199,7 @@ def _attach_covariance(s: Record, limits: Record, batch: Record, own: int,
             out[a, b] = covariance[a, b] if own else s.noise[a, b]
         if not (own and limits.trust_covariances):
             out[a, a] += s.step_variance[a] * rest_of(s, a) / s.n_averaged
+        out[a, a] += s.level_variance[a]
 
 
 @njit(cache=True)

@@ -8,7 +8,8 @@ import numpy as np
 from mag_tracking.arrays import FloatArray, IntArray, Record
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.decimation import Decimator
-from mag_tracking.calibration.quiet_level import QuietLevel
+from mag_tracking.calibration.doubtful_times import DoubtfulTimes
+from mag_tracking.calibration.frequent_level import QuietLevel
 from mag_tracking.calibration.screening import clear_spikes
 from mag_tracking.calibration.sensor_state import new_sensors
 from mag_tracking.errors import NetworkError
@@ -85,8 +86,7 @@ class Calibrate:
         if network.names != tuple(self._index):
             raise NetworkError(f'a network of {", ".join(network.names)} in place of one of '
                                f'{", ".join(self._index)}')
-        before = self._network if self._background else None
-        self._network = network
+        before, self._network = self._network if self._background else None, network
         self._decimators = {name: Decimator(self._settings.decimate_to_hz)
                             for name in network.names}
         for i, name in enumerate(network.names):
@@ -126,6 +126,10 @@ class Calibrate:
     def unready(self) -> list[str]:
         """Names of the sensors whose background is not known."""
         return [name for name, b in self._background.items() if not b.ready]
+
+    def doubtful_stretches(self) -> dict[str, DoubtfulTimes]:
+        """{sensor: ((begin, end) [ns], ...)} of those whose background was doubtful."""
+        return {n: b.doubtful_times for n, b in self._background.items() if b.doubtful_times}
 
     def counts_of(self, sensor: str) -> 'Counter[str]':
         """What was `accepted` and `rejected` of a sensor, and why."""
@@ -249,8 +253,7 @@ class Calibrate:
             self._background[name].begin_with(found.level, found.covariance)
 
     def resume(self, stored: Mapping[str, StoredBackground]) -> None:
-        """Restore {sensor: `StoredBackground`} where the sensor's first reading comes soon after.
-        """
+        """Restore {sensor: `StoredBackground`} where its first reading comes soon after."""
         self._restoration.offer(stored)
         self._note_restorable()
 
@@ -259,10 +262,10 @@ class Calibrate:
         self._sensors['is_restorable'] = [name in self._restoration for name in self._index]
 
     def stored(self, sensor: str) -> StoredBackground | None:
-        """Background of a sensor for `resume`; None before it is known."""
+        """Background of a sensor for `resume`; None before it is known for certain."""
         background = self._background[sensor]
         last = self.last_stamp_ns(sensor)
-        if not background.ready or last is None:
+        if not background.certain or last is None:
             return None
         return stored_background(background, last, self.background(sensor))
 

@@ -24,9 +24,9 @@ LEAST_WATCHED = 0.5
 class TrackEvidence:
     """Evidence for a target, and what speaks against its track."""
 
-    def __init__(self, doubted: bool) -> None:
-        """`doubted`: all of the track may be wrong, as the target was not seen approaching."""
-        self.doubted = doubted
+    def __init__(self) -> None:
+        self.doubted = False
+        """All of the track may be wrong."""
         self._log_odds = 0.0
         self._single_sensor_s = 0.0
         self._n_misfits = 0

@@ -5,9 +5,11 @@ each frame, and ends with the release, or when its target is lost.
 """
 
 from collections import Counter, deque
+from collections.abc import Mapping
 
 import numpy as np
 
+from mag_tracking.calibration.doubtful_times import DoubtfulTimes, are_doubtful
 from mag_tracking.errors import NetworkError
 from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank
@@ -48,6 +50,7 @@ class TrackManager:
         # A target that was lost is not started again in the tail of its own detection.
         self._tail_of_detection = False
         self._next_network: SensorNetwork | None = None
+        self._doubtful: dict[int, DoubtfulTimes] = {}
         uncertain = sum(bool(s is not None and s.max() > MOST_TURNED)
                         for s in network.orientation_std)
         if uncertain:
@@ -71,6 +74,18 @@ class TrackManager:
         self._settings = settings
         for track in self._tracks:
             track.configure(settings)
+
+    def doubt(self, times: Mapping[str, DoubtfulTimes]) -> None:
+        """Doubt all tracks of frames in which the background of one of their sensors is doubtful.
+
+        `times` {sensor: ((begin, end) [ns], ...)} take the place of those before.
+        """
+        self._doubtful = {self._network.index(name): t for name, t in times.items()}
+
+    def _doubtful_sensors(self, *frames: FieldFrame) -> list[int]:
+        """Rows of the sensors whose backgrounds are doubtful in one of the frames."""
+        return [j for j, times in self._doubtful.items()
+                if any(f.n_samples[j] and are_doubtful(times, f.stamp_ns) for f in frames)]
 
     @property
     def bank(self) -> FilterBank | None:
@@ -127,6 +142,9 @@ class TrackManager:
 
     def _maintain(self, frame: FieldFrame, dt: float) -> list[TrackRecord]:
         """Move every running track on to the frame; drop those that end."""
+        doubtful = self._doubtful_sensors(frame)
+        for track in self._tracks:
+            track.doubt(doubtful)
         out = [record for track in self._tracks for record in track.step(frame, dt)]
         self._delete_ended()
         return out
@@ -165,6 +183,7 @@ class TrackManager:
                              self.counts)
         self._next_id += 1
         self._tracks.append(track)
+        track.doubt(self._doubtful_sensors(*recent, frame))
         out = track.begin(frame, recent)
         self._delete_ended()
         return out

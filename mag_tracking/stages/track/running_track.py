@@ -4,6 +4,7 @@ Source: ICASSP11 section 2, T10 Alg. 2 and 3; PHD15 Paper A for the magnet.
 """
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -56,7 +57,7 @@ class RunningTrack:
             settings.relinearise_most)
         self._whole = WholeTrack(settings.smooth_longest_s)
         self._lag = FixedLag(settings.smoothing_lag_s) if settings.smoothing_lag_s else None
-        self._evidence = TrackEvidence(doubted=False)
+        self._evidence = TrackEvidence()
         self._last: Track | None = None
         self._spread = np.inf
         self._unseen = target.unseen()
@@ -73,6 +74,14 @@ class RunningTrack:
         self._settings = settings
         self._filter.configure(settings)
         self._relinearisation.begin_anew()
+
+    def doubt(self, sensors: Sequence[int]) -> None:
+        """All of the track may be wrong if it uses one of the `sensors` (rows): their backgrounds
+        are doubtful.
+        """
+        if not self._evidence.doubted and np.isin(self._sensors.rows, sensors).any():
+            self.counts['tracks of a doubtful background'] += 1
+            self._evidence.doubt()
 
     def begin(self, frame: FieldFrame, recent: list[FieldFrame]) -> list[TrackRecord]:
         """Run through the `recent` frames before the detection, and publish the first one after.
@@ -93,7 +102,8 @@ class RunningTrack:
         # a few sensors at one place what the model leaves out of its field.
         whole = self._sensors.whole
         at_one_place = len(whole) == 1 or whole.is_close and not self._target.starts_anywhere
-        self._evidence = TrackEvidence(doubted=is_late or at_one_place)
+        if is_late or at_one_place:
+            self._evidence.doubt()
         if recent:
             self._filter.predict(self.bank, (recent[0].stamp_ns - frame.stamp_ns) / NS)
         self._whole.begin(self.bank, self._filter)

@@ -23,7 +23,7 @@ def test_noise_contradicts_a_track_as_often_as_said():
     nis = rng.chisquare(6, 3_000_000)
     doubted = 0
     for value in nis[nis > 25.0]:
-        evidence = TrackEvidence(doubted=False)
+        evidence = TrackEvidence()
         evidence.contradicts(value * np.array([0.3, 0.7]), 6)
         doubted += evidence.doubted
     # A Poisson number with the mean 30.
@@ -31,7 +31,7 @@ def test_noise_contradicts_a_track_as_often_as_said():
 
 
 def test_a_track_that_was_contradicted_once_stays_doubted():
-    evidence = TrackEvidence(doubted=False)
+    evidence = TrackEvidence()
     for nis in (6.0, 60.0, 6.0):
         assert evidence.contradicts(np.array([nis, 0.0]), 6) == (nis > 50.0)
     assert evidence.is_doubtful
@@ -40,7 +40,7 @@ def test_a_track_that_was_contradicted_once_stays_doubted():
 @pytest.mark.parametrize('nis, doubted', [
     ([60.0, 1.0], True), ([60.0, 2.0, 1.0], False), ([60.0, np.nan, 1.0], False)])
 def test_three_sensors_correct_a_track(nis, doubted):
-    evidence = TrackEvidence(doubted=False)
+    evidence = TrackEvidence()
     assert evidence.contradicts(np.array(nis), 3 * np.count_nonzero(~np.isnan(nis)))
     assert evidence.doubted == doubted
 
@@ -48,7 +48,7 @@ def test_three_sensors_correct_a_track(nis, doubted):
 @pytest.mark.parametrize('nis, is_coming, reason', [
     (6.0, False, 'out of reach'), (6.0, True, None), (1e4, False, LOST)])
 def test_a_vehicle_that_comes_is_not_out_of_reach(nis, is_coming, reason):
-    evidence = TrackEvidence(doubted=False)
+    evidence = TrackEvidence()
     assert evidence.reason_to_end(pose(), 2.0, is_coming, SETTINGS) is None
     assert evidence.reason_to_end(pose(nis), 7.0, is_coming, SETTINGS) == reason
 

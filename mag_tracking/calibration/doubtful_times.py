@@ -1,0 +1,24 @@
+"""When the background of a sensor was doubtful, by the timestamps of its readings."""
+
+from typing import TypeAlias
+
+DoubtfulTimes: TypeAlias = tuple[tuple[int, int | None], ...]
+"""((begin, end) [ns], ...), oldest first, without the ends; an end of None is not known yet."""
+
+MOST = 16
+"""The latest stretches are kept."""
+
+
+def noted(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool) -> DoubtfulTimes:
+    """The `times`, and from `stamp_ns` on as `is_doubtful` says."""
+    is_open = bool(times) and times[-1][1] is None
+    if is_doubtful and not is_open:
+        return (*times, (stamp_ns, None))[-MOST:]
+    if is_open and not is_doubtful:
+        return (*times[:-1], (times[-1][0], stamp_ns))
+    return times
+
+
+def are_doubtful(times: DoubtfulTimes, stamp_ns: int) -> bool:
+    """Whether the background was doubtful at `stamp_ns`."""
+    return any(begin <= stamp_ns and (end is None or stamp_ns < end) for begin, end in times)

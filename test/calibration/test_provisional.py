@@ -1,0 +1,153 @@
+"""A background without a quiet beginning, live: provisional, doubted, replaced."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mag_tracking.calibration.doubtful_times import are_doubtful, noted
+from mag_tracking.settings import replace
+from mag_tracking.stages.calibrate.settings import CalibrateSettings
+from mag_tracking.stages.calibrate.stage import Calibrate
+from support.calibration_runs import EARTH, SIGMA, feed, running
+from support.dense_traffic import traffic
+from support.networks import line_network
+from support.samples import MagSample, batch
+
+RATE = 50.0
+
+
+def fed(signal, seconds, **changes):
+    """A background after `seconds` [s] of a signal [T] on the Earth's field."""
+    b = running(**changes)
+    feed(b, np.arange(0.0, seconds, 1.0 / RATE), signal=signal)
+    return b
+
+
+def level_deviation(b):
+    return np.sqrt(b.sensors[0]['level_variance'])
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_between_vehicles_a_provisional_background_is_found(seed):
+    """No stretch of three seconds is quiet; the level is right within its own deviation."""
+    signal = traffic(2.0, seed=seed)
+    assert not fed(signal, 5.5).ready
+    b = fed(signal, 14.0)
+    assert b.ready and b.doubtful and not b.certain
+    assert (np.abs(b.level(14.0) - EARTH) < 3.0 * level_deviation(b) + SIGMA).all()
+    assert (level_deviation(b) > 0.0).all()
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_it_gets_better_and_certain(seed):
+    signal = traffic(2.0, seed=seed)
+    b = fed(signal, 60.0)
+    assert b.certain and (level_deviation(b) == 0.0).all()
+    # Blocks of 12 readings lie within their own noise, and the tails of vehicles stay below that.
+    assert (np.abs(b.level(60.0) - EARTH) < 2.0 * SIGMA).all()
+
+
+def test_a_quiet_stretch_ends_it():
+    b = fed(traffic(2.0, end=12.0), 18.0)
+    assert b.certain
+    assert (np.abs(b.level(18.0) - EARTH) < SIGMA).all()
+
+
+@pytest.mark.parametrize('relearn', [0.0, 60.0])
+@pytest.mark.parametrize('signal', [
+    0.0, lambda t: np.array([2e-6, 0.0, 0.0]) / (1 + ((t - 12.0) / 0.8)**2)**2.5])
+def test_after_a_quiet_beginning_nothing_is_doubtful(signal, relearn):
+    b = fed(signal, 30.0, relearn=relearn)
+    assert b.certain and not b.doubtful_times
+
+
+def stood(until):
+    return lambda t: np.array([2e-6, -1e-6, 0.0]) * (t < until)
+
+
+def test_what_stood_there_in_the_beginning_is_doubted_and_replaced():
+    """Seen for four seconds: after as long without it, nobody knows which one is the background."""
+    for seconds, is_doubtful, has_left in ((4.0, False, False), (9.5, True, False),
+                                           (24.0, False, True)):
+        b = fed(stood(4.0), seconds)
+        assert b.ready and b.doubtful == is_doubtful
+        error = np.abs(b.level(seconds) - EARTH)
+        assert (error < SIGMA).all() == has_left
+
+
+def test_a_level_that_was_the_background_before_is_so_at_once():
+    """A car that parks for two minutes, and leaves."""
+    def parked(t):
+        return np.array([2e-6, 0.0, 1e-6]) * (20.0 < t < 140.0)
+    assert (np.abs(fed(parked, 130.0).level(130.0) - EARTH - parked(130.0)) < SIGMA).all()
+    b = fed(parked, 146.0)
+    assert not b.frozen and b.n_relearnt == 2
+    assert (np.abs(b.level(146.0) - EARTH) < SIGMA).all()
+
+
+def test_a_drift_that_no_sensor_has_is_doubted():
+    """A vehicle comes near while the background is learnt; a sensor that is warming does not."""
+    for rate, is_doubtful in ((2e-8, True), (1e-9, False)):
+        b = fed(lambda t, rate=rate: rate * t * np.ones(3), 6.0)
+        assert b.ready and b.doubtful == is_doubtful
+        assert (level_deviation(b) > 0.0).all() == is_doubtful
+
+
+def readings(signal, seconds, seed=0):
+    rng = np.random.default_rng(seed)
+    return batch([MagSample(int(t * 1e9), 'mag_1', EARTH + signal(t) + SIGMA
+                            * rng.standard_normal(3)) for t in np.arange(0.0, seconds, 1 / RATE)])
+
+
+def calibrated(parts, network=None, **changes):
+    stage = Calibrate(network or line_network(1), replace(CalibrateSettings(), changes))
+    out = [c for part in parts for c in stage.feed(part)]
+    return stage, np.concatenate([c.covariance for c in out]), np.concatenate(
+        [c.stamp_ns for c in out])
+
+
+def test_readings_say_what_a_provisional_background_may_be_off_by():
+    stage, covariance, stamps = calibrated([readings(traffic(2.0), 60.0)])
+    times = stage.doubtful_stretches()['mag_1']
+    doubtful = np.array([are_doubtful(times, s) for s in stamps.tolist()])
+    (begin, end), = times
+    assert 6e9 <= begin < 15e9 < end < 60e9
+    variance = np.einsum('kii->ki', covariance)
+    assert doubtful.any() and not doubtful.all()
+    assert variance[doubtful].min() > 1.5 * variance[~doubtful].max()
+
+
+def test_what_is_doubtful_does_not_depend_on_the_batches():
+    whole = readings(traffic(2.0), 40.0)
+    stage, covariance, _ = calibrated([whole])
+    parts = [whole.part(slice(i, i + 7)) for i in range(0, len(whole), 7)]
+    other, again, _ = calibrated(parts)
+    assert stage.doubtful_stretches() == other.doubtful_stretches() != {}
+    np.testing.assert_array_equal(covariance, again)
+
+
+def test_what_is_given_is_not_doubted():
+    network = dataclasses.replace(line_network(1), background=(EARTH,))
+    stage, covariance, _ = calibrated([readings(traffic(2.0), 30.0)], network)
+    assert stage.doubtful_stretches() == {}
+    np.testing.assert_array_equal(stage.background('mag_1'), EARTH)
+
+
+def test_what_is_doubtful_is_not_kept_for_a_restart():
+    stage, *_ = calibrated([readings(traffic(2.0), 14.0)])
+    assert stage.stored('mag_1') is None
+    stage, *_ = calibrated([readings(traffic(2.0), 60.0)])
+    assert stage.stored('mag_1') is not None
+
+
+def test_stretches_of_doubt():
+    times = ()
+    for stamp, is_doubtful in ((1, False), (2, True), (3, True), (5, False), (9, True)):
+        times = noted(times, stamp, is_doubtful)
+    assert times == ((2, 5), (9, None))
+    assert [are_doubtful(times, t) for t in (1, 2, 4, 5, 9, 99)] == [False, True, True, False, True,
+                                                                     True]
+    for k in range(100):
+        times = noted(times, 10 + k, k % 2 == 1)
+    assert len(times) == 16 and times[-1] == (109, None)
