@@ -38,7 +38,7 @@ _Smoothed: TypeAlias = tuple[FloatArray, FloatArray]
 LEADING = np.log(1e3)
 """A hypothesis leads that is not lighter than the heaviest by more than this."""
 
-PASSES = 5
+PASSES = 3
 """Gauss-Newton steps each time; the next time goes on from where they led."""
 
 STEP = 0.5

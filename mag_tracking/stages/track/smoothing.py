@@ -73,7 +73,7 @@ def _forth_and_back(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[
     steps: list[Step] = []
     left_out = 0
     for k, (frame, dt) in enumerate(zip(frames, intervals, strict=True)):
-        F, decay = bank_filter.predict(bank, dt) if k else (None, None)
+        F, decay = bank_filter.predict(bank, dt, x_lin[k - 1]) if k else (None, None)
         gains = None
         if k or not updated:
             before = bank.x.copy(), bank.P.copy()
