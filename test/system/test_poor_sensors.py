@@ -100,10 +100,6 @@ def test_a_recording_may_begin_while_a_vehicle_comes(name):
 
 
 @pytest.mark.study
-@pytest.mark.xfail(strict=True, reason=(
-    '7 of 8: where junction_left_to_right begins its car is beside the sensors, and a filter that '
-    'is widened there follows the mirrored path, flagged; not widened it is 8 of 8, but more '
-    'turning vehicles are sure and wrong'))
 def test_directions_where_a_recording_begins_beside_a_vehicle():
     found = [outcome(name, spoiler.beginning_cut(5.0)) for name in VEHICLES]
     right = sum(o.direction_is_right for o in found)

@@ -196,7 +196,10 @@ class Relinearisation:
             of_frame, step = self._forward(bank_filter, bank, k, paths)
             log_likelihood = log_likelihood + of_frame
             steps.append(step)
-        std = [np.sqrt(np.einsum('pii->p', step.P[:, :3, :3])) for step in steps]
+        variance = np.array([np.einsum('pii->p', step.P[:, :3, :3]) for step in steps])
+        # A path that runs over a sensor may end in rounding errors: it is of no use.
+        log_likelihood[~(variance >= 0.0).all(axis=0)] = -np.inf
+        std = np.sqrt(np.where(variance >= 0.0, variance, np.nan))
         return steps[-1], log_likelihood, list(zip(smoothed_states(steps), std, strict=True))
 
 

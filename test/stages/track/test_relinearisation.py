@@ -182,6 +182,15 @@ def test_of_a_path_that_is_less_sure_the_covariance_is_taken(monkeypatch, more, 
     np.testing.assert_allclose(bank.P[0], expected, atol=1e-9)
 
 
+def test_a_path_whose_covariance_is_none_is_of_no_use():
+    """Rounding errors over a sensor: its state and its path stay where they were."""
+    filter_, bank, relinearisation = less_sure(-3.0, np.inf)
+    x, P = bank.x.copy(), bank.P.copy()
+    assert relinearisation.improve(filter_, bank)[relinearise.IN_VAIN] == 1
+    np.testing.assert_array_equal(bank.x, x)
+    np.testing.assert_array_equal(bank.P, P)
+
+
 @pytest.mark.parametrize('window_s, most_frames', [(0.5, 64), (60.0, 10)])
 def test_it_is_done_over_twice_the_window_at_most(monkeypatch, window_s, most_frames):
     """Frames are 0.05 s apart or more; beside the passes the anchor moves over half of them."""
