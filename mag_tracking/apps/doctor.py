@@ -119,9 +119,9 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
         yield Finding(True, name, 'no background was learnt', 'begin without a target for a few '
                       'seconds, or give background and noise_std in the network file')
     if background.doubtful:
-        yield Finding(False, name, 'its background is doubtful', 'no stretch was quiet for long '
-                      'enough, or what stood there in the beginning has left: until it is '
-                      'certain its tracks are ambiguous')
+        yield Finding(False, name, 'its background is doubtful, and its tracks are ambiguous',
+                      'begin without a target for a few seconds, or give background and noise_std '
+                      'in the network file')
     if background.n_relearnt > n_known:
         yield Finding(False, name, f'a steady change was taken for its background '
                       f'{background.n_relearnt - n_known} times', 'a parked vehicle, or something '

@@ -25,14 +25,14 @@ from mag_tracking.calibration.blocks import (
     stacked,
 )
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, noted
-from mag_tracking.calibration.drift import DRIFT, is_steep
+from mag_tracking.calibration.drift import FormerLevel, is_steep
 from mag_tracking.calibration.frequent_level import MORE
-from mag_tracking.calibration.provisional import ProvisionalLevel
+from mag_tracking.calibration.provisional import SEEN_S, FrequentLevel, ProvisionalLevel
 from mag_tracking.calibration.resolution import LEAST_STD, corrected_steps
 
 LEAST_RELEARN_S = 10.0
-"""[s] What was resumed, or was seen for a moment only, gives way to another steady level after so
-long, whatever `relearn` is."""
+"""[s] A background that was resumed, or seen for a moment only, gives way to another steady level
+after this time at the earliest."""
 
 
 class RunningBackground:
@@ -48,7 +48,7 @@ class RunningBackground:
         A block departs if its mean is this many noise deviations off.
     relearn : float [s]
         After so long frozen on a steady level that level is the new
-        background; 0 = never.
+        background, or earlier if the old one was seen only briefly; 0 = never.
     background, noise_std : (3,) [T], optional
         Known beforehand: with both it is ready at once.
     phase : float, optional
@@ -83,6 +83,7 @@ class RunningBackground:
             None if noise_std is None else np.diag(np.asarray(noise_std, float) ** 2)
         self._level = BackgroundLevel(sensors, freeze_std)
         self.n_relearnt = 0
+        self.doubtful_times: DoubtfulTimes = ()
         self._provisional = ProvisionalLevel(learn)
         self.forget()
 
@@ -95,10 +96,11 @@ class RunningBackground:
         self._rested: deque[Block] = deque(maxlen=self._most)
         self.frozen = self._resumed = self._relearns_soon = self._contested = self._steep = False
         self._provisional.clear()
-        self.doubtful_times: DoubtfulTimes = ()
+        # What is doubtful in the frames that are still on their way stays so.
+        self.doubtful_times = noted(self.doubtful_times, int(self._state['last_ns']), False)
         # For how long the level was seen, until when, and which one it has replaced since when.
         self._seen_s, self._seen_until = (0.0 if self._given is None else inf), np.nan
-        self._former: tuple[float, FloatArray] | None = None
+        self._former: FormerLevel | None = None
         self._level.rely()
         self._level.set(None if self._given is None else (0.0, self._given, np.zeros(3), 0.0),
                         self._given_noise)
@@ -220,25 +222,31 @@ class RunningBackground:
 
     def _provide(self, block: Block) -> None:
         """Without a quiet stretch: begin with the most frequent level."""
-        found = self._provisional.add(block, corrected_steps(self._sensors))
-        if found is None:
-            return
-        level, deviation, is_certain = found
-        if is_certain or self._given is not None:
-            self.begin_with(level.level if self._given is None else self._given, level.covariance)
-            self._strange.clear()
-            return
-        noise = self._level.without_dead_axes(level.covariance)
-        if not np.isnan(noise).all():
-            noise = noise if self._given_noise is None else self._given_noise
-            self._level.set((0.0, level.level, np.zeros(3), 0.0), noise)
-            self._level.rely(deviation, is_provisional=True)
+        self._provisional.collect(block)
+        found = self._provisional.found(corrected_steps(self._sensors))
+        if found is not None and (found.is_certain or self._given is not None):
+            self._begin_with_frequent(found)
+        elif found is not None:
+            level, noise = found.level, self._level.without_dead_axes(found.level.covariance)
+            if not np.isnan(noise).all():
+                noise = noise if self._given_noise is None else self._given_noise
+                self._level.set((0.0, level.level, np.zeros(3), 0.0), noise)
+                self._level.rely(found.deviation, is_provisional=True)
+
+    def _begin_with_frequent(self, found: FrequentLevel) -> None:
+        """Begin with a level that is frequent enough; others may still take its place."""
+        level = found.level
+        self.begin_with(level.level if self._given is None else self._given, level.covariance)
+        self._seen_s = inf if self._given is not None else found.seen_s
+        self.frozen = self._contested = False
+        self._strange.clear()
 
     def _follow(self, block: Block) -> None:
         """Once ready: extend the quiet stretch, or freeze."""
         off = np.abs(self._level.departure(block.time, block.mean))
         # A comparison with NaN is false: an axis that is not reported freezes nothing.
         self.frozen = bool((off > self._level.limits).any())
+        self._provisional.collect(block)
         if self.frozen:
             self._pending.clear()
             self._strange.append(block)
@@ -268,35 +276,26 @@ class RunningBackground:
         if not longest:
             self._strange.clear()
             return
-        latest = self._steady() if self._is_young or self._is_former(block) else None
-        # Seen for as long, the one may be the background as well as the other.
-        self._contested = self._is_young and (
-            self._contested or latest is not None and since >= min(self._seen_s, longest))
-        if latest is not None and self._is_former(block):
+        other = self._provisional.found(corrected_steps(self._sensors))
+        if other is not None and other.level.is_at(self._level.at(block.time)):
+            other = None
+        latest = self._level.steady_end(self._strange, self._learn)
+        # Two levels that were seen for equally long may both be the background.
+        self._contested |= latest is not None and since >= min(self._seen_s, self._relearn) \
+            or other is not None and other.seen_s >= min(self._seen_s, SEEN_S)
+        if latest is not None and self._former is not None \
+                and self._former.is_at(block, self._level.limits):
             self._strange = latest
         elif since < longest:
             return
         if self._adopt_if_steady(self._strange):
             self.n_relearnt += 1
             self.frozen = self._contested = False
+        elif other is not None and other.is_certain:
+            self.n_relearnt += 1
+            self._begin_with_frequent(other)
         else:
             self._strange.popleft()
-
-    def _steady(self) -> deque[Block] | None:
-        """The latest strange blocks, as long as a quiet stretch has to be, if they are steady."""
-        blocks = list(self._strange)
-        since = blocks[-1].time - self._learn
-        latest = blocks[-max(3, sum(b.time > since for b in blocks)):]
-        is_long = len(blocks) >= 3 and blocks[0].time <= since
-        return deque(latest) if is_long and self._level.holds(stacked(latest)) else None
-
-    def _is_former(self, block: Block) -> bool:
-        """Whether a block has the level that was the background before the present one."""
-        if self._former is None:
-            return False
-        since, level = self._former
-        return not bool((np.abs(block.mean - level)
-                         > self._level.limits + DRIFT * (block.time - since)).any())
 
     def _adopt_if_steady(self, collected: deque[Block]) -> bool:
         """Take the collected blocks as the background if they lie on one line."""
@@ -318,13 +317,13 @@ class RunningBackground:
             self._strange.clear()
             return True
         if self.frozen and self._level.line is not None:
-            self._former = float(blocks.time[0]), self._level.at(float(blocks.time[0]))
+            since = float(blocks.time[0])
+            self._former = FormerLevel(since, self._level.at(since))
         # A steady stretch was asked for its own length; it need not be as long as at first.
         self._resumed = False
         self._seen_s = float(blocks.time[-1] - blocks.time[0]) + self._length
         self._seen_until = float(blocks.time[-1])
         self._level.rely()
-        self._provisional.clear()
         self._window.clear()
         for block in list(collected)[-self._most:]:
             self._window.append(block)

@@ -1,12 +1,14 @@
 """Background line and noise of one sensor, as compiled code reads them."""
 
+from collections import deque
+from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
 from numba import float64, int64, njit, void
 
 from mag_tracking.arrays import FloatArray, Record, StructArray
-from mag_tracking.calibration.blocks import Blocks, line_through, one_is_loud
+from mag_tracking.calibration.blocks import Block, Blocks, line_through, one_is_loud, stacked
 from mag_tracking.calibration.resolution import (
     LEAST_STD,
     apply_steps,
@@ -118,6 +120,13 @@ class BackgroundLevel:
         out = np.empty(3)
         _subtract(self._sensors, 0, time, field, out)
         return out
+
+    def steady_end(self, blocks: Sequence[Block], length: float) -> deque[Block] | None:
+        """The latest of the blocks, over a `length` [s], if they are of a steady level."""
+        since = blocks[-1].time - length
+        latest = list(blocks)[-max(3, sum(b.time > since for b in blocks)):]
+        is_long = len(blocks) >= 3 and blocks[0].time <= since
+        return deque(latest) if is_long and self.holds(stacked(latest)) else None
 
     def holds(self, blocks: Blocks) -> bool:
         """Whether blocks are those of a steady level, by the present noise."""

@@ -1,5 +1,6 @@
 """When the background of a sensor was doubtful, by the timestamps of its readings."""
 
+from collections.abc import Mapping
 from typing import TypeAlias
 
 DoubtfulTimes: TypeAlias = tuple[tuple[int, int | None], ...]
@@ -17,6 +18,18 @@ def noted(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool) -> DoubtfulTim
     if is_open and not is_doubtful:
         return (*times[:-1], (times[-1][0], stamp_ns))
     return times
+
+
+def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTimes]
+           ) -> dict[str, DoubtfulTimes]:
+    """{sensor: all its stretches}; where two begin together, the latest knows better."""
+    return {name: tuple(sorted({**dict(earlier.get(name, ())), **dict(latest.get(name, ()))}.items()
+                               ))[-MOST:] for name in {**earlier, **latest}}
+
+
+def shifted(times: DoubtfulTimes, ns: int) -> DoubtfulTimes:
+    """The `times` by a clock that is `ns` [ns] ahead."""
+    return tuple((begin + ns, None if end is None else end + ns) for begin, end in times)
 
 
 def are_doubtful(times: DoubtfulTimes, stamp_ns: int) -> bool:

@@ -1,9 +1,11 @@
 """How a background drifts, and what drifts faster."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.calibration.blocks import Blocks
+from mag_tracking.calibration.blocks import Block, Blocks
 
 DRIFT = 3e-9
 """[T/s] Usual drift of a background."""
@@ -11,8 +13,33 @@ DRIFT = 3e-9
 STEEP = 1e-8
 """[T/s] A sensor that is warming drifts so. What drifts faster may be a target that comes near."""
 
+FORGOTTEN_S = 600.0
+"""[s] A level that was the background so long ago is no longer remembered."""
+
+MOST_DRIFT = 4.0
+"""By at most so many of the limits of a block such a level may have drifted meanwhile: with a wider
+tolerance any vehicle that halts would seem to be it."""
+
 SIGNIFICANT = 4.0
 """Standard deviations by which a drift is faster."""
+
+
+@dataclass(frozen=True)
+class FormerLevel:
+    """The level that was the background before the present one."""
+
+    until: float
+    """[s]"""
+    level: FloatArray
+    """(3,) [T]"""
+
+    def is_at(self, block: Block, limits: FloatArray) -> bool:
+        """Whether a block has this level, with `limits` (3,) [T] for its mean."""
+        since = block.time - self.until
+        tolerance = limits + np.minimum(DRIFT * since, MOST_DRIFT * limits)
+        # A comparison with NaN is false: an axis that is not reported differs from nothing.
+        is_off = bool((np.abs(block.mean - self.level) > tolerance).any())
+        return since <= FORGOTTEN_S and not is_off
 
 
 def is_steep(blocks: Blocks, slope: FloatArray, variance: FloatArray) -> bool:

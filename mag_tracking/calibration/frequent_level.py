@@ -19,6 +19,9 @@ deviations on each axis."""
 LEAST_WIDTH = 5e-9
 """[T] Drift makes them differ, too."""
 
+REPORTED = 0.5
+"""An axis counts where it is reported in more than this share of the blocks."""
+
 LEAST_BLOCKS = 4
 """Fewer blocks of one level are no background."""
 
@@ -52,6 +55,10 @@ class QuietLevel:
     width: FloatArray
     """(3,) [T] Blocks whose means differ by less are of one level."""
 
+    def is_at(self, level: FloatArray) -> bool:
+        """Whether another level, (3,) [T], is about this one."""
+        return not bool((np.abs(self.level - level) > APART * self.width).any())
+
 
 def most_frequent_level(blocks: Blocks, steps: FloatArray, most: int) -> QuietLevel | None:
     """The level that most blocks of a sensor have.
@@ -75,7 +82,10 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, most: int) -> QuietLe
     variance = np.where(blocks.n > 1, np.maximum(variance, steps**2 / 12.0), np.nan)
     if np.isnan(variance).all():
         return None
-    known = ~np.isnan(variance).all(axis=0)
+    # An axis that hardly ever reports would rule out the blocks without it.
+    known = (~np.isnan(variance)).mean(axis=0) > REPORTED
+    if not known.any():
+        return None
     quietest = np.nanquantile(variance[:, known], 0.2, axis=0)
     calm = (variance[:, known] <= CALM**2 * quietest).all(axis=1)
     width = np.full(3, np.nan)

@@ -4,6 +4,7 @@ In dense traffic no stretch is quiet for seconds, and a sensor without a backgro
 """
 
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,6 +31,23 @@ TO_DEVIATION = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
 
+@dataclass(frozen=True)
+class FrequentLevel:
+    """The most frequent level of the latest blocks."""
+
+    level: QuietLevel
+    deviation: FloatArray
+    """(3,) [T] Median distance of all the blocks from it, as a standard deviation: a level seen for
+    less than half of the time may be that of something else. NaN = axis not reported."""
+    is_certain: bool
+    """Whether it was seen for long enough, and far longer than any other level."""
+
+    @property
+    def seen_s(self) -> float:
+        """[s] For how long it was seen, in all."""
+        return self.level.n_blocks * self.level.block_s
+
+
 class ProvisionalLevel:
     """Collects the blocks of a sensor and finds their most frequent level now and then."""
 
@@ -43,30 +61,29 @@ class ProvisionalLevel:
         self._blocks: deque[Block] = deque(maxlen=MOST_BLOCKS)
         self._since_last, self._due = 0, LEAST_BLOCKS
 
-    def add(self, block: Block, steps: FloatArray) -> tuple[QuietLevel, FloatArray, bool] | None:
-        """The next block of a sensor whose axes change by `steps` (3,) [T], inf = unknown.
-
-        Returns
-        -------
-        level : QuietLevel
-            All of it is None where it is too soon, or no level was found.
-        deviation : (3,) array, T
-            Of the level, which may be that of something that stands there; NaN = axis not reported.
-        is_certain : bool
-            Whether the level is the background.
-        """
+    def collect(self, block: Block) -> None:
+        """Take the next block."""
         self._blocks.append(block)
         self._since_last += 1
-        if self._since_last < self._due or block.time - self._blocks[0].time < self._patience_s:
+
+    def found(self, steps: FloatArray) -> FrequentLevel | None:
+        """The most frequent level, if it is time to look for it.
+
+        Parameters
+        ----------
+        steps : (3,) array, T
+            By which the axes of the sensor change; inf = unknown.
+        """
+        blocks = self._blocks
+        if self._since_last < self._due or blocks[-1].time - blocks[0].time < self._patience_s:
             return None
-        self._since_last, self._due = 0, max(1, int((GROWTH - 1.0) * len(self._blocks)))
-        blocks = stacked(self._blocks)
-        found = most_frequent_level(blocks, np.where(np.isfinite(steps), steps, 0.0), MOST_BLOCKS)
-        if found is None:
+        self._since_last, self._due = 0, max(1, int((GROWTH - 1.0) * len(blocks)))
+        all_of = stacked(blocks)
+        level = most_frequent_level(all_of, np.where(np.isfinite(steps), steps, 0.0), MOST_BLOCKS)
+        if level is None:
             return None
-        apart = np.full(3, np.nan)
-        known = ~np.isnan(found.level)
-        apart[known] = np.nanmedian(np.abs(blocks.mean[:, known] - found.level[known]), axis=0)
-        is_certain = found.n_blocks * found.block_s >= SEEN_S \
-            and found.n_blocks >= MORE * found.n_rival
-        return found, TO_DEVIATION * apart, is_certain
+        apart, known = np.full(3, np.nan), ~np.isnan(level.level)
+        apart[known] = np.nanmedian(np.abs(all_of.mean[:, known] - level.level[known]), axis=0)
+        is_certain = level.n_blocks * level.block_s >= SEEN_S \
+            and level.n_blocks >= MORE * level.n_rival
+        return FrequentLevel(level, TO_DEVIATION * apart, is_certain)

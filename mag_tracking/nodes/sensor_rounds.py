@@ -39,7 +39,7 @@ class SensorRounds:
         self._node, self._stage, self._health, self._store = node, stage, health, store
         self._is_live = is_live
         self._publish_status, self._publish_states = publish_status, publish_states
-        self._is_due, self._doubtful = False, frozenset[str]()
+        self._is_due = self._is_doubtful = False
         self.begin(network)
 
     def begin(self, network: SensorNetwork) -> None:
@@ -59,11 +59,13 @@ class SensorRounds:
             self._step()
 
     def report_doubts(self) -> None:
-        """Publish at once where a background has become doubtful or certain: tracks wait for it."""
-        doubtful = frozenset(n for n, b in self._stage.backgrounds().items() if b.doubtful)
-        if doubtful != self._doubtful:
-            self._doubtful = doubtful
+        """Publish before its turn where the first background has become doubtful: a track that
+        waits for the round would be sure meanwhile.
+        """
+        is_doubtful = any(b.doubtful for b in self._stage.backgrounds().values())
+        if is_doubtful and not self._is_doubtful:
             self._publish_states(self.states())
+        self._is_doubtful = is_doubtful
 
     def _step(self) -> None:
         """Go on with the round."""

@@ -23,6 +23,7 @@ from nav_msgs.msg import Odometry, Path
 from rclpy.publisher import Publisher
 from visualization_msgs.msg import MarkerArray
 
+from mag_tracking.calibration.doubtful_times import DoubtfulTimes, merged
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.calibration_state import doubtful_times, with_orientations
 from mag_tracking.messages.frame import frame_of
@@ -72,6 +73,7 @@ class TrackerNode(StageNode):
         self._markers = self.publisher(MarkerArray, '~/markers', RESULTS)
         self._path: deque[PoseStamped] = deque(maxlen=LONGEST_PATH)
         self._is_silent = False
+        self._doubtful: dict[str, DoubtfulTimes] = {}
         self.subscription(NetworkFrame, '/detection_node/frame', self._take, STREAM,
                           source='detection_node')
         self.create_timer(0.25, self.end_without_frames)
@@ -107,7 +109,9 @@ class TrackerNode(StageNode):
             self._stage.counts['rejected: bad calibration'] += 1
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return
-        self._stage.doubt(doubtful_times(message))
+        # The message has the latest stretch of each sensor; frames of others may be on their way.
+        self._doubtful = merged(self._doubtful, doubtful_times(message))
+        self._stage.doubt(self._doubtful)
         if _same_orientations(network, self.network):
             return
         self.network = network

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mag_tracking.calibration.doubtful_times import are_doubtful, noted
+from mag_tracking.calibration.doubtful_times import are_doubtful, merged, noted, shifted
 from mag_tracking.settings import replace
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
@@ -76,6 +76,48 @@ def test_what_stood_there_in_the_beginning_is_doubted_and_replaced():
         assert (error < SIGMA).all() == has_left
 
 
+@pytest.mark.parametrize('stood_s', [4.0, 20.0])
+def test_what_stood_there_before_dense_traffic_is_doubted_and_replaced(stood_s):
+    """No stretch is quiet any more: the most frequent level is the other one."""
+    vehicles = traffic(2.0, begin=stood_s)
+
+    def signal(t):
+        return stood(stood_s)(t) + vehicles(t)
+
+    doubted = fed(signal, stood_s + 55.0)
+    assert doubted.doubtful or (np.abs(doubted.level(60.0) - EARTH) < 2.0 * SIGMA).all()
+    b = fed(signal, 140.0)
+    assert b.certain and (np.abs(b.level(140.0) - EARTH) < 2.0 * SIGMA).all()
+
+
+def test_what_halts_in_dense_traffic_is_not_certain_for_ever():
+    """It is the only level for half a minute; then it leaves, and the traffic goes on."""
+    vehicles = traffic(2.0, begin=40.0)
+    b = fed(lambda t: stood(40.0)(t) + vehicles(t) + traffic(2.0, end=6.0)(t), 170.0)
+    assert b.certain and (np.abs(b.level(170.0) - EARTH) < 2.0 * SIGMA).all()
+
+
+@pytest.mark.parametrize('later', [60.0, 700.0])
+def test_another_car_that_halts_is_no_former_background(later):
+    """One parked for 100 s; a while later one halts for five, with two thirds of its field."""
+    def signal(t):
+        halts = 120.0 + later
+        return np.array([2e-6, 0.0, 1e-6]) * ((20.0 < t < 120.0)
+                                              + 0.6 * (halts < t < halts + 5.0))
+    b = running()
+    feed(b, np.arange(0.0, 127.0 + later, 0.04), signal=signal)
+    assert b.n_relearnt == 2 and (np.abs(b.level(127.0 + later) - EARTH) < SIGMA).all()
+
+
+def test_an_axis_that_falls_silent_early_does_not_hold_up_the_others():
+    vehicles = traffic(2.0)
+    b, rng = running(), np.random.default_rng(0)
+    for t in np.arange(0.0, 14.0, 1.0 / RATE):
+        field = EARTH + vehicles(t) + SIGMA * rng.standard_normal(3)
+        b.add(t, np.where([False, False, t > 1.5], np.nan, field))
+    assert b.ready and (np.abs(b.level(14.0) - EARTH)[:2] < 3.0 * level_deviation(b)[:2]).all()
+
+
 def test_a_level_that_was_the_background_before_is_so_at_once():
     """A car that parks for two minutes, and leaves."""
     def parked(t):
@@ -127,6 +169,14 @@ def test_what_is_doubtful_does_not_depend_on_the_batches():
     np.testing.assert_array_equal(covariance, again)
 
 
+def test_the_times_of_doubt_follow_the_clock():
+    network = line_network(1)
+    stage, *_ = calibrated([readings(traffic(2.0), 14.0)], network)
+    (begin, _), = stage.doubtful_stretches()['mag_1']
+    stage.renew(dataclasses.replace(network, clock_offset=np.array([0.5])))
+    assert stage.doubtful_stretches()['mag_1'] == ((begin - 500_000_000, None),)
+
+
 def test_what_is_given_is_not_doubted():
     network = dataclasses.replace(line_network(1), background=(EARTH,))
     stage, covariance, _ = calibrated([readings(traffic(2.0), 30.0)], network)
@@ -151,3 +201,6 @@ def test_stretches_of_doubt():
     for k in range(100):
         times = noted(times, 10 + k, k % 2 == 1)
     assert len(times) == 16 and times[-1] == (109, None)
+    assert shifted(times, 5)[-1] == (114, None)
+    assert merged({'a': ((1, 2), (4, None))}, {'a': ((4, 6),), 'b': ((3, None),)}) \
+        == {'a': ((1, 2), (4, 6)), 'b': ((3, None),)}

@@ -18,7 +18,7 @@ NAMES = ('calibration_node', 'detection_node', 'tracker_node')
 
 def test_after_dense_traffic_the_nodes_track_and_flag(ros):
     node, spin_until = ros
-    readings = after_dense_traffic('straight_small_left', 7.0)
+    readings = after_dense_traffic('junction_left_to_right', 7.0)
     t = (readings.stamp_ns - readings.stamp_ns.min()) / NS
     states, tracks = [], []
     node.create_subscription(CalibrationState, '/calibration_node/calibration', states.append,
@@ -38,9 +38,9 @@ def test_after_dense_traffic_the_nodes_track_and_flag(ros):
                           and node.count_subscribers('/detection_node/frame')
                           and node.count_subscribers('/calibration_node/calibration') > 1
                           and node.count_publishers('/tracker_node/tracks'))
-        publish(readings.part(t < 7.7))
+        publish(readings.part(t < 7.3))
         assert spin_until(lambda: states and any(s.doubtful for s in states[-1].sensors))
-        publish(readings.part(t >= 7.7))
+        publish(readings.part(t >= 7.3))
         assert spin_until(lambda: any(track.status == track.ENDED for m in tracks
                                       for track in m.tracks))
     finally:

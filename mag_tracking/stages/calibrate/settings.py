@@ -10,7 +10,8 @@ class CalibrateSettings:
     """Settings of the calibration."""
 
     learn_s: float = param(
-        3.0, 'Quiet time needed before a sensor is used, unless its calibration is given.',
+        3.0, 'Quiet time from which a background is learnt, unless it is given. Where nothing is '
+        'quiet for twice as long, the most frequent level is a provisional background.',
         's', (0.1, 3600.0))
     look_ahead_s: float = param(
         300.0, 'Offline: how much of a recording is searched for the most frequent level of a '
@@ -28,7 +29,8 @@ class CalibrateSettings:
         '', (0.5, 1000.0))
     relearn_s: float = param(
         60.0, 'After so long frozen on a steady level, that level becomes the background '
-        '(a parked car); 0 = never.', 's', (0.0, 86400.0))
+        '(a parked car); after 10 s, or four times as long as the background was seen, if that is '
+        'earlier. 0 = never.', 's', (0.0, 86400.0))
     max_field: float = param(
         1e-3, 'A reading above this is rejected: gauss or microtesla published as tesla is the '
         'commonest fault. Near magnets millitesla are legitimate.', 'T', (1e-6, 10.0))

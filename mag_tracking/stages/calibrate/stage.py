@@ -8,7 +8,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray, IntArray, Record
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.decimation import Decimator
-from mag_tracking.calibration.doubtful_times import DoubtfulTimes
+from mag_tracking.calibration.doubtful_times import DoubtfulTimes, shifted
 from mag_tracking.calibration.frequent_level import QuietLevel
 from mag_tracking.calibration.screening import clear_spikes
 from mag_tracking.calibration.sensor_state import new_sensors
@@ -79,9 +79,8 @@ class Calibrate:
     def renew(self, network: SensorNetwork) -> None:
         """Continue with another calibration of the same sensors.
 
-        A background is learnt again where the sensor's own offset or correction has changed;
-        otherwise it stays, also a frozen one: a target that stands there must not become the
-        background. Raises NetworkError where the sensors are others.
+        A background is learnt again where the offset or correction of its sensor has changed; else
+        it stays, also a frozen one. Raises NetworkError where the sensors are others.
         """
         if network.names != tuple(self._index):
             raise NetworkError(f'a network of {", ".join(network.names)} in place of one of '
@@ -108,6 +107,8 @@ class Calibrate:
         for name in ('first_ns', 'last_ns', 'unconfirmed_ns'):
             if s[name] != NEVER:
                 s[name] += shift
+        background = self._background[network.names[i]]
+        background.doubtful_times = shifted(background.doubtful_times, shift)
         offset, correction = network.offset[i], network.correction[i]
         s['clock_offset_ns'] = network.clock_offset_ns[i]
         s['offset'] = 0.0 if offset is None else offset
@@ -263,8 +264,7 @@ class Calibrate:
 
     def stored(self, sensor: str) -> StoredBackground | None:
         """Background of a sensor for `resume`; None before it is known for certain."""
-        background = self._background[sensor]
-        last = self.last_stamp_ns(sensor)
+        background, last = self._background[sensor], self.last_stamp_ns(sensor)
         if not background.certain or last is None:
             return None
         return stored_background(background, last, self.background(sensor))

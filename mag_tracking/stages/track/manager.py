@@ -50,6 +50,7 @@ class TrackManager:
         # A target that was lost is not started again in the tail of its own detection.
         self._tail_of_detection = False
         self._next_network: SensorNetwork | None = None
+        self._doubtful_times: Mapping[str, DoubtfulTimes] = {}
         self._doubtful: dict[int, DoubtfulTimes] = {}
         uncertain = sum(bool(s is not None and s.max() > MOST_TURNED)
                         for s in network.orientation_std)
@@ -80,7 +81,9 @@ class TrackManager:
 
         `times` {sensor: ((begin, end) [ns], ...)} take the place of those before.
         """
-        self._doubtful = {self._network.index(name): t for name, t in times.items()}
+        if times != self._doubtful_times:
+            self._doubtful_times = times
+            self._doubtful = {self._network.index(name): t for name, t in times.items()}
 
     def _doubtful_sensors(self, *frames: FieldFrame) -> list[int]:
         """Rows of the sensors whose backgrounds are doubtful in one of the frames."""

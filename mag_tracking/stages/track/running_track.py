@@ -130,7 +130,7 @@ class RunningTrack:
             return []
         best = self.bank.best()
         late = [] if self._lag is None else self._smoothed(best, False, self._lag.smoothed(
-            self._filter, self.bank, best, used, dt, publish))
+            self._filter, self.bank, best, used, dt, publish), self._evidence.doubted)
         return [*self._publish(used, dt, best), *late, *self._end_if_over()] if publish else []
 
     def _update(self, frame: FieldFrame, dt: float, publish: bool) -> FieldFrame | None:
@@ -210,7 +210,7 @@ class RunningTrack:
             mounting_covariance=observation.angle_covariances(bank.P[best])), self._settings)
 
     def _smoothed(self, best: int, complete: bool, states: list[TrackState],
-                  doubtful: bool = False) -> list[SmoothedPose]:
+                  doubtful: bool) -> list[SmoothedPose]:
         """The `SmoothedPose`s of states of the hypothesis `best`."""
         ambiguous = doubtful or is_ambiguous(self.bank, best)
         kind = int(self.bank.kind[best])

@@ -278,7 +278,8 @@ def test_clocks_that_are_far_apart_are_named_but_not_those_of_a_replay():
 def test_the_doctor_looks_at_backgrounds():
     # What was seen for a moment only would give way earlier.
     steps = doctored(lambda k, field: field + 1e-6 * (k > 1000), seconds=75.0)
-    assert len(steps) == 1 and 'its background has not been learnt for 5' in steps[0]
+    assert len(steps) == 2 and 'its background has not been learnt for 5' in steps[1]
+    assert 'its background is doubtful' in steps[0]
     parked = doctored(lambda k, field: field + 1e-6 * (k > 1000), seconds=95.0)
     assert len(parked) == 1 and 'was taken for its background 1 times' in parked[0]
     early = doctored(seconds=2.0)
