@@ -224,7 +224,10 @@ class RunningBackground:
         """Without a quiet stretch: begin with the most frequent level."""
         self._provisional.collect(block)
         found = self._provisional.found(corrected_steps(self._sensors))
-        if found is not None and (found.is_certain or self._given is not None):
+        if found is not None and self._given is not None:
+            self.begin_with(self._given, found.level.covariance)
+            self._strange.clear()
+        elif found is not None and found.is_certain:
             self._begin_with_frequent(found)
         elif found is not None:
             level, noise = found.level, self._level.without_dead_axes(found.level.covariance)
@@ -235,10 +238,8 @@ class RunningBackground:
 
     def _begin_with_frequent(self, found: FrequentLevel) -> None:
         """Begin with a level that is frequent enough; others may still take its place."""
-        level = found.level
-        self.begin_with(level.level if self._given is None else self._given, level.covariance)
-        self._seen_s = inf if self._given is not None else found.seen_s
-        self.frozen = self._contested = False
+        self.begin_with(found.level.level, found.level.covariance)
+        self._seen_s, self.frozen, self._contested = found.seen_s, False, False
         self._strange.clear()
 
     def _follow(self, block: Block) -> None:

@@ -5,20 +5,13 @@ first pass looks for a quiet stretch. A flagged or missing track is no error her
 """
 
 import argparse
-import os
 import sys
-from concurrent.futures import ProcessPoolExecutor
 
-import numpy as np
-from tqdm import tqdm
-
+from bench.two_simulators import MOST_WRONG, count_over, share_of_wrong
 from support import spoiler
 from support.dense_traffic import dense_traffic
 from support.random_passes import KINDS, SIMULATORS, one_random_pass
-
-MOST_WRONG = 0.01
-HEADING = np.cos(np.deg2rad(45.0))
-"""Cosine of the largest angle of a direction that is right."""
+from support.spoilt_runs import HEADING
 
 FAULTS = {
     'none': (),
@@ -56,9 +49,7 @@ def spoilt_pass(what, simulator, kind, seed):
 
 def summary(what, simulator, kind, found):
     """(line, whether the aim is met) of the `Tracked` of one product."""
-    n_sure = sum(int((~f.ambiguous).sum()) for f in found)
-    wrong = sum(int(f.sure_and_wrong.sum()) for f in found)
-    share = wrong / max(n_sure, 1)
+    _, share = share_of_wrong(found)
     n_tracked = sum(len(f.error) > 0 for f in found)
     right = sum(bool(f.heading > HEADING) for f in found)
     met = share <= MOST_WRONG
@@ -77,18 +68,8 @@ def main():
     given = parser.parse_args()
     print(f'{given.passes} random passes of each product, two sensors, 100 Hz; the aim is at most '
           f'{MOST_WRONG:.0%} sure and wrong')
-    met = True
-    with ProcessPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
-        jobs = {(w, s, k): [pool.submit(spoilt_pass, w, s, k, seed)
-                            for seed in range(given.passes)]
-                for w in FAULTS for s in SIMULATORS for k in given.kinds}
-        for product, some in jobs.items():
-            found = [job.result() for job in tqdm(some, desc=', '.join(product), disable=None,
-                                                  leave=False)]
-            line, good = summary(*product, found)
-            print(line, flush=True)
-            met &= good
-    return 0 if met else 1
+    return count_over([(w, s, k) for w in FAULTS for s in SIMULATORS for k in given.kinds],
+                      spoilt_pass, given.passes, summary)
 
 
 if __name__ == '__main__':

@@ -17,18 +17,36 @@ MOST_NEES = {'truck': 5.0, 'car': 2.5, 'turning': 2.5}
 MOST_WRONG, LEAST_SPEED = 0.01, 0.9
 
 
+def share_of_wrong(found):
+    """(number of unflagged poses, share of them that is wrong) of `Tracked`."""
+    n_sure = sum(int((~f.ambiguous).sum()) for f in found)
+    return n_sure, sum(int(f.sure_and_wrong.sum()) for f in found) / max(n_sure, 1)
+
+
+def count_over(products, one_pass, n, summary):
+    """Print the `summary` of `n` passes of each product (str, ...); 1 where an aim is missed."""
+    met = True
+    with ProcessPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
+        jobs = {p: [pool.submit(one_pass, *p, seed) for seed in range(n)] for p in products}
+        for product, some in jobs.items():
+            found = [job.result() for job in tqdm(some, desc=', '.join(product), disable=None,
+                                                  leave=False)]
+            line, good = summary(*product, found)
+            print(line, flush=True)
+            met &= good
+    return 0 if met else 1
+
+
 def summary(simulator, kind, found):
     """(line, whether the aims are met) of the `Tracked` of one kind of one simulator."""
     sure = [f for f in found if (~f.ambiguous).any()]
-    n_sure = sum(int((~f.ambiguous).sum()) for f in sure)
-    wrong = sum(int(f.sure_and_wrong.sum()) for f in sure)
     near = [~f.ambiguous & (f.distance < 5.0) for f in sure]
     nees = np.array([f.nees[rows].mean() for f, rows in zip(sure, near, strict=True)
                      if rows.any()])
     closest = [f.error[np.argmin(f.distance)] for f in sure]
     fast = np.array([f.speed_ratio for f in found])
     within = np.mean(np.abs(fast - 1.0) < 0.1)
-    share = wrong / max(n_sure, 1)
+    n_sure, share = share_of_wrong(sure)
     met = share <= MOST_WRONG and nees.mean() <= MOST_NEES[kind] and within >= LEAST_SPEED
     return (f'  {simulator}, {kind}: {len(sure)} of {len(found)} tracked and somewhere '
             f'unambiguous; {n_sure} such poses, sure and wrong {share:.1%} (aim 1 %), in '
@@ -44,17 +62,7 @@ def main():
     parser.add_argument('--passes', type=int, default=40)
     n = parser.parse_args().passes
     print(f'{n} random passes of each kind of each simulator, two sensors, 100 Hz')
-    met = True
-    with ProcessPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
-        jobs = {(s, k): [pool.submit(one_random_pass, s, k, seed) for seed in range(n)]
-                for s in SIMULATORS for k in KINDS}
-        for (simulator, kind), some in jobs.items():
-            found = [job.result() for job in tqdm(some, desc=f'{simulator}, {kind}', disable=None,
-                                                  leave=False)]
-            line, good = summary(simulator, kind, found)
-            print(line, flush=True)
-            met &= good
-    return 0 if met else 1
+    return count_over([(s, k) for s in SIMULATORS for k in KINDS], one_random_pass, n, summary)
 
 
 if __name__ == '__main__':

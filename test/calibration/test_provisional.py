@@ -90,6 +90,11 @@ def test_what_stood_there_before_dense_traffic_is_doubted_and_replaced(stood_s):
     assert b.certain and (np.abs(b.level(140.0) - EARTH) < 2.0 * SIGMA).all()
 
 
+def test_a_wrong_background_that_was_given_gives_way_once():
+    b = fed(traffic(2.0), 140.0, background=EARTH + 2e-6, noise_std=SIGMA)
+    assert b.n_relearnt == 1 and (np.abs(b.level(140.0) - EARTH) < 2.0 * SIGMA).all()
+
+
 def test_what_halts_in_dense_traffic_is_not_certain_for_ever():
     """It is the only level for half a minute; then it leaves, and the traffic goes on."""
     vehicles = traffic(2.0, begin=40.0)
@@ -133,7 +138,7 @@ def test_a_drift_that_no_sensor_has_is_doubted():
     for rate, is_doubtful in ((2e-8, True), (1e-9, False)):
         b = fed(lambda t, rate=rate: rate * t * np.ones(3), 6.0)
         assert b.ready and b.doubtful == is_doubtful
-        assert (level_deviation(b) > 0.0).all() == is_doubtful
+        assert ((level_deviation(b) > 0.0) == is_doubtful).all()
 
 
 def readings(signal, seconds, seed=0):

@@ -15,9 +15,11 @@ def test_every_fault_spoils(what):
     for fault in spoil_with(what):
         spoilt = fault(readings)
         if len(spoilt) == len(readings):
-            changed = ~np.isclose(spoilt.field, readings.field, rtol=0.0, atol=1e-12).all()
-            changed |= bool((spoilt.stamp_ns != readings.stamp_ns).any())
-            assert changed or spoilt.covariance is not None
+            # The recording states no covariance.
+            assert readings.covariance is None
+            assert spoilt.covariance is not None \
+                or (spoilt.stamp_ns != readings.stamp_ns).any() \
+                or not np.allclose(spoilt.field, readings.field, rtol=0.0, atol=1e-12)
         else:
             assert 0 < len(spoilt) < len(readings)
 
