@@ -8,7 +8,7 @@ import dataclasses
 import difflib
 import math
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from os import PathLike
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, TypeVar
 
@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 Scalar: TypeAlias = bool | int | float | str
 Value: TypeAlias = Scalar | tuple[Scalar, ...]
 """What a setting can be."""
+
+REPLACED = {'track.vehicle.soft_iron': 'track.vehicle.induced_share',
+            'track.vehicle.soft_iron_std': 'track.vehicle.induced_share_std'}
+"""Settings of before, and those that have taken their place."""
 
 _Class: TypeAlias = type[object]
 _Default = TypeVar('_Default')
@@ -155,11 +159,17 @@ def replace(settings: _Settings, changes: Mapping[str, Any]) -> _Settings:
     checked = {}
     for name, value in _dotted(changes).items():
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f'; did you mean {near[0]}?' if near else ''
-            raise SettingsError(f'unknown setting {name}{hint}')
+            raise SettingsError(f'unknown setting {name}{_hint(name, known)}')
         checked[name] = _checked(known[name], value)
     return _rebuild(settings, checked, '')
+
+
+def _hint(name: str, known: Iterable[str]) -> str:
+    """What may have been meant by a `name` that is not `known`."""
+    if name in REPLACED:
+        return f'; {REPLACED[name]} has taken its place, in another unit'
+    near = difflib.get_close_matches(name, known, n=1)
+    return f'; did you mean {near[0]}?' if near else ''
 
 
 def _rebuild(settings: _Settings, checked: Mapping[str, Value], prefix: str) -> _Settings:

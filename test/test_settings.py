@@ -36,6 +36,7 @@ def test_every_setting_is_documented_and_its_default_is_in_range():
 
 
 @pytest.mark.parametrize('changes, message', [
+    ({'track.vehicle.soft_iron': 4.0}, 'track.vehicle.induced_share has taken its place'),
     ({'align': {'perod_s': 0.1}}, 'unknown setting align.perod_s; did you mean align.period_s'),
     ({'align.period_s': 'long'}, 'align.period_s: expected float'),
     ({'align.period_s': -1.0}, 'align.period_s: -1.0 is outside'),

@@ -16,6 +16,37 @@ FASTEST_TURN = 1.0
 """[rad/s] Deviation of the turn rate of a vehicle that is slow; no car turns much faster."""
 
 
+@njit(error_model='numpy', forceinline=True)
+def _position(x: FloatArray, p: int, i: int, place: float, c: float, s: float, turn_x: float,
+           turn_y: float, r: FloatArray, dr_dx: FloatArray) -> None:
+    """Position of dipole i of hypothesis p, and its derivatives."""
+    for a in range(3):
+        r[p, i, a] = x[p, a]
+        dr_dx[p, i, a, a] = 1.0
+    d = r.shape[1]
+    if d > 1:
+        length = 9 + 3 * d
+        ahead = place * x[p, length]
+        r[p, i, 0] += ahead * c
+        r[p, i, 1] += ahead * s
+        dr_dx[p, i, 0, length], dr_dx[p, i, 1, length] = place * c, place * s
+        dr_dx[p, i, 0, 3], dr_dx[p, i, 0, 4] = -ahead * s * turn_x, -ahead * s * turn_y
+        dr_dx[p, i, 1, 3], dr_dx[p, i, 1, 4] = ahead * c * turn_x, ahead * c * turn_y
+
+
+@njit(error_model='numpy', forceinline=True)
+def _induced(soft_x: float, soft_y: float, ahead: float, left: float, c: float, s: float
+             ) -> tuple[float, float, float, float]:
+    """Horizontal moment [A m^2], in the world, that B/mu0 [A/m] `ahead` and to the `left` induces
+    in soft iron [m^3], and its derivative by the heading, whose cosine and sine are c and s.
+    """
+    m_ahead, m_left = soft_x * ahead, soft_y * left
+    # A body that turns anticlockwise sees the field turn clockwise.
+    dm_ahead, dm_left = soft_x * left - m_left, m_ahead - soft_y * ahead
+    return (c * m_ahead - s * m_left, s * m_ahead + c * m_left,
+            c * dm_ahead - s * dm_left, s * dm_ahead + c * dm_left)
+
+
 @njit('void(float64[:,:], float64[:], float64[:], float64[:,:,::1], float64[:,:,::1], '
       'float64[:,:,:,::1], float64[:,:,:,::1])', cache=True, error_model='numpy')
 def _row_dipoles(x: FloatArray, places: FloatArray, induction: FloatArray, r: FloatArray,
@@ -27,6 +58,7 @@ def _row_dipoles(x: FloatArray, places: FloatArray, induction: FloatArray, r: Fl
     """
     d = places.shape[0]
     soft = 6 + 3 * d
+    h_x, h_y, h_z = induction[0] / d, induction[1] / d, induction[2] / d
     for p in range(x.shape[0]):
         vx, vy = x[p, 3], x[p, 4]
         speed = math.sqrt(vx * vx + vy * vy)
@@ -36,42 +68,40 @@ def _row_dipoles(x: FloatArray, places: FloatArray, induction: FloatArray, r: Fl
             c, s = vx * slowness, vy * slowness
         # d(heading)/dv = [-sin, cos]/|v|
         turn_x, turn_y = -s * slowness, c * slowness
-        share = x[p, soft] / d
+        ahead, left = c * h_x + s * h_y, c * h_y - s * h_x
+        soft_x, soft_y, by_x, by_y = _induced(x[p, soft], x[p, soft + 1], ahead, left, c, s)
         for i in range(d):
             k = 6 + 3 * i
             hard_x, hard_y = c * x[p, k] - s * x[p, k + 1], s * x[p, k] + c * x[p, k + 1]
-            m[p, i, 0] = hard_x + share * induction[0]
-            m[p, i, 1] = hard_y + share * induction[1]
-            m[p, i, 2] = x[p, k + 2] + share * induction[2]
+            m[p, i, 0], m[p, i, 1] = hard_x + soft_x, hard_y + soft_y
+            m[p, i, 2] = x[p, k + 2] + h_z * x[p, soft + 2]
             dm_dx[p, i, 0, k], dm_dx[p, i, 0, k + 1] = c, -s
             dm_dx[p, i, 1, k], dm_dx[p, i, 1, k + 1] = s, c
             dm_dx[p, i, 2, k + 2] = 1.0
             # d(hard)/d(heading) = z x hard
-            dm_dx[p, i, 0, 3], dm_dx[p, i, 0, 4] = -hard_y * turn_x, -hard_y * turn_y
-            dm_dx[p, i, 1, 3], dm_dx[p, i, 1, 4] = hard_x * turn_x, hard_x * turn_y
-            for a in range(3):
-                r[p, i, a] = x[p, a]
-                dr_dx[p, i, a, a] = 1.0
-                dm_dx[p, i, a, soft] = induction[a] / d
-            if d > 1:
-                ahead = places[i] * x[p, soft + 1]
-                r[p, i, 0] += ahead * c
-                r[p, i, 1] += ahead * s
-                dr_dx[p, i, 0, soft + 1], dr_dx[p, i, 1, soft + 1] = places[i] * c, places[i] * s
-                dr_dx[p, i, 0, 3], dr_dx[p, i, 0, 4] = -ahead * s * turn_x, -ahead * s * turn_y
-                dr_dx[p, i, 1, 3], dr_dx[p, i, 1, 4] = ahead * c * turn_x, ahead * c * turn_y
+            turned_x, turned_y = by_x - hard_y, by_y + hard_x
+            dm_dx[p, i, 0, 3], dm_dx[p, i, 0, 4] = turned_x * turn_x, turned_x * turn_y
+            dm_dx[p, i, 1, 3], dm_dx[p, i, 1, 4] = turned_y * turn_x, turned_y * turn_y
+            dm_dx[p, i, 0, soft], dm_dx[p, i, 0, soft + 1] = c * ahead, -s * left
+            dm_dx[p, i, 1, soft], dm_dx[p, i, 1, soft + 1] = s * ahead, c * left
+            dm_dx[p, i, 2, soft + 2] = h_z
+            _position(x, p, i, places[i], c, s, turn_x, turn_y, r, dr_dx)
 
 
 @dataclass(frozen=True)
 class RowVehicle:
     """A row of equidistant dipoles along the heading, of unknown length; one dipole is a point.
 
-    State (6 + 3 d + 2, with one dipole 10, without a length; one more if any vehicle may turn):
+    State (6 + 3 d + 4, with one dipole 12, without a length; one more if any vehicle may turn):
     position r of the row's middle, velocity v, hard iron moment of each dipole in the vehicle's
-    frame (x forward, z up; from the tail to the head), soft iron scalar D [m^3] of the whole,
-    length L [m], turn rate w [rad/s].
+    frame (x forward, z up; from the tail to the head), soft iron of the whole, the diagonal
+    [m^3] of a tensor D in that frame, length L [m], turn rate w [rad/s].
 
-        m_i = Rz(heading) m0_i + D/(d mu0) B0,    r_i = r + (i - (d+1)/2) L/(d-1) heading
+        m_i = R (m0_i + D R^T B0/(d mu0)) with R = Rz(heading),
+        r_i = r + (i - (d+1)/2) L/(d-1) heading
+
+    Sheets and axles are magnetised along themselves, so that a body is easier to magnetise along
+    some of its axes; where all three are equal D is the scalar of the source.
 
     The heading is that of the horizontal velocity; no roll, pitch or slip. Where the speed is
     zero the heading is atan2(0, 0) = 0 and its derivative is taken as zero. With one dipole, or
@@ -79,7 +109,7 @@ class RowVehicle:
     its other end.
 
     Source: TSP14 eq. (10), (16); ICASSP11 eq. (8) for the moments, (D/mu0) B0 and not T10's
-    (3D/mu0) B0.
+    (3D/mu0) B0; MITRE12 eq. (A.5) for a D that depends on the axis.
     """
 
     earth_field: FloatArray
@@ -101,7 +131,8 @@ class RowVehicle:
     def state_names(self) -> tuple[str, ...]:
         """Names of the states, in order."""
         return ('x', 'y', 'z', 'vx', 'vy', 'vz',
-                *(f'm{i + 1}{axis}' for i in range(self.n_dipoles) for axis in 'xyz'), 'D',
+                *(f'm{i + 1}{axis}' for i in range(self.n_dipoles) for axis in 'xyz'),
+                'Dx', 'Dy', 'Dz',
                 *(('L',) if self.n_dipoles > 1 else ()),
                 *(('w',) if self.turn_acceleration else ()))
 
@@ -149,9 +180,9 @@ class RowVehicle:
         n, d = x.shape[1], self.n_dipoles
         Q = np.zeros((len(x), n, n))
         Q[:, :6, :6] = integrator_noise(dt, self.acceleration_density)
-        hard = slice(6, 6 + 3 * d)
+        hard, soft = slice(6, 6 + 3 * d), slice(6 + 3 * d, 9 + 3 * d)
         size2 = (np.square(x[:, hard].reshape(-1, d, 3).sum(axis=1)).sum(axis=1)
-                 + np.square(x[:, hard.stop]) * (self._induction @ self._induction))
+                 + np.square(x[:, soft]).mean(axis=1) * (self._induction @ self._induction))
         Q[:, hard, hard] = size2[:, None, None] * (abs(dt) * self._walk)
         if not self.turn_acceleration:
             F = np.eye(n)

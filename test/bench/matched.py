@@ -16,10 +16,10 @@ from tqdm import tqdm
 
 from mag_tracking.inference.crlb import path_bound
 from mag_tracking.network import SensorNetwork
-from mag_tracking.physics.dipole import sensor_fields
+from mag_tracking.physics.dipole import MU0, sensor_fields
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import FieldFrame
-from mag_tracking.stages.track.initiation_vehicle import vehicle_model
+from mag_tracking.stages.track.initiation_vehicle import SHARE_FIELD, vehicle_model
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.units import NS
 
@@ -36,32 +36,34 @@ MATCHED = {'track.mounting_std_deg': 0.0, 'track.model_error_time_s': 0.0,
            'track.vehicle.height_stds': [0.2],
            'track.vehicle.arrival_names': ['left'], 'track.vehicle.arrival_headings_deg': [0.0],
            'track.vehicle.turn_acceleration': 0.0,
-           'track.vehicle.speeds': [7.0, 10.0, 14.0], 'track.vehicle.soft_iron': 0.0,
-           'track.vehicle.soft_iron_std': 1.0, 'track.background_std': 1e-8,
+           'track.vehicle.speeds': [7.0, 10.0, 14.0], 'track.vehicle.induced_share': 0.0,
+           'track.vehicle.induced_share_std': 0.1, 'track.background_std': 1e-8,
            'track.background_drift': 1e-9, 'track.vehicle.acceleration': 0.3,
            'track.vehicle.moment_drift': 0.01, 'track.vehicle.difference_drift': 0.005}
 TARGETS = {
     'point': {**MATCHED, 'track.vehicle.lengths': [0.0], 'track.vehicle.length_stds': [0.0],
               'track.vehicle.difference_stds': [0.0]},
-    'row of three': {**MATCHED, 'track.vehicle.lengths': [3.0], 'track.vehicle.length_stds': [0.5],
-                     'track.vehicle.difference_stds': [30.0]}}
+    'row of three': {**MATCHED, 'track.vehicle.dipoles': 3, 'track.vehicle.lengths': [3.0],
+                     'track.vehicle.length_stds': [0.5], 'track.vehicle.difference_stds': [30.0]}}
 
 
 def prior_of(settings, n_t):
     """Mean and covariance of what the truths are drawn from: it comes along x, from 12 m on."""
     v = settings.vehicle
     x, P = np.zeros(n_t + 6), np.zeros((n_t + 6, n_t + 6))
-    hard = n_t - 2 if n_t > 10 else n_t - 1
-    d = (hard - 6) // 3
-    x[[0, 2, 3, hard]] = -12.0, v.heights[0], 10.0, v.soft_iron
-    x[hard + 1:n_t] = v.lengths[0]
+    assert v.induced_share == 0.0
+    d = vehicle_model(v, NETWORK).n_dipoles
+    hard = 6 + 3 * d
+    x[[0, 2, 3]] = -12.0, v.heights[0], 10.0
+    x[hard + 3:n_t] = v.lengths[0]
     std = np.r_[2.0, 2.0, v.height_stds[0], 3.0, 0.5, 0.05]
     P[:6, :6] = np.diag(std**2)
     mean = np.full((d, d), 1.0 / d)
     P[6:hard, 6:hard] = np.kron(v.moments[0]**2 / 3.0 / d * mean
                                 + v.difference_stds[0]**2 * (np.eye(d) - mean), np.eye(3))
-    P[hard, hard] = 1.0
-    P[hard + 1:n_t, hard + 1:n_t] = v.length_stds[0]**2
+    soft_iron_std = v.induced_share_std * v.moments[0] * MU0 / SHARE_FIELD
+    P[hard:hard + 3, hard:hard + 3] = soft_iron_std**2 * (1.0 + np.eye(3))
+    P[hard + 3:n_t, hard + 3:n_t] = v.length_stds[0]**2
     P[n_t:, n_t:] = settings.background_std**2 * np.eye(6)
     return x, P
 

@@ -38,8 +38,8 @@ def test_the_innovations_stay_with_their_hypotheses():
 def test_another_arrival_makes_a_track_ambiguous_even_where_the_places_agree(
         other, label, ambiguous):
     model = RowVehicle(np.zeros(3), np.ones(3), n_dipoles=1)
-    x = np.tile([1.0, 2.0, 0.5, 10.0, 0.0, 0.0, 100.0, 0.0, 0.0, 0.0], (2, 1))
-    b = FilterBank(x, np.repeat(np.eye(10)[None], 2, axis=0), np.log([other, 1.0 - other]),
+    x = np.tile([1.0, 2.0, 0.5, 10.0, 0.0, 0.0, 100.0, 0.0, 0.0, 0.0, 0.0, 0.0], (2, 1))
+    b = FilterBank(x, np.repeat(np.eye(12)[None], 2, axis=0), np.log([other, 1.0 - other]),
                    np.array([label, 0]), np.array([0, 1]), np.arange(2),
                    np.array([[7.0, np.nan], [1.0, 2.0]]))
     track = published_track(
@@ -140,9 +140,10 @@ def starts(network, earth, offset_std=0.5):
     for m in 300.0 * moment_directions():
         for lateral in (-1.0, 0.0, 1.0):
             for speed in (8.0, 10.0, 12.0):
-                x.append([-12.0, lateral, 0.5, speed, 0.0, 0.0, *(m - 4.0 * earth / MU0), 4.0])
+                x.append([-12.0, lateral, 0.5, speed, 0.0, 0.0, *(m - 4.0 * earth / MU0),
+                          4.0, 4.0, 4.0])
                 P.append(np.diag([0.5, offset_std, 0.1, 1.0, 0.3, 0.02,
-                                  120.0, 120.0, 120.0, 1.0]) ** 2)
+                                  120.0, 120.0, 120.0, 1.0, 1.0, 1.0]) ** 2)
     bank = FilterBank.of_targets(np.array(x), np.array(P), np.zeros(len(x), dtype=int),
                                  len(network), 1e-8)
     return bank
@@ -153,20 +154,20 @@ def matched_run(rng, network, model, sigma):
     earth = model.earth_field
     bank = starts(network, earth)
     row = rng.integers(len(bank))
-    n_x = bank.x.shape[1]
+    n_t, n_x = len(model.state_names), bank.x.shape[1]
     truth = rng.multivariate_normal(bank.x[row], bank.P[row])
     dt = 0.08
     C = np.repeat(sigma**2 * np.eye(3)[None], len(network), axis=0)
     for k in range(22):
         if k:
-            moved, F, Q = model.propagate(truth[None, :10], dt)
-            truth[:10] = moved[0] + rng.multivariate_normal(np.zeros(10), Q[0])
-            truth[10:] += 1e-9 * np.sqrt(dt) * rng.standard_normal(n_x - 10)
-            x_target, F, Q = model.propagate(bank.x[:, :10], dt)
+            moved, F, Q = model.propagate(truth[None, :n_t], dt)
+            truth[:n_t] = moved[0] + rng.multivariate_normal(np.zeros(n_t), Q[0])
+            truth[n_t:] += 1e-9 * np.sqrt(dt) * rng.standard_normal(n_x - n_t)
+            x_target, F, Q = model.propagate(bank.x[:, :n_t], dt)
             predict(bank.x, bank.P, x_target, F, Q, 1e-18 * dt)
-        h = sensor_fields(network.positions, network.R_sw, *model.dipoles(truth[None, :10]))[0][0]
-        y = h + truth[10:].reshape(-1, 3) + sigma * rng.standard_normal(h.shape)
-        h, H, _ = sensor_fields(network.positions, network.R_sw, *model.dipoles(bank.x[:, :10]))
+        h = sensor_fields(network.positions, network.R_sw, *model.dipoles(truth[None, :n_t]))[0][0]
+        y = h + truth[n_t:].reshape(-1, 3) + sigma * rng.standard_normal(h.shape)
+        h, H, _ = sensor_fields(network.positions, network.R_sw, *model.dipoles(bank.x[:, :n_t]))
         log_likelihood, _ = kalman.update(bank.x, bank.P, y, h, H, C,
                                           np.zeros((len(bank), len(network))))
         bank.reweight(log_likelihood)

@@ -71,7 +71,8 @@ def tracked(n_sensors, missing=False):
         y[1] = np.nan
     x, P = bank.x.copy(), bank.P.copy()
     model = target_of(pipeline.settings.track, network).model
-    h, H, gradient = sensor_fields(network.positions, network.R_sw, *model.dipoles(x[:, :10]))
+    h, H, gradient = sensor_fields(network.positions, network.R_sw,
+                                   *model.dipoles(x[:, :len(model.state_names)]))
     C = np.repeat(1.44e-16 * np.array([[1.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 0.8]])[None],
                   n_sensors, axis=0)
     return x, P, y, h, H, C, gradient**2

@@ -245,7 +245,7 @@ def test_parameters_have_descriptors_and_are_checked(ros):
     try:
         described = call(ros, DescribeParameters, '/tracker_node/describe_parameters',
                          DescribeParameters.Request(names=[
-                             'track.field_error', 'track.vehicle.soft_iron'])).descriptors
+                             'track.field_error', 'track.vehicle.induced_share'])).descriptors
         assert all(d.description for d in described)
         assert described[0].floating_point_range[0].to_value == 10.0
         assert [d.read_only for d in described] == [False, True]
@@ -255,8 +255,8 @@ def test_parameters_have_descriptors_and_are_checked(ros):
                         SetParameters.Request(parameters=[
                             Parameter(name, value=value).to_parameter_msg()])).results[0]
         assert set_parameter('track.field_error', 0.03).successful
-        for name, value in (('track.field_error', -1.0), ('track.vehicle.soft_iron', 1.0),
-                            ('track.nonsense', 1.0)):
+        for name, value in (('track.field_error', -1.0), ('track.nonsense', 1.0),
+                            ('track.vehicle.induced_share', 0.5)):
             assert not set_parameter(name, value).successful
     finally:
         codes, outputs = stop([process])

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from mag_tracking.geometry import cross_matrix, left_jacobian
+from mag_tracking.geometry import cross_matrix, left_jacobian, rotation_about_z
 from mag_tracking.physics import sources, vehicles
 from mag_tracking.physics.dipole import MU0, sensor_fields
+from mag_tracking.physics.ellipsoid import ellipsoid_moment
 from mag_tracking.physics.motion import constant_velocity, coordinated_turn, integrator_noise
 from mag_tracking.physics.sources import Magnet
 from mag_tracking.physics.vehicles import FASTEST_TURN, RowVehicle
@@ -161,10 +162,28 @@ def test_a_turn_rate_that_is_known_goes_straight_on():
 
 def test_vehicle_moment_is_hard_iron_turned_plus_soft_iron():
     model = EXAMPLES['RowVehicle of one']
-    x = np.zeros((1, 10))
-    x[0, 3:6], x[0, 6:9], x[0, 9] = [0.0, 7.0, 0.0], [100.0, 20.0, 5.0], 6.0
+    x = np.zeros((1, 12))
+    x[0, 3:6], x[0, 6:9], x[0, 9:] = [0.0, 7.0, 0.0], [100.0, 20.0, 5.0], 6.0
     expected = np.array([-20.0, 100.0, 5.0]) + 6.0 / MU0 * model.earth_field
     np.testing.assert_allclose(model.dipoles(x).m[0, 0], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize('heading', [0.0, 0.7, 2.0, -2.9])
+def test_soft_iron_is_induced_along_the_axes_of_the_vehicle(heading):
+    """R D R' B0/mu0; and `ellipsoid_moment`, MITRE12 eq. (A.5), the same written elsewhere."""
+    model, axes = EXAMPLES['RowVehicle'], (2.1, 0.9)
+    along = np.array([1.0, 0.0, 0.0])
+    p1, p2 = (ellipsoid_moment(axes, 11.0, 0.0, b)[k] * MU0 for k, b in (
+        (0, along), (1, np.roll(along, 1))))
+    x = np.zeros((1, len(model.state_names)))
+    x[0, 3:5] = 5.0 * np.array([np.cos(heading), np.sin(heading)])
+    x[0, 15:18] = 1.0, 2.0, 4.0
+    R = rotation_about_z(heading)
+    np.testing.assert_allclose(model.dipoles(x).m[0].sum(axis=0),
+                               R @ np.diag([1.0, 2.0, 4.0]) @ R.T @ EARTH / MU0, rtol=1e-9)
+    x[0, 15:18] = p1, p2, p2
+    np.testing.assert_allclose(model.dipoles(x).m[0].sum(axis=0),
+                               ellipsoid_moment(axes, 11.0, heading, EARTH), rtol=1e-9)
 
 
 @pytest.mark.parametrize('name', ['RowVehicle', 'RowVehicle of one'])
@@ -175,17 +194,17 @@ def test_standing_vehicle_has_a_finite_model(name):
 
 
 def test_states_of_another_model_are_refused():
-    with pytest.raises(ValueError, match=r'3 dipoles need 17 states, got an array \(2, 10\)'):
+    with pytest.raises(ValueError, match=r'3 dipoles need 19 states, got an array \(2, 10\)'):
         EXAMPLES['RowVehicle'].dipoles(np.zeros((2, 10)))
 
 
 def row_state(d, length, heading=0.6):
     """A state of a row of `d` dipoles whose whole moment does not depend on `d`."""
-    x = np.zeros((1, 6 + 3 * d + (2 if d > 1 else 1)))
+    x = np.zeros((1, 6 + 3 * d + (4 if d > 1 else 3)))
     x[0, :6] = [3.0, -1.0, 0.5, 8.0 * np.cos(heading), 8.0 * np.sin(heading), 0.2]
     x[0, 6:6 + 3 * d] = np.tile(np.array([250.0, -90.0, 60.0]) / d, d)
-    x[0, 6 + 3 * d] = 4.0
-    x[0, 7 + 3 * d:] = length
+    x[0, 6 + 3 * d:9 + 3 * d] = 4.0
+    x[0, 9 + 3 * d:] = length
     return x
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mag_tracking.physics.dipole import dipole_field
+from mag_tracking.physics.dipole import MU0, dipole_field
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track.bank_filter import BankFilter
@@ -47,21 +47,32 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
     frame = FieldFrame(0, np.full((2, 3), 1e-7), np.repeat(1e-16 * np.eye(3)[None], 2, axis=0),
                        np.full(2, 8), np.zeros(2))
     bank = start_vehicle(vehicle, road_network, frame, 2e-8, None)
-    m = vehicle_model(vehicle, road_network).dipoles(bank.x[:, :18]).m.sum(axis=1)
+    model = vehicle_model(vehicle, road_network)
+    length, turn = (model.state_names.index(name) for name in 'Lw')
+    m = model.dipoles(bank.x[:, :turn + 1]).m.sum(axis=1)
     np.testing.assert_allclose(np.linalg.norm(m, axis=1), np.take(vehicle.moments, bank.kind),
                                rtol=1e-9)
-    np.testing.assert_array_equal(bank.x[:, 16], np.take(vehicle.lengths, bank.kind))
+    np.testing.assert_array_equal(bank.x[:, length], np.take(vehicle.lengths, bank.kind))
+    # In 50 uT the soft iron of each axis has its share of that moment.
+    soft = [model.state_names.index(f'D{axis}') for axis in 'xyz']
+    share = bank.x[:, soft] * 5e-5 / MU0 / np.take(vehicle.moments, bank.kind)[:, None]
+    np.testing.assert_allclose(share, vehicle.induced_share, rtol=1e-12)
+    share_covariance = (bank.P[:, soft][:, :, soft] * (5e-5 / MU0)**2
+                        / np.square(np.take(vehicle.moments, bank.kind))[:, None, None])
+    np.testing.assert_allclose(share_covariance / vehicle.induced_share_std**2 - 1.0,
+                               np.tile(np.eye(3), (len(bank), 1, 1)), atol=1e-9)
     assert len(bank) == 3 * 3 * 14 * 3 * 3 * 2
     # Half of them turn, at first half as fast as the settings say; nobody knows which way.
-    turns = bank.P[:, 17, 17] > 0.0
-    assert np.count_nonzero(turns) == len(bank) // 2 and not bank.x[:, 17].any()
+    turns = bank.P[:, turn, turn] > 0.0
+    assert np.count_nonzero(turns) == len(bank) // 2 and not bank.x[:, turn].any()
     speed = np.hypot(*bank.x[:, 3:5].T)[turns]
-    np.testing.assert_allclose(bank.P[turns, 17, 17], (0.5 * vehicle.turn_acceleration / speed)**2)
+    np.testing.assert_allclose(bank.P[turns, turn, turn],
+                               (0.5 * vehicle.turn_acceleration / speed)**2)
     assert np.exp(bank.log_w[turns]).sum() == pytest.approx(vehicle.turn_share)
     assert len(set(bank.origin)) == len(bank)
     # What is called a point is one: neither a length nor differences.
     points = bank.P[bank.kind == 0]
-    assert not points[:, 16, 16].any()
+    assert not points[:, length, length].any()
     np.testing.assert_allclose(points[:, 6, 6], points[:, 6, 9], rtol=1e-12)
     for label, heading in enumerate(np.deg2rad(vehicle.arrival_headings_deg)):
         rows = bank.label == label
@@ -180,13 +191,13 @@ def test_backgrounds_wander_between_frames_and_angles_do_not(road_network):
     C = np.repeat(1e-16 * np.eye(3)[None], 2, axis=0)
     stage.feed(FieldFrame(0, np.full((2, 3), 1e-7), C, np.full(2, 8), np.zeros(2), True, 1e3, 6))
     before = np.diagonal(stage.bank.P, axis1=1, axis2=2).copy()
-    BankFilter(road_network, target_of(settings, road_network).model, settings).predict(
-        stage.bank, dt)
-    after = np.diagonal(stage.bank.P, axis1=1, axis2=2)
-    own, grown = before[:, 18:30].reshape(-1, 2, 6), after[:, 18:30].reshape(-1, 2, 6)
+    model = target_of(settings, road_network).model
+    BankFilter(road_network, model, settings).predict(stage.bank, dt)
+    after, n_t = np.diagonal(stage.bank.P, axis1=1, axis2=2), len(model.state_names)
+    own, grown = (a[:, n_t:n_t + 12].reshape(-1, 2, 6) for a in (before, after))
     np.testing.assert_array_equal(grown[:, :, :3], own[:, :, :3])
     # A model error forgets what was learnt of it, with its time of 0.3 s, and stays of size one.
     np.testing.assert_allclose(1.0 - grown[:, :, 3:],
                                np.exp(-2.0 * dt / 0.3) * (1.0 - own[:, :, 3:]), atol=1e-12)
     assert (own[:, :, 3:] < 1.0 - 1e-6).any()
-    np.testing.assert_allclose(after[:, 30:] - before[:, 30:], drift**2 * dt, rtol=1e-6)
+    np.testing.assert_allclose((after - before)[:, n_t + 12:], drift**2 * dt, rtol=1e-6)

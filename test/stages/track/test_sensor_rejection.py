@@ -46,10 +46,12 @@ def situation(n=6, seed=0, spread=0.3, n_hyp=5):
     network = line_network(n, spacing=4.0, tilt=0.2)
     model = vehicle_model(SETTINGS.vehicle, network)
     bank_filter = Counted(network, model, SETTINGS)
-    state = np.array([*TARGET, 10.0, 0.0, 0.0, *(MOMENT - 4.0 * network.earth_field / MU0), 4.0])
+    state = np.array([*TARGET, 10.0, 0.0, 0.0, *(MOMENT - 4.0 * network.earth_field / MU0),
+                      4.0, 4.0, 4.0])
     x = np.tile(state, (n_hyp, 1))
     x[:, :2] += spread * rng.standard_normal((n_hyp, 2))
-    P = np.tile(np.diag([spread, spread, 0.1, 1.0, 0.3, 0.02, 30.0, 30.0, 30.0, 0.2]) ** 2,
+    P = np.tile(np.diag([spread, spread, 0.1, 1.0, 0.3, 0.02, 30.0, 30.0, 30.0, 0.2, 0.2,
+                         0.2]) ** 2,
                 (n_hyp, 1, 1))
     bank = FilterBank.of_targets(x, P, np.arange(n_hyp), n, 1e-8,
                                  bank_filter.observation.own_covariance)
@@ -291,9 +293,14 @@ def test_of_two_sensors_the_track_is_flagged_from_then_on():
     assert not any(flags[None])
 
 
-@pytest.mark.parametrize('n_sensors', [3, 6])
-def test_of_more_the_others_are_believed(n_sensors):
-    pipeline, tracks, (begin, end) = passing(n_sensors, 'swaps axes')
+MISTAKEN = pytest.param(3, 0, marks=pytest.mark.xfail(strict=True, reason=(
+    'mag_3 is named in 6 of 17 frames: of three sensors, a track can be bent to any two; its poses '
+    'are flagged')))
+
+
+@pytest.mark.parametrize('n_sensors, seed', [MISTAKEN, (3, 1), (3, 2), (3, 3), (6, 0)])
+def test_of_more_the_others_are_believed(n_sensors, seed):
+    pipeline, tracks, (begin, end) = passing(n_sensors, 'swaps axes', seed)
     assert pipeline.track.counts['frames that mag_2 contradicted'] > 3
     assert [what for what in pipeline.track.counts if 'contradicted' in what] == [
         'frames that mag_2 contradicted']
@@ -304,6 +311,13 @@ def test_of_more_the_others_are_believed(n_sensors):
     assert {n_sensors - 1} <= set(used) <= {n_sensors - 1, n_sensors}
     assert all(t.degrees_of_freedom == 3 * np.count_nonzero(~np.isnan(t.nis_by_sensor))
                for t in tracks)
+
+
+def test_a_track_that_was_bent_to_the_wrong_two_is_flagged():
+    pipeline, tracks, (_, end) = passing(3, 'swaps axes', 0)
+    assert pipeline.track.counts['frames that mag_3 contradicted']
+    after = [t.ambiguous for t in tracks if t.stamp_ns / NS > end + 0.3]
+    assert len(after) > 10 and all(after)
 
 
 def test_without_a_fault_nobody_is_suspected():
