@@ -8,12 +8,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.stages.track.sensor_selection import from_nearest
 
 CAR_ROW = 4.0
-"""[m] A row of dipoles up to this length is that of a car, whose iron is about in its middle."""
-
-OFF_MIDDLE = 0.2
-"""The iron of a long vehicle is where its engine, axles and load are. What a row is longer than
-that of a car, times this, is the deviation of the vehicle's middle from that of the row, along the
-heading: the load may be at either end. No field tells it."""
+"""[m] A kind whose row is up to this long is a car: its iron is about in its middle."""
 
 MOVES = 3.0
 """A vehicle has a heading while its speed is larger than so many of its deviations."""
@@ -24,6 +19,10 @@ class UnseenLength:
 
     Until its rear has come near a sensor a car may be the engine of a truck: a row of dipoles
     explains either, and the evidence of the two is that of models which are both wrong.
+
+    The iron of a long vehicle is where its engine, axles and load are. By what it is longer than
+    its row it reaches back as long as its rear has not been felt; then at either end: where its
+    middle is, is uniform in between.
     """
 
     def __init__(self, lengths: Sequence[float], length_stds: Sequence[float]) -> None:
@@ -67,13 +66,16 @@ class UnseenLength:
             Row of the kind of vehicle among the lengths.
         """
         behind = 0.5 * (self._lengths - length)
+        square = np.maximum(behind, 0.0)**2 + 0.25 * self._stds**2
         # Once its middle would have passed a sensor, a longer vehicle has been felt.
         possible = ((self._lengths > self._lengths[kind]) & (behind > 0.0)
                     & (self._beyond < behind))
-        longer = (behind**2 + 0.25 * self._stds**2)[possible].sum() / len(self._lengths)
-        off_middle = OFF_MIDDLE * max(0.0, length - CAR_ROW)
+        variance = square[possible].sum() / len(self._lengths)
+        if self._lengths[kind] > CAR_ROW:
+            is_felt = self._beyond >= behind[kind]
+            variance += square[kind] / (3.0 if is_felt else 1.0)
         forward = self._forward_of(x, P)
-        covariance: FloatArray = (longer + off_middle**2) * np.outer(forward, forward)
+        covariance: FloatArray = variance * np.outer(forward, forward)
         return covariance
 
     def _forward_of(self, x: FloatArray, P: FloatArray) -> FloatArray:

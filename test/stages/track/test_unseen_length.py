@@ -5,10 +5,10 @@ import pytest
 
 from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.stages.track.published_pose import smoothed_pose, vehicle_orientation
-from mag_tracking.stages.track.unseen_length import CAR_ROW, OFF_MIDDLE, UnseenLength
+from mag_tracking.stages.track.unseen_length import UnseenLength
 
 SENSORS = np.array([[0.0, 4.0, 0.0], [1.0, -4.0, 0.0]])
-P = 0.04 * np.eye(17)
+P = 0.04 * np.eye(19)
 SMALL, CAR, TRUCK = range(3)
 
 
@@ -17,26 +17,50 @@ def of_vehicles():
 
 
 def at(place, heading=0.0, speed=8.0):
-    x = np.zeros(17)
+    x = np.zeros(19)
     x[:2], x[3:5] = place, [speed * np.cos(heading), speed * np.sin(heading)]
     return x
 
 
+def off_middle(length, half_std, is_felt, n=400_000):
+    """Samples of where the middle of a truck of 9 +- 3 m is, from that of its row, along it."""
+    rng = np.random.default_rng(0)
+    hidden = 0.5 * (9.0 - length) + half_std * rng.standard_normal(n)
+    return hidden * (rng.uniform(-1.0, 1.0, n) if is_felt else -1.0)
+
+
 @pytest.mark.parametrize('complete', [True, False])
-def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(complete):
-    """Along the heading, by a share of what it is longer than a car; a car as the filter says."""
-    model, unseen = RowVehicle(np.zeros(3), np.ones(3)), UnseenLength([3.0], [1.0])
-    x, said = at([0.0, 0.0], 0.5 * np.pi), {}
-    for length in (3.0, -3.0, 12.0):
-        x[16] = length
-        said[length] = smoothed_pose(
-            model, vehicle_orientation, x, P, unseen=unseen, stamp_ns=0, id=1, kind=0,
-            kinds=('car',), ambiguous=False, complete=complete).covariance
-    np.testing.assert_array_equal(said[3.0], P[:6, :6])
-    np.testing.assert_array_equal(said[-3.0], P[:6, :6])
-    expected = np.zeros((6, 6))
-    expected[1, 1] = (OFF_MIDDLE * (12.0 - CAR_ROW))**2
-    np.testing.assert_allclose(said[12.0] - P[:6, :6], expected, atol=1e-12)
+@pytest.mark.parametrize('length', [5.0, -5.0])
+def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(complete, length):
+    """Along the heading, by what it is longer than its row; a car as the filter says."""
+    model, x, said = RowVehicle(np.zeros(3), np.ones(3)), at([0.0, 0.0], 0.5 * np.pi), {}
+    x[18] = length
+    for kind, usual, std in (('car', 3.0, 1.0), ('truck', 9.0, 3.0)):
+        said[kind] = smoothed_pose(
+            model, vehicle_orientation, x, P, unseen=UnseenLength([usual], [std]), stamp_ns=0,
+            id=1, kind=0, kinds=(kind,), ambiguous=False,
+            complete=complete).covariance - P[:6, :6]
+    assert not said['car'].any()
+    along = said['truck'][1, 1]
+    assert along == pytest.approx(np.square(off_middle(5.0, 1.5, False)).mean(), rel=0.02)
+    said['truck'][1, 1] = 0.0
+    np.testing.assert_allclose(said['truck'], 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize('length', [4.0, 8.9])
+def test_a_truck_that_was_felt_has_its_iron_at_either_end(length):
+    unseen = of_vehicles()
+    for beyond in (-9.0, 8.0):
+        unseen.look(at([beyond, 0.0]), P, np.zeros((1, 3)), True)
+        expected = np.square(off_middle(length, 1.5, beyond > 0.0)).mean()
+        said = unseen.covariance(at([beyond, 0.0]), P, length, TRUCK)
+        assert said[0, 0] == pytest.approx(expected, rel=0.02)
+
+
+def test_a_row_that_is_longer_than_its_kind_hides_no_more_than_the_spread_of_it():
+    unseen = of_vehicles()
+    said = [unseen.covariance(at([-9.0, 0.0]), P, length, TRUCK)[0, 0] for length in (9.0, 15.0)]
+    np.testing.assert_allclose(said, 1.5**2)
 
 
 def test_a_car_that_comes_may_be_the_head_of_a_truck():
@@ -91,5 +115,7 @@ def test_nothing_is_longer_than_the_longest_kind():
     coming, cars = at([-20.0, 0.0]), UnseenLength([3.0], [1.0])
     for length in (2.0, 3.0, 4.0):
         assert not cars.covariance(coming, P, length, 0).any()
-    truck = of_vehicles().covariance(coming, P, 8.9, TRUCK)
-    assert truck[0, 0] == pytest.approx((OFF_MIDDLE * (8.9 - CAR_ROW))**2)
+    longest = [UnseenLength(lengths, [3.0] * len(lengths)).covariance(coming, P, 8.9, -1)
+               for lengths in ([9.0], [0.0, 3.0, 9.0])]
+    # Shorter kinds add nothing to what it is itself.
+    np.testing.assert_array_equal(*longest)
