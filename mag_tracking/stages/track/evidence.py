@@ -6,6 +6,7 @@ from scipy.special import chdtri
 from mag_tracking.arrays import FloatArray
 from mag_tracking.records import Track
 from mag_tracking.stages.track.settings import TrackSettings
+from mag_tracking.units import NS
 
 LONGEST_SINGLE_SENSOR_S = 0.5
 """[s] A track that one sensor of several has supported alone for longer stays ambiguous."""
@@ -16,6 +17,10 @@ LOST = 'lost its target'
 CONTRADICTION = 1e-5
 """A field that is less probable than this contradicts the track of a vehicle. The filter takes it
 in, and may afterwards be wrong and agree with all that comes."""
+
+OVERFIT_NATS = float(np.log(1e4))
+"""An extended filter linearises each frame elsewhere, and may fit frames better than one path can.
+Where the path of the same hypothesis makes them less probable by this, the filter is doubted."""
 
 LEAST_WATCHED = 0.5
 """A track that begins with less than this share of its lookback is ambiguous."""
@@ -30,6 +35,7 @@ class TrackEvidence:
         self._log_odds = 0.0
         self._single_sensor_s = 0.0
         self._n_misfits = 0
+        self._doubts_filter_until_ns = -1
         self._best_spread = np.inf
 
     def add(self, log_likelihood_ratio: float) -> None:
@@ -50,6 +56,23 @@ class TrackEvidence:
         if contradicted and len(nis) <= 2:
             self.doubt()
         return contradicted
+
+    def doubts_filter(self, gain: float, stamp_ns: int, window_s: float) -> bool:
+        """Whether the filter fits the frames much better than the path of its hypothesis does.
+
+        Once it did, it is doubted for `window_s`: the frames of the comparison are as old as that.
+
+        Parameters
+        ----------
+        gain : float [nats]
+            Log-likelihood of the latest frames along the path, minus that in the filter.
+        stamp_ns : int
+            Of the latest frame.
+        window_s : float
+        """
+        if gain < -OVERFIT_NATS:
+            self._doubts_filter_until_ns = stamp_ns + round(window_s * NS)
+        return stamp_ns <= self._doubts_filter_until_ns
 
     def support(self, by_one_sensor: bool, dt: float) -> None:
         """Count `dt` [s] for which one sensor of several supported the track, or more did.

@@ -69,6 +69,8 @@ class Relinearisation:
     def clear(self) -> None:
         """Nothing is kept: no track is running."""
         self._anchor: FilterBank | None = None
+        # {origin: log-likelihood along the path minus that in the filter}, as of the last time.
+        self._gain: dict[int, float] = {}
 
     def begin(self, bank: FilterBank) -> None:
         """A track begins with the `FilterBank`, which is not yet updated with its first frame.
@@ -84,6 +86,7 @@ class Relinearisation:
         self._log_likelihoods: list[FloatArray] = []
         self._last_ns: int | None = None
         self._stale = False
+        self._gain = {}
 
     def begin_anew(self) -> None:
         """The filter has changed: what it did before the next frame is not to be done again."""
@@ -144,12 +147,21 @@ class Relinearisation:
         for path, improved in zip(self._paths, paths, strict=True):
             path[rows[finite]] = improved[finite]
         filtered = np.sum(self._log_likelihoods[int(self._updated):], axis=0)[rows]
-        taken = finite & settled & ((log_likelihood >= filtered)
-                                    | ~bank_filter.are_long(bank.kind[leading]))
+        gain = np.subtract(log_likelihood, filtered, where=finite,
+                           out=np.full(len(rows), -np.inf))
+        self._gain = dict(zip(anchor.origin[rows[finite]].tolist(), gain[finite].tolist(),
+                              strict=True))
+        taken = finite & settled & ((gain >= 0.0) | ~bank_filter.are_long(bank.kind[leading]))
         _take(bank, leading[taken], last.x[taken], last.P[taken])
         rest = finite & ~taken
         _widen(bank, leading[rest], last.x[rest], last.P[rest], bank_filter.nearly_linear)
         return Counter({TRIED: len(taken), IN_VAIN: int(np.count_nonzero(~taken))})
+
+    def gain(self, origin: int) -> float:
+        """Log-likelihood [nats] of the latest frames along the path of a hypothesis, minus that in
+        its filter; 0 where there is no path, or it was not done last time.
+        """
+        return self._gain.get(origin, 0.0)
 
     def _leading(self, bank: FilterBank) -> IntArray:
         """Rows of the heaviest hypotheses, as many as it is done for."""

@@ -198,16 +198,26 @@ class RunningTrack:
         self._look(best, np.flatnonzero(measured.any(axis=1)))
         contradicted = not self._target.starts_anywhere \
             and self._evidence.contradicts(bank.nis[best], n_measured)
+        overfits = not self._target.starts_anywhere and self._overfits(best, frame.stamp_ns)
         return self._sensors.widened(published_track(
             bank, best, self._target.model, self._target.orientation, self._target.arrivals,
             self._target.kinds, stamp_ns=frame.stamp_ns, id=self.id, ended=False,
             existence=self._evidence.existence, degrees_of_freedom=n_measured,
-            strange=(self._filter.is_strange(bank, best, frame) or alone or contradicted
+            strange=(self._filter.is_strange(bank, best, frame) or alone or contradicted or overfits
                      or self._evidence.doubted),
             unseen=self._unseen,
             predicted=self._filter.predicted_field(bank, best, frame, dt),
             mounting=observation.angles(bank.x[best]),
             mounting_covariance=observation.angle_covariances(bank.P[best])), self._settings)
+
+    def _overfits(self, best: int, stamp_ns: int) -> bool:
+        """Whether the filter fits the frames much better than the path of hypothesis `best`."""
+        overfits = self._evidence.doubts_filter(
+            self._relinearisation.gain(int(self.bank.origin[best])), stamp_ns,
+            self._settings.relinearise_window_s)
+        if overfits:
+            self.counts['poses in doubt: the filter fits better than its path'] += 1
+        return overfits
 
     def _smoothed(self, best: int, complete: bool, states: list[TrackState],
                   doubtful: bool) -> list[SmoothedPose]:

@@ -8,8 +8,9 @@ import pytest
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.pipeline import settings_for
-from mag_tracking.stages.track.evidence import CONTRADICTION, LOST, TrackEvidence
+from mag_tracking.stages.track.evidence import CONTRADICTION, LOST, OVERFIT_NATS, TrackEvidence
 from mag_tracking.stages.track.published_pose import covariance_about
+from mag_tracking.units import NS
 
 SETTINGS = settings_for('vehicle').track
 
@@ -37,6 +38,15 @@ def test_a_track_that_was_contradicted_once_stays_doubted():
     assert evidence.is_doubtful
 
 
+def test_a_filter_that_fits_better_than_its_path_is_doubted_as_long_as_the_window():
+    evidence = TrackEvidence()
+    said = [evidence.doubts_filter(-loss * OVERFIT_NATS, round(t * NS), 2.0) for t, loss in (
+        (0.0, -9.0), (1.0, 0.9), (1.1, 1.1), (3.0, 0.0), (3.2, -9.0))]
+    assert said == [False, False, True, True, False]
+    # What it says of later poses is up to them: the track itself is not.
+    assert not evidence.is_doubtful
+
+
 @pytest.mark.parametrize('nis, doubted', [
     ([60.0, 1.0], True), ([60.0, 2.0, 1.0], False), ([60.0, np.nan, 1.0], False)])
 def test_three_sensors_correct_a_track(nis, doubted):
@@ -55,9 +65,10 @@ def test_a_vehicle_that_comes_is_not_out_of_reach(nis, is_coming, reason):
 
 def bank_of(places, weights, std=0.5, lengths=3.0):
     n, model = len(places), RowVehicle(np.zeros(3), np.ones(3))
-    x = np.zeros((n, 17))
-    x[:, 0], x[:, 3], x[:, 16] = places, 8.0, lengths
-    bank = FilterBank.of_targets(x, np.tile(std**2 * np.eye(17), (n, 1, 1)), np.zeros(n, int), 2,
+    n_t = len(model.state_names)
+    x = np.zeros((n, n_t))
+    x[:, 0], x[:, 3], x[:, n_t - 1] = places, 8.0, lengths
+    bank = FilterBank.of_targets(x, np.tile(std**2 * np.eye(n_t), (n, 1, 1)), np.zeros(n, int), 2,
                                  1e-8)
     bank.log_w = np.log(weights)
     return bank, model
@@ -75,10 +86,11 @@ def test_hypotheses_at_one_place_are_one_distribution():
 
 def test_other_places_make_a_track_ambiguous_but_its_covariance_no_wider():
     bank, model = bank_of([0.0, 40.0], [0.9, 0.1])
-    np.testing.assert_allclose(covariance_about(bank, 0, model), 0.25 * np.eye(17))
+    np.testing.assert_allclose(covariance_about(bank, 0, model),
+                               0.25 * np.eye(len(model.state_names)))
     assert bank.separated_weight(0) == pytest.approx(0.1)
 
 
 def test_the_same_row_from_its_other_end_is_as_long():
     bank, model = bank_of([0.0, 0.0], [0.5, 0.5], lengths=np.array([3.0, -3.0]))
-    assert covariance_about(bank, 0, model)[16, 16] == pytest.approx(0.25)
+    assert covariance_about(bank, 0, model)[-1, -1] == pytest.approx(0.25)

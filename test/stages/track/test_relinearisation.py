@@ -182,6 +182,20 @@ def test_of_a_path_that_is_less_sure_the_covariance_is_taken(monkeypatch, more, 
     np.testing.assert_allclose(bank.P[0], expected, atol=1e-9)
 
 
+@pytest.mark.parametrize('better', [-12.0, 3.0])
+def test_the_gain_is_what_the_frames_are_more_probable_by_along_the_path(better):
+    filter_, bank, relinearisation = less_sure(0.0, np.inf)
+    filter_.better = better
+    assert relinearisation.gain(0) == 0.0
+    relinearisation.improve(filter_, bank)
+    assert relinearisation.gain(0) == pytest.approx(better, abs=1e-9)
+    assert relinearisation.gain(1) == 0.0
+    relinearisation.begin(bank)
+    assert relinearisation.gain(0) == 0.0
+    relinearisation.clear()
+    assert relinearisation.gain(0) == 0.0
+
+
 def test_a_path_whose_covariance_is_none_is_of_no_use():
     """Rounding errors over a sensor: its state and its path stay where they were."""
     filter_, bank, relinearisation = less_sure(-3.0, np.inf)
@@ -268,14 +282,14 @@ def still_target(n, turns=False):
         P0 = np.insert(P0, n_t - 1, 0.0, axis=1)
         P0[n_t - 1, n_t - 1] = 0.3**2
     mean[6:9], P0[6:9, 6:9] = [200.0, -250.0, 100.0], 100.0**2 * np.eye(3)
-    std = np.sqrt(np.diagonal(P0))
-    truth = mean + 0.7 * std * rng.standard_normal(len(std))
+    root = np.linalg.cholesky(P0)
+    truth = mean + root @ (0.7 * rng.standard_normal(len(mean)))
     y = fields_along(model, matched.NETWORK, truth, n) \
         + matched.SIGMA * rng.standard_normal((n, 2, 3))
     fit = least_squares(
-        lambda z: np.append((y - fields_along(model, matched.NETWORK, mean + std * z, n)).ravel()
-                            / matched.SIGMA, z), np.zeros(len(std)), xtol=1e-12, ftol=1e-12)
-    first = mean + std * fit.x
+        lambda z: np.append((y - fields_along(model, matched.NETWORK, mean + root @ z, n)).ravel()
+                            / matched.SIGMA, z), np.zeros(len(mean)), xtol=1e-12, ftol=1e-12)
+    first = mean + root @ fit.x
     last = np.append(model.propagate(first[None, :n_t], (n - 1) * PERIOD)[0][0], first[n_t:])
     return (BankFilter(matched.NETWORK, model, settings),
             lambda rows: FilterBank.of_targets(

@@ -12,12 +12,15 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
 from mag_tracking.simulation.scenario import Imperfections, Path, point_body, random_vehicle
 from mag_tracking.stages.track.manager import TrackManager
+from mag_tracking.stages.track.relinearisation import Relinearisation
 from mag_tracking.stages.track.target import target_of
 from support.bundled import POINT
 from support.marks import studied
 from support.networks import line_network
 from support.samples import one, simulate
 from support.track_runs import drive, magnet_frames
+
+OVERFITS = 'poses in doubt: the filter fits better than its path'
 
 
 def test_a_matched_target_is_tracked_inside_its_covariance():
@@ -141,6 +144,26 @@ def test_a_vehicle_has_a_heading_and_no_roll():
     u = np.array([-v[1], v[0]])
     expected = u @ middle.covariance[3:5, 3:5] @ u / (middle.velocity[:2] @ middle.velocity[:2])
     assert C[2, 2] == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize('gain, doubted', [(-20.0, True), (0.0, False)])
+def test_poses_of_a_filter_that_fits_better_than_its_path_are_ambiguous(
+        monkeypatch, gain, doubted):
+    monkeypatch.setattr(Relinearisation, 'gain', lambda self, origin: gain)
+    tracks, pipeline, truth = drive(line_network(2), point_body([200.0, -150.0, 80.0], 5.0, 0.5),
+                                    Path(np.array([-70.0, -1.2]), 0.0, 10.0), POINT)
+    live = [t for t in tracks if not t.ended]
+    near = [t.ambiguous for t, place in zip(live, truth, strict=True) if np.hypot(*place) < 5.0]
+    assert len(near) > 8 and set(near) == {doubted}
+    assert bool(pipeline.track.counts[OVERFITS]) == doubted
+
+
+def test_a_magnet_is_not_doubted_for_its_path(monkeypatch):
+    monkeypatch.setattr(Relinearisation, 'gain', lambda self, origin: -20.0)
+    network, frames, _ = magnet_frames(20)
+    stage = TrackManager(network, settings_for('magnet').track)
+    tracks = [t for f in frames for t in stage.feed(f) if isinstance(t, Track)]
+    assert tracks and not tracks[-1].ambiguous and not stage.counts[OVERFITS]
 
 
 def test_gaps_and_backward_jumps_end_a_track():
