@@ -77,7 +77,7 @@ class TrackSettings:
         2.0, 'A track ends where the frames have a longer gap than this.', 's', (1e-3, 86400.0))
     smooth_longest_s: float = param(
         60.0, 'A track that is no longer than this is smoothed when it ends, over all of its '
-        'frames, which takes less than a millisecond a frame (more with many sensors); 0 = never.',
+        'frames, which takes about two milliseconds a frame (more with many sensors); 0 = never.',
         's', (0.0, 86400.0))
     smoothing_lag_s: float = param(
         0.0, 'While a track runs, each pose is given once more when so much time has passed, by '
