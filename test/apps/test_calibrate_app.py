@@ -81,8 +81,7 @@ def test_clocks_are_found_to_three_milliseconds(name):
 
 
 UNKNOWN_BIAS = {
-    'junction_left_turns_to_rear': '3.02 degrees: mag_2 has an unknown bias of 1.5 uT',
-    'straight_car_fast_left': '3.04 degrees: mag_1 has an unknown bias of 1.3 uT'}
+    'junction_left_turns_to_rear': '3.02 degrees: mag_2 has an unknown bias of 1.5 uT'}
 
 
 @pytest.mark.parametrize('name', studied(FILES, OFTEN, lambda n: [
