@@ -165,7 +165,7 @@ def replace(settings: _Settings, changes: Mapping[str, Any]) -> _Settings:
 
 
 def _hint(name: str, known: Iterable[str]) -> str:
-    """What may have been meant by a `name` that is not `known`."""
+    """Suggest a setting of the `known` ones for an unknown `name`; empty if none is near."""
     if name in REPLACED:
         return f'; {REPLACED[name]} has taken its place, in another unit'
     near = difflib.get_close_matches(name, known, n=1)

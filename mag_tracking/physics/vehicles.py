@@ -18,7 +18,7 @@ FASTEST_TURN = 1.0
 
 @njit(error_model='numpy', forceinline=True)
 def _position(x: FloatArray, p: int, i: int, place: float, c: float, s: float, turn_x: float,
-           turn_y: float, r: FloatArray, dr_dx: FloatArray) -> None:
+              turn_y: float, r: FloatArray, dr_dx: FloatArray) -> None:
     """Position of dipole i of hypothesis p, and its derivatives."""
     for a in range(3):
         r[p, i, a] = x[p, a]

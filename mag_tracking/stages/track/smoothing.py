@@ -1,9 +1,9 @@
 """Smooth: a track once more, by what came before and after each of its poses.
 
 One hypothesis of the bank, the one that stands at the end, is run through the frames again and
-then back, linearised once anew. Hypotheses do not touch each other, so it can be done
-alone. Frames that contradict it are left out: one of them would bend the whole track. What was
-published last need not be where the smoothed track ends: each was linearised elsewhere.
+then back, and is relinearised once. Hypotheses do not touch each other, so one can be run alone.
+Frames that contradict it are left out: one of them would bend the whole track. What was published
+last need not be where the smoothed track ends: each was linearised elsewhere.
 """
 
 from collections import deque
@@ -62,8 +62,9 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
     x_lin: Sequence[FloatArray | None] = [None] * len(frames)
     for _ in range(relinearisations + 1):
         steps, left_out = _filtered(bank_filter, bank.alone(0), frames, intervals, updated, x_lin)
-        x_lin = smoothed_states(steps)
-    return [(x[0], P[0]) for x, P in zip(smoothed_states(steps), smoothed_covariances(steps),
+        states = smoothed_states(steps)
+        x_lin = states
+    return [(x[0], P[0]) for x, P in zip(states, smoothed_covariances(steps),
                                          strict=True)], left_out
 
 
