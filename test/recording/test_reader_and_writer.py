@@ -119,11 +119,11 @@ def test_every_field_of_a_track_is_written(vehicle_replays):
 
 def test_a_cut_file_is_read_up_to_the_cut(tmp_path):
     path = tmp_path / 'cut.mcap'
-    write(tmp_path / 'a.mcap', 60_000)
+    write(tmp_path / 'a.mcap', 15_000)
     whole = (tmp_path / 'a.mcap').read_bytes()
     path.write_bytes(whole[:int(0.6 * len(whole))])
     messages, recording = read(path)
-    assert 0.3 * 120_000 < len(messages) < 0.65 * 120_000
+    assert 0.3 * 30_000 < len(messages) < 0.65 * 30_000
     assert any('cut off' in k for k in recording.losses)
     assert any('nothing readable after byte' in k for k in recording.losses)
     assert [m.log_time_ns for m in messages] == sorted(m.log_time_ns for m in messages)
@@ -131,7 +131,7 @@ def test_a_cut_file_is_read_up_to_the_cut(tmp_path):
 
 def test_flipped_bytes_cost_their_chunk_and_are_told(tmp_path):
     path = tmp_path / 'a.mcap'
-    write(path, 60_000)
+    write(path, 15_000)
     data = bytearray(path.read_bytes())
     chunks = make_reader(io.BytesIO(data)).get_summary().chunk_indexes
     middle = chunks[len(chunks) // 2]
@@ -139,7 +139,7 @@ def test_flipped_bytes_cost_their_chunk_and_are_told(tmp_path):
         data[middle.chunk_start_offset + middle.chunk_length // 2 + i] ^= 0xFF
     path.write_bytes(data)
     messages, recording = read(path)
-    assert 0.5 * 120_000 < len(messages) < 120_000
+    assert 0.5 * 30_000 < len(messages) < 30_000
     assert any('damaged stretch' in k for k in recording.losses)
 
 

@@ -21,9 +21,9 @@ NOISE = 1.2e-8
 """[T]."""
 FIRST = np.array([-20.0, -1.5])
 """[m] Where a vehicle appears; it is noticed some metres later."""
-SPEED = 10.0
-PASSING_S = 5.0
-"""[s] Then it is 30 m away, and its field below two nanotesla."""
+SPEED = 6.0
+PASSING_S = 8.0
+"""[s] Then it is 28 m away, and its field below two nanotesla."""
 CONNECT = b'\x10\x12\x00\x04MQTT\x04\x02\x00\x00\x00\x06boards'
 """MQTT 3.1.1, 3.1: CONNECT of the client `boards`, clean session, no keep-alive."""
 TWIN_S = 3.0

@@ -141,6 +141,7 @@ def test_kind(vehicle_replays, name):
     assert track['kind'] == KINDS[name]
 
 
+@pytest.mark.study
 def test_a_car_is_followed_along_a_corridor(tmp_path):
     """Eight sensors along 42 m, an accelerating car: one track, all the way."""
     folder = DATA / 'corridor'

@@ -9,13 +9,15 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Readings, SmoothedPose, Track
 from mag_tracking.simulation.scenario import Path, random_vehicle
 from mag_tracking.stages.track.manager import TrackManager
-from support.bundled import NETWORK_FILE
+from support.bundled import NETWORK_FILE, POINT
 from support.dense_traffic import after_dense_traffic
 from support.networks import line_network
 from support.samples import one, simulate
 
 SURE_WITHOUT = ('junction_left_to_right', 'junction_right_turns_to_rear')
 DOUBTED = 'tracks of a doubtful background'
+SETTINGS = settings_for('vehicle', POINT)
+"""A quick tracker: what is doubted does not depend on the model of the target."""
 
 
 @pytest.fixture(scope='module')
@@ -32,7 +34,7 @@ def passing():
 def tracked(passing, times, settings=None):
     """(TrackManager, poses), with doubtful times of sensors [s]."""
     network, frames = passing
-    manager = TrackManager(network, settings_for('vehicle', settings).track)
+    manager = TrackManager(network, settings_for('vehicle', {**POINT, **(settings or {})}).track)
     start = frames[0].stamp_ns
     manager.doubt({name: tuple((start + round(b * 1e9), None if e is None else
                                 start + round(e * 1e9)) for b, e in stretches)
@@ -100,7 +102,7 @@ def said(pipeline):
 def test_after_dense_traffic_a_vehicle_is_tracked_and_flagged(name):
     """Live there is no quiet stretch: nothing may be sure. The batches are no matter."""
     network, readings = read_network(NETWORK_FILE), after_dense_traffic(name, 7.0)
-    pipeline, other = (Pipeline(network, settings_for('vehicle')) for _ in range(2))
+    pipeline, other = (Pipeline(network, SETTINGS) for _ in range(2))
     tracks = poses_of(pipeline.feed(readings) + pipeline.flush())
     assert pipeline.calibrate.doubtful_stretches()
     assert len(tracks) > 10 and all(t.ambiguous for t in tracks)
@@ -116,7 +118,7 @@ def poses_of(records):
 @pytest.mark.parametrize('name', SURE_WITHOUT)
 def test_it_was_sure_before_it_knew_of_doubt(name):
     """Without the doubt many poses are sure, or the test above would show nothing."""
-    pipeline = Pipeline(read_network(NETWORK_FILE), settings_for('vehicle'))
+    pipeline = Pipeline(read_network(NETWORK_FILE), SETTINGS)
     pipeline.track.doubt = lambda times: None
     tracks = poses_of(pipeline.feed(after_dense_traffic(name, 7.0)) + pipeline.flush())
     assert sum(not t.ambiguous for t in tracks) > 10
@@ -124,7 +126,7 @@ def test_it_was_sure_before_it_knew_of_doubt(name):
 
 def test_poses_of_a_fixed_lag_are_no_surer():
     pipeline = Pipeline(read_network(NETWORK_FILE),
-                        settings_for('vehicle', {'track.smoothing_lag_s': 0.5}))
+                        settings_for('vehicle', {**POINT, 'track.smoothing_lag_s': 0.5}))
     records = pipeline.feed(after_dense_traffic(SURE_WITHOUT[0], 7.0)) + pipeline.flush()
     smoothed = [r for r in records if isinstance(r, SmoothedPose)]
     assert len(smoothed) > 10 and all(s.ambiguous for s in smoothed)
@@ -134,6 +136,6 @@ def test_the_doubt_of_a_recording_outlasts_a_jump_back():
     """Played twice in one batch: the frames of the first are tracked when it is known of no more.
     """
     readings = after_dense_traffic(SURE_WITHOUT[0], 7.0)
-    pipeline = Pipeline(read_network(NETWORK_FILE), settings_for('vehicle'))
+    pipeline = Pipeline(read_network(NETWORK_FILE), SETTINGS)
     tracks = poses_of(pipeline.feed(Readings.joined([readings, readings])) + pipeline.flush())
     assert len(tracks) > 20 and all(t.ambiguous for t in tracks)

@@ -15,7 +15,6 @@ from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.relinearisation import Relinearisation
 from mag_tracking.stages.track.target import target_of
 from support.bundled import POINT
-from support.marks import studied
 from support.networks import line_network
 from support.samples import one, simulate
 from support.track_runs import drive, magnet_frames
@@ -61,10 +60,10 @@ def test_the_evidence_says_of_which_kind_a_vehicle_is(kind, body):
         tracks[-1].kind_weight)
 
 
-@pytest.mark.parametrize('n', studied([4, 16], [4]))
-def test_most_trucks_are_told_and_of_the_others_it_is_not_sure(n):
+@pytest.mark.study
+def test_most_trucks_are_told_and_of_the_others_it_is_not_sure():
     """35 of 40 others, seeds 0 to 39, were told with other noise; the limit is the binomial's."""
-    ends = []
+    n, ends = 16, []
     for seed in range(n):
         body = random_vehicle(np.random.default_rng(seed), **TRUCK)
         tracks, *_ = drive(line_network(2), body, Path(np.array([-80.0, -1.2]), 0.0, 12.0))
