@@ -35,17 +35,24 @@ EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
 SIGMA = 4e-9
 
 
+N_TARGET = 12
+"""States of a point target."""
+
+
 def moment(x):
-    """Moment (3,) of a vehicle's state and its Jacobian (3, 10); ICASSP11 eq. (8)."""
+    """Moment (3,) of a vehicle's state and its Jacobian (3, 12); ICASSP11 eq. (8), with a
+    diagonal tensor in the vehicle's axes."""
     speed2 = x[3] ** 2 + x[4] ** 2
     c, s = x[3] / np.sqrt(speed2), x[4] / np.sqrt(speed2)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    hard = R @ x[6:9]
-    J = np.zeros((3, 10))
-    J[:2, 3:5] = np.outer([-hard[1], hard[0]], [-x[4], x[3]]) / speed2
+    b = R.T @ EARTH / MU0
+    m = R @ (x[6:9] + x[9:12] * b)
+    by_heading = np.cross([0.0, 0.0, 1.0], m) - R @ (x[9:12] * np.cross([0.0, 0.0, 1.0], b))
+    J = np.zeros((3, N_TARGET))
+    J[:, 3:5] = np.outer(by_heading, [-x[4], x[3]]) / speed2
     J[:, 6:9] = R
-    J[:, 9] = EARTH / MU0
-    return hard + x[9] * EARTH / MU0, J
+    J[:, 9:12] = R * b
+    return m, J
 
 
 def dipole(d, m):
@@ -63,13 +70,13 @@ def dipole(d, m):
 class Peer:
     """A loop of filterpy EKFs, each with a NumPy model that goes from sensor to sensor.
 
-    State: target (10), three mounting angles a sensor or none, three backgrounds a sensor.
+    State: target (12), three mounting angles a sensor or none, three backgrounds a sensor.
     """
 
     def __init__(self, positions, R_sw, x, P):
         self.positions, self.R_sw = positions, R_sw
         self.n = 3 * len(positions)
-        self.turned = x.shape[1] > 10 + self.n
+        self.turned = x.shape[1] > N_TARGET + self.n
         self.filters = []
         for xi, Pi in zip(x, P, strict=True):
             f = ExtendedKalmanFilter(x.shape[1], self.n)
@@ -83,9 +90,9 @@ class Peer:
                          for position, R in zip(self.positions, self.R_sw, strict=True)])
 
     def jacobians(self, x):
-        """(n_sensors, 3, 10) of the same."""
+        """(n_sensors, 3, 12) of the same."""
         m, J = moment(x)
-        out = np.empty((len(self.positions), 3, 10))
+        out = np.empty((len(self.positions), 3, N_TARGET))
         for j, (position, R) in enumerate(zip(self.positions, self.R_sw, strict=True)):
             _, J_d, J_m = dipole(position - x[:3], m)
             out[j] = R @ J_m @ J
@@ -96,7 +103,7 @@ class Peer:
         """Predicted measurement in standard deviations."""
         B = self.fields(x)
         if self.turned:
-            B = B + np.cross(x[10:10 + self.n].reshape(-1, 3), B)
+            B = B + np.cross(x[N_TARGET:N_TARGET + self.n].reshape(-1, 3), B)
         return (B.ravel() + x[-self.n:]) / SIGMA
 
     def H(self, x):
@@ -104,11 +111,12 @@ class Peer:
         out = np.zeros((self.n, len(x)))
         J = self.jacobians(x)
         if self.turned:
-            J = J + cross_matrix(x[10:10 + self.n].reshape(-1, 3)) @ J
+            J = J + cross_matrix(x[N_TARGET:N_TARGET + self.n].reshape(-1, 3)) @ J
             by_angle = -cross_matrix(self.fields(x))
             for j in range(len(J)):
-                out[3 * j:3 * j + 3, 10 + 3 * j:13 + 3 * j] = by_angle[j]
-        out[:, :10] = J.reshape(self.n, 10)
+                k = N_TARGET + 3 * j
+                out[3 * j:3 * j + 3, k:k + 3] = by_angle[j]
+        out[:, :N_TARGET] = J.reshape(self.n, N_TARGET)
         out[:, -self.n:] = np.eye(self.n)
         return out / SIGMA
 
@@ -156,23 +164,23 @@ def bank_case(n_sensors, n_hyp, rng, turned):
         0.2 * rng.standard_normal((n_sensors, 3))))
     model = RowVehicle(EARTH, np.ones(3), n_dipoles=1)
     n_own = 3 * n_sensors if turned else 0
-    x = np.zeros((n_hyp, 10 + n_own + 3 * n_sensors))
+    x = np.zeros((n_hyp, N_TARGET + n_own + 3 * n_sensors))
     x[:, :3] = [-6.0, -1.0, 0.5] + 0.3 * rng.standard_normal((n_hyp, 3))
     x[:, 3:6] = [10.0, 0.0, 0.0] + 0.3 * rng.standard_normal((n_hyp, 3))
     x[:, 6:9] = 200.0 * rng.standard_normal((n_hyp, 3))
-    x[:, 9] = 5.0
-    P = np.repeat(np.diag(np.r_[1.0, 1.0, 0.1, 4.0, 1.0, 0.01, [1e4] * 3, 4.0,
+    x[:, 9:12] = [6.0, 5.0, 4.0]
+    P = np.repeat(np.diag(np.r_[1.0, 1.0, 0.1, 4.0, 1.0, 0.01, [1e4] * 3, [4.0] * 3,
                                 np.full(n_own, 0.0076), np.full(3 * n_sensors, 4e-16)])[None],
                   n_hyp, axis=0)
-    y = sensor_fields(positions, R_sw, *model.dipoles(x[:1, :10]))[0][0]
+    y = sensor_fields(positions, R_sw, *model.dipoles(x[:1, :N_TARGET]))[0][0]
     return model, positions, R_sw, x, P, y + SIGMA * rng.standard_normal(y.shape)
 
 
 def our_update(model, positions, R_sw, x, P, y, C, zero, turned):
     """One measurement for the whole bank."""
-    h, H, _ = sensor_fields(positions, R_sw, *model.dipoles(x[:, :10]))
+    h, H, _ = sensor_fields(positions, R_sw, *model.dipoles(x[:, :N_TARGET]))
     if turned:
-        h, H = turned_fields(h, H, x[:, 10:10 + y.size].reshape(len(x), -1, 3))
+        h, H = turned_fields(h, H, x[:, N_TARGET:N_TARGET + y.size].reshape(len(x), -1, 3))
     kalman.update(x, P, y, h, H, C, zero, n_own=3 if turned else 0)
 
 
