@@ -88,10 +88,10 @@ def _move(P: FloatArray, p: int, F: FloatArray, f: int, moves: BoolArray, T: Flo
     # The same of the target's columns: F is applied from the right.
     for a in range(n_t):
         if moves[a]:
-            for b in range(n_t):
-                T[a, b] = 0.0
-                for c in range(n_t):
-                    if F[f, a, c] != 0.0:
+            T[a, :n_t] = 0.0
+            for c in range(n_t):
+                if F[f, a, c] != 0.0:
+                    for b in range(n_t):
                         T[a, b] += P[p, b, c] * F[f, a, c]
     for a in range(n_t):
         if moves[a]:
@@ -125,5 +125,6 @@ def _predict_bank(x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, va
         for a in range(n_t):
             P[p, a, a] += Q[q, a, a]
             for b in range(a):
-                P[p, a, b] = P[p, b, a] = 0.5 * (P[p, a, b] + P[p, b, a] + Q[q, a, b]
-                                                 + Q[q, b, a])
+                noise = 0.5 * (Q[q, a, b] + Q[q, b, a])
+                if moves[a] or moves[b] or noise != 0.0:
+                    P[p, a, b] = P[p, b, a] = 0.5 * (P[p, a, b] + P[p, b, a]) + noise

@@ -88,6 +88,25 @@ def _row_dipoles(x: FloatArray, places: FloatArray, induction: FloatArray, r: Fl
             _position(x, p, i, places[i], c, s, turn_x, turn_y, r, dr_dx)
 
 
+@njit('void(float64[:,:], float64[:,::1], float64, float64[:,:,::1])', cache=True,
+      error_model='numpy')
+def _moment_noise(x: FloatArray, walk: FloatArray, induction2: float, Q: FloatArray) -> None:
+    """Fill in the process noise of the hard iron moments, `walk` (3 d, 3 d) times the size of the
+    iron; `induction2` [A^2/m^2] is |B0/mu0|^2."""
+    k = len(walk)
+    soft = 6 + k
+    for p in range(len(x)):
+        size2 = 0.0
+        for axis in range(3):
+            moment = 0.0
+            for i in range(6 + axis, soft, 3):
+                moment += x[p, i]
+            size2 += moment * moment + x[p, soft + axis] ** 2 * induction2 / 3.0
+        for i in range(k):
+            for j in range(k):
+                Q[p, 6 + i, 6 + j] = size2 * walk[i, j]
+
+
 @dataclass(frozen=True)
 class RowVehicle:
     """A row of equidistant dipoles along the heading, of unknown length; one dipole is a point.
@@ -177,13 +196,10 @@ class RowVehicle:
         Over `dt` the rate is taken as its mean; what its noise does to place and velocity within
         that time is left out. See `SourceModel`.
         """
-        n, d = x.shape[1], self.n_dipoles
+        n = x.shape[1]
         Q = np.zeros((len(x), n, n))
         Q[:, :6, :6] = integrator_noise(dt, self.acceleration_density)
-        hard, soft = slice(6, 6 + 3 * d), slice(6 + 3 * d, 9 + 3 * d)
-        size2 = (np.square(x[:, hard].reshape(-1, d, 3).sum(axis=1)).sum(axis=1)
-                 + np.square(x[:, soft]).mean(axis=1) * (self._induction @ self._induction))
-        Q[:, hard, hard] = size2[:, None, None] * (abs(dt) * self._walk)
+        _moment_noise(x, abs(dt) * self._walk, float(self._induction @ self._induction), Q)
         if not self.turn_acceleration:
             F = np.eye(n)
             F[:6, :6] = constant_velocity(dt)
