@@ -66,11 +66,11 @@ studies: $(STAMP)  ## the tests that take many runs or all of the recordings
 
 # All of them run, also where one misses an aim.
 bench: $(STAMP)  ## measure times and accuracies
-	@status=0; for figures in bench.py matched.py extended_target.py two_simulators.py spoilt_passes.py junction_error.py pass_search.py \
-		load.py 'load.py --sensors 2 --lean --minutes 2' \
-		'load.py --sensors 2 --lean --minutes 2 --one-process --batches' chain.py; do \
-		echo "$(BIN)/python test/bench/$$figures"; \
-		PYTHONPATH=test $(BIN)/python test/bench/$$figures || status=1; \
+	@status=0; for figures in bench matched extended_target two_simulators spoilt_passes junction_error \
+		pass_search load 'load --sensors 2 --lean --minutes 2' \
+		'load --sensors 2 --lean --minutes 2 --one-process --batches' chain; do \
+		echo "PYTHONPATH=test $(BIN)/python -m bench.$$figures"; \
+		PYTHONPATH=test $(BIN)/python -m bench.$$figures || status=1; \
 	done; exit $$status
 
 fuzz: $(STAMP)  ## a million frames between garbage through every parser of the drivers
