@@ -125,6 +125,5 @@ def _predict_bank(x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, va
         for a in range(n_t):
             P[p, a, a] += Q[q, a, a]
             for b in range(a):
-                noise = 0.5 * (Q[q, a, b] + Q[q, b, a])
-                if moves[a] or moves[b] or noise != 0.0:
-                    P[p, a, b] = P[p, b, a] = 0.5 * (P[p, a, b] + P[p, b, a]) + noise
+                P[p, a, b] = P[p, b, a] = 0.5 * (P[p, a, b] + P[p, b, a] + Q[q, a, b]
+                                                 + Q[q, b, a])

@@ -36,12 +36,9 @@ def integrator_noise(dt: float, density: ArrayLike) -> FloatArray:
     Source: PHD15 Paper A eq. (24), the form that (18) should have.
     """
     Q, density = np.zeros((6, 6)), np.asarray(density, dtype=float)
-    # The diagonals of the four blocks; it is asked for at every step, and slices are quicker than
-    # lists of indices.
-    flat = Q.reshape(-1)
-    flat[0:15:7] = density * (dt**3 / 3.0)
-    flat[3:18:7] = flat[18:33:7] = density * (dt**2 / 2.0)
-    flat[21::7] = density * dt
+    Q[_INTEGRAL, _INTEGRAL] = density * (dt**3 / 3.0)
+    Q[_INTEGRAL, _RATE] = Q[_RATE, _INTEGRAL] = density * (dt**2 / 2.0)
+    Q[_RATE, _RATE] = density * dt
     return Q
 
 

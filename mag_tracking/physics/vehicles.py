@@ -91,8 +91,11 @@ def _row_dipoles(x: FloatArray, places: FloatArray, induction: FloatArray, r: Fl
 @njit('void(float64[:,:], float64[:,::1], float64, float64[:,:,::1])', cache=True,
       error_model='numpy')
 def _moment_noise(x: FloatArray, walk: FloatArray, induction2: float, Q: FloatArray) -> None:
-    """Fill in the process noise of the hard iron moments, `walk` (3 d, 3 d) times the size of the
-    iron; `induction2` [A^2/m^2] is |B0/mu0|^2."""
+    """Write the process noise of the hard iron moments into `Q`.
+
+    It is `walk` (3 d, 3 d) times the squared size of the iron; `induction2` [A^2/m^2] is
+    |B0/mu0|^2.
+    """
     k = len(walk)
     soft = 6 + k
     for p in range(len(x)):

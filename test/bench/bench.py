@@ -47,7 +47,7 @@ def moment(x):
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     b = R.T @ EARTH / MU0
     m = R @ (x[6:9] + x[9:12] * b)
-    # z x m, less what the field in the vehicle's axes turns; no np.cross, which is slow.
+    # z x m, and b rotates against the heading. np.cross would slow the peer down.
     turned = R @ (x[9:12] * [-b[1], b[0], 0.0])
     by_heading = np.array([-m[1], m[0], 0.0]) - turned
     J = np.zeros((3, N_TARGET))

@@ -226,11 +226,10 @@ def begin_anew(pipeline, name):
     # A track that begins where the vehicle is near already may be wrong, and says so.
     ('detection_node', -8.0, 1.0), ('tracker_node', -4.0, 1.0)])
 def test_a_gap_in_the_middle_of_a_pass(tmp_path, name, x, gap_s):
-    """As above but without processes, so that every run has the same times, and frames are as
-    frequent as by default."""
+    """As above but without processes: every run has the same times, and the default frames."""
     network, speed = read_network(network_file(tmp_path)), 10.0
     settings = settings_for('vehicle', {**POINT, **STEADY['calibration_node'],
-                                        'detect.background_drift': 0.0})
+                                        **STEADY['detection_node']})
     pipeline, first = Pipeline(network, settings), np.array([-40.0, FIRST[1]])
     samples, *_ = simulate(network, BODY, Path(first, 0.0, speed), RATE_HZ, 6.5,
                            np.random.default_rng(0), start_s=1000.0)

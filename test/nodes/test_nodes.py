@@ -155,38 +155,39 @@ def test_nodes_equal_offline_on_magnets(run_number, magnet_runs, tmp_path):
     assert worst <= 1e-9
 
 
-def test_four_processes_over_the_middleware(ros, tmp_path, road_network):
-    """Each node a process, as on a robot; poses equal the offline ones, and all leave cleanly.
+def hear(node):
+    """{message type: [messages]} of what the nodes publish, filled while `node` spins."""
+    topics = {NetworkFrame: '/detection_node/frame', TrackArray: '/tracker_node/tracks',
+              Odometry: '/tracker_node/odometry', MarkerArray: '/tracker_node/markers',
+              PassEvent: '/detection_node/events', Clock: '/clock',
+              CalibrationState: '/calibration_node/calibration'}
+    received = {kind: [] for kind in topics}
+    for kind, topic in topics.items():
+        node.create_subscription(kind, topic, received[kind].append,
+                                 LATCHED if kind is CalibrationState else STREAM)
+    return received
 
-    At this rate a queue of `STREAM` lasts for 2.5 s: on a machine that is four times slower, with
-    other tests beside, a node may be busy for one.
+
+def play_through_processes(ros, recording, received):
+    """Play a recording through a process for each node until its track and events have come.
+
+    At this rate a `STREAM` queue holds 2.5 s of samples: on a machine four times slower, a node
+    may be busy for more than a second.
     """
     node, spin_until = ros
-    name = 'straight_car_right'
-    received = {kind: [] for kind in (NetworkFrame, TrackArray, Odometry, MarkerArray, Clock,
-                                      PassEvent)}
-    for kind, topic in ((NetworkFrame, '/detection_node/frame'),
-                        (TrackArray, '/tracker_node/tracks'), (Clock, '/clock'),
-                        (Odometry, '/tracker_node/odometry'),
-                        (PassEvent, '/detection_node/events'),
-                        (MarkerArray, '/tracker_node/markers')):
-        node.create_subscription(kind, topic, received[kind].append, STREAM)
-    state = []
-    node.create_subscription(CalibrationState, '/calibration_node/calibration', state.append,
-                             LATCHED)
     network = ['-p', f'network:={NETWORK_FILE}', '-p', 'reliable_input:=true']
     patient = ['-p', 'align.max_wait_s:=5.0']
     processes = [start('calibration_node', *network), start('detection_node', *network, *patient),
                  start('tracker_node', *network)]
     try:
-        frames = node.count_publishers
-        assert spin_until(lambda: frames('/detection_node/frame') and frames('/tracker_node/tracks')
-                          and frames('/mag_1/imu/mag_calibrated')
-                          and node.count_subscribers('/detection_node/frame') > 1
-                          and node.count_subscribers('/mag_1/imu/mag_calibrated'))
-        processes.append(start('replay_node', '-p', f'recording:={vehicle_path(name)}',
-                               '-p', 'rate:=2.0', '-p', 'start_delay:=3.0',
-                               '-p', 'wait_for_subscribers:=300.0'))
+        sources, listeners = node.count_publishers, node.count_subscribers
+        assert spin_until(lambda: sources('/detection_node/frame')
+                          and sources('/tracker_node/tracks')
+                          and sources('/mag_1/imu/mag_calibrated')
+                          and listeners('/detection_node/frame') > 1
+                          and listeners('/mag_1/imu/mag_calibrated'))
+        processes.append(start('replay_node', '-p', f'recording:={recording}', '-p', 'rate:=2.0',
+                               '-p', 'start_delay:=3.0', '-p', 'wait_for_subscribers:=300.0'))
         assert spin_until(lambda: any(t.status == t.ENDED for m in received[TrackArray]
                                       for t in m.tracks))
         assert spin_until(lambda: len(received[PassEvent]) == 2)
@@ -194,7 +195,13 @@ def test_four_processes_over_the_middleware(ros, tmp_path, road_network):
         codes, outputs = stop(processes)
     assert codes == [0, 0, 0, 0], outputs
     assert not any('Traceback' in text for text in outputs), outputs
-    replay(Recording(vehicle_path(name)), road_network, settings_for('vehicle', PATIENT), tmp_path)
+
+
+def test_four_processes_over_the_middleware(ros, tmp_path, road_network):
+    """Each node a process, as on a robot; poses equal the offline ones, and all leave cleanly."""
+    recording, received = vehicle_path('straight_car_right'), hear(ros[0])
+    play_through_processes(ros, recording, received)
+    replay(Recording(recording), road_network, settings_for('vehicle', PATIENT), tmp_path)
     with open(tmp_path / 'poses.csv', newline='') as stream:
         offline = {int(r['stamp_ns']): [float(r['x']), float(r['y'])]
                    for r in csv.DictReader(stream)}
@@ -205,9 +212,10 @@ def test_four_processes_over_the_middleware(ros, tmp_path, road_network):
     assert received[Odometry][0].child_frame_id == 'track_1'
     # DELETE at the end of the track.
     assert {m.action for m in received[MarkerArray][-1].markers} == {2}
+    state = received[CalibrationState]
     assert state and all(s.ready for s in state[-1].sensors)
     offline = {e.sensor: pass_event_dict(e) for e in mt.events(
-        vehicle_path(name), road_network, PATIENT).events}
+        recording, road_network, PATIENT).events}
     for event in received[PassEvent]:
         expected = offline[event.sensor]
         assert event.left_to_right == expected['left_to_right']

@@ -88,7 +88,7 @@ def end_of(process, how):
 
 @pytest.mark.parametrize('how, words', [
     pytest.param(how, words, id=f'{name}-{how.name}',
-                 # Ctrl-C and a service manager: each as it is most often sent.
+                 # Commands get SIGINT, as from Ctrl-C; scripts SIGTERM, as from a service manager.
                  marks=[] if (how is signal.SIGINT) == (words in COMMANDS.values())
                  else pytest.mark.study)
     for how in (signal.SIGINT, signal.SIGTERM)

@@ -38,7 +38,7 @@ FRAME_S = 0.2
 """[s] `align.period_s`: longer than by default, so that a tracker on a busy machine keeps up."""
 NS = 1_000_000_000
 STEADY = {'calibration_node': {'calibrate.learn_s': 3600.0},
-          'detection_node': {'detect.background_drift': 0.0, 'align.period_s': FRAME_S}}
+          'detection_node': {'detect.background_drift': 0.0}}
 """Settings of a background that is as the network file says: nothing is learnt of it between two
 vehicles, and nothing is allowed for it."""
 
@@ -133,6 +133,8 @@ class World:
         """Start a node as a process, with what it is given in this world."""
         given = {'driver_node': {'drivers': self.drivers[self.link]},
                  'tracker_node': POINT, **STEADY}[name]
+        if name == 'detection_node':
+            given = {'align.period_s': FRAME_S, **given}
         if name != 'driver_node':
             # To the driver a sensor of no network (`guarded`) would be an error.
             given = {'network': self.network, **given}
@@ -201,9 +203,9 @@ class World:
                 and all(word in s.message for word in words)]
 
     def tracks(self, since_ns):
-        """[Track] of what has been measured since then.
+        """[Track] with a timestamp after `since_ns`.
 
-        On a busy machine the poses of the vehicle before may come while the next one is here.
+        On a busy machine, poses of the previous vehicle arrive while the next one is here.
         """
         tracks = (track_of(t) for _, m in self.since(since_ns, 'tracker_node') for t in m.tracks)
         return [t for t in tracks if t.stamp_ns > since_ns]
@@ -224,7 +226,7 @@ class World:
         assert self.wait(lambda: self.roadside.truth(time.time_ns())[0] >= x)
 
     def wrong(self, since_ns):
-        """The poses of what has been measured since then that are wrong."""
+        """The wrong poses with a timestamp after `since_ns`."""
         return [t for t in self.tracks(since_ns)
                 if not t.ended and is_wrong(t, self.roadside.truth(t.stamp_ns))]
 

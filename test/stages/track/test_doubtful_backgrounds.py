@@ -17,7 +17,7 @@ from support.samples import one, simulate
 SURE_WITHOUT = ('junction_left_to_right', 'junction_right_turns_to_rear')
 DOUBTED = 'tracks of a doubtful background'
 SETTINGS = settings_for('vehicle', POINT)
-"""A quick tracker: what is doubted does not depend on the model of the target."""
+"""A fast tracker: the doubt does not depend on the model of the target."""
 
 
 @pytest.fixture(scope='module')
