@@ -25,6 +25,10 @@ from mag_tracking.units import NS
 
 NO_SCALE = 'detections not tracked (one sensor does not tell the scale)'
 
+LOUDER = 4.0
+"""Where a target was lost, another one is started in a frame that has this times the energy of any
+frame of the lost track: twice the field. In the tail of a pass the field only falls."""
+
 
 class TrackManager:
     """Frames with a verdict to `Track`s, one a frame while a target is present.
@@ -47,8 +51,11 @@ class TrackManager:
         self._next_id = 1
         self._recent: deque[FieldFrame] = deque()
         self._last_ns: int | None = None
-        # A target that was lost is not started again in the tail of its own detection.
-        self._tail_of_detection = False
+        # Largest energy since a track was started.
+        self._loudest = 0.0
+        # A target that was lost is not started again in the tail of its own detection: in frames
+        # of less energy than this. None: there is no such tail.
+        self._tail_until: float | None = None
         self._next_network: SensorNetwork | None = None
         self._doubtful_times: Mapping[str, DoubtfulTimes] = {}
         self._doubtful: dict[int, DoubtfulTimes] = {}
@@ -105,11 +112,11 @@ class TrackManager:
         self.counts['frames'] += 1
         if not frame.target_present:
             out += self._end_all('released')
-            self._tail_of_detection = False
+            self._tail_until = None
             self._remember(frame)
         elif self._tracks and previous is not None:
             out += self._maintain(frame, (frame.stamp_ns - previous) / NS)
-        elif not self._tail_of_detection:
+        elif self._tail_until is None or frame.statistic > self._tail_until:
             out += self._initiate(frame)
         return out
 
@@ -121,7 +128,7 @@ class TrackManager:
     def give_up(self, reason: str) -> list[TrackRecord]:
         """End all tracks and forget the recent frames; nothing is known of what came since."""
         self._recent.clear()
-        self._tail_of_detection = False
+        self._tail_until = None
         return self._end_all(reason)
 
     def flush(self) -> list[TrackRecord]:
@@ -146,6 +153,7 @@ class TrackManager:
     def _maintain(self, frame: FieldFrame, dt: float) -> list[TrackRecord]:
         """Move every running track on to the frame; drop those that end."""
         doubtful = self._doubtful_sensors(frame)
+        self._loudest = max(self._loudest, frame.statistic)
         for track in self._tracks:
             track.doubt(doubtful)
         out = [record for track in self._tracks for record in track.step(frame, dt)]
@@ -156,7 +164,7 @@ class TrackManager:
         """Drop the tracks that have ended."""
         # In the tail of its own detection a vehicle would be started on the wrong line.
         if any(track.is_lost for track in self._tracks) and not self._target.starts_anywhere:
-            self._tail_of_detection = True
+            self._tail_until = LOUDER * self._loudest
         self._tracks = [track for track in self._tracks if track.ended is None]
 
     def _remember(self, frame: FieldFrame) -> None:
@@ -170,7 +178,7 @@ class TrackManager:
         """Start a track and run it through the frames before the detection."""
         if len(self._network) == 1 and not self._settings.single_sensor_prior:
             self.counts[NO_SCALE] += 1
-            self._tail_of_detection = True
+            self._tail_until = np.inf
             return []
         s, sensors = self._settings, self._sensors_at(frame)
         bank_filter = BankFilter(sensors.network, self._target.model, s)
@@ -182,6 +190,9 @@ class TrackManager:
             self.counts['frames without a start'] += 1
             return []
         self.counts['tracks'] += 1
+        if self._tail_until is not None:
+            self.counts['tracks begun in a louder field than that of a lost one'] += 1
+        self._tail_until, self._loudest = None, frame.statistic
         track = RunningTrack(self._next_id, self._target, s, sensors, bank_filter, bank,
                              self.counts)
         self._next_id += 1
