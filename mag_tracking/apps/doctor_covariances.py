@@ -39,11 +39,11 @@ def covariance_findings(name: str, topic: str, calibrate: Calibrate) -> Iterator
     advice = (f'the measured noise was used {n} times; have the driver publish the variance in '
               'T^2, or zeros where it is unknown (calibrate.trust_covariances: true uses it '
               'unchecked)')
-    known = (stated > 0.0) & (measured > 0.0)
+    known = (stated > 0.0) & np.isfinite(stated) & (measured > 0.0)
     if not known.any() or np.abs(np.log(stated[known] / measured[known])).max() < np.log(2.0):
         yield Finding(False, name, f'the covariances on {topic} are not those of the quiet '
-                      'readings (not positive definite, or axes that are said to err together)',
-                      advice)
+                      'readings (not positive definite, not finite, or axes that are said to err '
+                      'together)', advice)
         return
     ratio = np.full(3, -1.0)
     ratio[known] = np.abs(np.log(stated[known] / measured[known]))

@@ -192,7 +192,7 @@ def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[
     Parameters
     ----------
     recording : path
-        An .mcap file or a rosbag2 folder.
+        An .mcap, .db3 or .bag file, or a rosbag2 folder.
     network : SensorNetwork or path of a network file
     settings : {name: value}, optional
         What differs from the defaults for a vehicle.

@@ -55,7 +55,7 @@ def read_recording(path: str | PathLike[str],
     Parameters
     ----------
     path : path
-        An .mcap file or a rosbag2 folder.
+        An .mcap, .db3 or .bag file, or a rosbag2 folder.
     network : SensorNetwork or path of a network file
 
     Returns

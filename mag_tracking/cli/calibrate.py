@@ -45,7 +45,7 @@ def add(commands: Commands) -> None:
     p = add_command(commands, 'calibrate', _calibrate,
                     'Find how sensors are turned and their clocks are off.', _CALIBRATE)
     p.add_argument('recording', type=Path, metavar='RECORDING',
-                   help='an .mcap file or a rosbag2 folder')
+                   help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
     add_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='FILE',
                    help='the network file to write')

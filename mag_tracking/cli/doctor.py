@@ -38,7 +38,7 @@ def add(commands: Commands) -> None:
     """Register the command."""
     p = add_command(commands, 'doctor', _doctor, 'Say what is wrong with the sensors.', _DOCTOR)
     p.add_argument('recording', nargs='?', type=Path, metavar='RECORDING',
-                   help='an .mcap file or a rosbag2 folder')
+                   help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
     p.add_argument('--live', type=float, metavar='SECONDS',
                    help='listen to the topics for so long instead (needs ROS 2)')
     add_network(p)

@@ -57,7 +57,7 @@ def add(commands: Commands) -> None:
     """Register the command."""
     p = add_command(commands, 'fit', _fit, 'Fit whole passes at constant velocity, offline.', _FIT)
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
-                   help='an .mcap file or a rosbag2 folder')
+                   help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
     add_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder for the results')
     p.add_argument('--orders', nargs='+', type=int, default=[1, 2, 3, 4], metavar='N',

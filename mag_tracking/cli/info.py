@@ -25,6 +25,8 @@ def _info(args: argparse.Namespace) -> int:
           f'{sum(recording.message_counts.values())} messages')
     if recording.start_ns is not None and recording.end_ns is not None:
         print(f'  {(recording.end_ns - recording.start_ns) / 1e9:.2f} s')
+    if not recording.message_counts:
+        print('  warning: there is no message in it')
     for topic in sorted(recording.types):
         print(f'  {topic}  {recording.types[topic]}  {recording.message_counts[topic]}')
     for what, n in recording.losses.items():

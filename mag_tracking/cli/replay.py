@@ -23,7 +23,7 @@ from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.reader import Recording
 from mag_tracking.stages.track.evidence import LOST
-from mag_tracking.stages.track.manager import NO_SCALE
+from mag_tracking.stages.track.manager import ALONE, NO_SCALE
 
 _REPLAY = '''
 Reads the magnetic fields of the network's topics, learns each sensor's
@@ -58,7 +58,7 @@ def add(commands: Commands) -> None:
     """Register the command."""
     p = add_command(commands, 'replay', _replay, 'Track what is in recordings, offline.', _REPLAY)
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
-                   help='an .mcap file or a rosbag2 folder')
+                   help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
     add_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder for the results')
     add_settings(p)
@@ -150,7 +150,7 @@ def _print_track(t: dict[str, Any]) -> None:
 def _print_limits(summary: dict[str, Any]) -> None:
     """Print the limits of the tracks and their causes."""
     counts = summary['counts']['track']
-    if counts.get(NO_SCALE, 0):
+    if counts.get(NO_SCALE, 0) or counts.get(ALONE, 0) and not summary['tracks']:
         print('  no track: one sensor does not tell the scale. `mag-tracking events` describes '
               'what passes without it; where the settings are true of the vehicles here, '
               'track.single_sensor_prior: true takes the scale from them')

@@ -31,7 +31,7 @@ def add(commands: Commands) -> None:
     p = add_command(commands, 'tumble', _tumble,
                     'Find the hard and soft iron of sensors that were turned about.', _TUMBLE)
     p.add_argument('recording', type=Path, metavar='RECORDING',
-                   help='an .mcap file or a rosbag2 folder')
+                   help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
     add_network(p)
     p.add_argument('--sensor', nargs='+', default=[], metavar='NAME',
                    help='which were turned (default: all)')

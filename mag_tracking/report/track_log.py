@@ -120,7 +120,8 @@ class TrackLog:
     def summary(self) -> dict[str, Any]:
         """The track in a few JSON-ready numbers.
 
-        Speed and moment are those of the `surest` pose.
+        Speed and moment are those of the `surest` pose; arrival and kind those of the last one.
+        The verdict is `unique` where neither is ambiguous.
         """
         sure = self.surest()
         final = self.arrivals[-1]
@@ -133,7 +134,7 @@ class TrackLog:
             'arrival_weights': {k: v[0] for k, v in sorted(final.items())},
             'kind': self.kind[-1], 'kind_weight': self.kind_weight[-1],
             'length': self.length[sure],
-            'verdict': 'ambiguous' if self.ambiguous[-1] else 'unique',
+            'verdict': 'ambiguous' if self.ambiguous[-1] or self.ambiguous[sure] else 'unique',
             'ambiguous_share': float(np.mean(self.ambiguous)),
             'existence': self.existence,
             'speed': float(np.linalg.norm(self.velocity[sure][:2])),

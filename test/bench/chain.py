@@ -1,6 +1,6 @@
 """What the middleware alone takes: four bare rclpy nodes that hand on what the nodes hand on.
 
-    python test/bench/chain.py [--seconds 60]
+    PYTHONPATH=test python -m bench.chain [--seconds 60]
 
 A source sends a message of a hundred readings a hundred times a second; two nodes hand it on as it
 is, and the last one sends a pose for every eighth: the peer of `load.py`, whose nodes do their work

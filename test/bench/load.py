@@ -1,8 +1,8 @@
 """What the nodes cost: driver, calibration, detection and tracker as processes, live.
 
-    python test/bench/load.py                                    # 100 sensors x 100 Hz, ten minutes
-    python test/bench/load.py --sensors 2 --minutes 2 --lean     # two sensors, 126 hypotheses
-                              --one-process --batches            # the same, as cheap as can be
+    PYTHONPATH=test python -m bench.load                         # 100 sensors x 100 Hz, ten minutes
+    PYTHONPATH=test python -m bench.load --sensors 2 --minutes 2 --lean   # two, 126 hypotheses
+                                --one-process --batches          # the same, as cheap as can be
 
 The simulator is the hardware; it runs in the driver's process. Printed are how long a pose comes
 after the sample that completed its frame, by this machine's clock, what was lost, and what each

@@ -1,6 +1,6 @@
 """`make bench`: random trucks, cars and turning cars of two simulators of different structure.
 
-The share of poses that are sure and wrong, the normalised error, the speed.
+The share of poses that are sure and wrong, filtered and smoothed, the normalised error, the speed.
 """
 
 import argparse
@@ -47,13 +47,16 @@ def summary(simulator, kind, found):
     fast = np.array([f.speed_ratio for f in found])
     within = np.mean(np.abs(fast - 1.0) < 0.1)
     n_sure, share = share_of_wrong(sure)
+    n_smoothed = sum(f.smoothed_sure for f in found)
+    smoothed = sum(f.smoothed_wrong for f in found) / max(n_smoothed, 1)
     met = share <= MOST_WRONG and nees.mean() <= MOST_NEES[kind] and within >= LEAST_SPEED
     return (f'  {simulator}, {kind}: {len(sure)} of {len(found)} tracked and somewhere '
             f'unambiguous; {n_sure} such poses, sure and wrong {share:.1%} (aim 1 %), in '
             f'{sum(f.sure_and_wrong.any() for f in sure)} passes; within 5 m NEES an axis mean '
             f'{nees.mean():.1f} (aim {MOST_NEES[kind]:.1f}), median {np.median(nees):.1f}; speed '
             f'within 10 % in {within:.0%} (aim 90 %); at the closest point median '
-            f'{np.median(closest):.2f} m{"" if met else "  MISSED"}', met)
+            f'{np.median(closest):.2f} m; of {n_smoothed} unambiguous smoothed poses '
+            f'{smoothed:.1%} sure and wrong{"" if met else "  MISSED"}', met)
 
 
 def main():

@@ -6,7 +6,7 @@ import numpy as np
 
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
-from mag_tracking.records import Track
+from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.simulation.scenario import Imperfections, Path, random_vehicle
 from support.box_vehicles import BOUGHT, box_car, box_truck, random_drive
 from support.bundled import NETWORK_FILE
@@ -67,12 +67,34 @@ class Tracked:
     heading: float
     """Cosine of the angle between the two velocities there; NaN without a pose."""
     detected: bool
+    smoothed_sure: int
+    """Smoothed poses that are not flagged."""
+    smoothed_wrong: int
+    """Those of them that are wrong."""
 
     @property
     def sure_and_wrong(self):
         """(n,)"""
-        return (~self.ambiguous & (self.error > WRONG_M)
-                & (self.error > WRONG_SD * self.deviation))
+        return ~self.ambiguous & are_wrong(self.error, self.deviation)
+
+
+def are_wrong(error, deviation):
+    """Whether errors [m] of these stated deviations [m] are wrong."""
+    return (error > WRONG_M) & (error > WRONG_SD * deviation)
+
+
+def errors_of(poses, t, position):
+    """Horizontal error (n,) [m] of `Track`s or `SmoothedPose`s from the positions at times `t` [s],
+    its stated deviation (n,) [m], its square over what is stated, an axis, and the truth (n, 2).
+    """
+    stamps = np.array([r.stamp_ns for r in poses]) / 1e9
+    true = np.stack([np.interp(stamps, t, position[:, k]) for k in (0, 1)], axis=1)
+    error = np.array([r.position[:2] for r in poses]).reshape(-1, 2) - true
+    P = np.array([r.covariance[:2, :2] for r in poses]).reshape(-1, 2, 2)
+    size = np.hypot(*error.T)
+    along = np.sqrt(np.einsum('ni,nij,nj->n', error, P, error)) / np.maximum(size, 1e-9)
+    nees = np.einsum('ni,ni->n', error, np.linalg.solve(P, error[:, :, None])[:, :, 0]) / 2
+    return size, along, nees, true
 
 
 def tracked(network, body, course, duration, flaws, seed, changes=None, faults=()):
@@ -81,27 +103,23 @@ def tracked(network, body, course, duration, flaws, seed, changes=None, faults=(
                                                  np.random.default_rng(seed), flaws)
     readings = apply(readings, *faults)
     pipeline = Pipeline(network, settings_for('vehicle', changes))
-    tracks = [r for r in pipeline.feed(readings) + pipeline.flush()
-              if isinstance(r, Track) and not r.ended]
-    stamps = np.array([r.stamp_ns for r in tracks]) / 1e9
-    true = np.stack([np.interp(stamps, t, position[:, k]) for k in (0, 1)], axis=1)
+    records = pipeline.feed(readings) + pipeline.flush()
+    tracks = [r for r in records if isinstance(r, Track) and not r.ended]
+    size, along, nees, true = errors_of(tracks, t, position)
     velocity = np.gradient(position, t, axis=0)
-    error = np.array([r.position[:2] for r in tracks]).reshape(-1, 2) - true
-    P = np.array([r.covariance[:2, :2] for r in tracks]).reshape(-1, 2, 2)
-    size = np.hypot(*error.T)
     distance = np.hypot(*(true - network.centre[:2]).T)
     ratio = heading = np.nan
     if len(tracks):
         k = int(np.argmin(distance))
-        v = np.array([np.interp(stamps[k], t, v) for v in velocity.T[:2]])
+        v = np.array([np.interp(tracks[k].stamp_ns / 1e9, t, v) for v in velocity.T[:2]])
         stated = tracks[k].velocity[:2]
         ratio = np.hypot(*stated) / np.hypot(*v)
         heading = stated @ v / np.hypot(*stated) / np.hypot(*v)
-    along = np.sqrt(np.einsum('ni,nij,nj->n', error, P, error)) / np.maximum(size, 1e-9)
-    return Tracked(size, along,
-                   np.einsum('ni,ni->n', error, np.linalg.solve(P, error[:, :, None])[:, :, 0]) / 2,
-                   distance, np.array([r.ambiguous for r in tracks], dtype=bool), float(ratio),
-                   float(heading), pipeline.detect.counts['onsets'] > 0)
+    sure = [r for r in records if isinstance(r, SmoothedPose) and not r.ambiguous]
+    smoothed_error, smoothed_deviation, *_ = errors_of(sure, t, position)
+    return Tracked(size, along, nees, distance, np.array([r.ambiguous for r in tracks], dtype=bool),
+                   float(ratio), float(heading), pipeline.detect.counts['onsets'] > 0, len(sure),
+                   int(are_wrong(smoothed_error, smoothed_deviation).sum()))
 
 
 def one_random_pass(simulator, kind, seed, changes=None, faults=()):

@@ -37,7 +37,8 @@ def test_covariances_that_drivers_make_up_change_nothing(name):
 
 
 @pytest.mark.parametrize('stated', studied(
-    [[0.0] * 9, [-1.0] + [0.0] * 8, [1e-2, 0, 0, 0, 1e-2, 0, 0, 0, 1e-2], [-1e-2] * 9],
+    [[0.0] * 9, [-1.0] + [0.0] * 8, [1e-2, 0, 0, 0, 1e-2, 0, 0, 0, 1e-2], [-1e-2] * 9,
+     [float('inf'), 0, 0, 0, float('inf'), 0, 0, 0, float('inf')]],
     kept=([0.0] * 9, [-1e-2] * 9)))
 def test_covariances_in_a_recording(stated, tmp_path):
     readings = recorded(CAR).readings
@@ -57,6 +58,11 @@ def test_the_doctor_names_topic_sizes_and_cause():
     for variance, cause in (((std * 1e6)**2, 'microtesla^2'), (std, 'in place of the variance')):
         said = [f for f in findings(CAR, spoiler.covariance(variance)) if 'state a noise' in f]
         assert len(said) == 2 and all(cause in f for f in said), said
+
+
+def test_the_doctor_takes_infinite_covariances():
+    said = [f for f in findings(CAR, spoiler.covariance(np.inf)) if 'not finite' in f]
+    assert len(said) == 2
 
 
 @pytest.mark.parametrize('name', studied(VEHICLES, kept=(TURN,)))

@@ -4,6 +4,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.calibration.doubtful_times import DoubtfulTimes, are_doubtful, noted
 from mag_tracking.records import Track
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
@@ -36,6 +37,7 @@ class TrackEvidence:
         self._single_sensor_s = 0.0
         self._n_misfits = 0
         self._doubts_filter_until_ns = -1
+        self._filter_doubts: DoubtfulTimes = ()
         self._best_spread = np.inf
 
     def add(self, log_likelihood_ratio: float) -> None:
@@ -72,7 +74,13 @@ class TrackEvidence:
         """
         if gain < -OVERFIT_NATS:
             self._doubts_filter_until_ns = stamp_ns + round(window_s * NS)
-        return stamp_ns <= self._doubts_filter_until_ns
+        doubtful = stamp_ns <= self._doubts_filter_until_ns
+        self._filter_doubts = noted(self._filter_doubts, stamp_ns, doubtful)
+        return doubtful
+
+    def doubted_filter(self, stamp_ns: int) -> bool:
+        """Whether the filter was doubted at an earlier time."""
+        return are_doubtful(self._filter_doubts, stamp_ns)
 
     def support(self, by_one_sensor: bool, dt: float) -> None:
         """Count `dt` [s] for which one sensor of several supported the track, or more did.

@@ -78,12 +78,13 @@ class VehicleSettings:
     induced_share: float = param(
         0.4, 'Part of the starting moment that a field of 50 uT would induce: soft iron D = share '
         'x moment x mu0 / 50 uT along each axis of the vehicle, m = Rz (m0 + D Rz^T B0/mu0). '
-        'TSP14 Table VI has 0.35 for a car (its D times three), T10 Table 6.9 as fitted here 0.42. '
+        'TSP14 Tables V and VI have 0.26 for a car (its D times three), T10 Table 6.9 as fitted '
+        'here 0.42. '
         'Without an earth field it has no effect.', '', (0.0, 10.0))
     induced_share_std: float = param(
         0.3, 'Spread of that share: once of what the three axes have in common, and once more of '
-        'each axis. Those of MITRE12\'s car deviate by 0.13 from their mean (RMS); wider makes up '
-        'for what the model leaves out.', '', (0.0, 10.0))
+        'each axis. Those of MITRE12\'s car deviate by a third of their mean (RMS), which is 0.13 '
+        'here; wider makes up for what the model leaves out.', '', (0.0, 10.0))
     acceleration: float = param(
         1.0, 'Root spectral density of the horizontal acceleration.', 'm/s^1.5', (0.0, 1000.0))
     turn_acceleration: float = param(

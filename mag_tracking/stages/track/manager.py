@@ -24,10 +24,13 @@ from mag_tracking.stages.track.target import target_of
 from mag_tracking.units import NS
 
 NO_SCALE = 'detections not tracked (one sensor does not tell the scale)'
+ALONE = 'frames without a start (one sensor alone does not tell the scale)'
+
+LOUDER_THAN_LOST = 'tracks begun in a field larger than that of a lost one'
 
 LOUDER = 4.0
-"""Where a target was lost, another one is started in a frame that has this times the energy of any
-frame of the lost track: twice the field. In the tail of a pass the field only falls."""
+"""Where a target was lost, another one is started in a frame whose field has this times the energy
+of any frame of the lost track: twice the field. In the tail of a pass the field only falls."""
 
 
 class TrackManager:
@@ -51,10 +54,10 @@ class TrackManager:
         self._next_id = 1
         self._recent: deque[FieldFrame] = deque()
         self._last_ns: int | None = None
-        # Largest energy since a track was started.
+        # [T^2] Largest energy of the field since a track was started.
         self._loudest = 0.0
-        # A target that was lost is not started again in the tail of its own detection: in frames
-        # of less energy than this. None: there is no such tail.
+        # A target that was lost is not started again in the tail of its own detection: while the
+        # energy is no larger than this. None: there is no such tail.
         self._tail_until: float | None = None
         self._next_network: SensorNetwork | None = None
         self._doubtful_times: Mapping[str, DoubtfulTimes] = {}
@@ -116,7 +119,7 @@ class TrackManager:
             self._remember(frame)
         elif self._tracks and previous is not None:
             out += self._maintain(frame, (frame.stamp_ns - previous) / NS)
-        elif self._tail_until is None or frame.statistic > self._tail_until:
+        elif self._tail_until is None or _energy(frame) > self._tail_until:
             out += self._initiate(frame)
         return out
 
@@ -153,7 +156,7 @@ class TrackManager:
     def _maintain(self, frame: FieldFrame, dt: float) -> list[TrackRecord]:
         """Move every running track on to the frame; drop those that end."""
         doubtful = self._doubtful_sensors(frame)
-        self._loudest = max(self._loudest, frame.statistic)
+        self._loudest = max(self._loudest, _energy(frame))
         for track in self._tracks:
             track.doubt(doubtful)
         out = [record for track in self._tracks for record in track.step(frame, dt)]
@@ -168,7 +171,7 @@ class TrackManager:
         self._tracks = [track for track in self._tracks if track.ended is None]
 
     def _remember(self, frame: FieldFrame) -> None:
-        """Keep a frame without a target for a track that may begin soon."""
+        """Keep a frame without a track for one that may begin soon."""
         self._recent.append(frame)
         oldest = frame.stamp_ns - self._settings.lookback_s * NS
         while self._recent and self._recent[0].stamp_ns < oldest:
@@ -180,25 +183,33 @@ class TrackManager:
             self.counts[NO_SCALE] += 1
             self._tail_until = np.inf
             return []
-        s, sensors = self._settings, self._sensors_at(frame)
+        s = self._settings
+        recent = [f for f in self._recent if frame.stamp_ns - f.stamp_ns <= s.lookback_s * NS]
+        if not (s.single_sensor_prior or self._target.starts_anywhere) \
+                and _n_sensors(frame, *recent) < 2:
+            self.counts[ALONE] += 1
+            self._remember(frame)
+            return []
+        sensors = self._sensors_at(frame)
         bank_filter = BankFilter(sensors.network, self._target.model, s)
         bank = self._target.start(s, sensors.network, sensors.part_of(frame),
                                   bank_filter.observation.own_covariance)
-        recent = [f for f in self._recent if frame.stamp_ns - f.stamp_ns <= s.lookback_s * NS]
         self._recent.clear()
         if bank is None:
             self.counts['frames without a start'] += 1
             return []
         self.counts['tracks'] += 1
-        if self._tail_until is not None:
-            self.counts['tracks begun in a louder field than that of a lost one'] += 1
-        self._tail_until, self._loudest = None, frame.statistic
+        in_tail = self._tail_until is not None
+        if in_tail:
+            self.counts[LOUDER_THAN_LOST] += 1
+        self._tail_until, self._loudest = None, _energy(frame)
         track = RunningTrack(self._next_id, self._target, s, sensors, bank_filter, bank,
                              self.counts)
         self._next_id += 1
         self._tracks.append(track)
         track.doubt(self._doubtful_sensors(*recent, frame))
-        out = track.begin(frame, recent)
+        out = track.begin(frame, recent,
+                          unseen_coming=in_tail or bool(recent) and _n_sensors(*recent) < 2)
         self._delete_ended()
         return out
 
@@ -209,3 +220,16 @@ class TrackManager:
         strongest = int(np.argmax(whitened_energy(frame.field, frame.covariance)[0]))
         return SensorSubset.near(self._network, self._network.positions[strongest, :2],
                                  self._settings.most_sensors)
+
+
+def _energy(frame: FieldFrame) -> float:
+    """[T^2] Sum of the squared field of all sensors.
+
+    It is not weighed by its noise: what the detector allows for grows while a detection lasts.
+    """
+    return float(np.nansum(np.square(frame.field)))
+
+
+def _n_sensors(*frames: FieldFrame) -> int:
+    """How many sensors measured in one frame or another."""
+    return int(np.count_nonzero(np.any([~np.isnan(f.field) for f in frames], axis=(0, 2))))

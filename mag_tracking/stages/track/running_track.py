@@ -83,7 +83,8 @@ class RunningTrack:
             self.counts['tracks of a doubtful background'] += 1
             self._evidence.doubt()
 
-    def begin(self, frame: FieldFrame, recent: list[FieldFrame]) -> list[TrackRecord]:
+    def begin(self, frame: FieldFrame, recent: list[FieldFrame], unseen_coming: bool = False
+              ) -> list[TrackRecord]:
         """Run through the `recent` frames before the detection, and publish the first one after.
 
         Parameters
@@ -92,6 +93,8 @@ class RunningTrack:
             Of the whole network, with the detection.
         recent : list of FieldFrame
             Those before it, oldest first.
+        unseen_coming : bool
+            What came before says nothing of how this target came.
         """
         frame, recent = self._sensors.part_of(frame), [self._sensors.part_of(f) for f in recent]
         lookback_ns = self._settings.lookback_s * NS
@@ -102,7 +105,7 @@ class RunningTrack:
         # a few sensors at one place what the model leaves out of its field.
         whole = self._sensors.whole
         at_one_place = len(whole) == 1 or whole.is_close and not self._target.starts_anywhere
-        if is_late or at_one_place:
+        if is_late or at_one_place or unseen_coming:
             self._evidence.doubt()
         if recent:
             self._filter.predict(self.bank, (recent[0].stamp_ns - frame.stamp_ns) / NS)
@@ -221,13 +224,17 @@ class RunningTrack:
 
     def _smoothed(self, best: int, complete: bool, states: list[TrackState],
                   doubtful: bool) -> list[SmoothedPose]:
-        """The `SmoothedPose`s of states of the hypothesis `best`."""
+        """The `SmoothedPose`s of states of the hypothesis `best`.
+
+        What a filter is doubted for its smoother has only half mended.
+        """
         ambiguous = doubtful or is_ambiguous(self.bank, best)
         kind = int(self.bank.kind[best])
         return [smoothed_pose(
             self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,
             kind=kind, kinds=self._target.kinds, unseen=self._unseen, complete=complete,
-            ambiguous=ambiguous) for stamp_ns, x, P in states]
+            ambiguous=ambiguous or self._evidence.doubted_filter(stamp_ns))
+            for stamp_ns, x, P in states]
 
     def _smoothed_at_the_end(self) -> list[SmoothedPose]:
         """What is left of a fixed lag, and the whole track."""

@@ -16,6 +16,8 @@ from mag_tracking.records import PassEvent, Readings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.events.single_sensor_pass import MOST_SURE, closest_point, turning
 from mag_tracking.stages.events.stage import Events
+from mag_tracking.stages.track.manager import ALONE
+from mag_tracking.units import NS
 from support import spoiler
 from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
 from support.marks import studied
@@ -162,6 +164,27 @@ def test_a_single_sensor_is_tracked_with_a_stated_prior_only_and_never_unique():
     result = mt.track(readings, one, settings={'track.single_sensor_prior': True})
     assert len(result.poses) and result.poses['ambiguous'].all()
     assert result.smoothed['ambiguous'].all()
+
+
+def test_where_one_sensor_of_two_is_dead_nothing_is_tracked():
+    readings = spoiler.only_sensor('mag_2')(recorded('straight_car_right').readings)
+    result = mt.track(readings, NETWORK)
+    assert len(result.detections) and not len(result.poses)
+    assert result.counts['track'][ALONE] > 10
+    result = mt.track(readings, NETWORK, settings={'track.single_sensor_prior': True})
+    assert len(result.poses) and result.poses['ambiguous'].all()
+
+
+def test_a_track_begins_when_the_second_sensor_is_back_and_is_flagged():
+    readings = recorded('straight_car_right').readings
+    seconds = (readings.stamp_ns - readings.stamp_ns.min()) / NS
+    silent = (np.array(readings.sensor_names()) == 'mag_2') & (seconds > 4.0) & (seconds < 8.5)
+    whole = mt.track(readings, NETWORK).poses['stamp_ns'][0]
+    assert whole < readings.stamp_ns[silent].max(), 'nothing passes in that time'
+    result = mt.track(readings.part(~silent), NETWORK)
+    assert result.counts['track'][ALONE] > 0
+    assert len(result.poses) and result.poses['ambiguous'].all()
+    assert result.poses['stamp_ns'][0] > readings.stamp_ns[silent].max() - 0.1 * NS
 
 
 def test_the_events_do_not_depend_on_the_batches():

@@ -154,30 +154,33 @@ def test_a_magnet_that_was_not_seen_for_long_is_found_again(gap_s):
     assert stage.counts['frames'] == 40
 
 
-def contradicted(manager, energies):
-    """`Track`s of a steady field, then fields that no vehicle makes, of these energies."""
+def contradicted(manager, sizes):
+    """`Track`s of a steady field, then of fields that no vehicle makes, of these sizes [T]."""
     C = np.repeat(1e-16 * np.eye(3)[None], 2, axis=0)
     rng = np.random.default_rng(1)
     records = []
-    for k, energy in enumerate([1e3] * 10 + energies):
-        y = 1e-7 * np.ones((2, 3)) if k < 10 else 1e-4 * rng.standard_normal((2, 3))
+    for k, size in enumerate([1e-7] * 10 + sizes):
+        y = np.ones((2, 3)) if k < 10 else rng.standard_normal((2, 3))
+        y *= size / np.sqrt(np.mean(y**2))
         records += manager.feed(FieldFrame(80_000_000 * k, y, C, np.full(2, 8), np.zeros(2), True,
-                                           energy, 6))
+                                           1e3, 6))
     return [t for t in records if isinstance(t, Track)]
 
 
 def test_a_vehicle_that_the_field_contradicts_is_lost_and_not_started_anew():
     stage = TrackManager(line_network(2), settings_for('vehicle').track)
-    tracks = contradicted(stage, [3.9e3] + [1e3] * 19)
+    tracks = contradicted(stage, [1e-4] * 10 + [1.9e-4] * 10)
     assert stage.counts['tracks ended: lost its target'] == 1
     assert tracks[-1].ended and tracks[-2].ambiguous
     assert stage.counts['tracks'] == 1 and stage.bank is None
 
 
-def test_where_a_vehicle_was_lost_a_much_louder_one_is_started_and_flagged():
+@pytest.mark.parametrize('lookback_s', [1.0, 0.0])
+def test_where_a_vehicle_was_lost_one_of_twice_the_field_is_started_and_flagged(lookback_s):
     """In the tail of a pass the field only falls; what is twice as strong is something else."""
-    stage = TrackManager(line_network(2), settings_for('vehicle').track)
-    tracks = contradicted(stage, [1e3] * 19 + [4.1e3])
+    stage = TrackManager(line_network(2), settings_for(
+        'vehicle', {'track.lookback_s': lookback_s}).track)
+    tracks = contradicted(stage, [1e-4] * 19 + [2.1e-4])
     assert stage.counts['tracks'] == 2
-    assert stage.counts['tracks begun in a louder field than that of a lost one'] == 1
+    assert stage.counts['tracks begun in a field larger than that of a lost one'] == 1
     assert tracks[-1].id == 2 and tracks[-1].ambiguous

@@ -45,6 +45,9 @@ def test_a_filter_that_fits_better_than_its_path_is_doubted_as_long_as_the_windo
     assert said == [False, False, True, True, False]
     # What it says of later poses is up to them: the track itself is not.
     assert not evidence.is_doubtful
+    # Of its smoothed poses those of the same time are.
+    assert [evidence.doubted_filter(round(t * NS)) for t in (1.0, 1.1, 3.0, 3.2)] == [
+        False, True, True, False]
 
 
 @pytest.mark.parametrize('nis, doubted', [
