@@ -213,7 +213,9 @@ def smoothed_track_dict(poses: Sequence[SmoothedPose], frame: str) -> MessageDic
     """mag_tracking_msgs/SmoothedTrack of the `SmoothedPose`s of one track."""
     last = poses[-1]
     return {'header': header_dict(last.stamp_ns, frame), 'track_id': last.id, 'kind': last.kind,
-            'length': last.length, 'length_std': last.length_std, 'ambiguous': last.ambiguous,
+            'length': last.length, 'length_std': last.length_std,
+            'ambiguous': any(p.ambiguous for p in poses),
+            'pose_ambiguous': [p.ambiguous for p in poses],
             'poses': [smoothed_pose_dict(p, frame) for p in poses],
             'velocities': [xyz(p.velocity) for p in poses]}
 

@@ -16,9 +16,10 @@ class TrackSettings:
 
     target: str = param('vehicle', 'What moves: vehicle or magnet.')
     single_sensor_prior: bool = param(
-        False, 'Track with a network of one sensor, which does not tell the scale: the moments, '
-        'heights and offsets of the settings are true of the targets here, and size and range '
-        'follow from them alone. Such tracks are always ambiguous.')
+        False, 'Track with one sensor alone (a network of one, or the only one that measures). It '
+        'does not tell the scale: the moments, heights and offsets of the settings are taken for '
+        'true of the targets here, and size and range follow from them alone. Such tracks are '
+        'always ambiguous.')
     field_error: float = param(
         0.04, 'Error of the predicted field relative to its size: gains, axes, shape.',
         '', (0.0, 10.0), live=True)

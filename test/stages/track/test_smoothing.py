@@ -329,28 +329,42 @@ def spiked(stage, frames, at, size, n=1):
     return out + stage.flush()
 
 
-@pytest.mark.parametrize('size', studied([1e-6, 1e-5, 1e-3], [1e-5]))
-def test_a_frame_that_contradicts_the_track_does_not_bend_it(size):
-    """One spike, long after the pass: what is known of the pass stays as it is."""
+def paths_without_and_with_a_spike(size):
+    """Smoothed poses within 6 m of a pass, and with one spike of `size` [T], long after it."""
     network, samples, t, position = pass_of(
         random_vehicle(np.random.default_rng(1), length=4.0), seed=1)
     pipeline = Pipeline(network, settings_for('vehicle'))
     frames = [r for s in samples for r in pipeline.feed(one(s)) if isinstance(r, FieldFrame)]
     at = int(np.argmin([abs(np.interp(f.stamp_ns / 1e9, t, position[:, 0]) - 12.0)
                         for f in frames]))
-    paths = []
     for spike in (0.0, size):
         stage = TrackManager(network, settings_for('vehicle').track)
         out = spiked(stage, frames, at, spike)
         poses = [r for r in out if isinstance(r, SmoothedPose) and r.id == 1]
-        paths.append([p for p in poses if abs(np.interp(
-            p.stamp_ns / 1e9, t, position[:, 0])) < 6.0])
         assert stage.counts['frames left out of smoothing'] == (1 if spike else 0)
-    assert len(paths[0]) == len(paths[1]) > 10
-    # Of hypotheses that say nearly the same another may survive: two standard deviations.
-    for plain, spiked_ in zip(*paths, strict=True):
-        d = spiked_.position - plain.position
-        assert d @ np.linalg.solve(plain.covariance[:3, :3], d) < 2.0**2
+        yield [p for p in poses if abs(np.interp(p.stamp_ns / 1e9, t, position[:, 0])) < 6.0]
+
+
+@pytest.mark.parametrize('size', studied([1e-6, 1e-5, 1e-3], [1e-5]))
+def test_a_frame_that_contradicts_the_track_does_not_bend_it(size):
+    """What is known of the pass stays as it is. Of hypotheses that say nearly the same another may
+    survive: two standard deviations.
+    """
+    plain, spiked_ = paths_without_and_with_a_spike(size)
+    assert len(plain) == len(spiked_) > 10
+    for p, q in zip(plain, spiked_, strict=True):
+        d = q.position - p.position
+        assert d @ np.linalg.solve(p.covariance[:3, :3], d) < 2.0**2
+
+
+@pytest.mark.study
+@pytest.mark.xfail(strict=True, reason=(
+    '0.50 m, 1.65 of its deviations: of hypotheses that say nearly the same another survives'))
+def test_a_frame_that_contradicts_the_track_does_not_bend_it_by_a_foot():
+    """The aim, which a row of three dipoles met."""
+    plain, spiked_ = paths_without_and_with_a_spike(1e-5)
+    np.testing.assert_allclose([p.position for p in spiked_], [p.position for p in plain],
+                               rtol=0, atol=0.3)
 
 
 def test_a_track_that_was_lost_is_smoothed_with_a_doubt():
