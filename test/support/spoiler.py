@@ -39,7 +39,7 @@ def covariance(variance):
     def spoil(readings):
         if variance in (0.0, -1.0):
             return dataclasses.replace(readings, covariance=None)
-        C = np.repeat(variance * np.eye(3)[None], len(readings), axis=0)
+        C = np.repeat(np.diag(np.full(3, variance))[None], len(readings), axis=0)
         return dataclasses.replace(readings, covariance=C)
     return spoil
 
