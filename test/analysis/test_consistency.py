@@ -5,7 +5,6 @@ import pytest
 
 from mag_tracking.analysis.consistency import error_over_bound
 from mag_tracking.report.track_log import TrackLog
-from support.bundled import VEHICLES
 from support.passes import NOISE, ROAD
 
 N = 30
@@ -51,16 +50,6 @@ def test_only_poses_with_truth_count():
     assert ratio(log, (stamps[:20], true[:20], q[:20]), range(25, N)) is None
     log.position[0] = np.array([1e3, 0.0, 0.0])
     assert ratio(log, (stamps, true, q), range(5, N)) < 20.0
-
-
-@pytest.mark.parametrize('name', VEHICLES)
-def test_every_replay_with_truth_says_it(vehicle_replays, name):
-    run, _ = vehicle_replays[name]
-    found = run.summary['tracks'][0]['truth']['error_over_bound']
-    print(f'{name}: error over path bound {found:.1f}')
-    # The aim is 1, the bound itself. These limits are no aim: they are only what was reached (0.9
-    # to 5.2, the truck 12.9) with a margin, so that a change for the worse is seen.
-    assert 0.1 < found < (20.0 if 'truck' in name else 6.0)
 
 
 def test_magnets_too(magnet_replays):
