@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 from mag_tracking.errors import SettingsError
+from mag_tracking.event_records import Disturbance
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Detection, FieldFrame, Readings, SmoothedPose, Track
 from mag_tracking.settings import replace
@@ -74,7 +75,7 @@ def settings_for(target: str, changes: Mapping[str, Any] | None = None) -> Setti
     return replace(replace(Settings(), TARGET_DEFAULTS[target]), changes)
 
 
-Output: TypeAlias = FieldFrame | Detection | Track | SmoothedPose
+Output: TypeAlias = FieldFrame | Detection | Track | SmoothedPose | Disturbance
 """What leaves the chain."""
 
 
@@ -92,7 +93,7 @@ class Pipeline:
         self._calibrate: Stage[Readings, Readings] = self.calibrate
         self._align: Stage[Readings, FieldFrame] = self.align
         self._detect: Stage[FieldFrame, FieldFrame | Detection] = self.detect
-        self._track: Stage[FieldFrame, Track | SmoothedPose] = self.track
+        self._track: Stage[FieldFrame, Track | SmoothedPose | Disturbance] = self.track
 
     def feed(self, readings: Readings) -> list[Output]:
         """Raw `Readings` give the `FieldFrame | Detection | Track` records that follow.

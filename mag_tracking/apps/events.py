@@ -8,12 +8,12 @@ from typing import Any
 
 from mag_tracking.apps.first_pass import first_pass_of
 from mag_tracking.apps.readings import network_of
+from mag_tracking.event_records import PassEvent
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.records import PassEvent
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.events.stage import Events
 from mag_tracking.stages.stage import rejected

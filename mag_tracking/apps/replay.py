@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from os import PathLike
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,6 +15,7 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.first_pass import FirstPass, first_pass_of
 from mag_tracking.apps.no_detection import why_no_detection
 from mag_tracking.errors import OutputError
+from mag_tracking.event_records import Disturbance
 from mag_tracking.geometry import heading_of, speed_of
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Output, Pipeline, Settings
@@ -117,6 +118,9 @@ class Results(Protocol):
     def add_detection(self, detection: Detection, /) -> None:
         """Take an onset or a release."""
 
+    def add_disturbance(self, disturbance: Disturbance, /) -> None:
+        """Take a disturbance, when it is found and once more when it has ended."""
+
     def add_smoothed(self, pose: SmoothedPose, /) -> None:
         """Take a smoothed pose."""
 
@@ -133,6 +137,8 @@ class RunCollector:
         self._frame: FieldFrame
         self.logs: dict[int, TrackLog] = {}
         self.smoothed: dict[int, SmoothedLog] = {}
+        self.disturbances: dict[int, Disturbance] = {}
+        """{id: the latest record of it}."""
 
     def take(self, records: Iterable[Output]) -> None:
         """Take the outputs of a batch of readings."""
@@ -141,6 +147,9 @@ class RunCollector:
                 self._frame = record
             elif isinstance(record, Detection):
                 self._results.add_detection(record)
+            elif isinstance(record, Disturbance):
+                self._results.add_disturbance(record)
+                self.disturbances[record.id] = record
             elif isinstance(record, SmoothedPose):
                 self._results.add_smoothed(record)
                 if record.complete:
@@ -171,6 +180,7 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
                 None if np.isnan(v) else float(v) for v in pipeline.calibrate.background(name)]
     tracks = [_track_entry(log, taker.smoothed.get(log.id), pipeline, truth)
               for log in taker.logs.values()]
+    disturbances = [asdict(d) for d in taker.disturbances.values()]
     why = why_no_detection(pipeline.network, pipeline.settings, pipeline.calibrate,
                            pipeline.detect, reader.missing_topics(), rejections)
     return {'recording': recording.path.name, 'target': pipeline.settings.track.target,
@@ -178,7 +188,8 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
             'why_no_detection': why,
             'close_network': len(pipeline.network) > 1 and pipeline.network.is_close,
             'frames_too_long': too_long(pipeline.settings.align, pipeline.network),
-            'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks}
+            'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks,
+            'disturbances': disturbances}
 
 
 def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline,

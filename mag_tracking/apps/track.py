@@ -18,6 +18,7 @@ from mag_tracking.apps.readings import (
 from mag_tracking.apps.replay import RunCollector, errors_against_truth
 from mag_tracking.arrays import StructArray
 from mag_tracking.errors import UnknownTrackError
+from mag_tracking.event_records import Disturbance
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.recording.reader import Recording
@@ -74,11 +75,14 @@ class TrackingResult:
     sensors_without_background: tuple[str, ...]
     """Sensors that were not used because their background was never learnt: the readings need a
     quiet stretch, or the network file a `background` and a `noise_std`."""
+    disturbances: tuple[Disturbance, ...]
+    """Fields that something else than a target explains better."""
 
     def __repr__(self) -> str:
         unused = {**self.rejections, **self.lost}
         notes = [*(f'not used: {n} {cause}' for cause, n in unused.items()),
                  *(f'nothing on {topic}' for topic in self.missing_topics),
+                 *([f'{len(self.disturbances)} disturbances'] if self.disturbances else []),
                  *(f'no background of {name}' for name in self.sensors_without_background)]
         if self.why_no_detection:
             notes.append(f'nothing was detected: {self.why_no_detection}')
@@ -235,10 +239,15 @@ class _Results:
         self.poses: list[Track] = []
         self.smoothed: list[SmoothedPose] = []
         self.detections: list[Detection] = []
+        self.disturbances: dict[int, Disturbance] = {}
 
     def add_detection(self, detection: Detection) -> None:
         """Take an onset or a release."""
         self.detections.append(detection)
+
+    def add_disturbance(self, disturbance: Disturbance) -> None:
+        """Take a disturbance; its last record takes the place of those before."""
+        self.disturbances[disturbance.id] = disturbance
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
         """Take a smoothed pose."""
@@ -259,4 +268,5 @@ def _result(pipeline: Pipeline, results: _Results, tracks: dict[int, TrackLog],
         pipeline.network, pipeline.settings, pose_array(results.poses),
         smoothed_array(results.smoothed), detection_array(results.detections), tracks,
         recording.truth, rejections, pipeline.counts(), recording.lost,
-        recording.missing_topics, why, tuple(pipeline.calibrate.unready()))
+        recording.missing_topics, why, tuple(pipeline.calibrate.unready()),
+        tuple(results.disturbances.values()))

@@ -11,11 +11,11 @@ from tqdm import tqdm
 from mag_tracking.apps.events import EventsResult, find_events
 from mag_tracking.cli.options import Commands, add_command, add_network, add_settings, settings_of
 from mag_tracking.errors import OutputError
+from mag_tracking.event_records import PassEvent
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.network.file import read_network
 from mag_tracking.recording.event_tables import write_events
 from mag_tracking.recording.reader import Recording
-from mag_tracking.records import PassEvent
 from mag_tracking.units import NS
 
 _EVENTS = '''

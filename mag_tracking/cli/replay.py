@@ -22,8 +22,10 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.reader import Recording
+from mag_tracking.stages.track.doubts import MEANINGS
 from mag_tracking.stages.track.evidence import LOST
 from mag_tracking.stages.track.manager import ALONE, NO_SCALE
+from mag_tracking.units import NS
 
 _REPLAY = '''
 Reads the magnetic fields of the network's topics, learns each sensor's
@@ -34,6 +36,7 @@ Writes to DIR:
   poses.csv        the published pose, one row a frame
   poses_smoothed.csv  the same by what came before and after, when a track has ended
   detections.csv   onsets and releases
+  disturbances.csv fields that no target explains
   hypotheses.csv   every member of the bank, every frame
   summary.json     counts, rejected samples by cause, the tracks
   tracks.mcap      poses and tracks as ROS messages (with metadata.yaml)
@@ -118,8 +121,19 @@ def _print_summary(path: Path, summary: dict[str, Any]) -> None:
             print(f'  the recording does not begin quietly: the background of {name} is its most '
                   f'frequent level, at {begin:.1f} to {end:.1f} s')
     _print_limits(summary)
+    for d in summary['disturbances']:
+        _print_disturbance(d)
     for t in summary['tracks']:
         _print_track(t)
+
+
+def _print_disturbance(d: dict[str, Any]) -> None:
+    """A disturbance in a line."""
+    lasted = (d['stamp_ns'] - d['begin_ns']) / NS
+    over = 'over the whole network' if d['uniform'] > 0.5 else 'at each sensor on its own'
+    print(f'  disturbance {d["id"]}: {lasted:.1f} s, up to {1e9 * d["largest"]:.3g} nT at '
+          f'{", ".join(d["sensors"]) or "no sensor alone"}, {over}; no target explains it '
+          f'(track {d["track_id"]})')
 
 
 def _print_track(t: dict[str, Any]) -> None:
@@ -129,6 +143,8 @@ def _print_track(t: dict[str, Any]) -> None:
              if t['arrival'] else '')
           + (f', a {t["kind"]} ({t["kind_weight"]:.0%})' if t['kind'] else '')
           + f', {t["speed"]:.2f} m/s, {t["moment_size"]:.3g} A m^2, {t["verdict"]}')
+    for doubt, n in t['doubts'].items():
+        print(f'    ambiguous in {n} of {t["poses"]} poses: {MEANINGS[doubt]} ({doubt})')
     delay = t.get('delay', {})
     if 'speed' in delay:
         print(f'    by the delay between sensors: {delay["speed"]:.2f} '

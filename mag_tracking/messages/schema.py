@@ -8,16 +8,10 @@ from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
+from mag_tracking.event_records import Disturbance, PassEvent
 from mag_tracking.geometry import rotation_from_quaternion
 from mag_tracking.messages.shapes import FieldReadings, Imu, MagneticField, MessageDict, Time
-from mag_tracking.records import (
-    AccelerationSample,
-    Detection,
-    PassEvent,
-    Readings,
-    SmoothedPose,
-    Track,
-)
+from mag_tracking.records import AccelerationSample, Detection, Readings, SmoothedPose, Track
 from mag_tracking.units import LATEST_NS
 
 
@@ -191,7 +185,8 @@ def track_dict(track: Track, frame: str) -> MessageDict:
             'unobservable': list(track.unobservable),
             'predicted_field': doubles(track.predicted),
             'mounting': doubles(track.mounting),
-            'mounting_covariance': doubles(track.mounting_covariance)}
+            'mounting_covariance': doubles(track.mounting_covariance),
+            'doubts': list(track.doubts)}
 
 
 def hypotheses_dict(track: Track, frame: str) -> MessageDict:
@@ -226,6 +221,13 @@ def detection_dict(d: Detection, frame: str) -> MessageDict:
             'statistic': d.statistic, 'degrees_of_freedom': d.degrees_of_freedom,
             'threshold': d.threshold, 'false_alarm_probability': d.false_alarm_probability,
             'strongest_sensor': d.strongest_sensor}
+
+
+def disturbance_dict(d: Disturbance, frame: str) -> MessageDict:
+    """mag_tracking_msgs/Disturbance of a `Disturbance`."""
+    return {'header': header_dict(d.stamp_ns, frame), 'id': d.id, 'ended': d.ended,
+            'begin': stamp_dict(d.begin_ns), 'largest': d.largest, 'sensors': list(d.sensors),
+            'uniform': d.uniform, 'track_id': d.track_id}
 
 
 def pass_event_dict(e: PassEvent) -> MessageDict:

@@ -66,7 +66,8 @@ DEFINITIONS: dict[str, tuple[tuple[str, ...], str]] = {
         'float64[] innovation_by_sensor\nuint32 degrees_of_freedom\nstring arrival\nstring kind\n'
         'float64 kind_weight\nfloat64 length\nfloat64 length_std\nbool ambiguous\n'
         'bool[6] unobservable\n'
-        'float64[] predicted_field\nfloat64[] mounting\nfloat64[] mounting_covariance\n'),
+        'float64[] predicted_field\nfloat64[] mounting\nfloat64[] mounting_covariance\n'
+        'string[] doubts\n'),
     TRACK_ARRAY: (('std_msgs/msg/Header', 'mag_tracking_msgs/msg/Track'),
                   'std_msgs/Header header\nmag_tracking_msgs/Track[] tracks\n'),
 }

@@ -74,4 +74,5 @@ def track_of(message: Any, hypotheses: Any = None) -> Track:
         message.kind, message.kind_weight, message.length, message.length_std, message.ambiguous,
         tuple(message.unobservable),
         np.array(message.predicted_field).reshape(-1, 3), np.array(message.mounting).reshape(-1, 3),
-        np.array(message.mounting_covariance).reshape(-1, 3, 3), members)
+        np.array(message.mounting_covariance).reshape(-1, 3, 3), members,
+        tuple(message.doubts))

@@ -19,15 +19,18 @@ from mag_tracking_msgs.msg import (
     SmoothedTrack,
     TrackArray,
 )
+from mag_tracking_msgs.msg import Disturbance as DisturbanceMessage
 from nav_msgs.msg import Odometry, Path
 from rclpy.publisher import Publisher
 from visualization_msgs.msg import MarkerArray
 
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, merged
 from mag_tracking.errors import RecordingError
+from mag_tracking.event_records import Disturbance
 from mag_tracking.messages.calibration_state import doubtful_times, with_orientations
 from mag_tracking.messages.frame import frame_of
 from mag_tracking.messages.schema import (
+    disturbance_dict,
     header_dict,
     hypotheses_dict,
     odometry_dict,
@@ -70,6 +73,7 @@ class TrackerNode(StageNode):
             PoseWithCovarianceStamped, '~/pose_smoothed', SENT)
         self._smoothed = self.publisher(SmoothedTrack, '~/smoothed', RESULTS)
         self._smoothed_path = self.publisher(Path, '~/path_smoothed', RESULTS)
+        self._disturbances = self.publisher(DisturbanceMessage, '~/disturbances', SENT)
         self._markers = self.publisher(MarkerArray, '~/markers', RESULTS)
         self._path: deque[PoseStamped] = deque(maxlen=LONGEST_PATH)
         self._is_silent = False
@@ -130,10 +134,13 @@ class TrackerNode(StageNode):
         self._stage.idle()
 
     def _publish_all(self, records: list[TrackRecord]) -> None:
-        """`Track`s and `SmoothedPose`s, each where it belongs."""
+        """`Track`s, `SmoothedPose`s and `Disturbance`s, each where it belongs."""
         whole = []
         for record in records:
-            if not isinstance(record, SmoothedPose):
+            if isinstance(record, Disturbance):
+                self._disturbances.publish(to_message(
+                    DisturbanceMessage, disturbance_dict(record, self.network.frame)))
+            elif not isinstance(record, SmoothedPose):
                 self._publish(record)
             elif record.complete:
                 whole.append(record)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mag_tracking.errors import OutputError
-from mag_tracking.records import SIGNATURE_SPAN, PassEvent
+from mag_tracking.event_records import SIGNATURE_SPAN, PassEvent
 from mag_tracking.units import NS
 
 EVENT_COLUMNS = ('sensor', 'number', 'ended', 'onset_ns', 'release_ns', 'peak_ns', 'peak_x_nt',

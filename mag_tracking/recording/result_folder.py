@@ -11,6 +11,7 @@ from typing import Any, Protocol, TextIO
 import numpy as np
 
 from mag_tracking.errors import OutputError
+from mag_tracking.event_records import Disturbance
 from mag_tracking.messages.schema import header_dict, pose_with_covariance_dict, track_dict
 from mag_tracking.messages.types import POSE_WITH_COVARIANCE, TRACK_ARRAY
 from mag_tracking.recording.writer import RecordingWriter
@@ -18,10 +19,12 @@ from mag_tracking.records import Detection, SmoothedPose, Track
 
 POSE_COLUMNS = ('stamp_ns', 'track_id', 'x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z',
                 'sd_vx', 'sd_vy', 'sd_vz', 'mx', 'my', 'mz', 'weight', 'ambiguous',
-                'kind', 'kind_weight', 'length', 'sd_length')
+                'kind', 'kind_weight', 'length', 'sd_length', 'doubts')
 SMOOTHED_COLUMNS = (*POSE_COLUMNS[:17], 'ambiguous', 'kind', 'length', 'sd_length')
 DETECTION_COLUMNS = ('stamp_ns', 'id', 'event', 'statistic', 'degrees_of_freedom', 'threshold',
                      'false_alarm_probability', 'strongest_sensor')
+DISTURBANCE_COLUMNS = ('stamp_ns', 'id', 'ended', 'begin_ns', 'largest', 'sensors', 'uniform',
+                       'track_id')
 HYPOTHESIS_COLUMNS = ('stamp_ns', 'track_id', 'arrival', 'kind', 'weight', 'x', 'y', 'z', 'vx',
                       'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz', 'mx', 'my',
                       'mz')
@@ -49,6 +52,7 @@ class ResultFolder:
             self._poses = self._table('poses.csv', POSE_COLUMNS)
             self._smoothed = self._table('poses_smoothed.csv', SMOOTHED_COLUMNS)
             self._detections = self._table('detections.csv', DETECTION_COLUMNS)
+            self._disturbances = self._table('disturbances.csv', DISTURBANCE_COLUMNS)
             self._hypotheses = self._table('hypotheses.csv', HYPOTHESIS_COLUMNS)
         except OSError as error:
             self._close_tables()
@@ -96,11 +100,17 @@ class ResultFolder:
         self._poses.writerow([track.stamp_ns, track.id, *_floats(
             track.position, track.velocity, sd, track.moment, [track.weight]),
             int(track.ambiguous), track.kind, *_floats(
-                [track.kind_weight, track.length, track.length_std])])
+                [track.kind_weight, track.length, track.length_std]), ' '.join(track.doubts)])
         for h in track.hypotheses:
             sd = np.sqrt(np.diagonal(h.covariance))
             self._hypotheses.writerow([track.stamp_ns, track.id, h.arrival, h.kind, *_floats(
                 [h.weight], h.position, h.velocity, sd, h.moment)])
+
+    def add_disturbance(self, d: Disturbance) -> None:
+        """One row when a `Disturbance` is found, and one when it has ended."""
+        self._disturbances.writerow([
+            d.stamp_ns, d.id, int(d.ended), d.begin_ns, repr(d.largest), ' '.join(d.sensors),
+            repr(d.uniform), d.track_id])
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
         """One row for a `SmoothedPose` of a whole track; those of a fixed lag have none."""

@@ -63,7 +63,8 @@ def poses_dataframe(poses: StructArray) -> 'pd.DataFrame':
     DataFrame
     """
     columns = {**_state_columns(poses), **{name: poses[name] for name in (
-        'weight', 'ambiguous', 'kind', 'kind_weight', 'length')}, 'sd_length': poses['length_std']}
+        'weight', 'ambiguous', 'kind', 'kind_weight', 'length')}, 'sd_length': poses['length_std'],
+        'doubts': poses['doubts']}
     return dataframe(columns, STATE_UNITS)
 
 

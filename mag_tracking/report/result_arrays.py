@@ -1,7 +1,7 @@
 """Poses, smoothed poses and detections as structured arrays: one element a record."""
 
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -24,9 +24,9 @@ _STATE_FIELDS: _Fields = {
 """Fields that `Track` and `SmoothedPose` share; their documentation has the units."""
 
 _POSE_FIELDS: _Fields = {
-    **_STATE_FIELDS, 'arrival': ('U', ()), 'weight': ('f8', ()), 'kind_weight': ('f8', ()),
-    'existence': ('f8', ()), 'nis': ('f8', ()), 'degrees_of_freedom': ('i8', ()),
-    'unobservable': ('?', (6,))}
+    **_STATE_FIELDS, 'doubts': ('U', ()), 'arrival': ('U', ()), 'weight': ('f8', ()),
+    'kind_weight': ('f8', ()), 'existence': ('f8', ()), 'nis': ('f8', ()),
+    'degrees_of_freedom': ('i8', ()), 'unobservable': ('?', (6,))}
 
 _SMOOTHED_FIELDS: _Fields = {**_STATE_FIELDS, 'complete': ('?', ())}
 
@@ -84,11 +84,16 @@ def detection_array(detections: Sequence[Detection]) -> StructArray:
 
 def _array(records: Sequence[Track | SmoothedPose | Detection], fields: _Fields) -> StructArray:
     """(n,) structured array with the attributes of `records` that `fields` names."""
-    columns = {name: [getattr(r, 'id' if name == 'track_id' else name) for r in records]
-               for name in fields}
+    columns = {name: [_value(r, name) for r in records] for name in fields}
     dtype = [(name, f'U{max(_TEXT_WIDTH, *map(len, columns[name]), 1)}' if kind == 'U' else kind,
               shape) for name, (kind, shape) in fields.items()]
     out = np.zeros(len(records), dtype=dtype)
     for name, (_, shape) in fields.items():
         out[name] = np.array(columns[name], dtype=out[name].dtype).reshape(len(records), *shape)
     return out
+
+
+def _value(record: Track | SmoothedPose | Detection, name: str) -> Any:
+    """The value of a field of the array; several texts are joined by blanks."""
+    value = getattr(record, 'id' if name == 'track_id' else name)
+    return ' '.join(value) if name == 'doubts' else value

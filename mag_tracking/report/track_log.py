@@ -1,5 +1,6 @@
 """What a report remembers of a run: per track the poses, the weights, the fields."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
@@ -54,6 +55,7 @@ class TrackLog:
     ambiguous: list[bool] = field(default_factory=list)
     arrivals: list[dict[str, Arrival]] = field(default_factory=list)
     """Per frame {arrival: (weight, position, covariance (2, 2) of its best hypothesis)}."""
+    doubts: list[tuple[str, ...]] = field(default_factory=list)
     kind: list[str] = field(default_factory=list)
     kind_weight: list[float] = field(default_factory=list)
     length: list[float] = field(default_factory=list)
@@ -72,8 +74,8 @@ class TrackLog:
             self.ended = True
             return
         for name in ('stamp_ns', 'position', 'velocity', 'covariance', 'moment', 'orientation',
-                     'nis', 'nis_by_sensor', 'degrees_of_freedom', 'ambiguous', 'predicted',
-                     'mounting', 'mounting_std', 'kind', 'kind_weight', 'length'):
+                     'nis', 'nis_by_sensor', 'degrees_of_freedom', 'ambiguous', 'doubts',
+                     'predicted', 'mounting', 'mounting_std', 'kind', 'kind_weight', 'length'):
             getattr(self, name).append(getattr(track, name))
         self.measured.append(frame.field)
         self.noise.append(frame.covariance)
@@ -136,6 +138,7 @@ class TrackLog:
             'length': self.length[sure],
             'verdict': 'ambiguous' if self.ambiguous[-1] or self.ambiguous[sure] else 'unique',
             'ambiguous_share': float(np.mean(self.ambiguous)),
+            'doubts': dict(Counter(name for names in self.doubts for name in names)),
             'existence': self.existence,
             'speed': float(np.linalg.norm(self.velocity[sure][:2])),
             'heading_deg': float(np.degrees(np.arctan2(self.velocity[sure][1],

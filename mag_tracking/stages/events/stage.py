@@ -5,8 +5,9 @@ from collections import Counter, deque
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.event_records import SIGNATURE_SPAN, PassEvent
 from mag_tracking.network import SensorNetwork
-from mag_tracking.records import SIGNATURE_SPAN, Detection, PassEvent, Readings
+from mag_tracking.records import Detection, Readings
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.detect.settings import DetectSettings

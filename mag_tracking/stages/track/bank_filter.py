@@ -77,6 +77,17 @@ class BankFilter:
         return self.observation.fields(x, offset, self._near_field_lengths[kind],
                                        self._settings.field_error)
 
+    def model_error(self, bank: FilterBank, i: int, dt: float) -> FloatArray:
+        """(n_sensors,) [T^2] variance of what the model of hypothesis `i` leaves out of a field.
+
+        Only of what is new after `dt` [s].
+        """
+        error = self.observation.model_error(
+            bank.x[i], float(self._near_field_lengths[bank.kind[i]]), self._settings.field_error)
+        time = self._settings.model_error_time_s
+        share = -np.expm1(-2.0 * dt / time) if time else 1.0
+        return share * np.nan_to_num(error, posinf=0.0)
+
     def predicted_field(self, bank: FilterBank, i: int, frame: FieldFrame,
                         dt: float) -> FloatArray:
         """(n_sensors, 3) [T] the field of the frame as hypothesis `i` has it, with backgrounds.

@@ -3,9 +3,13 @@
 import numpy as np
 from scipy.special import chdtri
 
-from mag_tracking.arrays import FloatArray
-from mag_tracking.calibration.doubtful_times import DoubtfulTimes, are_doubtful, noted
-from mag_tracking.records import Track
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.inference.axes import whitened_energy
+from mag_tracking.records import FieldFrame, Track
+from mag_tracking.stages.track import doubts
+from mag_tracking.stages.track.consistency import InnovationConsistency
+from mag_tracking.stages.track.disturbances import size_of
+from mag_tracking.stages.track.explanation import Explanation
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 
@@ -13,7 +17,11 @@ LONGEST_SINGLE_SENSOR_S = 0.5
 """[s] A track that one sensor of several has supported alone for longer stays ambiguous."""
 
 LOST = 'lost its target'
-"""Reason for the end of a track."""
+UNEXPLAINED = 'unexplained'
+"""Reasons for the end of a track."""
+
+UNEXPLAINED_S = 3.0
+"""[s] A track that something else has explained better for so long ends, if a target never did."""
 
 CONTRADICTION = 1e-5
 """A field that is less probable than this contradicts the track of a vehicle. The filter takes it
@@ -26,27 +34,95 @@ Where the path of the same hypothesis makes them less probable by this, the filt
 LEAST_WATCHED = 0.5
 """A track that begins with less than this share of its lookback is ambiguous."""
 
+FELT = 4.0
+"""A sensor has felt a target when the energy of its fields exceeds that of noise by so many
+standard deviations of the latter."""
+
+PASSING_DOUBTS = (doubts.OVERFIT, doubts.SOMETHING_ELSE, doubts.INNOVATIONS, doubts.MISFIT,
+                  doubts.HEIGHT)
+"""What a filter is doubted for at one time, its smoother mends only in part."""
+
 
 class TrackEvidence:
-    """Evidence for a target, and what speaks against its track."""
+    """Evidence for a target, and what speaks against its track.
 
-    def __init__(self) -> None:
-        self.doubted = False
-        """All of the track may be wrong."""
+    Attributes
+    ----------
+    explanation : Explanation
+        Against something else than a target.
+    innovations : InnovationConsistency
+    largest : (n_sensors,) array, T
+        Size of the largest field that each sensor measured.
+    """
+
+    def __init__(self, n_sensors: int) -> None:
+        self.explanation = Explanation()
+        self.innovations = InnovationConsistency(n_sensors)
+        # For the whole track.
+        self._doubts: set[str] = set()
         self._log_odds = 0.0
         self._single_sensor_s = 0.0
         self._n_misfits = 0
         self._doubts_filter_until_ns = -1
-        self._filter_doubts: DoubtfulTimes = ()
+        self._doubtful_stamps: set[int] = set()
         self._best_spread = np.inf
+        # Of each sensor: whitened energy of its fields beyond that of noise, and number of axes.
+        self._energy, self._n_axes = np.zeros(n_sensors), np.zeros(n_sensors)
+        self.largest: FloatArray = np.zeros(n_sensors)
+
+    @property
+    def doubted(self) -> bool:
+        """Whether all of the track may be wrong."""
+        return bool(self._doubts)
+
+    @property
+    def doubts(self) -> set[str]:
+        """What the whole track is doubted for; a copy."""
+        return set(self._doubts)
 
     def add(self, log_likelihood_ratio: float) -> None:
         """Count a frame: its log-likelihood with a target less that without one."""
         self._log_odds += log_likelihood_ratio
 
-    def doubt(self) -> None:
+    def doubt(self, reason: str) -> None:
         """From now on all of the track may be wrong."""
-        self.doubted = True
+        self._doubts.add(reason)
+
+    def take(self, frame: FieldFrame, rows: IntArray, nis: FloatArray) -> None:
+        """Count what the sensors felt in a frame, and how it fits.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+            Of the sensors that the track uses.
+        rows : (n,) int array
+            Those, in the network.
+        nis : (n,) array
+            Normalised innovation squared of the published hypothesis, of each of them.
+        """
+        energy, n_axes = whitened_energy(frame.field, frame.covariance)
+        self._energy[rows] += energy - n_axes
+        self._n_axes[rows] += n_axes
+        self.largest[rows] = np.maximum(self.largest[rows], size_of(frame))
+        of_all, axes_of_all = np.full(len(self.largest), np.nan), np.zeros(len(self.largest))
+        of_all[rows], axes_of_all[rows] = nis, n_axes
+        self.innovations.add(of_all, axes_of_all, frame.stamp_ns)
+
+    @property
+    def felt(self) -> BoolArray:
+        """(n_sensors,) whether they have felt the target."""
+        felt: BoolArray = self._energy > FELT * np.sqrt(2.0 * np.maximum(self._n_axes, 1.0))
+        return felt
+
+    @property
+    def is_felt_by_one(self) -> bool:
+        """Whether fewer than two sensors have felt the target."""
+        return int(np.count_nonzero(self.felt)) < 2
+
+    def note(self, found: set[str], stamp_ns: int) -> None:
+        """Remember what the pose of a frame was doubted for, for the smoothed one."""
+        if found.intersection(PASSING_DOUBTS):
+            self._doubtful_stamps.add(stamp_ns)
 
     def contradicts(self, nis: FloatArray, degrees_of_freedom: int) -> bool:
         """Whether a normalised innovation is one that no target of ours makes.
@@ -56,7 +132,7 @@ class TrackEvidence:
         """
         contradicted = bool(np.nansum(nis) > chdtri(degrees_of_freedom, CONTRADICTION))
         if contradicted and len(nis) <= 2:
-            self.doubt()
+            self.doubt(doubts.CONTRADICTION)
         return contradicted
 
     def doubts_filter(self, gain: float, stamp_ns: int, window_s: float) -> bool:
@@ -74,13 +150,11 @@ class TrackEvidence:
         """
         if gain < -OVERFIT_NATS:
             self._doubts_filter_until_ns = stamp_ns + round(window_s * NS)
-        doubtful = stamp_ns <= self._doubts_filter_until_ns
-        self._filter_doubts = noted(self._filter_doubts, stamp_ns, doubtful)
-        return doubtful
+        return stamp_ns <= self._doubts_filter_until_ns
 
     def doubted_filter(self, stamp_ns: int) -> bool:
         """Whether the filter was doubted at an earlier time."""
-        return are_doubtful(self._filter_doubts, stamp_ns)
+        return stamp_ns in self._doubtful_stamps
 
     def support(self, by_one_sensor: bool, dt: float) -> None:
         """Count `dt` [s] for which one sensor of several supported the track, or more did.
@@ -89,12 +163,17 @@ class TrackEvidence:
         always correct the error when they are back.
         """
         self._single_sensor_s += dt if by_one_sensor else 0.0
-        self.doubted = self.doubted or self._single_sensor_s > LONGEST_SINGLE_SENSOR_S
+        if self._single_sensor_s > LONGEST_SINGLE_SENSOR_S:
+            self.doubt(doubts.ONE_SENSOR)
 
     @property
     def existence(self) -> float:
         """Probability that there is a target."""
         return float(1.0 / (1.0 + np.exp(-np.clip(self._log_odds, -700.0, 700.0))))
+
+    def is_unexplained(self, ratio: float) -> bool:
+        """Whether all of the track, as it stands, is no better than something else by `ratio`."""
+        return self.explanation.log_ratio < float(np.log(ratio))
 
     @property
     def is_doubtful(self) -> bool:
@@ -109,6 +188,9 @@ class TrackEvidence:
         several explain the field, what they differ by says nothing about how far away it is. A
         target that `is_coming` nearer to the sensors is not out of reach, however uncertain.
         """
+        if self.explanation.unexplained_s(settings.explained_ratio, track.stamp_ns) \
+                > UNEXPLAINED_S:
+            return UNEXPLAINED
         misfit = track.nis > settings.end_nis * track.degrees_of_freedom
         self._n_misfits = self._n_misfits + 1 if misfit else 0
         if self._n_misfits > 1:

@@ -16,6 +16,7 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.disturbances import Disturbances
 from mag_tracking.stages.track.observation import MOST_TURNED
 from mag_tracking.stages.track.running_track import RunningTrack, TrackRecord
 from mag_tracking.stages.track.sensor_selection import SensorSubset
@@ -25,6 +26,8 @@ from mag_tracking.units import NS
 
 NO_SCALE = 'detections not tracked (one sensor does not tell the scale)'
 ALONE = 'frames without a start (one sensor alone does not tell the scale)'
+
+DISTURBED = 'tracks of something else'
 
 LOUDER_THAN_LOST = 'tracks begun in a field larger than that of a lost one'
 
@@ -60,6 +63,7 @@ class TrackManager:
         # energy is no larger than this. None: there is no such tail.
         self._tail_until: float | None = None
         self._next_network: SensorNetwork | None = None
+        self._disturbances = Disturbances(network.names)
         self._doubtful_times: Mapping[str, DoubtfulTimes] = {}
         self._doubtful: dict[int, DoubtfulTimes] = {}
         uncertain = sum(bool(s is not None and s.max() > MOST_TURNED)
@@ -113,8 +117,9 @@ class TrackManager:
         out, previous = self._end_at_gap(frame), self._last_ns
         self._last_ns = frame.stamp_ns
         self.counts['frames'] += 1
+        self._disturbances.feed(frame)
         if not frame.target_present:
-            out += self._end_all('released')
+            out += self._end_all('released', frame.stamp_ns)
             self._tail_until = None
             self._remember(frame)
         elif self._tracks and previous is not None:
@@ -132,11 +137,11 @@ class TrackManager:
         """End all tracks and forget the recent frames; nothing is known of what came since."""
         self._recent.clear()
         self._tail_until = None
-        return self._end_all(reason)
+        return self._end_all(reason, self._last_ns)
 
     def flush(self) -> list[TrackRecord]:
         """End all tracks."""
-        return self._end_all('input ended')
+        return self._end_all('input ended', self._last_ns)
 
     def _end_at_gap(self, frame: FieldFrame) -> list[TrackRecord]:
         """End what cannot go on with a frame: time jumped back, or the gap is too long."""
@@ -148,10 +153,22 @@ class TrackManager:
             return self.give_up('time jumped back')
         return self.give_up('gap in the frames') if dt > self._settings.end_gap_s else []
 
-    def _end_all(self, reason: str) -> list[TrackRecord]:
-        """End every running track."""
+    def _end_all(self, reason: str, stamp_ns: int | None) -> list[TrackRecord]:
+        """End every running track, and a disturbance, at the latest frame that is known of it."""
         tracks, self._tracks = self._tracks, []
-        return [record for track in tracks for record in track.end(reason)]
+        out = [record for track in tracks for record in track.end(reason)]
+        if stamp_ns is None:
+            return out
+        return [*out, *self._unexplained(tracks, stamp_ns), *self._disturbances.end(stamp_ns)]
+
+    def _unexplained(self, tracks: list[RunningTrack], stamp_ns: int) -> list[TrackRecord]:
+        """The disturbances that tracks which have ended leave behind."""
+        out: list[TrackRecord] = []
+        for found in (track.unexplained for track in tracks):
+            if found is not None:
+                self.counts[DISTURBED] += 1
+                out += self._disturbances.begin(found, stamp_ns)
+        return out
 
     def _maintain(self, frame: FieldFrame, dt: float) -> list[TrackRecord]:
         """Move every running track on to the frame; drop those that end."""
@@ -160,15 +177,17 @@ class TrackManager:
         for track in self._tracks:
             track.doubt(doubtful)
         out = [record for track in self._tracks for record in track.step(frame, dt)]
-        self._delete_ended()
-        return out
+        return out + self._delete_ended(frame.stamp_ns)
 
-    def _delete_ended(self) -> None:
-        """Drop the tracks that have ended."""
+    def _delete_ended(self, stamp_ns: int) -> list[TrackRecord]:
+        """Drop the tracks that have ended; the disturbances that they leave behind."""
+        out = self._unexplained([track for track in self._tracks if track.ended is not None],
+                                stamp_ns)
         # In the tail of its own detection a vehicle would be started on the wrong line.
         if any(track.is_lost for track in self._tracks) and not self._target.starts_anywhere:
             self._tail_until = LOUDER * self._loudest
         self._tracks = [track for track in self._tracks if track.ended is None]
+        return out
 
     def _remember(self, frame: FieldFrame) -> None:
         """Keep a frame without a track for one that may begin soon."""
@@ -210,8 +229,7 @@ class TrackManager:
         track.doubt(self._doubtful_sensors(*recent, frame))
         out = track.begin(frame, recent,
                           unseen_coming=in_tail or bool(recent) and _n_sensors(*recent) < 2)
-        self._delete_ended()
-        return out
+        return out + self._delete_ended(frame.stamp_ns)
 
     def _sensors_at(self, frame: FieldFrame) -> SensorSubset:
         """The sensors for a track that starts: of a large network those near the strongest."""

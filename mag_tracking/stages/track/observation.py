@@ -90,6 +90,11 @@ class Observation:
         nearest: FloatArray = away.min(axis=1)
         return nearest
 
+    def second_nearest(self, x: FloatArray) -> float:
+        """[m] from the position of a state `x` (n_x,) to the second nearest sensor; inf for one."""
+        away = np.sort(np.linalg.norm(x[:3] - self._positions, axis=1))
+        return float(away[1]) if len(away) > 1 else np.inf
+
     def drift(self, dt: float, background_density: float) -> tuple[FloatArray, FloatArray]:
         """What becomes of the sensors' states over `dt` seconds.
 
@@ -147,10 +152,7 @@ class Observation:
         there as noise.
         """
         h, H, gradient = self.target_fields(x, time_offset)
-        # NaN where a dipole is on a sensor, as the field there: also where the length is zero.
-        with np.errstate(invalid='ignore'):
-            variance = (np.square(near_field_length)[:, None] * gradient**2
-                        + field_error**2 * np.einsum('pji,pji->pj', h, h))
+        variance = _model_error(h, gradient, near_field_length, field_error)
         own = self.own(x)
         if self._n_angles:
             h, H = turned_fields(h, H, np.ascontiguousarray(own[..., :3]))
@@ -160,3 +162,24 @@ class Observation:
         h = h + size * own[..., -3:]
         H = np.concatenate([H, size[..., None] * np.eye(3)], axis=3)
         return h, H, np.zeros_like(variance)
+
+    def model_error(self, x: FloatArray, near_field_length: float, field_error: float
+                    ) -> FloatArray:
+        """(n_sensors,) [T^2] Variance of what the model leaves out of the field of a state (n_x,).
+
+        NaN where a dipole is on a sensor.
+        """
+        h, _, gradient = self.target_fields(x[None], np.zeros(len(self._positions)))
+        variance: FloatArray = _model_error(h, gradient, np.array([near_field_length]),
+                                            field_error)[0]
+        return variance
+
+
+def _model_error(h: FloatArray, gradient: FloatArray, near_field_length: FloatArray,
+                 field_error: float) -> FloatArray:
+    """(n_hyp, n_sensors) [T^2] Variance of what the model leaves out of fields."""
+    # NaN where a dipole is on a sensor, as the field there: also where the length is zero.
+    with np.errstate(invalid='ignore'):
+        variance: FloatArray = (np.square(near_field_length)[:, None] * gradient**2
+                                + field_error**2 * np.einsum('pji,pji->pj', h, h))
+    return variance

@@ -1,6 +1,6 @@
 """From a bank to what is published: the best hypothesis, its pose and its honest doubts."""
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from typing import Protocol, TypeAlias, TypedDict
 
 import numpy as np
@@ -10,6 +10,7 @@ from mag_tracking.geometry import cross_matrix, quaternion_between, quaternion_f
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.physics.sources import SourceModel
 from mag_tracking.records import Hypotheses, SmoothedPose, Track
+from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.unseen_length import UnseenLength
 
 UNOBSERVED_VARIANCE = np.pi**2
@@ -99,9 +100,9 @@ def magnet_orientation(x: FloatArray, P: FloatArray, axis: FloatArray) -> Orient
 
 
 def published_track(bank: FilterBank, best: int, model: SourceModel, orientation: Orientation,
-                    names: Sequence[str], kinds: Sequence[str], strange: bool,
-                    unseen: UnseenLength | None, *, stamp_ns: int, id: int, ended: bool,
-                    existence: float, degrees_of_freedom: int, predicted: FloatArray,
+                    names: Sequence[str], kinds: Sequence[str], found: Set[str],
+                    unseen: UnseenLength | None, *, excess: float = 1.0, stamp_ns: int, id: int,
+                    ended: bool, existence: float, degrees_of_freedom: int, predicted: FloatArray,
                     mounting: FloatArray, mounting_covariance: FloatArray) -> Track:
     """The `Track` of a bank's hypothesis `best`.
 
@@ -117,16 +118,20 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
         The arrival of each label.
     kinds : sequence of str
         The name of each kind.
-    strange : bool
-        The measurement does not fit even the best hypothesis: ambiguous, too.
+    found : set of str
+        What speaks against the pose, of `doubts`; the bank's own ambiguity is added.
     unseen : UnseenLength, optional
         How the length of a vehicle moves its middle; None for a small target.
+    excess : float
+        The innovations are this many times larger than stated: so is the covariance, then.
     stamp_ns, id, ended, existence, degrees_of_freedom, predicted, mounting, mounting_covariance
         Fields of `Track` that the bank does not know.
     """
     n_t = len(model.state_names)
     said, flags = _said_of(model, orientation, bank.x[best, :n_t],
-                           covariance_about(bank, best, model), int(bank.kind[best]), unseen)
+                           excess * covariance_about(bank, best, model), int(bank.kind[best]),
+                           unseen)
+    reasons = doubts.listed({*found, *ambiguities(bank, best)})
     weights = np.exp(bank.log_w)
     moments = model.dipoles(bank.x[:, :n_t]).m.sum(axis=1)
     order = np.argsort(-bank.log_w, kind='stable')
@@ -142,7 +147,7 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
         nis_by_sensor=nis.copy(), weight=float(weights[best]), arrival=names[bank.label[best]],
         kind=kinds[bank.kind[best]],
         kind_weight=float(weights.sum(where=bank.kind == bank.kind[best])),
-        ambiguous=bool(strange or is_ambiguous(bank, best)),
+        ambiguous=bool(reasons), doubts=reasons,
         unobservable=(False, False, False, *flags), hypotheses=hypotheses, **said)
 
 
@@ -166,10 +171,14 @@ def covariance_about(bank: FilterBank, best: int, model: SourceModel) -> FloatAr
     return covariance
 
 
-def is_ambiguous(bank: FilterBank, best: int) -> bool:
+def ambiguities(bank: FilterBank, best: int) -> set[str]:
     """Whether another place, or another arrival, than that of hypothesis `best` is possible."""
-    same_arrival = np.exp(bank.log_w).sum(where=bank.label == bank.label[best])
-    return bool(bank.separated_weight(best) > DOUBT or 1.0 - same_arrival > DOUBT)
+    found = set()
+    if bank.separated_weight(best) > DOUBT:
+        found.add(doubts.ANOTHER_PLACE)
+    if 1.0 - np.exp(bank.log_w).sum(where=bank.label == bank.label[best]) > DOUBT:
+        found.add(doubts.ANOTHER_ARRIVAL)
+    return found
 
 
 def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray, *,

@@ -11,12 +11,16 @@ from itertools import pairwise
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, IntArray
+from mag_tracking.event_records import Disturbance
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
+from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.bank_filter import BankFilter, NoTarget
+from mag_tracking.stages.track.disturbances import Unexplained
 from mag_tracking.stages.track.evidence import LEAST_WATCHED, TrackEvidence
+from mag_tracking.stages.track.plausibility import implausible
 from mag_tracking.stages.track.published_pose import (
-    is_ambiguous,
+    ambiguities,
     published_track,
     smoothed_pose,
 )
@@ -25,10 +29,11 @@ from mag_tracking.stages.track.sensor_rejection import SensorRejection
 from mag_tracking.stages.track.sensor_selection import AHEAD_S, SensorSubset, from_nearest, hand_on
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import FixedLag, TrackState, WholeTrack
+from mag_tracking.stages.track.something_else import SomethingElse
 from mag_tracking.stages.track.target import Target
 from mag_tracking.units import NS
 
-TrackRecord = Track | SmoothedPose
+TrackRecord = Track | SmoothedPose | Disturbance
 
 
 class RunningTrack:
@@ -51,23 +56,28 @@ class RunningTrack:
         self.ended: str | None = None
         self.is_lost = False
         self._target, self._settings = target, settings
+        self._evidence = TrackEvidence(len(sensors.whole))
         self._use(sensors, bank_filter)
         self._relinearisation = Relinearisation(
             settings.relinearise_interval_s, settings.relinearise_window_s,
             settings.relinearise_most)
         self._whole = WholeTrack(settings.smooth_longest_s)
         self._lag = FixedLag(settings.smoothing_lag_s) if settings.smoothing_lag_s else None
-        self._evidence = TrackEvidence()
         self._last: Track | None = None
         self._spread = np.inf
         self._unseen = target.unseen()
         self._handover_due: int | None = None
+        self._was_sure = False
+        self._begin_ns = 0
 
-    def _use(self, sensors: SensorSubset, bank_filter: BankFilter) -> None:
+    def _use(self, sensors: SensorSubset, bank_filter: BankFilter,
+             is_handover: bool = False) -> None:
         """From now on the track is of these sensors."""
         self._sensors, self._filter = sensors, bank_filter
         self._rejection = SensorRejection(sensors.network.names)
         self._no_target = NoTarget(len(sensors.network), self._settings.background_std)
+        self._something_else = SomethingElse(sensors.network, self._settings.background_std,
+                                             is_handover)
 
     def configure(self, settings: TrackSettings) -> None:
         """Apply new values of the live settings."""
@@ -79,9 +89,10 @@ class RunningTrack:
         """All of the track may be wrong if it uses one of the `sensors` (rows): their backgrounds
         are doubtful.
         """
-        if not self._evidence.doubted and np.isin(self._sensors.rows, sensors).any():
+        is_new = doubts.DOUBTFUL_BACKGROUND not in self._evidence.doubts
+        if is_new and np.isin(self._sensors.rows, sensors).any():
             self.counts['tracks of a doubtful background'] += 1
-            self._evidence.doubt()
+            self._evidence.doubt(doubts.DOUBTFUL_BACKGROUND)
 
     def begin(self, frame: FieldFrame, recent: list[FieldFrame], unseen_coming: bool = False
               ) -> list[TrackRecord]:
@@ -105,8 +116,11 @@ class RunningTrack:
         # a few sensors at one place what the model leaves out of its field.
         whole = self._sensors.whole
         at_one_place = len(whole) == 1 or whole.is_close and not self._target.starts_anywhere
-        if is_late or at_one_place or unseen_coming:
-            self._evidence.doubt()
+        if is_late or unseen_coming:
+            self._evidence.doubt(doubts.NOT_SEEN_APPROACHING)
+        if at_one_place:
+            self._evidence.doubt(doubts.SENSORS_AT_ONE_PLACE)
+        self._begin_ns = frame.stamp_ns
         if recent:
             self._filter.predict(self.bank, (recent[0].stamp_ns - frame.stamp_ns) / NS)
         self._whole.begin(self.bank, self._filter)
@@ -146,12 +160,13 @@ class RunningTrack:
         self.counts.update(rejected)
         # Where no majority is left the track may as well be wrong.
         if rejected and np.count_nonzero(frame.n_samples) <= len(rejected):
-            self._evidence.doubt()
+            self._evidence.doubt(doubts.SENSORS_CONTRADICT)
         evidence = bank.reweight(log_likelihood)
         if not np.isfinite(evidence):
             self.counts['banks lost'] += 1
             return None
         self._evidence.add(evidence - self._no_target.log_density(frame, dt, s.background_drift))
+        self._compare(frame, dt, evidence)
         self._relinearisation.add(bank, predicted, log_likelihood, frame, dt)
         self.counts['hypotheses dropped'] += bank.prune(
             -np.log(s.prune_ratio),
@@ -164,6 +179,7 @@ class RunningTrack:
         """The `Track` of the hypothesis `best`."""
         self._last = self._published(frame, dt, best)
         self._spread = float(np.sqrt(np.trace(self.bank.P[best, :2, :2])))
+        self._was_sure |= not self._last.ambiguous
         self.counts['poses'] += 1
         self._handover_due = best if self._sensors.is_part else None
         return [self._last]
@@ -199,19 +215,72 @@ class RunningTrack:
         n_measured = int(np.count_nonzero(measured))
         self._evidence.support(alone, dt)
         self._look(best, np.flatnonzero(measured.any(axis=1)))
-        contradicted = not self._target.starts_anywhere \
-            and self._evidence.contradicts(bank.nis[best], n_measured)
-        overfits = not self._target.starts_anywhere and self._overfits(best, frame.stamp_ns)
+        found = self._doubts(frame, dt, best, alone)
+        self._evidence.note(found, frame.stamp_ns)
+        excess = 1.0 if self._target.starts_anywhere else self._evidence.innovations.excess
         return self._sensors.widened(published_track(
             bank, best, self._target.model, self._target.orientation, self._target.arrivals,
             self._target.kinds, stamp_ns=frame.stamp_ns, id=self.id, ended=False,
             existence=self._evidence.existence, degrees_of_freedom=n_measured,
-            strange=(self._filter.is_strange(bank, best, frame) or alone or contradicted or overfits
-                     or self._evidence.doubted),
-            unseen=self._unseen,
+            found=found, excess=excess, unseen=self._unseen,
             predicted=self._filter.predicted_field(bank, best, frame, dt),
             mounting=observation.angles(bank.x[best]),
             mounting_covariance=observation.angle_covariances(bank.P[best])), self._settings)
+
+    @property
+    def unexplained(self) -> Unexplained | None:
+        """What it says of the field, where it is no track of a target and no pose of it was sure;
+        else None.
+        """
+        evidence = self._evidence
+        if self._was_sure or not evidence.is_unexplained(1.0 / self._settings.explained_ratio):
+            return None
+        return Unexplained(self.id, self._begin_ns, evidence.largest, evidence.felt,
+                           self._something_else.uniform)
+
+    def _is_unexplained(self) -> bool:
+        """Whether, as a whole, the track is no track of a target."""
+        return self._evidence.is_unexplained(self._settings.explained_ratio) \
+            or not self._target.starts_anywhere and self._evidence.is_felt_by_one
+
+    def _doubts(self, frame: FieldFrame, dt: float, best: int, alone: bool) -> set[str]:
+        """What speaks against the pose of hypothesis `best`; `alone`: one sensor measured."""
+        bank, evidence, settings = self.bank, self._evidence, self._settings
+        found = evidence.doubts | ({doubts.ONE_SENSOR} if alone else set())
+        if self._filter.is_strange(bank, best, frame):
+            found.add(doubts.MISFIT)
+        if evidence.explanation.is_doubtful(settings.explained_ratio):
+            found.add(doubts.SOMETHING_ELSE)
+        if self._target.starts_anywhere:
+            return found
+        n_axes = np.count_nonzero(~np.isnan(frame.field), axis=1)
+        if evidence.contradicts(bank.nis[best], int(n_axes.sum())):
+            found.add(doubts.CONTRADICTION)
+        if self._overfits(best, frame.stamp_ns):
+            found.add(doubts.OVERFIT)
+        if evidence.is_felt_by_one:
+            found.add(doubts.FELT_BY_ONE_SENSOR)
+        if evidence.innovations.excess > 1.0:
+            found.add(doubts.INNOVATIONS)
+        if evidence.innovations.fails:
+            evidence.doubt(doubts.INNOVATIONS)
+        implausibilities = implausible(
+            self._filter.observation, bank.x[best], int(bank.kind[best]), settings.vehicle,
+            np.deg2rad(settings.mounting_std_deg), dt)
+        # The height is soon right again; the others have bent the track.
+        for reason in implausibilities - {doubts.HEIGHT}:
+            evidence.doubt(reason)
+        return found | implausibilities | evidence.doubts
+
+    def _compare(self, frame: FieldFrame, dt: float, evidence: float) -> None:
+        """Count what a frame with the log-evidence of a target says for something else, and for
+        the filter."""
+        best = self.bank.best()
+        something_else = self._something_else.log_density(
+            frame, dt, self._filter.model_error(self.bank, best, dt))
+        if something_else is not None:
+            self._evidence.explanation.add(evidence - something_else, frame.stamp_ns)
+        self._evidence.take(frame, self._sensors.rows, self.bank.nis[best])
 
     def _overfits(self, best: int, stamp_ns: int) -> bool:
         """Whether the filter fits the frames much better than the path of hypothesis `best`."""
@@ -228,7 +297,7 @@ class RunningTrack:
 
         What a filter is doubted for its smoother has only half mended.
         """
-        ambiguous = doubtful or is_ambiguous(self.bank, best)
+        ambiguous = doubtful or bool(ambiguities(self.bank, best))
         kind = int(self.bank.kind[best])
         return [smoothed_pose(
             self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,
@@ -238,7 +307,8 @@ class RunningTrack:
 
     def _smoothed_at_the_end(self) -> list[SmoothedPose]:
         """What is left of a fixed lag, and the whole track."""
-        best, doubtful = self.bank.best(), self._evidence.is_doubtful
+        best = self.bank.best()
+        doubtful = self._evidence.is_doubtful or self._is_unexplained()
         rest = [] if self._lag is None else self._smoothed(best, False, self._lag.rest(
             self._filter, self.bank, best), doubtful)
         states, left_out = self._whole.smoothed(self.bank, best)
@@ -263,7 +333,7 @@ class RunningTrack:
         if self._sensors.serves(place, n):
             return
         before, sensors = self._sensors, SensorSubset.near(self._sensors.whole, place, n)
-        self._use(sensors, BankFilter(sensors.network, self._target.model, self._settings))
+        self._use(sensors, BankFilter(sensors.network, self._target.model, self._settings), True)
         observation = self._filter.observation
         hand_on(self.bank, observation.n_own, before.rows, sensors.rows,
                 observation.own_covariance, self._settings.background_std)

@@ -38,6 +38,11 @@ class TrackSettings:
         'field is 3 % too long). 0 = as the file says; with dozens of sensors that is several '
         'times faster.',
         'deg', (0.0, 15.0))
+    explained_ratio: float = param(
+        20.0, 'A target has to explain the frames of its track this many times better than '
+        'something else: a smooth field of each sensor\'s own (temperature, a knock), or over the '
+        'network (a storm, a power line). Otherwise, or where it falls behind by this factor '
+        'within a second, its pose is ambiguous.', '', (1.0, 1e12), live=True)
     iterations: int = param(
         1, 'Linearisations an update: more than one helps when the field says far more than the '
         'prediction (magnets); for vehicles it locks into the wrong side.', '', (1, 20), live=True)

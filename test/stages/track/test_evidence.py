@@ -8,7 +8,16 @@ import pytest
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.pipeline import settings_for
-from mag_tracking.stages.track.evidence import CONTRADICTION, LOST, OVERFIT_NATS, TrackEvidence
+from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track import doubts
+from mag_tracking.stages.track.evidence import (
+    CONTRADICTION,
+    LOST,
+    OVERFIT_NATS,
+    UNEXPLAINED,
+    UNEXPLAINED_S,
+    TrackEvidence,
+)
 from mag_tracking.stages.track.published_pose import covariance_about
 from mag_tracking.units import NS
 
@@ -16,7 +25,7 @@ SETTINGS = settings_for('vehicle').track
 
 
 def pose(nis=6.0):
-    return SimpleNamespace(nis=nis, degrees_of_freedom=6)
+    return SimpleNamespace(nis=nis, degrees_of_freedom=6, stamp_ns=0)
 
 
 def test_noise_contradicts_a_track_as_often_as_said():
@@ -24,7 +33,7 @@ def test_noise_contradicts_a_track_as_often_as_said():
     nis = rng.chisquare(6, 3_000_000)
     doubted = 0
     for value in nis[nis > 25.0]:
-        evidence = TrackEvidence()
+        evidence = TrackEvidence(2)
         evidence.contradicts(value * np.array([0.3, 0.7]), 6)
         doubted += evidence.doubted
     # A Poisson number with the mean 30.
@@ -32,16 +41,18 @@ def test_noise_contradicts_a_track_as_often_as_said():
 
 
 def test_a_track_that_was_contradicted_once_stays_doubted():
-    evidence = TrackEvidence()
+    evidence = TrackEvidence(2)
     for nis in (6.0, 60.0, 6.0):
         assert evidence.contradicts(np.array([nis, 0.0]), 6) == (nis > 50.0)
     assert evidence.is_doubtful
 
 
 def test_a_filter_that_fits_better_than_its_path_is_doubted_as_long_as_the_window():
-    evidence = TrackEvidence()
-    said = [evidence.doubts_filter(-loss * OVERFIT_NATS, round(t * NS), 2.0) for t, loss in (
-        (0.0, -9.0), (1.0, 0.9), (1.1, 1.1), (3.0, 0.0), (3.2, -9.0))]
+    evidence = TrackEvidence(2)
+    said = []
+    for t, loss in ((0.0, -9.0), (1.0, 0.9), (1.1, 1.1), (3.0, 0.0), (3.2, -9.0)):
+        said.append(evidence.doubts_filter(-loss * OVERFIT_NATS, round(t * NS), 2.0))
+        evidence.note({doubts.OVERFIT} if said[-1] else {doubts.ANOTHER_PLACE}, round(t * NS))
     assert said == [False, False, True, True, False]
     # What it says of later poses is up to them: the track itself is not.
     assert not evidence.is_doubtful
@@ -53,7 +64,7 @@ def test_a_filter_that_fits_better_than_its_path_is_doubted_as_long_as_the_windo
 @pytest.mark.parametrize('nis, doubted', [
     ([60.0, 1.0], True), ([60.0, 2.0, 1.0], False), ([60.0, np.nan, 1.0], False)])
 def test_three_sensors_correct_a_track(nis, doubted):
-    evidence = TrackEvidence()
+    evidence = TrackEvidence(2)
     assert evidence.contradicts(np.array(nis), 3 * np.count_nonzero(~np.isnan(nis)))
     assert evidence.doubted == doubted
 
@@ -61,7 +72,7 @@ def test_three_sensors_correct_a_track(nis, doubted):
 @pytest.mark.parametrize('nis, is_coming, reason', [
     (6.0, False, 'out of reach'), (6.0, True, None), (1e4, False, LOST)])
 def test_a_vehicle_that_comes_is_not_out_of_reach(nis, is_coming, reason):
-    evidence = TrackEvidence()
+    evidence = TrackEvidence(2)
     assert evidence.reason_to_end(pose(), 2.0, is_coming, SETTINGS) is None
     assert evidence.reason_to_end(pose(nis), 7.0, is_coming, SETTINGS) == reason
 
@@ -97,3 +108,54 @@ def test_other_places_make_a_track_ambiguous_but_its_covariance_no_wider():
 def test_the_same_row_from_its_other_end_is_as_long():
     bank, model = bank_of([0.0, 0.0], [0.5, 0.5], lengths=np.array([3.0, -3.0]))
     assert covariance_about(bank, 0, model)[-1, -1] == pytest.approx(0.25)
+
+
+def frame(field, noise=1e-8):
+    field = np.array(field, dtype=float)
+    return FieldFrame(0, field, np.tile(noise**2 * np.eye(3), (len(field), 1, 1)),
+                      np.ones(len(field), dtype=int), np.zeros(len(field)))
+
+
+def test_noise_is_felt_by_no_sensor_and_a_field_by_those_that_measure_it():
+    rng = np.random.default_rng(1)
+    evidence = TrackEvidence(3)
+    for _ in range(50):
+        noise = 1e-8 * rng.standard_normal((2, 3))
+        # The second sensor of the network is not used.
+        evidence.take(frame(noise + [[3e-8, 0.0, 0.0], [0.0, 0.0, 0.0]]), np.array([0, 2]),
+                      np.ones(2))
+    assert evidence.felt.tolist() == [True, False, False] and evidence.is_felt_by_one
+    assert evidence.largest[0] > 3e-8 and evidence.largest[1] == 0.0
+
+
+def test_smoothed_poses_are_flagged_for_misfits_and_not_for_what_smoothing_settles():
+    evidence = TrackEvidence(2)
+    evidence.note({doubts.ANOTHER_ARRIVAL}, 1)
+    evidence.note({doubts.SOMETHING_ELSE, doubts.ANOTHER_PLACE}, 2)
+    assert [evidence.doubted_filter(k) for k in (1, 2)] == [False, True]
+
+
+def test_a_track_that_a_target_never_explained_ends_and_one_that_it_did_goes_on():
+    def end_of(steps):
+        evidence = TrackEvidence(2)
+        for k in range(200):
+            stamp = round(0.08 * k * NS)
+            evidence.explanation.add(steps(k), stamp)
+            late = pose()
+            late.stamp_ns = stamp
+            reason = evidence.reason_to_end(late, 1.0, False, SETTINGS)
+            if reason:
+                return reason, 0.08 * k
+        return None
+
+    reason, after_s = end_of(lambda k: -1.0)
+    assert reason == UNEXPLAINED
+    # log(20) is three frames.
+    assert after_s == pytest.approx(UNEXPLAINED_S + 0.24, abs=0.17)
+    assert end_of(lambda k: 1.0 if k < 5 else -1.0) is None
+
+
+def test_published_doubts_are_listed_in_one_order_and_each_has_a_meaning():
+    names = [value for name, value in vars(doubts).items() if name.isupper() and name != 'MEANINGS']
+    assert sorted(names) == sorted(doubts.MEANINGS)
+    assert doubts.listed({doubts.HEIGHT, doubts.ANOTHER_PLACE}) == ('another_place', 'height')

@@ -1,0 +1,71 @@
+"""Disturbances: what is left of tracks that something else explained better than a target."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mag_tracking.arrays import BoolArray, FloatArray
+from mag_tracking.event_records import Disturbance
+from mag_tracking.records import FieldFrame
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """What a track that no target explained says of the field."""
+
+    track_id: int
+    begin_ns: int
+    largest: FloatArray
+    """(n_sensors,) [T] size of the largest field at each sensor."""
+    felt: BoolArray
+    """(n_sensors,) which of them felt it."""
+    uniform: float
+
+
+class Disturbances:
+    """Follows one disturbance at a time, from the end of its first track to the release."""
+
+    def __init__(self, names: tuple[str, ...]) -> None:
+        self._names = names
+        self._next_id = 1
+        self._current: Disturbance | None = None
+        self._largest: FloatArray = np.zeros(len(names))
+        self._felt: BoolArray = np.zeros(len(names), dtype=bool)
+
+    def begin(self, found: Unexplained, stamp_ns: int) -> list[Disturbance]:
+        """A track was `Unexplained`: the record of a new disturbance, or none where one goes on."""
+        is_new = self._current is None
+        if is_new:
+            self._largest[:], self._felt[:] = 0.0, False
+        self._largest = np.maximum(self._largest, found.largest)
+        self._felt |= found.felt
+        begin_ns = found.begin_ns if self._current is None else self._current.begin_ns
+        number = self._next_id if self._current is None else self._current.id
+        self._next_id = number + 1
+        self._current = Disturbance(stamp_ns, number, False, begin_ns, float(self._largest.max()),
+                                    self._sensors(), found.uniform, found.track_id)
+        return [self._current] if is_new else []
+
+    def feed(self, frame: FieldFrame) -> None:
+        """Take a frame; the disturbance may be larger now."""
+        if self._current is not None:
+            self._largest = np.maximum(self._largest, size_of(frame))
+
+    def end(self, stamp_ns: int) -> list[Disturbance]:
+        """The network is quiet again, or nothing is known of it any more."""
+        if self._current is None:
+            return []
+        last, self._current = self._current, None
+        return [replace(last, stamp_ns=stamp_ns, ended=True, largest=float(self._largest.max()),
+                        sensors=self._sensors())]
+
+    def _sensors(self) -> tuple[str, ...]:
+        """Names of those that felt it, the strongest first."""
+        order = np.argsort(-self._largest, kind='stable')
+        return tuple(self._names[j] for j in order if self._felt[j])
+
+
+def size_of(frame: FieldFrame) -> FloatArray:
+    """(n_sensors,) [T] size of the field of a frame; 0 where it is missing."""
+    size: FloatArray = np.sqrt(np.nansum(np.square(frame.field), axis=1))
+    return size

@@ -1,0 +1,46 @@
+"""Why a pose is ambiguous: the names that are published, and what each means."""
+
+ANOTHER_PLACE = 'another_place'
+ANOTHER_ARRIVAL = 'another_arrival'
+NOT_SEEN_APPROACHING = 'not_seen_approaching'
+SENSORS_AT_ONE_PLACE = 'sensors_at_one_place'
+ONE_SENSOR = 'one_sensor'
+FELT_BY_ONE_SENSOR = 'felt_by_one_sensor'
+DOUBTFUL_BACKGROUND = 'doubtful_background'
+SENSORS_CONTRADICT = 'sensors_contradict'
+MISFIT = 'misfit'
+CONTRADICTION = 'contradiction'
+OVERFIT = 'overfit'
+SOMETHING_ELSE = 'something_else'
+INNOVATIONS = 'innovations'
+SENSORS_TURNED = 'sensors_turned'
+HEIGHT = 'height'
+FRAMES_TOO_LONG = 'frames_too_long'
+
+MEANINGS = {
+    ANOTHER_PLACE: 'another place is still possible',
+    ANOTHER_ARRIVAL: 'another arrival direction is still possible',
+    NOT_SEEN_APPROACHING: 'the target was not seen approaching, or the track began in the tail of '
+                          'a lost one',
+    SENSORS_AT_ONE_PLACE: 'there is one sensor, or all sensors are within two metres: range and '
+                          'size are those of the settings',
+    ONE_SENSOR: 'a single sensor of several measured for too long',
+    FELT_BY_ONE_SENSOR: 'only one sensor feels the target: range and size are those of the '
+                        'settings',
+    DOUBTFUL_BACKGROUND: 'the background of a sensor is doubtful',
+    SENSORS_CONTRADICT: 'the sensors contradict each other, and no majority is left',
+    MISFIT: 'the field does not fit the best hypothesis',
+    CONTRADICTION: 'the field is less probable than 1e-5',
+    OVERFIT: 'the filter fits the latest frames much better than the path of its own hypothesis',
+    SOMETHING_ELSE: 'a smooth field of no target explains the frames about as well',
+    INNOVATIONS: 'the innovations of the latest frames, or of the track, are larger than stated',
+    SENSORS_TURNED: 'the track needs sensors that are turned by more than stated',
+    HEIGHT: 'the iron is where no vehicle of the kind has it',
+    FRAMES_TOO_LONG: 'the target moves too far within a frame',
+}
+"""{doubt: what it means}, in the order in which they are listed."""
+
+
+def listed(doubts: 'set[str]') -> tuple[str, ...]:
+    """The doubts in the order of `MEANINGS`."""
+    return tuple(name for name in MEANINGS if name in doubts)

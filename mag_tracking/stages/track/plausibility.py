@@ -1,0 +1,58 @@
+"""Whether the state of a vehicle is one that a vehicle on this road can have."""
+
+import numpy as np
+from scipy.special import chdtri, ndtri
+
+from mag_tracking.arrays import FloatArray
+from mag_tracking.stages.track import doubts
+from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
+from mag_tracking.stages.track.observation import Observation
+
+MOUNTED = 0.05
+"""Probability that sensors mounted as stated are turned by as much as a track may need."""
+
+LEVEL = 1e-3
+"""Probability that the iron of a vehicle is as far from its kind's height as it may be."""
+
+LONGEST_WAY = 0.75
+"""A target may move so far within a frame, in units of its distance to the second nearest sensor:
+fields are averaged over the frame, with a relative error of about half of the square. One sensor
+that errs more, as it is passed closely, does not mislead a track."""
+
+
+def implausible(observation: Observation, x: FloatArray, kind: int, settings: VehicleSettings,
+                mounting_std: float, dt: float) -> set[str]:
+    """What about a state speaks against it, of `doubts`.
+
+    Parameters
+    ----------
+    observation : Observation
+    x : (n_x,) array
+        That of the published hypothesis.
+    kind : int
+    settings : VehicleSettings
+    mounting_std : float [rad]
+        Sensors may be turned by as much, also those that are known better: what the model leaves
+        out of a field turns it, too.
+    dt : float [s]
+        Length of the frame.
+    """
+    found = set()
+    if _needs_turned_sensors(observation, x, mounting_std):
+        found.add(doubts.SENSORS_TURNED)
+    off = abs(float(x[2]) - settings.heights[kind])
+    if off > -ndtri(LEVEL / 2.0) * settings.height_stds[kind]:
+        found.add(doubts.HEIGHT)
+    if np.hypot(x[3], x[4]) * dt > LONGEST_WAY * observation.second_nearest(x):
+        found.add(doubts.FRAMES_TOO_LONG)
+    return found
+
+
+def _needs_turned_sensors(observation: Observation, x: FloatArray, mounting_std: float) -> bool:
+    """Whether the mounting angles of a state are larger than stated."""
+    angles = observation.angles(x)
+    if not angles.size:
+        return False
+    variance = np.einsum('jii->ji', observation.own_covariance[:, :3, :3])
+    square = float((angles**2 / np.maximum(variance, mounting_std**2)).sum())
+    return bool(square > chdtri(angles.size, MOUNTED))

@@ -1,0 +1,88 @@
+"""The bank of integrated random walks against plain Kalman filters, and on its own process."""
+
+import numpy as np
+import pytest
+from filterpy.common import Q_continuous_white_noise
+from filterpy.kalman import KalmanFilter
+from scipy.special import logsumexp
+
+from mag_tracking.inference.gauss_markov import STRENGTHS, SWITCH_S, GaussMarkovVectors
+
+
+def plain_filter(density, std):
+    """filterpy's filter of one component."""
+    kf = KalmanFilter(dim_x=2, dim_z=1)
+    kf.H, kf.P = np.array([[1.0, 0.0]]), np.diag([std**2, density])
+    return kf
+
+
+def by_plain_filters(series, variance, dt, scale, std):
+    """Log-densities of the columns of `series` (n, m), which are one vector."""
+    banks = [[plain_filter((s * scale)**2, std) for _ in series[0]] for s in STRENGTHS]
+    log_w = np.full(len(STRENGTHS), -np.log(len(STRENGTHS)))
+    out = []
+    for y in series:
+        stay = np.exp(-dt / SWITCH_S)
+        log_w = np.log(stay * np.exp(log_w) + (1.0 - stay) / len(STRENGTHS))
+        for k, bank in enumerate(banks):
+            for kf, value in zip(bank, y, strict=True):
+                q = Q_continuous_white_noise(2, dt, (STRENGTHS[k] * scale)**2)
+                kf.predict(F=np.array([[1.0, dt], [0.0, 1.0]]), Q=q)
+                if np.isfinite(value):
+                    kf.update(value, R=variance)
+                    log_w[k] += kf.log_likelihood
+        out.append(logsumexp(log_w))
+        log_w -= out[-1]
+    return np.array(out)
+
+
+def test_densities_are_those_of_plain_filters():
+    rng = np.random.default_rng(0)
+    series = np.cumsum(rng.standard_normal((25, 3)), axis=0)
+    series[7, 1] = series[11] = np.nan
+    ours = GaussMarkovVectors(1, np.full(3, 0.5), 2.0)
+    densities = []
+    for y in series:
+        there = np.isfinite(y)
+        densities.append(ours.log_density(
+            np.zeros(there.sum(), dtype=np.int64), np.eye(3)[there], y[there],
+            np.full(there.sum(), 0.04), 0.1))
+    theirs = by_plain_filters(series, 0.04, 0.1, 0.5, 2.0)
+    assert densities == pytest.approx(theirs, rel=1e-9)
+
+
+def test_vectors_are_independent_and_seen_from_any_side():
+    rng = np.random.default_rng(1)
+    R = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    both, turned = GaussMarkovVectors(2, np.ones(3), 1.0), GaussMarkovVectors(1, np.ones(3), 1.0)
+    alone = [GaussMarkovVectors(1, np.ones(3), 1.0) for _ in range(2)]
+    zero, variance = np.zeros(3, dtype=np.int64), np.full(3, 0.01)
+    for _ in range(20):
+        y = rng.standard_normal((2, 3))
+        joint = both.log_density(np.repeat([0, 1], 3), np.tile(np.eye(3), (2, 1)), y.ravel(),
+                                 np.full(6, 0.01), 0.05)
+        each = [f.log_density(zero, np.eye(3), v, variance, 0.05)
+                for f, v in zip(alone, y, strict=True)]
+        assert joint == pytest.approx(sum(each), rel=1e-9)
+        # The axes of a sensor that is turned measure the same.
+        assert turned.log_density(zero, R, R @ y[0], variance, 0.05) == pytest.approx(
+            each[0], rel=1e-6)
+
+
+@pytest.mark.parametrize('strength', [0.1, 10.0, 1000.0])
+def test_it_explains_its_own_process_as_well_as_the_filter_that_knows_the_strength(strength):
+    rng = np.random.default_rng(2)
+    dt, n = 0.08, 400
+    rate = np.cumsum(strength * np.sqrt(dt) * rng.standard_normal(n))
+    y = np.cumsum(rate) * dt + rng.standard_normal(n)
+    bank, knows = GaussMarkovVectors(1, np.ones(1), 1.0), plain_filter(strength**2, 1.0)
+    ours = theirs = 0.0
+    for value in y:
+        ours += bank.log_density(np.zeros(1, dtype=np.int64), np.ones((1, 1)), np.array([value]),
+                                 np.ones(1), dt)
+        knows.predict(F=np.array([[1.0, dt], [0.0, 1.0]]),
+                      Q=Q_continuous_white_noise(2, dt, strength**2))
+        knows.update(value, R=1.0)
+        theirs += knows.log_likelihood
+    # Not to know it costs the start and what is kept for a switch: at most log(1/stay) a frame.
+    assert theirs - n * dt / SWITCH_S - np.log(len(STRENGTHS)) < ours < theirs + 10.0

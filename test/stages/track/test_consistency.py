@@ -1,0 +1,53 @@
+"""Innovations over time against their law."""
+
+import numpy as np
+
+from mag_tracking.stages.track.consistency import FALSE_ALARM, WINDOW_S, InnovationConsistency
+from mag_tracking.units import NS
+
+DT = 0.08
+AXES = np.array([3, 3])
+
+
+def run(nis):
+    """`InnovationConsistency` after frames (n, n_sensors)."""
+    consistency = InnovationConsistency(nis.shape[1])
+    for k, row in enumerate(nis):
+        consistency.add(row, AXES[:nis.shape[1]], round(k * DT * NS))
+    return consistency
+
+
+def test_consistent_filters_fail_as_often_as_stated():
+    rng = np.random.default_rng(0)
+    n = 5000
+    runs = [run(rng.chisquare(3, (30, 2))) for _ in range(n)]
+    # The whole network, and the two sensors with half the probability each: at most 2 x 1e-3, and
+    # at least that of the network alone; four deviations of the binomial.
+    for failed in (sum(r.fails for r in runs), sum(r.excess > 1.0 for r in runs)):
+        assert FALSE_ALARM * n - 4 * np.sqrt(n * FALSE_ALARM) < failed \
+            < 2 * FALSE_ALARM * n + 4 * np.sqrt(2 * n * FALSE_ALARM)
+
+
+def test_innovations_twice_as_large_as_stated_are_found_and_measured():
+    rng = np.random.default_rng(1)
+    runs = [run(4.0 * rng.chisquare(3, (30, 2))) for _ in range(200)]
+    assert all(r.fails for r in runs)
+    assert 3.5 < np.median([r.excess for r in runs]) < 6.0
+
+
+def test_one_of_many_sensors_is_found():
+    rng = np.random.default_rng(2)
+    nis = rng.chisquare(3, (30, 2))
+    nis[:, 1] *= 0.1
+    nis[:, 0] *= 3.0
+    assert run(nis).fails
+
+
+def test_a_burst_passes_with_its_window_and_missing_sensors_count_nothing():
+    nis = np.full((40, 2), 1.0)
+    nis[10:13] = 40.0
+    nis[:, 1] = np.nan
+    burst = run(nis[:13])
+    assert burst.excess > 1.0
+    assert run(nis[:13 + int(WINDOW_S / DT) + 1]).excess == 1.0
+    assert run(np.full((5, 2), np.nan)).excess == 1.0

@@ -1,0 +1,42 @@
+"""What about a vehicle's state speaks against it."""
+
+import numpy as np
+import pytest
+
+from mag_tracking.pipeline import settings_for
+from mag_tracking.stages.track import doubts
+from mag_tracking.stages.track.initiation_vehicle import vehicle_model
+from mag_tracking.stages.track.observation import Observation
+from mag_tracking.stages.track.plausibility import implausible
+from support.networks import line_network
+
+SETTINGS = settings_for('vehicle').track
+NETWORK = line_network(2)
+MOUNTING = np.deg2rad(5.0)
+
+
+def state(observation, z=0.5, speed=10.0, at=(0.0, 0.0), angles_deg=0.0):
+    x = np.zeros(observation.n_target + (observation.n_own + 3) * 2)
+    x[:5] = *at, z, speed, 0.0
+    observation.own(x)[..., :3] = np.deg2rad(angles_deg)
+    return x
+
+
+def found(mounting=MOUNTING, dt=0.08, **of_state):
+    observation = Observation(NETWORK, vehicle_model(SETTINGS.vehicle, NETWORK), mounting, 0.3)
+    return implausible(observation, state(observation, **of_state), 1, SETTINGS.vehicle,
+                       mounting, dt)
+
+
+@pytest.mark.parametrize('of_state, expected', [
+    ({}, set()),
+    ({'z': 1.1}, set()), ({'z': 1.2}, {doubts.HEIGHT}), ({'z': -0.3}, {doubts.HEIGHT}),
+    # 1.2 deviations of each of six angles are 8.6; 12.6 is exceeded by one mounting in twenty.
+    ({'angles_deg': 6.0}, set()), ({'angles_deg': 8.0}, {doubts.SENSORS_TURNED}),
+    ({'angles_deg': -8.0}, {doubts.SENSORS_TURNED}),
+    ({'mounting': 0.0}, set()),
+    # 4.5 m from both sensors, or over one of them.
+    ({'speed': 40.0}, set()), ({'speed': 45.0}, {doubts.FRAMES_TOO_LONG}),
+    ({'speed': 45.0, 'dt': 0.04}, set()), ({'speed': 40.0, 'at': (0.0, 4.4)}, set())])
+def test_states_that_no_vehicle_has(of_state, expected):
+    assert found(**of_state) == expected

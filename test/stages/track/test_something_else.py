@@ -1,0 +1,100 @@
+"""Fields of no target: evidence for them, which of the two they are, and a handover."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mag_tracking.physics.dipole import dipole_field
+from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track.something_else import SomethingElse
+from support.networks import line_network
+
+NOISE = 4e-9
+
+
+def frames(network, fields, dt=0.08, seed=0):
+    """[`FieldFrame`] of fields (n, n_sensors, 3) [T] in the world."""
+    rng = np.random.default_rng(seed)
+    seen = np.einsum('jik,nji->njk', network.R_ws, fields)
+    seen = seen + NOISE * rng.standard_normal(seen.shape)
+    n = len(network)
+    return [FieldFrame(round(k * dt * 1e9), y, np.tile(NOISE**2 * np.eye(3), (n, 1, 1)),
+                       np.ones(n, dtype=int), np.zeros(n)) for k, y in enumerate(seen)]
+
+
+def total(model, some, dt=0.08):
+    none = np.zeros(len(some[0].field))
+    return sum(model.log_density(f, dt if k else 0.0, none) or 0.0 for k, f in enumerate(some))
+
+
+def slow(t, network, own):
+    """Fields (n, n_sensors, 3) [T] of slow waves, of each sensor's own or of all."""
+    rng = np.random.default_rng(3)
+    size = 2e-7 * rng.standard_normal((len(network), 3))
+    if not own:
+        size = np.tile(size[:1], (len(network), 1))
+    phase = rng.uniform(0.0, 6.0, len(network)) if own else np.zeros(len(network))
+    return np.sin(t[:, None] + phase)[:, :, None] * size
+
+
+@pytest.mark.parametrize('n_sensors', [2, 4, 10])
+@pytest.mark.parametrize('own', [True, False])
+def test_it_tells_one_field_over_the_network_from_one_at_each_sensor(n_sensors, own):
+    network = line_network(n_sensors)
+    model = SomethingElse(network, 2e-8)
+    fields = slow(np.arange(0.0, 8.0, 0.08), network, own)
+    # Backgrounds are known to two deviations.
+    offsets = 2e-8 * np.random.default_rng(1).standard_normal((n_sensors, 3))
+    total(model, frames(network, fields - fields[0] + offsets))
+    assert model.uniform < 1e-3 if own else model.uniform > 0.999
+
+
+def test_a_gradient_over_the_network_is_one_field():
+    network = line_network(6)
+    away = network.positions - network.centre
+    G = np.array([[1.0, 0.5, 0.2], [0.5, -1.5, 0.3], [0.2, 0.3, 0.5]])
+    wave = np.sin(np.arange(0.0, 8.0, 0.08))[:, None, None]
+    shape = 2e-7 * np.array([1.0, -0.5, 0.7]) + 6e-9 * away @ G
+    model = SomethingElse(network, 2e-8)
+    total(model, frames(network, wave * shape))
+    assert model.uniform > 0.999
+
+
+def test_the_faster_a_dipole_passes_the_worse_is_it_explained():
+    network = line_network(2)
+    t = np.arange(-3.0, 3.0, 0.08)
+    explained = []
+    for speed in (4.0, 8.0, 16.0):
+        r = np.stack([speed * t, 0.0 * t - 1.0, 0.0 * t + 0.5], axis=1)
+        passing = dipole_field(network.positions - r[:, None], np.array([200.0, 100.0, -300.0]))
+        # Nothing is there at the beginning.
+        passing -= passing[0]
+        explained.append(total(SomethingElse(network, 2e-8), frames(network, passing)[20:-20]))
+    assert -np.diff(explained).max() > np.log(20.0)
+
+
+def test_missing_axes_and_sensors_are_left_out():
+    network = line_network(2)
+    some = frames(network, slow(np.arange(0.0, 4.0, 0.08), network, True))
+    without = [dataclasses.replace(f, field=np.where(
+        [[False, False, True], [True, True, True]], np.nan, f.field)) for f in some]
+    of_two_axes = total(SomethingElse(network, 2e-8), without)
+    assert np.isfinite(of_two_axes) and of_two_axes < total(SomethingElse(network, 2e-8), some)
+    nothing = [dataclasses.replace(f, field=np.full((2, 3), np.nan)) for f in some]
+    assert total(SomethingElse(network, 2e-8), nothing) == 0.0
+
+
+def test_the_first_frame_after_a_handover_is_not_compared():
+    network = line_network(2)
+    field = 1e-6 + slow(np.arange(0.0, 4.0, 0.08), network, True)
+    some = frames(network, field)
+    model, none = SomethingElse(network, 2e-8, is_handover=True), np.zeros(2)
+    assert model.log_density(some[0], 0.0, none) is None
+    # Then as if the field had not jumped: within what a fresh rate costs.
+    rest = sum(model.log_density(f, 0.08, none) for f in some[1:])
+    before = SomethingElse(network, 2e-8)
+    smooth = frames(network, field - 1e-6)
+    before.log_density(smooth[0], 0.0, none)
+    assert rest == pytest.approx(sum(before.log_density(f, 0.08, none) for f in smooth[1:]),
+                                 abs=60.0)
