@@ -1,0 +1,116 @@
+"""Worlds: any number of bodies and disturbances around a network, with the truth of all bodies."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mag_tracking.network import SensorNetwork
+from mag_tracking.records import Readings
+from mag_tracking.simulation.scenario import Imperfections, Path
+from support.box_vehicles import BOUGHT, _magnetised
+from support.samples import scenario
+
+GRID_S = 0.01
+"""[s] Steps in which a `Ride` adds its speed up."""
+
+
+@dataclass(frozen=True)
+class Ride:
+    """A course along a `Path` at any speed: it stops, reverses, and goes on."""
+
+    path: Path
+    times: tuple
+    """(k,) [s]."""
+    speeds: tuple
+    """(k,) [m/s] at those times, linear between them; negative = backwards."""
+
+    def at(self, t):
+        """See `mag_tracking.simulation.scenario.Course`."""
+        t = np.asarray(t, dtype=float)
+        grid = np.arange(0.0, max(self.times[-1], t.max()) + 2 * GRID_S, GRID_S)
+        speed = np.interp(grid, self.times, self.speeds)
+        way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * GRID_S)])
+        # The clock of a sensor may begin before the ride does.
+        before = np.minimum(t, 0.0) * self.speeds[0]
+        return self.path.at((np.interp(t, grid, way) + before) / self.path.speed)
+
+
+@dataclass(frozen=True)
+class Convoy:
+    """Bodies that follow each other rigidly: a car with a trailer, a train."""
+
+    bodies: tuple
+    behind: tuple
+    """[m] of each body's middle behind that of the convoy."""
+
+    def field(self, earth_field, position, heading, points):
+        """See `mag_tracking.simulation.scenario.Body`."""
+        forward = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+        return sum(body.field(earth_field, position - back * forward, heading, points)
+                   for body, back in zip(self.bodies, self.behind, strict=True))
+
+
+@dataclass(frozen=True)
+class World:
+    """What happens around a network."""
+
+    network: SensorNetwork
+    readings: Readings
+    t: np.ndarray
+    """(n,) [s]"""
+    positions: np.ndarray
+    """(n_bodies, n, 2) [m]"""
+
+
+def box_two_wheeler(rng, length, moment, iron=1.0):
+    """A motorcycle, a bicycle or a trolley of boxes: a frame, an engine (`iron`), two wheels."""
+    parts = [((0.0, 0.0, 0.5), (0.5 * length, 0.06, 0.5), 1.0),
+             ((0.05 * length, 0.0, 0.4), (0.35, 0.3, 0.3), iron)]
+    parts += [((0.35 * end * length, 0.0, 0.3), (0.05, 0.15, 0.5), 0.4) for end in (-1, 1)]
+    return _magnetised(rng, parts, length, moment)
+
+
+def world(network, movers, duration, rng, flaws=None, rate=100.0, ambient=None):
+    """`World` of movers [(body, course)] for a `duration` [s].
+
+    `ambient` takes times (n,) [s] and gives a field (n, n_sensors, 3) [T] in the world frame, which
+    is added; `flaws` are the `Imperfections` of the sensors.
+    """
+    flaws = flaws or Imperfections()
+    t = np.arange(0.0, duration, 1.0 / rate)
+    parts = []
+    for body, course in movers:
+        # Each body in a world of its own with perfect sensors; fields add up.
+        readings, *_ = scenario.simulate(network, body, course, rate, duration, rng,
+                                         Imperfections(noise_std=0.0))
+        parts.append(readings.field.reshape(len(t), len(network), 3) - _earth(network))
+    B = sum(parts, np.zeros((len(t), len(network), 3))) + _earth(network)
+    if ambient is not None:
+        B = B + np.einsum('nji,jik->njk', ambient(t), network.R_ws)
+    B = _flawed(B, flaws, t, rng)
+    stamps = np.repeat(np.round(t * 1e9).astype(np.int64), len(network))
+    readings = Readings(network.names, np.tile(np.arange(len(network)), len(t)), stamps,
+                        B.reshape(-1, 3))
+    positions = np.array([course.at(t)[0] for _, course in movers]).reshape(-1, len(t), 2)
+    return World(network, readings, t, positions)
+
+
+def _earth(network):
+    """(n_sensors, 3) [T], sensor frames."""
+    return np.einsum('jik,i->jk', network.R_ws, network.earth_field)
+
+
+def _flawed(B, flaws, t, rng):
+    """Fields (n, n_sensors, 3) [T] as sensors with `Imperfections` measure them."""
+    out = np.empty_like(B)
+    for j in range(B.shape[1]):
+        a, b, c = flaws.tilt_std * rng.standard_normal(3)
+        tilt = np.array([[1.0, -c, b], [c, 1.0, -a], [-b, a, 1.0]])
+        out[:, j] = B[:, j] @ tilt * (1.0 + flaws.gain_std * rng.standard_normal(3))
+        out[:, j] += flaws.bias_std * rng.standard_normal(3)
+        out[:, j] += flaws.drift_std * rng.standard_normal(3) * t[:, None]
+    return out + flaws.noise_std * rng.standard_normal(out.shape)
+
+
+FLAWS = {'clouds': Imperfections(), 'boxes': BOUGHT}
+"""{simulator: `Imperfections` of its sensors}."""
