@@ -13,7 +13,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, TypeVar
 
 from mag_tracking.errors import SettingsError
-from mag_tracking.yaml_file import read_yaml
+from mag_tracking.yaml_file import read_yaml, shown
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -95,16 +95,15 @@ def flatten(settings: 'DataclassInstance', prefix: str = '') -> list[Parameter]:
 
 def _scalar(name: str, value: object, kind: _Class) -> Scalar:
     """`value` as `kind`, or a SettingsError that names the setting."""
+    if isinstance(value, int) and value.bit_length() > 1000:
+        raise SettingsError(f'{name}: an integer of {value.bit_length()} bits is too large')
     if kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        try:
-            return float(value)
-        except OverflowError:
-            raise SettingsError(f'{name}: {str(value)[:20]}... is too large') from None
+        return float(value)
     if kind is int and isinstance(value, int) and not isinstance(value, bool):
         return value
     if kind in (bool, str) and isinstance(value, kind):
         return value
-    raise SettingsError(f'{name}: expected {kind.__name__}, got {value!r}')
+    raise SettingsError(f'{name}: expected {kind.__name__}, got {shown(value)}')
 
 
 def _checked(p: Parameter, value: object) -> Value:
@@ -112,7 +111,7 @@ def _checked(p: Parameter, value: object) -> Value:
     if p.element is not None:
         if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
             raise SettingsError(f'{p.name}: expected a list of {p.element.__name__}, '
-                                f'got {value!r}')
+                                f'got {shown(value)}')
         values = tuple(_scalar(p.name, v, p.element) for v in value)
         if p.length is not None and len(values) != p.length:
             raise SettingsError(f'{p.name}: expected {p.length} values, got {len(values)}')
@@ -146,7 +145,8 @@ def _join(out: dict[str, Any], more: Mapping[str, Any]) -> None:
     """Put `more` into `out`; raises SettingsError where the two disagree."""
     for name, value in more.items():
         if out.setdefault(name, value) is not value and out[name] != value:
-            raise SettingsError(f'{name} is there twice, as {out[name]!r} and as {value!r}')
+            raise SettingsError(f'{name} is there twice, as {shown(out[name])} and as '
+                                f'{shown(value)}')
 
 
 def replace(settings: _Settings, changes: Mapping[str, Any]) -> _Settings:
@@ -194,13 +194,11 @@ def read_parameter_file(path: str | PathLike[str]) -> dict[str, Any]:
     if content is None:
         return {}
     if not isinstance(content, Mapping):
-        raise SettingsError(f'{path}: expected a mapping of settings, got {content!r}')
+        raise SettingsError(f'{path}: expected a mapping of settings, got {shown(content)}')
     try:
         return _joined_sections(content)
     except SettingsError as error:
         raise SettingsError(f'{path}: {error}') from error
-    except RecursionError as error:
-        raise SettingsError(f'{path}: a mapping that holds itself') from error
 
 
 def _joined_sections(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -213,7 +211,7 @@ def _joined_sections(content: Mapping[str, Any]) -> dict[str, Any]:
         section = node.get('ros__parameters') if isinstance(node, Mapping) else None
         if name not in nodes or len(node) > 1 or not isinstance(section, Mapping | None):
             raise SettingsError(f'{name}: expected nothing but a mapping under ros__parameters, as '
-                                f'for {nodes[0]}, got {node!r}')
+                                f'for {nodes[0]}, got {shown(node)}')
         _join(joined, _dotted(section or {}))
     return joined
 

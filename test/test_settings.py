@@ -83,7 +83,7 @@ def test_parameter_files(tmp_path):
     for content, message in (
             ('- 1', 'expected a mapping'), ('{a: [', 'not YAML'),
             ('track: 2001-13-45', 'not YAML'), ('{? [1] : 2}', 'is no name'),
-            ('[' * 3000, 'nested too deeply'), ('track: &t {a: *t}', 'holds itself'),
+            ('[' * 3000, 'nested too deeply'), ('track: &t {a: *t}', 'an alias holds itself'),
             ('n: {ros__parameters: 5}', 'expected nothing but a mapping'),
             ('n: {ros__parameters: {track.iterations: 2}}\ntrack: {iterations: 3}',
              'track: expected nothing but'),

@@ -30,7 +30,7 @@ from mag_tracking.drivers.settings import DriverSettings
 from mag_tracking.errors import SettingsError
 from mag_tracking.network.sensor_network import SensorNetwork
 from mag_tracking.settings import replace
-from mag_tracking.yaml_file import read_yaml
+from mag_tracking.yaml_file import read_yaml, shown
 
 _HERE = 'mag_tracking.drivers'
 KINDS = {
@@ -65,7 +65,7 @@ def read_drivers(path: str | PathLike[str], network: SensorNetwork | None = None
     """
     content = read_yaml(path, SettingsError)
     if not isinstance(content, Mapping) or not content:
-        raise SettingsError(f'{path}: expected a mapping of devices, got {content!r}')
+        raise SettingsError(f'{path}: expected a mapping of devices, got {shown(content)}')
     try:
         drivers = [driver_of(name, entry) for name, entry in content.items()]
         _check_sensors(drivers, network)
@@ -80,7 +80,7 @@ def kind_of(role: str, name: object) -> Any:
     module, colon, leaf = target.partition(':')
     if not colon:
         raise SettingsError(f'{role}: expected {", ".join(KINDS[role])} or '
-                            f'package.module:Class, got {name!r}')
+                            f'package.module:Class, got {shown(name)}')
     try:
         cls = getattr(importlib.import_module(module), leaf)
     # A module of somebody else's may fail with anything.
@@ -95,7 +95,7 @@ def kind_of(role: str, name: object) -> Any:
 def driver_of(name: object, entry: object) -> Driver:
     """The `Driver` of one entry of the file; raises SettingsError that names the device."""
     if not isinstance(name, str) or not isinstance(entry, Mapping):
-        raise SettingsError(f'{name}: expected a mapping of settings, got {entry!r}')
+        raise SettingsError(f'{name}: expected a mapping of settings, got {shown(entry)}')
     rest = dict(entry)
     try:
         device = _device(rest)
@@ -141,7 +141,7 @@ def _group(rest: dict[str, Any], name: str) -> Mapping[str, Any]:
     """The mapping of settings under `name`, with the name before each; taken out of `rest`."""
     group = rest.pop(name, {})
     if not isinstance(group, Mapping):
-        raise SettingsError(f'{name}: expected a mapping of settings, got {group!r}')
+        raise SettingsError(f'{name}: expected a mapping of settings, got {shown(group)}')
     return group
 
 
@@ -155,13 +155,13 @@ def _sensors(rest: dict[str, Any]) -> dict[str, str]:
         sensors = rest.pop('sensors', None)
     if not isinstance(sensors, Mapping) or not sensors:
         raise SettingsError('expected `sensor: mag_1`, or `sensors:` with the name in the network '
-                            f'for each name at the device, got {sensors!r}')
+                            f'for each name at the device, got {shown(sensors)}')
     for key, value in sensors.items():
         if isinstance(key, bool) or not isinstance(key, (str, int)):
-            raise SettingsError(f'sensors: {key!r} is no name; put it in quotes')
+            raise SettingsError(f'sensors: {shown(key)} is no name; put it in quotes')
         if not isinstance(value, str) or not (value == IGNORED or _NAME.fullmatch(value)):
             raise SettingsError(f'sensors: {key}: expected the name of a sensor (letters, digits, '
-                                f'_ and /), or - to ignore it, got {value!r}')
+                                f'_ and /), or - to ignore it, got {shown(value)}')
     out = {str(key): value for key, value in sensors.items()}
     if len(out) < len(sensors):
         raise SettingsError('sensors: two of them have the same name at the device')

@@ -17,7 +17,7 @@ from mag_tracking.errors import NetworkError, OutputError
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
 from mag_tracking.network import Calibrated, SensorNetwork
 from mag_tracking.network.geomagnetic import Site, decimal_year, earth_field
-from mag_tracking.yaml_file import read_yaml
+from mag_tracking.yaml_file import read_yaml, shown
 
 _TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 _NAME = re.compile(r'[A-Za-z0-9_.-]+')
@@ -41,23 +41,23 @@ def _vector(what: str, value: object, lengths: tuple[int, ...]) -> FloatArray:
     """A list of finite numbers of one of `lengths`, as an array."""
     if not isinstance(value, list) or len(value) not in lengths:
         raise NetworkError(f'{what}: expected {" or ".join(map(str, lengths))} numbers, '
-                           f'got {value!r}')
+                           f'got {shown(value)}')
     for v in value:
         # YAML 1.1 reads 1e-8, without a point, as text, and 1.0e8, without a sign, too.
         if isinstance(v, str):
-            raise NetworkError(f'{what}: {v!r} is text; write numbers as 1.0e-8 or 1.0e+8')
+            raise NetworkError(f'{what}: {shown(v)} is text; write numbers as 1.0e-8 or 1.0e+8')
         if isinstance(v, bool) or not isinstance(v, (int, float)) or not abs(v) < 1e300:
-            raise NetworkError(f'{what}: {v!r} is not a finite number')
+            raise NetworkError(f'{what}: {shown(v)} is not a finite number')
     return np.array(value, dtype=float)
 
 
 def _known(what: str, mapping: object, keys: Collection[str]) -> None:
     """Raise NetworkError for a key that is not among `keys`."""
     if not isinstance(mapping, dict):
-        raise NetworkError(f'{what}: expected a mapping, got {mapping!r}')
+        raise NetworkError(f'{what}: expected a mapping, got {shown(mapping)}')
     for key in mapping:
         if key not in keys:
-            raise NetworkError(f'{what}: unknown key {key!r}; known are '
+            raise NetworkError(f'{what}: unknown key {shown(key)}; known are '
                                f'{", ".join(sorted(keys))}')
 
 
@@ -150,7 +150,8 @@ def _calibrated(what: str, value: Any) -> Calibrated | None:
     _known(what, value, {'date', 'by', 'clock_offset_std', 'stated', 'stated_std_deg'})
     for key in ('date', 'by'):
         if not isinstance(value.get(key), str):
-            raise NetworkError(f"{what}: {key} must be text ('...'), got {value.get(key)!r}")
+            raise NetworkError(f"{what}: {key} must be text ('...'), "
+                               f'got {shown(value.get(key))}')
     std, stated = value.get('clock_offset_std'), value.get('stated')
     std = float('nan') if std is None else float(_vector(what, [std], (1,))[0])
     if std < 0.0:
@@ -175,9 +176,9 @@ def _rotation(what: str, q: FloatArray) -> FloatArray:
 def _topic(what: str, key: str, topic: object) -> str:
     """A topic's name."""
     if not isinstance(topic, str) or not topic.startswith('/'):
-        raise NetworkError(f'{what}: {key} must begin with /, got {topic!r}')
+        raise NetworkError(f'{what}: {key} must begin with /, got {shown(topic)}')
     if not _TOPIC.fullmatch(topic):
-        raise NetworkError(f'{what}: {topic!r} is no ROS topic: letters, digits and _, '
+        raise NetworkError(f'{what}: {shown(topic)} is no ROS topic: letters, digits and _, '
                            'no part begins with a digit')
     return topic
 
@@ -200,11 +201,11 @@ def _network(content: Any) -> SensorNetwork:
     earth = _earth_field(content)
     frame = content.get('frame', 'map')
     if not isinstance(frame, str) or not _FRAME.fullmatch(frame):
-        raise NetworkError(f'frame: expected a name, got {frame!r}')
+        raise NetworkError(f'frame: expected a name, got {shown(frame)}')
     names = tuple(str(name) for name in sensors)
     for name in names:
         if not _NAME.fullmatch(name):
-            raise NetworkError(f'{name!r} is no name for a sensor: letters, digits, _ . and -')
+            raise NetworkError(f'{shown(name)} is no name for a sensor: letters, digits, _ . and -')
     entries = [_sensor(n, e) for n, e in zip(names, sensors.values(), strict=True)]
     columns: dict[str, Any] = {key: tuple(e[key] for e in entries) for key in entries[0]}
     for key in ('positions', 'R_ws', 'clock_offset'):
@@ -231,7 +232,7 @@ def _earth_field(content: dict[str, Any]) -> FloatArray | None:
         raise NetworkError(f'site: {missing[0]} is missing')
     day = site['date']
     if not isinstance(day, datetime.date) or isinstance(day, datetime.datetime):
-        raise NetworkError(f'site: date: expected a day such as 2026-05-01, got {day!r}')
+        raise NetworkError(f'site: date: expected a day such as 2026-05-01, got {shown(day)}')
     latitude, longitude, height, azimuth = _vector('site', [
         site[key] for key in ('latitude', 'longitude', 'height', 'x_azimuth_deg')], (4,))
     try:

@@ -9,13 +9,12 @@ from collections.abc import Collection, Iterator
 from os import PathLike
 from pathlib import Path
 
-import yaml
-
 from mag_tracking.errors import RecordingError
 from mag_tracking.recording.bag_file import BAG_SUFFIXES, BagFile
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.mcap_file import McapFile
 from mag_tracking.recording.raw_message import RawMessage
+from mag_tracking.yaml_file import read_yaml
 
 SUFFIXES = ('.mcap', *BAG_SUFFIXES)
 """Suffixes of readable files."""
@@ -99,11 +98,11 @@ def _files(path: Path) -> list[Path]:
     metadata = path / 'metadata.yaml'
     files = sorted(f for f in path.iterdir() if f.suffix in SUFFIXES)
     if metadata.exists():
+        content = read_yaml(metadata, RecordingError)
         try:
-            content = yaml.safe_load(metadata.read_text(encoding='utf-8'))
             listed = content['rosbag2_bagfile_information']['relative_file_paths']
             files = [path / name for name in listed]
-        except (yaml.YAMLError, KeyError, TypeError) as error:
+        except (KeyError, TypeError) as error:
             raise RecordingError(f'{metadata} is not rosbag2 metadata: {error}') from error
     if not files:
         raise RecordingError(f'{path} holds no recording ({", ".join(SUFFIXES)})')

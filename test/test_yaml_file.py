@@ -1,0 +1,76 @@
+"""YAML files that are small on disk and large in memory are refused, wherever they are read."""
+
+import pytest
+
+from mag_tracking.drivers.configuration import read_drivers
+from mag_tracking.errors import MagTrackingError, SettingsError
+from mag_tracking.network.file import read_network
+from mag_tracking.pipeline import Settings
+from mag_tracking.recording.reader import Recording
+from mag_tracking.settings import read_parameter_file, replace
+from mag_tracking.yaml_file import DEEPEST, MOST_NODES, read_yaml
+
+
+def nested_aliases(n, form='[{}]', width=9):
+    """Anchors a0 .. an: each `form` around `width` aliases of the one before."""
+    lines = ['a0: &a0 {x: 1}']
+    lines += [f'a{k}: &a{k} ' + form.format(', '.join([f'*a{k - 1}'] * width))
+              for k in range(1, n + 1)]
+    return '\n'.join(lines) + '\n'
+
+
+def message_of(read, path):
+    with pytest.raises(MagTrackingError) as error:
+        read(path)
+    return str(error.value)
+
+
+@pytest.mark.parametrize('read, key', [
+    (read_network, 'frame'), (read_parameter_file, 'track'), (read_drivers, 'board'),
+    (lambda path: Recording(path.parent), 'rosbag2_bagfile_information')])
+def test_aliases_that_expand_to_gigabytes_are_refused(tmp_path, read, key):
+    path = tmp_path / 'metadata.yaml'
+    for n in (6, 40):
+        path.write_text(f'{nested_aliases(n)}{key}: *a{n}\n')
+        assert f'{path} is not YAML as it should be: aliases expand to more than {MOST_NODES} ' \
+               'values (line 7)' in message_of(read, path)
+
+
+@pytest.mark.parametrize('text, told', [
+    (nested_aliases(40, '{{<<: [{}]}}', 2), 'aliases expand to more than'),
+    (nested_aliases(40, '{{a: [{}]}}', 2), 'aliases expand to more than'),
+    (nested_aliases(100, width=1), f'more than {DEEPEST} levels (line 64)'),
+    ('[' * 80 + ']' * 80, f'nested too deeply: more than {DEEPEST} levels (line 1)'),
+    ('[' * 5000, 'nested too deeply'),
+    ('a: 1\nb: &b {c: *b}', 'an alias holds itself (line 2)'),
+    ('&a [[*a]]', 'an alias holds itself (line 1)'),
+    ('a: &a {<<: *a}', 'an alias holds itself (line 1)'),
+    ('a: 0x' + 'f' * 9000, 'an integer of 36000 bits is more than')])
+def test_what_has_no_bound_is_named_with_its_line(tmp_path, text, told):
+    path = tmp_path / 'a.yaml'
+    path.write_text(text)
+    assert told in message_of(lambda path: read_yaml(path, SettingsError), path)
+
+
+def test_aliases_may_be_used(tmp_path):
+    path = tmp_path / 'a.yaml'
+    path.write_text('a: &a [1, 2]\nb: &b {c: *a, d: *a}\ne: {<<: *b, f: *b}\n' + 'g: ['
+                    + ', '.join(['*a'] * 20_000) + ']\n')
+    content = read_yaml(path, SettingsError)
+    b = {'c': [1, 2], 'd': [1, 2]}
+    assert content['b'] == b and content['e'] == {**b, 'f': b} and len(content['g']) == 20_000
+
+
+@pytest.mark.parametrize('read, key', [
+    (read_network, 'frame'), (read_drivers, 'board'),
+    (lambda path: replace(Settings(), read_parameter_file(path)), 'align.period_s')])
+def test_a_message_does_not_repeat_the_whole_file(tmp_path, read, key):
+    path = tmp_path / 'a.yaml'
+    path.write_text(f'{key}: [{", ".join(["[1, 2, 3]"] * 1000)}]')
+    assert len(message_of(read, path)) < 1000
+
+
+def test_an_integer_beyond_all_bounds_is_told_by_its_size():
+    for name in ('align.period_s', 'detect.onset_frames'):
+        with pytest.raises(SettingsError, match=f'{name}: an integer of 20001 bits is too large'):
+            replace(Settings(), {name: 1 << 20_000})
