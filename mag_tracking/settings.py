@@ -13,7 +13,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, TypeVar
 
 from mag_tracking.errors import SettingsError
-from mag_tracking.yaml_file import read_yaml, shown
+from mag_tracking.yaml_file import is_text, read_yaml, shown
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -101,6 +101,8 @@ def _scalar(name: str, value: object, kind: _Class) -> Scalar:
         return float(value)
     if kind is int and isinstance(value, int) and not isinstance(value, bool):
         return value
+    if kind is str and isinstance(value, str) and not is_text(value):
+        raise SettingsError(f'{name}: {shown(value)} is not text: it contains a lone surrogate')
     if kind in (bool, str) and isinstance(value, kind):
         return value
     raise SettingsError(f'{name}: expected {kind.__name__}, got {shown(value)}')

@@ -109,6 +109,11 @@ def read_yaml(path: str | PathLike[str], error: type[Exception]) -> Any:
         raise error(f'{path} is nested too deeply') from problem
 
 
+def is_text(value: str) -> bool:
+    """Whether a string can be written as UTF-8: lone surrogates, as "\\ud800" in YAML, cannot."""
+    return not any('\ud800' <= c <= '\udfff' for c in value)
+
+
 class _ShortRepr(Repr):
     """`repr` of bounded length."""
 

@@ -48,6 +48,9 @@ def test_every_setting_is_documented_and_its_default_is_in_range():
     ({'track.vehicle.speeds': []}, 'at least one'),
     ({'track.vehicle.speeds': 5.0}, 'expected a list'),
     ({'track.vehicle.speeds': [5.0, 1e9]}, 'outside'),
+    ({'track.vehicle.kinds': ['small', 'c\ud800r', 'truck']},
+     r"track.vehicle.kinds: 'c\\ud800r' is not text: it contains a lone surrogate"),
+    ({'track.vehicle.arrival_names': ['left', 'right', '\udcff']}, 'arrival_names: .* surrogate'),
 ])
 def test_faults_name_the_setting(changes, message):
     with pytest.raises(SettingsError, match=message):

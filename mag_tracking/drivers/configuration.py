@@ -30,7 +30,7 @@ from mag_tracking.drivers.settings import DriverSettings
 from mag_tracking.errors import SettingsError
 from mag_tracking.network.sensor_network import SensorNetwork
 from mag_tracking.settings import replace
-from mag_tracking.yaml_file import read_yaml, shown
+from mag_tracking.yaml_file import is_text, read_yaml, shown
 
 _HERE = 'mag_tracking.drivers'
 KINDS = {
@@ -96,6 +96,8 @@ def driver_of(name: object, entry: object) -> Driver:
     """The `Driver` of one entry of the file; raises SettingsError that names the device."""
     if not isinstance(name, str) or not isinstance(entry, Mapping):
         raise SettingsError(f'{name}: expected a mapping of settings, got {shown(entry)}')
+    if not is_text(name):
+        raise SettingsError(f'{shown(name)} is not a device name: it contains a lone surrogate')
     rest = dict(entry)
     try:
         device = _device(rest)
@@ -159,6 +161,8 @@ def _sensors(rest: dict[str, Any]) -> dict[str, str]:
     for key, value in sensors.items():
         if isinstance(key, bool) or not isinstance(key, (str, int)):
             raise SettingsError(f'sensors: {shown(key)} is no name; put it in quotes')
+        if not is_text(str(key)):
+            raise SettingsError(f'sensors: {shown(key)} is not a name: it has a lone surrogate')
         if not isinstance(value, str) or not (value == IGNORED or _NAME.fullmatch(value)):
             raise SettingsError(f'sensors: {key}: expected the name of a sensor (letters, digits, '
                                 f'_ and /), or - to ignore it, got {shown(value)}')

@@ -17,7 +17,7 @@ from mag_tracking.errors import NetworkError, OutputError
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
 from mag_tracking.network import Calibrated, SensorNetwork
 from mag_tracking.network.geomagnetic import Site, decimal_year, earth_field
-from mag_tracking.yaml_file import read_yaml, shown
+from mag_tracking.yaml_file import is_text, read_yaml, shown
 
 _TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 _NAME = re.compile(r'[A-Za-z0-9_.-]+')
@@ -149,7 +149,7 @@ def _calibrated(what: str, value: Any) -> Calibrated | None:
     what = f'{what}: calibrated'
     _known(what, value, {'date', 'by', 'clock_offset_std', 'stated', 'stated_std_deg'})
     for key in ('date', 'by'):
-        if not isinstance(value.get(key), str):
+        if not isinstance(value.get(key), str) or not is_text(value[key]):
             raise NetworkError(f"{what}: {key} must be text ('...'), "
                                f'got {shown(value.get(key))}')
     std, stated = value.get('clock_offset_std'), value.get('stated')
