@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from mag_tracking.arrays import FloatArray
 from mag_tracking.geometry import yaw_between
 from mag_tracking.report.figures import SCALE_1D
+from mag_tracking.report.literal_text import literal
 
 
 class _Network(Protocol):
@@ -92,7 +93,7 @@ def _knocks(before: Axes, after: Axes, found: _Calibration, most: int) -> None:
         for axes, shift in ((before, 0.0), (after, offset)):
             near = np.abs(t - shift - first) < 0.25
             axes.plot(t[near] - shift - first, s[near], '.-', ms=4, lw=0.8, color=f'C{k}',
-                      label=name)
+                      label=literal(name))
     for axes, title in ((before, 'a knock, clocks as they were'), (after, 'clocks set by it')):
         axes.set_title(title, fontsize=10)
         axes.set_xlabel('time [s]')
@@ -114,7 +115,7 @@ def _headings(axes: Axes, found: _Calibration, stated: _Network) -> None:
         axes.errorbar(yaw, np.arange(n) + shift, xerr=std, fmt='o', ms=4, capsize=3, color=colour,
                       label=label)
     axes.axvline(0.0, color='k', lw=0.8, ls=':', label='as stated')
-    axes.set_yticks(range(n), stated.names)
+    axes.set_yticks(range(n), [literal(name) for name in stated.names])
     axes.invert_yaxis()
     axes.set_title('turned about the vertical (90 %)', fontsize=10)
     axes.set_xlabel('[degrees]')
@@ -140,7 +141,7 @@ def tumble_figure(fits: Mapping[str, _EllipsoidFit], readings: Mapping[str, Floa
             size = np.linalg.norm(values, axis=1)
             left.plot(size / size.mean(), '.', ms=2, color=colour, rasterized=True,
                       label=f'{label}: scatters by {100 * size.std() / size.mean():.2f} %')
-        left.set_title(name, fontsize=9)
+        left.set_title(literal(name), fontsize=9)
         left.set_xlabel('reading')
         left.set_ylabel('size of the field\nover its mean')
         left.legend(fontsize=8, loc='upper right')

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.report.literal_text import literal
 from mag_tracking.report.track_log import TrackLog
 
 SCALE_2D = float(np.sqrt(chdtri(2, 0.1)))
@@ -94,7 +95,7 @@ def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None
         points = f * _without_switches(rows)
         weight = rows[-1][1] if rows[-1][0] == len(best) - 1 else 0.0
         axes.plot(*points.T, color=colour, lw=1.8 if weight > 0.5 else 1.0,
-                  label=f'{name or "hypothesis"} ({weight:.0%} at the end)')
+                  label=f'{literal(name) or "hypothesis"} ({weight:.0%} at the end)')
         for k, _, position, covariance in rows:
             if k % every == 0:
                 axes.fill(*(f * _ellipse(position, covariance)).T, color=colour,
@@ -131,7 +132,7 @@ def weights_figure(log: TrackLog) -> Figure:
     t = log.seconds()
     for name, colour in _colours(log).items():
         w = np.array([row[name][0] if name in row else 0.0 for row in log.arrivals])
-        top.plot(t, w, color=colour, label=name or 'hypothesis')
+        top.plot(t, w, color=colour, label=literal(name) or 'hypothesis')
         bottom.semilogy(t, np.where(w > 0.0, w, np.nan), color=colour)
     top.set_ylim(-0.03, 1.03)
     top.set_ylabel('weight')
@@ -173,7 +174,7 @@ def field_figure(log: TrackLog, network: _Network, most: int = 8) -> Figure:
                       label=f'{"xyz"[a]} measured' if j == rows[0] else None)
             axes.plot(t, f * predicted[:, j, a], '-', lw=1.2, color=colour,
                       label=f'{"xyz"[a]} predicted' if j == rows[0] else None)
-        axes.set_title(network.names[j], fontsize=9)
+        axes.set_title(literal(network.names[j]), fontsize=9)
         axes.set_ylabel(f'field [{unit}]')
         axes.grid(alpha=0.3)
     for axes in grid[-1]:

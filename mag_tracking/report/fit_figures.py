@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.report.figures import SCALE_1D, field_unit
+from mag_tracking.report.literal_text import literal
 
 _AXES = ('tab:red', 'tab:green', 'tab:blue')
 
@@ -121,12 +122,12 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
             axes.plot(t, f * (data.field - level)[mine, a], '.', ms=2.5, color=colour,
                       label=f'{"xyz"[a]}')
             axes.plot(t, middle, '-', lw=0.9, color='k')
-        axes.set_title(data.network.names[j], fontsize=9)
+        axes.set_title(literal(data.network.names[j]), fontsize=9)
         axes.set_ylabel(f'field [{unit}]')
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8, ncol=3, loc='upper right')
     axes.set_xlabel('time from the strongest field [s]')
-    figure.suptitle(f'{title}: measured (dots), fitted (lines), 90 % bands', fontsize=11)
+    figure.suptitle(f'{literal(title)}: measured (dots), fitted (lines), 90 % bands', fontsize=11)
     return figure
 
 
@@ -157,7 +158,7 @@ def order_figure(passes: Sequence[_FittedPass]) -> Figure:
             continue
         colour = f'C{k % 10}'
         axes.semilogy([f.n_dipoles for f in fits], [f.normalised_cost for f in fits], 'o-',
-                      mfc='w', color=colour, label=f'{one.recording}, pass {one.number}')
+                      mfc='w', color=colour, label=literal(f'{one.recording}, pass {one.number}'))
         if one.chosen is not None:
             axes.semilogy([one.chosen.n_dipoles], [one.chosen.normalised_cost], 'o', ms=8,
                           color=colour)

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure, SubFigure
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.report.figures import SCALE_1D
+from mag_tracking.report.literal_text import literal
 
 _SUSPECT = 'tab:red'
 _MOST_NAMES = 60
@@ -102,7 +103,8 @@ def geometry_figure(found: _Survey) -> Figure:
     _bars(rows[3], along, g.sensor_residual, suspect,
           'residual, in its deviations (rms; about 1 where noise and field error are right)')
     step = -(-n // _MOST_NAMES)
-    rows[3].set_xticks(along[::step], names[::step], rotation=90, fontsize=7)
+    rows[3].set_xticks(along[::step], [literal(name) for name in names[::step]], rotation=90,
+                       fontsize=7)
     rows[3].set_xlim(-0.7, n - 0.3)
     return figure
 
@@ -130,7 +132,7 @@ def _moves(figure: SubFigure, axes: Axes, found: _Survey, suspect: BoolArray) ->
                   color=_SUSPECT, label='does not fit')
     if len(places) <= _MOST_NAMES:
         for name, place in zip(found.network.names, places, strict=True):
-            axes.annotate(name, place[[a, b]], xytext=(3, -8), textcoords='offset points',
+            axes.annotate(literal(name), place[[a, b]], xytext=(3, -8), textcoords='offset points',
                           fontsize=6, color='0.35')
     # Not stretched by a few poses far off.
     low, high = places.min(axis=0) - 0.15 * extent, places.max(axis=0) + 0.15 * extent

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.report.figures import scale_of
+from mag_tracking.report.literal_text import literal
 
 
 class _Network(Protocol):
@@ -169,10 +170,10 @@ def lane_figure(plan: _Plan) -> Figure:
     for k, lane in enumerate(plan.lanes):
         colour = f'C{k % 10}'
         top.semilogy(f * lane.along, f * lane.filter_std, '-', color=colour,
-                     label=f'{lane.name}: filter so far')
+                     label=f'{literal(lane.name)}: filter so far')
         top.semilogy(f * lane.along, f * lane.pass_std[:, 0], '--', color=colour,
-                     label=f'{lane.name}: whole pass')
-        middle.plot(f * lane.along, lane.detection, color=colour, label=lane.name)
+                     label=f'{literal(lane.name)}: whole pass')
+        middle.plot(f * lane.along, lane.detection, color=colour, label=literal(lane.name))
     top.set_ylabel(f'position bound [{unit}]')
     top.set_ylim(top=min(top.get_ylim()[1], f * np.ptp(plan.x)))
     top.legend(fontsize=8)

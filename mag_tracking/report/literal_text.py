@@ -1,0 +1,13 @@
+"""Names in figures, drawn as they are."""
+
+_ZERO_WIDTH_SPACE = '\u200b'
+
+
+def literal(text: str) -> str:
+    r"""Text for matplotlib that it draws character by character.
+
+    Matplotlib parses text between two `$` as mathematics, and fails on invalid mathematics such as
+    `$\road$`. It omits labels that begin with `_` from a legend.
+    """
+    escaped = text.replace('$', r'\$')
+    return _ZERO_WIDTH_SPACE + escaped if escaped.startswith('_') else escaped

@@ -1,0 +1,101 @@
+"""Names of the user in figures: drawn as they are, whatever matplotlib reads in them."""
+
+import io
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from mag_tracking.network import SensorNetwork
+from mag_tracking.report.calibration_figures import calibration_figure, tumble_figure
+from mag_tracking.report.figures import field_figure, map_figure, weights_figure
+from mag_tracking.report.fit_figures import order_figure, pass_figure
+from mag_tracking.report.geometry_figures import geometry_figure
+from mag_tracking.report.literal_text import literal
+from mag_tracking.report.plan_figures import lane_figure
+from mag_tracking.report.track_log import TrackLog
+
+NAMES = ('$\\foo$', '_hidden $^{$', '\\$5$')
+
+
+def texts_of(figure):
+    """All texts of a figure that has been drawn: a name that is read as mathematics fails."""
+    figure.savefig(io.BytesIO(), dpi=40)
+    return {t.get_text().replace('\\$', '$').replace('\u200b', '') for t in figure.findobj(
+        lambda artist: hasattr(artist, 'get_text'))}
+
+
+@pytest.mark.parametrize('text', [*NAMES, '$', '$a\n$', '__', 'left', ''])
+def test_a_text_is_drawn_as_it_is(text):
+    figure = Figure()
+    axes = figure.add_subplot()
+    axes.plot([0, 1], label=literal(text) or 'none')
+    axes.legend()
+    assert (text or 'none') in texts_of(figure)
+
+
+NETWORK = SensorNetwork(NAMES, np.eye(3), np.repeat(np.eye(3)[None], 3, axis=0),
+                        ('/a', '/b', '/c'))
+T, ONES = np.arange(4.0), np.ones(4)
+FIELD = 1e-8 * np.ones((4, 3, 3))
+
+
+def log_of_track():
+    place = np.zeros(3), np.eye(2)
+    return TrackLog(1, stamp_ns=[0, 1, 2, 3], position=[np.ones(3) * k for k in range(4)],
+                    arrivals=[{name: (0.5, *place) for name in NAMES}] * 4,
+                    measured=list(FIELD), predicted=list(FIELD))
+
+
+def fitted_pass():
+    data = SimpleNamespace(network=NETWORK, t=np.arange(12.0), sensor=np.arange(12) % 3,
+                           field=FIELD.reshape(12, 3), sensors=np.arange(3),
+                           covariance=np.repeat(1e-18 * np.eye(3)[None], 12, axis=0))
+    return SimpleNamespace(n_dipoles=1, data=data, names=tuple('abcd'), x=ONES,
+                           predicted=data.field,
+                           predicted_std=1e-9 * np.ones((12, 3)), normalised_cost=1.0)
+
+
+def plan():
+    lanes = [SimpleNamespace(name=name, along=T, filter_std=ONES, pass_std=ONES[:, None],
+                             detection=ONES) for name in NAMES]
+    return SimpleNamespace(x=T, lanes=lanes, missed=np.stack([T, 0.1 * ONES], axis=1))
+
+
+def calibration():
+    survey = SimpleNamespace(network=NETWORK, shocks={name: (T, T) for name in NAMES})
+    return SimpleNamespace(network=NETWORK, survey=survey, evidence=None)
+
+
+def geometry():
+    found = SimpleNamespace(
+        position_std=np.ones((3, 3)), rotation_std=np.ones((3, 3)), gain=np.ones(3),
+        gain_std=np.ones(3), sensor_residual=np.ones(3), pose_residual=ONES,
+        suspect_sensors=NAMES[:1], poses=(np.ones((4, 3)), np.ones((4, 3))))
+    return SimpleNamespace(stated=NETWORK, network=NETWORK, geometry=found, rows=np.arange(4),
+                           suspect_rows=(), turned=np.ones(3))
+
+
+ELLIPSOID = SimpleNamespace(coverage=1.0, correct=lambda readings: readings)
+
+
+@pytest.mark.parametrize('drawn, what', [
+    (lambda: map_figure(log_of_track(), NETWORK), '{} (50% at the end)'),
+    (lambda: weights_figure(log_of_track()), '{}'),
+    (lambda: field_figure(log_of_track(), NETWORK), '{}'),
+    (lambda: pass_figure(fitted_pass(), ', '.join(NAMES)), '{}'),
+    (lambda: order_figure([SimpleNamespace(recording=name, number=1, fits=[fitted_pass()],
+                                           chosen=None) for name in NAMES]), '{}, pass 1'),
+    (lambda: lane_figure(plan()), '{}: whole pass'), (lambda: lane_figure(plan()), '{}'),
+    (lambda: calibration_figure(calibration(), NETWORK), '{}'),
+    (lambda: tumble_figure(dict.fromkeys(NAMES, ELLIPSOID), dict.fromkeys(NAMES, FIELD[0])), '{}'),
+    (lambda: geometry_figure(geometry()), '{}')])
+def test_every_figure_draws_names_as_they_are(drawn, what):
+    assert {what.format(name) for name in NAMES} <= texts_of(drawn())
+
+
+def test_a_title_of_a_pass_is_drawn_as_it_is():
+    title = '$\\foo$, pass 1, 1 dipole'
+    assert f'{title}: measured (dots), fitted (lines), 90 % bands' in texts_of(
+        pass_figure(fitted_pass(), title))
