@@ -12,6 +12,7 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.sources import SourceModel
 from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track.bank_size import check_magnet_bank, check_vehicle_bank
 from mag_tracking.stages.track.initiation_magnet import magnet_model, start_magnet
 from mag_tracking.stages.track.initiation_vehicle import start_vehicle, vehicle_model
 from mag_tracking.stages.track.published_pose import (
@@ -48,18 +49,23 @@ def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
     Raises
     ------
     SettingsError
-        If the target is unknown, or its settings contradict each other.
+        If the target is unknown, its settings contradict each other, or the start of a track
+        would take too much memory.
     """
     if settings.target == 'vehicle':
         vehicle = settings.vehicle
-        return Target(vehicle_model(vehicle, network), vehicle_orientation, vehicle.arrival_names,
+        row = vehicle_model(vehicle, network)
+        check_vehicle_bank(settings, network, row)
+        return Target(row, vehicle_orientation, vehicle.arrival_names,
                       vehicle.kinds, partial(UnseenLength, vehicle.lengths, vehicle.length_stds),
                       False, _start_vehicle)
     if settings.target == 'magnet':
         magnet = settings.magnet
         if not any(magnet.axis):
             raise SettingsError('track.magnet.axis: the zero vector has no direction')
-        return Target(magnet_model(magnet),
+        model = magnet_model(magnet)
+        check_magnet_bank(settings, network, model)
+        return Target(model,
                       partial(magnet_orientation, axis=np.array(magnet.axis)),
                       ('',), ('',), lambda: None, True, _start_magnet)
     raise SettingsError(f'track.target: expected vehicle or magnet, got {settings.target!r}')

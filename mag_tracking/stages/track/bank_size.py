@@ -1,0 +1,67 @@
+"""The memory that the start of a track takes, bounded before anything is allocated."""
+
+import math
+from collections.abc import Mapping
+
+from mag_tracking.errors import SettingsError
+from mag_tracking.network import SensorNetwork
+from mag_tracking.physics.sources import SourceModel
+from mag_tracking.stages.track.initiation_vehicle import moment_directions
+from mag_tracking.stages.track.settings import TrackSettings
+
+MOST_BYTES = 4 << 30
+"""Of the covariances of all starting hypotheses, or of the grid of a magnet; the peak is half as
+high again."""
+_FLOAT_BYTES = 8
+
+
+def check_vehicle_bank(settings: TrackSettings, network: SensorNetwork,
+                       model: SourceModel) -> None:
+    """Raise SettingsError where the starting hypotheses of a vehicle take too much memory."""
+    vehicle = settings.vehicle
+    _check_bank('track.vehicle', {
+        **{name: len(getattr(vehicle, name))
+           for name in ('kinds', 'arrival_names', 'lateral_offsets', 'speeds')},
+        'moment directions': len(moment_directions()),
+        'turning or not': 2 if vehicle.turn_acceleration else 1}, settings, network, model)
+
+
+def check_magnet_bank(settings: TrackSettings, network: SensorNetwork,
+                      model: SourceModel) -> None:
+    """Raise SettingsError where the grid or the hypotheses of a magnet take too much memory."""
+    magnet, n = settings.magnet, _n_sensors(settings, network)
+    # Each point has the derivative (3, 3) of every sensor's field by the moment.
+    size = magnet.grid_points * n * 9 * _FLOAT_BYTES
+    if size > MOST_BYTES:
+        raise SettingsError(f'track.magnet.grid_points: {magnet.grid_points} points x {n} sensors '
+                            f'need {_gigabytes(size)}, more than {_gigabytes(MOST_BYTES)}')
+    _check_bank('track.magnet', {'starts': magnet.starts}, settings, network, model)
+
+
+def _check_bank(group: str, factors: Mapping[str, int], settings: TrackSettings,
+                network: SensorNetwork, model: SourceModel) -> None:
+    """Compare the covariances of the product of `factors` {name: number} with `MOST_BYTES`."""
+    n, n_own = _n_sensors(settings, network), _states_per_sensor(settings)
+    n_hyp, n_x = math.prod(factors.values()), len(model.state_names) + n_own * n
+    size = n_hyp * n_x**2 * _FLOAT_BYTES
+    if size > MOST_BYTES:
+        product = ' x '.join(f'{name} ({number})' for name, number in factors.items())
+        raise SettingsError(
+            f'{group}: {n_hyp} starting hypotheses, {product}, with {n_x} states each for {n} '
+            f'sensors (track.most_sensors) need {_gigabytes(size)}, more than '
+            f'{_gigabytes(MOST_BYTES)}')
+
+
+def _n_sensors(settings: TrackSettings, network: SensorNetwork) -> int:
+    """Sensors that a track uses."""
+    return min(len(network), settings.most_sensors)
+
+
+def _states_per_sensor(settings: TrackSettings) -> int:
+    """Background, and mounting angles and model errors where they are estimated."""
+    return 3 * (1 + bool(settings.mounting_std_deg) + bool(settings.model_error_time_s))
+
+
+def _gigabytes(size: int) -> str:
+    """A size in decimal gigabytes."""
+    return f'{size / 1e9:.3g} GB'

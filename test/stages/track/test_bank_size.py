@@ -1,0 +1,62 @@
+"""Settings whose starting hypotheses would fill the memory are refused before a track starts."""
+
+import numpy as np
+import pytest
+
+from mag_tracking.errors import SettingsError
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track import bank_size
+from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.target import target_of
+from support.bundled import POINT
+from support.networks import line_network
+
+
+@pytest.mark.parametrize('target, changes, product', [
+    ('vehicle', {'track.vehicle.speeds': [1.0 + 1e-3 * k for k in range(100_000)]},
+     '75600000 starting hypotheses, kinds (3) x arrival_names (3) x lateral_offsets (3) x speeds '
+     '(100000) x moment directions (14) x turning or not (2), with 44 states each for 2 sensors '
+     '(track.most_sensors) need 1.17e+03 GB, more than 4.29 GB'),
+    ('vehicle', {**POINT, 'track.vehicle.lateral_offsets': [1e-3 * k for k in range(10_000)]},
+     'lateral_offsets (10000)'),
+    ('vehicle', {'track.vehicle.arrival_names': [str(k) for k in range(3000)],
+                 'track.vehicle.arrival_headings_deg': [0.1 * k for k in range(3000)]},
+     'arrival_names (3000)')])
+def test_too_many_hypotheses_are_refused_with_their_number(target, changes, product):
+    with pytest.raises(SettingsError) as error:
+        Pipeline(line_network(2), settings_for(target, changes))
+    assert str(error.value).startswith(f'track.{target}: ') and product in str(error.value)
+
+
+@pytest.mark.parametrize('changes, told', [
+    ({'grid_points': 1_000_000},
+     'track.magnet.grid_points: 1000000 points x 90 sensors need 6.48 GB, more than 4.29 GB'),
+    ({'starts': 1000},
+     'track.magnet: 1000 starting hypotheses, starts (1000), with 822 states each for 90 sensors')])
+def test_so_are_those_of_a_magnet(changes, told):
+    changes = {f'track.magnet.{name}': value for name, value in changes.items()}
+    settings = settings_for('magnet', {'track.mounting_std_deg': 5.0, 'track.most_sensors': 90,
+                                       'track.model_error_time_s': 0.3, **changes})
+    Pipeline(line_network(9), settings)
+    with pytest.raises(SettingsError) as error:
+        Pipeline(line_network(90), settings)
+    assert told in str(error.value)
+
+
+@pytest.mark.parametrize('n', [2, 5])
+@pytest.mark.parametrize('changes', [
+    {}, POINT, {'track.mounting_std_deg': 0.0}, {'track.model_error_time_s': 0.0},
+    {'track.vehicle.turn_acceleration': 0.0, 'track.vehicle.speeds': [3.0, 9.0]}])
+def test_the_bound_is_that_of_the_bank_that_is_made(monkeypatch, n, changes):
+    network, settings = line_network(n), settings_for('vehicle', changes).track
+    target = target_of(settings, network)
+    frame = FieldFrame(0, np.full((n, 3), 1e-7), np.repeat(1e-16 * np.eye(3)[None], n, axis=0),
+                       np.full(n, 8), np.zeros(n))
+    own = BankFilter(network, target.model, settings).observation.own_covariance
+    size = target.start(settings, network, frame, own).P.nbytes
+    monkeypatch.setattr(bank_size, 'MOST_BYTES', size)
+    target_of(settings, network)
+    monkeypatch.setattr(bank_size, 'MOST_BYTES', size - 1)
+    with pytest.raises(SettingsError, match='starting hypotheses'):
+        target_of(settings, network)
