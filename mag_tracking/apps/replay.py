@@ -285,6 +285,7 @@ def write_figures(run: Run, network: SensorNetwork, out: Path, most: int = 6,
     `stopped` is asked before each track; when it is true no more are drawn.
     """
     # Drawing needs matplotlib, which a run without figures should not wait for.
+    from mag_tracking.report.figure_file import save_figure
     from mag_tracking.report.figures import field_figure, map_figure, weights_figure
 
     paths = []
@@ -300,6 +301,6 @@ def write_figures(run: Run, network: SensorNetwork, out: Path, most: int = 6,
                              ('weights', weights_figure(log)),
                              ('field', field_figure(log, network))):
             path = out / f'{name}_track_{log.id}.png'
-            figure.savefig(path, dpi=110)
+            save_figure(figure, path)
             paths.append(path)
     return paths

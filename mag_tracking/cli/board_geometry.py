@@ -96,9 +96,10 @@ def _geometry(args: argparse.Namespace) -> int:
                       f'{args.table.name}; before that {(args.sensors or args.network).name}.')
         if args.figure is not None:
             # Drawing needs matplotlib, which a run without a figure should not wait for.
+            from mag_tracking.report.figure_file import save_figure
             from mag_tracking.report.geometry_figures import geometry_figure
 
-            geometry_figure(found).savefig(args.figure, dpi=110)
+            save_figure(geometry_figure(found), args.figure)
     print(f'the network is in {args.out}')
     return 0
 

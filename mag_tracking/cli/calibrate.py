@@ -74,8 +74,9 @@ def _calibrate(args: argparse.Namespace) -> int:
     if args.figure is not None:
         # Drawing needs matplotlib, which a run without a figure should not wait for.
         from mag_tracking.report.calibration_figures import calibration_figure
+        from mag_tracking.report.figure_file import save_figure
 
-        calibration_figure(found, network).savefig(args.figure, dpi=110)
+        save_figure(calibration_figure(found, network), args.figure)
     print(f'the network is in {args.out}')
     return 2 if found.survey.disagreements else 0
 

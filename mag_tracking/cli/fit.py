@@ -241,15 +241,17 @@ def _draw(one: FittedPass, out: Path) -> None:
     if fit is None:
         return
     # Drawing needs matplotlib, which a run without figures should not wait for.
+    from mag_tracking.report.figure_file import save_figure
     from mag_tracking.report.fit_figures import pass_figure
 
     title = f'{one.recording}, pass {one.number}, {fit.n_dipoles} dipole{"s" * (fit.n_dipoles > 1)}'
-    pass_figure(fit, title + (' (no answer)' if fit.reason else '')).savefig(
-        out / f'{one.recording}_pass_{one.number}.png', dpi=110)
+    save_figure(pass_figure(fit, title + (' (no answer)' if fit.reason else '')),
+                out / f'{one.recording}_pass_{one.number}.png')
 
 
 def _draw_orders(passes: Sequence[FittedPass], out: Path) -> None:
     """The figure of all orders."""
+    from mag_tracking.report.figure_file import save_figure
     from mag_tracking.report.fit_figures import order_figure
 
-    order_figure(passes).savefig(out / 'orders.png', dpi=110)
+    save_figure(order_figure(passes), out / 'orders.png')

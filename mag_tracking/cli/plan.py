@@ -11,7 +11,8 @@ from mag_tracking.apps.plan import GOOD_PD, Plan
 from mag_tracking.apps.plan_inputs import PlanInputs, plan_inputs
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import Commands, add_command, add_network
-from mag_tracking.errors import OutputError, SettingsError
+from mag_tracking.errors import SettingsError
+from mag_tracking.files import new_text_file, output_folder
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Settings, settings_for
@@ -91,10 +92,7 @@ def _plan(args: argparse.Namespace) -> int:
     kind = 'magnet' if args.target == 'magnet' else 'vehicle'
     settings = settings_for(kind, read_parameter_file(args.params) if args.params else {})
     inputs = _inputs(args, network, settings)
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f'cannot write to {args.out}: {error.strerror}') from error
+    output_folder(args.out)
     with tqdm(total=inputs.n_parts, desc='plan', disable=None) as bar:
         result = inputs.run(network, settings, bar.update)
     _print(result, inputs.sampling.noise_std)
@@ -150,12 +148,13 @@ def _write(p: Plan, out: Path) -> None:
         'lanes': [{'name': lane.name, 'along': lane.along.tolist(),
                    'filter_std': lane.filter_std.tolist(), 'pass_std': lane.pass_std.tolist(),
                    'detection': lane.detection.tolist()} for lane in p.lanes]}
-    with open(out / 'plan.json', 'w', encoding='utf-8') as stream:
+    with new_text_file(out / 'plan.json') as stream:
         json.dump(without_nan(content), stream, indent=1, allow_nan=False)
         stream.write('\n')
     # Drawing needs matplotlib, which the other commands should not wait for.
     from mag_tracking.report import plan_figures
+    from mag_tracking.report.figure_file import save_figure
 
     for name in ('position', 'detection', 'sensor', 'lane'):
         figure = getattr(plan_figures, f'{name}_figure')(p)
-        figure.savefig(out / f'plan_{name}{"s" * (name == "lane")}.png', dpi=110)
+        save_figure(figure, out / f'plan_{name}{"s" * (name == "lane")}.png')

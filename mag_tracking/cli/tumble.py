@@ -65,8 +65,9 @@ def _tumble(args: argparse.Namespace) -> int:
                   f'that {args.network.name}.')
     if args.figure is not None:
         from mag_tracking.report.calibration_figures import tumble_figure
+        from mag_tracking.report.figure_file import save_figure
 
-        tumble_figure({name: fits[name] for name in good}, readings).savefig(args.figure, dpi=110)
+        save_figure(tumble_figure({name: fits[name] for name in good}, readings), args.figure)
     print(f'the network is in {args.out}')
     return 0
 

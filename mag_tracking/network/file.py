@@ -6,7 +6,6 @@ import os
 import re
 from collections.abc import Collection, Iterable
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ import yaml
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import NetworkError, OutputError
+from mag_tracking.files import checked_path, new_text_file
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
 from mag_tracking.network import Calibrated, SensorNetwork
 from mag_tracking.network.geomagnetic import Site, decimal_year, earth_field
@@ -306,9 +306,9 @@ def write_network(path: str | PathLike[str], network: SensorNetwork, comment: st
     lines.append('sensors:')
     for i in range(len(network)):
         lines += _sensor_lines(network, i)
-    draft = Path(f'{path}.part')
+    draft = checked_path(f'{path}.part', OutputError)
     try:
-        with open(draft, 'w', encoding='utf-8') as stream:
+        with new_text_file(draft) as stream:
             stream.write('\n'.join(lines) + '\n')
             stream.flush()
             # Else a power cut might leave an empty file in the place of the old one.

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.files import new_text_file
 from mag_tracking.network import SensorNetwork
 from mag_tracking.stages.calibrate.restoration import StoredBackground
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
@@ -55,7 +56,8 @@ def write_backgrounds(path: str | PathLike[str], texts: Mapping[str, str]) -> No
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         beside = path.with_name(f'{path.name}.{os.getpid()}.new')
-        beside.write_text(f'{{"version": {VERSION}, "sensors": {{\n{rows}\n}}}}\n')
+        with new_text_file(beside) as stream:
+            stream.write(f'{{"version": {VERSION}, "sensors": {{\n{rows}\n}}}}\n')
         beside.replace(path)
     except (OSError, ValueError) as error:
         raise OutputError(f'{path}: {getattr(error, "strerror", None) or error}') from error

@@ -3,12 +3,12 @@
 import csv
 from collections.abc import Iterable
 from os import PathLike
-from pathlib import Path
 
 import numpy as np
 
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import SIGNATURE_SPAN, PassEvent
+from mag_tracking.files import new_text_file, output_folder
 from mag_tracking.units import NS
 
 EVENT_COLUMNS = ('sensor', 'number', 'ended', 'onset_ns', 'release_ns', 'peak_ns', 'peak_x_nt',
@@ -32,14 +32,13 @@ def _number(value: float) -> str:
 
 def write_events(folder: str | PathLike[str], events: Iterable[PassEvent]) -> None:
     """Write `events.csv` and `signatures.csv` into a folder; raises OutputError."""
-    folder, events = Path(folder), list(events)
+    folder, events = output_folder(folder), list(events)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with open(folder / 'events.csv', 'w', newline='', encoding='utf-8') as stream:
+        with new_text_file(folder / 'events.csv', newline='') as stream:
             writer = csv.writer(stream)
             writer.writerow(EVENT_COLUMNS)
             writer.writerows(map(event_row, events))
-        with open(folder / 'signatures.csv', 'w', newline='', encoding='utf-8') as stream:
+        with new_text_file(folder / 'signatures.csv', newline='') as stream:
             writer = csv.writer(stream)
             writer.writerow(SIGNATURE_COLUMNS)
             for event in events:

@@ -5,7 +5,6 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from os import PathLike
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,6 +13,7 @@ from mag_tracking.analysis.correlated_motion import CorrelatedMotion
 from mag_tracking.analysis.pass_result import Bearing, PassFit
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import OutputError
+from mag_tracking.files import new_text_file, output_folder
 from mag_tracking.recording.result_folder import without_nan
 
 FIT_COLUMNS = (
@@ -118,12 +118,11 @@ class FitFolder:
 
     def __init__(self, folder: str | PathLike[str]) -> None:
         """Raises OutputError where the folder cannot be made or written."""
-        self.folder = Path(folder)
+        self.folder = output_folder(folder)
         self.rows: list[dict[str, Any]] = []
         self.summary: dict[str, Any] = {}
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._stream = open(self.folder / 'fits.csv', 'w', newline='', encoding='utf-8')
+            self._stream = new_text_file(self.folder / 'fits.csv', newline='')
         except OSError as error:
             raise OutputError(f'cannot write to {self.folder}: {error.strerror}') from error
         self._writer = csv.writer(self._stream)
@@ -134,7 +133,7 @@ class FitFolder:
 
     def __exit__(self, *_: object) -> None:
         self._stream.close()
-        with open(self.folder / 'fits.json', 'w', encoding='utf-8') as stream:
+        with new_text_file(self.folder / 'fits.json') as stream:
             json.dump(without_nan({'fits': self.rows, **self.summary}), stream, indent=1,
                       allow_nan=False)
             stream.write('\n')

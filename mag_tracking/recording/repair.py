@@ -30,6 +30,7 @@ from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 
 from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.files import new_binary_file
 from mag_tracking.recording.damage import DAMAGE
 from mag_tracking.recording.rosbag2_folder import FileSummary, Topic, WholeStream, write_metadata
 
@@ -188,7 +189,7 @@ def finish_file(path: str | PathLike[str]) -> list[str]:
         torn = 0 if scan.has_data_end else path.stat().st_size - scan.end
         if torn:
             stream.seek(scan.end)
-            with open(f'{path}.cut', 'wb') as cut:
+            with new_binary_file(f'{path}.cut') as cut:
                 shutil.copyfileobj(stream, cut)
         _replace_end(raw, scan.end, scan.index())
     lines = [f'{path.name}: {scan.counts.total()} messages, index written']

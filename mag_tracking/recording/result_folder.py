@@ -4,17 +4,18 @@ import csv
 import json
 import math
 from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
 from os import PathLike
-from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import Any, Protocol
 
 import numpy as np
 
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import Disturbance
+from mag_tracking.files import new_text_file, output_folder
 from mag_tracking.messages.schema import header_dict, pose_with_covariance_dict, track_dict
 from mag_tracking.messages.types import POSE_WITH_COVARIANCE, TRACK_ARRAY
-from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.recording.writer import RecordingWriter, refuse_other_recording
 from mag_tracking.records import Detection, SmoothedPose, Track
 
 POSE_COLUMNS = ('stamp_ns', 'track_id', 'x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z',
@@ -28,6 +29,12 @@ DISTURBANCE_COLUMNS = ('stamp_ns', 'id', 'ended', 'begin_ns', 'largest', 'sensor
 HYPOTHESIS_COLUMNS = ('stamp_ns', 'track_id', 'arrival', 'kind', 'weight', 'x', 'y', 'z', 'vx',
                       'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz', 'mx', 'my',
                       'mz')
+
+
+_TABLES = {'poses.csv': POSE_COLUMNS, 'poses_smoothed.csv': SMOOTHED_COLUMNS,
+           'detections.csv': DETECTION_COLUMNS, 'disturbances.csv': DISTURBANCE_COLUMNS,
+           'hypotheses.csv': HYPOTHESIS_COLUMNS}
+_SUMMARY, _RECORDING = 'summary.json', 'tracks.mcap'
 
 
 class _Table(Protocol):
@@ -44,25 +51,25 @@ class ResultFolder:
 
     def __init__(self, folder: str | PathLike[str], frame: str) -> None:
         """Raises OutputError where the folder cannot be made or written."""
-        self.folder = Path(folder)
+        self.folder = output_folder(folder)
+        refuse_other_recording(self.folder / _RECORDING)
         self._frame = frame
-        self._files: list[TextIO] = []
+        self._files = ExitStack()
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._poses = self._table('poses.csv', POSE_COLUMNS)
-            self._smoothed = self._table('poses_smoothed.csv', SMOOTHED_COLUMNS)
-            self._detections = self._table('detections.csv', DETECTION_COLUMNS)
-            self._disturbances = self._table('disturbances.csv', DISTURBANCE_COLUMNS)
-            self._hypotheses = self._table('hypotheses.csv', HYPOTHESIS_COLUMNS)
+            (self._poses, self._smoothed, self._detections, self._disturbances,
+             self._hypotheses) = (
+                self._table(name, columns) for name, columns in _TABLES.items())
+            self._recording = RecordingWriter(self.folder / _RECORDING)
+        except OutputError:
+            self._files.close()
+            raise
         except OSError as error:
-            self._close_tables()
+            self._files.close()
             raise OutputError(f'cannot write to {self.folder}: {error.strerror}') from error
-        self._recording = RecordingWriter(self.folder / 'tracks.mcap')
 
     def _table(self, name: str, columns: tuple[str, ...]) -> _Table:
         """Open one CSV file and write its head."""
-        stream = open(self.folder / name, 'w', newline='', encoding='utf-8')
-        self._files.append(stream)
+        stream = self._files.enter_context(new_text_file(self.folder / name, newline=''))
         writer = csv.writer(stream)
         writer.writerow(columns)
         return writer
@@ -71,13 +78,11 @@ class ResultFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._close_tables()
-        self._recording.close()
-
-    def _close_tables(self) -> None:
-        """Close what is open."""
-        for stream in self._files:
-            stream.close()
+        # A full disk shows when a file is closed: the others are closed all the same.
+        try:
+            self._files.close()
+        finally:
+            self._recording.close()
 
     def add_detection(self, d: Detection) -> None:
         """One row for a `Detection`."""
@@ -122,7 +127,7 @@ class ResultFolder:
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """`summary.json`."""
-        with open(self.folder / 'summary.json', 'w', encoding='utf-8') as stream:
+        with new_text_file(self.folder / _SUMMARY) as stream:
             json.dump(without_nan(summary), stream, indent=1, allow_nan=False)
             stream.write('\n')
 

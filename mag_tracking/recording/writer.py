@@ -8,8 +8,22 @@ import yaml
 from mcap.writer import CompressionType, Writer
 
 from mag_tracking.errors import OutputError
+from mag_tracking.files import checked_path, new_binary_file, new_text_file
 from mag_tracking.messages.shapes import MessageDict
 from mag_tracking.messages.types import definition, encoder
+
+
+def refuse_other_recording(path: Path) -> None:
+    """Raise OutputError where the folder of an MCAP file to be is that of another recording."""
+    metadata = path.parent / 'metadata.yaml'
+    try:
+        # Reading a pipe or a device might never end.
+        if metadata.is_file() and f'- {path.name}\n' not in metadata.read_text(
+                encoding='utf-8', errors='replace'):
+            raise OutputError(f'{path.parent} holds another recording (its metadata.yaml does not '
+                              f'name {path.name}); choose another folder')
+    except OSError as error:
+        raise OutputError(f'cannot read {metadata}: {error.strerror}') from error
 
 
 class RecordingWriter:
@@ -20,16 +34,14 @@ class RecordingWriter:
     """
 
     def __init__(self, path: str | PathLike[str]) -> None:
-        """Raises OutputError where the file cannot be written."""
-        self.path = Path(path)
-        metadata = self.path.parent / 'metadata.yaml'
-        if metadata.exists() and f'- {self.path.name}\n' not in metadata.read_text(
-                encoding='utf-8', errors='replace'):
-            raise OutputError(f'{self.path.parent} holds another recording (its metadata.yaml does '
-                              f'not name {self.path.name}); choose another folder')
+        """Raises OutputError where the file cannot be written, or its folder holds another
+        recording.
+        """
+        self.path = checked_path(path, OutputError)
+        refuse_other_recording(self.path)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._stream = open(self.path, 'wb')
+            self._stream = new_binary_file(self.path)
         except OSError as error:
             raise OutputError(f'cannot write {self.path}: {error.strerror}') from error
         self._writer = Writer(self._stream, chunk_size=1 << 20, compression=CompressionType.ZSTD)
@@ -96,7 +108,7 @@ class RecordingWriter:
                        'duration': {'nanoseconds': last - first},
                        'message_count': sum(self._counts.values())}],
             'custom_data': None, 'ros_distro': 'jazzy'}}
-        with open(self.path.parent / 'metadata.yaml', 'w', encoding='utf-8') as stream:
+        with new_text_file(self.path.parent / 'metadata.yaml') as stream:
             yaml.safe_dump(metadata, stream, sort_keys=False)
 
 

@@ -154,8 +154,12 @@ def test_a_plan_is_consistent(road_plan):
 
 def test_plan_writes_all_that_it_promises(tmp_path, capsys):
     out = tmp_path / 'out'
+    out.mkdir()
+    for name in ('plan.json', 'plan_lanes.png'):
+        (out / name).symlink_to(tmp_path / 'elsewhere')
     assert main(['plan', '--network', str(NETWORK_FILE), '--target', 'truck', '--heading', '0',
                  '--grid', '9', '--out', str(out)]) == 0
+    assert not (tmp_path / 'elsewhere').exists()
     assert {p.name for p in out.iterdir()} == {
         'plan.json', 'plan_position.png', 'plan_detection.png', 'plan_sensor.png',
         'plan_lanes.png'}

@@ -287,10 +287,14 @@ def test_the_demo_draws_a_track_over_topics(tmp_path):
 def test_fit_writes_all_that_it_promises(tmp_path, capsys):
     out = tmp_path / 'out'
     names = ['straight_car_fast_left', 'junction_right_turns_to_rear']
+    out.mkdir()
+    for link in ('fits.json', 'orders.png', f'{names[0]}_pass_1.png'):
+        (out / link).symlink_to(tmp_path / 'elsewhere')
     assert main(['fit', *(str(vehicle_path(n)) for n in names), '--network', str(NETWORK_FILE),
                  '--orders', '1', '3', '--out', str(out)]) == 0
     assert {p.name for p in out.iterdir()} == {'fits.csv', 'fits.json', 'orders.png',
                                                *(f'{n}_pass_1.png' for n in names)}
+    assert not (tmp_path / 'elsewhere').exists()
     lines = (out / 'fits.csv').read_text().splitlines()
     assert lines[0] == ','.join(FIT_COLUMNS) and len(lines) == 5
     content = json.loads((out / 'fits.json').read_text())

@@ -12,6 +12,7 @@ from mag_tracking.errors import NetworkError, OutputError, SettingsError
 from mag_tracking.messages.schema import odometry_dict, pose_covariance
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.recording import result_folder
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import RecordingWriter
@@ -182,18 +183,16 @@ def test_more_faulty_network_files(tmp_path, content, message):
         read_network(path)
 
 
-def test_a_full_disk_is_one_line(tmp_path, capsys):
+def test_a_full_disk_is_one_line(tmp_path, capsys, monkeypatch):
     out = tmp_path / 'out'
-    out.mkdir()
-    (out / 'poses.csv').symlink_to('/dev/full')
+    monkeypatch.setattr(result_folder, 'new_text_file', lambda *_, **__: open('/dev/full', 'w'))
     assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE),
                  '--out', str(out), '--no-figures']) == 1
     assert 'No space left' in capsys.readouterr().err
 
 
 def test_a_summary_without_numbers_is_still_json(tmp_path):
-    from mag_tracking.recording.result_folder import ResultFolder
-    with ResultFolder(tmp_path, 'map') as folder:
+    with result_folder.ResultFolder(tmp_path, 'map') as folder:
         folder.write_summary({'a': float('nan'), 'b': [1.0, float('inf')]})
     assert json.loads((tmp_path / 'summary.json').read_text()) == {'a': None, 'b': [1.0, None]}
 

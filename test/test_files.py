@@ -1,0 +1,100 @@
+"""Files of results: made new under their own name, whatever had it."""
+
+import os
+
+import pytest
+from matplotlib.figure import Figure
+
+from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.files import checked_path, new_binary_file, new_text_file, output_folder
+from mag_tracking.network.file import write_network
+from mag_tracking.recording.background_file import write_backgrounds
+from mag_tracking.recording.event_tables import write_events
+from mag_tracking.recording.fit_folder import FitFolder
+from mag_tracking.recording.result_folder import ResultFolder
+from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.report.figure_file import save_figure
+from support.networks import line_network
+
+
+def write_results(out):
+    with ResultFolder(out, 'map') as results:
+        results.write_summary({})
+
+
+def write_fits(out):
+    with FitFolder(out):
+        pass
+
+
+def write_recording(out):
+    with RecordingWriter(out / 'a.mcap'):
+        pass
+
+
+def write_figures(out):
+    for suffix in ('png', 'PNG', 'svg'):
+        save_figure(Figure(), out / f'a.{suffix}')
+
+
+@pytest.mark.parametrize('write, more', [
+    (write_results, ()), (write_fits, ()), (write_recording, ()), (write_figures, ()),
+    (lambda out: write_events(out, []), ()),
+    (lambda out: write_network(out / 'n.yaml', line_network(2)), ('n.yaml.part',)),
+    (lambda out: write_backgrounds(out / 'b.json', {}), (f'b.json.{os.getpid()}.new',))])
+def test_no_result_is_written_through_a_link(tmp_path, write, more):
+    (tmp_path / 'new').mkdir()
+    write(tmp_path / 'new')
+    names = sorted(path.name for path in (tmp_path / 'new').iterdir())
+    out, theirs = tmp_path / 'out', tmp_path / 'theirs'
+    out.mkdir()
+    theirs.mkdir()
+    for name in (*names, *more):
+        # A recording may only take the place of one of the same name.
+        (theirs / name).write_text('- a.mcap\n- tracks.mcap\n')
+        (out / name).symlink_to(theirs / name)
+    write(out)
+    assert sorted(path.name for path in out.iterdir()) == names
+    assert not any(path.is_symlink() for path in out.iterdir())
+    assert {path.read_text() for path in theirs.iterdir()} == {'- a.mcap\n- tracks.mcap\n'}
+
+
+@pytest.mark.parametrize('make', [new_text_file, new_binary_file])
+def test_a_new_file_takes_the_place_of_what_had_its_name(tmp_path, make):
+    path, other = tmp_path / 'a', tmp_path / 'other'
+    other.write_text('theirs')
+    for before in (lambda: path.symlink_to(other), lambda: path.symlink_to(tmp_path / 'nowhere'),
+                   lambda: path.hardlink_to(other), lambda: os.mkfifo(path), lambda: None):
+        path.unlink(missing_ok=True)
+        before()
+        with make(path) as stream:
+            stream.write('' if make is new_text_file else b'')
+        assert path.is_file() and not path.is_symlink() and path.stat().st_size == 0
+        assert other.read_text() == 'theirs' and sorted(tmp_path.iterdir()) == [path, other]
+
+
+def test_a_row_is_there_as_soon_as_it_is_written(tmp_path):
+    with new_text_file(tmp_path / 'a') as stream:
+        stream.write('row\n')
+        stream.flush()
+        assert (tmp_path / 'a').read_text() == 'row\n'
+
+
+def test_a_folder_of_that_name_is_no_file(tmp_path):
+    (tmp_path / 'a').mkdir()
+    with pytest.raises(OSError, match='directory'):
+        new_text_file(tmp_path / 'a')
+    for name in ('poses.csv', 'tracks.mcap'):
+        (tmp_path / name / name).mkdir(parents=True)
+        with pytest.raises(OutputError, match='cannot write .*: Is a directory'):
+            ResultFolder(tmp_path / name, 'map')
+
+
+def test_a_path_with_a_nul_is_named(tmp_path):
+    told = r"'a\\x00b.* is not a valid path: it contains a NUL character"
+    with pytest.raises(RecordingError, match=told):
+        checked_path('a\0b', RecordingError)
+    for write in (output_folder, new_text_file, lambda path: write_events(path, []),
+                  RecordingWriter, FitFolder, lambda path: write_network(path, line_network(2))):
+        with pytest.raises(OutputError, match=told):
+            write('a\0b')
