@@ -56,8 +56,9 @@ class Recording:
         self.start_ns, self.end_ns = min(starts, default=None), max(ends, default=None)
 
     def lies_in(self, folder: str | PathLike[str]) -> bool:
-        """Whether a file of this recording is in `folder` itself."""
-        return any(f.resolve().parent == Path(folder).resolve() for f in self._files)
+        """Whether a file of this recording, or a link to it, is in `folder` itself."""
+        folder = Path(folder).resolve()
+        return any(folder in (f.resolve().parent, f.parent.resolve()) for f in self._files)
 
     @property
     def size(self) -> int:

@@ -43,6 +43,11 @@ def test_a_replay_does_not_overwrite_its_recording(tmp_path, road_network):
     with pytest.raises(OutputError, match='folder of the recording'):
         replay(Recording(path), road_network, settings_for('vehicle'), tmp_path)
     assert path.read_bytes() == vehicle_path(NAME).read_bytes()
+    (tmp_path / 'links').mkdir()
+    link = tmp_path / 'links' / 'tracks.mcap'
+    link.symlink_to(path)
+    with pytest.raises(OutputError, match='folder of the recording'):
+        replay(Recording(link), road_network, settings_for('vehicle'), tmp_path / 'links')
     with RecordingWriter(tmp_path / 'other' / 'a.mcap'):
         pass
     with pytest.raises(OutputError, match='another recording'):
