@@ -21,7 +21,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Output, Pipeline, Settings
 from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.result_folder import ResultFolder
+from mag_tracking.recording.result_folder import ResultFolder, figure_name
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Detection, FieldFrame, SmoothedPose, Track
 from mag_tracking.report.metrics import (
@@ -67,7 +67,8 @@ class Run:
 
 def replay(recording: Recording, network: SensorNetwork, settings: Settings,
            out: str | PathLike[str], progress: Callable[[int], object] | None = None,
-           stopped: Callable[[], bool] | None = None) -> Run:
+           stopped: Callable[[], bool] | None = None,
+           report: Callable[[str], object] | None = None) -> Run:
     """Track everything in a recording and write the results.
 
     Parameters
@@ -82,6 +83,8 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     stopped : function, optional
         Asked after every batch of readings and whenever the reading has got on. When it is
         true the reading ends, what was done is written, and the summary says so.
+    report : function, optional
+        Takes a line for the user where the results of an earlier run are replaced.
 
     Returns
     -------
@@ -98,6 +101,8 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     interrupted = False
 
     with ResultFolder(out, network.frame) as results:
+        if results.replaces_earlier and report is not None:
+            report(f'replaces the results of an earlier run in {out}')
         taker = RunCollector(results)
         try:
             for readings in until_stopped(reader.readings, progress, stopped):
@@ -300,7 +305,7 @@ def write_figures(run: Run, network: SensorNetwork, out: Path, most: int = 6,
         for name, figure in (('map', map_figure(log, network, truth, smoothed)),
                              ('weights', weights_figure(log)),
                              ('field', field_figure(log, network))):
-            path = out / f'{name}_track_{log.id}.png'
+            path = out / figure_name(name, log.id)
             save_figure(figure, path)
             paths.append(path)
     return paths

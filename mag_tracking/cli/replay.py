@@ -41,7 +41,8 @@ Writes to DIR:
   summary.json     counts, rejected samples by cause, the tracks
   tracks.mcap      poses and tracks as ROS messages (with metadata.yaml)
   *_track_N.png    the map, the weights, measured against predicted field
-With several recordings, each gets a folder of its own in DIR.
+With several recordings, each gets a folder of its own in DIR. Results of an earlier run are
+replaced, its figures removed; other files in the folder stay.
 
 examples:
   mag-tracking replay junction.mcap --network config/network.yaml --out out
@@ -88,7 +89,7 @@ def _replay_one(path: Path, network: SensorNetwork, settings: Settings, out: Pat
     recording = Recording(path)
     with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
               disable=None) as bar:
-        run = replay(recording, network, settings, out, bar.update, lambda: bool(seen))
+        run = replay(recording, network, settings, out, bar.update, lambda: bool(seen), tqdm.write)
     _print_summary(path, run.summary)
     if figures:
         write_figures(run, network, out, stopped=lambda: bool(seen))

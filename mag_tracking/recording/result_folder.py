@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import re
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from os import PathLike
@@ -35,6 +36,13 @@ _TABLES = {'poses.csv': POSE_COLUMNS, 'poses_smoothed.csv': SMOOTHED_COLUMNS,
            'detections.csv': DETECTION_COLUMNS, 'disturbances.csv': DISTURBANCE_COLUMNS,
            'hypotheses.csv': HYPOTHESIS_COLUMNS}
 _SUMMARY, _RECORDING = 'summary.json', 'tracks.mcap'
+_RESULTS = (*_TABLES, _SUMMARY, _RECORDING, 'metadata.yaml')
+_FIGURE = re.compile(r'(map|weights|field)_track_[0-9]+\.png')
+
+
+def figure_name(kind: str, track_id: int) -> str:
+    """File name of a figure, 'map', 'weights' or 'field', of a track."""
+    return f'{kind}_track_{track_id}.png'
 
 
 class _Table(Protocol):
@@ -47,6 +55,12 @@ class ResultFolder:
     """The tables and the recording of one run; a context manager.
 
     Rows are written as they come, so that an interrupted run keeps them.
+
+    Attributes
+    ----------
+    replaces_earlier : bool
+        The folder held results of an earlier run, which were removed with the figures of its
+        tracks. All other files stay.
     """
 
     def __init__(self, folder: str | PathLike[str], frame: str) -> None:
@@ -56,6 +70,7 @@ class ResultFolder:
         self._frame = frame
         self._files = ExitStack()
         try:
+            self.replaces_earlier = self._remove_earlier()
             (self._poses, self._smoothed, self._detections, self._disturbances,
              self._hypotheses) = (
                 self._table(name, columns) for name, columns in _TABLES.items())
@@ -66,6 +81,16 @@ class ResultFolder:
         except OSError as error:
             self._files.close()
             raise OutputError(f'cannot write to {self.folder}: {error.strerror}') from error
+
+    def _remove_earlier(self) -> bool:
+        """Remove the results of an earlier run; whether there were any."""
+        # Its summary and the figures of its tracks would be taken for those of this run.
+        earlier = [path for path in self.folder.iterdir()
+                   if (path.name in _RESULTS or _FIGURE.fullmatch(path.name))
+                   and (path.is_symlink() or not path.is_dir())]
+        for path in earlier:
+            path.unlink()
+        return bool(earlier)
 
     def _table(self, name: str, columns: tuple[str, ...]) -> _Table:
         """Open one CSV file and write its head."""

@@ -35,7 +35,25 @@ def test_replay_writes_all_that_it_promises(tmp_path, capsys):
     track = json.loads((out / 'summary.json').read_text())['tracks'][0]
     assert track['arrival'] == 'left' and track['verdict'] == 'unique'
     assert {'speed', 'moment', 'poses', 'truth', 'smoothed', 'kind'} <= set(track)
-    assert 'from left (100%), a car (100%)' in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert 'from left (100%), a car (100%)' in said and 'replaces' not in said
+
+
+def test_a_replay_says_what_it_replaces_and_writes_through_no_link(tmp_path, capsys):
+    out, theirs = tmp_path / 'out', tmp_path / 'theirs'
+    out.mkdir()
+    theirs.write_text('- tracks.mcap\n')
+    for name in ('poses.csv', 'summary.json', 'tracks.mcap', 'metadata.yaml', 'map_track_1.png'):
+        (out / name).symlink_to(theirs)
+    (out / 'field_track_7.png').write_text('of an earlier run')
+    (out / 'notes.txt').write_text('mine')
+    assert replay_one(out) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said.count(f'replaces the results of an earlier run in {out}') == 1
+    assert theirs.read_text() == '- tracks.mcap\n' and (out / 'notes.txt').exists()
+    assert not any(path.is_symlink() for path in out.iterdir())
+    assert {path.name for path in out.glob('*.png')} == {
+        f'{kind}_track_1.png' for kind in ('map', 'weights', 'field')}
 
 
 def test_a_track_that_is_too_long_to_smooth_is_said(tmp_path, capsys):
