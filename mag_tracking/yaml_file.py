@@ -7,6 +7,9 @@ from typing import Any
 
 import yaml
 
+from mag_tracking.errors import MagTrackingError
+from mag_tracking.files import checked_path
+
 MOST_NODES = 1_000_000
 """Keys, values, lists and mappings of a file, aliases expanded."""
 DEEPEST = 64
@@ -91,12 +94,13 @@ def _children(node: yaml.Node) -> list[yaml.Node]:
     return list(node.value) if isinstance(node, yaml.SequenceNode) else []
 
 
-def read_yaml(path: str | PathLike[str], error: type[Exception]) -> Any:
+def read_yaml(path: str | PathLike[str], error: type[MagTrackingError]) -> Any:
     """The content of a YAML file.
 
-    Raises `error`, an exception class, with a message that names the file: where
+    Raises `error` with a message that names the file: where
     it cannot be read, is no YAML, says something twice, or is too large or too deep.
     """
+    path = checked_path(path, error)
     try:
         with open(path, encoding='utf-8') as stream:
             return yaml.load(stream, Loader=_UniqueKeyLoader)

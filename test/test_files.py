@@ -5,15 +5,25 @@ import os
 import pytest
 from matplotlib.figure import Figure
 
+import mag_tracking as mt
+from mag_tracking.apps.replay import replay
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import checked_path, new_binary_file, new_text_file, output_folder
-from mag_tracking.network.file import write_network
+from mag_tracking.network.file import read_network, write_network
+from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.background_file import write_backgrounds
 from mag_tracking.recording.event_tables import write_events
+from mag_tracking.recording.field_table import import_field_table
 from mag_tracking.recording.fit_folder import FitFolder
+from mag_tracking.recording.pose_table import read_readings
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.recorder import Recorder
+from mag_tracking.recording.repair import repair
 from mag_tracking.recording.result_folder import ResultFolder
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.report.figure_file import save_figure
+from mag_tracking.settings import read_parameter_file
+from support.bundled import vehicle_path
 from support.networks import line_network
 
 
@@ -95,6 +105,14 @@ def test_a_path_with_a_nul_is_named(tmp_path):
     with pytest.raises(RecordingError, match=told):
         checked_path('a\0b', RecordingError)
     for write in (output_folder, new_text_file, lambda path: write_events(path, []),
-                  RecordingWriter, FitFolder, lambda path: write_network(path, line_network(2))):
+                  RecordingWriter, FitFolder, Recorder,
+                  lambda path: write_network(path, line_network(2)),
+                  lambda path: replay(Recording(vehicle_path('straight_car_right')),
+                                      line_network(2), settings_for('vehicle'), path)):
         with pytest.raises(OutputError, match=told):
             write('a\0b')
+    for read in (read_network, read_parameter_file, Recording, repair, read_readings,
+                 lambda path: mt.track(path, line_network(2)),
+                 lambda path: import_field_table(path, ['time=t', 'm.x=x'], 'T', 'out')):
+        with pytest.raises(mt.MagTrackingError, match=told):
+            read('a\0b')

@@ -15,6 +15,11 @@ INTERRUPTED = 'mag-tracking: interrupted'
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status (1 for an error that a message explains)."""
     words = sys.argv[1:] if argv is None else argv
+    for word in words:
+        # No path can contain one, and each function that takes a path fails in its own way.
+        if '\0' in word:
+            print(f'mag-tracking: {word!r} contains a NUL character', file=sys.stderr)
+            return 1
     if words[:1] == ['run']:
         # To end the nodes is no failure, neither before they are up.
         with exit_on_signals(0, signal.SIGINT, signal.SIGTERM):

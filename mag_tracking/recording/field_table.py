@@ -11,6 +11,7 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
+from mag_tracking.files import checked_path
 from mag_tracking.messages.schema import magnetic_field_dicts
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.recording.writer import RecordingWriter
@@ -141,6 +142,7 @@ def _readings(table: Path, columns: tuple[str, str | None, _Axes], scale: float,
 
 def _rows(table: Path, wanted: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
     """[(row, {column: text})] of a CSV file; raises RecordingError."""
+    table = checked_path(table, RecordingError)
     try:
         with open(table, newline='', encoding='utf-8-sig') as stream:
             reader = csv.DictReader(stream, skipinitialspace=True)

@@ -8,6 +8,7 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
+from mag_tracking.files import checked_path
 
 _Path: TypeAlias = str | PathLike[str]
 _Lines: TypeAlias = list[tuple[int, list[str]]]
@@ -100,6 +101,7 @@ def _read(path: _Path) -> tuple[list[str], _Lines]:
 
 def _lines(path: _Path) -> _Lines:
     """[(line, cells)] of the lines that are not empty."""
+    path = checked_path(path, RecordingError)
     try:
         with open(path, newline='', encoding='utf-8') as stream:
             reader = csv.reader(stream)

@@ -9,7 +9,8 @@ from collections.abc import Collection, Iterator
 from os import PathLike
 from pathlib import Path
 
-from mag_tracking.errors import RecordingError
+from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.files import checked_path
 from mag_tracking.recording.bag_file import BAG_SUFFIXES, BagFile
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.mcap_file import McapFile
@@ -36,7 +37,7 @@ class Recording:
 
     def __init__(self, path: str | PathLike[str]) -> None:
         """Raises RecordingError where there is no readable recording at `path`."""
-        self.path = Path(path)
+        self.path = checked_path(path, RecordingError)
         self.types: dict[str, str] = {}
         self.message_counts: Counter[str] = Counter()
         self.losses: Counter[str] = Counter()
@@ -57,7 +58,7 @@ class Recording:
 
     def lies_in(self, folder: str | PathLike[str]) -> bool:
         """Whether a file of this recording, or a link to it, is in `folder` itself."""
-        folder = Path(folder).resolve()
+        folder = checked_path(folder, OutputError).resolve()
         return any(folder in (f.resolve().parent, f.parent.resolve()) for f in self._files)
 
     @property

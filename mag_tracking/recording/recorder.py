@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.files import checked_path
 from mag_tracking.recording.open_file import OpenFile
 from mag_tracking.recording.repair import finish_file
 from mag_tracking.recording.rosbag2_folder import (
@@ -74,7 +75,7 @@ class Recorder:
 
         Raises OutputError where the folder holds a recording or cannot be written.
         """
-        self.folder = Path(folder)
+        self.folder = checked_path(folder, OutputError)
         self._split_bytes, self._split_ns, self._retry_ns = split_bytes, split_ns, retry_ns
         self._report, self._opener = report, opener
         self.counts: Counter[str] = Counter()

@@ -30,7 +30,7 @@ from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 
 from mag_tracking.errors import OutputError, RecordingError
-from mag_tracking.files import new_binary_file
+from mag_tracking.files import checked_path, new_binary_file
 from mag_tracking.recording.damage import DAMAGE
 from mag_tracking.recording.rosbag2_folder import FileSummary, Topic, WholeStream, write_metadata
 
@@ -224,7 +224,7 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
     Returns the number of files that were not whole. Raises RecordingError where there
     is no recording, OutputError where it cannot be written or is still recorded.
     """
-    path = Path(path)
+    path = checked_path(path, RecordingError)
     files = [path] if path.is_file() else sorted(path.glob('*.mcap'), key=_number)
     if not files:
         raise RecordingError(f'{path} holds no .mcap file')

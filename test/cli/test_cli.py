@@ -118,6 +118,17 @@ def test_failures_are_one_clear_line(tmp_path, capsys):
                                           '--out', tmp_path / 'out')
 
 
+@pytest.mark.parametrize('words', [
+    'replay a\0b --network n.yaml --out out', 'replay a.mcap --network n.yaml --out a\0b',
+    'events a\0b --network n.yaml', 'calibrate a.mcap --network a\0b --out c.yaml',
+    'tumble a.mcap --network n.yaml --out a\0b', 'board-geometry a\0b --moment 1 --out b.yaml',
+    'doctor a\0b --network n.yaml', 'fit a.mcap --network n.yaml --out a\0b',
+    'plan --network n.yaml --out a\0b', 'listen a\0b', 'record --network n.yaml --out a\0b',
+    'repair a\0b', 'run --network a\0b', 'info a\0b', 'import a\0b --background b --out out'])
+def test_an_argument_with_a_nul_is_named(capsys, words):
+    assert fail(capsys, *words.split()) == "mag-tracking: 'a\\x00b' contains a NUL character"
+
+
 def test_a_read_only_folder_is_named(tmp_path, capsys):
     folder = tmp_path / 'theirs'
     folder.mkdir(mode=0o500)
