@@ -27,11 +27,12 @@ def output_folder(path: str | PathLike[str]) -> Path:
 def new_text_file(path: str | PathLike[str], newline: str | None = None) -> TextIO:
     """A new, empty UTF-8 file, open for writing.
 
-    A file or link of that name is removed first; the target of a link stays untouched.
+    A file or link of that name is removed first; the target of a link stays untouched. Lone
+    surrogates, such as those of a file name that is not UTF-8, are written as `\\udcff`.
 
     Raises OSError, and OutputError where no file can have that name.
     """
-    return open(_free(path), 'x', newline=newline, encoding='utf-8')
+    return open(_free(path), 'x', newline=newline, encoding='utf-8', errors='backslashreplace')
 
 
 def new_binary_file(path: str | PathLike[str]) -> BinaryIO:

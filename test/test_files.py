@@ -90,6 +90,12 @@ def test_a_row_is_there_as_soon_as_it_is_written(tmp_path):
         assert (tmp_path / 'a').read_text() == 'row\n'
 
 
+def test_what_is_no_text_is_escaped(tmp_path):
+    with new_text_file(tmp_path / 'a') as stream:
+        stream.write('\udcff\u00e4')
+    assert (tmp_path / 'a').read_text(encoding='utf-8') == '\\udcff\u00e4'
+
+
 def test_a_folder_of_that_name_is_no_file(tmp_path):
     (tmp_path / 'a').mkdir()
     with pytest.raises(OSError, match='directory'):

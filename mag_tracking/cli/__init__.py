@@ -1,6 +1,7 @@
 """The command `mag-tracking`: one module a command."""
 
 import argparse
+import io
 import signal
 import sys
 from collections.abc import Sequence
@@ -20,6 +21,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if '\0' in word:
             print(f'mag-tracking: {word!r} contains a NUL character', file=sys.stderr)
             return 1
+    # A file name may not be valid UTF-8; by default stderr escapes it and stdout fails.
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == 'strict':
+        sys.stdout.reconfigure(errors='backslashreplace')
     if words[:1] == ['run']:
         # To end the nodes is no failure, neither before they are up.
         with exit_on_signals(0, signal.SIGINT, signal.SIGTERM):

@@ -7,7 +7,9 @@ def literal(text: str) -> str:
     r"""Text for matplotlib that it draws character by character.
 
     Matplotlib parses text between two `$` as mathematics, and fails on invalid mathematics such as
-    `$\road$`. It omits labels that begin with `_` from a legend.
+    `$\road$`. It omits labels that begin with `_` from a legend. Lone surrogates, such as those of
+    a file name that is not UTF-8, are drawn as `\udcff`.
     """
-    escaped = text.replace('$', r'\$')
+    drawable = text.encode('utf-8', 'backslashreplace').decode()
+    escaped = drawable.replace('$', r'\$')
     return _ZERO_WIDTH_SPACE + escaped if escaped.startswith('_') else escaped

@@ -1,6 +1,7 @@
 """The command line: what it writes, what it says, how it fails."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -333,6 +334,18 @@ def test_fit_writes_all_that_it_promises(tmp_path, capsys):
     assert turn['reason'].startswith('not at constant velocity') and turn['speed'] is None
     text = capsys.readouterr().out
     assert 'a turn, braking' in text and 'closest to the middle of the sensors' in text
+
+
+def test_a_file_name_need_not_be_text(tmp_path):
+    path = tmp_path / os.fsdecode(b'\xff$a$.mcap')
+    path.write_bytes(vehicle_path('straight_car_right').read_bytes())
+    done = subprocess.run(
+        [sys.executable, '-m', 'mag_tracking.cli', 'fit', path, '--network', NETWORK_FILE,
+         '--orders', '1', '--out', tmp_path / 'out'], capture_output=True, text=True, timeout=120,
+        env={**os.environ, 'PYTHONIOENCODING': 'utf-8:strict'})
+    assert done.returncode == 0, done.stderr
+    assert '\\udcff$a$, pass 1' in done.stdout
+    assert '\n\\udcff$a$,1,1,' in (tmp_path / 'out' / 'fits.csv').read_text()
 
 
 def test_fit_of_one_vehicle_tells_its_iron(tmp_path, capsys):

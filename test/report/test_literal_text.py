@@ -95,6 +95,11 @@ def test_every_figure_draws_names_as_they_are(drawn, what):
     assert {what.format(name) for name in NAMES} <= texts_of(drawn())
 
 
+def test_bytes_of_a_file_name_that_are_no_text_are_escaped():
+    assert 'a\\udcff: measured (dots), fitted (lines), 90 % bands' in texts_of(
+        pass_figure(fitted_pass(), 'a\udcff'))
+
+
 def test_a_title_of_a_pass_is_drawn_as_it_is():
     title = '$\\foo$, pass 1, 1 dipole'
     assert f'{title}: measured (dots), fitted (lines), 90 % bands' in texts_of(
