@@ -3,7 +3,7 @@
 from collections.abc import Hashable
 from os import PathLike
 from reprlib import Repr
-from typing import Any
+from typing import Any, TextIO
 
 import yaml
 
@@ -103,14 +103,23 @@ def read_yaml(path: str | PathLike[str], error: type[MagTrackingError]) -> Any:
     path = checked_path(path, error)
     try:
         with open(path, encoding='utf-8') as stream:
-            return yaml.load(stream, Loader=_UniqueKeyLoader)
+            return parse_yaml(stream, str(path), error)
     except OSError as problem:
         raise error(f'cannot read {path}: {problem.strerror}') from problem
+
+
+def parse_yaml(text: str | TextIO, name: str, error: type[MagTrackingError]) -> Any:
+    """The content of YAML text, or of a stream of it.
+
+    Raises `error` as `read_yaml` does, with a message that begins with `name`.
+    """
+    try:
+        return yaml.load(text, Loader=_UniqueKeyLoader)
     # ValueError: a date or a number that is none (2001-13-45); also bytes that are no text.
     except (yaml.YAMLError, ValueError) as problem:
-        raise error(f'{path} is not YAML as it should be: {problem}') from problem
+        raise error(f'{name} is not YAML as it should be: {problem}') from problem
     except RecursionError as problem:
-        raise error(f'{path} is nested too deeply') from problem
+        raise error(f'{name} is nested too deeply') from problem
 
 
 def is_text(value: str) -> bool:

@@ -11,8 +11,9 @@ from typing import NamedTuple, TypeAlias
 
 import yaml
 
-from mag_tracking.errors import OutputError
+from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.recording.writer import OFFERED_QOS
+from mag_tracking.yaml_file import parse_yaml
 
 Opener: TypeAlias = Callable[[Path], io.FileIO]
 """From the path of a new file to a stream without a buffer."""
@@ -92,6 +93,8 @@ def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[s
     ----------
     files : list of FileSummary
     topics : {name: Topic}
+
+    Raises OSError, and RecordingError where a topic's QoS is not YAML.
     """
     nothing: Counter[str] = Counter()
     counts = sum((f.counts for f in files), nothing)
@@ -103,7 +106,7 @@ def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[s
         'topics_with_message_count': [
             {'topic_metadata': {'name': name, 'type': topics[name].type,
                                 'serialization_format': 'cdr',
-                                'offered_qos_profiles': yaml.safe_load(topics[name].qos),
+                                'offered_qos_profiles': _qos_profiles(name, topics[name]),
                                 'type_description_hash': ''},
              'message_count': n} for name, n in counts.items()],
         'compression_format': '', 'compression_mode': '',
@@ -120,6 +123,11 @@ def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[s
     finally:
         stream.raw.close()
         new.unlink(missing_ok=True)
+
+
+def _qos_profiles(name: str, topic: Topic) -> object:
+    """The QoS profiles of a topic as a list; recordings, and `Topic`, have them as YAML text."""
+    return parse_yaml(topic.qos, f'offered_qos_profiles of {name}', RecordingError)
 
 
 def _span(firsts: Sequence[int], lasts: Sequence[int]) -> dict[str, dict[str, int]]:

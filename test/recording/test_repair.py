@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.messages.types import MAGNETIC_FIELD, definition
@@ -140,3 +141,19 @@ def test_repair_names_what_is_no_recording(tmp_path):
     with pytest.raises(RecordingError, match='x.mcap is not an MCAP file'):
         finish_file(tmp_path / 'x.mcap')
     assert (tmp_path / 'x.mcap').read_text() == 'nonsense of some length'
+
+
+@pytest.mark.parametrize('qos', ['a: [', '[' * 80 + ']' * 80, '\n'.join(
+    ['a0: &a0 [1, 1, 1, 1]'] + [f'a{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 9)}]'
+                                for k in range(1, 30)])])
+def test_repair_names_a_topic_whose_qos_is_not_yaml(tmp_path, qos):
+    with open(tmp_path / 'x_0.mcap', 'wb') as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema('std_msgs/msg/Header', 'ros2msg', b'')
+        writer.register_channel('/x', 'cdr', schema, {'offered_qos_profiles': qos})
+        writer.add_message(1, 1, b'\0\1\0\0', 1)
+        writer.finish()
+    with pytest.raises(RecordingError, match='offered_qos_profiles of /x is not YAML'):
+        repair(tmp_path)
+    assert not (tmp_path / 'metadata.yaml').exists()
