@@ -177,7 +177,7 @@ def test_dataframes_have_units(result):
     units = result.poses_dataframe().attrs['units']
     assert units['stamp_ns'] == 'ns' and units['sd_y'] == 'm' and units['vx'] == 'm/s'
     assert units['mz'] == 'A m^2'
-    without = {'track_id', 'weight', 'ambiguous', 'kind', 'kind_weight'}
+    without = {'track_id', 'weight', 'ambiguous', 'kind', 'kind_weight', 'doubts'}
     assert set(units) == set(POSE_COLUMNS) - without
 
 
@@ -186,6 +186,8 @@ def test_arrays_have_the_fields_of_the_records(result):
     assert result.poses['covariance'].shape == (n, 6, 6)
     assert set(result.poses['kind']) <= {'small', 'car', 'truck'}
     assert result.poses['ambiguous'].dtype == bool
+    assert ((result.poses['doubts'] != '') == result.poses['ambiguous']).all()
+    assert result.disturbances == ()
     assert result.detections['onset'].tolist() == [True, False]
     seconds = np.diff(result.poses['stamp_ns']) / 1e9
     np.testing.assert_allclose(seconds, 0.08, atol=1e-6)

@@ -133,7 +133,7 @@ def _print_disturbance(d: dict[str, Any]) -> None:
     lasted = (d['stamp_ns'] - d['begin_ns']) / NS
     over = 'over the whole network' if d['uniform'] > 0.5 else 'at each sensor on its own'
     print(f'  disturbance {d["id"]}: {lasted:.1f} s, up to {1e9 * d["largest"]:.3g} nT at '
-          f'{", ".join(d["sensors"]) or "no sensor alone"}, {over}; no target explains it '
+          f'{", ".join(d["sensors"]) or "no sensor alone"}, {over}; no single target explains it '
           f'(track {d["track_id"]})')
 
 

@@ -24,12 +24,12 @@ def test_replay_writes_all_that_it_promises(tmp_path, capsys):
     assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE),
                  '--out', str(out)]) == 0
     assert {p.name for p in out.iterdir()} == {
-        'poses.csv', 'poses_smoothed.csv', 'detections.csv', 'hypotheses.csv', 'summary.json',
-        'tracks.mcap', 'metadata.yaml', 'map_track_1.png', 'weights_track_1.png',
+        'poses.csv', 'poses_smoothed.csv', 'detections.csv', 'disturbances.csv', 'hypotheses.csv',
+        'summary.json', 'tracks.mcap', 'metadata.yaml', 'map_track_1.png', 'weights_track_1.png',
         'field_track_1.png'}
     head = (out / 'poses.csv').read_text().splitlines()[0]
     assert head == ('stamp_ns,track_id,x,y,z,vx,vy,vz,sd_x,sd_y,sd_z,sd_vx,sd_vy,sd_vz,'
-                    'mx,my,mz,weight,ambiguous,kind,kind_weight,length,sd_length'
+                    'mx,my,mz,weight,ambiguous,kind,kind_weight,length,sd_length,doubts'
                     ) == ','.join(POSE_COLUMNS)
     assert (out / 'poses_smoothed.csv').read_text().splitlines()[0] == ','.join(SMOOTHED_COLUMNS)
     assert (out / 'detections.csv').read_text().splitlines()[0] == ','.join(DETECTION_COLUMNS)
@@ -38,6 +38,9 @@ def test_replay_writes_all_that_it_promises(tmp_path, capsys):
     assert {'speed', 'moment', 'poses', 'truth', 'smoothed', 'kind'} <= set(track)
     said = capsys.readouterr().out
     assert 'from left (100%), a car (100%)' in said and 'replaces' not in said
+    n = track['doubts']['another_arrival']
+    assert f'ambiguous in {n} of {track["poses"]} poses' in said
+    assert n == sum('another_arrival' in row for row in (out / 'poses.csv').read_text().split())
 
 
 def test_a_replay_says_what_it_replaces_and_writes_through_no_link(tmp_path, capsys):
