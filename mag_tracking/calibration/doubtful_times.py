@@ -10,11 +10,12 @@ MOST = 16
 """The latest stretches are kept."""
 
 
-def noted(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool) -> DoubtfulTimes:
-    """The `times`, and from `stamp_ns` on as `is_doubtful` says."""
+def noted(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool, most: int = MOST
+          ) -> DoubtfulTimes:
+    """The `times`, and from `stamp_ns` on as `is_doubtful` says; the latest `most` stretches."""
     is_open = bool(times) and times[-1][1] is None
     if is_doubtful and not is_open:
-        return (*times, (stamp_ns, None))[-MOST:]
+        return (*times, (stamp_ns, None))[-most:]
     if is_open and not is_doubtful:
         return (*times[:-1], (times[-1][0], stamp_ns))
     return times

@@ -58,7 +58,7 @@ class GaussMarkovVectors:
         H : (n_y, m) array
             The measurement is H times the vector.
         y, variance : (n_y,) arrays
-            Measurements without NaN, and the variance of their noise.
+            Measurements without NaN, and the variance of their noise, which is positive.
         dt : float [s]
             Since the measurements before.
         """
@@ -91,7 +91,7 @@ def _update(x: FloatArray, P: FloatArray, h: FloatArray, y: float, variance: flo
             PH: FloatArray) -> float:
     """Update with a scalar measurement, in place; its log-density. `PH` (2 m,) is overwritten."""
     n, m = len(x), len(h)
-    S, nu = variance, y
+    S, nu = 0.0, y
     for i in range(n):
         PH[i] = 0.0
         for j in range(m):
@@ -99,11 +99,24 @@ def _update(x: FloatArray, P: FloatArray, h: FloatArray, y: float, variance: flo
     for j in range(m):
         S += h[j] * PH[j]
         nu -= h[j] * x[j]
+    # After a long gap the prediction is so wide that rounding errors exceed the noise.
+    S = max(S, 0.0) + variance
     for i in range(n):
         gain = PH[i] / S
         x[i] += gain * nu
         for j in range(n):
             P[i, j] -= gain * PH[j]
+    # Joseph's form: (I - K h') P (I - K h')' + K R K', with K = PH / S; symmetric.
+    for i in range(n):
+        left = 0.0
+        for j in range(m):
+            left += P[i, j] * h[j]
+        for j in range(n):
+            P[i, j] += (variance * PH[i] / S - left) * PH[j] / S
+    for i in range(n):
+        P[i, i] = max(P[i, i], 0.0)
+        for j in range(i):
+            P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
     return float(-0.5 * (nu * nu / S + np.log(2.0 * np.pi * S)))
 
 

@@ -24,6 +24,7 @@ POSE = 'geometry_msgs/msg/PoseStamped'
 POSE_WITH_COVARIANCE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 TRACK_ARRAY = 'mag_tracking_msgs/msg/TrackArray'
 FIELD_READINGS = 'mag_tracking_msgs/msg/FieldReadings'
+DISTURBANCE = 'mag_tracking_msgs/msg/Disturbance'
 
 RAW_READINGS = '/driver_node/readings'
 """The topic of raw readings of many sensors."""
@@ -68,6 +69,10 @@ DEFINITIONS: dict[str, tuple[tuple[str, ...], str]] = {
         'bool[6] unobservable\n'
         'float64[] predicted_field\nfloat64[] mounting\nfloat64[] mounting_covariance\n'
         'string[] doubts\n'),
+    DISTURBANCE: (
+        ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time'),
+        'std_msgs/Header header\nuint32 id\nbool ended\nbuiltin_interfaces/Time begin\n'
+        'float64 largest\nstring[] sensors\nfloat64 uniform\nuint32 track_id\n'),
     TRACK_ARRAY: (('std_msgs/msg/Header', 'mag_tracking_msgs/msg/Track'),
                   'std_msgs/Header header\nmag_tracking_msgs/Track[] tracks\n'),
 }

@@ -14,8 +14,13 @@ import numpy as np
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.files import new_text_file, output_folder
-from mag_tracking.messages.schema import header_dict, pose_with_covariance_dict, track_dict
-from mag_tracking.messages.types import POSE_WITH_COVARIANCE, TRACK_ARRAY
+from mag_tracking.messages.schema import (
+    disturbance_dict,
+    header_dict,
+    pose_with_covariance_dict,
+    track_dict,
+)
+from mag_tracking.messages.types import DISTURBANCE, POSE_WITH_COVARIANCE, TRACK_ARRAY
 from mag_tracking.recording.writer import RecordingWriter, refuse_other_recording
 from mag_tracking.records import Detection, SmoothedPose, Track
 
@@ -138,6 +143,8 @@ class ResultFolder:
 
     def add_disturbance(self, d: Disturbance) -> None:
         """One row when a `Disturbance` is found, and one when it has ended."""
+        self._recording.write('/tracker_node/disturbances', DISTURBANCE,
+                              disturbance_dict(d, self._frame), d.stamp_ns)
         self._disturbances.writerow([
             d.stamp_ns, d.id, int(d.ended), d.begin_ns, repr(d.largest), ' '.join(d.sensors),
             repr(d.uniform), d.track_id])

@@ -95,7 +95,7 @@ def test_one_that_would_fit_anothers_place_is_not_exchanged_with_it():
 
 
 @pytest.mark.parametrize('turn', [90.0, 180.0])
-def test_sensors_turned_by_right_angles_in_each_others_place_are_named(turn):
+def test_sensors_rotated_by_right_angles_in_each_others_place_are_named(turn):
     """As most are installed; two sensors with the same two axes flipped are less likely."""
     R_ws = np.array([np.eye(3), rotation_about_z(np.deg2rad(turn)), *R_WS[2:]])
     fields = right(None, R_ws)

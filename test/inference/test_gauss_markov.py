@@ -86,3 +86,20 @@ def test_it_explains_its_own_process_as_well_as_the_filter_that_knows_the_streng
         theirs += knows.log_likelihood
     # Not to know it costs the start and what is kept for a switch: at most log(1/stay) a frame.
     assert theirs - n * dt / SWITCH_S - np.log(len(STRENGTHS)) < ours < theirs + 10.0
+
+
+@pytest.mark.parametrize('gap, noise', [(3600.0, 4e-9), (86400.0, 1e-10), (10.0, 1e-12)])
+def test_densities_stay_finite_over_long_gaps_and_with_little_noise(gap, noise):
+    rng = np.random.default_rng(4)
+    bank = GaussMarkovVectors(1, np.full(3, 2e-8), 1e-4)
+    for k in range(20):
+        density = bank.log_density(np.zeros(3, dtype=np.int64), np.eye(3),
+                                   1e-6 + noise * rng.standard_normal(3), np.full(3, noise**2),
+                                   gap if k % 5 == 4 else 0.08)
+        assert np.isfinite(density)
+    # It still follows: what repeats itself within its noise is expected.
+    y = np.full(3, 1e-6)
+    known = [bank.log_density(np.zeros(3, dtype=np.int64), np.eye(3), value, np.full(3, noise**2),
+                              0.08) for value in (y, y, y + 1e3 * noise)]
+    # A strength a thousand times larger costs log(1000) on each axis.
+    assert known[2] < known[1] - 15.0

@@ -61,7 +61,7 @@ class BoxVehicle:
         return np.einsum('nij,nsj->nsi', R, B.reshape(shape).sum(axis=2))
 
 
-def _magnetised(rng, parts, length, moment):
+def magnetised(rng, parts, length, moment):
     """A `BoxVehicle` of [(centre, sides, weight)] with a whole moment of `moment` [A m^2].
 
     That is what real ones were found to have (TSP14 Table V), heading along x in the field of
@@ -98,7 +98,7 @@ def box_car(rng, length=None, moment=None):
     parts += [((0.0, 0.5 * side * width, 0.6), (0.8 * length, SHEET, 0.6), 1.2) for side in (-1, 1)]
     parts += [((0.33 * rear * length, 0.0, 0.55), (0.6, 0.6, 0.45), 2.5)]
     parts += [((0.3 * end * length, 0.0, 0.3), (0.08, 0.9 * width, 0.08), 0.7) for end in (-1, 1)]
-    return _magnetised(rng, parts, length, rng.uniform(300.0, 600.0) if moment is None else moment)
+    return magnetised(rng, parts, length, rng.uniform(300.0, 600.0) if moment is None else moment)
 
 
 def box_truck(rng, length=None, moment=None):
@@ -121,7 +121,7 @@ def box_truck(rng, length=None, moment=None):
     if kind == 2:
         at = rng.uniform(-front + 1.5, front - 4.0)
         parts += [((at, 0.0, 1.6), (2.0, 1.8, 0.9), 3.0)]
-    return _magnetised(rng, parts, length,
+    return magnetised(rng, parts, length,
                        rng.uniform(1200.0, 2200.0) if moment is None else moment)
 
 

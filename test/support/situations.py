@@ -17,7 +17,7 @@ from support import spoiler
 from support.box_vehicles import box_car, box_truck
 from support.bundled import NETWORK_FILE
 from support.passes import network_of
-from support.random_passes import SIMULATORS, are_wrong, random_pass
+from support.random_passes import SIMULATORS, are_wrong, errors_of, random_pass
 from support.worlds import FLAWS, Convoy, Ride, box_two_wheeler, world
 
 ROAD = read_network(NETWORK_FILE)
@@ -357,6 +357,8 @@ class Verdict:
     smoothed_wrong: int
     n_tracks: int
     n_disturbances: int
+    doubts: tuple
+    """(n,) of each pose."""
 
     @property
     def n_sure(self):
@@ -370,13 +372,8 @@ class Verdict:
 def wrong_of(poses, a_world):
     """(n,) whether `Track`s or `SmoothedPose`s are wrong of every body of a `World`."""
     wrong = np.ones(len(poses), dtype=bool)
-    stamps = np.array([r.stamp_ns for r in poses]) / 1e9
     for position in a_world.positions:
-        true = np.stack([np.interp(stamps, a_world.t, position[:, k]) for k in (0, 1)], axis=1)
-        error = np.array([r.position[:2] for r in poses]).reshape(-1, 2) - true
-        P = np.array([r.covariance[:2, :2] for r in poses]).reshape(-1, 2, 2)
-        size = np.hypot(*error.T)
-        along = np.sqrt(np.einsum('ni,nij,nj->n', error, P, error)) / np.maximum(size, 1e-9)
+        size, along, *_ = errors_of(poses, a_world.t, position)
         wrong &= are_wrong(size, along)
     return wrong
 
@@ -392,4 +389,5 @@ def verdict(name, simulator, seed, changes=None):
         np.array([r.stamp_ns for r in tracks]) / 1e9, np.array([r.id for r in tracks]),
         np.array([r.ambiguous for r in tracks], dtype=bool), wrong_of(tracks, a_world),
         len(smoothed), int(wrong_of(smoothed, a_world).sum()), pipeline.track.counts['tracks'],
-        sum(isinstance(r, Disturbance) and r.ended for r in records))
+        sum(isinstance(r, Disturbance) and r.ended for r in records),
+        tuple(r.doubts for r in tracks))

@@ -7,7 +7,7 @@ import numpy as np
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings
 from mag_tracking.simulation.scenario import Imperfections, Path
-from support.box_vehicles import BOUGHT, _magnetised
+from support.box_vehicles import BOUGHT, magnetised
 from support.samples import scenario
 
 GRID_S = 0.01
@@ -67,7 +67,7 @@ def box_two_wheeler(rng, length, moment, iron=1.0):
     parts = [((0.0, 0.0, 0.5), (0.5 * length, 0.06, 0.5), 1.0),
              ((0.05 * length, 0.0, 0.4), (0.35, 0.3, 0.3), iron)]
     parts += [((0.35 * end * length, 0.0, 0.3), (0.05, 0.15, 0.5), 0.4) for end in (-1, 1)]
-    return _magnetised(rng, parts, length, moment)
+    return magnetised(rng, parts, length, moment)
 
 
 def world(network, movers, duration, rng, flaws=None, rate=100.0, ambient=None):

@@ -3,10 +3,15 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtri
 
 from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.event_records import Disturbance
+from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.records import FieldFrame
+
+FALSE_ALARM = 1e-6
+"""Probability that a sensor is taken to feel a disturbance when a frame of it is noise."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +52,11 @@ class Disturbances:
         return [self._current] if is_new else []
 
     def feed(self, frame: FieldFrame) -> None:
-        """Take a frame; the disturbance may be larger now."""
+        """Take a frame of the disturbance alone: it may be larger now, and reach other sensors."""
         if self._current is not None:
+            energy, n_axes = whitened_energy(frame.field, frame.covariance)
             self._largest = np.maximum(self._largest, size_of(frame))
+            self._felt |= energy > chdtri(np.maximum(n_axes, 1), FALSE_ALARM)
 
     def end(self, stamp_ns: int) -> list[Disturbance]:
         """The network is quiet again, or nothing is known of it any more."""

@@ -13,7 +13,7 @@ CONTRADICTION = 'contradiction'
 OVERFIT = 'overfit'
 SOMETHING_ELSE = 'something_else'
 INNOVATIONS = 'innovations'
-SENSORS_TURNED = 'sensors_turned'
+SENSORS_ROTATED = 'sensors_rotated'
 HEIGHT = 'height'
 FRAMES_TOO_LONG = 'frames_too_long'
 
@@ -24,7 +24,7 @@ MEANINGS = {
                           'a lost one',
     SENSORS_AT_ONE_PLACE: 'there is one sensor, or all sensors are within two metres: range and '
                           'size are those of the settings',
-    ONE_SENSOR: 'a single sensor of several measured for too long',
+    ONE_SENSOR: 'a single sensor of several measures, or did for too long',
     FELT_BY_ONE_SENSOR: 'only one sensor feels the target: range and size are those of the '
                         'settings',
     DOUBTFUL_BACKGROUND: 'the background of a sensor is doubtful',
@@ -34,7 +34,7 @@ MEANINGS = {
     OVERFIT: 'the filter fits the latest frames much better than the path of its own hypothesis',
     SOMETHING_ELSE: 'a smooth field of no target explains the frames about as well',
     INNOVATIONS: 'the innovations of the latest frames, or of the track, are larger than stated',
-    SENSORS_TURNED: 'the track needs sensors that are turned by more than stated',
+    SENSORS_ROTATED: 'the track needs sensors that are rotated by more than stated',
     HEIGHT: 'the iron is where no vehicle of the kind has it',
     FRAMES_TOO_LONG: 'the target moves too far within a frame',
 }

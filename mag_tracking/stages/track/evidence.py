@@ -4,6 +4,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.calibration.doubtful_times import DoubtfulTimes, are_doubtful, noted
 from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track import doubts
@@ -35,12 +36,15 @@ LEAST_WATCHED = 0.5
 """A track that begins with less than this share of its lookback is ambiguous."""
 
 FELT = 4.0
-"""A sensor has felt a target when the energy of its fields exceeds that of noise by so many
-standard deviations of the latter."""
+"""Standard deviations of the noise's energy by which that of a sensor's fields must exceed it for
+the sensor to have felt the target."""
 
 PASSING_DOUBTS = (doubts.OVERFIT, doubts.SOMETHING_ELSE, doubts.INNOVATIONS, doubts.MISFIT,
                   doubts.HEIGHT)
-"""What a filter is doubted for at one time, its smoother mends only in part."""
+"""Doubts about the filter at one time, which smoothing removes only in part."""
+
+MOST_STRETCHES = 5000
+"""Stretches of doubtful poses that are remembered: more than a track has that is smoothed."""
 
 
 class TrackEvidence:
@@ -64,9 +68,9 @@ class TrackEvidence:
         self._single_sensor_s = 0.0
         self._n_misfits = 0
         self._doubts_filter_until_ns = -1
-        self._doubtful_stamps: set[int] = set()
+        self._doubtful_times: DoubtfulTimes = ()
         self._best_spread = np.inf
-        # Of each sensor: whitened energy of its fields beyond that of noise, and number of axes.
+        # Per sensor: whitened energy of its fields above that of noise, and number of axes.
         self._energy, self._n_axes = np.zeros(n_sensors), np.zeros(n_sensors)
         self.largest: FloatArray = np.zeros(n_sensors)
 
@@ -121,8 +125,8 @@ class TrackEvidence:
 
     def note(self, found: set[str], stamp_ns: int) -> None:
         """Remember what the pose of a frame was doubted for, for the smoothed one."""
-        if found.intersection(PASSING_DOUBTS):
-            self._doubtful_stamps.add(stamp_ns)
+        self._doubtful_times = noted(self._doubtful_times, stamp_ns,
+                                     bool(found.intersection(PASSING_DOUBTS)), MOST_STRETCHES)
 
     def contradicts(self, nis: FloatArray, degrees_of_freedom: int) -> bool:
         """Whether a normalised innovation is one that no target of ours makes.
@@ -154,7 +158,7 @@ class TrackEvidence:
 
     def doubted_filter(self, stamp_ns: int) -> bool:
         """Whether the filter was doubted at an earlier time."""
-        return stamp_ns in self._doubtful_stamps
+        return are_doubtful(self._doubtful_times, stamp_ns)
 
     def support(self, by_one_sensor: bool, dt: float) -> None:
         """Count `dt` [s] for which one sensor of several supported the track, or more did.
@@ -171,10 +175,6 @@ class TrackEvidence:
         """Probability that there is a target."""
         return float(1.0 / (1.0 + np.exp(-np.clip(self._log_odds, -700.0, 700.0))))
 
-    def is_unexplained(self, ratio: float) -> bool:
-        """Whether all of the track, as it stands, is no better than something else by `ratio`."""
-        return self.explanation.log_ratio < float(np.log(ratio))
-
     @property
     def is_doubtful(self) -> bool:
         """Whether the field contradicted the track at its end, or all of it may be wrong."""
@@ -188,8 +188,7 @@ class TrackEvidence:
         several explain the field, what they differ by says nothing about how far away it is. A
         target that `is_coming` nearer to the sensors is not out of reach, however uncertain.
         """
-        if self.explanation.unexplained_s(settings.explained_ratio, track.stamp_ns) \
-                > UNEXPLAINED_S:
+        if self.explanation.unexplained_s(track.stamp_ns) > UNEXPLAINED_S:
             return UNEXPLAINED
         misfit = track.nis > settings.end_nis * track.degrees_of_freedom
         self._n_misfits = self._n_misfits + 1 if misfit else 0

@@ -7,7 +7,7 @@ import numpy as np
 from mag_tracking.units import NS
 
 WINDOW_S = 1.0
-"""[s] Over the latest frames a target may fall behind by the ratio that it has to lead by."""
+"""[s] Length of the latest frames, over which a target must not fall behind."""
 
 
 class Explanation:
@@ -21,34 +21,47 @@ class Explanation:
 
     def __init__(self) -> None:
         self.log_ratio = 0.0
-        self._largest = -np.inf
+        self._is_known, self._has_led = True, False
         self._behind_since_ns: int | None = None
         self._recent: deque[tuple[int, float]] = deque()
 
-    def add(self, log_ratio: float, stamp_ns: int) -> None:
-        """Count a frame: its log-density with a target less that with something else."""
+    def add(self, log_ratio: float, stamp_ns: int, ratio: float) -> None:
+        """Count a frame.
+
+        Parameters
+        ----------
+        log_ratio : float [nats]
+            Log-density of the frame with a target, minus that with something else.
+        stamp_ns : int
+        ratio : float
+            By which one of them has to lead.
+        """
+        if not np.isfinite(log_ratio):
+            self._is_known = False
+            return
         self.log_ratio += log_ratio
-        self._largest = max(self._largest, self.log_ratio)
+        self._has_led = self._has_led or self.leads(ratio)
+        if self.log_ratio > -np.log(ratio):
+            self._behind_since_ns = None
+        elif self._behind_since_ns is None:
+            self._behind_since_ns = stamp_ns
         self._recent.append((stamp_ns, log_ratio))
         while self._recent[0][0] < stamp_ns - WINDOW_S * NS:
             self._recent.popleft()
 
-    def is_doubtful(self, ratio: float) -> bool:
-        """Whether a target does not explain the frames `ratio` times better than something else."""
-        least = float(np.log(ratio))
-        latest = sum(value for _, value in self._recent)
-        return self.log_ratio < least or latest < -least
+    def leads(self, ratio: float) -> bool:
+        """Whether a target explains the whole track `ratio` times better than something else."""
+        return self._is_known and self.log_ratio >= float(np.log(ratio))
 
-    def unexplained_s(self, ratio: float, stamp_ns: int) -> float:
-        """[s] for which something else has explained the track `ratio` times better.
+    def fell_behind(self, ratio: float) -> bool:
+        """Whether something else explains the latest frames `ratio` times better."""
+        return sum(value for _, value in self._recent) < -float(np.log(ratio))
 
-        0 where a target once did: it may have stopped, and is then as smooth as anything. To be
-        asked with every frame.
+    def unexplained_s(self, stamp_ns: int) -> float:
+        """[s] for which something else has led.
+
+        0 where a target has led before: it may have stopped, and is then as smooth as anything.
         """
-        least = float(np.log(ratio))
-        if self.log_ratio > -least or self._largest >= least:
-            self._behind_since_ns = None
+        if self._has_led or self._behind_since_ns is None or not self._is_known:
             return 0.0
-        if self._behind_since_ns is None:
-            self._behind_since_ns = stamp_ns
         return (stamp_ns - self._behind_since_ns) / NS

@@ -117,7 +117,8 @@ class TrackManager:
         out, previous = self._end_at_gap(frame), self._last_ns
         self._last_ns = frame.stamp_ns
         self.counts['frames'] += 1
-        self._disturbances.feed(frame)
+        if not self._tracks:
+            self._disturbances.feed(frame)
         if not frame.target_present:
             out += self._end_all('released', frame.stamp_ns)
             self._tail_until = None

@@ -38,8 +38,8 @@ def implausible(observation: Observation, x: FloatArray, kind: int, settings: Ve
         Length of the frame.
     """
     found = set()
-    if _needs_turned_sensors(observation, x, mounting_std):
-        found.add(doubts.SENSORS_TURNED)
+    if _needs_rotated_sensors(observation, x, mounting_std):
+        found.add(doubts.SENSORS_ROTATED)
     off = abs(float(x[2]) - settings.heights[kind])
     if off > -ndtri(LEVEL / 2.0) * settings.height_stds[kind]:
         found.add(doubts.HEIGHT)
@@ -48,7 +48,7 @@ def implausible(observation: Observation, x: FloatArray, kind: int, settings: Ve
     return found
 
 
-def _needs_turned_sensors(observation: Observation, x: FloatArray, mounting_std: float) -> bool:
+def _needs_rotated_sensors(observation: Observation, x: FloatArray, mounting_std: float) -> bool:
     """Whether the mounting angles of a state are larger than stated."""
     angles = observation.angles(x)
     if not angles.size:

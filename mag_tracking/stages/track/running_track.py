@@ -229,18 +229,17 @@ class RunningTrack:
 
     @property
     def unexplained(self) -> Unexplained | None:
-        """What it says of the field, where it is no track of a target and no pose of it was sure;
-        else None.
-        """
+        """What the track says of the field, if a target never explained it; else None."""
         evidence = self._evidence
-        if self._was_sure or not evidence.is_unexplained(1.0 / self._settings.explained_ratio):
+        if self._was_sure or self._last is None \
+                or not evidence.explanation.unexplained_s(self._last.stamp_ns) > 0.0:
             return None
         return Unexplained(self.id, self._begin_ns, evidence.largest, evidence.felt,
                            self._something_else.uniform)
 
     def _is_unexplained(self) -> bool:
-        """Whether, as a whole, the track is no track of a target."""
-        return self._evidence.is_unexplained(self._settings.explained_ratio) \
+        """Whether, as a whole, the track may be that of something else, or of any size."""
+        return not self._evidence.explanation.leads(self._settings.explained_ratio) \
             or not self._target.starts_anywhere and self._evidence.is_felt_by_one
 
     def _doubts(self, frame: FieldFrame, dt: float, best: int, alone: bool) -> set[str]:
@@ -249,10 +248,13 @@ class RunningTrack:
         found = evidence.doubts | ({doubts.ONE_SENSOR} if alone else set())
         if self._filter.is_strange(bank, best, frame):
             found.add(doubts.MISFIT)
-        if evidence.explanation.is_doubtful(settings.explained_ratio):
+        if not evidence.explanation.leads(settings.explained_ratio):
             found.add(doubts.SOMETHING_ELSE)
+        # A magnet may rest: it is then as smooth as anything, and is where it was.
         if self._target.starts_anywhere:
             return found
+        if evidence.explanation.fell_behind(settings.explained_ratio):
+            found.add(doubts.SOMETHING_ELSE)
         n_axes = np.count_nonzero(~np.isnan(frame.field), axis=1)
         if evidence.contradicts(bank.nis[best], int(n_axes.sum())):
             found.add(doubts.CONTRADICTION)
@@ -279,7 +281,8 @@ class RunningTrack:
         something_else = self._something_else.log_density(
             frame, dt, self._filter.model_error(self.bank, best, dt))
         if something_else is not None:
-            self._evidence.explanation.add(evidence - something_else, frame.stamp_ns)
+            self._evidence.explanation.add(evidence - something_else, frame.stamp_ns,
+                                           self._settings.explained_ratio)
         self._evidence.take(frame, self._sensors.rows, self.bank.nis[best])
 
     def _overfits(self, best: int, stamp_ns: int) -> bool:

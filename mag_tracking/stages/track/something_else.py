@@ -17,6 +17,9 @@ from mag_tracking.records import FieldFrame
 GRADIENT = 0.3
 """How much a field over the network may change from its centre to its edge, as a share."""
 
+LEAST_STD = 1e-15
+"""[T] No sensor is quieter: a network file with less noise is refused."""
+
 ANY_FIELD = 1e-4
 """[T] Deviation of a field that is not known."""
 
@@ -64,7 +67,7 @@ class SomethingElse:
         """
         present = np.isfinite(frame.field.ravel())
         noise = np.einsum('jii->ji', frame.covariance)
-        variance = (noise + model_error[:, None]).ravel()[present]
+        variance = np.maximum(noise + model_error[:, None], LEAST_STD**2).ravel()[present]
         y = frame.field.ravel()[present]
         is_first = self._filters is None and self._is_handover
         if self._filters is None:

@@ -140,7 +140,7 @@ def test_a_track_that_a_target_never_explained_ends_and_one_that_it_did_goes_on(
         evidence = TrackEvidence(2)
         for k in range(200):
             stamp = round(0.08 * k * NS)
-            evidence.explanation.add(steps(k), stamp)
+            evidence.explanation.add(steps(k), stamp, SETTINGS.explained_ratio)
             late = pose()
             late.stamp_ns = stamp
             reason = evidence.reason_to_end(late, 1.0, False, SETTINGS)
@@ -153,6 +153,24 @@ def test_a_track_that_a_target_never_explained_ends_and_one_that_it_did_goes_on(
     # log(20) is three frames.
     assert after_s == pytest.approx(UNEXPLAINED_S + 0.24, abs=0.17)
     assert end_of(lambda k: 1.0 if k < 5 else -1.0) is None
+    # What cannot be compared is doubted, but not ended.
+    assert end_of(lambda k: np.nan) is None
+
+
+def test_a_comparison_that_failed_once_is_doubted_for_good():
+    explanation = TrackEvidence(2).explanation
+    for k, value in enumerate([50.0, np.nan, 50.0]):
+        explanation.add(value, k, 20.0)
+        assert explanation.leads(20.0) == (k == 0)
+
+
+def test_falling_behind_is_forgotten_within_a_second():
+    explanation = TrackEvidence(2).explanation
+    explanation.add(50.0, 0, 20.0)
+    explanation.add(-5.0, 2 * NS, 20.0)
+    assert explanation.leads(20.0) and explanation.fell_behind(20.0)
+    explanation.add(0.0, round(3.1 * NS), 20.0)
+    assert explanation.leads(20.0) and not explanation.fell_behind(20.0)
 
 
 def test_published_doubts_are_listed_in_one_order_and_each_has_a_meaning():
