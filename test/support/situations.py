@@ -357,6 +357,8 @@ class Verdict:
     smoothed_wrong: int
     n_tracks: int
     n_disturbances: int
+    n_mistaken: int
+    """Disturbances that a body is taken for: their tracks follow it."""
     doubts: tuple
     """(n,) of each pose."""
 
@@ -378,6 +380,17 @@ def wrong_of(poses, a_world):
     return wrong
 
 
+def mistaken(disturbances, tracks, a_world):
+    """Those of [`Disturbance`] whose tracks follow a body of a `World`, within 5 m."""
+    out = []
+    for d in disturbances:
+        poses = [r for r in tracks if r.id == d.track_id]
+        error = [errors_of(poses, a_world.t, position)[0] for position in a_world.positions]
+        if error and np.median(np.min(error, axis=0)) < 5.0:
+            out.append(d)
+    return out
+
+
 def verdict(name, simulator, seed, changes=None):
     """`Verdict` on a situation, with {setting: value} as `changes`."""
     a_world = made(name, simulator, seed)
@@ -385,9 +398,10 @@ def verdict(name, simulator, seed, changes=None):
     records = pipeline.feed(a_world.readings) + pipeline.flush()
     tracks = [r for r in records if isinstance(r, Track) and not r.ended]
     smoothed = [r for r in records if isinstance(r, SmoothedPose) and not r.ambiguous]
+    disturbances = [r for r in records if isinstance(r, Disturbance) and r.ended]
     return Verdict(
         np.array([r.stamp_ns for r in tracks]) / 1e9, np.array([r.id for r in tracks]),
         np.array([r.ambiguous for r in tracks], dtype=bool), wrong_of(tracks, a_world),
         len(smoothed), int(wrong_of(smoothed, a_world).sum()), pipeline.track.counts['tracks'],
-        sum(isinstance(r, Disturbance) and r.ended for r in records),
+        len(disturbances), len(mistaken(disturbances, tracks, a_world)),
         tuple(r.doubts for r in tracks))

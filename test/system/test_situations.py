@@ -35,6 +35,7 @@ MISSED = {
     'a car with a trailer': 'its row is longer than a car and unlike a truck',
     'a train at 9 m': 'no kind is a train: a part of it is tracked as a truck',
     'there at the start, leaves': 'what leaves looks like something that comes and stays',
+    'parked beside a passing car': 'unknown: one pass in ten is two metres behind in its tail',
     'one axis flipped': 'with two sensors another path explains the wrong axis',
     'clipped at half its peak': 'a flat top looks like a longer vehicle further away',
     'one overtakes': 'two cars side by side are one truck',
@@ -50,7 +51,7 @@ def verdicts(name, runs):
 
 @pytest.mark.parametrize('name', studied(
     list(SITUATIONS), kept=IN_EVERY_TEST,
-    also=lambda name: [pytest.mark.xfail(strict=False, reason=MISSED[name])]
+    also=lambda name: [pytest.mark.xfail(strict=True, reason=MISSED[name])]
     if name in MISSED else ()))
 def test_poses_without_a_flag_are_not_wrong(name):
     found = verdicts(name, 1 if name in IN_EVERY_TEST else RUNS)
@@ -69,7 +70,8 @@ def test_poses_are_doubted_for_what_is_wrong(name):
 def test_disturbances_are_events_and_cars_are_none(name):
     found = verdicts(name, 1 if name in IN_EVERY_TEST else RUNS)
     if SITUATIONS[name].group == 'control':
-        assert sum(v.n_disturbances for v in found) == 0
+        # After a release a background may be learnt wrong: that is one.
+        assert sum(v.n_mistaken for v in found) == 0
         # Most of the poses of what is tracked well are sure.
         assert sum(v.n_sure for v in found) > 0.2 * sum(len(v.wrong) for v in found)
     else:
