@@ -43,6 +43,11 @@ MISSED = {
 }
 """{situation: why it misses its aim}; found by looking at the wrong poses of `RUNS` runs."""
 
+RIGHT_WITHOUT_DOUBTS = {'a car': 199, 'a truck': 249, 'a car that turns': 241,
+                        'a car of 25 to 40 m/s': 128, 'a U-turn': 125, 'a car, four sensors': 67}
+"""{situation: right poses without a flag in these runs, before tracks were compared with something
+else}. What is tracked well shall keep nineteen in twenty of them."""
+
 
 @functools.cache
 def verdicts(name, runs):
@@ -66,14 +71,17 @@ def test_poses_are_doubted_for_what_is_wrong(name):
 
 
 @pytest.mark.parametrize('name', studied(
-    [n for n, s in SITUATIONS.items() if s.group in ('nothing', 'control')], kept=IN_EVERY_TEST))
+    [n for n, s in SITUATIONS.items() if s.group in ('nothing', 'control')], kept=IN_EVERY_TEST,
+    also=lambda name: [pytest.mark.xfail(strict=True, reason='227 of 241: while a car turns, the '
+                                         'iron is for some frames at a height that no car has')]
+    if name == 'a car that turns' else ()))
 def test_disturbances_are_events_and_cars_are_none(name):
     found = verdicts(name, 1 if name in IN_EVERY_TEST else RUNS)
     if SITUATIONS[name].group == 'control':
         # After a release a background may be learnt wrong: that is one.
         assert sum(v.n_mistaken for v in found) == 0
-        # Most of the poses of what is tracked well are sure.
-        assert sum(v.n_sure for v in found) > 0.2 * sum(len(v.wrong) for v in found)
+        right = sum(v.n_sure - v.n_wrong for v in found)
+        assert right >= 0.95 * RIGHT_WITHOUT_DOUBTS[name]
     else:
         # Where nothing was detected there is nothing to tell of.
         tracked = [v for v in found if v.n_tracks]
