@@ -60,4 +60,4 @@ class Disturbance:
     uniform: float
     """Probability that one field over the network made it, and not one at each sensor."""
     track_id: int
-    """Of the track that was ambiguous for it, or the latest of them."""
+    """The latest track that it made ambiguous."""

@@ -18,7 +18,7 @@ from support.situations import SITUATIONS, made, verdict
 
 PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'situations.md'
 MOST_COST = 0.1
-"""Of a tracked frame, of "something else" and the tests."""
+"""Share of a tracked frame that "something else" and the tests may take."""
 
 HEAD = """# Situations
 
@@ -26,7 +26,7 @@ Written by `PYTHONPATH=test .venv/bin/python -m bench.situations --write`; do no
 worlds that the tracker's model does not assume, past two sensors 9 m apart unless said, live (no
 first pass), {n} runs of each of two simulators: clouds of magnetised points, and boxes of sheets
 with imperfect sensors. A published pose without the `ambiguous` flag is wrong if it is off by more
-than 2 m and three stated deviations from every vehicle, or if there is none.
+than 2 m and three stated deviations from every vehicle. Without a vehicle every such pose is wrong.
 
 | situation | poses | without a flag | of them wrong | smoothed, wrong | disturbances | aim |
 |---|---|---|---|---|---|---|

@@ -10,8 +10,8 @@ from mag_tracking.stages.track.initiation_vehicle import moment_directions
 from mag_tracking.stages.track.settings import TrackSettings
 
 MOST_BYTES = 4 << 30
-"""Of the covariances of all starting hypotheses, or of the grid of a magnet; the peak is half as
-high again."""
+"""Limit for the covariances of all starting hypotheses, and for the grid of a magnet. Peak memory
+is 1.5 times as much."""
 _FLOAT_BYTES = 8
 
 

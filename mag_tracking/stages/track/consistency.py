@@ -8,13 +8,11 @@ Source: Bar-Shalom, Li and Kirubarajan 2001, Estimation with Applications to Tra
 Navigation, section 5.4.2.
 """
 
-from collections import deque
-
 import numpy as np
 from scipy.special import chdtri
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.units import NS
+from mag_tracking.stages.track.latest_frames import LatestFrames
 
 WINDOW_S = 0.5
 """[s] Latest frames that are tested together."""
@@ -28,10 +26,10 @@ class InnovationConsistency:
 
     def __init__(self, n_sensors: int) -> None:
         self._n_sensors = n_sensors
+        # (2, n_sensors + 1): normalised innovations squared and degrees of freedom, of each sensor
+        # and of all.
         self._total = np.zeros((2, n_sensors + 1))
-        # Timestamp, and (2, n_sensors + 1): normalised innovations squared and degrees of freedom,
-        # of each sensor and of all.
-        self._recent: deque[tuple[int, FloatArray]] = deque()
+        self._latest = LatestFrames(WINDOW_S)
 
     def add(self, nis: FloatArray, n_axes: FloatArray, stamp_ns: int) -> None:
         """Count a frame.
@@ -47,14 +45,12 @@ class InnovationConsistency:
         values = np.stack([np.nan_to_num(nis), np.where(np.isnan(nis), 0, n_axes)])
         values = np.column_stack([values, values.sum(axis=1)])
         self._total += values
-        self._recent.append((stamp_ns, values))
-        while self._recent[0][0] < stamp_ns - WINDOW_S * NS:
-            self._recent.popleft()
+        self._latest.add(stamp_ns, values)
 
     @property
     def excess(self) -> float:
         """How many times too large the variances of the latest innovations are; 1 = as stated."""
-        latest = np.sum([values for _, values in self._recent], axis=0)
+        latest = self._latest.total
         fails = self._fails(latest)
         with np.errstate(invalid='ignore', divide='ignore'):
             ratio = np.where(fails, latest[0] / latest[1], 1.0)

@@ -16,7 +16,7 @@ FALSE_ALARM = 1e-6
 
 @dataclass(frozen=True)
 class Unexplained:
-    """What a track that no target explained says of the field."""
+    """The field during a track that no target explained."""
 
     track_id: int
     begin_ns: int
@@ -39,17 +39,17 @@ class Disturbances:
 
     def begin(self, found: Unexplained, stamp_ns: int) -> list[Disturbance]:
         """A track was `Unexplained`: the record of a new disturbance, or none where one goes on."""
-        is_new = self._current is None
-        if is_new:
-            self._largest[:], self._felt[:] = 0.0, False
-        self._largest = np.maximum(self._largest, found.largest)
-        self._felt |= found.felt
-        begin_ns = found.begin_ns if self._current is None else self._current.begin_ns
-        number = self._next_id if self._current is None else self._current.id
-        self._next_id = number + 1
-        self._current = Disturbance(stamp_ns, number, False, begin_ns, float(self._largest.max()),
-                                    self._sensors(), found.uniform, found.track_id)
-        return [self._current] if is_new else []
+        if self._current is not None:
+            self._largest = np.maximum(self._largest, found.largest)
+            self._felt |= found.felt
+            self._current = replace(self._current, uniform=found.uniform, track_id=found.track_id)
+            return []
+        self._largest, self._felt = found.largest.copy(), found.felt.copy()
+        self._current = Disturbance(stamp_ns, self._next_id, False, found.begin_ns,
+                                    float(self._largest.max()), self._sensors(), found.uniform,
+                                    found.track_id)
+        self._next_id += 1
+        return [self._current]
 
     def feed(self, frame: FieldFrame) -> None:
         """Take a frame of the disturbance alone: it may be larger now, and reach other sensors."""

@@ -1,5 +1,7 @@
 """Why a pose is ambiguous: the names that are published, and what each means."""
 
+from collections.abc import Set
+
 ANOTHER_PLACE = 'another_place'
 ANOTHER_ARRIVAL = 'another_arrival'
 NOT_SEEN_APPROACHING = 'not_seen_approaching'
@@ -41,6 +43,6 @@ MEANINGS = {
 """{doubt: what it means}, in the order in which they are listed."""
 
 
-def listed(doubts: 'set[str]') -> tuple[str, ...]:
+def listed(doubts: Set[str]) -> tuple[str, ...]:
     """The doubts in the order of `MEANINGS`."""
     return tuple(name for name in MEANINGS if name in doubts)

@@ -81,7 +81,7 @@ class TrackEvidence:
 
     @property
     def doubts(self) -> set[str]:
-        """What the whole track is doubted for; a copy."""
+        """Doubts about the whole track; a copy."""
         return set(self._doubts)
 
     def add(self, log_likelihood_ratio: float) -> None:
@@ -176,9 +176,9 @@ class TrackEvidence:
         return float(1.0 / (1.0 + np.exp(-np.clip(self._log_odds, -700.0, 700.0))))
 
     @property
-    def is_doubtful(self) -> bool:
-        """Whether the field contradicted the track at its end, or all of it may be wrong."""
-        return self._n_misfits > 0 or self.doubted
+    def ends_in_misfit(self) -> bool:
+        """Whether the latest field contradicted the track."""
+        return self._n_misfits > 0
 
     def reason_to_end(self, track: Track, spread: float, is_coming: bool,
                       settings: TrackSettings) -> str | None:

@@ -1,9 +1,8 @@
 """How much better a target explains the frames of a track than something else does."""
 
-from collections import deque
-
 import numpy as np
 
+from mag_tracking.stages.track.latest_frames import LatestFrames
 from mag_tracking.units import NS
 
 WINDOW_S = 1.0
@@ -23,7 +22,7 @@ class Explanation:
         self.log_ratio = 0.0
         self._is_known, self._has_led = True, False
         self._behind_since_ns: int | None = None
-        self._recent: deque[tuple[int, float]] = deque()
+        self._latest = LatestFrames(WINDOW_S)
 
     def add(self, log_ratio: float, stamp_ns: int, ratio: float) -> None:
         """Count a frame.
@@ -45,9 +44,7 @@ class Explanation:
             self._behind_since_ns = None
         elif self._behind_since_ns is None:
             self._behind_since_ns = stamp_ns
-        self._recent.append((stamp_ns, log_ratio))
-        while self._recent[0][0] < stamp_ns - WINDOW_S * NS:
-            self._recent.popleft()
+        self._latest.add(stamp_ns, log_ratio)
 
     def leads(self, ratio: float) -> bool:
         """Whether a target explains the whole track `ratio` times better than something else."""
@@ -55,7 +52,7 @@ class Explanation:
 
     def fell_behind(self, ratio: float) -> bool:
         """Whether something else explains the latest frames `ratio` times better."""
-        return sum(value for _, value in self._recent) < -float(np.log(ratio))
+        return bool(self._latest.total < -np.log(ratio))
 
     def unexplained_s(self, stamp_ns: int) -> float:
         """[s] for which something else has led.

@@ -22,7 +22,7 @@ that errs more, as it is passed closely, does not mislead a track."""
 
 def implausible(observation: Observation, x: FloatArray, kind: int, settings: VehicleSettings,
                 mounting_std: float, dt: float) -> set[str]:
-    """What about a state speaks against it, of `doubts`.
+    """Doubts about a state of a vehicle.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def implausible(observation: Observation, x: FloatArray, kind: int, settings: Ve
     settings : VehicleSettings
     mounting_std : float [rad]
         Sensors may be turned by as much, also those that are known better: what the model leaves
-        out of a field turns it, too.
+        out of a field rotates it, too.
     dt : float [s]
         Length of the frame.
     """

@@ -147,7 +147,7 @@ class RunningTrack:
             return []
         best = self.bank.best()
         late = [] if self._lag is None else self._smoothed(best, False, self._lag.smoothed(
-            self._filter, self.bank, best, used, dt, publish), self._evidence.doubted)
+            self._filter, self.bank, best, used, dt, publish), self._is_doubted())
         return [*self._publish(used, dt, best), *late, *self._end_if_over()] if publish else []
 
     def _update(self, frame: FieldFrame, dt: float, publish: bool) -> FieldFrame | None:
@@ -229,21 +229,22 @@ class RunningTrack:
 
     @property
     def unexplained(self) -> Unexplained | None:
-        """What the track says of the field, if a target never explained it; else None."""
+        """The field during the track, if a target never explained it; else None."""
         evidence = self._evidence
         if self._was_sure or self._last is None \
-                or not evidence.explanation.unexplained_s(self._last.stamp_ns) > 0.0:
+                or evidence.explanation.unexplained_s(self._last.stamp_ns) <= 0.0:
             return None
         return Unexplained(self.id, self._begin_ns, evidence.largest, evidence.felt,
                            self._something_else.uniform)
 
-    def _is_unexplained(self) -> bool:
-        """Whether, as a whole, the track may be that of something else, or of any size."""
-        return not self._evidence.explanation.leads(self._settings.explained_ratio) \
+    def _is_doubted(self) -> bool:
+        """Whether all of the track, as it stands, may be wrong."""
+        return self._evidence.doubted \
+            or not self._evidence.explanation.leads(self._settings.explained_ratio) \
             or not self._target.starts_anywhere and self._evidence.is_felt_by_one
 
     def _doubts(self, frame: FieldFrame, dt: float, best: int, alone: bool) -> set[str]:
-        """What speaks against the pose of hypothesis `best`; `alone`: one sensor measured."""
+        """Doubts about the pose of hypothesis `best`; `alone`: one sensor measured."""
         bank, evidence, settings = self.bank, self._evidence, self._settings
         found = evidence.doubts | ({doubts.ONE_SENSOR} if alone else set())
         if self._filter.is_strange(bank, best, frame):
@@ -298,7 +299,7 @@ class RunningTrack:
                   doubtful: bool) -> list[SmoothedPose]:
         """The `SmoothedPose`s of states of the hypothesis `best`.
 
-        What a filter is doubted for its smoother has only half mended.
+        Smoothing removes the doubts about its filter only in part.
         """
         ambiguous = doubtful or bool(ambiguities(self.bank, best))
         kind = int(self.bank.kind[best])
@@ -311,7 +312,7 @@ class RunningTrack:
     def _smoothed_at_the_end(self) -> list[SmoothedPose]:
         """What is left of a fixed lag, and the whole track."""
         best = self.bank.best()
-        doubtful = self._evidence.is_doubtful or self._is_unexplained()
+        doubtful = self._evidence.ends_in_misfit or self._is_doubted()
         rest = [] if self._lag is None else self._smoothed(best, False, self._lag.rest(
             self._filter, self.bank, best), doubtful)
         states, left_out = self._whole.smoothed(self.bank, best)

@@ -44,7 +44,7 @@ def test_a_track_that_was_contradicted_once_stays_doubted():
     evidence = TrackEvidence(2)
     for nis in (6.0, 60.0, 6.0):
         assert evidence.contradicts(np.array([nis, 0.0]), 6) == (nis > 50.0)
-    assert evidence.is_doubtful
+    assert evidence.doubted
 
 
 def test_a_filter_that_fits_better_than_its_path_is_doubted_as_long_as_the_window():
@@ -55,7 +55,7 @@ def test_a_filter_that_fits_better_than_its_path_is_doubted_as_long_as_the_windo
         evidence.note({doubts.OVERFIT} if said[-1] else {doubts.ANOTHER_PLACE}, round(t * NS))
     assert said == [False, False, True, True, False]
     # What it says of later poses is up to them: the track itself is not.
-    assert not evidence.is_doubtful
+    assert not evidence.doubted
     # Of its smoothed poses those of the same time are.
     assert [evidence.doubted_filter(round(t * NS)) for t in (1.0, 1.1, 3.0, 3.2)] == [
         False, True, True, False]

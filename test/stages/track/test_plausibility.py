@@ -1,4 +1,4 @@
-"""What about a vehicle's state speaks against it."""
+"""States that no vehicle on the road has."""
 
 import numpy as np
 import pytest

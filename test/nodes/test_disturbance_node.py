@@ -1,0 +1,60 @@
+"""A field that no target explains, from node to node: the tracker says the same as offline."""
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from mag_tracking_msgs.msg import Disturbance as DisturbanceMessage
+from mag_tracking_msgs.msg import FieldReadings, NetworkFrame
+
+from mag_tracking.event_records import Disturbance
+from mag_tracking.messages.schema import disturbance_dict, readings_dict, stamp_ns
+from mag_tracking.messages.types import RAW_READINGS
+from mag_tracking.nodes.convert import to_message
+from mag_tracking.nodes.stage_node import RESULTS, SENT, STREAM
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.units import NS
+from support.bundled import NETWORK_FILE
+from support.node_processes import start, stop
+from support.situations import made
+
+pytestmark = pytest.mark.timeout(600)
+NAMES = ('calibration_node', 'detection_node', 'tracker_node')
+
+
+def test_the_tracker_publishes_the_disturbance_that_a_replay_finds(ros):
+    node, spin_until = ros
+    world = made('a temperature step', 'boxes', 0)
+    readings = world.readings.part(world.readings.stamp_ns < 14 * NS)
+    pipeline = Pipeline(world.network, settings_for('vehicle'))
+    expected = [r for r in pipeline.feed(readings) if isinstance(r, Disturbance)]
+    assert len(expected) == 1 and not expected[0].ended
+    found, frames, heard = [], [], set()
+    # A node whose diagnostics come has also found what this one subscribes to.
+    node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: heard.update(
+        s.name.split(':')[0].strip('/') for s in m.status), RESULTS)
+    node.create_subscription(DisturbanceMessage, '/tracker_node/disturbances', found.append, SENT)
+    node.create_subscription(NetworkFrame, '/detection_node/frame', frames.append, STREAM)
+    publisher = node.create_publisher(FieldReadings, RAW_READINGS, SENT)
+    processes = [start(name, '-p', f'network:={NETWORK_FILE}') for name in NAMES]
+    try:
+        assert spin_until(lambda: publisher.get_subscription_count() > 0
+                          and node.count_subscribers('/calibration_node/readings')
+                          and node.count_subscribers('/detection_node/frame') > 1
+                          and node.count_publishers('/detection_node/frame')
+                          and node.count_publishers('/tracker_node/disturbances')
+                          and heard.issuperset(NAMES))
+        for i in range(0, len(readings), 40):
+            part = readings.part(slice(i, i + 40))
+            publisher.publish(to_message(FieldReadings, readings_dict(part)))
+            # Nothing is lost where nobody is ahead: wait for the frames, but for the open one.
+            reached = int(part.stamp_ns[0]) - NS // 2
+            assert spin_until(lambda reached=reached: reached < 4 * NS or frames
+                              and stamp_ns(frames[-1].header.stamp) >= reached)
+        assert spin_until(lambda: found)
+    finally:
+        codes, outputs = stop(processes)
+    assert codes == [0] * 3, outputs
+    said = to_message(DisturbanceMessage, disturbance_dict(expected[0], 'map'))
+    assert np.isclose(found[0].largest, said.largest) and np.isclose(found[0].uniform, said.uniform)
+    for name in ('header', 'id', 'ended', 'begin', 'sensors', 'track_id'):
+        assert getattr(found[0], name) == getattr(said, name), name

@@ -1,0 +1,258 @@
+"""Worlds for `support.situations`: bodies, courses, disturbances.
+
+Each function takes a random generator and the name of a simulator ('clouds' or 'boxes'), and gives
+a body or a `World`. Sizes, speeds and lanes are drawn for each seed.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from mag_tracking.network.file import read_network
+from mag_tracking.simulation.scenario import Path, random_vehicle
+from support import spoiler
+from support.box_vehicles import box_car, box_truck
+from support.bundled import NETWORK_FILE
+from support.passes import network_of
+from support.random_passes import random_pass
+from support.worlds import FLAWS, Convoy, Ride, box_two_wheeler, world
+
+ROAD = read_network(NETWORK_FILE)
+FOUR = network_of([[0.0, -4.5, 0.0], [0.0, 4.5, 0.0], [9.0, -4.5, 0.0], [9.0, 4.5, 0.0]])
+QUIET_S = 7.0
+"""[s] without a vehicle near, in which a background is learnt."""
+
+
+# Bodies.
+
+def car(rng, simulator):
+    if simulator == 'boxes':
+        return box_car(rng)
+    return random_vehicle(rng, rng.uniform(3.6, 4.8), moment=rng.uniform(300.0, 600.0))
+
+
+def truck(rng, simulator, length=None, moment=None):
+    length = rng.uniform(7.0, 16.0) if length is None else length
+    moment = rng.uniform(1200.0, 2200.0) if moment is None else moment
+    if simulator == 'boxes':
+        return box_truck(rng, length, moment)
+    return random_vehicle(rng, length, 2.4, 2.8, moment=moment)
+
+
+def small(rng, simulator, length, moment, iron=1.0):
+    """A motorcycle, a bicycle or a trolley."""
+    if simulator == 'boxes':
+        return box_two_wheeler(rng, length, moment, iron)
+    return random_vehicle(rng, length, 0.5, 1.0, n_parts=20, moment=moment)
+
+
+def car_with_trailer(rng, simulator):
+    trailer = truck(rng, simulator, rng.uniform(4.0, 6.0), rng.uniform(100.0, 300.0)) \
+        if simulator == 'clouds' else box_car(rng, rng.uniform(4.0, 6.0), rng.uniform(100.0, 300.0))
+    return Convoy((car(rng, simulator), trailer), (-2.9, 2.9))
+
+
+def wagon(rng, simulator):
+    return truck(rng, simulator, 18.0, rng.uniform(2500.0, 5000.0))
+
+
+# Courses.
+
+def lane(rng, speed, away=None, y=None):
+    """A straight `Path` along the road; the vehicle is at the sensors after away / speed [s]."""
+    away = QUIET_S * speed + 25.0 if away is None else away
+    y = rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 1.6) if y is None else y
+    forward = rng.random() < 0.5
+    return Path(np.array([-away if forward else away, y]), 0.0 if forward else np.pi, speed), away
+
+
+def straight(rng, simulator, body, speed, network=ROAD, **of_lane):
+    """A body straight past the sensors."""
+    path, away = lane(rng, speed, **of_lane)
+    return world(network, [(body, path)], 2.0 * away / speed + 4.0, rng, FLAWS[simulator])
+
+
+def stop_and(rng, stop_s, then):
+    """(`Ride`, duration [s]): a vehicle stops near the sensors, and then goes on at `then` times
+    its speed (0: never)."""
+    speed = rng.uniform(6.0, 12.0)
+    brake = rng.uniform(1.5, 3.0)
+    path, away = lane(rng, speed, y=rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 1.6))
+    at = away + rng.uniform(-5.0, 3.0)
+    braked = speed / brake
+    begin = (at - 0.5 * speed * braked) / speed
+    times = [0.0, begin, begin + braked, begin + braked + stop_s]
+    times += [times[-1] + max(abs(then), 0.1) * speed / 2.0]
+    duration = times[-1] + (50.0 / speed if then else 0.0)
+    return Ride(path, tuple(times), (speed, speed, 0.0, 0.0, then * speed)), duration
+
+
+def stopping(rng, simulator, stop_s, then=1.0):
+    ride, duration = stop_and(rng, stop_s, then)
+    return world(ROAD, [(car(rng, simulator), ride)], duration, rng, FLAWS[simulator])
+
+
+def u_turn(rng, simulator):
+    radius = rng.uniform(4.0, 5.5)
+    speed = np.sqrt(radius * rng.uniform(1.5, 3.5))
+    before = QUIET_S * speed + 20.0
+    path = Path(np.array([-before - rng.uniform(-2.0, 4.0), -0.9 * radius]), 0.0, speed, before,
+                np.pi, radius)
+    return world(ROAD, [(car(rng, simulator), path)], (2.0 * before + 15.0) / speed, rng,
+                 FLAWS[simulator])
+
+
+def leaves(rng, simulator, cars=0):
+    """A car stands near the sensors from the beginning and leaves; then others may pass."""
+    at, y = rng.uniform(-4.0, 4.0), rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 2.0)
+    stands = rng.uniform(10.0, 20.0)
+    top = rng.uniform(6.0, 12.0)
+    forward = rng.random() < 0.5
+    path = Path(np.array([at, y]), 0.0 if forward else np.pi, top)
+    ride = Ride(path, (0.0, stands, stands + top / 2.0), (0.0, 0.0, top))
+    duration = stands + top / 2.0 + 60.0 / top + 6.0
+    movers = [(car(rng, simulator), ride)]
+    for _ in range(cars):
+        speed = rng.uniform(7.0, 15.0)
+        other, _ = lane(rng, speed, away=speed * duration)
+        movers.append((car(rng, simulator), other))
+        duration += 12.0
+    return world(ROAD, movers, duration, rng, FLAWS[simulator])
+
+
+def parked(rng, simulator):
+    """A car stands 5 to 8 m beside the sensors for good; another one passes."""
+    place = np.array([rng.uniform(-4.0, 4.0), rng.choice([-1.0, 1.0]) * rng.uniform(7.0, 9.0)])
+    stands = Ride(Path(place, 0.0, 1.0), (0.0, 1.0), (0.0, 0.0))
+    speed = rng.uniform(7.0, 15.0)
+    path, away = lane(rng, speed)
+    return world(ROAD, [(car(rng, simulator), stands), (car(rng, simulator), path)],
+                 2.0 * away / speed, rng, FLAWS[simulator])
+
+
+def two(rng, simulator, how, network=ROAD):
+    """Two cars that 'meet', 'overtake' or 'follow' each other at the sensors."""
+    speed = rng.uniform(7.0, 14.0)
+    y = rng.uniform(1.0, 1.6)
+    away = QUIET_S * speed + 30.0
+    first = Path(np.array([-away, -y]), 0.0, speed)
+    if how == 'meet':
+        other = speed * rng.uniform(0.8, 1.2)
+        second = Path(np.array([away / speed * other + rng.uniform(-5.0, 5.0), y]), np.pi, other)
+    elif how == 'overtake':
+        other = speed * rng.uniform(1.3, 1.7)
+        second = Path(np.array([-away / speed * other + rng.uniform(-5.0, 5.0), y]), 0.0, other)
+    else:
+        second = Path(np.array([-away - speed * rng.uniform(1.0, 2.0), -y]), 0.0, speed)
+    movers = [(car(rng, simulator), first), (car(rng, simulator), second)]
+    return world(network, movers, 2.0 * away / speed + 4.0, rng, FLAWS[simulator])
+
+
+def spoilt_car(rng, simulator, *faults):
+    """A car past sensors with faults of `support.spoiler`."""
+    made = straight(rng, simulator, car(rng, simulator), rng.uniform(7.0, 20.0))
+    return replace(made, readings=spoiler.apply(made.readings, *faults))
+
+
+def usual(rng, simulator, kind):
+    """A pass of `support.random_passes`."""
+    seed = int(rng.integers(1 << 30))
+    body, course, duration, flaws = random_pass(simulator, kind, seed)
+    return world(ROAD, [(body, course)], duration, rng, flaws)
+
+
+# Without any target, or with one in a disturbance.
+
+def ambient_world(rng, simulator, ambient, duration, rate=100.0, cars=0):
+    """A field over the whole network, and perhaps cars."""
+    movers = []
+    for k in range(cars):
+        speed = rng.uniform(7.0, 15.0)
+        path, _ = lane(rng, speed, away=speed * (duration / cars * (k + 0.6)))
+        movers.append((car(rng, simulator), path))
+    return world(ROAD, movers, duration, rng, FLAWS[simulator], rate, ambient)
+
+
+def uniform(vector, of_time):
+    """A field (3,) [T] that is the same at all sensors, times a function of time."""
+    return lambda t: np.broadcast_to(of_time(t)[:, None, None] * vector, (len(t), len(ROAD), 3))
+
+
+def direction(rng):
+    v = rng.standard_normal(3)
+    return v / np.linalg.norm(v)
+
+
+def hum(rng, simulator, frequency, rate):
+    """A power line to one side: its field is larger at the nearer sensor."""
+    near = rng.uniform(0.5, 1.0, 2)
+    v = rng.uniform(1e-7, 3e-7) * direction(rng)
+    turns = 2.0 * np.pi * frequency * rng.uniform(0.9995, 1.0005)
+    return ambient_world(rng, simulator, lambda t: np.sin(turns * t)[:, None, None]
+                         * near[:, None] * v, 60.0, rate)
+
+
+def tram(rng, simulator):
+    """The current of a line 30 to 60 m away is switched on and off: 100 to 500 A, with ramps."""
+    times = np.sort(rng.uniform(12.0, 55.0, 4))
+    away, current = rng.uniform(30.0, 60.0), rng.uniform(100.0, 500.0)
+    y = ROAD.positions[:, 1]
+    # Of an infinite wire along x, 5 m above the ground.
+    r2 = (away - y)**2 + 25.0
+    B = 2e-7 * current * np.stack([0.0 * y, 5.0 / r2, (away - y) / r2], axis=1)
+    ramp = rng.uniform(0.2, 2.0)
+    return ambient_world(rng, simulator, lambda t: np.interp(
+        t, np.concatenate([[s, s + ramp] for s in times]), [0, 1, 1, 0, 0, 1, 1, 0]
+    )[:, None, None] * B, 65.0)
+
+
+def storm(rng, simulator, cars=0):
+    """500 nT in ten minutes, as a sum of slow waves; here the steepest minutes of it."""
+    v = 5e-7 * direction(rng)
+    periods, phases = rng.uniform(60.0, 400.0, 6), rng.uniform(0.0, 2.0 * np.pi, 6)
+    return ambient_world(rng, simulator, uniform(v, lambda t: sum(
+        np.sin(2.0 * np.pi * t / p + f) for p, f in zip(periods, phases, strict=True)) / 3.0
+        + t / 600.0), 120.0, cars=cars)
+
+
+def pulsations(rng, simulator):
+    """20 nT with a period of 20 to 60 s."""
+    p = rng.uniform(20.0, 60.0)
+    return ambient_world(rng, simulator, uniform(
+        2e-8 * direction(rng), lambda t: np.sin(2.0 * np.pi * t / p)), 120.0)
+
+
+def knocked(rng, simulator):
+    """A sensor is turned by some degrees within a tenth of a second."""
+    made = ambient_world(rng, simulator, None, 40.0)
+    angles = np.deg2rad(rng.uniform(1.0, 5.0)) * direction(rng)
+    n = int(15.0 * 100.0) * 2
+    field = made.readings.field.copy()
+    mine = np.flatnonzero(made.readings.sensor == 0)
+    mine = mine[mine >= n]
+    field[mine] += np.cross(field[mine], angles)
+    return replace(made, readings=replace(made.readings, field=field))
+
+
+def ramps(rng, simulator):
+    """Each sensor warms up on its own: up to 5 nT/s for 10 to 30 s, then back."""
+    rates = rng.uniform(1e-9, 5e-9, (2, 1)) * np.array([direction(rng), direction(rng)])
+    lasts = rng.uniform(10.0, 30.0)
+    return ambient_world(rng, simulator, lambda t: np.interp(
+        t, [12.0, 12.0 + lasts, 12.0 + 2 * lasts], [0.0, lasts, 0.0])[:, None, None] * rates, 90.0)
+
+
+def far(rng, simulator, body):
+    """Something large passes far away: hardly a field is felt."""
+    return straight(rng, simulator, body, rng.uniform(15.0, 25.0), away=200.0,
+                    y=rng.choice([-1.0, 1.0]) * rng.uniform(30.0, 60.0))
+
+
+def train(rng, simulator, y):
+    """Five wagons of 18 m; a pose at any of them is right."""
+    speed = rng.uniform(10.0, 20.0)
+    path, away = lane(rng, speed, away=250.0, y=rng.choice([-1.0, 1.0]) * y)
+    along = np.array([np.cos(path.heading), np.sin(path.heading)])
+    movers = [(wagon(rng, simulator), replace(path, start=path.start + 20.0 * k * along))
+              for k in range(-2, 3)]
+    return world(ROAD, movers, 2.0 * away / speed, rng, FLAWS[simulator])
