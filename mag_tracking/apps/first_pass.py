@@ -80,10 +80,12 @@ def first_pass(batches: Iterable[Readings], network: SensorNetwork,
     for name, background in recorder.backgrounds().items():
         assert isinstance(background, BlockRecorder)
         steps[name] = background.steps
-        level = background.quiet_level() if name in wanted else None
+        freed_at = beginning.backgrounds()[name].freed_at
+        level = background.quiet_level(freed_at or 0.0) if name in wanted else None
         if level is not None and level.n_blocks * level.block_s >= LEAST * settings.learn_s:
             found[name] = level
-            is_quiet &= _begins_quietly(learnt.get(name), level, background, settings)
+            is_quiet &= freed_at is None \
+                and _begins_quietly(learnt.get(name), level, background, settings)
     # A target that one sensor feels at the beginning may be in the background of all.
     return FirstPass({} if is_quiet else found, steps)
 
@@ -96,11 +98,12 @@ def _learn(beginning: Calibrate, readings: Readings, first_ns: dict[str, int],
     are changed.
     """
     for i in range(0, len(readings), FEW):
+        if len(learnt) == len(beginning.backgrounds()):
+            beginning.feed(readings.part(slice(i, None)))
+            return
         part = readings.part(slice(i, i + FEW))
         for name, stamp_ns in zip(part.sensor_names(), part.stamp_ns.tolist(), strict=True):
             first_ns.setdefault(name, stamp_ns)
-        if len(learnt) == len(beginning.backgrounds()):
-            return
         beginning.feed(part)
         for name, background in beginning.backgrounds().items():
             if background.ready and name not in learnt and name in first_ns:

@@ -1,39 +1,38 @@
 """Background field and noise of one sensor, learnt from target-free stretches.
 
-The background is a straight line in time (level and drift) through the means
-of short quiet blocks; the noise is their pooled scatter. A block that departs
-from the line freezes the learning, and takes with it what was learnt shortly
-before: a target comes near gradually. Without a quiet stretch the most frequent
-level is a provisional background. Source: TSP14 section VI, T10 section
-6.3 (mean and covariance of a target-free stretch); the line and the freezing
-are this package's own.
+The background is a straight line in time (level and drift) through the means of short quiet blocks;
+the noise is their pooled scatter. A block that departs from the line freezes the learning, and
+takes with it what was learnt shortly before: a target comes near gradually. Without a quiet stretch
+the most frequent level is a provisional background. Source: TSP14 section VI, T10 section 6.3 (mean
+and covariance of a target-free stretch); the line and the freezing are this package's own.
 """
 
 from collections import deque
+from functools import partial
 from math import inf
 
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.calibration.background_level import BackgroundLevel
+from mag_tracking.calibration.beginning import Beginning
 from mag_tracking.calibration.blocks import (
     Block,
-    BlockWindow,
+    Blocks,
     block_of,
     line_through,
     pooled_covariance,
     stacked,
 )
-from mag_tracking.calibration.doubtful_times import DoubtfulTimes, noted
+from mag_tracking.calibration.departure import SOONER, Departure
+from mag_tracking.calibration.doubtful_times import DoubtfulTimes, doubted_since, noted
 from mag_tracking.calibration.drift import FormerLevel, is_steep
 from mag_tracking.calibration.frequent_level import MORE
+from mag_tracking.calibration.level_change import Judge, SharedChanges
 from mag_tracking.calibration.provisional import SEEN_S, FrequentLevel, ProvisionalLevel
+from mag_tracking.calibration.quiet_stretch import QuietStretch, line_of
 from mag_tracking.calibration.resolution import LEAST_STD, corrected_steps
-
-LEAST_RELEARN_S = 10.0
-"""[s] A background that was resumed, or seen for a moment only, gives way to another steady level
-after this time at the earliest."""
-
+from mag_tracking.units import NS
 
 class RunningBackground:
     """Running estimate of one sensor's background; times in seconds of the records.
@@ -41,14 +40,13 @@ class RunningBackground:
     Parameters
     ----------
     learn, memory, guard, block : float [s]
-        Quiet time needed before it is ready; length of the stretch that the
-        line is fitted to; how far the line stays behind the present; length
-        of a block.
+        Quiet time needed before it is ready; length of the stretch that the line is fitted to, and
+        how far that stays behind the present; length of a block.
     freeze_std : float
         A block departs if its mean is this many noise deviations off.
     relearn : float [s]
-        After so long frozen on a steady level that level is the new
-        background, or earlier if the old one was seen only briefly; 0 = never.
+        After so long frozen on a steady level that level is the new background, or earlier if the
+        old one was seen only briefly, or was that of something that has left; 0 = never.
     background, noise_std : (3,) [T], optional
         Known beforehand: with both it is ready at once.
     phase : float, optional
@@ -57,6 +55,8 @@ class RunningBackground:
         `judge_block`, or before the next reading. Without a phase it is judged at once.
     sensors : (1,) SENSOR
         State of the sensor: holds the present block, and line and noise for compiled code.
+    judge : Judge, optional
+        Judges the sensor's changes of level together with those of other sensors.
 
     Attributes
     ----------
@@ -71,13 +71,13 @@ class RunningBackground:
     def __init__(self, learn: float, memory: float, guard: float, block: float,
                  freeze_std: float, relearn: float, background: FloatArray | None = None,
                  noise_std: FloatArray | None = None, phase: float | None = None, *,
-                 sensors: StructArray) -> None:
-        self._learn, self._guard, self._length = learn, guard, block
-        self._relearn, self._sensors = relearn, sensors
-        self._state = self._sensors[0]
+                 sensors: StructArray, judge: Judge | None = None) -> None:
+        self._learn, self._length, self._relearn = learn, block, relearn
+        self._sensors, self._state = sensors, sensors[0]
         self._state['length'], self._state['phase'] = block, np.nan if phase is None else phase
         self._most = max(3, int(round(memory / block)))
-        self._window = BlockWindow(self._most)
+        self._quiet = QuietStretch(guard, self._most)
+        self._beginning = Beginning(learn, block, self._most)
         self._given = None if background is None else np.asarray(background, dtype=float)
         self._given_noise: FloatArray | None = \
             None if noise_std is None else np.diag(np.asarray(noise_std, float) ** 2)
@@ -85,26 +85,27 @@ class RunningBackground:
         self.n_relearnt = 0
         self.doubtful_times: DoubtfulTimes = ()
         self._provisional = ProvisionalLevel(learn)
+        self._departure = Departure(learn, relearn, self._state, self._level,
+                                    judge or partial(SharedChanges().judge, 0))
         self.forget()
 
     def forget(self) -> None:
         """Drop what was learnt; what was given beforehand stays."""
         self._state['n'], self._state['end'], self._state['is_full'] = 0, np.nan, False
-        self._window.clear()
-        self._pending: deque[Block] = deque()
-        self._strange: deque[Block] = deque()
-        self._rested: deque[Block] = deque(maxlen=self._most)
-        self.frozen = self._resumed = self._relearns_soon = self._contested = self._steep = False
+        self._quiet.clear()
+        self._beginning.clear()
+        self._departure.forget()
+        self.frozen = self.stuck = False
+        self._resumed = self._relearns_soon = self._contested = self._steep = False
         self._provisional.clear()
         # What is doubtful in the frames that are still on their way stays so.
         self.doubtful_times = noted(self.doubtful_times, int(self._state['last_ns']), False)
-        # For how long the level was seen, until when, and which one it has replaced since when.
-        self._seen_s, self._seen_until = (0.0 if self._given is None else inf), np.nan
-        self._former: FormerLevel | None = None
+        # For how long the level was seen, until when, and since when it is the background.
+        self._seen_s = 0.0 if self._given is None else inf
+        self._seen_until, self._since = np.nan, 0.0
         self._level.rely()
         self._level.set(None if self._given is None else (0.0, self._given, np.zeros(3), 0.0),
                         self._given_noise)
-        self.stuck = False
 
     def resume(self, background: FloatArray, covariance: FloatArray) -> None:
         """Go on from what was known a moment ago: (3,) [T] and (3, 3) [T^2], NaN as elsewhere.
@@ -124,13 +125,10 @@ class RunningBackground:
         As after `resume`, but another level has to last as long as it always has to. Nothing is
         begun where no axis changes.
         """
-        steps = corrected_steps(self._sensors)
-        dead = (covariance.diagonal() <= LEAST_STD**2) & ~(np.isfinite(steps) & (steps > 0.0))
-        covariance = np.where(dead[:, None] | dead, np.nan, covariance)
-        if np.isnan(covariance).all():
-            return
-        self.resume(level, covariance)
-        self._relearns_soon = False
+        covariance = self._level.without_unknown_noise(covariance)
+        if not np.isnan(covariance).all():
+            self.resume(level, covariance)
+            self._relearns_soon = False
 
     @property
     def ready(self) -> bool:
@@ -143,9 +141,9 @@ class RunningBackground:
         return self._level.is_provisional or self._contested or self._steep
 
     @property
-    def _is_young(self) -> bool:
-        """Whether it was seen for so short that another steady level takes its place early."""
-        return MORE * self._seen_s < self._relearn
+    def freed_at(self) -> float | None:
+        """[s] When what had stood there since the beginning was gone; None where nothing had."""
+        return self._departure.freed_at
 
     @property
     def certain(self) -> bool:
@@ -168,19 +166,14 @@ class RunningBackground:
 
     @property
     def scatter_std(self) -> FloatArray:
-        """(3,) [T] scatter of the quiet readings and their steps, whatever noise was given; NaN =
-        unknown.
-        """
-        found = pooled_covariance(self._window.blocks()) if self._window else None
-        if found is None:
-            return np.full(3, np.nan)
-        variance = found.diagonal() + self._state['step_variance']
+        """(3,) [T] scatter of the quiet readings and their steps; NaN = unknown."""
+        variance = self._quiet.scatter() + self._state['step_variance']
         return np.where(variance > 0.0, np.sqrt(variance), np.nan)
 
     @property
     def measured(self) -> bool:
         """Whether the background is from readings, not from what was given beforehand."""
-        return bool(self._window) and self.ready
+        return bool(self._quiet) and self.ready
 
     def judge_block(self) -> None:
         """Judge the block that the latest sample has shown to be complete."""
@@ -204,20 +197,8 @@ class RunningBackground:
 
     def _begin(self, block: Block) -> None:
         """Before it is ready: collect until a quiet stretch is long enough."""
-        self._strange.append(block)
-        if self.stuck:
-            # Without a change nothing is known of the steps. The first one comes with a target.
-            self._rested.append(block)
-        elif self._rested and self._rested[-1].time - self._rested[0].time \
-                >= self._learn - 1.5 * self._length and self._adopt_if_steady(self._rested):
-            return
-        # From centre to centre; the blocks of a slow sensor may be longer than `_length`.
-        enough = self._learn - 1.5 * self._length
-        while len(self._strange) > 3 and block.time - self._strange[1].time >= enough:
-            self._strange.popleft()
-        is_adopted = len(self._strange) >= 3 and block.time - self._strange[0].time >= enough \
-            and self._adopt_if_steady(self._strange)
-        if not is_adopted and not self.stuck:
+        stretches = self._beginning.stretches(block, self.stuck)
+        if not any(self._adopt_if_steady(s) for s in stretches) and not self.stuck:
             self._provide(block)
 
     def _provide(self, block: Block) -> None:
@@ -226,21 +207,21 @@ class RunningBackground:
         found = self._provisional.found(corrected_steps(self._sensors))
         if found is not None and self._given is not None:
             self.begin_with(self._given, found.level.covariance)
-            self._strange.clear()
+            self._beginning.clear()
         elif found is not None and found.is_certain:
             self._begin_with_frequent(found)
         elif found is not None:
             level, noise = found.level, self._level.without_dead_axes(found.level.covariance)
             if not np.isnan(noise).all():
-                noise = noise if self._given_noise is None else self._given_noise
-                self._level.set((0.0, level.level, np.zeros(3), 0.0), noise)
+                self._level.set((0.0, level.level, np.zeros(3), 0.0),
+                                noise if self._given_noise is None else self._given_noise)
                 self._level.rely(found.deviation, is_provisional=True)
 
     def _begin_with_frequent(self, found: FrequentLevel) -> None:
         """Begin with a level that is frequent enough; others may still take its place."""
         self.begin_with(found.level.level, found.level.covariance)
         self._seen_s, self.frozen, self._contested = found.seen_s, False, False
-        self._strange.clear()
+        self._beginning.clear()
 
     def _follow(self, block: Block) -> None:
         """Once ready: extend the quiet stretch, or freeze."""
@@ -249,63 +230,87 @@ class RunningBackground:
         self.frozen = bool((off > self._level.limits).any())
         self._provisional.collect(block)
         if self.frozen:
-            self._pending.clear()
-            self._strange.append(block)
+            self._departure.add(block, self._quiet.pending)
+            self._quiet.pending.clear()
             self._change_if_steady(block)
             return
         self._contested = False
+        if self._departure.was_steady:
+            # What stood there is gone, and its level with it.
+            self._provisional.clear()
         if not np.isnan(self._seen_until):
             self._seen_s += block.time - self._seen_until
         self._seen_until = block.time
-        self._strange.clear()
-        self._pending.append(block)
-        while self._pending and self._pending[0].time <= block.time - self._guard:
-            self._window.append(self._pending.popleft())
-            self._fit()
+        self._departure.end()
+        for blocks in self._quiet.extend(block):
+            self._fit(blocks)
 
     def _change_if_steady(self, block: Block) -> None:
         """While frozen: take another level that lasts, or that was the background before."""
         self._seen_until = np.nan
-        since = block.time - self._strange[0].time
-        longest = self._relearn
-        if self._resumed and self._relearns_soon:
-            # It may be that the sensor was moved, or its surroundings changed, meanwhile.
-            longest = min(longest or inf, max(self._learn, LEAST_RELEARN_S))
-        elif longest:
-            # What stood there in the beginning may have left.
-            longest = min(longest, max(self._learn, LEAST_RELEARN_S, MORE * self._seen_s))
+        departure = self._departure
+        since = block.time - departure.blocks[0].time
+        longest = departure.longest(self._seen_s, self._resumed and self._relearns_soon)
         if not longest:
-            self._strange.clear()
-            return
+            return departure.end()
         other = self._provisional.found(corrected_steps(self._sensors))
         if other is not None and other.level.is_at(self._level.at(block.time)):
             other = None
-        latest = self._level.steady_end(self._strange, self._learn)
+        latest = departure.steady_end(SOONER)
+        if latest is not None and self._judge_change(latest):
+            return
+        latest = departure.steady_end()
         # Two levels that were seen for equally long may both be the background.
         self._contested |= latest is not None and since >= min(self._seen_s, self._relearn) \
             or other is not None and other.seen_s >= min(self._seen_s, SEEN_S)
-        if latest is not None and self._former is not None \
-                and self._former.is_at(block, self._level.limits):
-            self._strange = latest
-        elif since < longest:
+        self._contested &= not departure.has_come
+        if since < longest:
             return
-        if self._adopt_if_steady(self._strange):
+        if self._adopt_if_steady(departure.blocks):
             self.n_relearnt += 1
             self.frozen = self._contested = False
         elif other is not None and other.is_certain:
             self.n_relearnt += 1
             self._begin_with_frequent(other)
         else:
-            self._strange.popleft()
+            departure.shorten()
+
+    def _judge_change(self, latest: deque[Block]) -> bool:
+        """Whether the level of the `latest` blocks is the background from now on."""
+        if self._departure.former_seen_s():
+            self._change_to(latest)
+            return True
+        if not self._departure.has_left(latest) or self._given is not None and not self.n_relearnt:
+            return False
+        since_ns = int(self._state['first_ns']) + round(self._since * NS)
+        self._change_to(latest)
+        # All that came before was measured against what stood there.
+        self.doubtful_times = doubted_since(self.doubtful_times, since_ns)
+        return True
+
+    def _change_to(self, latest: deque[Block]) -> None:
+        """Go on with the level of the `latest` blocks, without the tail of what has left."""
+        seen_s = self._departure.former_seen_s() or self._learn
+        half = list(latest)[len(latest) // 2:]
+        self._depart_from(half[0].time)
+        self._level.set((0.0, line_through(stacked(half))[1], np.zeros(3), 0.0), self._level.noise)
+        self._resumed, self._relearns_soon, self._seen_s = True, False, seen_s
+        self._quiet.begin(half)
+        self.n_relearnt += 1
+        self.frozen = self._contested = self._steep = False
+
+    def _depart_from(self, begin: float) -> None:
+        """The present level is the former one, as another is the background since `begin` [s]."""
+        self._since = begin
+        self._departure.former = FormerLevel(begin, self._level.at(begin), self._seen_s)
+        self._departure.end()
 
     def _adopt_if_steady(self, collected: deque[Block]) -> bool:
         """Take the collected blocks as the background if they lie on one line."""
         blocks = stacked(collected)
         noise = pooled_covariance(blocks) if self._given_noise is None else self._given_noise
-        if noise is None:
-            return False
-        noise = self._level.without_dead_axes(noise)
-        if np.isnan(noise).all():
+        noise = None if noise is None else self._level.without_dead_axes(noise)
+        if noise is None or np.isnan(noise).all():
             return False
         before = self._level.noise
         self._level.set(self._level.line, noise)
@@ -315,36 +320,31 @@ class RunningBackground:
         if self._given is not None and self._level.line is not None and not self.n_relearnt \
                 and not self.frozen:
             # The background was given and only the noise had to be learnt.
-            self._strange.clear()
+            self._beginning.clear()
             return True
         if self.frozen and self._level.line is not None:
-            since = float(blocks.time[0])
-            self._former = FormerLevel(since, self._level.at(since))
+            self._depart_from(float(blocks.time[0]))
         # A steady stretch was asked for its own length; it need not be as long as at first.
         self._resumed = False
         self._seen_s = float(blocks.time[-1] - blocks.time[0]) + self._length
         self._seen_until = float(blocks.time[-1])
         self._level.rely()
-        self._window.clear()
-        for block in list(collected)[-self._most:]:
-            self._window.append(block)
-        self._strange.clear()
-        self._rested.clear()
-        self._fit()
+        self._quiet.begin(collected)
+        self._beginning.clear()
+        self._fit(self._quiet.blocks())
         return True
 
-    def _fit(self) -> None:
-        """Line and noise from the present window."""
-        blocks = self._window.blocks()
-        first, last = float(blocks.time.min()), float(blocks.time.max())
-        if (self._given is not None or self._resumed) and last - first < self._learn:
+    def _fit(self, blocks: Blocks) -> None:
+        """Line and noise from the quiet `blocks`."""
+        if (self._given is not None or self._resumed) and np.ptp(blocks.time) < self._learn:
             return
         self._resumed = False
-        centre, mean, slope = line_through(blocks)
+        line = line_of(blocks)
         assert self._level.noise is not None
-        self._steep = self._is_young and is_steep(
-            blocks, slope, self._level.noise.diagonal() + self._state['step_variance'])
-        self._level.rely(np.abs(slope) * self._learn if self._steep else 0.0)
+        is_young = MORE * self._seen_s < self._relearn
+        self._steep = is_young and is_steep(
+            blocks, line[2], self._level.noise.diagonal() + self._state['step_variance'])
+        self._level.rely(np.abs(line[2]) * self._learn if self._steep else 0.0)
         noise = pooled_covariance(blocks) if self._given_noise is None else None
-        self._level.set((centre, mean, slope, last + 2.0 * (last - first)),
-                  self._level.noise if noise is None else self._level.without_dead_axes(noise))
+        self._level.set(line, self._level.noise if noise is None
+                        else self._level.without_dead_axes(noise))

@@ -91,6 +91,12 @@ class BackgroundLevel:
         dead = ~np.isfinite(steps) | (steps == 0.0) & (variance <= LEAST_STD**2)
         return np.where(dead[:, None] | dead, np.nan, noise)
 
+    def without_unknown_noise(self, covariance: FloatArray) -> FloatArray:
+        """(3, 3) [T^2] `covariance` with NaN for an axis that neither changes nor has steps."""
+        steps = corrected_steps(self._sensors)
+        dead = (covariance.diagonal() <= LEAST_STD**2) & ~(np.isfinite(steps) & (steps > 0.0))
+        return np.where(dead[:, None] | dead, np.nan, covariance)
+
     def rely(self, deviation: FloatArray | float = 0.0, is_provisional: bool = False) -> None:
         """The line is the background, with a `deviation` (3,) [T]; NaN = axis not reported."""
         self.is_provisional = is_provisional

@@ -21,6 +21,14 @@ def noted(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool, most: int = MO
     return times
 
 
+def doubted_since(times: DoubtfulTimes, since_ns: int) -> DoubtfulTimes:
+    """The `times`, and all from `since_ns` on."""
+    earlier = tuple((begin, end) for begin, end in times if begin < since_ns)
+    if earlier and (earlier[-1][1] is None or earlier[-1][1] >= since_ns):
+        return (*earlier[:-1], (earlier[-1][0], None))
+    return (*earlier, (since_ns, None))[-MOST:]
+
+
 def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTimes]
            ) -> dict[str, DoubtfulTimes]:
     """{sensor: all its stretches}; where two begin together, the latest knows better."""

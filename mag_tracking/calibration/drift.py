@@ -32,6 +32,8 @@ class FormerLevel:
     """[s]"""
     level: FloatArray
     """(3,) [T]"""
+    seen_s: float
+    """[s] For how long it was seen."""
 
     def is_at(self, block: Block, limits: FloatArray) -> bool:
         """Whether a block has this level, with `limits` (3,) [T] for its mean."""

@@ -41,13 +41,14 @@ class BlockRecorder(RunningBackground):
         self._blocks: list[Block] = []
         super().forget()
 
-    def quiet_level(self) -> QuietLevel | None:
-        """The most frequent level of the sensor, or None where it has none."""
-        if len(self._blocks) < LEAST_BLOCKS:
+    def quiet_level(self, since: float = 0.0) -> QuietLevel | None:
+        """The most frequent level of the sensor `since` a time [s], or None where it has none."""
+        blocks = [block for block in self._blocks if block.time >= since]
+        if len(blocks) < LEAST_BLOCKS:
             return None
-        every = 1 + len(self._blocks) // MOST_BLOCKS
+        every = 1 + len(blocks) // MOST_BLOCKS
         steps = corrected_steps(self._sensors)
-        return most_frequent_level(stacked(self._blocks[::every]),
+        return most_frequent_level(stacked(blocks[::every]),
                                    np.where(np.isfinite(steps), steps, 0.0), self._most)
 
     def is_usual(self, beginning: FloatArray, found: QuietLevel) -> bool:

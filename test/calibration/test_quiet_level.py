@@ -78,6 +78,15 @@ def test_a_target_that_comes_later_and_stays_is_not_the_background(arrives, unti
     assert found(signal, never, seconds=10.0 * until).levels == {}
 
 
+def test_what_stood_there_for_most_of_the_recording_is_not_the_background():
+    """It is seen to leave: the level that it leaves behind is, however short."""
+    def leaving(t):
+        way = 0.5 * 2.0 * max(t - 30.0, 0.0)**2
+        return 4e-6 / (1.0 + (way / 5.0)**2)**1.5
+    level, = found(leaving, seconds=44.0).levels.values()
+    assert (np.abs(level.level - EARTH) < SIGMA).all() and level.begin > 33.0
+
+
 @pytest.mark.parametrize('rates', [(50.0, 1.0), (2.0, 2.0), (100.0, 5.0)])
 @pytest.mark.parametrize('starts', [0.0, 7.0, 40.0])
 def test_sensors_that_are_slow_or_start_late_begin_quietly(rates, starts):

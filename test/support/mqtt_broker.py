@@ -99,6 +99,7 @@ def password_lines(folder, user, password):
 
 def subscription_lines(folder, user, password, pattern):
     """Lines for a broker where `user` may subscribe to nothing but what fits `pattern`."""
+    executable('mosquitto')
     salt = b'twelve bytes'
     hashed = hashlib.pbkdf2_hmac('sha512', password.encode(), salt, 101)
     plugin = next((p for p in ('/usr/lib/x86_64-linux-gnu', '/usr/lib/aarch64-linux-gnu',

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Collection, Mapping
+from functools import partial
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.decimation import Decimator
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, shifted
 from mag_tracking.calibration.frequent_level import QuietLevel
+from mag_tracking.calibration.level_change import SharedChanges
 from mag_tracking.calibration.screening import clear_spikes
 from mag_tracking.calibration.sensor_state import new_sensors
 from mag_tracking.errors import NetworkError
@@ -59,20 +61,18 @@ class Calibrate:
         """`background_type` estimates the background of each sensor."""
         self.counts: Counter[str] = Counter()
         self._per_sensor: dict[str, Counter[str]] = {name: Counter() for name in network.names}
-        self._settings = settings
-        self._sensors = new_sensors(len(network))
+        self._settings, self._sensors = settings, new_sensors(len(network))
         self._batches = np.zeros(1, kernel.BATCH)
         self._limits = np.array([(
             settings.max_field, settings.jump_ahead_s * NS, settings.jump_back_s * NS,
             settings.reject_stuck, settings.spike_std, settings.decimate_to_hz > 0.0,
-            settings.trust_covariances)],
-            kernel.LIMITS)
+            settings.trust_covariances)], kernel.LIMITS)
         self._causes = {**CAUSES, kernel.TOO_LARGE: f'above {settings.max_field:g} T (gauss or '
                         'microtesla as tesla?)'}
-        self._background_type = background_type
+        self._network, self._background_type = network, background_type
         self._index = {name: i for i, name in enumerate(network.names)}
-        self._network = network
         self._background: dict[str, RunningBackground] = {}
+        self._changes = SharedChanges()
         self._restoration = BackgroundRestoration(settings.resume_s)
         self.renew(network)
 
@@ -122,7 +122,7 @@ class Calibrate:
             s.learn_s, s.memory_s, s.guard_s, s.block_s, s.freeze_std, s.relearn_s,
             network.background[i], network.noise_std[i],
             phase=i / len(network) if len(network) > AT_ONCE else None,
-            sensors=self._sensors[i:i + 1])
+            sensors=self._sensors[i:i + 1], judge=partial(self._changes.judge, i))
 
     def unready(self) -> list[str]:
         """Names of the sensors whose background is not known."""

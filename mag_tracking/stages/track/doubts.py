@@ -22,8 +22,8 @@ FRAMES_TOO_LONG = 'frames_too_long'
 MEANINGS = {
     ANOTHER_PLACE: 'another place is still possible',
     ANOTHER_ARRIVAL: 'another arrival direction is still possible',
-    NOT_SEEN_APPROACHING: 'the target was not seen approaching, or the track began in the tail of '
-                          'a lost one',
+    NOT_SEEN_APPROACHING: 'the target was not seen approaching: it stood there, or the track began '
+                          'in the tail of a lost one',
     SENSORS_AT_ONE_PLACE: 'there is one sensor, or all sensors are within two metres: range and '
                           'size are those of the settings',
     ONE_SENSOR: 'a single sensor of several measures, or did for too long',

@@ -8,6 +8,7 @@ from mag_tracking.calibration.doubtful_times import DoubtfulTimes, are_doubtful,
 from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track import doubts
+from mag_tracking.stages.track.approach import Approach
 from mag_tracking.stages.track.consistency import InnovationConsistency
 from mag_tracking.stages.track.disturbances import size_of
 from mag_tracking.stages.track.explanation import Explanation
@@ -62,6 +63,7 @@ class TrackEvidence:
     def __init__(self, n_sensors: int) -> None:
         self.explanation = Explanation()
         self.innovations = InnovationConsistency(n_sensors)
+        self._approach = Approach()
         # For the whole track.
         self._doubts: set[str] = set()
         self._log_odds = 0.0
@@ -91,6 +93,11 @@ class TrackEvidence:
     def doubt(self, reason: str) -> None:
         """From now on all of the track may be wrong."""
         self._doubts.add(reason)
+
+    def watch(self, frame: FieldFrame) -> None:
+        """Doubt the track where the field grows, up to this frame, as that of nothing from afar."""
+        if self._approach.add(frame):
+            self.doubt(doubts.NOT_SEEN_APPROACHING)
 
     def take(self, frame: FieldFrame, rows: IntArray, nis: FloatArray) -> None:
         """Count what the sensors felt in a frame, and how it fits.

@@ -153,6 +153,8 @@ class RunningTrack:
     def _update(self, frame: FieldFrame, dt: float, publish: bool) -> FieldFrame | None:
         """Move the bank through a frame; what was used of it, or None if nothing explains it."""
         s, bank = self._settings, self.bank
+        if not self._target.starts_anywhere:
+            self._evidence.watch(frame)
         if dt > 0.0:
             self._filter.predict(bank, dt)
         predicted = bank.x.copy()

@@ -280,7 +280,7 @@ def test_the_doctor_looks_at_backgrounds():
     steps = doctored(lambda k, field: field + 1e-6 * (k > 1000), seconds=75.0)
     assert len(steps) == 2 and 'its background has not been learnt for 5' in steps[1]
     assert 'its background is doubtful' in steps[0]
-    parked = doctored(lambda k, field: field + 1e-6 * (k > 1000), seconds=95.0)
+    parked = doctored(lambda k, field: field + 1e-6 * (k > 1000), seconds=155.0)
     assert len(parked) == 1 and 'was taken for its background 1 times' in parked[0]
     early = doctored(seconds=2.0)
     assert len(early) == 3 and all('no background was learnt' in text for text in early)

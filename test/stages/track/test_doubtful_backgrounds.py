@@ -14,7 +14,7 @@ from support.dense_traffic import after_dense_traffic
 from support.networks import line_network
 from support.samples import one, simulate
 
-SURE_WITHOUT = ('junction_left_to_right', 'junction_right_turns_to_rear')
+SURE_WITHOUT = ('junction_left_to_right', 'junction_left_turns_to_rear')
 DOUBTED = 'tracks of a doubtful background'
 SETTINGS = settings_for('vehicle', POINT)
 """A fast tracker: the doubt does not depend on the model of the target."""

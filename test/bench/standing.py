@@ -1,0 +1,47 @@
+"""`make bench`: vehicles that stop, and one that stood there when the nodes were started."""
+
+import argparse
+import sys
+
+import numpy as np
+
+from bench.two_simulators import count_over
+from support.standing import STOPS, first_after, goes_on, mended_after
+
+RUNS = 20
+
+
+def one(what, run):
+    """What became of a run."""
+    if what == 'stops':
+        return goes_on(STOPS[run % len(STOPS)], run // len(STOPS))
+    return mended_after(run) if what == 'leaves' else first_after(run)
+
+
+def summary(what, found):
+    """(line, whether it is as good as it has to be)."""
+    n = len(found)
+    if what == 'stops':
+        return (f'stopped for 5, 20 and 60 s: in {sum(found)} of {n} runs the same track goes on '
+                'and leaves (aim 90 %)', sum(found) >= 0.9 * n)
+    if what == 'leaves':
+        soon = sum(s <= 3.0 for s in found)
+        return (f'stood there at the start: in {soon} of {n} runs the background is right within '
+                f'3 s of its leaving, at the median after {np.median(found):.1f} s (aim all)',
+                soon == n)
+    tracked = sum(error < 2.0 for error, *_ in found)
+    sure, wrong = (sum(f[k] for f in found) for k in (1, 2))
+    return (f'the first vehicle after it, offline: tracked in {tracked} of {n} runs, {wrong} of '
+            f'{sure} poses without a flag wrong (aim all, none)', tracked == n and not wrong)
+
+
+def main():
+    """Print a line for each question; returns 1 where an aim is missed."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument('--runs', type=int, default=RUNS)
+    given = parser.parse_args()
+    return count_over([('stops',), ('leaves',), ('first',)], one, given.runs, summary)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

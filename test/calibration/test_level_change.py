@@ -1,0 +1,156 @@
+"""What has come, what has left: by how a field grows at either end of a change."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mag_tracking.calibration.blocks import Blocks
+from mag_tracking.calibration.growth import time_to_grow
+from mag_tracking.calibration.level_change import (
+    CLEAR_SIZE,
+    LevelChange,
+    SharedChanges,
+    level_change,
+)
+from mag_tracking.physics.dipole import dipole_field
+from support.calibration_runs import EARTH, SIGMA, feed, running
+
+BLOCK_S = 0.25
+
+
+@pytest.mark.parametrize('ratio', [4.0, 10.0, 40.0])
+def test_growth_from_afar_and_from_rest_are_as_theory_says(ratio):
+    """Sizes at even times: (distance)^-3 at a constant speed, and the square of the time."""
+    t = np.linspace(0.0, 1.0, 4001)
+    near = ratio**(-1.0 / 3.0)
+    # From a little below 1 to a little above the ratio.
+    distance = 1.02 - (1.05 - 0.98 * near) * t
+    early, late = time_to_grow(distance**-3.0, 1.0, ratio)
+    assert early / late == pytest.approx(ratio**(1.0 / 6.0), rel=2e-3)
+    early, late = time_to_grow(1.1 * ratio * t**2, 1.0, ratio)
+    assert early / late == pytest.approx(ratio**-0.25, rel=2e-3)
+
+
+def test_no_growth_is_timed_that_has_no_beginning_or_no_end():
+    assert time_to_grow(np.array([2.0, 3.0, 20.0]), 1.0, 10.0) is None
+    assert time_to_grow(np.array([0.5, 3.0, 5.0]), 1.0, 10.0) is None
+
+
+def ride(t, at, acceleration, top, stops):
+    """(n,) [m] along the road: to rest at a time `at` [s], or from rest."""
+    since = np.maximum(at - t if stops else t - at, 0.0)
+    straight = np.minimum(since, top / acceleration)
+    way = 0.5 * acceleration * straight**2 + top * (since - straight)
+    return -way if stops else way
+
+
+def vehicle(seed, stops, at=12.0):
+    """Signal (3,) [T] of t [s]: of one that stops beside a sensor, or stood there and leaves."""
+    rng = np.random.default_rng(seed)
+    moment = rng.uniform(200.0, 600.0) * _direction(rng)
+    place = np.array([rng.uniform(-3.0, 3.0), rng.uniform(3.0, 6.0), 0.5])
+    acceleration, top = rng.uniform(1.0, 4.0), rng.uniform(6.0, 14.0)
+
+    def signal(t):
+        r = np.array([ride(t, at, acceleration, top, stops), 0.0, 0.0]) + place
+        return dipole_field(r, moment)
+    return signal
+
+
+def _direction(rng):
+    v = rng.standard_normal(3)
+    return v / np.linalg.norm(v)
+
+
+def blocks_of(signal, seconds, seed=0):
+    """`Blocks` of a signal, with the noise of 25 readings in each."""
+    time = np.arange(0.5 * BLOCK_S, seconds, BLOCK_S)
+    noise = np.random.default_rng(seed).standard_normal((len(time), 3)) * SIGMA / 5.0
+    mean = np.array([signal(t) for t in time]) + noise
+    return Blocks(time, mean, np.zeros((len(time), 3, 3)), np.full((len(time), 3), 25.0))
+
+
+def judged(blocks, n_steady=12):
+    before = np.tile(blocks.mean[:6].mean(axis=0), (len(blocks.time), 1))
+    return level_change(blocks, n_steady, before, SIGMA, 0.0)
+
+
+def backwards(blocks):
+    return blocks._replace(mean=blocks.mean[::-1])
+
+
+@pytest.mark.parametrize('stops', [True, False])
+def test_what_stops_has_come_and_what_starts_has_left(stops):
+    """Eighty vehicles each; forwards and backwards in time the same change says the opposite."""
+    verdicts = []
+    for seed in range(80):
+        begin, end = (0.0, 16.0) if stops else (8.0, 30.0)
+        signal = vehicle(seed, stops)
+        blocks = blocks_of(lambda t, s=signal, b=begin: s(t + b), end - begin, seed)
+        found, reverse = judged(blocks), judged(backwards(blocks))
+        if found.size >= CLEAR_SIZE:
+            verdicts.append(found.has_left)
+            assert reverse.has_left in (None, not found.has_left) or found.has_left is None
+    assert len(verdicts) > 20
+    # Wrong is worse than undecided.
+    assert verdicts.count(stops) == 0
+    assert verdicts.count(not stops) >= 0.9 * len(verdicts)
+
+
+def test_a_jump_a_ramp_and_a_small_change_are_not_decided():
+    def ramp(t, length=2.0, size=1e-6):
+        return size * np.clip((t - 6.0) / length, 0.0, 1.0) * np.ones(3)
+    for signal in (lambda t: ramp(t, 1e-3), ramp, lambda t: 1e-3 * vehicle(0, True)(t)):
+        assert judged(blocks_of(signal, 16.0)).has_left is None
+
+
+def test_a_change_that_is_not_clear_is_judged_by_a_clear_one():
+    shared = SharedChanges()
+    weak = LevelChange(100.0, 0.5 * CLEAR_SIZE, False)
+    strong = LevelChange(101.0, 2.0 * CLEAR_SIZE, True)
+    assert shared.judge(0, weak) is False
+    assert shared.judge(1, strong) is True
+    assert shared.judge(0, weak) is True
+    # Not by one of another time, and a clear one only by itself.
+    assert shared.judge(0, dataclasses.replace(weak, since=90.0)) is False
+    assert shared.judge(2, dataclasses.replace(strong, size=1.5 * CLEAR_SIZE, has_left=False)) \
+        is False
+
+
+def is_clear(seed):
+    """Whether the field of a vehicle where it stands is one that is judged alone."""
+    field = vehicle(seed, stops=True, at=0.0)(1.0)
+    return np.linalg.norm(field / SIGMA) > 1.2 * CLEAR_SIZE
+
+
+CLEAR = [seed for seed in range(20) if is_clear(seed)][:4]
+
+
+@pytest.mark.parametrize('seed', CLEAR)
+def test_what_stood_there_and_leaves_is_no_background_three_seconds_later(seed):
+    """By then it is 30 m away or more; its own tail is within the noise of one reading."""
+    signal = vehicle(seed, stops=False, at=15.0)
+    b = running()
+    b.sensors['first_ns'] = 0
+    feed(b, np.arange(0.0, 22.5, 0.01), signal=signal)
+    assert b.n_relearnt == 1 and (np.abs(b.level(22.5) - EARTH - signal(22.5)) < SIGMA).all()
+    # All that was measured against it is doubtful, and nothing is from now on.
+    (begin, end), = b.doubtful_times
+    assert begin == 0 and end is not None and not b.doubtful
+    assert b.freed_at == pytest.approx(19.0, abs=2.0)
+
+
+@pytest.mark.parametrize('seed', CLEAR)
+def test_what_stops_is_no_background_for_as_long_as_a_traffic_light_is_red(seed):
+    """Though the background was seen for a few seconds only, it is not doubted for that."""
+    b = running(relearn=120.0)
+    feed(b, np.arange(0.0, 70.0, 0.02), signal=vehicle(seed, stops=True, at=12.0))
+    assert b.frozen and not b.n_relearnt and not b.doubtful and b.freed_at is None
+
+
+def test_what_was_given_is_not_replaced_by_what_seems_to_be_left():
+    signal = vehicle(CLEAR[0], stops=False, at=15.0)
+    b = running(background=EARTH + signal(0.0), noise_std=SIGMA)
+    feed(b, np.arange(0.0, 22.5, 0.01), signal=signal)
+    assert b.n_relearnt == 0

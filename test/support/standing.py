@@ -1,0 +1,93 @@
+"""What becomes of vehicles that stand: the tracks of `support.situations`, and the backgrounds."""
+
+import numpy as np
+
+from mag_tracking.apps.first_pass import first_pass
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.records import Track
+from support.random_passes import SIMULATORS, errors_of
+from support.situations import made, wrong_of
+
+STOPS = ('stops for 5 s', 'stops for 20 s', 'stops for 60 s')
+STANDING = 0.05
+"""[m/s] Slower is standing."""
+RIGHT = 2.0
+"""Standard deviations of one reading: a background that is off by more is not right."""
+PART = 50
+"""Readings that are fed at once."""
+
+
+def poses_of(records):
+    return [r for r in records if isinstance(r, Track) and not r.ended]
+
+
+def stands(a_world, body=0):
+    """(begin, end) [s] of when a body of a `World` stands."""
+    velocity = np.gradient(a_world.positions[body], a_world.t, axis=0)
+    still = a_world.t[np.linalg.norm(velocity, axis=1) < STANDING]
+    return still.min(), still.max()
+
+
+def goes_on(name, run):
+    """Whether one track has a vehicle before it stops, and still two seconds after it started."""
+    a_world = made(name, SIMULATORS[run % 2], run // 2)
+    pipeline = Pipeline(a_world.network, settings_for('vehicle'))
+    poses = poses_of(pipeline.feed(a_world.readings) + pipeline.flush())
+    begin, end = stands(a_world)
+    spans = {}
+    for pose in poses:
+        spans.setdefault(pose.id, []).append(pose.stamp_ns / 1e9)
+    return any(times[0] < begin and times[-1] > end + 2.0 for times in spans.values())
+
+
+def mended_after(run):
+    """[s] from when a vehicle that stood there at the start is gone to when all backgrounds are
+    right for good; infinite where they never are.
+
+    It is gone where no sensor is off its last level by `RIGHT` any more. Live: no first pass.
+    """
+    a_world = made('there at the start, leaves', SIMULATORS[run % 2], run // 2)
+    stage = Pipeline(a_world.network, settings_for('vehicle')).calibrate
+    readings, names = a_world.readings, a_world.network.names
+    n = len(names)
+    field = readings.field.reshape(-1, n, 3)
+    latest = a_world.t > a_world.t[-1] - 3.0
+    level, std = field[latest].mean(axis=0), field[latest].std(axis=0)
+    width = 25
+    smooth = np.stack([[np.convolve(field[:, j, a], np.ones(width) / width, 'same')
+                        for a in range(3)] for j in range(n)]).transpose(2, 0, 1)
+    off = (np.abs(smooth - level) > RIGHT * std).any(axis=(1, 2))[width:-width]
+    gone = a_world.t[width + np.flatnonzero(off).max()]
+    times, right = [], []
+    for a in range(0, len(readings), PART):
+        stage.feed(readings.part(slice(a, a + PART)))
+        times.append(readings.stamp_ns[min(a + PART, len(readings)) - 1] / 1e9)
+        right.append(not stage.unready() and all(
+            (np.abs(stage.background(name) - level[j]) < RIGHT * std[j]).all()
+            for j, name in enumerate(names)))
+    wrong = np.flatnonzero(~np.array(right))
+    return np.inf if wrong.max() == len(times) - 1 else max(times[wrong.max() + 1] - gone, 0.0)
+
+
+def first_after(run):
+    """Of the first vehicle that passes after one that stood there has left, replayed offline.
+
+    Returns
+    -------
+    error : float [m]
+        Median over the poses of the track that is nearest to it; infinite without a track.
+    n_sure, n_wrong : int
+        Poses of that track without a flag, and wrong ones among them.
+    """
+    a_world = made('there at the start, then cars', SIMULATORS[run % 2], run // 2)
+    pipeline = Pipeline(a_world.network, settings_for('vehicle'))
+    first_pass([a_world.readings], a_world.network,
+               pipeline.settings.calibrate).apply(pipeline.calibrate)
+    poses = poses_of(pipeline.feed(a_world.readings) + pipeline.flush())
+    best = np.inf, 0, 0
+    for id in {pose.id for pose in poses}:
+        mine = [pose for pose in poses if pose.id == id]
+        error = float(np.median(errors_of(mine, a_world.t, a_world.positions[1])[0]))
+        sure = np.array([not pose.ambiguous for pose in mine])
+        best = min(best, (error, int(sure.sum()), int((sure & wrong_of(mine, a_world)).sum())))
+    return best
