@@ -81,6 +81,8 @@ SITUATIONS = {
     'a train at 9 m': Situation(lambda r, s: train(r, s, 13.5)),
     'there at the start, leaves': Situation(leaves),
     'there at the start, then cars': Situation(lambda r, s: leaves(r, s, cars=2)),
+    # Longer than `relearn_s`: it has become background when it leaves.
+    'was parked for minutes, leaves': Situation(lambda r, s: stopping(r, s, 150.0)),
     'parked beside a passing car': Situation(parked),
     'one sensor alone': Situation(lambda r, s: spoilt_car(r, s, spoiler.only_sensor('mag_1'))),
     'one axis flipped': Situation(lambda r, s: spoilt_car(r, s, spoiler.wrong_sign('mag_2', 'y'))),
