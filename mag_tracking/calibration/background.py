@@ -34,6 +34,7 @@ from mag_tracking.calibration.quiet_stretch import QuietStretch, line_of
 from mag_tracking.calibration.resolution import LEAST_STD, corrected_steps
 from mag_tracking.units import NS
 
+
 class RunningBackground:
     """Running estimate of one sensor's background; times in seconds of the records.
 
@@ -192,8 +193,8 @@ class RunningBackground:
         else:
             self.stuck = bool(still[block.n > 1].all())
             self._begin(block)
-        self.doubtful_times = noted(
-            self.doubtful_times, int(self._state['last_ns']), self.doubtful)
+        last_ns = int(self._state['last_ns'])
+        self.doubtful_times = noted(self.doubtful_times, last_ns, self.doubtful)
 
     def _begin(self, block: Block) -> None:
         """Before it is ready: collect until a quiet stretch is long enough."""
@@ -236,8 +237,7 @@ class RunningBackground:
             return
         self._contested = False
         if self._departure.was_steady:
-            # What stood there is gone, and its level with it.
-            self._provisional.clear()
+            self._provisional.clear()  # What stood there is gone, and its level with it.
         if not np.isnan(self._seen_until):
             self._seen_s += block.time - self._seen_until
         self._seen_until = block.time

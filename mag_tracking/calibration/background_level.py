@@ -119,6 +119,14 @@ class BackgroundLevel:
         """(3,) [T] background at `time` [s]; raises ValueError before it is ready."""
         return -self.departure(time, np.zeros(3))
 
+    def at_all(self, times: FloatArray) -> FloatArray:
+        """(k, 3) [T] background at `times` (k,) [s]; raises ValueError before it is ready."""
+        if self.line is None:
+            raise ValueError('the background has not been learnt yet')
+        centre, mean, slope, horizon = self.line
+        out: FloatArray = mean + (np.minimum(times, horizon) - centre)[:, None] * slope
+        return out
+
     def departure(self, time: float, field: FloatArray) -> FloatArray:
         """(3,) [T] `field` without the background at `time` [s]."""
         if self.line is None:
@@ -130,9 +138,13 @@ class BackgroundLevel:
     def steady_end(self, blocks: Sequence[Block], length: float) -> deque[Block] | None:
         """The latest of the blocks, over a `length` [s], if they are of a steady level."""
         since = blocks[-1].time - length
-        latest = list(blocks)[-max(3, sum(b.time > since for b in blocks)):]
+        latest: deque[Block] = deque()
+        for block in reversed(blocks):
+            if block.time <= since and len(latest) >= 3:
+                break
+            latest.appendleft(block)
         is_long = len(blocks) >= 3 and blocks[0].time <= since
-        return deque(latest) if is_long and self.holds(stacked(latest)) else None
+        return latest if is_long and self.holds(stacked(latest)) else None
 
     def holds(self, blocks: Blocks) -> bool:
         """Whether blocks are those of a steady level, by the present noise."""

@@ -4,8 +4,6 @@ from collections import deque
 from collections.abc import Iterable
 from math import inf
 
-import numpy as np
-
 from mag_tracking.arrays import Record
 from mag_tracking.calibration.background_level import BackgroundLevel
 from mag_tracking.calibration.blocks import Block, stacked
@@ -21,6 +19,10 @@ after this time at the earliest."""
 SOONER = 2.0 / 3.0
 """What has left leaves a level behind that lasts for this share of the usual time; so does a former
 one that is back."""
+
+MOST_JUDGED = 240
+"""Blocks, a minute of the usual length, after which it is not judged any more whether something
+came or left: each judgement looks at all of them."""
 
 
 class Departure:
@@ -103,14 +105,13 @@ class Departure:
         """Whether what made the background left before the `latest` blocks, and not something
         else came; None where it cannot be told.
         """
-        if not self._has_begin:
-            return None
+        if self.has_come or not self._has_begin or len(self.blocks) > MOST_JUDGED:
+            return False if self.has_come else None
         blocks = stacked([*self._before, *self.blocks])
-        change = level_change(blocks, len(latest), np.array([
-            self._level.at(t) for t in blocks.time]), self._state['noise_std'],
-            int(self._state['first_ns']) / NS)
-        has_left = self._judge(change)
-        self.has_come |= has_left is False
+        has_left = self._judge(level_change(
+            blocks, len(latest), self._level.at_all(blocks.time), self._state['noise_std'],
+            int(self._state['first_ns']) / NS))
+        self.has_come = has_left is False
         if has_left and self.former is None:
             self.freed_at = latest[0].time
         return has_left

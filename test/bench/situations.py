@@ -105,20 +105,24 @@ def main():
 
     print(HEAD.format(n=given.runs), end='')
     status = count_over([(name,) for name in given.only], both_simulators, 2 * given.runs, summary)
-    one = [v for name, v in zip(np.repeat(given.only, 2 * given.runs), everything, strict=True)
-           if SITUATIONS[name].group != 'several']
-    nothing = [v for v, name in zip(everything, np.repeat(given.only, 2 * given.runs), strict=True)
-               if SITUATIONS[name].group == 'nothing']
-    end = (f'\nWithout a vehicle, {" of ".join(map(str, n_events(nothing)))} runs with a detection '
-           f'leave a disturbance (aim {LEAST_EVENTS:.0%}). All situations with one vehicle or none: '
-           f'{share(sum(v.n_wrong for v in one), sum(v.n_sure for v in one))} of '
-           f'{sum(v.n_sure for v in one)} poses without a flag are wrong (aim 0.5 %). '
-           f'"Something else" and the tests take {cost():.1%} of a tracked frame (aim at most '
-           f'{MOST_COST:.0%}).\n')
+    end = summary_of(list(zip(np.repeat(given.only, 2 * given.runs), everything, strict=True)))
     print(end)
     if given.write:
         PAGE.write_text(HEAD.format(n=given.runs) + '\n'.join(rows) + '\n' + end, encoding='utf-8')
     return status
+
+
+def summary_of(found):
+    """The text below the table, of [(situation, `Verdict`)]."""
+    one = [v for name, v in found if SITUATIONS[name].group != 'several']
+    nothing = [v for name, v in found if SITUATIONS[name].group == 'nothing']
+    sure, wrong = sum(v.n_sure for v in one), sum(v.n_wrong for v in one)
+    events, detected = n_events(nothing)
+    return (f'\nWithout a vehicle, {events} of {detected} runs with a detection leave a '
+            f'disturbance (aim {LEAST_EVENTS:.0%}). All situations with one vehicle or none: '
+            f'{share(wrong, sure)} of {sure} poses without a flag are wrong (aim 0.5 %). '
+            f'"Something else" and the tests take {cost():.1%} of a tracked frame (aim at most '
+            f'{MOST_COST:.0%}).\n')
 
 
 def both_simulators(name, run):

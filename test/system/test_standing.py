@@ -19,7 +19,8 @@ def test_the_track_of_a_vehicle_that_stops_goes_on_and_leaves(runs):
     assert sum(found) >= 0.9 * runs
 
 
-@pytest.mark.parametrize('runs, least', [(2, 2), pytest.param(RUNS, LEAST_MENDED, marks=pytest.mark.study)])
+@pytest.mark.parametrize('runs, least', [
+    (2, 2), pytest.param(RUNS, LEAST_MENDED, marks=pytest.mark.study)])
 def test_the_background_is_right_soon_after_what_stood_there_has_left(runs, least):
     assert sum(mended_after(run) <= MENDED_S for run in range(runs)) >= least
 
