@@ -80,14 +80,27 @@ def first_pass(batches: Iterable[Readings], network: SensorNetwork,
     for name, background in recorder.backgrounds().items():
         assert isinstance(background, BlockRecorder)
         steps[name] = background.steps
-        freed_at = beginning.backgrounds()[name].freed_at
-        level = background.quiet_level(freed_at or 0.0) if name in wanted else None
+        level, was_freed = _level_of(background, beginning.backgrounds()[name].freed_at,
+                                     learnt.get(name)) if name in wanted else (None, False)
         if level is not None and level.n_blocks * level.block_s >= LEAST * settings.learn_s:
             found[name] = level
-            is_quiet &= freed_at is None \
+            is_quiet &= not was_freed \
                 and _begins_quietly(learnt.get(name), level, background, settings)
     # A target that one sensor feels at the beginning may be in the background of all.
     return FirstPass({} if is_quiet else found, steps)
+
+
+def _level_of(recorder: BlockRecorder, freed_at: float | None,
+              learnt: tuple[float, FloatArray] | None) -> tuple[QuietLevel | None, bool]:
+    """Most frequent level of a sensor, and whether something had stood there until `freed_at` [s].
+
+    It had not where the level of the beginning, as it was `learnt`, comes back.
+    """
+    level = recorder.quiet_level()
+    if level is None or freed_at is None or learnt is None \
+            or recorder.is_back(learnt[1], level, freed_at):
+        return level, False
+    return recorder.quiet_level(freed_at), True
 
 
 def _learn(beginning: Calibrate, readings: Readings, first_ns: dict[str, int],

@@ -16,14 +16,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.calibration.background_level import BackgroundLevel
 from mag_tracking.calibration.beginning import Beginning
-from mag_tracking.calibration.blocks import (
-    Block,
-    Blocks,
-    block_of,
-    line_through,
-    pooled_covariance,
-    stacked,
-)
+from mag_tracking.calibration.blocks import Block, Blocks, block_of, pooled_covariance, stacked
 from mag_tracking.calibration.departure import SOONER, Departure
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, doubted_since, noted
 from mag_tracking.calibration.drift import FormerLevel, is_steep
@@ -103,7 +96,7 @@ class RunningBackground:
         self.doubtful_times = noted(self.doubtful_times, int(self._state['last_ns']), False)
         # For how long the level was seen, until when, and since when it is the background.
         self._seen_s = 0.0 if self._given is None else inf
-        self._seen_until, self._since = np.nan, 0.0
+        self._seen_until = self._since = np.nan
         self._level.rely()
         self._level.set(None if self._given is None else (0.0, self._given, np.zeros(3), 0.0),
                         self._given_noise)
@@ -198,6 +191,7 @@ class RunningBackground:
 
     def _begin(self, block: Block) -> None:
         """Before it is ready: collect until a quiet stretch is long enough."""
+        self._since = block.time if np.isnan(self._since) else self._since
         stretches = self._beginning.stretches(block, self.stuck)
         if not any(self._adopt_if_steady(s) for s in stretches) and not self.stuck:
             self._provide(block)
@@ -223,6 +217,7 @@ class RunningBackground:
         self.begin_with(found.level.level, found.level.covariance)
         self._seen_s, self.frozen, self._contested = found.seen_s, False, False
         self._beginning.clear()
+        self._departure.end()
 
     def _follow(self, block: Block) -> None:
         """Once ready: extend the quiet stretch, or freeze."""
@@ -257,7 +252,7 @@ class RunningBackground:
         if other is not None and other.level.is_at(self._level.at(block.time)):
             other = None
         latest = departure.steady_end(SOONER)
-        if latest is not None and self._judge_change(latest):
+        if latest is not None and self._relearn and self._judge_change(latest):
             return
         latest = departure.steady_end()
         # Two levels that were seen for equally long may both be the background.
@@ -278,26 +273,27 @@ class RunningBackground:
     def _judge_change(self, latest: deque[Block]) -> bool:
         """Whether the level of the `latest` blocks is the background from now on."""
         if self._departure.former_seen_s():
-            self._change_to(latest)
-            return True
-        if not self._departure.has_left(latest) or self._given is not None and not self.n_relearnt:
+            return self._change_to(latest)
+        is_given = self._given is not None and self._departure.former is None
+        if not self._departure.has_left(latest) or is_given:
             return False
-        since_ns = int(self._state['first_ns']) + round(self._since * NS)
+        since_ns = int(self._state['first_ns']) + round(np.nan_to_num(self._since) * NS)
         self._change_to(latest)
         # All that came before was measured against what stood there.
         self.doubtful_times = doubted_since(self.doubtful_times, since_ns)
         return True
 
-    def _change_to(self, latest: deque[Block]) -> None:
+    def _change_to(self, latest: deque[Block]) -> bool:
         """Go on with the level of the `latest` blocks, without the tail of what has left."""
         seen_s = self._departure.former_seen_s() or self._learn
         half = list(latest)[len(latest) // 2:]
         self._depart_from(half[0].time)
-        self._level.set((0.0, line_through(stacked(half))[1], np.zeros(3), 0.0), self._level.noise)
+        self._level.rest_at(stacked(half))
         self._resumed, self._relearns_soon, self._seen_s = True, False, seen_s
         self._quiet.begin(half)
         self.n_relearnt += 1
         self.frozen = self._contested = self._steep = False
+        return True
 
     def _depart_from(self, begin: float) -> None:
         """The present level is the former one, as another is the background since `begin` [s]."""

@@ -119,6 +119,10 @@ class BackgroundLevel:
         """(3,) [T] background at `time` [s]; raises ValueError before it is ready."""
         return -self.departure(time, np.zeros(3))
 
+    def rest_at(self, blocks: Blocks) -> None:
+        """From now on the level is that of `blocks`, without a drift."""
+        self.set((0.0, line_through(blocks)[1], np.zeros(3), 0.0), self.noise)
+
     def at_all(self, times: FloatArray) -> FloatArray:
         """(k, 3) [T] background at `times` (k,) [s]; raises ValueError before it is ready."""
         if self.line is None:

@@ -9,7 +9,7 @@ from mag_tracking.calibration.background_level import BackgroundLevel
 from mag_tracking.calibration.blocks import Block, stacked
 from mag_tracking.calibration.drift import FormerLevel
 from mag_tracking.calibration.frequent_level import MORE
-from mag_tracking.calibration.level_change import Judge, level_change
+from mag_tracking.calibration.level_change import NO_CHANGE, Judge, level_change
 from mag_tracking.units import NS
 
 LEAST_RELEARN_S = 10.0
@@ -53,6 +53,7 @@ class Departure:
         """Drop all, also the former level."""
         self.freed_at: float | None = None
         self.former: FormerLevel | None = None
+        self._judge(NO_CHANGE)
         self.end()
 
     def end(self) -> None:
@@ -112,6 +113,6 @@ class Departure:
             blocks, len(latest), self._level.at_all(blocks.time), self._state['noise_std'],
             int(self._state['first_ns']) / NS))
         self.has_come = has_left is False
-        if has_left and self.former is None:
+        if has_left and self.former is None and self.freed_at is None:
             self.freed_at = latest[0].time
         return has_left

@@ -22,7 +22,7 @@ def noted(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool, most: int = MO
 
 
 def doubted_since(times: DoubtfulTimes, since_ns: int) -> DoubtfulTimes:
-    """The `times`, and all from `since_ns` on."""
+    """The `times`, with one open stretch from `since_ns` on in place of those after it."""
     earlier = tuple((begin, end) for begin, end in times if begin < since_ns)
     if earlier and (earlier[-1][1] is None or earlier[-1][1] >= since_ns):
         return (*earlier[:-1], (earlier[-1][0], None))
@@ -31,9 +31,15 @@ def doubted_since(times: DoubtfulTimes, since_ns: int) -> DoubtfulTimes:
 
 def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTimes]
            ) -> dict[str, DoubtfulTimes]:
-    """{sensor: all its stretches}; where two begin together, the latest knows better."""
-    return {name: tuple(sorted({**dict(earlier.get(name, ())), **dict(latest.get(name, ()))}.items()
-                               ))[-MOST:] for name in {**earlier, **latest}}
+    """{sensor: all its stretches}; where one of the latest begins no later than an earlier one and
+    ends after its begin, it takes that one's place.
+    """
+    out = dict(earlier)
+    for name, times in latest.items():
+        kept = [(begin, end) for begin, end in earlier.get(name, ())
+                if not any(b <= begin and (e is None or begin < e) for b, e in times)]
+        out[name] = tuple(sorted([*kept, *times]))[-MOST:]
+    return out
 
 
 def shifted(times: DoubtfulTimes, ns: int) -> DoubtfulTimes:

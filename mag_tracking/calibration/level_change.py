@@ -14,7 +14,7 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.blocks import Blocks
-from mag_tracking.calibration.growth import time_to_grow
+from mag_tracking.calibration.growth import growth_of
 
 SMALL = 0.3
 """A change is small at its beginning, and at its end, up to this share of its size."""
@@ -28,6 +28,14 @@ vehicles that start or brake with 1 to 4 m/s^2 were never beyond 0 on the wrong 
 
 LEAST_GROWTH = 3.5
 """Both ends can be seen of a change that is small up to so many times what is felt."""
+
+STALLS = 0.5
+"""The growth stalls where one quarter of it takes this share of its time, and a block, at least. By
+theory 0.3 to 0.54, where the size grows to 4 to 300 times as much, half of it within few blocks."""
+
+SLOW_START = 0.9
+"""At the near end the first half of the growth takes less than this share of the second one. By
+theory 0.7 to 0.24, at the far end 1.3 to 2.6."""
 
 LEAST_BLOCKS = 2.0
 """The far end takes so many blocks at least: what jumps neither comes nor leaves."""
@@ -77,14 +85,14 @@ def level_change(blocks: Blocks, n_steady: int, before: FloatArray, noise_std: F
     after = np.average(blocks.mean[-n_steady:], axis=0)
     off_before, off_after = (_size((blocks.mean - level) / noise_std) for level in (before, after))
     size = float(_size((after - before[-1]) / noise_std))
-    felt = FELT * float(np.sqrt(np.count_nonzero(~np.isnan(after)) / np.nanmedian(blocks.n)))
+    n_axes, n_readings = np.count_nonzero(~np.isnan(after)), np.median(blocks.n[blocks.n > 0.0])
+    felt = FELT * float(np.sqrt(n_axes / n_readings))
     end = int(np.flatnonzero(off_after > felt).max(initial=-1)) + 1
     since = origin + float(blocks.time[min(end, len(blocks.time) - 1)])
-    arrow = _arrow(off_before, off_after[::-1], felt, SMALL * size) or 0.0
     # While the latest blocks are on their way to a level, its end seems shorter than it is.
     is_there = not (off_after[-n_steady:] > felt).any()
-    return LevelChange(since, size, True if arrow > DECIDED
-                       else False if arrow < -DECIDED and is_there else None)
+    arrow = _arrow(blocks.time, off_before, off_after, felt, SMALL * size) if is_there else 0.0
+    return LevelChange(since, size, None if abs(arrow) < DECIDED else arrow > 0.0)
 
 
 def _size(off: FloatArray) -> FloatArray:
@@ -93,19 +101,38 @@ def _size(off: FloatArray) -> FloatArray:
     return size
 
 
-def _arrow(first: FloatArray, last: FloatArray, felt: float, small: float) -> float | None:
-    """How much more the far end is the last one: binary logarithm of both ratios.
+def _arrow(time: FloatArray, off_before: FloatArray, off_after: FloatArray, felt: float,
+           small: float) -> float:
+    """Binary logarithm by which the change is small for longer, and grows faster, at its last end.
 
-    `first` and `last` are the sizes of a change, block by block from either end.
+    0 where that cannot be told: the growth at one end stalls, as where a second vehicle comes up to
+    a first one; or neither end is that of a vehicle that starts or stops.
+
+    Parameters
+    ----------
+    time : (k,) array, s
+    off_before, off_after : (k,) array
+        Sizes of what is off either level, in deviations of one reading.
+    felt, small : float
+        From which size on an end is looked at, and up to which.
     """
-    if small < LEAST_GROWTH * felt:
-        return None
-    grows, fades = (time_to_grow(size, felt, small) for size in (first, last))
-    if grows is None or fades is None or max(sum(grows), sum(fades)) < LEAST_BLOCKS:
-        return None
-    longer = (sum(fades) + 0.5) / (sum(grows) + 0.5)
-    faster = (fades[0] + 0.25) / (fades[1] + 0.25) * (grows[1] + 0.25) / (grows[0] + 0.25)
-    return float(np.log2(longer * faster))
+    length = float(np.median(np.diff(time)))
+    first = growth_of(time, off_before, felt, small)
+    last = growth_of(-time[::-1], off_after[::-1], felt, small)
+    if small < LEAST_GROWTH * felt or first is None or last is None \
+            or max(first.whole, last.whole) < LEAST_BLOCKS * length \
+            or any(max(end.quarters) > STALLS * end.whole + length for end in (first, last)):
+        return 0.0
+    # It is not known where within a block an end is.
+    longer = (last.whole + 0.5 * length) / (first.whole + 0.5 * length)
+    rise, fall = ((end.early + 0.25 * length) / (end.late + 0.25 * length)
+                  for end in (first, last))
+    starts_slowly = (rise if longer > 1.0 else fall) < SLOW_START
+    return float(np.log2(longer * fall / rise)) if starts_slowly else 0.0
+
+
+NO_CHANGE = LevelChange(np.nan, 0.0, None)
+"""Takes the place of an earlier change that is over."""
 
 
 class SharedChanges:

@@ -73,6 +73,13 @@ class BlockRecorder(RunningBackground):
         is_near = not (np.abs(beginning - found.level) > NEAR * noise).any()
         return (MORE_NEAR if is_near else MORE) * n > found.n_blocks
 
+    def is_back(self, beginning: FloatArray, found: QuietLevel, since: float) -> bool:
+        """Whether blocks `since` a time [s] have the level of the beginning, (3,) [T], again, as
+        wide as the level that was `found`.
+        """
+        off = [np.abs(b.mean - beginning) > found.width for b in self._blocks if b.time >= since]
+        return sum(not o.any() for o in off) >= LEAST_BLOCKS
+
     @property
     def steps(self) -> FloatArray:
         """(3,) [T] steps of each raw axis; inf where they were not seen."""

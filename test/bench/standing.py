@@ -6,7 +6,7 @@ import sys
 import numpy as np
 
 from bench.two_simulators import count_over
-from support.standing import STOPS, first_after, goes_on, mended_after
+from support.standing import STOPS, first_after, goes_on, right_after
 
 RUNS = 20
 
@@ -15,7 +15,7 @@ def one(what, run):
     """What became of a run."""
     if what == 'stops':
         return goes_on(STOPS[run % len(STOPS)], run // len(STOPS))
-    return mended_after(run) if what == 'leaves' else first_after(run)
+    return right_after(run) if what == 'leaves' else first_after(run)
 
 
 def summary(what, found):

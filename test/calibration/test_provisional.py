@@ -5,7 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mag_tracking.calibration.doubtful_times import are_doubtful, merged, noted, shifted
+from mag_tracking.calibration.doubtful_times import (
+    are_doubtful,
+    doubted_since,
+    merged,
+    noted,
+    shifted,
+)
 from mag_tracking.settings import replace
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
@@ -207,5 +213,9 @@ def test_stretches_of_doubt():
         times = noted(times, 10 + k, k % 2 == 1)
     assert len(times) == 16 and times[-1] == (109, None)
     assert shifted(times, 5)[-1] == (114, None)
+    # What turns out to have begun earlier takes the place of what was open.
+    assert merged({'a': ((1, 2), (4, None))}, {'a': ((3, 6),)}) == {'a': ((1, 2), (3, 6))}
+    assert doubted_since(((1, 2), (4, 5), (6, None)), 3) == ((1, 2), (3, None))
+    assert doubted_since(((1, 4),), 3) == ((1, None),)
     assert merged({'a': ((1, 2), (4, None))}, {'a': ((4, 6),), 'b': ((3, None),)}) \
         == {'a': ((1, 2), (4, 6)), 'b': ((3, None),)}

@@ -87,6 +87,14 @@ def test_what_stood_there_for_most_of_the_recording_is_not_the_background():
     assert (np.abs(level.level - EARTH) < SIGMA).all() and level.begin > 33.0
 
 
+def test_a_level_of_the_beginning_that_comes_back_is_that_of_the_background():
+    """Whatever left in between: half of the field of what came stays for a while."""
+    def queue(t):
+        way = 0.5 * 2.0 * max(t - 30.0, 0.0)**2
+        return (2e-6 + 2e-6 / (1.0 + (way / 5.0)**2)**1.5) * (20.0 < t < 60.0)
+    assert found(queue, seconds=80.0).levels == {}
+
+
 @pytest.mark.parametrize('rates', [(50.0, 1.0), (2.0, 2.0), (100.0, 5.0)])
 @pytest.mark.parametrize('starts', [0.0, 7.0, 40.0])
 def test_sensors_that_are_slow_or_start_late_begin_quietly(rates, starts):

@@ -40,7 +40,7 @@ def goes_on(name, run):
     return any(times[0] < begin and times[-1] > end + 2.0 for times in spans.values())
 
 
-def mended_after(run):
+def right_after(run):
     """[s] from when a vehicle that stood there at the start is gone to when all backgrounds are
     right for good; infinite where they never are.
 

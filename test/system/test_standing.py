@@ -5,11 +5,11 @@
 
 import pytest
 
-from support.standing import STOPS, first_after, goes_on, mended_after
+from support.standing import STOPS, first_after, goes_on, right_after
 
 RUNS = 20
-MENDED_S = 3.0
-LEAST_MENDED = 18
+RIGHT_S = 3.0
+LEAST_RIGHT = 18
 """The aim is all 20: in the others it takes 3.0 and 3.3 s."""
 
 
@@ -20,9 +20,9 @@ def test_the_track_of_a_vehicle_that_stops_goes_on_and_leaves(runs):
 
 
 @pytest.mark.parametrize('runs, least', [
-    (2, 2), pytest.param(RUNS, LEAST_MENDED, marks=pytest.mark.study)])
+    (2, 2), pytest.param(RUNS, LEAST_RIGHT, marks=pytest.mark.study)])
 def test_the_background_is_right_soon_after_what_stood_there_has_left(runs, least):
-    assert sum(mended_after(run) <= MENDED_S for run in range(runs)) >= least
+    assert sum(right_after(run) <= RIGHT_S for run in range(runs)) >= least
 
 
 @pytest.mark.parametrize('runs', [1, pytest.param(RUNS, marks=pytest.mark.study)])

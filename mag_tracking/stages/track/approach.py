@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from mag_tracking.calibration.growth import time_to_grow
+from mag_tracking.calibration.growth import growth_of
 from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.records import FieldFrame
+from mag_tracking.units import NS
 
 FELT = 2.5
 """Root mean square of the whitened field where it is first felt."""
@@ -22,29 +23,36 @@ STEADY = 0.85
 HALF_FRAME = 0.5
 """It is not known when within a frame a size was reached."""
 
+MOST_FRAMES = 1000
+"""A target that is not loud by then is not judged."""
+
 
 class Approach:
     """The first frames of a track, until its field is loud."""
 
     def __init__(self) -> None:
+        self._times: list[float] = []
         self._sizes: list[float] = []
         self._is_open = True
 
     def add(self, frame: FieldFrame) -> bool:
-        """Whether the field has grown, with this frame, as that of nothing that comes from afar."""
+        """Whether the field has grown, with this frame, unlike that of a target from afar."""
         if not self._is_open:
             return False
+        self._times.append(frame.stamp_ns / NS)
         energy, n_axes = whitened_energy(frame.field, frame.covariance)
         # A frame that is quieter than its noise is not quieter than that.
         self._sizes.append(float(np.sqrt(max(energy.sum() / max(n_axes.sum(), 1), 1.0))))
-        if self._sizes[-1] <= LOUD * FELT:
-            return False
-        self._is_open = False
-        sizes = np.array(self._sizes)
-        times = time_to_grow(sizes, FELT, LOUD * FELT)
+        self._is_open = self._sizes[-1] <= LOUD * FELT and len(self._sizes) < MOST_FRAMES
+        return not self._is_open and self._is_doubtful()
+
+    def _is_doubtful(self) -> bool:
+        """Whether the frames tell that the target did not come from afar."""
+        time, sizes = np.array(self._times), np.array(self._sizes)
+        growth = growth_of(time, sizes, FELT, LOUD * FELT)
         # What falls meanwhile is of a target that has passed a first sensor.
         falls = sizes < STEADY * np.maximum.accumulate(sizes)
-        if times is None or (falls & (sizes > FELT)).any():
+        if growth is None or (falls & (sizes > FELT)).any():
             return False
-        early, late = times
-        return bool(np.log2((early + HALF_FRAME) / (late + HALF_FRAME)) < LEAST)
+        half = HALF_FRAME * float(np.median(np.diff(time)))
+        return bool(np.log2((growth.early + half) / (growth.late + half)) < LEAST)

@@ -95,7 +95,7 @@ class TrackEvidence:
         self._doubts.add(reason)
 
     def watch(self, frame: FieldFrame) -> None:
-        """Doubt the track where the field grows, up to this frame, as that of nothing from afar."""
+        """Doubt the track where the field has grown unlike that of a target from afar."""
         if self._approach.add(frame):
             self.doubt(doubts.NOT_SEEN_APPROACHING)
 
