@@ -136,7 +136,7 @@ class RunningBackground:
 
     @property
     def freed_at(self) -> float | None:
-        """[s] When what had stood there since the beginning was gone; None where nothing had."""
+        """[s] When a vehicle that stood there at first was gone; None where there was none."""
         return self._departure.freed_at
 
     @property
@@ -232,7 +232,7 @@ class RunningBackground:
             return
         self._contested = False
         if self._departure.was_steady:
-            self._provisional.clear()  # What stood there is gone, and its level with it.
+            self._provisional.clear()  # The vehicle is gone, and its level.
         if not np.isnan(self._seen_until):
             self._seen_s += block.time - self._seen_until
         self._seen_until = block.time
@@ -279,7 +279,7 @@ class RunningBackground:
             return False
         since_ns = int(self._state['first_ns']) + round(np.nan_to_num(self._since) * NS)
         self._change_to(latest)
-        # All that came before was measured against what stood there.
+        # All before was measured against the vehicle that stood there.
         self.doubtful_times = doubted_since(self.doubtful_times, since_ns)
         return True
 

@@ -17,8 +17,8 @@ LEAST_RELEARN_S = 10.0
 after this time at the earliest."""
 
 SOONER = 2.0 / 3.0
-"""What has left leaves a level behind that lasts for this share of the usual time; so does a former
-one that is back."""
+"""Where a vehicle has left, or a former level is back, the level has to last for this share of the
+usual time only."""
 
 MOST_JUDGED = 240
 """Blocks, a minute of the usual length, after which it is not judged any more whether something
@@ -38,7 +38,7 @@ class Departure:
     was_steady : bool
         Whether the sensor was at another level for long enough.
     freed_at : float or None, s
-        When what had stood there since the beginning was gone.
+        When a vehicle that had stood there since the beginning was gone.
     """
 
     def __init__(self, learn: float, relearn: float, state: Record, level: BackgroundLevel,
@@ -90,7 +90,7 @@ class Departure:
             return min(self._relearn or inf, max(self._learn, LEAST_RELEARN_S))
         if self.has_come:
             return self._relearn
-        # What stood there in the beginning may have left.
+        # A vehicle that stood there in the beginning may have left.
         return self._relearn and min(
             self._relearn, max(self._learn, LEAST_RELEARN_S, MORE * seen_s))
 
@@ -103,8 +103,8 @@ class Departure:
         return former.seen_s if former is not None and is_at_it else 0.0
 
     def has_left(self, latest: deque[Block]) -> bool | None:
-        """Whether what made the background left before the `latest` blocks, and not something
-        else came; None where it cannot be told.
+        """Whether a vehicle that was in the background has left before the `latest` blocks; False
+        where one has come, None where it cannot be told. The answer is remembered.
         """
         if self.has_come or not self._has_begin or len(self.blocks) > MOST_JUDGED:
             return False if self.has_come else None

@@ -1,4 +1,4 @@
-"""Whether what has changed the field for good has come or left, by the arrow of time.
+"""Whether a vehicle has come or left where the field has changed for good, by the arrow of time.
 
 A vehicle comes from afar, where its field grows with the cube of its distance, and stops as slowly
 as it brakes. One that stood there starts slowly, and its field fades with the cube of its distance.

@@ -34,7 +34,7 @@ class QuietStretch:
         return len(self._window)
 
     def clear(self) -> None:
-        """Without any block."""
+        """Drop all blocks."""
         self._window.clear()
         self.pending.clear()
 
