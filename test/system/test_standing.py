@@ -9,6 +9,9 @@ from support.standing import STOPS, first_after, goes_on, right_after
 
 RUNS = 20
 RIGHT_S = 3.0
+pytestmark = pytest.mark.timeout(1800)
+"""[s] Twenty runs of up to a minute and a half, one after the other, on a slow machine."""
+
 LEAST_RIGHT = 18
 """The aim is all 20: in the others it takes 3.0 and 3.3 s."""
 
