@@ -254,11 +254,12 @@ class RunningBackground:
         latest = departure.steady_end(SOONER)
         if latest is not None and self._relearn and self._judge_change(latest):
             return
-        latest = departure.steady_end()
-        # Two levels that were seen for equally long may both be the background.
-        self._contested |= latest is not None and since >= min(self._seen_s, self._relearn) \
-            or other is not None and other.seen_s >= min(self._seen_s, SEEN_S)
-        self._contested &= not departure.has_come
+        # Two levels that were seen for equally long may both be the background, unless a vehicle
+        # was seen to come to one of them.
+        self._contested = not departure.has_come and (
+            self._contested
+            or since >= min(self._seen_s, self._relearn) and departure.steady_end() is not None
+            or other is not None and other.seen_s >= min(self._seen_s, SEEN_S))
         if since < longest:
             return
         if self._adopt_if_steady(departure.blocks):
@@ -272,20 +273,22 @@ class RunningBackground:
 
     def _judge_change(self, latest: deque[Block]) -> bool:
         """Whether the level of the `latest` blocks is the background from now on."""
-        if self._departure.former_seen_s():
-            return self._change_to(latest)
+        former_seen_s = self._departure.former_seen_s()
+        if former_seen_s:
+            self._change_to(latest, former_seen_s)
+            return True
         is_given = self._given is not None and self._departure.former is None
         if not self._departure.has_left(latest) or is_given:
             return False
         since_ns = int(self._state['first_ns']) + round(np.nan_to_num(self._since) * NS)
-        self._change_to(latest)
+        self._change_to(latest, self._learn)
         # All before was measured against the vehicle that stood there.
         self.doubtful_times = doubted_since(self.doubtful_times, since_ns)
         return True
 
-    def _change_to(self, latest: deque[Block]) -> bool:
-        """Go on with the level of the `latest` blocks, without the tail of what has left."""
-        seen_s = self._departure.former_seen_s() or self._learn
+    def _change_to(self, latest: deque[Block], seen_s: float) -> None:
+        """Go on with the level of the `latest` blocks, which was seen for `seen_s` [s] in all."""
+        # The first half may have the tail of the vehicle that has left.
         half = list(latest)[len(latest) // 2:]
         self._depart_from(half[0].time)
         self._level.rest_at(stacked(half))
@@ -293,7 +296,6 @@ class RunningBackground:
         self._quiet.begin(half)
         self.n_relearnt += 1
         self.frozen = self._contested = self._steep = False
-        return True
 
     def _depart_from(self, begin: float) -> None:
         """The present level is the former one, as another is the background since `begin` [s]."""

@@ -34,7 +34,7 @@ class Departure:
     former : FormerLevel or None
         The level before the present one.
     has_come : bool
-        Whether something has come and stands now.
+        Whether a vehicle has come and stands now.
     was_steady : bool
         Whether the sensor was at another level for long enough.
     freed_at : float or None, s
@@ -103,8 +103,8 @@ class Departure:
         return former.seen_s if former is not None and is_at_it else 0.0
 
     def has_left(self, latest: deque[Block]) -> bool | None:
-        """Whether a vehicle that was in the background has left before the `latest` blocks; False
-        where one has come, None where it cannot be told. The answer is remembered.
+        """Whether a vehicle that was in the background has left before the `latest` blocks; False:
+        one has come; None: unknown. An answer is remembered.
         """
         if self.has_come or not self._has_begin or len(self.blocks) > MOST_JUDGED:
             return False if self.has_come else None

@@ -23,8 +23,8 @@ FELT = 3.0
 """Standard deviations of the mean of a block, on each axis: so much is felt of a change."""
 
 DECIDED = 0.8
-"""Of both ratios together, as a binary logarithm. 2 to 3 is usual, 0 where both ends are alike;
-vehicles that start or brake with 1 to 4 m/s^2 were never beyond 0 on the wrong side."""
+"""Binary logarithm of both ratios together from which on it is decided: it is 0 where both ends are
+alike."""
 
 LEAST_GROWTH = 3.5
 """Both ends can be seen of a change that is small up to so many times what is felt."""
@@ -55,14 +55,14 @@ class LevelChange:
     since: float
     """[s] When the later level began."""
     size: float
-    """Of the change, in standard deviations of one reading."""
+    """Size of the change, in standard deviations of one reading."""
     has_left: bool | None
-    """Whether what made the earlier level has left; False: what makes the later one has come;
-    None: it cannot be told."""
+    """Whether a vehicle that made the earlier level has left; False: one that makes the later level
+    has come; None: unknown."""
 
 
 Judge: TypeAlias = Callable[[LevelChange], bool | None]
-"""Whether what changed a sensor has left or come, from its `LevelChange`."""
+"""Takes the `LevelChange` of a sensor; whether a vehicle has left, as `has_left` there."""
 
 
 def level_change(blocks: Blocks, n_steady: int, before: FloatArray, noise_std: FloatArray,
@@ -105,8 +105,8 @@ def _arrow(time: FloatArray, off_before: FloatArray, off_after: FloatArray, felt
            small: float) -> float:
     """Binary logarithm by which the change is small for longer, and grows faster, at its last end.
 
-    0 where that cannot be told: the growth at one end stalls, as where a second vehicle comes up to
-    a first one; or neither end is that of a vehicle that starts or stops.
+    It is 0 where the growth at one end stalls, as it does when a second vehicle comes up to a first
+    one, and where neither end is that of a vehicle that starts or stops.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ class SharedChanges:
         self._latest: dict[int, LevelChange] = {}
 
     def judge(self, sensor: int, change: LevelChange) -> bool | None:
-        """Whether what changed a `sensor` has left or come, by this change and those of others.
+        """Whether a vehicle has left a `sensor`, by this change and those of the others.
 
         A change that is not clear is judged by the largest one at the same time.
         """

@@ -6,13 +6,13 @@ import sys
 import numpy as np
 
 from bench.two_simulators import count_over
-from support.standing import STOPS, first_after, goes_on, right_after
+from support.standing import SOON_S, STOPS, TRACKED_M, first_after, goes_on, right_after
 
 RUNS = 20
 
 
 def one(what, run):
-    """What became of a run."""
+    """Result of a run of `support.standing`."""
     if what == 'stops':
         return goes_on(STOPS[run % len(STOPS)], run // len(STOPS))
     return right_after(run) if what == 'leaves' else first_after(run)
@@ -25,11 +25,11 @@ def summary(what, found):
         return (f'stopped for 5, 20 and 60 s: in {sum(found)} of {n} runs the same track goes on '
                 'and leaves (aim 90 %)', sum(found) >= 0.9 * n)
     if what == 'leaves':
-        soon = sum(s <= 3.0 for s in found)
+        soon = sum(s <= SOON_S for s in found)
         return (f'stood there at the start: in {soon} of {n} runs the background is right within '
-                f'3 s of its leaving, at the median after {np.median(found):.1f} s (aim all)',
-                soon == n)
-    tracked = sum(error < 2.0 for error, *_ in found)
+                f'{SOON_S:g} s of its leaving, at the median after {np.median(found):.1f} s '
+                '(aim all)', soon == n)
+    tracked = sum(error < TRACKED_M for error, *_ in found)
     sure, wrong = (sum(f[k] for f in found) for k in (1, 2))
     return (f'the first vehicle after it, offline: tracked in {tracked} of {n} runs, {wrong} of '
             f'{sure} poses without a flag wrong (aim all, none)', tracked == n and not wrong)

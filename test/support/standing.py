@@ -1,4 +1,4 @@
-"""What becomes of vehicles that stand: the tracks of `support.situations`, and the backgrounds."""
+"""Vehicles that stand: their tracks in the worlds of `support.situations`, and the backgrounds."""
 
 import numpy as np
 
@@ -13,6 +13,10 @@ STANDING = 0.05
 """[m/s] Slower is standing."""
 RIGHT = 2.0
 """Standard deviations of one reading: a background that is off by more is not right."""
+SOON_S = 3.0
+"""[s] The background shall be right so soon after a vehicle that stood there has left."""
+TRACKED_M = 2.0
+"""[m] A vehicle is tracked where the median error is less."""
 PART = 50
 """Readings that are fed at once."""
 
@@ -70,7 +74,7 @@ def right_after(run):
 
 
 def first_after(run):
-    """Of the first vehicle that passes after one that stood there has left, replayed offline.
+    """Track of the first vehicle after one that stood there at the start has left, offline.
 
     Returns
     -------

@@ -31,7 +31,7 @@ class CalibrateSettings:
         120.0, 'After so long frozen on a steady level, that level becomes the background '
         '(a parked car); after 10 s, or four times as long as the background was seen, if that is '
         'earlier and nothing was seen to come; after two seconds where a vehicle that stood there '
-        'was seen to leave, if the sensor has 10 Hz or more. 0 = never.', 's', (0.0, 86400.0))
+        'was seen to leave, if the sensor has 20 Hz or more. 0 = never.', 's', (0.0, 86400.0))
     max_field: float = param(
         1e-3, 'A reading above this is rejected: gauss or microtesla published as tesla is the '
         'commonest fault. Near magnets millitesla are legitimate.', 'T', (1e-6, 10.0))

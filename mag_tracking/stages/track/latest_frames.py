@@ -10,7 +10,7 @@ from mag_tracking.units import NS
 
 
 class LatestFrames:
-    """What was added within a time before the latest frame."""
+    """Values added within a time before the latest frame."""
 
     def __init__(self, window_s: float) -> None:
         self._window_ns = round(window_s * NS)
