@@ -10,7 +10,7 @@ N_DOMAINS = 100
 
 
 class RosDomain:
-    """The first free domain from one on that depends on the process; free again when it ends."""
+    """The first free domain from one on that depends on the process; free again when closed."""
 
     def __init__(self):
         folder = Path(tempfile.gettempdir()) / f'mag_tracking_domains_{os.getuid()}'
@@ -24,3 +24,13 @@ class RosDomain:
             except BlockingIOError:
                 self._lock.close()
         raise RuntimeError(f'all {N_DOMAINS} ROS domains are in use by test runs')
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *raised):
+        self.close()
+
+    def close(self):
+        """Also done where the process ends."""
+        self._lock.close()
