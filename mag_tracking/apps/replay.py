@@ -193,6 +193,7 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
             'why_no_detection': why,
             'close_network': len(pipeline.network) > 1 and pipeline.network.is_close,
             'frames_too_long': too_long(pipeline.settings.align, pipeline.network),
+            'clocks_apart': pipeline.track.clocks_apart,
             'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks,
             'disturbances': disturbances}
 

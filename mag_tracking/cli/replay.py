@@ -179,6 +179,8 @@ def _print_limits(summary: dict[str, Any]) -> None:
               'are always ambiguous; speed and direction are those of the delay')
     if summary['frames_too_long']:
         print(f'  warning: {summary["frames_too_long"]}')
+    if summary['clocks_apart']:
+        print(f'  warning: {summary["clocks_apart"]}')
     lost = counts.get(f'tracks ended: {LOST}', 0)
     if lost:
         print(f'  warning: {lost} of the tracks lost their target: an orientation in the network '

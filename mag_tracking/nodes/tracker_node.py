@@ -132,6 +132,8 @@ class TrackerNode(StageNode):
             return
         self._publish_all(self._stage.feed(frame))
         self._stage.idle()
+        if self._stage.clocks_apart:
+            self.get_logger().warning(self._stage.clocks_apart, throttle_duration_sec=60.0)
 
     def _publish_all(self, records: list[TrackRecord]) -> None:
         """`Track`s, `SmoothedPose`s and `Disturbance`s, each where it belongs."""

@@ -18,6 +18,7 @@ INNOVATIONS = 'innovations'
 SENSORS_ROTATED = 'sensors_rotated'
 HEIGHT = 'height'
 FRAMES_TOO_LONG = 'frames_too_long'
+CLOCKS_APART = 'clocks_apart'
 
 MEANINGS = {
     ANOTHER_PLACE: 'another place is still possible',
@@ -39,6 +40,7 @@ MEANINGS = {
     SENSORS_ROTATED: 'the track needs sensors that are rotated by more than stated',
     HEIGHT: 'the iron is where no vehicle of the kind has it',
     FRAMES_TOO_LONG: 'the target moves too far within a frame',
+    CLOCKS_APART: 'the clocks of the sensors are apart: the pass, or those before, say so',
 }
 """{doubt: what it means}, in the order in which they are listed."""
 

@@ -146,6 +146,25 @@ class TrackEvidence:
             self.doubt(doubts.CONTRADICTION)
         return contradicted
 
+    def vehicle_doubts(self, nis: FloatArray, degrees_of_freedom: int, ratio: float) -> set[str]:
+        """Doubts about the pose of a vehicle by what was measured so far.
+
+        `nis` and `degrees_of_freedom` of the frame as for `contradicts`; `ratio` is that by which
+        a target has to explain the frames better.
+        """
+        found = set()
+        if self.explanation.fell_behind(ratio):
+            found.add(doubts.SOMETHING_ELSE)
+        if self.contradicts(nis, degrees_of_freedom):
+            found.add(doubts.CONTRADICTION)
+        if self.is_felt_by_one:
+            found.add(doubts.FELT_BY_ONE_SENSOR)
+        if self.innovations.excess > 1.0:
+            found.add(doubts.INNOVATIONS)
+        if self.innovations.fails:
+            self.doubt(doubts.INNOVATIONS)
+        return found
+
     def doubts_filter(self, gain: float, stamp_ns: int, window_s: float) -> bool:
         """Whether the filter fits the frames much better than the path of its hypothesis does.
 

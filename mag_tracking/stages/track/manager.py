@@ -16,6 +16,7 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.clock_evidence import ClockEvidence
 from mag_tracking.stages.track.disturbances import Disturbances
 from mag_tracking.stages.track.observation import MOST_TURNED
 from mag_tracking.stages.track.running_track import RunningTrack, TrackRecord
@@ -51,6 +52,7 @@ class TrackManager:
             If the settings contradict each other.
         """
         self.counts: Counter[str] = Counter()
+        self._clocks = ClockEvidence(len(network))
         self._network, self._settings = network, settings
         self._target = target_of(settings, network)
         self._tracks: list[RunningTrack] = []
@@ -105,6 +107,12 @@ class TrackManager:
                 if any(f.n_samples[j] and are_doubtful(times, f.stamp_ns) for f in frames)]
 
     @property
+    def clocks_apart(self) -> str:
+        """Which clocks seem apart, as a sentence; empty where none do."""
+        apart = self._clocks.apart
+        return '' if apart is None else apart.text(self._network.names)
+
+    @property
     def bank(self) -> FilterBank | None:
         """Hypotheses of the first running track; None where none runs."""
         return self._tracks[0].bank if self._tracks else None
@@ -114,6 +122,7 @@ class TrackManager:
         self.idle()
         if self._next_network is not None and not self._tracks:
             self._network, self._next_network = self._next_network, None
+            self._clocks = ClockEvidence(len(self._network))
         out, previous = self._end_at_gap(frame), self._last_ns
         self._last_ns = frame.stamp_ns
         self.counts['frames'] += 1
@@ -224,7 +233,7 @@ class TrackManager:
             self.counts[LOUDER_THAN_LOST] += 1
         self._tail_until, self._loudest = None, _energy(frame)
         track = RunningTrack(self._next_id, self._target, s, sensors, bank_filter, bank,
-                             self.counts)
+                             self.counts, self._clocks)
         self._next_id += 1
         self._tracks.append(track)
         track.doubt(self._doubtful_sensors(*recent, frame))

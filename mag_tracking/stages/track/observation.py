@@ -43,7 +43,8 @@ class Observation:
     def __init__(self, network: SensorNetwork, model: SourceModel, mounting_std: float,
                  error_time: float) -> None:
         """`mounting_std` [rad] is that of a sensor whose `orientation_std` is not known."""
-        self._positions: FloatArray = np.ascontiguousarray(network.positions, dtype=float)
+        self.positions: FloatArray = np.ascontiguousarray(network.positions, dtype=float)
+        """(n_sensors, 3) [m]"""
         self._R_sw = network.R_sw
         self._model = model
         self._error_time = error_time
@@ -64,7 +65,7 @@ class Observation:
 
     def own(self, x: FloatArray) -> FloatArray:
         """(..., n_sensors, n_own): the sensors' own states among those on the last axis of `x`."""
-        n = len(self._positions)
+        n = len(self.positions)
         own = x[..., self.n_target:x.shape[-1] - 3 * n]
         return own.reshape(*own.shape[:-1], n, self.n_own)
 
@@ -74,7 +75,7 @@ class Observation:
 
     def angle_covariances(self, P: FloatArray) -> FloatArray:
         """(n_sensors, 3, 3) [rad^2] of the mounting angles, among `P` (n_x, n_x); or (0, 3, 3)."""
-        first = self.n_target + self.n_own * np.arange(len(self._positions))
+        first = self.n_target + self.n_own * np.arange(len(self.positions))
         rows = first[:, None] + np.arange(3)
         return P[rows[:, :, None], rows[:, None, :]] if self._n_angles else np.zeros((0, 3, 3))
 
@@ -86,14 +87,9 @@ class Observation:
 
     def nearest(self, x: FloatArray) -> FloatArray:
         """(n_hyp,) [m] from the positions of the states `x` (n_hyp, n_x) to the nearest sensor."""
-        away = np.linalg.norm(x[:, None, :3] - self._positions, axis=2)
+        away = np.linalg.norm(x[:, None, :3] - self.positions, axis=2)
         nearest: FloatArray = away.min(axis=1)
         return nearest
-
-    def second_nearest(self, x: FloatArray) -> float:
-        """[m] from the position of a state `x` (n_x,) to the second nearest sensor; inf for one."""
-        away = np.sort(np.linalg.norm(x[:3] - self._positions, axis=1))
-        return float(away[1]) if len(away) > 1 else np.inf
 
     def drift(self, dt: float, background_density: float) -> tuple[FloatArray, FloatArray]:
         """What becomes of the sensors' states over `dt` seconds.
@@ -103,7 +99,7 @@ class Observation:
         decay, variance : (n_own + 3) n_sensors
             They are multiplied by the one, and the other is added.
         """
-        n = len(self._positions)
+        n = len(self.positions)
         fading = math.exp(-abs(dt) / self._error_time) if self._error_time else 1.0
         decay, variance = np.ones((self.n_own + 3) * n), np.zeros((self.n_own + 3) * n)
         decay[:-3 * n].reshape(n, self.n_own)[:, self._n_angles:] = fading
@@ -114,9 +110,9 @@ class Observation:
     def target_fields(self, x: FloatArray, time_offset: FloatArray
                       ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Field of the target alone, at each sensor's own time; see `sensor_fields`."""
-        n_hyp, n, n_t = len(x), len(self._positions), self.n_target
+        n_hyp, n, n_t = len(x), len(self.positions), self.n_target
         if not time_offset.any():
-            return sensor_fields(self._positions, self._R_sw, *self._model.dipoles(x[:, :n_t]))
+            return sensor_fields(self.positions, self._R_sw, *self._model.dipoles(x[:, :n_t]))
         h, H = np.empty((n_hyp, n, 3)), np.empty((n_hyp, n, 3, n_t))
         gradient = np.empty((n_hyp, n))
         steps = np.round(time_offset / SAME_TIME_S)
@@ -124,7 +120,7 @@ class Observation:
             j = np.flatnonzero(steps == step)
             moved, F, _ = self._model.propagate(x[:, :n_t], step * SAME_TIME_S)
             h[:, j], H_moved, gradient[:, j] = sensor_fields(
-                self._positions[j], self._R_sw[j], *self._model.dipoles(moved))
+                self.positions[j], self._R_sw[j], *self._model.dipoles(moved))
             H[:, j] = H_moved @ (F if F.ndim == 2 else F[:, None])
         return h, H, gradient
 
@@ -169,7 +165,7 @@ class Observation:
 
         NaN where a dipole is on a sensor.
         """
-        h, _, gradient = self.target_fields(x[None], np.zeros(len(self._positions)))
+        h, _, gradient = self.target_fields(x[None], np.zeros(len(self.positions)))
         variance: FloatArray = _model_error(h, gradient, np.array([near_field_length]),
                                             field_error)[0]
         return variance

@@ -16,6 +16,7 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.bank_filter import BankFilter, NoTarget
+from mag_tracking.stages.track.clock_evidence import ClockEvidence
 from mag_tracking.stages.track.disturbances import Unexplained
 from mag_tracking.stages.track.evidence import LEAST_WATCHED, TrackEvidence
 from mag_tracking.stages.track.plausibility import implausible
@@ -25,6 +26,7 @@ from mag_tracking.stages.track.published_pose import (
     smoothed_pose,
 )
 from mag_tracking.stages.track.relinearisation import Relinearisation
+from mag_tracking.stages.track.second_opinion import SecondOpinion
 from mag_tracking.stages.track.sensor_rejection import SensorRejection
 from mag_tracking.stages.track.sensor_selection import AHEAD_S, SensorSubset, from_nearest, hand_on
 from mag_tracking.stages.track.settings import TrackSettings
@@ -51,8 +53,9 @@ class RunningTrack:
     """
 
     def __init__(self, id: int, target: Target, settings: TrackSettings, sensors: SensorSubset,
-                 bank_filter: BankFilter, bank: FilterBank, counts: 'Counter[str]') -> None:
-        self.id, self.bank, self.counts = id, bank, counts
+                 bank_filter: BankFilter, bank: FilterBank, counts: 'Counter[str]',
+                 clocks: ClockEvidence) -> None:
+        self.id, self.bank, self.counts, self._clocks = id, bank, counts, clocks
         self.ended: str | None = None
         self.is_lost = False
         self._target, self._settings = target, settings
@@ -78,6 +81,7 @@ class RunningTrack:
         self._no_target = NoTarget(len(sensors.network), self._settings.background_std)
         self._something_else = SomethingElse(sensors.network, self._settings.background_std,
                                              is_handover)
+        self._opinion = SecondOpinion(sensors.network)
 
     def configure(self, settings: TrackSettings) -> None:
         """Apply new values of the live settings."""
@@ -241,7 +245,7 @@ class RunningTrack:
 
     def _is_doubted(self) -> bool:
         """Whether all of the track, as it stands, may be wrong."""
-        return self._evidence.doubted \
+        return self._evidence.doubted or self._opinion.is_doubtful \
             or not self._evidence.explanation.leads(self._settings.explained_ratio) \
             or not self._target.starts_anywhere and self._evidence.is_felt_by_one
 
@@ -256,19 +260,11 @@ class RunningTrack:
         # A magnet may rest: it is then as smooth as anything, and is where it was.
         if self._target.starts_anywhere:
             return found
-        if evidence.explanation.fell_behind(settings.explained_ratio):
-            found.add(doubts.SOMETHING_ELSE)
-        n_axes = np.count_nonzero(~np.isnan(frame.field), axis=1)
-        if evidence.contradicts(bank.nis[best], int(n_axes.sum())):
-            found.add(doubts.CONTRADICTION)
+        found |= evidence.vehicle_doubts(
+            bank.nis[best], int(np.count_nonzero(~np.isnan(frame.field))), settings.explained_ratio)
         if self._overfits(best, frame.stamp_ns):
             found.add(doubts.OVERFIT)
-        if evidence.is_felt_by_one:
-            found.add(doubts.FELT_BY_ONE_SENSOR)
-        if evidence.innovations.excess > 1.0:
-            found.add(doubts.INNOVATIONS)
-        if evidence.innovations.fails:
-            evidence.doubt(doubts.INNOVATIONS)
+        found |= self._opinion.doubts(self._clocks.apart_s)
         implausibilities = implausible(
             self._filter.observation, bank.x[best], int(bank.kind[best]), settings.vehicle,
             np.deg2rad(settings.mounting_std_deg), dt)
@@ -287,6 +283,8 @@ class RunningTrack:
             self._evidence.explanation.add(evidence - something_else, frame.stamp_ns,
                                            self._settings.explained_ratio)
         self._evidence.take(frame, self._sensors.rows, self.bank.nis[best])
+        if self._settings.second_opinion and not self._target.starts_anywhere:
+            self._opinion.add(frame, self.bank.x[best], dt)
 
     def _overfits(self, best: int, stamp_ns: int) -> bool:
         """Whether the filter fits the frames much better than the path of hypothesis `best`."""
@@ -325,6 +323,7 @@ class RunningTrack:
     def end(self, reason: str) -> list[TrackRecord]:
         """End the track: its last record again, marked as ended, then the smoothed poses."""
         self.ended = reason
+        self._opinion.conclude(self._clocks, self._sensors.rows)
         self.counts[f'tracks ended: {reason}'] += 1
         return [] if self._last is None else [replace(self._last, ended=True),
                                               *self._smoothed_at_the_end()]

@@ -67,6 +67,10 @@ class TrackSettings:
         'number of sensors; with frames of 100 Hz rather choose 0.5.', 's', (0.0, 60.0))
     relinearise_most: int = param(
         20, 'For how many hypotheses it is done at most.', '', (1, 100000))
+    second_opinion: bool = param(
+        True, 'Once a vehicle has passed, and about four times after that, the whole pass is '
+        'fitted as one along a path that cannot bend (10 to 50 ms each): what it says of the '
+        'clocks of the sensors, and of very fast vehicles, no filter sees.', live=True)
     lookback_s: float = param(
         1.0, 'A track begins so long before its detection, with the frames kept since: what is '
         'too weak to detect still tells where the target came from.', 's', (0.0, 60.0))
