@@ -81,9 +81,11 @@ class ClockEvidence:
     def add(self, found: RigidPass, rows: IntArray) -> None:
         """Count a pass of the sensors `rows`.
 
-        One that no path explains says nothing, nor one that is too slow to depend on clocks.
+        One that no straight path explains says nothing, nor one that is too slow to depend on
+        clocks.
         """
-        if not found.is_explained or found.speed * LONGEST_OFFSET < LEAST_WAY:
+        is_slow = found.speed * LONGEST_OFFSET < LEAST_WAY
+        if is_slow or not (found.is_explained and found.is_straight):
             return
         self._information *= KEPT
         self._pull *= KEPT

@@ -19,6 +19,7 @@ SENSORS_ROTATED = 'sensors_rotated'
 HEIGHT = 'height'
 FRAMES_TOO_LONG = 'frames_too_long'
 CLOCKS_APART = 'clocks_apart'
+NO_STEADY_PATH = 'no_steady_path'
 
 MEANINGS = {
     ANOTHER_PLACE: 'another place is still possible',
@@ -40,7 +41,8 @@ MEANINGS = {
     SENSORS_ROTATED: 'the track needs sensors that are rotated by more than stated',
     HEIGHT: 'the iron is where no vehicle of the kind has it',
     FRAMES_TOO_LONG: 'the target moves too far within a frame',
-    CLOCKS_APART: 'the clocks of the sensors are apart: the pass, or those before, say so',
+    CLOCKS_APART: 'the clocks of the sensors seem to be apart, by this pass or those before',
+    NO_STEADY_PATH: 'no vehicle that accelerates and turns steadily explains the pass as a whole',
 }
 """{doubt: what it means}, in the order in which they are listed."""
 

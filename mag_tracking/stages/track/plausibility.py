@@ -43,17 +43,19 @@ def implausible(observation: Observation, x: FloatArray, kind: int, settings: Ve
     off = abs(float(x[2]) - settings.heights[kind])
     if off > -ndtri(LEVEL / 2.0) * settings.height_stds[kind]:
         found.add(doubts.HEIGHT)
-    if moves_too_far(x[:3], np.hypot(x[3], x[4]) * dt, observation.positions):
+    if moves_too_far(x[:3], x[3:6], dt, observation.positions):
         found.add(doubts.FRAMES_TOO_LONG)
     return found
 
 
-def moves_too_far(position: FloatArray, way: float, positions: FloatArray) -> bool:
-    """Whether a target at a position (3,) moves too far within a frame, by a `way` [m].
+def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positions: FloatArray
+                  ) -> bool:
+    """Whether a target (3,) moves too far within a frame of `dt` [s].
 
     `positions` (n, 3) are those of the sensors.
     """
     away = np.sort(np.linalg.norm(position - positions, axis=1))
+    way = float(np.hypot(velocity[0], velocity[1])) * dt
     return len(away) > 1 and bool(way > LONGEST_WAY * away[1])
 
 

@@ -1,14 +1,15 @@
-"""A vehicle's whole pass at once, along a path that cannot bend: does it need other clocks?
+"""A vehicle's whole pass at once, along a path that bends only steadily.
 
-A filter bends the path of its target until it fits, with what sensors say whose clocks are apart,
-too. A path at constant speed cannot: the frames of a pass tell within milliseconds by how much the
-clocks differ, as long as the vehicle went straight on.
+A filter bends the path of its target until it fits whatever the sensors say: clocks that are apart,
+a clipped field, a second vehicle. A path of steady acceleration and turning cannot. If it does not
+explain the frames of a pass, something else than a vehicle past good sensors made them; if a
+straight one does as soon as the clocks are free, these are apart.
 
 Source: TSP14 sections III.A and V for the fit of a row of dipoles at constant velocity.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,17 +18,23 @@ from scipy.special import chdtri
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.least_squares import SeparableProblem, refine
 from mag_tracking.network import SensorNetwork
-from mag_tracking.physics.arc_pass import N_PATH, ArcPass
+from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, PATH, SteadyPass
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import known_covariance
 from mag_tracking.units import NS
 
-N_DIPOLES = 3
-LENGTH = 3.0
+SHORT, LONG = 3, 5
+"""Dipoles of the rows: the clocks are compared by the path of a short one, which cannot make up
+for them; whether any vehicle explains the pass is asked of a long one."""
+
+LENGTH, LONG_LENGTH = 3.0, 8.0
 """[m] Between the first and the last of them, where the search starts."""
 
 MODEL_ERROR = 0.04
-"""Share of the field that such a row leaves out of a car's."""
+"""Share of the field that a row leaves out of a car's; it counts as noise."""
+
+REACH = 0.2
+"""[m] Over the distance it is the share that it leaves out near a sensor, if that is more."""
 
 MOST_SENSORS = 4
 """Those with the strongest fields are compared."""
@@ -42,11 +49,11 @@ N_STEPS, TOLERANCE = 15, 1e-3
 """Of the search: steps, and the share of the cost by which the last one improves it."""
 
 WELL = 1.3
-"""Reduced chi-square up to which a path explains a pass: those of cars are 0.5 to 1.1 where the
-model error above is counted as noise, those of sensors with a wrong sign 2 to 10."""
+"""Reduced chi-square up to which a path explains a pass."""
 
-CHANCE = 1e-5
-"""Probability that clocks which agree make the fit better by as much."""
+CHANCE, BENDS = 1e-5, 1e-3
+"""Probability that clocks which agree make the fit of a straight path better by as much, and that
+of a path that bends."""
 
 LEAST_WAY = 1.0
 """[m] Clocks that move the target by less do no harm; two of `MIDDLE_STD`."""
@@ -54,25 +61,28 @@ LEAST_WAY = 1.0
 MIDDLE_STD = 0.5
 """[m] The iron of a vehicle has another middle for each sensor."""
 
-_STRAIGHT = np.arange(N_PATH - 1)
-_ARC = np.arange(N_PATH)
+_STRAIGHT = np.arange(N_STRAIGHT)
+_BENT = np.arange(N_PATH)
 
 
 @dataclass(frozen=True)
 class RigidPass:
-    """What the frames of a pass say of a vehicle that keeps its speed.
+    """What the frames of a pass say of a vehicle on a steady path.
 
     The costs are sums of squared whitened residuals.
     """
 
     straight: float
     """Cost of a straight path."""
-    arc: float
-    """Of an arc."""
+    bent: float
+    """Of one that bends."""
     apart: float
-    """Of a straight path, the clocks being apart."""
+    """Of a straight path at constant speed, the clocks being apart."""
     freedom: int
     """Degrees of freedom of the last."""
+    misfit: float
+    """Reduced chi-square of a long row on a path that bends; about one where that explains the
+    pass."""
     offset: FloatArray
     """(n_sensors,) [s] how far each clock is ahead of the one of the sensor with the strongest
     field, which is 0; NaN = not compared."""
@@ -84,9 +94,22 @@ class RigidPass:
     """(3,) [m/s]"""
 
     @property
+    def n_clocks(self) -> int:
+        """That were compared to the one of the sensor with the strongest field."""
+        return int(np.count_nonzero(~np.isnan(self.offset))) - 1
+
+    @property
     def is_explained(self) -> bool:
         """Whether a straight path explains the pass, if need be with clocks that are apart."""
         return self.apart <= WELL * self.freedom
+
+    def closest(self, positions: FloatArray) -> FloatArray:
+        """(3,) [m] where the path comes nearest to one of the sensors at `positions` (n, 3)."""
+        away = positions - self.position
+        square = max(float(self.velocity @ self.velocity), 1e-12)
+        places = self.position + (away @ self.velocity / square)[:, None] * self.velocity
+        nearest: FloatArray = places[np.argmin(np.linalg.norm(places - positions, axis=1))]
+        return nearest
 
     @cached_property
     def speed(self) -> float:
@@ -110,9 +133,14 @@ class RigidPass:
         offset = float(np.nanmax(np.abs(self.offset)))
         if not self.is_explained or offset > LONGEST_OFFSET or offset * self.speed < LEAST_WAY:
             return False
-        gain = (min(self.straight, self.arc) - self.apart) / self.widening
-        n_clocks = int(np.count_nonzero(~np.isnan(self.offset))) - 1
-        return bool(gain > chdtri(n_clocks, CHANCE))
+        gains = np.array([self.straight - self.apart, self.bent - self.apart]) / self.widening
+        return bool((gains > chdtri(self.n_clocks, [CHANCE, BENDS])).all())
+
+    @property
+    def is_straight(self) -> bool:
+        """Whether the path need not bend, nor the vehicle accelerate."""
+        gain = (min(self.straight, self.apart) - self.bent) / self.widening
+        return bool(gain <= chdtri(N_PATH - N_STRAIGHT, BENDS))
 
 
 def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_ns: int,
@@ -132,25 +160,29 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
     """
     data = _Samples.of(network, frames, stamp_ns)
     n_clocks = data.n_clocks
-    if n_clocks < 1 or data.n_values <= N_PATH + n_clocks + 3 * (N_DIPOLES + MOST_SENSORS):
+    if n_clocks < 1 or data.n_free(LONG) <= N_PATH:
         return None
     first = np.stack([starts[:, 0], starts[:, 1], starts[:, 2],
                       np.hypot(starts[:, 3], starts[:, 4]),
                       np.arctan2(starts[:, 4], starts[:, 3]), starts[:, 5],
                       np.full(len(starts), LENGTH)], axis=1)
-    straight, cost, _ = data.fit(_STRAIGHT, first)
-    _, cost_of_arc, _ = data.fit(_ARC, straight[None, _ARC])
+    straight, cost, _ = data.fit(SHORT, _STRAIGHT, first)
+    path, bent, _ = data.fit(SHORT, _BENT, straight[None, _BENT])
+    longer = path.copy()
+    longer[PATH.index('length')] = LONG_LENGTH
+    _, of_long, _ = data.near(path).fit(LONG, _BENT, np.array([straight, path, longer])[:, _BENT])
     free = np.concatenate([_STRAIGHT, N_PATH + np.arange(n_clocks)])
     with_clocks = np.repeat(straight[None, free], len(FIRST_OFFSETS), axis=0)
-    with_clocks[:, len(_STRAIGHT):] = np.array(FIRST_OFFSETS)[:, None]
-    path, apart, P = data.fit(free, with_clocks)
-    if not np.isfinite([cost, cost_of_arc, apart]).all():
+    with_clocks[:, N_STRAIGHT:] = np.array(FIRST_OFFSETS)[:, None]
+    path, apart, P = data.fit(SHORT, free, with_clocks)
+    if not np.isfinite([cost, bent, apart, of_long]).all():
         return None
     offset, std = np.full(len(network), np.nan), np.full(len(network), np.nan)
     offset[data.compared] = np.append(0.0, path[N_PATH:])
-    std[data.compared] = np.append(0.0, np.sqrt(np.diagonal(P)[len(_STRAIGHT):]))
+    std[data.compared] = np.append(0.0, np.sqrt(np.diagonal(P)[N_STRAIGHT:]))
     c, s = np.cos(path[4]), np.sin(path[4])
-    return RigidPass(cost, cost_of_arc, apart, data.n_free - len(free), offset, std, path[:3],
+    return RigidPass(cost, bent, apart, data.n_free(SHORT) - len(free),
+                     of_long / (data.n_free(LONG) - N_PATH), offset, std, path[:3],
                      np.array([c * path[3], s * path[3], path[5]]))
 
 
@@ -167,7 +199,7 @@ class _Samples:
     M: FloatArray
     """(n, 3, 3) world to sensor, and whitening."""
     clock: IntArray
-    """(n,) see `ArcPass`."""
+    """(n,) see `SteadyPass`."""
     y: FloatArray
     """(3 n,) whitened fields; 0 on missing axes."""
     backgrounds: FloatArray
@@ -180,10 +212,22 @@ class _Samples:
         """Besides that of the sensor with the strongest field."""
         return len(self.compared) - 1
 
-    @property
-    def n_free(self) -> int:
+    def n_free(self, n_dipoles: int) -> int:
         """Numbers less backgrounds and moments."""
-        return self.n_values - self.backgrounds.shape[1] - 3 * N_DIPOLES
+        return self.n_values - self.backgrounds.shape[1] - 3 * n_dipoles
+
+    def near(self, path: FloatArray) -> '_Samples':
+        """The same with the model error of a vehicle near the sensors, on a path (10,)."""
+        c, s = np.cos(path[4]), np.sin(path[4])
+        way = self.t[:, None] * np.array([c * path[3], s * path[3], path[5]])
+        share = np.maximum(MODEL_ERROR, REACH / np.linalg.norm(
+            self.positions - path[:3] - way, axis=1))
+        # In units of the noise that the model error is counted in already.
+        signal = np.square(np.linalg.norm(self.y.reshape(-1, 3), axis=1))
+        weight = 1.0 / np.sqrt(1.0 + (share**2 - MODEL_ERROR**2) * signal)
+        rows = np.repeat(weight, 3)
+        return replace(self, M=self.M * weight[:, None, None], y=self.y * rows,
+                       backgrounds=self.backgrounds * rows[:, None])
 
     @classmethod
     def of(cls, network: SensorNetwork, frames: Sequence[FieldFrame], stamp_ns: int
@@ -199,10 +243,10 @@ class _Samples:
         t = np.array([(f.stamp_ns - stamp_ns) / NS + f.time_offset[compared] for f in frames])
         y = field[:, compared].reshape(-1, 3)
         there = ~np.isnan(y)
+        of_sensor = np.tile(np.arange(n), len(frames))
         error = MODEL_ERROR**2 * energy[:, compared].ravel()
         W = np.linalg.inv(np.linalg.cholesky(C + error[:, None, None] * np.eye(3)))
         W = W * there[:, :, None] * there[:, None, :]
-        of_sensor = np.tile(np.arange(n), len(frames))
         level = np.zeros((len(y), 3, n, 3))
         level[np.arange(len(y)), :, of_sensor] = W
         columns = level.reshape(3 * len(y), -1)
@@ -211,13 +255,14 @@ class _Samples:
                    np.einsum('nij,nj->ni', W, np.nan_to_num(y)).ravel(),
                    columns[:, columns.any(axis=0)], int(np.count_nonzero(there)))
 
-    def fit(self, free: IntArray, starts: FloatArray) -> tuple[FloatArray, float, FloatArray]:
+    def fit(self, n_dipoles: int, free: IntArray, starts: FloatArray
+            ) -> tuple[FloatArray, float, FloatArray]:
         """(path and clocks, cost, covariance of those that are free) of the best minimum.
 
-        `free` as for `ArcPass`; `starts` (n, n_free).
+        `free` as for `SteadyPass`; `starts` (n, n_free).
         """
-        model = ArcPass(self.t, self.positions, self.M, self.clock, free,
-                        np.zeros(N_PATH + self.n_clocks), N_DIPOLES)
+        model = SteadyPass(self.t, self.positions, self.M, self.clock, free,
+                           np.zeros(N_PATH + self.n_clocks), n_dipoles)
         problem = SeparableProblem(model, self.y, self.backgrounds)
         theta, cost, P, _ = refine(problem.residual_and_jacobian, starts, N_STEPS, TOLERANCE)
         k = int(np.argmin(cost))

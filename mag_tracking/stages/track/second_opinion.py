@@ -30,6 +30,17 @@ MOST_FITTED = 64
 """Of more frames, every other one."""
 
 
+MISFIT = 1.5
+"""A pass is of no vehicle on a steady path where the reduced chi-square is larger: the one of cars
+and trucks past good sensors is 0.5 to 1.2."""
+
+STEADY_S = 1.5
+"""[s] After the strongest field: until then a vehicle goes on as steadily as it passed."""
+
+MISFIT_LATER = 8.0
+"""What it may then do makes it as large as 5, not larger."""
+
+
 class _Seen(NamedTuple):
     """A frame of the track."""
 
@@ -56,6 +67,7 @@ class SecondOpinion:
         # When the field was strongest, and how long after it the next opinion is due.
         self._peak_ns, self._due_s = -1, FIRST_S
         self._dt = np.inf
+        self._is_misfit = False
 
     def add(self, frame: FieldFrame, state: FloatArray, dt: float) -> None:
         """Take a frame, `dt` [s] after the one before; `state` (n_x,) of the best hypothesis."""
@@ -102,15 +114,22 @@ class SecondOpinion:
         frames = [seen.frame for seen in self._frames]
         self.latest = fit_rigid_pass(self._network, frames[::-(-len(frames) // MOST_FITTED)],
                                      self._peak_ns, np.array([back, peak.state]))
+        if self.latest is not None and since <= STEADY_S:
+            self._is_misfit = self.latest.misfit > MISFIT
 
     def _of_pass(self) -> set[str]:
         """Doubts by the latest opinion."""
         found: set[str] = set()
-        if self.latest is None or not self.latest.is_explained:
+        latest = self.latest
+        if latest is None:
             return found
-        if self.latest.needs_clocks_apart:
+        if self._is_misfit or latest.misfit > MISFIT_LATER:
+            found.add(doubts.NO_STEADY_PATH)
+        if not latest.is_explained:
+            return found
+        if latest.needs_clocks_apart:
             found.add(doubts.CLOCKS_APART)
-        if moves_too_far(self.latest.position, self.latest.speed * self._dt,
+        if moves_too_far(latest.closest(self._network.positions), latest.velocity, self._dt,
                          self._network.positions):
             found.add(doubts.FRAMES_TOO_LONG)
         return found

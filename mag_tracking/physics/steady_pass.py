@@ -1,7 +1,8 @@
-"""Passes at constant speed along an arc, seen by sensors whose clocks may be apart.
+"""Passes along a path that bends steadily, seen by sensors whose clocks may be apart.
 
-Unlike `passes.RowPass` the path may turn, and the row of dipoles turns with it. The moments enter
-linearly, the path and the clocks do not (`inference.least_squares` fits such models).
+Unlike `passes.RowPass` the vehicle may accelerate and turn, and the row of dipoles turns with it.
+The moments enter linearly, the path and the clocks do not (`inference.least_squares` fits such
+models).
 """
 
 from dataclasses import dataclass, field
@@ -12,42 +13,56 @@ from numba import njit
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.physics.dipole import field_and_jacobians
 
-PATH = ('x', 'y', 'z', 'speed', 'heading', 'climb', 'length', 'turn_rate')
-"""[m], [m/s], [rad], [m/s], [m], [rad/s]: of the row's middle at time zero."""
+PATH = ('x', 'y', 'z', 'speed', 'heading', 'climb', 'length', 'acceleration', 'turn_rate',
+        'turn_acceleration')
+"""[m], [m/s], [rad], [m/s], [m], [m/s^2], [rad/s], [rad/s^2]: of the row's middle at time zero."""
 
 N_PATH = len(PATH)
+N_STRAIGHT = PATH.index('acceleration')
+"""Those before it are of a straight path at constant speed."""
 
-_STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1e-4, 1e-3, 1e-3, 1e-4])
+_STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1e-4, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4])
 _CLOCK_STEP = 1e-4
 """[s] Steps of the numerical derivatives: much shorter than what a field changes on, and long
 enough for rounding."""
 
-_STRAIGHT = 1e-6
-"""[rad] An arc that turns by less than this is a straight line."""
+_NODES, _WEIGHTS = (np.ascontiguousarray(a) for a in np.polynomial.legendre.leggauss(6))
+"""A path that bends is integrated with these: right to a micrometre for turns of 90 degrees."""
 
 
 @njit('void(float64[:,::1], float64[::1], float64[:,::1], float64[::1], int64[::1], '
-      'float64[:,:,::1], float64[:,:,::1])', cache=True, error_model='numpy')
-def _arc_basis(theta: FloatArray, places: FloatArray, positions: FloatArray, t: FloatArray,
-               clock: IntArray, M: FloatArray, A: FloatArray) -> None:
+      'float64[:,:,::1], float64[::1], float64[::1], float64[:,:,::1])', cache=True,
+      error_model='numpy')
+def _basis(theta: FloatArray, places: FloatArray, positions: FloatArray, t: FloatArray,
+           clock: IntArray, M: FloatArray, nodes: FloatArray, weights: FloatArray,
+           A: FloatArray) -> None:
     """Fields of unit moments: A (n, 3 n_samples, 3 d), each sample's turned by its M."""
+    n_path = 10
     for p in range(theta.shape[0]):
-        v, climb, length, rate = theta[p, 3], theta[p, 5], theta[p, 6], theta[p, 7]
-        c, s = np.cos(theta[p, 4]), np.sin(theta[p, 4])
+        x0, y0, z0, v, heading = (theta[p, 0], theta[p, 1], theta[p, 2], theta[p, 3],
+                                  theta[p, 4])
+        climb, length, gain, rate, more = (theta[p, 5], theta[p, 6], theta[p, 7], theta[p, 8],
+                                           theta[p, 9])
         for k in range(t.shape[0]):
             time = t[k]
             if clock[k] >= 0:
                 # A clock that is ahead says too late a time.
-                time -= theta[p, 8 + clock[k]]
-            angle = rate * time
-            if abs(angle) < _STRAIGHT:
-                ahead, aside = v * time, 0.5 * v * time * angle
+                time -= theta[p, n_path + clock[k]]
+            x, y = positions[k, 0] - x0, positions[k, 1] - y0
+            if rate == 0.0 and more == 0.0:
+                way = (v + 0.5 * gain * time) * time
+                x -= way * np.cos(heading)
+                y -= way * np.sin(heading)
             else:
-                ahead, aside = v / rate * np.sin(angle), v / rate * (1.0 - np.cos(angle))
-            x = positions[k, 0] - theta[p, 0] - c * ahead + s * aside
-            y = positions[k, 1] - theta[p, 1] - s * ahead - c * aside
-            z = positions[k, 2] - theta[p, 2] - climb * time
-            ux, uy = np.cos(theta[p, 4] + angle), np.sin(theta[p, 4] + angle)
+                for g in range(nodes.shape[0]):
+                    at = 0.5 * time * (nodes[g] + 1.0)
+                    way = 0.5 * time * weights[g] * (v + gain * at)
+                    angle = heading + (rate + 0.5 * more * at) * at
+                    x -= way * np.cos(angle)
+                    y -= way * np.sin(angle)
+            z = positions[k, 2] - z0 - climb * time
+            angle = heading + (rate + 0.5 * more * time) * time
+            ux, uy = np.cos(angle), np.sin(angle)
             for i in range(places.shape[0]):
                 q = places[i] * length
                 _, _, (j00, j01, j02, j11, j12, j22) = field_and_jacobians(
@@ -60,8 +75,8 @@ def _arc_basis(theta: FloatArray, places: FloatArray, positions: FloatArray, t: 
 
 
 @dataclass(frozen=True)
-class ArcPass:
-    """A row of `n_dipoles` dipoles along a horizontal arc, at constant speed and climb.
+class SteadyPass:
+    """A row of `n_dipoles` dipoles along a path of steady acceleration and turning.
 
     theta: those of `PATH` and of the clocks that are in `free`, in that order; the others stay as
     in `fixed`. Linear (3 d): combinations of the moments.
@@ -78,8 +93,8 @@ class ArcPass:
     free: IntArray
     """Columns of (path, clocks) that theta holds, ascending."""
     fixed: FloatArray
-    """(8 + n_clocks,) path and clocks [s]; only those that are not free count."""
-    n_dipoles: int = 3
+    """(10 + n_clocks,) path and clocks [s]; only those that are not free count."""
+    n_dipoles: int
     _places: FloatArray = field(init=False)
     _combinations: FloatArray = field(init=False)
 
@@ -91,14 +106,17 @@ class ArcPass:
             np.linalg.qr(np.vander(places, increasing=True))[0], np.eye(3)))
 
     def whole(self, theta: FloatArray) -> FloatArray:
-        """(n_paths, 8 + n_clocks) path and clocks for theta (n_paths, n_free)."""
+        """(n_paths, 10 + n_clocks) path and clocks for theta (n_paths, n_free)."""
         out = np.tile(self.fixed, (len(theta), 1))
         out[:, self.free] = theta
         return out
 
     def basis(self, theta: FloatArray) -> FloatArray:
         """Fields of unit combinations, (n_paths, 3 n, 3 d), for theta (n_paths, n_free)."""
-        return self._basis(self.whole(theta))
+        A = np.empty((len(theta), 3 * len(self.t), 3 * self.n_dipoles))
+        _basis(self.whole(theta), self._places, self.positions, self.t, self.clock, self.M,
+               _NODES, _WEIGHTS, A)
+        return A @ self._combinations
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
         """d(basis(theta) p)/d(theta), (n_paths, 3 n, n_free); `p` (n_paths, 3 d)."""
@@ -111,8 +129,3 @@ class ArcPass:
             difference = self.basis(there) - self.basis(back)
             D[:, :, k] = np.einsum('nyk,nk->ny', difference, p) / (2.0 * step)
         return D
-
-    def _basis(self, whole: FloatArray) -> FloatArray:
-        A = np.empty((len(whole), 3 * len(self.t), 3 * self.n_dipoles))
-        _arc_basis(whole, self._places, self.positions, self.t, self.clock, self.M, A)
-        return A @ self._combinations
