@@ -100,7 +100,8 @@ class SteadyPass:
 
     def __post_init__(self) -> None:
         """Places in lengths of the row; combinations of moments that are orthogonal along it."""
-        places = np.linspace(-0.5, 0.5, self.n_dipoles)
+        d = self.n_dipoles
+        places = np.linspace(-0.5, 0.5, d) if d > 1 else np.zeros(1)
         object.__setattr__(self, '_places', places)
         object.__setattr__(self, '_combinations', np.kron(
             np.linalg.qr(np.vander(places, increasing=True))[0], np.eye(3)))

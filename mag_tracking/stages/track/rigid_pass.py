@@ -39,13 +39,13 @@ REACH = 0.2
 MOST_SENSORS = 4
 """Those with the strongest fields are compared."""
 
-FIRST_OFFSETS = (-0.1, 0.0, 0.1)
-"""[s] The search for the clocks starts with these."""
+NEAR, FAR = 0.1, 0.3
+"""[s] The search for the clocks starts with these, either way."""
 
 LONGEST_OFFSET = 0.5
 """[s] A longer one is no answer: a turn looks like it."""
 
-N_STEPS, TOLERANCE = 15, 1e-3
+N_STEPS, TOLERANCE = 30, 1e-3
 """Of the search: steps, and the share of the cost by which the last one improves it."""
 
 WELL = 1.3
@@ -172,8 +172,9 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
     longer[PATH.index('length')] = LONG_LENGTH
     _, of_long, _ = data.near(path).fit(LONG, _BENT, np.array([straight, path, longer])[:, _BENT])
     free = np.concatenate([_STRAIGHT, N_PATH + np.arange(n_clocks)])
-    with_clocks = np.repeat(straight[None, free], len(FIRST_OFFSETS), axis=0)
-    with_clocks[:, N_STRAIGHT:] = np.array(FIRST_OFFSETS)[:, None]
+    # A path that was fitted with clocks that are far apart leads elsewhere.
+    with_clocks = np.array([np.append(p, np.full(n_clocks, sign * offset)) for sign in (-1.0, 1.0)
+                            for p, offset in ((straight[_STRAIGHT], NEAR), (first[0], FAR))])
     path, apart, P = data.fit(SHORT, free, with_clocks)
     if not np.isfinite([cost, bent, apart, of_long]).all():
         return None
@@ -249,7 +250,7 @@ class _Samples:
         W = W * there[:, :, None] * there[:, None, :]
         level = np.zeros((len(y), 3, n, 3))
         level[np.arange(len(y)), :, of_sensor] = W
-        columns = level.reshape(3 * len(y), -1)
+        columns = level.reshape(3 * len(y), 3 * n)
         return cls(compared, np.nan_to_num(t).ravel(), network.positions[compared][of_sensor],
                    W @ network.R_sw[compared][of_sensor], of_sensor - 1,
                    np.einsum('nij,nj->ni', W, np.nan_to_num(y)).ravel(),

@@ -1,0 +1,52 @@
+"""`replay` names a clock that is off, and the offset that it gives puts it right."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from mag_tracking.cli import main
+from mag_tracking.messages.types import MAGNETIC_FIELD
+from mag_tracking.recording.writer import RecordingWriter
+from support import spoiler
+from support.samples import sample_dict, samples_of
+from support.situation_worlds import ambient_world
+
+NETWORK = '''earth_field: [2.0e-6, 1.55e-5, -4.9e-5]
+sensors:
+  mag_1: {{position: [0.0, -4.5, 0.0]}}
+  mag_2: {{position: [0.0, 4.5, 0.0], clock_offset: {}}}
+'''
+
+
+@pytest.fixture(scope='module')
+def recording(tmp_path_factory):
+    """Three cars past two sensors, the clock of the second 0.2 s ahead."""
+    a_world = ambient_world(np.random.default_rng(5), 'boxes', None, 75.0, cars=3)
+    path = tmp_path_factory.mktemp('clocks') / 'cars.mcap'
+    with RecordingWriter(path) as writer:
+        for s in samples_of(spoiler.apply(a_world.readings, spoiler.delayed('mag_2', 0.2))):
+            writer.write(f'/{s.sensor}/imu/mag', MAGNETIC_FIELD, sample_dict(s, s.sensor),
+                         s.stamp_ns)
+    return str(path)
+
+
+def replayed(recording, folder, offset, capsys):
+    """(what was said, summary) with a `clock_offset` [s] in the network file."""
+    folder.mkdir()
+    (folder / 'network.yaml').write_text(NETWORK.format(offset))
+    assert main(['replay', recording, '--network', str(folder / 'network.yaml'), '--out',
+                 str(folder / 'out'), '--no-figures']) == 0
+    return capsys.readouterr().out, json.loads((folder / 'out' / 'summary.json').read_text())
+
+
+def test_the_clock_is_named_and_its_offset_puts_it_right(recording, tmp_path, capsys):
+    said, summary = replayed(recording, tmp_path / 'wrong', 0.0, capsys)
+    assert f'warning: {summary["clocks_apart"]}' in said
+    assert 'the clock of mag_2 seems' in said and 'clocks_apart' in summary['tracks'][-1]['doubts']
+    offset = float(re.search(r'clock_offset of mag_2: (\S+) more', said).group(1))
+    assert offset == pytest.approx(0.2, abs=0.05)
+    said, summary = replayed(recording, tmp_path / 'right', offset, capsys)
+    assert summary['clocks_apart'] == '' and 'the clock' not in said
+    assert not any('clocks_apart' in t['doubts'] for t in summary['tracks'])

@@ -1,0 +1,73 @@
+"""A row of dipoles on a path that bends steadily, seen by clocks that are apart."""
+
+import numpy as np
+import pytest
+
+from mag_tracking.physics.passes import RowPass
+from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, PATH, SteadyPass
+
+RNG = np.random.default_rng(4)
+T, PLACES, M = RNG.uniform(-1.0, 1.0, 6), RNG.uniform(-5.0, 5.0, (6, 3)), RNG.standard_normal(
+    (6, 3, 3))
+CLOCK = np.array([-1, 0, -1, 1, 0, 1])
+STRAIGHT = np.array([1.0, 2.0, 0.5, 9.0, 0.3, 0.2, 2.5])
+BENT = np.append(STRAIGHT, [1.5, -0.6, 0.8])
+
+
+def model(free, n_dipoles=3, t=T, fixed=None):
+    return SteadyPass(t, PLACES, M, CLOCK, np.arange(free),
+                      np.zeros(N_PATH + 2) if fixed is None else fixed, n_dipoles)
+
+
+@pytest.mark.parametrize('n_dipoles', [1, 3, 5])
+def test_without_bends_it_is_a_row_at_constant_velocity(n_dipoles):
+    v, heading = STRAIGHT[3:5]
+    path = np.array([*STRAIGHT[:3], v * np.cos(heading), v * np.sin(heading), 0.0, STRAIGHT[6]])
+    level = np.where(np.arange(N_STRAIGHT) == PATH.index('climb'), 0.0, STRAIGHT)
+    row = RowPass(T, PLACES, M, n_dipoles).basis(path[None, :7 if n_dipoles > 1 else 6])
+    np.testing.assert_allclose(model(N_STRAIGHT, n_dipoles).basis(level[None]), row, rtol=1e-9,
+                               atol=1e-20)
+
+
+def test_a_clock_that_is_ahead_says_too_late_a_time():
+    offsets = np.array([0.12, -0.05])
+    late = T - np.append(offsets, 0.0)[CLOCK]
+    apart = model(N_PATH + 2).basis(np.append(BENT, offsets)[None])
+    np.testing.assert_allclose(apart, model(N_PATH, t=late).basis(BENT[None]), rtol=1e-12)
+
+
+def test_a_bend_is_where_many_small_steps_lead():
+    """One dipole: where the field of the last sample says that it is."""
+    _, _, _, v, heading, climb, _, gain, rate, more = BENT
+    for time in (-1.0, 0.7, 1.5):
+        steps = (np.arange(200_000) + 0.5) * time / 200_000
+        angle = heading + (rate + 0.5 * more * steps) * steps
+        speed = v + gain * steps
+        way = np.array([np.mean(speed * np.cos(angle)), np.mean(speed * np.sin(angle)), climb])
+        there = np.zeros(N_PATH + 2)
+        there[:3] = BENT[:3] + time * way
+        bent = model(N_PATH, 1, np.full(6, time)).basis(BENT[None])
+        still = model(N_PATH, 1, np.zeros(6)).basis(there[None, :N_PATH])
+        np.testing.assert_allclose(bent, still, rtol=1e-6, atol=1e-20)
+
+
+def test_derivatives():
+    """Against differences of a tenth of their steps."""
+    theta = np.append(BENT, [0.02, -0.03])[None]
+    m = model(N_PATH + 2)
+    p = RNG.standard_normal((1, 9))
+    D = m.derivative(theta, p)
+    for k in range(theta.shape[1]):
+        h = 1e-5 * np.eye(theta.shape[1])[k]
+        numeric = np.einsum('nyi,ni->ny', m.basis(theta + h) - m.basis(theta - h), p) / 2e-5
+        np.testing.assert_allclose(D[:, :, k], numeric, rtol=0, atol=1e-5 * np.abs(numeric).max())
+
+
+def test_what_is_not_free_stays_as_it_is_fixed():
+    fixed = np.append(BENT, [0.1, 0.2])
+    part = SteadyPass(T, PLACES, M, CLOCK, np.array([0, 3, 10]), fixed, 3)
+    theta = np.array([[1.5, 8.0, 0.3]])
+    whole = fixed.copy()
+    whole[[0, 3, 10]] = theta[0]
+    np.testing.assert_array_equal(part.whole(theta), whole[None])
+    np.testing.assert_array_equal(part.basis(theta), model(N_PATH + 2).basis(whole[None]))

@@ -1,0 +1,96 @@
+"""A whole pass at once: clocks that are apart, and what no vehicle on a steady path explains."""
+
+import numpy as np
+import pytest
+
+from mag_tracking.physics.steady_pass import N_PATH
+from mag_tracking.stages.track.rigid_pass import MODEL_ERROR, fit_rigid_pass
+from support.steady_frames import FOUR, ROAD, STRAIGHT, TURNS, steady_frames
+
+
+def found(made, network=ROAD, path=STRAIGHT):
+    """From a start half a metre and a tenth of the speed off."""
+    c, s = np.cos(path[4]), np.sin(path[4])
+    start = np.array([path[0] + 0.5, path[1], 0.5, 0.9 * path[3] * c, 0.9 * path[3] * s, 0.0])
+    return fit_rigid_pass(network, made, 0, start[None])
+
+
+@pytest.mark.parametrize('offset', [0.0, 0.1, -0.2, 0.35])
+def test_the_clock_of_the_other_sensor_is_found(offset):
+    """Within three deviations, which hold a model error that is not there."""
+    said = found(steady_frames(np.random.default_rng(1), clocks=(offset,)))
+    # The second sensor has the stronger field: the clocks are compared to its own.
+    assert said.reference == 1
+    assert abs(said.offset[0] + offset) < 3.0 * said.offset_std[0] < 0.1
+    assert said.is_explained and said.needs_clocks_apart is (offset != 0.0)
+
+
+def test_offsets_have_the_sign_of_a_clock_that_is_ahead():
+    for nearer, sign in ((1.0, -1.0), (-1.0, 1.0)):
+        path = np.where(np.arange(N_PATH) == 1, nearer, STRAIGHT)
+        said = found(steady_frames(np.random.default_rng(1), path=path, clocks=(0.1,)), path=path)
+        assert said.reference == (1 if nearer > 0.0 else 0)
+        assert np.nansum(said.offset) == pytest.approx(0.1 * sign, abs=0.01)
+
+
+def test_deviations_of_clocks_are_no_smaller_than_errors():
+    """Noise alone: a row that fits has no model error, so that they are too large."""
+    rng = np.random.default_rng(2)
+    z = []
+    for _ in range(30):
+        said = found(steady_frames(rng))
+        z.append(np.nansum(said.offset) / np.nansum(said.offset_std))
+    print(f'mean squared error of the clock, in variances: {np.mean(np.square(z)):.2f}')
+    # Chi-square with 30 degrees of freedom is larger once in two hundred times.
+    assert np.mean(np.square(z)) < 1.8
+
+
+def test_several_clocks_are_compared_at_once_with_a_dead_axis():
+    def dead(B):
+        B = B.copy()
+        B[:, 2, 1] = np.nan
+        return B
+
+    said = found(steady_frames(np.random.default_rng(3), FOUR, clocks=(0.0, 0.15, 0.0),
+                               change=dead), FOUR)
+    offsets = said.offset - said.offset[0]
+    np.testing.assert_allclose(offsets, [0.0, 0.0, 0.15, 0.0], atol=0.02)
+    assert said.needs_clocks_apart
+
+
+def test_a_turn_is_no_clock():
+    said = found(steady_frames(np.random.default_rng(4), path=TURNS), path=TURNS)
+    assert not said.needs_clocks_apart and not said.is_straight
+    assert said.misfit < 1.2
+
+
+@pytest.mark.parametrize('change', [
+    lambda B: np.clip(B, -0.3 * np.abs(B).max(), 0.3 * np.abs(B).max()),
+    lambda B: B + np.roll(B, 9, axis=0)[:, ::-1],
+    lambda B: B * np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 1.0]])])
+def test_no_steady_path_explains_what_no_vehicle_makes(change):
+    """A clipped field, a second vehicle on the other lane, a flipped axis."""
+    said = found(steady_frames(np.random.default_rng(5), change=change))
+    assert said.misfit > 1.5 and not said.needs_clocks_apart
+
+
+def test_a_model_error_of_the_stated_size_is_explained():
+    rng = np.random.default_rng(6)
+    said = found(steady_frames(rng, change=lambda B: B * (1.0 + MODEL_ERROR * rng.standard_normal(
+        B.shape))))
+    assert said.misfit < 1.3 and not said.needs_clocks_apart
+
+
+@pytest.mark.parametrize('change', [
+    lambda B: np.where(np.arange(2)[:, None] == 0, np.nan, B),
+    lambda B: np.full_like(B, np.nan)])
+def test_one_sensor_or_none_compares_no_clocks(change):
+    assert found(steady_frames(np.random.default_rng(7), change=change)) is None
+    assert found(steady_frames(np.random.default_rng(7))[:4]) is None
+
+
+def test_the_closest_point_is_that_of_the_nearest_sensor():
+    said = found(steady_frames(np.random.default_rng(8)))
+    away = np.linalg.norm(said.closest(ROAD.positions) - ROAD.positions, axis=1)
+    assert away.min() == pytest.approx(3.5, abs=0.2)
+    assert said.speed == pytest.approx(20.0, rel=0.1)

@@ -1,0 +1,106 @@
+"""When a second opinion is formed, and what it says of a track."""
+
+import numpy as np
+import pytest
+
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.records import Track
+from mag_tracking.stages.track import doubts
+from mag_tracking.stages.track.clock_evidence import ClockEvidence
+from mag_tracking.stages.track.second_opinion import SecondOpinion
+from support import spoiler
+from support.situation_worlds import ambient_world
+from support.situations import made
+from support.steady_frames import PERIOD_S, ROAD, STRAIGHT, steady_frames
+
+FAST = np.where(np.arange(10) == 3, 60.0, STRAIGHT)
+
+
+def state_at(frame, path=STRAIGHT):
+    velocity = path[3] * np.array([np.cos(path[4]), np.sin(path[4]), 0.0])
+    return np.append(path[:3] + frame.stamp_ns / 1e9 * velocity, velocity)
+
+
+def heard(opinion, frames, path=STRAIGHT):
+    """[(seconds, doubts, how many opinions by then)] of frame after frame."""
+    out, n, latest = [], 0, None
+    for frame in frames:
+        opinion.add(frame, state_at(frame, path), PERIOD_S)
+        found = opinion.doubts(0.0)
+        n += opinion.latest is not latest
+        latest = opinion.latest
+        out.append((frame.stamp_ns / 1e9, found, n))
+    return out
+
+
+def test_opinions_follow_the_closest_point_ever_more_rarely():
+    said = heard(SecondOpinion(ROAD), steady_frames(np.random.default_rng(1)))
+    times = [t for (t, _, n), (_, _, before) in zip(said[1:], said[:-1], strict=True) if n > before]
+    print(f'opinions at {times} s')
+    assert min(times) > 0.0 and 2 <= len(times) <= 6
+    assert (np.diff(times, n=2) >= 0.0).all()
+    assert not any(found for _, found, _ in said)
+
+
+@pytest.mark.parametrize('of_frames, path, expected', [
+    ({'clocks': (0.2,)}, STRAIGHT, doubts.CLOCKS_APART),
+    ({'path': FAST}, FAST, doubts.FRAMES_TOO_LONG),
+    ({'change': lambda B: np.clip(B, -3e-7, 3e-7)}, STRAIGHT, doubts.NO_STEADY_PATH)])
+def test_what_the_whole_pass_tells_doubts_the_track(of_frames, path, expected):
+    """Once it has passed, and for good."""
+    opinion = SecondOpinion(ROAD)
+    said = heard(opinion, steady_frames(np.random.default_rng(2), **of_frames), path)
+    assert not said[15][1]
+    assert all(expected in found for _, found, _ in said[-8:]) and opinion.is_doubtful
+
+
+def test_clocks_that_earlier_passes_found_apart_doubt_a_track_from_its_first_frame():
+    opinion = SecondOpinion(ROAD)
+    frame = steady_frames(np.random.default_rng(3))[0]
+    opinion.add(frame, state_at(frame), PERIOD_S)
+    assert opinion.doubts(0.1) == {doubts.CLOCKS_APART}
+    # Less than a metre.
+    assert opinion.doubts(0.04) == set()
+
+
+def test_a_track_that_ends_tells_of_its_clocks():
+    clocks, opinion = ClockEvidence(2), SecondOpinion(ROAD)
+    heard(opinion, steady_frames(np.random.default_rng(4), clocks=(0.2,)))
+    for _ in range(2):
+        opinion.conclude(clocks, np.arange(2))
+    assert clocks.apart.ahead == 1 and clocks.apart_s == pytest.approx(0.2, abs=0.05)
+
+
+def test_no_frame_is_no_opinion():
+    opinion = SecondOpinion(ROAD)
+    assert opinion.doubts(1.0) == set()
+    clocks = ClockEvidence(2)
+    opinion.conclude(clocks, np.arange(2))
+    assert clocks.apart is None and not opinion.is_doubtful
+
+
+def tracks_of(readings, network, **changes):
+    pipeline = Pipeline(network, settings_for('vehicle', changes))
+    records = pipeline.feed(readings) + pipeline.flush()
+    return [r for r in records if isinstance(r, Track) and not r.ended], pipeline
+
+
+def test_it_can_be_switched_off():
+    a_world = made('clocks 200 ms apart', 'clouds', 1)
+    for on in (True, False):
+        tracks, _ = tracks_of(a_world.readings, a_world.network, **{'track.second_opinion': on})
+        assert any(doubts.CLOCKS_APART in t.doubts for t in tracks) is on
+
+
+def test_the_third_car_past_a_wrong_clock_is_doubted_from_its_first_pose():
+    rng = np.random.default_rng(5)
+    a_world = ambient_world(rng, 'clouds', None, 75.0, cars=3)
+    readings = spoiler.apply(a_world.readings, spoiler.delayed('mag_2', 0.25))
+    tracks, pipeline = tracks_of(readings, a_world.network)
+    last = [t for t in tracks if t.id == max(t.id for t in tracks)]
+    assert all(doubts.CLOCKS_APART in t.doubts for t in last)
+    print(pipeline.track.clocks_apart)
+    assert 'the clock of mag_2 seems' in pipeline.track.clocks_apart
+    right, pipeline = tracks_of(a_world.readings, a_world.network)
+    assert not any(doubts.CLOCKS_APART in t.doubts for t in right)
+    assert pipeline.track.clocks_apart == ''
