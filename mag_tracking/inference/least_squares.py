@@ -4,6 +4,7 @@ The model comes in as a function or an object, so that this file is mathematics 
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
@@ -17,6 +18,13 @@ ResidualAndJacobian: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatA
 
 CORRELATED_S = 0.2
 """[s] What a model leaves out of a vehicle is alike for so long: a car's length at 20 m/s."""
+
+
+def _running_away() -> AbstractContextManager[None]:
+    """Start of a block in which numbers may grow beyond all bounds: a search that does so costs
+    infinity.
+    """
+    return np.errstate(over='ignore', invalid='ignore')
 
 
 def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iterations: int = 40,
@@ -89,8 +97,9 @@ def _damped_step(J: FloatArray, residual: FloatArray, damping: FloatArray) -> Fl
 def _evaluate(residual_and_jacobian: ResidualAndJacobian, x: FloatArray
               ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Residuals, Jacobians and costs; an unusable point costs infinity."""
-    residual, J = residual_and_jacobian(x)
-    cost = np.einsum('ni,ni->n', residual, residual)
+    with _running_away():
+        residual, J = residual_and_jacobian(x)
+        cost = np.einsum('ni,ni->n', residual, residual)
     bad = ~(np.isfinite(cost) & np.isfinite(J).all(axis=(1, 2)))
     residual[bad], J[bad], cost[bad] = 0.0, 0.0, np.inf
     return residual, J, cost
@@ -99,14 +108,20 @@ def _evaluate(residual_and_jacobian: ResidualAndJacobian, x: FloatArray
 def _inverse(A: FloatArray, rank: float = 1e-15) -> FloatArray:
     """Pseudo-inverses (n, k, k), scaled to unit diagonal first: units differ by decades.
 
-    Directions whose eigenvalue is then below the share `rank` of the largest are left out.
+    Directions whose eigenvalue is then below the share `rank` of the largest are left out. Of what
+    is not finite, as of a search that ran away, NaN.
     """
+    finite: BoolArray = np.all(np.isfinite(A), axis=(1, 2))
+    if not finite.all():
+        A = np.where(finite[:, None, None], A, np.eye(A.shape[1]))
     scale = np.sqrt(np.einsum('nii->ni', A))
     scale = np.where(scale > 0.0, scale, 1.0)
     w, V = np.linalg.eigh(A / (scale[:, :, None] * scale[:, None, :]))
     w = np.where(w > rank * w[:, -1:], w, np.inf)
     V = V / scale[:, :, None]
-    inverse: FloatArray = (V / w[:, None, :]) @ np.swapaxes(V, 1, 2)
+    with _running_away():
+        inverse: FloatArray = (V / w[:, None, :]) @ np.swapaxes(V, 1, 2)
+    inverse[~finite] = np.nan
     return inverse
 
 
@@ -129,9 +144,10 @@ def project_out_linear(A: FloatArray, y: FloatArray
         Pseudo-inverse of A'A.
     """
     At = np.swapaxes(A, 1, 2)
-    inverse = _inverse(At @ A, LINEAR_RANK)
-    p = np.einsum('nij,nj->ni', inverse, At @ y)
-    return p, y - np.einsum('nyi,ni->ny', A, p), inverse
+    with _running_away():
+        inverse = _inverse(At @ A, LINEAR_RANK)
+        p = np.einsum('nij,nj->ni', inverse, At @ y)
+        return p, y - np.einsum('nyi,ni->ny', A, p), inverse
 
 
 LINEAR_RANK = 1e-11
@@ -236,18 +252,20 @@ class SeparableProblem:
 
     def cost(self, theta: FloatArray) -> FloatArray:
         """(n,) least sum of squares for theta (n, n_theta); infinite where it is no number."""
-        A = self._without_nuisance(self._model.basis(theta))
-        p, _, _ = project_out_linear(A, self._y)
-        # Not from the residuals: a grid of starts has many, and digits enough.
-        cost = self.energy - np.einsum('ni,ni->n', p, self._y @ A)
+        with _running_away():
+            A = self._without_nuisance(self._model.basis(theta))
+            p, _, _ = project_out_linear(A, self._y)
+            # Not from the residuals: a grid of starts has many, and digits enough.
+            cost = self.energy - np.einsum('ni,ni->n', p, self._y @ A)
         return np.where(np.isfinite(cost), cost, np.inf)
 
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals (n, n_y) and the Jacobians (n, n_y, n_theta) of what is predicted."""
-        A = self._without_nuisance(self._model.basis(theta))
-        p, residual, inverse = project_out_linear(A, self._y)
-        D = self._without_nuisance(self._model.derivative(theta, p))
-        return residual, D - A @ (inverse @ (np.swapaxes(A, 1, 2) @ D))
+        with _running_away():
+            A = self._without_nuisance(self._model.basis(theta))
+            p, residual, inverse = project_out_linear(A, self._y)
+            D = self._without_nuisance(self._model.derivative(theta, p))
+            return residual, D - A @ (inverse @ (np.swapaxes(A, 1, 2) @ D))
 
     def linear(self, theta: FloatArray) -> FloatArray:
         """p (k,) at theta (n_theta,)."""

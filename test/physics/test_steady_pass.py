@@ -51,16 +51,17 @@ def test_a_bend_is_where_many_small_steps_lead():
         np.testing.assert_allclose(bent, still, rtol=1e-6, atol=1e-20)
 
 
-def test_derivatives():
-    """Against differences of a tenth of their steps."""
-    theta = np.append(BENT, [0.02, -0.03])[None]
+@pytest.mark.parametrize('path', [np.append(STRAIGHT, [0.0, 0.0, 0.0]), BENT])
+def test_derivatives(path):
+    """Against differences."""
+    theta = np.append(path, [0.02, -0.03])[None]
     m = model(N_PATH + 2)
     p = RNG.standard_normal((1, 9))
     D = m.derivative(theta, p)
     for k in range(theta.shape[1]):
-        h = 1e-5 * np.eye(theta.shape[1])[k]
-        numeric = np.einsum('nyi,ni->ny', m.basis(theta + h) - m.basis(theta - h), p) / 2e-5
-        np.testing.assert_allclose(D[:, :, k], numeric, rtol=0, atol=1e-5 * np.abs(numeric).max())
+        h = 1e-6 * np.eye(theta.shape[1])[k]
+        numeric = np.einsum('nyi,ni->ny', m.basis(theta + h) - m.basis(theta - h), p) / 2e-6
+        np.testing.assert_allclose(D[:, :, k], numeric, rtol=0, atol=1e-6 * np.abs(numeric).max())
 
 
 def test_what_is_not_free_stays_as_it_is_fixed():

@@ -17,9 +17,13 @@ SOMETHING_ELSE = 'something_else'
 INNOVATIONS = 'innovations'
 SENSORS_ROTATED = 'sensors_rotated'
 HEIGHT = 'height'
+OFF_THE_ROAD = 'off_the_road'
 FRAMES_TOO_LONG = 'frames_too_long'
 CLOCKS_APART = 'clocks_apart'
 NO_STEADY_PATH = 'no_steady_path'
+
+OF_ONE_POSE = (HEIGHT, OFF_THE_ROAD)
+"""Of a state that no vehicle has, and that may soon be right again; others have bent the track."""
 
 MEANINGS = {
     ANOTHER_PLACE: 'another place is still possible',
@@ -40,6 +44,7 @@ MEANINGS = {
     INNOVATIONS: 'the innovations of the latest frames, or of the track, are larger than stated',
     SENSORS_ROTATED: 'the track needs sensors that are rotated by more than stated',
     HEIGHT: 'the iron is where no vehicle of the kind has it',
+    OFF_THE_ROAD: 'the target passes all sensors on one side, beyond the lanes of the settings',
     FRAMES_TOO_LONG: 'the target moves too far within a frame',
     CLOCKS_APART: 'the clocks of the sensors seem to be apart, by this pass or those before',
     NO_STEADY_PATH: 'no vehicle that accelerates and turns steadily explains the pass as a whole',

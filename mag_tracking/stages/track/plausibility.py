@@ -14,6 +14,9 @@ MOUNTED = 0.05
 LEVEL = 1e-3
 """Probability that the iron of a vehicle is as far from its kind's height as it may be."""
 
+LANE = 3.0
+"""Deviations by which a vehicle may be beside the outermost lane of the settings."""
+
 LONGEST_WAY = 0.75
 """A target may move so far within a frame, in units of its distance to the second nearest sensor:
 fields are averaged over the frame, with a relative error of about half of the square. One sensor
@@ -43,9 +46,27 @@ def implausible(observation: Observation, x: FloatArray, kind: int, settings: Ve
     off = abs(float(x[2]) - settings.heights[kind])
     if off > -ndtri(LEVEL / 2.0) * settings.height_stds[kind]:
         found.add(doubts.HEIGHT)
+    if _is_off_the_road(x[:3], x[3:6], settings, observation.positions):
+        found.add(doubts.OFF_THE_ROAD)
     if moves_too_far(x[:3], x[3:6], dt, observation.positions):
         found.add(doubts.FRAMES_TOO_LONG)
     return found
+
+
+def _is_off_the_road(position: FloatArray, velocity: FloatArray, settings: VehicleSettings,
+                     positions: FloatArray) -> bool:
+    """Whether a vehicle goes past all sensors, at `positions` (n, 3), on one side, farther from
+    their centre than any lane is.
+
+    There the distance is hardly measured: a train on another line looks like a truck nearby.
+    """
+    speed = float(np.hypot(velocity[0], velocity[1]))
+    if speed == 0.0:
+        return False
+    away = positions - position
+    aside = (velocity[0] * away[:, 1] - velocity[1] * away[:, 0]) / speed
+    farthest = max(map(abs, settings.lateral_offsets)) + LANE * settings.lateral_std
+    return bool((aside > 0.0).all() or (aside < 0.0).all()) and abs(aside.mean()) > farthest
 
 
 def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positions: FloatArray

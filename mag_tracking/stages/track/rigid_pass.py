@@ -45,13 +45,16 @@ NEAR, FAR = 0.1, 0.3
 LONGEST_OFFSET = 0.5
 """[s] A longer one is no answer: a turn looks like it."""
 
+TURN = 0.4
+"""[rad/s] The search for a path that bends starts with this, either way, too."""
+
 N_STEPS, TOLERANCE = 30, 1e-3
 """Of the search: steps, and the share of the cost by which the last one improves it."""
 
 WELL = 1.3
 """Reduced chi-square up to which a path explains a pass."""
 
-CHANCE, BENDS = 1e-5, 1e-3
+CHANCE, BENDS = 1e-5, 1e-4
 """Probability that clocks which agree make the fit of a straight path better by as much, and that
 of a path that bends."""
 
@@ -81,8 +84,8 @@ class RigidPass:
     freedom: int
     """Degrees of freedom of the last."""
     misfit: float
-    """Reduced chi-square of a long row on a path that bends; about one where that explains the
-    pass."""
+    """Reduced chi-square of a row on a path that bends, a long one if need be; about one where that
+    explains the pass."""
     offset: FloatArray
     """(n_sensors,) [s] how far each clock is ahead of the one of the sensor with the strongest
     field, which is 0; NaN = not compared."""
@@ -167,23 +170,32 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
                       np.arctan2(starts[:, 4], starts[:, 3]), starts[:, 5],
                       np.full(len(starts), LENGTH)], axis=1)
     straight, cost, _ = data.fit(SHORT, _STRAIGHT, first)
-    path, bent, _ = data.fit(SHORT, _BENT, straight[None, _BENT])
-    longer = path.copy()
-    longer[PATH.index('length')] = LONG_LENGTH
-    _, of_long, _ = data.near(path).fit(LONG, _BENT, np.array([straight, path, longer])[:, _BENT])
+    bends, apart_from = straight[None, _BENT], [(straight[_STRAIGHT], NEAR)]
+    if cost > WELL * (data.n_free(SHORT) - N_STRAIGHT):
+        # A path that was fitted to a turn, or with clocks that are far apart, leads elsewhere.
+        bends = np.vstack([bends, [np.append(first[0], [0.0, turn, 0.0])
+                                   for turn in (-TURN, TURN)]])
+        apart_from.append((first[0], FAR))
+    clocks = np.array([np.append(p, np.full(n_clocks, sign * offset))
+                       for p, offset in apart_from for sign in (-1.0, 1.0)])
+    path, bent, _ = data.fit(SHORT, _BENT, bends)
+    misfit = bent / (data.n_free(SHORT) - N_PATH)
+    if misfit > WELL:
+        longer = path.copy()
+        longer[PATH.index('length')] = LONG_LENGTH
+        _, of_long, _ = data.near(path).fit(
+            LONG, _BENT, np.array([straight, path, longer])[:, _BENT])
+        misfit = min(misfit, of_long / (data.n_free(LONG) - N_PATH))
     free = np.concatenate([_STRAIGHT, N_PATH + np.arange(n_clocks)])
-    # A path that was fitted with clocks that are far apart leads elsewhere.
-    with_clocks = np.array([np.append(p, np.full(n_clocks, sign * offset)) for sign in (-1.0, 1.0)
-                            for p, offset in ((straight[_STRAIGHT], NEAR), (first[0], FAR))])
-    path, apart, P = data.fit(SHORT, free, with_clocks)
-    if not np.isfinite([cost, bent, apart, of_long]).all():
+    path, apart, P = data.fit(SHORT, free, clocks)
+    if not np.isfinite([cost, bent, apart, misfit]).all():
         return None
     offset, std = np.full(len(network), np.nan), np.full(len(network), np.nan)
     offset[data.compared] = np.append(0.0, path[N_PATH:])
     std[data.compared] = np.append(0.0, np.sqrt(np.diagonal(P)[N_STRAIGHT:]))
     c, s = np.cos(path[4]), np.sin(path[4])
     return RigidPass(cost, bent, apart, data.n_free(SHORT) - len(free),
-                     of_long / (data.n_free(LONG) - N_PATH), offset, std, path[:3],
+                     misfit, offset, std, path[:3],
                      np.array([c * path[3], s * path[3], path[5]]))
 
 

@@ -268,8 +268,7 @@ class RunningTrack:
         implausibilities = implausible(
             self._filter.observation, bank.x[best], int(bank.kind[best]), settings.vehicle,
             np.deg2rad(settings.mounting_std_deg), dt)
-        # The height is soon right again; the others have bent the track.
-        for reason in implausibilities - {doubts.HEIGHT}:
+        for reason in implausibilities.difference(doubts.OF_ONE_POSE):
             evidence.doubt(reason)
         return found | implausibilities | evidence.doubts
 

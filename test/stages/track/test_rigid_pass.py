@@ -30,7 +30,7 @@ def test_offsets_have_the_sign_of_a_clock_that_is_ahead():
         path = np.where(np.arange(N_PATH) == 1, nearer, STRAIGHT)
         said = found(steady_frames(np.random.default_rng(1), path=path, clocks=(0.1,)), path=path)
         assert said.reference == (1 if nearer > 0.0 else 0)
-        assert np.nansum(said.offset) == pytest.approx(0.1 * sign, abs=0.01)
+        assert np.nansum(said.offset) == pytest.approx(0.1 * sign, abs=0.03)
 
 
 def test_deviations_of_clocks_are_no_smaller_than_errors():

@@ -43,7 +43,7 @@ def test_opinions_follow_the_closest_point_ever_more_rarely():
 
 
 @pytest.mark.parametrize('of_frames, path, expected', [
-    ({'clocks': (0.2,)}, STRAIGHT, doubts.CLOCKS_APART),
+    ({'clocks': (0.3,)}, STRAIGHT, doubts.CLOCKS_APART),
     ({'path': FAST}, FAST, doubts.FRAMES_TOO_LONG),
     ({'change': lambda B: np.clip(B, -3e-7, 3e-7)}, STRAIGHT, doubts.NO_STEADY_PATH)])
 def test_what_the_whole_pass_tells_doubts_the_track(of_frames, path, expected):
@@ -65,10 +65,10 @@ def test_clocks_that_earlier_passes_found_apart_doubt_a_track_from_its_first_fra
 
 def test_a_track_that_ends_tells_of_its_clocks():
     clocks, opinion = ClockEvidence(2), SecondOpinion(ROAD)
-    heard(opinion, steady_frames(np.random.default_rng(4), clocks=(0.2,)))
+    heard(opinion, steady_frames(np.random.default_rng(4), clocks=(0.3,)))
     for _ in range(2):
         opinion.conclude(clocks, np.arange(2))
-    assert clocks.apart.ahead == 1 and clocks.apart_s == pytest.approx(0.2, abs=0.05)
+    assert clocks.apart.ahead == 1 and clocks.apart_s == pytest.approx(0.3, abs=0.05)
 
 
 def test_no_frame_is_no_opinion():
