@@ -174,6 +174,7 @@ def test_falling_behind_is_forgotten_within_a_second():
 
 
 def test_published_doubts_are_listed_in_one_order_and_each_has_a_meaning():
-    names = [value for name, value in vars(doubts).items() if name.isupper() and isinstance(value, str)]
+    names = [value for name, value in vars(doubts).items()
+             if name.isupper() and isinstance(value, str)]
     assert sorted(names) == sorted(doubts.MEANINGS)
     assert doubts.listed({doubts.HEIGHT, doubts.ANOTHER_PLACE}) == ('another_place', 'height')
