@@ -90,7 +90,9 @@ class ClockEvidence:
         self._information *= KEPT
         self._pull *= KEPT
         reference = rows[found.reference]
-        for j in np.flatnonzero(found.offset_std > 0.0):
+        for j in np.flatnonzero(~np.isnan(found.offset)):
+            if j == found.reference:
+                continue
             variance = found.widening * found.offset_std[j]**2 + (MIDDLE_STD / found.speed)**2
             direction = np.zeros(len(self._pull))
             direction[rows[j]], direction[reference] = 1.0, -1.0

@@ -42,8 +42,8 @@ MOST_SENSORS = 4
 NEAR, FAR = 0.1, 0.3
 """[s] The search for the clocks starts with these, either way."""
 
-LONGEST_OFFSET = 0.5
-"""[s] A longer one is no answer: a turn looks like it."""
+OFFSET_STD, LONGEST_OFFSET = 0.15, 0.5
+"""[s] Of clocks that nobody compared. A longer offset is no answer: a turn looks like it."""
 
 TURN = 0.4
 """[rad/s] The search for a path that bends starts with this, either way, too."""
@@ -54,7 +54,7 @@ N_STEPS, TOLERANCE = 30, 1e-3
 WELL = 1.3
 """Reduced chi-square up to which a path explains a pass."""
 
-CHANCE, BENDS = 1e-5, 1e-4
+CHANCE, BENDS = 1e-5, 1e-3
 """Probability that clocks which agree make the fit of a straight path better by as much, and that
 of a path that bends."""
 
@@ -86,11 +86,12 @@ class RigidPass:
     misfit: float
     """Reduced chi-square of a row on a path that bends, a long one if need be; about one where that
     explains the pass."""
+    reference: int
+    """Row of the sensor with the strongest field: its clock is what the others are compared to."""
     offset: FloatArray
-    """(n_sensors,) [s] how far each clock is ahead of the one of the sensor with the strongest
-    field, which is 0; NaN = not compared."""
+    """(n_sensors,) [s] how far each clock is ahead of that; NaN = not compared, or it cannot be."""
     offset_std: FloatArray
-    """(n_sensors,) [s] by noise and model error alone."""
+    """(n_sensors,) [s] by noise and model error alone; 0 of the reference."""
     position: FloatArray
     """(3,) [m] where the field was strongest; of the straight path, the clocks being apart."""
     velocity: FloatArray
@@ -98,7 +99,7 @@ class RigidPass:
 
     @property
     def n_clocks(self) -> int:
-        """That were compared to the one of the sensor with the strongest field."""
+        """How many clocks were compared to that of the reference."""
         return int(np.count_nonzero(~np.isnan(self.offset))) - 1
 
     @property
@@ -125,11 +126,6 @@ class RigidPass:
         return max(self.apart / self.freedom, 1.0)
 
     @property
-    def reference(self) -> int:
-        """Row of the sensor that the clocks are compared to."""
-        return int(np.flatnonzero(self.offset_std == 0.0)[0])
-
-    @property
     def needs_clocks_apart(self) -> bool:
         """Whether a straight path explains the pass with clocks that are apart, and no path does
         without."""
@@ -137,7 +133,8 @@ class RigidPass:
         if not self.is_explained or offset > LONGEST_OFFSET or offset * self.speed < LEAST_WAY:
             return False
         gains = np.array([self.straight - self.apart, self.bent - self.apart]) / self.widening
-        return bool((gains > chdtri(self.n_clocks, [CHANCE, BENDS])).all())
+        improbable = float(np.nansum(np.square(self.offset / OFFSET_STD)))
+        return bool((gains - improbable > chdtri(self.n_clocks, [CHANCE, BENDS])).all())
 
     @property
     def is_straight(self) -> bool:
@@ -148,7 +145,7 @@ class RigidPass:
 
 def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_ns: int,
                    starts: FloatArray) -> RigidPass | None:
-    """Fit straight paths and an arc to the frames of a pass.
+    """Fit straight paths and one that bends to the frames of a pass.
 
     Parameters
     ----------
@@ -179,24 +176,34 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
     clocks = np.array([np.append(p, np.full(n_clocks, sign * offset))
                        for p, offset in apart_from for sign in (-1.0, 1.0)])
     path, bent, _ = data.fit(SHORT, _BENT, bends)
-    misfit = bent / (data.n_free(SHORT) - N_PATH)
-    if misfit > WELL:
-        longer = path.copy()
-        longer[PATH.index('length')] = LONG_LENGTH
-        _, of_long, _ = data.near(path).fit(
-            LONG, _BENT, np.array([straight, path, longer])[:, _BENT])
-        misfit = min(misfit, of_long / (data.n_free(LONG) - N_PATH))
+    misfit = _misfit(data, straight, path, bent)
     free = np.concatenate([_STRAIGHT, N_PATH + np.arange(n_clocks)])
     path, apart, P = data.fit(SHORT, free, clocks)
     if not np.isfinite([cost, bent, apart, misfit]).all():
         return None
     offset, std = np.full(len(network), np.nan), np.full(len(network), np.nan)
-    offset[data.compared] = np.append(0.0, path[N_PATH:])
-    std[data.compared] = np.append(0.0, np.sqrt(np.diagonal(P)[N_STRAIGHT:]))
+    # What nothing is known of has no variance in a pseudo-inverse.
+    variance = np.diagonal(P)[N_STRAIGHT:]
+    known = np.append(True, variance > 0.0)
+    offset[data.compared[known]] = np.append(0.0, path[N_PATH:])[known]
+    std[data.compared[known]] = np.sqrt(np.append(0.0, variance))[known]
     c, s = np.cos(path[4]), np.sin(path[4])
-    return RigidPass(cost, bent, apart, data.n_free(SHORT) - len(free),
-                     misfit, offset, std, path[:3],
+    return RigidPass(cost, bent, apart, data.n_free(SHORT) - len(free), misfit,
+                     int(data.compared[0]), offset, std, path[:3],
                      np.array([c * path[3], s * path[3], path[5]]))
+
+
+def _misfit(data: '_Samples', straight: FloatArray, path: FloatArray, cost: float) -> float:
+    """Reduced chi-square of a row on a path that bends, of a long one where the short one that has
+    this `cost` on the `path` does not explain the pass.
+    """
+    misfit = cost / (data.n_free(SHORT) - N_PATH)
+    if misfit <= WELL:
+        return misfit
+    longer = path.copy()
+    longer[PATH.index('length')] = LONG_LENGTH
+    _, of_long, _ = data.near(path).fit(LONG, _BENT, np.array([straight, path, longer])[:, _BENT])
+    return min(misfit, of_long / (data.n_free(LONG) - N_PATH))
 
 
 @dataclass(frozen=True)

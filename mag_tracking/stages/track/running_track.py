@@ -88,6 +88,8 @@ class RunningTrack:
         self._settings = settings
         self._filter.configure(settings)
         self._relinearisation.begin_anew()
+        if not settings.second_opinion:
+            self._opinion = SecondOpinion(self._sensors.network)
 
     def doubt(self, sensors: Sequence[int]) -> None:
         """All of the track may be wrong if it uses one of the `sensors` (rows): their backgrounds
@@ -283,7 +285,7 @@ class RunningTrack:
                                            self._settings.explained_ratio)
         self._evidence.take(frame, self._sensors.rows, self.bank.nis[best])
         if self._settings.second_opinion and not self._target.starts_anywhere:
-            self._opinion.add(frame, self.bank.x[best], dt)
+            self._opinion.add(frame, self.bank.x[best])
 
     def _overfits(self, best: int, stamp_ns: int) -> bool:
         """Whether the filter fits the frames much better than the path of hypothesis `best`."""

@@ -66,14 +66,12 @@ class SecondOpinion:
         self._frames: deque[_Seen] = deque(maxlen=MOST_FRAMES)
         # When the field was strongest, and how long after it the next opinion is due.
         self._peak_ns, self._due_s = -1, FIRST_S
-        self._dt = np.inf
         self._is_misfit = False
 
-    def add(self, frame: FieldFrame, state: FloatArray, dt: float) -> None:
-        """Take a frame, `dt` [s] after the one before; `state` (n_x,) of the best hypothesis."""
+    def add(self, frame: FieldFrame, state: FloatArray) -> None:
+        """Take a frame, and the `state` (n_x,) of the best hypothesis."""
         size = float(np.sqrt(np.nansum(np.square(frame.field), axis=1).max(initial=0.0)))
         self._frames.append(_Seen(frame, size, state[:6].copy()))
-        self._dt = dt or self._dt
 
     def doubts(self, clocks_apart_s: float) -> set[str]:
         """Doubts about the track by now; earlier ones say that the clocks are so far apart [s]."""
@@ -129,7 +127,8 @@ class SecondOpinion:
             return found
         if latest.needs_clocks_apart:
             found.add(doubts.CLOCKS_APART)
-        if moves_too_far(latest.closest(self._network.positions), latest.velocity, self._dt,
+        period = float(np.median(np.diff([seen.frame.stamp_ns for seen in self._frames]))) / NS
+        if moves_too_far(latest.closest(self._network.positions), latest.velocity, period,
                          self._network.positions):
             found.add(doubts.FRAMES_TOO_LONG)
         return found

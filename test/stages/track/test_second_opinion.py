@@ -11,7 +11,7 @@ from mag_tracking.stages.track.second_opinion import SecondOpinion
 from support import spoiler
 from support.situation_worlds import ambient_world
 from support.situations import made
-from support.steady_frames import PERIOD_S, ROAD, STRAIGHT, steady_frames
+from support.steady_frames import ROAD, STRAIGHT, steady_frames
 
 FAST = np.where(np.arange(10) == 3, 60.0, STRAIGHT)
 
@@ -25,7 +25,7 @@ def heard(opinion, frames, path=STRAIGHT):
     """[(seconds, doubts, how many opinions by then)] of frame after frame."""
     out, n, latest = [], 0, None
     for frame in frames:
-        opinion.add(frame, state_at(frame, path), PERIOD_S)
+        opinion.add(frame, state_at(frame, path))
         found = opinion.doubts(0.0)
         n += opinion.latest is not latest
         latest = opinion.latest
@@ -57,7 +57,7 @@ def test_what_the_whole_pass_tells_doubts_the_track(of_frames, path, expected):
 def test_clocks_that_earlier_passes_found_apart_doubt_a_track_from_its_first_frame():
     opinion = SecondOpinion(ROAD)
     frame = steady_frames(np.random.default_rng(3))[0]
-    opinion.add(frame, state_at(frame), PERIOD_S)
+    opinion.add(frame, state_at(frame))
     assert opinion.doubts(0.1) == {doubts.CLOCKS_APART}
     # Less than a metre.
     assert opinion.doubts(0.04) == set()
