@@ -108,8 +108,8 @@ def _evaluate(residual_and_jacobian: ResidualAndJacobian, x: FloatArray
 def _inverse(A: FloatArray, rank: float = 1e-15) -> FloatArray:
     """Pseudo-inverses (n, k, k), scaled to unit diagonal first: units differ by decades.
 
-    Directions whose eigenvalue is then below the share `rank` of the largest are left out. Of what
-    is not finite, as of a search that ran away, NaN.
+    Directions whose eigenvalue is then below the share `rank` of the largest are left out. A
+    matrix that is not finite, of a search that ran away, has an inverse of NaN.
     """
     finite: BoolArray = np.all(np.isfinite(A), axis=(1, 2))
     if not finite.all():

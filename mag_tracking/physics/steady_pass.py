@@ -33,7 +33,7 @@ _FIRST_CLOCK = N_PATH
 
 @njit(**_INLINE)
 def _own_time(theta: FloatArray, p: int, t: float, clock: int) -> float:
-    """When a sample was measured: a clock that is ahead says too late a time."""
+    """When a sample was measured: the stamps of a clock that is ahead are too late."""
     return t - theta[p, _FIRST_CLOCK + clock] if clock >= 0 else t
 
 
@@ -166,7 +166,7 @@ class SteadyPass:
     free: IntArray
     """Columns of (path, clocks) that theta holds, ascending."""
     fixed: FloatArray
-    """(10 + n_clocks,) path and clocks [s]; only those that are not free count."""
+    """(N_PATH + n_clocks,) path and clocks [s]; only those that are not free count."""
     n_dipoles: int
     _places: FloatArray = field(init=False)
     _combinations: FloatArray = field(init=False)
@@ -180,7 +180,7 @@ class SteadyPass:
             np.linalg.qr(np.vander(places, increasing=True))[0], np.eye(3)))
 
     def whole(self, theta: FloatArray) -> FloatArray:
-        """(n_paths, 10 + n_clocks) path and clocks for theta (n_paths, n_free)."""
+        """(n_paths, N_PATH + n_clocks) path and clocks for theta (n_paths, n_free)."""
         out = np.tile(self.fixed, (len(theta), 1))
         out[:, self.free] = theta
         return out

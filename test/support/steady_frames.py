@@ -12,16 +12,16 @@ FOUR = network_of([[0.0, -4.5, 0.0], [0.0, 4.5, 0.0], [9.0, -4.5, 0.0], [9.0, 4.
 STRAIGHT = np.array([0.0, 1.0, 0.5, 20.0, 0.05, 0.0, 3.0, 0.0, 0.0, 0.0])
 TURNS = np.array([0.0, 1.0, 0.5, 8.0, 0.0, 0.0, 3.0, 1.0, 0.7, 0.0])
 MOMENTS = np.array([[150.0, 40.0, -120.0], [90.0, -60.0, -160.0], [110.0, 70.0, -90.0]])
-PERIOD_S = 0.08
 
 
-def steady_frames(rng, network=ROAD, path=STRAIGHT, clocks=(), change=None):
-    """Frames from 1.6 s before to 1.2 s after the closest point.
+def steady_frames(rng, network=ROAD, path=STRAIGHT, clocks=(), change=None, period_s=0.08,
+                  until_s=1.2):
+    """Frames from 1.6 s before to `until_s` after the closest point.
 
     `clocks` [s] ahead, of all sensors but the first; `change` takes and gives fields
     (n_frames, n_sensors, 3).
     """
-    t = np.arange(-20, 16) * PERIOD_S
+    t = np.arange(-1.6, until_s, period_s)
     n = len(network)
     theta = np.concatenate([path, np.zeros(n - 1)])
     theta[N_PATH:N_PATH + len(clocks)] = clocks

@@ -22,8 +22,8 @@ FRAMES_TOO_LONG = 'frames_too_long'
 CLOCKS_APART = 'clocks_apart'
 NO_STEADY_PATH = 'no_steady_path'
 
-OF_ONE_POSE = (HEIGHT, OFF_THE_ROAD)
-"""Of a state that no vehicle has, and that may soon be right again; others have bent the track."""
+FOR_GOOD = frozenset({SENSORS_ROTATED, FRAMES_TOO_LONG, CLOCKS_APART})
+"""What has bent the track; another state that no vehicle has may soon be right again."""
 
 MEANINGS = {
     ANOTHER_PLACE: 'another place is still possible',

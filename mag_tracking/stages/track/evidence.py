@@ -41,7 +41,7 @@ FELT = 4.0
 the sensor to have felt the target."""
 
 PASSING_DOUBTS = (doubts.OVERFIT, doubts.SOMETHING_ELSE, doubts.INNOVATIONS, doubts.MISFIT,
-                  *doubts.OF_ONE_POSE)
+                  doubts.HEIGHT, doubts.OFF_THE_ROAD, doubts.NO_STEADY_PATH)
 """Doubts about the filter at one time, which smoothing removes only in part."""
 
 MOST_STRETCHES = 5000

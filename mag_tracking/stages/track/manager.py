@@ -109,7 +109,7 @@ class TrackManager:
     @property
     def clocks_apart(self) -> str:
         """Which clocks seem apart, as a sentence; empty where none do."""
-        apart = self._clocks.apart
+        apart = self._clocks.apart if self._settings.second_opinion else None
         return '' if apart is None else apart.text(self._network.names)
 
     @property
@@ -121,8 +121,9 @@ class TrackManager:
         """The records that follow from a `FieldFrame`."""
         self.idle()
         if self._next_network is not None and not self._tracks:
+            if not np.array_equal(self._next_network.clock_offset, self._network.clock_offset):
+                self._clocks = ClockEvidence(len(self._network))
             self._network, self._next_network = self._next_network, None
-            self._clocks = ClockEvidence(len(self._network))
         out, previous = self._end_at_gap(frame), self._last_ns
         self._last_ns = frame.stamp_ns
         self.counts['frames'] += 1

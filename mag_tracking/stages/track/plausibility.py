@@ -17,6 +17,9 @@ LEVEL = 1e-3
 LANE = 3.0
 """Deviations by which a vehicle may be beside the outermost lane of the settings."""
 
+LEAST_SPEED = 1.0
+"""[m/s] A slower vehicle has no direction."""
+
 LONGEST_WAY = 0.75
 """A target may move so far within a frame, in units of its distance to the second nearest sensor:
 fields are averaged over the frame, with a relative error of about half of the square. One sensor
@@ -55,18 +58,20 @@ def implausible(observation: Observation, x: FloatArray, kind: int, settings: Ve
 
 def _is_off_the_road(position: FloatArray, velocity: FloatArray, settings: VehicleSettings,
                      positions: FloatArray) -> bool:
-    """Whether a vehicle goes past all sensors, at `positions` (n, 3), on one side, farther from
-    their centre than any lane is.
+    """Whether a vehicle passes all sensors, at `positions` (n, 3), on one side, beyond the lanes.
 
-    There the distance is hardly measured: a train on another line looks like a truck nearby.
+    There its distance is hardly measured: a train on another line looks like a truck nearby. Lanes
+    are on both sides of the centre of the network; past a network that covers an area a vehicle
+    may be as near to the outermost sensors.
     """
     speed = float(np.hypot(velocity[0], velocity[1]))
-    if speed == 0.0:
+    if speed < LEAST_SPEED:
         return False
     away = positions - position
     aside = (velocity[0] * away[:, 1] - velocity[1] * away[:, 0]) / speed
-    farthest = max(map(abs, settings.lateral_offsets)) + LANE * settings.lateral_std
-    return bool((aside > 0.0).all() or (aside < 0.0).all()) and abs(aside.mean()) > farthest
+    outermost = max(map(abs, settings.lateral_offsets))
+    return bool((aside > outermost).all() or (aside < -outermost).all()) \
+        and abs(aside.mean()) > outermost + LANE * settings.lateral_std
 
 
 def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positions: FloatArray

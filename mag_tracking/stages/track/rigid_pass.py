@@ -24,17 +24,16 @@ from mag_tracking.stages.track.bank_filter import known_covariance
 from mag_tracking.units import NS
 
 SHORT, LONG = 3, 5
-"""Dipoles of the rows: the clocks are compared by the path of a short one, which cannot make up
-for them; whether any vehicle explains the pass is asked of a long one."""
+"""Dipoles of the rows: a long one explains any vehicle, a short one cannot make up for clocks."""
 
 LENGTH, LONG_LENGTH = 3.0, 8.0
 """[m] Between the first and the last of them, where the search starts."""
 
 MODEL_ERROR = 0.04
-"""Share of the field that a row leaves out of a car's; it counts as noise."""
+"""Error of the field of a row, relative to it; it counts as noise."""
 
 REACH = 0.2
-"""[m] Over the distance it is the share that it leaves out near a sensor, if that is more."""
+"""[m] Near a sensor the error is this length over the distance, if that is more."""
 
 MOST_SENSORS = 4
 """Those with the strongest fields are compared."""
@@ -59,7 +58,7 @@ CHANCE, BENDS = 1e-5, 1e-3
 of a path that bends."""
 
 LEAST_WAY = 1.0
-"""[m] Clocks that move the target by less do no harm; two of `MIDDLE_STD`."""
+"""[m] Clocks that move the target by less do no harm."""
 
 MIDDLE_STD = 0.5
 """[m] The iron of a vehicle has another middle for each sensor."""
@@ -124,6 +123,10 @@ class RigidPass:
     def widening(self) -> float:
         """What the variances are to be multiplied by for what the path leaves unexplained."""
         return max(self.apart / self.freedom, 1.0)
+
+    def clock_variance(self, sensor: int) -> float:
+        """[s^2] of the offset of a sensor's clock (row), with all that the model leaves out."""
+        return float(self.widening * self.offset_std[sensor]**2 + (MIDDLE_STD / self.speed)**2)
 
     @property
     def needs_clocks_apart(self) -> bool:

@@ -266,13 +266,12 @@ class RunningTrack:
             bank.nis[best], int(np.count_nonzero(~np.isnan(frame.field))), settings.explained_ratio)
         if self._overfits(best, frame.stamp_ns):
             found.add(doubts.OVERFIT)
-        found |= self._opinion.doubts(self._clocks.apart_s)
-        implausibilities = implausible(
+        found |= self._opinion.doubts(self._clocks.apart_s(self._sensors.rows)) | implausible(
             self._filter.observation, bank.x[best], int(bank.kind[best]), settings.vehicle,
             np.deg2rad(settings.mounting_std_deg), dt)
-        for reason in implausibilities.difference(doubts.OF_ONE_POSE):
+        for reason in found & doubts.FOR_GOOD:
             evidence.doubt(reason)
-        return found | implausibilities | evidence.doubts
+        return found | evidence.doubts
 
     def _compare(self, frame: FieldFrame, dt: float, evidence: float) -> None:
         """Count what a frame with the log-evidence of a target says for something else, and for
@@ -339,6 +338,7 @@ class RunningTrack:
         if self._sensors.serves(place, n):
             return
         before, sensors = self._sensors, SensorSubset.near(self._sensors.whole, place, n)
+        self._opinion.conclude(self._clocks, before.rows)
         self._use(sensors, BankFilter(sensors.network, self._target.model, self._settings), True)
         observation = self._filter.observation
         hand_on(self.bank, observation.n_own, before.rows, sensors.rows,

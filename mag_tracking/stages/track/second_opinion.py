@@ -1,6 +1,5 @@
 """A second opinion on a running track, once its vehicle has passed: see `rigid_pass`."""
 
-from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -18,33 +17,32 @@ PASSED = 0.6
 """A vehicle has passed once the field is below this share of its largest."""
 
 FIRST_S = 0.12
-"""[s] After the strongest field: the first opinion."""
+"""[s] The first opinion follows so long after the strongest field."""
 
 AGAIN = 1.7
-"""The next one follows after so many times as long: each has more to go by."""
+"""The next opinion follows after so many times as long."""
+
+BEFORE_S, AFTER_S = 4.0, 3.0
+"""[s] Frames from so long before to so long after the strongest field are of the pass."""
 
 LEAST_FRAMES, MOST_FRAMES = 12, 128
-"""The latest frames are looked at, if there are as many."""
-
-MOST_FITTED = 64
-"""Of more frames, every other one."""
-
+"""A pass is fitted to no fewer frames; of more every other one is left out, or more of them."""
 
 MISFIT = 1.5
-"""A pass is of no vehicle on a steady path where the reduced chi-square is larger: the one of cars
-and trucks past good sensors is 0.5 to 1.2."""
+"""No vehicle on a steady path explains a pass whose reduced chi-square is larger; cars and trucks
+past good sensors have 0.5 to 1.2."""
 
 STEADY_S = 1.5
 """[s] After the strongest field: until then a vehicle goes on as steadily as it passed."""
 
 MISFIT_LATER = 8.0
-"""What it may then do makes it as large as 5, not larger."""
+"""The same limit for later opinions: a car that turned sharply has 5 there, a U-turn 20 to 40."""
 
 
 class _Seen(NamedTuple):
-    """A frame of the track."""
+    """A frame of the track, in short."""
 
-    frame: FieldFrame
+    stamp_ns: int
     size: float
     """[T] largest field of a sensor."""
     state: FloatArray
@@ -52,7 +50,7 @@ class _Seen(NamedTuple):
 
 
 class SecondOpinion:
-    """The latest frames of a track, and what a rigid path says of them.
+    """The frames of a track, and the fits of its pass as a whole.
 
     Attributes
     ----------
@@ -63,23 +61,39 @@ class SecondOpinion:
     def __init__(self, network: SensorNetwork) -> None:
         self.latest: RigidPass | None = None
         self._network = network
-        self._frames: deque[_Seen] = deque(maxlen=MOST_FRAMES)
-        # When the field was strongest, and how long after it the next opinion is due.
-        self._peak_ns, self._due_s = -1, FIRST_S
+        self._frames: list[FieldFrame] = []
+        self._peak: _Seen | None = None
+        self._now: _Seen | None = None
+        self._period_s = np.inf
+        self._due_s = FIRST_S
         self._is_misfit = False
 
     def add(self, frame: FieldFrame, state: FloatArray) -> None:
         """Take a frame, and the `state` (n_x,) of the best hypothesis."""
         size = float(np.sqrt(np.nansum(np.square(frame.field), axis=1).max(initial=0.0)))
-        self._frames.append(_Seen(frame, size, state[:6].copy()))
+        if self._now is not None:
+            # A gap is no frame period.
+            self._period_s = min(self._period_s, (frame.stamp_ns - self._now.stamp_ns) / NS)
+        self._now = _Seen(frame.stamp_ns, size, state[:6].copy())
+        if self._peak is None or size > self._peak.size:
+            self._peak, self._due_s = self._now, FIRST_S
+        # What is no longer of this pass, and will not be of another.
+        earliest = frame.stamp_ns - BEFORE_S * NS
+        self._frames = [f for f in self._frames if f.stamp_ns >= earliest or self._is_of_pass(f)]
+        self._frames.append(frame)
+
+    def _is_of_pass(self, frame: FieldFrame) -> bool:
+        """Whether a frame is near the strongest field in time."""
+        assert self._peak is not None
+        return -BEFORE_S * NS <= frame.stamp_ns - self._peak.stamp_ns <= AFTER_S * NS
 
     def doubts(self, clocks_apart_s: float) -> set[str]:
         """Doubts about the track by now; earlier ones say that the clocks are so far apart [s]."""
-        if not self._frames:
+        if self._now is None:
             return set()
-        self._form_if_due(self._frames[-1].size)
+        self._form_if_due(self._now.size)
         found = self._of_pass()
-        speed = float(np.hypot(*self._frames[-1].state[3:5]))
+        speed = float(np.hypot(self._now.state[3], self._now.state[4]))
         if clocks_apart_s * speed > LEAST_WAY:
             found.add(doubts.CLOCKS_APART)
         return found
@@ -91,29 +105,31 @@ class SecondOpinion:
 
     def conclude(self, clocks: ClockEvidence, rows: IntArray) -> None:
         """The track ends: form a last opinion, and tell the `clocks` of the sensors `rows`."""
-        if self._frames:
-            self._form_if_due(0.0)
+        self._form_if_due(0.0)
         if self.latest is not None:
             clocks.add(self.latest, rows)
 
     def _form_if_due(self, size: float) -> None:
         """Form an opinion if it is time to; the field is now of this `size` [T]."""
-        peak = max(self._frames, key=lambda seen: seen.size)
-        if peak.frame.stamp_ns != self._peak_ns:
-            self._peak_ns, self._due_s = peak.frame.stamp_ns, FIRST_S
-        since = (self._frames[-1].frame.stamp_ns - self._peak_ns) / NS
-        if since < self._due_s or size > PASSED * peak.size or len(self._frames) < LEAST_FRAMES:
+        now, peak = self._now, self._peak
+        if now is None or peak is None or self._due_s > AFTER_S or size > PASSED * peak.size:
+            return
+        since = (now.stamp_ns - peak.stamp_ns) / NS
+        frames = [f for f in self._frames if self._is_of_pass(f)]
+        if since < self._due_s or len(frames) < LEAST_FRAMES:
             return
         self._due_s = AGAIN * since
-        now = self._frames[-1]
+        # The search starts from what the filter says now, and from what it said then.
         back = now.state.copy()
-        # Searched for from what the filter says now, and from what it said then.
         back[:3] -= since * back[3:]
-        frames = [seen.frame for seen in self._frames]
-        self.latest = fit_rigid_pass(self._network, frames[::-(-len(frames) // MOST_FITTED)],
-                                     self._peak_ns, np.array([back, peak.state]))
-        if self.latest is not None and since <= STEADY_S:
-            self._is_misfit = self.latest.misfit > MISFIT
+        step = -(-len(frames) // MOST_FRAMES)
+        found = fit_rigid_pass(self._network, frames[::step], peak.stamp_ns,
+                               np.array([back, peak.state]))
+        if found is None:
+            return
+        self.latest = found
+        if since <= STEADY_S:
+            self._is_misfit = found.misfit > MISFIT
 
     def _of_pass(self) -> set[str]:
         """Doubts by the latest opinion."""
@@ -127,8 +143,7 @@ class SecondOpinion:
             return found
         if latest.needs_clocks_apart:
             found.add(doubts.CLOCKS_APART)
-        period = float(np.median(np.diff([seen.frame.stamp_ns for seen in self._frames]))) / NS
-        if moves_too_far(latest.closest(self._network.positions), latest.velocity, period,
-                         self._network.positions):
+        if moves_too_far(latest.closest(self._network.positions), latest.velocity,
+                         self._period_s, self._network.positions):
             found.add(doubts.FRAMES_TOO_LONG)
         return found

@@ -68,9 +68,9 @@ class TrackSettings:
     relinearise_most: int = param(
         20, 'For how many hypotheses it is done at most.', '', (1, 100000))
     second_opinion: bool = param(
-        True, 'Once a vehicle has passed, and about four times after that, the whole pass is '
-        'fitted as one along a path that cannot bend (10 to 50 ms each): what it says of the '
-        'clocks of the sensors, and of very fast vehicles, no filter sees.', live=True)
+        True, 'Once a vehicle has passed, and about four times after that, its whole pass is '
+        'fitted at once, along a path of steady acceleration and turning (5 to 50 ms each). That '
+        'tells of clocks that are apart, of clipped sensors and of two vehicles.', live=True)
     lookback_s: float = param(
         1.0, 'A track begins so long before its detection, with the frames kept since: what is '
         'too weak to detect still tells where the target came from.', 's', (0.0, 60.0))

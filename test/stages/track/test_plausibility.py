@@ -40,6 +40,6 @@ def found(mounting=MOUNTING, dt=0.08, **of_state):
     ({'speed': 45.0, 'dt': 0.04}, set()), ({'speed': 40.0, 'at': (0.0, 4.4)}, set()),
     # Three deviations of 1.5 m beyond the outermost lane, at 4 m; a standing one goes nowhere.
     ({'at': (0.0, 8.4)}, set()), ({'at': (0.0, 8.6)}, {doubts.OFF_THE_ROAD}),
-    ({'at': (30.0, -8.6)}, {doubts.OFF_THE_ROAD}), ({'at': (0.0, 8.6), 'speed': 0.0}, set())])
+    ({'at': (30.0, -8.6)}, {doubts.OFF_THE_ROAD}), ({'at': (0.0, 8.6), 'speed': 0.9}, set())])
 def test_states_that_no_vehicle_has(of_state, expected):
     assert found(**of_state) == expected

@@ -1,10 +1,12 @@
 """When a second opinion is formed, and what it says of a track."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mag_tracking.pipeline import Pipeline, settings_for
-from mag_tracking.records import Track
+from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.clock_evidence import ClockEvidence
 from mag_tracking.stages.track.second_opinion import SecondOpinion
@@ -68,7 +70,8 @@ def test_a_track_that_ends_tells_of_its_clocks():
     heard(opinion, steady_frames(np.random.default_rng(4), clocks=(0.3,)))
     for _ in range(2):
         opinion.conclude(clocks, np.arange(2))
-    assert clocks.apart.ahead == 1 and clocks.apart_s == pytest.approx(0.3, abs=0.05)
+    assert clocks.apart.sensor == 1
+    assert clocks.apart_s(np.arange(2)) == pytest.approx(0.3, abs=0.05)
 
 
 def test_no_frame_is_no_opinion():
@@ -79,28 +82,58 @@ def test_no_frame_is_no_opinion():
     assert clocks.apart is None and not opinion.is_doubtful
 
 
+def test_a_long_track_is_judged_by_its_closest_point():
+    """At 100 frames a second, and for half a minute after it."""
+    opinion, n, latest = SecondOpinion(ROAD), 0, None
+    for frame in steady_frames(np.random.default_rng(6), clocks=(0.3,), period_s=0.01, until_s=30):
+        opinion.add(frame, state_at(frame))
+        found = opinion.doubts(0.0)
+        n += opinion.latest is not latest
+        latest = opinion.latest
+    print(f'{n} opinions')
+    assert doubts.CLOCKS_APART in found and n <= 12
+
+
+def test_an_opinion_stands_where_later_frames_allow_none():
+    """One of two sensors falls silent."""
+    opinion = SecondOpinion(ROAD)
+    frames = steady_frames(np.random.default_rng(7), clocks=(0.3,), until_s=6.0)
+    for frame in frames:
+        silent = frame.stamp_ns > 0.5e9
+        opinion.add(replace(frame, field=np.where([[silent], [False]], np.nan, frame.field)),
+                    state_at(frame))
+        found = opinion.doubts(0.0)
+    assert doubts.CLOCKS_APART in found
+
+
 def tracks_of(readings, network, **changes):
     pipeline = Pipeline(network, settings_for('vehicle', changes))
     records = pipeline.feed(readings) + pipeline.flush()
-    return [r for r in records if isinstance(r, Track) and not r.ended], pipeline
+    return [r for r in records if not getattr(r, 'ended', False)], pipeline
 
 
 def test_it_can_be_switched_off():
     a_world = made('clocks 200 ms apart', 'clouds', 1)
     for on in (True, False):
-        tracks, _ = tracks_of(a_world.readings, a_world.network, **{'track.second_opinion': on})
-        assert any(doubts.CLOCKS_APART in t.doubts for t in tracks) is on
+        records, pipeline = tracks_of(a_world.readings, a_world.network,
+                                      **{'track.second_opinion': on})
+        assert any(doubts.CLOCKS_APART in t.doubts for t in records if isinstance(t, Track)) is on
+        # Smoothed poses are of the whole track.
+        assert all(t.ambiguous for t in records if isinstance(t, SmoothedPose)) is on
 
 
 def test_the_third_car_past_a_wrong_clock_is_doubted_from_its_first_pose():
     rng = np.random.default_rng(5)
     a_world = ambient_world(rng, 'clouds', None, 75.0, cars=3)
     readings = spoiler.apply(a_world.readings, spoiler.delayed('mag_2', 0.25))
-    tracks, pipeline = tracks_of(readings, a_world.network)
-    last = [t for t in tracks if t.id == max(t.id for t in tracks)]
-    assert all(doubts.CLOCKS_APART in t.doubts for t in last)
+    records, pipeline = tracks_of(readings, a_world.network)
+    tracks = [r for r in records if isinstance(r, Track)]
+    last = [r for r in records if isinstance(r, Track | SmoothedPose)
+            and r.id == max(t.id for t in tracks)]
+    assert all(doubts.CLOCKS_APART in t.doubts for t in last if isinstance(t, Track))
+    assert all(t.ambiguous for t in last)
     print(pipeline.track.clocks_apart)
     assert 'the clock of mag_2 seems' in pipeline.track.clocks_apart
     right, pipeline = tracks_of(a_world.readings, a_world.network)
-    assert not any(doubts.CLOCKS_APART in t.doubts for t in right)
+    assert not any(doubts.CLOCKS_APART in t.doubts for t in right if isinstance(t, Track))
     assert pipeline.track.clocks_apart == ''
