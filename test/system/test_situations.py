@@ -31,8 +31,8 @@ MISSED = {
     'clocks 200 ms apart': 'the clock: the four wrong poses are within 0.5 s of the closest point, '
                            'before the pass as a whole tells',
     'a car with a trailer': 'unknown: it is taken for a car of 3 to 6 m',
-    'a train at 9 m': 'unknown: nearly all poses are flagged as beside the road; in one run a truck that '
-                      'hardly moves is seen at the right distance',
+    'a train at 9 m': 'unknown: nearly all poses are flagged as beside the road; in one run a '
+                      'truck that hardly moves is seen at the right distance',
     'parked beside a passing car': 'unknown: one pass in ten is two metres behind in its tail',
     'one axis flipped': 'the axis: without it none is wrong',
     'one overtakes': 'two cars side by side are taken for a truck of 8 to 12 m',
