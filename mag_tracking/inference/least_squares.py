@@ -144,10 +144,9 @@ def project_out_linear(A: FloatArray, y: FloatArray
         Pseudo-inverse of A'A.
     """
     At = np.swapaxes(A, 1, 2)
-    with _running_away():
-        inverse = _inverse(At @ A, LINEAR_RANK)
-        p = np.einsum('nij,nj->ni', inverse, At @ y)
-        return p, y - np.einsum('nyi,ni->ny', A, p), inverse
+    inverse = _inverse(At @ A, LINEAR_RANK)
+    p = np.einsum('nij,nj->ni', inverse, At @ y)
+    return p, y - np.einsum('nyi,ni->ny', A, p), inverse
 
 
 LINEAR_RANK = 1e-11
@@ -261,11 +260,10 @@ class SeparableProblem:
 
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals (n, n_y) and the Jacobians (n, n_y, n_theta) of what is predicted."""
-        with _running_away():
-            A = self._without_nuisance(self._model.basis(theta))
-            p, residual, inverse = project_out_linear(A, self._y)
-            D = self._without_nuisance(self._model.derivative(theta, p))
-            return residual, D - A @ (inverse @ (np.swapaxes(A, 1, 2) @ D))
+        A = self._without_nuisance(self._model.basis(theta))
+        p, residual, inverse = project_out_linear(A, self._y)
+        D = self._without_nuisance(self._model.derivative(theta, p))
+        return residual, D - A @ (inverse @ (np.swapaxes(A, 1, 2) @ D))
 
     def linear(self, theta: FloatArray) -> FloatArray:
         """p (k,) at theta (n_theta,)."""

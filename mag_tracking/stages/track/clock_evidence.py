@@ -33,7 +33,7 @@ class ClockOffset:
     """How far it is ahead; negative = behind."""
     std_s: float
     n_passes: int
-    """That compared it."""
+    """Number of passes that compared it."""
 
     def text(self, names: Sequence[str]) -> str:
         """A sentence about it; `names` are those of the sensors."""

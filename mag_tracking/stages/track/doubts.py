@@ -23,7 +23,7 @@ CLOCKS_APART = 'clocks_apart'
 NO_STEADY_PATH = 'no_steady_path'
 
 FOR_GOOD = frozenset({SENSORS_ROTATED, FRAMES_TOO_LONG, CLOCKS_APART})
-"""What has bent the track; another state that no vehicle has may soon be right again."""
+"""These doubts stay: the track was bent. A state that no vehicle has may soon be right again."""
 
 MEANINGS = {
     ANOTHER_PLACE: 'another place is still possible',

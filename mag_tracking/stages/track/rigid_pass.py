@@ -48,7 +48,7 @@ TURN = 0.4
 """[rad/s] The search for a path that bends starts with this, either way, too."""
 
 N_STEPS, TOLERANCE = 30, 1e-3
-"""Of the search: steps, and the share of the cost by which the last one improves it."""
+"""The search ends after so many steps, or where one improves the cost by less than this share."""
 
 WELL = 1.3
 """Reduced chi-square up to which a path explains a pass."""
@@ -69,7 +69,7 @@ _BENT = np.arange(N_PATH)
 
 @dataclass(frozen=True)
 class RigidPass:
-    """What the frames of a pass say of a vehicle on a steady path.
+    """Fits of a vehicle on a steady path to the frames of its whole pass.
 
     The costs are sums of squared whitened residuals.
     """
@@ -77,11 +77,11 @@ class RigidPass:
     straight: float
     """Cost of a straight path."""
     bent: float
-    """Of one that bends."""
+    """Cost of a path that bends."""
     apart: float
-    """Of a straight path at constant speed, the clocks being apart."""
+    """Cost of a straight path at constant speed, the clocks being apart."""
     freedom: int
-    """Degrees of freedom of the last."""
+    """Degrees of freedom of that fit."""
     misfit: float
     """Reduced chi-square of a row on a path that bends, a long one if need be; about one where that
     explains the pass."""
@@ -121,7 +121,7 @@ class RigidPass:
 
     @property
     def widening(self) -> float:
-        """What the variances are to be multiplied by for what the path leaves unexplained."""
+        """Factor on the variances where the residuals are larger than their law allows."""
         return max(self.apart / self.freedom, 1.0)
 
     def clock_variance(self, sensor: int) -> float:

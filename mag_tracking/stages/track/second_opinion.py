@@ -9,6 +9,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.clock_evidence import ClockEvidence
+from mag_tracking.stages.track.disturbances import size_of
 from mag_tracking.stages.track.plausibility import moves_too_far
 from mag_tracking.stages.track.rigid_pass import LEAST_WAY, RigidPass, fit_rigid_pass
 from mag_tracking.units import NS
@@ -29,14 +30,13 @@ LEAST_FRAMES, MOST_FRAMES = 12, 128
 """A pass is fitted to no fewer frames; of more every other one is left out, or more of them."""
 
 MISFIT = 1.5
-"""No vehicle on a steady path explains a pass whose reduced chi-square is larger; cars and trucks
-past good sensors have 0.5 to 1.2."""
+"""No vehicle on a steady path explains a pass whose reduced chi-square is larger: theory is one."""
 
 STEADY_S = 1.5
 """[s] After the strongest field: until then a vehicle goes on as steadily as it passed."""
 
 MISFIT_LATER = 8.0
-"""The same limit for later opinions: a car that turned sharply has 5 there, a U-turn 20 to 40."""
+"""The limit for later opinions, when a car may have turned otherwise than steadily."""
 
 
 class _Seen(NamedTuple):
@@ -70,7 +70,7 @@ class SecondOpinion:
 
     def add(self, frame: FieldFrame, state: FloatArray) -> None:
         """Take a frame, and the `state` (n_x,) of the best hypothesis."""
-        size = float(np.sqrt(np.nansum(np.square(frame.field), axis=1).max(initial=0.0)))
+        size = float(size_of(frame).max(initial=0.0))
         if self._now is not None:
             # A gap is no frame period.
             self._period_s = min(self._period_s, (frame.stamp_ns - self._now.stamp_ns) / NS)
@@ -92,7 +92,7 @@ class SecondOpinion:
         if self._now is None:
             return set()
         self._form_if_due(self._now.size)
-        found = self._of_pass()
+        found = self._pass_doubts()
         speed = float(np.hypot(self._now.state[3], self._now.state[4]))
         if clocks_apart_s * speed > LEAST_WAY:
             found.add(doubts.CLOCKS_APART)
@@ -101,7 +101,7 @@ class SecondOpinion:
     @property
     def is_doubtful(self) -> bool:
         """Whether the latest opinion doubts the track."""
-        return bool(self._of_pass())
+        return bool(self._pass_doubts())
 
     def conclude(self, clocks: ClockEvidence, rows: IntArray) -> None:
         """The track ends: form a last opinion, and tell the `clocks` of the sensors `rows`."""
@@ -131,7 +131,7 @@ class SecondOpinion:
         if since <= STEADY_S:
             self._is_misfit = found.misfit > MISFIT
 
-    def _of_pass(self) -> set[str]:
+    def _pass_doubts(self) -> set[str]:
         """Doubts by the latest opinion."""
         found: set[str] = set()
         latest = self.latest

@@ -69,7 +69,7 @@ class TrackSettings:
         20, 'For how many hypotheses it is done at most.', '', (1, 100000))
     second_opinion: bool = param(
         True, 'Once a vehicle has passed, and about four times after that, its whole pass is '
-        'fitted at once, along a path of steady acceleration and turning (5 to 50 ms each). That '
+        'fitted at once, along a path of steady acceleration and turning. That '
         'tells of clocks that are apart, of clipped sensors and of two vehicles.', live=True)
     lookback_s: float = param(
         1.0, 'A track begins so long before its detection, with the frames kept since: what is '

@@ -10,7 +10,7 @@ TWO = np.arange(2)
 
 
 def a_pass(offset, std=0.02, speed=15.0, misfit=1.0, reference=0, bent=100.0):
-    """Of two sensors, or of as many as `offset` has numbers."""
+    """A pass of two sensors, or of one more than `offset` has numbers."""
     offsets = np.insert(np.atleast_1d(offset).astype(float), reference, 0.0)
     stds = np.where(np.arange(len(offsets)) == reference, 0.0, std)
     return RigidPass(100.0, bent, 100.0 * misfit, 100, 1.0, reference, offsets, stds, np.zeros(3),
