@@ -263,7 +263,8 @@ class Track:
     """(3,) [m/s], world."""
     covariance: FloatArray
     """(6, 6) of position and velocity, world: about this pose, of all hypotheses at this place.
-    That of a vehicle's position holds what of its length is not yet seen, too."""
+    That of a vehicle's position holds what of its length is not yet seen, too, and how far the
+    track is from a straight path that explains its whole pass."""
     orientation: FloatArray
     """(4,) quaternion xyzw, body to world."""
     orientation_covariance: FloatArray

@@ -44,7 +44,7 @@ def test_another_arrival_makes_a_track_ambiguous_even_where_the_places_agree(
                    np.array([[7.0, np.nan], [1.0, 2.0]]))
     track = published_track(
         b, 1, model, vehicle_orientation, ('left', 'right'), ('car', 'truck'),
-        set(), None, stamp_ns=1, id=1, ended=False,
+        set(), None, difference=np.zeros(6), stamp_ns=1, id=1, ended=False,
         existence=1.0, degrees_of_freedom=6, predicted=np.zeros((2, 3)),
         mounting=np.zeros((0, 3)), mounting_covariance=np.zeros((0, 3, 3)))
     assert track.ambiguous == ambiguous

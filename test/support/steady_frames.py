@@ -38,3 +38,9 @@ def steady_frames(rng, network=ROAD, path=STRAIGHT, clocks=(), change=None, peri
     return [FieldFrame(round(at * NS), field,
                        np.where(np.isnan(field)[:, :, None] | np.isnan(field)[:, None], np.nan, C),
                        np.full(n, 8), np.zeros(n)) for at, field in zip(t, B, strict=True)]
+
+
+def state_at(t, path=STRAIGHT):
+    """(6,) [m], [m/s] at time `t` [s] on a straight path."""
+    velocity = path[3] * np.array([np.cos(path[4]), np.sin(path[4]), 0.0])
+    return np.append(path[:3] + t * velocity, velocity)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mag_tracking.stages.track.latest_frames import LatestFrames
+from mag_tracking.inference.latest_frames import LatestFrames
 from mag_tracking.units import NS
 
 WINDOW_S = 1.0

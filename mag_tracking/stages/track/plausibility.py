@@ -14,8 +14,9 @@ MOUNTED = 0.05
 LEVEL = 1e-3
 """Probability that the iron of a vehicle is as far from its kind's height as it may be."""
 
-LANE = 3.0
-"""Deviations by which a vehicle may be beside the outermost lane of the settings."""
+LANE, LANE_NOW = 1.645, 3.0
+"""Deviations by which a vehicle may be beside the outermost lane of the settings: one vehicle in
+twenty of that lane is farther beside it where it passes. Once it has passed it may turn off."""
 
 LEAST_SPEED = 1.0
 """[m/s] A slower vehicle has no direction."""
@@ -26,52 +27,74 @@ fields are averaged over the frame, with a relative error of about half of the s
 that errs more, as it is passed closely, does not mislead a track."""
 
 
-def implausible(observation: Observation, x: FloatArray, kind: int, settings: VehicleSettings,
-                mounting_std: float, dt: float) -> set[str]:
-    """Doubts about a state of a vehicle.
+class Plausibility:
+    """Doubts about the states of a vehicle on its way past some sensors."""
 
-    Parameters
-    ----------
-    observation : Observation
-    x : (n_x,) array
-        That of the published hypothesis.
-    kind : int
-    settings : VehicleSettings
-    mounting_std : float [rad]
-        Sensors may be turned by as much, also those that are known better: what the model leaves
-        out of a field rotates it, too.
-    dt : float [s]
-        Length of the frame.
-    """
-    found = set()
-    if _needs_rotated_sensors(observation, x, mounting_std):
-        found.add(doubts.SENSORS_ROTATED)
-    off = abs(float(x[2]) - settings.heights[kind])
-    if off > -ndtri(LEVEL / 2.0) * settings.height_stds[kind]:
-        found.add(doubts.HEIGHT)
-    if _is_off_the_road(x[:3], x[3:6], settings, observation.positions):
-        found.add(doubts.OFF_THE_ROAD)
-    if moves_too_far(x[:3], x[3:6], dt, observation.positions):
-        found.add(doubts.FRAMES_TOO_LONG)
-    return found
+    def __init__(self) -> None:
+        self._nearest = np.inf
+        self._passes_off_the_road = False
+
+    def doubts(self, observation: Observation, x: FloatArray, kind: int,
+               settings: VehicleSettings, mounting_std: float, dt: float) -> set[str]:
+        """Doubts about the next state.
+
+        Parameters
+        ----------
+        observation : Observation
+        x : (n_x,) array
+            The state of the published hypothesis.
+        kind : int
+        settings : VehicleSettings
+        mounting_std : float [rad]
+            Sensors may be turned by as much, also those that are known better: what the model
+            leaves out of a field rotates it, too.
+        dt : float [s]
+            Length of the frame.
+        """
+        found = set()
+        if _needs_rotated_sensors(observation, x, mounting_std):
+            found.add(doubts.SENSORS_ROTATED)
+        off = abs(float(x[2]) - settings.heights[kind])
+        if off > -ndtri(LEVEL / 2.0) * settings.height_stds[kind]:
+            found.add(doubts.HEIGHT)
+        if self._goes_off_the_road(x[:3], x[3:6], settings, observation.positions):
+            found.add(doubts.OFF_THE_ROAD)
+        if moves_too_far(x[:3], x[3:6], dt, observation.positions):
+            found.add(doubts.FRAMES_TOO_LONG)
+        return found
+
+    def _goes_off_the_road(self, position: FloatArray, velocity: FloatArray,
+                           settings: VehicleSettings, positions: FloatArray) -> bool:
+        """Whether the path is beside the road, now or where it was nearest to a sensor so far."""
+        if np.hypot(velocity[0], velocity[1]) < LEAST_SPEED:
+            return self._passes_off_the_road
+        nearest = float(np.hypot(*(positions - position)[:, :2].T).min())
+        if nearest <= self._nearest:
+            self._nearest = nearest
+            self._passes_off_the_road = _is_off_the_road(position, velocity, settings, positions,
+                                                         LANE)
+        return self._passes_off_the_road or _is_off_the_road(position, velocity, settings,
+                                                             positions, LANE_NOW)
 
 
 def _is_off_the_road(position: FloatArray, velocity: FloatArray, settings: VehicleSettings,
-                     positions: FloatArray) -> bool:
+                     positions: FloatArray, deviations: float) -> bool:
     """Whether a vehicle passes all sensors, at `positions` (n, 3), on one side, beyond the lanes.
 
-    There its distance is hardly measured: a train on another line looks like a truck nearby. Lanes
-    are on both sides of the centre of the network; past a network that covers an area a vehicle
-    may be as near to the outermost sensors.
+    There its distance is hardly measured: a train on another line looks like a truck nearby, and a
+    truck beyond a sensor like a car before one that has an axis the wrong way round. Lanes are on
+    both sides of the centre of the network. One that is wider than the road covers an area: a
+    vehicle may then be as near to the outermost sensors.
     """
     speed = float(np.hypot(velocity[0], velocity[1]))
-    if speed < LEAST_SPEED:
-        return False
     away = positions - position
     aside = (velocity[0] * away[:, 1] - velocity[1] * away[:, 0]) / speed
     outermost = max(map(abs, settings.lateral_offsets))
-    return bool((aside > outermost).all() or (aside < -outermost).all()) \
-        and abs(aside.mean()) > outermost + LANE * settings.lateral_std
+    edge = outermost + deviations * settings.lateral_std
+    half_width = float(np.ptp(aside)) / 2.0
+    if half_width > edge:
+        edge = half_width + outermost
+    return bool((aside > 0.0).all() or (aside < 0.0).all()) and abs(aside.mean()) > edge
 
 
 def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positions: FloatArray

@@ -7,6 +7,7 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.geometry import cross_matrix, quaternion_between, quaternion_from_yaw
+from mag_tracking.inference.covariance_union import covering
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.physics.sources import SourceModel
 from mag_tracking.records import Hypotheses, SmoothedPose, Track
@@ -101,9 +102,10 @@ def magnet_orientation(x: FloatArray, P: FloatArray, axis: FloatArray) -> Orient
 
 def published_track(bank: FilterBank, best: int, model: SourceModel, orientation: Orientation,
                     names: Sequence[str], kinds: Sequence[str], found: Set[str],
-                    unseen: UnseenLength | None, *, excess: float = 1.0, stamp_ns: int, id: int,
-                    ended: bool, existence: float, degrees_of_freedom: int, predicted: FloatArray,
-                    mounting: FloatArray, mounting_covariance: FloatArray) -> Track:
+                    unseen: UnseenLength | None, *, excess: float = 1.0, difference: FloatArray,
+                    stamp_ns: int, id: int, ended: bool, existence: float,
+                    degrees_of_freedom: int, predicted: FloatArray, mounting: FloatArray,
+                    mounting_covariance: FloatArray) -> Track:
     """The `Track` of a bank's hypothesis `best`.
 
     Parameters
@@ -124,13 +126,15 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
         How the length of a vehicle moves its middle; None for a small target.
     excess : float
         The innovations are this many times larger than stated: so is the covariance, then.
+    difference : (6,) [m], [m/s]
+        From where the target may be, too, as `covering` takes it.
     stamp_ns, id, ended, existence, degrees_of_freedom, predicted, mounting, mounting_covariance
         Fields of `Track` that the bank does not know.
     """
     n_t = len(model.state_names)
     said, flags = _said_of(model, orientation, bank.x[best, :n_t],
-                           excess * covariance_about(bank, best, model), int(bank.kind[best]),
-                           unseen)
+                           covering(excess * covariance_about(bank, best, model), difference),
+                           int(bank.kind[best]), unseen)
     reasons = doubts.listed({*found, *ambiguities(bank, best)})
     weights = np.exp(bank.log_w)
     moments = model.dipoles(bank.x[:, :n_t]).m.sum(axis=1)
@@ -182,17 +186,18 @@ def ambiguities(bank: FilterBank, best: int) -> set[str]:
 
 
 def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray, *,
-                  unseen: UnseenLength | None, stamp_ns: int, id: int, kind: int,
-                  kinds: Sequence[str], ambiguous: bool, complete: bool) -> SmoothedPose:
+                  unseen: UnseenLength | None, difference: FloatArray, stamp_ns: int, id: int,
+                  kind: int, kinds: Sequence[str], ambiguous: bool, complete: bool
+                  ) -> SmoothedPose:
     """The `SmoothedPose` of a state `x` (n_x,) with covariance `P` (n_x, n_x).
 
-    The model and the orientation are as for `published_track`.
+    The other parameters are as for `published_track`.
     """
     n_t = len(model.state_names)
     return SmoothedPose(stamp_ns=stamp_ns, id=id, kind=kinds[kind], ambiguous=ambiguous,
                         complete=complete,
-                        **_said_of(model, orientation, x[:n_t], P[:n_t, :n_t], kind,
-                                   unseen)[0])
+                        **_said_of(model, orientation, x[:n_t],
+                                   covering(P[:n_t, :n_t], difference), kind, unseen)[0])
 
 
 def _said_of(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray,

@@ -50,8 +50,8 @@ TURN = 0.4
 N_STEPS, TOLERANCE = 30, 1e-3
 """The search ends after so many steps, or where one improves the cost by less than this share."""
 
-WELL = 1.3
-"""Reduced chi-square up to which a path explains a pass."""
+WELL, MISFIT = 1.3, 1.5
+"""Reduced chi-square up to which a path explains a pass, and up to which it may."""
 
 CHANCE, BENDS = 1e-5, 1e-3
 """Probability that clocks which agree make the fit of a straight path better by as much, and that
@@ -62,6 +62,9 @@ LEAST_WAY = 1.0
 
 MIDDLE_STD = 0.5
 """[m] The iron of a vehicle has another middle for each sensor."""
+
+FARTHEST, FASTEST = 30.0, 100.0
+"""[m], [m/s] A path that is farther from all sensors, or faster, is that of no vehicle."""
 
 _STRAIGHT = np.arange(N_STRAIGHT)
 _BENT = np.arange(N_PATH)
@@ -95,6 +98,9 @@ class RigidPass:
     """(3,) [m] where the field was strongest; of the straight path, the clocks being apart."""
     velocity: FloatArray
     """(3,) [m/s]"""
+    straight_paths: FloatArray
+    """(k, 6) [m], [m/s] positions and velocities where the field was strongest, on straight paths
+    of a short row and a long one; those that may explain the pass."""
 
     @property
     def n_clocks(self) -> int:
@@ -112,6 +118,18 @@ class RigidPass:
         square = max(float(self.velocity @ self.velocity), 1e-12)
         places = self.position + (away @ self.velocity / square)[:, None] * self.velocity
         nearest: FloatArray = places[np.argmin(np.linalg.norm(places - positions, axis=1))]
+        return nearest
+
+    def difference(self, t: float, state: FloatArray) -> FloatArray:
+        """(6,) [m], [m/s] from the nearest straight path that may explain the pass to a position
+        and velocity, `state` (6,), at time `t` [s]; horizontal. Zero where none explains it.
+        """
+        if not len(self.straight_paths):
+            return np.zeros(6)
+        differences = state - self.straight_paths
+        differences[:, :3] -= t * self.straight_paths[:, 3:]
+        differences[:, [2, 5]] = 0.0
+        nearest: FloatArray = differences[np.argmin(np.hypot(*differences[:, :2].T))]
         return nearest
 
     @cached_property
@@ -179,7 +197,7 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
     clocks = np.array([np.append(p, np.full(n_clocks, sign * offset))
                        for p, offset in apart_from for sign in (-1.0, 1.0)])
     path, bent, _ = data.fit(SHORT, _BENT, bends)
-    misfit = _misfit(data, straight, path, bent)
+    misfit, straight_paths = _longer(data, straight, cost, path, bent)
     free = np.concatenate([_STRAIGHT, N_PATH + np.arange(n_clocks)])
     path, apart, P = data.fit(SHORT, free, clocks)
     if not np.isfinite([cost, bent, apart, misfit]).all():
@@ -190,23 +208,40 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
     known = np.append(True, variance > 0.0)
     offset[data.compared[known]] = np.append(0.0, path[N_PATH:])[known]
     std[data.compared[known]] = np.sqrt(np.append(0.0, variance))[known]
-    c, s = np.cos(path[4]), np.sin(path[4])
+    x = _where(path)
     return RigidPass(cost, bent, apart, data.n_free(SHORT) - len(free), misfit,
-                     int(data.compared[0]), offset, std, path[:3],
-                     np.array([c * path[3], s * path[3], path[5]]))
+                     int(data.compared[0]), offset, std, x[:3], x[3:], straight_paths)
 
 
-def _misfit(data: '_Samples', straight: FloatArray, path: FloatArray, cost: float) -> float:
-    """Reduced chi-square of a row on a path that bends, of a long one where the short one that has
-    this `cost` on the `path` does not explain the pass.
+def _where(path: FloatArray) -> FloatArray:
+    """(6,) position and velocity of a path at time zero."""
+    c, s = np.cos(path[4]), np.sin(path[4])
+    return np.array([*path[:3], c * path[3], s * path[3], path[5]])
+
+
+def _longer(data: '_Samples', straight: FloatArray, cost: float, bent: FloatArray, of_bent: float
+            ) -> tuple[float, FloatArray]:
+    """`RigidPass.misfit` and `RigidPass.straight_paths`.
+
+    A short row has this `cost` on the `straight` path, and the cost `of_bent` on one that bends.
     """
-    misfit = cost / (data.n_free(SHORT) - N_PATH)
-    if misfit <= WELL:
-        return misfit
-    longer = path.copy()
+    near = data.near(bent)
+    longer = straight.copy()
     longer[PATH.index('length')] = LONG_LENGTH
-    _, of_long, _ = data.near(path).fit(LONG, _BENT, np.array([straight, path, longer])[:, _BENT])
-    return min(misfit, of_long / (data.n_free(LONG) - N_PATH))
+    long, of_long, _ = near.fit(LONG, _STRAIGHT, np.array([straight, longer])[:, _STRAIGHT])
+    chi_square = np.array([cost / (data.n_free(SHORT) - N_STRAIGHT),
+                           of_long / (data.n_free(LONG) - N_STRAIGHT)])
+    x = np.array([_where(straight), _where(long)])
+    nearest = np.linalg.norm(x[:, None, :3] - data.positions, axis=2).min(axis=1)
+    is_of_vehicle = (nearest < FARTHEST) & (np.linalg.norm(x[:, 3:], axis=1) < FASTEST)
+    paths = x[is_of_vehicle & (chi_square <= MISFIT)]
+    misfit = of_bent / (data.n_free(SHORT) - N_PATH)
+    if misfit > WELL:
+        longer = bent.copy()
+        longer[PATH.index('length')] = LONG_LENGTH
+        _, of_long, _ = near.fit(LONG, _BENT, np.array([straight, bent, longer])[:, _BENT])
+        misfit = min(misfit, of_long / (data.n_free(LONG) - N_PATH))
+    return misfit, paths
 
 
 @dataclass(frozen=True)

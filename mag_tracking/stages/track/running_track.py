@@ -19,12 +19,8 @@ from mag_tracking.stages.track.bank_filter import BankFilter, NoTarget
 from mag_tracking.stages.track.clock_evidence import ClockEvidence
 from mag_tracking.stages.track.disturbances import Unexplained
 from mag_tracking.stages.track.evidence import LEAST_WATCHED, TrackEvidence
-from mag_tracking.stages.track.plausibility import implausible
-from mag_tracking.stages.track.published_pose import (
-    ambiguities,
-    published_track,
-    smoothed_pose,
-)
+from mag_tracking.stages.track.plausibility import Plausibility
+from mag_tracking.stages.track.published_pose import ambiguities, published_track, smoothed_pose
 from mag_tracking.stages.track.relinearisation import Relinearisation
 from mag_tracking.stages.track.second_opinion import SecondOpinion
 from mag_tracking.stages.track.sensor_rejection import SensorRejection
@@ -81,7 +77,7 @@ class RunningTrack:
         self._no_target = NoTarget(len(sensors.network), self._settings.background_std)
         self._something_else = SomethingElse(sensors.network, self._settings.background_std,
                                              is_handover)
-        self._opinion = SecondOpinion(sensors.network)
+        self._opinion, self._plausibility = SecondOpinion(sensors.network), Plausibility()
 
     def configure(self, settings: TrackSettings) -> None:
         """Apply new values of the live settings."""
@@ -231,6 +227,7 @@ class RunningTrack:
             self._target.kinds, stamp_ns=frame.stamp_ns, id=self.id, ended=False,
             existence=self._evidence.existence, degrees_of_freedom=n_measured,
             found=found, excess=excess, unseen=self._unseen,
+            difference=self._opinion.difference(frame.stamp_ns, bank.x[best, :6]),
             predicted=self._filter.predicted_field(bank, best, frame, dt),
             mounting=observation.angles(bank.x[best]),
             mounting_covariance=observation.angle_covariances(bank.P[best])), self._settings)
@@ -266,7 +263,8 @@ class RunningTrack:
             bank.nis[best], int(np.count_nonzero(~np.isnan(frame.field))), settings.explained_ratio)
         if self._overfits(best, frame.stamp_ns):
             found.add(doubts.OVERFIT)
-        found |= self._opinion.doubts(self._clocks.apart_s(self._sensors.rows)) | implausible(
+        found |= self._opinion.doubts(self._clocks.apart_s(self._sensors.rows))
+        found |= self._plausibility.doubts(
             self._filter.observation, bank.x[best], int(bank.kind[best]), settings.vehicle,
             np.deg2rad(settings.mounting_std_deg), dt)
         for reason in found & doubts.FOR_GOOD:
@@ -306,6 +304,7 @@ class RunningTrack:
         return [smoothed_pose(
             self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,
             kind=kind, kinds=self._target.kinds, unseen=self._unseen, complete=complete,
+            difference=self._opinion.difference(stamp_ns, x[:6]),
             ambiguous=ambiguous or self._evidence.doubted_filter(stamp_ns))
             for stamp_ns, x, P in states]
 

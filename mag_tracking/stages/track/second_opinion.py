@@ -11,7 +11,7 @@ from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.clock_evidence import ClockEvidence
 from mag_tracking.stages.track.disturbances import size_of
 from mag_tracking.stages.track.plausibility import moves_too_far
-from mag_tracking.stages.track.rigid_pass import LEAST_WAY, RigidPass, fit_rigid_pass
+from mag_tracking.stages.track.rigid_pass import LEAST_WAY, MISFIT, RigidPass, fit_rigid_pass
 from mag_tracking.units import NS
 
 PASSED = 0.6
@@ -28,9 +28,6 @@ BEFORE_S, AFTER_S = 4.0, 3.0
 
 LEAST_FRAMES, MOST_FRAMES = 12, 128
 """A pass is fitted to no fewer frames; of more every other one is left out, or more of them."""
-
-MISFIT = 1.5
-"""No vehicle on a steady path explains a pass whose reduced chi-square is larger: theory is one."""
 
 STEADY_S = 1.5
 """[s] After the strongest field: until then a vehicle goes on as steadily as it passed."""
@@ -67,6 +64,7 @@ class SecondOpinion:
         self._period_s = np.inf
         self._due_s = FIRST_S
         self._is_misfit = False
+        self._difference: FloatArray = np.zeros(6)
 
     def add(self, frame: FieldFrame, state: FloatArray) -> None:
         """Take a frame, and the `state` (n_x,) of the best hypothesis."""
@@ -92,11 +90,21 @@ class SecondOpinion:
         if self._now is None:
             return set()
         self._form_if_due(self._now.size)
+        self._difference = self.difference(self._now.stamp_ns, self._now.state)
         found = self._pass_doubts()
         speed = float(np.hypot(self._now.state[3], self._now.state[4]))
         if clocks_apart_s * speed > LEAST_WAY:
             found.add(doubts.CLOCKS_APART)
         return found
+
+    def difference(self, stamp_ns: int, state: FloatArray) -> FloatArray:
+        """(6,) as `RigidPass.difference` of a `state` (6,); after the pass the last one of it."""
+        if self.latest is None or self._peak is None:
+            return np.zeros(6)
+        t = (stamp_ns - self._peak.stamp_ns) / NS
+        if t > AFTER_S:
+            return self._difference
+        return self.latest.difference(t, state) if t >= -BEFORE_S else np.zeros(6)
 
     @property
     def is_doubtful(self) -> bool:

@@ -1,11 +1,14 @@
 """A whole pass at once: clocks that are apart, and what no vehicle on a steady path explains."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mag_tracking.physics.steady_pass import N_PATH
+from mag_tracking.stages.track import rigid_pass
 from mag_tracking.stages.track.rigid_pass import MODEL_ERROR, fit_rigid_pass
-from support.steady_frames import FOUR, ROAD, STRAIGHT, TURNS, steady_frames
+from support.steady_frames import FOUR, ROAD, STRAIGHT, TURNS, state_at, steady_frames
 
 
 def found(made, network=ROAD, path=STRAIGHT):
@@ -94,3 +97,31 @@ def test_the_closest_point_is_that_of_the_nearest_sensor():
     away = np.linalg.norm(said.closest(ROAD.positions) - ROAD.positions, axis=1)
     assert away.min() == pytest.approx(3.5, abs=0.2)
     assert said.speed == pytest.approx(20.0, rel=0.1)
+
+
+def test_the_difference_is_that_from_the_nearest_path_and_horizontal():
+    said = replace(found(steady_frames(np.random.default_rng(9))), straight_paths=np.array(
+        [[0.0, 1.0, 0.5, 10.0, 0.0, 0.1], [0.0, 5.0, 0.5, 20.0, 0.0, 0.1]]))
+    state = np.array([21.0, 2.0, 3.0, 11.0, 0.5, 0.0])
+    np.testing.assert_allclose(said.difference(2.0, state), [1.0, 1.0, 0.0, 1.0, 0.5, 0.0])
+    np.testing.assert_allclose(said.difference(1.0, state), [1.0, -3.0, 0.0, -9.0, 0.5, 0.0])
+    assert not replace(said, straight_paths=np.zeros((0, 6))).difference(2.0, state).any()
+
+
+def test_paths_that_may_explain_a_pass_are_where_the_vehicle_was():
+    said = found(steady_frames(np.random.default_rng(9)))
+    assert len(said.straight_paths) == 2
+    for x in said.straight_paths:
+        assert np.hypot(*(x - state_at(0.0))[:2]) < 0.5
+        assert np.hypot(*(x - state_at(0.0))[3:5]) < 1.0
+    # A turn is none of them.
+    assert not len(found(steady_frames(np.random.default_rng(4), path=TURNS, until_s=3.0),
+                         path=TURNS).straight_paths)
+
+
+@pytest.mark.parametrize('limit, most', [('FARTHEST', 3.0), ('FASTEST', 15.0)])
+def test_paths_that_are_too_far_or_too_fast_explain_nothing(monkeypatch, limit, most):
+    """This one passes a sensor at 3.5 m and 20 m/s."""
+    monkeypatch.setattr(rigid_pass, limit, most)
+    said = found(steady_frames(np.random.default_rng(9)))
+    assert said.misfit < 1.3 and not len(said.straight_paths)

@@ -13,21 +13,16 @@ from mag_tracking.stages.track.second_opinion import SecondOpinion
 from support import spoiler
 from support.situation_worlds import ambient_world
 from support.situations import made
-from support.steady_frames import ROAD, STRAIGHT, steady_frames
+from support.steady_frames import ROAD, STRAIGHT, state_at, steady_frames
 
 FAST = np.where(np.arange(10) == 3, 60.0, STRAIGHT)
-
-
-def state_at(frame, path=STRAIGHT):
-    velocity = path[3] * np.array([np.cos(path[4]), np.sin(path[4]), 0.0])
-    return np.append(path[:3] + frame.stamp_ns / 1e9 * velocity, velocity)
 
 
 def heard(opinion, frames, path=STRAIGHT):
     """[(seconds, doubts, how many opinions by then)] of frame after frame."""
     out, n, latest = [], 0, None
     for frame in frames:
-        opinion.add(frame, state_at(frame, path))
+        opinion.add(frame, state_at(frame.stamp_ns / 1e9, path))
         found = opinion.doubts(0.0)
         n += opinion.latest is not latest
         latest = opinion.latest
@@ -59,7 +54,7 @@ def test_what_the_whole_pass_tells_doubts_the_track(of_frames, path, expected):
 def test_clocks_that_earlier_passes_found_apart_doubt_a_track_from_its_first_frame():
     opinion = SecondOpinion(ROAD)
     frame = steady_frames(np.random.default_rng(3))[0]
-    opinion.add(frame, state_at(frame))
+    opinion.add(frame, state_at(frame.stamp_ns / 1e9))
     assert opinion.doubts(0.1) == {doubts.CLOCKS_APART}
     # Less than a metre.
     assert opinion.doubts(0.04) == set()
@@ -86,7 +81,7 @@ def test_a_long_track_is_judged_by_its_closest_point():
     """At 100 frames a second, and for half a minute after it."""
     opinion, n, latest = SecondOpinion(ROAD), 0, None
     for frame in steady_frames(np.random.default_rng(6), clocks=(0.3,), period_s=0.01, until_s=30):
-        opinion.add(frame, state_at(frame))
+        opinion.add(frame, state_at(frame.stamp_ns / 1e9))
         found = opinion.doubts(0.0)
         n += opinion.latest is not latest
         latest = opinion.latest
@@ -101,7 +96,7 @@ def test_an_opinion_stands_where_later_frames_allow_none():
     for frame in frames:
         silent = frame.stamp_ns > 0.5e9
         opinion.add(replace(frame, field=np.where([[silent], [False]], np.nan, frame.field)),
-                    state_at(frame))
+                    state_at(frame.stamp_ns / 1e9))
         found = opinion.doubts(0.0)
     assert doubts.CLOCKS_APART in found
 
@@ -137,3 +132,21 @@ def test_the_third_car_past_a_wrong_clock_is_doubted_from_its_first_pose():
     right, pipeline = tracks_of(a_world.readings, a_world.network)
     assert not any(doubts.CLOCKS_APART in t.doubts for t in right if isinstance(t, Track))
     assert pipeline.track.clocks_apart == ''
+
+
+def test_a_track_that_goes_another_way_than_its_pass_differs_by_that():
+    """After the pass it still differs by what it did at its end."""
+    opinion = SecondOpinion(ROAD)
+    slow = np.where(np.arange(10) == 3, 14.0, STRAIGHT)
+    away = []
+    for frame in steady_frames(np.random.default_rng(9), until_s=6.0):
+        t = frame.stamp_ns / 1e9
+        opinion.add(frame, state_at(t, slow if t > 0.0 else STRAIGHT))
+        opinion.doubts(0.0)
+        away.append(np.hypot(*opinion.difference(frame.stamp_ns, state_at(t, slow))[:2]))
+        if opinion.latest is None:
+            assert away[-1] == 0.0
+        elif t < 3.0:
+            # A long row explains it at another speed, too: the nearer one counts.
+            assert 3.0 * t - 1.0 < away[-1] < 6.0 * t + 1.0
+    assert away[-1] == away[-20] > 15.0

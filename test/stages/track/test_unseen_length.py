@@ -37,8 +37,8 @@ def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(comp
     x[18] = length
     for kind, usual, std in (('car', 3.0, 1.0), ('truck', 9.0, 3.0)):
         said[kind] = smoothed_pose(
-            model, vehicle_orientation, x, P, unseen=UnseenLength([usual], [std]), stamp_ns=0,
-            id=1, kind=0, kinds=(kind,), ambiguous=False,
+            model, vehicle_orientation, x, P, unseen=UnseenLength([usual], [std]),
+            difference=np.zeros(6), stamp_ns=0, id=1, kind=0, kinds=(kind,), ambiguous=False,
             complete=complete).covariance - P[:6, :6]
     assert not said['car'].any()
     along = said['truck'][1, 1]

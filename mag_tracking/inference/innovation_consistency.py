@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.stages.track.latest_frames import LatestFrames
+from mag_tracking.inference.latest_frames import LatestFrames
 
 WINDOW_S = 0.5
 """[s] Latest frames that are tested together."""

@@ -2,7 +2,11 @@
 
 import numpy as np
 
-from mag_tracking.stages.track.consistency import FALSE_ALARM, WINDOW_S, InnovationConsistency
+from mag_tracking.inference.innovation_consistency import (
+    FALSE_ALARM,
+    WINDOW_S,
+    InnovationConsistency,
+)
 from mag_tracking.units import NS
 
 DT = 0.08
