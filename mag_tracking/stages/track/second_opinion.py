@@ -11,7 +11,13 @@ from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.clock_evidence import ClockEvidence
 from mag_tracking.stages.track.disturbances import size_of
 from mag_tracking.stages.track.plausibility import moves_too_far
-from mag_tracking.stages.track.rigid_pass import LEAST_WAY, MISFIT, RigidPass, fit_rigid_pass
+from mag_tracking.stages.track.rigid_pass import (
+    LEAST_WAY,
+    LONG_LENGTH,
+    MISFIT,
+    RigidPass,
+    fit_rigid_pass,
+)
 from mag_tracking.units import NS
 
 PASSED = 0.6
@@ -145,6 +151,9 @@ class SecondOpinion:
         latest = self.latest
         if latest is None:
             return found
+        # The middle of a long vehicle is uncertain by as much as it is long, and not by more.
+        if np.hypot(self._difference[0], self._difference[1]) > LONG_LENGTH:
+            found.add(doubts.ANOTHER_PLACE)
         if self._is_misfit or latest.misfit > MISFIT_LATER:
             found.add(doubts.NO_STEADY_PATH)
         if not latest.is_explained:

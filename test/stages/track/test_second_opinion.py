@@ -142,11 +142,13 @@ def test_a_track_that_goes_another_way_than_its_pass_differs_by_that():
     for frame in steady_frames(np.random.default_rng(9), until_s=6.0):
         t = frame.stamp_ns / 1e9
         opinion.add(frame, state_at(t, slow if t > 0.0 else STRAIGHT))
-        opinion.doubts(0.0)
+        found = opinion.doubts(0.0)
         away.append(np.hypot(*opinion.difference(frame.stamp_ns, state_at(t, slow))[:2]))
+        # Farther than a long vehicle is long, it is another place.
+        assert found == ({doubts.ANOTHER_PLACE} if away[-1] > 8.0 else set())
         if opinion.latest is None:
             assert away[-1] == 0.0
         elif t < 3.0:
             # A long row explains it at another speed, too: the nearer one counts.
             assert 3.0 * t - 1.0 < away[-1] < 6.0 * t + 1.0
-    assert away[-1] == away[-20] > 15.0
+    assert away[-1] == away[-20] > 15.0 and opinion.is_doubtful
