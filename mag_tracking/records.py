@@ -263,8 +263,8 @@ class Track:
     """(3,) [m/s], world."""
     covariance: FloatArray
     """(6, 6) of position and velocity, world: about this pose, of all hypotheses at this place.
-    That of a vehicle's position holds what of its length is not yet seen, too, and how far the
-    track is from a straight path that explains its whole pass."""
+    That of a vehicle also covers what of its length is not yet seen, and a straight path that
+    explains its whole pass and leads elsewhere; those of its `hypotheses` do not."""
     orientation: FloatArray
     """(4,) quaternion xyzw, body to world."""
     orientation_covariance: FloatArray

@@ -6,12 +6,12 @@ from scipy.special import chdtri
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, are_doubtful, noted
 from mag_tracking.inference.axes import whitened_energy
+from mag_tracking.inference.explanation import Explanation
 from mag_tracking.inference.innovation_consistency import InnovationConsistency
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.approach import Approach
 from mag_tracking.stages.track.disturbances import size_of
-from mag_tracking.stages.track.explanation import Explanation
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 

@@ -3,7 +3,8 @@
 import numpy as np
 from scipy.special import chdtri, ndtri
 
-from mag_tracking.arrays import FloatArray
+from mag_tracking.arrays import BoolArray, FloatArray
+from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
 from mag_tracking.stages.track.observation import Observation
@@ -14,9 +15,10 @@ MOUNTED = 0.05
 LEVEL = 1e-3
 """Probability that the iron of a vehicle is as far from its kind's height as it may be."""
 
-LANE, LANE_NOW = 1.645, 3.0
-"""Deviations by which a vehicle may be beside the outermost lane of the settings: one vehicle in
-twenty of that lane is farther beside it where it passes. Once it has passed it may turn off."""
+LANE, LANE_LATER = 1.645, 3.0
+"""Deviations by which a vehicle may be beside the outermost lane of the settings: where it is
+nearest to a sensor so far (one in twenty of that lane is farther beside it), and at any later time,
+when it may have turned off."""
 
 LEAST_SPEED = 1.0
 """[m/s] A slower vehicle has no direction."""
@@ -28,73 +30,85 @@ that errs more, as it is passed closely, does not mislead a track."""
 
 
 class Plausibility:
-    """Doubts about the states of a vehicle on its way past some sensors."""
+    """Doubts about the states of a vehicle on its way past the sensors."""
 
     def __init__(self) -> None:
-        self._nearest = np.inf
-        self._passes_off_the_road = False
+        # Of each hypothesis by its origin: how near to a sensor it has been, and whether its path
+        # was beside the road there.
+        self._nearest: FloatArray = np.zeros(0)
+        self._was_beside: BoolArray = np.zeros(0, dtype=bool)
 
-    def doubts(self, observation: Observation, x: FloatArray, kind: int,
-               settings: VehicleSettings, mounting_std: float, dt: float) -> set[str]:
-        """Doubts about the next state.
+    def judge(self, observation: Observation, bank: FilterBank, best: int,
+              settings: VehicleSettings, mounting_std: float, dt: float) -> set[str]:
+        """Doubts about the state of hypothesis `best`; to be asked once a frame, in order.
 
         Parameters
         ----------
         observation : Observation
-        x : (n_x,) array
-            The state of the published hypothesis.
-        kind : int
+        bank : FilterBank
+        best : int
+            Row of the hypothesis that is published.
         settings : VehicleSettings
         mounting_std : float [rad]
-            Sensors may be turned by as much, also those that are known better: what the model
-            leaves out of a field rotates it, too.
+            Of the angles by which any sensor may be turned, also one that is known better: what
+            the model leaves out of a field rotates it, too.
         dt : float [s]
             Length of the frame.
         """
+        x, kind = bank.x[best], int(bank.kind[best])
+        self._look(bank, settings, observation.positions)
         found = set()
         if _needs_rotated_sensors(observation, x, mounting_std):
             found.add(doubts.SENSORS_ROTATED)
         off = abs(float(x[2]) - settings.heights[kind])
         if off > -ndtri(LEVEL / 2.0) * settings.height_stds[kind]:
             found.add(doubts.HEIGHT)
-        if self._goes_off_the_road(x[:3], x[3:6], settings, observation.positions):
+        if self._was_beside[bank.origin[best]] or _passes_beside(
+                x[None], settings, observation.positions, LANE_LATER)[0]:
             found.add(doubts.OFF_THE_ROAD)
         if moves_too_far(x[:3], x[3:6], dt, observation.positions):
             found.add(doubts.FRAMES_TOO_LONG)
         return found
 
-    def _goes_off_the_road(self, position: FloatArray, velocity: FloatArray,
-                           settings: VehicleSettings, positions: FloatArray) -> bool:
-        """Whether the path is beside the road, now or where it was nearest to a sensor so far."""
-        if np.hypot(velocity[0], velocity[1]) < LEAST_SPEED:
-            return self._passes_off_the_road
-        nearest = float(np.hypot(*(positions - position)[:, :2].T).min())
-        if nearest <= self._nearest:
-            self._nearest = nearest
-            self._passes_off_the_road = _is_off_the_road(position, velocity, settings, positions,
-                                                         LANE)
-        return self._passes_off_the_road or _is_off_the_road(position, velocity, settings,
-                                                             positions, LANE_NOW)
+    def _look(self, bank: FilterBank, settings: VehicleSettings, positions: FloatArray) -> None:
+        """Remember how near to a sensor each hypothesis has been, and whether beside the road."""
+        more = max(int(bank.origin.max()) + 1 - len(self._nearest), 0)
+        self._nearest = np.append(self._nearest, np.full(more, np.inf))
+        self._was_beside = np.append(self._was_beside, np.zeros(more, dtype=bool))
+        distance = np.hypot(*(positions[:, :2, None] - bank.x[:, :2].T).transpose(1, 0, 2))
+        nearest = distance.min(axis=0)
+        is_nearest = (nearest <= self._nearest[bank.origin]) & _moves(bank.x)
+        beside = _passes_beside(bank.x[is_nearest], settings, positions, LANE)
+        of_those = bank.origin[is_nearest]
+        self._nearest[of_those], self._was_beside[of_those] = nearest[is_nearest], beside
 
 
-def _is_off_the_road(position: FloatArray, velocity: FloatArray, settings: VehicleSettings,
-                     positions: FloatArray, deviations: float) -> bool:
-    """Whether a vehicle passes all sensors, at `positions` (n, 3), on one side, beyond the lanes.
+def _passes_beside(x: FloatArray, settings: VehicleSettings, positions: FloatArray,
+                   deviations: float) -> BoolArray:
+    """Which of the states `x` (n, n_x) pass all sensors on one side, beyond the lanes.
 
-    There its distance is hardly measured: a train on another line looks like a truck nearby, and a
+    There the distance is hardly measured: a train on another line looks like a truck nearby, and a
     truck beyond a sensor like a car before one that has an axis the wrong way round. Lanes are on
-    both sides of the centre of the network. One that is wider than the road covers an area: a
-    vehicle may then be as near to the outermost sensors.
+    both sides of the centre of the network. The wider a network is than the road, the more it
+    covers an area, and a vehicle may be as near to its outermost sensors as a lane to the centre.
+    The sensors are at `positions` (n_sensors, 3).
     """
-    speed = float(np.hypot(velocity[0], velocity[1]))
-    away = positions - position
-    aside = (velocity[0] * away[:, 1] - velocity[1] * away[:, 0]) / speed
+    speed = np.maximum(np.hypot(x[:, 3], x[:, 4]), LEAST_SPEED)
+    away = positions[:, :2, None] - x[:, :2].T
+    aside = (x[:, 3] * away[:, 1] - x[:, 4] * away[:, 0]) / speed
     outermost = max(map(abs, settings.lateral_offsets))
-    edge = outermost + deviations * settings.lateral_std
-    half_width = float(np.ptp(aside)) / 2.0
-    if half_width > edge:
-        edge = half_width + outermost
-    return bool((aside > 0.0).all() or (aside < 0.0).all()) and abs(aside.mean()) > edge
+    half_width = np.ptp(aside, axis=0) / 2.0
+    edge = np.maximum(outermost + deviations * settings.lateral_std,
+                      half_width + np.minimum(outermost, half_width - outermost))
+    on_one_side = (aside > 0.0).all(axis=0) | (aside < 0.0).all(axis=0)
+    beside: BoolArray = on_one_side & (np.abs(aside.mean(axis=0)) > edge) & _moves(x)
+    return beside
+
+
+def _moves(x: FloatArray) -> BoolArray:
+    """Which of the states `x` (n, n_x) are fast enough to have a direction."""
+    moves: BoolArray = np.hypot(x[:, 3], x[:, 4]) >= LEAST_SPEED
+    return moves
 
 
 def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positions: FloatArray

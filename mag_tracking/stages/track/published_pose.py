@@ -7,7 +7,7 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.geometry import cross_matrix, quaternion_between, quaternion_from_yaw
-from mag_tracking.inference.covariance_union import covering
+from mag_tracking.inference.covariance_union import widened_to_cover
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.physics.sources import SourceModel
 from mag_tracking.records import Hypotheses, SmoothedPose, Track
@@ -127,14 +127,15 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
     excess : float
         The innovations are this many times larger than stated: so is the covariance, then.
     difference : (6,) [m], [m/s]
-        From where the target may be, too, as `covering` takes it.
+        The target may as well be so far from the published position and velocity; the covariance
+        covers that.
     stamp_ns, id, ended, existence, degrees_of_freedom, predicted, mounting, mounting_covariance
         Fields of `Track` that the bank does not know.
     """
     n_t = len(model.state_names)
     said, flags = _said_of(model, orientation, bank.x[best, :n_t],
-                           covering(excess * covariance_about(bank, best, model), difference),
-                           int(bank.kind[best]), unseen)
+                           excess * covariance_about(bank, best, model), int(bank.kind[best]),
+                           unseen, difference)
     reasons = doubts.listed({*found, *ambiguities(bank, best)})
     weights = np.exp(bank.log_w)
     moments = model.dipoles(bank.x[:, :n_t]).m.sum(axis=1)
@@ -196,25 +197,28 @@ def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P
     n_t = len(model.state_names)
     return SmoothedPose(stamp_ns=stamp_ns, id=id, kind=kinds[kind], ambiguous=ambiguous,
                         complete=complete,
-                        **_said_of(model, orientation, x[:n_t],
-                                   covering(P[:n_t, :n_t], difference), kind, unseen)[0])
+                        **_said_of(model, orientation, x[:n_t], P[:n_t, :n_t], kind, unseen,
+                                   difference)[0])
 
 
 def _said_of(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray,
-             kind: int, unseen: UnseenLength | None) -> tuple[PoseFields, Flags]:
+             kind: int, unseen: UnseenLength | None, difference: FloatArray
+             ) -> tuple[PoseFields, Flags]:
     """What a target state says, as fields of a record, and which rotations it does not."""
     dipoles = model.dipoles(x[None])
     dm_dx = dipoles.dm_dx[0].sum(axis=0)
-    q, T, unobserved, flags = orientation(x, P)
     length, length_std = 0.0, 0.0
-    covariance = P[:6, :6].copy()
     if 'L' in model.state_names:
         L = model.state_names.index('L')
         # From its other end it is the same row.
         length, length_std = abs(float(x[L])), float(np.sqrt(max(P[L, L], 0.0)))
     if unseen is not None:
-        covariance[:2, :2] += unseen.covariance(x, P, length, kind)
-    return {'position': x[:3].copy(), 'velocity': x[3:6].copy(), 'covariance': covariance,
+        of_middle = unseen.covariance(x, P, length, kind)
+        P = P.copy()
+        P[:2, :2] += of_middle
+    P = widened_to_cover(P, difference)
+    q, T, unobserved, flags = orientation(x, P)
+    return {'position': x[:3].copy(), 'velocity': x[3:6].copy(), 'covariance': P[:6, :6].copy(),
             'orientation': q, 'orientation_covariance': T @ P @ T.T + unobserved,
             'position_orientation_covariance': P[:3] @ T.T,
             'moment': dipoles.m[0].sum(axis=0), 'moment_covariance': dm_dx @ P @ dm_dx.T,

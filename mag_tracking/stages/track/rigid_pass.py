@@ -9,18 +9,18 @@ Source: TSP14 sections III.A and V for the fit of a row of dipoles at constant v
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
 
-from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.inference.least_squares import SeparableProblem, refine
+from mag_tracking.arrays import FloatArray
 from mag_tracking.network import SensorNetwork
-from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, PATH, SteadyPass
+from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, PATH
 from mag_tracking.records import FieldFrame
-from mag_tracking.stages.track.bank_filter import known_covariance
+from mag_tracking.stages.track.pass_samples import PassSamples
 from mag_tracking.units import NS
 
 SHORT, LONG = 3, 5
@@ -28,15 +28,6 @@ SHORT, LONG = 3, 5
 
 LENGTH, LONG_LENGTH = 3.0, 8.0
 """[m] Between the first and the last of them, where the search starts."""
-
-MODEL_ERROR = 0.04
-"""Error of the field of a row, relative to it; it counts as noise."""
-
-REACH = 0.2
-"""[m] Near a sensor the error is this length over the distance, if that is more."""
-
-MOST_SENSORS = 4
-"""Those with the strongest fields are compared."""
 
 NEAR, FAR = 0.1, 0.3
 """[s] The search for the clocks starts with these, either way."""
@@ -47,11 +38,8 @@ OFFSET_STD, LONGEST_OFFSET = 0.15, 0.5
 TURN = 0.4
 """[rad/s] The search for a path that bends starts with this, either way, too."""
 
-N_STEPS, TOLERANCE = 30, 1e-3
-"""The search ends after so many steps, or where one improves the cost by less than this share."""
-
 WELL, MISFIT = 1.3, 1.5
-"""Reduced chi-square up to which a path explains a pass, and up to which it may."""
+"""Reduced chi-square: a path explains a pass well up to the first, and cannot beyond the second."""
 
 CHANCE, BENDS = 1e-5, 1e-3
 """Probability that clocks which agree make the fit of a straight path better by as much, and that
@@ -64,7 +52,7 @@ MIDDLE_STD = 0.5
 """[m] The iron of a vehicle has another middle for each sensor."""
 
 FARTHEST, FASTEST = 30.0, 100.0
-"""[m], [m/s] A path that is farther from all sensors, or faster, is that of no vehicle."""
+"""[m], [m/s] No vehicle that was tracked is farther from all sensors, or faster."""
 
 _STRAIGHT = np.arange(N_STRAIGHT)
 _BENT = np.arange(N_PATH)
@@ -77,6 +65,8 @@ class RigidPass:
     The costs are sums of squared whitened residuals.
     """
 
+    stamp_ns: int
+    """When the field was strongest: time zero of the paths."""
     straight: float
     """Cost of a straight path."""
     bent: float
@@ -100,7 +90,7 @@ class RigidPass:
     """(3,) [m/s]"""
     straight_paths: FloatArray
     """(k, 6) [m], [m/s] positions and velocities where the field was strongest, on straight paths
-    of a short row and a long one; those that may explain the pass."""
+    of a short row and of a long one, if these explain the pass about as well as paths that bend."""
 
     @property
     def n_clocks(self) -> int:
@@ -120,14 +110,14 @@ class RigidPass:
         nearest: FloatArray = places[np.argmin(np.linalg.norm(places - positions, axis=1))]
         return nearest
 
-    def difference(self, t: float, state: FloatArray) -> FloatArray:
-        """(6,) [m], [m/s] from the nearest straight path that may explain the pass to a position
-        and velocity, `state` (6,), at time `t` [s]; horizontal. Zero where none explains it.
+    def difference(self, stamp_ns: int, state: FloatArray) -> FloatArray:
+        """(6,) [m], [m/s] from the nearest of the `straight_paths` to a position and velocity,
+        `state` (6,), at the time `stamp_ns`. Horizontal; zero where there are no such paths.
         """
         if not len(self.straight_paths):
             return np.zeros(6)
         differences = state - self.straight_paths
-        differences[:, :3] -= t * self.straight_paths[:, 3:]
+        differences[:, :3] -= (stamp_ns - self.stamp_ns) / NS * self.straight_paths[:, 3:]
         differences[:, [2, 5]] = 0.0
         nearest: FloatArray = differences[np.argmin(np.hypot(*differences[:, :2].T))]
         return nearest
@@ -179,7 +169,7 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
 
     Returns the `RigidPass`, or None where the frames do not determine one.
     """
-    data = _Samples.of(network, frames, stamp_ns)
+    data = PassSamples.of(network, frames, stamp_ns)
     n_clocks = data.n_clocks
     if n_clocks < 1 or data.n_free(LONG) <= N_PATH:
         return None
@@ -197,7 +187,11 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
     clocks = np.array([np.append(p, np.full(n_clocks, sign * offset))
                        for p, offset in apart_from for sign in (-1.0, 1.0)])
     path, bent, _ = data.fit(SHORT, _BENT, bends)
-    misfit, straight_paths = _longer(data, straight, cost, path, bent)
+    short = _RowFits(_state_at_zero(straight), cost, bent, data.n_free(SHORT) - N_PATH)
+    long = _long_row(data, straight, path, short.misfit > WELL)
+    misfit = short.misfit if short.misfit <= WELL else min(short.misfit, long.misfit)
+    straight_paths = [f.straight for f in (short, long) if f.needs_no_bend
+                      and _is_of_vehicle(f.straight, data.positions)]
     free = np.concatenate([_STRAIGHT, N_PATH + np.arange(n_clocks)])
     path, apart, P = data.fit(SHORT, free, clocks)
     if not np.isfinite([cost, bent, apart, misfit]).all():
@@ -208,120 +202,55 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
     known = np.append(True, variance > 0.0)
     offset[data.compared[known]] = np.append(0.0, path[N_PATH:])[known]
     std[data.compared[known]] = np.sqrt(np.append(0.0, variance))[known]
-    x = _where(path)
-    return RigidPass(cost, bent, apart, data.n_free(SHORT) - len(free), misfit,
-                     int(data.compared[0]), offset, std, x[:3], x[3:], straight_paths)
+    x = _state_at_zero(path)
+    return RigidPass(stamp_ns, cost, bent, apart, data.n_free(SHORT) - len(free), misfit,
+                     int(data.compared[0]), offset, std, x[:3], x[3:],
+                     np.reshape(straight_paths, (-1, 6)))
 
 
-def _where(path: FloatArray) -> FloatArray:
+class _RowFits(NamedTuple):
+    """Fits of a row of dipoles, on a straight path and on one that bends."""
+
+    straight: FloatArray
+    """(6,) position and velocity of the straight path at time zero."""
+    cost: float
+    cost_bent: float
+    freedom: int
+    """Degrees of freedom of the path that bends."""
+
+    @property
+    def misfit(self) -> float:
+        """Reduced chi-square of the path that bends."""
+        return self.cost_bent / self.freedom
+
+    @property
+    def needs_no_bend(self) -> bool:
+        """Whether the straight path may explain the pass, and one that bends hardly does better."""
+        n_more = N_PATH - N_STRAIGHT
+        gain = (self.cost - self.cost_bent) / max(self.misfit, 1.0)
+        return bool(self.cost <= MISFIT * (self.freedom + n_more)
+                    and gain <= chdtri(n_more, BENDS))
+
+
+def _long_row(data: PassSamples, straight: FloatArray, bent: FloatArray, thorough: bool
+              ) -> _RowFits:
+    """Fits of a long row, from the paths of a short one; a `thorough` search has more starts."""
+    near = data.near(bent)
+    starts = np.array([straight, bent, straight, bent])
+    starts[2:, PATH.index('length')] = LONG_LENGTH
+    path, cost, _ = near.fit(LONG, _STRAIGHT, starts[::2, _STRAIGHT])
+    also = starts[[0, 1, 3]] if thorough else starts[:0]
+    _, cost_bent, _ = near.fit(LONG, _BENT, np.vstack([path[None, _BENT], also[:, _BENT]]))
+    return _RowFits(_state_at_zero(path), cost, cost_bent, data.n_free(LONG) - N_PATH)
+
+
+def _state_at_zero(path: FloatArray) -> FloatArray:
     """(6,) position and velocity of a path at time zero."""
     c, s = np.cos(path[4]), np.sin(path[4])
     return np.array([*path[:3], c * path[3], s * path[3], path[5]])
 
 
-def _longer(data: '_Samples', straight: FloatArray, cost: float, bent: FloatArray, of_bent: float
-            ) -> tuple[float, FloatArray]:
-    """`RigidPass.misfit` and `RigidPass.straight_paths`.
-
-    A short row has this `cost` on the `straight` path, and the cost `of_bent` on one that bends.
-    """
-    near = data.near(bent)
-    longer = straight.copy()
-    longer[PATH.index('length')] = LONG_LENGTH
-    long, of_long, _ = near.fit(LONG, _STRAIGHT, np.array([straight, longer])[:, _STRAIGHT])
-    chi_square = np.array([cost / (data.n_free(SHORT) - N_STRAIGHT),
-                           of_long / (data.n_free(LONG) - N_STRAIGHT)])
-    x = np.array([_where(straight), _where(long)])
-    nearest = np.linalg.norm(x[:, None, :3] - data.positions, axis=2).min(axis=1)
-    is_of_vehicle = (nearest < FARTHEST) & (np.linalg.norm(x[:, 3:], axis=1) < FASTEST)
-    paths = x[is_of_vehicle & (chi_square <= MISFIT)]
-    misfit = of_bent / (data.n_free(SHORT) - N_PATH)
-    if misfit > WELL:
-        longer = bent.copy()
-        longer[PATH.index('length')] = LONG_LENGTH
-        _, of_long, _ = near.fit(LONG, _BENT, np.array([straight, bent, longer])[:, _BENT])
-        misfit = min(misfit, of_long / (data.n_free(LONG) - N_PATH))
-    return misfit, paths
-
-
-@dataclass(frozen=True)
-class _Samples:
-    """The frames of a pass as whitened arrays, sensor by sensor."""
-
-    compared: IntArray
-    """(k,) rows of the network, that with the strongest field first."""
-    t: FloatArray
-    """(n,) [s]"""
-    positions: FloatArray
-    """(n, 3) [m]"""
-    M: FloatArray
-    """(n, 3, 3) world to sensor, and whitening."""
-    clock: IntArray
-    """(n,) see `SteadyPass`."""
-    y: FloatArray
-    """(3 n,) whitened fields; 0 on missing axes."""
-    backgrounds: FloatArray
-    """(3 n, q)"""
-    n_values: int
-    """How many numbers were measured."""
-
-    @property
-    def n_clocks(self) -> int:
-        """Besides that of the sensor with the strongest field."""
-        return len(self.compared) - 1
-
-    def n_free(self, n_dipoles: int) -> int:
-        """Numbers less backgrounds and moments."""
-        return self.n_values - self.backgrounds.shape[1] - 3 * n_dipoles
-
-    def near(self, path: FloatArray) -> '_Samples':
-        """The same with the model error of a vehicle near the sensors, on a path (10,)."""
-        c, s = np.cos(path[4]), np.sin(path[4])
-        way = self.t[:, None] * np.array([c * path[3], s * path[3], path[5]])
-        share = np.maximum(MODEL_ERROR, REACH / np.linalg.norm(
-            self.positions - path[:3] - way, axis=1))
-        # In units of the noise that the model error is counted in already.
-        signal = np.square(np.linalg.norm(self.y.reshape(-1, 3), axis=1))
-        weight = 1.0 / np.sqrt(1.0 + (share**2 - MODEL_ERROR**2) * signal)
-        rows = np.repeat(weight, 3)
-        return replace(self, M=self.M * weight[:, None, None], y=self.y * rows,
-                       backgrounds=self.backgrounds * rows[:, None])
-
-    @classmethod
-    def of(cls, network: SensorNetwork, frames: Sequence[FieldFrame], stamp_ns: int
-           ) -> '_Samples':
-        """The samples of the sensors with the strongest fields."""
-        field = np.array([f.field for f in frames])
-        energy = np.nansum(np.square(field), axis=2)
-        measured = np.count_nonzero(~np.isnan(field).all(axis=2), axis=0)
-        order = np.argsort(-energy.max(axis=0), kind='stable')
-        compared = order[measured[order] > len(frames) // 2][:MOST_SENSORS]
-        n = len(compared)
-        C = np.array([known_covariance(f)[compared] for f in frames]).reshape(-1, 3, 3)
-        t = np.array([(f.stamp_ns - stamp_ns) / NS + f.time_offset[compared] for f in frames])
-        y = field[:, compared].reshape(-1, 3)
-        there = ~np.isnan(y)
-        of_sensor = np.tile(np.arange(n), len(frames))
-        error = MODEL_ERROR**2 * energy[:, compared].ravel()
-        W = np.linalg.inv(np.linalg.cholesky(C + error[:, None, None] * np.eye(3)))
-        W = W * there[:, :, None] * there[:, None, :]
-        level = np.zeros((len(y), 3, n, 3))
-        level[np.arange(len(y)), :, of_sensor] = W
-        columns = level.reshape(3 * len(y), 3 * n)
-        return cls(compared, np.nan_to_num(t).ravel(), network.positions[compared][of_sensor],
-                   W @ network.R_sw[compared][of_sensor], of_sensor - 1,
-                   np.einsum('nij,nj->ni', W, np.nan_to_num(y)).ravel(),
-                   columns[:, columns.any(axis=0)], int(np.count_nonzero(there)))
-
-    def fit(self, n_dipoles: int, free: IntArray, starts: FloatArray
-            ) -> tuple[FloatArray, float, FloatArray]:
-        """(path and clocks, cost, covariance of those that are free) of the best minimum.
-
-        `free` as for `SteadyPass`; `starts` (n, n_free).
-        """
-        model = SteadyPass(self.t, self.positions, self.M, self.clock, free,
-                           np.zeros(N_PATH + self.n_clocks), n_dipoles)
-        problem = SeparableProblem(model, self.y, self.backgrounds)
-        theta, cost, P, _ = refine(problem.residual_and_jacobian, starts, N_STEPS, TOLERANCE)
-        k = int(np.argmin(cost))
-        return model.whole(theta[k:k + 1])[0], float(cost[k]), P[k]
+def _is_of_vehicle(state: FloatArray, positions: FloatArray) -> bool:
+    """Whether a vehicle past sensors at `positions` (n, 3) can have this `state` (6,)."""
+    nearest = np.linalg.norm(state[:3] - positions, axis=1).min()
+    return bool(nearest < FARTHEST and np.linalg.norm(state[3:]) < FASTEST)

@@ -55,7 +55,7 @@ class RunningTrack:
         self.ended: str | None = None
         self.is_lost = False
         self._target, self._settings = target, settings
-        self._evidence = TrackEvidence(len(sensors.whole))
+        self._evidence, self._plausibility = TrackEvidence(len(sensors.whole)), Plausibility()
         self._use(sensors, bank_filter)
         self._relinearisation = Relinearisation(
             settings.relinearise_interval_s, settings.relinearise_window_s,
@@ -77,7 +77,7 @@ class RunningTrack:
         self._no_target = NoTarget(len(sensors.network), self._settings.background_std)
         self._something_else = SomethingElse(sensors.network, self._settings.background_std,
                                              is_handover)
-        self._opinion, self._plausibility = SecondOpinion(sensors.network), Plausibility()
+        self._opinion = SecondOpinion(sensors.network)
 
     def configure(self, settings: TrackSettings) -> None:
         """Apply new values of the live settings."""
@@ -227,7 +227,7 @@ class RunningTrack:
             self._target.kinds, stamp_ns=frame.stamp_ns, id=self.id, ended=False,
             existence=self._evidence.existence, degrees_of_freedom=n_measured,
             found=found, excess=excess, unseen=self._unseen,
-            difference=self._opinion.difference(frame.stamp_ns, bank.x[best, :6]),
+            difference=self._opinion.difference,
             predicted=self._filter.predicted_field(bank, best, frame, dt),
             mounting=observation.angles(bank.x[best]),
             mounting_covariance=observation.angle_covariances(bank.P[best])), self._settings)
@@ -264,8 +264,8 @@ class RunningTrack:
         if self._overfits(best, frame.stamp_ns):
             found.add(doubts.OVERFIT)
         found |= self._opinion.doubts(self._clocks.apart_s(self._sensors.rows))
-        found |= self._plausibility.doubts(
-            self._filter.observation, bank.x[best], int(bank.kind[best]), settings.vehicle,
+        found |= self._plausibility.judge(
+            self._filter.observation, bank, best, settings.vehicle,
             np.deg2rad(settings.mounting_std_deg), dt)
         for reason in found & doubts.FOR_GOOD:
             evidence.doubt(reason)
@@ -304,9 +304,10 @@ class RunningTrack:
         return [smoothed_pose(
             self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,
             kind=kind, kinds=self._target.kinds, unseen=self._unseen, complete=complete,
-            difference=self._opinion.difference(stamp_ns, x[:6]),
+            difference=difference,
             ambiguous=ambiguous or self._evidence.doubted_filter(stamp_ns))
-            for stamp_ns, x, P in states]
+            for (stamp_ns, x, P), difference in zip(states, self._opinion.differences(states),
+                                                    strict=True)]
 
     def _smoothed_at_the_end(self) -> list[SmoothedPose]:
         """What is left of a fixed lag, and the whole track."""

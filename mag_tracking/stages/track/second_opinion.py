@@ -1,5 +1,6 @@
 """A second opinion on a running track, once its vehicle has passed: see `rigid_pass`."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from mag_tracking.stages.track.rigid_pass import (
     RigidPass,
     fit_rigid_pass,
 )
+from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.units import NS
 
 PASSED = 0.6
@@ -59,6 +61,8 @@ class SecondOpinion:
     ----------
     latest : RigidPass or None
         None before the vehicle has passed.
+    difference : (6,) array, m and m/s
+        As `RigidPass.difference`, of the latest state; after the pass that at its end.
     """
 
     def __init__(self, network: SensorNetwork) -> None:
@@ -70,7 +74,9 @@ class SecondOpinion:
         self._period_s = np.inf
         self._due_s = FIRST_S
         self._is_misfit = False
-        self._difference: FloatArray = np.zeros(6)
+        self._smallest = np.inf
+        self._has_risen = False
+        self.difference: FloatArray = np.zeros(6)
 
     def add(self, frame: FieldFrame, state: FloatArray) -> None:
         """Take a frame, and the `state` (n_x,) of the best hypothesis."""
@@ -81,6 +87,8 @@ class SecondOpinion:
         self._now = _Seen(frame.stamp_ns, size, state[:6].copy())
         if self._peak is None or size > self._peak.size:
             self._peak, self._due_s = self._now, FIRST_S
+            self._has_risen = self._smallest <= PASSED * size
+        self._smallest = min(self._smallest, size)
         # What is no longer of this pass, and will not be of another.
         earliest = frame.stamp_ns - BEFORE_S * NS
         self._frames = [f for f in self._frames if f.stamp_ns >= earliest or self._is_of_pass(f)]
@@ -96,21 +104,36 @@ class SecondOpinion:
         if self._now is None:
             return set()
         self._form_if_due(self._now.size)
-        self._difference = self.difference(self._now.stamp_ns, self._now.state)
+        if self._covers(self._now.stamp_ns):
+            self.difference = self._differs(self._now.stamp_ns, self._now.state)
         found = self._pass_doubts()
         speed = float(np.hypot(self._now.state[3], self._now.state[4]))
         if clocks_apart_s * speed > LEAST_WAY:
             found.add(doubts.CLOCKS_APART)
         return found
 
-    def difference(self, stamp_ns: int, state: FloatArray) -> FloatArray:
-        """(6,) as `RigidPass.difference` of a `state` (6,); after the pass the last one of it."""
-        if self.latest is None or self._peak is None:
-            return np.zeros(6)
-        t = (stamp_ns - self._peak.stamp_ns) / NS
-        if t > AFTER_S:
-            return self._difference
-        return self.latest.difference(t, state) if t >= -BEFORE_S else np.zeros(6)
+    def differences(self, states: Sequence[TrackState]) -> list[FloatArray]:
+        """`difference` of each of the smoothed `states`, oldest first.
+
+        Before and after the pass it is that at the pass's begin and end.
+        """
+        covered = [(k, stamp_ns) for k, (stamp_ns, _, _) in enumerate(states)
+                   if self._covers(stamp_ns)]
+        if not covered:
+            return [self.difference] * len(states)
+        (first, _), (last, _) = covered[0], covered[-1]
+        inside = [self._differs(stamp_ns, x[:6]) for stamp_ns, x, _ in states[first:last + 1]]
+        return [inside[min(max(k, first), last) - first] for k in range(len(states))]
+
+    def _covers(self, stamp_ns: int) -> bool:
+        """Whether the latest opinion is of a time."""
+        return self.latest is not None \
+            and -BEFORE_S * NS <= stamp_ns - self.latest.stamp_ns <= AFTER_S * NS
+
+    def _differs(self, stamp_ns: int, state: FloatArray) -> FloatArray:
+        """(6,) difference of a `state` (6,) at a time that the latest opinion covers."""
+        assert self.latest is not None
+        return self.latest.difference(stamp_ns, state)
 
     @property
     def is_doubtful(self) -> bool:
@@ -130,7 +153,8 @@ class SecondOpinion:
             return
         since = (now.stamp_ns - peak.stamp_ns) / NS
         frames = [f for f in self._frames if self._is_of_pass(f)]
-        if since < self._due_s or len(frames) < LEAST_FRAMES:
+        # What begins with its strongest field is a part of a pass, which many paths explain.
+        if since < self._due_s or len(frames) < LEAST_FRAMES or not self._has_risen:
             return
         self._due_s = AGAIN * since
         # The search starts from what the filter says now, and from what it said then.
@@ -152,7 +176,7 @@ class SecondOpinion:
         if latest is None:
             return found
         # The middle of a long vehicle is uncertain by as much as it is long, and not by more.
-        if np.hypot(self._difference[0], self._difference[1]) > LONG_LENGTH:
+        if np.hypot(self.difference[0], self.difference[1]) > LONG_LENGTH:
             found.add(doubts.ANOTHER_PLACE)
         if self._is_misfit or latest.misfit > MISFIT_LATER:
             found.add(doubts.NO_STEADY_PATH)

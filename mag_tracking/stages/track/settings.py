@@ -70,8 +70,8 @@ class TrackSettings:
     second_opinion: bool = param(
         True, 'Once a vehicle has passed, and about four times after that, its whole pass is '
         'fitted at once, along a path of steady acceleration and turning. That '
-        'tells of clocks that are apart, of clipped sensors and of two vehicles; where a straight '
-        'path explains the pass, the covariance covers how far the track is from it.', live=True)
+        'tells of clocks that are apart, of clipped sensors and of two vehicles. Where a straight '
+        'path explains the pass and leads elsewhere, the covariance covers it, too.', live=True)
     lookback_s: float = param(
         1.0, 'A track begins so long before its detection, with the frames kept since: what is '
         'too weak to detect still tells where the target came from.', 's', (0.0, 60.0))

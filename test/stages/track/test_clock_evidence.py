@@ -13,8 +13,8 @@ def a_pass(offset, std=0.02, speed=15.0, misfit=1.0, reference=0, bent=100.0):
     """A pass of two sensors, or of one more than `offset` has numbers."""
     offsets = np.insert(np.atleast_1d(offset).astype(float), reference, 0.0)
     stds = np.where(np.arange(len(offsets)) == reference, 0.0, std)
-    return RigidPass(100.0, bent, 100.0 * misfit, 100, 1.0, reference, offsets, stds, np.zeros(3),
-                     np.array([speed, 0.0, 0.0]), np.zeros((0, 6)))
+    return RigidPass(0, 100.0, bent, 100.0 * misfit, 100, 1.0, reference, offsets, stds,
+                     np.zeros(3), np.array([speed, 0.0, 0.0]), np.zeros((0, 6)))
 
 
 def evidence(passes, rows=TWO, n_sensors=2):

@@ -1,5 +1,7 @@
 """States that no vehicle on the road has."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -23,10 +25,14 @@ def state(observation, z=0.5, speed=10.0, at=(0.0, 0.0), angles_deg=0.0):
     return x
 
 
+def judged(plausibility, observation, x, dt=0.08, mounting=MOUNTING, origin=0):
+    bank = SimpleNamespace(x=x[None], kind=np.array([1]), origin=np.array([origin]))
+    return plausibility.judge(observation, bank, 0, SETTINGS.vehicle, mounting, dt)
+
+
 def found(mounting=MOUNTING, dt=0.08, **of_state):
     observation = Observation(NETWORK, vehicle_model(SETTINGS.vehicle, NETWORK), mounting, 0.3)
-    return Plausibility().doubts(observation, state(observation, **of_state), 1,
-                                 SETTINGS.vehicle, mounting, dt)
+    return judged(Plausibility(), observation, state(observation, **of_state), dt, mounting)
 
 
 @pytest.mark.parametrize('of_state, expected', [
@@ -46,24 +52,46 @@ def test_states_that_no_vehicle_has(of_state, expected):
     assert found(**of_state) == expected
 
 
+def observed_by(network=NETWORK):
+    return Observation(network, vehicle_model(SETTINGS.vehicle, network), MOUNTING, 0.3)
+
+
 @pytest.mark.parametrize('y, after, expected', [
     (0.0, 8.0, set()), (8.0, 0.0, {doubts.OFF_THE_ROAD}), (0.0, 8.6, {doubts.OFF_THE_ROAD})])
 def test_a_path_is_judged_where_it_is_nearest_to_a_sensor(y, after, expected):
     """A vehicle that turns off afterwards stays believed, unless it goes where none does, and one
-    beside the road stays doubted."""
-    plausibility = Plausibility()
-    observation = Observation(NETWORK, vehicle_model(SETTINGS.vehicle, NETWORK), MOUNTING, 0.3)
-    for x, aside in ((-20.0, 0.0), (0.0, y), (20.0, after)):
-        said = plausibility.doubts(observation, state(observation, at=(x, aside)), 1,
-                                   SETTINGS.vehicle, MOUNTING, 0.08)
+    beside the road stays doubted, also where it stops.
+    """
+    plausibility, observation = Plausibility(), observed_by()
+    for x, aside, speed in ((-20.0, 0.0, 10.0), (0.0, y, 10.0), (20.0, after, 10.0)):
+        said = judged(plausibility, observation, state(observation, at=(x, aside), speed=speed))
     assert said == expected
+    for at in ((22.0, after), (0.0, y)):
+        stands = judged(plausibility, observation, state(observation, at=at, speed=0.5))
+        assert stands == (expected if y else set())
 
 
-@pytest.mark.parametrize('y, expected', [(12.9, set()), (13.1, {doubts.OFF_THE_ROAD})])
-def test_past_a_network_that_is_wider_than_the_road_a_vehicle_is_as_near_to_its_edge(y, expected):
-    """As the outermost lane is to the middle: 4 m from the sensor at 9 m."""
-    network = network_of([[0.0, -9.0, 0.0], [0.0, 0.0, 0.0], [0.0, 9.0, 0.0]])
-    observation = Observation(network, vehicle_model(SETTINGS.vehicle, network), MOUNTING, 0.3)
+def test_each_hypothesis_has_a_path_of_its_own():
+    """Also while another one is published."""
+    plausibility, observation = Plausibility(), observed_by()
+    paths = {5: ((0.0, 7.0), (4.0, 0.0)), 2: ((0.0, 1.0), (4.0, 7.0))}
+    for k in range(2):
+        bank = SimpleNamespace(x=np.array([state(observation, at=at[k]) for at in paths.values()]),
+                               kind=np.array([1, 1]), origin=np.array(list(paths)))
+        said = [plausibility.judge(observation, bank, best, SETTINGS.vehicle, MOUNTING, 0.08)
+                for best in range(2)]
+        assert said == [{doubts.OFF_THE_ROAD}, set()]
+
+
+@pytest.mark.parametrize('half_width, edge', [
+    (1.0, 6.47), (4.5, 6.47), (5.0, 6.47), (6.0, 8.0), (8.0, 12.0), (9.0, 13.0)])
+def test_a_vehicle_may_pass_a_wide_network_outside(half_width, edge):
+    """As far outside as the network is wider than the road, and at most as far as a lane is from
+    the middle.
+    """
+    network = network_of([[0.0, -half_width, 0.0], [0.0, 0.0, 0.0], [0.0, half_width, 0.0]])
+    observation = observed_by(network)
     x = np.zeros(observation.n_target + (observation.n_own + 3) * 3)
-    x[:5] = 0.0, y, 0.5, 10.0, 0.0
-    assert Plausibility().doubts(observation, x, 1, SETTINGS.vehicle, MOUNTING, 0.08) == expected
+    for y, expected in ((edge - 0.1, set()), (edge + 0.1, {doubts.OFF_THE_ROAD})):
+        x[:5] = 0.0, y, 0.5, 10.0, 0.0
+        assert judged(Plausibility(), observation, x) == expected

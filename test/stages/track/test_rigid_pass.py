@@ -7,7 +7,9 @@ import pytest
 
 from mag_tracking.physics.steady_pass import N_PATH
 from mag_tracking.stages.track import rigid_pass
-from mag_tracking.stages.track.rigid_pass import MODEL_ERROR, fit_rigid_pass
+from mag_tracking.stages.track.pass_samples import MODEL_ERROR
+from mag_tracking.stages.track.rigid_pass import fit_rigid_pass
+from mag_tracking.units import NS
 from support.steady_frames import FOUR, ROAD, STRAIGHT, TURNS, state_at, steady_frames
 
 
@@ -103,9 +105,9 @@ def test_the_difference_is_that_from_the_nearest_path_and_horizontal():
     said = replace(found(steady_frames(np.random.default_rng(9))), straight_paths=np.array(
         [[0.0, 1.0, 0.5, 10.0, 0.0, 0.1], [0.0, 5.0, 0.5, 20.0, 0.0, 0.1]]))
     state = np.array([21.0, 2.0, 3.0, 11.0, 0.5, 0.0])
-    np.testing.assert_allclose(said.difference(2.0, state), [1.0, 1.0, 0.0, 1.0, 0.5, 0.0])
-    np.testing.assert_allclose(said.difference(1.0, state), [1.0, -3.0, 0.0, -9.0, 0.5, 0.0])
-    assert not replace(said, straight_paths=np.zeros((0, 6))).difference(2.0, state).any()
+    np.testing.assert_allclose(said.difference(2 * NS, state), [1.0, 1.0, 0.0, 1.0, 0.5, 0.0])
+    np.testing.assert_allclose(said.difference(NS, state), [1.0, -3.0, 0.0, -9.0, 0.5, 0.0])
+    assert not replace(said, straight_paths=np.zeros((0, 6))).difference(2 * NS, state).any()
 
 
 def test_paths_that_may_explain_a_pass_are_where_the_vehicle_was():
@@ -115,7 +117,7 @@ def test_paths_that_may_explain_a_pass_are_where_the_vehicle_was():
         assert np.hypot(*(x - state_at(0.0))[:2]) < 0.5
         assert np.hypot(*(x - state_at(0.0))[3:5]) < 1.0
     # A turn is none of them.
-    assert not len(found(steady_frames(np.random.default_rng(4), path=TURNS, until_s=3.0),
+    assert not len(found(steady_frames(np.random.default_rng(4), path=TURNS),
                          path=TURNS).straight_paths)
 
 

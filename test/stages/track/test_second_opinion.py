@@ -11,6 +11,7 @@ from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.clock_evidence import ClockEvidence
 from mag_tracking.stages.track.second_opinion import SecondOpinion
 from support import spoiler
+from support.passes import network_of
 from support.situation_worlds import ambient_world
 from support.situations import made
 from support.steady_frames import ROAD, STRAIGHT, state_at, steady_frames
@@ -138,12 +139,12 @@ def test_a_track_that_goes_another_way_than_its_pass_differs_by_that():
     """After the pass it still differs by what it did at its end."""
     opinion = SecondOpinion(ROAD)
     slow = np.where(np.arange(10) == 3, 14.0, STRAIGHT)
-    away = []
+    away, states = [], []
     for frame in steady_frames(np.random.default_rng(9), until_s=6.0):
         t = frame.stamp_ns / 1e9
         opinion.add(frame, state_at(t, slow if t > 0.0 else STRAIGHT))
         found = opinion.doubts(0.0)
-        away.append(np.hypot(*opinion.difference(frame.stamp_ns, state_at(t, slow))[:2]))
+        away.append(np.hypot(*opinion.difference[:2]))
         # Farther than a long vehicle is long, it is another place.
         assert found == ({doubts.ANOTHER_PLACE} if away[-1] > 8.0 else set())
         if opinion.latest is None:
@@ -151,4 +152,44 @@ def test_a_track_that_goes_another_way_than_its_pass_differs_by_that():
         elif t < 3.0:
             # A long row explains it at another speed, too: the nearer one counts.
             assert 3.0 * t - 1.0 < away[-1] < 6.0 * t + 1.0
+        states.append((frame.stamp_ns, state_at(t), np.eye(6)))
     assert away[-1] == away[-20] > 15.0 and opinion.is_doubtful
+    # Smoothed states have differences of their own: these are where the vehicle was.
+    far = [(stamp_ns, state_at(stamp_ns / 1e9, slow), P) for stamp_ns, _, P in states]
+    assert all(np.hypot(*d[:2]) < 2.0 for d in opinion.differences(states))
+    of_far = [np.hypot(*d[:2]) for d in opinion.differences(far)]
+    assert len(of_far) == len(states) and of_far[0] > 5.0 and of_far[-1] == of_far[-20] > 15.0
+    # Without one that the opinion covers, they have that of the filter.
+    assert opinion.differences(far[-3:]) == [opinion.difference] * 3
+
+
+def test_before_the_pass_is_judged_smoothed_states_differ_by_what_they_do_at_its_begin():
+    opinion = SecondOpinion(ROAD)
+    heard(opinion, steady_frames(np.random.default_rng(9)))
+    slow = np.where(np.arange(10) == 3, 14.0, STRAIGHT)
+    states = [(round(t * 1e9), state_at(t, slow), np.eye(6)) for t in (-6.0, -4.5, -3.9, -3.0)]
+    first, second, third, fourth = opinion.differences(states)
+    assert first is second is third and np.hypot(*first[:2]) > np.hypot(*fourth[:2]) > 10.0
+
+
+def test_an_opinion_stays_one_of_its_own_peak():
+    """The second two sensors feel the vehicle later, and more."""
+    network = network_of([[0.0, -4.5, 0.0], [0.0, 4.5, 0.0], [12.0, -3.5, 0.0], [12.0, 3.5, 0.0]])
+    path = np.where(np.arange(10) == 3, 8.0, np.where(np.arange(10) == 4, 0.0, STRAIGHT))
+    opinion, away, peaks = SecondOpinion(network), [], set()
+    for frame in steady_frames(np.random.default_rng(3), network, path, until_s=4.0):
+        state = state_at(frame.stamp_ns / 1e9, path)
+        opinion.add(frame, state)
+        assert opinion.doubts(0.0) == set()
+        away.append(np.hypot(*opinion.difference[:2]))
+        if opinion.latest is not None:
+            peaks.add(opinion.latest.stamp_ns)
+    print(f'largest difference {max(away):.2f} m')
+    assert len(peaks) > 1 and max(away) < 1.5
+
+
+def test_a_pass_that_begins_at_its_strongest_is_not_judged():
+    opinion = SecondOpinion(ROAD)
+    late = [f for f in steady_frames(np.random.default_rng(2), until_s=3.0) if f.stamp_ns > 3e8]
+    assert not any(found for _, found, _ in heard(opinion, late))
+    assert opinion.latest is None and not opinion.difference.any()

@@ -119,3 +119,23 @@ def test_nothing_is_longer_than_the_longest_kind():
                for lengths in ([9.0], [0.0, 3.0, 9.0])]
     # Shorter kinds add nothing to what it is itself.
     np.testing.assert_array_equal(*longest)
+
+
+def test_what_is_not_seen_and_where_else_it_may_be_are_covered_together():
+    """Along x: position, velocity and heading of a smoothed pose; jointly it stays a covariance."""
+    model, x = RowVehicle(np.zeros(3), np.ones(3)), at([0.0, 0.0], 0.5 * np.pi)
+    said = {}
+    for name, difference in (('here', np.zeros(6)), ('apart', np.array([6.0, 0, 0, 2.0, 0, 0]))):
+        said[name] = smoothed_pose(
+            model, vehicle_orientation, x, P, unseen=None, difference=difference, stamp_ns=0, id=1,
+            kind=0, kinds=('car',), ambiguous=False, complete=True)
+    here, apart = said['here'], said['apart']
+    assert apart.covariance[0, 0] == pytest.approx(36.0)
+    assert here.covariance[0, 0] < 36.0
+    assert apart.covariance[3, 3] > here.covariance[3, 3]
+    assert apart.orientation_covariance[2, 2] > here.orientation_covariance[2, 2]
+    whole = np.block([
+        [apart.covariance[:3, :3], apart.position_orientation_covariance],
+        [apart.position_orientation_covariance.T, apart.orientation_covariance]])
+    assert np.linalg.eigvalsh(whole)[0] > -1e-9
+    np.testing.assert_allclose(apart.covariance[1, 1], here.covariance[1, 1])

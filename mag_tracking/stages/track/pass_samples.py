@@ -1,0 +1,109 @@
+"""The frames of a pass as whitened arrays, and the fit of a row of dipoles on a steady path."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.inference.least_squares import SeparableProblem, refine
+from mag_tracking.network import SensorNetwork
+from mag_tracking.physics.steady_pass import N_PATH, SteadyPass
+from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track.bank_filter import known_covariance
+from mag_tracking.units import NS
+
+MODEL_ERROR = 0.04
+"""Error of the field of a row, relative to it; it counts as noise."""
+
+REACH = 0.2
+"""[m] Near a sensor the error is this length over the distance, if that is more."""
+
+MOST_SENSORS = 4
+"""Those with the strongest fields are compared."""
+
+N_STEPS, TOLERANCE = 30, 1e-3
+"""The search ends after so many steps, or where one improves the cost by less than this share."""
+
+
+@dataclass(frozen=True)
+class PassSamples:
+    """The frames of a pass as whitened arrays, sensor by sensor."""
+
+    compared: IntArray
+    """(k,) rows of the network, that with the strongest field first."""
+    t: FloatArray
+    """(n,) [s]"""
+    positions: FloatArray
+    """(n, 3) [m]"""
+    M: FloatArray
+    """(n, 3, 3) world to sensor, and whitening."""
+    clock: IntArray
+    """(n,) see `SteadyPass`."""
+    y: FloatArray
+    """(3 n,) whitened fields; 0 on missing axes."""
+    backgrounds: FloatArray
+    """(3 n, q)"""
+    n_values: int
+    """How many numbers were measured."""
+
+    @property
+    def n_clocks(self) -> int:
+        """Besides that of the sensor with the strongest field."""
+        return len(self.compared) - 1
+
+    def n_free(self, n_dipoles: int) -> int:
+        """Numbers less backgrounds and moments."""
+        return self.n_values - self.backgrounds.shape[1] - 3 * n_dipoles
+
+    def near(self, path: FloatArray) -> 'PassSamples':
+        """The same with the model error of a vehicle near the sensors, on a path (10,)."""
+        c, s = np.cos(path[4]), np.sin(path[4])
+        way = self.t[:, None] * np.array([c * path[3], s * path[3], path[5]])
+        share = np.maximum(MODEL_ERROR, REACH / np.linalg.norm(
+            self.positions - path[:3] - way, axis=1))
+        # In units of the noise that the model error is counted in already.
+        signal = np.square(np.linalg.norm(self.y.reshape(-1, 3), axis=1))
+        weight = 1.0 / np.sqrt(1.0 + (share**2 - MODEL_ERROR**2) * signal)
+        rows = np.repeat(weight, 3)
+        return replace(self, M=self.M * weight[:, None, None], y=self.y * rows,
+                       backgrounds=self.backgrounds * rows[:, None])
+
+    @classmethod
+    def of(cls, network: SensorNetwork, frames: Sequence[FieldFrame], stamp_ns: int
+           ) -> 'PassSamples':
+        """The samples of the sensors with the strongest fields."""
+        field = np.array([f.field for f in frames])
+        energy = np.nansum(np.square(field), axis=2)
+        measured = np.count_nonzero(~np.isnan(field).all(axis=2), axis=0)
+        order = np.argsort(-energy.max(axis=0), kind='stable')
+        compared = order[measured[order] > len(frames) // 2][:MOST_SENSORS]
+        n = len(compared)
+        C = np.array([known_covariance(f)[compared] for f in frames]).reshape(-1, 3, 3)
+        t = np.array([(f.stamp_ns - stamp_ns) / NS + f.time_offset[compared] for f in frames])
+        y = field[:, compared].reshape(-1, 3)
+        there = ~np.isnan(y)
+        of_sensor = np.tile(np.arange(n), len(frames))
+        error = MODEL_ERROR**2 * energy[:, compared].ravel()
+        W = np.linalg.inv(np.linalg.cholesky(C + error[:, None, None] * np.eye(3)))
+        W = W * there[:, :, None] * there[:, None, :]
+        level = np.zeros((len(y), 3, n, 3))
+        level[np.arange(len(y)), :, of_sensor] = W
+        columns = level.reshape(3 * len(y), 3 * n)
+        return cls(compared, np.nan_to_num(t).ravel(), network.positions[compared][of_sensor],
+                   W @ network.R_sw[compared][of_sensor], of_sensor - 1,
+                   np.einsum('nij,nj->ni', W, np.nan_to_num(y)).ravel(),
+                   columns[:, columns.any(axis=0)], int(np.count_nonzero(there)))
+
+    def fit(self, n_dipoles: int, free: IntArray, starts: FloatArray
+            ) -> tuple[FloatArray, float, FloatArray]:
+        """(path and clocks, cost, covariance of those that are free) of the best minimum.
+
+        `free` as for `SteadyPass`; `starts` (n, n_free).
+        """
+        model = SteadyPass(self.t, self.positions, self.M, self.clock, free,
+                           np.zeros(N_PATH + self.n_clocks), n_dipoles)
+        problem = SeparableProblem(model, self.y, self.backgrounds)
+        theta, cost, P, _ = refine(problem.residual_and_jacobian, starts, N_STEPS, TOLERANCE)
+        k = int(np.argmin(cost))
+        return model.whole(theta[k:k + 1])[0], float(cost[k]), P[k]
