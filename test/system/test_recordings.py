@@ -30,6 +30,17 @@ def every(replays):
     return {name: replays[name] for name in VEHICLES}
 
 
+LARGEST_STEP = 1.5
+"""By which a stated deviation may grow from a pose to the next one: in 0.08 s a vehicle goes a
+fraction of its distance. What was found out does make it smaller at once."""
+
+
+def step_of(covariances):
+    """The largest ratio of the deviations of a position to those of the pose before."""
+    std = np.sqrt(np.trace(np.array(covariances)[:, :2, :2], axis1=1, axis2=2))
+    return (std[1:] / std[:-1]).max()
+
+
 def pass_of(replays, name):
     """The one track of a recording, and its errors."""
     run, _ = replays[name]
@@ -171,6 +182,7 @@ def test_a_car_is_followed_along_a_corridor(tmp_path):
         print(f'corridor, {name}: {along.sum()} poses, RMS {rms:.2f} m, ANEES {anees:.1f}')
         assert np.ptp(true[along, 0]) > 41.0
         assert rms <= 0.6
+        assert step_of(poses.covariance) < LARGEST_STEP
         # As the other cars; 1 = consistent.
         assert anees <= {'filtered': 3.0, 'smoothed': 4.0}[name]
 
@@ -239,6 +251,13 @@ def test_published_covariances_are_covariances(vehicle_replays, magnet_replays):
             C = np.array(log.covariance)
             np.testing.assert_allclose(C, np.swapaxes(C, 1, 2))
             assert np.linalg.eigvalsh(C).min() > -1e-12
+
+
+def test_what_is_stated_does_not_jump(vehicle_replays):
+    for name, (run, _) in every(vehicle_replays).items():
+        for log in (*run.logs.values(), *run.smoothed.values()):
+            print(f'{name}: a deviation grows by {step_of(log.covariance):.2f} at most')
+            assert step_of(log.covariance) < LARGEST_STEP
 
 
 def test_no_sample_is_lost_without_a_word(vehicle_replays):

@@ -9,6 +9,7 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.clock_evidence import ClockEvidence
+from mag_tracking.stages.track.rigid_pass import RigidPass
 from mag_tracking.stages.track.second_opinion import SecondOpinion
 from support import spoiler
 from support.passes import network_of
@@ -193,3 +194,20 @@ def test_a_pass_that_begins_at_its_strongest_is_not_judged():
     late = [f for f in steady_frames(np.random.default_rng(2), until_s=3.0) if f.stamp_ns > 3e8]
     assert not any(found for _, found, _ in heard(opinion, late))
     assert opinion.latest is None and not opinion.difference.any()
+
+
+def test_what_leads_elsewhere_is_in_the_covariance_of_tracks_and_smoothed_poses(monkeypatch):
+    """Here every path is said to lead five metres away, along x."""
+    away = np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    monkeypatch.setattr(RigidPass, 'difference', lambda *_: away)
+    a_world = made('a car', 'clouds', 0)
+    records, _ = tracks_of(a_world.readings, a_world.network)
+    for kind, share in ((Track, 0.3), (SmoothedPose, 1.0)):
+        std = np.array([np.sqrt(r.covariance[0, 0]) for r in records if isinstance(r, kind)])
+        print(f'{kind.__name__}: {std.round(1)} m')
+        assert np.mean(std > 5.0 - 1e-6) >= share
+    # Not before the pass.
+    assert std.size and min(np.sqrt(r.covariance[0, 0]) for r in records
+                            if isinstance(r, Track)) < 2.0
+    without, _ = tracks_of(a_world.readings, a_world.network, **{'track.second_opinion': False})
+    assert not any(r.covariance[0, 0] > 24.0 for r in without if isinstance(r, SmoothedPose))
