@@ -75,7 +75,7 @@ class SecondOpinion:
         self._due_s = FIRST_S
         self._is_misfit = False
         self._smallest = np.inf
-        self._has_risen = False
+        self._has_risen, self._is_of_whole = False, False
         self.difference: FloatArray = np.zeros(6)
 
     def add(self, frame: FieldFrame, state: FloatArray) -> None:
@@ -126,8 +126,12 @@ class SecondOpinion:
         return [inside[min(max(k, first), last) - first] for k in range(len(states))]
 
     def _covers(self, stamp_ns: int) -> bool:
-        """Whether the latest opinion is of a time."""
-        return self.latest is not None \
+        """Whether the latest opinion says where the vehicle was at a time.
+
+        Where a track begins with its strongest field, that is a part of a pass, which many paths
+        explain.
+        """
+        return self.latest is not None and self._is_of_whole \
             and -BEFORE_S * NS <= stamp_ns - self.latest.stamp_ns <= AFTER_S * NS
 
     def _differs(self, stamp_ns: int, state: FloatArray) -> FloatArray:
@@ -153,8 +157,7 @@ class SecondOpinion:
             return
         since = (now.stamp_ns - peak.stamp_ns) / NS
         frames = [f for f in self._frames if self._is_of_pass(f)]
-        # What begins with its strongest field is a part of a pass, which many paths explain.
-        if since < self._due_s or len(frames) < LEAST_FRAMES or not self._has_risen:
+        if since < self._due_s or len(frames) < LEAST_FRAMES:
             return
         self._due_s = AGAIN * since
         # The search starts from what the filter says now, and from what it said then.
@@ -165,7 +168,7 @@ class SecondOpinion:
                                np.array([back, peak.state]))
         if found is None:
             return
-        self.latest = found
+        self.latest, self._is_of_whole = found, self._has_risen
         if since <= STEADY_S:
             self._is_misfit = found.misfit > MISFIT
 
