@@ -186,9 +186,6 @@ def smoothing_study(bodies, changes):
 
 
 @pytest.mark.study
-@pytest.mark.xfail(strict=True, reason=(
-    'ANEES 1.65: a few tracks are surer than they are right. With a moment that wanders more '
-    '(moment_drift 0.1) it is 0.90 and the error larger; four passes for one change nothing'))
 def test_smoothing_a_matched_target_takes_half_of_the_error_away():
     """Of the whole track; near the sensors, where the filter already knows nearly all, less."""
     rng = np.random.default_rng(5)
