@@ -7,7 +7,7 @@ from mag_tracking.inference.covariance_union import widened_to_cover
 
 
 def test_a_covariance_is_widened_until_it_covers_a_difference_and_no_further():
-    """With the velocity, whose difference goes with it."""
+    """The velocity is widened along with it."""
     P = np.diag([1.0, 4.0, 9.0, 1.0, 1.0, 1.0, 100.0])
     difference = np.array([3.0, 0.0, 0.0, 2.0, 0.0, 0.0])
     wider = widened_to_cover(P, difference)

@@ -31,8 +31,8 @@ def every(replays):
 
 
 LARGEST_STEP = 1.5
-"""By which a stated deviation may grow from a pose to the next one: in 0.08 s a vehicle goes a
-fraction of its distance. What was found out does make it smaller at once."""
+"""A stated deviation may grow by this factor from a pose to the next: in 0.08 s a vehicle goes a
+fraction of its distance. New evidence may make it smaller at once."""
 
 
 def step_of(covariances):

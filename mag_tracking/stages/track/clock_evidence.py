@@ -68,7 +68,7 @@ class ClockEvidence:
     def apart_s(self, rows: IntArray) -> float:
         """[s] How far two clocks of the sensors `rows` are apart.
 
-        By two passes or more: one may have been of two vehicles.
+        Clocks that a single pass compared do not count: it may have been of two vehicles.
         """
         repeated = rows[self._n_passes[rows] > 1]
         return float(self._apart[np.ix_(repeated, repeated)].max(initial=0.0))

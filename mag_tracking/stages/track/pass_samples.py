@@ -49,11 +49,11 @@ class PassSamples:
 
     @property
     def n_clocks(self) -> int:
-        """Besides that of the sensor with the strongest field."""
+        """Number of clocks besides that of the sensor with the strongest field."""
         return len(self.compared) - 1
 
     def n_free(self, n_dipoles: int) -> int:
-        """Numbers less backgrounds and moments."""
+        """Degrees of freedom that backgrounds and moments leave to the path."""
         return self.n_values - self.backgrounds.shape[1] - 3 * n_dipoles
 
     def near(self, path: FloatArray) -> 'PassSamples':
@@ -62,7 +62,7 @@ class PassSamples:
         way = self.t[:, None] * np.array([c * path[3], s * path[3], path[5]])
         share = np.maximum(MODEL_ERROR, REACH / np.linalg.norm(
             self.positions - path[:3] - way, axis=1))
-        # In units of the noise that the model error is counted in already.
+        # The whitened signal is in units of a noise that already counts the model error.
         signal = np.square(np.linalg.norm(self.y.reshape(-1, 3), axis=1))
         weight = 1.0 / np.sqrt(1.0 + (share**2 - MODEL_ERROR**2) * signal)
         rows = np.repeat(weight, 3)

@@ -33,8 +33,8 @@ class Plausibility:
     """Doubts about the states of a vehicle on its way past the sensors."""
 
     def __init__(self) -> None:
-        # Of each hypothesis by its origin: how near to a sensor it has been, and whether its path
-        # was beside the road there.
+        # Each hypothesis, by its origin, has been so near to a sensor, and its path was or was not
+        # beside the road there.
         self._nearest: FloatArray = np.zeros(0)
         self._was_beside: BoolArray = np.zeros(0, dtype=bool)
 
@@ -50,8 +50,8 @@ class Plausibility:
             Row of the hypothesis that is published.
         settings : VehicleSettings
         mounting_std : float [rad]
-            Of the angles by which any sensor may be turned, also one that is known better: what
-            the model leaves out of a field rotates it, too.
+            Standard deviation of the angles by which any sensor may be turned, also one that is
+            known better: what the model leaves out of a field rotates it, too.
         dt : float [s]
             Length of the frame.
         """
@@ -71,7 +71,7 @@ class Plausibility:
         return found
 
     def _look(self, bank: FilterBank, settings: VehicleSettings, positions: FloatArray) -> None:
-        """Remember how near to a sensor each hypothesis has been, and whether beside the road."""
+        """Remember how near to a sensor each hypothesis has been, and if it was off the road."""
         more = max(int(bank.origin.max()) + 1 - len(self._nearest), 0)
         self._nearest = np.append(self._nearest, np.full(more, np.inf))
         self._was_beside = np.append(self._was_beside, np.zeros(more, dtype=bool))

@@ -115,13 +115,12 @@ class SecondOpinion:
     def differences(self, states: Sequence[TrackState]) -> list[FloatArray]:
         """`difference` of each of the smoothed `states`, oldest first.
 
-        Before and after the pass it is that at the pass's begin and end.
+        Earlier and later states than those of the pass have the difference of its first and last.
         """
-        covered = [(k, stamp_ns) for k, (stamp_ns, _, _) in enumerate(states)
-                   if self._covers(stamp_ns)]
+        covered = [k for k, (stamp_ns, _, _) in enumerate(states) if self._covers(stamp_ns)]
         if not covered:
             return [self.difference] * len(states)
-        (first, _), (last, _) = covered[0], covered[-1]
+        first, last = covered[0], covered[-1]
         inside = [self._differs(stamp_ns, x[:6]) for stamp_ns, x, _ in states[first:last + 1]]
         return [inside[min(max(k, first), last) - first] for k in range(len(states))]
 

@@ -72,7 +72,7 @@ def test_a_path_is_judged_where_it_is_nearest_to_a_sensor(y, after, expected):
 
 
 def test_each_hypothesis_has_a_path_of_its_own():
-    """Also while another one is published."""
+    """It is remembered while another hypothesis is published, too."""
     plausibility, observation = Plausibility(), observed_by()
     paths = {5: ((0.0, 7.0), (4.0, 0.0)), 2: ((0.0, 1.0), (4.0, 7.0))}
     for k in range(2):

@@ -116,14 +116,19 @@ def test_paths_that_may_explain_a_pass_are_where_the_vehicle_was():
     for x in said.straight_paths:
         assert np.hypot(*(x - state_at(0.0))[:2]) < 0.5
         assert np.hypot(*(x - state_at(0.0))[3:5]) < 1.0
-    # A turn is none of them.
+    # A vehicle that turns is on no straight path.
     assert not len(found(steady_frames(np.random.default_rng(4), path=TURNS),
                          path=TURNS).straight_paths)
 
 
 @pytest.mark.parametrize('limit, most', [('FARTHEST', 3.0), ('FASTEST', 15.0)])
 def test_paths_that_are_too_far_or_too_fast_explain_nothing(monkeypatch, limit, most):
-    """This one passes a sensor at 3.5 m and 20 m/s."""
+    """This vehicle passes one sensor at 3.5 m, the other at 5.5 m, at 20 m/s."""
     monkeypatch.setattr(rigid_pass, limit, most)
     said = found(steady_frames(np.random.default_rng(9)))
     assert said.misfit < 1.3 and not len(said.straight_paths)
+
+
+def test_a_path_that_is_near_to_one_sensor_is_near(monkeypatch):
+    monkeypatch.setattr(rigid_pass, 'FARTHEST', 4.5)
+    assert len(found(steady_frames(np.random.default_rng(9))).straight_paths) == 2
