@@ -1,0 +1,153 @@
+"""`make bench`: poses without a flag, and errors against truth, where the tracker is right.
+
+All bundled recordings with one vehicle or magnet, and simulated controls. `--against FOLDER` has
+the same measured by another checkout, and says what got worse.
+"""
+
+import argparse
+import csv
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from mag_tracking.apps.replay import replay
+from mag_tracking.network.file import read_network
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.recording.importers import import_pose_table
+from mag_tracking.recording.reader import Recording
+from mag_tracking.records import Track
+from mag_tracking.report.metrics import interpolate_truth
+from support.bundled import DATA, NETWORK_FILE, ROOT, VEHICLES, vehicle_path
+from support.random_passes import KINDS, SIMULATORS, WRONG_M, errors_of
+from support.situation_worlds import FOUR, car, straight, usual
+
+RUNS = 5
+"""Of each control and simulator."""
+LEAST_SURE = 0.95
+"""Share of the other checkout's poses without a flag that there must be: of the right ones
+everywhere, of all of them together."""
+MOST_ERROR = 1.03
+"""Ratio to the error of the other checkout that is no worse."""
+SURE, RIGHT = 'no flag', f'no flag, within {WRONG_M:g} m'
+ERRORS = {'rms': 'RMS [m]', 'closest': 'closest [m]', 'anees': 'ANEES', 'position_mean': 'mean [m]',
+          'axis_median_deg': 'axis [deg]'}
+
+
+def recordings(folder):
+    """{name: (recording, network file, preset)}; the tables of the magnet are imported there."""
+    found = {name: (vehicle_path(name), NETWORK_FILE, 'vehicle') for name in VEHICLES}
+    corridor = DATA / 'corridor'
+    found['corridor'] = (corridor / 'corridor_8_sensors.mcap', corridor / 'network.yaml', 'vehicle')
+    for run in (1, 2):
+        source = DATA / 'magnet_16_sensors' / f'lisa_data{run}'
+        made = import_pose_table(source.with_suffix('.csv'), f'{source}_background.csv',
+                                 folder / f'magnet{run}', 1e-6)
+        found[f'magnet {run}'] = (*made[:2], 'magnet')
+    return found
+
+
+def of_table(table, truth):
+    """The number of poses without a flag in a table of results, and that of the right ones."""
+    with open(table, newline='', encoding='utf-8') as stream:
+        sure = [row for row in csv.DictReader(stream) if row['ambiguous'] == '0']
+    found = np.array([[float(row['x']), float(row['y'])] for row in sure]).reshape(-1, 2)
+    true = interpolate_truth(truth, [int(row['stamp_ns']) for row in sure])[:, :2]
+    return len(sure), int((np.linalg.norm(found - true, axis=1) <= WRONG_M).sum())
+
+
+def of_recording(recording, network, preset, folder):
+    """{figure: value} of a replay: poses without a flag, and each error of the first track."""
+    run = replay(Recording(recording), read_network(network), settings_for(preset), folder)
+    truth = next(iter(run.truth.values()))
+    found = {}
+    for prefix, table in (('', 'poses.csv'), ('smoothed: ', 'poses_smoothed.csv')):
+        found[prefix + SURE], found[prefix + RIGHT] = of_table(folder / table, truth)
+    for track in run.summary['tracks'][:1]:
+        for prefix, of in (('', track), ('smoothed: ', track.get('smoothed') or {})):
+            found |= {prefix + text: of['truth'][error] for error, text in ERRORS.items()
+                      if of.get('truth') and of['truth'].get(error) is not None}
+    return found
+
+
+def of_control(name):
+    """{figure: value} of `RUNS` simulated passes by each simulator, live."""
+    total = {SURE: 0, RIGHT: 0}
+    for s, simulator in enumerate(SIMULATORS):
+        for seed in range(RUNS):
+            rng = np.random.default_rng([seed, s])
+            a_world = (straight(rng, simulator, car(rng, simulator), rng.uniform(7.0, 20.0), FOUR)
+                       if name == 'car, four sensors' else usual(rng, simulator, name))
+            pipeline = Pipeline(a_world.network, settings_for('vehicle'))
+            sure = [r for r in pipeline.feed(a_world.readings) + pipeline.flush()
+                    if isinstance(r, Track) and not r.ended and not r.ambiguous]
+            total[SURE] += len(sure)
+            total[RIGHT] += int((errors_of(sure, a_world.t, a_world.positions[0])[0]
+                                 <= WRONG_M).sum()) if sure else 0
+    return total
+
+
+def measured():
+    """{name: its figures}."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        found = {name: of_recording(*given, folder / 'results' / name.replace(' ', '_'))
+                 for name, given in recordings(folder).items()}
+    found |= {f'simulated {name}': of_control(name) for name in (*KINDS, 'car, four sensors')}
+    return found | {'all': {f: sum(x.get(f, 0) for x in found.values()) for f in (SURE, RIGHT)}}
+
+
+def measured_by(checkout):
+    """The same by the package of another checkout."""
+    # The folder that a module is run in comes first of all places of packages.
+    done = subprocess.run([sys.executable, '-m', 'bench.recordings', '--json'], check=True,
+                          cwd=checkout, env=os.environ | {'PYTHONPATH': str(ROOT / 'test')},
+                          stdout=subprocess.PIPE, text=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def is_worse(name, figure, now, before):
+    """Whether a figure is worse than before by more than may be."""
+    if RIGHT in figure or (name, figure) == ('all', SURE):
+        return now < LEAST_SURE * before
+    if SURE in figure:
+        return False  # Fewer are better where they were wrong.
+    return now > max(MOST_ERROR * before, 1.0 if 'ANEES' in figure else 0.0)
+
+
+def compared(name, figure, now, before):
+    """(line, whether it is worse) of a figure; None where it was not measured."""
+    worse = before is not None and (now is None or is_worse(name, figure, now, before))
+    values = [f'{"-" if now is None else f"{now:.4g}":>8s}']
+    values += [] if before is None else [f'before {before:8.4g}']
+    return f'  {figure:28s} {"  ".join(values)}{"  WORSE" if worse else ""}', worse
+
+
+def main():
+    """Print the figures; returns 1 where one is worse than that of the other checkout."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument('--against', type=Path, metavar='FOLDER', help='another checkout')
+    parser.add_argument('--json', action='store_true', help='only the figures, as JSON')
+    given = parser.parse_args()
+    found = measured()
+    if given.json:
+        print(json.dumps(found))
+        return 0
+    before = measured_by(given.against) if given.against else {}
+    n_worse = 0
+    for name, figures in found.items():
+        print(f'{name}:')
+        old = before.get(name, {})
+        for figure in figures | old:
+            text, worse = compared(name, figure, figures.get(figure), old.get(figure))
+            print(text)
+            n_worse += worse
+    return 1 if n_worse else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
