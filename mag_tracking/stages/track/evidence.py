@@ -44,6 +44,10 @@ PASSING_DOUBTS = (doubts.OVERFIT, doubts.SOMETHING_ELSE, doubts.INNOVATIONS, dou
                   doubts.HEIGHT, doubts.OFF_THE_ROAD, doubts.NO_STEADY_PATH)
 """Doubts about the filter at one time, which smoothing removes only in part."""
 
+LASTS_S = 0.1
+"""[s] A passing doubt lasts for so long: one that is gone for a single frame may be back in the
+next one."""
+
 MOST_STRETCHES = 5000
 """Stretches of doubtful poses that are remembered: more than a track has that is smoothed."""
 
@@ -71,6 +75,8 @@ class TrackEvidence:
         self._n_misfits = 0
         self._doubts_filter_until_ns = -1
         self._doubtful_times: DoubtfulTimes = ()
+        # When each passing doubt was found last.
+        self._found_ns: dict[str, int] = {}
         self._best_spread = np.inf
         # Per sensor: whitened energy of its fields above that of noise, and number of axes.
         self._energy, self._n_axes = np.zeros(n_sensors), np.zeros(n_sensors)
@@ -130,10 +136,13 @@ class TrackEvidence:
         """Whether fewer than two sensors have felt the target."""
         return int(np.count_nonzero(self.felt)) < 2
 
-    def note(self, found: set[str], stamp_ns: int) -> None:
-        """Remember what the pose of a frame was doubted for, for the smoothed one."""
-        self._doubtful_times = noted(self._doubtful_times, stamp_ns,
-                                     bool(found.intersection(PASSING_DOUBTS)), MOST_STRETCHES)
+    def note(self, found: set[str], stamp_ns: int) -> set[str]:
+        """Remember what the pose of a frame is doubted for; that, and the doubts that last."""
+        passing = found.intersection(PASSING_DOUBTS)
+        self._doubtful_times = noted(self._doubtful_times, stamp_ns, bool(passing), MOST_STRETCHES)
+        self._found_ns |= dict.fromkeys(passing, stamp_ns)
+        return found | {reason for reason, when in self._found_ns.items()
+                        if (stamp_ns - when) / NS <= LASTS_S}
 
     def contradicts(self, nis: FloatArray, degrees_of_freedom: int) -> bool:
         """Whether a normalised innovation is one that no target of ours makes.

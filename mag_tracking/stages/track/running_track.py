@@ -220,7 +220,7 @@ class RunningTrack:
         self._evidence.support(alone, dt)
         self._look(best, np.flatnonzero(measured.any(axis=1)))
         found = self._doubts(frame, dt, best, alone)
-        self._evidence.note(found, frame.stamp_ns)
+        found = self._evidence.note(found, frame.stamp_ns)
         excess = 1.0 if self._target.starts_anywhere else self._evidence.innovations.excess
         return self._sensors.widened(published_track(
             bank, best, self._target.model, self._target.orientation, self._target.arrivals,

@@ -178,3 +178,18 @@ def test_published_doubts_are_listed_in_one_order_and_each_has_a_meaning():
              if name.isupper() and isinstance(value, str)]
     assert sorted(names) == sorted(doubts.MEANINGS)
     assert doubts.listed({doubts.HEIGHT, doubts.ANOTHER_PLACE}) == ('another_place', 'height')
+
+
+def test_a_passing_doubt_lasts_for_a_tenth_of_a_second():
+    """Poses that are sure for a single frame are more often wrong than others."""
+    evidence = TrackEvidence(2)
+    assert evidence.note({doubts.HEIGHT, doubts.ANOTHER_PLACE}, NS) == \
+        {doubts.HEIGHT, doubts.ANOTHER_PLACE}
+    # What the bank can decide from one frame to the next does not last.
+    assert evidence.note(set(), NS + round(0.08 * NS)) == {doubts.HEIGHT}
+    assert evidence.note({doubts.OVERFIT}, NS + round(0.16 * NS)) == {doubts.OVERFIT}
+    assert evidence.note(set(), NS + round(0.24 * NS)) == {doubts.OVERFIT}
+    assert evidence.note(set(), NS + round(0.32 * NS)) == set()
+    # The smoothed poses are doubted where the doubt was found.
+    assert not evidence.doubted_filter(NS + round(0.32 * NS))
+    assert evidence.doubted_filter(NS + round(0.16 * NS))
