@@ -14,6 +14,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from tqdm import tqdm
 
 from mag_tracking.apps.replay import replay
 from mag_tracking.network.file import read_network
@@ -91,13 +92,19 @@ def of_control(name):
     return total
 
 
+def shown(items, what):
+    """The items, with a bar on a terminal."""
+    return tqdm(items, desc=what, disable=None, leave=False)
+
+
 def measured():
     """{name: its figures}."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         found = {name: of_recording(*given, folder / 'results' / name.replace(' ', '_'))
-                 for name, given in recordings(folder).items()}
-    found |= {f'simulated {name}': of_control(name) for name in (*KINDS, 'car, four sensors')}
+                 for name, given in shown(recordings(folder).items(), 'recordings')}
+    found |= {f'simulated {name}': of_control(name)
+              for name in shown((*KINDS, 'car, four sensors'), 'controls')}
     return found | {'all': {f: sum(x.get(f, 0) for x in found.values()) for f in (SURE, RIGHT)}}
 
 
@@ -133,6 +140,9 @@ def main():
     parser.add_argument('--against', type=Path, metavar='FOLDER', help='another checkout')
     parser.add_argument('--json', action='store_true', help='only the figures, as JSON')
     given = parser.parse_args()
+    if given.against and not (given.against / 'mag_tracking' / '__init__.py').is_file():
+        # The installed package would be measured instead.
+        parser.error(f'{given.against} is no checkout: it has no package mag_tracking')
     found = measured()
     if given.json:
         print(json.dumps(found))
