@@ -1,7 +1,7 @@
 """`make bench`: poses without a flag, and errors against truth, where the tracker is right.
 
-All bundled recordings with one vehicle or magnet, and simulated controls. `--against FOLDER` has
-the same measured by another checkout, and says what got worse.
+It replays all bundled recordings with one vehicle or magnet, and tracks simulated controls.
+`--against FOLDER` measures the same with the package of another checkout, and names what got worse.
 """
 
 import argparse
@@ -28,12 +28,12 @@ from support.random_passes import KINDS, SIMULATORS, WRONG_M, errors_of
 from support.situation_worlds import FOUR, car, straight, usual
 
 RUNS = 5
-"""Of each control and simulator."""
+"""Number of simulated passes of each control and simulator."""
 LEAST_SURE = 0.95
-"""Share of the other checkout's poses without a flag that there must be: of the right ones
-everywhere, of all of them together."""
+"""The least ratio to the other checkout's number of poses without a flag: of the right ones in each
+row, of all of them in the total."""
 MOST_ERROR = 1.03
-"""Ratio to the error of the other checkout that is no worse."""
+"""The largest ratio to an error of the other checkout that counts as no worse."""
 SURE, RIGHT = 'no flag', f'no flag, within {WRONG_M:g} m'
 ERRORS = {'rms': 'RMS [m]', 'closest': 'closest [m]', 'anees': 'ANEES', 'position_mean': 'mean [m]',
           'axis_median_deg': 'axis [deg]'}
@@ -87,8 +87,8 @@ def of_control(name):
             sure = [r for r in pipeline.feed(a_world.readings) + pipeline.flush()
                     if isinstance(r, Track) and not r.ended and not r.ambiguous]
             total[SURE] += len(sure)
-            total[RIGHT] += int((errors_of(sure, a_world.t, a_world.positions[0])[0]
-                                 <= WRONG_M).sum()) if sure else 0
+            error = errors_of(sure, a_world.t, a_world.positions[0])[0]
+            total[RIGHT] += int((error <= WRONG_M).sum())
     return total
 
 
@@ -109,8 +109,8 @@ def measured():
 
 
 def measured_by(checkout):
-    """The same by the package of another checkout."""
-    # The folder that a module is run in comes first of all places of packages.
+    """`measured` with the package of another checkout."""
+    # Python looks for packages first in the folder in which `-m` is run.
     done = subprocess.run([sys.executable, '-m', 'bench.recordings', '--json'], check=True,
                           cwd=checkout, env=os.environ | {'PYTHONPATH': str(ROOT / 'test')},
                           stdout=subprocess.PIPE, text=True)

@@ -45,8 +45,8 @@ PASSING_DOUBTS = (doubts.OVERFIT, doubts.SOMETHING_ELSE, doubts.INNOVATIONS, dou
 """Doubts about the filter at one time, which smoothing removes only in part."""
 
 LASTS_S = 0.1
-"""[s] A passing doubt lasts for so long: one that is gone for a single frame may be back in the
-next one."""
+"""[s] Time for which a passing doubt outlasts the frame that it was found in: one that is missing
+in a single frame may be back in the next."""
 
 MOST_STRETCHES = 5000
 """Stretches of doubtful poses that are remembered: more than a track has that is smoothed."""
@@ -75,7 +75,7 @@ class TrackEvidence:
         self._n_misfits = 0
         self._doubts_filter_until_ns = -1
         self._doubtful_times: DoubtfulTimes = ()
-        # When each passing doubt was found last.
+        # The latest timestamp of each passing doubt.
         self._found_ns: dict[str, int] = {}
         self._best_spread = np.inf
         # Per sensor: whitened energy of its fields above that of noise, and number of axes.
@@ -137,7 +137,7 @@ class TrackEvidence:
         return int(np.count_nonzero(self.felt)) < 2
 
     def note(self, found: set[str], stamp_ns: int) -> set[str]:
-        """Remember what the pose of a frame is doubted for; that, and the doubts that last."""
+        """Record the doubts about the pose of a frame; return them and those that last."""
         passing = found.intersection(PASSING_DOUBTS)
         self._doubtful_times = noted(self._doubtful_times, stamp_ns, bool(passing), MOST_STRETCHES)
         self._found_ns |= dict.fromkeys(passing, stamp_ns)
