@@ -31,6 +31,31 @@ def quaternion_from_rotation_vector(v: ArrayLike) -> FloatArray:
     return np.concatenate([0.5 * v * np.sinc(half / np.pi), np.cos(half)], axis=-1)
 
 
+def rotation_vectors_between(q: ArrayLike, other: ArrayLike) -> FloatArray:
+    """The shortest rotations about world axes from orientation `q` to others.
+
+    Parameters
+    ----------
+    q : (4,) unit quaternion xyzw
+    other : (..., 4) unit quaternions xyzw
+
+    Returns
+    -------
+    (..., 3) array, rad
+        Of length pi at most.
+    """
+    q, other = np.asarray(q, dtype=float), np.asarray(other, dtype=float)
+    v, w = -q[:3], q[3]
+    along = other[..., 3:] * v + w * other[..., :3] + np.cross(other[..., :3], v)
+    cosine = other[..., 3] * w - other[..., :3] @ v
+    sine = np.linalg.norm(along, axis=-1)
+    angle = 2.0 * np.arctan2(sine, np.abs(cosine))
+    scale = np.where(cosine < 0.0, -1.0, 1.0) * np.divide(
+        angle, sine, out=np.full(sine.shape, 2.0), where=sine > 1e-12)
+    vectors: FloatArray = scale[..., None] * along
+    return vectors
+
+
 def cross_matrix(a: ArrayLike) -> FloatArray:
     """Matrices [a]x with [a]x b = a x b; `a` (..., 3) gives (..., 3, 3)."""
     a = np.asarray(a, dtype=float)

@@ -217,6 +217,18 @@ class Hypotheses(Sequence[Hypothesis]):
 
 
 @dataclass(frozen=True, slots=True)
+class PoseUncertainty:
+    """Covariances about a pose."""
+
+    covariance: FloatArray
+    """(6, 6) of position and velocity, world."""
+    orientation_covariance: FloatArray
+    """(3, 3) [rad^2], small rotations about the fixed world axes."""
+    position_orientation_covariance: FloatArray
+    """(3, 3) [m rad]."""
+
+
+@dataclass(frozen=True, slots=True)
 class SmoothedPose:
     """A target at one time, by what came before it and after."""
 
@@ -307,6 +319,9 @@ class Track:
     """Heaviest first; the published one is among them."""
     doubts: tuple[str, ...] = ()
     """Why it is ambiguous: names of `stages.track.doubts`."""
+    topic_uncertainty: PoseUncertainty | None = None
+    """For messages without a flag. About the pose of an ambiguous track, that of all hypotheses at
+    any place; None: no such message is sent (`track.ambiguous_poses`)."""
 
     @property
     def mounting_std(self) -> FloatArray:

@@ -32,7 +32,7 @@ _Settings = TypeVar('_Settings', bound='DataclassInstance')
 
 
 def param(default: _Default, doc: str, unit: str = '', range: tuple[float, float] | None = None,
-          live: bool = False, length: int | None = None) -> _Default:
+          live: bool = False, length: int | None = None, choices: tuple[str, ...] = ()) -> _Default:
     """Declare one setting of a frozen dataclass.
 
     Parameters
@@ -47,9 +47,12 @@ def param(default: _Default, doc: str, unit: str = '', range: tuple[float, float
         May change while running (a ROS parameter that is not read-only).
     length : int, optional
         Required length of a tuple; None = any but zero.
+    choices : tuple of str, optional
+        The values that a text may have.
     """
     return dataclasses.field(default=default, metadata={
-        'doc': doc, 'unit': unit, 'range': range, 'live': live, 'length': length})
+        'doc': doc, 'unit': unit, 'range': range, 'live': live, 'length': length,
+        'choices': choices})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,6 +68,7 @@ class Parameter:
     range: tuple[float, float] | None
     live: bool
     length: int | None
+    choices: tuple[str, ...]
 
 
 def _kind(hint: Any) -> tuple[_Class, _Class | None]:
@@ -122,6 +126,9 @@ def _checked(p: Parameter, value: object) -> Value:
     else:
         values = (_scalar(p.name, value, p.type),)
     for v in values:
+        if p.choices and v not in p.choices:
+            raise SettingsError(f'{p.name}: expected {", ".join(p.choices[:-1])} or '
+                                f'{p.choices[-1]}, got {shown(v)}')
         if isinstance(v, float) and math.isnan(v):
             raise SettingsError(f'{p.name}: NaN is not a value')
         if isinstance(v, str) or p.range is None:
@@ -245,6 +252,7 @@ def to_yaml(settings: 'DataclassInstance', node: str = '/**') -> str:
         pad = '      ' if head else '    '
         notes = [p.unit] if p.unit else []
         notes += [f'{p.range[0]} .. {p.range[1]}'] if p.range else []
+        notes += [', '.join(p.choices)] if p.choices else []
         notes += ['live'] if p.live else []
         lines.append(f'{pad}# {p.doc}' + (f' [{"; ".join(notes)}]' if notes else ''))
         lines.append(f'{pad}{leaf}: {_yaml_value(p.value)}')
@@ -256,7 +264,7 @@ def to_reference(settings: 'DataclassInstance', live: bool = True) -> str:
     head = ['parameter', 'default', 'unit', 'range', *(['live'] if live else []), 'what']
     lines = [f'| {" | ".join(head)} |', '|' + '---|' * len(head)]
     for p in flatten(settings):
-        bounds = f'{p.range[0]} .. {p.range[1]}' if p.range else ''
+        bounds = f'{p.range[0]} .. {p.range[1]}' if p.range else ', '.join(p.choices)
         row = [f'`{p.name}`', f'`{_yaml_value(p.value)}`', p.unit, bounds,
                *(['yes' if p.live else ''] if live else []), p.doc.replace('|', '\\|')]
         lines.append(f'| {" | ".join(row)} |')

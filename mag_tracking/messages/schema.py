@@ -11,7 +11,14 @@ from mag_tracking.errors import RecordingError
 from mag_tracking.event_records import Disturbance, PassEvent
 from mag_tracking.geometry import rotation_from_quaternion
 from mag_tracking.messages.shapes import FieldReadings, Imu, MagneticField, MessageDict, Time
-from mag_tracking.records import AccelerationSample, Detection, Readings, SmoothedPose, Track
+from mag_tracking.records import (
+    AccelerationSample,
+    Detection,
+    PoseUncertainty,
+    Readings,
+    SmoothedPose,
+    Track,
+)
 from mag_tracking.units import LATEST_NS
 
 
@@ -154,20 +161,30 @@ def _pose(position: FloatArray, quaternion: FloatArray) -> MessageDict:
             'orientation': {**xyz(quaternion), 'w': float(quaternion[3])}}
 
 
-def pose_covariance(track: Track | SmoothedPose) -> FloatArray:
+def pose_covariance(about: Track | SmoothedPose | PoseUncertainty) -> FloatArray:
     """(6, 6) of position and small rotations about fixed axes, as ROS orders them."""
     C = np.empty((6, 6))
-    C[:3, :3] = track.covariance[:3, :3]
-    C[:3, 3:] = track.position_orientation_covariance
-    C[3:, :3] = track.position_orientation_covariance.T
-    C[3:, 3:] = track.orientation_covariance
+    C[:3, :3] = about.covariance[:3, :3]
+    C[:3, 3:] = about.position_orientation_covariance
+    C[3:, :3] = about.position_orientation_covariance.T
+    C[3:, 3:] = about.orientation_covariance
     return C
 
 
-def pose_with_covariance_dict(track: Track | SmoothedPose) -> MessageDict:
-    """geometry_msgs/PoseWithCovariance of a `Track` or `SmoothedPose`."""
+def pose_with_covariance_dict(track: Track | SmoothedPose,
+                              uncertainty: PoseUncertainty | None = None) -> MessageDict:
+    """geometry_msgs/PoseWithCovariance of a `Track` or `SmoothedPose`, with its own or another
+    uncertainty."""
     return {'pose': _pose(track.position, track.orientation),
-            'covariance': pose_covariance(track).ravel().tolist()}
+            'covariance': pose_covariance(uncertainty or track).ravel().tolist()}
+
+
+def pose_message_dict(track: Track, frame: str) -> MessageDict | None:
+    """geometry_msgs/PoseWithCovarianceStamped of a `Track`; None where it is held back."""
+    if track.topic_uncertainty is None:
+        return None
+    return {'header': header_dict(track.stamp_ns, frame),
+            'pose': pose_with_covariance_dict(track, track.topic_uncertainty)}
 
 
 def track_dict(track: Track, frame: str) -> MessageDict:
@@ -241,16 +258,20 @@ def pass_event_dict(e: PassEvent) -> MessageDict:
             'signature': doubles(e.signature.ravel())}
 
 
-def odometry_dict(track: Track, frame: str, child_frame: str) -> MessageDict:
+def odometry_dict(track: Track, frame: str, child_frame: str) -> MessageDict | None:
     """nav_msgs/Odometry: the twist is in the child frame, as REP-105 has it.
 
-    The angular velocity is not estimated here: zero, with variance pi^2.
+    The angular velocity is not estimated here: zero, with variance pi^2. None where the pose is
+    held back.
     """
+    uncertainty = track.topic_uncertainty
+    if uncertainty is None:
+        return None
     R = rotation_from_quaternion(track.orientation)
     twist = np.zeros((6, 6))
-    twist[:3, :3] = R.T @ track.covariance[3:, 3:] @ R
+    twist[:3, :3] = R.T @ uncertainty.covariance[3:, 3:] @ R
     twist[3:, 3:] = np.pi**2 * np.eye(3)
     return {'header': header_dict(track.stamp_ns, frame), 'child_frame_id': child_frame,
-            'pose': pose_with_covariance_dict(track),
+            'pose': pose_with_covariance_dict(track, uncertainty),
             'twist': {'twist': {'linear': xyz(R.T @ track.velocity), 'angular': xyz(np.zeros(3))},
                       'covariance': twist.ravel().tolist()}}

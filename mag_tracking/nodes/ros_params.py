@@ -20,7 +20,8 @@ from mag_tracking.settings import Parameter, flatten, replace
 def _descriptor(p: Parameter) -> ParameterDescriptor:
     """Description, unit and range of one setting."""
     d = ParameterDescriptor(description=p.doc, read_only=not p.live,
-                            additional_constraints=f'unit: {p.unit}' if p.unit else '')
+                            additional_constraints=f'unit: {p.unit}' if p.unit else
+                            f'one of {", ".join(p.choices)}' if p.choices else '')
     if p.range and p.type is float:
         d.floating_point_range = [FloatingPointRange(from_value=float(p.range[0]),
                                                      to_value=float(p.range[1]))]

@@ -31,15 +31,15 @@ from mag_tracking.messages.calibration_state import doubtful_times, with_orienta
 from mag_tracking.messages.frame import frame_of
 from mag_tracking.messages.schema import (
     disturbance_dict,
-    header_dict,
     hypotheses_dict,
     odometry_dict,
     pose_dict,
-    pose_with_covariance_dict,
+    pose_message_dict,
     smoothed_pose_dict,
     smoothed_track_dict,
     track_dict,
 )
+from mag_tracking.messages.shapes import MessageDict
 from mag_tracking.network import SensorNetwork
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
@@ -50,6 +50,7 @@ from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.stages.stage import Stage
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.running_track import TrackRecord
+from mag_tracking.stages.track.settings import BEST
 
 SLACK_S = 1.0
 """[s] What the way of a frame may take on top of the longest gap."""
@@ -146,7 +147,8 @@ class TrackerNode(StageNode):
                 self._publish(record)
             elif record.complete:
                 whole.append(record)
-            else:
+            # It has no flag, and what else is possible is not smoothed.
+            elif not record.ambiguous or self.settings.track.ambiguous_poses == BEST:
                 self._smoothed_pose.publish(to_message(
                     PoseWithCovarianceStamped, smoothed_pose_dict(record, self.network.frame)))
         if whole:
@@ -165,9 +167,7 @@ class TrackerNode(StageNode):
         frame = self.network.frame
         if not track.ended:
             # What somebody steers by comes first.
-            self._pose.publish(to_message(PoseWithCovarianceStamped, {
-                'header': header_dict(track.stamp_ns, frame),
-                'pose': pose_with_covariance_dict(track)}))
+            publish_if_any(self._pose, PoseWithCovarianceStamped, pose_message_dict(track, frame))
             # Then the hypotheses: who waits for the track has them already.
             if is_heard(self._hypotheses):
                 self._hypotheses.publish(
@@ -179,8 +179,7 @@ class TrackerNode(StageNode):
             self._path.clear()
             self._markers.publish(to_message(MarkerArray, delete_markers(track, frame)))
             return
-        self._odometry.publish(to_message(
-            Odometry, odometry_dict(track, frame, f'track_{track.id}')))
+        publish_if_any(self._odometry, Odometry, odometry_dict(track, frame, f'track_{track.id}'))
         self._path.append(to_message(PoseStamped, pose_dict(
             track.stamp_ns, frame, track.position, track.orientation)))
         if is_heard(self._path_publisher):
@@ -188,6 +187,12 @@ class TrackerNode(StageNode):
                 Path(header=self._path[-1].header, poses=list(self._path)))
         if is_heard(self._markers):
             self._markers.publish(to_message(MarkerArray, track_markers(track, frame)))
+
+
+def publish_if_any(publisher: Publisher, cls: Any, content: MessageDict | None) -> None:
+    """Publish a message of class `cls`, unless it is held back."""
+    if content is not None:
+        publisher.publish(to_message(cls, content))
 
 
 def is_heard(publisher: Publisher) -> bool:

@@ -16,8 +16,7 @@ from mag_tracking.event_records import Disturbance
 from mag_tracking.files import new_text_file, output_folder
 from mag_tracking.messages.schema import (
     disturbance_dict,
-    header_dict,
-    pose_with_covariance_dict,
+    pose_message_dict,
     track_dict,
 )
 from mag_tracking.messages.types import DISTURBANCE, POSE_WITH_COVARIANCE, TRACK_ARRAY
@@ -128,9 +127,9 @@ class ResultFolder:
             'header': message['header'], 'tracks': [message]}, track.stamp_ns)
         if track.ended:
             return
-        self._recording.write('/tracker_node/pose', POSE_WITH_COVARIANCE, {
-            'header': header_dict(track.stamp_ns, self._frame),
-            'pose': pose_with_covariance_dict(track)}, track.stamp_ns)
+        pose = pose_message_dict(track, self._frame)
+        if pose is not None:
+            self._recording.write('/tracker_node/pose', POSE_WITH_COVARIANCE, pose, track.stamp_ns)
         sd = np.sqrt(np.diagonal(track.covariance))
         self._poses.writerow([track.stamp_ns, track.id, *_floats(
             track.position, track.velocity, sd, track.moment, [track.weight]),

@@ -1,6 +1,6 @@
 """Passes of random vehicles of both simulators, and what the tracker makes of them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -58,6 +58,8 @@ class Tracked:
     """(n,) [m], as stated, along the error."""
     nees: np.ndarray
     """(n,), an axis."""
+    topic_nees: np.ndarray
+    """(n,) the same by the covariance of the pose topics; NaN where they carry nothing."""
     distance: np.ndarray
     """(n,) [m] of the truth from the sensors' middle."""
     ambiguous: np.ndarray
@@ -106,6 +108,10 @@ def tracked(network, body, course, duration, flaws, seed, changes=None, faults=(
     records = pipeline.feed(readings) + pipeline.flush()
     tracks = [r for r in records if isinstance(r, Track) and not r.ended]
     size, along, nees, true = errors_of(tracks, t, position)
+    topic_nees = np.full(len(tracks), np.nan)
+    sent = [k for k, r in enumerate(tracks) if r.topic_uncertainty is not None]
+    topic_nees[sent] = errors_of([replace(tracks[k], covariance=tracks[
+        k].topic_uncertainty.covariance) for k in sent], t, position)[2]
     velocity = np.gradient(position, t, axis=0)
     distance = np.hypot(*(true - network.centre[:2]).T)
     ratio = heading = np.nan
@@ -117,7 +123,7 @@ def tracked(network, body, course, duration, flaws, seed, changes=None, faults=(
         heading = stated @ v / np.hypot(*stated) / np.hypot(*v)
     sure = [r for r in records if isinstance(r, SmoothedPose) and not r.ambiguous]
     smoothed_error, smoothed_deviation, *_ = errors_of(sure, t, position)
-    return Tracked(size, along, nees, distance, np.array([r.ambiguous for r in tracks], dtype=bool),
+    return Tracked(size, along, nees, topic_nees, distance, np.array([r.ambiguous for r in tracks], dtype=bool),
                    float(ratio), float(heading), pipeline.detect.counts['onsets'] > 0, len(sure),
                    int(are_wrong(smoothed_error, smoothed_deviation).sum()))
 

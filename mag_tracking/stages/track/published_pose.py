@@ -6,12 +6,19 @@ from typing import Protocol, TypeAlias, TypedDict
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.geometry import cross_matrix, quaternion_between, quaternion_from_yaw
+from mag_tracking.geometry import (
+    cross_matrix,
+    quaternion_between,
+    quaternion_from_yaw,
+    rotation_vectors_between,
+)
 from mag_tracking.inference.covariance_union import widened_to_cover
 from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.inference.mixture import second_moment
 from mag_tracking.physics.sources import SourceModel
-from mag_tracking.records import Hypotheses, SmoothedPose, Track
+from mag_tracking.records import Hypotheses, PoseUncertainty, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
+from mag_tracking.stages.track.settings import BEST, MIXTURE
 from mag_tracking.stages.track.unseen_length import UnseenLength
 
 UNOBSERVED_VARIANCE = np.pi**2
@@ -102,7 +109,8 @@ def magnet_orientation(x: FloatArray, P: FloatArray, axis: FloatArray) -> Orient
 
 def published_track(bank: FilterBank, best: int, model: SourceModel, orientation: Orientation,
                     names: Sequence[str], kinds: Sequence[str], found: Set[str],
-                    unseen: UnseenLength | None, *, excess: float = 1.0, difference: FloatArray,
+                    unseen: UnseenLength | None, *, excess: float = 1.0,
+                    ambiguous_poses: str = MIXTURE, difference: FloatArray,
                     stamp_ns: int, id: int, ended: bool, existence: float,
                     degrees_of_freedom: int, predicted: FloatArray, mounting: FloatArray,
                     mounting_covariance: FloatArray) -> Track:
@@ -126,6 +134,8 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
         How the length of a vehicle moves its middle; None for a small target.
     excess : float
         The innovations are this many times larger than stated: so is the covariance, then.
+    ambiguous_poses : str
+        `track.ambiguous_poses`.
     difference : (6,) [m], [m/s]
         The target may as well be so far from the published position and velocity; the covariance
         covers that.
@@ -133,10 +143,14 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
         Fields of `Track` that the bank does not know.
     """
     n_t = len(model.state_names)
-    said, flags = _said_of(model, orientation, bank.x[best, :n_t],
-                           excess * covariance_about(bank, best, model), int(bank.kind[best]),
-                           unseen, difference)
+    P = covariance_about(bank, best, model)
+    said, flags = _said_of(model, orientation, bank.x[best, :n_t], excess * P,
+                           int(bank.kind[best]), unseen, difference)
     reasons = doubts.listed({*found, *ambiguities(bank, best)})
+    uncertainty: PoseUncertainty | None = own_uncertainty(said)
+    if reasons and ambiguous_poses != BEST:
+        uncertainty = mixture_uncertainty(bank, best, model, orientation, said, P) \
+            if ambiguous_poses == MIXTURE else None
     weights = np.exp(bank.log_w)
     moments = model.dipoles(bank.x[:, :n_t]).m.sum(axis=1)
     order = np.argsort(-bank.log_w, kind='stable')
@@ -153,7 +167,8 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
         kind=kinds[bank.kind[best]],
         kind_weight=float(weights.sum(where=bank.kind == bank.kind[best])),
         ambiguous=bool(reasons), doubts=reasons,
-        unobservable=(False, False, False, *flags), hypotheses=hypotheses, **said)
+        unobservable=(False, False, False, *flags), hypotheses=hypotheses,
+        topic_uncertainty=uncertainty, **said)
 
 
 def covariance_about(bank: FilterBank, best: int, model: SourceModel) -> FloatArray:
@@ -162,18 +177,63 @@ def covariance_about(bank: FilterBank, best: int, model: SourceModel) -> FloatAr
     Hypotheses that are not apart differ by where each was linearised, by the kind of target and by
     its motion; that they do is part of the error. Those that are apart make the track ambiguous.
     """
+    return _second_moment(bank, best, model, np.where(bank.apart(best), -np.inf, bank.log_w))
+
+
+def _second_moment(bank: FilterBank, best: int, model: SourceModel,
+                   log_w: FloatArray) -> FloatArray:
+    """As `covariance_about`, of the hypotheses by their log-weights (n_hyp,)."""
     n_t = len(model.state_names)
-    weight = np.where(bank.apart(best), 0.0, np.exp(bank.log_w - bank.log_w[best]))
-    here = np.flatnonzero(weight >= NO_WEIGHT * weight.max())
-    x, weight = bank.x[here, :n_t], weight[here] / weight[here].sum()
+    weight = np.exp(log_w - log_w.max())
+    rows = np.flatnonzero(weight >= NO_WEIGHT)
+    x = bank.x[rows, :n_t]
     difference = x - bank.x[best, :n_t]
     if 'L' in model.state_names:
         # From its other end it is the same row.
         L = model.state_names.index('L')
         difference[:, L] = np.abs(x[:, L]) - abs(bank.x[best, L])
-    covariance: FloatArray = (np.einsum('n,nij->ij', weight, bank.P[here, :n_t, :n_t])
-                              + np.einsum('n,ni,nj->ij', weight, difference, difference))
-    return covariance
+    return second_moment(weight[rows], difference, bank.P[rows, :n_t, :n_t])
+
+
+def mixture_uncertainty(bank: FilterBank, best: int, model: SourceModel, orientation: Orientation,
+                        here: PoseFields, P_here: FloatArray) -> PoseUncertainty:
+    """Uncertainty about the pose of hypothesis `best`, where each hypothesis may be right.
+
+    Parameters
+    ----------
+    bank : FilterBank
+    best : int
+    model : SourceModel
+    orientation : function
+    here : PoseFields
+        As published of the hypotheses at this place.
+    P_here : (n_t, n_t) array
+        `covariance_about` before it was widened to `here`.
+    """
+    n_t = len(model.state_names)
+    widening = here['covariance'] - P_here[:6, :6]
+    covariance = widening + _second_moment(bank, best, model, bank.log_w)[:6, :6]
+    # Headings may be opposite, and are too far apart for a derivative.
+    log_w = np.where(bank.apart(best), bank.log_w, -np.inf)
+    rows = np.flatnonzero(log_w >= bank.log_w.max() + np.log(NO_WEIGHT))
+    if not len(rows):
+        return PoseUncertainty(covariance, here['orientation_covariance'],
+                               here['position_orientation_covariance'])
+    weight = np.exp(log_w[rows])
+    turned = rotation_vectors_between(here['orientation'], np.array(
+        [orientation(bank.x[i, :n_t], bank.P[i, :n_t, :n_t])[0] for i in rows]))
+    moved = bank.x[rows, :3] - bank.x[best, :3]
+    return PoseUncertainty(
+        covariance, here['orientation_covariance'] + np.einsum('n,ni,nj->ij', weight, turned,
+                                                               turned),
+        (1.0 - weight.sum()) * here['position_orientation_covariance']
+        + np.einsum('n,ni,nj->ij', weight, moved, turned))
+
+
+def own_uncertainty(said: PoseFields) -> PoseUncertainty:
+    """That of the published fields themselves."""
+    return PoseUncertainty(said['covariance'], said['orientation_covariance'],
+                           said['position_orientation_covariance'])
 
 
 def ambiguities(bank: FilterBank, best: int) -> set[str]:

@@ -227,7 +227,7 @@ class RunningTrack:
             self._target.kinds, stamp_ns=frame.stamp_ns, id=self.id, ended=False,
             existence=self._evidence.existence, degrees_of_freedom=n_measured,
             found=found, excess=excess, unseen=self._unseen,
-            difference=self._opinion.difference,
+            difference=self._opinion.difference, ambiguous_poses=self._settings.ambiguous_poses,
             predicted=self._filter.predicted_field(bank, best, frame, dt),
             mounting=observation.angles(bank.x[best]),
             mounting_covariance=observation.angle_covariances(bank.P[best])), self._settings)

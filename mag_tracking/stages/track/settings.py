@@ -9,12 +9,20 @@ from mag_tracking.settings import param
 from mag_tracking.stages.track.initiation_magnet import MagnetSettings
 from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
 
+MIXTURE, HOLD, BEST = 'mixture', 'hold', 'best'
+"""What the pose topics carry while a track is ambiguous."""
+
 
 @dataclass(frozen=True)
 class TrackSettings:
     """Settings of the tracker."""
 
     target: str = param('vehicle', 'What moves: vehicle or magnet.')
+    ambiguous_poses: str = param(
+        MIXTURE, 'What the pose and odometry topics, which have no flag, carry while a track is '
+        'ambiguous: the best pose with the covariance of all that is still possible (mixture), '
+        'nothing (hold), or the best pose with its own covariance (best).', choices=(
+            MIXTURE, HOLD, BEST))
     single_sensor_prior: bool = param(
         False, 'Track with one sensor alone (a network of one, or the only one that measures). It '
         'does not tell the scale: the moments, heights and offsets of the settings are taken for '
