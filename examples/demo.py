@@ -40,7 +40,7 @@ class Spectator(Node):
         self.network = network
         self.logs, self.truth, self.smoothed = {}, [], {}
         self._frames, self._hypotheses = {}, {}
-        self.create_subscription(NetworkFrame, '/detection_node/frame', self._frame, STREAM)
+        self.create_subscription(NetworkFrame, '/network_frame', self._frame, STREAM)
         self.create_subscription(HypothesisArray, '/tracker_node/hypotheses', self._bank, STREAM)
         self.create_subscription(TrackArray, '/tracker_node/tracks', self._track, STREAM)
         self.create_subscription(SmoothedTrack, '/tracker_node/smoothed', self._whole, RESULTS)

@@ -1,13 +1,21 @@
 """Which topics `mag-tracking record` records, and what it reports."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from mag_tracking.messages.types import RAW_READINGS
+from mag_tracking.messages.types import (
+    CALIBRATED_READINGS,
+    CALIBRATION_STATE,
+    NETWORK_FRAME,
+    RAW_READINGS,
+)
 
-RESULTS_OF = ('/calibration_node/', '/detection_node/', '/tracker_node/')
+RESULTS_OF = ('calibration_node/', 'detection_node/', 'tracker_node/')
+"""Topics that begin so are results, in the namespace of the recorder."""
+RESULTS = (CALIBRATED_READINGS, CALIBRATION_STATE, NETWORK_FRAME)
+"""These are, too."""
 
 
 class Recorded(Protocol):
@@ -28,7 +36,7 @@ class Recorded(Protocol):
 
 
 class Selection(NamedTuple):
-    """Which topics to record."""
+    """Which topics to record, as the user names them or, `resolved`, as the graph does."""
 
     fields: tuple[str, ...] = ()
     """Magnetic fields of the network."""
@@ -37,15 +45,29 @@ class Selection(NamedTuple):
     topics: tuple[str, ...] = ()
     results: bool = False
     everything: bool = False
+    readings: str = RAW_READINGS
+    """Of many sensors."""
+    results_of: tuple[str, ...] = RESULTS_OF
+    result_topics: tuple[str, ...] = RESULTS
+
+    def resolved(self, resolve: Callable[[str], str]) -> 'Selection':
+        """The selection with absolute names; `resolve` takes a name and returns its absolute one.
+        """
+        return self._replace(
+            fields=tuple(map(resolve, self.fields)), imus=tuple(map(resolve, self.imus)),
+            topics=tuple(map(resolve, self.topics)), readings=resolve(self.readings),
+            results_of=tuple(f'{resolve(name.rstrip("/"))}/' for name in self.results_of),
+            result_topics=tuple(map(resolve, self.result_topics)))
 
     def wants(self, topic: str) -> bool:
         """Whether to record a topic."""
-        if topic == RAW_READINGS or topic in self.fields + self.imus + self.topics:
+        if topic == self.readings or topic in self.fields + self.imus + self.topics:
             return True
         # ROS hides what has a part that begins with an underscore, and so does rosbag2.
         if self.everything and '/_' not in topic:
             return True
-        return self.results and (topic.startswith(RESULTS_OF) or topic == '/diagnostics'
+        return self.results and (topic.startswith(self.results_of) or topic == '/diagnostics'
+                                 or topic in self.result_topics
                                  or topic.removesuffix('_calibrated') in self.fields)
 
 

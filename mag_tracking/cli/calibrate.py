@@ -11,14 +11,15 @@ from mag_tracking.apps.calibrate import Calibration, calibrate
 from mag_tracking.cli.options import (
     Commands,
     add_command,
-    add_network,
+    add_recorded_network,
     add_settings,
     check_outputs,
     now,
+    recorded_network,
     settings_of,
 )
 from mag_tracking.interrupts import noted_signals
-from mag_tracking.network.file import read_network, write_network
+from mag_tracking.network.file import write_network
 from mag_tracking.recording.reader import Recording
 
 _CALIBRATE = '''
@@ -46,7 +47,7 @@ def add(commands: Commands) -> None:
                     'Find how sensors are turned and their clocks are off.', _CALIBRATE)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
-    add_network(p)
+    add_recorded_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='FILE',
                    help='the network file to write')
     add_settings(p)
@@ -56,7 +57,7 @@ def add(commands: Commands) -> None:
 
 def _calibrate(args: argparse.Namespace) -> int:
     """mag-tracking calibrate."""
-    network, settings = read_network(args.network), settings_of(args)
+    network, settings = recorded_network(args), settings_of(args)
     recording = Recording(args.recording)
     check_outputs(args)
     times = 1 if args.no_passes else 2

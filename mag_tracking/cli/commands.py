@@ -20,6 +20,10 @@ from mag_tracking.cli import (
     tumble,
 )
 
+ROS_ARGUMENTS = '--ros-args'
+WITH_ROS = ('run', 'record', 'doctor')
+"""Commands that take arguments of ROS."""
+
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
     """The parsed command line; its `run_command` takes it and returns the exit status."""
@@ -29,4 +33,11 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     for module in (replay, events, calibrate, tumble, board_geometry, doctor, fit, plan, listen,
                    record, repair, run, info, import_table):
         module.add(commands)
-    return parser.parse_args(words)
+    words = list(words)
+    split = words.index(ROS_ARGUMENTS) if ROS_ARGUMENTS in words else len(words)
+    args = parser.parse_args(words[:split])
+    args.ros_arguments = words[split:]
+    if args.ros_arguments and args.command not in WITH_ROS:
+        parser.error(f'{ROS_ARGUMENTS}: {args.command} runs without ROS; only '
+                     f'{", ".join(WITH_ROS)} take arguments of ROS')
+    return args

@@ -11,13 +11,13 @@ from mag_tracking.apps.doctor import examine
 from mag_tracking.cli.options import (
     Commands,
     add_command,
-    add_network,
+    add_recorded_network,
     add_settings,
+    recorded_network,
     settings_of,
 )
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import noted_signals
-from mag_tracking.network.file import read_network
 from mag_tracking.recording.reader import Recording
 from mag_tracking.stages.health.sensor_health import SensorHealth
 
@@ -41,7 +41,7 @@ def add(commands: Commands) -> None:
                    help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
     p.add_argument('--live', type=float, metavar='SECONDS',
                    help='listen to the topics for so long instead (needs ROS 2)')
-    add_network(p)
+    add_recorded_network(p)
     add_settings(p)
 
 
@@ -49,7 +49,7 @@ def _doctor(args: argparse.Namespace) -> int:
     """mag-tracking doctor."""
     if (args.recording is None) == (args.live is None):
         raise SettingsError('doctor: either a RECORDING or --live SECONDS')
-    network, settings = read_network(args.network), settings_of(args)
+    network, settings = recorded_network(args), settings_of(args)
     with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
         if args.live is not None:
             if not 1.0 <= args.live <= 86400.0:
@@ -57,7 +57,8 @@ def _doctor(args: argparse.Namespace) -> int:
             # Only this needs ROS.
             from mag_tracking.nodes.doctor_node import listen
 
-            doctor, more = listen(network, settings, args.live, lambda: bool(seen))
+            doctor, more = listen(network, settings, args.live, lambda: bool(seen),
+                                  args.ros_arguments)
         else:
             recording = Recording(args.recording)
             with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,

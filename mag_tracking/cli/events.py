@@ -9,11 +9,17 @@ import numpy as np
 from tqdm import tqdm
 
 from mag_tracking.apps.events import EventsResult, find_events
-from mag_tracking.cli.options import Commands, add_command, add_network, add_settings, settings_of
+from mag_tracking.cli.options import (
+    Commands,
+    add_command,
+    add_recorded_network,
+    add_settings,
+    recorded_network,
+    settings_of,
+)
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import PassEvent
 from mag_tracking.interrupts import noted_signals
-from mag_tracking.network.file import read_network
 from mag_tracking.recording.event_tables import write_events
 from mag_tracking.recording.reader import Recording
 from mag_tracking.units import NS
@@ -38,14 +44,14 @@ def add(commands: Commands) -> None:
                     _EVENTS)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
-    add_network(p)
+    add_recorded_network(p)
     p.add_argument('--out', type=Path, metavar='DIR', help='folder for tables')
     add_settings(p)
 
 
 def _events(args: argparse.Namespace) -> int:
     """mag-tracking events."""
-    network, settings = read_network(args.network), settings_of(args)
+    network, settings = recorded_network(args), settings_of(args)
     recording = Recording(args.recording)
     if args.out is not None and recording.lies_in(args.out):
         raise OutputError(f'{args.out} is the folder of the recording; the tables would be in it')

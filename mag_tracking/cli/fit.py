@@ -13,12 +13,17 @@ from mag_tracking.analysis.correlated_motion import disagree
 from mag_tracking.analysis.pass_result import Bearing, PassFit
 from mag_tracking.apps.fit import FittedPass, RecordingFit, check_cpa_range, check_orders
 from mag_tracking.arrays import FloatArray
-from mag_tracking.cli.options import Commands, add_command, add_network, distinct_names
+from mag_tracking.cli.options import (
+    Commands,
+    add_command,
+    add_recorded_network,
+    distinct_names,
+    recorded_network,
+)
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.inference.iron import hard_and_soft_iron
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.network import SensorNetwork
-from mag_tracking.network.file import read_network
 from mag_tracking.physics.dipole import MU0
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.fit_folder import FitFolder
@@ -58,7 +63,7 @@ def add(commands: Commands) -> None:
     p = add_command(commands, 'fit', _fit, 'Fit whole passes at constant velocity, offline.', _FIT)
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
                    help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
-    add_network(p)
+    add_recorded_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder for the results')
     p.add_argument('--orders', nargs='+', type=int, default=[1, 2, 3, 4], metavar='N',
                    help='numbers of dipoles to try (default: 1 2 3 4)')
@@ -73,7 +78,7 @@ def add(commands: Commands) -> None:
 
 def _fit(args: argparse.Namespace) -> int:
     """mag-tracking fit."""
-    network = read_network(args.network)
+    network = recorded_network(args)
     settings = settings_for('vehicle', read_parameter_file(args.params) if args.params else {})
     _check(args, network)
     # All is opened before anything is written.

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.network.file import read_network
+from mag_tracking.network.topics import absolute, namespaces_of
 from mag_tracking.recording.reader import Recording
 
 
@@ -33,7 +34,11 @@ def _info(args: argparse.Namespace) -> int:
         print(f'  warning: {what}: {n}')
     if args.network:
         network = read_network(args.network)
+        namespaces = namespaces_of(network.topics, recording.types) or ['/']
+        if len(namespaces) > 1:
+            print(f'  the topics of the network are in the namespaces {", ".join(namespaces)}')
         for name, topic in zip(network.names, network.topics, strict=True):
+            topic = absolute(topic, namespaces[0])
             state = 'there' if topic in recording.types else 'MISSING'
             print(f'  sensor {name}: {topic} is {state}')
     return 0

@@ -1,12 +1,16 @@
 """What several commands share: options and settings."""
 
 import argparse
+import dataclasses
 import datetime
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
 from mag_tracking.errors import OutputError, SettingsError
+from mag_tracking.network import SensorNetwork
+from mag_tracking.network.file import read_network
+from mag_tracking.network.topics import checked_namespace
 from mag_tracking.pipeline import TARGET_DEFAULTS, Settings, settings_for
 from mag_tracking.settings import read_parameter_file
 
@@ -30,6 +34,21 @@ def add_network(parser: argparse._ActionsContainer, required: bool = True,
                 text: str = 'positions and orientations of the sensors (network.yaml)') -> None:
     """--network."""
     parser.add_argument('--network', required=required, type=Path, metavar='FILE', help=text)
+
+
+def add_recorded_network(parser: argparse._ActionsContainer) -> None:
+    """--network and --namespace."""
+    add_network(parser)
+    parser.add_argument('--namespace', metavar='NAMESPACE', help='of the relative topics of the '
+                        'network file, such as /robot1, where the recording has several')
+
+
+def recorded_network(args: argparse.Namespace) -> SensorNetwork:
+    """The network of `add_recorded_network`; raises NetworkError."""
+    network = read_network(args.network)
+    if args.namespace is None:
+        return network
+    return dataclasses.replace(network, namespace=checked_namespace(args.namespace))
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:

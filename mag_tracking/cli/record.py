@@ -8,6 +8,7 @@ from mag_tracking.apps.record import Selection
 from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.errors import SettingsError
 from mag_tracking.network.file import read_network
+from mag_tracking.network.topics import NAME
 
 _RECORD = '''
 Records the magnetic fields of the network's topics, as they are, until Ctrl-C,
@@ -21,6 +22,7 @@ examples:
   mag-tracking record --network config/network.yaml --out night
   mag-tracking record --network site.yaml --out night --results --split-s 600
   mag-tracking record --network site.yaml --out night --topics /camera /gps/fix
+  mag-tracking record --network site.yaml --out night --ros-args -r __ns:=/robot1
 '''
 
 
@@ -47,12 +49,13 @@ def _record(args: argparse.Namespace) -> int:
         if not (math.isfinite(value) and value >= least):
             raise SettingsError(f'{option}: {value:g} is not a number of at least {least:g}')
     for topic in args.topics:
-        if not topic.startswith('/'):
-            raise SettingsError(f'--topics: {topic!r} is not a whole name (it begins with /)')
+        if not NAME.fullmatch(topic):
+            raise SettingsError(f'--topics: {topic!r} is not the name of a topic')
     network = read_network(args.network)
     # Only this command needs ROS.
     from mag_tracking.nodes.record_node import run
 
     imus = tuple(filter(None, network.imu_topics))
     selection = Selection(tuple(network.topics), imus, tuple(args.topics), args.results, args.all)
-    return run(selection, args.out, int(args.split_mb * 1e6), int(args.split_s * 1e9))
+    return run(selection, args.out, int(args.split_mb * 1e6), int(args.split_s * 1e9),
+               args.ros_arguments)

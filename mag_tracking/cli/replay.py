@@ -12,14 +12,14 @@ from mag_tracking.apps.replay import replay, write_figures
 from mag_tracking.cli.options import (
     Commands,
     add_command,
-    add_network,
+    add_recorded_network,
     add_settings,
     distinct_names,
+    recorded_network,
     settings_of,
 )
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.network import SensorNetwork
-from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.reader import Recording
 from mag_tracking.stages.track.doubts import MEANINGS
@@ -63,7 +63,7 @@ def add(commands: Commands) -> None:
     p = add_command(commands, 'replay', _replay, 'Track what is in recordings, offline.', _REPLAY)
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
                    help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
-    add_network(p)
+    add_recorded_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder for the results')
     add_settings(p)
     p.add_argument('--no-figures', action='store_true', help='leave the pictures out')
@@ -71,7 +71,7 @@ def add(commands: Commands) -> None:
 
 def _replay(args: argparse.Namespace) -> int:
     """mag-tracking replay."""
-    network, settings = read_network(args.network), settings_of(args)
+    network, settings = recorded_network(args), settings_of(args)
     names = distinct_names(args.recordings)
     with noted_signals(signal.SIGINT) as seen:
         for path, name in zip(args.recordings, names, strict=True):

@@ -17,11 +17,12 @@ _RUN = '''
 Starts calibration, detection and tracker nodes in one process, and with a
 RECORDING the replay node, with DRIVERS the driver node as well. Drivers of your
 own publish sensor_msgs/MagneticField on the topics of the network file. Ctrl-C
-ends it.
+ends it. Arguments of ROS (--ros-args ...) come last.
 
 examples:
   mag-tracking run --network config/network.yaml --drivers config/drivers.yaml
   mag-tracking run --network config/network.yaml --recording junction.mcap --rate 2
+  mag-tracking run --network config/network.yaml --ros-args -r __ns:=/robot1
 '''
 
 
@@ -36,6 +37,8 @@ def add(commands: Commands) -> None:
     p.add_argument('--batches', action='store_true',
                    help='the drivers put readings of many sensors in one message, which dozens of '
                    'sensors need')
+    p.add_argument('--use-sim-time', action='store_true',
+                   help='take the time from /clock, as where a bag is played')
     p.add_argument('--rate', type=float, default=1.0, help='speed of the replay (default: 1)')
     p.add_argument('--loop', action='store_true', help='begin again at the end')
 
@@ -45,9 +48,11 @@ def _run(args: argparse.Namespace) -> int:
     # Only this command needs ROS.
     from mag_tracking.nodes.runner import run
 
-    settings = settings_of(args)
+    settings, ros_arguments = settings_of(args), list(args.ros_arguments)
+    if args.use_sim_time:
+        ros_arguments += ['--ros-args', '-p', 'use_sim_time:=true']
     read_network(args.network)
     if args.recording:
         Recording(args.recording)
     return run(args.network, settings, args.recording, args.rate, args.loop,
-               drivers=args.drivers, batches=args.batches)
+               drivers=args.drivers, batches=args.batches, ros_arguments=ros_arguments)

@@ -8,10 +8,17 @@ from tqdm import tqdm
 
 from mag_tracking.apps.tumble import tumble
 from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit
-from mag_tracking.cli.options import Commands, add_command, add_network, check_outputs, now
+from mag_tracking.cli.options import (
+    Commands,
+    add_command,
+    add_recorded_network,
+    check_outputs,
+    now,
+    recorded_network,
+)
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import noted_signals
-from mag_tracking.network.file import read_network, write_network
+from mag_tracking.network.file import write_network
 from mag_tracking.recording.reader import Recording
 
 _TUMBLE = '''
@@ -32,7 +39,7 @@ def add(commands: Commands) -> None:
                     'Find the hard and soft iron of sensors that were turned about.', _TUMBLE)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
-    add_network(p)
+    add_recorded_network(p)
     p.add_argument('--sensor', nargs='+', default=[], metavar='NAME',
                    help='which were turned (default: all)')
     p.add_argument('--field-size', type=float, metavar='TESLA',
@@ -46,7 +53,7 @@ def _tumble(args: argparse.Namespace) -> int:
     """mag-tracking tumble."""
     if args.field_size is not None and not 1e-6 <= args.field_size <= 1e-3:
         raise SettingsError(f'--field-size: {args.field_size:g} is not between 1e-6 and 1e-3 tesla')
-    network, recording = read_network(args.network), Recording(args.recording)
+    network, recording = recorded_network(args), Recording(args.recording)
     check_outputs(args)
     with noted_signals(signal.SIGINT) as seen:
         with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,

@@ -26,10 +26,15 @@ TRACK_ARRAY = 'mag_tracking_msgs/msg/TrackArray'
 FIELD_READINGS = 'mag_tracking_msgs/msg/FieldReadings'
 DISTURBANCE = 'mag_tracking_msgs/msg/Disturbance'
 
-RAW_READINGS = '/driver_node/readings'
-"""The topic of raw readings of many sensors."""
-CALIBRATED_READINGS = '/calibration_node/readings'
+RAW_READINGS = 'field_readings'
+"""The topic of raw readings of many sensors. It and the next ones are relative to the namespace of
+the nodes, whatever these are called."""
+CALIBRATED_READINGS = 'field_readings_calibrated'
 """The same, calibrated."""
+CALIBRATION_STATE = 'calibration_state'
+"""The topic of the sensors' calibration."""
+NETWORK_FRAME = 'network_frame'
+"""The topic of frames of the network."""
 
 DEFINITIONS: dict[str, tuple[tuple[str, ...], str]] = {
     'builtin_interfaces/msg/Time': ((), 'int32 sec\nuint32 nanosec\n'),

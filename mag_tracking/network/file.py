@@ -17,9 +17,9 @@ from mag_tracking.files import checked_path, new_text_file
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
 from mag_tracking.network import Calibrated, SensorNetwork
 from mag_tracking.network.geomagnetic import Site, decimal_year, earth_field
+from mag_tracking.network.topics import NAME
 from mag_tracking.yaml_file import is_text, read_yaml, shown
 
-_TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 _NAME = re.compile(r'[A-Za-z0-9_.-]+')
 _FRAME = re.compile(r'[A-Za-z0-9_./-]+')
 _TOP = {'frame', 'earth_field', 'site', 'sensors'}
@@ -72,7 +72,7 @@ def _sensor(name: str, entry: Any) -> dict[str, Any]:
         raise NetworkError(f'{what}: position: {position.tolist()} m is nowhere on Earth')
     q = _vector(f'{what}: orientation', entry.get('orientation', [0, 0, 0, 1]), (4,))
     R_ws = _rotation(f'{what}: orientation', q)
-    topic = _topic(what, 'topic', entry.get('topic', f'/{name}/imu/mag'))
+    topic = _topic(what, 'topic', entry.get('topic', f'{name}/imu/mag'))
     # Where a driver puts a sensor's accelerometer, by REP-145, beside its magnetometer.
     beside = topic.removesuffix('/mag') + '/data_raw' if topic.endswith('/mag') else None
     imu_topic = entry.get('imu_topic', beside)
@@ -175,11 +175,9 @@ def _rotation(what: str, q: FloatArray) -> FloatArray:
 
 def _topic(what: str, key: str, topic: object) -> str:
     """A topic's name."""
-    if not isinstance(topic, str) or not topic.startswith('/'):
-        raise NetworkError(f'{what}: {key} must begin with /, got {shown(topic)}')
-    if not _TOPIC.fullmatch(topic):
-        raise NetworkError(f'{what}: {shown(topic)} is no ROS topic: letters, digits and _, '
-                           'no part begins with a digit')
+    if not isinstance(topic, str) or not NAME.fullmatch(topic):
+        raise NetworkError(f'{what}: {key}: {shown(topic)} is not a ROS topic: letters, digits and '
+                           '_, and no part begins with a digit')
     return topic
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import NetworkError
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
+from mag_tracking.network.topics import absolute
 from mag_tracking.units import NS
 
 CLOSE = 2.0
@@ -43,6 +44,7 @@ class SensorNetwork:
     R_ws: FloatArray
     """(n, 3, 3), sensor to world."""
     topics: tuple[str, ...]
+    """Per sensor; those that do not begin with / are relative to a namespace."""
     frame: str = 'map'
     earth_field: FloatArray | None = None
     """(3,) [T], world; None = unknown."""
@@ -64,6 +66,8 @@ class SensorNetwork:
     """Per sensor, of its accelerometer; None = it has none."""
     calibrated: tuple[Calibrated | None, ...] = ()
     """Per sensor; None = never."""
+    namespace: str | None = None
+    """Of the relative topics in a recording; None = the one in which they are."""
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -72,7 +76,8 @@ class SensorNetwork:
         twice = sorted({name for name in self.names if self.names.count(name) > 1})
         if twice:
             raise NetworkError(f'sensor {twice[0]} is there twice')
-        shared = sorted({t for t in self.topics if self.topics.count(t) > 1})
+        names = [absolute(t) for t in self.topics]
+        shared = sorted({t for t in names if names.count(t) > 1})
         if shared:
             raise NetworkError(f'topic {shared[0]} is that of two sensors')
         if self.positions.shape != (n, 3) or self.R_ws.shape != (n, 3, 3):

@@ -13,7 +13,6 @@ from typing import Any
 from mag_tracking_msgs.msg import CalibrationState, FieldReadings, SensorCalibration
 from mag_tracking_msgs.srv import Calibrate as CalibrateService
 from mag_tracking_msgs.srv import Survey as SurveyMessage
-from rcl_interfaces.msg import ParameterDescriptor
 from sensor_msgs.msg import Imu, MagneticField
 
 from mag_tracking.errors import NetworkError
@@ -23,12 +22,12 @@ from mag_tracking.messages.schema import (
     reading_of,
     readings_dict,
 )
-from mag_tracking.messages.types import CALIBRATED_READINGS, RAW_READINGS
+from mag_tracking.messages.types import CALIBRATED_READINGS, CALIBRATION_STATE, RAW_READINGS
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.background_store import BackgroundStore
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.deferred import Deferred
-from mag_tracking.nodes.ros_params import declare_settings
+from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.sensor_rounds import SensorRounds
 from mag_tracking.nodes.stage_node import LATCHED, SENT, STREAM, StageNode
@@ -60,13 +59,15 @@ class CalibrationNode(StageNode):
                                       self.get_logger())
         self._store.restore(self.network)
         self._survey = Survey(self.network, self.settings.survey)
-        self._survey_service = SurveyService(self._survey, self._stage, self._survey_path())
-        self._health = HealthDiagnostics(self.network, self.settings)
+        self._survey_service = SurveyService(
+            self._survey, self._stage, self._survey_path(),
+            [self.resolve_topic_name(t) for t in self.network.imu_topics if t is not None])
+        self._health = HealthDiagnostics(self.network, self.settings, self.sensor_topics)
         self._unseen: list[tuple[Readings, int]] = []
         self._deferred = Deferred(self, DEFERRED_S, self._do_deferred_work)
         self._connect()
         self._rounds = SensorRounds(
-            self.get_name(), self.network, self._stage, self._health, self._store, self._is_live,
+            self.title, self.network, self._stage, self._health, self._store, self._is_live,
             lambda status: self.publish_statuses([status]), self._publish_states)
         self.create_timer(max(1.0 / (2 * len(self.network) + 3), SHORTEST_STEP_S),
                           self._rounds.tick)
@@ -87,23 +88,23 @@ class CalibrationNode(StageNode):
                                   self.input_qos)
         self._readings = self.publisher(FieldReadings, CALIBRATED_READINGS, SENT)
         self.subscription(FieldReadings, RAW_READINGS, self._take_many, STREAM, source='sensors')
-        self.expect('detection_node', CALIBRATED_READINGS)
-        self._state = self.publisher(CalibrationState, '~/calibration', LATCHED)
+        self.expect('detection', CALIBRATED_READINGS, 'mag_tracking_msgs/msg/NetworkFrame')
+        self._state = self.publisher(CalibrationState, CALIBRATION_STATE, LATCHED)
 
     def _state_path(self) -> Path | None:
         """File in which the backgrounds are stored; None during the replay of a recording."""
-        place = self.declare_parameter('state_file', '', ParameterDescriptor(
-            read_only=True, description='File in which the backgrounds are kept for a restart; '
-            'left out: below $ROS_HOME, or ~/.ros.')).value
+        place = fixed_parameter(self, 'state_file', '', 'File in which the backgrounds are kept '
+                                'for a restart; left out: below $ROS_HOME, or ~/.ros.')
         if self.is_replayed or not self.settings.calibrate.resume_s:
             return None
         return Path(place) if place else usual_path(
-            self.get_parameter('network').value, self.get_fully_qualified_name())
+            self.network_path, self.get_fully_qualified_name())
 
     def _survey_path(self) -> Path:
         """File to which a survey is saved: beside the network file, which is written by hand."""
-        save_as = self.declare_parameter('save_as', '').value
-        path = Path(self.get_parameter('network').value)
+        save_as = fixed_parameter(self, 'save_as', '', 'Network file that a survey writes; left '
+                                  'out: <network>_calibrated.yaml.')
+        path = self.network_path
         return Path(save_as) if save_as else path.with_name(f'{path.stem}_calibrated.yaml')
 
     def stages(self) -> dict[str, Stage[Any, Any]]:

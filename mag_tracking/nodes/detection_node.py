@@ -16,7 +16,7 @@ from sensor_msgs.msg import MagneticField
 
 from mag_tracking.messages.frame import frame_dict
 from mag_tracking.messages.schema import detection_dict, pass_event_dict, reading_of
-from mag_tracking.messages.types import CALIBRATED_READINGS
+from mag_tracking.messages.types import CALIBRATED_READINGS, NETWORK_FRAME, TRACK_ARRAY
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
@@ -44,14 +44,14 @@ class DetectionNode(StageNode):
             if len(self.network) <= self.settings.events.most_sensors else None
         self._described = self.publisher(PassEventMessage, '~/events', RESULTS)
         self._detect = Detect(self.network, self.settings.detect)
-        self._frames = self.publisher(NetworkFrame, '~/frame', SENT)
+        self._frames = self.publisher(NetworkFrame, NETWORK_FRAME, SENT)
         self._detections = self.publisher(DetectionMessage, '~/detections', RESULTS)
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self.subscription(MagneticField, f'{topic}_calibrated', partial(self._take, sensor),
-                              STREAM, source='calibration_node')
+                              STREAM, source='calibration')
         self.subscription(FieldReadings, CALIBRATED_READINGS, self._take_many, STREAM,
-                          source='calibration_node')
-        self.expect('tracker_node', '~/frame')
+                          source='calibration')
+        self.expect('tracker', NETWORK_FRAME, TRACK_ARRAY)
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
         """{name: stage} whose counts are published."""

@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -26,9 +26,11 @@ class DoctorNode(Node):
     """Hands the readings of a network to a `Doctor`, with the time at which they came."""
 
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
-        super().__init__('doctor')
+        super().__init__('doctor', namespace=network.namespace)
         self.doctor = Doctor(network, settings)
-        for sensor, topic in zip(network.names, network.topics, strict=True):
+        self._topics = dict(zip(network.names, map(self.resolve_topic_name, network.topics),
+                                strict=True))
+        for sensor, topic in self._topics.items():
             self.create_subscription(MagneticField, topic, partial(self._take, sensor), SENSORS)
         self._in_batches: set[str] = set()
         self._bad: Counter[str] = Counter()
@@ -52,10 +54,10 @@ class DoctorNode(Node):
 
     def findings(self) -> list[Finding]:
         """What only the graph tells: list of `Finding`."""
-        found = [Finding(True, RAW_READINGS, f'{n} messages that are none: {error}', 'look at the '
-                         'driver that publishes it') for error, n in self._bad.items()]
-        network = self.doctor.network
-        for sensor, topic in zip(network.names, network.topics, strict=True):
+        topic = self.resolve_topic_name(RAW_READINGS)
+        found = [Finding(True, topic, f'{n} messages that are none: {error}', 'look at the driver '
+                         'that publishes it') for error, n in self._bad.items()]
+        for sensor, topic in self._topics.items():
             publishers = self.get_publishers_info_by_topic(topic)
             if not publishers and sensor not in self._in_batches:
                 found.append(Finding(True, sensor, f'nobody publishes {topic}', 'start its driver, '
@@ -72,9 +74,10 @@ class DoctorNode(Node):
 
 
 def listen(network: SensorNetwork, settings: Settings, seconds: float,
-           stopped: Callable[[], bool]) -> tuple[Doctor, list[Finding]]:
+           stopped: Callable[[], bool], ros_arguments: Sequence[str] = ()
+           ) -> tuple[Doctor, list[Finding]]:
     """Listen for `seconds` or until `stopped()`: (Doctor, list of Finding of the graph)."""
-    begin()
+    begin(list(ros_arguments))
     executor = make_executor()
     node = DoctorNode(network, settings)
     try:

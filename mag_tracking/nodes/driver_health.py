@@ -6,6 +6,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from mag_tracking.drivers.driver import Driver
+from mag_tracking.nodes.stage_node import title_of
 
 HARMLESS = ('samples: ', 'came late: ', 'other messages: ', 'lines that are comments',
             'lines without the prefix', 'lines that are empty', 'retained messages skipped',
@@ -50,7 +51,7 @@ class DriverDiagnostics:
             values[f'messages behind the quickest [ms]{behind}'] = f'{1e3 * clock.spread_s:.3g}'
             values[f'std of its stamps [ms]{behind}'] = f'{1e3 * clock.stamp_std:.3g}'
         return DiagnosticStatus(
-            level=level, name=f'{self._node.get_name()}: {driver.name}', hardware_id=driver.name,
+            level=level, name=f'{title_of(self._node)}: {driver.name}', hardware_id=driver.name,
             message=message, values=[KeyValue(key=k, value=v) for k, v in values.items()])
 
     def _log(self, name: str, level: bytes, message: str) -> None:

@@ -30,6 +30,7 @@ from mag_tracking.network.file import read_network
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.driver_health import DriverDiagnostics
+from mag_tracking.nodes.ros_params import fixed_parameter
 from mag_tracking.nodes.stage_node import RESULTS, SENT
 from mag_tracking.records import AccelerationSample, Readings
 
@@ -43,10 +44,11 @@ class DriverNode(LifecycleNode):
     def __init__(self, **node_arguments: Any) -> None:
         """Raises MagTrackingError where `autostart` finds that the settings are unusable."""
         super().__init__('driver_node', **node_arguments)
-        self._path = self.declare_parameter('drivers', '').value
-        self._network_path = self.declare_parameter('network', '').value
+        self._path = fixed_parameter(self, 'drivers', '', 'Path of the drivers file.')
+        self._network_path = fixed_parameter(self, 'network', '', 'Path of the network file.')
         self._readings = self.create_publisher(FieldReadings, RAW_READINGS, SENT) \
-            if self.declare_parameter('batches', False).value else None
+            if fixed_parameter(self, 'batches', False, 'Readings of many sensors in one '
+                               'message.') else None
         self._drivers: list[Driver] = []
         self._threads: list[threading.Thread] = []
         self._publishers_by_sensor: dict[str, tuple[Publisher, Publisher]] = {}
@@ -55,7 +57,7 @@ class DriverNode(LifecycleNode):
         self._health = DriverDiagnostics(self)
         self.create_timer(1.0, self._publish_diagnostics)
         self._refused: MagTrackingError | None = None
-        if self.declare_parameter('autostart', True).value:
+        if fixed_parameter(self, 'autostart', True, 'Configure and activate at the start.'):
             done = self.trigger_configure()
             if self._refused is not None:
                 raise self._refused
@@ -116,7 +118,7 @@ class DriverNode(LifecycleNode):
     def _advertise(self, sensor: str,
                    network: SensorNetwork | None) -> tuple[Publisher, Publisher]:
         """Publishers (field, acceleration) of a sensor."""
-        topic, imu_topic = f'/{sensor}/imu/mag', f'/{sensor}/imu/data_raw'
+        topic, imu_topic = f'{sensor}/imu/mag', f'{sensor}/imu/data_raw'
         if network is not None:
             j = network.names.index(sensor)
             topic, imu_topic = network.topics[j], network.imu_topics[j] or imu_topic

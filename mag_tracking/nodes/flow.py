@@ -16,11 +16,12 @@ MOST_NOTED = 10_000
 
 
 class Flow:
-    """The messages that a node takes from `source`, another node."""
+    """The messages that a node takes from a `source`: the sensors, or the step before."""
 
     def __init__(self, source: str) -> None:
         self.source = source
         self.topics: list[str] = []
+        """Absolute names, as remapped."""
         self.heard: float | None = None
         """`time.monotonic()` [s] of the latest message, or None."""
         self.n_lost = 0
@@ -85,18 +86,36 @@ class Flow:
 
 
 class Listener:
-    """The node that is to listen to a topic; it is known by its name."""
+    """The node of the next step, `role`, which subscribes to a topic.
 
-    def __init__(self, name: str, topic: str) -> None:
-        self.name, self.topic = name, topic
-        self._seen = False
+    It may have any name: it is known by the type of message that it publishes. Others that
+    subscribe, such as recorders, come and go.
+    """
 
-    def status(self, node: str, names: Collection[str]) -> DiagnosticStatus:
-        """The DiagnosticStatus; `names` are those of the nodes that listen now."""
-        self._seen = self._seen or self.name in names
-        gone = self._seen and self.name not in names
+    def __init__(self, role: str, topic: str, publishes: str) -> None:
+        self.role, self.topic, self._publishes = role, topic, publishes
+        self._seen: set[str] = set()
+
+    def status(self, node: str, names: Collection[str],
+               types_of: Callable[[str], Collection[str]]) -> DiagnosticStatus:
+        """The DiagnosticStatus of the next step.
+
+        Parameters
+        ----------
+        node : str
+            Title of the node that reports.
+        names : collection of str
+            Nodes that subscribe to the topic now.
+        types_of : function
+            {node: types of the messages that it publishes}.
+        """
+        self._seen |= {name for name in set(names) - self._seen
+                       if self._publishes in types_of(name)}
+        gone = sorted(self._seen - set(names))
+        is_gone = bool(gone) and not self._seen.intersection(names)
+        message = 'running' if self._seen else \
+            f'no {self.role} node subscribes to {self.topic} yet'
         return DiagnosticStatus(
-            level=DiagnosticStatus.ERROR if gone else DiagnosticStatus.OK,
-            name=f'{node}: to {self.name}', hardware_id='magnetometer network',
-            message=f'{self.name} has gone; does it still run?' if gone else
-            'running' if self._seen else f'{self.name} has not been seen yet')
+            level=DiagnosticStatus.ERROR if is_gone else DiagnosticStatus.OK,
+            name=f'{node}: to {self.role}', hardware_id='magnetometer network',
+            message=f'{", ".join(gone)} has gone; does it still run?' if is_gone else message)

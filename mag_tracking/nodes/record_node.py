@@ -4,7 +4,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -99,15 +99,16 @@ class RecordNode(Node):
     def __init__(self, recorder: Recorder, selection: Selection,
                  report: Callable[[str], None] = print) -> None:
         super().__init__('record_node', start_parameter_services=False)
-        self.recorder, self.selection, self._report = recorder, selection, report
+        self.recorder, self._report = recorder, report
+        self.selection = selection.resolved(self.resolve_topic_name)
         self._sources: dict[str, _Source] = {}
         self._refused: dict[str, str] = {}
         self._described: set[str] = set()
         self._lost_before: Counter[str] = Counter()
         # Their type is known: nothing is missed of a driver that starts later.
-        for topic in selection.fields:
+        for topic in self.selection.fields:
             self._subscribe(topic, MAGNETIC_FIELD, [])
-        for topic in selection.imus:
+        for topic in self.selection.imus:
             self._subscribe(topic, IMU, [])
 
     @property
@@ -206,7 +207,7 @@ def say(text: str) -> None:
 
 
 def run(selection: Selection, out: Path, split_bytes: int = 10**9,
-        split_ns: int = 3600 * 10**9) -> int:
+        split_ns: int = 3600 * 10**9, ros_arguments: Sequence[str] = ()) -> int:
     """Record until SIGINT, SIGTERM or SIGHUP; returns the exit status.
 
     Parameters
@@ -216,18 +217,20 @@ def run(selection: Selection, out: Path, split_bytes: int = 10**9,
         Folder for the recording.
     split_bytes, split_ns : int
         A new file begins when one is that large, or has been open for that long.
+    ros_arguments : sequence of str
+        Of the node, beginning with `--ros-args`.
 
     Raises OutputError where `out` cannot take a recording.
     """
     with noted_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as seen:
         with Recorder(out, split_bytes, split_ns, report=say) as recorder:
-            begin()
+            begin(list(ros_arguments))
             node = None
             try:
                 node = RecordNode(recorder, selection, say)
                 say(f'recording into {out}; Ctrl-C ends it')
                 _record(node, lambda: bool(seen))
-                lost, refused = node.lost, node.refused
+                lost, refused, selection = node.lost, node.refused, node.selection
             finally:
                 if node is not None:
                     node.destroy_node()

@@ -22,6 +22,7 @@ from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import message_class
+from mag_tracking.nodes.ros_params import fixed_parameter
 from mag_tracking.nodes.stage_node import STREAM
 from mag_tracking.recording.reader import Recording
 
@@ -39,18 +40,18 @@ class ReplayNode(Node):
     def __init__(self, **node_arguments: Any) -> None:
         """Raises RecordingError or SettingsError where there is nothing to play."""
         super().__init__('replay_node', **node_arguments)
-        path = self.declare_parameter('recording', '').value
+        path = fixed_parameter(self, 'recording', '', 'Path of the recording.')
         if not path:
             raise SettingsError('replay_node: parameter recording: a path is needed')
-        self._rate = self.declare_parameter('rate', 1.0).value
+        self._rate = fixed_parameter(self, 'rate', 1.0, 'Speed of the replay.')
         if not 0.0 < self._rate < float('inf'):
             raise SettingsError(f'replay_node: parameter rate: {self._rate} is not a number '
                                 'above 0')
-        self._loop = self.declare_parameter('loop', False).value
-        offset = self.declare_parameter('start_offset', 0.0).value
-        topics = self.declare_parameter('topics', ['']).value
-        delay = self.declare_parameter('start_delay', 2.0).value
-        self._paused = self.declare_parameter('paused', False).value
+        self._loop = fixed_parameter(self, 'loop', False, 'Begin again at the end.')
+        offset = fixed_parameter(self, 'start_offset', 0.0, 'Where to begin [s].')
+        topics = fixed_parameter(self, 'topics', [''], 'Recorded topics to play; none: all.')
+        delay = fixed_parameter(self, 'start_delay', 2.0, 'Time for discovery [s].')
+        self._paused = fixed_parameter(self, 'paused', False, 'Begin paused.')
         self._recording = Recording(path)
         self.counts: Counter[str] = Counter()
         self._missing: set[str] = set()
@@ -64,7 +65,8 @@ class ReplayNode(Node):
         self._seek(offset)
         # Discovery takes a moment; what is published before it is lost.
         self._start = time.monotonic() + delay
-        self._patience = self.declare_parameter('wait_for_subscribers', 0.0).value
+        self._patience = fixed_parameter(self, 'wait_for_subscribers', 0.0,
+                                         'Longest wait for subscribers to the fields [s].')
         self.create_service(Trigger, '~/pause', self._pause)
         self.create_service(Trigger, '~/resume', self._resume)
         self.create_service(Seek, '~/seek', self._seek_service)
@@ -100,8 +102,14 @@ class ReplayNode(Node):
                 self._missing.add(topic)
                 self.get_logger().warning(f'{topic} is not played: {kind} is not installed')
             else:
-                self.publishers_by_topic[topic] = self.create_publisher(cls, topic, STREAM)
+                self.publishers_by_topic[topic] = self.create_publisher(
+                    cls, self._within_namespace(topic), STREAM)
         return self.publishers_by_topic.get(topic)
+
+    def _within_namespace(self, topic: str) -> str:
+        """The name under which a recorded topic is played: below the namespace of this node."""
+        namespace = self.get_namespace().rstrip('/')
+        return topic if topic.startswith(f'{namespace}/') else f'{namespace}{topic}'
 
     def _seek(self, offset: float) -> None:
         """Go on from `offset` seconds after the first message."""

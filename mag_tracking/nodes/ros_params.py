@@ -17,6 +17,12 @@ from mag_tracking.pipeline import Settings
 from mag_tracking.settings import Parameter, flatten, replace
 
 
+def fixed_parameter(node: Node, name: str, default: Any, description: str) -> Any:
+    """Declare a parameter that is read once, at the start; its value."""
+    return node.declare_parameter(name, default, ParameterDescriptor(
+        description=description, read_only=True)).value
+
+
 def _descriptor(p: Parameter) -> ParameterDescriptor:
     """Description, unit and range of one setting."""
     d = ParameterDescriptor(description=p.doc, read_only=not p.live,

@@ -16,6 +16,7 @@ from rclpy.parameter import Parameter
 
 from mag_tracking.errors import MagTrackingError
 from mag_tracking.interrupts import noted_signals
+from mag_tracking.messages.types import NETWORK_FRAME
 from mag_tracking.nodes.calibration_node import CalibrationNode
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.detection_node import DetectionNode
@@ -24,7 +25,7 @@ from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.replay_node import ReplayNode
 from mag_tracking.nodes.stage_node import STREAM, StageNode, make_executor, spin
 from mag_tracking.nodes.tracker_node import TrackerNode
-from mag_tracking.pipeline import Settings
+from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.records import Track
 from mag_tracking.settings import flatten
 
@@ -38,11 +39,12 @@ LONGEST_DISCOVERY_S = 60.0
 class TrackPrinter(Node):
     """Prints the track as it grows; subscribes like any other program."""
 
-    def __init__(self, every: int = 1, out: TextIO = sys.stdout) -> None:
+    def __init__(self, topic: str = 'tracker_node/tracks', every: int = 1,
+                 out: TextIO = sys.stdout) -> None:
         super().__init__('track_printer')
         self._every, self._out = every, out
         self._n = 0
-        self.create_subscription(TrackArray, '/tracker_node/tracks', self._take, STREAM)
+        self.create_subscription(TrackArray, topic, self._take, STREAM)
 
     def _take(self, message: TrackArray) -> None:
         """One line a pose."""
@@ -71,12 +73,16 @@ def line_of(track: Track) -> str:
 
 
 def parameters(network_path: PathLike, settings: Settings, reliable: bool) -> list[Parameter]:
-    """ROS parameters that put `settings` in force in the nodes."""
+    """ROS parameters that put `settings` in force in the nodes.
+
+    Defaults are left out: the arguments of ROS may change them.
+    """
     out = [Parameter('network', value=str(network_path)),
            Parameter('target', value=settings.track.target),
            Parameter('reliable_input', value=reliable)]
+    defaults = {p.name: p.value for p in flatten(settings_for(settings.track.target))}
     return out + [Parameter(p.name, value=list(p.value) if isinstance(p.value, tuple) else p.value)
-                  for p in flatten(settings)]
+                  for p in flatten(settings) if p.value != defaults[p.name]]
 
 
 def driver_node(drivers_path: PathLike, network_path: PathLike, batches: bool) -> DriverNode:
@@ -106,17 +112,18 @@ def make_nodes(network_path: PathLike, settings: Settings, recording: PathLike |
 
 def all_connected(stages: list[StageNode], replay: ReplayNode) -> bool:
     """Whether every topic of the way has found its subscriber."""
-    network = stages[0].network
-    raw = [replay.publishers_by_topic[t] for t in network.topics
-           if t in replay.publishers_by_topic]
+    raw = [p for p in replay.publishers_by_topic.values()
+           if p.topic_name in stages[0].sensor_topics]
     calibrated = [p for p in stages[0].publishers if p.topic_name.endswith('_calibrated')]
-    frames = [p for p in stages[1].publishers if p.topic_name.endswith('/frame')]
+    frame = stages[1].resolve_topic_name(NETWORK_FRAME)
+    frames = [p for p in stages[1].publishers if p.topic_name == frame]
     return all(p.get_subscription_count() > 0 for p in raw + calibrated + frames)
 
 
 def run(network_path: PathLike, settings: Settings, recording: PathLike | None = None,
         rate: float = 1.0, loop: bool = False, observers: Sequence[Callable[[], Node]] = (),
-        drivers: PathLike | None = None, batches: bool = False) -> int:
+        drivers: PathLike | None = None, batches: bool = False,
+        ros_arguments: Sequence[str] = ()) -> int:
     """Run the nodes until Ctrl-C, or until the recording has been played and worked off.
 
     Parameters
@@ -132,27 +139,33 @@ def run(network_path: PathLike, settings: Settings, recording: PathLike | None =
         A drivers file: run its devices as well.
     batches : bool
         Readings of many sensors go in one message.
+    ros_arguments : sequence of str
+        Of all nodes, beginning with `--ros-args`.
 
     Returns the exit status.
     """
     with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
         # The driver node comes last, when there is somebody to hear it.
-        observers = [*(observers or (TrackPrinter,)), *(
-            [partial(driver_node, drivers, network_path, batches)] if drivers else [])]
-        return _run_until(lambda: bool(seen), network_path, settings, recording, rate, loop,
-                          observers)
+        last = [partial(driver_node, drivers, network_path, batches)] if drivers else []
+        begin(list(ros_arguments))
+        try:
+            return _run_until(lambda: bool(seen), network_path, settings, recording, rate, loop,
+                              observers, last)
+        finally:
+            rclpy.try_shutdown()
 
 
 def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Settings,
                recording: PathLike | None, rate: float, loop: bool,
-               observers: Sequence[Callable[[], Node]]) -> int:
-    """As `run`, until `stopped()`."""
-    begin()
+               observers: Sequence[Callable[[], Node]], last: Sequence[Callable[[], Node]]) -> int:
+    """As `run`, until `stopped()`; the nodes `last` are created after all others."""
     executor = make_executor()
     nodes: list[Node] = []
     try:
         stages, replay = make_nodes(network_path, settings, recording, rate, loop)
-        nodes = [*stages, *(make() for make in observers)]
+        tracks = stages[-1].resolve_topic_name('~/tracks')
+        nodes = [*stages, *(make() for make in observers or [partial(TrackPrinter, tracks)]),
+                 *(make() for make in last)]
         nodes += [replay] if replay else []
         for node in nodes:
             executor.add_node(node)
@@ -174,7 +187,6 @@ def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Se
             executor.remove_node(node)
             node.destroy_node()
         executor.shutdown()
-        rclpy.try_shutdown()
 
 
 def _work_off(executor: Executor, stages: list[StageNode], stopped: Callable[[], bool],

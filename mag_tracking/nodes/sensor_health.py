@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Sequence
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -26,9 +27,19 @@ PATIENCE = 3.0
 
 
 class HealthDiagnostics:
-    """Looks at the raw readings of a network; `statuses` says how the sensors are."""
+    """Looks at the raw readings of a network; `statuses` says how the sensors are.
 
-    def __init__(self, network: SensorNetwork, settings: Settings) -> None:
+    Parameters
+    ----------
+    network : SensorNetwork
+    settings : Settings
+    topics : sequence of str, optional
+        The sensors' topics as remapped; those of the network file if left out.
+    """
+
+    def __init__(self, network: SensorNetwork, settings: Settings,
+                 topics: Sequence[str] = ()) -> None:
+        self._topics = topics or network.topics
         self._settings = settings
         self._index = {name: j for j, name in enumerate(network.names)}
         # When, by the monotonic clock [s]; NaN: never.
@@ -114,7 +125,7 @@ class HealthDiagnostics:
         if not silent_s <= SILENT_S:
             what = 'nothing has come' if math.isnan(silent_s) else f'silent for {silent_s:.0f} s'
             return [Finding(True, name, what, 'look at its cable, its driver and the topic '
-                            f'{self._network.topics[j]}')]
+                            f'{self._topics[j]}')]
         found = {f.what: f for f in self._compared[name]}
         # While it learns for the first time that is no fault yet.
         patience = 5.0 + PATIENCE * self._settings.calibrate.learn_s
@@ -122,7 +133,7 @@ class HealthDiagnostics:
             found.update({f.what: f for f in background_findings(
                 name, calibrate, self._frozen_ns.get(name), self._relearnt[0][name])})
         found.update({f.what: f for f in covariance_findings(
-            name, self._network.topics[j], calibrate)})
+            name, self._topics[j], calibrate)})
         for health in (self._past[name], self._present[name]):
             if health is not None and health.counts['readings']:
                 for f in health.findings(name, self._network.noise_std[j],

@@ -5,6 +5,7 @@ import signal
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -13,7 +14,7 @@ from mag_tracking_msgs.msg import FieldReadings
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
+from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -23,9 +24,10 @@ from mag_tracking.errors import MagTrackingError, RecordingError, SettingsError
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.messages.schema import readings_of, stamp_ns
 from mag_tracking.network.file import read_network
+from mag_tracking.network.topics import absolute
 from mag_tracking.nodes.flow import Flow, Listener
 from mag_tracking.nodes.middleware import begin
-from mag_tracking.nodes.ros_params import declare_settings
+from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import Readings
 from mag_tracking.stages.stage import Stage
@@ -53,14 +55,17 @@ class StageNode(Node):
     def __init__(self, name: str, group: str, **node_arguments: Any) -> None:
         """Raises SettingsError or NetworkError where parameters or network are unusable."""
         super().__init__(name, **node_arguments)
-        path = self.declare_parameter('network', '').value
+        path = fixed_parameter(self, 'network', '', 'Path of the network file.')
         if not path:
             raise SettingsError(f'{name}: parameter network: the path of a network.yaml is needed')
-        target = self.declare_parameter('target', 'vehicle').value
-        reliable = self.declare_parameter('reliable_input', False).value
+        target = fixed_parameter(self, 'target', 'vehicle', 'What moves: vehicle or magnet.')
+        reliable = fixed_parameter(self, 'reliable_input', False, 'The sensors\' topics are '
+                                   'reliable, as those of a replay are.')
+        self.network_path = Path(path).resolve()
+        self.title = title_of(self)
         self.input_qos = STREAM if reliable else SENSORS
         self.is_replayed = reliable or self.get_parameter('use_sim_time').value
-        self.network = read_network(path)
+        self.network = read_network(self.network_path)
         self.settings = declare_settings(self, settings_for(target), group, self.OWN_PARAMETERS)
         if self.settings.track.target != target:
             raise SettingsError(f'{name}: track.target is {self.settings.track.target!r}, but '
@@ -73,6 +78,11 @@ class StageNode(Node):
         self.now_ns = 0
         self.create_timer(1.0, self._publish_diagnostics)
 
+    @property
+    def sensor_topics(self) -> tuple[str, ...]:
+        """The sensors' topics: absolute names, as remapped."""
+        return tuple(map(self.resolve_topic_name, self.network.topics))
+
     def stages(self) -> dict[str, Stage[Any, Any]]:
         """{name: stage} whose counts are published."""
         raise NotImplementedError
@@ -81,9 +91,12 @@ class StageNode(Node):
         """{name of a stage: how many records it holds}."""
         return {}
 
-    def expect(self, listener: str, topic: str) -> None:
-        """Say so in diagnostics when the node named `listener` no longer listens to `topic`."""
-        self._listeners.append(Listener(listener, topic))
+    def expect(self, role: str, topic: str, publishes: str) -> None:
+        """Report in diagnostics when the node of the next step no longer subscribes to `topic`.
+
+        `publishes` is a type of message, by which it is known.
+        """
+        self._listeners.append(Listener(role, self.resolve_topic_name(topic), publishes))
 
     def publisher(self, message_type: Any, topic: str, qos: QoSProfile) -> Publisher:
         """A publisher that logs a subscriber with unfit QoS."""
@@ -99,11 +112,11 @@ class StageNode(Node):
                      qos: QoSProfile, source: str = '') -> Subscription:
         """A subscription that logs a publisher with unfit QoS.
 
-        With a `source`, the node that sends, diagnostics tell of what comes and how late.
+        With a `source`, the step that sends, diagnostics tell of what comes and how late.
         """
         flow = self.flows.setdefault(source, Flow(source)) if source else None
         if flow is not None:
-            flow.topics.append(topic)
+            flow.topics.append(self.resolve_topic_name(topic))
 
         def unfit(event: Any) -> None:
             self.get_logger().warning(
@@ -145,18 +158,27 @@ class StageNode(Node):
                 self.get_logger().warning(f'{name}: {cause}: {n}')
             statuses.append(DiagnosticStatus(
                 level=DiagnosticStatus.WARN if news else DiagnosticStatus.OK,
-                name=f'{self.get_name()}: {name}', hardware_id='magnetometer network',
+                name=f'{self.title}: {name}', hardware_id='magnetometer network',
                 message='samples were rejected' if news else 'running',
                 values=[KeyValue(key=k, value=str(n)) for k, n in sorted(
                     {**stage.counts, **({'queue': queues[name]} if name in queues else {})}.items()
                 )]))
-        statuses += [flow.status(self.get_name(), partial(self._has_publisher, flow))
+        statuses += [flow.status(self.title, partial(self._has_publisher, flow))
                      for flow in self.flows.values()]
         for listener in self._listeners:
-            ends = self.get_subscriptions_info_by_topic(self.resolve_topic_name(listener.topic))
-            statuses.append(listener.status(self.get_name(), {
-                e.node_name for e in ends if e.node_namespace == self.get_namespace()}))
+            ends = self.get_subscriptions_info_by_topic(listener.topic)
+            statuses.append(listener.status(self.title, {
+                absolute(e.node_name, e.node_namespace) for e in ends}, self._published_types))
         self.publish_statuses(statuses)
+
+    def _published_types(self, name: str) -> set[str]:
+        """The types that a node publishes, by what is known of it so far."""
+        namespace, _, leaf = name.rpartition('/')
+        try:
+            found = self.get_publisher_names_and_types_by_node(leaf, namespace or '/')
+        except NodeNameNonExistentError:
+            return set()
+        return {kind for _, kinds in found for kind in kinds}
 
     def _has_publisher(self, flow: Flow) -> bool:
         """Whether somebody would still publish what the flow is of."""
@@ -168,6 +190,11 @@ class StageNode(Node):
             array = DiagnosticArray(status=statuses)
             array.header.stamp = self.get_clock().now().to_msg()
             self._diagnostics.publish(array)
+
+
+def title_of(node: Node) -> str:
+    """The name of a node in diagnostics: with its namespace, where it has one."""
+    return node.get_fully_qualified_name().removeprefix('/')
 
 
 def make_executor() -> Executor:

@@ -1,6 +1,7 @@
 """The service `~/survey` of calibration_node: orientations and clocks of a running network."""
 
 import datetime
+from collections.abc import Sequence
 from pathlib import Path
 
 from mag_tracking_msgs.srv import Survey as SurveyMessage
@@ -15,8 +16,10 @@ from mag_tracking.stages.survey.stage import Survey, with_noise
 class SurveyService:
     """Solves a survey and saves the network that it found."""
 
-    def __init__(self, survey: Survey, stage: Calibrate, save_as: Path) -> None:
+    def __init__(self, survey: Survey, stage: Calibrate, save_as: Path,
+                 imu_topics: Sequence[str]) -> None:
         self._survey, self._stage, self._save_as = survey, stage, save_as
+        self._imu_topics = imu_topics
 
     def solve(self, network: SensorNetwork, save: bool,
               response: SurveyMessage.Response) -> SensorNetwork | None:
@@ -27,7 +30,7 @@ class SurveyService:
                   if background.certain and self._stage.last_stamp_ns(name) is not None}
         if not fields or not self._survey.counts['accelerations']:
             response.message = 'no background has been learnt yet' if not fields else \
-                f'no acceleration has come on {", ".join(filter(None, network.imu_topics))}'
+                f'no acceleration has come on {", ".join(filter(None, self._imu_topics))}'
             return None
         date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
         found = self._survey.solve(fields, date)

@@ -40,6 +40,7 @@ from mag_tracking.messages.schema import (
     track_dict,
 )
 from mag_tracking.messages.shapes import MessageDict
+from mag_tracking.messages.types import CALIBRATION_STATE, NETWORK_FRAME
 from mag_tracking.network import SensorNetwork
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
@@ -79,11 +80,10 @@ class TrackerNode(StageNode):
         self._path: deque[PoseStamped] = deque(maxlen=LONGEST_PATH)
         self._is_silent = False
         self._doubtful: dict[str, DoubtfulTimes] = {}
-        self.subscription(NetworkFrame, '/detection_node/frame', self._take, STREAM,
-                          source='detection_node')
+        self.subscription(NetworkFrame, NETWORK_FRAME, self._take, STREAM,
+                          source='detection')
         self.create_timer(0.25, self.end_without_frames)
-        self.subscription(CalibrationState, '/calibration_node/calibration', self._calibrated,
-                          LATCHED)
+        self.subscription(CalibrationState, CALIBRATION_STATE, self._calibrated, LATCHED)
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
         """{name: stage} whose counts are published."""
@@ -97,7 +97,7 @@ class TrackerNode(StageNode):
         """
         if self._stage.bank is None or self.is_replayed:
             return
-        heard = self.flows['detection_node'].heard
+        heard = self.flows['detection'].heard
         assert heard is not None, 'a track without a frame'
         silent_s = time.monotonic() - heard
         # Twice in a row: while the node was busy, frames may have come that wait.

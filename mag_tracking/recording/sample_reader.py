@@ -19,12 +19,14 @@ from mag_tracking.messages.types import (
     decode,
 )
 from mag_tracking.network import SensorNetwork
+from mag_tracking.network.topics import absolute, namespaces_of
 from mag_tracking.recording.interruptible import Progress, ReadingStopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.records import AccelerationSample, Readings
 
-TRUTH_PREFIX = '/ground_truth/'
-"""Poses on topics below this are truth: for reports, never for tracking."""
+TRUTH_PREFIX = 'ground_truth/'
+"""Poses on topics below this, in the namespace of the sensors, are truth: for reports, never for
+tracking."""
 GATHERED = 256
 """Messages whose readings are gathered in one batch: each batch costs as much as a few readings."""
 
@@ -39,19 +41,25 @@ class SampleReader:
     rejected : Counter
         {cause: number} of messages and readings that cannot be used.
     truth : {topic: list of (stamp_ns, x, y, z, qx, qy, qz, qw)}
+    namespace : str
+        Of the network's relative topics in the recording.
     """
 
     def __init__(self, recording: Recording, network: SensorNetwork) -> None:
         """Raises RecordingError where the recording has none of the network's topics."""
         self._recording = recording
-        self._sensors = dict(zip(network.topics, network.names, strict=True))
+        self.namespace = _namespace(recording, network)
+        self._sensors = {absolute(topic, self.namespace): name for topic, name in zip(
+            network.topics, network.names, strict=True)}
         self._imus: dict[str, list[str]] = {}
         for topic, name in zip(network.imu_topics, network.names, strict=True):
             if topic is not None:
-                self._imus.setdefault(topic, []).append(name)
+                self._imus.setdefault(absolute(topic, self.namespace), []).append(name)
+        self._many = absolute(RAW_READINGS, self.namespace)
+        self._truth_prefix = absolute(TRUTH_PREFIX, self.namespace)
         self.rejected: Counter[str] = Counter()
         self.truth: dict[str, list[_Pose]] = {}
-        self._together = recording.types.get(RAW_READINGS) == FIELD_READINGS
+        self._together = recording.types.get(self._many) == FIELD_READINGS
         if recording.types and not self._together \
                 and not any(t in recording.types for t in self._sensors):
             fields = sorted(t for t, k in recording.types.items() if k == MAGNETIC_FIELD)
@@ -103,8 +111,8 @@ class SampleReader:
         """(record, log time) of the sensors, and of the accelerometers {topic: sensors}."""
         for message in self._recording.messages(progress=progress):
             sensor = self._sensors.get(message.topic)
-            truth = message.topic.startswith(TRUTH_PREFIX) and message.type == POSE
-            many = message.topic == RAW_READINGS and message.type == FIELD_READINGS
+            truth = message.topic.startswith(self._truth_prefix) and message.type == POSE
+            many = message.topic == self._many and message.type == FIELD_READINGS
             shaken = imus.get(message.topic) if message.type == IMU else None
             if sensor is None and shaken is None and not truth and not many:
                 continue
@@ -145,7 +153,23 @@ class SampleReader:
         out = {}
         for topic, rows in self.truth.items():
             rows = sorted(rows)
-            out[topic.removeprefix(TRUTH_PREFIX).removesuffix('/pose')] = (
+            out[topic.removeprefix(self._truth_prefix).removesuffix('/pose')] = (
                 np.array([r[0] for r in rows], dtype=np.int64),
                 np.array([r[1:4] for r in rows]), np.array([r[4:] for r in rows]))
         return out
+
+
+def _namespace(recording: Recording, network: SensorNetwork) -> str:
+    """Namespace of the network's relative topics in a recording; the root where none is recorded.
+
+    Raises RecordingError where several are possible.
+    """
+    if network.namespace is not None:
+        return network.namespace
+    names = [name for name, kind in recording.types.items()
+             if kind in (MAGNETIC_FIELD, FIELD_READINGS)]
+    found = namespaces_of((*network.topics, RAW_READINGS), names)
+    if len(found) > 1:
+        raise RecordingError(f'{recording.path} has the topics of the network in the namespaces '
+                             f'{", ".join(found)}: choose one with --namespace')
+    return found[0] if found else '/'

@@ -12,12 +12,14 @@ from hypothesis import strategies as st
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import readings_dict, readings_of
 from mag_tracking.messages.types import FIELD_READINGS, MAGNETIC_FIELD, RAW_READINGS
+from mag_tracking.network.topics import absolute
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import RecordingWriter
 from support.networks import line_network
 from support.samples import MagSample, batch, recorded, sample_dict, samples_of
 
+TOGETHER = absolute(RAW_READINGS)
 START = 1_700_000_000_123_456_789
 
 
@@ -124,7 +126,7 @@ def test_a_recording_gives_the_same_samples(tmp_path, known):
     rng = np.random.default_rng(1)
     groups = [some(n, known, rng, ('mag_1', 'mag_2')) for n in (5, 1, 100)]
     reader = SampleReader(recording(tmp_path / 'a.mcap', [
-        (RAW_READINGS, FIELD_READINGS, readings_dict(batch(g))) for g in groups]),
+        (TOGETHER, FIELD_READINGS, readings_dict(batch(g))) for g in groups]),
                           line_network(2))
     assert reader.missing_topics() == []
     got = list(reader.readings_as_received())
@@ -140,11 +142,11 @@ def test_readings_of_others_and_messages_that_are_none_are_counted(tmp_path):
     broken = readings_dict(batch(mine))
     broken['stamp'] = broken['stamp'][:2]
     reader = SampleReader(recording(tmp_path / 'a.mcap', [
-        (RAW_READINGS, FIELD_READINGS, readings_dict(batch(other + mine))),
-        (RAW_READINGS, FIELD_READINGS, broken)]), line_network(2))
+        (TOGETHER, FIELD_READINGS, readings_dict(batch(other + mine))),
+        (TOGETHER, FIELD_READINGS, broken)]), line_network(2))
     assert same(recorded(reader), mine)
     assert reader.rejected == {'reading of elsewhere, which is not in the network': 4,
-                               f'undecodable message on {RAW_READINGS}': 1}
+                               f'undecodable message on {TOGETHER}': 1}
 
 
 def test_both_kinds_of_topics_are_read(tmp_path):
@@ -152,7 +154,7 @@ def test_both_kinds_of_topics_are_read(tmp_path):
     (one,), many = some(1, True, rng, ('mag_2',)), some(3, True, rng, ('mag_1',))
     reader = SampleReader(recording(tmp_path / 'a.mcap', [
         ('/mag_2/imu/mag', MAGNETIC_FIELD, sample_dict(one, 'mag_2')),
-        (RAW_READINGS, FIELD_READINGS, readings_dict(batch(many)))]), line_network(2))
+        (TOGETHER, FIELD_READINGS, readings_dict(batch(many)))]), line_network(2))
     assert same(recorded(reader), [one, *many])
 
 
@@ -160,9 +162,9 @@ def test_a_topic_of_that_name_with_another_type_is_left_alone(tmp_path):
     (one,) = some(1, True, np.random.default_rng(4), ('mag_1',))
     reader = SampleReader(recording(tmp_path / 'a.mcap', [
         ('/mag_1/imu/mag', MAGNETIC_FIELD, sample_dict(one, 'mag_1')),
-        (RAW_READINGS, MAGNETIC_FIELD, sample_dict(one, 'mag_1'))]), line_network(2))
+        (TOGETHER, MAGNETIC_FIELD, sample_dict(one, 'mag_1'))]), line_network(2))
     assert same(recorded(reader), [one])
     assert reader.missing_topics() == ['/mag_2/imu/mag']
     with pytest.raises(RecordingError, match="none of the network's topics"):
         SampleReader(recording(tmp_path / 'b' / 'b.mcap', [
-            (RAW_READINGS, MAGNETIC_FIELD, sample_dict(one, 'mag_1'))]), line_network(2))
+            (TOGETHER, MAGNETIC_FIELD, sample_dict(one, 'mag_1'))]), line_network(2))

@@ -49,7 +49,7 @@ def test_of_readings_that_come_together_each_is_looked_at(ros):
     node, spin_until = ros
     heard, statuses, rng, stamps = [], {}, np.random.default_rng(0), []
     publisher = node.create_publisher(FieldReadings, RAW_READINGS, STREAM)
-    node.create_subscription(FieldReadings, '/calibration_node/readings', heard.append, STREAM)
+    node.create_subscription(FieldReadings, '/field_readings_calibrated', heard.append, STREAM)
     node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: statuses.update(
         {s.name: {v.key: v.value for v in s.values} for s in m.status}), RESULTS)
 

@@ -33,14 +33,14 @@ def test_the_tracker_publishes_the_disturbance_that_a_replay_finds(ros):
     node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: heard.update(
         s.name.split(':')[0].strip('/') for s in m.status), RESULTS)
     node.create_subscription(DisturbanceMessage, '/tracker_node/disturbances', found.append, SENT)
-    node.create_subscription(NetworkFrame, '/detection_node/frame', frames.append, STREAM)
+    node.create_subscription(NetworkFrame, '/network_frame', frames.append, STREAM)
     publisher = node.create_publisher(FieldReadings, RAW_READINGS, SENT)
     processes = [start(name, '-p', f'network:={NETWORK_FILE}') for name in NAMES]
     try:
         assert spin_until(lambda: publisher.get_subscription_count() > 0
-                          and node.count_subscribers('/calibration_node/readings')
-                          and node.count_subscribers('/detection_node/frame') > 1
-                          and node.count_publishers('/detection_node/frame')
+                          and node.count_subscribers('/field_readings_calibrated')
+                          and node.count_subscribers('/network_frame') > 1
+                          and node.count_publishers('/network_frame')
                           and node.count_publishers('/tracker_node/disturbances')
                           and heard.issuperset(NAMES))
         for i in range(0, len(readings), 40):

@@ -21,7 +21,7 @@ def test_after_dense_traffic_the_nodes_track_and_flag(ros):
     readings = after_dense_traffic('junction_left_to_right', 7.0)
     t = (readings.stamp_ns - readings.stamp_ns.min()) / NS
     states, tracks = [], []
-    node.create_subscription(CalibrationState, '/calibration_node/calibration', states.append,
+    node.create_subscription(CalibrationState, '/calibration_state', states.append,
                              LATCHED)
     node.create_subscription(TrackArray, '/tracker_node/tracks', tracks.append, STREAM)
     publisher = node.create_publisher(FieldReadings, RAW_READINGS, SENT)
@@ -34,9 +34,9 @@ def test_after_dense_traffic_the_nodes_track_and_flag(ros):
     processes = [start(name, '-p', f'network:={NETWORK_FILE}') for name in NAMES]
     try:
         assert spin_until(lambda: publisher.get_subscription_count() > 0
-                          and node.count_subscribers('/calibration_node/readings')
-                          and node.count_subscribers('/detection_node/frame')
-                          and node.count_subscribers('/calibration_node/calibration') > 1
+                          and node.count_subscribers('/field_readings_calibrated')
+                          and node.count_subscribers('/network_frame')
+                          and node.count_subscribers('/calibration_state') > 1
                           and node.count_publishers('/tracker_node/tracks'))
         publish(readings.part(t < 7.3))
         assert spin_until(lambda: states and any(s.doubtful for s in states[-1].sensors))

@@ -183,7 +183,7 @@ def test_a_life_cycle(board):
 def test_readings_in_batches(board):
     node, spin_until, _, drivers, _ = board
     drivers.write_text(drivers.read_text().replace('  unit: nT', '  unit: nT\n  gather_s: 0.05'))
-    batches = listen(node, FieldReadings, '/driver_node/readings')
+    batches = listen(node, FieldReadings, '/field_readings')
     fields = listen(node, MagneticField, '/mag_2/imu/mag')
     process = start('driver_node', '-p', f'drivers:={drivers}', '-p', 'batches:=true')
     try:
@@ -211,12 +211,12 @@ def test_readings_in_batches_reach_the_tracker(ros, tmp_path):
     drivers.write_text(
         f'road:\n  device: simulator\n  simulator: {{network: {network}, moment: 0.0}}\n'
         '  sensors: {' + ', '.join(f'mag_{k}: mag_{k}' for k in range(20)) + '}\n')
-    frames = listen(node, NetworkFrame, '/detection_node/frame')
+    frames = listen(node, NetworkFrame, '/network_frame')
     processes = [start(name, '-p', f'network:={network}')
                  for name in ('calibration_node', 'detection_node')]
     try:
-        assert spin_until(lambda: node.count_subscribers('/driver_node/readings')
-                          and node.count_subscribers('/calibration_node/readings'))
+        assert spin_until(lambda: node.count_subscribers('/field_readings')
+                          and node.count_subscribers('/field_readings_calibrated'))
         processes.append(start('driver_node', '-p', f'drivers:={drivers}', '-p',
                                f'network:={network}', '-p', 'batches:=true'))
         assert spin_until(lambda: len(frames) > 30)

@@ -112,8 +112,8 @@ def test_no_node_keeps_more_than_can_be_asked_for_at_once(ros):
     try:
         driver.trigger_configure()
         sent = {p.topic_name: p.qos_profile.depth for node in nodes for p in node.publishers}
-        assert {'/mag_1/imu/mag', '/driver_node/readings', '/calibration_node/readings',
-                '/detection_node/frame', '/tracker_node/tracks'} <= sent.keys()
+        assert {'/mag_1/imu/mag', '/field_readings', '/field_readings_calibrated',
+                '/network_frame', '/tracker_node/tracks'} <= sent.keys()
         # The middleware's own topics of parameters are not the project's.
         assert {t: n for t, n in sent.items()
                 if n > MOST_ASKED_FOR and t not in ('/parameter_events', '/rosout')} == {}

@@ -90,7 +90,7 @@ def test_frames_that_cannot_be_are_counted(ros):
     node, spin_until = ros
     diagnostics = []
     node.create_subscription(DiagnosticArray, '/diagnostics', diagnostics.append, 10)
-    publisher = node.create_publisher(NetworkFrame, '/detection_node/frame', STREAM)
+    publisher = node.create_publisher(NetworkFrame, '/network_frame', STREAM)
     process = start('tracker_node', '-p', f'network:={NETWORK_FILE}')
     try:
         assert spin_until(lambda: publisher.get_subscription_count() > 0)

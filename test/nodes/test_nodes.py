@@ -159,10 +159,10 @@ def test_nodes_equal_offline_on_magnets(run_number, magnet_runs, tmp_path):
 
 def hear(node):
     """{message type: [messages]} of what the nodes publish, filled while `node` spins."""
-    topics = {NetworkFrame: '/detection_node/frame', TrackArray: '/tracker_node/tracks',
+    topics = {NetworkFrame: '/network_frame', TrackArray: '/tracker_node/tracks',
               Odometry: '/tracker_node/odometry', MarkerArray: '/tracker_node/markers',
               PassEvent: '/detection_node/events', Clock: '/clock',
-              CalibrationState: '/calibration_node/calibration'}
+              CalibrationState: '/calibration_state'}
     received = {kind: [] for kind in topics}
     for kind, topic in topics.items():
         node.create_subscription(kind, topic, received[kind].append,
@@ -183,10 +183,10 @@ def play_through_processes(ros, recording, received):
                  start('tracker_node', *network)]
     try:
         sources, listeners = node.count_publishers, node.count_subscribers
-        assert spin_until(lambda: sources('/detection_node/frame')
+        assert spin_until(lambda: sources('/network_frame')
                           and sources('/tracker_node/tracks')
                           and sources('/mag_1/imu/mag_calibrated')
-                          and listeners('/detection_node/frame') > 1
+                          and listeners('/network_frame') > 1
                           and listeners('/mag_1/imu/mag_calibrated'))
         processes.append(start('replay_node', '-p', f'recording:={recording}', '-p', 'rate:=2.0',
                                '-p', 'start_delay:=3.0', '-p', 'wait_for_subscribers:=300.0'))

@@ -160,10 +160,10 @@ def test_a_publisher_that_begins_anew_or_a_second_one_is_no_loss(ros, desk):
 
 def test_latched_messages_and_a_later_publisher_that_has_none(ros, desk):
     node, _ = ros
-    early = node.create_publisher(Header, '/calibration_node/calibration', LATCHED)
+    early = node.create_publisher(Header, '/calibration_state', LATCHED)
     early.publish(Header(frame_id='early'))
     d = desk(Selection((), results=True), split_bytes=2000)
-    topic = '/calibration_node/calibration'
+    topic = '/calibration_state'
     assert d.until(lambda: d.recorder.counts[topic] == 1)
     volatile = node.create_publisher(Header, topic, QoSProfile(
         depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))

@@ -25,7 +25,7 @@ def offline(road_network):
 def test_a_survey_changes_the_network_of_the_next_track(ros, tmp_path, road_network):
     node, spin_until = ros
     states, tracks = [], []
-    node.create_subscription(CalibrationState, '/calibration_node/calibration', states.append,
+    node.create_subscription(CalibrationState, '/calibration_state', states.append,
                              LATCHED)
     node.create_subscription(TrackArray, '/tracker_node/tracks', tracks.append, STREAM)
     saved = tmp_path / 'surveyed.yaml'
@@ -35,7 +35,7 @@ def test_a_survey_changes_the_network_of_the_next_track(ros, tmp_path, road_netw
     try:
         assert spin_until(lambda: node.count_publishers('/tracker_node/tracks')
                           and node.count_publishers('/mag_1/imu/mag_calibrated')
-                          and node.count_subscribers('/detection_node/frame'))
+                          and node.count_subscribers('/network_frame'))
         refused = call(ros, Survey, '/calibration_node/survey', Survey.Request(save=True))
         assert not refused.success and 'no background' in refused.message
         assert not saved.exists()
@@ -67,7 +67,7 @@ def test_a_survey_changes_the_network_of_the_next_track(ros, tmp_path, road_netw
 
 def test_a_calibration_of_other_sensors_is_refused(ros):
     node, spin_until = ros
-    publisher = node.create_publisher(CalibrationState, '/calibration_node/calibration', LATCHED)
+    publisher = node.create_publisher(CalibrationState, '/calibration_state', LATCHED)
     process = start('tracker_node', '-p', f'network:={NETWORK_FILE}')
     try:
         assert spin_until(lambda: publisher.get_subscription_count() > 0)

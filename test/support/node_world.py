@@ -31,7 +31,7 @@ BODY = point_body([0.0, 300.0, -300.0], 5.0, 0.5)
 """Its hard and soft iron do not cancel: it is noticed from 12 m."""
 TOPICS = {'driver_node': (MagneticField, '/mag_1/imu/mag'),
           'calibration_node': (MagneticField, '/mag_1/imu/mag_calibrated'),
-          'detection_node': (NetworkFrame, '/detection_node/frame'),
+          'detection_node': (NetworkFrame, '/network_frame'),
           'tracker_node': (TrackArray, '/tracker_node/tracks')}
 """What each node gives."""
 FRAME_S = 0.2

@@ -123,7 +123,8 @@ def tracked(network, body, course, duration, flaws, seed, changes=None, faults=(
         heading = stated @ v / np.hypot(*stated) / np.hypot(*v)
     sure = [r for r in records if isinstance(r, SmoothedPose) and not r.ambiguous]
     smoothed_error, smoothed_deviation, *_ = errors_of(sure, t, position)
-    return Tracked(size, along, nees, topic_nees, distance, np.array([r.ambiguous for r in tracks], dtype=bool),
+    ambiguous = np.array([r.ambiguous for r in tracks], dtype=bool)
+    return Tracked(size, along, nees, topic_nees, distance, ambiguous,
                    float(ratio), float(heading), pipeline.detect.counts['onsets'] > 0, len(sure),
                    int(are_wrong(smoothed_error, smoothed_deviation).sum()))
 

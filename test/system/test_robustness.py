@@ -174,7 +174,7 @@ def test_no_second_detection_in_the_wake_of_a_target(seed):
 @pytest.mark.parametrize('content, message', [
     (b'sensors: {"m\xff": 1}', 'not YAML'),
     (b'sensors:\n  "m 1": {position: [0, 0, 0]}', 'no name for a sensor'),
-    (b'sensors:\n  1abc: {position: [0, 0, 0]}', 'no ROS topic'),
+    (b'sensors:\n  1abc: {position: [0, 0, 0]}', 'not a ROS topic'),
     (b'frame:\nsensors:\n  a: {position: [0, 0, 0]}', 'frame: expected a name'),
     (b'sensors:\n  a: {position: [0, 0, 0], noise_std: 12.0}', 'below a millitesla'),
     (b'sensors:\n  a: {position: [0, 0, 0], background: [15.0, 0, 0]}', 'microtesla'),
