@@ -1,5 +1,7 @@
 """Validated paths, and result files created from scratch, never written through a link."""
 
+import os
+import secrets
 from os import PathLike, fspath
 from pathlib import Path
 from typing import BinaryIO, TextIO
@@ -38,6 +40,28 @@ def new_text_file(path: str | PathLike[str], newline: str | None = None) -> Text
 def new_binary_file(path: str | PathLike[str]) -> BinaryIO:
     """A new, empty file for bytes, created in the same way as a text file."""
     return open(_free(path), 'xb')
+
+
+def replace_text(path: str | PathLike[str], text: str) -> None:
+    """Write a UTF-8 file as a whole: until it is complete, what was there stays.
+
+    It is written under a fresh name and moved into place, so that no link is written through,
+    neither one of that name nor one that was planted under the temporary name.
+
+    Raises OutputError.
+    """
+    path = checked_path(path, OutputError)
+    draft = path.parent / f'.{path.name}.{secrets.token_hex(8)}.part'
+    try:
+        with open(draft, 'x', encoding='utf-8', errors='backslashreplace') as stream:
+            stream.write(text)
+            stream.flush()
+            # Else a power cut might leave an empty file in the place of the old one.
+            os.fsync(stream.fileno())
+        draft.replace(path)
+    except OSError as error:
+        draft.unlink(missing_ok=True)
+        raise OutputError(f'cannot write {path}: {error.strerror}') from error
 
 
 def _free(path: str | PathLike[str]) -> Path:

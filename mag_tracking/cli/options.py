@@ -26,7 +26,7 @@ def add_command(commands: Commands, name: str, run: Callable[[argparse.Namespace
     """A command's parser; `run` takes the parsed arguments and returns the exit status."""
     parser = commands.add_parser(name, aliases=aliases, help=short, description=short, epilog=text,
                                  formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.set_defaults(run_command=run)
+    parser.set_defaults(run_command=run, ros_arguments=[])
     return parser
 
 

@@ -24,6 +24,7 @@ from mag_tracking.drivers.settings import (
     DriverSettings,
     scale_of,
 )
+from mag_tracking.drivers.sole_source import SoleSource
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.records import AccelerationSample, Readings
 
@@ -85,7 +86,7 @@ class Driver:
         self._retry_s, self._heard_ns = settings.retry_s, 0
         self._retry_ns: int | None = None
         self._offset_ns: int | None = None
-        self._only: tuple[str, str] | None = None
+        self._sole_source = SoleSource()
         self._unknown: set[str] = set()
         # Of the reading before: those that a device gives together were measured together.
         self._measurement: tuple[ArrivalClock | DeviceClock, float | None, int] | None = None
@@ -121,6 +122,7 @@ class Driver:
         """{what: number} of all that was lost, refused or found odd, and of the samples."""
         # Copied as wholes: the thread that polls may count something new in the meantime.
         total = self.own_counts.copy()
+        total.update({'sources changed': n} if (n := self._sole_source.changes) else {})
         total.update(self._device.counts.copy())
         for sensor, check in self._sequences.items():
             total.update({f'{what}: {sensor}': n for what, n in check.counts.copy().items() if n})
@@ -260,11 +262,9 @@ class Driver:
         """The network's name of a sensor; None for one that nobody has named."""
         sensor = next((self.sensors[name] for name in (at_device, source)
                        if name and name in self.sensors), None)
-        if sensor is None and '' in self.sensors:
-            # The one sensor there is: two of them in one topic would be neither.
-            self._only = self._only or (at_device, source)
-            if self._only == (at_device, source):
-                return self.sensors['']
+        if sensor is None and '' in self.sensors and self._sole_source.is_this(
+                (at_device, source), self._monotonic_ns()):
+            return self.sensors['']
         if sensor is None:
             name = (at_device or source)[:80]
             if len(self._unknown) < MOST_NAMES:

@@ -2,7 +2,6 @@
 
 import datetime
 import json
-import os
 import re
 from collections.abc import Collection, Iterable
 from os import PathLike
@@ -12,8 +11,8 @@ import numpy as np
 import yaml
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.errors import NetworkError, OutputError
-from mag_tracking.files import checked_path, new_text_file
+from mag_tracking.errors import NetworkError
+from mag_tracking.files import replace_text
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
 from mag_tracking.network import Calibrated, SensorNetwork
 from mag_tracking.network.geomagnetic import Site, decimal_year, earth_field
@@ -304,14 +303,4 @@ def write_network(path: str | PathLike[str], network: SensorNetwork, comment: st
     lines.append('sensors:')
     for i in range(len(network)):
         lines += _sensor_lines(network, i)
-    draft = checked_path(f'{path}.part', OutputError)
-    try:
-        with new_text_file(draft) as stream:
-            stream.write('\n'.join(lines) + '\n')
-            stream.flush()
-            # Else a power cut might leave an empty file in the place of the old one.
-            os.fsync(stream.fileno())
-        draft.replace(path)
-    except OSError as error:
-        draft.unlink(missing_ok=True)
-        raise OutputError(f'cannot write {path}: {error.strerror}') from error
+    replace_text(path, '\n'.join(lines) + '\n')

@@ -15,7 +15,7 @@ from mag_tracking_msgs.srv import Calibrate as CalibrateService
 from mag_tracking_msgs.srv import Survey as SurveyMessage
 from sensor_msgs.msg import Imu, MagneticField
 
-from mag_tracking.errors import NetworkError
+from mag_tracking.errors import NetworkError, SettingsError
 from mag_tracking.messages.schema import (
     acceleration_of,
     magnetic_field_dicts,
@@ -28,11 +28,12 @@ from mag_tracking.nodes.background_store import BackgroundStore
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.deferred import Deferred
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
+from mag_tracking.nodes.sensor_graph import shortened
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.sensor_rounds import SensorRounds
-from mag_tracking.nodes.stage_node import LATCHED, SENT, STREAM, StageNode
+from mag_tracking.nodes.stage_node import LATCHED, READY, SENT, STREAM, StageNode
 from mag_tracking.nodes.survey_service import SurveyService
-from mag_tracking.recording.background_file import usual_path
+from mag_tracking.recording.background_file import state_folder, usual_path
 from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.stage import Stage
@@ -62,17 +63,17 @@ class CalibrationNode(StageNode):
         self._survey_service = SurveyService(
             self._survey, self._stage, self._survey_path(),
             [self.resolve_topic_name(t) for t in self.network.imu_topics if t is not None])
-        self._health = HealthDiagnostics(self.network, self.settings, self.sensor_topics)
+        self._health = HealthDiagnostics(self.network, self.settings, self, self.is_replayed)
         self._unseen: list[tuple[Readings, int]] = []
         self._deferred = Deferred(self, DEFERRED_S, self._do_deferred_work)
         self._connect()
         self._rounds = SensorRounds(
             self.title, self.network, self._stage, self._health, self._store, self._is_live,
             lambda status: self.publish_statuses([status]), self._publish_states)
-        self.create_timer(max(1.0 / (2 * len(self.network) + 3), SHORTEST_STEP_S),
-                          self._rounds.tick)
-        self.create_service(CalibrateService, '~/calibrate', self._calibrate)
-        self.create_service(SurveyMessage, '~/survey', self._solve)
+        self.every(max(1.0 / (2 * len(self.network) + 3), SHORTEST_STEP_S), self._rounds.tick)
+        self.service(CalibrateService, '~/calibrate', self._calibrate)
+        self.service(SurveyMessage, '~/survey', self._solve)
+        self.report_state()
 
     def _connect(self) -> None:
         """Subscribe to the sensors and advertise what comes of them."""
@@ -87,7 +88,8 @@ class CalibrationNode(StageNode):
                 self.subscription(Imu, imu_topic, partial(self._take_acceleration, sensor),
                                   self.input_qos)
         self._readings = self.publisher(FieldReadings, CALIBRATED_READINGS, SENT)
-        self.subscription(FieldReadings, RAW_READINGS, self._take_many, STREAM, source='sensors')
+        self.subscription(FieldReadings, RAW_READINGS, self._take_many, STREAM, source='sensors',
+                          batches=True)
         self.expect('detection', CALIBRATED_READINGS, 'mag_tracking_msgs/msg/NetworkFrame')
         self._state = self.publisher(CalibrationState, CALIBRATION_STATE, LATCHED)
 
@@ -97,19 +99,42 @@ class CalibrationNode(StageNode):
                                 'for a restart; left out: below $ROS_HOME, or ~/.ros.')
         if self.is_replayed or not self.settings.calibrate.resume_s:
             return None
-        return Path(place) if place else usual_path(
+        return self._own_path('state_file', place) if place else usual_path(
             self.network_path, self.get_fully_qualified_name())
+
+    def _own_path(self, parameter: str, name: str) -> Path:
+        """The path of a file to write; raises SettingsError for one that is not its place."""
+        beside, below = self.network_path.parent, state_folder().resolve()
+        path = beside / name
+        folder = path.parent.resolve()
+        if folder != beside and not folder.is_relative_to(below):
+            raise SettingsError(f'calibration_node: parameter {parameter}: {path} is neither '
+                                f'beside the network file, in {beside}, nor below {below}')
+        return folder / path.name
 
     def _survey_path(self) -> Path:
         """File to which a survey is saved: beside the network file, which is written by hand."""
         save_as = fixed_parameter(self, 'save_as', '', 'Network file that a survey writes; left '
                                   'out: <network>_calibrated.yaml.')
         path = self.network_path
-        return Path(save_as) if save_as else path.with_name(f'{path.stem}_calibrated.yaml')
+        return self._own_path('save_as', save_as or f'{path.stem}_calibrated.yaml')
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
         """{name: stage} whose counts are published."""
         return {'calibrate': self._stage, 'survey': self._survey}
+
+    def state(self) -> str:
+        """Waiting for sensors, learning their backgrounds, or ready."""
+        waiting = [topic for name, topic in zip(self.network.names, self.sensor_topics,
+                                                strict=True) if self._health.is_waited_for(name)]
+        learning = [name for name in self._stage.unready()
+                    if not self._health.is_waited_for(name)]
+        parts = [f'waiting for {shortened(waiting)}'] if waiting else []
+        if learning:
+            parts.append(f'learning backgrounds, {self.settings.calibrate.learn_s:g} s')
+        elif len(waiting) < len(self.network):
+            parts.append(READY)
+        return ', '.join(parts)
 
     def queues(self) -> dict[str, int]:
         """{name of a stage: how many records it holds}."""

@@ -50,8 +50,9 @@ class DetectionNode(StageNode):
             self.subscription(MagneticField, f'{topic}_calibrated', partial(self._take, sensor),
                               STREAM, source='calibration')
         self.subscription(FieldReadings, CALIBRATED_READINGS, self._take_many, STREAM,
-                          source='calibration')
+                          source='calibration', batches=True)
         self.expect('tracker', NETWORK_FRAME, TRACK_ARRAY)
+        self.report_state()
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
         """{name: stage} whose counts are published."""

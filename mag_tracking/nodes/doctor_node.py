@@ -17,6 +17,7 @@ from mag_tracking.messages.schema import reading_of, readings_of
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.network import SensorNetwork
 from mag_tracking.nodes.middleware import begin
+from mag_tracking.nodes.sensor_graph import missing_publisher, topic_findings
 from mag_tracking.nodes.stage_node import SENSORS, STREAM, make_executor, spin
 from mag_tracking.pipeline import Settings
 from mag_tracking.stages.health.sensor_health import Finding
@@ -58,18 +59,9 @@ class DoctorNode(Node):
         found = [Finding(True, topic, f'{n} messages that are none: {error}', 'look at the driver '
                          'that publishes it') for error, n in self._bad.items()]
         for sensor, topic in self._topics.items():
-            publishers = self.get_publishers_info_by_topic(topic)
-            if not publishers and sensor not in self._in_batches:
-                found.append(Finding(True, sensor, f'nobody publishes {topic}', 'start its driver, '
-                                     'and compare its topic with the network file'))
-            elif len(publishers) > 1:
-                names = ', '.join(sorted(p.node_name for p in publishers))
-                found.append(Finding(True, sensor, f'{len(publishers)} nodes publish {topic}: '
-                                     f'{names}', 'stop all but one'))
-            for p in publishers:
-                if p.topic_type != 'sensor_msgs/msg/MagneticField':
-                    found.append(Finding(True, sensor, f'{p.node_name} publishes {p.topic_type} on '
-                                         f'{topic}', 'it has to be sensor_msgs/msg/MagneticField'))
+            found += topic_findings(self, sensor, topic)
+            if sensor not in self._in_batches and not self.count_publishers(topic):
+                found.append(missing_publisher(self, sensor, topic, self._topics))
         return found
 
 

@@ -5,12 +5,19 @@ from collections.abc import Callable, Collection
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
+from mag_tracking.nodes.sensor_graph import shortened
 from mag_tracking.stages.health.sensor_health import REPLAYED_S
 from mag_tracking.stages.health.window import quantiles
 from mag_tracking.units import NS
 
 SILENT_S = 2.0
 """[s] A sensor or a node of which nothing came for longer is silent."""
+PATIENCE_S = 8.0
+"""[s] Longer than a background takes to be learnt: until then nothing need come."""
+MOST_BUSY = 0.95
+"""A node that works for a larger share of the time cannot keep up."""
+LATE_S = 1.0
+"""[s] Poses that are later are of no use to anybody who drives by them."""
 MOST_NOTED = 10_000
 """Messages between two reports whose times are kept; a second of a thousand sensors has less."""
 
@@ -22,6 +29,9 @@ class Flow:
         self.source = source
         self.topics: list[str] = []
         """Absolute names, as remapped."""
+        self.batches: list[str] = []
+        """Topics that may take their place."""
+        self._began = time.monotonic()
         self.heard: float | None = None
         """`time.monotonic()` [s] of the latest message, or None."""
         self.n_lost = 0
@@ -63,8 +73,14 @@ class Flow:
         ages, self._ages = self._ages, []
         news, self._told_lost = self.n_lost - self._told_lost, self.n_lost
         level, message = DiagnosticStatus.OK, 'running'
+        busy = self._busy_s / elapsed
+        middle, late = quantiles([a for a in ages if abs(a) < REPLAYED_S], 0.5, 0.99)
         if self.heard is None:
-            message = f'nothing has come from {self.source} yet'
+            message = f'waiting for {shortened(self.topics)}'
+            if now - self._began > PATIENCE_S:
+                level = DiagnosticStatus.WARN
+                message = f'nothing has come on {shortened(self.topics)}' + (
+                    '' if is_there() else ', which nobody publishes')
         elif now - self.heard > SILENT_S:
             level = DiagnosticStatus.WARN
             message = f'nothing has come from {self.source} for {now - self.heard:.0f} s'
@@ -74,11 +90,14 @@ class Flow:
         elif news:
             level = DiagnosticStatus.WARN
             message = f'{news} messages from {self.source} did not fit the queue'
-        middle, late = quantiles([a for a in ages if abs(a) < REPLAYED_S], 0.5, 0.99)
+        elif busy > MOST_BUSY or middle > LATE_S:
+            level = DiagnosticStatus.WARN
+            message = (f'{self.source}: {100.0 * busy:.0f} % busy, {1e3 * middle:.0f} ms behind: '
+                       'this computer is too slow, or its clock is not that of the sensors')
         values = {'messages': self._n, 'lost in the queue': self.n_lost,
                   'latency, median [ms]': f'{1e3 * middle:.4g}',
                   'latency, 99 % [ms]': f'{1e3 * late:.4g}',
-                  'busy [%]': f'{100.0 * self._busy_s / elapsed:.3g}'}
+                  'busy [%]': f'{100.0 * busy:.3g}'}
         self._busy_s = 0.0
         return DiagnosticStatus(
             level=level, name=f'{node}: from {self.source}', hardware_id='magnetometer network',

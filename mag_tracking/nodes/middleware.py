@@ -4,7 +4,13 @@ import os
 from pathlib import Path
 
 import rclpy
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.signals import SignalHandlerOptions
+
+from mag_tracking.errors import SettingsError
+
+RCLError, UnknownROSArgsError = (rclpy_implementation.RCLError,
+                                 rclpy_implementation.UnknownROSArgsError)
 
 PROFILE = Path(__file__).with_name('fastdds.xml')
 """Nodes that find each other at once, also one that was killed and is started again."""
@@ -19,11 +25,17 @@ def begin(arguments: list[str] | None = None) -> None:
 
     Other middlewares do not look at it. Signals stay with the caller: rclpy's own handlers raise
     KeyboardInterrupt wherever Python is, in its C++ too.
+
+    Raises SettingsError for arguments that are not those of ROS.
     """
     named = os.environ.get(PROFILE_VARIABLE)
     if named is None and not Path(PROFILE_IN_FOLDER).exists():
         os.environ[PROFILE_VARIABLE] = str(PROFILE)
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    except (RCLError, UnknownROSArgsError) as error:
+        # What follows are places in the source of rcl.
+        raise SettingsError(f'arguments of ROS: {str(error).partition(", at /")[0]}') from error
     if named and not Path(named).exists():
         rclpy.logging.get_logger('middleware').warning(
             f'{PROFILE_VARIABLE} names {named}, which does not exist: no profile is in force, and '

@@ -2,26 +2,35 @@
 
 import math
 import time
-from collections.abc import Sequence
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from numpy.typing import ArrayLike
+from rclpy.node import Node
 
 from mag_tracking.apps.doctor import background_findings, network_findings
 from mag_tracking.apps.doctor_covariances import covariance_findings
 from mag_tracking.network import SensorNetwork
+from mag_tracking.network.topics import absolute
 from mag_tracking.nodes.flow import SILENT_S
+from mag_tracking.nodes.sensor_graph import missing_publisher, topic_findings
 from mag_tracking.pipeline import Settings
 from mag_tracking.records import Readings, plain
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.reading_buffer import ReadingBuffer
-from mag_tracking.stages.health.sensor_health import WINDOW, Finding, SensorHealth
+from mag_tracking.stages.health.sensor_health import (
+    REPLAYED_S,
+    WINDOW,
+    Finding,
+    SensorHealth,
+)
 
 TERM_S = 60.0
 """[s] What was wrong is forgotten after one to two of these."""
 FEW = 64
 """Readings of this term that are too few to speak of; the term before it still speaks then."""
+STARTING_S = 3.0
+"""[s] That nothing has come of a sensor is no fault until then."""
 PATIENCE = 3.0
 """A background that has not been learnt is a fault after so many times what that takes."""
 
@@ -33,13 +42,18 @@ class HealthDiagnostics:
     ----------
     network : SensorNetwork
     settings : Settings
-    topics : sequence of str, optional
-        The sensors' topics as remapped; those of the network file if left out.
+    node : Node, optional
+        Knows the sensors' topics as remapped, and who publishes them.
+    is_replayed : bool
+        Old stamps are those of a recording.
     """
 
-    def __init__(self, network: SensorNetwork, settings: Settings,
-                 topics: Sequence[str] = ()) -> None:
-        self._topics = topics or network.topics
+    def __init__(self, network: SensorNetwork, settings: Settings, node: Node | None = None,
+                 is_replayed: bool = False) -> None:
+        self._node, self._is_replayed = node, is_replayed
+        resolve = absolute if node is None else node.resolve_topic_name
+        self._topics = {name: resolve(topic) for name, topic in zip(
+            network.names, network.topics, strict=True)}
         self._settings = settings
         self._index = {name: j for j, name in enumerate(network.names)}
         # When, by the monotonic clock [s]; NaN: never.
@@ -122,24 +136,55 @@ class HealthDiagnostics:
     def _findings(self, j: int, name: str, calibrate: Calibrate) -> list[Finding]:
         """What is wrong with a sensor, the worst first."""
         silent_s = time.monotonic() - self._heard[j]
+        of_topic = [] if self._node is None else topic_findings(
+            self._node, name, self._topics[name])
         if not silent_s <= SILENT_S:
-            what = 'nothing has come' if math.isnan(silent_s) else f'silent for {silent_s:.0f} s'
-            return [Finding(True, name, what, 'look at its cable, its driver and the topic '
-                            f'{self._topics[j]}')]
-        found = {f.what: f for f in self._compared[name]}
+            return [*of_topic, *self._silence(name, silent_s)]
+        found = {f.what: f for f in (*of_topic, *self._compared[name],
+                                     *self._clock_finding(name))}
         # While it learns for the first time that is no fault yet.
         patience = 5.0 + PATIENCE * self._settings.calibrate.learn_s
         if time.monotonic() - self._began > patience:
             found.update({f.what: f for f in background_findings(
                 name, calibrate, self._frozen_ns.get(name), self._relearnt[0][name])})
         found.update({f.what: f for f in covariance_findings(
-            name, self._topics[j], calibrate)})
+            name, self._topics[name], calibrate)})
         for health in (self._past[name], self._present[name]):
             if health is not None and health.counts['readings']:
                 for f in health.findings(name, self._network.noise_std[j],
                                          self._settings.calibrate.max_field):
                     found.setdefault(f.what, f)
         return sorted(found.values(), key=lambda f: not f.serious)
+
+    def _silence(self, name: str, silent_s: float) -> list[Finding]:
+        """The fault of a sensor that is silent for `silent_s`; NaN where nothing has ever come."""
+        topic = self._topics[name]
+        if not math.isnan(silent_s):
+            return [Finding(True, name, f'silent for {silent_s:.0f} s', 'look at its cable, its '
+                            f'driver and the topic {topic}')]
+        # Nodes that are started together do not come up at the same time.
+        if time.monotonic() - self._began < STARTING_S:
+            return []
+        if self._node is None:
+            return [Finding(True, name, 'nothing has come', 'look at its cable, its driver and the '
+                            f'topic {topic}')]
+        return [missing_publisher(self._node, name, topic, self._topics)]
+
+    def _clock_finding(self, name: str) -> list[Finding]:
+        """Stamps of another day than that of this computer."""
+        behind_s = self._latest(name).delay_s[0]
+        if self._is_replayed or not abs(behind_s) > REPLAYED_S:
+            return []
+        days = abs(behind_s) / 86400.0
+        far = f'{days / 365.25:.0f} years' if days > 730.0 else f'{days:.0f} days'
+        return [Finding(False, name, f'its stamps are {far} '
+                        f'{"behind" if behind_s > 0.0 else "ahead of"} the clock of this computer',
+                        'for a recording set use_sim_time (--use-sim-time); else set the clock of '
+                        'the device, or have its driver stamp')]
+
+    def is_waited_for(self, name: str) -> bool:
+        """Whether nothing has come of a sensor yet."""
+        return bool(np.isnan(self._heard[self._index[name]]))
 
     def status(self, node: str, j: int, calibrate: Calibrate) -> DiagnosticStatus:
         """The DiagnosticStatus of sensor `j`, as of the latest `look` at it."""
@@ -165,7 +210,8 @@ class HealthDiagnostics:
             'backgrounds taken anew': background.n_relearnt}
         return DiagnosticStatus(
             level=level, name=f'{node}: {name}', hardware_id=name,
-            message=f'{found[0].what}; {found[0].advice}' if found else 'running',
+            message=f'{found[0].what}; {found[0].advice}' if found else
+            f'waiting for {self._topics[name]}' if self.is_waited_for(name) else 'running',
             values=[KeyValue(key=k, value=v if isinstance(v, str) else _number(v))
                     for k, v in values.items()]
             + [KeyValue(key='also', value=f.what) for f in found[1:]])

@@ -11,14 +11,18 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from mag_tracking_msgs.msg import FieldReadings
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.task import Future
+from rclpy.timer import Timer
 
 from mag_tracking.errors import MagTrackingError, RecordingError, SettingsError
 from mag_tracking.interrupts import noted_signals
@@ -28,6 +32,8 @@ from mag_tracking.network.topics import absolute
 from mag_tracking.nodes.flow import Flow, Listener
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
+from mag_tracking.nodes.sensor_graph import shortened
+from mag_tracking.nodes.status_log import StatusLog
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import Readings
 from mag_tracking.stages.stage import Stage
@@ -45,6 +51,11 @@ SENSORS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Best effort matches reliable and best-effort drivers alike."""
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+CALLS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+"""Of services: calls that wait for their turn."""
+READY = 'ready'
 
 
 class StageNode(Node):
@@ -76,7 +87,29 @@ class StageNode(Node):
         self._listeners: list[Listener] = []
         # When the message came that is worked on, by the clock of ROS.
         self.now_ns = 0
-        self.create_timer(1.0, self._publish_diagnostics)
+        self._log, self._reported_state = StatusLog(self.get_logger()), ''
+        self.every(1.0, self._publish_diagnostics)
+
+    def every(self, seconds: float, call: Callable[[], None]) -> Timer:
+        """A timer by the time that passes, not that of a recording, which may stand still."""
+        return self.create_timer(seconds, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def service(self, service_type: Any, name: str, callback: Callable[[Any, Any], Any]) -> Service:
+        """A service that answers each of many calls at once."""
+        return self.create_service(service_type, name, callback, qos_profile=CALLS)
+
+    def state(self) -> str:
+        """What the node does: waiting for its input, or ready."""
+        silent = [topic for flow in self.flows.values() if flow.heard is None
+                  for topic in flow.topics]
+        return f'waiting for {shortened(silent)}' if silent else READY
+
+    def report_state(self) -> None:
+        """Log the state where it has changed."""
+        state = self.state()
+        if state != self._reported_state:
+            self._reported_state = state
+            self.get_logger().info(state)
 
     @property
     def sensor_topics(self) -> tuple[str, ...]:
@@ -109,14 +142,15 @@ class StageNode(Node):
         return self.create_publisher(message_type, topic, qos, event_callbacks=events)
 
     def subscription(self, message_type: Any, topic: str, callback: Callable[[Any], None],
-                     qos: QoSProfile, source: str = '') -> Subscription:
+                     qos: QoSProfile, source: str = '', batches: bool = False) -> Subscription:
         """A subscription that logs a publisher with unfit QoS.
 
-        With a `source`, the step that sends, diagnostics tell of what comes and how late.
+        With a `source`, the step that sends, diagnostics tell of what comes and how
+        late; `batches` may come in place of the other topics.
         """
         flow = self.flows.setdefault(source, Flow(source)) if source else None
         if flow is not None:
-            flow.topics.append(self.resolve_topic_name(topic))
+            (flow.batches if batches else flow.topics).append(self.resolve_topic_name(topic))
 
         def unfit(event: Any) -> None:
             self.get_logger().warning(
@@ -153,13 +187,11 @@ class StageNode(Node):
         for name, stage in self.stages().items():
             bad = {k: n for k, n in stage.counts.items() if k.startswith('rejected: ')}
             news = {k: n for k, n in bad.items() if n != self._reported.get((name, k), 0)}
-            for cause, n in news.items():
-                self._reported[name, cause] = n
-                self.get_logger().warning(f'{name}: {cause}: {n}')
+            self._reported |= {(name, cause): n for cause, n in news.items()}
             statuses.append(DiagnosticStatus(
                 level=DiagnosticStatus.WARN if news else DiagnosticStatus.OK,
                 name=f'{self.title}: {name}', hardware_id='magnetometer network',
-                message='samples were rejected' if news else 'running',
+                message='; '.join(f'{cause}: {n}' for cause, n in news.items()) or 'running',
                 values=[KeyValue(key=k, value=str(n)) for k, n in sorted(
                     {**stage.counts, **({'queue': queues[name]} if name in queues else {})}.items()
                 )]))
@@ -169,7 +201,23 @@ class StageNode(Node):
             ends = self.get_subscriptions_info_by_topic(listener.topic)
             statuses.append(listener.status(self.title, {
                 absolute(e.node_name, e.node_namespace) for e in ends}, self._published_types))
-        self.publish_statuses(statuses)
+        self.publish_statuses([*statuses, *self._own_statuses()])
+        self.report_state()
+
+    def _own_statuses(self) -> list[DiagnosticStatus]:
+        """Faults of how the node was started."""
+        faults = []
+        own = self.get_name(), self.get_namespace()
+        n_same = self.get_node_names_and_namespaces().count(own)
+        if n_same > 1:
+            faults.append(f'{n_same} nodes are named {self.get_fully_qualified_name()}: stop all '
+                          'but one, or rename it (-r __node:=NAME)')
+        if self.get_parameter('use_sim_time').value and not self.get_clock().now().nanoseconds:
+            faults.append('use_sim_time is set, and nothing has come on /clock')
+        return [DiagnosticStatus(
+            level=DiagnosticStatus.ERROR if faults else DiagnosticStatus.OK,
+            name=f'{self.title}: start', hardware_id='magnetometer network',
+            message='; '.join(faults) or self.state())]
 
     def _published_types(self, name: str) -> set[str]:
         """The types that a node publishes, by what is known of it so far."""
@@ -182,10 +230,12 @@ class StageNode(Node):
 
     def _has_publisher(self, flow: Flow) -> bool:
         """Whether somebody would still publish what the flow is of."""
-        return any(map(self.count_publishers, flow.topics))
+        return any(map(self.count_publishers, (*flow.topics, *flow.batches)))
 
     def publish_statuses(self, statuses: list[DiagnosticStatus]) -> None:
-        """Publish [DiagnosticStatus], if there are any."""
+        """Publish [DiagnosticStatus], if there are any, and log what is wrong."""
+        for status in statuses:
+            self._log.note(status)
         if statuses:
             array = DiagnosticArray(status=statuses)
             array.header.stamp = self.get_clock().now().to_msg()
@@ -226,7 +276,11 @@ def main(node_class: Callable[[], Node], arguments: list[str] | None = None) -> 
 def _run_until(seen: list[int], node_class: Callable[[], Node],
                arguments: list[str] | None) -> int:
     """Run one node until there is something in `seen`."""
-    begin(arguments)
+    try:
+        begin(arguments)
+    except SettingsError as error:
+        rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
+        return 1
     executor, node = make_executor(), None
     try:
         node = node_class()

@@ -78,12 +78,13 @@ class TrackerNode(StageNode):
         self._disturbances = self.publisher(DisturbanceMessage, '~/disturbances', SENT)
         self._markers = self.publisher(MarkerArray, '~/markers', RESULTS)
         self._path: deque[PoseStamped] = deque(maxlen=LONGEST_PATH)
-        self._is_silent = False
+        self._is_silent, self._latest_id = False, -1
         self._doubtful: dict[str, DoubtfulTimes] = {}
         self.subscription(NetworkFrame, NETWORK_FRAME, self._take, STREAM,
                           source='detection')
-        self.create_timer(0.25, self.end_without_frames)
+        self.every(0.25, self.end_without_frames)
         self.subscription(CalibrationState, CALIBRATION_STATE, self._calibrated, LATCHED)
+        self.report_state()
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
         """{name: stage} whose counts are published."""
@@ -165,6 +166,12 @@ class TrackerNode(StageNode):
     def _publish(self, track: Track) -> None:
         """Everything about one track at one time."""
         frame = self.network.frame
+        if track.id != self._latest_id:
+            self._latest_id = track.id
+            self.get_logger().info(f'track {track.id} begins' + (
+                f', arrival {track.arrival}' if track.arrival else ''))
+        if track.ended:
+            self.get_logger().info(f'track {track.id} has ended')
         if not track.ended:
             # What somebody steers by comes first.
             publish_if_any(self._pose, PoseWithCovarianceStamped, pose_message_dict(track, frame))

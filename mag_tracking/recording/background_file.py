@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mag_tracking.errors import OutputError, RecordingError
-from mag_tracking.files import new_text_file
+from mag_tracking.files import replace_text
 from mag_tracking.network import SensorNetwork
 from mag_tracking.stages.calibrate.restoration import StoredBackground
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
@@ -23,11 +23,15 @@ VERSION = 1
 
 
 def usual_path(network_path: str | PathLike[str], node: str) -> Path:
-    """Where node `node` keeps the backgrounds of a network file: below $ROS_HOME, or ~/.ros."""
+    """Where node `node` keeps the backgrounds of a network file, in the state folder."""
     path = Path(network_path).resolve()
-    home = Path(os.environ.get('ROS_HOME') or Path.home() / '.ros')
     mark = hashlib.sha256(f'{path} {node}'.encode()).hexdigest()[:8]
-    return home / 'mag_tracking' / f'{path.stem}_{mark}.json'
+    return state_folder() / f'{path.stem}_{mark}.json'
+
+
+def state_folder() -> Path:
+    """The folder of what nodes keep: below $ROS_HOME, or ~/.ros."""
+    return Path(os.environ.get('ROS_HOME') or Path.home() / '.ros') / 'mag_tracking'
 
 
 def _made_of(network: SensorNetwork, j: int, settings: CalibrateSettings) -> list[Any]:
@@ -55,12 +59,9 @@ def write_backgrounds(path: str | PathLike[str], texts: Mapping[str, str]) -> No
     rows = ',\n'.join(f'{json.dumps(name)}: {text}' for name, text in texts.items())
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        beside = path.with_name(f'{path.name}.{os.getpid()}.new')
-        with new_text_file(beside) as stream:
-            stream.write(f'{{"version": {VERSION}, "sensors": {{\n{rows}\n}}}}\n')
-        beside.replace(path)
-    except (OSError, ValueError) as error:
-        raise OutputError(f'{path}: {getattr(error, "strerror", None) or error}') from error
+    except OSError as error:
+        raise OutputError(f'{path}: {error.strerror}') from error
+    replace_text(path, f'{{"version": {VERSION}, "sensors": {{\n{rows}\n}}}}\n')
 
 
 def read_backgrounds(path: str | PathLike[str], network: SensorNetwork,

@@ -18,6 +18,7 @@ from mag_tracking.apps.record import Selection
 from mag_tracking.cli import record, repair
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.messages.types import decode
+from mag_tracking.network.topics import absolute
 from mag_tracking.nodes import record_node
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.recorder import Recorder
@@ -88,22 +89,24 @@ def test_the_command_in_this_process(tmp_path, monkeypatch, capsys):
 
 def test_what_the_options_mean(tmp_path, monkeypatch):
     calls = []
-    monkeypatch.setattr(record_node, 'run', lambda *a: calls.append(a) or 7)
+    monkeypatch.setattr(record_node, 'run', lambda selection, *more: calls.append(
+        (selection.resolved(absolute), *more)) or 7)
     words = ('record', '--network', NETWORK_FILE, '--out', tmp_path)
     for more in ((), ('--topics', '/a', '/b', '--split-mb', 0.5, '--split-s', 60, '--all'),
                  ('--results',)):
         args = arguments_of(*words, *more)
         assert args.run_command(args) == 7
-    assert calls == [
-        (Selection(FIELDS, IMUS), tmp_path, 10**9, 3600 * S),
-        (Selection(FIELDS, IMUS, ('/a', '/b'), everything=True), tmp_path, 500_000, 60 * S),
-        (Selection(FIELDS, IMUS, results=True), tmp_path, 10**9, 3600 * S)]
+    assert calls == [(selection.resolved(absolute), tmp_path, size, seconds * S, [])
+                     for selection, size, seconds in (
+        (Selection(FIELDS, IMUS), 10**9, 3600),
+        (Selection(FIELDS, IMUS, ('/a', '/b'), everything=True), 500_000, 60),
+        (Selection(FIELDS, IMUS, results=True), 10**9, 3600))]
 
 
 @pytest.mark.parametrize(('options', 'message'), [
     (('--split-mb', '0'), '--split-mb: 0 is not a number of at least 0.1'),
     (('--split-mb', 'nan'), '--split-mb: nan'), (('--split-s', 'inf'), '--split-s: inf'),
-    (('--split-s', '-5'), '--split-s: -5'), (('--topics', '/a', 'imu'), "--topics: 'imu'")])
+    (('--split-s', '-5'), '--split-s: -5'), (('--topics', '/a', 'i mu'), "--topics: 'i mu'")])
 def test_bad_options_are_named(tmp_path, options, message):
     args = arguments_of('record', '--network', NETWORK_FILE, '--out', tmp_path / 'a', *options)
     with pytest.raises(SettingsError, match=message):

@@ -58,11 +58,16 @@ def test_latency_is_from_the_stamp_to_the_end_of_the_work(clock):
 
 def test_an_input_that_has_stopped_is_an_error_until_it_is_back(clock):
     flow = Flow('a_node')
-    clock[0] += 10.0
+    flow.topics.append('/a')
+    clock[0] += 5.0
     first = status_of(flow)
     # At first that may be as it should: the calibration learns.
-    assert first.level == DiagnosticStatus.OK
-    assert first.message == 'nothing has come from a_node yet'
+    assert first.level == DiagnosticStatus.OK and first.message == 'waiting for /a'
+    clock[0] += module.PATIENCE_S
+    late = status_of(flow, is_there=False)
+    assert late.level == DiagnosticStatus.WARN
+    assert late.message == 'nothing has come on /a, which nobody publishes'
+    assert status_of(flow).message == 'nothing has come on /a'
     flow.note(0, 0, clock[0])
     clock[0] += module.SILENT_S
     assert status_of(flow).message == 'running'
@@ -102,6 +107,18 @@ def test_a_recording_of_old_is_not_late_and_not_live(clock):
     assert flow.is_live
 
 
+@pytest.mark.parametrize('busy_s, age_s', [(0.99, 0.0), (0.01, 2.0)])
+def test_a_computer_that_is_too_slow_is_told(clock, busy_s, age_s):
+    flow = Flow('a_node')
+    clock[0] += 1.0
+    flow.note(10 * NS, round((10 + age_s) * NS), clock[0] - busy_s)
+    status = status_of(flow)
+    assert status.level == DiagnosticStatus.WARN and 'too slow' in status.message
+    clock[0] += 1.0
+    flow.note(11 * NS, 11 * NS, clock[0] - 0.01)
+    assert status_of(flow).level == DiagnosticStatus.OK
+
+
 def test_memory_is_bounded(clock):
     flow = Flow('a_node')
     for _ in range(MOST_NOTED + 50):
@@ -111,13 +128,20 @@ def test_memory_is_bounded(clock):
 
 
 def test_a_listener_is_missed_when_it_was_there():
-    listener = Listener('other', '~/frame')
-    assert listener.status('me', {'rviz'}).message == 'other has not been seen yet'
-    assert listener.status('me', {'rviz', 'other'}).message == 'running'
-    gone = listener.status('me', {'rviz'})
-    assert gone.level == DiagnosticStatus.ERROR and gone.name == 'me: to other'
-    assert gone.message == 'other has gone; does it still run?'
-    assert listener.status('me', {'other'}).level == DiagnosticStatus.OK
+    listener = Listener('tracker', '/network_frame', 'its type')
+
+    def status(*names):
+        return listener.status('me', set(names), lambda name: {
+            '/other': {'its type'}, '/second': {'its type', 'more'}}.get(name, set()))
+    assert status('/rviz').message == 'no tracker node subscribes to /network_frame yet'
+    assert status('/rviz', '/other').message == 'running'
+    gone = status('/rviz')
+    assert gone.level == DiagnosticStatus.ERROR and gone.name == 'me: to tracker'
+    assert gone.message == '/other has gone; does it still run?'
+    assert status('/other').level == DiagnosticStatus.OK
+    # One that takes its place under another name is as good; what only records is missed by none.
+    assert status('/second').level == DiagnosticStatus.OK
+    assert status('/second', '/rviz').message == status('/second').message == 'running'
 
 
 class StandIn:
@@ -125,7 +149,7 @@ class StandIn:
 
     def __init__(self, clock, is_replayed=False):
         self._clock, self.is_replayed, self._is_silent = clock, is_replayed, False
-        self.flows = {'detection_node': Flow('detection_node')}
+        self.flows = {'detection': Flow('detection')}
         self.settings = settings_for('magnet')
         self._stage = SimpleNamespace(bank=object(), give_up=lambda why: [why])
         self.published = []
@@ -138,7 +162,7 @@ class StandIn:
         for _ in range(round(4 * seconds)):
             self._clock[0] += 0.25
             if frames:
-                self.flows['detection_node'].note(0, 3600 * NS, self._clock[0])
+                self.flows['detection'].note(0, 3600 * NS, self._clock[0])
             TrackerNode.end_without_frames(self)
 
 
@@ -187,8 +211,8 @@ def test_a_node_tells_its_queue_and_latency(ros):
         # The other sensor is silent, so that it waits for it.
         out.publish(message)
         assert spin_until(lambda: statuses.get(
-            'detection_node: from calibration_node', {}).get('messages') == '1')
-        assert 0.0 < float(statuses['detection_node: from calibration_node']
+            'detection_node: from calibration', {}).get('messages') == '1')
+        assert 0.0 < float(statuses['detection_node: from calibration']
                            ['latency, median [ms]']) < 1000.0
         assert spin_until(lambda: statuses['detection_node: align']['queue'] == '1')
     finally:

@@ -125,9 +125,9 @@ def test_a_node_is_killed_and_started_again(here, name):
 
 
 @pytest.mark.parametrize('name, by, words', [
-    ('calibration_node', 'detection_node: from calibration_node', 'nothing has come'),
-    ('detection_node', 'tracker_node: from detection_node', 'nothing has come'),
-    ('tracker_node', 'detection_node: to tracker_node', 'tracker_node has gone')])
+    ('calibration_node', 'detection_node: from calibration', 'nothing has come'),
+    ('detection_node', 'tracker_node: from detection', 'nothing has come'),
+    ('tracker_node', 'detection_node: to tracker', 'tracker_node has gone')])
 def test_a_dead_node_is_named_by_its_neighbour(here, name, by, words):
     """And of a track that gets no frames any more it is said that it is lost."""
     here.use('mqtt')

@@ -11,7 +11,7 @@ from rclpy.node import Node
 
 from mag_tracking.nodes import middleware
 from support.bundled import NETWORK_FILE, ROOT, vehicle_path
-from support.node_processes import environment
+from support.node_processes import environment, without_states
 from support.ros_domain import RosDomain
 
 pytestmark = pytest.mark.timeout(600)
@@ -87,7 +87,7 @@ def end_of(process, how):
     """(exit status, output) of a process that is sent a signal."""
     process.send_signal(how)
     output = process.communicate(timeout=LONGEST_START_S)[0]
-    return process.returncode, output
+    return process.returncode, without_states(output)
 
 
 @pytest.mark.parametrize('how, words', [

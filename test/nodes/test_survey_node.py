@@ -28,9 +28,11 @@ def test_a_survey_changes_the_network_of_the_next_track(ros, tmp_path, road_netw
     node.create_subscription(CalibrationState, '/calibration_state', states.append,
                              LATCHED)
     node.create_subscription(TrackArray, '/tracker_node/tracks', tracks.append, STREAM)
-    saved = tmp_path / 'surveyed.yaml'
-    network = ['-p', f'network:={NETWORK_FILE}', '-p', 'reliable_input:=true']
-    processes = [start('calibration_node', *network, '-p', f'save_as:={saved}'),
+    # The file lies beside that of the network.
+    saved, network_file = tmp_path / 'surveyed.yaml', tmp_path / 'network.yaml'
+    network_file.write_text(NETWORK_FILE.read_text())
+    network = ['-p', f'network:={network_file}', '-p', 'reliable_input:=true']
+    processes = [start('calibration_node', *network, '-p', 'save_as:=surveyed.yaml'),
                  start('detection_node', *network), start('tracker_node', *network)]
     try:
         assert spin_until(lambda: node.count_publishers('/tracker_node/tracks')

@@ -42,6 +42,12 @@ def stop(processes):
     return [p.returncode for p in processes], outputs
 
 
+def without_states(output):
+    """The output of nodes without the lines that tell what they wait for."""
+    return ''.join(line for line in output.splitlines(keepends=True)
+                   if not line.startswith('[INFO]'))
+
+
 def call(ros, kind, name, request):
     """The response of a service; asked again where none comes.
 

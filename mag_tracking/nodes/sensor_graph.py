@@ -1,0 +1,47 @@
+"""What the graph says of the sensors' topics: who publishes them, and what else is published."""
+
+from collections.abc import Mapping
+
+from rclpy.node import Node
+
+from mag_tracking.messages.types import MAGNETIC_FIELD
+from mag_tracking.stages.health.sensor_health import Finding
+
+MOST_NAMED = 4
+"""Topics that a message names; of more it gives the number."""
+
+
+def topic_findings(node: Node, sensor: str, topic: str) -> list[Finding]:
+    """Faults of a sensor's topic, an absolute name."""
+    publishers = node.get_publishers_info_by_topic(topic)
+    found = [Finding(True, sensor, f'{p.node_name} publishes {p.topic_type} on {topic}',
+                     f'it has to be {MAGNETIC_FIELD}')
+             for p in publishers if p.topic_type != MAGNETIC_FIELD]
+    if len(publishers) > 1:
+        names = ', '.join(sorted(p.node_name for p in publishers))
+        found.append(Finding(True, sensor, f'{len(publishers)} nodes publish {topic}: {names}',
+                             'stop all but one'))
+    return found
+
+
+def missing_publisher(node: Node, sensor: str, topic: str, known: Mapping[str, str]) -> Finding:
+    """The fault of a sensor whose `topic` is silent; it names what is published instead.
+
+    `known` is {sensor: topic} of the whole network.
+    """
+    if node.count_publishers(topic):
+        return Finding(True, sensor, f'nothing has come on {topic}, which is published',
+                       'look at the sensor and its driver')
+    others = sorted(name for name, kinds in node.get_topic_names_and_types()
+                    if MAGNETIC_FIELD in kinds and name not in known.values()
+                    and not name.endswith('_calibrated') and node.count_publishers(name))
+    advice = 'start its driver, or remap its topic'
+    if others:
+        advice += f'; magnetic fields are published on {shortened(others)}'
+    return Finding(True, sensor, f'nothing has come: {topic} is not published', advice)
+
+
+def shortened(names: list[str]) -> str:
+    """The first of many names, and how many more there are."""
+    more = len(names) - MOST_NAMED
+    return ', '.join(names[:MOST_NAMED]) + (f' and {more} more' if more > 0 else '')

@@ -1,0 +1,143 @@
+"""Two networks on one graph: other namespaces, other names of nodes, remapped topics."""
+
+import csv
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from mag_tracking_msgs.msg import TrackArray
+
+from mag_tracking.apps.replay import replay
+from mag_tracking.nodes.convert import track_of
+from mag_tracking.nodes.stage_node import RESULTS, STREAM
+from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.reader import Recording
+from support.bundled import NETWORK_FILE, vehicle_path
+from support.node_processes import LONGEST_S, environment, start, stop
+
+pytestmark = [pytest.mark.alone, pytest.mark.timeout(600)]
+
+PATIENT = {'align.max_wait_s': 5.0}
+NODES = {'calibration_node': 'magnetic_calibration', 'detection_node': 'watchman',
+         'tracker_node': 'follower', 'replay_node': 'player'}
+"""{node: its name in these tests}."""
+NETWORKS = {'/north': ('straight_car_right', {}),
+            '/a/b': ('straight_car_fast_left', {'mag_1/imu/mag': '/yard/first'})}
+"""{namespace: (recording, {topic: remapped})}."""
+
+
+def processes_of(namespace, remapped):
+    """The nodes of one network, but for its replay."""
+    names = [a for one, other in remapped.items() for a in ('-r', f'{one}:={other}')]
+    return [start(node, *names, *named(namespace, node), '-p', f'network:={NETWORK_FILE}',
+                  '-p', 'reliable_input:=true',
+                  *(['-p', 'align.max_wait_s:=5.0'] if node == 'detection_node' else []))
+            for node in list(NODES)[:3]]
+
+
+def named(namespace, node):
+    """Arguments that give a node its namespace and name."""
+    return ['-r', f'__ns:={namespace}', '-r', f'__node:={NODES[node]}']
+
+
+def play(namespace, recording, remapped):
+    """The replay of one network."""
+    names = [a for one, other in remapped.items() for a in ('-r', f'{one}:={other}')]
+    return start('replay_node', *names, *named(namespace, 'replay_node'),
+                 '-p', f'recording:={vehicle_path(recording)}', '-p', 'rate:=1.5',
+                 '-p', 'start_delay:=3.0', '-p', 'wait_for_subscribers:=300.0')
+
+
+def positions(folder):
+    """{stamp_ns: [x, y]} of poses.csv."""
+    with open(folder / 'poses.csv', newline='') as stream:
+        return {int(r['stamp_ns']): [float(r['x']), float(r['y'])] for r in csv.DictReader(stream)}
+
+
+def test_two_networks_on_one_graph(ros, tmp_path, road_network):
+    node, spin_until = ros
+    heard, statuses = {ns: [] for ns in NETWORKS}, {}
+    for namespace, messages in heard.items():
+        node.create_subscription(TrackArray, f'{namespace}/follower/tracks', messages.append,
+                                 STREAM)
+    node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: statuses.update(
+        {s.name: s.message for s in m.status}), RESULTS)
+    processes = [p for ns, (_, remapped) in NETWORKS.items() for p in processes_of(ns, remapped)]
+    try:
+        assert spin_until(lambda: all(
+            node.count_publishers(f'{ns}/follower/tracks')
+            and node.count_subscribers(f'{ns}/network_frame')
+            and node.count_publishers(f'{ns}/calibration_state') for ns in NETWORKS))
+        assert spin_until(lambda: node.count_subscribers('/yard/first'))
+        assert not node.count_subscribers(
+            '/a/b/mag_1/imu/mag')
+        processes += [play(ns, *what) for ns, what in NETWORKS.items()]
+        assert spin_until(lambda: all(any(t.status == t.ENDED for m in messages for t in m.tracks)
+                                      for messages in heard.values()))
+        # What each waits for is found, whatever it is called.
+        assert spin_until(lambda: all(
+            statuses.get(f'{ns[1:]}/magnetic_calibration: to detection') == 'running'
+            and statuses.get(f'{ns[1:]}/watchman: to tracker') == 'running' for ns in NETWORKS))
+        lost = processes.pop(2)
+        lost.kill()
+        lost.communicate(timeout=LONGEST_S)
+        assert spin_until(lambda: statuses['north/watchman: to tracker'].startswith(
+            '/north/follower has gone'))
+        assert statuses['a/b/watchman: to tracker'] == 'running'
+    finally:
+        codes, outputs = stop(processes)
+    assert not any(codes), outputs
+    assert not any('Traceback' in text for text in outputs), outputs
+    assert 'waiting for /yard/first, /a/b/mag_2/imu/mag' in outputs[2], outputs[2]
+    for namespace, messages in heard.items():
+        folder = tmp_path / namespace[1:].replace('/', '_')
+        replay(Recording(vehicle_path(NETWORKS[namespace][0])), road_network,
+               settings_for('vehicle', PATIENT), folder)
+        offline = positions(folder)
+        live = [t for m in messages for t in map(track_of, m.tracks) if not t.ended]
+        assert [t.stamp_ns for t in live] == list(offline)
+        np.testing.assert_allclose([t.position[:2] for t in live], list(offline.values()),
+                                   rtol=1e-9)
+
+
+def run_command(*arguments):
+    """(status, output) of the command."""
+    done = subprocess.run([sys.executable, '-m', 'mag_tracking.cli', *arguments], text=True,
+                          stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=LONGEST_S * 2,
+                          env=environment(ROS_HOME=os.environ['ROS_HOME']), check=False)
+    return done.returncode, done.stdout
+
+
+def test_the_runner_takes_arguments_of_ros():
+    code, output = run_command(
+        'run', '--network', str(NETWORK_FILE), '--recording',
+        str(vehicle_path('straight_car_fast_left')), '--rate', '3', '--ros-args', '-r',
+        '__ns:=/robot1', '-r', 'tracker_node:__node:=follower', '-p', 'align.max_wait_s:=5.0')
+    assert code == 0, output
+    assert 'track 1 ' in output and 'track 1 has ended' in output, output
+    assert '[robot1.follower]' in output and 'waiting for /robot1/mag_1/imu/mag' in output, output
+
+
+@pytest.mark.parametrize('arguments, told', [
+    (['-r', '__ns:=/rob ot'], '__ns'), (['-r', '__node:=1 2'], 'name'),
+    (['-p', 'align.max_wait_s'], 'align.max_wait_s'), (['-p', 'align.nonsense:=1.0'], 'nonsense')])
+def test_arguments_that_are_none_are_named(arguments, told):
+    code, output = run_command('run', '--network', str(NETWORK_FILE), '--ros-args', *arguments)
+    assert code == 1 and told in output and 'Traceback' not in output, output
+
+
+def test_a_twin_of_the_same_name_is_told(ros):
+    node, spin_until = ros
+    statuses = []
+    node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: statuses.extend(
+        s.message for s in m.status if s.name == 'tracker_node: start'), RESULTS)
+    twins = [start('tracker_node', '-p', f'network:={NETWORK_FILE}') for _ in range(2)]
+    try:
+        assert spin_until(lambda: any('2 nodes are named /tracker_node' in s for s in statuses))
+    finally:
+        codes, outputs = stop(twins)
+    assert codes == [0, 0], outputs
+    assert any('2 nodes are named /tracker_node' in text for text in outputs), outputs
