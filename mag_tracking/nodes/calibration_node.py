@@ -27,6 +27,7 @@ from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.background_store import BackgroundStore
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.deferred import Deferred
+from mag_tracking.nodes.paced_service import paced_service
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
 from mag_tracking.nodes.sensor_graph import shortened
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
@@ -71,8 +72,8 @@ class CalibrationNode(StageNode):
             self.title, self.network, self._stage, self._health, self._store, self._is_live,
             lambda status: self.publish_statuses([status]), self._publish_states)
         self.every(max(1.0 / (2 * len(self.network) + 3), SHORTEST_STEP_S), self._rounds.tick)
-        self.service(CalibrateService, '~/calibrate', self._calibrate)
-        self.service(SurveyMessage, '~/survey', self._solve)
+        paced_service(self, CalibrateService, '~/calibrate', self._calibrate)
+        paced_service(self, SurveyMessage, '~/survey', self._solve)
         self.report_state()
 
     def _connect(self) -> None:

@@ -22,6 +22,7 @@ from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import message_class
+from mag_tracking.nodes.paced_service import paced_service
 from mag_tracking.nodes.ros_params import fixed_parameter
 from mag_tracking.nodes.stage_node import STREAM
 from mag_tracking.recording.reader import Recording
@@ -67,9 +68,9 @@ class ReplayNode(Node):
         self._start = time.monotonic() + delay
         self._patience = fixed_parameter(self, 'wait_for_subscribers', 0.0,
                                          'Longest wait for subscribers to the fields [s].')
-        self.create_service(Trigger, '~/pause', self._pause)
-        self.create_service(Trigger, '~/resume', self._resume)
-        self.create_service(Seek, '~/seek', self._seek_service)
+        paced_service(self, Trigger, '~/pause', self._pause)
+        paced_service(self, Trigger, '~/resume', self._resume)
+        paced_service(self, Seek, '~/seek', self._seek_service)
         self.create_timer(TICK_S, self._tick)
 
     def _open(self, topics: Sequence[str]) -> None:

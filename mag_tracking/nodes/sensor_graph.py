@@ -32,9 +32,11 @@ def missing_publisher(node: Node, sensor: str, topic: str, known: Mapping[str, s
     if node.count_publishers(topic):
         return Finding(True, sensor, f'nothing has come on {topic}, which is published',
                        'look at the sensor and its driver')
-    others = sorted(name for name, kinds in node.get_topic_names_and_types()
-                    if MAGNETIC_FIELD in kinds and name not in known.values()
-                    and not name.endswith('_calibrated') and node.count_publishers(name))
+    own = node.get_namespace().rstrip('/')
+    others = sorted((name for name, kinds in node.get_topic_names_and_types()
+                     if MAGNETIC_FIELD in kinds and name not in known.values()
+                     and not name.endswith('_calibrated') and node.count_publishers(name)),
+                    key=lambda name: (not name.startswith(f'{own}/'), name))
     advice = 'start its driver, or remap its topic'
     if others:
         advice += f'; magnetic fields are published on {shortened(others)}'

@@ -19,7 +19,6 @@ from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedE
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.task import Future
 from rclpy.timer import Timer
@@ -53,8 +52,6 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-CALLS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-"""Of services: calls that wait for their turn."""
 READY = 'ready'
 
 
@@ -93,10 +90,6 @@ class StageNode(Node):
     def every(self, seconds: float, call: Callable[[], None]) -> Timer:
         """A timer by the time that passes, not that of a recording, which may stand still."""
         return self.create_timer(seconds, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-    def service(self, service_type: Any, name: str, callback: Callable[[Any, Any], Any]) -> Service:
-        """A service that answers each of many calls at once."""
-        return self.create_service(service_type, name, callback, qos_profile=CALLS)
 
     def state(self) -> str:
         """What the node does: waiting for its input, or ready."""

@@ -1,6 +1,7 @@
 """The service `~/survey` of calibration_node: orientations and clocks of a running network."""
 
 import datetime
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +13,9 @@ from mag_tracking.network.file import write_network
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.survey.stage import Survey, with_noise
 
+PAUSE_S = 0.5
+"""[s] Calls that come sooner after the last one are refused: readings wait while it is solved."""
+
 
 class SurveyService:
     """Solves a survey and saves the network that it found."""
@@ -20,10 +24,22 @@ class SurveyService:
                  imu_topics: Sequence[str]) -> None:
         self._survey, self._stage, self._save_as = survey, stage, save_as
         self._imu_topics = imu_topics
+        self._ended = -PAUSE_S
 
     def solve(self, network: SensorNetwork, save: bool,
               response: SurveyMessage.Response) -> SensorNetwork | None:
         """The network as it was found, or None; the response says what came of it."""
+        if time.monotonic() - self._ended < PAUSE_S:
+            response.message = f'a survey has just run: try again in {PAUSE_S:g} s'
+            return None
+        try:
+            return self._solve(network, save, response)
+        finally:
+            self._ended = time.monotonic()
+
+    def _solve(self, network: SensorNetwork, save: bool,
+               response: SurveyMessage.Response) -> SensorNetwork | None:
+        """As `solve`, now."""
         # Of a sensor with a target nearby, the background from before it came.
         fields = {name: self._stage.background(name)
                   for name, background in self._stage.backgrounds().items()

@@ -1,0 +1,63 @@
+"""Names of topics in namespaces, and recordings that were made in one."""
+
+import dataclasses
+
+import pytest
+
+from mag_tracking.errors import NetworkError, RecordingError
+from mag_tracking.messages.types import MAGNETIC_FIELD
+from mag_tracking.network.topics import absolute, checked_namespace, namespaces_of
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.recording.writer import RecordingWriter
+from support.networks import line_network
+from support.samples import MagSample, recorded, sample_dict
+
+RELATIVE = ('mag_1/imu/mag', 'mag_2/imu/mag')
+
+
+def recording_of(path, *namespaces):
+    """A recording with one reading of mag_1 in each namespace, 1, 2, ... tesla."""
+    path.parent.mkdir(exist_ok=True)
+    with RecordingWriter(path) as writer:
+        for k, namespace in enumerate(namespaces):
+            sample = MagSample(10**9 + k, 'mag_1', [float(k + 1), 0.0, 0.0])
+            writer.write(f'{namespace}/mag_1/imu/mag', MAGNETIC_FIELD,
+                         sample_dict(sample, 'mag_1'), sample.stamp_ns)
+    return Recording(path)
+
+
+def fields(recording, namespace=None):
+    """The x axes that a reader of a network with relative topics finds."""
+    network = dataclasses.replace(line_network(2), topics=RELATIVE, namespace=namespace)
+    reader = SampleReader(recording, network)
+    return [s.field[0] for s in recorded(reader)], reader.missing_topics()
+
+
+@pytest.mark.parametrize('namespaces, expected', [
+    (('',), (1.0, '/mag_2/imu/mag')), (('/robot1',), (1.0, '/robot1/mag_2/imu/mag')),
+    (('/a/b',), (1.0, '/a/b/mag_2/imu/mag')), (('/sim', ''), (2.0, '/mag_2/imu/mag'))])
+def test_relative_topics_are_found_where_they_are(tmp_path, namespaces, expected):
+    assert fields(recording_of(tmp_path / 'a.mcap', *namespaces)) == (
+        [expected[0]], [expected[1]])
+
+
+def test_of_several_namespaces_one_has_to_be_chosen(tmp_path):
+    recording = recording_of(tmp_path / 'a.mcap', '/north', '/south')
+    with pytest.raises(RecordingError, match='the namespaces /north, /south: choose .*--namespace'):
+        fields(recording)
+    assert fields(recording, '/south') == ([2.0], ['/south/mag_2/imu/mag'])
+    with pytest.raises(RecordingError, match="none of the network's topics .*/west/mag_1/imu/mag"):
+        fields(recording, '/west')
+
+
+def test_names():
+    assert absolute('a/b') == '/a/b' and absolute('a', '/n/m') == '/n/m/a'
+    assert absolute('/a', '/n') == '/a'
+    # The end of a longer name is another name.
+    assert namespaces_of(['mag'], ['/imag', '/x/mag']) == ['/x']
+    assert namespaces_of(['/mag'], ['/x/mag']) == []
+    assert checked_namespace('/') == '/' and checked_namespace('/a/b_1') == '/a/b_1'
+    for name in ('', 'a', '/a/', '//', '/1a', '/a b', '/a//b', '/ä'):
+        with pytest.raises(NetworkError, match='is not a namespace'):
+            checked_namespace(name)

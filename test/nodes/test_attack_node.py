@@ -1,0 +1,187 @@
+"""An attack on running nodes: nothing is written outside, no node dies, every call is answered."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mag_tracking_msgs.srv import Calibrate, Seek, Survey
+from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+
+from support.bundled import NETWORK_FILE, vehicle_path
+from support.node_processes import LONGEST_S, start, stop
+
+pytestmark = [pytest.mark.alone, pytest.mark.timeout(600)]
+
+N_TRIES = 200
+N_AT_ONCE = 40
+PATHS = ('', '/', '.', '..', '/etc/passwd', '/dev/full', '/dev/null', '../../../../tmp/x.yaml',
+         '~/.bashrc', 'a' * 5000, '/proc/self/mem', 'outside/theirs.yaml', '\n', '//', 'ä\u202e',
+         '/nonexistent/dir/file.yaml', 'link.yaml', 'network.yaml')
+NODES = ('calibration_node', 'detection_node', 'tracker_node', 'replay_node', 'driver_node')
+FIXED = {'calibration_node': ('network', 'save_as', 'state_file', 'target', 'reliable_input'),
+         'detection_node': ('network', 'target'), 'tracker_node': ('network', 'target'),
+         'replay_node': ('recording', 'topics', 'rate'),
+         'driver_node': ('drivers', 'network', 'autostart')}
+
+
+@pytest.fixture
+def place(tmp_path):
+    """(folder of the network file, folder that nobody may touch); links lead from one to other."""
+    here, theirs = tmp_path / 'here', tmp_path / 'outside'
+    here.mkdir()
+    theirs.mkdir()
+    (here / 'network.yaml').write_text(NETWORK_FILE.read_text())
+    for name in ('network_calibrated.yaml', 'network_calibrated.yaml.part', 'link.yaml'):
+        (theirs / name).write_text('theirs')
+        (here / name).symlink_to(theirs / name)
+    (here / 'outside').symlink_to(theirs)
+    return here, theirs
+
+
+def contents(*folders):
+    """{path: (bytes, link)} of all that lies in folders."""
+    return {path: (path.read_bytes() if path.is_file() else b'', path.is_symlink())
+            for folder in folders for path in sorted(Path(folder).rglob('*'))}
+
+
+def nodes_of(here, home):
+    """The nodes as processes, with a recording that plays over and over."""
+    network = ['-p', f'network:={here / "network.yaml"}']
+    drivers = here / 'drivers.yaml'
+    drivers.write_text(NO_DEVICES)
+    return {name: start(name, *arguments, home=home) for name, arguments in {
+        'calibration_node': network, 'detection_node': network, 'tracker_node': network,
+        'replay_node': ['-p', f'recording:={vehicle_path("straight_car_right")}',
+                        '-p', 'loop:=true'],
+        'driver_node': ['-p', f'drivers:={drivers}']}.items()}
+
+
+NO_DEVICES = """
+nobody:
+  transport: udp
+  udp: {port: 47123, address: 127.0.0.1}
+  framing: text
+  text: {fields: [x, y, z]}
+  unit: nT
+  sensor: mag_9
+"""
+
+
+class Attacker:
+    """Calls services, each through one client."""
+
+    def __init__(self, ros):
+        self.node, self.spin_until = ros
+        self._clients = {}
+
+    def __call__(self, kind, name, request):
+        """The response of a service."""
+        client = self._clients.get(name) or self.node.create_client(kind, name)
+        self._clients[name] = client
+        assert self.spin_until(client.service_is_ready), f'there is no {name}'
+        for _ in range(12):
+            future = client.call_async(request)
+            self.node.executor.spin_until_future_complete(future, 10.0)
+            if future.done():
+                return future.result()
+        raise AssertionError(f'{name} has not answered')
+
+
+def set_parameters(call, node, pairs, atomically=False):
+    """Results of setting parameters of a node."""
+    parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in pairs]
+    kind, leaf = (SetParametersAtomically, 'set_parameters_atomically') if atomically else \
+        (SetParameters, 'set_parameters')
+    answer = call(kind, f'/{node}/{leaf}', kind.Request(parameters=parameters))
+    return [answer.result] if atomically else answer.results
+
+
+def one_try(call, rng, k):
+    """One of the attacks: a parameter, a service with odd values."""
+    node = NODES[k % len(NODES)]
+    path = PATHS[int(rng.integers(len(PATHS)))]
+    if k % 4 < 2:
+        name = FIXED[node][int(rng.integers(len(FIXED[node])))]
+        for result in set_parameters(call, node, [(name, path)], atomically=k % 4 == 1):
+            assert not result.successful, (node, name, path)
+    elif k % 4 == 2:
+        answer = call(Survey, '/calibration_node/survey', Survey.Request(save=True))
+        assert isinstance(answer.success, bool)
+        answer = call(Calibrate, '/calibration_node/calibrate',
+                      Calibrate.Request(sensors=[path]))
+        assert not answer.success
+    else:
+        offset = float(rng.choice([-1.0, np.nan, np.inf, 1e300, 2.0]))
+        answer = call(Seek, '/replay_node/seek', Seek.Request(offset=offset))
+        assert answer.success == (offset == 2.0)
+
+
+def many_at_once(ros):
+    """Ask for many things at once; every call is answered."""
+    node, spin_until = ros
+    clients = [(node.create_client(kind, name), request) for kind, name, request in (
+        (Survey, '/calibration_node/survey', Survey.Request(save=True)),
+        (Calibrate, '/calibration_node/calibrate', Calibrate.Request(sensors=['nobody'])),
+        (Trigger, '/replay_node/pause', Trigger.Request()),
+        (GetParameters, '/tracker_node/get_parameters', GetParameters.Request(names=['network'])),
+        (Trigger, '/replay_node/resume', Trigger.Request()))
+        for _ in range(N_AT_ONCE // 5)]
+    assert spin_until(lambda: all(c.service_is_ready() for c, _ in clients))
+    # A server may know a client a moment later than the client knows it.
+    spin_until(lambda: False, 2.0)
+    futures = [client.call_async(request) for client, request in clients]
+    assert spin_until(lambda: all(f.done() for f in futures), LONGEST_S), sum(
+        f.done() for f in futures)
+    one, request = clients[0]
+    futures = [one.call_async(request) for _ in range(N_AT_ONCE)]
+    assert spin_until(lambda: all(f.done() for f in futures), LONGEST_S), sum(
+        f.done() for f in futures)
+    for client, _ in clients:
+        node.destroy_client(client)
+
+
+def test_an_attack(ros, place, tmp_path):
+    here, theirs = place
+    node, spin_until = ros
+    home = tmp_path / 'home'
+    home.mkdir()
+    processes = nodes_of(here, home)
+    try:
+        assert spin_until(lambda: all(node.count_clients(f'/{n}/get_parameters') is not None
+                                      and n in node.get_node_names() for n in NODES))
+        before, attack = contents(here, theirs), Attacker(ros)
+        # The one thing that may be written is, in the place of a link that was planted.
+        answers = []
+        assert spin_until(lambda: answers.append(attack(
+            Survey, '/calibration_node/survey', Survey.Request(save=True)).success)
+            or any(answers))
+        rng = np.random.default_rng(0)
+        for k in range(N_TRIES):
+            one_try(attack, rng, k)
+        many_at_once(ros)
+        assert not [name for name, p in processes.items() if p.poll() is not None]
+        after = contents(here, theirs)
+    finally:
+        codes, outputs = stop(list(processes.values()))
+    assert not any(codes), outputs
+    assert not any('Traceback' in text for text in outputs), outputs
+    changed = {p for p in before.keys() | after.keys() if before.get(p) != after.get(p)}
+    assert changed == {here / 'network_calibrated.yaml'}
+    assert not (here / 'network_calibrated.yaml').is_symlink()
+    written = [p.relative_to(home) for p in home.rglob('*') if p.is_file()]
+    assert all(p.parts[0] in ('mag_tracking', 'log') for p in written), written
+
+
+@pytest.mark.parametrize('parameter', ['save_as', 'state_file'])
+@pytest.mark.parametrize('name', ['/etc/x.yaml', '../x.yaml', 'outside/x.yaml'])
+def test_a_place_outside_is_refused_at_the_start(ros, place, parameter, name):
+    here, theirs = place
+    process = start('calibration_node', '-p', f'network:={here / "network.yaml"}',
+                    '-p', f'{parameter}:={name}')
+    output, _ = process.communicate(timeout=LONGEST_S)
+    assert process.returncode == 1 and 'is neither beside the network file' in output, output
+    assert set(os.listdir(theirs)) == {'network_calibrated.yaml', 'network_calibrated.yaml.part',
+                                       'link.yaml'}
