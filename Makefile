@@ -12,7 +12,8 @@ PINS := -c constraints.txt --build-constraint constraints.txt
 STAMP := $(VENV)/.stamp
 SOURCES := constraints.txt setup.py setup.cfg pyproject.toml package.xml \
 	msg_defs msg_defs/CMakeLists.txt msg_defs/package.xml msg_defs/pyproject.toml msg_defs/setup.py \
-	msg_defs/msg msg_defs/srv $(wildcard msg_defs/msg/*.msg msg_defs/srv/*.srv)
+	msg_defs/msg msg_defs/srv $(wildcard msg_defs/msg/*.msg msg_defs/srv/*.srv \
+	msg_defs/cmake/*.cmake msg_defs/standard/*/* msg_defs/standard/*/msg/*.msg)
 LOCK := build/lock/bin/python -m pip --quiet --disable-pip-version-check --no-input
 
 # setuptools warns of every editable package that is not below src/, through pip's --quiet too.

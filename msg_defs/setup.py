@@ -14,6 +14,9 @@ from setuptools.command.build_ext import build_ext
 
 NAME = 'mag_tracking_msgs'
 SOURCE = Path(__file__).resolve().parent
+PROJECTS = {NAME: SOURCE, **{name: SOURCE / 'standard' / name for name in (
+    'tf2_msgs', 'vision_msgs')}}
+"""{package: folder of its CMakeLists.txt}: ours, and those of others that PyPI does not have."""
 
 
 def ros_prefix():
@@ -29,24 +32,29 @@ class CMakeBuild(build_ext):
     """Build with CMake in place of a compiler call; an extension makes the wheel platform's own."""
 
     def run(self):
-        work = Path(self.build_temp).resolve() / NAME
+        self.distribution.data_files = []
+        for name, source in PROJECTS.items():
+            self._build(name, source)
+
+    def _build(self, name, source):
+        work = Path(self.build_temp).resolve() / name
         installed = work / 'install'
         # An older CMake cache would name an older build environment, which pip has removed.
         shutil.rmtree(work, ignore_errors=True)
-        self._cmake(work / 'build', installed)
+        self._cmake(source, work / 'build', installed)
 
-        package = Path(self.build_lib) / NAME
+        package = Path(self.build_lib) / name
         shutil.rmtree(package, ignore_errors=True)
-        shutil.copytree(installed / 'python' / NAME, package)
+        shutil.copytree(installed / 'python' / name, package)
         # Libraries and the ament index go below the environment's prefix, where rclpy looks.
-        self.distribution.data_files = [
+        self.distribution.data_files += [
             (str(file.parent.relative_to(installed)), [str(file)])
             for folder in ('lib', 'share')
             for file in sorted((installed / folder).rglob('*'))
             if file.is_file()
         ]
 
-    def _cmake(self, build, installed):
+    def _cmake(self, source, build, installed):
         prefix = ros_prefix()
         env = {**os.environ, 'AMENT_PREFIX_PATH': str(prefix), 'CMAKE_PREFIX_PATH': str(prefix)}
         options = {
@@ -60,7 +68,7 @@ class CMakeBuild(build_ext):
         }
         defines = [f'-D{key}={value}' for key, value in options.items()]
         for command in (
-            ['cmake', '-G', 'Ninja', '-S', SOURCE, '-B', build, *defines],
+            ['cmake', '-G', 'Ninja', '-S', source, '-B', build, *defines],
             ['cmake', '--build', build, '--target', 'install'],
         ):
             subprocess.run(command, env=env, check=True)

@@ -23,6 +23,8 @@ from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.result_folder import ResultFolder, figure_name
 from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.recording.truth import read_truth_table
+from mag_tracking.recording.tum_file import write_tum
 from mag_tracking.records import Detection, FieldFrame, SmoothedPose, Track
 from mag_tracking.report.metrics import (
     MAGNET_SKIP,
@@ -68,7 +70,7 @@ class Run:
 def replay(recording: Recording, network: SensorNetwork, settings: Settings,
            out: str | PathLike[str], progress: Callable[[int], object] | None = None,
            stopped: Callable[[], bool] | None = None,
-           report: Callable[[str], object] | None = None) -> Run:
+           report: Callable[[str], object] | None = None, truth: str | None = None) -> Run:
     """Track everything in a recording and write the results.
 
     Parameters
@@ -85,6 +87,9 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
         true the reading ends, what was done is written, and the summary says so.
     report : function, optional
         Takes a line for the user where the results of an earlier run are replaced.
+    truth : str, optional
+        A CSV file (`recording.truth`), or a topic of the recording with PoseStamped,
+        PoseWithCovarianceStamped or Odometry; left out: the topics below /ground_truth.
 
     Returns
     -------
@@ -94,7 +99,8 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     """
     if recording.lies_in(out):
         raise OutputError(f'{out} is the folder of the recording; the results would overwrite it')
-    reader = SampleReader(recording, network)
+    table = read_truth_table(truth) if truth is not None and Path(truth).is_file() else None
+    reader = SampleReader(recording, network, truth if table is None else None)
     pipeline = Pipeline(network, settings)
     found = first_pass_of(recording, network, settings.calibrate, stopped)
     found.apply(pipeline.calibrate)
@@ -110,11 +116,11 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
         except ReadingStopped:
             interrupted = True
         taker.take(pipeline.flush())
-        truth = reader.truth_arrays()
-        summary = summarise(recording, reader, pipeline, taker, truth, found)
+        arrays = reader.truth_arrays() if table is None else table
+        summary = summarise(recording, reader, pipeline, taker, arrays, found)
         summary['interrupted'] = interrupted
         results.write_summary(summary)
-    return Run(summary, taker.logs, taker.smoothed, truth)
+    return Run(summary, taker.logs, taker.smoothed, arrays)
 
 
 class Results(Protocol):
@@ -282,6 +288,19 @@ def _bound_ratio(log: TrackLog, pipeline: Pipeline, truth: Truth) -> float | Non
     return error_over_bound(pipeline.network, log, truth, acceleration_density(track),
                             track.vehicle.moment_drift, track.field_error, track.background_std,
                             rows, 2)
+
+
+def write_trajectories(run: Run, out: Path) -> list[Path]:
+    """Write each track, and each that was smoothed, as a TUM trajectory; returns the paths.
+
+    Raises OutputError.
+    """
+    paths = []
+    for logs, suffix in ((run.logs, ''), (run.smoothed, '_smoothed')):
+        for log in logs.values():
+            paths.append(out / f'track_{log.id}{suffix}.tum')
+            write_tum(paths[-1], log.stamp_ns, log.position, log.orientation)
+    return paths
 
 
 def write_figures(run: Run, network: SensorNetwork, out: Path, most: int = 6,

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
+from importlib.metadata import version
 
 from mag_tracking.cli import (
     board_geometry,
@@ -20,6 +21,7 @@ from mag_tracking.cli import (
     tumble,
 )
 
+PACKAGE = 'mag_tracking'
 ROS_ARGUMENTS = '--ros-args'
 WITH_ROS = ('run', 'record', 'doctor')
 """Commands that take arguments of ROS."""
@@ -29,6 +31,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     """The parsed command line; its `run_command` takes it and returns the exit status."""
     parser = argparse.ArgumentParser(
         prog='mag-tracking', description='Track magnetic targets with stationary magnetometers.')
+    parser.add_argument('--version', action='version', version=f'mag_tracking {version(PACKAGE)}')
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
     for module in (replay, events, calibrate, tumble, board_geometry, doctor, fit, plan, listen,
                    record, repair, run, info, import_table):

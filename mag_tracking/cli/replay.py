@@ -8,7 +8,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from mag_tracking.apps.replay import replay, write_figures
+from mag_tracking.apps.replay import replay, write_figures, write_trajectories
 from mag_tracking.cli.options import (
     Commands,
     add_command,
@@ -58,6 +58,18 @@ has them all, with their meaning):
 '''
 
 
+TRUTH_METRICS = {
+    'rms': ('horizontal RMS error within 5 m', ' m'),
+    'closest': ('horizontal error at the closest point', ' m'),
+    'closest_distance': ('distance there', ' m'),
+    'position_mean': ('mean position error', ' m'),
+    'position_max': ('largest position error', ' m'),
+    'axis_median_deg': ('median angle of the axis', ' deg'),
+    'anees': ('squared error over what the covariance says, an axis (ANEES)', ''),
+    'error_over_bound': ('error over the path bound', '')}
+"""{key of a track's `truth` in summary.json: (meaning, unit)}."""
+
+
 def add(commands: Commands) -> None:
     """Register the command."""
     p = add_command(commands, 'replay', _replay, 'Track what is in recordings, offline.', _REPLAY)
@@ -66,6 +78,12 @@ def add(commands: Commands) -> None:
     add_recorded_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder for the results')
     add_settings(p)
+    p.add_argument('--truth', metavar='TOPIC|FILE.csv', help='true poses to compare with: a topic '
+                   'with PoseStamped, PoseWithCovarianceStamped or Odometry, or a table with '
+                   'the columns t [s] or stamp_ns, x, y, z [m], qx, qy, qz, qw (default: the '
+                   'topics below /ground_truth)')
+    p.add_argument('--tum', action='store_true',
+                   help='write each track as track_N.tum, too (time x y z qx qy qz qw)')
     p.add_argument('--no-figures', action='store_true', help='leave the pictures out')
 
 
@@ -76,7 +94,7 @@ def _replay(args: argparse.Namespace) -> int:
     with noted_signals(signal.SIGINT) as seen:
         for path, name in zip(args.recordings, names, strict=True):
             out = args.out / name if len(args.recordings) > 1 else args.out
-            _replay_one(path, network, settings, out, seen, not args.no_figures)
+            _replay_one(path, network, settings, out, seen, args)
             if seen:
                 print(f'interrupted; what was done is in {out}')
                 return 130
@@ -84,14 +102,17 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def _replay_one(path: Path, network: SensorNetwork, settings: Settings, out: Path,
-                seen: Sequence[int], figures: bool) -> None:
+                seen: Sequence[int], args: argparse.Namespace) -> None:
     """Replay one recording into one folder; what was done stays when it is interrupted."""
     recording = Recording(path)
     with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
               disable=None) as bar:
-        run = replay(recording, network, settings, out, bar.update, lambda: bool(seen), tqdm.write)
+        run = replay(recording, network, settings, out, bar.update, lambda: bool(seen), tqdm.write,
+                     args.truth)
     _print_summary(path, run.summary)
-    if figures:
+    if args.tum:
+        write_trajectories(run, out)
+    if not args.no_figures:
         write_figures(run, network, out, stopped=lambda: bool(seen))
     if not seen:
         print(f'results in {out}')
@@ -159,9 +180,10 @@ def _print_track(t: dict[str, Any]) -> None:
             print(f'    warning: {name} fits best if turned by '
                   f'{max(m["angles_deg"], key=abs):+.0f} degrees about one axis: its '
                   'orientation in the network file is wrong, or the target is not as modelled')
-    for name, value in t.get('truth', {}).items():
-        if isinstance(value, float):
-            print(f'    against truth: {name} {value:.4g}')
+    truth = t.get('truth', {})
+    for name, (text, unit) in TRUTH_METRICS.items():
+        if isinstance(truth.get(name), float):
+            print(f'    against {truth["name"]}: {text} {truth[name]:.4g}{unit}')
 
 
 def _print_limits(summary: dict[str, Any]) -> None:

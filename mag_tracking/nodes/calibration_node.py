@@ -6,6 +6,7 @@ if __name__ == '__main__':
 
     calibration_node()
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
 from mag_tracking.nodes.sensor_graph import shortened
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.sensor_rounds import SensorRounds
+from mag_tracking.nodes.sensor_transforms import SensorTransforms
 from mag_tracking.nodes.stage_node import LATCHED, READY, SENT, STREAM, StageNode
 from mag_tracking.nodes.survey_service import SurveyService
 from mag_tracking.recording.background_file import state_folder, usual_path
@@ -51,11 +53,9 @@ about that long: until then the processes that compute it need the cores."""
 class CalibrationNode(StageNode):
     """Subscribes to each sensor's topic; publishes it with `_calibrated` appended to its name."""
 
-    OWN_PARAMETERS = (*StageNode.OWN_PARAMETERS, 'save_as', 'state_file')
-
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__('calibration_node', 'calibrate', **node_arguments)
-        self.settings = declare_settings(self, self.settings, 'survey', self.OWN_PARAMETERS)
+        self.settings = declare_settings(self, self.settings, 'survey')
         self._stage = Calibrate(self.network, self.settings.calibrate)
         self._store = BackgroundStore(self._state_path(), self._stage, self.settings.calibrate,
                                       self.get_logger())
@@ -93,6 +93,15 @@ class CalibrationNode(StageNode):
                           batches=True)
         self.expect('detection', CALIBRATED_READINGS, 'mag_tracking_msgs/msg/NetworkFrame')
         self._state = self.publisher(CalibrationState, CALIBRATION_STATE, LATCHED)
+        self._tf = SensorTransforms(self, self.network) if fixed_parameter(
+            self, 'publish_sensor_tf', True, 'Publish where the sensors are as static '
+            'transforms.') else None
+        self._report_frames({})
+
+    def _report_frames(self, frames: Mapping[str, str]) -> None:
+        """Publish where the sensors are; `frames` is what is news: {sensor: frame}."""
+        if self._tf is not None:
+            self._tf.publish(self.network, frames)
 
     def _state_path(self) -> Path | None:
         """File in which the backgrounds are stored; None during the replay of a recording."""
@@ -148,6 +157,8 @@ class CalibrationNode(StageNode):
     def _take(self, sensor: str, message: MagneticField) -> None:
         """One raw reading."""
         raw = reading_of(message, sensor)
+        if self._tf is not None and self._tf.is_news(sensor, message.header.frame_id):
+            self._report_frames({sensor: message.header.frame_id})
         for calibrated in self._stage.feed(raw):
             for _, content in magnetic_field_dicts(calibrated, message.header.frame_id):
                 self._publishers_by_sensor[sensor].publish(to_message(MagneticField, content))
@@ -205,6 +216,7 @@ class CalibrationNode(StageNode):
             return response
         self.network = network
         self._stage.renew(network)
+        self._report_frames({})
         self._health.renew(network)
         self._rounds.begin(network)
         self._publish_states(self._rounds.states())

@@ -34,8 +34,8 @@ class DetectionNode(StageNode):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__('detection_node', 'align', **node_arguments)
-        self.settings = declare_settings(self, self.settings, 'detect', self.OWN_PARAMETERS)
-        self.settings = declare_settings(self, self.settings, 'events', self.OWN_PARAMETERS)
+        self.settings = declare_settings(self, self.settings, 'detect')
+        self.settings = declare_settings(self, self.settings, 'events')
         self._align = Align(self.network, self.settings.align)
         warning = too_long(self.settings.align, self.network)
         if warning:

@@ -1,6 +1,6 @@
 """Settings as ROS parameters: descriptors, ranges, checks, live changes."""
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -16,9 +16,18 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.pipeline import Settings
 from mag_tracking.settings import Parameter, flatten, replace
 
+NODE_PARAMETERS = frozenset({
+    'use_sim_time', 'start_type_description_service', 'network', 'target', 'reliable_input',
+    'save_as', 'state_file', 'publish_sensor_tf', 'child_frame', 'publish_tf', 'drivers', 'batches',
+    'autostart', 'recording', 'rate', 'loop', 'start_offset', 'topics', 'start_delay', 'paused',
+    'wait_for_subscribers'})
+"""Parameters of the nodes that are no settings. Those of one are no errors of another: a parameter
+file, and the arguments of one process, are for all of them."""
+
 
 def fixed_parameter(node: Node, name: str, default: Any, description: str) -> Any:
     """Declare a parameter that is read once, at the start; its value."""
+    assert name in NODE_PARAMETERS, name
     return node.declare_parameter(name, default, ParameterDescriptor(
         description=description, read_only=True)).value
 
@@ -36,8 +45,7 @@ def _descriptor(p: Parameter) -> ParameterDescriptor:
     return d
 
 
-def declare_settings(node: Node, settings: Settings, group: str,
-                     own: Collection[str] = ()) -> Settings:
+def declare_settings(node: Node, settings: Settings, group: str) -> Settings:
     """Declare the settings of one group as parameters of `node`; returns the settings in force.
 
     Parameters
@@ -47,8 +55,6 @@ def declare_settings(node: Node, settings: Settings, group: str,
         The whole tree, with the defaults of the target.
     group : str
         Only `group.*` become parameters; a parameter file may hold the others.
-    own : collection of str
-        Parameters of the node itself.
 
     Raises SettingsError for an override that names no setting at all, or with
     a wrong type, length or range.
@@ -56,7 +62,8 @@ def declare_settings(node: Node, settings: Settings, group: str,
     known = {p.name: p for p in flatten(settings)}
     overrides = dict(node._parameter_overrides)  # rclpy has no public way to list them
     for name in overrides:
-        if name not in known and name not in own and not name.startswith('qos_overrides.'):
+        if name not in known and name not in NODE_PARAMETERS \
+                and not name.startswith('qos_overrides.'):
             replace(settings, {name: overrides[name].value})
     changes = {name: _plain(p.value) for name, p in overrides.items() if name in known}
     in_force = replace(settings, changes)

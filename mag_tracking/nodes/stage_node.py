@@ -52,13 +52,13 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
+TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+"""Of /tf, as tf2 has it."""
 READY = 'ready'
 
 
 class StageNode(Node):
     """A node that knows the network and the settings of one group of stages."""
-
-    OWN_PARAMETERS: tuple[str, ...] = ('network', 'target', 'reliable_input', 'use_sim_time')
 
     def __init__(self, name: str, group: str, **node_arguments: Any) -> None:
         """Raises SettingsError or NetworkError where parameters or network are unusable."""
@@ -74,7 +74,7 @@ class StageNode(Node):
         self.input_qos = STREAM if reliable else SENSORS
         self.is_replayed = reliable or self.get_parameter('use_sim_time').value
         self.network = read_network(self.network_path)
-        self.settings = declare_settings(self, settings_for(target), group, self.OWN_PARAMETERS)
+        self.settings = declare_settings(self, settings_for(target), group)
         if self.settings.track.target != target:
             raise SettingsError(f'{name}: track.target is {self.settings.track.target!r}, but '
                                 f'target is {target!r}')

@@ -22,6 +22,8 @@ from mag_tracking_msgs.msg import (
 from mag_tracking_msgs.msg import Disturbance as DisturbanceMessage
 from nav_msgs.msg import Odometry, Path
 from rclpy.publisher import Publisher
+from tf2_msgs.msg import TFMessage
+from vision_msgs.msg import Detection3DArray
 from visualization_msgs.msg import MarkerArray
 
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, merged
@@ -29,6 +31,7 @@ from mag_tracking.errors import RecordingError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.messages.calibration_state import doubtful_times, with_orientations
 from mag_tracking.messages.frame import frame_of
+from mag_tracking.messages.markers import delete_markers, sensor_markers, track_markers
 from mag_tracking.messages.schema import (
     disturbance_dict,
     hypotheses_dict,
@@ -40,13 +43,20 @@ from mag_tracking.messages.schema import (
     track_dict,
 )
 from mag_tracking.messages.shapes import MessageDict
+from mag_tracking.messages.standard import detections_3d_dict, track_transform_dict
 from mag_tracking.messages.types import CALIBRATION_STATE, NETWORK_FRAME
 from mag_tracking.network import SensorNetwork
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
-from mag_tracking.nodes.markers import delete_markers, track_markers
-from mag_tracking.nodes.ros_params import follow_changes
-from mag_tracking.nodes.stage_node import LATCHED, RESULTS, SENT, STREAM, StageNode
+from mag_tracking.nodes.ros_params import fixed_parameter, follow_changes
+from mag_tracking.nodes.stage_node import (
+    LATCHED,
+    RESULTS,
+    SENT,
+    STREAM,
+    TRANSFORMS,
+    StageNode,
+)
 from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.stages.stage import Stage
 from mag_tracking.stages.track.manager import TrackManager
@@ -66,6 +76,12 @@ class TrackerNode(StageNode):
         super().__init__('tracker_node', 'track', **node_arguments)
         self._stage = TrackManager(self.network, self.settings.track)
         follow_changes(self, self.settings, lambda s: self._stage.configure(s.track))
+        self._child_frame = fixed_parameter(
+            self, 'child_frame', '', 'Frame of the target in odometry and transforms, as '
+            'robot_localization wants it; left out: track_<id>.')
+        self._tf = self.publisher(TFMessage, '/tf', TRANSFORMS) if fixed_parameter(
+            self, 'publish_tf', False, 'Publish the transform from the frame of the network to '
+            'that of the target.') else None
         self._pose = self.publisher(PoseWithCovarianceStamped, '~/pose', SENT)
         self._odometry = self.publisher(Odometry, '~/odometry', RESULTS)
         self._tracks = self.publisher(TrackArray, '~/tracks', SENT)
@@ -77,6 +93,9 @@ class TrackerNode(StageNode):
         self._smoothed_path = self.publisher(Path, '~/path_smoothed', RESULTS)
         self._disturbances = self.publisher(DisturbanceMessage, '~/disturbances', SENT)
         self._markers = self.publisher(MarkerArray, '~/markers', RESULTS)
+        self._detections_3d = self.publisher(Detection3DArray, '~/detections_3d', RESULTS)
+        self._sensor_markers = self.publisher(MarkerArray, '~/sensor_markers', LATCHED)
+        self._sensor_markers.publish(to_message(MarkerArray, sensor_markers(self.network)))
         self._path: deque[PoseStamped] = deque(maxlen=LONGEST_PATH)
         self._is_silent, self._latest_id = False, -1
         self._doubtful: dict[str, DoubtfulTimes] = {}
@@ -122,6 +141,7 @@ class TrackerNode(StageNode):
             return
         self.network = network
         self._stage.use_network(network)
+        self._sensor_markers.publish(to_message(MarkerArray, sensor_markers(network)))
         self.get_logger().info('the next track is of sensors as they were surveyed')
 
     def _take(self, message: NetworkFrame) -> None:
@@ -182,11 +202,18 @@ class TrackerNode(StageNode):
         content = track_dict(track, frame)
         self._tracks.publish(to_message(
             TrackArray, {'header': content['header'], 'tracks': [content]}))
+        if is_heard(self._detections_3d):
+            self._detections_3d.publish(to_message(
+                Detection3DArray, detections_3d_dict(track, frame)))
         if track.ended:
             self._path.clear()
             self._markers.publish(to_message(MarkerArray, delete_markers(track, frame)))
             return
-        publish_if_any(self._odometry, Odometry, odometry_dict(track, frame, f'track_{track.id}'))
+        child_frame = self._child_frame or f'track_{track.id}'
+        publish_if_any(self._odometry, Odometry, odometry_dict(track, frame, child_frame))
+        if self._tf is not None and track.topic_uncertainty is not None:
+            self._tf.publish(to_message(TFMessage, {'transforms': [
+                track_transform_dict(track, frame, child_frame)]}))
         self._path.append(to_message(PoseStamped, pose_dict(
             track.stamp_ns, frame, track.position, track.orientation)))
         if is_heard(self._path_publisher):

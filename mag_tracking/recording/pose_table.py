@@ -1,22 +1,15 @@
 """Tables of a magnet's poses over a board of sensors: a row a pose, all sensors in it."""
 
-import csv
-from os import PathLike
-from typing import TypeAlias
-
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
-from mag_tracking.files import checked_path
+from mag_tracking.recording.csv_file import CsvPath, Lines, csv_lines, number, read_csv
 
-_Path: TypeAlias = str | PathLike[str]
-_Lines: TypeAlias = list[tuple[int, list[str]]]
-"""Number of each line, and its cells."""
 _POSE = ('mag_x0', 'mag_y0', 'mag_z0', 'mag_mx0', 'mag_my0', 'mag_mz0')
 
 
-def read_pose_table(path: _Path) -> tuple[FloatArray, FloatArray, FloatArray]:
+def read_pose_table(path: CsvPath) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Readings of fixed sensors and the tracked poses of a magnet.
 
     Parameters
@@ -44,7 +37,7 @@ def read_pose_table(path: _Path) -> tuple[FloatArray, FloatArray, FloatArray]:
     return (values[:, :-6].reshape(len(rows), -1, 3), values[:, -6:-3], axes / length[:, None])
 
 
-def read_readings(path: _Path) -> FloatArray:
+def read_readings(path: CsvPath) -> FloatArray:
     """Readings (K, n, 3) [T, sensor frame] alone of such a table, which needs no poses.
 
     Raises RecordingError, which names file, row and column.
@@ -53,24 +46,24 @@ def read_readings(path: _Path) -> FloatArray:
     return values.reshape(len(rows), -1, 3)
 
 
-def read_sensor_positions(path: _Path) -> FloatArray:
+def read_sensor_positions(path: CsvPath) -> FloatArray:
     """Positions (n, 3) [m] of a CSV of x,y,z with comments after #.
 
     Raises RecordingError, which names file, row and column.
     """
-    rows = [(line, row) for line, row in _lines(path) if not row[0].lstrip().startswith('#')]
+    rows = [(line, row) for line, row in csv_lines(path) if not row[0].lstrip().startswith('#')]
     if not rows:
         raise RecordingError(f'{path} has no rows')
     for line, row in rows:
         if len(row) != 3:
             raise RecordingError(f'{path}: row {line}: expected 3 columns, got {len(row)}')
-    return np.array([[_number(path, line, name, text, True)
+    return np.array([[number(path, line, name, text, True)
                       for name, text in zip('xyz', row, strict=True)] for line, row in rows])
 
 
-def _values(path: _Path, pose: tuple[str, ...]) -> tuple[_Lines, FloatArray]:
+def _values(path: CsvPath, pose: tuple[str, ...]) -> tuple[Lines, FloatArray]:
     """[(line, row)] and the numbers of all readings, then of the columns `pose`."""
-    header, rows = _read(path)
+    header, rows = read_csv(path)
     n = sum(name[:1] == 'x' and name[1:].isdigit() for name in header)
     fields = [f'{a}{j}' for j in range(n) for a in 'xyz']
     if not n:
@@ -80,44 +73,7 @@ def _values(path: _Path, pose: tuple[str, ...]) -> tuple[_Lines, FloatArray]:
             there = 'missing' if name not in header else 'there twice'
             raise RecordingError(f'{path}: column {name} is {there}')
     places = [header.index(name) for name in (*fields, *pose)]
-    values = np.array([[_number(path, line, name, row[i], name in pose)
+    values = np.array([[number(path, line, name, row[i], name in pose)
                         for name, i in zip((*fields, *pose), places, strict=True)]
                        for line, row in rows])
     return rows, values
-
-
-def _read(path: _Path) -> tuple[list[str], _Lines]:
-    """Header and [(line, row)]."""
-    lines = _lines(path)
-    if len(lines) < 2:
-        raise RecordingError(f'{path} has no rows')
-    header = [name.strip() for name in lines[0][1]]
-    for line, row in lines[1:]:
-        if len(row) != len(header):
-            raise RecordingError(f'{path}: row {line}: expected {len(header)} columns, '
-                                 f'got {len(row)}')
-    return header, lines[1:]
-
-
-def _lines(path: _Path) -> _Lines:
-    """[(line, cells)] of the lines that are not empty."""
-    path = checked_path(path, RecordingError)
-    try:
-        with open(path, newline='', encoding='utf-8') as stream:
-            reader = csv.reader(stream)
-            return [(reader.line_num, row) for row in reader if row]
-    except OSError as error:
-        raise RecordingError(f'cannot read {path}: {error.strerror}') from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise RecordingError(f'{path}: {error}') from error
-
-
-def _number(path: _Path, line: int, column: str, text: str, finite: bool) -> float:
-    """One cell; empty = NaN, where that is allowed."""
-    try:
-        value = float(text) if text.strip() else np.nan
-    except ValueError:
-        raise RecordingError(f'{path}: row {line}: {column} is {text!r}, no number') from None
-    if np.isinf(value) or (finite and np.isnan(value)):
-        raise RecordingError(f'{path}: row {line}: {column} is not a finite number')
-    return value

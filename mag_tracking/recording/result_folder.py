@@ -41,7 +41,7 @@ _TABLES = {'poses.csv': POSE_COLUMNS, 'poses_smoothed.csv': SMOOTHED_COLUMNS,
            'hypotheses.csv': HYPOTHESIS_COLUMNS}
 _SUMMARY, _RECORDING = 'summary.json', 'tracks.mcap'
 _RESULTS = (*_TABLES, _SUMMARY, _RECORDING, 'metadata.yaml')
-_FIGURE = re.compile(r'(map|weights|field)_track_[0-9]+\.png')
+_OF_A_TRACK = re.compile(r'(map|weights|field)_track_[0-9]+\.png|track_[0-9]+(_smoothed)?\.tum')
 
 
 def figure_name(kind: str, track_id: int) -> str:
@@ -63,8 +63,8 @@ class ResultFolder:
     Attributes
     ----------
     replaces_earlier : bool
-        The folder held results of an earlier run, which were removed with the figures of its
-        tracks. All other files stay.
+        The folder held results of an earlier run, which were removed with the figures and
+        trajectories of its tracks. All other files stay.
     """
 
     def __init__(self, folder: str | PathLike[str], frame: str) -> None:
@@ -90,7 +90,7 @@ class ResultFolder:
         """Remove the results of an earlier run; whether there were any."""
         # Its summary and the figures of its tracks would be taken for those of this run.
         earlier = [path for path in self.folder.iterdir()
-                   if (path.name in _RESULTS or _FIGURE.fullmatch(path.name))
+                   if (path.name in _RESULTS or _OF_A_TRACK.fullmatch(path.name))
                    and (path.is_symlink() or not path.is_dir())]
         for path in earlier:
             path.unlink()

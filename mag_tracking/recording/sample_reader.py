@@ -2,19 +2,15 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TypeAlias
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.schema import acceleration_of, reading_of, readings_of, stamp_ns
-from mag_tracking.messages.shapes import PoseStamped
+from mag_tracking.messages.schema import acceleration_of, reading_of, readings_of
 from mag_tracking.messages.types import (
     FIELD_READINGS,
     IMU,
     MAGNETIC_FIELD,
-    POSE,
     RAW_READINGS,
     decode,
 )
@@ -22,6 +18,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.network.topics import absolute, namespaces_of
 from mag_tracking.recording.interruptible import Progress, ReadingStopped
 from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.truth import TRUTH_TYPES, TruthArrays, TruthTopics
 from mag_tracking.records import AccelerationSample, Readings
 
 TRUTH_PREFIX = 'ground_truth/'
@@ -29,8 +26,6 @@ TRUTH_PREFIX = 'ground_truth/'
 tracking."""
 GATHERED = 256
 """Messages whose readings are gathered in one batch: each batch costs as much as a few readings."""
-
-_Pose: TypeAlias = tuple[int, float, float, float, float, float, float, float]
 
 
 class SampleReader:
@@ -40,13 +35,15 @@ class SampleReader:
     ----------
     rejected : Counter
         {cause: number} of messages and readings that cannot be used.
-    truth : {topic: list of (stamp_ns, x, y, z, qx, qy, qz, qw)}
     namespace : str
         Of the network's relative topics in the recording.
     """
 
-    def __init__(self, recording: Recording, network: SensorNetwork) -> None:
-        """Raises RecordingError where the recording has none of the network's topics."""
+    def __init__(self, recording: Recording, network: SensorNetwork,
+                 truth: str | None = None) -> None:
+        """Raises RecordingError where the recording has none of the network's topics, or nothing
+        that can be `truth`, the name of a topic.
+        """
         self._recording = recording
         self.namespace = _namespace(recording, network)
         self._sensors = {absolute(topic, self.namespace): name for topic, name in zip(
@@ -56,9 +53,13 @@ class SampleReader:
             if topic is not None:
                 self._imus.setdefault(absolute(topic, self.namespace), []).append(name)
         self._many = absolute(RAW_READINGS, self.namespace)
-        self._truth_prefix = absolute(TRUTH_PREFIX, self.namespace)
+        self._truth = TruthTopics(absolute(TRUTH_PREFIX, self.namespace), network.frame, truth)
+        if truth is not None and recording.types and not self._truth.wants(
+                truth, recording.types.get(truth, '')):
+            raise RecordingError(f'{recording.path}: the truth on {truth} is '
+                                 f'{recording.types.get(truth, "not in the recording")}; expected '
+                                 f'one of {", ".join(TRUTH_TYPES)}')
         self.rejected: Counter[str] = Counter()
-        self.truth: dict[str, list[_Pose]] = {}
         self._together = recording.types.get(self._many) == FIELD_READINGS
         if recording.types and not self._together \
                 and not any(t in recording.types for t in self._sensors):
@@ -111,7 +112,7 @@ class SampleReader:
         """(record, log time) of the sensors, and of the accelerometers {topic: sensors}."""
         for message in self._recording.messages(progress=progress):
             sensor = self._sensors.get(message.topic)
-            truth = message.topic.startswith(self._truth_prefix) and message.type == POSE
+            truth = self._truth.wants(message.topic, message.type)
             many = message.topic == self._many and message.type == FIELD_READINGS
             shaken = imus.get(message.topic) if message.type == IMU else None
             if sensor is None and shaken is None and not truth and not many:
@@ -123,7 +124,7 @@ class SampleReader:
                 self.rejected[f'undecodable message on {message.topic}'] += 1
                 continue
             if truth:
-                self._add_truth(message.topic, content)
+                self._truth.add(message.topic, content)
             elif readings is not None:
                 yield self._of_network(readings), message.log_time_ns
             elif shaken is not None:
@@ -142,21 +143,11 @@ class SampleReader:
                              for name in readings.part(~is_known).sensor_names())
         return readings.part(is_known)
 
-    def _add_truth(self, topic: str, content: PoseStamped) -> None:
-        """Keep a pose for the report."""
-        p, q = content.pose.position, content.pose.orientation
-        self.truth.setdefault(topic, []).append(
-            (stamp_ns(content.header.stamp), p.x, p.y, p.z, q.x, q.y, q.z, q.w))
-
-    def truth_arrays(self) -> dict[str, tuple[IntArray, FloatArray, FloatArray]]:
-        """{name: (stamps_ns (n,), positions (n, 3), quaternions (n, 4))}."""
-        out = {}
-        for topic, rows in self.truth.items():
-            rows = sorted(rows)
-            out[topic.removeprefix(self._truth_prefix).removesuffix('/pose')] = (
-                np.array([r[0] for r in rows], dtype=np.int64),
-                np.array([r[1:4] for r in rows]), np.array([r[4:] for r in rows]))
-        return out
+    def truth_arrays(self) -> dict[str, TruthArrays]:
+        """{name: arrays} of the true poses that were read."""
+        self.rejected.update(self._truth.rejected)
+        self._truth.rejected.clear()
+        return self._truth.arrays()
 
 
 def _namespace(recording: Recording, network: SensorNetwork) -> str:

@@ -24,10 +24,11 @@ class SmoothedLog:
     velocity: list[FloatArray] = field(default_factory=list)
     covariance: list[FloatArray] = field(default_factory=list)
     moment: list[FloatArray] = field(default_factory=list)
+    orientation: list[FloatArray] = field(default_factory=list)
 
     def add(self, pose: SmoothedPose) -> None:
         """Take a `SmoothedPose`."""
-        for name in ('stamp_ns', 'position', 'velocity', 'covariance', 'moment'):
+        for name in ('stamp_ns', 'position', 'velocity', 'covariance', 'moment', 'orientation'):
             getattr(self, name).append(getattr(pose, name))
 
     def summary(self) -> dict[str, float]:

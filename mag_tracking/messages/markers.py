@@ -1,0 +1,119 @@
+"""What RViz shows: of a track its 90 % ellipsoid, an arrow along the moment and a label; sensors.
+
+One namespace a kind of marker, one id a track, so that a viewer can switch a kind off. Markers of
+a track vanish by themselves where nobody takes them away.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from mag_tracking.arrays import FloatArray
+from mag_tracking.geometry import quaternion_from_rotation
+from mag_tracking.messages.schema import header_dict, xyz
+from mag_tracking.network import SensorNetwork
+from mag_tracking.records import PoseUncertainty, Track
+
+TRACK_KINDS = ('ellipsoid', 'moment', 'label')
+"""Namespaces of the markers of a track."""
+SENSOR_KINDS = ('sensors', 'sensor_labels')
+LIFETIME_S = 2
+"""[s] Of the markers of a track."""
+_ARROW, _CUBE, _SPHERE, _TEXT = 0, 1, 2, 9
+_ADD, _DELETE = 0, 2
+_SCALE_3D = 2.5003
+"""Deviations to the surface of the 90 % region in space (chi-square, 3 degrees of freedom)."""
+SENSOR_SIZE_M = 0.3
+"""[m] Largest size of a sensor's marker; on a board half of the smallest distance."""
+_UPRIGHT = {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
+_BLUE, _RED = {'r': 0.0, 'g': 0.45, 'b': 0.7}, {'r': 0.84, 'g': 0.37, 'b': 0.0}
+"""Colours that colour-blind people tell apart (Okabe and Ito)."""
+_GREY = {'r': 0.35, 'g': 0.35, 'b': 0.35, 'a': 1.0}
+
+
+def track_markers(track: Track, frame: str) -> dict[str, Any]:
+    """visualization_msgs/MarkerArray of a `Track`, as a dict.
+
+    The ellipsoid is that of the pose topics: of an ambiguous track that of all that is possible.
+    """
+    return {'markers': [_ellipsoid(track, frame), _arrow(track, frame), _label(track, frame)]}
+
+
+def delete_markers(track: Track, frame: str) -> dict[str, Any]:
+    """visualization_msgs/MarkerArray that takes the markers of an ended `Track` away."""
+    return {'markers': [_marker(track, frame, kind, _SPHERE, action=_DELETE)
+                        for kind in TRACK_KINDS]}
+
+
+def sensor_markers(network: SensorNetwork) -> dict[str, Any]:
+    """visualization_msgs/MarkerArray of the sensors, with their names."""
+    size = min(SENSOR_SIZE_M, 0.5 * _smallest_distance(network.positions))
+    markers = []
+    for j, name in enumerate(network.names):
+        common = {'header': header_dict(0, network.frame), 'id': j, 'action': _ADD}
+        markers.append({
+            **common, 'ns': SENSOR_KINDS[0], 'type': _CUBE, 'color': _GREY,
+            'pose': {'position': xyz(network.positions[j]), 'orientation': _quaternion(
+                network.R_ws[j])}, 'scale': xyz(np.array([1.0, 0.6, 0.2]) * size)})
+        above = network.positions[j] + [0.0, 0.0, size]
+        markers.append({
+            **common, 'ns': SENSOR_KINDS[1], 'type': _TEXT, 'color': _GREY, 'text': name,
+            'pose': {'position': xyz(above), 'orientation': _UPRIGHT},
+            'scale': {'x': 0.0, 'y': 0.0, 'z': size}})
+    return {'markers': markers}
+
+
+def _smallest_distance(positions: FloatArray) -> float:
+    """[m] Between two sensors; infinite for one alone."""
+    apart = np.linalg.norm(positions[:, None] - positions, axis=-1)
+    np.fill_diagonal(apart, np.inf)
+    return float(apart.min())
+
+
+def _marker(track: Track, frame: str, kind: str, shape: int, **content: Any) -> dict[str, Any]:
+    """A visualization_msgs/Marker as a dict."""
+    return {'header': header_dict(track.stamp_ns, frame), 'ns': kind, 'id': track.id,
+            'type': shape, **content}
+
+
+def _quaternion(R: FloatArray) -> dict[str, float]:
+    """A geometry_msgs/Quaternion as a dict."""
+    return dict(zip('xyzw', quaternion_from_rotation(R).tolist(), strict=True))
+
+
+def _ellipsoid(track: Track, frame: str) -> dict[str, Any]:
+    """The 90 % region of the position."""
+    about: Track | PoseUncertainty = track.topic_uncertainty or track
+    values, R = np.linalg.eigh(about.covariance[:3, :3])
+    if np.linalg.det(R) < 0.0:
+        R = -R
+    axes = 2.0 * _SCALE_3D * np.sqrt(np.maximum(values, 0.0))
+    return _marker(
+        track, frame, 'ellipsoid', _SPHERE, action=_ADD, lifetime={'sec': LIFETIME_S},
+        pose={'position': xyz(track.position), 'orientation': _quaternion(R)},
+        # A sphere of no thickness is refused by RViz.
+        scale=xyz(np.maximum(axes, 1e-6)),
+        color={**_BLUE, 'a': 0.15 if track.ambiguous else 0.35})
+
+
+def _arrow(track: Track, frame: str) -> dict[str, Any]:
+    """Along the moment, as long as three deviations of the position."""
+    length = max(float(np.sqrt(np.trace(track.covariance[:3, :3]))), 1e-3) * 3.0
+    tip = track.position + length * track.moment / np.linalg.norm(track.moment)
+    return _marker(
+        track, frame, 'moment', _ARROW, action=_ADD, lifetime={'sec': LIFETIME_S},
+        points=[xyz(track.position), xyz(tip)], pose={'orientation': _UPRIGHT},
+        scale={'x': 0.08 * length, 'y': 0.16 * length, 'z': 0.2 * length},
+        color={**_RED, 'a': 1.0})
+
+
+def _label(track: Track, frame: str) -> dict[str, Any]:
+    """What the target is and how fast, with a question mark where the track is ambiguous."""
+    size = float(np.clip(np.sqrt(np.trace(track.covariance[:3, :3])), 0.005, 0.5))
+    words = [word for word in (f'{track.id}', track.kind,
+                               f'{np.hypot(*track.velocity[:2]):.1f} m/s') if word]
+    return _marker(
+        track, frame, 'label', _TEXT, action=_ADD, lifetime={'sec': LIFETIME_S},
+        text=' '.join(words) + ('?' if track.ambiguous else ''),
+        pose={'position': xyz(track.position + [0.0, 0.0, 2.0 * size]), 'orientation': _UPRIGHT},
+        scale={'x': 0.0, 'y': 0.0, 'z': size}, color={**_GREY})

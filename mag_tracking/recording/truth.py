@@ -1,0 +1,111 @@
+"""True poses, from topics of a recording or from a table: for reports, never for tracking."""
+
+from collections import Counter
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.errors import RecordingError
+from mag_tracking.messages.schema import stamp_ns
+from mag_tracking.messages.types import ODOMETRY, POSE, POSE_WITH_COVARIANCE
+from mag_tracking.recording.csv_file import number, read_csv
+from mag_tracking.units import NS
+
+TRUTH_TYPES = (POSE, POSE_WITH_COVARIANCE, ODOMETRY)
+"""Types of messages that carry true poses."""
+TruthArrays: TypeAlias = tuple[IntArray, FloatArray, FloatArray]
+"""Stamps (n,) [ns], positions (n, 3) [m], quaternions (n, 4) xyzw."""
+_Row: TypeAlias = tuple[int, float, float, float, float, float, float, float]
+_TIMES = {'stamp_ns': 1, 't': NS, 'time': NS}
+"""{column: ns}."""
+
+
+class TruthTopics:
+    """Collects true poses from the messages of a recording.
+
+    Parameters
+    ----------
+    prefix : str
+        Poses on topics below this are truth, unless a topic is given.
+    frame : str
+        Of the network. Poses in another frame are not comparable, and are counted.
+    topic : str, optional
+
+    Attributes
+    ----------
+    rejected : Counter
+        {cause: number} of messages.
+    """
+
+    def __init__(self, prefix: str, frame: str, topic: str | None = None) -> None:
+        self._prefix, self._frame, self._topic = prefix, frame, topic
+        self.rejected: Counter[str] = Counter()
+        self._rows: dict[str, list[_Row]] = {}
+
+    def wants(self, topic: str, kind: str) -> bool:
+        """Whether a topic of a type carries truth."""
+        is_truth = topic.startswith(self._prefix) if self._topic is None else topic == self._topic
+        return is_truth and kind in TRUTH_TYPES
+
+    def add(self, topic: str, content: Any) -> None:
+        """Take a decoded message of a topic that it `wants`."""
+        frame = content.header.frame_id
+        if frame and frame != self._frame:
+            self.rejected[f'truth on {topic} is in frame {frame}, not {self._frame}'] += 1
+            return
+        pose = content.pose if hasattr(content.pose, 'position') else content.pose.pose
+        p, q = pose.position, pose.orientation
+        self._rows.setdefault(topic, []).append(
+            (stamp_ns(content.header.stamp), p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+
+    def arrays(self) -> dict[str, TruthArrays]:
+        """{name: arrays} of the topics, in order of time."""
+        out = {}
+        for topic, rows in self._rows.items():
+            rows = sorted(rows)
+            out[topic.removeprefix(self._prefix).removesuffix('/pose')] = (
+                np.array([r[0] for r in rows], dtype=np.int64),
+                np.array([r[1:4] for r in rows]), np.array([r[4:] for r in rows]))
+        return out
+
+
+def read_truth_table(path: str | PathLike[str]) -> dict[str, TruthArrays]:
+    """True poses of a CSV file, in the frame of the network.
+
+    Parameters
+    ----------
+    path : path
+        Columns: `stamp_ns` [ns], or `t` or `time` [s], since 1970; `x`, `y` [m]; `z` [m] and
+        `qx`, `qy`, `qz`, `qw` may be left out. Others are not read.
+
+    Returns
+    -------
+    {stem of the file: arrays}
+
+    Raises RecordingError, which names file, row and column.
+    """
+    header, rows = read_csv(path)
+    time = next((name for name in _TIMES if name in header), None)
+    missing = [name for name in ('x', 'y') if name not in header]
+    if time is None or missing:
+        raise RecordingError(f'{path}: column {(missing or ["stamp_ns, t or time"])[0]} is missing')
+    names = [name for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw') if name in header]
+    stamps = np.array([_stamp(path, line, time, row[header.index(time)]) for line, row in rows],
+                      dtype=np.int64)
+    values = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(rows), 1))
+    columns = ['x', 'y', 'z', 'qx', 'qy', 'qz', 'qw']
+    for name in names:
+        values[:, columns.index(name)] = [
+            number(path, line, name, row[header.index(name)], True) for line, row in rows]
+    order = np.argsort(stamps, kind='stable')
+    return {Path(path).stem: (stamps[order], values[order, :3], values[order, 3:])}
+
+
+def _stamp(path: str | PathLike[str], line: int, column: str, text: str) -> int:
+    """[ns] A cell of a column of times; nanoseconds do not fit a float."""
+    if column == 'stamp_ns' and text.strip().lstrip('-').isdigit():
+        return int(text)
+    return round(number(path, line, column, text, True) * _TIMES[column])

@@ -1,0 +1,127 @@
+"""Tracks and sensors as messages of other packages: transforms, detections, markers."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mag_tracking.geometry import rotation_from_quaternion
+from mag_tracking.messages.markers import (
+    LIFETIME_S,
+    SENSOR_KINDS,
+    TRACK_KINDS,
+    delete_markers,
+    sensor_markers,
+    track_markers,
+)
+from mag_tracking.messages.schema import pose_message_dict
+from mag_tracking.messages.standard import (
+    detections_3d_dict,
+    sensor_transform_dicts,
+    track_transform_dict,
+)
+from support.networks import line_network
+from support.track_runs import magnet_frames
+
+
+@pytest.fixture(scope='module')
+def tracks():
+    """{ambiguous: the last such `Track`} of one replay."""
+    from mag_tracking.network.file import read_network
+    from mag_tracking.pipeline import Pipeline, settings_for
+    from mag_tracking.recording.reader import Recording
+    from mag_tracking.recording.sample_reader import SampleReader
+    from mag_tracking.records import Track
+    from support.bundled import NETWORK_FILE, vehicle_path
+    network = read_network(NETWORK_FILE)
+    pipeline = Pipeline(network, settings_for('vehicle'))
+    found = {}
+    for readings in SampleReader(Recording(vehicle_path('straight_car_fast_left')),
+                                 network).readings():
+        for record in pipeline.feed(readings):
+            if isinstance(record, Track) and not record.ended:
+                found[record.ambiguous] = record
+    return found
+
+
+def test_transforms_of_the_sensors_are_the_network():
+    network = line_network(4)
+    messages = sensor_transform_dicts(network, {'mag_2': 'imu_link'}, 7)
+    assert [m['child_frame_id'] for m in messages] == ['mag_1', 'imu_link', 'mag_3', 'mag_4']
+    for j, m in enumerate(messages):
+        t, q = m['transform']['translation'], m['transform']['rotation']
+        np.testing.assert_allclose([t['x'], t['y'], t['z']], network.positions[j])
+        np.testing.assert_allclose(rotation_from_quaternion([q[a] for a in 'xyzw']),
+                                   network.R_ws[j], atol=1e-12)
+        assert m['header'] == {'stamp': {'sec': 0, 'nanosec': 7}, 'frame_id': 'map'}
+
+
+def test_the_transform_of_a_track_is_its_pose(tracks):
+    track = tracks[False]
+    message, pose = (track_transform_dict(track, 'map', 'target'),
+                     pose_message_dict(track, 'map')['pose']['pose'])
+    assert message['transform'] == {'translation': pose['position'],
+                                    'rotation': pose['orientation']}
+    assert message['child_frame_id'] == 'target'
+
+
+def test_a_track_is_a_detection_with_the_probability_of_each_kind(tracks):
+    for track in tracks.values():
+        ((detection,),) = [detections_3d_dict(track, 'map')['detections']]
+        scores = {r['hypothesis']['class_id']: r['hypothesis']['score']
+                  for r in detection['results']}
+        assert sum(scores.values()) == pytest.approx(1.0)
+        assert scores[track.kind] == pytest.approx(track.kind_weight)
+        assert list(scores.values()) == sorted(scores.values(), reverse=True)
+        assert detection['bbox']['size']['x'] == track.length and detection['id'] == '1'
+        pose = pose_message_dict(track, 'map')['pose']
+        assert all(r['pose'] == pose for r in detection['results'])
+    held = dataclasses.replace(track, topic_uncertainty=None)
+    for gone in (held, dataclasses.replace(track, ended=True)):
+        assert detections_3d_dict(gone, 'map')['detections'] == []
+
+
+def test_a_magnet_has_a_class_too():
+    from mag_tracking.pipeline import settings_for
+    from mag_tracking.stages.track.manager import TrackManager
+    network, frames, _ = magnet_frames(3)
+    stage = TrackManager(network, settings_for('magnet').track)
+    track = [t for f in frames for t in stage.feed(f)][-1]
+    ((detection,),) = [detections_3d_dict(track, 'map')['detections']]
+    assert [r['hypothesis']['class_id'] for r in detection['results']] == ['magnet']
+
+
+def test_markers_have_a_namespace_a_kind_and_an_id_a_track(tracks):
+    track = dataclasses.replace(tracks[False], id=7)
+    markers = track_markers(track, 'map')['markers']
+    assert tuple(m['ns'] for m in markers) == TRACK_KINDS
+    assert all(m['id'] == 7 and m['lifetime'] == {'sec': LIFETIME_S} for m in markers)
+    gone = delete_markers(track, 'map')['markers']
+    assert [(m['ns'], m['id'], m['action']) for m in gone] == [(k, 7, 2) for k in TRACK_KINDS]
+    label = markers[2]['text']
+    assert label.startswith(f'7 {track.kind} ') and label.endswith(' m/s')
+    assert track_markers(tracks[True], 'map')['markers'][2]['text'].endswith(' m/s?')
+
+
+def test_the_ellipsoid_is_that_of_the_pose_topics(tracks):
+    """Of an ambiguous track it covers all that is possible."""
+    for ambiguous, track in tracks.items():
+        scale = track_markers(track, 'map')['markers'][0]['scale']
+        about = track.topic_uncertainty.covariance[:3, :3]
+        np.testing.assert_allclose(
+            sorted(scale.values()), 2 * 2.5003 * np.sqrt(np.linalg.eigvalsh(about)), rtol=1e-9)
+        own = 2 * 2.5003 * np.sqrt(np.linalg.eigvalsh(track.covariance[:3, :3])[-1])
+        assert (max(scale.values()) > 1.001 * own) <= ambiguous
+
+
+def test_sensors_are_shown_where_they_are():
+    network = line_network(4, spacing=0.02)
+    network = dataclasses.replace(network, positions=network.positions * 0.01)
+    markers = sensor_markers(network)['markers']
+    assert [m['ns'] for m in markers] == list(SENSOR_KINDS) * 4
+    assert [m['text'] for m in markers[1::2]] == list(network.names)
+    for j, m in enumerate(markers[::2]):
+        p = m['pose']['position']
+        np.testing.assert_allclose([p['x'], p['y'], p['z']], network.positions[j])
+        # On a board a marker is smaller than the distance of two.
+        assert 0.0 < m['scale']['x'] < 0.0002

@@ -1,0 +1,61 @@
+"""What other packages take from the nodes: transforms, detections, markers, over the middleware."""
+
+import numpy as np
+import pytest
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from tf2_msgs.msg import TFMessage
+from vision_msgs.msg import Detection3DArray
+from visualization_msgs.msg import MarkerArray
+
+from mag_tracking.messages.schema import stamp_ns
+from mag_tracking.nodes.runner import run
+from mag_tracking.nodes.stage_node import LATCHED, STREAM, TRANSFORMS
+from mag_tracking.pipeline import settings_for
+from support.bundled import NETWORK_FILE, vehicle_path
+
+pytestmark = pytest.mark.timeout(600)
+
+
+class Consumer(Node):
+    """Keeps what it is sent."""
+
+    def __init__(self):
+        super().__init__('consumer')
+        self.tf, self.static, self.odometry, self.detections, self.markers = [], [], [], [], []
+        self.sensors = []
+        for kind, topic, kept, qos in (
+                (TFMessage, '/tf', self.tf, TRANSFORMS),
+                (TFMessage, '/tf_static', self.static, LATCHED),
+                (Odometry, 'tracker_node/odometry', self.odometry, STREAM),
+                (Detection3DArray, 'tracker_node/detections_3d', self.detections, STREAM),
+                (MarkerArray, 'tracker_node/markers', self.markers, STREAM),
+                (MarkerArray, 'tracker_node/sensor_markers', self.sensors, LATCHED)):
+            self.create_subscription(kind, topic, kept.append, qos)
+
+
+def test_transforms_detections_and_markers():
+    """In a namespace, with the parameters that `robot_localization` wants."""
+    holder = []
+    run(NETWORK_FILE, settings_for('vehicle', {'align.max_wait_s': 5.0}),
+        vehicle_path('straight_car_fast_left'), 3.0,
+        observers=[lambda: holder.append(Consumer()) or holder[-1]],
+        ros_arguments=['--ros-args', '-r', '__ns:=/road', '-p', 'publish_tf:=true',
+                       '-p', 'child_frame:=vehicle'])
+    heard, = holder
+    frames = [t.child_frame_id for m in heard.static for t in m.transforms]
+    assert set(frames) == {'mag_1', 'mag_2'}
+    assert {t.header.frame_id for m in heard.static for t in m.transforms} == {'map'}
+    assert len(heard.odometry) > 10
+    assert {m.child_frame_id for m in heard.odometry} == {'vehicle'}
+    transforms = [t for m in heard.tf for t in m.transforms]
+    assert {t.child_frame_id for t in transforms} == {'vehicle'}
+    by_time = {stamp_ns(m.header.stamp): m.pose.pose.position for m in heard.odometry}
+    for t in transforms:
+        p = by_time[stamp_ns(t.header.stamp)]
+        np.testing.assert_array_equal([t.transform.translation.x, t.transform.translation.y],
+                                      [p.x, p.y])
+    last = heard.detections[-1]
+    assert last.detections == [] and heard.detections[-2].detections[0].id == '1'
+    assert {m.ns for m in heard.markers[-1].markers} == {'ellipsoid', 'moment', 'label'}
+    assert {m.text for a in heard.sensors for m in a.markers if m.text} == {'mag_1', 'mag_2'}

@@ -1,0 +1,122 @@
+"""Truth from topics of several types and from tables; trajectories for others."""
+
+import csv
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mag_tracking.apps.replay import replay, write_trajectories
+from mag_tracking.errors import RecordingError
+from mag_tracking.messages.schema import header_dict
+from mag_tracking.messages.types import MAGNETIC_FIELD, POSE, POSE_WITH_COVARIANCE
+from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.recording.truth import read_truth_table
+from mag_tracking.recording.tum_file import write_tum
+from mag_tracking.recording.writer import RecordingWriter
+from support.bundled import vehicle_path
+from support.networks import line_network
+from support.samples import MagSample, sample_dict
+
+NAME = 'straight_car_fast_left'
+
+
+def pose(x):
+    """geometry_msgs/Pose."""
+    return {'position': {'x': x, 'y': 2.0, 'z': 3.0}, 'orientation': {'w': 1.0}}
+
+
+def recording_of(path, frame):
+    """A recording with a field, and poses of two types on topics of their own."""
+    sample = MagSample(10**9, 'mag_1', [0.0, 0.0, 0.0])
+    with RecordingWriter(path) as writer:
+        writer.write('/mag_1/imu/mag', MAGNETIC_FIELD, sample_dict(sample, 'mag_1'), 10**9)
+        for k in (2, 1):
+            header = header_dict(k * 10**9 + 7, frame)
+            writer.write('/gnss/pose', POSE, {'header': header, 'pose': pose(float(k))}, k * 10**9)
+            writer.write('/slam', POSE_WITH_COVARIANCE, {
+                'header': header, 'pose': {'pose': pose(10.0 * k), 'covariance': [0.0] * 36}},
+                k * 10**9)
+    return Recording(path)
+
+
+def truth_of(recording, topic, network=None):
+    """What a reader finds: (arrays, rejected)."""
+    reader = SampleReader(recording, network or line_network(2), topic)
+    list(reader.readings())
+    return reader.truth_arrays(), dict(reader.rejected)
+
+
+def test_a_topic_of_either_type_is_truth_in_order_of_time(tmp_path):
+    recording = recording_of(tmp_path / 'a.mcap', 'map')
+    assert truth_of(recording, None) == ({}, {})
+    for topic, name, first in (('/gnss/pose', '/gnss', 1.0), ('/slam', '/slam', 10.0)):
+        arrays, rejected = truth_of(recording, topic)
+        assert list(arrays) == [name] and not rejected
+        stamps, position, quaternion = arrays[name]
+        assert stamps.tolist() == [10**9 + 7, 2 * 10**9 + 7]
+        assert position.tolist() == [[first, 2.0, 3.0], [2.0 * first, 2.0, 3.0]]
+        assert quaternion.tolist() == [[0.0, 0.0, 0.0, 1.0]] * 2
+
+
+def test_truth_in_another_frame_is_not_compared_and_said(tmp_path):
+    recording = recording_of(tmp_path / 'a.mcap', 'odom')
+    assert truth_of(recording, '/slam') == ({}, {'truth on /slam is in frame odom, not map': 2})
+    network = dataclasses.replace(line_network(2), frame='odom')
+    assert list(truth_of(recording, '/slam', network)[0]) == ['/slam']
+
+
+@pytest.mark.parametrize('topic, told', [
+    ('/nowhere', 'the truth on /nowhere is not in the recording'),
+    ('/mag_1/imu/mag', 'the truth on /mag_1/imu/mag is sensor_msgs/msg/MagneticField')])
+def test_a_topic_that_cannot_be_truth_is_named(tmp_path, topic, told):
+    with pytest.raises(RecordingError, match=told):
+        truth_of(recording_of(tmp_path / 'a.mcap', 'map'), topic)
+
+
+def test_a_table_is_the_same_truth_as_the_topic(tmp_path, road_network):
+    """In either unit of time; the errors of the track are those against the topic."""
+    settings = settings_for('vehicle')
+    run = replay(Recording(vehicle_path(NAME)), road_network, settings, tmp_path / 'a')
+    ((stamps, position, _),) = run.truth.values()
+    expected = run.summary['tracks'][0]['truth']
+    for column, times in (('stamp_ns', stamps.tolist()),
+                          ('t', [f'{t // 10**9}.{t % 10**9:09d}' for t in stamps.tolist()])):
+        path = tmp_path / f'by_{column}.csv'
+        with open(path, 'w', newline='') as stream:
+            writer = csv.writer(stream)
+            writer.writerow([column, 'comment', 'x', 'y'])
+            writer.writerows([t, 'text', repr(x), repr(y)] for t, (x, y) in zip(
+                times, position[:, :2].tolist(), strict=True))
+        found = replay(Recording(vehicle_path(NAME)), road_network, settings, tmp_path / 'b',
+                       truth=str(path)).summary['tracks'][0]['truth']
+        assert found['name'] == f'by_{column}'
+        for key in ('rms', 'closest', 'anees'):
+            assert found[key] == pytest.approx(expected[key], rel=1e-3)
+
+
+@pytest.mark.parametrize('text, told', [
+    ('t,y\n1,2\n', 'column x is missing'), ('x,y\n1,2\n', 'column stamp_ns, t or time is missing'),
+    ('t,x,y\n1,2\n', 'row 2: expected 3 columns'), ('t,x,y\n1,2,north\n', "row 2: y is 'north'"),
+    ('t,x,y\n,1,2\n', 'row 2: t is not a finite number'), ('t,x,y\n', 'has no rows'),
+    ('t,x,y\n1,2,inf\n', 'row 2: y is not a finite number')])
+def test_faults_of_a_table_are_named(tmp_path, text, told):
+    (tmp_path / 'truth.csv').write_text(text)
+    with pytest.raises(RecordingError, match=told):
+        read_truth_table(tmp_path / 'truth.csv')
+
+
+def test_trajectories_read_back(tmp_path, vehicle_replays):
+    run, _ = vehicle_replays[NAME]
+    paths = write_trajectories(run, tmp_path)
+    assert [p.name for p in paths] == ['track_1.tum', 'track_1_smoothed.tum']
+    log = run.logs[1]
+    rows = np.loadtxt(paths[0])
+    np.testing.assert_allclose(rows[:, 1:4], log.position, rtol=1e-8)
+    np.testing.assert_allclose(rows[:, 4:], log.orientation, atol=1e-8)
+    text = paths[0].read_text().split()[0]
+    assert text == f'{log.stamp_ns[0] // 10**9}.{log.stamp_ns[0] % 10**9:09d}'
+    write_tum(tmp_path / 'none.tum', [], [], [])
+    assert (tmp_path / 'none.tum').read_text() == '\n'
