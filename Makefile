@@ -50,8 +50,9 @@ $(STAMP): $(SOURCES)
 demo: $(STAMP)  ## run the demonstration; results in out/demo
 	$(BIN)/python examples/demo.py --out out/demo
 
-config: $(STAMP)  ## write config/ and docs/parameters.md anew from the settings
+config: $(STAMP)  ## write config/ and docs/parameters.md anew from the settings and the nodes
 	$(BIN)/python tools/generate_config.py
+	$(BIN)/python tools/generate_policies.py
 
 test: $(STAMP)  ## check style, floors, types and behaviour
 	@sh tools/check_broker.sh

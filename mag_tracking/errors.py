@@ -35,3 +35,7 @@ class UnknownTrackError(MagTrackingError, LookupError):
 
 class MissingDependencyError(MagTrackingError, ImportError):
     """An optional package is not installed."""
+
+
+class GraphError(MagTrackingError):
+    """A topic, service or node of the ROS graph is missing, refuses, or does not answer."""

@@ -10,6 +10,7 @@ from mag_tracking.cli import (
     doctor,
     events,
     fit,
+    graph,
     import_table,
     info,
     listen,
@@ -23,7 +24,7 @@ from mag_tracking.cli import (
 
 PACKAGE = 'mag_tracking'
 ROS_ARGUMENTS = '--ros-args'
-WITH_ROS = ('run', 'record', 'doctor')
+WITH_ROS = ('run', 'record', 'doctor', 'topics', 'echo', 'param', 'lifecycle')
 """Commands that take arguments of ROS."""
 
 
@@ -34,7 +35,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument('--version', action='version', version=f'mag_tracking {version(PACKAGE)}')
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
     for module in (replay, events, calibrate, tumble, board_geometry, doctor, fit, plan, listen,
-                   record, repair, run, info, import_table):
+                   record, repair, run, info, import_table, graph):
         module.add(commands)
     words = list(words)
     split = words.index(ROS_ARGUMENTS) if ROS_ARGUMENTS in words else len(words)

@@ -1,0 +1,31 @@
+"""The policies for SROS 2 are what the nodes do, and well-formed."""
+
+import subprocess
+import sys
+from xml.etree import ElementTree
+
+from support.bundled import ROOT
+from support.node_processes import LONGEST_S
+
+POLICIES = ROOT / 'config' / 'security' / 'policies.xml'
+
+
+def test_policies_are_up_to_date():
+    done = subprocess.run([sys.executable, str(ROOT / 'tools' / 'generate_policies.py'), '--check'],
+                          text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                          timeout=LONGEST_S, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+def test_policies_allow_each_node_what_it_needs_and_no_more():
+    """As the schema of sros2 has it: rules of allowed topics and services by profile."""
+    profiles = {p.get('node'): p for p in ElementTree.parse(POLICIES).iter('profile')}
+    assert set(profiles) == {'calibration_node', 'detection_node', 'tracker_node', 'driver_node'}
+    rules = {(node, rule.tag, *rule.attrib.items()): [e.text for e in rule]
+             for node, profile in profiles.items() for rule in profile}
+    assert '/*/imu/mag' in rules['driver_node', 'topics', ('publish', 'ALLOW')]
+    assert '/network_frame' in rules['tracker_node', 'topics', ('subscribe', 'ALLOW')]
+    assert '/tracker_node/pose' in rules['tracker_node', 'topics', ('publish', 'ALLOW')]
+    assert not [r for (node, *_), r in rules.items() if '*' in r]
+    assert '/calibration_node/survey' in rules[
+        'calibration_node', 'services', ('reply', 'ALLOW')]
