@@ -169,7 +169,12 @@ class Driver:
         return arrivals
 
     def close(self) -> None:
-        """Close the device; the next `poll` opens it again."""
+        """Close the device; the next `poll` opens it again.
+
+        What the device measures until then is not lost.
+        """
+        for check in self._sequences.values():
+            check.pause()
         self._device.close()
         self._open, self._retry_ns = False, None
 

@@ -23,6 +23,10 @@ class SequenceCheck:
         self._seen: dict[int, bytes] = {}
         self._missing: dict[int, bool] = {}
 
+    def pause(self) -> None:
+        """What does not come from now on is not lost: nobody listens."""
+        self._begin()
+
     def is_new(self, sequence: int, values: bytes) -> bool:
         """Whether the reading with this number and these `values`, bytes, has not come before.
 

@@ -39,8 +39,11 @@ class DriverDiagnostics:
             message = 'not active'
         elif not served:
             level, message = DiagnosticStatus.ERROR, 'its thread has ended: start the node again'
-        elif driver.trouble or not driver.is_open:
-            level, message = DiagnosticStatus.ERROR, driver.trouble or 'not open yet'
+        elif driver.trouble:
+            level, message = DiagnosticStatus.ERROR, driver.trouble
+        elif not driver.is_open:
+            # It has no trouble, and some devices take seconds.
+            message = 'opening'
         elif news:
             level, message = DiagnosticStatus.WARN, '; '.join(news)
         self._log(driver.name, level, message)

@@ -2,12 +2,15 @@
 
 import re
 import time
+from collections import Counter
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
 REPEATED_S = 60.0
 """[s] Interval at which a fault that lasts is logged again."""
+MOST_ALIKE = 4
+"""Lines within that interval that differ in numbers only, as those of many sensors do."""
 MOST_FAULTS = 1000
 """Faults that are remembered; more are those of a loop that makes up names."""
 _NUMBER = re.compile(r'[\d.]+')
@@ -20,13 +23,16 @@ class StatusLog:
         self._logger = logger
         self._faulty: set[str] = set()
         self._logged: dict[tuple[str, str], float] = {}
+        self._alike: Counter[str] = Counter()
+        self._alike_since = 0.0
 
     def note(self, status: DiagnosticStatus) -> None:
         """Log a status, where it is news."""
+        subject = str(status.name.rpartition(': ')[2])
         if status.level == DiagnosticStatus.OK:
             if status.name in self._faulty:
                 self._faulty.discard(status.name)
-                self._logger.info(f'{_subject(status)}: {status.message} again')
+                self._log(DiagnosticStatus.OK, f'{subject}: {status.message} again')
             return
         self._faulty.add(status.name)
         # The same fault has other numbers every second.
@@ -36,13 +42,22 @@ class StatusLog:
         if len(self._logged) >= MOST_FAULTS:
             self._logged.clear()
         self._logged[fault] = now
-        text = f'{_subject(status)}: {status.message}'
-        if status.level == DiagnosticStatus.ERROR:
+        self._log(status.level, f'{subject}: {status.message}')
+
+    def _log(self, level: bytes, text: str) -> None:
+        """Log a line, but of many that are alike only the first."""
+        now, pattern = time.monotonic(), _NUMBER.sub('#', text)
+        if now - self._alike_since > REPEATED_S or len(self._alike) >= MOST_FAULTS:
+            self._alike.clear()
+            self._alike_since = now
+        self._alike[pattern] += 1
+        if self._alike[pattern] > MOST_ALIKE:
+            return
+        if self._alike[pattern] == MOST_ALIKE:
+            text += ' (more that are alike are in /diagnostics only)'
+        if level == DiagnosticStatus.ERROR:
             self._logger.error(text)
+        elif level == DiagnosticStatus.OK:
+            self._logger.info(text)
         else:
             self._logger.warning(text)
-
-
-def _subject(status: DiagnosticStatus) -> str:
-    """What a status is of: the logger names the node."""
-    return str(status.name.rpartition(': ')[2])

@@ -425,3 +425,18 @@ def test_messages_are_whole():
     arrivals = device.read(0.0) + device.read(0.0)
     assert [(a.source, a.reading.field[0]) for a in arrivals] == [('a', 1.0), ('b', 3.0)]
     assert device.counts == {'dropped': 2, 'bytes between frames': 1}
+
+
+def test_what_is_measured_while_nobody_listens_is_not_lost():
+    """A deliberate pause is not one of the link: that is counted."""
+    def at(*numbers):
+        return [Reading('', (float(n), 0.0, 0.0), sequence=n) for n in numbers]
+    driver, *_ = driver_of([at(1, 2), at(50, 51, 53)])
+    said(driver, 0.1)
+    driver.close()
+    assert len(said(driver, 0.1)) == 3
+    assert driver.counts()['lost: mag_1'] == 1
+    driver, *_ = driver_of([at(1, 2), at(50, 51, 53)])
+    said(driver, 0.1)
+    said(driver, 0.1)
+    assert driver.counts()['lost: mag_1'] == 48
