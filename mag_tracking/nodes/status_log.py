@@ -26,6 +26,11 @@ class StatusLog:
         self._alike: Counter[str] = Counter()
         self._alike_since = 0.0
 
+    @property
+    def n_remembered(self) -> int:
+        """Faults and kinds of lines that are remembered."""
+        return len(self._logged) + len(self._alike)
+
     def note(self, status: DiagnosticStatus) -> None:
         """Log a status, where it is news."""
         subject = str(status.name.rpartition(': ')[2])

@@ -3,16 +3,17 @@
 Uncertainty is drawn as 90 % regions throughout.
 """
 
-from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.report.literal_text import literal
+from mag_tracking.report.style import AXIS_COLOURS, SERIES, VERMILLION, legend_beside
 from mag_tracking.report.track_log import TrackLog
 
 SCALE_2D = float(np.sqrt(chdtri(2, 0.1)))
@@ -20,7 +21,9 @@ SCALE_2D = float(np.sqrt(chdtri(2, 0.1)))
 SCALE_1D = 1.645
 """Deviations to the edge of a 90 % interval."""
 
-_COLOURS = ('tab:blue', 'tab:orange', 'tab:green', 'tab:purple', 'tab:brown', 'tab:cyan')
+LEAST_DRAWN = 0.01
+"""Hypotheses of an arrival are on the map while it weighs more: what is as good as dropped would
+stretch it."""
 
 
 class _Network(Protocol):
@@ -47,7 +50,7 @@ def _ellipse(position: FloatArray, covariance: FloatArray, n: int = 48) -> Float
 def _colours(log: TrackLog) -> dict[str, str]:
     """{arrival: colour}, in a fixed order."""
     names = sorted({name for row in log.arrivals for name in row})
-    return {name: _COLOURS[i % len(_COLOURS)] for i, name in enumerate(names)}
+    return {name: SERIES[i % len(SERIES)] for i, name in enumerate(names)}
 
 
 def scale_of(extent: float) -> tuple[float, str]:
@@ -60,10 +63,9 @@ def field_unit(strongest: float) -> tuple[float, str]:
     return (1e9, 'nT') if strongest < 1e-5 else (1e6, 'µT') if strongest < 1e-2 else (1e3, 'mT')
 
 
-def _without_switches(rows: Sequence[tuple[int, float, FloatArray, FloatArray]]) -> FloatArray:
-    """Points (n, 2), with NaN where the best of an arrival is suddenly elsewhere: another one."""
-    points = np.array([r[2][:2] for r in rows])
-    certain = np.array([3.0 * np.sqrt(np.trace(r[3])) for r in rows])
+def _without_switches(points: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Points (n, 2), with NaN where another hypothesis begins, which is suddenly elsewhere."""
+    certain = 3.0 * np.sqrt(np.trace(covariances, axis1=1, axis2=2))
     steps = np.hypot(*np.diff(points, axis=0).T)
     usual = 4.0 * np.median(steps) if len(steps) else 0.0
     switch = np.flatnonzero(steps > np.maximum(usual, 0.5 * certain[1:])) + 1
@@ -81,33 +83,30 @@ def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None
     truth : (n, 3) [m], optional
     smoothed : (n, 3) [m], optional
     """
-    figure = Figure(figsize=(7.5, 6.5), layout='constrained')
+    figure = Figure(figsize=(8.5, 6.5), layout='constrained')
     axes = figure.add_subplot()
-    best = np.array(log.position)
-    reach = np.vstack([best[:, :2], network.positions[:, :2]])
+    best = np.array(log.position)[:, :2]
+    covariance = np.array(log.covariance)[:, :2, :2]
+    ambiguous = np.array(log.ambiguous, dtype=bool)
+    reach = np.vstack([best, network.positions[:, :2]])
     low, high = reach.min(axis=0), reach.max(axis=0)
-    f, unit = scale_of((high - low).max())
     span = max((high - low).max(), 1e-6)
-    every = max(1, len(best) // 14)
-    colours = _colours(log)
-    for name, colour in colours.items():
-        rows = [(k, *row[name]) for k, row in enumerate(log.arrivals) if name in row]
-        points = f * _without_switches(rows)
-        weight = rows[-1][1] if rows[-1][0] == len(best) - 1 else 0.0
-        axes.plot(*points.T, color=colour, lw=1.8 if weight > 0.5 else 1.0,
-                  label=f'{literal(name) or "hypothesis"} ({weight:.0%} at the end)')
-        for k, _, position, covariance in rows:
-            if k % every == 0:
-                axes.fill(*(f * _ellipse(position, covariance)).T, color=colour,
-                          alpha=0.10 if weight > 0.5 else 0.04, lw=0)
+    f, unit = scale_of(span)
+    _draw_arrivals(axes, log, f)
+    for k in range(0, len(best), max(1, len(best) // 14)):
+        axes.fill(*(f * _ellipse(best[k], covariance[k])).T, color='k', lw=0,
+                  alpha=0.04 if ambiguous[k] else 0.10)
+    axes.plot(*(f * _without_switches(best, covariance)).T, color='k', lw=1.8, label='track')
+    if ambiguous.any():
+        axes.plot(*(f * best[ambiguous]).T, 'o', mfc='w', mec='k', ms=4, label='ambiguous pose')
+    axes.plot(*(f * best[0]), 's', mfc='w', mec='k', ms=7, label='first pose')
     if truth is not None and np.isfinite(truth).any():
-        axes.plot(f * truth[:, 0], f * truth[:, 1], 'k--', lw=1.2, label='truth')
+        axes.plot(f * truth[:, 0], f * truth[:, 1], '--', color='0.5', lw=1.4, label='truth')
     if smoothed is not None:
-        axes.plot(*(f * np.asarray(smoothed)[:, :2]).T, color='tab:red', lw=1.4,
+        axes.plot(*(f * np.asarray(smoothed)[:, :2]).T, color=VERMILLION, lw=1.4,
                   label='smoothed')
     axes.plot(f * network.positions[:, 0], f * network.positions[:, 1], 'k^', ms=8,
               label='magnetometers')
-    axes.plot(*(f * best[0, :2]), 'o', mfc='w', mec='k', ms=6, label='first pose')
     middle, half = 0.5 * (low + high), 0.5 * span + 0.12 * span
     axes.set_xlim(f * (middle[0] - half), f * (middle[0] + half))
     axes.set_ylim(f * (middle[1] - half), f * (middle[1] + half))
@@ -115,9 +114,25 @@ def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None
     axes.set_xlabel(f'x [{unit}]')
     axes.set_ylabel(f'y [{unit}]')
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8, loc='best')
-    axes.set_title(f'Track {log.id}: hypotheses with 90 % ellipses')
+    legend_beside(axes)
+    axes.set_title(f'Track {log.id} with 90 % ellipses')
     return figure
+
+
+def _draw_arrivals(axes: Axes, log: TrackLog, f: float) -> None:
+    """The best hypothesis of each arrival, while it weighs something, where there are several."""
+    colours = _colours(log)
+    if len(colours) < 2:
+        return
+    for name, colour in colours.items():
+        rows = [row[name] for row in log.arrivals if name in row and row[name][0] > LEAST_DRAWN]
+        if not rows:
+            continue
+        points = _without_switches(np.array([position[:2] for _, position, _ in rows]),
+                                   np.array([C for *_, C in rows]))
+        weight = log.arrivals[-1].get(name, (0.0,))[0]
+        axes.plot(*(f * points).T, color=colour, lw=3.0 if weight > 0.5 else 1.2, alpha=0.8,
+                  label=f'from {literal(name)} ({weight:.0%} at the end)')
 
 
 def weights_figure(log: TrackLog) -> Figure:
@@ -127,17 +142,19 @@ def weights_figure(log: TrackLog) -> Figure:
     ----------
     log : TrackLog
     """
-    figure = Figure(figsize=(7.5, 4.5), layout='constrained')
+    figure = Figure(figsize=(8.5, 4.5), layout='constrained')
     top, bottom = figure.subplots(2, 1, sharex=True)
     t = log.seconds()
     for name, colour in _colours(log).items():
         w = np.array([row[name][0] if name in row else 0.0 for row in log.arrivals])
-        top.plot(t, w, color=colour, label=literal(name) or 'hypothesis')
+        top.plot(t, w, color=colour, label=literal(name) or 'all hypotheses')
         bottom.semilogy(t, np.where(w > 0.0, w, np.nan), color=colour)
     top.set_ylim(-0.03, 1.03)
     top.set_ylabel('weight')
-    top.legend(fontsize=8)
-    top.set_title(f'Track {log.id}: weight of each arrival direction (gone = dropped)')
+    legend_beside(top)
+    what = 'each arrival direction (a line ends where it was dropped)' \
+        if any(_colours(log)) else 'the hypotheses, which have no arrival directions'
+    top.set_title(f'Track {log.id}: weight of {what}')
     bottom.set_ylim(1e-13, 3.0)
     bottom.set_ylabel('weight (log)')
     bottom.set_xlabel('time since the first pose [s]')
@@ -169,7 +186,7 @@ def field_figure(log: TrackLog, network: _Network, most: int = 8) -> Figure:
     for axes in grid.flat[len(rows):]:
         axes.set_visible(False)
     for axes, j in zip(grid.flat, rows, strict=False):
-        for a, colour in enumerate(('tab:red', 'tab:green', 'tab:blue')):
+        for a, colour in enumerate(AXIS_COLOURS):
             axes.plot(t, f * measured[:, j, a], '.', ms=4, color=colour,
                       label=f'{"xyz"[a]} measured' if j == rows[0] else None)
             axes.plot(t, f * predicted[:, j, a], '-', lw=1.2, color=colour,
@@ -179,7 +196,8 @@ def field_figure(log: TrackLog, network: _Network, most: int = 8) -> Figure:
         axes.grid(alpha=0.3)
     for axes in grid[-1]:
         axes.set_xlabel('time since the first pose [s]')
-    grid[0, 0].legend(fontsize=7, ncol=2)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, fontsize=8, ncol=6, loc='outside lower center')
     shown = '' if len(rows) == len(network) else f' (the strongest {len(rows)} of {len(network)})'
     figure.suptitle(f'Track {log.id}: measured and predicted field, sensor frame{shown}')
     return figure

@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.report.figures import SCALE_1D, field_unit
 from mag_tracking.report.literal_text import literal
-
-_AXES = ('tab:red', 'tab:green', 'tab:blue')
+from mag_tracking.report.style import AXIS_COLOURS, SERIES, legend_beside, plain_log_ticks
 
 
 class _Network(Protocol):
@@ -113,7 +112,7 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
         t = data.t[mine]
         # A coarse sensor at rest has a larger one, so that all its readings count as one.
         noise = np.nanmin(np.einsum('nii->ni', data.covariance[mine]), axis=0, initial=np.inf)
-        for a, colour in enumerate(_AXES):
+        for a, colour in enumerate(AXIS_COLOURS):
             if np.isnan(data.field[mine, a]).all():
                 continue
             middle = f * (fit.predicted - level)[mine, a]
@@ -125,7 +124,7 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
         axes.set_title(literal(data.network.names[j]), fontsize=9)
         axes.set_ylabel(f'field [{unit}]')
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=8, ncol=3, loc='upper right')
+        legend_beside(axes)
     axes.set_xlabel('time from the strongest field [s]')
     figure.suptitle(f'{literal(title)}: measured (dots), fitted (lines), 90 % bands', fontsize=11)
     return figure
@@ -156,7 +155,7 @@ def order_figure(passes: Sequence[_FittedPass]) -> Figure:
         fits = [f for f in one.fits if len(f.x)]
         if not fits:
             continue
-        colour = f'C{k % 10}'
+        colour = SERIES[k % len(SERIES)]
         axes.semilogy([f.n_dipoles for f in fits], [f.normalised_cost for f in fits], 'o-',
                       mfc='w', color=colour, label=literal(f'{one.recording}, pass {one.number}'))
         if one.chosen is not None:
@@ -167,6 +166,8 @@ def order_figure(passes: Sequence[_FittedPass]) -> Figure:
     axes.set_xlabel('number of dipoles')
     axes.set_ylabel('normalised cost (1 = the model is right)')
     axes.grid(alpha=0.3, which='both')
-    axes.legend(fontsize=8)
-    axes.set_title('How well a row of dipoles describes each pass (filled: the order chosen)')
+    legend_beside(axes)
+    plain_log_ticks(axes)
+    figure.suptitle('How well a row of dipoles describes each pass (filled: the order chosen)',
+                    fontsize=11)
     return figure

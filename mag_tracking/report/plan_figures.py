@@ -11,6 +11,10 @@ from matplotlib.figure import Figure
 from mag_tracking.arrays import FloatArray
 from mag_tracking.report.figures import scale_of
 from mag_tracking.report.literal_text import literal
+from mag_tracking.report.style import SERIES, legend_beside, plain_log_ticks
+
+LEAST_MISSED = 1e-6
+"""Smaller probabilities of a miss are not drawn."""
 
 
 class _Network(Protocol):
@@ -162,27 +166,45 @@ def f_text(metres: float) -> str:
     return f'{metres:.3g} m' if metres >= 0.01 else f'{1e3 * metres:.2g} mm'
 
 
+def _distinct(lanes: Sequence[_Lane]) -> list[tuple[str, _Lane]]:
+    """[(names, lane)], one for lanes whose curves are the same: one would hide the other."""
+    out: list[tuple[list[str], _Lane]] = []
+    for lane in lanes:
+        for names, other in out:
+            if all(np.array_equal(a.shape, b.shape) and np.allclose(a, b, rtol=1e-3) for a, b in (
+                    (lane.along, other.along), (lane.filter_std, other.filter_std),
+                    (lane.pass_std, other.pass_std), (lane.detection, other.detection))):
+                names.append(literal(lane.name))
+                break
+        else:
+            out.append(([literal(lane.name)], lane))
+    return [(' and '.join(names), lane) for names, lane in out]
+
+
 def lane_figure(plan: _Plan) -> Figure:
     """Bounds and detection along the lanes, and how many passes are missed by their distance."""
-    figure = Figure(figsize=(8.5, 9.0), layout='constrained')
+    figure = Figure(figsize=(10.0, 9.0), layout='constrained')
     top, middle, bottom = figure.subplots(3, 1)
     f, unit = scale_of(np.ptp(plan.x))
-    for k, lane in enumerate(plan.lanes):
-        colour = f'C{k % 10}'
+    for k, (name, lane) in enumerate(_distinct(plan.lanes)):
+        colour = SERIES[k % len(SERIES)]
         top.semilogy(f * lane.along, f * lane.filter_std, '-', color=colour,
-                     label=f'{literal(lane.name)}: filter so far')
+                     label=f'{name}: filter so far')
         top.semilogy(f * lane.along, f * lane.pass_std[:, 0], '--', color=colour,
-                     label=f'{literal(lane.name)}: whole pass')
-        middle.plot(f * lane.along, lane.detection, color=colour, label=literal(lane.name))
+                     label=f'{name}: whole pass')
+        middle.plot(f * lane.along, lane.detection, color=colour, label=name)
     top.set_ylabel(f'position bound [{unit}]')
     top.set_ylim(top=min(top.get_ylim()[1], f * np.ptp(plan.x)))
-    top.legend(fontsize=8)
+    legend_beside(top)
+    plain_log_ticks(top)
     top.set_title('Along the lanes (in the direction of travel, 0 = nearest to the middle)')
     middle.set_ylabel('P(one frame detects it)')
     middle.set_xlabel(f'distance along the lane [{unit}]')
-    middle.legend(fontsize=8)
-    bottom.semilogy(f * plan.missed[:, 0], np.maximum(plan.missed[:, 1], 1e-6), 'k.-')
-    bottom.set_ylim(1e-6, 1.5)
+    legend_beside(middle)
+    known = plan.missed[plan.missed[:, 1] >= LEAST_MISSED]
+    bottom.semilogy(f * known[:, 0], known[:, 1], '.-', color='k')
+    bottom.set_xlim(f * plan.missed[0, 0], 1.02 * f * plan.missed[-1, 0])
+    bottom.set_ylim(0.5 * LEAST_MISSED, 2.0)
     bottom.set_xlabel(f'lateral distance of a pass from the middle of the sensors [{unit}]')
     bottom.set_ylabel('P(a pass is missed)')
     for axes in (top, middle, bottom):

@@ -44,6 +44,7 @@ FIELD = 1e-8 * np.ones((4, 3, 3))
 def log_of_track():
     place = np.zeros(3), np.eye(2)
     return TrackLog(1, stamp_ns=[0, 1, 2, 3], position=[np.ones(3) * k for k in range(4)],
+                    covariance=[np.eye(6)] * 4, ambiguous=[True, False, False, False],
                     arrivals=[{name: (0.5, *place) for name in NAMES}] * 4,
                     measured=list(FIELD), predicted=list(FIELD))
 
@@ -58,8 +59,9 @@ def fitted_pass():
 
 
 def plan():
-    lanes = [SimpleNamespace(name=name, along=T, filter_std=ONES, pass_std=ONES[:, None],
-                             detection=ONES) for name in NAMES]
+    lanes = [SimpleNamespace(name=name, along=T, filter_std=(k + 1.0) * ONES,
+                             pass_std=ONES[:, None], detection=ONES)
+             for k, name in enumerate(NAMES)]
     return SimpleNamespace(x=T, lanes=lanes, missed=np.stack([T, 0.1 * ONES], axis=1))
 
 
@@ -81,7 +83,7 @@ ELLIPSOID = SimpleNamespace(coverage=1.0, correct=lambda readings: readings)
 
 
 @pytest.mark.parametrize('drawn, what', [
-    (lambda: map_figure(log_of_track(), NETWORK), '{} (50% at the end)'),
+    (lambda: map_figure(log_of_track(), NETWORK), 'from {} (50% at the end)'),
     (lambda: weights_figure(log_of_track()), '{}'),
     (lambda: field_figure(log_of_track(), NETWORK), '{}'),
     (lambda: pass_figure(fitted_pass(), ', '.join(NAMES)), '{}'),
@@ -93,6 +95,26 @@ ELLIPSOID = SimpleNamespace(coverage=1.0, correct=lambda readings: readings)
     (lambda: geometry_figure(geometry()), '{}')])
 def test_every_figure_draws_names_as_they_are(drawn, what):
     assert {what.format(name) for name in NAMES} <= texts_of(drawn())
+
+
+def test_lanes_that_are_equal_share_a_curve_and_a_label():
+    """Of two equal curves one would hide the other."""
+    lanes = plan()
+    lanes.lanes[2].filter_std = lanes.lanes[0].filter_std
+    texts = texts_of(lane_figure(lanes))
+    assert {f'{NAMES[0]} and {NAMES[2]}', NAMES[1]} <= texts and NAMES[2] not in texts
+
+
+def test_the_first_pose_is_on_the_line_of_the_track():
+    """Also where the best hypothesis of its arrival is elsewhere."""
+    log = log_of_track()
+    (axes,) = map_figure(log, NETWORK).axes
+    lines = {line.get_label(): line.get_xydata() for line in axes.get_lines()}
+    assert lines['first pose'].tolist() == [lines['track'][0].tolist()]
+    # Only what weighs something is drawn.
+    log.arrivals = [{name: (0.001, np.zeros(3), np.eye(2)) for name in NAMES}] * 4
+    labels = [line.get_label() for line in map_figure(log, NETWORK).axes[0].get_lines()]
+    assert not any(label.startswith('from ') for label in labels)
 
 
 def test_bytes_of_a_file_name_that_are_no_text_are_escaped():
