@@ -28,7 +28,7 @@ from support.networks import line_network
 
 
 def write_results(out):
-    with ResultFolder(out, 'map') as results:
+    with ResultFolder(out, line_network(2)) as results:
         results.write_summary({})
 
 
@@ -103,7 +103,7 @@ def test_a_folder_of_that_name_is_no_file(tmp_path):
     for name in ('poses.csv', 'tracks.mcap'):
         (tmp_path / name / name).mkdir(parents=True)
         with pytest.raises(OutputError, match='cannot write .*: Is a directory'):
-            ResultFolder(tmp_path / name, 'map')
+            ResultFolder(tmp_path / name, line_network(2))
 
 
 def test_a_path_with_a_nul_is_named(tmp_path):

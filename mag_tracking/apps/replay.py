@@ -106,7 +106,7 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     found.apply(pipeline.calibrate)
     interrupted = False
 
-    with ResultFolder(out, network.frame) as results:
+    with ResultFolder(out, network) as results:
         if results.replaces_earlier and report is not None:
             report(f'replaces the results of an earlier run in {out}')
         taker = RunCollector(results)
@@ -132,6 +132,9 @@ class Results(Protocol):
     def add_disturbance(self, disturbance: Disturbance, /) -> None:
         """Take a disturbance, when it is found and once more when it has ended."""
 
+    def add_frame(self, frame: FieldFrame, /) -> None:
+        """Take a frame with a target in it."""
+
     def add_smoothed(self, pose: SmoothedPose, /) -> None:
         """Take a smoothed pose."""
 
@@ -156,6 +159,8 @@ class RunCollector:
         for record in records:
             if isinstance(record, FieldFrame):
                 self._frame = record
+                if record.target_present:
+                    self._results.add_frame(record)
             elif isinstance(record, Detection):
                 self._results.add_detection(record)
             elif isinstance(record, Disturbance):

@@ -23,7 +23,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.records import Detection, Readings, SmoothedPose, Track
+from mag_tracking.records import Detection, FieldFrame, Readings, SmoothedPose, Track
 from mag_tracking.report.dataframes import (
     detections_dataframe,
     poses_dataframe,
@@ -248,6 +248,9 @@ class _Results:
     def add_disturbance(self, disturbance: Disturbance) -> None:
         """Take a disturbance; its last record takes the place of those before."""
         self.disturbances[disturbance.id] = disturbance
+
+    def add_frame(self, frame: FieldFrame) -> None:
+        """Frames with a target are in the history of its track."""
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
         """Take a smoothed pose."""

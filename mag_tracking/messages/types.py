@@ -1,10 +1,10 @@
 """Message types as text, and their CDR bytes, without ROS.
 
-The definitions of this package's own messages stand in `msg_defs/`; the copy
-here is what a recording carries, and a test compares the two.
+What the definitions are stands in `definitions`; a recording carries them.
 """
 
 import functools
+import re
 import struct
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -16,6 +16,7 @@ from mcap_ros2 import _dynamic
 from mcap_ros2.decoder import DecoderFactory
 
 from mag_tracking.errors import RecordingError
+from mag_tracking.messages.definitions import DEFINITIONS
 from mag_tracking.messages.shapes import MessageDict
 
 MAGNETIC_FIELD = 'sensor_msgs/msg/MagneticField'
@@ -26,6 +27,10 @@ ODOMETRY = 'nav_msgs/msg/Odometry'
 TRACK_ARRAY = 'mag_tracking_msgs/msg/TrackArray'
 FIELD_READINGS = 'mag_tracking_msgs/msg/FieldReadings'
 DISTURBANCE = 'mag_tracking_msgs/msg/Disturbance'
+SMOOTHED_TRACK = 'mag_tracking_msgs/msg/SmoothedTrack'
+PATH = 'nav_msgs/msg/Path'
+MARKERS = 'visualization_msgs/msg/MarkerArray'
+TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 
 RAW_READINGS = 'field_readings'
 """The topic of raw readings of many sensors. It and the next ones are relative to the namespace of
@@ -37,64 +42,34 @@ CALIBRATION_STATE = 'calibration_state'
 NETWORK_FRAME = 'network_frame'
 """The topic of frames of the network."""
 
-DEFINITIONS: dict[str, tuple[tuple[str, ...], str]] = {
-    'builtin_interfaces/msg/Time': ((), 'int32 sec\nuint32 nanosec\n'),
-    'std_msgs/msg/Header': (('builtin_interfaces/msg/Time',),
-                            'builtin_interfaces/Time stamp\nstring frame_id\n'),
-    'geometry_msgs/msg/Vector3': ((), 'float64 x\nfloat64 y\nfloat64 z\n'),
-    'geometry_msgs/msg/Point': ((), 'float64 x\nfloat64 y\nfloat64 z\n'),
-    'geometry_msgs/msg/Quaternion': (
-        (), 'float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n'),
-    'geometry_msgs/msg/Pose': (
-        ('geometry_msgs/msg/Point', 'geometry_msgs/msg/Quaternion'),
-        'geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n'),
-    'geometry_msgs/msg/PoseWithCovariance': (
-        ('geometry_msgs/msg/Pose',), 'geometry_msgs/Pose pose\nfloat64[36] covariance\n'),
-    POSE: (('std_msgs/msg/Header', 'geometry_msgs/msg/Pose'),
-           'std_msgs/Header header\ngeometry_msgs/Pose pose\n'),
-    POSE_WITH_COVARIANCE: (
-        ('std_msgs/msg/Header', 'geometry_msgs/msg/PoseWithCovariance'),
-        'std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose\n'),
-    MAGNETIC_FIELD: (
-        ('std_msgs/msg/Header', 'geometry_msgs/msg/Vector3'),
-        'std_msgs/Header header\ngeometry_msgs/Vector3 magnetic_field\n'
-        'float64[9] magnetic_field_covariance\n'),
-    FIELD_READINGS: (
-        ('std_msgs/msg/Header',),
-        'std_msgs/Header header\nstring[] sensors\nuint16[] sensor\nint64[] stamp\n'
-        'float64[] field\nfloat64[] covariance\n'),
-    'mag_tracking_msgs/msg/Track': (
-        ('std_msgs/msg/Header', 'geometry_msgs/msg/PoseWithCovariance',
-         'geometry_msgs/msg/Vector3'),
-        'uint8 ACTIVE=0\nuint8 ENDED=1\nstd_msgs/Header header\nuint32 id\nuint8 status\n'
-        'geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/Vector3 velocity\n'
-        'float64[36] covariance\ngeometry_msgs/Vector3 moment\nfloat64[9] moment_covariance\n'
-        'float64 existence\nfloat64 weight\nfloat64 normalised_innovation\n'
-        'float64[] innovation_by_sensor\nuint32 degrees_of_freedom\nstring arrival\nstring kind\n'
-        'float64 kind_weight\nfloat64 length\nfloat64 length_std\nbool ambiguous\n'
-        'bool[6] unobservable\n'
-        'float64[] predicted_field\nfloat64[] mounting\nfloat64[] mounting_covariance\n'
-        'string[] doubts\n'),
-    DISTURBANCE: (
-        ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time'),
-        'std_msgs/Header header\nuint32 id\nbool ended\nbuiltin_interfaces/Time begin\n'
-        'float64 largest\nstring[] sensors\nfloat64 uniform\nuint32 track_id\n'),
-    TRACK_ARRAY: (('std_msgs/msg/Header', 'mag_tracking_msgs/msg/Track'),
-                  'std_msgs/Header header\nmag_tracking_msgs/Track[] tracks\n'),
-}
-"""{type: (types that it names, text)}; Jazzy's definitions without comments."""
+_BUILT_IN = {'bool', 'byte', 'char', 'string', 'wstring', 'float32', 'float64',
+             *(f'{u}int{n}' for u in ('', 'u') for n in (8, 16, 32, 64))}
+_FIELD = re.compile(r'\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[(?:<=)?\d*\])?\s+[A-Za-z]\w*\s*(=?)')
+
+
+def named_in(text: str, package: str) -> list[str]:
+    """The types that a definition of a `package` names, each once."""
+    out: list[str] = []
+    for line in text.splitlines():
+        field = _FIELD.match(line.partition('#')[0])
+        if field and not field[2] and field[1] not in _BUILT_IN:
+            owner, _, leaf = field[1].rpartition('/')
+            name = f'{(owner or package).partition("/")[0]}/msg/{leaf}'
+            if name not in out:
+                out.append(name)
+    return out
 
 
 def _closure(type_name: str) -> list[str]:
     """The types below `type_name`, each once, in the order met."""
     seen: list[str] = []
-    queue = list(DEFINITIONS[type_name][0])
+    queue = [type_name]
     while queue:
         name = queue.pop(0)
         if name not in seen:
             seen.append(name)
-            queue += DEFINITIONS[name][0]
-    return seen
+            queue += named_in(DEFINITIONS[name], name.partition('/')[0])
+    return seen[1:]
 
 
 def definition(type_name: str) -> str:
@@ -104,10 +79,10 @@ def definition(type_name: str) -> str:
     """
     if type_name not in DEFINITIONS:
         raise RecordingError(f'no definition of {type_name} to write it with')
-    text = DEFINITIONS[type_name][1]
+    text = DEFINITIONS[type_name]
     for name in _closure(type_name):
         package, _, leaf = name.split('/')
-        text += f'{"=" * 80}\nMSG: {package}/{leaf}\n{DEFINITIONS[name][1]}'
+        text += f'{"=" * 80}\nMSG: {package}/{leaf}\n{DEFINITIONS[name]}'
     return text
 
 

@@ -2,16 +2,11 @@
 
 import functools
 import os
-import re
 import sys
 from pathlib import Path
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.types import definition
-
-_BUILT_IN = {'bool', 'byte', 'char', 'string', 'wstring', 'float32', 'float64',
-             *(f'{u}int{n}' for u in ('', 'u') for n in (8, 16, 32, 64))}
-_FIELD = re.compile(r'\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[(?:<=)?\d*\])?\s+[A-Za-z]\w*\s*(=?)')
+from mag_tracking.messages.types import definition, named_in
 
 
 @functools.cache
@@ -32,7 +27,7 @@ def definition_of(type_name: str) -> str | None:
             return None
         package, _, leaf = name.split('/')
         text += own if not text else f'{"=" * 80}\nMSG: {package}/{leaf}\n{own}'
-        new = [t for t in _named_in(own, package) if t not in seen]
+        new = [t for t in named_in(own, package) if t not in seen]
         seen += new
         queue += new
     return text
@@ -49,16 +44,3 @@ def _own_text(type_name: str) -> str | None:
             text = file.read_text(encoding='utf-8', errors='replace')
             return text if text.endswith('\n') else f'{text}\n'
     return None
-
-
-def _named_in(text: str, package: str) -> list[str]:
-    """The types that a definition names, each once."""
-    out: list[str] = []
-    for line in text.splitlines():
-        field = _FIELD.match(line.partition('#')[0])
-        if field and not field[2] and field[1] not in _BUILT_IN:
-            owner, _, leaf = field[1].rpartition('/')
-            name = f'{(owner or package).partition("/")[0]}/msg/{leaf}'
-            if name not in out:
-                out.append(name)
-    return out

@@ -25,7 +25,7 @@ from mag_tracking.nodes.convert import message_class
 from mag_tracking.nodes.definitions import definition_of
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.recording.recorder import Recorder
-from mag_tracking.recording.rosbag2_folder import offered_qos
+from mag_tracking.recording.writer import offered_qos
 
 POLL_S = 0.02
 """How often messages are fetched [s]."""

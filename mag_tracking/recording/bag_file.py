@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.types import DEFINITIONS, encoder, schema_of
+from mag_tracking.messages.definitions import DEFINITIONS
+from mag_tracking.messages.types import encoder, schema_of
 from mag_tracking.recording.damage import DAMAGE
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.raw_message import RawMessage

@@ -25,10 +25,10 @@ from mag_tracking.recording.rosbag2_folder import (
     Opener,
     Topic,
     check_is_free,
-    offered_qos,
     open_new,
     write_metadata,
 )
+from mag_tracking.recording.writer import offered_qos
 
 FLUSH_NS = 400_000_000
 """What a crash may cost, less the time between two ticks [ns]."""

@@ -14,14 +14,10 @@ import numpy as np
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.files import new_text_file, output_folder
-from mag_tracking.messages.schema import (
-    disturbance_dict,
-    pose_message_dict,
-    track_dict,
-)
-from mag_tracking.messages.types import DISTURBANCE, POSE_WITH_COVARIANCE, TRACK_ARRAY
-from mag_tracking.recording.writer import RecordingWriter, refuse_other_recording
-from mag_tracking.records import Detection, SmoothedPose, Track
+from mag_tracking.network import SensorNetwork
+from mag_tracking.recording.track_recording import TrackRecording
+from mag_tracking.recording.writer import refuse_other_recording
+from mag_tracking.records import Detection, FieldFrame, SmoothedPose, Track
 
 POSE_COLUMNS = ('stamp_ns', 'track_id', 'x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z',
                 'sd_vx', 'sd_vy', 'sd_vz', 'mx', 'my', 'mz', 'weight', 'ambiguous',
@@ -67,18 +63,17 @@ class ResultFolder:
         trajectories of its tracks. All other files stay.
     """
 
-    def __init__(self, folder: str | PathLike[str], frame: str) -> None:
+    def __init__(self, folder: str | PathLike[str], network: SensorNetwork) -> None:
         """Raises OutputError where the folder cannot be made or written."""
         self.folder = output_folder(folder)
         refuse_other_recording(self.folder / _RECORDING)
-        self._frame = frame
         self._files = ExitStack()
         try:
             self.replaces_earlier = self._remove_earlier()
             (self._poses, self._smoothed, self._detections, self._disturbances,
              self._hypotheses) = (
                 self._table(name, columns) for name, columns in _TABLES.items())
-            self._recording = RecordingWriter(self.folder / _RECORDING)
+            self._recording = TrackRecording(self.folder / _RECORDING, network)
         except OutputError:
             self._files.close()
             raise
@@ -120,16 +115,15 @@ class ResultFolder:
             d.degrees_of_freedom, repr(d.threshold), repr(d.false_alarm_probability),
             d.strongest_sensor])
 
+    def add_frame(self, frame: FieldFrame) -> None:
+        """Take a frame with a target in it."""
+        self._recording.add_frame(frame)
+
     def add_track(self, track: Track) -> None:
         """One row a pose and one a hypothesis; the closing record of a track has no row."""
-        message = track_dict(track, self._frame)
-        self._recording.write('/tracker_node/tracks', TRACK_ARRAY, {
-            'header': message['header'], 'tracks': [message]}, track.stamp_ns)
+        self._recording.add_track(track)
         if track.ended:
             return
-        pose = pose_message_dict(track, self._frame)
-        if pose is not None:
-            self._recording.write('/tracker_node/pose', POSE_WITH_COVARIANCE, pose, track.stamp_ns)
         sd = np.sqrt(np.diagonal(track.covariance))
         self._poses.writerow([track.stamp_ns, track.id, *_floats(
             track.position, track.velocity, sd, track.moment, [track.weight]),
@@ -142,8 +136,7 @@ class ResultFolder:
 
     def add_disturbance(self, d: Disturbance) -> None:
         """One row when a `Disturbance` is found, and one when it has ended."""
-        self._recording.write('/tracker_node/disturbances', DISTURBANCE,
-                              disturbance_dict(d, self._frame), d.stamp_ns)
+        self._recording.add_disturbance(d)
         self._disturbances.writerow([
             d.stamp_ns, d.id, int(d.ended), d.begin_ns, repr(d.largest), ' '.join(d.sensors),
             repr(d.uniform), d.track_id])
@@ -151,6 +144,7 @@ class ResultFolder:
     def add_smoothed(self, pose: SmoothedPose) -> None:
         """One row for a `SmoothedPose` of a whole track; those of a fixed lag have none."""
         if pose.complete:
+            self._recording.add_smoothed(pose)
             sd = np.sqrt(np.diagonal(pose.covariance))
             self._smoothed.writerow([
                 pose.stamp_ns, pose.id, *_floats(pose.position, pose.velocity, sd, pose.moment),

@@ -36,13 +36,6 @@ class FileSummary(NamedTuple):
     last_ns: int | None = None
 
 
-def offered_qos(reliable: bool = True, latched: bool = False) -> str:
-    """`offered_qos_profiles` of a topic, as rosbag2 writes it."""
-    text = OFFERED_QOS if reliable else OFFERED_QOS.replace('reliability: reliable',
-                                                            'reliability: best_effort')
-    return text.replace('durability: volatile', 'durability: transient_local') if latched else text
-
-
 def open_new(path: Path) -> io.FileIO:
     """A file of one's own to write to, without a buffer that a crash would lose."""
     stream = open(path, 'xb', buffering=0)

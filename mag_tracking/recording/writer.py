@@ -1,6 +1,7 @@
 """Writer of MCAP recordings that rosbag2 plays."""
 
 from collections import Counter
+from collections.abc import Collection
 from os import PathLike
 from pathlib import Path
 
@@ -33,10 +34,12 @@ class RecordingWriter:
     recording. Chunks are small, so that a crash loses little.
     """
 
-    def __init__(self, path: str | PathLike[str]) -> None:
-        """Raises OutputError where the file cannot be written, or its folder holds another
-        recording.
+    def __init__(self, path: str | PathLike[str], latched: Collection[str] = ()) -> None:
+        """`latched` are topics whose messages are kept for those who come later.
+
+        Raises OutputError where the file cannot be written, or its folder holds another recording.
         """
+        self._latched = frozenset(latched)
         self.path = checked_path(path, OutputError)
         refuse_other_recording(self.path)
         try:
@@ -80,7 +83,8 @@ class RecordingWriter:
             self._schemas[type_name] = self._writer.register_schema(
                 type_name, 'ros2msg', definition(type_name).encode())
         channel = self._writer.register_channel(
-            topic, 'cdr', self._schemas[type_name], {'offered_qos_profiles': OFFERED_QOS})
+            topic, 'cdr', self._schemas[type_name],
+            {'offered_qos_profiles': offered_qos(latched=topic in self._latched)})
         self._channels[topic] = channel, type_name
 
     def close(self) -> None:
@@ -97,7 +101,8 @@ class RecordingWriter:
             'message_count': sum(self._counts.values()),
             'topics_with_message_count': [
                 {'topic_metadata': {'name': t, 'type': type_name, 'serialization_format': 'cdr',
-                                    'offered_qos_profiles': yaml.safe_load(OFFERED_QOS),
+                                    'offered_qos_profiles': yaml.safe_load(offered_qos(
+                                        latched=t in self._latched)),
                                     'type_description_hash': ''},
                  'message_count': self._counts[t]}
                 for t, (_, type_name) in self._channels.items()],
@@ -122,3 +127,10 @@ OFFERED_QOS = '''- history: keep_last
   liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}
   avoid_ros_namespace_conventions: false
 '''
+
+
+def offered_qos(reliable: bool = True, latched: bool = False) -> str:
+    """`offered_qos_profiles` of a topic, as rosbag2 writes it."""
+    text = OFFERED_QOS if reliable else OFFERED_QOS.replace('reliability: reliable',
+                                                            'reliability: best_effort')
+    return text.replace('durability: volatile', 'durability: transient_local') if latched else text

@@ -10,8 +10,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.messages.definitions import DEFINITIONS
 from mag_tracking.messages.schema import header_dict, reading_of, track_dict
-from mag_tracking.messages.types import DEFINITIONS, MAGNETIC_FIELD, TRACK_ARRAY, decode
+from mag_tracking.messages.types import MAGNETIC_FIELD, TRACK_ARRAY, decode
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import RecordingWriter
@@ -94,7 +95,7 @@ def fields(text):
 
 
 def test_definitions_are_those_of_the_message_package():
-    for name, (_, text) in DEFINITIONS.items():
+    for name, text in DEFINITIONS.items():
         if name.startswith('mag_tracking_msgs/'):
             source = ROOT / 'msg_defs' / 'msg' / f'{name.split("/")[-1]}.msg'
             assert fields(source.read_text()) == fields(text), name
@@ -102,7 +103,7 @@ def test_definitions_are_those_of_the_message_package():
 
 def test_definitions_are_those_of_jazzy():
     store = get_typestore(Stores.ROS2_JAZZY)
-    for name, (_, text) in DEFINITIONS.items():
+    for name, text in DEFINITIONS.items():
         if not name.startswith('mag_tracking_msgs/'):
             ours = get_types_from_msg(text, name)[name]
             # The generated text has them in the same order with the same types.
@@ -112,7 +113,7 @@ def test_definitions_are_those_of_jazzy():
 
 def test_every_field_of_a_track_is_written(vehicle_replays):
     """The encoder fills a missing field with zero without a word: none may be missing."""
-    names = {line.split()[1] for line in fields(DEFINITIONS['mag_tracking_msgs/msg/Track'][1])
+    names = {line.split()[1] for line in fields(DEFINITIONS['mag_tracking_msgs/msg/Track'])
              if '=' not in line}
     _, folder = vehicle_replays['straight_car_right']
     message = next(m for m in Recording(folder / 'tracks.mcap').messages()

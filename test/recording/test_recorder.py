@@ -11,7 +11,7 @@ from mag_tracking.errors import OutputError
 from mag_tracking.messages.types import MAGNETIC_FIELD, definition, encoder
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.recorder import FLUSH_NS, Recorder
-from mag_tracking.recording.rosbag2_folder import offered_qos
+from mag_tracking.recording.writer import offered_qos
 from support.recorded_numbers import TOPIC, S, by_rosbags, field, numbers, started
 
 # A kill in time, or a full disk, is not tested beside what computes.

@@ -4,11 +4,12 @@ import pytest
 
 from mag_tracking.errors import OutputError
 from mag_tracking.recording.result_folder import ResultFolder, figure_name
+from support.networks import line_network
 
 
 def write(out):
     """Whether it took the place of an earlier run."""
-    with ResultFolder(out, 'map') as results:
+    with ResultFolder(out, line_network(2)) as results:
         results.write_summary({})
     return results.replaces_earlier
 
@@ -36,7 +37,7 @@ def test_one_file_is_an_earlier_run(tmp_path, name):
 
 def test_a_run_that_was_killed_has_no_summary_of_the_one_before(tmp_path):
     write(tmp_path)
-    with ResultFolder(tmp_path, 'map'):
+    with ResultFolder(tmp_path, line_network(2)):
         assert not (tmp_path / 'summary.json').exists()
         assert not (tmp_path / 'metadata.yaml').exists()
 
@@ -45,6 +46,6 @@ def test_another_recording_is_left_as_it_is(tmp_path):
     (tmp_path / 'metadata.yaml').write_text('- theirs.mcap\n')
     (tmp_path / 'poses.csv').write_text('theirs')
     with pytest.raises(OutputError, match='another recording'):
-        ResultFolder(tmp_path, 'map')
+        ResultFolder(tmp_path, line_network(2))
     assert (tmp_path / 'poses.csv').read_text() == 'theirs'
     assert len(list(tmp_path.iterdir())) == 2

@@ -197,7 +197,7 @@ def test_a_full_disk_is_one_line(tmp_path, capsys, monkeypatch):
 
 
 def test_a_summary_without_numbers_is_still_json(tmp_path):
-    with result_folder.ResultFolder(tmp_path, 'map') as folder:
+    with result_folder.ResultFolder(tmp_path, line_network(2)) as folder:
         folder.write_summary({'a': float('nan'), 'b': [1.0, float('inf')]})
     assert json.loads((tmp_path / 'summary.json').read_text()) == {'a': None, 'b': [1.0, None]}
 

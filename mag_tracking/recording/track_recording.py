@@ -1,0 +1,140 @@
+"""`tracks.mcap`: what the nodes would have published, for the viewers of ROS.
+
+Fields, tracks, poses, odometry, path, smoothed tracks, markers, transforms, disturbances.
+"""
+
+from os import PathLike
+
+from mag_tracking.event_records import Disturbance
+from mag_tracking.messages.markers import delete_markers, sensor_markers, track_markers
+from mag_tracking.messages.schema import (
+    disturbance_dict,
+    header_dict,
+    magnetic_field_dicts,
+    odometry_dict,
+    pose_dict,
+    pose_message_dict,
+    smoothed_track_dict,
+    track_dict,
+)
+from mag_tracking.messages.shapes import MessageDict
+from mag_tracking.messages.standard import sensor_transform_dicts, track_transform_dict
+from mag_tracking.messages.types import (
+    DISTURBANCE,
+    MAGNETIC_FIELD,
+    MARKERS,
+    ODOMETRY,
+    PATH,
+    POSE_WITH_COVARIANCE,
+    SMOOTHED_TRACK,
+    TRACK_ARRAY,
+    TRANSFORMS,
+)
+from mag_tracking.network import SensorNetwork
+from mag_tracking.network.topics import absolute
+from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.records import FieldFrame, Readings, SmoothedPose, Track
+
+LATCHED = ('/tf_static', '/tracker_node/sensor_markers')
+"""Topics with one message, for those who come later."""
+
+
+class TrackRecording:
+    """Writes tracks and what belongs to them as messages; a context manager.
+
+    Parameters
+    ----------
+    path : path
+    network : SensorNetwork
+
+    Raises OutputError where the file cannot be written.
+    """
+
+    def __init__(self, path: str | PathLike[str], network: SensorNetwork) -> None:
+        self._writer = RecordingWriter(path, LATCHED)
+        self._network, self._frame = network, network.frame
+        self._topics = {name: f'{absolute(topic, network.namespace or "/")}_calibrated'
+                        for name, topic in zip(network.names, network.topics, strict=True)}
+        self._path: list[MessageDict] = []
+        self._smoothed: list[SmoothedPose] = []
+        self._is_begun = False
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._write_smoothed()
+        self._writer.close()
+
+    def _begin(self, stamp_ns: int) -> None:
+        """Write where the sensors are, once, at the time of the first message."""
+        if self._is_begun:
+            return
+        self._is_begun = True
+        self._writer.write('/tf_static', TRANSFORMS, {'transforms': sensor_transform_dicts(
+            self._network, {}, stamp_ns)}, stamp_ns)
+        self._writer.write('/tracker_node/sensor_markers', MARKERS,
+                           sensor_markers(self._network), stamp_ns)
+
+    def add_frame(self, frame: FieldFrame) -> None:
+        """Write the calibrated field of each sensor in a frame."""
+        self._write_smoothed()
+        self._begin(frame.stamp_ns)
+        for j, name in enumerate(self._network.names):
+            if frame.n_samples[j]:
+                stamp_ns = frame.stamp_ns + round(1e9 * frame.time_offset[j])
+                readings = Readings.single(name, stamp_ns, frame.field[j], frame.covariance[j])
+                ((_, content),) = magnetic_field_dicts(readings)
+                self._writer.write(self._topics[name], MAGNETIC_FIELD, content, frame.stamp_ns)
+
+    def add_track(self, track: Track) -> None:
+        """Write a pose of a track and what is shown of it, or its end."""
+        self._write_smoothed()
+        self._begin(track.stamp_ns)
+        stamp_ns, frame = track.stamp_ns, self._frame
+        content = track_dict(track, frame)
+        self._write('tracks', TRACK_ARRAY, {'header': content['header'], 'tracks': [content]},
+                    stamp_ns)
+        if track.ended:
+            self._write('markers', MARKERS, delete_markers(track, frame), stamp_ns)
+            if self._path:
+                self._write('path', PATH, {'header': header_dict(stamp_ns, frame),
+                                           'poses': self._path}, stamp_ns)
+            self._path = []
+            return
+        child_frame = f'track_{track.id}'
+        for name, kind, message in (
+                ('pose', POSE_WITH_COVARIANCE, pose_message_dict(track, frame)),
+                ('odometry', ODOMETRY, odometry_dict(track, frame, child_frame))):
+            if message is not None:
+                self._write(name, kind, message, stamp_ns)
+        if track.topic_uncertainty is not None:
+            self._writer.write('/tf', TRANSFORMS, {'transforms': [
+                track_transform_dict(track, frame, child_frame)]}, stamp_ns)
+        self._write('markers', MARKERS, track_markers(track, frame), stamp_ns)
+        self._path.append(pose_dict(stamp_ns, frame, track.position, track.orientation))
+
+    def add_smoothed(self, pose: SmoothedPose) -> None:
+        """Take a smoothed pose; a whole track is one message."""
+        if self._smoothed and pose.id != self._smoothed[0].id:
+            self._write_smoothed()
+        self._smoothed.append(pose)
+
+    def _write_smoothed(self) -> None:
+        """Write a whole smoothed track."""
+        poses = self._smoothed
+        if not poses:
+            return
+        self._smoothed, last_ns = [], poses[-1].stamp_ns
+        self._write('smoothed', SMOOTHED_TRACK, smoothed_track_dict(poses, self._frame), last_ns)
+        self._write('path_smoothed', PATH, {
+            'header': header_dict(last_ns, self._frame),
+            'poses': [pose_dict(p.stamp_ns, self._frame, p.position, p.orientation)
+                      for p in poses]}, last_ns)
+
+    def add_disturbance(self, disturbance: Disturbance) -> None:
+        """Write a disturbance, when it is found and once more when it has ended."""
+        self._write('disturbances', DISTURBANCE, disturbance_dict(disturbance, self._frame),
+                    disturbance.stamp_ns)
+
+    def _write(self, name: str, kind: str, content: MessageDict, stamp_ns: int) -> None:
+        """Write a message on a topic of the tracker."""
+        self._writer.write(f'/tracker_node/{name}', kind, content, stamp_ns)

@@ -1,0 +1,79 @@
+"""`tracks.mcap` holds what viewers of ROS need: read back by an independent library."""
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from mag_tracking.messages.markers import SENSOR_KINDS, TRACK_KINDS
+
+TOPICS = {'/mag_1/imu/mag_calibrated', '/mag_2/imu/mag_calibrated', '/tf', '/tf_static',
+          *(f'/tracker_node/{name}' for name in (
+              'tracks', 'pose', 'odometry', 'path', 'markers', 'sensor_markers', 'smoothed',
+              'path_smoothed'))}
+
+
+@pytest.fixture(scope='module')
+def read(vehicle_replays):
+    """(Run, {topic: [(log time, message)]}, {topic: durability}) of a replay."""
+    run, folder = vehicle_replays['straight_car_right']
+    messages, durability = {}, {}
+    with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        for connection, time_ns, raw in reader.messages():
+            messages.setdefault(connection.topic, []).append(
+                (time_ns, reader.deserialize(raw, connection.msgtype)))
+            durability[connection.topic] = connection.ext.offered_qos_profiles[0].durability.name
+    return run, messages, durability
+
+
+def test_every_topic_is_there(read):
+    _, messages, durability = read
+    assert messages.keys() == TOPICS
+    latched = {topic for topic, name in durability.items() if name == 'TRANSIENT_LOCAL'}
+    assert latched == {'/tf_static', '/tracker_node/sensor_markers'}
+    # Where the sensors are is known from the first message on.
+    first = min(time_ns for rows in messages.values() for time_ns, _ in rows)
+    assert all(messages[topic][0][0] == first and len(messages[topic]) == 1 for topic in latched)
+
+
+def test_each_pose_has_its_odometry_transform_and_markers(read):
+    run, messages, _ = read
+    log = run.logs[1]
+    n = len(log.stamp_ns)
+    assert [len(messages[t]) for t in ('/tracker_node/pose', '/tracker_node/odometry', '/tf')] == [
+        n, n, n]
+    for position, (_, odometry), (_, tf) in zip(log.position, messages['/tracker_node/odometry'],
+                                                messages['/tf'], strict=True):
+        p, (transform,) = odometry.pose.pose.position, tf.transforms
+        t = transform.transform.translation
+        assert [p.x, p.y, p.z] == [t.x, t.y, t.z] == position.tolist()
+        assert odometry.child_frame_id == transform.child_frame_id == 'track_1'
+    arrays = [m.markers for _, m in messages['/tracker_node/markers']]
+    assert len(arrays) == n + 1
+    assert all([m.ns for m in markers] == list(TRACK_KINDS) for markers in arrays)
+    assert {m.action for m in arrays[-1]} == {2}
+    sensors = messages['/tracker_node/sensor_markers'][0][1].markers
+    assert {m.ns for m in sensors} == set(SENSOR_KINDS)
+
+
+def test_paths_are_the_whole_track(read):
+    run, messages, _ = read
+    for topic, log in (('path', run.logs[1]), ('path_smoothed', run.smoothed[1])):
+        ((_, path),) = messages[f'/tracker_node/{topic}']
+        assert [[s.pose.position.x, s.pose.position.y] for s in path.poses] == [
+            p[:2].tolist() for p in log.position]
+    ((_, smoothed),) = messages['/tracker_node/smoothed']
+    assert len(smoothed.poses) == len(run.smoothed[1].position)
+
+
+def test_fields_are_those_that_were_tracked(read):
+    run, messages, _ = read
+    log = run.logs[1]
+    for j in (0, 1):
+        found = {time_ns: m.magnetic_field for time_ns, m in messages[
+            f'/mag_{j + 1}/imu/mag_calibrated']}
+        compared = [(found[stamp], field[j]) for stamp, field in zip(
+            log.stamp_ns, log.measured, strict=True) if stamp in found]
+        assert len(compared) > 0.5 * len(log.stamp_ns)
+        for ours, theirs in compared:
+            np.testing.assert_array_equal([ours.x, ours.y, ours.z], theirs)
