@@ -53,6 +53,7 @@ demo: $(STAMP)  ## run the demonstration; results in out/demo
 config: $(STAMP)  ## write config/ and docs/parameters.md anew from the settings and the nodes
 	$(BIN)/python tools/generate_config.py
 	$(BIN)/python tools/generate_policies.py
+	$(BIN)/python tools/generate_viewers.py
 
 test: $(STAMP)  ## check style, floors, types and behaviour
 	@sh tools/check_broker.sh

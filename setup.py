@@ -29,6 +29,7 @@ setup(
         (f'share/{NAME}/launch', sorted(glob('launch/*.py'))),
         (f'share/{NAME}/config', sorted(glob('config/*.yaml'))),
         (f'share/{NAME}/config/security', sorted(glob('config/security/*.xml'))),
+        (f'share/{NAME}/config/viewers', sorted(glob('config/viewers/*'))),
     ],
     # ROS itself and mag_tracking_msgs stay out: people with a ROS from apt have them from there,
     # and pip would look for mag-tracking-msgs on the index, where it is not.
