@@ -5,7 +5,7 @@ ros2 launch mag_tracking tracking.launch.py network:=/path/to/network.yaml
 
 from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution, PythonExpression
+from launch.substitutions import LaunchConfiguration, NotEqualsSubstitution, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
@@ -25,8 +25,8 @@ def generate_launch_description():
     recording = LaunchConfiguration('recording')
     drivers = LaunchConfiguration('drivers')
     namespace = LaunchConfiguration('namespace')
-    has_recording = PythonExpression(["'", recording, "' != ''"])
-    has_drivers = PythonExpression(["'", drivers, "' != ''"])
+    has_recording = NotEqualsSubstitution(recording, '')
+    has_drivers = NotEqualsSubstitution(drivers, '')
     sim_time = {'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'),
                                                value_type=bool)}
     common = [{'network': network, 'target': target, **sim_time,

@@ -1,6 +1,7 @@
 """Write config/security/policies.xml: what each node may do, as SROS 2 has it.
 
-By what the nodes do: they are created, and the graph is asked. `--check` compares.
+By what the nodes do: they are created, and asked. `--check` compares; `--namespace /robot1` prints
+the policies of nodes in a namespace.
 """
 
 import os
@@ -13,35 +14,30 @@ ROOT = Path(__file__).resolve().parents[1]
 POLICIES = ROOT / 'config' / 'security' / 'policies.xml'
 SENSORS = ('mag_1', 'mag_2')
 """Of the bundled network file: in the policies any sensor takes their place."""
-COMMENT = """
-Written by tools/generate_policies.py; do not edit. Policies for SROS 2 of a ROS from apt:
-  ros2 security create_keystore keys
-  ros2 security generate_artifacts -k keys -p policies.xml
-Then start each node with
-  ROS_SECURITY_ENABLE=true ROS_SECURITY_STRATEGY=Enforce ROS_SECURITY_KEYSTORE=keys
-  ... ros-args -enclave /mag_tracking/NODE (with two dashes each)
-In a namespace put it before the names of the nodes (profile ns).
-"""
+COMMENT = ' Written by tools/generate_policies.py; do not edit. How to use it: docs/ros.md. '
+RECORDING = ROOT / 'test' / 'data' / 'vehicles' / 'straight_car_right.mcap'
 
 
-def nodes(folder):
+def nodes(folder, namespace):
     """The nodes, in this process."""
     from rclpy.parameter import Parameter
 
     from mag_tracking.nodes.calibration_node import CalibrationNode
     from mag_tracking.nodes.detection_node import DetectionNode
     from mag_tracking.nodes.driver_node import DriverNode
+    from mag_tracking.nodes.replay_node import ReplayNode
     from mag_tracking.nodes.tracker_node import TrackerNode
 
     network = Parameter('network', value=str(ROOT / 'config' / 'network.yaml'))
     drivers = folder / 'drivers.yaml'
     drivers.write_text('board: {transport: udp, udp: {port: 47199, address: 127.0.0.1}, framing: '
                        'text, text: {fields: [x, y, z]}, unit: nT, sensor: mag_1}\n')
-    yield CalibrationNode(parameter_overrides=[network])
-    yield DetectionNode(parameter_overrides=[network])
-    yield TrackerNode(parameter_overrides=[network, Parameter('publish_tf', value=True)])
-    yield DriverNode(parameter_overrides=[
-        network, Parameter('drivers', value=str(drivers)), Parameter('batches', value=True)])
+    for make, more in (
+            (CalibrationNode, {}), (DetectionNode, {}), (TrackerNode, {'publish_tf': True}),
+            (DriverNode, {'drivers': str(drivers), 'batches': True}),
+            (ReplayNode, {'recording': str(RECORDING)})):
+        yield make(namespace=namespace, parameter_overrides=[
+            network, *(Parameter(name, value=value) for name, value in more.items())])
 
 
 def expression(name):
@@ -60,7 +56,7 @@ def add(profile, kind, what, names):
         ElementTree.SubElement(group, kind.removesuffix('s')).text = name
 
 
-def policies():
+def policies(namespace='/'):
     """The text of the file."""
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
     from mag_tracking.nodes.middleware import begin
@@ -70,11 +66,12 @@ def policies():
     enclaves = ElementTree.SubElement(root, 'enclaves')
     with tempfile.TemporaryDirectory() as folder:
         os.environ['ROS_HOME'] = folder
-        for node in nodes(Path(folder)):
+        for node in nodes(Path(folder), namespace):
             name = node.get_name()
             enclave = ElementTree.SubElement(enclaves, 'enclave', {'path': f'/mag_tracking/{name}'})
             profile = ElementTree.SubElement(
-                ElementTree.SubElement(enclave, 'profiles'), 'profile', {'ns': '/', 'node': name})
+                ElementTree.SubElement(enclave, 'profiles'), 'profile', {
+                    'ns': namespace, 'node': name})
             add(profile, 'topics', 'publish', [p.topic_name for p in node.publishers]
                 + ['/rosout', '/parameter_events'])
             add(profile, 'topics', 'subscribe', [s.topic_name for s in node.subscriptions]
@@ -87,6 +84,9 @@ def policies():
 
 def main():
     """Write the file, or compare it; returns the exit status."""
+    if '--namespace' in sys.argv:
+        print(policies(sys.argv[sys.argv.index('--namespace') + 1]), end='')
+        return 0
     text = policies()
     if '--check' in sys.argv:
         if text != POLICIES.read_text():

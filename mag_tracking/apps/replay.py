@@ -99,7 +99,9 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     """
     if recording.lies_in(out):
         raise OutputError(f'{out} is the folder of the recording; the results would overwrite it')
-    table = read_truth_table(truth) if truth is not None and Path(truth).is_file() else None
+    # A file that does not exist is no topic: no topic has a point in its name.
+    is_table = truth is not None and (Path(truth).is_file() or '.' in truth)
+    table = read_truth_table(truth) if truth is not None and is_table else None
     reader = SampleReader(recording, network, truth if table is None else None)
     pipeline = Pipeline(network, settings)
     found = first_pass_of(recording, network, settings.calibrate, stopped)

@@ -1,9 +1,12 @@
 """mag-tracking topics, echo, param and lifecycle."""
 
 import argparse
+import os
 import signal
+import sys
 
 from mag_tracking.cli.options import Commands, add_command
+from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import noted_signals
 
 _NOTE = '''
@@ -44,12 +47,19 @@ def _echo(args: argparse.Namespace) -> int:
     """mag-tracking echo."""
     from mag_tracking.nodes.graph_tools import as_text, listen, observer
 
+    if args.count is not None and args.count < 1:
+        raise SettingsError(f'--count: {args.count} is not a number of at least 1')
     n = 0
 
     def show(message: object) -> bool:
         nonlocal n
         n += 1
-        print(f'{as_text(message)}---', flush=True)
+        try:
+            print(f'{as_text(message)}---', flush=True)
+        except BrokenPipeError:
+            # Nobody reads on, as behind `| head`; Python would complain once more at its end.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return False
         return not seen and n != args.count
 
     with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:

@@ -109,7 +109,7 @@ def _replay_one(path: Path, network: SensorNetwork, settings: Settings, out: Pat
               disable=None) as bar:
         run = replay(recording, network, settings, out, bar.update, lambda: bool(seen), tqdm.write,
                      args.truth)
-    _print_summary(path, run.summary)
+    _print_summary(path, run.summary, bool(run.truth))
     if args.tum:
         write_trajectories(run, out)
     if not args.no_figures:
@@ -118,7 +118,7 @@ def _replay_one(path: Path, network: SensorNetwork, settings: Settings, out: Pat
         print(f'results in {out}')
 
 
-def _print_summary(path: Path, summary: dict[str, Any]) -> None:
+def _print_summary(path: Path, summary: dict[str, Any], has_truth: bool) -> None:
     """The run in a few lines."""
     print(f'{path.name}: {summary["counts"]["align"].get("frames", 0)} frames, '
           f'{summary["counts"]["detect"].get("onsets", 0)} detections, '
@@ -147,6 +147,8 @@ def _print_summary(path: Path, summary: dict[str, Any]) -> None:
         _print_disturbance(d)
     for t in summary['tracks']:
         _print_track(t)
+        if has_truth and 'truth' not in t:
+            print('    no true pose at the time of this track')
 
 
 def _print_disturbance(d: dict[str, Any]) -> None:

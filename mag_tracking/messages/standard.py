@@ -1,7 +1,5 @@
 """Tracks and sensors as the messages of other packages: transforms and detections in space."""
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from mag_tracking.geometry import quaternion_from_rotation
@@ -18,15 +16,11 @@ def track_transform_dict(track: Track, frame: str, child_frame: str) -> MessageD
                 **xyz(track.orientation), 'w': float(track.orientation[3])}}}
 
 
-def sensor_transform_dicts(network: SensorNetwork, frames: Mapping[str, str],
-                           stamp_ns: int) -> list[MessageDict]:
-    """geometry_msgs/TransformStamped from the frame of the network to each sensor.
-
-    `frames` is {sensor: its frame}; a sensor that is missing in it has its name.
-    """
+def sensor_transform_dicts(network: SensorNetwork, stamp_ns: int) -> list[MessageDict]:
+    """geometry_msgs/TransformStamped from the frame of the network to each sensor, by its name."""
     quaternions = map(quaternion_from_rotation, network.R_ws)
     return [{'header': header_dict(stamp_ns, network.frame),
-             'child_frame_id': frames.get(name, name),
+             'child_frame_id': name,
              'transform': {'translation': xyz(position), 'rotation': {
                  **xyz(q), 'w': float(q[3])}}}
             for name, position, q in zip(network.names, network.positions, quaternions,

@@ -6,7 +6,6 @@ if __name__ == '__main__':
 
     calibration_node()
 
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from mag_tracking_msgs.srv import Survey as SurveyMessage
 from sensor_msgs.msg import Imu, MagneticField
 
 from mag_tracking.errors import NetworkError, SettingsError
+from mag_tracking.files import checked_path
 from mag_tracking.messages.schema import (
     acceleration_of,
     magnetic_field_dicts,
@@ -36,7 +36,11 @@ from mag_tracking.nodes.sensor_rounds import SensorRounds
 from mag_tracking.nodes.sensor_transforms import SensorTransforms
 from mag_tracking.nodes.stage_node import LATCHED, READY, SENT, STREAM, StageNode
 from mag_tracking.nodes.survey_service import SurveyService
-from mag_tracking.recording.background_file import state_folder, usual_path
+from mag_tracking.recording.background_file import (
+    is_background_file,
+    state_folder,
+    usual_path,
+)
 from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.stage import Stage
@@ -93,15 +97,15 @@ class CalibrationNode(StageNode):
                           batches=True)
         self.expect('detection', CALIBRATED_READINGS, 'mag_tracking_msgs/msg/NetworkFrame')
         self._state = self.publisher(CalibrationState, CALIBRATION_STATE, LATCHED)
-        self._tf = SensorTransforms(self, self.network) if fixed_parameter(
+        self._tf = SensorTransforms(self) if fixed_parameter(
             self, 'publish_sensor_tf', True, 'Publish where the sensors are as static '
             'transforms.') else None
-        self._report_frames({})
+        self._publish_transforms()
 
-    def _report_frames(self, frames: Mapping[str, str]) -> None:
-        """Publish where the sensors are; `frames` is what is news: {sensor: frame}."""
+    def _publish_transforms(self) -> None:
+        """Publish where the sensors are."""
         if self._tf is not None:
-            self._tf.publish(self.network, frames)
+            self._tf.publish(self.network)
 
     def _state_path(self) -> Path | None:
         """File in which the backgrounds are stored; None during the replay of a recording."""
@@ -109,17 +113,27 @@ class CalibrationNode(StageNode):
                                 'for a restart; left out: below $ROS_HOME, or ~/.ros.')
         if self.is_replayed or not self.settings.calibrate.resume_s:
             return None
-        return self._own_path('state_file', place) if place else usual_path(
-            self.network_path, self.get_fully_qualified_name())
+        if not place:
+            return usual_path(self.network_path, self.get_fully_qualified_name())
+        path = self._own_path('state_file', place)
+        if path.exists() and not is_background_file(path):
+            raise SettingsError(f'calibration_node: parameter state_file: {path} is another file '
+                                'than one with backgrounds; it would be replaced')
+        return path
 
     def _own_path(self, parameter: str, name: str) -> Path:
         """The path of a file to write; raises SettingsError for one that is not its place."""
+        what = f'calibration_node: parameter {parameter}: '
         beside, below = self.network_path.parent, state_folder().resolve()
-        path = beside / name
+        path = checked_path(beside / name, SettingsError)
         folder = path.parent.resolve()
+        if not path.name or path.name == '..' or path.is_dir():
+            raise SettingsError(f'{what}{name!r} is not the name of a file')
+        if folder / path.name == self.network_path:
+            raise SettingsError(f'{what}{path} is the network file itself')
         if folder != beside and not folder.is_relative_to(below):
-            raise SettingsError(f'calibration_node: parameter {parameter}: {path} is neither '
-                                f'beside the network file, in {beside}, nor below {below}')
+            raise SettingsError(f'{what}{path} is neither beside the network file, in {beside}, '
+                                f'nor below {below}')
         return folder / path.name
 
     def _survey_path(self) -> Path:
@@ -157,8 +171,6 @@ class CalibrationNode(StageNode):
     def _take(self, sensor: str, message: MagneticField) -> None:
         """One raw reading."""
         raw = reading_of(message, sensor)
-        if self._tf is not None and self._tf.is_news(sensor, message.header.frame_id):
-            self._report_frames({sensor: message.header.frame_id})
         for calibrated in self._stage.feed(raw):
             for _, content in magnetic_field_dicts(calibrated, message.header.frame_id):
                 self._publishers_by_sensor[sensor].publish(to_message(MagneticField, content))
@@ -216,7 +228,7 @@ class CalibrationNode(StageNode):
             return response
         self.network = network
         self._stage.renew(network)
-        self._report_frames({})
+        self._publish_transforms()
         self._health.renew(network)
         self._rounds.begin(network)
         self._publish_states(self._rounds.states())

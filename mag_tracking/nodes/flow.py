@@ -92,8 +92,9 @@ class Flow:
             message = f'{news} messages from {self.source} did not fit the queue'
         elif busy > MOST_BUSY or middle > LATE_S:
             level = DiagnosticStatus.WARN
-            message = (f'{self.source}: {100.0 * busy:.0f} % busy, {1e3 * middle:.0f} ms behind: '
-                       'this computer is too slow, or its clock is not that of the sensors')
+            message = f'{self.source}: {100.0 * busy:.0f} % busy' + (
+                f', {1e3 * middle:.0f} ms behind: this computer is too slow, or its clock is not '
+                'that of the sensors' if middle > LATE_S else ': this computer is too slow')
         values = {'messages': self._n, 'lost in the queue': self.n_lost,
                   'latency, median [ms]': f'{1e3 * middle:.4g}',
                   'latency, 99 % [ms]': f'{1e3 * late:.4g}',

@@ -8,7 +8,14 @@ from typing import Any
 import rclpy
 import yaml
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
-from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    GetParameterTypes,
+    ListParameters,
+    SetParameters,
+)
+from rclpy.exceptions import NameValidationException
 from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
@@ -16,7 +23,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from mag_tracking.errors import GraphError
 from mag_tracking.nodes.convert import message_class
-from mag_tracking.nodes.middleware import begin
+from mag_tracking.nodes.middleware import RCLError, begin
 from mag_tracking.nodes.stage_node import make_executor, spin
 
 DISCOVERY_S = 1.5
@@ -24,6 +31,8 @@ DISCOVERY_S = 1.5
 ANSWER_S = 5.0
 """[s] Longest wait for an answer."""
 TRIES = 3
+CHANGE_S = 60.0
+"""[s] Longest wait for a change: a device may take long to open."""
 
 
 class Observer:
@@ -43,20 +52,37 @@ class Observer:
         spin(self._executor, lambda: condition() or time.monotonic() > end)
         return condition()
 
-    def ask(self, service_type: Any, name: str, request: Any) -> Any:
-        """The response of a service; raises GraphError where there is none."""
-        client = self.node.create_client(service_type, name)
+    def ask(self, service_type: Any, name: str, request: Any, once: bool = False) -> Any:
+        """The response of a service; raises GraphError where there is none.
+
+        A question is repeated where no answer comes: a server that does not know the client yet
+        loses its answer. What changes something is asked `once`, a moment later.
+        """
+        with valid_names():
+            client = self.node.create_client(service_type, name)
         try:
             if not self.wait(client.service_is_ready, ANSWER_S):
                 raise GraphError(f'there is no service {name}')
-            for _ in range(TRIES):
-                # A server may not know the client yet, and its answer is then lost.
-                future = client.call_async(request)
-                if self.wait(future.done, ANSWER_S / TRIES):
-                    return future.result()
+            if once:
+                self.wait(lambda: False, DISCOVERY_S)
+            futures: list[Any] = []
+            for _ in range(1 if once else TRIES):
+                futures.append(client.call_async(request))
+                if self.wait(lambda: any(f.done() for f in futures),
+                             CHANGE_S if once else ANSWER_S / TRIES):
+                    return next(f for f in futures if f.done()).result()
             raise GraphError(f'{name} does not answer')
         finally:
             self.node.destroy_client(client)
+
+
+@contextmanager
+def valid_names() -> Iterator[None]:
+    """Names that ROS does not allow are a GraphError."""
+    try:
+        yield
+    except (NameValidationException, RCLError) as error:
+        raise GraphError(str(error)) from error
 
 
 @contextmanager
@@ -89,7 +115,9 @@ def listen(graph: Observer, topic: str, take: Callable[[Any], bool],
     The quality of service is that of the publishers: latched messages come, too. Raises
     GraphError where nobody publishes the topic, or its type is not installed.
     """
-    name = graph.node.resolve_topic_name(topic)
+    with valid_names():
+        name = graph.node.resolve_topic_name(topic)
+        graph.node.count_publishers(name)
     if not graph.wait(lambda: graph.node.count_publishers(name) > 0 or stopped(), ANSWER_S):
         raise GraphError(f'nobody publishes {name}')
     if stopped():
@@ -123,7 +151,8 @@ def as_dict(message: Any) -> Any:
         return message.tolist()
     if isinstance(message, (list, tuple)):
         return [as_dict(v) for v in message]
-    return message
+    # A byte, as the level of a diagnostic status is.
+    return int.from_bytes(message, 'big') if isinstance(message, bytes) else message
 
 
 def as_text(message: Any) -> str:
@@ -151,11 +180,16 @@ def parameter_lines(graph: Observer, node: str, name: str | None = None) -> list
 def set_parameter(graph: Observer, node: str, name: str, text: str) -> None:
     """Set a parameter to a YAML value; raises GraphError where the node refuses."""
     try:
-        parameter = Parameter(name, value=yaml.safe_load(text))
+        value = yaml.safe_load(text)
+        (kind,) = graph.ask(GetParameterTypes, f'{node}/get_parameter_types',
+                            GetParameterTypes.Request(names=[name])).types or (0,)
+        if kind == Parameter.Type.DOUBLE.value and isinstance(value, int):
+            value = float(value)
+        parameter = Parameter(name, value=value)
     except (yaml.YAMLError, TypeError, ValueError) as error:
         raise GraphError(f'{name}: {text!r} is not a value: {error}') from error
     result = graph.ask(SetParameters, f'{node}/set_parameters', SetParameters.Request(
-        parameters=[parameter.to_parameter_msg()])).results[0]
+        parameters=[parameter.to_parameter_msg()]), once=True).results[0]
     if not result.successful:
         raise GraphError(f'{node} refuses {name}: {result.reason}')
 
@@ -178,5 +212,5 @@ def change_lifecycle_state(graph: Observer, node: str, transition: str) -> None:
         raise GraphError(f'{node}: {transition} is not possible now, but {names}')
     request = ChangeState.Request()
     request.transition.id = found[0].id
-    if not graph.ask(ChangeState, f'{node}/change_state', request).success:
+    if not graph.ask(ChangeState, f'{node}/change_state', request, once=True).success:
         raise GraphError(f'{node}: {transition} has failed')

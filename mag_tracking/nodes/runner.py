@@ -16,7 +16,8 @@ from rclpy.parameter import Parameter
 
 from mag_tracking.errors import MagTrackingError
 from mag_tracking.interrupts import noted_signals
-from mag_tracking.messages.types import NETWORK_FRAME
+from mag_tracking.messages.types import NETWORK_FRAME, RAW_READINGS
+from mag_tracking.network.topics import namespaces_of
 from mag_tracking.nodes.calibration_node import CalibrationNode
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.detection_node import DetectionNode
@@ -172,6 +173,7 @@ def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Se
         if replay is None:
             spin(executor, stopped)
             return 0
+        _check_topics(stages[0], replay)
         deadline = time.monotonic() + LONGEST_DISCOVERY_S
         spin(executor, lambda: all_connected(stages, replay) or stopped()
              or time.monotonic() > deadline)
@@ -187,6 +189,17 @@ def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Se
             executor.remove_node(node)
             node.destroy_node()
         executor.shutdown()
+
+
+def _check_topics(node: StageNode, replay: ReplayNode) -> None:
+    """Raise MagTrackingError where nothing that is played is of the network."""
+    names = {p.topic_name: topic for topic, p in replay.publishers_by_topic.items()}
+    if names.keys() & {*node.sensor_topics, node.resolve_topic_name(RAW_READINGS)}:
+        return
+    found = namespaces_of((*node.network.topics, RAW_READINGS), list(replay.publishers_by_topic))
+    hint = f'; start the nodes in its namespace: --ros-args -r __ns:={found[0]}' \
+        if found and found != ['/'] else ''
+    raise MagTrackingError(f'the recording has none of {", ".join(node.sensor_topics)}{hint}')
 
 
 def _work_off(executor: Executor, stages: list[StageNode], stopped: Callable[[], bool],

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from rclpy.node import Node
 
 from mag_tracking.messages.types import MAGNETIC_FIELD
+from mag_tracking.network.topics import absolute
 from mag_tracking.stages.health.sensor_health import Finding
 
 MOST_NAMED = 4
@@ -18,8 +19,8 @@ def topic_findings(node: Node, sensor: str, topic: str) -> list[Finding]:
                      f'it has to be {MAGNETIC_FIELD}')
              for p in publishers if p.topic_type != MAGNETIC_FIELD]
     if len(publishers) > 1:
-        names = ', '.join(sorted(p.node_name for p in publishers))
-        found.append(Finding(True, sensor, f'{len(publishers)} nodes publish {topic}: {names}',
+        names = ', '.join(sorted(absolute(p.node_name, p.node_namespace) for p in publishers))
+        found.append(Finding(True, sensor, f'{len(publishers)} publishers of {topic}: {names}',
                              'stop all but one'))
     return found
 

@@ -59,6 +59,8 @@ class HealthDiagnostics:
         # When, by the monotonic clock [s]; NaN: never.
         self._heard = np.full(len(network), np.nan)
         self._frozen_ns: dict[str, int] = {}
+        # Since when it learns, by the monotonic clock [s].
+        self._unready_since: dict[str, float] = {}
         self._compared: dict[str, list[Finding]] = {}
         # How many backgrounds had been taken anew when the last term began, and this one.
         self._relearnt: list[dict[str, int]] = [dict.fromkeys(network.names, 0)] * 2
@@ -142,9 +144,12 @@ class HealthDiagnostics:
             return [*of_topic, *self._silence(name, silent_s)]
         found = {f.what: f for f in (*of_topic, *self._compared[name],
                                      *self._clock_finding(name))}
-        # While it learns for the first time that is no fault yet.
+        # While it learns, at the start or again, that is no fault yet.
         patience = 5.0 + PATIENCE * self._settings.calibrate.learn_s
-        if time.monotonic() - self._began > patience:
+        if calibrate.backgrounds()[name].ready:
+            self._unready_since.pop(name, None)
+        since = self._unready_since.setdefault(name, time.monotonic())
+        if calibrate.backgrounds()[name].ready or time.monotonic() - since > patience:
             found.update({f.what: f for f in background_findings(
                 name, calibrate, self._frozen_ns.get(name), self._relearnt[0][name])})
         found.update({f.what: f for f in covariance_findings(
@@ -152,7 +157,8 @@ class HealthDiagnostics:
         for health in (self._past[name], self._present[name]):
             if health is not None and health.counts['readings']:
                 for f in health.findings(name, self._network.noise_std[j],
-                                         self._settings.calibrate.max_field):
+                                         self._settings.calibrate.max_field,
+                                         not self._is_replayed):
                     found.setdefault(f.what, f)
         return sorted(found.values(), key=lambda f: not f.serious)
 

@@ -102,7 +102,7 @@ class StageNode(Node):
         state = self.state()
         if state != self._reported_state:
             self._reported_state = state
-            self.get_logger().info(state)
+            self._log.tell(state)
 
     @property
     def sensor_topics(self) -> tuple[str, ...]:
@@ -204,7 +204,8 @@ class StageNode(Node):
         n_same = self.get_node_names_and_namespaces().count(own)
         if n_same > 1:
             faults.append(f'{n_same} nodes are named {self.get_fully_qualified_name()}: stop all '
-                          'but one, or rename it (-r __node:=NAME)')
+                          'but one, or rename it (-r __node:=NAME; where several run in one '
+                          f'process, -r {self.get_name()}:__node:=NAME)')
         if self.get_parameter('use_sim_time').value and not self.get_clock().now().nanoseconds:
             faults.append('use_sim_time is set, and nothing has come on /clock')
         return [DiagnosticStatus(

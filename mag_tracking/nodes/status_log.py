@@ -49,6 +49,10 @@ class StatusLog:
         self._logged[fault] = now
         self._log(status.level, f'{subject}: {status.message}')
 
+    def tell(self, text: str) -> None:
+        """Log a line of information."""
+        self._log(DiagnosticStatus.OK, text)
+
     def _log(self, level: bytes, text: str) -> None:
         """Log a line, but of many that are alike only the first."""
         now, pattern = time.monotonic(), _NUMBER.sub('#', text)

@@ -186,16 +186,10 @@ class TrackerNode(StageNode):
     def _publish(self, track: Track) -> None:
         """Everything about one track at one time."""
         frame = self.network.frame
-        if track.id != self._latest_id:
-            self._latest_id = track.id
-            self.get_logger().info(f'track {track.id} begins' + (
-                f', arrival {track.arrival}' if track.arrival else ''))
-        if track.ended:
-            self.get_logger().info(f'track {track.id} has ended')
         if not track.ended:
-            # What somebody steers by comes first.
+            # The pose first: it may be steered by.
             publish_if_any(self._pose, PoseWithCovarianceStamped, pose_message_dict(track, frame))
-            # Then the hypotheses: who waits for the track has them already.
+            # Then the hypotheses: a subscriber of the track has them already.
             if is_heard(self._hypotheses):
                 self._hypotheses.publish(
                     to_message(HypothesisArray, hypotheses_dict(track, frame)))
@@ -208,15 +202,33 @@ class TrackerNode(StageNode):
         if track.ended:
             self._path.clear()
             self._markers.publish(to_message(MarkerArray, delete_markers(track, frame)))
-            return
+        else:
+            self._publish_views(track, frame)
+        self._log_life(track)
+
+    def _log_life(self, track: Track) -> None:
+        """Log that a track begins, and that it has ended."""
+        if track.id != self._latest_id:
+            self._latest_id = track.id
+            self.get_logger().info(f'track {track.id} begins' + (
+                f', arrival {track.arrival}' if track.arrival else ''))
+        if track.ended:
+            self.get_logger().info(f'track {track.id} has ended')
+
+    def _publish_views(self, track: Track, frame: str) -> None:
+        """Odometry, transform, path and markers of a running track."""
         child_frame = self._child_frame or f'track_{track.id}'
         publish_if_any(self._odometry, Odometry, odometry_dict(track, frame, child_frame))
-        if self._tf is not None and track.topic_uncertainty is not None:
+        is_held = track.topic_uncertainty is None
+        # A transform has no covariance either.
+        if self._tf is not None and not is_held and (
+                not track.ambiguous or self.settings.track.ambiguous_poses == BEST):
             self._tf.publish(to_message(TFMessage, {'transforms': [
                 track_transform_dict(track, frame, child_frame)]}))
-        self._path.append(to_message(PoseStamped, pose_dict(
-            track.stamp_ns, frame, track.position, track.orientation)))
-        if is_heard(self._path_publisher):
+        if not is_held:
+            self._path.append(to_message(PoseStamped, pose_dict(
+                track.stamp_ns, frame, track.position, track.orientation)))
+        if self._path and is_heard(self._path_publisher):
             self._path_publisher.publish(
                 Path(header=self._path[-1].header, poses=list(self._path)))
         if is_heard(self._markers):

@@ -20,6 +20,7 @@ from mag_tracking.stages.calibrate.restoration import StoredBackground
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 
 VERSION = 1
+_HEAD = '{"version": '
 
 
 def usual_path(network_path: str | PathLike[str], node: str) -> Path:
@@ -27,6 +28,12 @@ def usual_path(network_path: str | PathLike[str], node: str) -> Path:
     path = Path(network_path).resolve()
     mark = hashlib.sha256(f'{path} {node}'.encode()).hexdigest()[:8]
     return state_folder() / f'{path.stem}_{mark}.json'
+
+
+def is_background_file(path: Path) -> bool:
+    """Whether a file begins as one with backgrounds does."""
+    with open(path, 'rb') as stream:
+        return stream.read(len(_HEAD)) == _HEAD.encode()
 
 
 def state_folder() -> Path:
@@ -61,7 +68,7 @@ def write_backgrounds(path: str | PathLike[str], texts: Mapping[str, str]) -> No
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f'{path}: {error.strerror}') from error
-    replace_text(path, f'{{"version": {VERSION}, "sensors": {{\n{rows}\n}}}}\n')
+    replace_text(path, f'{_HEAD}{VERSION}, "sensors": {{\n{rows}\n}}}}\n')
 
 
 def read_backgrounds(path: str | PathLike[str], network: SensorNetwork,

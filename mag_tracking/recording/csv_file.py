@@ -31,7 +31,7 @@ def csv_lines(path: CsvPath) -> Lines:
     """The lines that are not empty; raises RecordingError."""
     path = checked_path(path, RecordingError)
     try:
-        with open(path, newline='', encoding='utf-8') as stream:
+        with open(path, newline='', encoding='utf-8-sig') as stream:
             reader = csv.reader(stream)
             return [(reader.line_num, row) for row in reader if row]
     except OSError as error:

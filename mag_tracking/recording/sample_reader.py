@@ -53,12 +53,14 @@ class SampleReader:
             if topic is not None:
                 self._imus.setdefault(absolute(topic, self.namespace), []).append(name)
         self._many = absolute(RAW_READINGS, self.namespace)
+        truth = None if truth is None else absolute(truth, self.namespace)
         self._truth = TruthTopics(absolute(TRUTH_PREFIX, self.namespace), network.frame, truth)
         if truth is not None and recording.types and not self._truth.wants(
                 truth, recording.types.get(truth, '')):
+            poses = sorted(t for t, kind in recording.types.items() if kind in TRUTH_TYPES)
             raise RecordingError(f'{recording.path}: the truth on {truth} is '
-                                 f'{recording.types.get(truth, "not in the recording")}; expected '
-                                 f'one of {", ".join(TRUTH_TYPES)}')
+                                 f'{recording.types.get(truth, "not in the recording")}; its poses '
+                                 f'are on: {", ".join(poses) or "no topic at all"}')
         self.rejected: Counter[str] = Counter()
         self._together = recording.types.get(self._many) == FIELD_READINGS
         if recording.types and not self._together \

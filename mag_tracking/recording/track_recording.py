@@ -70,7 +70,7 @@ class TrackRecording:
             return
         self._is_begun = True
         self._writer.write('/tf_static', TRANSFORMS, {'transforms': sensor_transform_dicts(
-            self._network, {}, stamp_ns)}, stamp_ns)
+            self._network, stamp_ns)}, stamp_ns)
         self._writer.write('/tracker_node/sensor_markers', MARKERS,
                            sensor_markers(self._network), stamp_ns)
 
@@ -106,11 +106,13 @@ class TrackRecording:
                 ('odometry', ODOMETRY, odometry_dict(track, frame, child_frame))):
             if message is not None:
                 self._write(name, kind, message, stamp_ns)
-        if track.topic_uncertainty is not None:
+        if not track.ambiguous:
             self._writer.write('/tf', TRANSFORMS, {'transforms': [
                 track_transform_dict(track, frame, child_frame)]}, stamp_ns)
         self._write('markers', MARKERS, track_markers(track, frame), stamp_ns)
-        self._path.append(pose_dict(stamp_ns, frame, track.position, track.orientation))
+        if track.topic_uncertainty is not None:
+            self._path.append(pose_dict(
+                stamp_ns, frame, track.position, track.orientation))
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
         """Take a smoothed pose; a whole track is one message."""

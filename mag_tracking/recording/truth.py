@@ -12,7 +12,7 @@ from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.messages.types import ODOMETRY, POSE, POSE_WITH_COVARIANCE
 from mag_tracking.recording.csv_file import number, read_csv
-from mag_tracking.units import NS
+from mag_tracking.units import LATEST_NS, NS
 
 TRUTH_TYPES = (POSE, POSE_WITH_COVARIANCE, ODOMETRY)
 """Types of messages that carry true poses."""
@@ -106,6 +106,11 @@ def read_truth_table(path: str | PathLike[str]) -> dict[str, TruthArrays]:
 
 def _stamp(path: str | PathLike[str], line: int, column: str, text: str) -> int:
     """[ns] A cell of a column of times; nanoseconds do not fit a float."""
-    if column == 'stamp_ns' and text.strip().lstrip('-').isdigit():
-        return int(text)
-    return round(number(path, line, column, text, True) * _TIMES[column])
+    try:
+        stamp = int(text) if column == 'stamp_ns' else None
+    except ValueError:
+        stamp = None
+    exact = stamp if stamp is not None else number(path, line, column, text, True) * _TIMES[column]
+    if abs(exact) > LATEST_NS:
+        raise RecordingError(f'{path}: row {line}: {column} is {text.strip()}, which is no time')
+    return round(exact)

@@ -5,11 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rclpy
 from mag_tracking_msgs.srv import Calibrate, Seek, Survey
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
+from mag_tracking.errors import SettingsError
+from mag_tracking.nodes.calibration_node import CalibrationNode
+from mag_tracking.nodes.middleware import begin
+from mag_tracking.recording.background_file import write_backgrounds
 from support.bundled import NETWORK_FILE, vehicle_path
 from support.node_processes import LONGEST_S, start, stop
 
@@ -176,12 +181,35 @@ def test_an_attack(ros, place, tmp_path):
 
 
 @pytest.mark.parametrize('parameter', ['save_as', 'state_file'])
-@pytest.mark.parametrize('name', ['/etc/x.yaml', '../x.yaml', 'outside/x.yaml'])
-def test_a_place_outside_is_refused_at_the_start(ros, place, parameter, name):
+@pytest.mark.parametrize('name, told', [
+    ('/etc/x.yaml', 'is neither beside the network file'), ('../x.yaml', 'is neither beside'),
+    ('outside/x.yaml', 'is neither beside'), ('..', 'is not the name of a file'),
+    ('network.yaml', 'is the network file itself')])
+def test_a_place_outside_is_refused_at_the_start(place, parameter, name, told):
     here, theirs = place
-    process = start('calibration_node', '-p', f'network:={here / "network.yaml"}',
-                    '-p', f'{parameter}:={name}')
-    output, _ = process.communicate(timeout=LONGEST_S)
-    assert process.returncode == 1 and 'is neither beside the network file' in output, output
+    with pytest.raises(SettingsError, match=told):
+        created(here, parameter, name)
     assert set(os.listdir(theirs)) == {'network_calibrated.yaml', 'network_calibrated.yaml.part',
                                        'link.yaml'}
+
+
+def created(here, parameter, name):
+    """A calibration node that is given the name of a file."""
+    begin()
+    try:
+        node = CalibrationNode(parameter_overrides=[
+            Parameter('network', value=str(here / 'network.yaml')),
+            Parameter(parameter, value=name)])
+        node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+
+
+def test_a_file_of_somebody_else_is_not_taken_for_backgrounds(place):
+    here, _ = place
+    (here / 'notes.txt').write_text('theirs')
+    with pytest.raises(SettingsError, match='another file than one with backgrounds'):
+        created(here, 'state_file', 'notes.txt')
+    write_backgrounds(here / 'kept.json', {})
+    created(here, 'state_file', 'kept.json')
+    created(here, 'state_file', 'new.json')

@@ -59,6 +59,42 @@ def test_a_tracker_and_a_driver_as_seen_by_somebody_without_ros2(ros, tmp_path):
     assert not any(codes), outputs
 
 
+SLOW = """
+import time
+import rclpy
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+class Slow(LifecycleNode):
+    def on_configure(self, state):
+        time.sleep(4.0)
+        return TransitionCallbackReturn.SUCCESS
+rclpy.init()
+rclpy.spin(Slow('slow'))
+"""
+
+
+def test_a_transition_that_takes_long_is_made_once(ros):
+    node, spin_until = ros
+    process = subprocess.Popen([sys.executable, '-c', SLOW], stdout=subprocess.PIPE,
+                               stderr=subprocess.STDOUT, text=True)
+    try:
+        assert spin_until(lambda: 'slow' in node.get_node_names())
+        code, text = command('lifecycle', '/slow', 'configure')
+        assert code == 0 and text.startswith('inactive; possible: '), text
+    finally:
+        process.kill()
+        output, _ = process.communicate()
+    assert 'No transition matching' not in output
+
+
+@pytest.mark.parametrize('words, told', [
+    (('echo', 'a b'), 'topic name'), (('param', '/live/bad name'), 'service name'),
+    (('lifecycle', '/1abc', 'activate'), 'service name'), (('echo', '/a', '--count', '0'), '0 is'),
+    (('echo', ''), 'topic name')])
+def test_names_that_are_none_are_one_line(words, told):
+    code, text = command(*words)
+    assert code == 1 and told in text and 'Traceback' not in text, text
+
+
 def test_arguments_of_ros_are_refused_where_no_ros_runs():
     code, text = command('info', 'a.mcap', '--ros-args', '-r', '__ns:=/x')
     assert code == 2 and '--ros-args: info runs without ROS' in text

@@ -227,7 +227,7 @@ def test_the_doctor_on_a_live_system(ros, talking):
         assert spin_until(lambda: len(doctor.get_publishers_info_by_topic('/mag_1/imu/mag')) == 2
                           and len(doctor.get_publishers_info_by_topic('/mag_2/imu/mag')) == 1)
         found = [str(f) for f in doctor.findings()]
-        assert any('mag_1: 2 nodes publish /mag_1/imu/mag' in t for t in found), found
+        assert any('mag_1: 2 publishers of /mag_1/imu/mag' in t for t in found), found
         assert any('publishes std_msgs/msg/String on /mag_2/imu/mag' in t for t in found), found
         assert twin
     finally:

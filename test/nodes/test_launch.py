@@ -24,7 +24,8 @@ HAS_LAUNCH = importlib.util.find_spec('launch_ros') is not None
 CLASSES = {
     'launch': ('LaunchDescription',), 'launch.actions': ('DeclareLaunchArgument',),
     'launch.conditions': ('IfCondition',), 'launch_ros.actions': ('Node',),
-    'launch.substitutions': ('LaunchConfiguration', 'PathJoinSubstitution', 'PythonExpression'),
+    'launch.substitutions': ('LaunchConfiguration', 'NotEqualsSubstitution',
+                             'PathJoinSubstitution'),
     'launch_ros.parameter_descriptions': ('ParameterValue',),
     'launch_ros.substitutions': ('FindPackageShare',)}
 """{module: classes} that the launch file imports."""

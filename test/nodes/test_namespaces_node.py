@@ -1,6 +1,7 @@
 """Two networks on one graph: other namespaces, other names of nodes, remapped topics."""
 
 import csv
+import itertools
 import os
 import subprocess
 import sys
@@ -11,12 +12,16 @@ from diagnostic_msgs.msg import DiagnosticArray
 from mag_tracking_msgs.msg import TrackArray
 
 from mag_tracking.apps.replay import replay
+from mag_tracking.messages.schema import stamp_ns
+from mag_tracking.messages.types import MAGNETIC_FIELD, decode
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.stage_node import RESULTS, STREAM
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.writer import RecordingWriter
 from support.bundled import NETWORK_FILE, vehicle_path
 from support.node_processes import LONGEST_S, environment, start, stop
+from support.samples import MagSample, sample_dict
 
 pytestmark = [pytest.mark.alone, pytest.mark.timeout(600)]
 
@@ -119,6 +124,20 @@ def test_the_runner_takes_arguments_of_ros():
     assert code == 0, output
     assert 'track 1 ' in output and 'track 1 has ended' in output, output
     assert '[robot1.follower]' in output and 'waiting for /robot1/mag_1/imu/mag' in output, output
+
+
+def test_a_recording_of_a_namespace_is_not_played_to_nobody(tmp_path):
+    source, path = Recording(vehicle_path('straight_car_right')), tmp_path / 'a.mcap'
+    with RecordingWriter(path) as writer:
+        for message in itertools.islice(source.messages(), 50):
+            if message.type == MAGNETIC_FIELD:
+                header = decode(message).header
+                writer.write(f'/robot1{message.topic}', MAGNETIC_FIELD, sample_dict(
+                    MagSample(stamp_ns(header.stamp), 'mag_1', [0.0, 0.0, 0.0]), 'mag_1'),
+                    message.log_time_ns)
+    code, output = run_command('run', '--network', str(NETWORK_FILE), '--recording', str(path))
+    assert code == 1 and 'none of /mag_1/imu/mag, /mag_2/imu/mag; start the nodes in its ' \
+        'namespace: --ros-args -r __ns:=/robot1' in output, output
 
 
 @pytest.mark.parametrize('arguments, told', [

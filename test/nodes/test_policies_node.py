@@ -17,10 +17,22 @@ def test_policies_are_up_to_date():
     assert done.returncode == 0, done.stdout
 
 
+def test_policies_of_a_namespace_name_it_everywhere():
+    done = subprocess.run([sys.executable, str(ROOT / 'tools' / 'generate_policies.py'),
+                           '--namespace', '/robot1'], text=True, stdout=subprocess.PIPE,
+                          stderr=subprocess.DEVNULL, timeout=LONGEST_S, check=False)
+    profiles = list(ElementTree.fromstring(done.stdout).iter('profile'))
+    assert {p.get('ns') for p in profiles} == {'/robot1'}
+    names = {e.text for p in profiles for rule in p for e in rule}
+    common = {'/clock', '/diagnostics', '/rosout', '/parameter_events', '/tf', '/tf_static'}
+    assert names & common == common and all(n.startswith('/robot1/') for n in names - common)
+
+
 def test_policies_allow_each_node_what_it_needs_and_no_more():
     """As the schema of sros2 has it: rules of allowed topics and services by profile."""
     profiles = {p.get('node'): p for p in ElementTree.parse(POLICIES).iter('profile')}
-    assert set(profiles) == {'calibration_node', 'detection_node', 'tracker_node', 'driver_node'}
+    assert set(profiles) == {'calibration_node', 'detection_node', 'tracker_node', 'driver_node',
+                             'replay_node'}
     rules = {(node, rule.tag, *rule.attrib.items()): [e.text for e in rule]
              for node, profile in profiles.items() for rule in profile}
     assert '/*/imu/mag' in rules['driver_node', 'topics', ('publish', 'ALLOW')]

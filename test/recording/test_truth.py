@@ -69,7 +69,8 @@ def test_truth_in_another_frame_is_not_compared_and_said(tmp_path):
 
 
 @pytest.mark.parametrize('topic, told', [
-    ('/nowhere', 'the truth on /nowhere is not in the recording'),
+    ('/nowhere', 'the truth on /nowhere is not in the recording; its poses are on: /gnss/pose'),
+    ('nowhere', 'the truth on /nowhere is not in the recording'),
     ('/mag_1/imu/mag', 'the truth on /mag_1/imu/mag is sensor_msgs/msg/MagneticField')])
 def test_a_topic_that_cannot_be_truth_is_named(tmp_path, topic, told):
     with pytest.raises(RecordingError, match=told):
@@ -101,11 +102,27 @@ def test_a_table_is_the_same_truth_as_the_topic(tmp_path, road_network):
     ('t,y\n1,2\n', 'column x is missing'), ('x,y\n1,2\n', 'column stamp_ns, t or time is missing'),
     ('t,x,y\n1,2\n', 'row 2: expected 3 columns'), ('t,x,y\n1,2,north\n', "row 2: y is 'north'"),
     ('t,x,y\n,1,2\n', 'row 2: t is not a finite number'), ('t,x,y\n', 'has no rows'),
-    ('t,x,y\n1,2,inf\n', 'row 2: y is not a finite number')])
+    ('t,x,y\n1,2,inf\n', 'row 2: y is not a finite number'),
+    ('stamp_ns,x,y\n\u00b2,1,2\n', 'row 2: stamp_ns'), ('t,x,y\n1e300,1,2\n', 'is no time'),
+    ('stamp_ns,x,y\n99999999999999999999999,1,2\n', 'is no time')])
 def test_faults_of_a_table_are_named(tmp_path, text, told):
     (tmp_path / 'truth.csv').write_text(text)
     with pytest.raises(RecordingError, match=told):
         read_truth_table(tmp_path / 'truth.csv')
+
+
+def test_a_table_of_a_spreadsheet_with_a_mark_at_its_begin(tmp_path):
+    (tmp_path / 'truth.csv').write_text('t,x,y\n2,3,4\n1,1,2\n', encoding='utf-8-sig')
+    stamps, position, quaternion = read_truth_table(tmp_path / 'truth.csv')['truth']
+    assert stamps.tolist() == [10**9, 2 * 10**9]
+    assert position.tolist() == [[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]]
+    assert quaternion.tolist() == [[0.0, 0.0, 0.0, 1.0]] * 2
+
+
+def test_a_table_that_does_not_exist_is_no_topic(tmp_path, road_network):
+    with pytest.raises(RecordingError, match='cannot read .*missing.csv'):
+        replay(Recording(vehicle_path(NAME)), road_network, settings_for('vehicle'), tmp_path,
+               truth=str(tmp_path / 'missing.csv'))
 
 
 def test_trajectories_read_back(tmp_path, vehicle_replays):

@@ -83,5 +83,6 @@ def test_the_recipe_is_complete():
     given = recipe()
     assert len(given['pose0_config']) == 15 and given['pose0_config'][:2] == [True, True]
     assert len(given['process_noise_covariance']) == 225
-    assert given['world_frame'] == given['odom_frame'] != given['base_link_frame']
+    assert given['world_frame'] == given['odom_frame'] == 'map'
+    assert len({given[f'{name}_frame'] for name in ('map', 'odom', 'base_link')}) == 3
     assert given['pose0'] == 'tracker_node/pose'

@@ -261,7 +261,7 @@ class SensorHealth:
         return self._delays
 
     def findings(self, name: str, noise_std: FloatArray | None = None,
-                 max_field: float = 1e-3) -> list[Finding]:
+                 max_field: float = 1e-3, is_live: bool = True) -> list[Finding]:
         """What is wrong, the worst first: list of `Finding`.
 
         Parameters
@@ -272,12 +272,15 @@ class SensorHealth:
             That it was calibrated to.
         max_field : float [T]
             Beyond this it is rejected.
+        is_live : bool
+            False for a recording that is played, perhaps over and over: its clock is no fault.
         """
         n = self.counts['readings']
         if not n:
             return [Finding(True, name, 'no reading', 'look at its cable, its driver and the topic '
                             'in the network file')]
-        found = [*self._time_findings(name, n), *self._value_findings(name, n, max_field)]
+        found = [*(self._clock_findings(name) if is_live else ()),
+                 *self._time_findings(name, n), *self._value_findings(name, n, max_field)]
         if noise_std is not None and not np.nanmax(np.abs(self.field), initial=0.0) > max_field:
             worse = self.noise_std / noise_std
             if np.nanmax(worse, initial=0.0) > 3.0:
@@ -287,17 +290,20 @@ class SensorHealth:
                                      'it (a motor, a cable), or calibrate anew'))
         return sorted(found, key=lambda f: not f.serious)
 
+    def _clock_findings(self, name: str) -> Iterator[Finding]:
+        """What is wrong with the clock."""
+        if n := self.counts['clock steps']:
+            yield Finding(True, name, f'its clock stepped {n} times against the '
+                          f'host\'s, by up to {self._largest_step_s:+.2f} s', 'let the clocks '
+                          'follow one source (chrony, PTP), and stamp by a monotonic one')
+        if n := self.counts['stamps that went back']:
+            yield Finding(True, name, f'stamps went back {n} times',
+                          'two publishers on one topic, a clock that was set, or a looped replay')
+
     def _time_findings(self, name: str, n: int) -> Iterator[Finding]:
         """What is wrong with stamps."""
         c = self.counts
         middle, low, high = self.delay_s
-        if c['clock steps']:
-            yield Finding(True, name, f'its clock stepped {c["clock steps"]} times against the '
-                          f'host\'s, by up to {self._largest_step_s:+.2f} s', 'let the clocks '
-                          'follow one source (chrony, PTP), and stamp by a monotonic one')
-        if c['stamps that went back']:
-            yield Finding(True, name, f'stamps went back {c["stamps that went back"]} times',
-                          'two publishers on one topic, a clock that was set, or a looped replay')
         if c['duplicates'] > 0.001 * n:
             yield Finding(False, name, f'{c["duplicates"]} of {n} readings have the stamp of the '
                           'one before', 'the driver publishes readings twice, or stamps too '

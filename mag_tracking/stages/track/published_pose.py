@@ -149,7 +149,7 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
     reasons = doubts.listed({*found, *ambiguities(bank, best)})
     uncertainty: PoseUncertainty | None = own_uncertainty(said)
     if reasons and ambiguous_poses != BEST:
-        uncertainty = mixture_uncertainty(bank, best, model, orientation, said, P) \
+        uncertainty = mixture_uncertainty(bank, best, model, orientation, said, P, excess) \
             if ambiguous_poses == MIXTURE else None
     weights = np.exp(bank.log_w)
     moments = model.dipoles(bank.x[:, :n_t]).m.sum(axis=1)
@@ -196,7 +196,8 @@ def _second_moment(bank: FilterBank, best: int, model: SourceModel,
 
 
 def mixture_uncertainty(bank: FilterBank, best: int, model: SourceModel, orientation: Orientation,
-                        here: PoseFields, P_here: FloatArray) -> PoseUncertainty:
+                        here: PoseFields, P_here: FloatArray,
+                        excess: float = 1.0) -> PoseUncertainty:
     """Uncertainty about the pose of hypothesis `best`, where each hypothesis may be right.
 
     Parameters
@@ -209,10 +210,12 @@ def mixture_uncertainty(bank: FilterBank, best: int, model: SourceModel, orienta
         As published of the hypotheses at this place.
     P_here : (n_t, n_t) array
         `covariance_about` before it was widened to `here`.
+    excess : float
+        As for `published_track`.
     """
     n_t = len(model.state_names)
-    widening = here['covariance'] - P_here[:6, :6]
-    covariance = widening + _second_moment(bank, best, model, bank.log_w)[:6, :6]
+    widening = here['covariance'] - excess * P_here[:6, :6]
+    covariance = widening + excess * _second_moment(bank, best, model, bank.log_w)[:6, :6]
     # Headings may be opposite, and are too far apart for a derivative.
     log_w = np.where(bank.apart(best), bank.log_w, -np.inf)
     rows = np.flatnonzero(log_w >= bank.log_w.max() + np.log(NO_WEIGHT))
