@@ -1,4 +1,4 @@
-"""Which source a device's only sensor is, where the drivers file does not name it."""
+"""Selection of the source of a device's only sensor, where the drivers file does not name it."""
 
 from typing import TypeAlias
 
@@ -28,7 +28,7 @@ class SoleSource:
         self._heard_ns = 0
 
     def is_this(self, source: Source, now_ns: int) -> bool:
-        """Whether it is `source`, of which something comes at `now_ns` (monotonic)."""
+        """Whether `source`, heard at `now_ns` (monotonic), is the sole source."""
         if self._source is not None and self._source != source \
                 and now_ns - self._heard_ns > RELEASED_S * NS:
             self.changes += 1

@@ -1,4 +1,4 @@
-"""What RViz shows: of a track its 90 % ellipsoid, an arrow along the moment and a label; sensors.
+"""Markers for RViz: a track as a 90 % ellipsoid, an arrow along the moment and a label; sensors.
 
 One namespace a kind of marker, one id a track, so that a viewer can switch a kind off. Markers of
 a track vanish by themselves where nobody takes them away.

@@ -13,11 +13,11 @@ from mag_tracking.units import NS
 SILENT_S = 2.0
 """[s] A sensor or a node of which nothing came for longer is silent."""
 PATIENCE_S = 8.0
-"""[s] Longer than a background takes to be learnt: until then nothing need come."""
+"""[s] Grace period for the first message, longer than learning a background takes."""
 MOST_BUSY = 0.95
-"""A node that works for a larger share of the time cannot keep up."""
+"""Largest share of the time that a node can spend on messages and keep up."""
 LATE_S = 1.0
-"""[s] Poses that are later are of no use to anybody who drives by them."""
+"""[s] A median latency above this is a fault: such poses are too old for control."""
 MOST_NOTED = 10_000
 """Messages between two reports whose times are kept; a second of a thousand sensors has less."""
 

@@ -1,4 +1,4 @@
-"""A little of what `ros2` does, for those who have ROS from PyPI, which lacks it."""
+"""Small substitutes for the command `ros2`, which ROS from PyPI lacks."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -1,8 +1,9 @@
-"""What the graph says of the sensors' topics: who publishes them, and what else is published."""
+"""Publishers of the sensors' topics, and faults in how they are connected."""
 
 from collections.abc import Mapping
 
 from rclpy.node import Node
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.network.topics import absolute
@@ -19,14 +20,23 @@ def topic_findings(node: Node, sensor: str, topic: str) -> list[Finding]:
                      f'it has to be {MAGNETIC_FIELD}')
              for p in publishers if p.topic_type != MAGNETIC_FIELD]
     if len(publishers) > 1:
-        names = ', '.join(sorted(absolute(p.node_name, p.node_namespace) for p in publishers))
+        names = ', '.join(sorted(name for name in map(node_of, publishers) if name)) or 'unknown'
         found.append(Finding(True, sensor, f'{len(publishers)} publishers of {topic}: {names}',
                              'stop all but one'))
     return found
 
 
+def node_of(endpoint: TopicEndpointInfo) -> str | None:
+    """Absolute name of the node of an endpoint; None where it is not discovered yet.
+
+    The middleware announces endpoints and nodes separately, and has a placeholder in between.
+    """
+    namespace = endpoint.node_namespace
+    return absolute(endpoint.node_name, namespace) if namespace.startswith('/') else None
+
+
 def missing_publisher(node: Node, sensor: str, topic: str, known: Mapping[str, str]) -> Finding:
-    """The fault of a sensor whose `topic` is silent; it names what is published instead.
+    """Fault of a sensor whose `topic` is silent, with the fields that are published instead.
 
     `known` is {sensor: topic} of the whole network.
     """

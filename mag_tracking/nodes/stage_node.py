@@ -27,11 +27,10 @@ from mag_tracking.errors import MagTrackingError, RecordingError, SettingsError
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.messages.schema import readings_of, stamp_ns
 from mag_tracking.network.file import read_network
-from mag_tracking.network.topics import absolute
 from mag_tracking.nodes.flow import Flow, Listener
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
-from mag_tracking.nodes.sensor_graph import shortened
+from mag_tracking.nodes.sensor_graph import node_of, shortened
 from mag_tracking.nodes.status_log import StatusLog
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import Readings
@@ -88,11 +87,11 @@ class StageNode(Node):
         self.every(1.0, self._publish_diagnostics)
 
     def every(self, seconds: float, call: Callable[[], None]) -> Timer:
-        """A timer by the time that passes, not that of a recording, which may stand still."""
+        """A timer on a steady clock: that of a recording may stand still."""
         return self.create_timer(seconds, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def state(self) -> str:
-        """What the node does: waiting for its input, or ready."""
+        """State of the node: waiting for its input, or ready."""
         silent = [topic for flow in self.flows.values() if flow.heard is None
                   for topic in flow.topics]
         return f'waiting for {shortened(silent)}' if silent else READY
@@ -193,7 +192,7 @@ class StageNode(Node):
         for listener in self._listeners:
             ends = self.get_subscriptions_info_by_topic(listener.topic)
             statuses.append(listener.status(self.title, {
-                absolute(e.node_name, e.node_namespace) for e in ends}, self._published_types))
+                name for name in map(node_of, ends) if name}, self._published_types))
         self.publish_statuses([*statuses, *self._own_statuses()])
         self.report_state()
 
@@ -214,7 +213,7 @@ class StageNode(Node):
             message='; '.join(faults) or self.state())]
 
     def _published_types(self, name: str) -> set[str]:
-        """The types that a node publishes, by what is known of it so far."""
+        """Types of the messages that a node publishes, as far as it is discovered."""
         namespace, _, leaf = name.rpartition('/')
         try:
             found = self.get_publisher_names_and_types_by_node(leaf, namespace or '/')
@@ -227,7 +226,7 @@ class StageNode(Node):
         return any(map(self.count_publishers, (*flow.topics, *flow.batches)))
 
     def publish_statuses(self, statuses: list[DiagnosticStatus]) -> None:
-        """Publish [DiagnosticStatus], if there are any, and log what is wrong."""
+        """Publish [DiagnosticStatus], if there are any, and log faults."""
         for status in statuses:
             self._log.note(status)
         if statuses:

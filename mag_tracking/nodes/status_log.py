@@ -1,4 +1,4 @@
-"""Diagnostics in the log: each fault when it appears, and again while it lasts."""
+"""Log of the diagnostics: each fault when it appears, and once a minute while it lasts."""
 
 import re
 import time

@@ -1,4 +1,4 @@
-"""`tracks.mcap`: what the nodes would have published, for the viewers of ROS.
+"""`tracks.mcap`: the messages of the nodes, for the viewers of ROS.
 
 Fields, tracks, poses, odometry, path, smoothed tracks, markers, transforms, disturbances.
 """
@@ -36,7 +36,7 @@ from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import FieldFrame, Readings, SmoothedPose, Track
 
 LATCHED = ('/tf_static', '/tracker_node/sensor_markers')
-"""Topics with one message, for those who come later."""
+"""Latched topics, with one message each."""
 
 
 class TrackRecording:
@@ -86,7 +86,7 @@ class TrackRecording:
                 self._writer.write(self._topics[name], MAGNETIC_FIELD, content, frame.stamp_ns)
 
     def add_track(self, track: Track) -> None:
-        """Write a pose of a track and what is shown of it, or its end."""
+        """Write a pose of a track with its markers and transform, or its end."""
         self._write_smoothed()
         self._begin(track.stamp_ns)
         stamp_ns, frame = track.stamp_ns, self._frame

@@ -35,7 +35,7 @@ class RecordingWriter:
     """
 
     def __init__(self, path: str | PathLike[str], latched: Collection[str] = ()) -> None:
-        """`latched` are topics whose messages are kept for those who come later.
+        """Open the file; the topics `latched` are transient local.
 
         Raises OutputError where the file cannot be written, or its folder holds another recording.
         """

@@ -22,8 +22,7 @@ SCALE_1D = 1.645
 """Deviations to the edge of a 90 % interval."""
 
 LEAST_DRAWN = 0.01
-"""Hypotheses of an arrival are on the map while it weighs more: what is as good as dropped would
-stretch it."""
+"""Weight above which the hypotheses of an arrival are drawn: lighter ones would stretch the map."""
 
 
 class _Network(Protocol):

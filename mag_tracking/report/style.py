@@ -1,4 +1,4 @@
-"""What all figures have in common: colours that colour-blind people tell apart, ticks, legends."""
+"""Common style of the figures: a palette safe for colour-blind people, ticks, legends."""
 
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, NullFormatter
@@ -11,7 +11,7 @@ SERIES = (BLUE, ORANGE, GREEN, PINK, SKY)
 AXIS_COLOURS = (VERMILLION, GREEN, BLUE)
 """Of the axes x, y, z."""
 FEW_DECADES = 1.5
-"""A logarithmic axis that covers less has labels between the powers of ten."""
+"""Range below which a logarithmic axis has labels between the powers of ten."""
 
 
 def legend_beside(axes: Axes, **named: float) -> None:

@@ -291,7 +291,7 @@ class SensorHealth:
         return sorted(found, key=lambda f: not f.serious)
 
     def _clock_findings(self, name: str) -> Iterator[Finding]:
-        """What is wrong with the clock."""
+        """Faults of the clock."""
         if n := self.counts['clock steps']:
             yield Finding(True, name, f'its clock stepped {n} times against the '
                           f'host\'s, by up to {self._largest_step_s:+.2f} s', 'let the clocks '
@@ -301,7 +301,7 @@ class SensorHealth:
                           'two publishers on one topic, a clock that was set, or a looped replay')
 
     def _time_findings(self, name: str, n: int) -> Iterator[Finding]:
-        """What is wrong with stamps."""
+        """Faults of the timestamps."""
         c = self.counts
         middle, low, high = self.delay_s
         if c['duplicates'] > 0.001 * n:

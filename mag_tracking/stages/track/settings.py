@@ -10,7 +10,7 @@ from mag_tracking.stages.track.initiation_magnet import MagnetSettings
 from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
 
 MIXTURE, HOLD, BEST = 'mixture', 'hold', 'best'
-"""What the pose topics carry while a track is ambiguous."""
+"""Choices for poses on topics without a flag while a track is ambiguous."""
 
 
 @dataclass(frozen=True)
@@ -19,9 +19,9 @@ class TrackSettings:
 
     target: str = param('vehicle', 'What moves: vehicle or magnet.')
     ambiguous_poses: str = param(
-        MIXTURE, 'What the pose and odometry topics, which have no flag, carry while a track is '
-        'ambiguous: the best pose with the covariance of all that is still possible (mixture), '
-        'nothing (hold), or the best pose with its own covariance (best).', choices=(
+        MIXTURE, 'Poses on the topics without a flag (pose, odometry, detections_3d) while a track '
+        'is ambiguous: the best pose with the covariance of all hypotheses (mixture), none (hold), '
+        'or the best pose with its own covariance (best).', choices=(
             MIXTURE, HOLD, BEST))
     single_sensor_prior: bool = param(
         False, 'Track with one sensor alone (a network of one, or the only one that measures). It '

@@ -1,0 +1,36 @@
+"""What is read of the graph, also while it is discovered."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from mag_tracking.messages.types import MAGNETIC_FIELD
+from mag_tracking.nodes.sensor_graph import node_of, shortened, topic_findings
+
+
+def endpoint(name, namespace='/', kind=MAGNETIC_FIELD):
+    """As rclpy describes one."""
+    return SimpleNamespace(node_name=name, node_namespace=namespace, topic_type=kind)
+
+
+UNKNOWN = endpoint('_NODE_NAME_UNKNOWN_', '_NODE_NAMESPACE_UNKNOWN_')
+"""An endpoint that was announced before its node."""
+
+
+@pytest.mark.parametrize('one, name', [
+    (endpoint('a'), '/a'), (endpoint('a', '/n/m'), '/n/m/a'), (UNKNOWN, None)])
+def test_the_node_of_an_endpoint(one, name):
+    assert node_of(one) == name
+
+
+def test_two_publishers_are_a_fault_also_before_their_nodes_are_known():
+    for publishers, told in (([UNKNOWN, UNKNOWN], 'unknown'), ([endpoint('b', '/n'), UNKNOWN,
+                                                                endpoint('a')], '/a, /n/b')):
+        graph = SimpleNamespace(get_publishers_info_by_topic=lambda _, found=publishers: found)
+        (finding,) = topic_findings(graph, 'mag_1', '/mag_1/imu/mag')
+        assert finding.what == f'{len(publishers)} publishers of /mag_1/imu/mag: {told}'
+
+
+def test_many_names_are_shortened():
+    assert shortened(['a', 'b']) == 'a, b'
+    assert shortened(list('abcdefg')) == 'a, b, c, d and 3 more'
