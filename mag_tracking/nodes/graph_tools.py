@@ -130,7 +130,8 @@ def listen(graph: Observer, topic: str, take: Callable[[Any], bool],
     done: list[bool] = []
 
     def take_one(message: Any) -> None:
-        if not take(message):
+        # Several may wait when the last one that is wanted comes.
+        if not done and not take(message):
             done.append(True)
 
     graph.node.create_subscription(
