@@ -10,7 +10,6 @@ from mag_tracking.apps.first_pass import first_pass_of
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.agreement import consensus, disagreements
 from mag_tracking.network import SensorNetwork
-from mag_tracking.network.topics import absolute
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
@@ -191,8 +190,7 @@ class Doctor:
             found += health.findings(name, self.network.noise_std[j],
                                      self._settings.calibrate.max_field)
             found += background_findings(name, self.calibrate, self._frozen_ns.get(name))
-            found += covariance_findings(name, absolute(
-                self.network.topics[j], self.network.namespace or '/'), self.calibrate)
+            found += covariance_findings(name, self.network.absolute_topics[j], self.calibrate)
         found += self._missed.findings()
         found += network_findings(self.network, self._settings.survey, self.calibrate,
                                   self.sensors)

@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from mag_tracking.network import SensorNetwork
-from mag_tracking.network.topics import absolute
 from mag_tracking.pipeline import Settings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.stage import Detect
@@ -37,8 +36,8 @@ def why_no_detection(network: SensorNetwork, settings: Settings, calibrate: Cali
         cause, n = max(rejected.items(), key=lambda item: item[1])
         return f'no reading could be used: {n} were rejected ({cause})'
     if not n_accepted:
-        return 'there were no readings on ' + ', '.join(missing_topics or [
-            absolute(topic, network.namespace or '/') for topic in network.topics])
+        return 'there were no readings on ' + ', '.join(
+            missing_topics or network.absolute_topics)
     if not detect.counts['frames']:
         hung = [name for name in calibrate.unready() if calibrate.backgrounds()[name].stuck]
         if hung:

@@ -13,9 +13,9 @@ from mag_tracking.messages.types import (
 )
 
 RESULTS_OF = ('calibration_node/', 'detection_node/', 'tracker_node/')
-"""Topics that begin so are results, in the namespace of the recorder."""
+"""Prefixes of topics of results, in the namespace of the recorder."""
 RESULTS = (CALIBRATED_READINGS, CALIBRATION_STATE, NETWORK_FRAME)
-"""These are, too."""
+"""Other topics of results."""
 
 
 class Recorded(Protocol):
@@ -46,7 +46,7 @@ class Selection(NamedTuple):
     results: bool = False
     everything: bool = False
     readings: str = RAW_READINGS
-    """Of many sensors."""
+    """Topic of the readings of many sensors."""
     results_of: tuple[str, ...] = RESULTS_OF
     result_topics: tuple[str, ...] = RESULTS
 

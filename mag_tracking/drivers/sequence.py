@@ -24,7 +24,7 @@ class SequenceCheck:
         self._missing: dict[int, bool] = {}
 
     def pause(self) -> None:
-        """What does not come from now on is not lost: nobody listens."""
+        """Begin a new count: readings during a deliberate pause are not lost."""
         self._begin()
 
     def is_new(self, sequence: int, values: bytes) -> bool:

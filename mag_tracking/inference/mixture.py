@@ -26,7 +26,7 @@ def second_moment(weights: FloatArray, differences: FloatArray,
     References
     ----------
     Bar-Shalom, Li and Kirubarajan 2001, Estimation with Applications to Tracking and Navigation,
-    eq. (1.4.16-10), with the estimate in place of the mean.
+    section 1.4.16, with the estimate in place of the mean.
     """
     w = weights / weights.sum()
     moment: FloatArray = (np.einsum('n,nij->ij', w, covariances)

@@ -18,7 +18,7 @@ TRACK_KINDS = ('ellipsoid', 'moment', 'label')
 """Namespaces of the markers of a track."""
 SENSOR_KINDS = ('sensors', 'sensor_labels')
 LIFETIME_S = 2
-"""[s] Of the markers of a track."""
+"""[s] Lifetime of the markers of a track."""
 _ARROW, _CUBE, _SPHERE, _TEXT = 0, 1, 2, 9
 _ADD, _DELETE = 0, 2
 _SCALE_3D = 2.5003
@@ -108,7 +108,7 @@ def _arrow(track: Track, frame: str) -> dict[str, Any]:
 
 
 def _label(track: Track, frame: str) -> dict[str, Any]:
-    """What the target is and how fast, with a question mark where the track is ambiguous."""
+    """Label with kind and speed of the target, and a question mark where the track is ambiguous."""
     size = float(np.clip(np.sqrt(np.trace(track.covariance[:3, :3])), 0.005, 0.5))
     words = [word for word in (f'{track.id}', track.kind,
                                f'{np.hypot(*track.velocity[:2]):.1f} m/s') if word]

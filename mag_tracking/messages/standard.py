@@ -9,11 +9,17 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Track
 
 
-def track_transform_dict(track: Track, frame: str, child_frame: str) -> MessageDict:
-    """geometry_msgs/TransformStamped from `frame` to the pose of a `Track`."""
-    return {'header': header_dict(track.stamp_ns, frame), 'child_frame_id': child_frame,
-            'transform': {'translation': xyz(track.position), 'rotation': {
-                **xyz(track.orientation), 'w': float(track.orientation[3])}}}
+def track_transform_dict(track: Track, frame: str, child_frame: str) -> MessageDict | None:
+    """tf2_msgs/TFMessage from `frame` to the pose of a `Track`.
+
+    None for an ambiguous pose: a transform has neither a flag nor a covariance.
+    """
+    if track.ambiguous:
+        return None
+    return {'transforms': [{
+        'header': header_dict(track.stamp_ns, frame), 'child_frame_id': child_frame,
+        'transform': {'translation': xyz(track.position), 'rotation': {
+            **xyz(track.orientation), 'w': float(track.orientation[3])}}}]}
 
 
 def sensor_transform_dicts(network: SensorNetwork, stamp_ns: int) -> list[MessageDict]:

@@ -1,6 +1,6 @@
 """Message types as text, and their CDR bytes, without ROS.
 
-What the definitions are stands in `definitions`; a recording carries them.
+The texts are those of `definitions`; a recording carries them.
 """
 
 import functools

@@ -67,7 +67,7 @@ class SensorNetwork:
     calibrated: tuple[Calibrated | None, ...] = ()
     """Per sensor; None = never."""
     namespace: str | None = None
-    """Of the relative topics in a recording; None = the one in which they are."""
+    """Namespace of the relative topics in a recording; None = the one in which they are found."""
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -96,6 +96,11 @@ class SensorNetwork:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def absolute_topics(self) -> tuple[str, ...]:
+        """(n,) `topics` as a recording without a known namespace has them at the root."""
+        return tuple(absolute(topic, self.namespace or '/') for topic in self.topics)
 
     @property
     def R_sw(self) -> FloatArray:

@@ -35,6 +35,7 @@ from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.sensor_rounds import SensorRounds
 from mag_tracking.nodes.sensor_transforms import SensorTransforms
 from mag_tracking.nodes.stage_node import LATCHED, READY, SENT, STREAM, StageNode
+from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.nodes.survey_service import SurveyService
 from mag_tracking.recording.background_file import (
     is_background_file,
@@ -75,7 +76,8 @@ class CalibrationNode(StageNode):
         self._rounds = SensorRounds(
             self.title, self.network, self._stage, self._health, self._store, self._is_live,
             lambda status: self.publish_statuses([status]), self._publish_states)
-        self.every(max(1.0 / (2 * len(self.network) + 3), SHORTEST_STEP_S), self._rounds.tick)
+        steady_timer(self, max(1.0 / (2 * len(self.network) + 3), SHORTEST_STEP_S),
+                     self._rounds.tick)
         paced_service(self, CalibrateService, '~/calibrate', self._calibrate)
         paced_service(self, SurveyMessage, '~/survey', self._solve)
         self.report_state()

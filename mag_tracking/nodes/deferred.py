@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
+
+from mag_tracking.nodes.steady_timer import steady_timer
 
 
 class Deferred:
@@ -16,9 +16,7 @@ class Deferred:
 
     def __init__(self, node: Node, delay_s: float, call: Callable[[], None]) -> None:
         self._call = call
-        # Not that of a recording, which may stand still.
-        self._timer = node.create_timer(delay_s, self._due, autostart=False,
-                                        clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._timer = steady_timer(node, delay_s, self._due, autostart=False)
 
     def request(self) -> None:
         """Have it called; who has asked already waits no longer for that."""

@@ -7,6 +7,7 @@ from rclpy.node import Node
 
 from mag_tracking.drivers.driver import Driver
 from mag_tracking.nodes.stage_node import title_of
+from mag_tracking.nodes.status_log import StatusLog
 
 HARMLESS = ('samples: ', 'came late: ', 'other messages: ', 'lines that are comments',
             'lines without the prefix', 'lines that are empty', 'retained messages skipped',
@@ -20,7 +21,7 @@ class DriverDiagnostics:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._reported: dict[str, dict[str, int]] = {}
-        self._trouble: dict[str, str] = {}
+        self._log = StatusLog(node.get_logger())
 
     def statuses(self, drivers: Sequence[Driver], served: Collection[str],
                  active: bool) -> list[DiagnosticStatus]:
@@ -46,24 +47,14 @@ class DriverDiagnostics:
             message = 'opening'
         elif news:
             level, message = DiagnosticStatus.WARN, '; '.join(news)
-        self._log(driver.name, level, message)
         values = {what: str(n) for what, n in sorted(counts.items())}
         for source, clock in driver.clocks().items():
             behind = f' ({source})' if source else ''
             values[f'drift of its clock [ppm]{behind}'] = f'{clock.drift_ppm:.2f}'
             values[f'messages behind the quickest [ms]{behind}'] = f'{1e3 * clock.spread_s:.3g}'
             values[f'std of its stamps [ms]{behind}'] = f'{1e3 * clock.stamp_std:.3g}'
-        return DiagnosticStatus(
+        status = DiagnosticStatus(
             level=level, name=f'{title_of(self._node)}: {driver.name}', hardware_id=driver.name,
             message=message, values=[KeyValue(key=k, value=v) for k, v in values.items()])
-
-    def _log(self, name: str, level: bytes, message: str) -> None:
-        """Log what has changed: what is wrong, and that it is well again."""
-        trouble = message if level == DiagnosticStatus.ERROR else ''
-        if trouble and trouble != self._trouble.get(name):
-            self._node.get_logger().error(f'{name}: {trouble}')
-        elif not trouble and self._trouble.get(name):
-            self._node.get_logger().info(f'{name}: open again')
-        elif level == DiagnosticStatus.WARN:
-            self._node.get_logger().warning(f'{name}: {message}', throttle_duration_sec=10.0)
-        self._trouble[name] = trouble
+        self._log.note(status)
+        return status

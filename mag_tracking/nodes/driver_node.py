@@ -32,6 +32,7 @@ from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.driver_health import DriverDiagnostics
 from mag_tracking.nodes.ros_params import fixed_parameter
 from mag_tracking.nodes.stage_node import RESULTS, SENT
+from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.records import AccelerationSample, Readings
 
 PATIENCE_S = 15.0
@@ -55,7 +56,7 @@ class DriverNode(LifecycleNode):
         self._stopping: threading.Event | None = None
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RESULTS)
         self._health = DriverDiagnostics(self)
-        self.create_timer(1.0, self._publish_diagnostics)
+        steady_timer(self, 1.0, self._publish_diagnostics)
         self._refused: MagTrackingError | None = None
         if fixed_parameter(self, 'autostart', True, 'Configure and activate at the start.'):
             done = self.trigger_configure()

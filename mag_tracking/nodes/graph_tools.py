@@ -53,10 +53,10 @@ class Observer:
         return condition()
 
     def ask(self, service_type: Any, name: str, request: Any, once: bool = False) -> Any:
-        """The response of a service; raises GraphError where there is none.
+        """Response of a service; raises GraphError where none comes.
 
-        A question is repeated where no answer comes: a server that does not know the client yet
-        loses its answer. What changes something is asked `once`, a moment later.
+        A query is repeated: the answer of a server that has not discovered the client is lost. A
+        change is requested `once`, after a wait for the discovery.
         """
         with valid_names():
             client = self.node.create_client(service_type, name)

@@ -4,11 +4,11 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.service import Service
+
+from mag_tracking.nodes.steady_timer import steady_timer
 
 PACE_S = 0.002
 """[s] Between two answers."""
@@ -37,7 +37,6 @@ def paced_service(node: Node, service_type: Any, name: str,
         if timer.is_canceled():
             timer.reset()
 
-    timer = node.create_timer(PACE_S, send_next, autostart=False,
-                              clock=Clock(clock_type=ClockType.STEADY_TIME))
+    timer = steady_timer(node, PACE_S, send_next, autostart=False)
     service.send_response = send_later  # type: ignore[method-assign]
     return service

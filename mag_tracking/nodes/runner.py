@@ -193,8 +193,8 @@ def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Se
 
 def _check_topics(node: StageNode, replay: ReplayNode) -> None:
     """Raise MagTrackingError where nothing that is played is of the network."""
-    names = {p.topic_name: topic for topic, p in replay.publishers_by_topic.items()}
-    if names.keys() & {*node.sensor_topics, node.resolve_topic_name(RAW_READINGS)}:
+    played = {p.topic_name for p in replay.publishers_by_topic.values()}
+    if played & {*node.sensor_topics, node.resolve_topic_name(RAW_READINGS)}:
         return
     found = namespaces_of((*node.network.topics, RAW_READINGS), list(replay.publishers_by_topic))
     hint = f'; start the nodes in its namespace: --ros-args -r __ns:={found[0]}' \

@@ -11,8 +11,6 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from mag_tracking_msgs.msg import FieldReadings
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
@@ -21,7 +19,6 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.task import Future
-from rclpy.timer import Timer
 
 from mag_tracking.errors import MagTrackingError, RecordingError, SettingsError
 from mag_tracking.interrupts import noted_signals
@@ -32,6 +29,7 @@ from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
 from mag_tracking.nodes.sensor_graph import node_of, shortened
 from mag_tracking.nodes.status_log import StatusLog
+from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import Readings
 from mag_tracking.stages.stage import Stage
@@ -52,7 +50,7 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
 
 
 TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-"""Of /tf, as tf2 has it."""
+"""QoS of /tf, that of tf2."""
 READY = 'ready'
 
 
@@ -84,11 +82,7 @@ class StageNode(Node):
         # When the message came that is worked on, by the clock of ROS.
         self.now_ns = 0
         self._log, self._reported_state = StatusLog(self.get_logger()), ''
-        self.every(1.0, self._publish_diagnostics)
-
-    def every(self, seconds: float, call: Callable[[], None]) -> Timer:
-        """A timer on a steady clock: that of a recording may stand still."""
-        return self.create_timer(seconds, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady_timer(self, 1.0, self._publish_diagnostics)
 
     def state(self) -> str:
         """State of the node: waiting for its input, or ready."""

@@ -57,6 +57,7 @@ from mag_tracking.nodes.stage_node import (
     TRANSFORMS,
     StageNode,
 )
+from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.stages.stage import Stage
 from mag_tracking.stages.track.manager import TrackManager
@@ -101,7 +102,7 @@ class TrackerNode(StageNode):
         self._doubtful: dict[str, DoubtfulTimes] = {}
         self.subscription(NetworkFrame, NETWORK_FRAME, self._take, STREAM,
                           source='detection')
-        self.every(0.25, self.end_without_frames)
+        steady_timer(self, 0.25, self.end_without_frames)
         self.subscription(CalibrationState, CALIBRATION_STATE, self._calibrated, LATCHED)
         self.report_state()
 
@@ -219,13 +220,9 @@ class TrackerNode(StageNode):
         """Odometry, transform, path and markers of a running track."""
         child_frame = self._child_frame or f'track_{track.id}'
         publish_if_any(self._odometry, Odometry, odometry_dict(track, frame, child_frame))
-        is_held = track.topic_uncertainty is None
-        # A transform has no covariance either.
-        if self._tf is not None and not is_held and (
-                not track.ambiguous or self.settings.track.ambiguous_poses == BEST):
-            self._tf.publish(to_message(TFMessage, {'transforms': [
-                track_transform_dict(track, frame, child_frame)]}))
-        if not is_held:
+        if self._tf is not None:
+            publish_if_any(self._tf, TFMessage, track_transform_dict(track, frame, child_frame))
+        if track.topic_uncertainty is not None:
             self._path.append(to_message(PoseStamped, pose_dict(
                 track.stamp_ns, frame, track.position, track.orientation)))
         if self._path and is_heard(self._path_publisher):

@@ -18,8 +18,9 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.network.topics import absolute, namespaces_of
 from mag_tracking.recording.interruptible import Progress, ReadingStopped
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.truth import TRUTH_TYPES, TruthArrays, TruthTopics
+from mag_tracking.recording.truth import TRUTH_TYPES, TruthTopics
 from mag_tracking.records import AccelerationSample, Readings
+from mag_tracking.report.metrics import Truth
 
 TRUTH_PREFIX = 'ground_truth/'
 """Poses on topics below this, in the namespace of the sensors, are truth: for reports, never for
@@ -145,7 +146,7 @@ class SampleReader:
                              for name in readings.part(~is_known).sensor_names())
         return readings.part(is_known)
 
-    def truth_arrays(self) -> dict[str, TruthArrays]:
+    def truth_arrays(self) -> dict[str, Truth]:
         """{name: arrays} of the true poses that were read."""
         self.rejected.update(self._truth.rejected)
         self._truth.rejected.clear()

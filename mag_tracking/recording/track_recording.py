@@ -31,7 +31,6 @@ from mag_tracking.messages.types import (
     TRANSFORMS,
 )
 from mag_tracking.network import SensorNetwork
-from mag_tracking.network.topics import absolute
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import FieldFrame, Readings, SmoothedPose, Track
 
@@ -40,7 +39,7 @@ LATCHED = ('/tf_static', '/tracker_node/sensor_markers')
 
 
 class TrackRecording:
-    """Writes tracks and what belongs to them as messages; a context manager.
+    """Writer of tracks, and of the fields and sensors that belong to them, as messages.
 
     Parameters
     ----------
@@ -53,8 +52,8 @@ class TrackRecording:
     def __init__(self, path: str | PathLike[str], network: SensorNetwork) -> None:
         self._writer = RecordingWriter(path, LATCHED)
         self._network, self._frame = network, network.frame
-        self._topics = {name: f'{absolute(topic, network.namespace or "/")}_calibrated'
-                        for name, topic in zip(network.names, network.topics, strict=True)}
+        self._topics = {name: f'{topic}_calibrated' for name, topic in zip(
+            network.names, network.absolute_topics, strict=True)}
         self._path: list[MessageDict] = []
         self._smoothed: list[SmoothedPose] = []
         self._is_begun = False
@@ -101,18 +100,15 @@ class TrackRecording:
             self._path = []
             return
         child_frame = f'track_{track.id}'
-        for name, kind, message in (
-                ('pose', POSE_WITH_COVARIANCE, pose_message_dict(track, frame)),
-                ('odometry', ODOMETRY, odometry_dict(track, frame, child_frame))):
+        for topic, kind, message in (
+                ('/tracker_node/pose', POSE_WITH_COVARIANCE, pose_message_dict(track, frame)),
+                ('/tracker_node/odometry', ODOMETRY, odometry_dict(track, frame, child_frame)),
+                ('/tf', TRANSFORMS, track_transform_dict(track, frame, child_frame))):
             if message is not None:
-                self._write(name, kind, message, stamp_ns)
-        if not track.ambiguous:
-            self._writer.write('/tf', TRANSFORMS, {'transforms': [
-                track_transform_dict(track, frame, child_frame)]}, stamp_ns)
+                self._writer.write(topic, kind, message, stamp_ns)
         self._write('markers', MARKERS, track_markers(track, frame), stamp_ns)
         if track.topic_uncertainty is not None:
-            self._path.append(pose_dict(
-                stamp_ns, frame, track.position, track.orientation))
+            self._path.append(pose_dict(stamp_ns, frame, track.position, track.orientation))
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
         """Take a smoothed pose; a whole track is one message."""

@@ -7,17 +7,15 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.messages.types import ODOMETRY, POSE, POSE_WITH_COVARIANCE
 from mag_tracking.recording.csv_file import number, read_csv
+from mag_tracking.report.metrics import Truth
 from mag_tracking.units import LATEST_NS, NS
 
 TRUTH_TYPES = (POSE, POSE_WITH_COVARIANCE, ODOMETRY)
 """Types of messages that carry true poses."""
-TruthArrays: TypeAlias = tuple[IntArray, FloatArray, FloatArray]
-"""Stamps (n,) [ns], positions (n, 3) [m], quaternions (n, 4) xyzw."""
 _Row: TypeAlias = tuple[int, float, float, float, float, float, float, float]
 _TIMES = {'stamp_ns': 1, 't': NS, 'time': NS}
 """{column: ns}."""
@@ -61,7 +59,7 @@ class TruthTopics:
         self._rows.setdefault(topic, []).append(
             (stamp_ns(content.header.stamp), p.x, p.y, p.z, q.x, q.y, q.z, q.w))
 
-    def arrays(self) -> dict[str, TruthArrays]:
+    def arrays(self) -> dict[str, Truth]:
         """{name: arrays} of the topics, in order of time."""
         out = {}
         for topic, rows in self._rows.items():
@@ -72,7 +70,7 @@ class TruthTopics:
         return out
 
 
-def read_truth_table(path: str | PathLike[str]) -> dict[str, TruthArrays]:
+def read_truth_table(path: str | PathLike[str]) -> dict[str, Truth]:
     """True poses of a CSV file, in the frame of the network.
 
     Parameters

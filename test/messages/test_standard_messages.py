@@ -58,11 +58,12 @@ def test_transforms_of_the_sensors_are_the_network():
 
 def test_the_transform_of_a_track_is_its_pose(tracks):
     track = tracks[False]
-    message, pose = (track_transform_dict(track, 'map', 'target'),
-                     pose_message_dict(track, 'map')['pose']['pose'])
+    (message,) = track_transform_dict(track, 'map', 'target')['transforms']
+    pose = pose_message_dict(track, 'map')['pose']['pose']
     assert message['transform'] == {'translation': pose['position'],
                                     'rotation': pose['orientation']}
     assert message['child_frame_id'] == 'target'
+    assert track_transform_dict(tracks[True], 'map', 'target') is None
 
 
 def test_a_track_is_a_detection_with_the_probability_of_each_kind(tracks):
@@ -104,7 +105,7 @@ def test_markers_have_a_namespace_a_kind_and_an_id_a_track(tracks):
 
 
 def test_the_ellipsoid_is_that_of_the_pose_topics(tracks):
-    """Of an ambiguous track it covers all that is possible."""
+    """The ellipsoid of an ambiguous track covers all that is possible."""
     for ambiguous, track in tracks.items():
         scale = track_markers(track, 'map')['markers'][0]['scale']
         about = track.topic_uncertainty.covariance[:3, :3]

@@ -1,4 +1,4 @@
-"""What a newcomer does wrong stands in the log and in the diagnostics, within seconds."""
+"""Mistakes of a newcomer are reported in the log and in the diagnostics, within seconds."""
 
 import subprocess
 import sys

@@ -72,17 +72,17 @@ def test_a_calibration_and_a_driver_as_seen_without_ros2(command, tmp_path):
 
 
 def check_parameters(command):
-    """Of the calibration node, which has no tracker's."""
+    """Show and refuse parameters of the calibration node."""
     code, text = command('param', '/lab/calibration_node', 'network')
     assert code == 0 and text.startswith(f'network: {NETWORK_FILE}  (read-only)  # Path'), text
-    code, text = command('param', '/lab/calibration_node', 'network', '/tmp/x')
+    code, text = command('param', '/lab/calibration_node', 'network', 'other.yaml')
     assert code == 1 and 'refuses network' in text, text
     code, text = command('param', '/lab/calibration_node', 'nonsense')
     assert code == 1 and 'has no parameter nonsense' in text, text
 
 
 def check_lifecycle(command):
-    """Of the driver node."""
+    """Show and change the state of the driver node."""
     code, text = command('lifecycle', 'driver_node', *WITHIN)
     assert code == 0 and text.startswith('active; possible: deactivate'), text
     code, text = command('lifecycle', 'driver_node', 'deactivate', *WITHIN)

@@ -234,7 +234,7 @@ def mixture_uncertainty(bank: FilterBank, best: int, model: SourceModel, orienta
 
 
 def own_uncertainty(said: PoseFields) -> PoseUncertainty:
-    """That of the published fields themselves."""
+    """Uncertainty of the published fields themselves."""
     return PoseUncertainty(said['covariance'], said['orientation_covariance'],
                            said['position_orientation_covariance'])
 

@@ -1,0 +1,15 @@
+"""Timers on a steady clock."""
+
+from collections.abc import Callable
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from rclpy.timer import Timer
+
+
+def steady_timer(node: Node, seconds: float, call: Callable[[], None],
+                 autostart: bool = True) -> Timer:
+    """A timer that does not follow the time of a recording, which may stand still."""
+    return node.create_timer(seconds, call, autostart=autostart,
+                             clock=Clock(clock_type=ClockType.STEADY_TIME))
