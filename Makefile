@@ -56,7 +56,8 @@ config: $(STAMP)  ## write config/ and docs/parameters.md anew from the settings
 	$(BIN)/python tools/generate_viewers.py
 
 test: $(STAMP)  ## check style, floors, types and behaviour
-	@sh tools/check_broker.sh
+	@sh tools/check_program.sh mosquitto mosquitto 'the tests of MQTT'
+	@sh tools/check_program.sh chromium chromium 'the tests of reports and live pages'
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
 	$(BIN)/mypy

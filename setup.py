@@ -22,7 +22,7 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', 'nodes/*.xml']},
+    package_data={NAME: ['py.typed', 'nodes/*.xml', 'report/page/*']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
@@ -41,6 +41,7 @@ setup(
         'numba',
         'numpy',
         'paho-mqtt>=2',
+        'plotly',
         'pygeomag',
         'pyserial',
         'PyYAML',
@@ -48,6 +49,7 @@ setup(
         'scipy',
         'smbus2',
         'tqdm',
+        'websockets>=14',
         'zstandard',
     ],
     extras_require={
@@ -71,6 +73,7 @@ setup(
             'mypy',
             'pandas',
             'pandas-stubs',
+            'playwright',
             'pytest',
             'pytest-timeout',
             'pytest-xdist',

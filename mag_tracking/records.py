@@ -4,7 +4,7 @@ A missing axis or sensor is NaN. Arrays in a record are not to be changed.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar, overload
 
 import numpy as np
@@ -214,6 +214,21 @@ class Hypotheses(Sequence[Hypothesis]):
             return tuple(self[k] for k in range(*i.indices(len(self))))
         return Hypothesis(self.arrivals[i], float(self.weights[i]), self.states[i, :3],
                           self.states[i, 3:], self.covariances[i], self.moments[i], self.kinds[i])
+
+
+def best_of_arrivals(members: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The best hypothesis of each arrival, heaviest first, with the weight of all from there."""
+    if isinstance(members, Hypotheses):
+        arrivals, weights = members.arrivals, members.weights.tolist()
+    else:
+        arrivals, weights = tuple(h.arrival for h in members), [h.weight for h in members]
+    best, total = dict[str, int](), dict[str, float]()
+    for k, (name, weight) in enumerate(zip(arrivals, weights, strict=True)):
+        total[name] = total.get(name, 0.0) + weight
+        if name not in best or weight > weights[best[name]]:
+            best[name] = k
+    return sorted((replace(members[k], weight=total[name]) for name, k in best.items()),
+                  key=lambda h: -h.weight)
 
 
 @dataclass(frozen=True, slots=True)

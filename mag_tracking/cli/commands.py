@@ -14,6 +14,7 @@ from mag_tracking.cli import (
     import_table,
     info,
     listen,
+    live_page,
     plan,
     record,
     repair,
@@ -24,7 +25,7 @@ from mag_tracking.cli import (
 
 PACKAGE = 'mag_tracking'
 ROS_ARGUMENTS = '--ros-args'
-WITH_ROS = ('run', 'record', 'doctor', 'topics', 'echo', 'param', 'lifecycle')
+WITH_ROS = ('run', 'record', 'doctor', 'topics', 'echo', 'param', 'lifecycle', 'watch')
 """Commands that take arguments of ROS."""
 
 
@@ -35,7 +36,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument('--version', action='version', version=f'mag_tracking {version(PACKAGE)}')
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
     for module in (replay, events, calibrate, tumble, board_geometry, doctor, fit, plan, listen,
-                   record, repair, run, info, import_table, graph):
+                   record, repair, run, info, import_table, graph, live_page):
         module.add(commands)
     words = list(words)
     split = words.index(ROS_ARGUMENTS) if ROS_ARGUMENTS in words else len(words)

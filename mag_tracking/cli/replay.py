@@ -9,6 +9,8 @@ from typing import Any
 from tqdm import tqdm
 
 from mag_tracking.apps.replay import replay, write_figures, write_trajectories
+from mag_tracking.apps.replay_notes import notes_of
+from mag_tracking.apps.replay_report import write_report
 from mag_tracking.cli.options import (
     Commands,
     add_command,
@@ -22,10 +24,8 @@ from mag_tracking.interrupts import noted_signals
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.reader import Recording
+from mag_tracking.report.page import WARNING
 from mag_tracking.stages.track.doubts import MEANINGS
-from mag_tracking.stages.track.evidence import LOST
-from mag_tracking.stages.track.manager import ALONE, NO_SCALE
-from mag_tracking.units import NS
 
 _REPLAY = '''
 Reads the magnetic fields of the network's topics, learns each sensor's
@@ -40,6 +40,7 @@ Writes to DIR:
   hypotheses.csv   every member of the bank, every frame
   summary.json     counts, rejected samples by cause, the tracks
   tracks.mcap      poses and tracks as ROS messages (with metadata.yaml)
+  report.html      all of it to look at in a browser: map, time slider, curves, tables
   *_track_N.png    the map, the weights, measured against predicted field
 With several recordings, each gets a folder of its own in DIR. Results of an earlier run are
 replaced, its figures removed; other files in the folder stay.
@@ -112,6 +113,7 @@ def _replay_one(path: Path, network: SensorNetwork, settings: Settings, out: Pat
     _print_summary(path, run.summary, bool(run.truth))
     if args.tum:
         write_trajectories(run, out)
+    write_report(run, network, out)
     if not args.no_figures:
         write_figures(run, network, out, stopped=lambda: bool(seen))
     if not seen:
@@ -123,41 +125,12 @@ def _print_summary(path: Path, summary: dict[str, Any], has_truth: bool) -> None
     print(f'{path.name}: {summary["counts"]["align"].get("frames", 0)} frames, '
           f'{summary["counts"]["detect"].get("onsets", 0)} detections, '
           f'{len(summary["tracks"])} tracks')
-    for topic in summary['missing_topics']:
-        print(f'  warning: nothing on {topic}')
-    if summary['why_no_detection']:
-        print(f'  nothing was detected with the settings for a {summary["target"]}: '
-              f'{summary["why_no_detection"]}')
-    for what, n in {**summary['rejected'], **summary['lost']}.items():
-        print(f'  warning: {what}: {n}')
-    stuck = [name for name, s in summary['sensors'].items() if s['stuck']]
-    if stuck:
-        print(f'  warning: {", ".join(stuck)}: an axis does not vary (see mag-tracking doctor)')
-    waiting = [name for name, s in summary['sensors'].items() if not s['ready'] and not s['stuck']]
-    if waiting:
-        print(f'  warning: no background was learnt for {", ".join(waiting)}: the field was not '
-              'steady for long enough; give background and noise_std in the network file')
-    for name, s in summary['sensors'].items():
-        if s['quiet_stretch_s'] is not None:
-            begin, end = s['quiet_stretch_s']
-            print(f'  the recording does not begin quietly: the background of {name} is its most '
-                  f'frequent level, at {begin:.1f} to {end:.1f} s')
-    _print_limits(summary)
-    for d in summary['disturbances']:
-        _print_disturbance(d)
+    for note in notes_of(summary):
+        print(f'  {"warning: " if note.level == WARNING else ""}{note.text}')
     for t in summary['tracks']:
         _print_track(t)
         if has_truth and 'truth' not in t:
             print('    no true pose at the time of this track')
-
-
-def _print_disturbance(d: dict[str, Any]) -> None:
-    """A disturbance in a line."""
-    lasted = (d['stamp_ns'] - d['begin_ns']) / NS
-    over = 'over the whole network' if d['uniform'] > 0.5 else 'at each sensor on its own'
-    print(f'  disturbance {d["id"]}: {lasted:.1f} s, up to {1e9 * d["largest"]:.3g} nT at '
-          f'{", ".join(d["sensors"]) or "no sensor alone"}, {over}; no single target explains it '
-          f'(track {d["track_id"]})')
 
 
 def _print_track(t: dict[str, Any]) -> None:
@@ -186,35 +159,3 @@ def _print_track(t: dict[str, Any]) -> None:
     for name, (text, unit) in TRUTH_METRICS.items():
         if isinstance(truth.get(name), float):
             print(f'    against {truth["name"]}: {text} {truth[name]:.4g}{unit}')
-
-
-def _print_limits(summary: dict[str, Any]) -> None:
-    """Print the limits of the tracks and their causes."""
-    counts = summary['counts']['track']
-    if counts.get(NO_SCALE, 0) or counts.get(ALONE, 0) and not summary['tracks']:
-        print('  no track: one sensor does not tell the scale. `mag-tracking events` describes '
-              'what passes without it; where the settings are true of the vehicles here, '
-              'track.single_sensor_prior: true takes the scale from them')
-    elif len(summary['sensors']) == 1 and summary['tracks']:
-        print('  range and size are those of the settings (track.single_sensor_prior): one sensor '
-              'does not tell the scale')
-    if summary['close_network'] and summary['target'] == 'vehicle' and summary['tracks']:
-        print('  all sensors are within two metres: they hardly tell range and size, so the tracks '
-              'are always ambiguous; speed and direction are those of the delay')
-    if summary['frames_too_long']:
-        print(f'  warning: {summary["frames_too_long"]}')
-    if summary['clocks_apart']:
-        print(f'  warning: {summary["clocks_apart"]}')
-    lost = counts.get(f'tracks ended: {LOST}', 0)
-    if lost:
-        print(f'  warning: {lost} of the tracks lost their target: an orientation in the network '
-              'file is wrong, there were two targets at once, or it was none of the kinds that '
-              'the settings know')
-    hardly = counts.get('sensors whose orientation is hardly known', 0)
-    if hardly:
-        print(f'  warning: {hardly} sensors may be turned by more than 15 degrees, as the network '
-              'file says: calibrate them')
-    too_long = counts.get('tracks too long to smooth', 0)
-    if too_long:
-        print(f'  warning: {too_long} tracks were too long to smooth (track.smooth_longest_s, or '
-              'too many frames for so many sensors)')

@@ -1,8 +1,10 @@
 """mag-tracking run."""
 
 import argparse
+from contextlib import nullcontext
 from pathlib import Path
 
+from mag_tracking.cli.live_page import add_page, page_process
 from mag_tracking.cli.options import (
     Commands,
     add_command,
@@ -12,6 +14,7 @@ from mag_tracking.cli.options import (
 )
 from mag_tracking.network.file import read_network
 from mag_tracking.recording.reader import Recording
+from mag_tracking.web.page_server import DEFAULT_PORT
 
 _RUN = '''
 Starts calibration, detection and tracker nodes in one process, and with a
@@ -22,6 +25,7 @@ ends it. Arguments of ROS (--ros-args ...) come last.
 examples:
   mag-tracking run --network config/network.yaml --drivers config/drivers.yaml
   mag-tracking run --network config/network.yaml --recording junction.mcap --rate 2
+  mag-tracking run --network config/network.yaml --recording junction.mcap --loop --web
   mag-tracking run --network config/network.yaml --ros-args -r __ns:=/robot1
 '''
 
@@ -41,6 +45,9 @@ def add(commands: Commands) -> None:
                    help='take the time from /clock, as where a bag is played')
     p.add_argument('--rate', type=float, default=1.0, help='speed of the replay (default: 1)')
     p.add_argument('--loop', action='store_true', help='begin again at the end')
+    p.add_argument('--web', type=int, nargs='?', const=DEFAULT_PORT, metavar='PORT',
+                   help=f'show it on a live page, too (at port {DEFAULT_PORT} if left out)')
+    add_page(p, port=False)
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -54,5 +61,6 @@ def _run(args: argparse.Namespace) -> int:
     read_network(args.network)
     if args.recording:
         Recording(args.recording)
-    return run(args.network, settings, args.recording, args.rate, args.loop,
-               drivers=args.drivers, batches=args.batches, ros_arguments=ros_arguments)
+    with nullcontext() if args.web is None else page_process(args.host, args.web, ros_arguments):
+        return run(args.network, settings, args.recording, args.rate, args.loop,
+                   drivers=args.drivers, batches=args.batches, ros_arguments=ros_arguments)

@@ -1,5 +1,7 @@
 """Frames of a network to and from messages, as nested dicts, without ROS."""
 
+from typing import Protocol
+
 import numpy as np
 
 from mag_tracking.errors import RecordingError
@@ -13,6 +15,15 @@ LONGEST_OFFSET_S = 60.0
 """[s] The longest frame there can be (`align.period_s`)."""
 
 
+class NamedSensors(Protocol):
+    """What frames are compared with, such as a `SensorNetwork`."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    def __len__(self) -> int: ...
+
+
 def frame_dict(frame: FieldFrame, network: SensorNetwork) -> MessageDict:
     """mag_tracking_msgs/NetworkFrame of a `FieldFrame`."""
     return {'header': header_dict(frame.stamp_ns, network.frame), 'sensors': list(network.names),
@@ -22,7 +33,7 @@ def frame_dict(frame: FieldFrame, network: SensorNetwork) -> MessageDict:
             'statistic': frame.statistic, 'degrees_of_freedom': frame.degrees_of_freedom}
 
 
-def frame_of(message: NetworkFrame, network: SensorNetwork) -> FieldFrame:
+def frame_of(message: NetworkFrame, network: NamedSensors) -> FieldFrame:
     """`FieldFrame` of a message-shaped NetworkFrame.
 
     Raises RecordingError where sensors or lengths are not those of the network.

@@ -14,10 +14,12 @@ from mag_tracking.messages.shapes import FieldReadings, Imu, MagneticField, Mess
 from mag_tracking.records import (
     AccelerationSample,
     Detection,
+    Hypothesis,
     PoseUncertainty,
     Readings,
     SmoothedPose,
     Track,
+    best_of_arrivals,
 )
 from mag_tracking.units import LATEST_NS
 
@@ -203,17 +205,21 @@ def track_dict(track: Track, frame: str) -> MessageDict:
             'predicted_field': doubles(track.predicted),
             'mounting': doubles(track.mounting),
             'mounting_covariance': doubles(track.mounting_covariance),
-            'doubts': list(track.doubts)}
+            'doubts': list(track.doubts),
+            'arrivals': [_hypothesis_dict(h) for h in best_of_arrivals(track.hypotheses)]}
 
 
 def hypotheses_dict(track: Track, frame: str) -> MessageDict:
     """mag_tracking_msgs/HypothesisArray of a `Track`."""
     return {'header': header_dict(track.stamp_ns, frame), 'track_id': track.id,
-            'hypotheses': [
-                {'arrival': h.arrival, 'kind': h.kind, 'weight': h.weight,
-                 'position': xyz(h.position), 'velocity': xyz(h.velocity),
-                 'covariance': h.covariance.ravel().tolist(), 'moment': xyz(h.moment)}
-                for h in track.hypotheses]}
+            'hypotheses': [_hypothesis_dict(h) for h in track.hypotheses]}
+
+
+def _hypothesis_dict(h: Hypothesis) -> MessageDict:
+    """mag_tracking_msgs/Hypothesis of a `Hypothesis`."""
+    return {'arrival': h.arrival, 'kind': h.kind, 'weight': h.weight,
+            'position': xyz(h.position), 'velocity': xyz(h.velocity),
+            'covariance': h.covariance.ravel().tolist(), 'moment': xyz(h.moment)}
 
 
 def smoothed_pose_dict(pose: SmoothedPose, frame: str) -> MessageDict:

@@ -56,13 +56,16 @@ def _vector(v: Any) -> FloatArray:
 
 
 def track_of(message: Any, hypotheses: Any = None) -> Track:
-    """`Track` of a mag_tracking_msgs/Track and, if given, its HypothesisArray."""
+    """`Track` of a mag_tracking_msgs/Track and, if given, its HypothesisArray.
+
+    Without that its hypotheses are the best of each arrival.
+    """
     pose = np.array(message.pose.covariance).reshape(6, 6)
     q = message.pose.pose.orientation
-    members = () if hypotheses is None else tuple(
+    members = tuple(
         Hypothesis(h.arrival, h.weight, _vector(h.position), _vector(h.velocity),
                    np.array(h.covariance).reshape(6, 6), _vector(h.moment), h.kind)
-        for h in hypotheses.hypotheses)
+        for h in (message.arrivals if hypotheses is None else hypotheses.hypotheses))
     return Track(
         stamp_ns(message.header.stamp), message.id, message.status == message.ENDED,
         _vector(message.pose.pose.position), _vector(message.velocity),

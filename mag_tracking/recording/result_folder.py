@@ -36,7 +36,7 @@ _TABLES = {'poses.csv': POSE_COLUMNS, 'poses_smoothed.csv': SMOOTHED_COLUMNS,
            'detections.csv': DETECTION_COLUMNS, 'disturbances.csv': DISTURBANCE_COLUMNS,
            'hypotheses.csv': HYPOTHESIS_COLUMNS}
 _SUMMARY, _RECORDING = 'summary.json', 'tracks.mcap'
-_RESULTS = (*_TABLES, _SUMMARY, _RECORDING, 'metadata.yaml')
+_RESULTS = (*_TABLES, _SUMMARY, _RECORDING, 'metadata.yaml', 'report.html')
 _OF_A_TRACK = re.compile(r'(map|weights|field)_track_[0-9]+\.png|track_[0-9]+(_smoothed)?\.tum')
 
 

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.records import FieldFrame, SmoothedPose, Track
+from mag_tracking.records import FieldFrame, SmoothedPose, Track, best_of_arrivals
 
 Arrival: TypeAlias = tuple[float, FloatArray, FloatArray]
 """Weight of an arrival, position and covariance (2, 2) of its best hypothesis."""
@@ -81,12 +81,8 @@ class TrackLog:
         self.measured.append(frame.field)
         self.noise.append(frame.covariance)
         self.existence = track.existence
-        best: dict[str, Arrival] = {}
-        for h in track.hypotheses:
-            weight, position, covariance = best.get(
-                h.arrival, (0.0, h.position, h.covariance[:2, :2]))
-            best[h.arrival] = weight + h.weight, position, covariance
-        self.arrivals.append(best)
+        self.arrivals.append({h.arrival: (h.weight, h.position, h.covariance[:2, :2])
+                              for h in best_of_arrivals(track.hypotheses)})
 
     def seconds(self) -> FloatArray:
         """(n,) [s] since the first pose."""

@@ -1,0 +1,86 @@
+"""The report of a replay: one page with map, time slider, curves, tables."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mag_tracking.apps.replay import Run
+from mag_tracking.apps.replay_notes import notes_of
+from mag_tracking.files import replace_text
+from mag_tracking.network import SensorNetwork
+from mag_tracking.report.metrics import interpolate_truth
+from mag_tracking.report.page import NOTE, Note, Page, Table, report_html
+from mag_tracking.report.page_scene import (
+    MOST_SENSORS,
+    facts_of,
+    path_entry,
+    scene_of,
+    smoothed_entry,
+    step_of,
+    strongest_sensors,
+    track_entry,
+)
+
+REPORT = 'report.html'
+
+
+def write_report(run: Run, network: SensorNetwork, out: Path) -> Path:
+    """Write `report.html` into folder `out`; returns its path. Raises OutputError."""
+    path = out / REPORT
+    replace_text(path, report_html(replay_page(run, network)))
+    return path
+
+
+def replay_page(run: Run, network: SensorNetwork) -> Page:
+    """The page of a run."""
+    summary, logs = run.summary, list(run.logs.values())
+    notes, scene = notes_of(summary), None
+    if summary['interrupted']:
+        notes.insert(0, Note(NOTE, 'the replay was interrupted: this is what was done until then'))
+    if logs:
+        step = step_of(logs)
+        if step > 1:
+            notes.append(Note(NOTE, f'the page has one pose of {step}; poses.csv has all'))
+        if len(network) > MOST_SENSORS:
+            notes.append(Note(NOTE, f'of each track the page has the field of the {MOST_SENSORS} '
+                              f'sensors where it was strongest, of {len(network)}'))
+        begin_ns = min(log.stamp_ns[0] for log in logs)
+        entries = {t['id']: t for t in summary['tracks']}
+        tracks = []
+        for log in logs:
+            entry = track_entry(log, begin_ns, strongest_sensors(log),
+                                slice(None, None, step))
+            facts = entries[log.id]
+            entry['facts'] = facts_of(facts)
+            if log.id in run.smoothed:
+                entry['smoothed'] = smoothed_entry(run.smoothed[log.id])
+            if 'truth' in facts:
+                entry['truth'] = path_entry(log.id, interpolate_truth(
+                    run.truth[facts['truth']['name']], log.stamp_ns[::step]))
+            tracks.append(entry)
+        scene = scene_of(network, begin_ns, max(log.stamp_ns[-1] for log in logs), tracks)
+    counts = summary['counts']
+    return Page(f'{summary["recording"]}: {len(logs)} track{"s" * (len(logs) != 1)}',
+                f'{counts["align"].get("frames", 0)} frames, '
+                f'{counts["detect"].get("onsets", 0)} detections, '
+                f'{len(summary["disturbances"])} disturbances', notes, scene,
+                tables=[_sensor_table(summary, run, network)])
+
+
+def _sensor_table(summary: Mapping[str, Any], run: Run, network: SensorNetwork) -> Table:
+    """Health of the sensors."""
+    innovations = [t['nis_by_sensor'] for t in summary['tracks']]
+    rows = []
+    for j, (name, s) in enumerate(summary['sensors'].items()):
+        noise = [v for v in s.get('noise_std', []) if v is not None]
+        state = ('stuck' if s['stuck'] else 'no background' if not s['ready'] else
+                 'doubtful at times' if s['doubtful_ns'] else 'ready')
+        nis = [found[name] for found in innovations if found[name] is not None]
+        rows.append([
+            name, state, s['accepted'], s['rejected'],
+            1e9 * float(np.mean(noise)) if noise else None, s['times_relearnt'],
+            float(np.mean(nis)) if nis else None, *network.positions[j].tolist()])
+    return Table('Sensors', ['sensor', 'background', 'readings used', 'rejected', 'noise [nT]',
+                             'times learnt anew', 'NIS an axis', 'x [m]', 'y [m]', 'z [m]'], rows)

@@ -1,0 +1,121 @@
+"""mag-tracking view and watch, and the live page of run."""
+
+import argparse
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from mag_tracking.apps.view import view
+from mag_tracking.cli.options import (
+    Commands,
+    add_command,
+    add_recorded_network,
+    add_settings,
+    recorded_network,
+    settings_of,
+)
+from mag_tracking.errors import SettingsError
+from mag_tracking.interrupts import noted_signals
+from mag_tracking.recording.reader import Recording
+from mag_tracking.web.live_scene import LiveScene
+from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK, PageServer, check_port
+
+_PAGE = '''
+Open the address that is printed in a browser: a map with the tracks, their 90 % regions and
+hypotheses, the sensors' fields, and what is wrong. Any number of people may look. It is for this
+machine only; --host 0.0.0.0 lets others see it who have the address with its token.
+'''
+_VIEW = f'''
+Tracks a recording at its own pace and shows it on a live page. Ctrl-C ends it.
+{_PAGE}
+example:
+  mag-tracking view junction.mcap --network config/network.yaml
+'''
+_WATCH = f'''
+Shows what running nodes track. The page says what it waits for. Ctrl-C ends it; the nodes go on.
+{_PAGE}
+examples:
+  mag-tracking watch
+  mag-tracking watch --ros-args -r __ns:=/robot1
+  mag-tracking watch --ros-args -r tracker_node/tracks:=/other_tracker/tracks
+'''
+
+
+def add(commands: Commands) -> None:
+    """Register the commands."""
+    p = add_command(commands, 'view', _view, 'Show a recording on a live page.', _VIEW)
+    p.add_argument('recording', type=Path, metavar='RECORDING',
+                   help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
+    add_recorded_network(p)
+    add_settings(p)
+    p.add_argument('--rate', type=float, default=1.0, help='speed (default: 1)')
+    add_page(p)
+    p = add_command(commands, 'watch', _watch, 'Show running nodes on a live page (needs ROS 2).',
+                    _WATCH)
+    add_page(p)
+
+
+def add_page(parser: argparse.ArgumentParser, port: bool = True) -> None:
+    """--host and --port."""
+    if port:
+        parser.add_argument('--port', type=int, default=DEFAULT_PORT, metavar='PORT',
+                            help=f'of the page (default: {DEFAULT_PORT}; 0: any that is free)')
+    parser.add_argument('--host', default=LOOPBACK, metavar='ADDRESS', help='address of this '
+                        f'machine on which the page is served (default: {LOOPBACK})')
+
+
+def _told(line: str) -> None:
+    """Print a line at once."""
+    print(line, flush=True)
+
+
+def _view(args: argparse.Namespace) -> int:
+    """mag-tracking view."""
+    if not 0.0 < args.rate < float('inf'):
+        raise SettingsError(f'--rate: {args.rate:g} is not a number above 0')
+    network, settings = recorded_network(args), settings_of(args)
+    recording = Recording(args.recording)
+    scene = LiveScene(args.recording.name, network)
+    scene.subtitle = f'{len(network)} sensors, frame {network.frame}'
+    with noted_signals(signal.SIGINT, signal.SIGTERM) as seen, \
+            PageServer(scene, args.host, args.port) as server:
+        _told(f'live page: {server.url}')
+        view(recording, network, settings, scene, args.rate, lambda: bool(seen))
+        if not seen:
+            _told('the recording has ended; the page stays until Ctrl-C')
+        while not seen:
+            time.sleep(0.1)
+    return 0
+
+
+def _watch(args: argparse.Namespace) -> int:
+    """mag-tracking watch."""
+    # Only this needs ROS.
+    from mag_tracking.nodes.page_node import watch
+
+    return watch(args.host, args.port, _told, args.ros_arguments)
+
+
+@contextmanager
+def page_process(host: str, port: int, ros_arguments: Sequence[str]) -> Iterator[None]:
+    """The live page of the nodes of this command, in a process of its own: it delays no pose.
+
+    Raises DeviceError where the port cannot be opened.
+    """
+    check_port(host, port)
+    process = subprocess.Popen([
+        sys.executable, '-m', 'mag_tracking.cli', 'watch', '--host', host, '--port', str(port),
+        *ros_arguments])
+    try:
+        yield
+    finally:
+        process.terminate()
+        try:
+            process.wait(10.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

@@ -1,0 +1,182 @@
+"""Listens to running nodes and feeds a live page; it needs no network file."""
+
+import signal
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from mag_tracking_msgs.msg import NetworkFrame, SmoothedTrack, TrackArray
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+from visualization_msgs.msg import MarkerArray
+
+from mag_tracking.arrays import FloatArray
+from mag_tracking.errors import RecordingError
+from mag_tracking.interrupts import noted_signals
+from mag_tracking.messages.frame import frame_of
+from mag_tracking.messages.markers import SENSOR_KINDS
+from mag_tracking.messages.types import NETWORK_FRAME
+from mag_tracking.nodes.convert import track_of
+from mag_tracking.nodes.middleware import begin
+from mag_tracking.nodes.stage_node import LATCHED, RESULTS, STREAM, make_executor, spin
+from mag_tracking.nodes.steady_timer import steady_timer
+from mag_tracking.report.page import ERROR, WARNING, Note, Table
+from mag_tracking.web.live_scene import LiveScene
+from mag_tracking.web.page_server import TICK_S, PageServer
+
+FRAMES_KEPT = 64
+"""Latest frames that wait, not yet read, for a track that is of them."""
+SILENT_S = 5.0
+"""[s] A status that has not been repeated for so long is no longer true."""
+_LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warning',
+           DiagnosticStatus.ERROR: 'error', DiagnosticStatus.STALE: 'stale'}
+
+
+@dataclass(frozen=True, eq=False)
+class SensorPlaces:
+    """Names and places of the sensors, as the tracker publishes them."""
+
+    frame: str
+    names: tuple[str, ...]
+    positions: FloatArray
+    """(n, 3) [m]."""
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+NOWHERE = SensorPlaces('', (), np.zeros((0, 3)))
+"""Before the tracker has told of its sensors."""
+
+
+class PageNode(Node):
+    """Takes what the tracker publishes, several messages at once, and hands it to a scene.
+
+    The topics are relative: `tracker_node/tracks`, `tracker_node/smoothed`,
+    `tracker_node/sensor_markers`, `network_frame`. Remapped and in a namespace, it looks at others.
+    """
+
+    def __init__(self, scene: LiveScene) -> None:
+        super().__init__('mag_tracking_page', start_parameter_services=False)
+        self._scene = scene
+        self._places = NOWHERE
+        self._frames: deque[bytes] = deque(maxlen=FRAMES_KEPT)
+        self._tracks: list[Any] = []
+        self._statuses: dict[str, tuple[float, DiagnosticStatus]] = {}
+        self._tracks_topic = self.resolve_topic_name('tracker_node/tracks')
+        self.create_subscription(MarkerArray, 'tracker_node/sensor_markers', self._take_sensors,
+                                 LATCHED)
+        # Frames come often and are large: only those that are shown are read.
+        self.create_subscription(NetworkFrame, NETWORK_FRAME, self._take_frame, STREAM, raw=True)
+        self.create_subscription(TrackArray, self._tracks_topic, self._take_tracks, STREAM)
+        self.create_subscription(SmoothedTrack, 'tracker_node/smoothed', self._take_smoothed,
+                                 RESULTS)
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._take_diagnostics, STREAM)
+        steady_timer(self, TICK_S, self._tick)
+        steady_timer(self, 1.0, self._tell_health)
+
+    def _take_sensors(self, message: MarkerArray) -> None:
+        """The sensors' places; a survey moves none, and another network begins a new scene."""
+        bodies = [m for m in message.markers if m.ns == SENSOR_KINDS[0]]
+        texts = {m.id: m.text for m in message.markers if m.ns == SENSOR_KINDS[1]}
+        if not bodies or {m.id for m in bodies} - texts.keys():
+            return
+        places = SensorPlaces(
+            bodies[0].header.frame_id, tuple(texts[m.id] for m in bodies),
+            np.array([[m.pose.position.x, m.pose.position.y, m.pose.position.z] for m in bodies]))
+        if (places.names, places.frame) != (self._places.names, self._places.frame) \
+                or not np.array_equal(places.positions, self._places.positions):
+            self._places = places
+            self._frames.clear()
+            self._tracks.clear()
+            self._scene.subtitle = f'{len(places)} sensors, frame {places.frame}'
+            self._scene.use_network(places)
+
+    def _take_frame(self, message: bytes) -> None:
+        """Frames wait for the next tick, unread."""
+        self._frames.append(message)
+
+    def _take_tracks(self, message: TrackArray) -> None:
+        """Tracks wait for the next tick, so that a fast tracker is read many at once."""
+        self._tracks.extend(message.tracks)
+
+    def _take_smoothed(self, message: SmoothedTrack) -> None:
+        """A track that has ended."""
+        self._tick()
+        points = [p.pose.pose.position for p in message.poses]
+        self._scene.add_smoothed(message.track_id, np.array([[p.x, p.y, p.z] for p in points]))
+
+    def _take_diagnostics(self, message: DiagnosticArray) -> None:
+        """Keep the latest of each status."""
+        now = time.monotonic()
+        self._statuses.update({s.name: (now, s) for s in message.status})
+
+    def _tick(self) -> None:
+        """Hand over what has come: all frames where there is a track, else the latest."""
+        if not len(self._places) or not self._frames:
+            return
+        raw = list(self._frames) if self._tracks else [self._frames[-1]]
+        self._frames.clear()
+        for one in raw:
+            try:
+                self._scene.add_frame(
+                    frame_of(deserialize_message(one, NetworkFrame), self._places))
+            except RecordingError as error:
+                self.get_logger().error(str(error), throttle_duration_sec=10.0)
+        tracks, self._tracks = self._tracks, []
+        for message in tracks:
+            if len(message.predicted_field) == 3 * len(self._places):
+                self._scene.add_track(track_of(message))
+
+    def _tell_health(self) -> None:
+        """Faults at the head of the page, all statuses at its foot."""
+        now = time.monotonic()
+        notes, rows = [], []
+        for name, (heard, status) in sorted(self._statuses.items()):
+            old = now - heard > SILENT_S
+            level = 'stale' if old else _LEVELS.get(status.level, 'error')
+            rows.append([name, level, status.message])
+            if level in ('warning', 'error'):
+                notes.append(Note(ERROR if level == 'error' else WARNING,
+                                  f'{name}: {status.message}'))
+        if not self.count_publishers(self._tracks_topic):
+            notes.insert(0, Note(WARNING, f'nobody publishes {self._tracks_topic}: start the '
+                                 'tracker, or look in another namespace (--ros-args -r __ns:=...)'))
+        self._scene.set_health(notes, [Table('Health', ['node', 'level', 'message'], rows)])
+
+
+def watch(host: str, port: int, report: Callable[[str], object],
+          ros_arguments: Sequence[str] = ()) -> int:
+    """Serve the page of running nodes until SIGINT or SIGTERM; returns the exit status.
+
+    Parameters
+    ----------
+    host, port : str, int
+        As of `PageServer`.
+    report : function
+        Takes the line that tells the address of the page.
+    ros_arguments : sequence of str
+        Beginning with `--ros-args`.
+
+    Raises DeviceError where the port cannot be opened.
+    """
+    scene = LiveScene('mag_tracking', NOWHERE)
+    with noted_signals(signal.SIGINT, signal.SIGTERM) as seen, \
+            PageServer(scene, host, port) as server:
+        report(f'live page: {server.url}')
+        begin(list(ros_arguments))
+        executor, node = make_executor(), PageNode(scene)
+        executor.add_node(node)
+        try:
+            spin(executor, lambda: bool(seen))
+        finally:
+            executor.remove_node(node)
+            node.destroy_node()
+            executor.shutdown()
+            rclpy.try_shutdown()
+    return 0

@@ -1,0 +1,125 @@
+// The curves over time: fields, weights, innovation, speed; each with a line at the time shown.
+'use strict';
+
+const STRONGEST = 'strongest';
+const MOST_PANELS = 4;
+// What is drawn before the latest time of a live page, and kept of its fields [s].
+const WINDOW_S = 20;
+
+const AXES = [[VERMILLION, 'solid'], [SERIES[2], 'dash'], [SERIES[0], 'dot']];
+
+function curveLayout(title, t, range, more) {
+  return {font: FONT, margin: {l: 60, r: 10, t: 8, b: 40}, hovermode: 'closest',
+    xaxis: {title: {text: 'time [s]'}, range: range, gridcolor: '#e3e3e3', zeroline: false},
+    yaxis: {title: {text: title}, gridcolor: '#e3e3e3', zeroline: false, ...more},
+    legend: {orientation: 'h', y: 1.02, yanchor: 'bottom', font: {size: 12}},
+    shapes: [{type: 'line', xref: 'x', yref: 'paper', x0: t, x1: t, y0: 0, y1: 1,
+      line: {color: '#555555', width: 1.5, dash: 'dot'}}]};
+}
+
+function unitOf(strongest) {
+  return strongest < 1e-5 ? [1e9, 'nT'] : strongest < 1e-2 ? [1e6, 'µT'] : [1e3, 'mT'];
+}
+
+function largest(axes) {
+  let most = 0;
+  for (const axis of axes) for (const v of axis) if (Math.abs(v) > most) most = Math.abs(v);
+  return most;
+}
+
+// [{name, t, measured, predicted or null}] of a track, or of what a live page hears without one.
+function fieldsOf(scene, track) {
+  if (track) {
+    return track.fields.map(field => ({name: scene.sensors.names[field.sensor],
+      t: field.t || track.columns.t, measured: field.measured, predicted: field.predicted}));
+  }
+  return scene.heard ? scene.sensors.names.map((name, j) => ({name: name, t: scene.heard.t,
+    measured: scene.heard.fields.map(axis => axis[j]), predicted: null})) : [];
+}
+
+function chosenFields(scene, track, choice) {
+  const fields = fieldsOf(scene, track);
+  if (choice !== STRONGEST) return fields.filter(field => field.name === choice);
+  const strength = new Map(fields.map(field => [field, largest(field.measured)]));
+  const strongest = [...fields].sort((a, b) => strength.get(b) - strength.get(a));
+  return fields.filter(field => strongest.slice(0, MOST_PANELS).includes(field));
+}
+
+function drawFields(scene, track, choice, t, range) {
+  const holder = document.getElementById('field');
+  const fields = chosenFields(scene, track, choice);
+  while (holder.children.length > fields.length) {
+    Plotly.purge(holder.lastChild);
+    holder.lastChild.remove();
+  }
+  while (holder.children.length < fields.length) {
+    const panel = document.createElement('div');
+    panel.className = 'plot panel';
+    holder.append(panel);
+  }
+  holder.style.setProperty('--panels', fields.length);
+  const [f, unit] = unitOf(Math.max(0, ...fields.map(field => largest(field.measured))));
+  fields.forEach((field, i) => {
+    const traces = [];
+    AXES.forEach(([colour, dash], a) => {
+      const name = 'xyz'[a];
+      traces.push({type: 'scatter', mode: 'markers', x: field.t, name: `${name} measured`,
+        y: Array.from(field.measured[a], v => f * v), legendgroup: name, showlegend: i === 0,
+        marker: {color: colour, symbol: SYMBOLS[a], size: 5}});
+      if (field.predicted) {
+        traces.push({type: 'scatter', mode: 'lines', x: field.t, name: `${name} predicted`,
+          y: Array.from(field.predicted[a], v => f * v), legendgroup: name, showlegend: i === 0,
+          line: {color: colour, width: 1.8, dash: dash}});
+      }
+    });
+    const layout = curveLayout(`${plain(field.name)} [${unit}]`, t, range);
+    if (i < fields.length - 1) layout.xaxis.title = {text: ''};
+    Plotly.react(holder.children[i], traces, layout, CONFIG);
+  });
+}
+
+function drawWeights(track, t, range) {
+  const traces = !track ? [] : Object.entries(looksOf(track)).map(([name, [colour, dash]]) => ({
+    type: 'scatter', mode: 'lines', x: track.columns.t, y: track.arrivals[name].weight,
+    name: plain(name) || 'all hypotheses', showlegend: true,
+    line: {color: colour, dash: dash, width: 2}}));
+  Plotly.react('weights', traces, curveLayout('weight', t, range, {range: [-0.03, 1.03]}), CONFIG);
+}
+
+function drawInnovation(track, t, range) {
+  const c = track && track.columns;
+  const traces = !track ? [] : [
+    {type: 'scatter', mode: 'lines', x: c.t, y: c.nis_low, line: {width: 0}, hoverinfo: 'skip',
+      showlegend: false},
+    {type: 'scatter', mode: 'lines', x: c.t, y: c.nis_high, line: {width: 0}, fill: 'tonexty',
+      fillcolor: 'rgba(0,114,178,0.18)', name: '90 % band of a right model', hoverinfo: 'skip'},
+    {type: 'scatter', mode: 'lines+markers', x: c.t, y: c.nis, marker: {size: 4}, name: 'NIS an axis',
+      line: {color: BLACK, width: 1.5}}];
+  Plotly.react('innovation', traces,
+    curveLayout('NIS an axis', t, range, {rangemode: 'tozero'}), CONFIG);
+}
+
+function drawSpeed(track, t, range) {
+  const c = track && track.columns;
+  const traces = [];
+  if (track) {
+    const speed = Array.from(c.t, (_, k) => Math.hypot(c.vx[k], c.vy[k]));
+    const edge = sign => speed.map((v, k) => Math.max(0, v + sign * SCALE_1D * c.speed_sd[k]));
+    traces.push(
+      {type: 'scatter', mode: 'lines', x: c.t, y: edge(-1), line: {width: 0}, hoverinfo: 'skip',
+        showlegend: false},
+      {type: 'scatter', mode: 'lines', x: c.t, y: edge(1), line: {width: 0}, fill: 'tonexty',
+        fillcolor: 'rgba(0,114,178,0.18)', name: '90 % band', hoverinfo: 'skip'},
+      {type: 'scatter', mode: 'lines', x: c.t, y: speed, name: 'speed',
+        line: {color: BLACK, width: 1.5}});
+  }
+  Plotly.react('speed', traces, curveLayout('m/s', t, range, {rangemode: 'tozero'}), CONFIG);
+}
+
+// Move the line at the time shown, without drawing the curves anew.
+function moveLines(t) {
+  for (const plot of [...document.querySelectorAll('#field .plot'),
+    ...['weights', 'innovation', 'speed'].map(id => document.getElementById(id))]) {
+    if (plot.layout) Plotly.relayout(plot, {'shapes[0].x0': t, 'shapes[0].x1': t});
+  }
+}

@@ -1,0 +1,2 @@
+'use strict';
+begin(JSON.parse(document.getElementById('data').textContent));

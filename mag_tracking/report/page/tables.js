@@ -1,0 +1,81 @@
+// Notes, tables and charts that do not depend on the time shown.
+'use strict';
+
+function element(tag, text, more) {
+  const e = document.createElement(tag);
+  if (text !== undefined && text !== null) e.textContent = text;
+  return Object.assign(e, more || {});
+}
+
+function table(columns, rows, classes) {
+  const out = element('table'), head = element('tr');
+  for (const name of columns) head.append(element('th', name));
+  out.append(element('thead'), element('tbody'));
+  out.firstChild.append(head);
+  rows.forEach((row, i) => {
+    const tr = element('tr', null, {className: classes ? classes[i] : ''});
+    for (const cell of row) {
+      const td = element('td', null, {className: typeof cell === 'number' ? 'number' : ''});
+      td.append(cell instanceof Node ? cell : shown(cell));
+      tr.append(td);
+    }
+    out.lastChild.append(tr);
+  });
+  return out;
+}
+
+function shown(cell) {
+  if (cell === null || cell === undefined) return '–';
+  return typeof cell === 'number' ? String(Number(cell.toPrecision(4))) : String(cell);
+}
+
+function showNotes(notes) {
+  const list = document.getElementById('notes');
+  list.replaceChildren(...notes.map(
+    note => element('li', note.text, {className: note.level})));
+  list.hidden = !notes.length;
+}
+
+function card(title) {
+  const out = element('div', null, {className: 'card'});
+  out.append(element('h2', title));
+  return out;
+}
+
+function showTables(tables) {
+  document.getElementById('tables').replaceChildren(...tables.map(one => {
+    const out = card(one.title), holder = element('div', null, {className: 'table'});
+    holder.append(table(one.columns, one.rows));
+    out.append(holder);
+    return out;
+  }));
+}
+
+// Charts come as Plotly traces and a layout; titles stand in the head of the card.
+function showCharts(charts) {
+  const holder = document.getElementById('charts');
+  for (const chart of charts) {
+    const out = card(chart.title), plot = element('div', null, {className: 'plot'});
+    out.append(plot);
+    holder.append(out);
+    Plotly.newPlot(plot, chart.traces, {font: FONT, margin: {l: 65, r: 15, t: 10, b: 50},
+      hovermode: 'closest', legend: {orientation: 'h', y: 1.02, yanchor: 'bottom'},
+      ...chart.layout}, CONFIG);
+  }
+}
+
+function showTrackTable(scene, jump, current) {
+  const columns = ['track', 'begins [s]', 'ends [s]', 'from', 'kind', 'speed [m/s]',
+    'moment [A m²]', 'verdict', 'error [m]', 'doubts (poses)'];
+  const rows = scene.tracks.map(track => {
+    const go = element('button', `${track.id}`, {type: 'button', title: 'show this track'});
+    go.addEventListener('click', () => jump(track));
+    const facts = track.facts || {};
+    return [go, beginOf(track), endOf(track), facts.arrival, facts.kind, facts.speed,
+      facts.moment, facts.verdict || (track.ended ? '' : 'running'), facts.error,
+      facts.doubts];
+  });
+  document.getElementById('tracks').replaceChildren(rows.length
+    ? table(columns, rows, scene.tracks.map(track => track === current ? 'chosen' : ''))
+    : element('p', 'No track yet.'));
+}

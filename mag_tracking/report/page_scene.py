@@ -1,0 +1,196 @@
+"""The map over time of a page, as JSON: sensors, tracks, their hypotheses, fields."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from scipy.special import chdtri
+
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.report.figures import scale_of
+from mag_tracking.report.packed import packed
+from mag_tracking.report.track_log import SmoothedLog, TrackLog
+from mag_tracking.units import NS
+
+MOST_SENSORS = 8
+"""Sensors of a track whose field a report has: those with the strongest."""
+MOST_BYTES = 4_000_000
+"""Size of the columns of a report, about; beyond it every n-th pose is left out."""
+WIDEST = 6.0
+"""Spans of the network to each side beyond which the map does not follow a track."""
+LEAST_REACH_M = 10.0
+"""[m] The same for a single sensor."""
+
+
+class Sensors(Protocol):
+    """What the page reads of a `SensorNetwork`."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def positions(self) -> FloatArray: ...
+
+    @property
+    def frame(self) -> str: ...
+
+    def __len__(self) -> int: ...
+
+
+def scene_of(network: Sensors, begin_ns: int, end_ns: int,
+             tracks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """A scene, as JSON.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    begin_ns, end_ns : int [ns]
+        The page counts seconds from the beginning.
+    tracks : sequence of dict
+        Each as `track_entry` gives it.
+    """
+    xy = network.positions[:, :2]
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    span = float((high - low).max())
+    far = WIDEST * span if span > 0.0 else LEAST_REACH_M
+    spare = 0.15 * span if span > 0.0 else 1.0
+    factor, unit = scale_of(span if span > 0.0 else LEAST_REACH_M)
+    return {'frame': network.frame, 'begin_ns': str(begin_ns), 'begin': 0.0,
+            'end': (end_ns - begin_ns) / NS, 'scale': {'factor': factor, 'unit': unit},
+            'sensors': {'names': list(network.names), 'x': packed(xy[:, 0]), 'y': packed(xy[:, 1])},
+            'reach': _box(low - spare, high + spare), 'most_reach': _box(low - far, high + far),
+            'tracks': list(tracks)}
+
+
+def _box(low: FloatArray, high: FloatArray) -> list[float]:
+    """[x0, x1, y0, y1] [m]."""
+    return [float(low[0]), float(high[0]), float(low[1]), float(high[1])]
+
+
+def strongest_sensors(log: TrackLog, most: int = MOST_SENSORS) -> IntArray:
+    """Indices of the `most` sensors with the strongest field while a track ran, in their order."""
+    measured = np.abs(np.array(log.measured))
+    strength = np.nan_to_num(np.nanmax(np.where(np.isnan(measured), 0.0, measured), axis=(0, 2)))
+    return np.sort(np.argsort(-strength, kind='stable')[:most])
+
+
+def step_of(logs: Sequence[TrackLog], most_bytes: int = MOST_BYTES) -> int:
+    """Every how many poses one is kept, so that a report is not larger than allowed."""
+    size = 0
+    for log in logs:
+        n_sensors = min(MOST_SENSORS, len(log.measured[0]))
+        n_arrivals = len({name for row in log.arrivals for name in row})
+        # In bytes of base64: four for three.
+        size += len(log.stamp_ns) * (4 * (80 + 24 * n_sensors + 24 * n_arrivals)) // 3
+    return max(1, -(-size // most_bytes))
+
+
+def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
+                rows: slice = slice(None)) -> dict[str, Any]:
+    """Poses of a track, as JSON.
+
+    Parameters
+    ----------
+    log : TrackLog
+    begin_ns : int [ns]
+        Of the scene.
+    sensors : (k,) int
+        Sensors whose fields are told.
+    rows : slice
+        Which poses; all of them if left out.
+    """
+    position = _array(log.position[rows], 3)
+    velocity = _array(log.velocity[rows], 3)
+    C = _array(log.covariance[rows], 6, 6)
+    times = (np.array(log.stamp_ns[rows], dtype=np.int64) - begin_ns) / NS
+    columns = {
+        't': packed(times), 'x': packed(position[:, 0]), 'y': packed(position[:, 1]),
+        'z': packed(position[:, 2]), 'vx': packed(velocity[:, 0]), 'vy': packed(velocity[:, 1]),
+        'xx': packed(C[:, 0, 0], 'f4'), 'xy': packed(C[:, 0, 1], 'f4'),
+        'yy': packed(C[:, 1, 1], 'f4'), 'speed_sd': packed(_speed_std(velocity, C), 'f4'),
+        'ambiguous': packed(log.ambiguous[rows], 'u1'), **_innovation(log, rows)}
+    return {'id': log.id, 'ended': log.ended, 'columns': columns,
+            'arrivals': _arrivals(log, rows), 'fields': _fields(log, rows, sensors),
+            'doubts': [', '.join(doubts) for doubts in log.doubts[rows]],
+            'smoothed': None, 'truth': None, 'facts': None}
+
+
+def path_entry(track_id: int, points: FloatArray) -> dict[str, Any]:
+    """A smoothed or true path (n, 2 or more) [m] of a track, as JSON."""
+    return {'id': track_id, 'x': packed(points[:, 0]), 'y': packed(points[:, 1])}
+
+
+def smoothed_entry(log: SmoothedLog) -> dict[str, Any]:
+    """The path of a smoothed track, as JSON."""
+    return path_entry(log.id, _array(log.position, 3))
+
+
+def facts_of(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """What the table of tracks says of one, as JSON.
+
+    Parameters
+    ----------
+    entry : dict
+        `TrackLog.summary()`, or the entry of a track in `summary.json`, which may have a `truth`.
+    """
+    truth = entry.get('truth', {})
+    error = next((truth[key] for key in ('closest', 'position_mean')
+                  if isinstance(truth.get(key), float) and np.isfinite(truth[key])), None)
+    arrival = entry['arrival']
+    return {'arrival': f'{arrival} ({entry["arrival_weights"][arrival]:.0%})' if arrival else None,
+            'kind': f'{entry["kind"]} ({entry["kind_weight"]:.0%})' if entry['kind'] else None,
+            'speed': entry['speed'], 'moment': entry['moment_size'],
+            'verdict': entry['verdict'], 'error': error,
+            'doubts': ', '.join(f'{name.replace("_", " ")} ({n})'
+                                for name, n in entry['doubts'].items())}
+
+
+def _array(values: Sequence[FloatArray], *shape: int) -> FloatArray:
+    """(n, *shape), also where there is no value."""
+    return np.array(values, dtype=float).reshape(-1, *shape)
+
+
+def _speed_std(velocity: FloatArray, C: FloatArray) -> FloatArray:
+    """(n,) [m/s] deviation of the horizontal speed, to first order."""
+    flat = velocity[:, :2]
+    u = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
+    variance = np.einsum('na,nab,nb->n', u, C[:, 3:5, 3:5], u)
+    std: FloatArray = np.sqrt(np.maximum(variance, 0.0))
+    return std
+
+
+def _innovation(log: TrackLog, rows: slice) -> dict[str, dict[str, str]]:
+    """Normalised innovation squared an axis, and the band that holds 90 % of a right model's."""
+    n = np.array(log.degrees_of_freedom[rows], dtype=float)
+    axes = np.maximum(n, 1.0)
+    low, high = (np.where(n > 0.0, chdtri(axes, p) / axes, np.nan) for p in (0.95, 0.05))
+    nis = np.where(n > 0.0, np.array(log.nis[rows], dtype=float) / axes, np.nan)
+    return {'nis': packed(nis, 'f4'), 'nis_low': packed(low, 'f4'), 'nis_high': packed(high, 'f4')}
+
+
+def _arrivals(log: TrackLog, rows: slice) -> dict[str, dict[str, dict[str, str]]]:
+    """{arrival: columns of its weight and of its best hypothesis}; NaN where it was dropped."""
+    log_rows = log.arrivals[rows]
+    out = {}
+    for name in sorted({name for row in log_rows for name in row}):
+        values = np.full((len(log_rows), 6), np.nan)
+        values[:, 0] = 0.0
+        for k, row in enumerate(log_rows):
+            if name in row:
+                weight, position, C = row[name]
+                values[k] = weight, position[0], position[1], C[0, 0], C[0, 1], C[1, 1]
+        out[name] = {key: packed(column, 'f4') for key, column in zip(
+            ('weight', 'x', 'y', 'xx', 'xy', 'yy'), values.T, strict=True)}
+    return out
+
+
+def _fields(log: TrackLog, rows: slice, sensors: IntArray) -> list[dict[str, Any]]:
+    """Measured and predicted field of the sensors, [{sensor, measured, predicted}] [T]."""
+    out = []
+    measured = np.array(log.measured[rows]).reshape(-1, len(log.measured[0]), 3)
+    predicted = np.array(log.predicted[rows]).reshape(measured.shape)
+    for j in sensors.tolist():
+        out.append({'sensor': j, **{
+            name: [packed(values[:, j, axis], 'f4') for axis in range(3)]
+            for name, values in (('measured', measured), ('predicted', predicted))}})
+    return out

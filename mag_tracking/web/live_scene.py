@@ -1,0 +1,210 @@
+"""What a live page shows: the tracks of the last minutes, the latest frame, the health."""
+
+import json
+import threading
+from collections import OrderedDict
+from collections.abc import Iterable
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.records import FieldFrame, Track
+from mag_tracking.report.packed import packed
+from mag_tracking.report.page import Note, Table
+from mag_tracking.report.page_scene import (
+    Sensors,
+    facts_of,
+    path_entry,
+    scene_of,
+    strongest_sensors,
+    track_entry,
+)
+from mag_tracking.report.track_log import TrackLog
+from mag_tracking.units import NS
+
+KEPT_S = 600.0
+"""[s] Tracks that ended earlier are forgotten."""
+MOST_POSES = 30_000
+"""Poses of all tracks together; the oldest tracks are forgotten first."""
+MATCHING_FRAMES = 64
+"""Latest frames, among which that of a track is looked for."""
+JUMP_BACK_S = 1.0
+"""[s] A frame that is so much older than the latest begins a new scene: a bag was played again."""
+
+
+class _LiveTrack:
+    """A track, and how much of it the viewers have."""
+
+    def __init__(self, track_id: int) -> None:
+        self.log = TrackLog(track_id)
+        self.sent = 0
+        self.end_sent = False
+        # Chosen once: rows that follow have to fit those before.
+        self.sensors: IntArray | None = None
+        self.smoothed: dict[str, Any] | None = None
+
+    def rows(self, begin_ns: int, rows: slice) -> dict[str, Any]:
+        """Some of the poses, as JSON."""
+        if self.sensors is None:
+            self.sensors = strongest_sensors(self.log)
+        entry = track_entry(self.log, begin_ns, self.sensors, rows)
+        if self.log.ended:
+            entry['facts'] = facts_of(self.log.summary())
+        return entry
+
+
+class LiveScene:
+    """Takes records as they come, and tells what is new; may be used from two threads.
+
+    Attributes
+    ----------
+    title, subtitle : str
+        May be changed at any time; they are told with the next whole scene.
+    """
+
+    def __init__(self, title: str, network: Sensors) -> None:
+        self.title, self.subtitle = title, ''
+        self._network = network
+        self._lock = threading.Lock()
+        self._notes: list[Note] = []
+        self._tables: list[Table] = []
+        self._is_health_new = False
+        self._clear()
+
+    def use_network(self, network: Sensors) -> None:
+        """Begin anew with other sensors."""
+        with self._lock:
+            self._network = network
+            self._clear()
+
+    def _clear(self) -> None:
+        """Begin anew, as after a jump of time."""
+        self._begin_ns: int | None = None
+        self._end_ns = 0
+        self._frames: OrderedDict[int, FieldFrame] = OrderedDict()
+        self._is_frame_new = False
+        self._tracks: dict[int, _LiveTrack] = {}
+        self._smoothed_news: list[dict[str, Any]] = []
+        self._is_new = True
+
+    def add_frame(self, frame: FieldFrame) -> None:
+        """Take a frame, before the tracks that came of it."""
+        with self._lock:
+            self._note_time(frame.stamp_ns)
+            self._frames[frame.stamp_ns] = frame
+            self._is_frame_new = True
+            while len(self._frames) > MATCHING_FRAMES:
+                self._frames.popitem(last=False)
+
+    def add_track(self, track: Track) -> None:
+        """Take a pose, or the closing record of a track."""
+        with self._lock:
+            self._note_time(track.stamp_ns)
+            live = self._tracks.get(track.id)
+            if live is None and track.ended:
+                return
+            if live is None:
+                live = self._tracks[track.id] = _LiveTrack(track.id)
+            live.log.add(track, self._frames.get(track.stamp_ns) or self._no_frame(track))
+            self._forget()
+
+    def _no_frame(self, track: Track) -> FieldFrame:
+        """A frame without a reading, in place of one that was not heard."""
+        n = len(self._network)
+        return FieldFrame(track.stamp_ns, np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan),
+                          np.zeros(n, dtype=int), np.zeros(n))
+
+    def add_smoothed(self, track_id: int, points: FloatArray) -> None:
+        """Take the smoothed path (n, 3) [m] of a track that has ended."""
+        with self._lock:
+            live = self._tracks.get(track_id)
+            if live is not None:
+                live.smoothed = path_entry(track_id, points)
+                self._smoothed_news.append(live.smoothed)
+
+    def set_health(self, notes: Iterable[Note], tables: Iterable[Table]) -> None:
+        """Replace what stands at the head and at the foot of the page."""
+        notes, tables = list(notes), list(tables)
+        with self._lock:
+            if (notes, tables) != (self._notes, self._tables):
+                self._notes, self._tables, self._is_health_new = notes, tables, True
+
+    def whole(self) -> list[str]:
+        """Messages for somebody who has nothing: all that was told before, as JSON."""
+        with self._lock:
+            begin_ns = self._begin_ns or 0
+            tracks = []
+            for live in self._tracks.values():
+                if live.sent:
+                    entry = live.rows(begin_ns, slice(live.sent))
+                    entry['smoothed'] = live.smoothed
+                    tracks.append(entry)
+            scene = scene_of(self._network, begin_ns, max(self._end_ns, begin_ns), tracks)
+            return [json.dumps({'type': 'scene', 'title': self.title, 'subtitle': self.subtitle,
+                                'scene': scene}), self._health()]
+
+    def news(self) -> list[str]:
+        """Messages about what came since the last time, as JSON."""
+        with self._lock:
+            if self._is_new:
+                self._is_new = False
+                return self._restarted()
+            out = [self._health()] if self._is_health_new else []
+            self._is_health_new = False
+            tracks = [self._track_news(live) for live in self._tracks.values()
+                      if live.sent < len(live.log.stamp_ns)
+                      or live.log.ended and not live.end_sent]
+            if tracks or self._smoothed_news or self._is_frame_new:
+                out.append(self._rows(tracks))
+            return out
+
+    def _restarted(self) -> list[str]:
+        """An empty scene: the first, or that after a jump of time; its rows come next."""
+        begin_ns = self._begin_ns or 0
+        scene = scene_of(self._network, begin_ns, begin_ns, [])
+        return [json.dumps({'type': 'scene', 'title': self.title, 'subtitle': self.subtitle,
+                            'scene': scene})]
+
+    def _track_news(self, live: _LiveTrack) -> dict[str, Any]:
+        """The poses of a track that were not yet sent."""
+        entry = live.rows(self._begin_ns or 0, slice(live.sent, None))
+        live.sent, live.end_sent = len(live.log.stamp_ns), live.log.ended
+        return entry
+
+    def _rows(self, tracks: list[dict[str, Any]]) -> str:
+        """One message of rows."""
+        begin_ns, frame = self._begin_ns or 0, None
+        if self._is_frame_new:
+            latest = next(reversed(self._frames.values()))
+            frame = {'t': (latest.stamp_ns - begin_ns) / NS,
+                     'field': packed(latest.field.ravel(), 'f4')}
+        smoothed, self._smoothed_news, self._is_frame_new = self._smoothed_news, [], False
+        return json.dumps({
+            'type': 'rows', 'tracks': tracks, 'smoothed': smoothed, 'frame': frame,
+            'end': (self._end_ns - begin_ns) / NS, 'latest_ns': str(self._end_ns)})
+
+    def _health(self) -> str:
+        """The message about the health."""
+        return json.dumps({'type': 'health', 'notes': [asdict(note) for note in self._notes],
+                           'tables': [asdict(table) for table in self._tables]})
+
+    def _note_time(self, stamp_ns: int) -> None:
+        """Keep begin and end of the scene; a jump back clears it."""
+        if self._end_ns - stamp_ns > JUMP_BACK_S * NS:
+            self._clear()
+        if self._begin_ns is None:
+            self._begin_ns = stamp_ns
+            # What was told of an empty scene began at no time.
+            self._is_new = True
+        self._end_ns = max(self._end_ns, stamp_ns)
+
+    def _forget(self) -> None:
+        """Forget tracks that ended long ago, and the oldest where there are too many poses."""
+        n = sum(len(live.log.stamp_ns) for live in self._tracks.values())
+        for track_id, live in list(self._tracks.items())[:-1]:
+            old = (self._end_ns - live.log.stamp_ns[-1]) / NS > KEPT_S
+            if old or n > MOST_POSES:
+                n -= len(live.log.stamp_ns)
+                del self._tracks[track_id]

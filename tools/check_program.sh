@@ -1,0 +1,26 @@
+#!/bin/sh
+# check_program.sh PROGRAM PACKAGE TESTS: is there a program that some tests use?
+# As root it is installed from apt; otherwise its absence is told, and those tests are skipped.
+set -u
+
+program=$1
+package=$2
+tests=$3
+
+there() {
+    command -v "$program" >/dev/null || [ -x "/usr/sbin/$program" ]
+}
+
+there && exit 0
+
+if [ "$(id -u)" -eq 0 ] && command -v apt-get >/dev/null; then
+    echo "Setting up: installing $package from apt, for $tests"
+    log=$(mktemp)
+    { apt-get update && DEBIAN_FRONTEND=noninteractive apt-get install -y "$package"; } \
+        >"$log" 2>&1 || tail -n 5 "$log" >&2
+    rm -f "$log"
+    there && exit 0
+fi
+
+echo "There is no $program: $tests are skipped. To run them, too:"
+echo "    sudo apt update && sudo apt install $package"
