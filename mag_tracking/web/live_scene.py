@@ -134,23 +134,20 @@ class LiveScene:
     def whole(self) -> list[str]:
         """Messages for somebody who has nothing: all that was told before, as JSON."""
         with self._lock:
-            begin_ns = self._begin_ns or 0
             tracks = []
             for live in self._tracks.values():
                 if live.sent:
-                    entry = live.rows(begin_ns, slice(live.sent))
+                    entry = live.rows(self._begin_ns or 0, slice(live.sent))
                     entry['smoothed'] = live.smoothed
                     tracks.append(entry)
-            scene = scene_of(self._network, begin_ns, max(self._end_ns, begin_ns), tracks)
-            return [json.dumps({'type': 'scene', 'title': self.title, 'subtitle': self.subtitle,
-                                'scene': scene}), self._health()]
+            return [*self._scene(tracks), self._health()]
 
     def news(self) -> list[str]:
         """Messages about what came since the last time, as JSON."""
         with self._lock:
             if self._is_new:
                 self._is_new = False
-                return self._restarted()
+                return self._scene([])
             out = [self._health()] if self._is_health_new else []
             self._is_health_new = False
             tracks = [self._track_news(live) for live in self._tracks.values()
@@ -160,10 +157,12 @@ class LiveScene:
                 out.append(self._rows(tracks))
             return out
 
-    def _restarted(self) -> list[str]:
-        """An empty scene: the first, or that after a jump of time; its rows come next."""
+    def _scene(self, tracks: list[dict[str, Any]]) -> list[str]:
+        """A scene that replaces what was shown; nothing while the sensors are not known."""
+        if not len(self._network):
+            return []
         begin_ns = self._begin_ns or 0
-        scene = scene_of(self._network, begin_ns, begin_ns, [])
+        scene = scene_of(self._network, begin_ns, max(self._end_ns, begin_ns), tracks)
         return [json.dumps({'type': 'scene', 'title': self.title, 'subtitle': self.subtitle,
                             'scene': scene})]
 

@@ -7,7 +7,7 @@ import secrets
 import socket
 import threading
 from http import HTTPStatus
-from logging import CRITICAL, getLogger
+from logging import ERROR, getLogger
 from typing import Protocol
 from urllib.parse import parse_qs, urlsplit
 
@@ -28,6 +28,7 @@ MOST_BUFFERED = 1_000_000
 GIVE_UP_S = 20.0
 """[s] A viewer that has not caught up by then is disconnected."""
 MOST_VIEWERS = 100
+MOST_PORT = 65535
 START_S = 10.0
 PAGE, STREAM = '/', '/stream'
 
@@ -109,9 +110,10 @@ class PageServer:
 
     async def _serve(self) -> None:
         """Serve until told to stop."""
-        # Ill-formed requests are no news for the user of a robot, and everybody can send them.
         log = getLogger('mag_tracking.web')
-        log.setLevel(CRITICAL)
+        log.setLevel(ERROR)
+        # Everybody can send ill-formed requests: they are no news.
+        log.addFilter(lambda record: record.msg != 'opening handshake failed')
         # Compression would be done once a viewer.
         async with serve(self._look, sock=self._socket, process_request=self._answer,
                          compression=None, max_size=1024, max_queue=4, logger=log,
@@ -226,11 +228,14 @@ def _waiting(viewer: ServerConnection) -> int:
 
 def _listening(host: str, port: int) -> socket.socket:
     """A socket that listens; raises DeviceError where it cannot be had."""
+    if not 0 <= port <= MOST_PORT:
+        raise DeviceError(f'the live page cannot be served on port {port}: expected a number up '
+                          f'to {MOST_PORT}')
     try:
         family, _, _, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(address[:2], family=family, backlog=64)
-    except (OSError, OverflowError, UnicodeError) as error:
+    except (OSError, UnicodeError) as error:
         reason = getattr(error, 'strerror', None) or str(error)
         raise DeviceError(f'the live page cannot be served on {host} port {port}: {reason}; '
                           'choose another port') from error

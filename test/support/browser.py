@@ -2,6 +2,7 @@
 
 import contextlib
 import shutil
+import time
 
 import pytest
 
@@ -51,8 +52,14 @@ class Page:
         return self.page.evaluate(expression)
 
     def wait(self, expression, seconds=60.0):
-        """Wait until JavaScript gives something true."""
-        self.page.wait_for_function(expression, timeout=1000 * seconds)
+        """Wait until JavaScript gives something true.
+
+        Playwright's own function to wait evaluates text, which the page does not allow.
+        """
+        end = time.monotonic() + seconds
+        while not self.value(expression):
+            assert time.monotonic() < end, f'{expression} has not become true'
+            self.page.wait_for_timeout(20)
 
     def move_slider(self, t):
         """Move it as a hand does, and wait until that is drawn."""

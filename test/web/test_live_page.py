@@ -1,0 +1,295 @@
+"""The live page in headless Chromium, fed without ROS: values, delay, reconnection, many viewers."""
+
+import json
+import socket
+import threading
+import time
+import urllib.error
+import urllib.request
+from dataclasses import replace
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from mag_tracking.errors import DeviceError
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.records import FieldFrame, Track
+from mag_tracking.report.page import ERROR, Note
+from mag_tracking.web.live_scene import LiveScene
+from mag_tracking.web.page_server import PageServer
+from support.browser import Page as Opened
+from support.browser import browser, needs_browser
+from support.bundled import vehicle_path
+
+MOST_DELAY_MS = 200.0
+"""From the stamp of a pose until it is drawn, in the middle of all."""
+SECOND_NS = 1_000_000_000
+
+
+@pytest.fixture(scope='module')
+def chromium():
+    with browser() as found:
+        yield found
+
+
+@pytest.fixture(scope='module')
+def records(road_network):
+    """Frames and tracks of a recording, in the order in which they come."""
+    pipeline = Pipeline(road_network, settings_for('vehicle'))
+    out = []
+    for readings in SampleReader(Recording(vehicle_path('straight_car_right')),
+                                 road_network).readings():
+        out += pipeline.feed(readings)
+    return [r for r in [*out, *pipeline.flush()] if isinstance(r, (FieldFrame, Track))]
+
+
+def feed(scene, records):
+    for record in records:
+        if isinstance(record, FieldFrame):
+            scene.add_frame(record)
+        else:
+            scene.add_track(record)
+
+
+def poses(records):
+    return [r for r in records if isinstance(r, Track) and not r.ended]
+
+
+@pytest.fixture
+def scene(road_network):
+    return LiveScene('road', road_network)
+
+
+@pytest.fixture
+def server(scene):
+    with PageServer(scene, port=0) as found:
+        yield found
+
+
+def received(url, until, seconds=60.0):
+    """Messages of a viewer until `until(message)`."""
+    out = []
+    with connect(url.replace('http', 'ws') + 'stream', max_size=None) as viewer:
+        end = time.monotonic() + seconds
+        while not (out and until(out[-1])):
+            out.append(json.loads(viewer.recv(max(0.1, end - time.monotonic()))))
+    return out
+
+
+@needs_browser
+def test_the_page_has_the_poses_that_were_tracked(chromium, scene, server, records):
+    """Half of them came before it was opened."""
+    half = len(records) // 2
+    feed(scene, records[:half])
+    page = Opened(chromium, server.url)
+    page.wait('magTracking.connected && magTracking.scene.tracks.length')
+    feed(scene, records[half:])
+    wanted = poses(records)
+    page.wait(f'magTracking.scene.tracks[0].columns.t.length >= {len(wanted)}')
+    page.wait('magTracking.scene.tracks[0].ended')
+    for name, axis in (('x', 0), ('y', 1), ('z', 2)):
+        np.testing.assert_array_equal(
+            page.value(f'Array.from(magTracking.scene.tracks[0].columns.{name})'),
+            [p.position[axis] for p in wanted])
+    begin_ns = int(page.value('magTracking.scene.begin_ns'))
+    t = (wanted[20].stamp_ns - begin_ns) / 1e9
+    page.move_slider(t)
+    np.testing.assert_allclose(page.pose_on_map(), wanted[20].position[:2])
+    assert not page.value('magTracking.follows')
+    page.page.click('#latest')
+    page.wait('magTracking.follows')
+    assert page.complaints == []
+    page.page.close()
+
+
+@needs_browser
+@pytest.mark.alone
+def test_a_pose_is_on_the_page_within_200_ms(chromium, scene, server, records):
+    page = Opened(chromium, server.url)
+    page.wait('magTracking.connected')
+    page.value('''() => { window.delays = []; let before = 0; const look = () => {
+        if (magTracking.drawn !== before && magTracking.latestDrawn) {
+          before = magTracking.drawn;
+          window.delays.push(Date.now() - Number(magTracking.latestDrawn) / 1e6); }
+        requestAnimationFrame(look); }; look(); }''')
+    template = [r for r in records if isinstance(r, FieldFrame)][-1]
+    pose, stop = poses(records)[30], threading.Event()
+
+    def publish():
+        while not stop.wait(0.08):
+            now = time.time_ns()
+            scene.add_frame(replace(template, stamp_ns=now))
+            scene.add_track(replace(pose, stamp_ns=now))
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        page.wait('window.delays.length > 120')
+    finally:
+        stop.set()
+        thread.join()
+    # The first are those of the drawing of everything.
+    delays = np.array(page.value('window.delays'))[20:]
+    print(f'from stamp to drawing: median {np.median(delays):.0f} ms, '
+          f'90 % {np.quantile(delays, 0.9):.0f} ms')
+    assert np.median(delays) < MOST_DELAY_MS
+    page.page.close()
+
+
+@needs_browser
+def test_it_reconnects_after_a_restart(chromium, road_network, records):
+    first = LiveScene('before', road_network)
+    with PageServer(first, port=0) as server:
+        port = server.port
+        feed(first, records)
+        page = Opened(chromium, server.url)
+        page.wait('magTracking.connected && magTracking.scene.tracks.length === 1')
+    page.wait('!magTracking.connected')
+    assert 'lost' in page.value('document.getElementById("connection").textContent')
+    second = LiveScene('after', road_network)
+    with PageServer(second, port=port):
+        page.wait('magTracking.connected && document.title && '
+                  'document.getElementById("title").textContent === "after"')
+        assert page.value('magTracking.scene.tracks.length') == 0
+        feed(second, records)
+        page.wait('magTracking.scene.tracks.length === 1')
+        page.page.close()
+
+
+@needs_browser
+def test_markup_in_health_is_shown_as_it_is(chromium, scene, server):
+    evil = '<img src=x onerror="window.broken = true">'
+    scene.set_health([Note(ERROR, evil)], [])
+    page = Opened(chromium, server.url)
+    page.wait('document.getElementById("notes").children.length')
+    assert page.value('document.getElementById("notes").textContent') == evil
+    assert page.value('window.broken === undefined')
+    page.page.close()
+
+
+def test_ten_viewers_hear_the_same_and_one_that_goes_away_disturbs_none(scene, server, records):
+    urls = [server.url.replace('http', 'ws') + 'stream'] * 10
+    viewers = [connect(url, max_size=None) for url in urls]
+    quitter = connect(urls[0], max_size=None)
+    feed(scene, records[:len(records) // 2])
+    quitter.socket.close()
+    feed(scene, records[len(records) // 2:])
+    wanted = [p.stamp_ns for p in poses(records)]
+    for viewer in viewers:
+        n = 0
+        while n < len(wanted):
+            message = json.loads(viewer.recv(60.0))
+            for track in message.get('tracks', message.get('scene', {}).get('tracks', ())):
+                n += len(track['doubts'])
+        assert n == len(wanted)
+        viewer.close()
+
+
+def test_a_viewer_that_cannot_follow_gets_the_whole_later(road_network, records):
+    """What waits for it is bounded, and the others are served all the while."""
+    scene = LiveScene('road', road_network)
+    with PageServer(scene, port=0) as server:
+        url = server.url.replace('http', 'ws') + 'stream'
+        quick = connect(url, max_size=None)
+        template = [r for r in records if isinstance(r, FieldFrame)][-1]
+        blocked = _blocked(url)
+        stamp = template.stamp_ns
+        end = time.monotonic() + 60.0
+        while not server.n_behind and time.monotonic() < end:
+            for _ in range(50):
+                stamp += 10_000_000
+                scene.add_frame(replace(template, stamp_ns=stamp))
+                scene.add_track(replace(poses(records)[30], stamp_ns=stamp))
+            quick.recv(60.0)
+        assert server.n_behind >= 1
+        blocked.close()
+        quick.close()
+
+
+def _blocked(url):
+    """A viewer that shakes hands and never reads again."""
+    address = urlsplit(url)
+    raw = socket.socket()
+    raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    raw.connect((address.hostname, address.port))
+    raw.sendall((f'GET /stream HTTP/1.1\r\nHost: {address.netloc}\r\nUpgrade: websocket\r\n'
+                 'Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n'
+                 'Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n').encode())
+    return raw
+
+
+def test_a_looped_bag_begins_anew(scene, server, records):
+    feed(scene, records)
+    messages = received(server.url, lambda m: m['type'] == 'scene')
+    assert messages[-1]['type'] == 'scene'
+    with connect(server.url.replace('http', 'ws') + 'stream', max_size=None) as viewer:
+        feed(scene, records[:50])
+        while True:
+            message = json.loads(viewer.recv(60.0))
+            if message['type'] == 'scene' and message['scene']['tracks'] == []:
+                break
+        begin = [r for r in records[:50] if isinstance(r, FieldFrame)][0].stamp_ns
+        assert int(message['scene']['begin_ns']) == begin
+
+
+def test_a_port_in_use_is_said(scene, server):
+    with pytest.raises(DeviceError, match=f'port {server.port}: Address already in use'):
+        PageServer(scene, port=server.port)
+    for port in (-1, 70000):
+        with pytest.raises(DeviceError, match='cannot be served'):
+            PageServer(scene, port=port)
+    with pytest.raises(DeviceError, match='cannot be served'):
+        PageServer(scene, host='no.such.host.invalid', port=0)
+
+
+def status_of(url, **headers):
+    request = urllib.request.Request(url, headers=headers)
+    try:
+        with urllib.request.urlopen(request, timeout=60.0) as response:
+            return response.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_without_a_token_only_this_machine_sees_it(server):
+    """A page of elsewhere may have its own name point here, or open the socket from its script."""
+    assert 'token' not in server.url
+    assert status_of(server.url) == 200
+    assert status_of(server.url + 'etc/passwd') == 404
+    assert status_of(server.url, Host='evil.example') == 403
+    assert status_of(server.url, Host='[::1') == 403
+    stream = server.url.replace('http', 'ws') + 'stream'
+    with pytest.raises(InvalidStatus) as refused:
+        connect(stream, origin='http://evil.example')
+    assert refused.value.response.status_code == 403
+    connect(stream, origin=server.url.rstrip('/')).close()
+
+
+def test_from_elsewhere_the_token_is_needed(scene):
+    with PageServer(scene, host='0.0.0.0', port=0) as server:
+        address, token = server.url.split('?token=')
+        address = address.replace('0.0.0.0', '127.0.0.1')
+        assert len(token) > 20
+        for wrong in ('', '?token=', '?token=x', f'?token={token}x', '?token=%C3%A9'):
+            assert status_of(address + wrong) == 403
+            with pytest.raises(InvalidStatus):
+                connect(address.replace('http', 'ws') + 'stream' + wrong)
+        assert status_of(f'{address}?token={token}') == 200
+        connect(f'{address.replace("http", "ws")}stream?token={token}').close()
+
+
+def test_nonsense_does_not_end_the_server(server):
+    for text in (b'\x16\x03\x01garbage\r\n\r\n', b'POST / HTTP/1.1\r\n\r\n', b'', b'A' * 100_000):
+        with socket.create_connection(('127.0.0.1', server.port)) as raw:
+            try:
+                raw.sendall(text)
+                raw.shutdown(socket.SHUT_WR)
+                raw.recv(1000)
+            except OSError:
+                continue
+    assert status_of(server.url) == 200

@@ -1,0 +1,204 @@
+"""The report of a replay in headless Chromium: its numbers are those of the tables."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from mag_tracking.apps.replay import replay
+from mag_tracking.apps.replay_report import write_report
+from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.reader import Recording
+from mag_tracking.report.page import Note, Page, Table, report_html
+from support.browser import Page as Opened
+from support.browser import browser, needs_browser
+from support.bundled import vehicle_path
+
+pytestmark = needs_browser
+
+RECORDING = 'junction_left_turns_to_rear'
+MOST_MB = 10.0
+EVIL = '</script><script>window.broken = true</script><b>left</b>'
+
+
+@pytest.fixture(scope='module')
+def chromium():
+    with browser() as found:
+        yield found
+
+
+@pytest.fixture(scope='module')
+def report(vehicle_replays, road_network):
+    """(path, rows of poses.csv) of a report."""
+    run, folder = vehicle_replays[RECORDING]
+    path = write_report(run, road_network, folder)
+    with open(folder / 'poses.csv', newline='') as stream:
+        return path, list(csv.DictReader(stream))
+
+
+@pytest.fixture
+def opened(chromium, report):
+    page = Opened(chromium, report[0].as_uri())
+    page.wait('magTracking.drawn > 0')
+    yield page
+    page.page.close()
+
+
+def column(rows, name):
+    return np.array([float(row[name]) for row in rows])
+
+
+def columns(page, name):
+    return np.array(page.value(f'Array.from(magTracking.scene.tracks[0].columns.{name})'))
+
+
+def test_numbers_of_the_page_are_those_of_the_table(opened, report):
+    rows = report[1]
+    begin_ns = int(opened.value('magTracking.scene.begin_ns'))
+    stamps = np.array([int(row['stamp_ns']) for row in rows])
+    np.testing.assert_allclose(columns(opened, 't'), (stamps - begin_ns) / 1e9, atol=1e-9)
+    for mine, theirs in (('x', 'x'), ('y', 'y'), ('z', 'z'), ('vx', 'vx'), ('vy', 'vy')):
+        np.testing.assert_array_equal(columns(opened, mine), column(rows, theirs))
+    for mine, theirs in (('xx', 'sd_x'), ('yy', 'sd_y')):
+        np.testing.assert_allclose(np.sqrt(columns(opened, mine)), column(rows, theirs), rtol=1e-6)
+    np.testing.assert_array_equal(columns(opened, 'ambiguous'), column(rows, 'ambiguous'))
+
+
+def test_fields_weights_and_innovations_are_those_of_the_run(opened, vehicle_replays):
+    log = vehicle_replays[RECORDING][0].logs[1]
+    for j in range(2):
+        for name in ('measured', 'predicted'):
+            found = opened.value('magTracking.scene.tracks[0].fields'
+                                 f'[{j}].{name}.map(axis => Array.from(axis))')
+            np.testing.assert_allclose(np.array(found, dtype=float).T,
+                                       np.array(getattr(log, name))[:, j], rtol=1e-6)
+    for name in {name for row in log.arrivals for name in row}:
+        found = opened.value(f'Array.from(magTracking.scene.tracks[0].arrivals.{name}.weight)')
+        np.testing.assert_allclose(found, [row[name][0] if name in row else 0.0
+                                           for row in log.arrivals], rtol=1e-6)
+    per_axis = np.array(log.nis) / np.maximum(1, log.degrees_of_freedom)
+    np.testing.assert_allclose(columns(opened, 'nis').astype(float), per_axis, rtol=1e-6)
+
+
+def test_the_slider_moves_map_curves_and_text_together(opened, report):
+    t = columns(opened, 't')
+    for k in (0, len(t) // 2, len(t) - 1):
+        opened.move_slider(t[k])
+        row = report[1][k]
+        np.testing.assert_allclose(opened.pose_on_map(), [float(row['x']), float(row['y'])])
+        opened.wait(f'Math.abs(document.getElementById("speed").layout.shapes[0].x0 - {t[k]})'
+                    ' < 1e-9')
+        np.testing.assert_allclose(opened.lines(), t[k])
+        text = opened.value('document.getElementById("readout").textContent')
+        assert f'x {float(row["x"]):.2f}, y {float(row["y"]):.2f}' in text
+        assert ('ambiguous' in text) == (row['ambiguous'] == '1')
+
+
+def test_it_needs_nothing_from_outside_and_nothing_is_wrong(opened, report):
+    t = columns(opened, 't')
+    for share in np.linspace(0.0, 1.0, 7):
+        opened.move_slider(t[0] + share * (t[-1] - t[0]))
+    opened.page.select_option('#sensors', 'mag_2')
+    opened.page.set_viewport_size({'width': 390, 'height': 800})
+    opened.page.click('#play')
+    opened.wait('magTracking.plays')
+    opened.wait('!magTracking.plays')
+    assert opened.complaints == []
+    assert opened.requests == [report[0].as_uri()]
+    assert report[0].stat().st_size < MOST_MB * 1e6
+
+
+def test_a_telephone_shows_it_in_its_width(chromium, report):
+    page = Opened(chromium, report[0].as_uri(), viewport={'width': 360, 'height': 740},
+                  is_mobile=True, has_touch=True)
+    page.wait('magTracking.drawn > 0')
+    assert page.value('document.documentElement.scrollWidth') <= 360
+    small = page.value('''[...document.querySelectorAll('p, td, th, li, h2, output, text')]
+        .filter(e => e.textContent && e.getClientRects().length)
+        .map(e => parseFloat(getComputedStyle(e).fontSize)).filter(size => size < 11)''')
+    assert small == []
+    page.page.close()
+
+
+def test_the_table_jumps_to_each_track(chromium, vehicle_replays, road_network, tmp_path):
+    """Two tracks of one run: that of the recording, and the same, later and elsewhere."""
+    run, _ = vehicle_replays[RECORDING]
+    later = second_track(run.logs[1])
+    both = type(run)({**run.summary, 'tracks': [*run.summary['tracks'], {
+        **run.summary['tracks'][0], 'id': 2}]}, {1: run.logs[1], 2: later}, run.smoothed, run.truth)
+    page = Opened(chromium, write_report(both, road_network, tmp_path).as_uri())
+    page.wait('magTracking.drawn > 0')
+    for track_id, log in ((2, later), (1, run.logs[1])):
+        page.page.click(f'#tracks button:text-is("{track_id}")')
+        page.wait(f'magTracking.current === {track_id}')
+        assert f'Track {track_id}:' in page.value('document.getElementById("readout").textContent')
+        x, y = page.pose_on_map()
+        assert np.hypot(*(np.array(log.position)[:, :2] - [x, y]).T).min() < 1e-9
+    assert page.complaints == []
+    page.page.close()
+
+
+def second_track(log):
+    """A copy of a log, a minute later."""
+    from copy import deepcopy
+
+    later = deepcopy(log)
+    later.id = 2
+    later.stamp_ns = [stamp + 60_000_000_000 for stamp in log.stamp_ns]
+    later.position = [p + [1.0, 0.5, 0.0] for p in log.position]
+    return later
+
+
+def test_markup_in_names_is_shown_as_it_is(chromium, road_network, tmp_path):
+    """Names of arrivals and of files come from users."""
+    settings = settings_for('vehicle', {'track.vehicle.arrival_names': [EVIL, 'right', 'rear']})
+    recording = Recording(vehicle_path('straight_small_left'))
+    run = replay(recording, road_network, settings, tmp_path)
+    run.summary['recording'] = EVIL
+    page = Opened(chromium, write_report(run, road_network, tmp_path).as_uri())
+    page.wait('magTracking.drawn > 0')
+    page.move_slider(0.0)
+    assert page.value('window.broken === undefined')
+    assert EVIL in page.value('document.getElementById("title").textContent')
+    assert page.value('document.querySelectorAll("b, .plot b").length') == 0
+    assert EVIL in page.value('document.getElementById("weights").textContent')
+    assert page.complaints == []
+    page.page.close()
+
+
+def test_notes_tables_and_missing_values_are_shown(chromium, tmp_path):
+    path = tmp_path / 'page.html'
+    path.write_text(report_html(Page(
+        'nothing', notes=[Note('warning', 'nothing on <i>/mag_1</i>')],
+        tables=[Table('Sensors', ['sensor', 'noise'], [['mag_1', None], ['mag_2', 12.3456]])])),
+        encoding='utf-8')
+    page = Opened(chromium, path.as_uri())
+    assert page.value('document.getElementById("notes").innerText').strip() \
+        == 'nothing on <i>/mag_1</i>'
+    cells = page.value('[...document.querySelectorAll("td")].map(td => td.textContent)')
+    assert cells == ['mag_1', '–', 'mag_2', '12.35']
+    assert not page.value('document.getElementById("scene").checkVisibility()')
+    assert page.complaints == []
+    page.page.close()
+
+
+def test_a_report_of_very_many_poses_is_thinned_and_says_so(vehicle_replays, road_network,
+                                                            tmp_path):
+    """A day of traffic has thousands of tracks; the page has to open all the same."""
+    run, _ = vehicle_replays[RECORDING]
+    n = 600
+    logs = {}
+    for k in range(1, n + 1):
+        log = second_track(run.logs[1])
+        log.id = k
+        logs[k] = log
+    entry = run.summary['tracks'][0]
+    many = type(run)({**run.summary, 'tracks': [{**entry, 'id': k} for k in logs]}, logs,
+                     {}, run.truth)
+    path = write_report(many, road_network, tmp_path)
+    assert path.stat().st_size < MOST_MB * 1e6
+    text = path.read_text(encoding='utf-8')
+    data = json.loads(text.split('id="data">')[1].split('</script>')[0])
+    assert any('one pose of' in note['text'] for note in data['notes'])
+    assert len(data['scene']['tracks']) == n
