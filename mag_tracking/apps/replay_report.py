@@ -11,7 +11,7 @@ from mag_tracking.apps.replay_notes import notes_of
 from mag_tracking.files import replace_text
 from mag_tracking.network import SensorNetwork
 from mag_tracking.report.metrics import interpolate_truth
-from mag_tracking.report.page import NOTE, Note, Page, Table, report_html
+from mag_tracking.report.page import NOTE, REPORT, Note, Page, Table, report_html
 from mag_tracking.report.page_scene import (
     MOST_SENSORS,
     facts_of,
@@ -22,8 +22,6 @@ from mag_tracking.report.page_scene import (
     strongest_sensors,
     track_entry,
 )
-
-REPORT = 'report.html'
 
 
 def write_report(run: Run, network: SensorNetwork, out: Path) -> Path:

@@ -8,10 +8,12 @@ import numpy as np
 from tqdm import tqdm
 
 from mag_tracking.apps.calibrate import Calibration, calibrate
+from mag_tracking.apps.calibrate_report import write_report
 from mag_tracking.cli.options import (
     Commands,
     add_command,
     add_recorded_network,
+    add_report,
     add_settings,
     check_outputs,
     now,
@@ -53,6 +55,7 @@ def add(commands: Commands) -> None:
     add_settings(p)
     p.add_argument('--no-passes', action='store_true', help='do not track what passes')
     p.add_argument('--figure', type=Path, metavar='FILE', help='draw what was found (.png, .pdf)')
+    add_report(p)
 
 
 def _calibrate(args: argparse.Namespace) -> int:
@@ -72,6 +75,8 @@ def _calibrate(args: argparse.Namespace) -> int:
         return 130
     write_network(args.out, found.network,
                   f'Calibrated from {args.recording.name} and {args.network.name}.')
+    if args.report is not None:
+        write_report(found, network, args.recording.name, args.report)
     if args.figure is not None:
         # Drawing needs matplotlib, which a run without a figure should not wait for.
         from mag_tracking.report.calibration_figures import calibration_figure

@@ -8,11 +8,14 @@ import numpy as np
 from tqdm import tqdm
 
 from mag_tracking.apps.doctor import examine
+from mag_tracking.apps.doctor_report import write_report
 from mag_tracking.cli.options import (
     Commands,
     add_command,
     add_recorded_network,
+    add_report,
     add_settings,
+    check_writable,
     recorded_network,
     settings_of,
 )
@@ -43,6 +46,7 @@ def add(commands: Commands) -> None:
                    help='listen to the topics for so long instead (needs ROS 2)')
     add_recorded_network(p)
     add_settings(p)
+    add_report(p)
 
 
 def _doctor(args: argparse.Namespace) -> int:
@@ -50,6 +54,7 @@ def _doctor(args: argparse.Namespace) -> int:
     if (args.recording is None) == (args.live is None):
         raise SettingsError('doctor: either a RECORDING or --live SECONDS')
     network, settings = recorded_network(args), settings_of(args)
+    check_writable(args.report)
     with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
         if args.live is not None:
             if not 1.0 <= args.live <= 86400.0:
@@ -73,6 +78,9 @@ def _doctor(args: argparse.Namespace) -> int:
               f'      {finding.advice}')
     if not findings:
         print('nothing is wrong')
+    if args.report is not None:
+        write_report(doctor, findings, 'the running sensors' if args.recording is None
+                     else args.recording.name, args.report)
     if seen:
         print('interrupted: this is of what was read until then')
         return 130

@@ -12,6 +12,7 @@ from tqdm import tqdm
 from mag_tracking.analysis.correlated_motion import disagree
 from mag_tracking.analysis.pass_result import Bearing, PassFit
 from mag_tracking.apps.fit import FittedPass, RecordingFit, check_cpa_range, check_orders
+from mag_tracking.apps.fit_report import write_report
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import (
     Commands,
@@ -44,6 +45,7 @@ without any model.
 
 Writes to DIR:
   fits.csv, fits.json   a row a pass and order
+  report.html           map, time slider and fields, to look at in a browser
   *_pass_N.png          measured against fitted field, with 90 % bands
   orders.png            normalised cost over the order
 
@@ -87,6 +89,7 @@ def _fit(args: argparse.Namespace) -> int:
         raise OutputError(f'{args.out} is the folder of a recording; the results would be in it')
     jobs = [RecordingFit(r, network, settings, args.orders, args.cpa_range) for r in recordings]
     passes: list[FittedPass] = []
+    warnings: list[str] = []
     with noted_signals(signal.SIGINT) as seen, FitFolder(args.out) as folder:
         for path, recording, job in zip(args.recordings, recordings, jobs, strict=True):
             with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
@@ -98,12 +101,15 @@ def _fit(args: argparse.Namespace) -> int:
                     _print_pass(one)
                     if not args.no_figures:
                         _draw(one, args.out)
-            for line in job.warnings():
-                print(f'  warning: {path.name}: {line}')
+            lines = [f'{path.name}: {line}' for line in job.warnings()]
+            warnings += lines
+            for line in lines:
+                print(f'  warning: {line}')
             if seen:
                 break
         iron = _iron(passes, network) if args.same_vehicle else None
         folder.summary = {'iron': iron, 'interrupted': bool(seen)}
+    write_report(passes, network, warnings, args.out)
     if not passes:
         print('no pass: nothing was detected')
     elif not args.no_figures:

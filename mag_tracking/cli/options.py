@@ -79,12 +79,23 @@ def now() -> str:
     return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
 
 
+def add_report(parser: argparse.ArgumentParser) -> None:
+    """--report."""
+    parser.add_argument('--report', type=Path, metavar='FILE.html',
+                        help='write what was found as a page to look at in a browser')
+
+
+def check_writable(path: Path | None) -> None:
+    """Raise OutputError where a file that is to be written has no folder to be in."""
+    if path is not None and not path.absolute().parent.is_dir():
+        raise OutputError(f'cannot write {path}: there is no folder {path.parent}')
+    if path is not None and path.is_dir():
+        raise OutputError(f'cannot write {path}: it is a folder')
+
+
 def check_outputs(args: argparse.Namespace) -> None:
     """Raise OutputError where what is to be written has no folder to be in."""
-    for path in (args.out, args.figure):
-        if path is not None and not path.absolute().parent.is_dir():
-            raise OutputError(f'cannot write {path}: there is no folder {path.parent}')
-        if path is not None and path.is_dir():
-            raise OutputError(f'cannot write {path}: it is a folder')
+    for path in (args.out, args.figure, getattr(args, 'report', None)):
+        check_writable(path)
     if args.figure is not None and args.figure.suffix.lower() not in FIGURES:
         raise SettingsError(f'--figure: {args.figure.name} ends in none of {", ".join(FIGURES)}')

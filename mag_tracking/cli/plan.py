@@ -4,12 +4,11 @@ import argparse
 import json
 from pathlib import Path
 
-import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.apps.plan import GOOD_PD, Plan
+from mag_tracking.apps.plan import Plan
 from mag_tracking.apps.plan_inputs import PlanInputs, plan_inputs
-from mag_tracking.arrays import FloatArray
+from mag_tracking.apps.plan_report import answers, write_report
 from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.errors import SettingsError
 from mag_tracking.files import new_text_file, output_folder
@@ -31,6 +30,7 @@ Writes to DIR:
   plan_detection.png   map: probability that one frame detects the target
   plan_sensor.png      map: what one more sensor would bring, and the best place
   plan_lanes.png       along the lanes: filter and whole pass; passes missed by distance
+  report.html          the maps and curves, to look at in a browser
   plan.json            all of it in numbers
 
 examples:
@@ -95,46 +95,13 @@ def _plan(args: argparse.Namespace) -> int:
     output_folder(args.out)
     with tqdm(total=inputs.n_parts, desc='plan', disable=None) as bar:
         result = inputs.run(network, settings, bar.update)
-    _print(result, inputs.sampling.noise_std)
+    lines = answers(result)
+    for line in lines:
+        print(line)
     _write(result, args.out)
+    write_report(result, lines, args.out)
     print(f'results in {args.out}')
     return 0
-
-
-def _print(p: Plan, noise: FloatArray | float) -> None:
-    """The answers in a few lines."""
-    from mag_tracking.report.plan_figures import f_text
-
-    print(f'{len(p.network)} sensors, noise of a frame {1e9 * float(np.median(noise)):.2g} nT; '
-          f'target of {p.target.moment:g} A m^2 at {p.target.speed:g} m/s')
-    o = p.observability
-    seen = (f'not observable: {", ".join(o.unobservable)}' if o.unobservable
-            else f'observable, condition number {o.condition_number:.3g}')
-    print(f'one pass on lane {p.lanes[0].name}, without priors: {seen}')
-    for name, (r, v, m) in p.blocks.items():
-        print(f'  closest point, {name}: position {f_text(r)}, velocity {v:.3g} m/s, '
-              f'moment {m:.3g} A m^2')
-    for lane in p.lanes:
-        good = np.flatnonzero(lane.detection >= GOOD_PD)
-        first = (f'from {-lane.along[good[0]]:.3g} m before the middle on' if len(good)
-                 else 'nowhere')
-        closest = int(np.argmin(np.abs(lane.along)))
-        print(f'lane {lane.name}: a frame detects it with {GOOD_PD:.0%} {first}; '
-              f'at the middle a filter knows it to {f_text(lane.filter_std[closest])}, a whole '
-              f'pass to {f_text(lane.pass_std[closest, 0])}')
-    caught = p.missed[p.missed[:, 1] < 0.01, 0]
-    print(f'99 % of passes are detected up to {caught.max():.3g} m from the middle' if len(caught)
-          else 'nowhere are 99 % of the passes detected')
-    print('(bounds of a point: real vehicles are followed several times less well)')
-    if not np.isfinite(p.with_one_more).any():
-        print('one more sensor: nowhere in the area is it clear of the lanes')
-    elif np.nanmin(p.with_one_more) > 0.99 * p.without:
-        print('one more sensor helps nowhere in the area')
-    else:
-        x, y = p.best_place
-        edge = ' (on the edge of the area)' if x in p.x[[0, -1]] or y in p.y[[0, -1]] else ''
-        print(f'one more sensor helps most at ({x:.2f}, {y:.2f}) m{edge}: the median bound near '
-              f'the sensors becomes {f_text(np.nanmin(p.with_one_more))}, now {f_text(p.without)}')
 
 
 def _write(p: Plan, out: Path) -> None:

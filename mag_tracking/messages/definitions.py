@@ -70,6 +70,9 @@ DEFINITIONS: dict[str, str] = {
     'mag_tracking_msgs/msg/FieldReadings': (
         'std_msgs/Header header\nstring[] sensors\nuint16[] sensor\nint64[] stamp\n'
         'float64[] field\nfloat64[] covariance\n'),
+    'mag_tracking_msgs/msg/Hypothesis': (
+        'string arrival\nstring kind\nfloat64 weight\ngeometry_msgs/Point position\n'
+        'geometry_msgs/Vector3 velocity\nfloat64[36] covariance\ngeometry_msgs/Vector3 moment\n'),
     'mag_tracking_msgs/msg/SmoothedTrack': (
         'std_msgs/Header header\nuint32 track_id\nstring kind\nfloat64 length\n'
         'float64 length_std\nbool ambiguous\nbool[] pose_ambiguous\n'
@@ -82,7 +85,8 @@ DEFINITIONS: dict[str, str] = {
         'float64[] innovation_by_sensor\nuint32 degrees_of_freedom\nstring arrival\nstring kind\n'
         'float64 kind_weight\nfloat64 length\nfloat64 length_std\nbool ambiguous\n'
         'bool[6] unobservable\nfloat64[] predicted_field\nfloat64[] mounting\n'
-        'float64[] mounting_covariance\nstring[] doubts\n'),
+        'float64[] mounting_covariance\nstring[] doubts\n'
+        'mag_tracking_msgs/Hypothesis[] arrivals\n'),
     'mag_tracking_msgs/msg/TrackArray': (
         'std_msgs/Header header\nmag_tracking_msgs/Track[] tracks\n'),
 }

@@ -19,7 +19,8 @@ class NamedSensors(Protocol):
     """What frames are compared with, such as a `SensorNetwork`."""
 
     @property
-    def names(self) -> tuple[str, ...]: ...
+    def names(self) -> tuple[str, ...]:
+        """Their names."""
 
     def __len__(self) -> int: ...
 

@@ -83,11 +83,19 @@ def calibration_figure(found: _Calibration, stated: _Network, most: int = 8) -> 
     return figure
 
 
+def first_knock(shocks: Mapping[str, tuple[FloatArray, FloatArray]]) -> float:
+    """[s] When the first loud shock began; 0 without any.
+
+    `shocks` is {sensor: (times (n,) [s], sizes (n,))}.
+    """
+    return min((float(t[s > 0.3 * s.max()][0]) for t, s in shocks.values()
+                if len(s) and s.max() > 0.0), default=0.0)
+
+
 def _knocks(before: Axes, after: Axes, found: _Calibration, most: int) -> None:
     """The first loud second of each sensor."""
     shocks = {name: found.survey.shocks[name] for name in list(found.survey.shocks)[:most]}
-    first = min((t[s > 0.3 * s.max()][0] for t, s in shocks.values() if len(s) and s.max() > 0.0),
-                default=0.0)
+    first = first_knock(shocks)
     for k, (name, (t, s)) in enumerate(shocks.items()):
         offset = found.network.clock_offset[found.network.index(name)]
         for axes, shift in ((before, 0.0), (after, offset)):

@@ -100,7 +100,7 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
     Source: TSP14 Fig. 6.
     """
     data = fit.data
-    level = fit.predicted - _target_alone(fit)
+    level = fit.predicted - target_alone(fit)
     strength = {j: np.nanmax(np.abs(data.field - level)[data.sensor == j]) for j in data.sensors}
     shown = sorted(sorted(strength, key=lambda j: -strength[j])[:most])
     f, unit = field_unit(max(strength.values()))
@@ -130,7 +130,7 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
     return figure
 
 
-def _target_alone(fit: _Fit) -> FloatArray:
+def target_alone(fit: _Fit) -> FloatArray:
     """(n, 3) [T] the fitted field without the backgrounds, which are the last unknowns."""
     out = fit.predicted.copy()
     for name, value in zip(fit.names, fit.x, strict=True):

@@ -12,6 +12,8 @@ from typing import Any
 
 SCRIPTS = ('scene', 'map', 'curves', 'tables', 'live', 'main', 'start')
 """Parts of the script, in their order."""
+REPORT = 'report.html'
+"""Name of a report in a folder of results."""
 ERROR, WARNING, NOTE = 'error', 'warning', 'note'
 """Levels of a note."""
 

@@ -6,9 +6,9 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.special import chdtri
 
-from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.report.figures import scale_of
-from mag_tracking.report.packed import packed
+from mag_tracking.report.packed import Packed, packed
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.units import NS
 
@@ -26,13 +26,16 @@ class Sensors(Protocol):
     """What the page reads of a `SensorNetwork`."""
 
     @property
-    def names(self) -> tuple[str, ...]: ...
+    def names(self) -> tuple[str, ...]:
+        """Their names."""
 
     @property
-    def positions(self) -> FloatArray: ...
+    def positions(self) -> FloatArray:
+        """(n, 3) [m]."""
 
     @property
-    def frame(self) -> str: ...
+    def frame(self) -> str:
+        """Name of the world frame."""
 
     def __len__(self) -> int: ...
 
@@ -99,20 +102,48 @@ def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
     rows : slice
         Which poses; all of them if left out.
     """
-    position = _array(log.position[rows], 3)
-    velocity = _array(log.velocity[rows], 3)
-    C = _array(log.covariance[rows], 6, 6)
     times = (np.array(log.stamp_ns[rows], dtype=np.int64) - begin_ns) / NS
-    columns = {
-        't': packed(times), 'x': packed(position[:, 0]), 'y': packed(position[:, 1]),
-        'z': packed(position[:, 2]), 'vx': packed(velocity[:, 0]), 'vy': packed(velocity[:, 1]),
-        'xx': packed(C[:, 0, 0], 'f4'), 'xy': packed(C[:, 0, 1], 'f4'),
-        'yy': packed(C[:, 1, 1], 'f4'), 'speed_sd': packed(_speed_std(velocity, C), 'f4'),
-        'ambiguous': packed(log.ambiguous[rows], 'u1'), **_innovation(log, rows)}
+    columns = _columns(times, _array(log.position[rows], 3), _array(log.velocity[rows], 3),
+                       _array(log.covariance[rows], 6, 6), np.array(log.ambiguous[rows], bool))
+    columns |= _innovation(np.array(log.nis[rows], dtype=float),
+                           np.array(log.degrees_of_freedom[rows], dtype=float))
     return {'id': log.id, 'ended': log.ended, 'columns': columns,
             'arrivals': _arrivals(log, rows), 'fields': _fields(log, rows, sensors),
             'doubts': [', '.join(doubts) for doubts in log.doubts[rows]],
             'smoothed': None, 'truth': None, 'facts': None}
+
+
+def fitted_entry(track_id: int, times: FloatArray, state: FloatArray, covariance: FloatArray,
+                 ambiguous: bool, fields: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """A path at constant velocity, as JSON.
+
+    Parameters
+    ----------
+    track_id : int
+    times : (n,) [s] of the scene
+    state : (n, 6) [m], [m/s], world
+    covariance : (n, 6, 6)
+    ambiguous : bool
+    fields : sequence of dict
+        As `field_entry` gives them.
+    """
+    n = len(times)
+    columns = _columns(times, state[:, :3], state[:, 3:], covariance, np.full(n, ambiguous))
+    columns |= _innovation(np.full(n, np.nan), np.zeros(n))
+    return {'id': track_id, 'ended': True, 'columns': columns, 'arrivals': {},
+            'fields': list(fields), 'doubts': [''] * n, 'smoothed': None, 'truth': None,
+            'facts': None}
+
+
+def field_entry(sensor: int, measured: FloatArray, predicted: FloatArray,
+                times: FloatArray | None = None) -> dict[str, Any]:
+    """Measured and predicted field (n, 3) [T] of one sensor, as JSON.
+
+    `times` (n,) [s] are those of the scene; left out: those of the poses.
+    """
+    return {'sensor': sensor, 't': None if times is None else packed(times), **{
+        name: [packed(column, 'f4') for column in values.T]
+        for name, values in (('measured', measured), ('predicted', predicted))}}
 
 
 def path_entry(track_id: int, points: FloatArray) -> dict[str, Any]:
@@ -159,16 +190,26 @@ def _speed_std(velocity: FloatArray, C: FloatArray) -> FloatArray:
     return std
 
 
-def _innovation(log: TrackLog, rows: slice) -> dict[str, dict[str, str]]:
+def _columns(times: FloatArray, position: FloatArray, velocity: FloatArray, C: FloatArray,
+             ambiguous: BoolArray) -> dict[str, Packed]:
+    """Poses (n,) as columns."""
+    return {
+        't': packed(times), 'x': packed(position[:, 0]), 'y': packed(position[:, 1]),
+        'z': packed(position[:, 2]), 'vx': packed(velocity[:, 0]), 'vy': packed(velocity[:, 1]),
+        'xx': packed(C[:, 0, 0], 'f4'), 'xy': packed(C[:, 0, 1], 'f4'),
+        'yy': packed(C[:, 1, 1], 'f4'), 'speed_sd': packed(_speed_std(velocity, C), 'f4'),
+        'ambiguous': packed(ambiguous, 'u1')}
+
+
+def _innovation(nis: FloatArray, degrees_of_freedom: FloatArray) -> dict[str, Packed]:
     """Normalised innovation squared an axis, and the band that holds 90 % of a right model's."""
-    n = np.array(log.degrees_of_freedom[rows], dtype=float)
-    axes = np.maximum(n, 1.0)
+    n, axes = degrees_of_freedom, np.maximum(degrees_of_freedom, 1.0)
     low, high = (np.where(n > 0.0, chdtri(axes, p) / axes, np.nan) for p in (0.95, 0.05))
-    nis = np.where(n > 0.0, np.array(log.nis[rows], dtype=float) / axes, np.nan)
-    return {'nis': packed(nis, 'f4'), 'nis_low': packed(low, 'f4'), 'nis_high': packed(high, 'f4')}
+    return {'nis': packed(np.where(n > 0.0, nis / axes, np.nan), 'f4'),
+            'nis_low': packed(low, 'f4'), 'nis_high': packed(high, 'f4')}
 
 
-def _arrivals(log: TrackLog, rows: slice) -> dict[str, dict[str, dict[str, str]]]:
+def _arrivals(log: TrackLog, rows: slice) -> dict[str, dict[str, Packed]]:
     """{arrival: columns of its weight and of its best hypothesis}; NaN where it was dropped."""
     log_rows = log.arrivals[rows]
     out = {}
@@ -185,12 +226,7 @@ def _arrivals(log: TrackLog, rows: slice) -> dict[str, dict[str, dict[str, str]]
 
 
 def _fields(log: TrackLog, rows: slice, sensors: IntArray) -> list[dict[str, Any]]:
-    """Measured and predicted field of the sensors, [{sensor, measured, predicted}] [T]."""
-    out = []
+    """Fields of the sensors at the times of the poses."""
     measured = np.array(log.measured[rows]).reshape(-1, len(log.measured[0]), 3)
     predicted = np.array(log.predicted[rows]).reshape(measured.shape)
-    for j in sensors.tolist():
-        out.append({'sensor': j, **{
-            name: [packed(values[:, j, axis], 'f4') for axis in range(3)]
-            for name, values in (('measured', measured), ('predicted', predicted))}})
-    return out
+    return [field_entry(j, measured[:, j], predicted[:, j]) for j in sensors.tolist()]

@@ -166,7 +166,7 @@ def f_text(metres: float) -> str:
     return f'{metres:.3g} m' if metres >= 0.01 else f'{1e3 * metres:.2g} mm'
 
 
-def _distinct(lanes: Sequence[_Lane]) -> list[tuple[str, _Lane]]:
+def distinct(lanes: Sequence[_Lane]) -> list[tuple[str, _Lane]]:
     """[(names, lane)], one for lanes whose curves are the same: one would hide the other."""
     out: list[tuple[list[str], _Lane]] = []
     for lane in lanes:
@@ -186,7 +186,7 @@ def lane_figure(plan: _Plan) -> Figure:
     figure = Figure(figsize=(10.0, 9.0), layout='constrained')
     top, middle, bottom = figure.subplots(3, 1)
     f, unit = scale_of(np.ptp(plan.x))
-    for k, (name, lane) in enumerate(_distinct(plan.lanes)):
+    for k, (name, lane) in enumerate(distinct(plan.lanes)):
         colour = SERIES[k % len(SERIES)]
         top.semilogy(f * lane.along, f * lane.filter_std, '-', color=colour,
                      label=f'{name}: filter so far')

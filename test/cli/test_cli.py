@@ -26,7 +26,7 @@ def test_replay_writes_all_that_it_promises(tmp_path, capsys):
     assert {p.name for p in out.iterdir()} == {
         'poses.csv', 'poses_smoothed.csv', 'detections.csv', 'disturbances.csv', 'hypotheses.csv',
         'summary.json', 'tracks.mcap', 'metadata.yaml', 'map_track_1.png', 'weights_track_1.png',
-        'field_track_1.png'}
+        'field_track_1.png', 'report.html'}
     head = (out / 'poses.csv').read_text().splitlines()[0]
     assert head == ('stamp_ns,track_id,x,y,z,vx,vy,vz,sd_x,sd_y,sd_z,sd_vx,sd_vy,sd_vz,'
                     'mx,my,mz,weight,ambiguous,kind,kind_weight,length,sd_length,doubts'
@@ -325,7 +325,7 @@ def test_fit_writes_all_that_it_promises(tmp_path, capsys):
         (out / link).symlink_to(tmp_path / 'elsewhere')
     assert main(['fit', *(str(vehicle_path(n)) for n in names), '--network', str(NETWORK_FILE),
                  '--orders', '1', '3', '--out', str(out)]) == 0
-    assert {p.name for p in out.iterdir()} == {'fits.csv', 'fits.json', 'orders.png',
+    assert {p.name for p in out.iterdir()} == {'fits.csv', 'fits.json', 'orders.png', 'report.html',
                                                *(f'{n}_pass_1.png' for n in names)}
     assert not (tmp_path / 'elsewhere').exists()
     lines = (out / 'fits.csv').read_text().splitlines()

@@ -1,4 +1,4 @@
-"""The live page in headless Chromium, fed without ROS: values, delay, reconnection, many viewers."""
+"""The live page, fed without ROS: values and delay in Chromium, reconnection, many viewers."""
 
 import json
 import socket

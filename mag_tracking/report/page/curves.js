@@ -5,6 +5,7 @@ const STRONGEST = 'strongest';
 const MOST_PANELS = 4;
 // What is drawn before the latest time of a live page, and kept of its fields [s].
 const WINDOW_S = 20;
+const MANY_DOTS = 250;
 
 const AXES = [[VERMILLION, 'solid'], [SERIES[2], 'dash'], [SERIES[0], 'dot']];
 
@@ -60,16 +61,18 @@ function drawFields(scene, track, choice, t, range) {
   holder.style.setProperty('--panels', fields.length);
   const [f, unit] = unitOf(Math.max(0, ...fields.map(field => largest(field.measured))));
   fields.forEach((field, i) => {
-    const traces = [];
+    const traces = [], many = field.t.length > MANY_DOTS;
+    // Many dots would hide the lines.
+    const dots = many ? {size: 3, opacity: 0.45} : {size: 5};
     AXES.forEach(([colour, dash], a) => {
       const name = 'xyz'[a];
       traces.push({type: 'scatter', mode: 'markers', x: field.t, name: `${name} measured`,
         y: Array.from(field.measured[a], v => f * v), legendgroup: name, showlegend: i === 0,
-        marker: {color: colour, symbol: SYMBOLS[a], size: 5}});
+        marker: {color: colour, symbol: SYMBOLS[a], ...dots}});
       if (field.predicted) {
         traces.push({type: 'scatter', mode: 'lines', x: field.t, name: `${name} predicted`,
           y: Array.from(field.predicted[a], v => f * v), legendgroup: name, showlegend: i === 0,
-          line: {color: colour, width: 1.8, dash: dash}});
+          line: {color: many ? BLACK : colour, width: 1.8, dash: dash}});
       }
     });
     const layout = curveLayout(`${plain(field.name)} [${unit}]`, t, range);

@@ -27,6 +27,11 @@ function setScene(packed) {
     ...scene.sensors.names.map(name => element('option', name, {value: name})));
   at('sensors').value = page.choice = STRONGEST;
   page.current = undefined;
+  // A fitted pass has neither.
+  at('weights-card').hidden = !page.live && scene.tracks.every(
+    track => !Object.keys(track.arrivals).length);
+  at('innovation-card').hidden = !page.live && scene.tracks.every(
+    track => track.columns.nis.every(Number.isNaN));
   boundSlider();
   const first = scene.tracks[0];
   moveTo(page.follows ? scene.end : first ? best(first) : 0);

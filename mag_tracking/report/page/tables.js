@@ -9,7 +9,8 @@ function element(tag, text, more) {
 
 function table(columns, rows, classes) {
   const out = element('table'), head = element('tr');
-  for (const name of columns) head.append(element('th', name));
+  columns.forEach((name, i) => head.append(element('th', name,
+    {className: rows.some(row => typeof row[i] === 'number') ? 'number' : ''})));
   out.append(element('thead'), element('tbody'));
   out.firstChild.append(head);
   rows.forEach((row, i) => {
@@ -68,10 +69,11 @@ function showTrackTable(scene, jump, current) {
   const columns = ['track', 'begins [s]', 'ends [s]', 'from', 'kind', 'speed [m/s]',
     'moment [A m²]', 'verdict', 'error [m]', 'doubts (poses)'];
   const rows = scene.tracks.map(track => {
-    const go = element('button', `${track.id}`, {type: 'button', title: 'show this track'});
-    go.addEventListener('click', () => jump(track));
     const facts = track.facts || {};
-    return [go, beginOf(track), endOf(track), facts.arrival, facts.kind, facts.speed,
+    const go = element('button', `${facts.label || track.id}`,
+      {type: 'button', title: 'show this track'});
+    go.addEventListener('click', () => jump(track));
+    return [go, Number(beginOf(track).toFixed(2)), Number(endOf(track).toFixed(2)), facts.arrival, facts.kind, facts.speed,
       facts.moment, facts.verdict || (track.ended ? '' : 'running'), facts.error,
       facts.doubts];
   });

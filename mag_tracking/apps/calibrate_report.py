@@ -1,0 +1,95 @@
+"""The report of a calibration: knocks, headings, noise, and what is wrong."""
+
+from pathlib import Path
+
+import numpy as np
+
+from mag_tracking.apps.calibrate import Calibration
+from mag_tracking.files import replace_text
+from mag_tracking.geometry import yaw_between
+from mag_tracking.network import SensorNetwork
+from mag_tracking.report.calibration_figures import first_knock
+from mag_tracking.report.figures import SCALE_1D
+from mag_tracking.report.page import ERROR, NOTE, WARNING, Chart, Note, Page, Table, report_html
+from mag_tracking.report.page_charts import axes, curve, plain
+from mag_tracking.report.style import SERIES
+
+MOST_KNOCKS = 8
+"""Sensors whose knocks are drawn."""
+SHOWN_S = 0.25
+"""[s] To each side of a knock."""
+
+
+def write_report(found: Calibration, stated: SensorNetwork, name: str, path: Path) -> None:
+    """Write the page of a calibration from the recording `name`; raises OutputError."""
+    replace_text(path, report_html(calibration_page(found, stated, name)))
+
+
+def calibration_page(found: Calibration, stated: SensorNetwork, name: str) -> Page:
+    """The page of a calibration."""
+    survey = found.survey
+    level = ERROR if survey.disagreements else WARNING
+    notes = [Note(level, text) for text in survey.warnings()]
+    notes += [Note(WARNING, f'{sensor}: no background was learnt')
+              for sensor in found.without_background]
+    notes += [Note(WARNING, f'{cause}: {n}') for cause, n in found.rejected.items()]
+    if found.evidence is not None:
+        n = found.evidence.n_tracks
+        notes.append(Note(NOTE, f'{n} pass{"es" * (n != 1)} counted in'))
+    return Page(f'Calibration from {name}', f'{len(stated)} sensors', notes, None,
+                [*_knocks(found), _headings(found, stated)], [_table(found)])
+
+
+def _knocks(found: Calibration) -> list[Chart]:
+    """The first knock by the clocks as they were, and as they are set by it."""
+    shocks = dict(list(found.survey.shocks.items())[:MOST_KNOCKS])
+    if not shocks:
+        return []
+    first, charts = first_knock(shocks), []
+    for title, is_set in (('A knock, clocks as they were', False), ('Clocks set by it', True)):
+        traces = []
+        for k, (name, (t, size)) in enumerate(shocks.items()):
+            offset = found.network.clock_offset[found.network.index(name)] if is_set else 0.0
+            near = np.abs(t - offset - first) < SHOWN_S
+            traces.append(curve(t[near] - offset - first, size[near], name, k, 'lines+markers'))
+        charts.append(Chart(title, traces, axes('time [s]', 'acceleration from rest [m/s²]')))
+    return charts
+
+
+def _headings(found: Calibration, stated: SensorNetwork) -> Chart:
+    """How far each sensor is turned from what was stated, with 90 % intervals."""
+    steps = [('compass', found.survey.network)]
+    if found.evidence is not None:
+        steps.append(('compass and passes', found.network))
+    traces = []
+    for k, (label, network) in enumerate(steps):
+        yaw = [float(np.degrees(yaw_between(stated.R_ws[j], network.R_ws[j])))
+               for j in range(len(stated))]
+        half = [0.0 if s is None else SCALE_1D * float(np.degrees(s[2]))
+                for s in network.orientation_std]
+        traces.append({
+            'type': 'scatter', 'mode': 'markers', 'x': yaw, 'name': label, 'showlegend': True,
+            'y': [plain(name) for name in stated.names],
+            'error_x': {'type': 'data', 'array': half, 'color': SERIES[k]},
+            'marker': {'color': SERIES[k], 'size': 8, 'symbol': ('circle', 'square')[k]}})
+    return Chart('Turned about the vertical from what was stated (90 %)', traces,
+                 axes('[degrees]', ''))
+
+
+def _table(found: Calibration) -> Table:
+    """One row a sensor."""
+    network, rows = found.network, list[list[str | float | None]]()
+    for j, name in enumerate(network.names):
+        R, std, noise = network.R_ws[j], network.orientation_std[j], network.noise_std[j]
+        done = network.calibrated[j]
+        known = done is not None and not np.isnan(done.clock_offset_std)
+        rows.append([
+            name, float(np.degrees(np.arccos(np.clip(R[2, 2], -1.0, 1.0)))),
+            float(np.degrees(np.arctan2(R[1, 0], R[0, 0]))),
+            None if std is None else float(np.degrees(std[2])),
+            1e3 * float(network.clock_offset[j]) if known else None,
+            1e3 * done.clock_offset_std if done is not None and known else None,
+            None if noise is None else 1e9 * float(np.nanmean(noise)),
+            'as stated' if done is None else done.by])
+    return Table('Sensors', ['sensor', 'tilted [deg]', 'heads [deg]', 'its deviation [deg]',
+                             'clock [ms]', 'its deviation [ms]', 'noise [nT]', 'by'], rows)

@@ -1,0 +1,62 @@
+"""The report of the doctor: what is wrong with which sensor, and what to do."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mag_tracking.apps.doctor import Doctor
+from mag_tracking.files import replace_text
+from mag_tracking.report.page import ERROR, NOTE, Chart, Note, Page, Table, report_html
+from mag_tracking.report.page_charts import axes, plain
+from mag_tracking.report.style import AXIS_COLOURS
+from mag_tracking.stages.health.sensor_health import Finding
+
+
+def write_report(doctor: Doctor, findings: Sequence[Finding], subject: str, path: Path) -> None:
+    """Write the page of what was found in `subject`; raises OutputError."""
+    replace_text(path, report_html(doctor_page(doctor, findings, subject)))
+
+
+def doctor_page(doctor: Doctor, findings: Sequence[Finding], subject: str) -> Page:
+    """The page of what was found."""
+    notes = [Note(ERROR if f.serious else NOTE, f'{f.subject}: {f.what}. {f.advice}')
+             for f in findings] or [Note(NOTE, 'nothing is wrong')]
+    serious = sum(f.serious for f in findings)
+    return Page(f'Health of {subject}', f'{serious} serious findings, {len(findings) - serious} '
+                'notes', notes, None, [_noise(doctor), _rates(doctor)], [_table(doctor)])
+
+
+def _noise(doctor: Doctor) -> Chart:
+    """Noise of each axis of each sensor."""
+    names = [plain(name) for name in doctor.sensors]
+    traces = []
+    for axis, (letter, colour) in enumerate(zip('xyz', AXIS_COLOURS, strict=True)):
+        values = [1e9 * float(h.noise_std[axis]) for h in doctor.sensors.values()]
+        traces.append({'type': 'bar', 'x': names, 'name': letter, 'marker': {
+            'color': colour, 'pattern': {'shape': ('', '/', 'x')[axis]}},
+            'y': [v if np.isfinite(v) else None for v in values]})
+    return Chart('Noise of each axis', traces, axes('', 'deviation [nT]'))
+
+
+def _rates(doctor: Doctor) -> Chart:
+    """Rates of the sensors."""
+    rates = [float(h.rate) if h.counts['readings'] else 0.0 for h in doctor.sensors.values()]
+    return Chart('Readings a second', [{
+        'type': 'bar', 'x': [plain(name) for name in doctor.sensors],
+        'y': [v if np.isfinite(v) else None for v in rates], 'showlegend': False}],
+        axes('', 'rate [Hz]'))
+
+
+def _table(doctor: Doctor) -> Table:
+    """One row a sensor."""
+    rows: list[list[str | float | None]] = []
+    for name, health in doctor.sensors.items():
+        c, delay = health.counts, float(health.delay_s[0])
+        there = bool(c['readings'])
+        rows.append([
+            name, c['readings'], float(health.rate) if there else None, c['lost'], c['duplicates'],
+            c['spikes'], 1e6 * float(np.sqrt(np.nansum(health.field**2))) if there else None,
+            None if np.isnan(delay) else 1e3 * delay])
+    return Table('Sensors', ['sensor', 'readings', 'rate [Hz]', 'lost', 'duplicates', 'spikes',
+                             'field [µT]', 'delay [ms]'], rows)

@@ -1,0 +1,123 @@
+"""The report of fitted passes: one page with map, time slider, fields, orders."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.apps.fit import FittedPass
+from mag_tracking.files import replace_text
+from mag_tracking.network import SensorNetwork
+from mag_tracking.report.fit_figures import target_alone
+from mag_tracking.report.page import NOTE, REPORT, WARNING, Chart, Note, Page, Table, report_html
+from mag_tracking.report.page_charts import axes, curve
+from mag_tracking.report.page_scene import field_entry, fitted_entry, scene_of
+from mag_tracking.units import NS
+
+BETWEEN_S = 5.0
+"""[s] Between two recordings on the time line of the page."""
+STEPS = 120
+"""Poses of a pass."""
+
+
+def write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings: Sequence[str],
+                 out: Path) -> Path:
+    """Write `report.html` into folder `out`; returns its path. Raises OutputError.
+
+    `warnings` are those of `RecordingFit.warnings`, of all recordings.
+    """
+    path = out / REPORT
+    replace_text(path, report_html(fit_page(passes, network, warnings)))
+    return path
+
+
+def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
+             warnings: Sequence[str]) -> Page:
+    """The page of fitted passes; those without an answer are in its table only."""
+    notes = [Note(WARNING, text) for text in warnings]
+    if not passes:
+        notes.append(Note(NOTE, 'no pass: nothing was detected'))
+    begins = [ns / NS for ns in _begins_ns(passes)]
+    if len({one.recording for one in passes}) > 1:
+        notes.append(Note(NOTE, 'the recordings follow one another on the time line'))
+    tracks = [_track(k + 1, one, one.chosen, begins[k])
+              for k, one in enumerate(passes) if one.chosen is not None]
+    ends = [begins[k] + float(one.fits[0].data.t.max()) for k, one in enumerate(passes)]
+    scene = scene_of(network, 0, int(max(ends) * NS), tracks) if tracks else None
+    n_answers = len(tracks)
+    return Page(f'{len(passes)} pass{"es" * (len(passes) != 1)}, {n_answers} with an answer',
+                'each fitted as a row of dipoles at constant velocity', notes, scene,
+                [_order_chart(passes)] if passes else [], [_table(passes)])
+
+
+def _begins_ns(passes: Sequence[FittedPass]) -> list[int]:
+    """[ns] The strongest field of each pass on the time line of the page."""
+    out: list[int] = []
+    recording, shift, end = '', 0, 0
+    for one in passes:
+        data = one.fits[0].data
+        if one.recording != recording:
+            recording = one.recording
+            first = data.stamp_ns + int(NS * data.t.min())
+            shift = end + (int(BETWEEN_S * NS) if out else 0) - first
+        out.append(data.stamp_ns + shift)
+        end = out[-1] + int(NS * data.t.max())
+    return out
+
+
+def _track(number: int, one: FittedPass, fit: PassFit, begin: float) -> dict[str, Any]:
+    """The chosen fit of a pass, as JSON."""
+    data = fit.data
+    t = np.linspace(data.t.min(), data.t.max(), STEPS)
+    F = np.tile(np.eye(6), (STEPS, 1, 1))
+    F[:, :3, 3:] = t[:, None, None] * np.eye(3)
+    state = F @ fit.x[:6]
+    C = F @ fit.honest_covariance[:6, :6] @ F.transpose(0, 2, 1)
+    alone = target_alone(fit)
+    level = fit.predicted - alone
+    fields = [field_entry(int(j), (data.field - level)[data.sensor == j], alone[data.sensor == j],
+                          begin + data.t[data.sensor == j]) for j in data.sensors]
+    entry = fitted_entry(number, begin + t, state, C, fit.ambiguous, fields)
+    entry['facts'] = {
+        'label': f'{one.recording}, pass {one.number}', 'kind': _dipoles(fit.n_dipoles),
+        'speed': float(fit.speed[0]), 'moment': float(np.linalg.norm(fit.moment[0])),
+        'verdict': ('ambiguous' if fit.ambiguous else 'unique')
+        + f', cost {fit.normalised_cost:.2f}'}
+    return entry
+
+
+def _dipoles(n: int) -> str:
+    """A number of dipoles in words."""
+    return f'{n} dipole{"s" * (n > 1)}'
+
+
+def _order_chart(passes: Sequence[FittedPass]) -> Chart:
+    """Normalised cost over the number of dipoles."""
+    traces = []
+    for k, one in enumerate(passes):
+        fits = [f for f in one.fits if len(f.x)]
+        traces.append(curve([f.n_dipoles for f in fits], [f.normalised_cost for f in fits],
+                            f'{one.recording}, pass {one.number}', k, 'lines+markers'))
+    layout = axes('number of dipoles', 'normalised cost (1 = the model is right)', log_y=True)
+    layout['xaxis']['dtick'] = 1
+    return Chart('How well a row of dipoles describes each pass', traces, layout)
+
+
+def _table(passes: Sequence[FittedPass]) -> Table:
+    """All orders of all passes."""
+    rows: list[list[str | float | None]] = []
+    for one in passes:
+        for fit in one.fits:
+            row: list[str | float | None] = [one.recording, one.number, fit.n_dipoles]
+            known = bool(len(fit.x)) and not fit.reason
+            row += [float(fit.normalised_cost) if len(fit.x) else None]
+            row += [*map(float, fit.position), float(fit.speed[0]),
+                    float(np.degrees(fit.heading[0])), float(fit.length[0]),
+                    float(np.linalg.norm(fit.moment[0]))] if known else [None] * 7
+            row += ['chosen' if fit is one.chosen else fit.reason]
+            rows.append(row)
+    return Table('All fits', ['recording', 'pass', 'dipoles', 'cost', 'x [m]', 'y [m]', 'z [m]',
+                              'speed [m/s]', 'heading [deg]', 'length [m]', 'moment [A m²]', ''],
+                 rows)

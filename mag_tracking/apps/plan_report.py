@@ -1,0 +1,144 @@
+"""The report of a plan: maps of what can be known where, and curves along the lanes."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mag_tracking.apps.plan import GOOD_PD, Plan
+from mag_tracking.arrays import FloatArray
+from mag_tracking.files import replace_text
+from mag_tracking.report.figures import scale_of
+from mag_tracking.report.page import NOTE, REPORT, Chart, Note, Page, Table, report_html
+from mag_tracking.report.page_charts import axes, curve, heat_map, places
+from mag_tracking.report.plan_figures import LEAST_MISSED, distinct, f_text
+
+LOW_SHARE = 0.02
+"""Quantile of a bound at which its colours begin and end."""
+
+
+def write_report(plan: Plan, lines: list[str], out: Path) -> Path:
+    """Write `report.html` with the answers in `lines` into folder `out`; returns its path.
+
+    Raises OutputError.
+    """
+    path = out / REPORT
+    replace_text(path, report_html(plan_page(plan, lines)))
+    return path
+
+
+def answers(p: Plan) -> list[str]:
+    """The answers of a plan in a few lines."""
+    noise, out = float(np.median(p.sampling.noise_std)), list[str]()
+    out.append(f'{len(p.network)} sensors, noise of a frame {1e9 * noise:.2g} nT; '
+          f'target of {p.target.moment:g} A m^2 at {p.target.speed:g} m/s')
+    o = p.observability
+    seen = (f'not observable: {", ".join(o.unobservable)}' if o.unobservable
+            else f'observable, condition number {o.condition_number:.3g}')
+    out.append(f'one pass on lane {p.lanes[0].name}, without priors: {seen}')
+    for name, (r, v, m) in p.blocks.items():
+        out.append(f'  closest point, {name}: position {f_text(r)}, velocity {v:.3g} m/s, '
+              f'moment {m:.3g} A m^2')
+    for lane in p.lanes:
+        good = np.flatnonzero(lane.detection >= GOOD_PD)
+        first = (f'from {-lane.along[good[0]]:.3g} m before the middle on' if len(good)
+                 else 'nowhere')
+        closest = int(np.argmin(np.abs(lane.along)))
+        out.append(f'lane {lane.name}: a frame detects it with {GOOD_PD:.0%} {first}; '
+              f'at the middle a filter knows it to {f_text(lane.filter_std[closest])}, a whole '
+              f'pass to {f_text(lane.pass_std[closest, 0])}')
+    caught = p.missed[p.missed[:, 1] < 0.01, 0]
+    out.append(f'99 % of passes are detected up to {caught.max():.3g} m from the middle'
+               if len(caught) else 'nowhere are 99 % of the passes detected')
+    out.append('(bounds of a point: real vehicles are followed several times less well)')
+    if not np.isfinite(p.with_one_more).any():
+        out.append('one more sensor: nowhere in the area is it clear of the lanes')
+    elif np.nanmin(p.with_one_more) > 0.99 * p.without:
+        out.append('one more sensor helps nowhere in the area')
+    else:
+        x, y = p.best_place
+        edge = ' (on the edge of the area)' if x in p.x[[0, -1]] or y in p.y[[0, -1]] else ''
+        out.append(f'one more sensor helps most at ({x:.2f}, {y:.2f}) m{edge}: the median bound '
+                   f'near the sensors becomes {f_text(np.nanmin(p.with_one_more))}, now '
+                   f'{f_text(p.without)}')
+    return out
+
+
+def plan_page(plan: Plan, lines: list[str]) -> Page:
+    """The page of a plan."""
+    network = plan.network
+    return Page(f'Plan for {len(network)} sensors',
+                f'target of {plan.target.moment:g} A m² at {plan.target.speed:g} m/s',
+                [Note(NOTE, line.strip()) for line in lines], None,
+                [*_maps(plan), *_lanes(plan)],
+                [Table('Sensors', ['sensor', 'x [m]', 'y [m]', 'z [m]'],
+                       [[name, *map(float, place)] for name, place in zip(
+                           network.names, network.positions, strict=True)])])
+
+
+def _maps(plan: Plan) -> list[Chart]:
+    """Bound, detection and the place for one more sensor."""
+    f, unit = scale_of(np.ptp(plan.x))
+    layout = axes(f'x [{unit}]', f'y [{unit}]', is_map=True)
+    x, y = f * plan.x, f * plan.y
+    bound = np.log10(f * np.clip(plan.position_std, None, np.ptp(plan.x)))
+    low, high = np.nanquantile(bound, [LOW_SHARE, 1.0 - LOW_SHARE])
+    bar = _log_bar(low, high, f'deviation [{unit}]')
+    position = heat_map(x, y, bound, 'Viridis', '', float(low), float(high)) | {
+        'colorbar': bar, 'text': [[f'{10.0**v:.3g} {unit}' for v in row] for row in bound],
+        'hoverinfo': 'x+y+text'}
+    gain = 100.0 * (1.0 - plan.with_one_more / plan.without)
+    ny, nx = gain.shape
+    charts = [Chart('How well a whole pass tells a position', [position, *_marks(plan, f)], layout),
+              Chart('Probability that one frame detects the target', [
+                  heat_map(x, y, plan.detection, 'Cividis', 'probability', 0.0, 1.0),
+                  *_marks(plan, f)], layout)]
+    if np.isfinite(gain).any():
+        charts.append(Chart('Where one more sensor helps', [
+            heat_map(np.linspace(x[0], x[-1], nx), np.linspace(y[0], y[-1], ny), gain, 'Cividis',
+                     'smaller by [%]'), *_marks(plan, f),
+            {'type': 'scatter', 'mode': 'markers', 'x': [f * plan.best_place[0]],
+             'y': [f * plan.best_place[1]], 'name': 'best place', 'hoverinfo': 'name+x+y',
+             'marker': {'symbol': 'star', 'size': 15, 'color': '#D55E00',
+                        'line': {'color': '#ffffff', 'width': 1}}}], layout))
+    return charts
+
+
+def _log_bar(low: float, high: float, title: str) -> dict[str, Any]:
+    """A bar with plain numbers for colours that are logarithms."""
+    steps = [10.0**k * m for k in range(-7, 8) for m in (1, 2, 5)]
+    inside = [v for v in steps if low <= np.log10(v) <= high] or [10.0 ** (0.5 * (low + high))]
+    return {'title': {'text': title, 'side': 'right'}, 'tickvals': np.log10(inside).tolist(),
+            'ticktext': [f'{v:.3g}' for v in inside]}
+
+
+def _marks(plan: Plan, f: float) -> list[dict[str, Any]]:
+    """Lanes within the map, and the sensors."""
+    low, high = (plan.x[0], plan.y[0]), (plan.x[-1], plan.y[-1])
+    out = []
+    for lane in plan.lanes:
+        inside = f * lane.points[((lane.points >= low) & (lane.points <= high)).all(axis=1)]
+        out.append({'type': 'scatter', 'mode': 'lines', 'x': inside[:, 0].tolist(),
+                    'y': inside[:, 1].tolist(), 'hoverinfo': 'skip', 'showlegend': False,
+                    'line': {'color': '#ffffff', 'dash': 'dash', 'width': 1.5}})
+    return [*out, places(f * plan.network.positions, plan.network.names)]
+
+
+def _lanes(plan: Plan) -> list[Chart]:
+    """Bounds and detection along the lanes, and missed passes."""
+    f, unit = scale_of(np.ptp(plan.x))
+    bounds, seen = [], []
+    for k, (name, lane) in enumerate(distinct(plan.lanes)):
+        along: FloatArray = f * lane.along
+        bounds += [curve(along, f * lane.filter_std, f'{name}: filter so far', 2 * k),
+                   curve(along, f * lane.pass_std[:, 0], f'{name}: whole pass', 2 * k + 1)]
+        seen.append(curve(along, lane.detection, name, k))
+    known = plan.missed[plan.missed[:, 1] >= LEAST_MISSED]
+    way = f'distance along the lane, 0 = nearest to the middle [{unit}]'
+    return [Chart('Position bound along the lanes', bounds,
+                  axes(way, f'deviation [{unit}]', log_y=True)),
+            Chart('Detection along the lanes', seen, axes(way, 'probability a frame')),
+            Chart('Passes that are missed', [curve(f * known[:, 0], known[:, 1], '', 0,
+                                                   'lines+markers')],
+                  axes(f'lateral distance from the middle of the sensors [{unit}]',
+                       'probability of a miss', log_y=True))]

@@ -1,0 +1,61 @@
+"""Charts of a page in the terms of Plotly, in the palette of the figures."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mag_tracking.arrays import FloatArray
+from mag_tracking.report.style import SERIES
+
+DASHES = ('solid', 'dash', 'dot', 'dashdot', 'longdash')
+"""Each colour goes with a dash of its own."""
+
+
+def plain(text: str) -> str:
+    """A text in which Plotly finds no markup."""
+    return text.replace('&', '&amp;').replace('<', '&lt;').replace('>', '&gt;')
+
+
+def numbers(values: ArrayLike) -> list[Any]:
+    """Numbers in nested lists, those that are not finite as None."""
+    array = np.asarray(values, dtype=float)
+    if array.ndim > 1:
+        return [numbers(row) for row in array]
+    return [float(f'{v:.6g}') if np.isfinite(v) else None for v in array]
+
+
+def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') -> dict[str, Any]:
+    """A curve in the `k`-th colour and dash; with mode 'markers' dots."""
+    colour = SERIES[k % len(SERIES)]
+    return {'type': 'scatter', 'mode': mode, 'x': numbers(x), 'y': numbers(y),
+            'name': plain(name), 'showlegend': bool(name),
+            'line': {'color': colour, 'dash': DASHES[k % len(DASHES)], 'width': 2},
+            'marker': {'color': colour, 'size': 6}}
+
+
+def heat_map(x: FloatArray, y: FloatArray, z: FloatArray, scale: str, title: str,
+             low: float | None = None, high: float | None = None) -> dict[str, Any]:
+    """A map of z [y, x] in a colour scale of equal steps for the eye."""
+    return {'type': 'heatmap', 'x': numbers(x), 'y': numbers(y), 'z': numbers(z),
+            'colorscale': scale, 'zmin': low, 'zmax': high, 'hoverongaps': False,
+            'colorbar': {'title': {'text': title, 'side': 'right'}}}
+
+
+def places(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:
+    """Sensors on a map: (n, 2 or more) [m]."""
+    return {'type': 'scatter', 'mode': 'markers', 'x': numbers(points[:, 0]),
+            'y': numbers(points[:, 1]), 'text': [plain(name) for name in names],
+            'hoverinfo': 'text', 'name': 'magnetometers', 'showlegend': False,
+            'marker': {'symbol': 'triangle-up', 'size': 11, 'color': '#ffffff',
+                       'line': {'color': '#000000', 'width': 1.5}}}
+
+
+def axes(x: str, y: str, is_map: bool = False, log_y: bool = False) -> dict[str, Any]:
+    """The layout of a chart with titles of its axes; on a map both have one scale."""
+    grid = {'gridcolor': '#e3e3e3', 'zeroline': False}
+    return {'xaxis': {'title': {'text': x}, **grid, **({'constrain': 'domain'} if is_map else {})},
+            'yaxis': {'title': {'text': y}, **grid,
+                      **({'scaleanchor': 'x', 'constrain': 'domain'} if is_map else {}),
+                      **({'type': 'log'} if log_y else {})}}

@@ -1,0 +1,107 @@
+"""The reports of fit, plan, calibrate and doctor in headless Chromium."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from mag_tracking.cli import main
+from support.browser import Page as Opened
+from support.browser import browser, needs_browser
+from support.bundled import NETWORK_FILE, vehicle_path
+
+pytestmark = needs_browser
+
+TWO = [vehicle_path('straight_car_right'), vehicle_path('straight_small_left')]
+
+
+@pytest.fixture(scope='module')
+def chromium():
+    with browser() as found:
+        yield found
+
+
+def run(*words):
+    return main([*map(str, words), '--network', str(NETWORK_FILE)])
+
+
+def opened(chromium, path):
+    page = Opened(chromium, path.as_uri())
+    page.wait('document.querySelectorAll(".plot .main-svg").length')
+    return page
+
+
+def closed(page, path):
+    """Nothing was wrong, and nothing came from outside."""
+    assert page.complaints == []
+    assert page.requests == [path.as_uri()]
+    page.page.close()
+
+
+def test_a_fit_shows_the_paths_of_its_table(chromium, tmp_path):
+    assert run('fit', *TWO, '--out', tmp_path, '--no-figures') == 0
+    with open(tmp_path / 'fits.csv', newline='') as stream:
+        chosen = [row for row in csv.DictReader(stream) if row['chosen'] == '1']
+    path = tmp_path / 'report.html'
+    page = opened(chromium, path)
+    assert page.value('magTracking.scene.tracks.length') == len(chosen) == 2
+    for k, row in enumerate(chosen):
+        columns = f'magTracking.scene.tracks[{k}].columns'
+        x, y, vx, vy = (np.array(page.value(f'Array.from({columns}.{name})'))
+                        for name in ('x', 'y', 'vx', 'vy'))
+        np.testing.assert_allclose(vx, float(row['vx']))
+        np.testing.assert_allclose(vy, float(row['vy']))
+        # The table has the place at the strongest field, which the straight path goes through.
+        d = [float(row['x']) - x[0], float(row['y']) - y[0]]
+        assert abs(d[0] * vy[0] - d[1] * vx[0]) / np.hypot(vx[0], vy[0]) < 1e-6
+    begin, end = page.value('(t => [t[0], t[t.length - 1]])(magTracking.scene.tracks[1].columns.t)')
+    page.move_slider(0.5 * (begin + end))
+    page.wait('magTracking.current === 2')
+    assert 'Track 2' in page.value('document.getElementById("readout").textContent')
+    assert not page.value('document.getElementById("weights-card").checkVisibility()')
+    closed(page, path)
+
+
+def test_a_plan_shows_its_maps(chromium, tmp_path, capsys):
+    assert run('plan', '--target', 'car', '--grid', 15, '--out', tmp_path) == 0
+    lines = capsys.readouterr().out.splitlines()
+    path = tmp_path / 'report.html'
+    page = opened(chromium, path)
+    maps = page.value('''[...document.querySelectorAll('#charts .plot')]
+        .map(p => p.data.find(d => d.type === 'heatmap')).filter(Boolean).map(d => d.z)''')
+    assert len(maps) == 3
+    plan = json.loads((tmp_path / 'plan.json').read_text())
+    np.testing.assert_allclose(maps[1], plan['detection'], atol=1e-6)
+    bound = np.log10(np.minimum(plan['position_std'], np.ptp(plan['x'])))
+    np.testing.assert_allclose(np.array(maps[0], dtype=float), bound, atol=1e-4)
+    notes = page.value('[...document.querySelectorAll("#notes li")].map(e => e.textContent)')
+    assert notes == [line.strip() for line in lines[:-1]]
+    closed(page, path)
+
+
+def test_a_calibration_shows_each_sensor(chromium, tmp_path):
+    path = tmp_path / 'found.html'
+    assert run('calibrate', TWO[0], '--out', tmp_path / 'network.yaml', '--report', path) == 0
+    page = opened(chromium, path)
+    cells = page.value('[...document.querySelectorAll("tbody tr")].map(r => r.cells[0].innerText)')
+    assert cells == ['mag_1', 'mag_2']
+    titles = page.value('[...document.querySelectorAll("#charts h2")].map(e => e.innerText)')
+    assert 'Clocks set by it' in titles
+    closed(page, path)
+
+
+def test_the_doctor_shows_its_findings(chromium, tmp_path, capsys):
+    path = tmp_path / 'health.html'
+    assert run('doctor', TWO[0], '--report', path) == 0
+    assert 'nothing is wrong' in capsys.readouterr().out
+    page = opened(chromium, path)
+    assert page.value('document.getElementById("notes").innerText').strip() == 'nothing is wrong'
+    closed(page, path)
+
+
+@pytest.mark.parametrize('where', ['missing/health.html', '.'])
+def test_a_report_that_cannot_be_written_is_said_before_the_work(tmp_path, capsys, where):
+    assert run('doctor', TWO[0], '--report', tmp_path / where) == 1
+    out = capsys.readouterr()
+    assert 'cannot write' in out.err and out.out == ''
