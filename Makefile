@@ -71,7 +71,7 @@ studies: $(STAMP)  ## the tests that take many runs or all of the recordings
 # All of them run, also where one misses an aim.
 bench: $(STAMP)  ## measure times and accuracies
 	@status=0; for figures in bench recordings matched ambiguous_poses extended_target two_simulators spoilt_passes \
-		situations standing junction_error pass_search load 'load --sensors 2 --lean --minutes 2' \
+		situations standing junction_error pass_search load pages 'load --sensors 2 --lean --minutes 2' \
 		'load --sensors 2 --lean --minutes 2 --one-process --batches' chain; do \
 		echo "PYTHONPATH=test $(BIN)/python -m bench.$$figures"; \
 		PYTHONPATH=test $(BIN)/python -m bench.$$figures || status=1; \

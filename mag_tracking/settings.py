@@ -210,6 +210,21 @@ def read_parameter_file(path: str | PathLike[str]) -> dict[str, Any]:
         raise SettingsError(f'{path}: {error}') from error
 
 
+def as_ros_parameters(path: str | PathLike[str]) -> str | None:
+    """A plain parameter file in the form of ROS, for all nodes; None where it has that form.
+
+    Raises SettingsError.
+    """
+    content = read_yaml(path, SettingsError)
+    if not isinstance(content, Mapping) or any(
+            isinstance(v, Mapping) and 'ros__parameters' in v for v in content.values()):
+        return None
+    values = read_parameter_file(path)
+    lines = [f'    {name}: {_yaml_value(tuple(v) if isinstance(v, list) else v)}'
+             for name, v in values.items()]
+    return '\n'.join(['/**:', '  ros__parameters:', *lines, ''])
+
+
 def _joined_sections(content: Mapping[str, Any]) -> dict[str, Any]:
     """The settings of a plain mapping, or of all the nodes of a ROS parameter file."""
     nodes = [k for k, v in content.items() if isinstance(v, Mapping) and 'ros__parameters' in v]

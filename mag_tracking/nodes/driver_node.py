@@ -16,13 +16,13 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from mag_tracking_msgs.msg import FieldReadings
-from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
+from rclpy.lifecycle import State, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import Imu, MagneticField
 
 from mag_tracking.drivers.configuration import read_drivers
 from mag_tracking.drivers.driver import IGNORED, Driver, serve
-from mag_tracking.errors import MagTrackingError, SettingsError
+from mag_tracking.errors import SettingsError
 from mag_tracking.messages.schema import acceleration_dict, magnetic_field_dicts, readings_dict
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.network import SensorNetwork
@@ -30,6 +30,7 @@ from mag_tracking.network.file import read_network
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.driver_health import DriverDiagnostics
+from mag_tracking.nodes.managed_node import ManagedNode
 from mag_tracking.nodes.ros_params import fixed_parameter
 from mag_tracking.nodes.stage_node import RESULTS, SENT
 from mag_tracking.nodes.steady_timer import steady_timer
@@ -39,7 +40,7 @@ PATIENCE_S = 15.0
 """[s] Time that a driver has to stop; a broker that does not answer takes a while."""
 
 
-class DriverNode(LifecycleNode):
+class DriverNode(ManagedNode):
     """One thread a device, which publishes what the device says."""
 
     def __init__(self, **node_arguments: Any) -> None:
@@ -57,29 +58,17 @@ class DriverNode(LifecycleNode):
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RESULTS)
         self._health = DriverDiagnostics(self)
         steady_timer(self, 1.0, self._publish_diagnostics)
-        self._refused: MagTrackingError | None = None
-        if fixed_parameter(self, 'autostart', True, 'Configure and activate at the start.'):
-            done = self.trigger_configure()
-            if self._refused is not None:
-                raise self._refused
-            if done == TransitionCallbackReturn.SUCCESS:
-                self.trigger_activate()
+        self.start_by_itself()
 
-    def on_configure(self, state: State) -> TransitionCallbackReturn:
+    def prepare(self) -> None:
         """Read the drivers file and advertise the sensors' topics."""
-        try:
-            if not self._path:
-                raise SettingsError('parameter drivers: the path of a drivers.yaml is needed')
-            network = read_network(self._network_path) if self._network_path else None
-            self._drivers = read_drivers(self._path, network)
-        except MagTrackingError as error:
-            self._refused = error
-            self.get_logger().error(str(error))
-            return TransitionCallbackReturn.FAILURE
+        if not self._path:
+            raise SettingsError('parameter drivers: the path of a drivers.yaml is needed')
+        network = read_network(self._network_path) if self._network_path else None
+        self._drivers = read_drivers(self._path, network)
         for driver in self._drivers:
             for sensor in set(driver.sensors.values()) - {IGNORED}:
                 self._publishers_by_sensor[sensor] = self._advertise(sensor, network)
-        return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
         """Open the devices, each in a thread of its own."""
@@ -114,7 +103,7 @@ class DriverNode(LifecycleNode):
     def destroy_node(self) -> None:
         """Stop the threads first: they publish."""
         self._stop()
-        LifecycleNode.destroy_node(self)
+        ManagedNode.destroy_node(self)
 
     def _advertise(self, sensor: str,
                    network: SensorNetwork | None) -> tuple[Publisher, Publisher]:

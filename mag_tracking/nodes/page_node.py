@@ -1,5 +1,6 @@
 """Listens to running nodes and feeds a live page; it needs no network file."""
 
+import os
 import signal
 import time
 from collections import deque
@@ -29,6 +30,8 @@ from mag_tracking.report.page import ERROR, WARNING, Note, Table
 from mag_tracking.web.live_scene import LiveScene
 from mag_tracking.web.page_server import TICK_S, PageServer
 
+NICENESS = 10
+"""By how much the process gives way to the nodes."""
 FRAMES_KEPT = 64
 """Latest frames that wait, not yet read, for a track that is of them."""
 SILENT_S = 5.0
@@ -165,6 +168,8 @@ def watch(host: str, port: int, report: Callable[[str], object],
 
     Raises DeviceError where the port cannot be opened.
     """
+    # To look may not delay what is looked at.
+    os.nice(NICENESS)
     scene = LiveScene('mag_tracking', NOWHERE)
     with noted_signals(signal.SIGINT, signal.SIGTERM) as seen, \
             PageServer(scene, host, port) as server:

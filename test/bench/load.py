@@ -1,6 +1,7 @@
 """What the nodes cost: driver, calibration, detection and tracker as processes, live.
 
     PYTHONPATH=test python -m bench.load                         # 100 sensors x 100 Hz, ten minutes
+    PYTHONPATH=test python -m bench.load --pages 10              # the same, with live pages open
     PYTHONPATH=test python -m bench.load --sensors 2 --minutes 2 --lean   # two, 126 hypotheses
                                 --one-process --batches          # the same, as cheap as can be
 
@@ -133,6 +134,17 @@ def start(folder, n, parameters, in_turn, batches, together):
     return processes
 
 
+def open_pages(n):
+    """The server of the live page, and as many viewers, which read all that comes."""
+    server = subprocess.Popen(
+        [Path(sys.executable).with_name('mag-tracking'), 'watch', '--port', '0'],
+        stdout=subprocess.PIPE, text=True)
+    url = server.stdout.readline().split()[-1]
+    viewers = subprocess.Popen([sys.executable, '-m', 'support.page_viewers', url, str(n)],
+                               stdout=subprocess.PIPE, text=True)
+    return {'page': server}, viewers
+
+
 def parameters_of(folder, lean):
     """The parameter file."""
     text = (ROOT / 'config' / 'large_network.yaml').read_text()
@@ -162,7 +174,7 @@ def watch(processes, ear, executor, minutes):
 
 
 def report(ear, rows):
-    """Print what was measured; whether anything was lost."""
+    """Print what was measured; (99 % quantile of the latency [ms], whether anything was lost)."""
     late = 1e3 * np.array(ear.latencies)
     if not len(late):
         print('no pose has come')
@@ -183,7 +195,7 @@ def report(ear, rows):
     print(f'lost: {losses or "nothing"}')
     for text, n in Counter(ear.troubles.values()).most_common(5):
         print(f'diagnostics of {n}: {text}')
-    return bool(losses)
+    return float(np.quantile(late, 0.99)) if len(late) else float('nan'), bool(losses)
 
 
 def main():
@@ -198,7 +210,13 @@ def main():
     parser.add_argument('--lean', action='store_true', help='126 hypotheses')
     parser.add_argument('--in-turn', action='store_true',
                         help='the sensors measure one after the other, not all at the same time')
-    args = parser.parse_args()
+    parser.add_argument('--pages', type=int, default=0, help='so many look at the live page')
+    found = measure(parser.parse_args())
+    return 1 if found is None else int(found[1])
+
+
+def measure(args):
+    """What `report` gives, or None where it was interrupted at once."""
     import rclpy
 
     from mag_tracking.nodes.stage_node import make_executor, spin
@@ -213,12 +231,17 @@ def main():
         gc.disable()
         processes = start(Path(folder), args.sensors, parameters_of(Path(folder), args.lean),
                           args.in_turn, args.batches, args.one_process)
+        pages, viewers = open_pages(args.pages) if args.pages else ({}, None)
+        processes |= pages
         try:
             end = time.monotonic() + WARM_UP_S
             spin(executor, lambda: time.monotonic() > end)
             ear.begin()
             rows = watch(processes, ear, executor, args.minutes)
         finally:
+            if viewers is not None:
+                viewers.terminate()
+                print(f'viewers: {viewers.communicate(timeout=30.0)[0].strip()}')
             for process in reversed(list(processes.values())):
                 process.send_signal(2)
                 process.wait(30.0)
@@ -226,7 +249,7 @@ def main():
     node.destroy_node()
     executor.shutdown()
     rclpy.try_shutdown()
-    return int(report(ear, rows)) if rows else 1
+    return report(ear, rows) if rows else None
 
 
 if __name__ == '__main__':

@@ -1,0 +1,44 @@
+"""What ten open pages cost the poses of 100 sensors at 100 Hz: `bench.load` with and without.
+
+    PYTHONPATH=test python -m bench.pages
+
+Alternately, as these machines are noisy. Exits with 1 where something was lost, or where the 99 %
+quantile of the latency is worse by more than 10 %.
+"""
+
+import argparse
+import sys
+
+import numpy as np
+
+from bench.load import measure
+
+PAGES, MOST_WORSE = 10, 1.10
+
+
+def main():
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--rounds', type=int, default=3)
+    parser.add_argument('--minutes', type=float, default=1.0)
+    args = parser.parse_args()
+    p99, lost = {0: [], PAGES: []}, False
+    for k in range(args.rounds):
+        for n in (0, PAGES) if k % 2 == 0 else (PAGES, 0):
+            print(f'--- round {k + 1}, {n} pages', flush=True)
+            found = measure(argparse.Namespace(
+                sensors=100, minutes=args.minutes, batches=False, one_process=False, lean=False,
+                in_turn=False, pages=n))
+            if found is None:
+                return 1
+            p99[n].append(found[0])
+            lost |= found[1]
+    without, with_pages = np.median(p99[0]), np.median(p99[PAGES])
+    print(f'99 % of the poses within {without:.1f} ms, with {PAGES} pages within '
+          f'{with_pages:.1f} ms: {with_pages / without:.2f} times (aim {MOST_WORSE}); '
+          f'{"something" if lost else "nothing"} was lost')
+    return int(lost or not with_pages <= MOST_WORSE * without)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

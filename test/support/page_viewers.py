@@ -1,0 +1,38 @@
+"""Viewers of a live page, who read all that comes: `page_viewers.py URL N`.
+
+At its end it prints how much came: a viewer that hears nothing would cost nothing. They are
+browsers of other machines, and give way here to what is measured.
+"""
+
+import asyncio
+import os
+import signal
+import sys
+
+from websockets.asyncio.client import connect
+
+
+async def look(url, heard):
+    """One viewer."""
+    async with connect(url.replace('http', 'ws') + 'stream', max_size=None,
+                       compression=None) as viewer:
+        async for message in viewer:
+            heard.append(len(message))
+
+
+async def main(url, n):
+    """All of them, until SIGTERM."""
+    heard = [[] for _ in range(n)]
+    tasks = [asyncio.create_task(look(url, one)) for one in heard]
+    asyncio.get_running_loop().add_signal_handler(
+        signal.SIGTERM, lambda: [task.cancel() for task in tasks])
+    ended = await asyncio.gather(*tasks, return_exceptions=True)
+    lost = sum(not isinstance(e, asyncio.CancelledError) for e in ended)
+    counts = [len(one) for one in heard]
+    print(f'{n}, each {min(counts)} to {max(counts)} messages, {sum(heard[0]) / 1e6:.1f} MB; '
+          f'{lost} disconnected')
+
+
+if __name__ == '__main__':
+    os.nice(19)
+    asyncio.run(main(sys.argv[1], int(sys.argv[2])))
