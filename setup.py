@@ -61,6 +61,7 @@ setup(
             'ros-jazzy-rmw-fastrtps-cpp',
         ],
         'pandas': ['pandas'],
+        'rerun': ['rerun-sdk'],
         # `colcon test` runs pytest only where the extra "test" names it.
         'test': [
             # Drivers for CircuitPython, as users have them.

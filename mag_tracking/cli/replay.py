@@ -25,6 +25,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.reader import Recording
 from mag_tracking.report.page import WARNING
+from mag_tracking.report.rerun_file import RERUN_FILE, check_rerun, write_rerun
 from mag_tracking.stages.track.doubts import MEANINGS
 
 _REPLAY = '''
@@ -85,6 +86,8 @@ def add(commands: Commands) -> None:
                    'topics below /ground_truth)')
     p.add_argument('--tum', action='store_true',
                    help='write each track as track_N.tum, too (time x y z qx qy qz qw)')
+    p.add_argument('--rerun', action='store_true',
+                   help='write tracks.rrd for the Rerun viewer, too (needs rerun-sdk)')
     p.add_argument('--no-figures', action='store_true', help='leave the pictures out')
 
 
@@ -92,6 +95,8 @@ def _replay(args: argparse.Namespace) -> int:
     """mag-tracking replay."""
     network, settings = recorded_network(args), settings_of(args)
     names = distinct_names(args.recordings)
+    if args.rerun:
+        check_rerun()
     with noted_signals(signal.SIGINT) as seen:
         for path, name in zip(args.recordings, names, strict=True):
             out = args.out / name if len(args.recordings) > 1 else args.out
@@ -113,6 +118,8 @@ def _replay_one(path: Path, network: SensorNetwork, settings: Settings, out: Pat
     _print_summary(path, run.summary, bool(run.truth))
     if args.tum:
         write_trajectories(run, out)
+    if args.rerun:
+        write_rerun(out / RERUN_FILE, network, run.logs, run.smoothed)
     write_report(run, network, out)
     if not args.no_figures:
         write_figures(run, network, out, stopped=lambda: bool(seen))

@@ -19,6 +19,7 @@ from mag_tracking.recording.track_recording import TrackRecording
 from mag_tracking.recording.writer import refuse_other_recording
 from mag_tracking.records import Detection, FieldFrame, SmoothedPose, Track
 from mag_tracking.report.page import REPORT
+from mag_tracking.report.rerun_file import RERUN_FILE
 
 POSE_COLUMNS = ('stamp_ns', 'track_id', 'x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z',
                 'sd_vx', 'sd_vy', 'sd_vz', 'mx', 'my', 'mz', 'weight', 'ambiguous',
@@ -37,7 +38,7 @@ _TABLES = {'poses.csv': POSE_COLUMNS, 'poses_smoothed.csv': SMOOTHED_COLUMNS,
            'detections.csv': DETECTION_COLUMNS, 'disturbances.csv': DISTURBANCE_COLUMNS,
            'hypotheses.csv': HYPOTHESIS_COLUMNS}
 _SUMMARY, _RECORDING = 'summary.json', 'tracks.mcap'
-_RESULTS = (*_TABLES, _SUMMARY, _RECORDING, 'metadata.yaml', REPORT)
+_RESULTS = (*_TABLES, _SUMMARY, _RECORDING, 'metadata.yaml', REPORT, RERUN_FILE)
 _OF_A_TRACK = re.compile(r'(map|weights|field)_track_[0-9]+\.png|track_[0-9]+(_smoothed)?\.tum')
 
 

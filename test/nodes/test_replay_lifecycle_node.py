@@ -14,8 +14,8 @@ from support.node_processes import call, start, stop
 
 RECORDING = vehicle_path('straight_car_right')
 PLAIN = 'detect:\n  onset_frames: 4\ntrack:\n  vehicle:\n    arrival_names: [east, west, "no"]\n'
-ROS = ('/**:\n  ros__parameters:\n    detect:\n      onset_frames: 4\n    track.vehicle.arrival_names:'
-       ' [east, west, "no"]\n')
+ROS = ('/**:\n  ros__parameters:\n    detect:\n      onset_frames: 4\n'
+       '    track.vehicle.arrival_names: [east, west, "no"]\n')
 
 
 def test_a_life_cycle(ros):

@@ -1,0 +1,87 @@
+"""Tracks as a recording for the Rerun viewer, where its SDK is installed."""
+
+from collections.abc import Mapping
+from importlib.util import find_spec
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from scipy.special import chdtri
+
+from mag_tracking.arrays import FloatArray
+from mag_tracking.errors import MissingDependencyError, OutputError
+from mag_tracking.geometry import quaternion_from_rotation
+from mag_tracking.report.page_scene import Sensors
+from mag_tracking.report.track_log import SmoothedLog, TrackLog
+
+RERUN_FILE = 'tracks.rrd'
+"""Name of the file in a folder of results."""
+TIME = 'stamp'
+SCALE_3D = float(np.sqrt(chdtri(3, 0.1)))
+"""Deviations to the surface of the 90 % region in space."""
+
+
+def check_rerun() -> None:
+    """Raise MissingDependencyError where the SDK is not installed."""
+    if find_spec('rerun') is None:
+        raise MissingDependencyError('a recording for Rerun needs its SDK: pip install rerun-sdk')
+
+
+def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, TrackLog],
+                smoothed: Mapping[int, SmoothedLog]) -> None:
+    """Write sensors, poses with 90 % ellipsoids, speeds and fields over time.
+
+    Parameters
+    ----------
+    path : path
+    network : SensorNetwork
+    logs, smoothed : {track id: log}
+
+    Raises MissingDependencyError and OutputError.
+    """
+    check_rerun()
+    import rerun
+
+    stream = rerun.RecordingStream('mag_tracking')
+    try:
+        stream.save(path)
+    except (OSError, RuntimeError) as error:
+        raise OutputError(f'cannot write {path}: {error}') from error
+    stream.log(f'{network.frame}/sensors', rerun.Points3D(
+        network.positions, labels=list(network.names)), static=True)
+    for log in logs.values():
+        _write_track(rerun, stream, network, log)
+    for track in smoothed.values():
+        stream.log(f'{network.frame}/track_{track.id}/smoothed', rerun.LineStrips3D(
+            [np.array(track.position)]), static=True)
+    stream.flush()
+    stream.disconnect()
+
+
+def _write_track(rerun: Any, stream: Any, network: Sensors, log: TrackLog) -> None:
+    """The poses of a track at their times, and nothing after its end."""
+    root = f'{network.frame}/track_{log.id}'
+    for k, ns in enumerate(log.stamp_ns):
+        stream.set_time(TIME, timestamp=np.datetime64(ns, 'ns'))
+        size, orientation = _ellipsoid(log.covariance[k][:3, :3])
+        stream.log(f'{root}/region', rerun.Ellipsoids3D(
+            centers=[log.position[k]], half_sizes=[size],
+            quaternions=[rerun.Quaternion(xyzw=orientation)]))
+        stream.log(f'{root}/pose', rerun.Points3D([log.position[k]], labels=[
+            f'{log.id} {log.kind[k]}{"?" if log.ambiguous[k] else ""}']))
+        stream.log(f'{root}/moment', rerun.Arrows3D(
+            origins=[log.position[k]], vectors=[log.moment[k] / np.linalg.norm(log.moment[k])]))
+        stream.log(f'speed/track_{log.id}', rerun.Scalars(float(np.hypot(*log.velocity[k][:2]))))
+        for j, name in enumerate(network.names):
+            for what, fields in (('measured', log.measured[k]), ('predicted', log.predicted[k])):
+                stream.log(f'field/{name}/{what}', rerun.Scalars(1e9 * fields[j]))
+    stream.log(root, rerun.Clear(recursive=True))
+
+
+def _ellipsoid(C: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(half sizes (3,) [m], quaternion xyzw) of the 90 % region of a covariance."""
+    values, R = np.linalg.eigh(C)
+    if np.linalg.det(R) < 0.0:
+        R = -R
+    half: FloatArray = SCALE_3D * np.sqrt(np.maximum(values, 0.0))
+    return half, quaternion_from_rotation(R)
