@@ -17,6 +17,7 @@ from mag_tracking_msgs.msg import HypothesisArray, NetworkFrame, SmoothedTrack, 
 from rclpy.node import Node
 
 from mag_tracking.errors import MagTrackingError, OutputError
+from mag_tracking.files import replace_text
 from mag_tracking.messages.frame import frame_of
 from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.network.file import read_network
@@ -26,6 +27,14 @@ from mag_tracking.nodes.stage_node import RESULTS, STREAM
 from mag_tracking.pipeline import settings_for
 from mag_tracking.report.figures import field_figure, map_figure, weights_figure
 from mag_tracking.report.metrics import interpolate_truth, pass_errors
+from mag_tracking.report.page import Page, report_html
+from mag_tracking.report.page_scene import (
+    facts_of,
+    path_entry,
+    scene_of,
+    strongest_sensors,
+    track_entry,
+)
 from mag_tracking.report.track_log import TrackLog
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -62,6 +71,12 @@ class Spectator(Node):
         p, q = message.pose.position, message.pose.orientation
         self.truth.append((stamp_ns(message.header.stamp), p.x, p.y, p.z, q.x, q.y, q.z, q.w))
 
+    def truth_arrays(self):
+        """(stamps (n,), positions (n, 3), quaternions (n, 4))."""
+        rows = sorted(self.truth)
+        return (np.array([r[0] for r in rows], dtype=np.int64), np.array([r[1:4] for r in rows]),
+                np.array([r[4:] for r in rows]))
+
     def _track(self, message):
         for m in message.tracks:
             track = track_of(m)
@@ -79,9 +94,7 @@ class Spectator(Node):
 
 def draw(spectator, out):
     """Write the pictures and the errors; returns the paths."""
-    rows = sorted(spectator.truth)
-    truth = (np.array([r[0] for r in rows], dtype=np.int64), np.array([r[1:4] for r in rows]),
-             np.array([r[4:] for r in rows]))
+    truth = spectator.truth_arrays()
     paths, network = [], spectator.network
     for log in spectator.logs.values():
         if not log.stamp_ns:
@@ -99,6 +112,25 @@ def draw(spectator, out):
               f'error at the closest point {summary["truth"]["closest"]:.2f} m, '
               f'within 5 m RMS {summary["truth"]["rms"] or float("nan"):.2f} m')
     return paths
+
+
+def write_page(spectator, out):
+    """Write all of it as one page to look at in a browser; returns its path."""
+    logs = [log for log in spectator.logs.values() if log.stamp_ns]
+    begin_ns = min(log.stamp_ns[0] for log in logs)
+    tracks = []
+    for log in logs:
+        entry = track_entry(log, begin_ns, strongest_sensors(log))
+        entry['facts'] = facts_of(log.summary())
+        if log.id in spectator.smoothed:
+            entry['smoothed'] = path_entry(log.id, spectator.smoothed[log.id])
+        entry['truth'] = path_entry(log.id, interpolate_truth(spectator.truth_arrays(),
+                                                              log.stamp_ns))
+        tracks.append(entry)
+    scene = scene_of(spectator.network, begin_ns, max(log.stamp_ns[-1] for log in logs), tracks)
+    path = out / 'report.html'
+    replace_text(path, report_html(Page('A car turns at a junction', scene=scene)))
+    return path
 
 
 def main(argv=None):
@@ -128,6 +160,7 @@ def main(argv=None):
         print('no track was seen', file=sys.stderr)
         return 1
     print('pictures:', *paths, sep='\n  ')
+    print(f'to look at in a browser: {write_page(spectators[0], args.out)}')
     return status
 
 

@@ -67,11 +67,11 @@ function drawFields(scene, track, choice, t, range) {
     AXES.forEach(([colour, dash], a) => {
       const name = 'xyz'[a];
       traces.push({type: 'scatter', mode: 'markers', x: field.t, name: `${name} measured`,
-        y: Array.from(field.measured[a], v => f * v), legendgroup: name, showlegend: i === 0,
+        y: Array.from(field.measured[a], v => f * v), showlegend: false,
         marker: {color: colour, symbol: SYMBOLS[a], ...dots}});
       if (field.predicted) {
         traces.push({type: 'scatter', mode: 'lines', x: field.t, name: `${name} predicted`,
-          y: Array.from(field.predicted[a], v => f * v), legendgroup: name, showlegend: i === 0,
+          y: Array.from(field.predicted[a], v => f * v), showlegend: false,
           line: {color: many ? BLACK : colour, width: 1.8, dash: dash}});
       }
     });

@@ -56,9 +56,9 @@ function mapTraces(scene, t) {
     // An ambiguous pose may jump; a line through it would show a way that nothing went.
     const sure = axis => Array.from(axis, (v, i) => c.ambiguous[i] ? null : f * v);
     const doubtful = axis => scaled(axis.slice(0, k + 1).filter((_, i) => c.ambiguous[i]));
-    traces.push(line(sure(c.x), sure(c.y), named('track'), {color: '#a8a8a8', width: 1.5}));
+    traces.push(line(sure(c.x), sure(c.y), '', {color: '#a8a8a8', width: 1.5}));
     traces.push(line(sure(c.x).slice(0, k + 1), sure(c.y).slice(0, k + 1),
-      named('track until now'), {color: BLACK, width: 2.5}));
+      named('track'), {color: BLACK, width: 2.5}));
     traces.push({type: 'scatter', mode: 'markers', x: doubtful(c.x), y: doubtful(c.y),
       name: 'ambiguous poses', hoverinfo: 'skip', showlegend: first && c.ambiguous.includes(1),
       marker: {size: 5, color: '#ffffff', line: {color: '#707070', width: 1.2}}});
@@ -67,7 +67,8 @@ function mapTraces(scene, t) {
   traces.push({type: 'scatter', mode: scene.sensors.names.length > 24 ? 'markers'
     : 'markers+text', x: scaled(scene.sensors.x), y: scaled(scene.sensors.y),
   text: scene.sensors.names.map(plain), textposition: 'top center', hoverinfo: 'text',
-  name: 'magnetometers', marker: {symbol: 'triangle-up', size: 11, color: '#333333'}});
+  name: 'magnetometers', cliponaxis: false,
+  marker: {symbol: 'triangle-up', size: 11, color: '#333333'}});
   return traces;
 }
 
@@ -91,9 +92,9 @@ function nowTraces(track, k, f, named) {
   traces.push(line(xs, ys, named('90 % region'), {color: BLACK, width: 1},
     {fill: 'toself', fillcolor: c.ambiguous[k] ? 'rgba(0,0,0,0.05)' : 'rgba(0,0,0,0.16)'}));
   traces.push(line([f * c.x[k], f * (c.x[k] + c.vx[k])], [f * c.y[k], f * (c.y[k] + c.vy[k])],
-    named('way of one second'), {color: BLACK, width: 1.5, dash: 'dot'}));
+    '', {color: BLACK, width: 1.5, dash: 'dot'}));
   traces.push({type: 'scatter', mode: 'markers', x: [f * c.x[k]], y: [f * c.y[k]],
-    name: c.ambiguous[k] ? 'pose (ambiguous)' : 'pose', showlegend: Boolean(named('pose')),
+    name: c.ambiguous[k] ? 'pose (ambiguous)' : 'pose', showlegend: false,
     hoverinfo: 'x+y', meta: 'pose', marker: {size: 11, symbol: 'circle',
       color: c.ambiguous[k] ? '#ffffff' : BLACK, line: {color: BLACK, width: 2}}});
   return traces;
@@ -103,10 +104,10 @@ function mapLayout(scene) {
   const unit = scene.scale.unit, f = scene.scale.factor, r = scene.reach;
   const axis = (title, low, high) => ({title: {text: `${title} [${unit}]`}, zeroline: false,
     range: [f * low, f * high], gridcolor: '#e3e3e3'});
-  return {font: FONT, margin: {l: 55, r: 10, t: 10, b: 45}, uirevision: 'map', hovermode: 'closest',
+  return {font: FONT, margin: {l: 55, r: 10, t: 25, b: 45}, uirevision: 'map', hovermode: 'closest',
     xaxis: {...axis('x', r[0], r[1]), constrain: 'range'},
     yaxis: {...axis('y', r[2], r[3]), scaleanchor: 'x', constrain: 'range'},
-    legend: {orientation: 'h', y: -0.14, font: {size: 12}}};
+    legend: {orientation: 'h', y: 1.04, yanchor: 'bottom', font: {size: 12}}};
 }
 
 // The region that holds the sensors, and the poses that are not yet far out.
