@@ -217,7 +217,7 @@ class Hypotheses(Sequence[Hypothesis]):
 
 
 def best_of_arrivals(members: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """The best hypothesis of each arrival, heaviest first, with the weight of all from there."""
+    """Best hypothesis of each arrival with the arrival's total weight, heaviest first."""
     if isinstance(members, Hypotheses):
         arrivals, weights = members.arrivals, members.weights.tolist()
     else:

@@ -211,7 +211,7 @@ def read_parameter_file(path: str | PathLike[str]) -> dict[str, Any]:
 
 
 def as_ros_parameters(path: str | PathLike[str]) -> str | None:
-    """A plain parameter file in the form of ROS, for all nodes; None where it has that form.
+    """Plain parameter file converted to a ROS parameter file; None if it already is one.
 
     Raises SettingsError.
     """

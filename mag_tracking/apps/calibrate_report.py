@@ -1,4 +1,4 @@
-"""The report of a calibration: knocks, headings, noise, and what is wrong."""
+"""Report of a calibration: clock alignment, headings, noise, warnings."""
 
 from pathlib import Path
 
@@ -15,18 +15,18 @@ from mag_tracking.report.page_charts import axes, curve, plain
 from mag_tracking.report.style import SERIES
 
 MOST_KNOCKS = 8
-"""Sensors whose knocks are drawn."""
+"""Maximum number of sensors in the charts of knocks."""
 SHOWN_S = 0.25
-"""[s] To each side of a knock."""
+"""[s] Time shown before and after a knock."""
 
 
 def write_report(found: Calibration, stated: SensorNetwork, name: str, path: Path) -> None:
-    """Write the page of a calibration from the recording `name`; raises OutputError."""
+    """Write the page of a calibration from recording `name`; raises OutputError."""
     replace_text(path, report_html(calibration_page(found, stated, name)))
 
 
 def calibration_page(found: Calibration, stated: SensorNetwork, name: str) -> Page:
-    """The page of a calibration."""
+    """Page of a calibration."""
     survey = found.survey
     level = ERROR if survey.disagreements else WARNING
     notes = [Note(level, text) for text in survey.warnings()]
@@ -41,12 +41,13 @@ def calibration_page(found: Calibration, stated: SensorNetwork, name: str) -> Pa
 
 
 def _knocks(found: Calibration) -> list[Chart]:
-    """The first knock by the clocks as they were, and as they are set by it."""
+    """Charts of the first knock, before and after clock correction."""
     shocks = dict(list(found.survey.shocks.items())[:MOST_KNOCKS])
     if not shocks:
         return []
     first, charts = first_knock(shocks), []
-    for title, is_set in (('A knock, clocks as they were', False), ('Clocks set by it', True)):
+    for title, is_set in (('First knock, uncorrected clocks', False),
+                          ('First knock, corrected clocks', True)):
         traces = []
         for k, (name, (t, size)) in enumerate(shocks.items()):
             offset = found.network.clock_offset[found.network.index(name)] if is_set else 0.0
@@ -57,7 +58,7 @@ def _knocks(found: Calibration) -> list[Chart]:
 
 
 def _headings(found: Calibration, stated: SensorNetwork) -> Chart:
-    """How far each sensor is turned from what was stated, with 90 % intervals."""
+    """Chart of each sensor's rotation about the vertical against the network file."""
     steps = [('compass', found.survey.network)]
     if found.evidence is not None:
         steps.append(('compass and passes', found.network))
@@ -72,12 +73,12 @@ def _headings(found: Calibration, stated: SensorNetwork) -> Chart:
             'y': [plain(name) for name in stated.names],
             'error_x': {'type': 'data', 'array': half, 'color': SERIES[k]},
             'marker': {'color': SERIES[k], 'size': 8, 'symbol': ('circle', 'square')[k]}})
-    return Chart('Turned about the vertical from what was stated (90 %)', traces,
+    return Chart('Rotation about the vertical against the network file (90 %)', traces,
                  axes('[degrees]', ''))
 
 
 def _table(found: Calibration) -> Table:
-    """One row a sensor."""
+    """Table of the sensors."""
     network, rows = found.network, list[list[str | float | None]]()
     for j, name in enumerate(network.names):
         R, std, noise = network.R_ws[j], network.orientation_std[j], network.noise_std[j]
@@ -91,5 +92,5 @@ def _table(found: Calibration) -> Table:
             1e3 * done.clock_offset_std if done is not None and known else None,
             None if noise is None else 1e9 * float(np.nanmean(noise)),
             'as stated' if done is None else done.by])
-    return Table('Sensors', ['sensor', 'tilted [deg]', 'heads [deg]', 'its deviation [deg]',
-                             'clock [ms]', 'its deviation [ms]', 'noise [nT]', 'by'], rows)
+    return Table('Sensors', ['sensor', 'tilt [deg]', 'heading [deg]', 'std [deg]',
+                             'clock [ms]', 'std [ms]', 'noise [nT]', 'source'], rows)

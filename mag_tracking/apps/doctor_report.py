@@ -1,4 +1,4 @@
-"""The report of the doctor: what is wrong with which sensor, and what to do."""
+"""Report of the doctor: faults of the sensors and advice."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,12 +14,12 @@ from mag_tracking.stages.health.sensor_health import Finding
 
 
 def write_report(doctor: Doctor, findings: Sequence[Finding], subject: str, path: Path) -> None:
-    """Write the page of what was found in `subject`; raises OutputError."""
+    """Write the page with the findings in `subject`; raises OutputError."""
     replace_text(path, report_html(doctor_page(doctor, findings, subject)))
 
 
 def doctor_page(doctor: Doctor, findings: Sequence[Finding], subject: str) -> Page:
-    """The page of what was found."""
+    """Page with findings, noise and rates."""
     notes = [Note(ERROR if f.serious else NOTE, f'{f.subject}: {f.what}. {f.advice}')
              for f in findings] or [Note(NOTE, 'nothing is wrong')]
     serious = sum(f.serious for f in findings)
@@ -28,7 +28,7 @@ def doctor_page(doctor: Doctor, findings: Sequence[Finding], subject: str) -> Pa
 
 
 def _noise(doctor: Doctor) -> Chart:
-    """Noise of each axis of each sensor."""
+    """Chart of the noise of each axis."""
     names = [plain(name) for name in doctor.sensors]
     traces = []
     for axis, (letter, colour) in enumerate(zip('xyz', AXIS_COLOURS, strict=True)):
@@ -36,20 +36,20 @@ def _noise(doctor: Doctor) -> Chart:
         traces.append({'type': 'bar', 'x': names, 'name': letter, 'marker': {
             'color': colour, 'pattern': {'shape': ('', '/', 'x')[axis]}},
             'y': [v if np.isfinite(v) else None for v in values]})
-    return Chart('Noise of each axis', traces, axes('', 'deviation [nT]'))
+    return Chart('Noise per axis', traces, axes('', 'standard deviation [nT]'))
 
 
 def _rates(doctor: Doctor) -> Chart:
-    """Rates of the sensors."""
+    """Chart of the sample rates."""
     rates = [float(h.rate) if h.counts['readings'] else 0.0 for h in doctor.sensors.values()]
-    return Chart('Readings a second', [{
+    return Chart('Sample rate', [{
         'type': 'bar', 'x': [plain(name) for name in doctor.sensors],
         'y': [v if np.isfinite(v) else None for v in rates], 'showlegend': False}],
         axes('', 'rate [Hz]'))
 
 
 def _table(doctor: Doctor) -> Table:
-    """One row a sensor."""
+    """Table of the sensors."""
     rows: list[list[str | float | None]] = []
     for name, health in doctor.sensors.items():
         c, delay = health.counts, float(health.delay_s[0])

@@ -1,4 +1,4 @@
-"""The report of fitted passes: one page with map, time slider, fields, orders."""
+"""Report of fitted passes: map with time slider, fields, model orders."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,16 +17,16 @@ from mag_tracking.report.page_scene import field_entry, fitted_entry, scene_of
 from mag_tracking.units import NS
 
 BETWEEN_S = 5.0
-"""[s] Between two recordings on the time line of the page."""
+"""[s] Gap between two recordings on the time axis of the page."""
 STEPS = 120
-"""Poses of a pass."""
+"""Number of poses shown per pass."""
 
 
 def write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings: Sequence[str],
                  out: Path) -> Path:
     """Write `report.html` into folder `out`; returns its path. Raises OutputError.
 
-    `warnings` are those of `RecordingFit.warnings`, of all recordings.
+    `warnings` are the lines of `RecordingFit.warnings` of all recordings.
     """
     path = out / REPORT
     replace_text(path, report_html(fit_page(passes, network, warnings)))
@@ -35,13 +35,13 @@ def write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings:
 
 def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
              warnings: Sequence[str]) -> Page:
-    """The page of fitted passes; those without an answer are in its table only."""
+    """Page of fitted passes; a pass without an answer appears only in the table."""
     notes = [Note(WARNING, text) for text in warnings]
     if not passes:
         notes.append(Note(NOTE, 'no pass: nothing was detected'))
     begins = [ns / NS for ns in _begins_ns(passes)]
     if len({one.recording for one in passes}) > 1:
-        notes.append(Note(NOTE, 'the recordings follow one another on the time line'))
+        notes.append(Note(NOTE, 'the time axis places the recordings one after another'))
     tracks = [_track(k + 1, one, one.chosen, begins[k])
               for k, one in enumerate(passes) if one.chosen is not None]
     ends = [begins[k] + float(one.fits[0].data.t.max()) for k, one in enumerate(passes)]
@@ -53,7 +53,7 @@ def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
 
 
 def _begins_ns(passes: Sequence[FittedPass]) -> list[int]:
-    """[ns] The strongest field of each pass on the time line of the page."""
+    """[ns] Time of the strongest field of each pass on the time axis of the page."""
     out: list[int] = []
     recording, shift, end = '', 0, 0
     for one in passes:
@@ -68,7 +68,7 @@ def _begins_ns(passes: Sequence[FittedPass]) -> list[int]:
 
 
 def _track(number: int, one: FittedPass, fit: PassFit, begin: float) -> dict[str, Any]:
-    """The chosen fit of a pass, as JSON."""
+    """Chosen fit of a pass, as JSON."""
     data = fit.data
     t = np.linspace(data.t.min(), data.t.max(), STEPS)
     F = np.tile(np.eye(6), (STEPS, 1, 1))
@@ -89,7 +89,7 @@ def _track(number: int, one: FittedPass, fit: PassFit, begin: float) -> dict[str
 
 
 def _dipoles(n: int) -> str:
-    """A number of dipoles in words."""
+    """Number of dipoles in words."""
     return f'{n} dipole{"s" * (n > 1)}'
 
 
@@ -106,7 +106,7 @@ def _order_chart(passes: Sequence[FittedPass]) -> Chart:
 
 
 def _table(passes: Sequence[FittedPass]) -> Table:
-    """All orders of all passes."""
+    """Table of all model orders of all passes."""
     rows: list[list[str | float | None]] = []
     for one in passes:
         for fit in one.fits:

@@ -1,4 +1,4 @@
-"""The report of a plan: maps of what can be known where, and curves along the lanes."""
+"""Report of a plan: maps of accuracy and detection, and curves along the lanes."""
 
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,11 @@ from mag_tracking.report.page_charts import axes, curve, heat_map, places
 from mag_tracking.report.plan_figures import LEAST_MISSED, distinct, f_text
 
 LOW_SHARE = 0.02
-"""Quantile of a bound at which its colours begin and end."""
+"""Quantiles of a bound (this and one minus this) that limit its colour scale."""
 
 
 def write_report(plan: Plan, lines: list[str], out: Path) -> Path:
-    """Write `report.html` with the answers in `lines` into folder `out`; returns its path.
+    """Write `report.html` with the lines of `answers` into folder `out`; returns its path.
 
     Raises OutputError.
     """
@@ -28,7 +28,7 @@ def write_report(plan: Plan, lines: list[str], out: Path) -> Path:
 
 
 def answers(p: Plan) -> list[str]:
-    """The answers of a plan in a few lines."""
+    """Summary of a plan, one line per result."""
     noise, out = float(np.median(p.sampling.noise_std)), list[str]()
     out.append(f'{len(p.network)} sensors, noise of a frame {1e9 * noise:.2g} nT; '
           f'target of {p.target.moment:g} A m^2 at {p.target.speed:g} m/s')
@@ -65,7 +65,7 @@ def answers(p: Plan) -> list[str]:
 
 
 def plan_page(plan: Plan, lines: list[str]) -> Page:
-    """The page of a plan."""
+    """Page of a plan."""
     network = plan.network
     return Page(f'Plan for {len(network)} sensors',
                 f'target of {plan.target.moment:g} A m² at {plan.target.speed:g} m/s',
@@ -77,7 +77,7 @@ def plan_page(plan: Plan, lines: list[str]) -> Page:
 
 
 def _maps(plan: Plan) -> list[Chart]:
-    """Bound, detection and the place for one more sensor."""
+    """Maps of the position bound, the detection probability and the gain of one more sensor."""
     f, unit = scale_of(np.ptp(plan.x))
     layout = axes(f'x [{unit}]', f'y [{unit}]', is_map=True)
     x, y = f * plan.x, f * plan.y
@@ -89,7 +89,7 @@ def _maps(plan: Plan) -> list[Chart]:
         'hoverinfo': 'x+y+text'}
     gain = 100.0 * (1.0 - plan.with_one_more / plan.without)
     ny, nx = gain.shape
-    charts = [Chart('How well a whole pass tells a position', [position, *_marks(plan, f)], layout),
+    charts = [Chart('Position bound of a whole pass', [position, *_marks(plan, f)], layout),
               Chart('Probability that one frame detects the target', [
                   heat_map(x, y, plan.detection, 'Cividis', 'probability', 0.0, 1.0),
                   *_marks(plan, f)], layout)]
@@ -105,7 +105,7 @@ def _maps(plan: Plan) -> list[Chart]:
 
 
 def _log_bar(low: float, high: float, title: str) -> dict[str, Any]:
-    """A bar with plain numbers for colours that are logarithms."""
+    """Colour bar with plain numbers for logarithmic values."""
     steps = [10.0**k * m for k in range(-7, 8) for m in (1, 2, 5)]
     inside = [v for v in steps if low <= np.log10(v) <= high] or [10.0 ** (0.5 * (low + high))]
     return {'title': {'text': title, 'side': 'right'}, 'tickvals': np.log10(inside).tolist(),
@@ -113,7 +113,7 @@ def _log_bar(low: float, high: float, title: str) -> dict[str, Any]:
 
 
 def _marks(plan: Plan, f: float) -> list[dict[str, Any]]:
-    """Lanes within the map, and the sensors."""
+    """Traces of the lanes and sensors."""
     low, high = (plan.x[0], plan.y[0]), (plan.x[-1], plan.y[-1])
     out = []
     for lane in plan.lanes:
@@ -125,7 +125,7 @@ def _marks(plan: Plan, f: float) -> list[dict[str, Any]]:
 
 
 def _lanes(plan: Plan) -> list[Chart]:
-    """Bounds and detection along the lanes, and missed passes."""
+    """Charts of bounds and detection along the lanes, and of missed passes."""
     f, unit = scale_of(np.ptp(plan.x))
     bounds, seen = [], []
     for k, (name, lane) in enumerate(distinct(plan.lanes)):
@@ -137,7 +137,7 @@ def _lanes(plan: Plan) -> list[Chart]:
     way = f'distance along the lane, 0 = nearest to the middle [{unit}]'
     return [Chart('Position bound along the lanes', bounds,
                   axes(way, f'deviation [{unit}]', log_y=True)),
-            Chart('Detection along the lanes', seen, axes(way, 'probability a frame')),
+            Chart('Detection along the lanes', seen, axes(way, 'probability per frame')),
             Chart('Passes that are missed', [curve(f * known[:, 0], known[:, 1], '', 0,
                                                    'lines+markers')],
                   axes(f'lateral distance from the middle of the sensors [{unit}]',

@@ -1,4 +1,4 @@
-"""What a user should know of a replay beside its tracks: warnings, limits and disturbances."""
+"""Notes on a replay: warnings, limits and disturbances."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -10,12 +10,12 @@ from mag_tracking.units import NS
 
 
 def notes_of(summary: Mapping[str, Any]) -> list[Note]:
-    """The notes on a run.
+    """Notes on a run.
 
     Parameters
     ----------
     summary : dict
-        The content of `summary.json`.
+        Content of `summary.json`.
     """
     return [*_input_notes(summary), *_limit_notes(summary),
             *(Note(NOTE, _disturbance_text(d)) for d in summary['disturbances'])]

@@ -1,4 +1,4 @@
-"""The report of a replay: one page with map, time slider, curves, tables."""
+"""Report of a replay: map with time slider, curves and tables."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -32,18 +32,18 @@ def write_report(run: Run, network: SensorNetwork, out: Path) -> Path:
 
 
 def replay_page(run: Run, network: SensorNetwork) -> Page:
-    """The page of a run."""
+    """Page of a run."""
     summary, logs = run.summary, list(run.logs.values())
     notes, scene = notes_of(summary), None
     if summary['interrupted']:
-        notes.insert(0, Note(NOTE, 'the replay was interrupted: this is what was done until then'))
+        notes.insert(0, Note(NOTE, 'the replay was interrupted; results are incomplete'))
     if logs:
         step = step_of(logs)
         if step > 1:
-            notes.append(Note(NOTE, f'the page has one pose of {step}; poses.csv has all'))
+            notes.append(Note(NOTE, f'the page shows one pose in {step}; poses.csv has all'))
         if len(network) > MOST_SENSORS:
-            notes.append(Note(NOTE, f'of each track the page has the field of the {MOST_SENSORS} '
-                              f'sensors where it was strongest, of {len(network)}'))
+            notes.append(Note(NOTE, f'fields are shown for the {MOST_SENSORS} sensors (of '
+                              f'{len(network)}) with the strongest field of each track'))
         begin_ns = min(log.stamp_ns[0] for log in logs)
         entries = {t['id']: t for t in summary['tracks']}
         tracks = []
@@ -68,7 +68,7 @@ def replay_page(run: Run, network: SensorNetwork) -> Page:
 
 
 def _sensor_table(summary: Mapping[str, Any], run: Run, network: SensorNetwork) -> Table:
-    """Health of the sensors."""
+    """Table of the sensors."""
     innovations = [t['nis_by_sensor'] for t in summary['tracks']]
     rows = []
     for j, (name, s) in enumerate(summary['sensors'].items()):
@@ -81,4 +81,4 @@ def _sensor_table(summary: Mapping[str, Any], run: Run, network: SensorNetwork) 
             1e9 * float(np.mean(noise)) if noise else None, s['times_relearnt'],
             float(np.mean(nis)) if nis else None, *network.positions[j].tolist()])
     return Table('Sensors', ['sensor', 'background', 'readings used', 'rejected', 'noise [nT]',
-                             'times learnt anew', 'NIS an axis', 'x [m]', 'y [m]', 'z [m]'], rows)
+                             'relearnt', 'NIS per axis', 'x [m]', 'y [m]', 'z [m]'], rows)

@@ -1,4 +1,4 @@
-"""A recording, tracked at its own pace and shown on a live page: what `mag-tracking view` does."""
+"""Track a recording at its original speed and show it on a live page."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -17,14 +17,14 @@ from mag_tracking.units import NS
 from mag_tracking.web.live_scene import LiveScene
 
 PART_S = 0.05
-"""[s] Readings of so long are taken at once."""
+"""[s] Duration of a batch of readings."""
 HEALTH_S = 1.0
-"""[s] Between two looks at the sensors."""
+"""[s] Interval of health updates."""
 
 
 def view(recording: Recording, network: SensorNetwork, settings: Settings, scene: LiveScene,
          rate: float, stopped: Callable[[], bool]) -> None:
-    """Track what is in a recording as if it came now, until it ends or `stopped()`.
+    """Track a recording in real time until it ends or `stopped()` returns True.
 
     Parameters
     ----------
@@ -32,11 +32,11 @@ def view(recording: Recording, network: SensorNetwork, settings: Settings, scene
     network : SensorNetwork
     settings : Settings
     scene : LiveScene
-        Takes what is tracked.
+        Receives frames and tracks.
     rate : float
-        Speed: 1 is that of the recording.
+        Playback speed; 1 is real time.
     stopped : function
-        Asked several times a second.
+        Called several times per second.
 
     Raises RecordingError.
     """
@@ -60,7 +60,7 @@ def view(recording: Recording, network: SensorNetwork, settings: Settings, scene
 
 
 def _parts(batches: Iterable[Readings]) -> Iterator[Readings]:
-    """The readings in parts of `PART_S`, in the order in which they were recorded."""
+    """Batches of at most `PART_S`, in recorded order."""
     for readings in batches:
         part = (np.maximum.accumulate(readings.stamp_ns) - readings.stamp_ns[0]) // int(PART_S * NS)
         edges = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(readings)]
@@ -69,7 +69,7 @@ def _parts(batches: Iterable[Readings]) -> Iterator[Readings]:
 
 
 def _take(scene: LiveScene, records: Iterable[Output]) -> None:
-    """Hand frames and tracks to the scene."""
+    """Add frames and tracks to the scene."""
     smoothed: dict[int, list[FloatArray]] = {}
     for record in records:
         if isinstance(record, FieldFrame):
@@ -84,7 +84,7 @@ def _take(scene: LiveScene, records: Iterable[Output]) -> None:
 
 def _tell_health(scene: LiveScene, pipeline: Pipeline, reader: SampleReader,
                  notes: list[Note]) -> None:
-    """What was rejected, and the sensors."""
+    """Update rejections and the sensor table."""
     rejected = {**reader.rejected, **pipeline.rejections()}
     notes = [*notes, *(Note(WARNING, f'nothing on {topic}') for topic in reader.missing_topics()),
              *(Note(WARNING, f'{cause}: {n}') for cause, n in rejected.items())]

@@ -1,4 +1,4 @@
-"""mag-tracking view and watch, and the live page of run."""
+"""mag-tracking view and watch, and the live page of `mag-tracking run`."""
 
 import argparse
 import signal
@@ -25,18 +25,18 @@ from mag_tracking.web.live_scene import LiveScene
 from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK, PageServer, check_port
 
 _PAGE = '''
-Open the address that is printed in a browser: a map with the tracks, their 90 % regions and
-hypotheses, the sensors' fields, and what is wrong. Any number of people may look. It is for this
-machine only; --host 0.0.0.0 lets others see it who have the address with its token.
+Open the printed address in a browser. The page shows a map with tracks, 90 % regions and
+hypotheses, the sensors' fields, and the health of the system. It is available on this machine
+only; --host 0.0.0.0 also serves it to other machines, which need the token in the address.
 '''
 _VIEW = f'''
-Tracks a recording at its own pace and shows it on a live page. Ctrl-C ends it.
+Tracks a recording in real time and shows it on a live page. Ctrl-C ends it.
 {_PAGE}
 example:
   mag-tracking view junction.mcap --network config/network.yaml
 '''
 _WATCH = f'''
-Shows what running nodes track. The page says what it waits for. Ctrl-C ends it; the nodes go on.
+Shows the tracks of running nodes. Ctrl-C ends the page, not the nodes.
 {_PAGE}
 examples:
   mag-tracking watch
@@ -52,7 +52,7 @@ def add(commands: Commands) -> None:
                    help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
     add_recorded_network(p)
     add_settings(p)
-    p.add_argument('--rate', type=float, default=1.0, help='speed (default: 1)')
+    p.add_argument('--rate', type=float, default=1.0, help='playback speed (default: 1)')
     add_page(p)
     p = add_command(commands, 'watch', _watch, 'Show running nodes on a live page (needs ROS 2).',
                     _WATCH)
@@ -63,13 +63,13 @@ def add_page(parser: argparse.ArgumentParser, port: bool = True) -> None:
     """--host and --port."""
     if port:
         parser.add_argument('--port', type=int, default=DEFAULT_PORT, metavar='PORT',
-                            help=f'of the page (default: {DEFAULT_PORT}; 0: any that is free)')
-    parser.add_argument('--host', default=LOOPBACK, metavar='ADDRESS', help='address of this '
-                        f'machine on which the page is served (default: {LOOPBACK})')
+                            help=f'port of the page (default: {DEFAULT_PORT}; 0: any free port)')
+    parser.add_argument('--host', default=LOOPBACK, metavar='ADDRESS', help='local address of '
+                        f'the page (default: {LOOPBACK})')
 
 
 def _told(line: str) -> None:
-    """Print a line at once."""
+    """Print a line without buffering."""
     print(line, flush=True)
 
 
@@ -86,7 +86,7 @@ def _view(args: argparse.Namespace) -> int:
         _told(f'live page: {server.url}')
         view(recording, network, settings, scene, args.rate, lambda: bool(seen))
         if not seen:
-            _told('the recording has ended; the page stays until Ctrl-C')
+            _told('end of the recording; the page is served until Ctrl-C')
         while not seen:
             time.sleep(0.1)
     return 0
@@ -102,7 +102,7 @@ def _watch(args: argparse.Namespace) -> int:
 
 @contextmanager
 def page_process(host: str, port: int, ros_arguments: Sequence[str]) -> Iterator[None]:
-    """The live page of the nodes of this command, in a process of its own: it delays no pose.
+    """Run the live page in a separate process, so that it cannot delay the nodes.
 
     Raises DeviceError where the port cannot be opened.
     """

@@ -82,11 +82,11 @@ def now() -> str:
 def add_report(parser: argparse.ArgumentParser) -> None:
     """--report."""
     parser.add_argument('--report', type=Path, metavar='FILE.html',
-                        help='write what was found as a page to look at in a browser')
+                        help='write a report for the browser')
 
 
 def check_writable(path: Path | None) -> None:
-    """Raise OutputError where a file that is to be written has no folder to be in."""
+    """Raise OutputError if a file cannot be written because of its folder."""
     if path is not None and not path.absolute().parent.is_dir():
         raise OutputError(f'cannot write {path}: there is no folder {path.parent}')
     if path is not None and path.is_dir():

@@ -46,7 +46,7 @@ def add(commands: Commands) -> None:
     p.add_argument('--rate', type=float, default=1.0, help='speed of the replay (default: 1)')
     p.add_argument('--loop', action='store_true', help='begin again at the end')
     p.add_argument('--web', type=int, nargs='?', const=DEFAULT_PORT, metavar='PORT',
-                   help=f'show it on a live page, too (at port {DEFAULT_PORT} if left out)')
+                   help=f'serve a live page (default port: {DEFAULT_PORT})')
     add_page(p, port=False)
 
 

@@ -16,11 +16,11 @@ LONGEST_OFFSET_S = 60.0
 
 
 class NamedSensors(Protocol):
-    """What frames are compared with, such as a `SensorNetwork`."""
+    """Sensors with names, such as a `SensorNetwork`."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Their names."""
+        """Sensor names."""
 
     def __len__(self) -> int: ...
 

@@ -1,4 +1,4 @@
-"""A lifecycle node that starts by itself unless it is told to wait."""
+"""Lifecycle node with automatic start."""
 
 from typing import Any
 
@@ -9,16 +9,16 @@ from mag_tracking.nodes.ros_params import fixed_parameter
 
 
 class ManagedNode(LifecycleNode):
-    """Configuring prepares; with `autostart` (the default) it configures and activates itself."""
+    """Lifecycle node that configures and activates itself unless `autostart` is false."""
 
     def __init__(self, name: str, **node_arguments: Any) -> None:
         super().__init__(name, **node_arguments)
         self._refused: MagTrackingError | None = None
 
     def start_by_itself(self) -> None:
-        """Configure and activate, if the parameter says so.
+        """Configure and activate the node if `autostart` is true.
 
-        Raises MagTrackingError where the settings are unusable.
+        Raises MagTrackingError if the settings are invalid.
         """
         if not fixed_parameter(self, 'autostart', True, 'Configure and activate at the start.'):
             return
@@ -29,11 +29,11 @@ class ManagedNode(LifecycleNode):
             self.trigger_activate()
 
     def prepare(self) -> None:
-        """Read files and advertise topics; raises MagTrackingError."""
+        """Read files and advertise topics; called on configuration. Raises MagTrackingError."""
         raise NotImplementedError
 
     def on_configure(self, state: State) -> TransitionCallbackReturn:
-        """Prepare; what is wrong is logged, and the state stays."""
+        """Call `prepare`; an error is logged and leaves the node unconfigured."""
         try:
             self.prepare()
         except MagTrackingError as error:

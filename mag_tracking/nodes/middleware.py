@@ -29,7 +29,7 @@ def begin(arguments: list[str] | None = None) -> None:
 
     Other middlewares do not look at it. Signals stay with the caller: rclpy's own handlers raise
     KeyboardInterrupt wherever Python is, in its C++ too. Parameter files (`--params-file`) may be
-    plain ones, as `--params` takes them.
+    plain files, as for `--params`.
 
     Raises SettingsError for arguments that are not those of ROS.
     """
@@ -54,13 +54,13 @@ def _init(arguments: list[str] | None) -> None:
 
 
 def _with_ros_files(arguments: list[str] | None, folder: Path) -> list[str] | None:
-    """The arguments, in which plain parameter files are replaced by copies in the form of ROS.
+    """Arguments in which plain parameter files are replaced by converted copies.
 
-    Those of the process for None. ROS reads the files once, in `rclpy.init`. Raises SettingsError.
+    None selects `sys.argv`. The files are read once, in `rclpy.init`. Raises SettingsError.
     """
     words = list(sys.argv if arguments is None else arguments)
     for k, word in enumerate(words[:-1]):
-        # A file that cannot be read is ROS's to complain of, as are arguments that are not its own.
+        # rclpy reports missing files and invalid arguments.
         if word != PARAMETER_FILE or ROS_ARGUMENTS not in words[:k] \
                 or not Path(words[k + 1]).is_file():
             continue

@@ -1,4 +1,4 @@
-"""Listens to running nodes and feeds a live page; it needs no network file."""
+"""Node that shows running nodes on a live page; it needs no network file."""
 
 import os
 import signal
@@ -31,18 +31,18 @@ from mag_tracking.web.live_scene import LiveScene
 from mag_tracking.web.page_server import TICK_S, PageServer
 
 NICENESS = 10
-"""By how much the process gives way to the nodes."""
+"""Scheduling niceness of the process, which must not delay the nodes."""
 FRAMES_KEPT = 64
-"""Latest frames that wait, not yet read, for a track that is of them."""
+"""Number of recent serialised frames kept for matching with tracks."""
 SILENT_S = 5.0
-"""[s] A status that has not been repeated for so long is no longer true."""
+"""[s] A diagnostic status that was not repeated for longer is stale."""
 _LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warning',
            DiagnosticStatus.ERROR: 'error', DiagnosticStatus.STALE: 'stale'}
 
 
 @dataclass(frozen=True, eq=False)
 class SensorPlaces:
-    """Names and places of the sensors, as the tracker publishes them."""
+    """Names and positions of the sensors, as published by the tracker."""
 
     frame: str
     names: tuple[str, ...]
@@ -54,14 +54,14 @@ class SensorPlaces:
 
 
 NOWHERE = SensorPlaces('', (), np.zeros((0, 3)))
-"""Before the tracker has told of its sensors."""
+"""Placeholder until the tracker has published its sensors."""
 
 
 class PageNode(Node):
-    """Takes what the tracker publishes, several messages at once, and hands it to a scene.
+    """Subscribes to the tracker's topics and adds their messages to a scene.
 
-    The topics are relative: `tracker_node/tracks`, `tracker_node/smoothed`,
-    `tracker_node/sensor_markers`, `network_frame`. Remapped and in a namespace, it looks at others.
+    The topics `tracker_node/tracks`, `tracker_node/smoothed`, `tracker_node/sensor_markers` and
+    `network_frame` are relative and can be remapped.
     """
 
     def __init__(self, scene: LiveScene) -> None:
@@ -74,7 +74,7 @@ class PageNode(Node):
         self._tracks_topic = self.resolve_topic_name('tracker_node/tracks')
         self.create_subscription(MarkerArray, 'tracker_node/sensor_markers', self._take_sensors,
                                  LATCHED)
-        # Frames come often and are large: only those that are shown are read.
+        # Frames are frequent and large: only those that are shown are deserialised.
         self.create_subscription(NetworkFrame, NETWORK_FRAME, self._take_frame, STREAM, raw=True)
         self.create_subscription(TrackArray, self._tracks_topic, self._take_tracks, STREAM)
         self.create_subscription(SmoothedTrack, 'tracker_node/smoothed', self._take_smoothed,
@@ -84,7 +84,7 @@ class PageNode(Node):
         steady_timer(self, 1.0, self._tell_health)
 
     def _take_sensors(self, message: MarkerArray) -> None:
-        """The sensors' places; a survey moves none, and another network begins a new scene."""
+        """Store the sensor positions; another network starts a new scene."""
         bodies = [m for m in message.markers if m.ns == SENSOR_KINDS[0]]
         texts = {m.id: m.text for m in message.markers if m.ns == SENSOR_KINDS[1]}
         if not bodies or {m.id for m in bodies} - texts.keys():
@@ -101,26 +101,26 @@ class PageNode(Node):
             self._scene.use_network(places)
 
     def _take_frame(self, message: bytes) -> None:
-        """Frames wait for the next tick, unread."""
+        """Keep a serialised frame for the next tick."""
         self._frames.append(message)
 
     def _take_tracks(self, message: TrackArray) -> None:
-        """Tracks wait for the next tick, so that a fast tracker is read many at once."""
+        """Keep tracks for the next tick."""
         self._tracks.extend(message.tracks)
 
     def _take_smoothed(self, message: SmoothedTrack) -> None:
-        """A track that has ended."""
+        """Add the smoothed path of an ended track."""
         self._tick()
         points = [p.pose.pose.position for p in message.poses]
         self._scene.add_smoothed(message.track_id, np.array([[p.x, p.y, p.z] for p in points]))
 
     def _take_diagnostics(self, message: DiagnosticArray) -> None:
-        """Keep the latest of each status."""
+        """Keep the latest message of each status."""
         now = time.monotonic()
         self._statuses.update({s.name: (now, s) for s in message.status})
 
     def _tick(self) -> None:
-        """Hand over what has come: all frames where there is a track, else the latest."""
+        """Add received messages to the scene: all frames during a track, otherwise the latest."""
         if not len(self._places) or not self._frames:
             return
         raw = list(self._frames) if self._tracks else [self._frames[-1]]
@@ -137,7 +137,7 @@ class PageNode(Node):
                 self._scene.add_track(track_of(message))
 
     def _tell_health(self) -> None:
-        """Faults at the head of the page, all statuses at its foot."""
+        """Update the notes with faults, and the table of all statuses."""
         now = time.monotonic()
         notes, rows = [], []
         for name, (heard, status) in sorted(self._statuses.items()):
@@ -148,8 +148,8 @@ class PageNode(Node):
                 notes.append(Note(ERROR if level == 'error' else WARNING,
                                   f'{name}: {status.message}'))
         if not self.count_publishers(self._tracks_topic):
-            notes.insert(0, Note(WARNING, f'nobody publishes {self._tracks_topic}: start the '
-                                 'tracker, or look in another namespace (--ros-args -r __ns:=...)'))
+            notes.insert(0, Note(WARNING, f'no publisher on {self._tracks_topic}: start the '
+                                 'tracker, or select its namespace (--ros-args -r __ns:=...)'))
         self._scene.set_health(notes, [Table('Health', ['node', 'level', 'message'], rows)])
 
 
@@ -160,15 +160,14 @@ def watch(host: str, port: int, report: Callable[[str], object],
     Parameters
     ----------
     host, port : str, int
-        As of `PageServer`.
+        Arguments of `PageServer`.
     report : function
-        Takes the line that tells the address of the page.
+        Called with a line that contains the address of the page.
     ros_arguments : sequence of str
         Beginning with `--ros-args`.
 
     Raises DeviceError where the port cannot be opened.
     """
-    # To look may not delay what is looked at.
     os.nice(NICENESS)
     scene = LiveScene('mag_tracking', NOWHERE)
     with noted_signals(signal.SIGINT, signal.SIGTERM) as seen, \

@@ -1,7 +1,7 @@
 """replay_node: plays a recording over topics, with /clock, pause, resume and seek.
 
-A lifecycle node: configuring opens the recording and advertises its topics, activating plays,
-deactivating stops where it is. With `autostart` (the default) it does both by itself.
+A lifecycle node: configuration opens the recording and advertises its topics, activation starts
+playback, deactivation stops it. `autostart` (the default) does both at startup.
 """
 
 if __name__ == '__main__':
@@ -90,14 +90,14 @@ class ReplayNode(ManagedNode):
         self._seek(self._offset)
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
-        """Play on from where it is."""
+        """Start playback at the current position."""
         # Discovery takes a moment; what is published before it is lost.
         self._start = time.monotonic() + self._delay
         self._is_active, self._wall = True, None
         return super().on_activate(state)
 
     def on_deactivate(self, state: State) -> TransitionCallbackReturn:
-        """Stop where it is."""
+        """Stop playback; the position is kept."""
         self._is_active = False
         return super().on_deactivate(state)
 
@@ -107,7 +107,7 @@ class ReplayNode(ManagedNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: State) -> TransitionCallbackReturn:
-        """Stop for good."""
+        """Stop playback and close the recording."""
         self._forget()
         return TransitionCallbackReturn.SUCCESS
 
@@ -228,7 +228,7 @@ class ReplayNode(ManagedNode):
 
 
 def _begin_of(recording: Recording) -> int:
-    """[ns] The time of the first message; raises RecordingError where there is none."""
+    """[ns] Time of the first message; raises RecordingError if there is none."""
     if recording.start_ns is not None:
         return recording.start_ns
     # A file without an end does not tell: read on until it does.
@@ -239,7 +239,7 @@ def _begin_of(recording: Recording) -> int:
 
 
 def _wanted(recording: Recording, topics: Sequence[str]) -> set[str] | None:
-    """The topics to be played, None for all; raises RecordingError where one is unknown."""
+    """Topics to play, None for all; raises RecordingError for an unknown topic."""
     wanted = [t for t in topics if t]
     unknown = [t for t in wanted if t not in recording.types]
     if unknown and recording.message_counts:

@@ -84,7 +84,7 @@ def calibration_figure(found: _Calibration, stated: _Network, most: int = 8) -> 
 
 
 def first_knock(shocks: Mapping[str, tuple[FloatArray, FloatArray]]) -> float:
-    """[s] When the first loud shock began; 0 without any.
+    """[s] Start of the first strong knock; 0 if there is none.
 
     `shocks` is {sensor: (times (n,) [s], sizes (n,))}.
     """

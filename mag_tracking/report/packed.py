@@ -1,4 +1,4 @@
-"""Arrays as base64 within JSON: a third of the size of their digits, and exact."""
+"""Arrays as base64 in JSON: exact, and a third of the size of decimal numbers."""
 
 import base64
 
@@ -6,17 +6,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 Packed = dict[str, str]
-"""{type: base64 of the little-endian numbers}; the types are those of scene.js."""
+"""{type: base64 of little-endian numbers}; `scene.js` decodes the types."""
 
 
 def packed(values: ArrayLike, kind: str = 'f8') -> Packed:
-    """One array as JSON.
+    """Array as a JSON object.
 
     Parameters
     ----------
     values : (n,) array
     kind : 'f8', 'f4' or 'u1'
-        Fields and covariances are drawn, and 'f4' is enough; times and positions are read.
+        'f4' is sufficient for values that are only plotted.
     """
     raw = np.ascontiguousarray(values, dtype=f'<{kind}').tobytes()
     return {kind: base64.b64encode(raw).decode('ascii')}

@@ -1,6 +1,6 @@
-"""The page of a report and of the live view: one HTML file that needs nothing else.
+"""Self-contained HTML page of reports and of the live view.
 
-Its parts are in the folder `page`; the plotting library is that of the package plotly.
+Template and scripts are in the folder `page`; the plotting library comes from the package plotly.
 """
 
 import json
@@ -11,16 +11,16 @@ from importlib import resources
 from typing import Any
 
 SCRIPTS = ('scene', 'map', 'curves', 'tables', 'live', 'main', 'start')
-"""Parts of the script, in their order."""
+"""Script files, in load order."""
 REPORT = 'report.html'
-"""Name of a report in a folder of results."""
+"""File name of a report in a result folder."""
 ERROR, WARNING, NOTE = 'error', 'warning', 'note'
-"""Levels of a note."""
+"""Severities of a note."""
 
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """One sentence at the head of a page."""
+    """Message at the top of a page."""
 
     level: str
     text: str
@@ -28,7 +28,7 @@ class Note:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table; numbers are shown with four digits, None as a dash."""
+    """Table; numbers are shown with four significant digits, None as a dash."""
 
     title: str
     columns: Sequence[str]
@@ -37,46 +37,45 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """Curves or a map that do not depend on the time shown."""
+    """Static chart."""
 
     title: str
     traces: Sequence[Mapping[str, Any]]
-    """In the terms of Plotly."""
+    """Plotly traces."""
     layout: Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """What a page shows."""
+    """Content of a page."""
 
     title: str
     subtitle: str = ''
     notes: Sequence[Note] = ()
     scene: Mapping[str, Any] | None = None
-    """A map over time: what `page_scene.scene_of` gives."""
+    """Map with a time slider, as returned by `page_scene.scene_of`."""
     charts: Sequence[Chart] = ()
     tables: Sequence[Table] = ()
 
 
 def report_html(page: Page) -> str:
-    """A whole HTML file, without anything from outside."""
+    """HTML of a report; it loads no external resources."""
     return _html(page.title, asdict(page))
 
 
 def live_html() -> str:
-    """The page that gets its data from the WebSocket `stream` beside it."""
+    """HTML of the live page, which receives its data from the WebSocket `stream`."""
     return _html('mag_tracking', {'title': 'mag_tracking', 'live': True})
 
 
 def _html(title: str, data: Mapping[str, Any]) -> str:
-    """The template with its parts.
+    """Template with title, style, scripts and data filled in.
 
-    Within a script only the characters of a closing tag matter: they are escaped in the data.
+    In the data `<` is escaped, so that no text can close the script element.
     """
     folder = resources.files('mag_tracking.report') / 'page'
     plotly = resources.files('plotly') / 'package_data' / 'plotly.min.js'
     script = '\n'.join(_text(folder / f'{name}.js') for name in SCRIPTS)
-    # The data comes last: it may contain what looks like another mark.
     parts = (('@TITLE@', escape(title)), ('@STYLE@', _text(folder / 'page.css')),
              ('@PLOTLY@', _text(plotly)), ('@SCRIPT@', script),
              ('@DATA@', json.dumps(data, allow_nan=False).replace('<', '\\u003c')))
@@ -89,6 +88,6 @@ def _html(title: str, data: Mapping[str, Any]) -> str:
 
 
 def _text(path: Any) -> str:
-    """The text of a file of a package."""
+    """Text of a package file."""
     text: str = path.read_text(encoding='utf-8')
     return text

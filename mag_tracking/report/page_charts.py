@@ -1,4 +1,4 @@
-"""Charts of a page in the terms of Plotly, in the palette of the figures."""
+"""Plotly charts in the palette of the figures."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,16 +10,16 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.report.style import SERIES
 
 DASHES = ('solid', 'dash', 'dot', 'dashdot', 'longdash')
-"""Each colour goes with a dash of its own."""
+"""Dash styles, one per colour."""
 
 
 def plain(text: str) -> str:
-    """A text in which Plotly finds no markup."""
+    """Text with the markup characters of Plotly escaped."""
     return text.replace('&', '&amp;').replace('<', '&lt;').replace('>', '&gt;')
 
 
 def numbers(values: ArrayLike) -> list[Any]:
-    """Numbers in nested lists, those that are not finite as None."""
+    """Nested lists of numbers; non-finite values become None."""
     array = np.asarray(values, dtype=float)
     if array.ndim > 1:
         return [numbers(row) for row in array]
@@ -27,7 +27,7 @@ def numbers(values: ArrayLike) -> list[Any]:
 
 
 def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') -> dict[str, Any]:
-    """A curve in the `k`-th colour and dash; with mode 'markers' dots."""
+    """Curve in the `k`-th colour and dash style."""
     colour = SERIES[k % len(SERIES)]
     return {'type': 'scatter', 'mode': mode, 'x': numbers(x), 'y': numbers(y),
             'name': plain(name), 'showlegend': bool(name),
@@ -37,14 +37,14 @@ def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') ->
 
 def heat_map(x: FloatArray, y: FloatArray, z: FloatArray, scale: str, title: str,
              low: float | None = None, high: float | None = None) -> dict[str, Any]:
-    """A map of z [y, x] in a colour scale of equal steps for the eye."""
+    """Heat map of z (n_y, n_x) in a perceptually uniform colour scale."""
     return {'type': 'heatmap', 'x': numbers(x), 'y': numbers(y), 'z': numbers(z),
             'colorscale': scale, 'zmin': low, 'zmax': high, 'hoverongaps': False,
             'colorbar': {'title': {'text': title, 'side': 'right'}}}
 
 
 def places(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:
-    """Sensors on a map: (n, 2 or more) [m]."""
+    """Sensors on a map; `points` is (n, 2 or 3) [m]."""
     return {'type': 'scatter', 'mode': 'markers', 'x': numbers(points[:, 0]),
             'y': numbers(points[:, 1]), 'text': [plain(name) for name in names],
             'hoverinfo': 'text', 'name': 'magnetometers', 'showlegend': False,
@@ -53,7 +53,7 @@ def places(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:
 
 
 def axes(x: str, y: str, is_map: bool = False, log_y: bool = False) -> dict[str, Any]:
-    """The layout of a chart with titles of its axes; on a map both have one scale."""
+    """Layout with axis titles; the axes of a map have the same scale."""
     grid = {'gridcolor': '#e3e3e3', 'zeroline': False}
     return {'xaxis': {'title': {'text': x}, **grid, **({'constrain': 'domain'} if is_map else {})},
             'yaxis': {'title': {'text': y}, **grid,

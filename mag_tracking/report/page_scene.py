@@ -1,4 +1,4 @@
-"""The map over time of a page, as JSON: sensors, tracks, their hypotheses, fields."""
+"""JSON of the map with time slider: sensors, tracks, hypotheses, fields."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
@@ -13,25 +13,25 @@ from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.units import NS
 
 MOST_SENSORS = 8
-"""Sensors of a track whose field a report has: those with the strongest."""
+"""Maximum number of sensors with fields per track; those with the strongest field are shown."""
 MOST_BYTES = 4_000_000
-"""Size of the columns of a report, about; beyond it every n-th pose is left out."""
+"""Approximate size limit of the track data. Larger reports show every n-th pose."""
 WIDEST = 6.0
-"""Spans of the network to each side beyond which the map does not follow a track."""
+"""Limit of the map on each side of the network, in spans of the network."""
 LEAST_REACH_M = 10.0
-"""[m] The same for a single sensor."""
+"""[m] Limit of the map for a single sensor."""
 
 
 class Sensors(Protocol):
-    """What the page reads of a `SensorNetwork`."""
+    """Attributes of a `SensorNetwork` that a page uses."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Their names."""
+        """Sensor names."""
 
     @property
     def positions(self) -> FloatArray:
-        """(n, 3) [m]."""
+        """(n, 3) [m] sensor positions, world frame."""
 
     @property
     def frame(self) -> str:
@@ -42,15 +42,15 @@ class Sensors(Protocol):
 
 def scene_of(network: Sensors, begin_ns: int, end_ns: int,
              tracks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """A scene, as JSON.
+    """Map with a time slider, as JSON.
 
     Parameters
     ----------
     network : SensorNetwork
     begin_ns, end_ns : int [ns]
-        The page counts seconds from the beginning.
+        Time range; the page shows seconds since `begin_ns`.
     tracks : sequence of dict
-        Each as `track_entry` gives it.
+        As returned by `track_entry`.
     """
     xy = network.positions[:, :2]
     low, high = xy.min(axis=0), xy.max(axis=0)
@@ -71,19 +71,19 @@ def _box(low: FloatArray, high: FloatArray) -> list[float]:
 
 
 def strongest_sensors(log: TrackLog, most: int = MOST_SENSORS) -> IntArray:
-    """Indices of the `most` sensors with the strongest field while a track ran, in their order."""
+    """Indices of the `most` sensors with the strongest field during a track, ascending."""
     measured = np.abs(np.array(log.measured))
     strength = np.nan_to_num(np.nanmax(np.where(np.isnan(measured), 0.0, measured), axis=(0, 2)))
     return np.sort(np.argsort(-strength, kind='stable')[:most])
 
 
 def step_of(logs: Sequence[TrackLog], most_bytes: int = MOST_BYTES) -> int:
-    """Every how many poses one is kept, so that a report is not larger than allowed."""
+    """Decimation factor that keeps the size of a report below `most_bytes`."""
     size = 0
     for log in logs:
         n_sensors = min(MOST_SENSORS, len(log.measured[0]))
         n_arrivals = len({name for row in log.arrivals for name in row})
-        # In bytes of base64: four for three.
+        # Base64 needs four bytes for three.
         size += len(log.stamp_ns) * (4 * (80 + 24 * n_sensors + 24 * n_arrivals)) // 3
     return max(1, -(-size // most_bytes))
 
@@ -96,11 +96,11 @@ def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
     ----------
     log : TrackLog
     begin_ns : int [ns]
-        Of the scene.
+        Start of the scene.
     sensors : (k,) int
-        Sensors whose fields are told.
+        Sensors whose fields are included.
     rows : slice
-        Which poses; all of them if left out.
+        Range of poses; all by default.
     """
     times = (np.array(log.stamp_ns[rows], dtype=np.int64) - begin_ns) / NS
     columns = _columns(times, _array(log.position[rows], 3), _array(log.velocity[rows], 3),
@@ -115,17 +115,17 @@ def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
 
 def fitted_entry(track_id: int, times: FloatArray, state: FloatArray, covariance: FloatArray,
                  ambiguous: bool, fields: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """A path at constant velocity, as JSON.
+    """Track at constant velocity, as JSON.
 
     Parameters
     ----------
     track_id : int
-    times : (n,) [s] of the scene
+    times : (n,) [s], scene time
     state : (n, 6) [m], [m/s], world
     covariance : (n, 6, 6)
     ambiguous : bool
     fields : sequence of dict
-        As `field_entry` gives them.
+        As returned by `field_entry`.
     """
     n = len(times)
     columns = _columns(times, state[:, :3], state[:, 3:], covariance, np.full(n, ambiguous))
@@ -139,7 +139,7 @@ def field_entry(sensor: int, measured: FloatArray, predicted: FloatArray,
                 times: FloatArray | None = None) -> dict[str, Any]:
     """Measured and predicted field (n, 3) [T] of one sensor, as JSON.
 
-    `times` (n,) [s] are those of the scene; left out: those of the poses.
+    `times` is (n,) [s], scene time; None if the field was measured at the times of the poses.
     """
     return {'sensor': sensor, 't': None if times is None else packed(times), **{
         name: [packed(column, 'f4') for column in values.T]
@@ -147,22 +147,22 @@ def field_entry(sensor: int, measured: FloatArray, predicted: FloatArray,
 
 
 def path_entry(track_id: int, points: FloatArray) -> dict[str, Any]:
-    """A smoothed or true path (n, 2 or more) [m] of a track, as JSON."""
+    """Smoothed or true path (n, 2 or 3) [m] of a track, as JSON."""
     return {'id': track_id, 'x': packed(points[:, 0]), 'y': packed(points[:, 1])}
 
 
 def smoothed_entry(log: SmoothedLog) -> dict[str, Any]:
-    """The path of a smoothed track, as JSON."""
+    """Path of a smoothed track, as JSON."""
     return path_entry(log.id, _array(log.position, 3))
 
 
 def facts_of(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """What the table of tracks says of one, as JSON.
+    """Row of the table of tracks, as JSON.
 
     Parameters
     ----------
     entry : dict
-        `TrackLog.summary()`, or the entry of a track in `summary.json`, which may have a `truth`.
+        `TrackLog.summary()`, or the entry of a track in `summary.json`, which may contain `truth`.
     """
     truth = entry.get('truth', {})
     error = next((truth[key] for key in ('closest', 'position_mean')
@@ -177,12 +177,12 @@ def facts_of(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _array(values: Sequence[FloatArray], *shape: int) -> FloatArray:
-    """(n, *shape), also where there is no value."""
+    """Array (n, *shape), also for n = 0."""
     return np.array(values, dtype=float).reshape(-1, *shape)
 
 
 def _speed_std(velocity: FloatArray, C: FloatArray) -> FloatArray:
-    """(n,) [m/s] deviation of the horizontal speed, to first order."""
+    """(n,) [m/s] standard deviation of the horizontal speed, to first order."""
     flat = velocity[:, :2]
     u = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
     variance = np.einsum('na,nab,nb->n', u, C[:, 3:5, 3:5], u)
@@ -192,7 +192,7 @@ def _speed_std(velocity: FloatArray, C: FloatArray) -> FloatArray:
 
 def _columns(times: FloatArray, position: FloatArray, velocity: FloatArray, C: FloatArray,
              ambiguous: BoolArray) -> dict[str, Packed]:
-    """Poses (n,) as columns."""
+    """Columns of n poses."""
     return {
         't': packed(times), 'x': packed(position[:, 0]), 'y': packed(position[:, 1]),
         'z': packed(position[:, 2]), 'vx': packed(velocity[:, 0]), 'vy': packed(velocity[:, 1]),
@@ -202,7 +202,7 @@ def _columns(times: FloatArray, position: FloatArray, velocity: FloatArray, C: F
 
 
 def _innovation(nis: FloatArray, degrees_of_freedom: FloatArray) -> dict[str, Packed]:
-    """Normalised innovation squared an axis, and the band that holds 90 % of a right model's."""
+    """Normalised innovation squared per axis, and its 90 % band for a consistent filter."""
     n, axes = degrees_of_freedom, np.maximum(degrees_of_freedom, 1.0)
     low, high = (np.where(n > 0.0, chdtri(axes, p) / axes, np.nan) for p in (0.95, 0.05))
     return {'nis': packed(np.where(n > 0.0, nis / axes, np.nan), 'f4'),
@@ -210,7 +210,7 @@ def _innovation(nis: FloatArray, degrees_of_freedom: FloatArray) -> dict[str, Pa
 
 
 def _arrivals(log: TrackLog, rows: slice) -> dict[str, dict[str, Packed]]:
-    """{arrival: columns of its weight and of its best hypothesis}; NaN where it was dropped."""
+    """{arrival: columns of its weight and best hypothesis}; NaN after it was pruned."""
     log_rows = log.arrivals[rows]
     out = {}
     for name in sorted({name for row in log_rows for name in row}):
@@ -226,7 +226,7 @@ def _arrivals(log: TrackLog, rows: slice) -> dict[str, dict[str, Packed]]:
 
 
 def _fields(log: TrackLog, rows: slice, sensors: IntArray) -> list[dict[str, Any]]:
-    """Fields of the sensors at the times of the poses."""
+    """Fields of the selected sensors at the times of the poses."""
     measured = np.array(log.measured[rows]).reshape(-1, len(log.measured[0]), 3)
     predicted = np.array(log.predicted[rows]).reshape(measured.shape)
     return [field_entry(j, measured[:, j], predicted[:, j]) for j in sensors.tolist()]

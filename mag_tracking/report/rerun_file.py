@@ -1,4 +1,4 @@
-"""Tracks as a recording for the Rerun viewer, where its SDK is installed."""
+"""Recording for the Rerun viewer; needs the optional package rerun-sdk."""
 
 from collections.abc import Mapping
 from importlib.util import find_spec
@@ -15,14 +15,14 @@ from mag_tracking.report.page_scene import Sensors
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
 
 RERUN_FILE = 'tracks.rrd'
-"""Name of the file in a folder of results."""
+"""File name in a result folder."""
 TIME = 'stamp'
 SCALE_3D = float(np.sqrt(chdtri(3, 0.1)))
-"""Deviations to the surface of the 90 % region in space."""
+"""Standard deviations to the surface of the 90 % region in 3-D."""
 
 
 def check_rerun() -> None:
-    """Raise MissingDependencyError where the SDK is not installed."""
+    """Raise MissingDependencyError if rerun-sdk is not installed."""
     if find_spec('rerun') is None:
         raise MissingDependencyError('a recording for Rerun needs its SDK: pip install rerun-sdk')
 
@@ -59,7 +59,7 @@ def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, 
 
 
 def _write_track(rerun: Any, stream: Any, network: Sensors, log: TrackLog) -> None:
-    """The poses of a track at their times, and nothing after its end."""
+    """Log the poses of a track, and clear them after its end."""
     root = f'{network.frame}/track_{log.id}'
     for k, ns in enumerate(log.stamp_ns):
         stream.set_time(TIME, timestamp=np.datetime64(ns, 'ns'))

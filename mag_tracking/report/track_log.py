@@ -84,6 +84,12 @@ class TrackLog:
         self.arrivals.append({h.arrival: (h.weight, h.position, h.covariance[:2, :2])
                               for h in best_of_arrivals(track.hypotheses)})
 
+    def forget(self, n: int) -> None:
+        """Remove the first `n` poses."""
+        for values in vars(self).values():
+            if isinstance(values, list):
+                del values[:n]
+
     def seconds(self) -> FloatArray:
         """(n,) [s] since the first pose."""
         stamps = np.array(self.stamp_ns, dtype=np.int64)

@@ -1,1 +1,1 @@
-"""The live page: what is tracked now, sent to browsers over a WebSocket."""
+"""Live page: tracks sent to browsers over a WebSocket."""

@@ -1,4 +1,4 @@
-"""What a live page shows: the tracks of the last minutes, the latest frame, the health."""
+"""State of a live page: recent tracks, latest frame, health."""
 
 import json
 import threading
@@ -25,28 +25,38 @@ from mag_tracking.report.track_log import TrackLog
 from mag_tracking.units import NS
 
 KEPT_S = 600.0
-"""[s] Tracks that ended earlier are forgotten."""
+"""[s] Tracks that ended earlier are removed."""
 MOST_POSES = 30_000
-"""Poses of all tracks together; the oldest tracks are forgotten first."""
+"""Maximum number of poses over all tracks; the oldest tracks are removed first."""
+MOST_OF_TRACK, FORGOTTEN = 8_000, 1_000
+"""Maximum number of poses of one track, and how many are removed when it is exceeded. The page
+script uses the same numbers."""
 MATCHING_FRAMES = 64
-"""Latest frames, among which that of a track is looked for."""
+"""Number of recent frames kept for matching with tracks."""
 JUMP_BACK_S = 1.0
-"""[s] A frame that is so much older than the latest begins a new scene: a bag was played again."""
+"""[s] A larger backward jump of time starts a new scene, for example when a bag is looped."""
 
 
 class _LiveTrack:
-    """A track, and how much of it the viewers have."""
+    """A track and how many of its poses were sent."""
 
     def __init__(self, track_id: int) -> None:
         self.log = TrackLog(track_id)
         self.sent = 0
         self.end_sent = False
-        # Chosen once: rows that follow have to fit those before.
+        # Selected once, because later rows must match the earlier ones.
         self.sensors: IntArray | None = None
         self.smoothed: dict[str, Any] | None = None
+        self.is_smoothed_new = False
+
+    def shorten(self) -> None:
+        """Remove the oldest poses of a very long track."""
+        if len(self.log.stamp_ns) > MOST_OF_TRACK:
+            self.log.forget(FORGOTTEN)
+            self.sent = max(0, self.sent - FORGOTTEN)
 
     def rows(self, begin_ns: int, rows: slice) -> dict[str, Any]:
-        """Some of the poses, as JSON."""
+        """JSON of a range of poses."""
         if self.sensors is None:
             self.sensors = strongest_sensors(self.log)
         entry = track_entry(self.log, begin_ns, self.sensors, rows)
@@ -56,12 +66,12 @@ class _LiveTrack:
 
 
 class LiveScene:
-    """Takes records as they come, and tells what is new; may be used from two threads.
+    """Collects records and creates messages for the page. Thread-safe.
 
     Attributes
     ----------
     title, subtitle : str
-        May be changed at any time; they are told with the next whole scene.
+        Sent with the next whole scene.
     """
 
     def __init__(self, title: str, network: Sensors) -> None:
@@ -74,23 +84,22 @@ class LiveScene:
         self._clear()
 
     def use_network(self, network: Sensors) -> None:
-        """Begin anew with other sensors."""
+        """Start a new scene with another network."""
         with self._lock:
             self._network = network
             self._clear()
 
     def _clear(self) -> None:
-        """Begin anew, as after a jump of time."""
+        """Start a new scene."""
         self._begin_ns: int | None = None
         self._end_ns = 0
         self._frames: OrderedDict[int, FieldFrame] = OrderedDict()
         self._is_frame_new = False
         self._tracks: dict[int, _LiveTrack] = {}
-        self._smoothed_news: list[dict[str, Any]] = []
         self._is_new = True
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Take a frame, before the tracks that came of it."""
+        """Add a frame; call it before `add_track` of the same time."""
         with self._lock:
             self._note_time(frame.stamp_ns)
             self._frames[frame.stamp_ns] = frame
@@ -99,7 +108,7 @@ class LiveScene:
                 self._frames.popitem(last=False)
 
     def add_track(self, track: Track) -> None:
-        """Take a pose, or the closing record of a track."""
+        """Add a pose or the closing record of a track."""
         with self._lock:
             self._note_time(track.stamp_ns)
             live = self._tracks.get(track.id)
@@ -108,31 +117,31 @@ class LiveScene:
             if live is None:
                 live = self._tracks[track.id] = _LiveTrack(track.id)
             live.log.add(track, self._frames.get(track.stamp_ns) or self._no_frame(track))
+            live.shorten()
             self._forget()
 
     def _no_frame(self, track: Track) -> FieldFrame:
-        """A frame without a reading, in place of one that was not heard."""
+        """Empty frame, used when the frame of a track was not received."""
         n = len(self._network)
         return FieldFrame(track.stamp_ns, np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan),
                           np.zeros(n, dtype=int), np.zeros(n))
 
     def add_smoothed(self, track_id: int, points: FloatArray) -> None:
-        """Take the smoothed path (n, 3) [m] of a track that has ended."""
+        """Add the smoothed path (n, 3) [m] of an ended track."""
         with self._lock:
             live = self._tracks.get(track_id)
             if live is not None:
-                live.smoothed = path_entry(track_id, points)
-                self._smoothed_news.append(live.smoothed)
+                live.smoothed, live.is_smoothed_new = path_entry(track_id, points), True
 
     def set_health(self, notes: Iterable[Note], tables: Iterable[Table]) -> None:
-        """Replace what stands at the head and at the foot of the page."""
+        """Replace the notes and tables of the page."""
         notes, tables = list(notes), list(tables)
         with self._lock:
             if (notes, tables) != (self._notes, self._tables):
                 self._notes, self._tables, self._is_health_new = notes, tables, True
 
     def whole(self) -> list[str]:
-        """Messages for somebody who has nothing: all that was told before, as JSON."""
+        """JSON messages with everything sent so far, for a new viewer."""
         with self._lock:
             tracks = []
             for live in self._tracks.values():
@@ -143,7 +152,7 @@ class LiveScene:
             return [*self._scene(tracks), self._health()]
 
     def news(self) -> list[str]:
-        """Messages about what came since the last time, as JSON."""
+        """JSON messages with everything new since the last call."""
         with self._lock:
             if self._is_new:
                 self._is_new = False
@@ -153,12 +162,15 @@ class LiveScene:
             tracks = [self._track_news(live) for live in self._tracks.values()
                       if live.sent < len(live.log.stamp_ns)
                       or live.log.ended and not live.end_sent]
-            if tracks or self._smoothed_news or self._is_frame_new:
-                out.append(self._rows(tracks))
+            smoothed = [live.smoothed for live in self._tracks.values() if live.is_smoothed_new]
+            for live in self._tracks.values():
+                live.is_smoothed_new = False
+            if tracks or smoothed or self._is_frame_new:
+                out.append(self._rows(tracks, smoothed))
             return out
 
     def _scene(self, tracks: list[dict[str, Any]]) -> list[str]:
-        """A scene that replaces what was shown; nothing while the sensors are not known."""
+        """Message that replaces the scene; empty while the sensors are unknown."""
         if not len(self._network):
             return []
         begin_ns = self._begin_ns or 0
@@ -167,40 +179,40 @@ class LiveScene:
                             'scene': scene})]
 
     def _track_news(self, live: _LiveTrack) -> dict[str, Any]:
-        """The poses of a track that were not yet sent."""
+        """JSON of the poses of a track that were not sent yet."""
         entry = live.rows(self._begin_ns or 0, slice(live.sent, None))
         live.sent, live.end_sent = len(live.log.stamp_ns), live.log.ended
         return entry
 
-    def _rows(self, tracks: list[dict[str, Any]]) -> str:
-        """One message of rows."""
+    def _rows(self, tracks: list[dict[str, Any]], smoothed: list[dict[str, Any] | None]) -> str:
+        """Message with new poses and the latest frame."""
         begin_ns, frame = self._begin_ns or 0, None
         if self._is_frame_new:
             latest = next(reversed(self._frames.values()))
             frame = {'t': (latest.stamp_ns - begin_ns) / NS,
                      'field': packed(latest.field.ravel(), 'f4')}
-        smoothed, self._smoothed_news, self._is_frame_new = self._smoothed_news, [], False
+        self._is_frame_new = False
         return json.dumps({
             'type': 'rows', 'tracks': tracks, 'smoothed': smoothed, 'frame': frame,
             'end': (self._end_ns - begin_ns) / NS, 'latest_ns': str(self._end_ns)})
 
     def _health(self) -> str:
-        """The message about the health."""
+        """Message with notes and tables."""
         return json.dumps({'type': 'health', 'notes': [asdict(note) for note in self._notes],
                            'tables': [asdict(table) for table in self._tables]})
 
     def _note_time(self, stamp_ns: int) -> None:
-        """Keep begin and end of the scene; a jump back clears it."""
+        """Update begin and end of the scene; a backward jump starts a new one."""
         if self._end_ns - stamp_ns > JUMP_BACK_S * NS:
             self._clear()
         if self._begin_ns is None:
             self._begin_ns = stamp_ns
-            # What was told of an empty scene began at no time.
+            # An empty scene that was sent before had no start time.
             self._is_new = True
         self._end_ns = max(self._end_ns, stamp_ns)
 
     def _forget(self) -> None:
-        """Forget tracks that ended long ago, and the oldest where there are too many poses."""
+        """Remove tracks that ended long ago, and the oldest ones if there are too many poses."""
         n = sum(len(live.log.stamp_ns) for live in self._tracks.values())
         for track_id, live in list(self._tracks.items())[:-1]:
             old = (self._end_ns - live.log.stamp_ns[-1]) / NS > KEPT_S

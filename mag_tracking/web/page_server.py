@@ -1,4 +1,4 @@
-"""Serves the live page and its WebSocket, in a thread of its own."""
+"""HTTP and WebSocket server of the live page, in its own thread."""
 
 import asyncio
 import gzip
@@ -22,11 +22,11 @@ from mag_tracking.report.page import live_html
 LOOPBACK = '127.0.0.1'
 DEFAULT_PORT = 8765
 TICK_S = 0.05
-"""[s] Between two messages: a target at 50 km/h gets on by 0.7 m."""
+"""[s] Interval between messages. A target at 50 km/h moves 0.7 m in this time."""
 MOST_BUFFERED = 1_000_000
-"""Bytes that wait for a viewer; beyond, it gets nothing more until it has read them."""
+"""Send buffer of a viewer, in bytes. A viewer above it receives no messages until it is empty."""
 GIVE_UP_S = 20.0
-"""[s] A viewer that has not caught up by then is disconnected."""
+"""[s] A viewer that lags for longer is disconnected."""
 MOST_VIEWERS = 100
 MOST_PORT = 65535
 START_S = 10.0
@@ -34,34 +34,33 @@ PAGE, STREAM = '/', '/stream'
 
 
 class Source(Protocol):
-    """What is shown, such as a `LiveScene`."""
+    """Source of the messages, such as a `LiveScene`."""
 
     def whole(self) -> list[str]:
-        """Messages for a viewer that has nothing."""
+        """Messages that bring a new viewer up to date."""
 
     def news(self) -> list[str]:
-        """Messages for all viewers."""
+        """New messages for all viewers."""
 
 
 class PageServer:
-    """A live page that any number of browsers may look at.
+    """Live page for any number of browsers.
 
     Parameters
     ----------
     source : LiveScene
     host : str
-        An address of this machine. From others than this the page is seen where it is not of the
-        loopback, and then only with a token.
+        Local address to listen on. Addresses other than loopback require a token.
     port : int
-        0: any that is free.
+        0 selects a free port.
 
     Attributes
     ----------
     url : str
-        What a browser opens, with the token where one is needed.
+        Address of the page, including the token if there is one.
     n_viewers : int
     n_behind : int
-        Viewers that could not follow and got no news for a while, in all.
+        How many times a viewer lagged and had to wait.
 
     Raises DeviceError where the port cannot be opened.
     """
@@ -85,11 +84,11 @@ class PageServer:
 
     @property
     def n_viewers(self) -> int:
-        """Browsers that look at the page now."""
+        """Number of connected viewers."""
         return len(self._viewers)
 
     def close(self) -> None:
-        """Disconnect all viewers and free the port."""
+        """Disconnect all viewers and release the port."""
         if self._thread.is_alive():
             self._loop.call_soon_threadsafe(self._stop.set)
             self._thread.join(START_S)
@@ -101,7 +100,7 @@ class PageServer:
         self.close()
 
     def _run(self) -> None:
-        """The thread."""
+        """Run the event loop of the server thread."""
         asyncio.set_event_loop(self._loop)
         try:
             self._loop.run_until_complete(self._serve())
@@ -109,12 +108,12 @@ class PageServer:
             self._loop.close()
 
     async def _serve(self) -> None:
-        """Serve until told to stop."""
+        """Serve until `close` is called."""
         log = getLogger('mag_tracking.web')
         log.setLevel(ERROR)
-        # Everybody can send ill-formed requests: they are no news.
+        # Malformed requests from the network must not fill the log.
         log.addFilter(lambda record: record.msg != 'opening handshake failed')
-        # Compression would be done once a viewer.
+        # Compression would run separately for each viewer.
         async with serve(self._look, sock=self._socket, process_request=self._answer,
                          compression=None, max_size=1024, max_queue=4, logger=log,
                          open_timeout=10.0, close_timeout=1.0, ping_interval=10.0,
@@ -127,7 +126,7 @@ class PageServer:
                     continue
 
     def _tell(self) -> None:
-        """Send what is new to all who can follow; a whole scene to those who have caught up."""
+        """Send new messages to all viewers, and the whole scene to those that have caught up."""
         if not self._viewers and not self._behind:
             return
         now = self._loop.time()
@@ -147,8 +146,8 @@ class PageServer:
                 viewer.transport.abort()
 
     def _welcome(self, viewer: ServerConnection) -> None:
-        """Send all that there is, after which the news follow."""
-        # What is new goes out first: it is part of the whole, and must not come again.
+        """Send the whole scene to a viewer; new messages follow."""
+        # Pending messages go out first: they are part of the whole scene and must not be repeated.
         for message in self._source.news():
             broadcast(self._viewers, message)
         for message in self._source.whole():
@@ -156,7 +155,7 @@ class PageServer:
         self._viewers.add(viewer)
 
     async def _look(self, viewer: ServerConnection) -> None:
-        """One viewer, until it goes; what it says is not heard."""
+        """Handle one connection until it closes; incoming messages are ignored."""
         if len(self._viewers) + len(self._behind) >= MOST_VIEWERS:
             await viewer.close(1013, 'too many viewers')
             return
@@ -171,7 +170,7 @@ class PageServer:
             self._behind.pop(viewer, None)
 
     def _answer(self, _: ServerConnection, request: Request) -> Response | None:
-        """The page, a refusal, or None for a WebSocket that may go on."""
+        """Response to an HTTP request; None accepts a WebSocket."""
         address = urlsplit(request.path)
         refusal = self._refusal(request, parse_qs(address.query).get('token', [''])[0])
         if refusal:
@@ -179,32 +178,32 @@ class PageServer:
         if address.path == STREAM:
             return None
         if address.path != PAGE:
-            return _response(HTTPStatus.NOT_FOUND, b'There is only the page / here.\n',
+            return _response(HTTPStatus.NOT_FOUND, b'Not found.\n',
                              'text/plain')
         return _response(HTTPStatus.OK, self._page, 'text/html', 'gzip')
 
     def _refusal(self, request: Request, token: str) -> str:
-        """Why a request is refused, or nothing."""
+        """Reason to refuse a request; empty if it is allowed."""
         host = request.headers.get('Host', '')
         if self._token:
             if not secrets.compare_digest(token.encode('utf-8'), self._token.encode('utf-8')):
-                return 'The address of this page needs the token that was printed at the start.\n'
-        # A page of elsewhere could name this address under a name of its own.
+                return 'Missing or wrong token. Open the address that was printed at startup.\n'
+        # DNS rebinding: a foreign page can make its own host name resolve to this address.
         elif not is_loopback(_host_name(host)):
-            return 'Without a token this page is for this machine only.\n'
+            return 'This page is available on the local machine only.\n'
         origin = request.headers.get('Origin')
         if origin is not None and urlsplit(origin).netloc != host:
-            return 'Pages of other servers may not look at this stream.\n'
+            return 'Connections from pages of other origins are refused.\n'
         return ''
 
 
 def check_port(host: str, port: int) -> None:
-    """Raise DeviceError where a page could not be served."""
+    """Raise DeviceError if the page cannot be served on this port."""
     _listening(host, port).close()
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host name or address is that of this machine alone."""
+    """True if a host name or address is a loopback address."""
     if host == 'localhost':
         return True
     try:
@@ -214,7 +213,7 @@ def is_loopback(host: str) -> bool:
 
 
 def _host_name(host: str) -> str:
-    """The name or address in a Host header, without the port."""
+    """Host name or address of a Host header, without the port."""
     try:
         return urlsplit(f'//{host}').hostname or ''
     except ValueError:
@@ -222,12 +221,12 @@ def _host_name(host: str) -> str:
 
 
 def _waiting(viewer: ServerConnection) -> int:
-    """Bytes that a viewer has not yet read."""
+    """Number of bytes in the send buffer of a viewer."""
     return viewer.transport.get_write_buffer_size()
 
 
 def _listening(host: str, port: int) -> socket.socket:
-    """A socket that listens; raises DeviceError where it cannot be had."""
+    """Listening socket; raises DeviceError if it cannot be opened."""
     if not 0 <= port <= MOST_PORT:
         raise DeviceError(f'the live page cannot be served on port {port}: expected a number up '
                           f'to {MOST_PORT}')
@@ -242,7 +241,7 @@ def _listening(host: str, port: int) -> socket.socket:
 
 
 def _response(status: HTTPStatus, body: bytes, kind: str, encoding: str = '') -> Response:
-    """A response with the headers that keep a page to itself."""
+    """HTTP response with security headers."""
     headers = Headers({
         'Content-Type': f'{kind}; charset=utf-8', 'Content-Length': str(len(body)),
         'Cache-Control': 'no-store', 'Referrer-Policy': 'no-referrer', 'Connection': 'close',

@@ -50,7 +50,7 @@ def test_the_page_of_running_nodes_has_the_values_of_the_topic(ros):
         with browser() as chromium:
             page = Opened(chromium, address(watch))
             page.wait('document.getElementById("notes").textContent.includes('
-                      '"nobody publishes /tracker_node/tracks")')
+                      '"no publisher on /tracker_node/tracks")')
             run = command('run', '--network', NETWORK_FILE, '--recording', RECORDING)
             assert spin_until(lambda: any(t.status == t.ENDED for m in heard for t in m.tracks))
             page.wait('magTracking.scene.tracks.length && magTracking.scene.tracks[0].ended')

@@ -24,7 +24,9 @@ def browser():
 
     with sync_playwright() as playwright:
         # In a container root may not make a sandbox; the pages are our own.
-        found = playwright.chromium.launch(executable_path=chromium(), args=['--no-sandbox'])
+        # Its shared memory is small there, too.
+        found = playwright.chromium.launch(executable_path=chromium(), args=[
+            '--no-sandbox', '--disable-dev-shm-usage'])
         try:
             yield found
         finally:

@@ -237,6 +237,39 @@ def test_a_looped_bag_begins_anew(scene, server, records):
         assert int(message['scene']['begin_ns']) == begin
 
 
+@needs_browser
+def test_a_target_that_stays_for_hours_fills_no_memory(chromium, scene, server, records):
+    """Neither that of the server, with and without viewers, nor that of the browser."""
+    template = [r for r in records if isinstance(r, FieldFrame)][-1]
+    pose, stamp = poses(records)[30], template.stamp_ns
+
+    def stay(n):
+        nonlocal stamp
+        for _ in range(n):
+            stamp += SECOND_NS // 10
+            scene.add_frame(replace(template, stamp_ns=stamp))
+            scene.add_track(replace(pose, stamp_ns=stamp))
+
+    stay(12_000)
+    page = Opened(chromium, server.url)
+    page.wait('magTracking.connected && magTracking.scene.tracks.length')
+    for _ in range(4):
+        stay(3_000)
+        page.wait(f'magTracking.scene.latestNs === "{stamp}"')
+        assert page.value('magTracking.scene.tracks[0].columns.t.length') <= 8_000
+    last = page.value('(t => t[t.length - 1])(magTracking.scene.tracks[0].columns.t)')
+    begin_ns = int(page.value('magTracking.scene.begin_ns'))
+    assert last == pytest.approx((stamp - begin_ns) / SECOND_NS)
+    lengths = page.value("""(track => [...Object.values(track.columns), track.doubts,
+        ...track.fields.flatMap(f => [...f.measured, ...f.predicted]),
+        ...Object.values(track.arrivals).flatMap(Object.values)].map(v => v.length))
+        (magTracking.scene.tracks[0])""")
+    assert len(set(lengths)) == 1
+    assert sum(len(message) for message in scene.whole()) < 10_000_000
+    assert page.complaints == []
+    page.page.close()
+
+
 def test_a_port_in_use_is_said(scene, server):
     with pytest.raises(DeviceError, match=f'port {server.port}: Address already in use'):
         PageServer(scene, port=server.port)

@@ -87,7 +87,7 @@ def test_a_calibration_shows_each_sensor(chromium, tmp_path):
     cells = page.value('[...document.querySelectorAll("tbody tr")].map(r => r.cells[0].innerText)')
     assert cells == ['mag_1', 'mag_2']
     titles = page.value('[...document.querySelectorAll("#charts h2")].map(e => e.innerText)')
-    assert 'Clocks set by it' in titles
+    assert 'First knock, corrected clocks' in titles
     closed(page, path)
 
 

@@ -1,9 +1,9 @@
-// The curves over time: fields, weights, innovation, speed; each with a line at the time shown.
+// Curves over time (fields, weights, innovation, speed) with a line at the current time.
 'use strict';
 
 const STRONGEST = 'strongest';
 const MOST_PANELS = 4;
-// What is drawn before the latest time of a live page, and kept of its fields [s].
+// Length of the time axis of a live page [s].
 const WINDOW_S = 20;
 const MANY_DOTS = 250;
 
@@ -28,7 +28,7 @@ function largest(axes) {
   return most;
 }
 
-// [{name, t, measured, predicted or null}] of a track, or of what a live page hears without one.
+// [{name, t, measured, predicted or null}] of a track; of recent frames if there is no track.
 function fieldsOf(scene, track) {
   if (track) {
     return track.fields.map(field => ({name: scene.sensors.names[field.sensor],
@@ -62,7 +62,7 @@ function drawFields(scene, track, choice, t, range) {
   const [f, unit] = unitOf(Math.max(0, ...fields.map(field => largest(field.measured))));
   fields.forEach((field, i) => {
     const traces = [], many = field.t.length > MANY_DOTS;
-    // Many dots would hide the lines.
+    // Dense dots would hide the lines.
     const dots = many ? {size: 3, opacity: 0.45} : {size: 5};
     AXES.forEach(([colour, dash], a) => {
       const name = 'xyz'[a];
@@ -95,11 +95,11 @@ function drawInnovation(track, t, range) {
     {type: 'scatter', mode: 'lines', x: c.t, y: c.nis_low, line: {width: 0}, hoverinfo: 'skip',
       showlegend: false},
     {type: 'scatter', mode: 'lines', x: c.t, y: c.nis_high, line: {width: 0}, fill: 'tonexty',
-      fillcolor: 'rgba(0,114,178,0.18)', name: '90 % band of a right model', hoverinfo: 'skip'},
-    {type: 'scatter', mode: 'lines+markers', x: c.t, y: c.nis, marker: {size: 4}, name: 'NIS an axis',
+      fillcolor: 'rgba(0,114,178,0.18)', name: '90 % band (consistent filter)', hoverinfo: 'skip'},
+    {type: 'scatter', mode: 'lines+markers', x: c.t, y: c.nis, marker: {size: 4}, name: 'NIS per axis',
       line: {color: BLACK, width: 1.5}}];
   Plotly.react('innovation', traces,
-    curveLayout('NIS an axis', t, range, {rangemode: 'tozero'}), CONFIG);
+    curveLayout('NIS per axis', t, range, {rangemode: 'tozero'}), CONFIG);
 }
 
 function drawSpeed(track, t, range) {
@@ -119,7 +119,7 @@ function drawSpeed(track, t, range) {
   Plotly.react('speed', traces, curveLayout('m/s', t, range, {rangemode: 'tozero'}), CONFIG);
 }
 
-// Move the line at the time shown, without drawing the curves anew.
+// Move the time line without redrawing the curves.
 function moveLines(t) {
   for (const plot of [...document.querySelectorAll('#field .plot'),
     ...['weights', 'innovation', 'speed'].map(id => document.getElementById(id))]) {

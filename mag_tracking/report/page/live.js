@@ -1,8 +1,8 @@
-// The WebSocket of a live page: whole scenes, rows that follow, health; it reconnects by itself.
+// WebSocket client of a live page with automatic reconnection.
 'use strict';
 
 const RETRY_MS = 1000;
-// Of the past, so much is kept [s].
+// History [s].
 const KEPT_S = 600;
 
 function connect() {
@@ -14,9 +14,9 @@ function connect() {
   address.protocol = location.protocol === 'https:' ? 'wss:' : 'ws:';
   const socket = new WebSocket(address);
   socket.addEventListener('message', event => take(JSON.parse(event.data)));
-  socket.addEventListener('open', () => say('connected', false));
+  socket.addEventListener('open', () => say('Connected', false));
   socket.addEventListener('close', () => {
-    say('The connection is lost; it is tried again every second.', true);
+    say('Connection lost. Reconnecting…', true);
     setTimeout(connect, RETRY_MS);
   });
 }

@@ -1,9 +1,9 @@
-// The page: what is shown at which time. A live page gets its data from live.js.
+// State of the page and current time. A live page receives its data through live.js.
 'use strict';
 
 const page = {scene: null, t: 0, follows: false, choice: STRONGEST, current: undefined,
   plays: false, drawn: 0};
-// For people who look into it, and for tests.
+// Public for debugging and tests.
 window.magTracking = page;
 
 const at = id => document.getElementById(id);
@@ -27,7 +27,7 @@ function setScene(packed) {
     ...scene.sensors.names.map(name => element('option', name, {value: name})));
   at('sensors').value = page.choice = STRONGEST;
   page.current = undefined;
-  // A fitted pass has neither.
+  // Fitted passes have neither.
   at('weights-card').hidden = !page.live && scene.tracks.every(
     track => !Object.keys(track.arrivals).length);
   at('innovation-card').hidden = !page.live && scene.tracks.every(
@@ -37,7 +37,7 @@ function setScene(packed) {
   moveTo(page.follows ? scene.end : first ? best(first) : 0);
 }
 
-// The time at which most is known of a track.
+// Time of the most accurate pose of a track.
 function best(track) {
   const c = track.columns;
   let k = 0;
@@ -75,7 +75,7 @@ let curvesDue = 0;
 function draw() {
   const scene = page.scene, t = page.t;
   const nearest = currentTrack(scene, t);
-  // A live page without a target shows what the sensors say now.
+  // Without a target a live page shows the current fields.
   const track = page.follows && !tracksAt(scene, t).length ? null : nearest;
   at('slider').value = t;
   at('clock').textContent = `${t.toFixed(2)} s`;

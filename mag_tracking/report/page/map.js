@@ -1,12 +1,12 @@
-// The map: sensors, tracks, 90 % regions and hypotheses at one time.
+// Map of sensors, tracks, 90 % regions and hypotheses at the current time.
 'use strict';
 
-// Okabe and Ito 2008; each colour goes with a dash of its own.
+// Okabe and Ito 2008; each colour has its own dash style.
 const SERIES = ['#0072B2', '#E69F00', '#009E73', '#CC79A7', '#56B4E9'];
 const DASHES = ['solid', 'dash', 'dot', 'dashdot', 'longdash'];
 const VERMILLION = '#D55E00', BLACK = '#000000';
 const SYMBOLS = ['circle', 'square', 'diamond'];
-// Deviations to the edge of a 90 % ellipse in the plane, and of a 90 % interval.
+// Standard deviations to the edge of a 90 % ellipse and of a 90 % interval.
 const SCALE_2D = Math.sqrt(-2 * Math.log(0.1)), SCALE_1D = 1.645;
 const LEAST_DRAWN = 0.01;
 const FONT = {size: 13, color: '#1b1b1b'};
@@ -53,7 +53,7 @@ function mapTraces(scene, t) {
       traces.push(line(scaled(track.smoothed.x), scaled(track.smoothed.y), named('smoothed'),
         {color: VERMILLION, width: 1.5}));
     }
-    // An ambiguous pose may jump; a line through it would show a way that nothing went.
+    // Ambiguous poses may jump, so no line connects them.
     const sure = axis => Array.from(axis, (v, i) => c.ambiguous[i] ? null : f * v);
     const doubtful = axis => scaled(axis.slice(0, k + 1).filter((_, i) => c.ambiguous[i]));
     traces.push(line(sure(c.x), sure(c.y), '', {color: '#a8a8a8', width: 1.5}));
@@ -72,7 +72,7 @@ function mapTraces(scene, t) {
   return traces;
 }
 
-// What is known of one track at one time: hypotheses, region, pose, and where it heads.
+// Hypotheses, 90 % region, pose and velocity of a track.
 function nowTraces(track, k, f, named) {
   const c = track.columns, traces = [], looks = looksOf(track);
   const arrivals = Object.entries(track.arrivals).filter(
@@ -110,7 +110,7 @@ function mapLayout(scene) {
     legend: {orientation: 'h', y: 1.04, yanchor: 'bottom', font: {size: 12}}};
 }
 
-// The region that holds the sensors, and the poses that are not yet far out.
+// Extend the map to the unambiguous poses of a track, up to a limit.
 function grownReach(scene, track) {
   const c = track.columns, r = scene.reach, edge = scene.most_reach;
   for (let k = 0; k < c.t.length; k++) {

@@ -1,7 +1,10 @@
-// The data of a page: columns of tracks, decoded from base64, and how rows are appended live.
+// Data of a page: decoding, appending of live rows, and lookup by time.
 'use strict';
 
 const ARRAYS = {f8: Float64Array, f4: Float32Array, u1: Uint8Array};
+
+// Maximum number of poses of a live track, and how many are removed when it is exceeded.
+const MOST_OF_TRACK = 8000, FORGOTTEN = 1000;
 
 // A typed array of {f8: base64}, {f4: base64} or {u1: base64}.
 function decoded(packed) {
@@ -30,7 +33,7 @@ function joined(one, other) {
   return out;
 }
 
-// Append the columns of `rows` to those of `track`; a new arrival weighed nothing before.
+// Append the columns of `rows` to those of `track`; a new arrival had no weight before.
 function append(track, rows) {
   const before = track.columns.t.length, added = rows.columns.t.length;
   for (const name of Object.keys(track.columns)) {
@@ -49,8 +52,23 @@ function append(track, rows) {
     }
   });
   track.doubts = track.doubts.concat(rows.doubts);
+  const spare = track.columns.t.length - MOST_OF_TRACK;
+  if (spare > 0) forget(track, spare + FORGOTTEN);
   track.ended = rows.ended;
   track.facts = rows.facts;
+}
+
+// Remove the first `n` poses.
+function forget(track, n) {
+  const cut = columns => Object.fromEntries(
+    Object.entries(columns).map(([name, values]) => [name, values.slice(n)]));
+  track.columns = cut(track.columns);
+  track.arrivals = Object.fromEntries(
+    Object.entries(track.arrivals).map(([name, columns]) => [name, cut(columns)]));
+  for (const field of track.fields) {
+    for (const key of ['measured', 'predicted']) field[key] = field[key].map(axis => axis.slice(n));
+  }
+  track.doubts = track.doubts.slice(n);
 }
 
 function absent(like, n) {
@@ -58,7 +76,7 @@ function absent(like, n) {
     key => [key, new like[key].constructor(n).fill(key === 'weight' ? 0 : NaN)]));
 }
 
-// The index of the last time that is not later than `t`; -1 before the first.
+// Index of the last time up to `t`; -1 before the first.
 function indexAt(times, t) {
   let low = 0, high = times.length;
   while (low < high) {
@@ -71,16 +89,16 @@ function indexAt(times, t) {
 const beginOf = track => track.columns.t[0];
 const endOf = track => track.columns.t[track.columns.t.length - 1];
 
-// How long the last pose of a track is shown where none follows [s].
+// How long the last pose of a track stays on the map [s].
 const SHOWN_AFTER_S = 0.6;
 
-// The tracks that have a pose at `t`.
+// Tracks with a pose at `t`.
 function tracksAt(scene, t) {
   return scene.tracks.filter(
     track => beginOf(track) <= t + 1e-9 && t <= endOf(track) + SHOWN_AFTER_S);
 }
 
-// The track whose curves are drawn at `t`: the newest there, else the nearest in time.
+// Track whose curves are drawn at `t`: the newest one, otherwise the nearest in time.
 function currentTrack(scene, t) {
   const there = tracksAt(scene, t);
   if (there.length) return there[there.length - 1];
@@ -89,7 +107,7 @@ function currentTrack(scene, t) {
     (best, track) => best === null || away(track) < away(best) ? track : best, null);
 }
 
-// Plotly reads a few tags in its texts; a name is to be shown as it is.
+// Escape the markup characters of Plotly.
 function plain(text) {
   return String(text).replace(/&/g, '&amp;').replace(/</g, '&lt;').replace(/>/g, '&gt;');
 }

@@ -1,4 +1,4 @@
-// Notes, tables and charts that do not depend on the time shown.
+// Notes, tables and static charts.
 'use strict';
 
 function element(tag, text, more) {
@@ -52,7 +52,7 @@ function showTables(tables) {
   }));
 }
 
-// Charts come as Plotly traces and a layout; titles stand in the head of the card.
+// A chart consists of Plotly traces and a layout.
 function showCharts(charts) {
   const holder = document.getElementById('charts');
   for (const chart of charts) {
