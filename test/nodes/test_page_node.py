@@ -53,7 +53,7 @@ def test_the_page_of_running_nodes_has_the_values_of_the_topic(ros):
                       '"no publisher on /tracker_node/tracks")')
             run = command('run', '--network', NETWORK_FILE, '--recording', RECORDING)
             assert spin_until(lambda: any(t.status == t.ENDED for m in heard for t in m.tracks))
-            page.wait('magTracking.scene.tracks.length && magTracking.scene.tracks[0].ended')
+            page.wait('magTracking.scene?.tracks.length && magTracking.scene?.tracks[0]?.ended')
             poses = [track_of(t) for m in heard for t in m.tracks if t.status == t.ACTIVE]
             columns = 'magTracking.scene.tracks[0].columns'
             n = page.value(f'{columns}.t.length')
@@ -70,7 +70,7 @@ def test_the_page_of_running_nodes_has_the_values_of_the_topic(ros):
             measured = page.value('magTracking.scene.tracks[0].fields.map('
                                   'f => f.measured[1].filter(v => Number.isFinite(v)).length)')
             assert min(measured) > 0.9 * n
-            page.wait('magTracking.scene.tracks[0].smoothed')
+            page.wait('magTracking.scene?.tracks[0]?.smoothed')
             page.wait('document.getElementById("tables").textContent.includes("tracker_node")')
             assert page.complaints == []
             run.communicate(timeout=LONGEST_S)

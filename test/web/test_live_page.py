@@ -87,11 +87,11 @@ def test_the_page_has_the_poses_that_were_tracked(chromium, scene, server, recor
     half = len(records) // 2
     feed(scene, records[:half])
     page = Opened(chromium, server.url)
-    page.wait('magTracking.connected && magTracking.scene.tracks.length')
+    page.wait('magTracking.connected && magTracking.scene?.tracks.length')
     feed(scene, records[half:])
     wanted = poses(records)
-    page.wait(f'magTracking.scene.tracks[0].columns.t.length >= {len(wanted)}')
-    page.wait('magTracking.scene.tracks[0].ended')
+    page.wait(f'magTracking.scene?.tracks[0]?.columns.t.length >= {len(wanted)}')
+    page.wait('magTracking.scene?.tracks[0]?.ended')
     for name, axis in (('x', 0), ('y', 1), ('z', 2)):
         np.testing.assert_array_equal(
             page.value(f'Array.from(magTracking.scene.tracks[0].columns.{name})'),
@@ -148,7 +148,7 @@ def test_it_reconnects_after_a_restart(chromium, road_network, records):
         port = server.port
         feed(first, records)
         page = Opened(chromium, server.url)
-        page.wait('magTracking.connected && magTracking.scene.tracks.length === 1')
+        page.wait('magTracking.connected && magTracking.scene?.tracks.length === 1')
     page.wait('!magTracking.connected')
     assert 'lost' in page.value('document.getElementById("connection").textContent')
     second = LiveScene('after', road_network)
@@ -157,7 +157,7 @@ def test_it_reconnects_after_a_restart(chromium, road_network, records):
                   'document.getElementById("title").textContent === "after"')
         assert page.value('magTracking.scene.tracks.length') == 0
         feed(second, records)
-        page.wait('magTracking.scene.tracks.length === 1')
+        page.wait('magTracking.scene?.tracks.length === 1')
         page.page.close()
 
 
@@ -252,7 +252,7 @@ def test_a_target_that_stays_for_hours_fills_no_memory(chromium, scene, server, 
 
     stay(12_000)
     page = Opened(chromium, server.url)
-    page.wait('magTracking.connected && magTracking.scene.tracks.length')
+    page.wait('magTracking.connected && magTracking.scene?.tracks.length')
     for _ in range(4):
         stay(3_000)
         page.wait(f'magTracking.scene.latestNs === "{stamp}"')
