@@ -1,6 +1,6 @@
 """Report of a replay: map with time slider, curves and tables."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,16 @@ from mag_tracking.report.metrics import interpolate_truth
 from mag_tracking.report.page import NOTE, REPORT, Note, Page, Table, report_html
 from mag_tracking.report.page_scene import (
     MOST_SENSORS,
+    MOST_TRACKS,
     facts_of,
+    most_poses_of,
     path_entry,
     scene_of,
-    smoothed_entry,
-    step_of,
     strongest_sensors,
+    thinned,
     track_entry,
 )
+from mag_tracking.report.track_log import TrackLog
 
 
 def write_report(run: Run, network: SensorNetwork, out: Path) -> Path:
@@ -38,33 +40,41 @@ def replay_page(run: Run, network: SensorNetwork) -> Page:
     if summary['interrupted']:
         notes.insert(0, Note(NOTE, 'the replay was interrupted; results are incomplete'))
     if logs:
-        step = step_of(logs)
-        if step > 1:
-            notes.append(Note(NOTE, f'the page shows one pose in {step}; poses.csv has all'))
-        if len(network) > MOST_SENSORS:
-            notes.append(Note(NOTE, f'fields are shown for the {MOST_SENSORS} sensors (of '
-                              f'{len(network)}) with the strongest field of each track'))
-        begin_ns = min(log.stamp_ns[0] for log in logs)
-        entries = {t['id']: t for t in summary['tracks']}
-        tracks = []
-        for log in logs:
-            entry = track_entry(log, begin_ns, strongest_sensors(log),
-                                slice(None, None, step))
-            facts = entries[log.id]
-            entry['facts'] = facts_of(facts)
-            if log.id in run.smoothed:
-                entry['smoothed'] = smoothed_entry(run.smoothed[log.id])
-            if 'truth' in facts:
-                entry['truth'] = path_entry(log.id, interpolate_truth(
-                    run.truth[facts['truth']['name']], log.stamp_ns[::step]))
-            tracks.append(entry)
-        scene = scene_of(network, begin_ns, max(log.stamp_ns[-1] for log in logs), tracks)
+        scene = _scene(run, network, logs[:MOST_TRACKS], notes)
     counts = summary['counts']
     return Page(f'{summary["recording"]}: {len(logs)} track{"s" * (len(logs) != 1)}',
                 f'{counts["align"].get("frames", 0)} frames, '
                 f'{counts["detect"].get("onsets", 0)} detections, '
                 f'{len(summary["disturbances"])} disturbances', notes, scene,
                 tables=[_sensor_table(summary, run, network)])
+
+
+def _scene(run: Run, network: SensorNetwork, logs: Sequence[TrackLog],
+           notes: list[Note]) -> dict[str, Any]:
+    """Map of the tracks; what it leaves out is added to the notes."""
+    if len(logs) < len(run.logs):
+        notes.append(Note(NOTE, f'the page shows the first {len(logs)} of {len(run.logs)} tracks'))
+    most = most_poses_of(logs)
+    if any(len(log.stamp_ns) > most for log in logs):
+        notes.append(Note(NOTE, f'the page shows {most} poses per track; poses.csv has all'))
+    if len(network) > MOST_SENSORS:
+        notes.append(Note(NOTE, f'fields are shown for the {MOST_SENSORS} sensors (of '
+                          f'{len(network)}) with the strongest field of each track'))
+    begin_ns = min(log.stamp_ns[0] for log in logs)
+    entries = {t['id']: t for t in run.summary['tracks']}
+    tracks = []
+    for log in logs:
+        rows, facts = thinned(log, most), entries[log.id]
+        entry = track_entry(log, begin_ns, strongest_sensors(log), rows)
+        entry['facts'] = facts_of(facts)
+        if log.id in run.smoothed:
+            path = np.array(run.smoothed[log.id].position)
+            entry['smoothed'] = path_entry(log.id, path[::-(-len(path) // most)])
+        if 'truth' in facts:
+            entry['truth'] = path_entry(log.id, interpolate_truth(
+                run.truth[facts['truth']['name']], [log.stamp_ns[k] for k in rows]))
+        tracks.append(entry)
+    return scene_of(network, begin_ns, max(log.stamp_ns[-1] for log in logs), tracks)
 
 
 def _sensor_table(summary: Mapping[str, Any], run: Run, network: SensorNetwork) -> Table:

@@ -18,6 +18,8 @@ from mag_tracking.web.live_scene import LiveScene
 
 PART_S = 0.05
 """[s] Duration of a batch of readings."""
+LONGEST_WAIT_S = 5.0
+"""[s] Longer gaps of a recording are shortened."""
 HEALTH_S = 1.0
 """[s] Interval of health updates."""
 
@@ -42,11 +44,11 @@ def view(recording: Recording, network: SensorNetwork, settings: Settings, scene
     """
     reader, pipeline = SampleReader(recording, network), Pipeline(network, settings)
     first_pass_of(recording, network, settings.calibrate, stopped).apply(pipeline.calibrate)
-    begin_ns, began, health_due = None, time.monotonic(), 0.0
-    for readings in _parts(reader.readings()):
-        latest_ns = int(readings.stamp_ns.max())
-        begin_ns = latest_ns if begin_ns is None else begin_ns
-        due = began + (latest_ns - begin_ns) / NS / rate
+    due, before_ns, health_due = time.monotonic(), None, 0.0
+    for readings, log_ns in _parts(reader.readings_as_received()):
+        # By the time of recording: a single wrong timestamp of a sensor must not stop the page.
+        step_s = 0.0 if before_ns is None else (log_ns - before_ns) / NS
+        due, before_ns = due + min(max(step_s, 0.0), LONGEST_WAIT_S) / rate, log_ns
         while time.monotonic() < due and not stopped():
             time.sleep(min(0.05, max(0.0, due - time.monotonic())))
         if stopped():
@@ -56,16 +58,22 @@ def view(recording: Recording, network: SensorNetwork, settings: Settings, scene
             health_due = time.monotonic() + HEALTH_S
             _tell_health(scene, pipeline, reader, [])
     _take(scene, pipeline.flush())
-    _tell_health(scene, pipeline, reader, [Note(NOTE, 'the recording has ended')])
+    _tell_health(scene, pipeline, reader, [Note(NOTE, 'end of the recording')])
 
 
-def _parts(batches: Iterable[Readings]) -> Iterator[Readings]:
-    """Batches of at most `PART_S`, in recorded order."""
-    for readings in batches:
-        part = (np.maximum.accumulate(readings.stamp_ns) - readings.stamp_ns[0]) // int(PART_S * NS)
-        edges = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(readings)]
-        for begin, end in zip(edges, edges[1:], strict=False):
-            yield readings.part(slice(begin, end))
+def _parts(messages: Iterable[tuple[Readings, int]]) -> Iterator[tuple[Readings, int]]:
+    """Readings of about `PART_S` with the time of recording [ns] of the last one."""
+    waiting: list[Readings] = []
+    begin_ns = log_ns = 0
+    for readings, log_ns in messages:
+        if not waiting:
+            begin_ns = log_ns
+        waiting.append(readings)
+        if not 0 <= log_ns - begin_ns < PART_S * NS:
+            yield Readings.joined(waiting), log_ns
+            waiting = []
+    if waiting:
+        yield Readings.joined(waiting), log_ns
 
 
 def _take(scene: LiveScene, records: Iterable[Output]) -> None:

@@ -16,6 +16,7 @@ from mag_tracking.cli.options import (
     add_report,
     add_settings,
     check_outputs,
+    check_report,
     now,
     recorded_network,
     settings_of,
@@ -63,6 +64,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     network, settings = recorded_network(args), settings_of(args)
     recording = Recording(args.recording)
     check_outputs(args)
+    check_report(args, args.recording, args.network, args.out, args.figure)
     times = 1 if args.no_passes else 2
     with noted_signals(signal.SIGINT) as seen:
         with tqdm(total=times * recording.size, unit='B', unit_scale=True,

@@ -15,7 +15,7 @@ from mag_tracking.cli.options import (
     add_recorded_network,
     add_report,
     add_settings,
-    check_writable,
+    check_report,
     recorded_network,
     settings_of,
 )
@@ -54,7 +54,7 @@ def _doctor(args: argparse.Namespace) -> int:
     if (args.recording is None) == (args.live is None):
         raise SettingsError('doctor: either a RECORDING or --live SECONDS')
     network, settings = recorded_network(args), settings_of(args)
-    check_writable(args.report)
+    check_report(args, args.recording, args.network)
     with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
         if args.live is not None:
             if not 1.0 <= args.live <= 86400.0:

@@ -4,6 +4,7 @@ import argparse
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -41,7 +42,7 @@ Shows the tracks of running nodes. Ctrl-C ends the page, not the nodes.
 examples:
   mag-tracking watch
   mag-tracking watch --ros-args -r __ns:=/robot1
-  mag-tracking watch --ros-args -r tracker_node/tracks:=/other_tracker/tracks
+  mag-tracking watch --ros-args -r tracker_node/tracks:=/robot1/follower/tracks
 '''
 
 
@@ -57,6 +58,7 @@ def add(commands: Commands) -> None:
     p = add_command(commands, 'watch', _watch, 'Show running nodes on a live page (needs ROS 2).',
                     _WATCH)
     add_page(p)
+    p.add_argument('--until-eof', action='store_true', help=argparse.SUPPRESS)
 
 
 def add_page(parser: argparse.ArgumentParser, port: bool = True) -> None:
@@ -84,12 +86,13 @@ def _view(args: argparse.Namespace) -> int:
     with noted_signals(signal.SIGINT, signal.SIGTERM) as seen, \
             PageServer(scene, args.host, args.port) as server:
         _told(f'live page: {server.url}')
-        view(recording, network, settings, scene, args.rate, lambda: bool(seen))
+        view(recording, network, settings, scene, args.rate,
+             lambda: bool(seen) or not server.is_serving)
         if not seen:
             _told('end of the recording; the page is served until Ctrl-C')
-        while not seen:
+        while not seen and server.is_serving:
             time.sleep(0.1)
-    return 0
+        return 0 if server.is_serving else 1
 
 
 def _watch(args: argparse.Namespace) -> int:
@@ -97,7 +100,21 @@ def _watch(args: argparse.Namespace) -> int:
     # Only this needs ROS.
     from mag_tracking.nodes.page_node import watch
 
-    return watch(args.host, args.port, _told, args.ros_arguments)
+    ended = _ended_input() if args.until_eof else None
+    return watch(args.host, args.port, _told, args.ros_arguments,
+                 ended.is_set if ended is not None else lambda: False)
+
+
+def _ended_input() -> threading.Event:
+    """Event that is set at the end of the standard input: the parent process has ended."""
+    ended = threading.Event()
+
+    def read() -> None:
+        sys.stdin.read()
+        ended.set()
+
+    threading.Thread(target=read, daemon=True).start()
+    return ended
 
 
 @contextmanager
@@ -107,12 +124,22 @@ def page_process(host: str, port: int, ros_arguments: Sequence[str]) -> Iterator
     Raises DeviceError where the port cannot be opened.
     """
     check_port(host, port)
+    # The page ends with the pipe, also if this process is killed.
     process = subprocess.Popen([
         sys.executable, '-m', 'mag_tracking.cli', 'watch', '--host', host, '--port', str(port),
-        *ros_arguments])
+        '--until-eof', *ros_arguments], stdin=subprocess.PIPE)
+    is_closing = threading.Event()
+
+    def report_end() -> None:
+        status = process.wait()
+        if not is_closing.is_set():
+            print(f'mag-tracking: the live page ended with status {status}', file=sys.stderr)
+
+    threading.Thread(target=report_end, daemon=True).start()
     try:
         yield
     finally:
+        is_closing.set()
         process.terminate()
         try:
             process.wait(10.0)

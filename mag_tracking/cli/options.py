@@ -93,9 +93,21 @@ def check_writable(path: Path | None) -> None:
         raise OutputError(f'cannot write {path}: it is a folder')
 
 
+def check_report(args: argparse.Namespace, *others: Path | None) -> None:
+    """Raise OutputError if the report cannot be written, or would replace another file."""
+    path = args.report
+    if path is None:
+        return
+    check_writable(path)
+    if path.suffix.lower() not in ('.html', '.htm'):
+        raise OutputError(f'--report: {path.name} does not end in .html')
+    if any(other is not None and other.resolve() == path.resolve() for other in others):
+        raise OutputError(f'--report: {path} is another file of this command')
+
+
 def check_outputs(args: argparse.Namespace) -> None:
     """Raise OutputError where what is to be written has no folder to be in."""
-    for path in (args.out, args.figure, getattr(args, 'report', None)):
+    for path in (args.out, args.figure):
         check_writable(path)
     if args.figure is not None and args.figure.suffix.lower() not in FIGURES:
         raise SettingsError(f'--figure: {args.figure.name} ends in none of {", ".join(FIGURES)}')

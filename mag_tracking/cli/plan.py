@@ -15,7 +15,7 @@ from mag_tracking.files import new_text_file, output_folder
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Settings, settings_for
-from mag_tracking.recording.result_folder import without_nan
+from mag_tracking.report.json_text import without_nan
 from mag_tracking.settings import read_parameter_file
 
 _PLAN = '''

@@ -12,9 +12,10 @@ from mag_tracking.cli.options import (
     add_settings,
     settings_of,
 )
+from mag_tracking.errors import SettingsError
 from mag_tracking.network.file import read_network
 from mag_tracking.recording.reader import Recording
-from mag_tracking.web.page_server import DEFAULT_PORT
+from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK
 
 _RUN = '''
 Starts calibration, detection and tracker nodes in one process, and with a
@@ -56,6 +57,8 @@ def _run(args: argparse.Namespace) -> int:
     from mag_tracking.nodes.runner import run
 
     settings, ros_arguments = settings_of(args), list(args.ros_arguments)
+    if args.web is None and args.host != LOOPBACK:
+        raise SettingsError('--host is the address of the live page: add --web')
     if args.use_sim_time:
         ros_arguments += ['--ros-args', '-p', 'use_sim_time:=true']
     read_network(args.network)

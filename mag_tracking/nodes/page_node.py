@@ -4,7 +4,7 @@ import os
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from mag_tracking_msgs.msg import NetworkFrame, SmoothedTrack, TrackArray
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
 from visualization_msgs.msg import MarkerArray
 
 from mag_tracking.arrays import FloatArray
@@ -34,6 +35,9 @@ NICENESS = 10
 """Scheduling niceness of the process, which must not delay the nodes."""
 FRAMES_KEPT = 64
 """Number of recent serialised frames kept for matching with tracks."""
+TRACKS_KEPT = 1000
+"""Maximum number of messages about tracks that are kept for the next tick."""
+TRACKS = 'mag_tracking_msgs/msg/TrackArray'
 SILENT_S = 5.0
 """[s] A diagnostic status that was not repeated for longer is stale."""
 _LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warning',
@@ -60,8 +64,9 @@ NOWHERE = SensorPlaces('', (), np.zeros((0, 3)))
 class PageNode(Node):
     """Subscribes to the tracker's topics and adds their messages to a scene.
 
-    The topics `tracker_node/tracks`, `tracker_node/smoothed`, `tracker_node/sensor_markers` and
-    `network_frame` are relative and can be remapped.
+    The topics `tracker_node/tracks` and `network_frame` are relative and can be remapped; the
+    other topics of the tracker are beside its tracks. A tracker of another name is found by the
+    type of its tracks, if it is the only one in the namespace.
     """
 
     def __init__(self, scene: LiveScene) -> None:
@@ -69,19 +74,38 @@ class PageNode(Node):
         self._scene = scene
         self._places = NOWHERE
         self._frames: deque[bytes] = deque(maxlen=FRAMES_KEPT)
-        self._tracks: list[Any] = []
+        self._tracks: deque[Any] = deque(maxlen=TRACKS_KEPT)
         self._statuses: dict[str, tuple[float, DiagnosticStatus]] = {}
-        self._tracks_topic = self.resolve_topic_name('tracker_node/tracks')
-        self.create_subscription(MarkerArray, 'tracker_node/sensor_markers', self._take_sensors,
-                                 LATCHED)
+        self._tracker: list[Subscription] = []
+        self._attach(self.resolve_topic_name('tracker_node/tracks'))
         # Frames are frequent and large: only those that are shown are deserialised.
+        self._frames_topic = self.resolve_topic_name(NETWORK_FRAME)
         self.create_subscription(NetworkFrame, NETWORK_FRAME, self._take_frame, STREAM, raw=True)
-        self.create_subscription(TrackArray, self._tracks_topic, self._take_tracks, STREAM)
-        self.create_subscription(SmoothedTrack, 'tracker_node/smoothed', self._take_smoothed,
-                                 RESULTS)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._take_diagnostics, STREAM)
         steady_timer(self, TICK_S, self._tick)
         steady_timer(self, 1.0, self._tell_health)
+
+    def _attach(self, tracks: str) -> None:
+        """Subscribe to the topics of the tracker that publishes `tracks`."""
+        for subscription in self._tracker:
+            self.destroy_subscription(subscription)
+        self._tracks_topic, base = tracks, tracks.rpartition('/')[0]
+        self._tracker = [
+            self.create_subscription(MarkerArray, f'{base}/sensor_markers', self._take_sensors,
+                                     LATCHED),
+            self.create_subscription(TrackArray, tracks, self._take_tracks, STREAM),
+            self.create_subscription(SmoothedTrack, f'{base}/smoothed', self._take_smoothed,
+                                     RESULTS)]
+
+    def _look_for_tracker(self) -> list[str]:
+        """Attach to the only tracker in the namespace if it has another name; all tracks topics."""
+        namespace = self.get_namespace().rstrip('/')
+        found = [name for name, kinds in self.get_topic_names_and_types()
+                 if TRACKS in kinds and name.startswith(f'{namespace}/')
+                 and self.count_publishers(name)]
+        if found and self._tracks_topic not in found and len(found) == 1:
+            self._attach(found[0])
+        return found
 
     def _take_sensors(self, message: MarkerArray) -> None:
         """Store the sensor positions; another network starts a new scene."""
@@ -131,7 +155,8 @@ class PageNode(Node):
                     frame_of(deserialize_message(one, NetworkFrame), self._places))
             except RecordingError as error:
                 self.get_logger().error(str(error), throttle_duration_sec=10.0)
-        tracks, self._tracks = self._tracks, []
+        tracks = list(self._tracks)
+        self._tracks.clear()
         for message in tracks:
             if len(message.predicted_field) == 3 * len(self._places):
                 self._scene.add_track(track_of(message))
@@ -147,14 +172,26 @@ class PageNode(Node):
             if level in ('warning', 'error'):
                 notes.append(Note(ERROR if level == 'error' else WARNING,
                                   f'{name}: {status.message}'))
-        if not self.count_publishers(self._tracks_topic):
-            notes.insert(0, Note(WARNING, f'no publisher on {self._tracks_topic}: start the '
-                                 'tracker, or select its namespace (--ros-args -r __ns:=...)'))
-        self._scene.set_health(notes, [Table('Health', ['node', 'level', 'message'], rows)])
+        self._scene.set_health([*self._missing(), *notes],
+                               [Table('Health', ['node', 'level', 'message'], rows)])
+
+    def _missing(self) -> Iterator[Note]:
+        """Notes on topics without a publisher."""
+        found = self._look_for_tracker()
+        if len(found) > 1 and self._tracks_topic not in found:
+            yield Note(WARNING, f'several trackers: {", ".join(found)}; choose one (--ros-args -r '
+                       'tracker_node/tracks:=...)')
+        elif not found:
+            yield Note(WARNING, f'no publisher on {self._tracks_topic}: start the tracker, or '
+                       'select its namespace (--ros-args -r __ns:=...)')
+        elif not len(self._places):
+            yield Note(WARNING, 'no sensors from the tracker yet')
+        if not self.count_publishers(self._frames_topic):
+            yield Note(WARNING, f'no publisher on {self._frames_topic}: fields are not shown')
 
 
 def watch(host: str, port: int, report: Callable[[str], object],
-          ros_arguments: Sequence[str] = ()) -> int:
+          ros_arguments: Sequence[str] = (), ended: Callable[[], bool] = lambda: False) -> int:
     """Serve the page of running nodes until SIGINT or SIGTERM; returns the exit status.
 
     Parameters
@@ -165,6 +202,8 @@ def watch(host: str, port: int, report: Callable[[str], object],
         Called with a line that contains the address of the page.
     ros_arguments : sequence of str
         Beginning with `--ros-args`.
+    ended : function, optional
+        The page is closed when it returns True.
 
     Raises DeviceError where the port cannot be opened.
     """
@@ -177,10 +216,10 @@ def watch(host: str, port: int, report: Callable[[str], object],
         executor, node = make_executor(), PageNode(scene)
         executor.add_node(node)
         try:
-            spin(executor, lambda: bool(seen))
+            spin(executor, lambda: bool(seen) or not server.is_serving or ended())
         finally:
             executor.remove_node(node)
             node.destroy_node()
             executor.shutdown()
             rclpy.try_shutdown()
-    return 0
+        return 0 if server.is_serving else 1

@@ -14,7 +14,7 @@ from mag_tracking.analysis.pass_result import Bearing, PassFit
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import OutputError
 from mag_tracking.files import new_text_file, output_folder
-from mag_tracking.recording.result_folder import without_nan
+from mag_tracking.report.json_text import without_nan
 
 FIT_COLUMNS = (
     'recording', 'pass', 'n_dipoles', 'chosen', 'reason', 'stamp_ns', 'n_values', 'n_unknowns',

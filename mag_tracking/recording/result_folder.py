@@ -2,7 +2,6 @@
 
 import csv
 import json
-import math
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
@@ -18,6 +17,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.track_recording import TrackRecording
 from mag_tracking.recording.writer import refuse_other_recording
 from mag_tracking.records import Detection, FieldFrame, SmoothedPose, Track
+from mag_tracking.report.json_text import without_nan
 from mag_tracking.report.page import REPORT
 from mag_tracking.report.rerun_file import RERUN_FILE
 
@@ -157,15 +157,6 @@ class ResultFolder:
         with new_text_file(self.folder / _SUMMARY) as stream:
             json.dump(without_nan(summary), stream, indent=1, allow_nan=False)
             stream.write('\n')
-
-
-def without_nan(value: Any) -> Any:
-    """NaN and infinity are no JSON: null instead."""
-    if isinstance(value, dict):
-        return {k: without_nan(v) for k, v in value.items()}
-    if isinstance(value, list):
-        return [without_nan(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _floats(*groups: Iterable[float]) -> list[str]:

@@ -3,12 +3,13 @@
 Template and scripts are in the folder `page`; the plotting library comes from the package plotly.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from html import escape
 from importlib import resources
 from typing import Any
+
+from mag_tracking.report.json_text import json_text
 
 SCRIPTS = ('scene', 'map', 'curves', 'tables', 'live', 'main', 'start')
 """Script files, in load order."""
@@ -78,7 +79,7 @@ def _html(title: str, data: Mapping[str, Any]) -> str:
     script = '\n'.join(_text(folder / f'{name}.js') for name in SCRIPTS)
     parts = (('@TITLE@', escape(title)), ('@STYLE@', _text(folder / 'page.css')),
              ('@PLOTLY@', _text(plotly)), ('@SCRIPT@', script),
-             ('@DATA@', json.dumps(data, allow_nan=False).replace('<', '\\u003c')))
+             ('@DATA@', json_text(data).replace('<', '\\u003c')))
     out, rest = [], _text(folder / 'page.html')
     by_place = sorted(parts, key=lambda part: rest.index(part[0]))
     for mark, text in by_place:

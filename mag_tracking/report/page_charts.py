@@ -23,7 +23,7 @@ def numbers(values: ArrayLike) -> list[Any]:
     array = np.asarray(values, dtype=float)
     if array.ndim > 1:
         return [numbers(row) for row in array]
-    return [float(f'{v:.6g}') if np.isfinite(v) else None for v in array]
+    return [float(f'{v:.10g}') if np.isfinite(v) else None for v in array]
 
 
 def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') -> dict[str, Any]:
@@ -54,7 +54,8 @@ def places(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:
 
 def axes(x: str, y: str, is_map: bool = False, log_y: bool = False) -> dict[str, Any]:
     """Layout with axis titles; the axes of a map have the same scale."""
-    grid = {'gridcolor': '#e3e3e3', 'zeroline': False}
+    grid = {'gridcolor': '#e3e3e3', 'zeroline': False, 'exponentformat': 'none',
+            'automargin': True}
     return {'xaxis': {'title': {'text': x}, **grid, **({'constrain': 'domain'} if is_map else {})},
             'yaxis': {'title': {'text': y}, **grid,
                       **({'scaleanchor': 'x', 'constrain': 'domain'} if is_map else {}),

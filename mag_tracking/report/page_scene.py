@@ -1,6 +1,6 @@
 """JSON of the map with time slider: sensors, tracks, hypotheses, fields."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -9,13 +9,17 @@ from scipy.special import chdtri
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.report.figures import scale_of
 from mag_tracking.report.packed import Packed, packed
-from mag_tracking.report.track_log import SmoothedLog, TrackLog
+from mag_tracking.report.track_log import TrackLog
 from mag_tracking.units import NS
 
 MOST_SENSORS = 8
 """Maximum number of sensors with fields per track; those with the strongest field are shown."""
 MOST_BYTES = 4_000_000
-"""Approximate size limit of the track data. Larger reports show every n-th pose."""
+"""Approximate size limit of the track data; larger reports show fewer poses of each track."""
+MOST_TRACKS = 1_000
+"""Maximum number of tracks in a report."""
+LEAST_POSES, TRACK_SIZE = 4, 2_500
+"""Minimum number of poses per track, and its size in bytes without poses."""
 WIDEST = 6.0
 """Limit of the map on each side of the network, in spans of the network."""
 LEAST_REACH_M = 10.0
@@ -70,26 +74,51 @@ def _box(low: FloatArray, high: FloatArray) -> list[float]:
     return [float(low[0]), float(high[0]), float(low[1]), float(high[1])]
 
 
-def strongest_sensors(log: TrackLog, most: int = MOST_SENSORS) -> IntArray:
-    """Indices of the `most` sensors with the strongest field during a track, ascending."""
-    measured = np.abs(np.array(log.measured))
-    strength = np.nan_to_num(np.nanmax(np.where(np.isnan(measured), 0.0, measured), axis=(0, 2)))
+def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
+                      most: int = MOST_SENSORS) -> IntArray:
+    """Indices of the `most` sensors with the strongest field during a track, ascending.
+
+    `rows` are the numbers of the poses that count; all by default.
+    """
+    chosen = log.measured if rows is None else [log.measured[k] for k in rows]
+    measured = np.abs(np.array(chosen).reshape(-1, len(log.measured[0]), 3))
+    strength = np.nan_to_num(measured).max(axis=(0, 2), initial=0.0)
     return np.sort(np.argsort(-strength, kind='stable')[:most])
 
 
-def step_of(logs: Sequence[TrackLog], most_bytes: int = MOST_BYTES) -> int:
-    """Decimation factor that keeps the size of a report below `most_bytes`."""
-    size = 0
-    for log in logs:
-        n_sensors = min(MOST_SENSORS, len(log.measured[0]))
-        n_arrivals = len({name for row in log.arrivals for name in row})
-        # Base64 needs four bytes for three.
-        size += len(log.stamp_ns) * (4 * (80 + 24 * n_sensors + 24 * n_arrivals)) // 3
-    return max(1, -(-size // most_bytes))
+def most_poses_of(logs: Sequence[TrackLog], most_bytes: int = MOST_BYTES) -> int:
+    """Number of poses per track that keeps the size of a report below `most_bytes`, about."""
+    lengths = np.array([len(log.stamp_ns) for log in logs])
+    sizes = np.array([_pose_size(log) for log in logs])
+    low, high = LEAST_POSES, max(int(lengths.max()), LEAST_POSES)
+    while low < high:
+        middle = (low + high + 1) // 2
+        if TRACK_SIZE * len(logs) + (np.minimum(lengths, middle) * sizes).sum() > most_bytes:
+            high = middle - 1
+        else:
+            low = middle
+    return low
+
+
+def _pose_size(log: TrackLog) -> int:
+    """Size of a pose in bytes of base64, with its true and smoothed position."""
+    n_sensors = min(MOST_SENSORS, len(log.measured[0]))
+    n_arrivals = len({name for row in log.arrivals for name in row})
+    # Base64 needs four bytes for three.
+    return (4 * (120 + 24 * n_sensors + 32 * n_arrivals)) // 3
+
+
+def thinned(log: TrackLog, most: int) -> list[int]:
+    """Numbers of at most `most` poses, evenly spaced; the first, last and surest are included."""
+    n = len(log.stamp_ns)
+    if n <= most:
+        return list(range(n))
+    rows = np.linspace(0, n - 1, most - 1).round().astype(int)
+    return sorted({*rows.tolist(), log.surest()})
 
 
 def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
-                rows: slice = slice(None)) -> dict[str, Any]:
+                rows: Sequence[int] | None = None) -> dict[str, Any]:
     """Poses of a track, as JSON.
 
     Parameters
@@ -99,17 +128,20 @@ def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
         Start of the scene.
     sensors : (k,) int
         Sensors whose fields are included.
-    rows : slice
-        Range of poses; all by default.
+    rows : sequence of int
+        Numbers of the poses; all by default.
     """
-    times = (np.array(log.stamp_ns[rows], dtype=np.int64) - begin_ns) / NS
-    columns = _columns(times, _array(log.position[rows], 3), _array(log.velocity[rows], 3),
-                       _array(log.covariance[rows], 6, 6), np.array(log.ambiguous[rows], bool))
-    columns |= _innovation(np.array(log.nis[rows], dtype=float),
-                           np.array(log.degrees_of_freedom[rows], dtype=float))
-    return {'id': log.id, 'ended': log.ended, 'columns': columns,
+    rows = range(len(log.stamp_ns)) if rows is None else rows
+    times = (np.array([log.stamp_ns[k] for k in rows], dtype=np.int64) - begin_ns) / NS
+    columns = _columns(times, _array([log.position[k] for k in rows], 3),
+                       _array([log.velocity[k] for k in rows], 3),
+                       _array([log.covariance[k] for k in rows], 6, 6),
+                       np.array([log.ambiguous[k] for k in rows], bool))
+    columns |= _innovation(np.array([log.nis[k] for k in rows], dtype=float),
+                           np.array([log.degrees_of_freedom[k] for k in rows], dtype=float))
+    return {'id': log.id, 'key': log.id, 'ended': log.ended, 'columns': columns,
             'arrivals': _arrivals(log, rows), 'fields': _fields(log, rows, sensors),
-            'doubts': [', '.join(doubts) for doubts in log.doubts[rows]],
+            'doubts': [', '.join(log.doubts[k]) for k in rows],
             'smoothed': None, 'truth': None, 'facts': None}
 
 
@@ -130,7 +162,7 @@ def fitted_entry(track_id: int, times: FloatArray, state: FloatArray, covariance
     n = len(times)
     columns = _columns(times, state[:, :3], state[:, 3:], covariance, np.full(n, ambiguous))
     columns |= _innovation(np.full(n, np.nan), np.zeros(n))
-    return {'id': track_id, 'ended': True, 'columns': columns, 'arrivals': {},
+    return {'id': track_id, 'key': track_id, 'ended': True, 'columns': columns, 'arrivals': {},
             'fields': list(fields), 'doubts': [''] * n, 'smoothed': None, 'truth': None,
             'facts': None}
 
@@ -149,11 +181,6 @@ def field_entry(sensor: int, measured: FloatArray, predicted: FloatArray,
 def path_entry(track_id: int, points: FloatArray) -> dict[str, Any]:
     """Smoothed or true path (n, 2 or 3) [m] of a track, as JSON."""
     return {'id': track_id, 'x': packed(points[:, 0]), 'y': packed(points[:, 1])}
-
-
-def smoothed_entry(log: SmoothedLog) -> dict[str, Any]:
-    """Path of a smoothed track, as JSON."""
-    return path_entry(log.id, _array(log.position, 3))
 
 
 def facts_of(entry: Mapping[str, Any]) -> dict[str, Any]:
@@ -209,9 +236,9 @@ def _innovation(nis: FloatArray, degrees_of_freedom: FloatArray) -> dict[str, Pa
             'nis_low': packed(low, 'f4'), 'nis_high': packed(high, 'f4')}
 
 
-def _arrivals(log: TrackLog, rows: slice) -> dict[str, dict[str, Packed]]:
+def _arrivals(log: TrackLog, rows: Sequence[int]) -> dict[str, dict[str, Packed]]:
     """{arrival: columns of its weight and best hypothesis}; NaN after it was pruned."""
-    log_rows = log.arrivals[rows]
+    log_rows = [log.arrivals[k] for k in rows]
     out = {}
     for name in sorted({name for row in log_rows for name in row}):
         values = np.full((len(log_rows), 6), np.nan)
@@ -220,13 +247,14 @@ def _arrivals(log: TrackLog, rows: slice) -> dict[str, dict[str, Packed]]:
             if name in row:
                 weight, position, C = row[name]
                 values[k] = weight, position[0], position[1], C[0, 0], C[0, 1], C[1, 1]
-        out[name] = {key: packed(column, 'f4') for key, column in zip(
+        # Coordinates of a large frame need all digits.
+        out[name] = {key: packed(column, 'f8' if key in 'xy' else 'f4') for key, column in zip(
             ('weight', 'x', 'y', 'xx', 'xy', 'yy'), values.T, strict=True)}
     return out
 
 
-def _fields(log: TrackLog, rows: slice, sensors: IntArray) -> list[dict[str, Any]]:
+def _fields(log: TrackLog, rows: Sequence[int], sensors: IntArray) -> list[dict[str, Any]]:
     """Fields of the selected sensors at the times of the poses."""
-    measured = np.array(log.measured[rows]).reshape(-1, len(log.measured[0]), 3)
-    predicted = np.array(log.predicted[rows]).reshape(measured.shape)
+    measured = np.array([log.measured[k] for k in rows]).reshape(-1, len(log.measured[0]), 3)
+    predicted = np.array([log.predicted[k] for k in rows]).reshape(measured.shape)
     return [field_entry(j, measured[:, j], predicted[:, j]) for j in sensors.tolist()]

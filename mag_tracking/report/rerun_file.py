@@ -10,13 +10,17 @@ from scipy.special import chdtri
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import MissingDependencyError, OutputError
+from mag_tracking.files import new_binary_file
 from mag_tracking.geometry import quaternion_from_rotation
 from mag_tracking.report.page_scene import Sensors
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
+from mag_tracking.units import NS
 
 RERUN_FILE = 'tracks.rrd'
 """File name in a result folder."""
 TIME = 'stamp'
+LEAST_MOMENT = 1e-12
+"""[A m^2] Smaller moments have no direction."""
 SCALE_3D = float(np.sqrt(chdtri(3, 0.1)))
 """Standard deviations to the surface of the 90 % region in 3-D."""
 
@@ -44,6 +48,8 @@ def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, 
 
     stream = rerun.RecordingStream('mag_tracking')
     try:
+        # A new file: a link of this name is not followed.
+        new_binary_file(path).close()
         stream.save(path)
     except (OSError, RuntimeError) as error:
         raise OutputError(f'cannot write {path}: {error}') from error
@@ -69,12 +75,16 @@ def _write_track(rerun: Any, stream: Any, network: Sensors, log: TrackLog) -> No
             quaternions=[rerun.Quaternion(xyzw=orientation)]))
         stream.log(f'{root}/pose', rerun.Points3D([log.position[k]], labels=[
             f'{log.id} {log.kind[k]}{"?" if log.ambiguous[k] else ""}']))
+        size_of_moment = max(float(np.linalg.norm(log.moment[k])), LEAST_MOMENT)
         stream.log(f'{root}/moment', rerun.Arrows3D(
-            origins=[log.position[k]], vectors=[log.moment[k] / np.linalg.norm(log.moment[k])]))
+            origins=[log.position[k]], vectors=[log.moment[k] / size_of_moment]))
         stream.log(f'speed/track_{log.id}', rerun.Scalars(float(np.hypot(*log.velocity[k][:2]))))
         for j, name in enumerate(network.names):
             for what, fields in (('measured', log.measured[k]), ('predicted', log.predicted[k])):
                 stream.log(f'field/{name}/{what}', rerun.Scalars(1e9 * fields[j]))
+    # One period after the last pose, which stays visible until then.
+    period = log.stamp_ns[-1] - log.stamp_ns[-2] if len(log.stamp_ns) > 1 else NS
+    stream.set_time(TIME, timestamp=np.datetime64(log.stamp_ns[-1] + period, 'ns'))
     stream.log(root, rerun.Clear(recursive=True))
 
 

@@ -1,6 +1,5 @@
 """State of a live page: recent tracks, latest frame, health."""
 
-import json
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable
@@ -9,60 +8,23 @@ from typing import Any
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.arrays import FloatArray
 from mag_tracking.records import FieldFrame, Track
+from mag_tracking.report.json_text import json_text
 from mag_tracking.report.packed import packed
 from mag_tracking.report.page import Note, Table
-from mag_tracking.report.page_scene import (
-    Sensors,
-    facts_of,
-    path_entry,
-    scene_of,
-    strongest_sensors,
-    track_entry,
-)
-from mag_tracking.report.track_log import TrackLog
+from mag_tracking.report.page_scene import Sensors, path_entry, scene_of
 from mag_tracking.units import NS
+from mag_tracking.web.live_track import LiveTrack
 
 KEPT_S = 600.0
 """[s] Tracks that ended earlier are removed."""
 MOST_POSES = 30_000
 """Maximum number of poses over all tracks; the oldest tracks are removed first."""
-MOST_OF_TRACK, FORGOTTEN = 8_000, 1_000
-"""Maximum number of poses of one track, and how many are removed when it is exceeded. The page
-script uses the same numbers."""
 MATCHING_FRAMES = 64
 """Number of recent frames kept for matching with tracks."""
 JUMP_BACK_S = 1.0
-"""[s] A larger backward jump of time starts a new scene, for example when a bag is looped."""
-
-
-class _LiveTrack:
-    """A track and how many of its poses were sent."""
-
-    def __init__(self, track_id: int) -> None:
-        self.log = TrackLog(track_id)
-        self.sent = 0
-        self.end_sent = False
-        # Selected once, because later rows must match the earlier ones.
-        self.sensors: IntArray | None = None
-        self.smoothed: dict[str, Any] | None = None
-        self.is_smoothed_new = False
-
-    def shorten(self) -> None:
-        """Remove the oldest poses of a very long track."""
-        if len(self.log.stamp_ns) > MOST_OF_TRACK:
-            self.log.forget(FORGOTTEN)
-            self.sent = max(0, self.sent - FORGOTTEN)
-
-    def rows(self, begin_ns: int, rows: slice) -> dict[str, Any]:
-        """JSON of a range of poses."""
-        if self.sensors is None:
-            self.sensors = strongest_sensors(self.log)
-        entry = track_entry(self.log, begin_ns, self.sensors, rows)
-        if self.log.ended:
-            entry['facts'] = facts_of(self.log.summary())
-        return entry
+"""[s] A larger backward jump of frames starts a new scene, for example when a bag is looped."""
 
 
 class LiveScene:
@@ -81,6 +43,7 @@ class LiveScene:
         self._notes: list[Note] = []
         self._tables: list[Table] = []
         self._is_health_new = False
+        self._n_tracks = 0
         self._clear()
 
     def use_network(self, network: Sensors) -> None:
@@ -92,15 +55,21 @@ class LiveScene:
     def _clear(self) -> None:
         """Start a new scene."""
         self._begin_ns: int | None = None
-        self._end_ns = 0
+        self._end_ns = self._frame_ns = 0
         self._frames: OrderedDict[int, FieldFrame] = OrderedDict()
         self._is_frame_new = False
-        self._tracks: dict[int, _LiveTrack] = {}
+        self._tracks: dict[int, LiveTrack] = {}
+        # {number of a track: its latest `LiveTrack`}
+        self._latest: dict[int, LiveTrack] = {}
         self._is_new = True
 
     def add_frame(self, frame: FieldFrame) -> None:
         """Add a frame; call it before `add_track` of the same time."""
         with self._lock:
+            # Frames only: the record of a track may be late, or repeat its last pose.
+            if self._frame_ns - frame.stamp_ns > JUMP_BACK_S * NS:
+                self._clear()
+            self._frame_ns = frame.stamp_ns
             self._note_time(frame.stamp_ns)
             self._frames[frame.stamp_ns] = frame
             self._is_frame_new = True
@@ -110,14 +79,15 @@ class LiveScene:
     def add_track(self, track: Track) -> None:
         """Add a pose or the closing record of a track."""
         with self._lock:
+            live = self._latest.get(track.id)
+            if live is None or not live.continues(track):
+                if track.ended:
+                    return
+                self._n_tracks += 1
+                live = LiveTrack(self._n_tracks, track.id)
+                self._tracks[live.key] = self._latest[track.id] = live
             self._note_time(track.stamp_ns)
-            live = self._tracks.get(track.id)
-            if live is None and track.ended:
-                return
-            if live is None:
-                live = self._tracks[track.id] = _LiveTrack(track.id)
-            live.log.add(track, self._frames.get(track.stamp_ns) or self._no_frame(track))
-            live.shorten()
+            live.add(track, self._frames.get(track.stamp_ns) or self._no_frame(track))
             self._forget()
 
     def _no_frame(self, track: Track) -> FieldFrame:
@@ -129,9 +99,10 @@ class LiveScene:
     def add_smoothed(self, track_id: int, points: FloatArray) -> None:
         """Add the smoothed path (n, 3) [m] of an ended track."""
         with self._lock:
-            live = self._tracks.get(track_id)
+            live = self._latest.get(track_id)
             if live is not None:
-                live.smoothed, live.is_smoothed_new = path_entry(track_id, points), True
+                live.smoothed = {**path_entry(track_id, points), 'key': live.key}
+                live.is_smoothed_new = True
 
     def set_health(self, notes: Iterable[Note], tables: Iterable[Table]) -> None:
         """Replace the notes and tables of the page."""
@@ -143,13 +114,9 @@ class LiveScene:
     def whole(self) -> list[str]:
         """JSON messages with everything sent so far, for a new viewer."""
         with self._lock:
-            tracks = []
-            for live in self._tracks.values():
-                if live.sent:
-                    entry = live.rows(self._begin_ns or 0, slice(live.sent))
-                    entry['smoothed'] = live.smoothed
-                    tracks.append(entry)
-            return [*self._scene(tracks), self._health()]
+            begin_ns = self._begin_ns or 0
+            tracks = [live.sent(begin_ns) for live in self._tracks.values()]
+            return [*self._scene([t for t in tracks if t is not None]), self._health()]
 
     def news(self) -> list[str]:
         """JSON messages with everything new since the last call."""
@@ -159,14 +126,20 @@ class LiveScene:
                 return self._scene([])
             out = [self._health()] if self._is_health_new else []
             self._is_health_new = False
-            tracks = [self._track_news(live) for live in self._tracks.values()
-                      if live.sent < len(live.log.stamp_ns)
-                      or live.log.ended and not live.end_sent]
+            begin_ns, frame = self._begin_ns or 0, None
+            tracks = [live.news(begin_ns) for live in self._tracks.values() if live.is_news]
             smoothed = [live.smoothed for live in self._tracks.values() if live.is_smoothed_new]
             for live in self._tracks.values():
                 live.is_smoothed_new = False
-            if tracks or smoothed or self._is_frame_new:
-                out.append(self._rows(tracks, smoothed))
+            if self._is_frame_new:
+                latest = next(reversed(self._frames.values()))
+                frame = {'t': (latest.stamp_ns - begin_ns) / NS,
+                         'field': packed(latest.field.ravel(), 'f4')}
+            if tracks or smoothed or frame:
+                out.append(json_text({
+                    'type': 'rows', 'tracks': tracks, 'smoothed': smoothed, 'frame': frame,
+                    'end': (self._end_ns - begin_ns) / NS, 'latest_ns': str(self._end_ns)}))
+            self._is_frame_new = False
             return out
 
     def _scene(self, tracks: list[dict[str, Any]]) -> list[str]:
@@ -175,36 +148,16 @@ class LiveScene:
             return []
         begin_ns = self._begin_ns or 0
         scene = scene_of(self._network, begin_ns, max(self._end_ns, begin_ns), tracks)
-        return [json.dumps({'type': 'scene', 'title': self.title, 'subtitle': self.subtitle,
-                            'scene': scene})]
-
-    def _track_news(self, live: _LiveTrack) -> dict[str, Any]:
-        """JSON of the poses of a track that were not sent yet."""
-        entry = live.rows(self._begin_ns or 0, slice(live.sent, None))
-        live.sent, live.end_sent = len(live.log.stamp_ns), live.log.ended
-        return entry
-
-    def _rows(self, tracks: list[dict[str, Any]], smoothed: list[dict[str, Any] | None]) -> str:
-        """Message with new poses and the latest frame."""
-        begin_ns, frame = self._begin_ns or 0, None
-        if self._is_frame_new:
-            latest = next(reversed(self._frames.values()))
-            frame = {'t': (latest.stamp_ns - begin_ns) / NS,
-                     'field': packed(latest.field.ravel(), 'f4')}
-        self._is_frame_new = False
-        return json.dumps({
-            'type': 'rows', 'tracks': tracks, 'smoothed': smoothed, 'frame': frame,
-            'end': (self._end_ns - begin_ns) / NS, 'latest_ns': str(self._end_ns)})
+        return [json_text({'type': 'scene', 'title': self.title, 'subtitle': self.subtitle,
+                           'scene': scene})]
 
     def _health(self) -> str:
         """Message with notes and tables."""
-        return json.dumps({'type': 'health', 'notes': [asdict(note) for note in self._notes],
-                           'tables': [asdict(table) for table in self._tables]})
+        return json_text({'type': 'health', 'notes': [asdict(note) for note in self._notes],
+                          'tables': [asdict(table) for table in self._tables]})
 
     def _note_time(self, stamp_ns: int) -> None:
-        """Update begin and end of the scene; a backward jump starts a new one."""
-        if self._end_ns - stamp_ns > JUMP_BACK_S * NS:
-            self._clear()
+        """Update begin and end of the scene."""
         if self._begin_ns is None:
             self._begin_ns = stamp_ns
             # An empty scene that was sent before had no start time.
@@ -214,8 +167,10 @@ class LiveScene:
     def _forget(self) -> None:
         """Remove tracks that ended long ago, and the oldest ones if there are too many poses."""
         n = sum(len(live.log.stamp_ns) for live in self._tracks.values())
-        for track_id, live in list(self._tracks.items())[:-1]:
-            old = (self._end_ns - live.log.stamp_ns[-1]) / NS > KEPT_S
+        for key, live in list(self._tracks.items())[:-1]:
+            old = (self._end_ns - live.end_ns) / NS > KEPT_S
             if old or n > MOST_POSES:
                 n -= len(live.log.stamp_ns)
-                del self._tracks[track_id]
+                del self._tracks[key]
+                if self._latest.get(live.log.id) is live:
+                    del self._latest[live.log.id]

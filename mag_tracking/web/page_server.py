@@ -6,8 +6,9 @@ import ipaddress
 import secrets
 import socket
 import threading
+from collections.abc import Callable
 from http import HTTPStatus
-from logging import ERROR, getLogger
+from logging import getLogger
 from typing import Protocol
 from urllib.parse import parse_qs, urlsplit
 
@@ -17,6 +18,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from mag_tracking.errors import DeviceError
+from mag_tracking.report.json_text import json_text
 from mag_tracking.report.page import live_html
 
 LOOPBACK = '127.0.0.1'
@@ -26,11 +28,12 @@ TICK_S = 0.05
 MOST_BUFFERED = 1_000_000
 """Send buffer of a viewer, in bytes. A viewer above it receives no messages until it is empty."""
 GIVE_UP_S = 20.0
-"""[s] A viewer that lags for longer is disconnected."""
+"""[s] A lagging viewer whose buffer does not shrink for this time is disconnected."""
 MOST_VIEWERS = 100
 MOST_PORT = 65535
 START_S = 10.0
 PAGE, STREAM = '/', '/stream'
+LOG = getLogger('mag_tracking.web')
 
 
 class Source(Protocol):
@@ -69,12 +72,15 @@ class PageServer:
         self._source, self._host = source, host
         self._token = '' if is_loopback(host) else secrets.token_urlsafe(16)
         self._page = gzip.compress(live_html().encode('utf-8'), 6)
-        self._viewers: set[ServerConnection] = set()
-        self._behind: dict[ServerConnection, float] = {}
+        # {viewer: bytes that its buffer may hold}
+        self._viewers: dict[ServerConnection, int] = {}
+        # {viewer: (time of the latest progress [s], bytes in its buffer then)}
+        self._behind: dict[ServerConnection, tuple[float, int]] = {}
+        self._faults: set[str] = set()
         self.n_behind = 0
         self._socket = _listening(host, port)
         self.port = int(self._socket.getsockname()[1])
-        shown = f'[{host}]' if ':' in host else host
+        shown = _reachable_name(host)
         self.url = f'http://{shown}:{self.port}/' + (
             f'?token={self._token}' if self._token else '')
         self._loop = asyncio.new_event_loop()
@@ -83,9 +89,14 @@ class PageServer:
         self._thread.start()
 
     @property
+    def is_serving(self) -> bool:
+        """True until the server is closed or has failed."""
+        return self._thread.is_alive()
+
+    @property
     def n_viewers(self) -> int:
         """Number of connected viewers."""
-        return len(self._viewers)
+        return len(self._viewers) + len(self._behind)
 
     def close(self) -> None:
         """Disconnect all viewers and release the port."""
@@ -109,15 +120,13 @@ class PageServer:
 
     async def _serve(self) -> None:
         """Serve until `close` is called."""
-        log = getLogger('mag_tracking.web')
-        log.setLevel(ERROR)
         # Malformed requests from the network must not fill the log.
-        log.addFilter(lambda record: record.msg != 'opening handshake failed')
+        LOG.addFilter(lambda record: record.msg != 'opening handshake failed')
         # Compression would run separately for each viewer.
         async with serve(self._look, sock=self._socket, process_request=self._answer,
-                         compression=None, max_size=1024, max_queue=4, logger=log,
+                         compression=None, max_size=1024, max_queue=4, logger=LOG,
                          open_timeout=10.0, close_timeout=1.0, ping_interval=10.0,
-                         ping_timeout=20.0):
+                         ping_timeout=60.0):
             while not self._stop.is_set():
                 self._tell()
                 try:
@@ -125,22 +134,41 @@ class PageServer:
                 except asyncio.TimeoutError:
                     continue
 
+    def _messages(self, ask: Callable[[], list[str]]) -> list[str]:
+        """Messages of the source; a fault of it is logged once and shown on the page."""
+        try:
+            return ask()
+        except Exception as error:
+            # The page is an addition: a fault of it must end neither the server nor the nodes.
+            text = f'{type(error).__name__}: {error}'
+            if text not in self._faults:
+                self._faults.add(text)
+                LOG.exception('fault of the live page')
+            return [json_text({'type': 'fault', 'text': text})]
+
     def _tell(self) -> None:
         """Send new messages to all viewers, and the whole scene to those that have caught up."""
         if not self._viewers and not self._behind:
             return
         now = self._loop.time()
-        for viewer in list(self._viewers):
-            if _waiting(viewer) > MOST_BUFFERED:
-                self._viewers.discard(viewer)
-                self._behind[viewer] = now
+        for viewer, allowed in list(self._viewers.items()):
+            waiting = _waiting(viewer)
+            if waiting > allowed:
+                del self._viewers[viewer]
+                self._behind[viewer] = now, waiting
                 self.n_behind += 1
-        for message in self._source.news():
+            else:
+                # What a welcome may have left in the buffer is allowed until it has been sent.
+                self._viewers[viewer] = max(MOST_BUFFERED, min(allowed, waiting + MOST_BUFFERED))
+        for message in self._messages(self._source.news):
             broadcast(self._viewers, message)
-        for viewer, since in list(self._behind.items()):
-            if not _waiting(viewer):
+        for viewer, (since, least) in list(self._behind.items()):
+            waiting = _waiting(viewer)
+            if not waiting:
                 del self._behind[viewer]
                 self._welcome(viewer)
+            elif waiting < least:
+                self._behind[viewer] = now, waiting
             elif now - since > GIVE_UP_S:
                 del self._behind[viewer]
                 viewer.transport.abort()
@@ -148,11 +176,11 @@ class PageServer:
     def _welcome(self, viewer: ServerConnection) -> None:
         """Send the whole scene to a viewer; new messages follow."""
         # Pending messages go out first: they are part of the whole scene and must not be repeated.
-        for message in self._source.news():
+        for message in self._messages(self._source.news):
             broadcast(self._viewers, message)
-        for message in self._source.whole():
+        for message in self._messages(self._source.whole):
             broadcast([viewer], message)
-        self._viewers.add(viewer)
+        self._viewers[viewer] = _waiting(viewer) + MOST_BUFFERED
 
     async def _look(self, viewer: ServerConnection) -> None:
         """Handle one connection until it closes; incoming messages are ignored."""
@@ -166,7 +194,7 @@ class PageServer:
         except ConnectionClosed:
             pass
         finally:
-            self._viewers.discard(viewer)
+            self._viewers.pop(viewer, None)
             self._behind.pop(viewer, None)
 
     def _answer(self, _: ServerConnection, request: Request) -> Response | None:
@@ -195,6 +223,13 @@ class PageServer:
         if origin is not None and urlsplit(origin).netloc != host:
             return 'Connections from pages of other origins are refused.\n'
         return ''
+
+
+def _reachable_name(host: str) -> str:
+    """Host part of the address that viewers open."""
+    if host in ('0.0.0.0', '::'):
+        return socket.gethostname()
+    return f'[{host}]' if ':' in host else host
 
 
 def check_port(host: str, port: int) -> None:

@@ -6,25 +6,22 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from contextlib import contextmanager
 from dataclasses import replace
-from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from websockets.exceptions import InvalidStatus
+from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import connect
 
 from mag_tracking.errors import DeviceError
-from mag_tracking.pipeline import Pipeline, settings_for
-from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.records import FieldFrame, Track
+from mag_tracking.records import FieldFrame
 from mag_tracking.report.page import ERROR, Note
 from mag_tracking.web.live_scene import LiveScene
 from mag_tracking.web.page_server import PageServer
 from support.browser import Page as Opened
 from support.browser import browser, needs_browser
-from support.bundled import vehicle_path
+from support.live_records import feed, poses, records_of
 
 MOST_DELAY_MS = 200.0
 """From the stamp of a pose until it is drawn, in the middle of all."""
@@ -39,25 +36,7 @@ def chromium():
 
 @pytest.fixture(scope='module')
 def records(road_network):
-    """Frames and tracks of a recording, in the order in which they come."""
-    pipeline = Pipeline(road_network, settings_for('vehicle'))
-    out = []
-    for readings in SampleReader(Recording(vehicle_path('straight_car_right')),
-                                 road_network).readings():
-        out += pipeline.feed(readings)
-    return [r for r in [*out, *pipeline.flush()] if isinstance(r, (FieldFrame, Track))]
-
-
-def feed(scene, records):
-    for record in records:
-        if isinstance(record, FieldFrame):
-            scene.add_frame(record)
-        else:
-            scene.add_track(record)
-
-
-def poses(records):
-    return [r for r in records if isinstance(r, Track) and not r.ended]
+    return records_of('straight_car_right', road_network)
 
 
 @pytest.fixture
@@ -190,37 +169,129 @@ def test_ten_viewers_hear_the_same_and_one_that_goes_away_disturbs_none(scene, s
         viewer.close()
 
 
-def test_a_viewer_that_cannot_follow_gets_the_whole_later(road_network, records):
-    """What waits for it is bounded, and the others are served all the while."""
-    scene = LiveScene('road', road_network)
+def test_a_viewer_that_cannot_follow_gets_the_whole_later(scene, server, records):
+    """What waits for it is bounded, the others are served, and at last it has all poses."""
+    with viewer_of(server) as quick, unread(server) as slow:
+        stamp = publish_until(scene, records, lambda: server.n_behind, quick)
+        received = read_until(slow, lambda text: text.count(b'"type": "scene"') == 2)
+        # The scene with all poses is followed by what is new.
+        stamp = more(scene, records, stamp)
+        received += read_until(slow, lambda text: f'"latest_ns": "{stamp}"'.encode() in text)
+        assert received.count(b'"type": "scene"') == 2
+
+
+def viewer_of(server):
+    """A viewer that reads."""
+    return connect(server.url.replace('http', 'ws') + 'stream', max_size=None)
+
+
+def read_until(raw, condition, seconds=60.0):
+    """What came until the condition held of it."""
+    received, end = b'', time.monotonic() + seconds
+    raw.settimeout(seconds)
+    while not condition(received):
+        assert time.monotonic() < end
+        part = raw.recv(1 << 20)
+        assert part, 'the server has closed the connection'
+        received += part
+    return received
+
+
+def more(scene, records, stamp, n=1):
+    """Publish `n` more poses; the time of the last."""
+    template = [r for r in records if isinstance(r, FieldFrame)][-1]
+    for _ in range(n):
+        stamp += 10_000_000
+        scene.add_frame(replace(template, stamp_ns=stamp))
+        scene.add_track(replace(poses(records)[30], stamp_ns=stamp))
+    return stamp
+
+
+def publish_until(scene, records, condition, quick, seconds=60.0):
+    """Publish many poses until the condition holds; the time of the last."""
+    stamp, end = records[-1].stamp_ns, time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        stamp = more(scene, records, stamp, 400)
+        # This one is served all the while.
+        quick.recv(60.0)
+    return stamp
+
+
+@contextmanager
+def unread(server):
+    """A viewer that shakes hands and does not read by itself."""
+    with socket.socket() as raw:
+        raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        raw.connect(('127.0.0.1', server.port))
+        raw.sendall((f'GET /stream HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n'
+                     'Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n'
+                     'Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n').encode())
+        yield raw
+
+
+def test_a_viewer_that_never_reads_is_disconnected(scene, records, monkeypatch):
+    monkeypatch.setattr('mag_tracking.web.page_server.GIVE_UP_S', 0.5)
+    with PageServer(scene, port=0) as server, viewer_of(server) as quick, unread(server):
+        stamp = publish_until(scene, records, lambda: server.n_behind, quick)
+        end = time.monotonic() + 60.0
+        while server.n_viewers > 1:
+            stamp = more(scene, records, stamp)
+            quick.recv(60.0)
+            assert time.monotonic() < end
+
+
+def test_a_scene_larger_than_the_buffer_is_followed_by_rows(scene, server, records):
+    """A new viewer of a long session reads megabytes first; it must not be sent them again."""
+    with viewer_of(server) as quick:
+        stamp = more(scene, records, records[-1].stamp_ns, 7_900)
+        while f'"latest_ns": "{stamp}"' not in quick.recv(60.0):
+            pass
+    with unread(server) as slow:
+        received, due = b'', time.monotonic()
+        slow.settimeout(60.0)
+        while b'"type": "rows"' not in received[-300_000:]:
+            # So many ticks pass meanwhile that the server sees the full buffer.
+            due += 0.02
+            time.sleep(max(0.0, due - time.monotonic()))
+            part = slow.recv(100_000)
+            assert part
+            received += part
+            stamp = more(scene, records, stamp)
+        assert received.count(b'"type": "scene"') == 1
+        assert server.n_behind == 0 and len(received) > 1_500_000
+
+
+def test_the_number_of_viewers_is_limited(scene, monkeypatch):
+    monkeypatch.setattr('mag_tracking.web.page_server.MOST_VIEWERS', 2)
     with PageServer(scene, port=0) as server:
         url = server.url.replace('http', 'ws') + 'stream'
-        quick = connect(url, max_size=None)
-        template = [r for r in records if isinstance(r, FieldFrame)][-1]
-        blocked = _blocked(url)
-        stamp = template.stamp_ns
-        end = time.monotonic() + 60.0
-        while not server.n_behind and time.monotonic() < end:
-            for _ in range(50):
-                stamp += 10_000_000
-                scene.add_frame(replace(template, stamp_ns=stamp))
-                scene.add_track(replace(poses(records)[30], stamp_ns=stamp))
-            quick.recv(60.0)
-        assert server.n_behind >= 1
-        blocked.close()
-        quick.close()
+        viewers = [connect(url) for _ in range(2)]
+        for viewer in viewers:
+            viewer.recv(60.0)
+        third = connect(url)
+        with pytest.raises(ConnectionClosedError) as closed:
+            third.recv(60.0)
+        assert closed.value.rcvd.code == 1013
+        for viewer in viewers:
+            viewer.close()
 
 
-def _blocked(url):
-    """A viewer that shakes hands and never reads again."""
-    address = urlsplit(url)
-    raw = socket.socket()
-    raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    raw.connect((address.hostname, address.port))
-    raw.sendall((f'GET /stream HTTP/1.1\r\nHost: {address.netloc}\r\nUpgrade: websocket\r\n'
-                 'Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n'
-                 'Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n').encode())
-    return raw
+def test_a_fault_of_the_source_is_said_and_ends_nothing(caplog):
+    class Broken:
+        def whole(self):
+            return ['{"type": "health", "notes": [], "tables": []}']
+
+        def news(self):
+            raise ValueError('broken')
+
+    with PageServer(Broken(), port=0) as server:
+        messages = received(server.url, lambda m: m['type'] == 'fault')
+        assert messages[-1]['text'] == 'ValueError: broken'
+        received(server.url, lambda m: m['type'] == 'fault')
+        assert server.is_serving
+    assert len([r for r in caplog.records if 'fault of the live page' in r.message]) == 1
+    assert not server.is_serving
 
 
 def test_a_looped_bag_begins_anew(scene, server, records):
@@ -250,10 +321,10 @@ def test_a_target_that_stays_for_hours_fills_no_memory(chromium, scene, server, 
             scene.add_frame(replace(template, stamp_ns=stamp))
             scene.add_track(replace(pose, stamp_ns=stamp))
 
-    stay(12_000)
+    stay(9_000)
     page = Opened(chromium, server.url)
     page.wait('magTracking.connected && magTracking.scene?.tracks.length')
-    for _ in range(4):
+    for _ in range(2):
         stay(3_000)
         page.wait(f'magTracking.scene.latestNs === "{stamp}"')
         assert page.value('magTracking.scene.tracks[0].columns.t.length') <= 8_000
@@ -306,7 +377,8 @@ def test_without_a_token_only_this_machine_sees_it(server):
 def test_from_elsewhere_the_token_is_needed(scene):
     with PageServer(scene, host='0.0.0.0', port=0) as server:
         address, token = server.url.split('?token=')
-        address = address.replace('0.0.0.0', '127.0.0.1')
+        assert socket.gethostname() in address
+        address = address.replace(socket.gethostname(), '127.0.0.1')
         assert len(token) > 20
         for wrong in ('', '?token=', '?token=x', f'?token={token}x', '?token=%C3%A9'):
             assert status_of(address + wrong) == 403

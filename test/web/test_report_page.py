@@ -132,6 +132,8 @@ def test_the_table_jumps_to_each_track(chromium, vehicle_replays, road_network, 
     for track_id, log in ((2, later), (1, run.logs[1])):
         page.page.click(f'#tracks button:text-is("{track_id}")')
         page.wait(f'magTracking.current === {track_id}')
+        assert page.value('document.querySelector("#tracks tr.chosen").cells[0].innerText') \
+            == str(track_id)
         assert f'Track {track_id}:' in page.value('document.getElementById("readout").textContent')
         x, y = page.pose_on_map()
         assert np.hypot(*(np.array(log.position)[:, :2] - [x, y]).T).min() < 1e-9
@@ -200,5 +202,5 @@ def test_a_report_of_very_many_poses_is_thinned_and_says_so(vehicle_replays, roa
     assert path.stat().st_size < MOST_MB * 1e6
     text = path.read_text(encoding='utf-8')
     data = json.loads(text.split('id="data">')[1].split('</script>')[0])
-    assert any('one pose in' in note['text'] for note in data['notes'])
+    assert any('poses per track' in note['text'] for note in data['notes'])
     assert len(data['scene']['tracks']) == n

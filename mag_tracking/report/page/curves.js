@@ -38,17 +38,21 @@ function fieldsOf(scene, track) {
     measured: scene.heard.fields.map(axis => axis[j]), predicted: null})) : [];
 }
 
-function chosenFields(scene, track, choice) {
+function chosenFields(scene, track, choice, range) {
   const fields = fieldsOf(scene, track);
   if (choice !== STRONGEST) return fields.filter(field => field.name === choice);
-  const strength = new Map(fields.map(field => [field, largest(field.measured)]));
+  const strength = new Map(fields.map(field => {
+    const first = indexAt(field.t, range[0]) + 1, end = indexAt(field.t, range[1]) + 1;
+    return [field, largest(field.measured.map(axis => axis.slice(first, end)))];
+  }));
   const strongest = [...fields].sort((a, b) => strength.get(b) - strength.get(a));
   return fields.filter(field => strongest.slice(0, MOST_PANELS).includes(field));
 }
 
 function drawFields(scene, track, choice, t, range) {
   const holder = document.getElementById('field');
-  const fields = chosenFields(scene, track, choice);
+  const fields = chosenFields(scene, track, choice, range);
+  document.getElementById('no-field').hidden = fields.length > 0;
   while (holder.children.length > fields.length) {
     Plotly.purge(holder.lastChild);
     holder.lastChild.remove();

@@ -38,6 +38,8 @@ function take(message) {
       () => page.scene.sensors.names.map(() => []))};
   } else if (message.type === 'rows' && page.scene) {
     takeRows(decodedAll(message));
+  } else if (message.type === 'fault') {
+    say(`Fault of the page: ${message.text}`, true);
   } else if (message.type === 'health') {
     showNotes(message.notes);
     showTables(message.tables);
@@ -47,21 +49,22 @@ function take(message) {
 function takeRows(message) {
   const scene = page.scene;
   for (const rows of message.tracks) {
-    const track = scene.tracks.find(other => other.id === rows.id);
+    const track = scene.tracks.find(other => other.key === rows.key);
     if (track) append(track, rows); else scene.tracks.push(rows);
     grownReach(scene, track || rows);
-    if (!track || rows.ended) page.current = undefined;
+    if (!track || rows.ended) page.tableDue = 0;
   }
   for (const one of message.smoothed) {
-    const track = scene.tracks.find(other => other.id === one.id);
+    const track = scene.tracks.find(other => other.key === one.key);
     if (track) track.smoothed = one;
   }
   if (message.frame) hear(scene.heard, message.frame);
   scene.end = Math.max(scene.end, message.end);
   scene.latestNs = message.latest_ns;
   scene.tracks = scene.tracks.filter(track => endOf(track) > scene.end - KEPT_S);
+  scene.begin = Math.max(scene.begin, scene.end - KEPT_S);
   boundSlider();
-  if (page.follows) moveTo(scene.end);
+  moveTo(page.follows ? scene.end : page.t);
 }
 
 function hear(heard, frame) {

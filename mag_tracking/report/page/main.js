@@ -2,7 +2,9 @@
 'use strict';
 
 const page = {scene: null, t: 0, follows: false, choice: STRONGEST, current: undefined,
-  plays: false, drawn: 0};
+  plays: false, drawn: 0, tableDue: 0};
+// The table of a live page is updated this often [ms].
+const TABLE_MS = 1000;
 // Public for debugging and tests.
 window.magTracking = page;
 
@@ -25,8 +27,10 @@ function setScene(packed) {
   at('sensors').replaceChildren(
     element('option', `strongest ${MOST_PANELS}`, {value: STRONGEST}),
     ...scene.sensors.names.map(name => element('option', name, {value: name})));
-  at('sensors').value = page.choice = STRONGEST;
+  if (!scene.sensors.names.includes(page.choice)) page.choice = STRONGEST;
+  at('sensors').value = page.choice;
   page.current = undefined;
+  page.tableDue = 0;
   // Fitted passes have neither.
   at('weights-card').hidden = !page.live && scene.tracks.every(
     track => !Object.keys(track.arrivals).length);
@@ -82,17 +86,19 @@ function draw() {
   at('latest').hidden = !page.live || page.follows;
   at('readout').textContent = readout(scene, t);
   Plotly.react('map', mapTraces(scene, t), mapLayout(scene), CONFIG);
-  const key = track ? track.id : null;
+  const key = track ? track.key : null;
   if (page.follows ? performance.now() > curvesDue : key !== page.current) {
     drawCurves(track, t);
     if (page.follows) curvesDue = performance.now() + 250;
   } else if (!page.follows) {
     moveLines(t);
   }
-  if (key !== page.current) {
-    page.current = key;
-    showTrackTable(scene, track => jump(track), track);
+  page.current = key;
+  if (performance.now() > page.tableDue) {
+    showTrackTable(scene, track => jump(track));
+    page.tableDue = page.live ? performance.now() + TABLE_MS : Infinity;
   }
+  markTrack(key);
   page.drawn += 1;
   page.latestDrawn = scene.latestNs;
 }

@@ -103,8 +103,8 @@ function nowTraces(track, k, f, named) {
 function mapLayout(scene) {
   const unit = scene.scale.unit, f = scene.scale.factor, r = scene.reach;
   const axis = (title, low, high) => ({title: {text: `${title} [${unit}]`}, zeroline: false,
-    range: [f * low, f * high], gridcolor: '#e3e3e3'});
-  return {font: FONT, margin: {l: 55, r: 10, t: 25, b: 45}, uirevision: 'map', hovermode: 'closest',
+    range: [f * low, f * high], gridcolor: '#e3e3e3', exponentformat: 'none', automargin: true});
+  return {font: FONT, margin: {l: 55, r: 10, t: 25, b: 45}, uirevision: `${scene.begin_ns} ${scene.sensors.names.join(' ')}`, hovermode: 'closest',
     xaxis: {...axis('x', r[0], r[1]), constrain: 'range'},
     yaxis: {...axis('y', r[2], r[3]), scaleanchor: 'x', constrain: 'range'},
     legend: {orientation: 'h', y: 1.04, yanchor: 'bottom', font: {size: 12}}};
@@ -129,8 +129,8 @@ function readout(scene, t) {
     const c = track.columns, k = indexAt(c.t, t), f = scene.scale.factor, u = scene.scale.unit;
     const sd = f * Math.sqrt(c.xx[k] + c.yy[k]), digits = u === 'm' ? 2 : 1;
     return `Track ${track.id}: x ${(f * c.x[k]).toFixed(digits)}, y ` +
-      `${(f * c.y[k]).toFixed(digits)}, z ${(f * c.z[k]).toFixed(digits)} ${u}; deviation ` +
-      `${sd.toFixed(digits)} ${u}; ${Math.hypot(c.vx[k], c.vy[k]).toFixed(2)} m/s` +
+      `${(f * c.y[k]).toFixed(digits)}, z ${(f * c.z[k]).toFixed(digits)} ${u}; standard deviation ` +
+      `${sd.toFixed(digits)} ${u}; ${(f * Math.hypot(c.vx[k], c.vy[k])).toFixed(digits)} ${u}/s` +
       (c.ambiguous[k] ? `; ambiguous (${track.doubts[k].replaceAll('_', ' ') || 'no cause given'})`
         : '');
   }).join('\n');

@@ -46,16 +46,26 @@ function append(track, rows) {
     track.arrivals[name] = Object.fromEntries(
       Object.keys(old).map(key => [key, joined(old[key], more[key])]));
   }
-  track.fields.forEach((field, i) => {
-    for (const key of ['measured', 'predicted']) {
-      field[key] = field[key].map((axis, a) => joined(axis, rows.fields[i][key][a]));
-    }
-  });
+  track.fields = joinedFields(track.fields, before, rows.fields, added);
   track.doubts = track.doubts.concat(rows.doubts);
   const spare = track.columns.t.length - MOST_OF_TRACK;
   if (spare > 0) forget(track, spare + FORGOTTEN);
   track.ended = rows.ended;
   track.facts = rows.facts;
+}
+
+// Fields of the sensors in either list, by sensor; NaN where one list lacks a sensor.
+function joinedFields(fields, before, more, added) {
+  const bySensor = list => new Map(list.map(field => [field.sensor, field]));
+  const old = bySensor(fields), news = bySensor(more);
+  const empty = n => [0, 1, 2].map(() => new Float32Array(n).fill(NaN));
+  const both = (a, b) => a.map((axis, i) => joined(axis, b[i]));
+  return [...new Set([...old.keys(), ...news.keys()])].sort((a, b) => a - b).map(sensor => {
+    const one = old.get(sensor), other = news.get(sensor);
+    return {sensor: sensor, t: null,
+      measured: both(one ? one.measured : empty(before), other ? other.measured : empty(added)),
+      predicted: both(one ? one.predicted : empty(before), other ? other.predicted : empty(added))};
+  });
 }
 
 // Remove the first `n` poses.

@@ -27,7 +27,9 @@ function table(columns, rows, classes) {
 
 function shown(cell) {
   if (cell === null || cell === undefined) return '–';
-  return typeof cell === 'number' ? String(Number(cell.toPrecision(4))) : String(cell);
+  if (typeof cell !== 'number' || Number.isInteger(cell)) return String(cell);
+  // Coordinates may be large.
+  return String(Number(Math.abs(cell) < 1000 ? cell.toPrecision(4) : cell.toFixed(2)));
 }
 
 function showNotes(notes) {
@@ -65,7 +67,7 @@ function showCharts(charts) {
   }
 }
 
-function showTrackTable(scene, jump, current) {
+function showTrackTable(scene, jump) {
   const columns = ['track', 'begins [s]', 'ends [s]', 'from', 'kind', 'speed [m/s]',
     'moment [A m²]', 'verdict', 'error [m]', 'doubts (poses)'];
   const rows = scene.tracks.map(track => {
@@ -77,7 +79,19 @@ function showTrackTable(scene, jump, current) {
       facts.moment, facts.verdict || (track.ended ? '' : 'running'), facts.error,
       facts.doubts];
   });
-  document.getElementById('tracks').replaceChildren(rows.length
-    ? table(columns, rows, scene.tracks.map(track => track === current ? 'chosen' : ''))
-    : element('p', 'No track yet.'));
+  // A column without any value says nothing.
+  const used = columns.map((_, i) => i === 0 || rows.some(
+    row => row[i] !== null && row[i] !== undefined && row[i] !== ''));
+  const only = row => row.filter((_, i) => used[i]);
+  const found = rows.length ? table(only(columns), rows.map(only)) : element('p', 'No track yet.');
+  scene.tracks.forEach((track, i) => {
+    found.tBodies[0].rows[i].dataset.key = track.key;
+  });
+  document.getElementById('tracks').replaceChildren(found);
+}
+
+function markTrack(key) {
+  for (const row of document.querySelectorAll('#tracks tr.chosen')) row.className = '';
+  const row = document.querySelector(`#tracks tr[data-key="${key}"]`);
+  if (row) row.className = 'chosen';
 }

@@ -1,0 +1,81 @@
+"""Track of a live page, and how much of it the viewers have."""
+
+from typing import Any
+
+from mag_tracking.records import FieldFrame, Track
+from mag_tracking.report.page_scene import facts_of, strongest_sensors, track_entry
+from mag_tracking.report.track_log import TrackLog
+from mag_tracking.units import NS
+
+MOST_OF_TRACK, FORGOTTEN = 8_000, 1_000
+"""Maximum number of poses of one track, and how many are removed when it is exceeded. The page
+script uses the same numbers."""
+LONGEST_GAP_S = 60.0
+"""[s] A pose after a longer gap belongs to another track of the same number."""
+RECENT = 100
+"""Number of latest poses that select the sensors whose fields are sent."""
+
+
+class LiveTrack:
+    """Track of a live page.
+
+    Parameters
+    ----------
+    key : int
+        Unique on the page; the numbers of tracks are not, as a restarted tracker begins again at 1.
+    track_id : int
+
+    Attributes
+    ----------
+    log : TrackLog
+    smoothed : dict or None
+        Path of the smoothed track, as JSON.
+    is_smoothed_new : bool
+        The path was not sent yet.
+    """
+
+    def __init__(self, key: int, track_id: int) -> None:
+        self.key, self.log = key, TrackLog(track_id)
+        self.smoothed: dict[str, Any] | None = None
+        self.is_smoothed_new = False
+        self._sent, self._is_end_sent = 0, False
+
+    @property
+    def end_ns(self) -> int:
+        """[ns] Time of the latest pose."""
+        return self.log.stamp_ns[-1]
+
+    @property
+    def is_news(self) -> bool:
+        """True if there are poses, or an end, that were not sent yet."""
+        return self._sent < len(self.log.stamp_ns) or self.log.ended and not self._is_end_sent
+
+    def continues(self, track: Track) -> bool:
+        """True if a pose belongs to this track."""
+        return not self.log.ended and abs(track.stamp_ns - self.end_ns) <= LONGEST_GAP_S * NS
+
+    def add(self, track: Track, frame: FieldFrame) -> None:
+        """Add a pose; the oldest poses of a very long track are removed."""
+        self.log.add(track, frame)
+        if len(self.log.stamp_ns) > MOST_OF_TRACK:
+            self.log.forget(FORGOTTEN)
+            self._sent = max(0, self._sent - FORGOTTEN)
+
+    def news(self, begin_ns: int) -> dict[str, Any]:
+        """JSON of what was not sent yet; it counts as sent from now on."""
+        first, self._sent = self._sent, len(self.log.stamp_ns)
+        self._is_end_sent = self.log.ended
+        return self._entry(begin_ns, range(first, self._sent))
+
+    def sent(self, begin_ns: int) -> dict[str, Any] | None:
+        """JSON of everything that was sent; None if there is nothing."""
+        return self._entry(begin_ns, range(self._sent)) if self._sent else None
+
+    def _entry(self, begin_ns: int, rows: range) -> dict[str, Any]:
+        """JSON of some poses, with the fields that were strongest during the latest of them."""
+        recent = range(max(0, rows.stop - max(RECENT, len(rows))), rows.stop)
+        entry = track_entry(self.log, begin_ns, strongest_sensors(self.log, recent), rows)
+        entry['key'], entry['smoothed'] = self.key, self.smoothed
+        if self.log.ended:
+            entry['facts'] = facts_of(self.log.summary())
+        return entry

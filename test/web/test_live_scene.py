@@ -1,0 +1,165 @@
+"""What a live page is told: restarts, late records, forgetting, and invalid numbers."""
+
+import base64
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mag_tracking.records import FieldFrame
+from mag_tracking.web.live_scene import KEPT_S, MOST_POSES, LiveScene
+from support.live_records import NS, feed, later, poses, records_of
+
+
+@pytest.fixture(scope='module')
+def records(road_network):
+    return records_of('straight_car_right', road_network)
+
+
+@pytest.fixture
+def scene(road_network):
+    return LiveScene('road', road_network)
+
+
+class Viewer:
+    """Keeps what a page would keep: {key: times of the poses}, by the messages alone."""
+
+    def __init__(self):
+        self.tracks, self.ended, self.scenes = {}, set(), 0
+
+    def take(self, messages):
+        for message in map(json.loads, messages):
+            if message['type'] == 'scene':
+                self.tracks, self.ended, self.scenes = {}, set(), self.scenes + 1
+            for track in message.get('tracks', message.get('scene', {}).get('tracks', ())):
+                times = np.frombuffer(base64.b64decode(track['columns']['t']['f8']))
+                self.tracks.setdefault(track['key'], []).extend(times.tolist())
+                if track['ended']:
+                    self.ended.add(track['key'])
+        return self
+
+
+def follow(scene, records):
+    """A viewer from the beginning on, which is told often."""
+    viewer = Viewer().take(scene.news())
+    for k in range(0, len(records), 7):
+        feed(scene, records[k:k + 7])
+        viewer.take(scene.news())
+    # The first message after the first record is the scene; rows follow it.
+    return viewer.take(scene.news())
+
+
+def test_who_follows_and_who_comes_late_have_the_same(scene, records):
+    viewer = follow(scene, records)
+    late = Viewer().take(scene.whole())
+    assert late.tracks == viewer.tracks and late.ended == viewer.ended == {1}
+    assert len(viewer.tracks[1]) == len(poses(records))
+    assert all(np.diff(viewer.tracks[1]) > 0.0)
+
+
+@pytest.mark.parametrize('seconds', [40.0, 4000.0])
+def test_the_track_1_of_a_restarted_tracker_is_another(scene, records, seconds):
+    viewer = follow(scene, records)
+    viewer.take(scene.news())
+    for part in (later(records, seconds),):
+        feed(scene, part)
+        viewer.take(scene.news())
+    assert len(viewer.tracks) == 2
+    assert [len(times) for times in viewer.tracks.values()] == [len(poses(records))] * 2
+    assert viewer.scenes <= 2
+
+
+def test_a_tracker_that_was_killed_has_not_ended_its_track(scene, records):
+    """The first track has no closing record; the next one begins minutes later."""
+    viewer = follow(scene, records[:-1])
+    feed(scene, later(records, 300.0))
+    viewer.take(scene.news())
+    assert len(viewer.tracks) == 2
+
+
+def test_a_late_record_of_a_track_does_not_clear_the_page(scene, records):
+    """A closing record has the time of the last pose, which may be seconds ago."""
+    viewer = follow(scene, [r for r in records if isinstance(r, FieldFrame) or not r.ended])
+    last = [r for r in records if isinstance(r, FieldFrame)][-1]
+    scene.add_frame(replace(last, stamp_ns=last.stamp_ns + 8 * NS))
+    scenes = viewer.scenes
+    scene.add_track(replace(poses(records)[-1], ended=True))
+    viewer.take(scene.news())
+    assert viewer.scenes == scenes and viewer.ended == {1}
+
+
+def test_a_looped_bag_clears_the_page(scene, records):
+    viewer = follow(scene, records)
+    scenes = viewer.scenes
+    viewer.take(follow_on(scene, records[:60]))
+    assert viewer.scenes == scenes + 1
+    assert sum(map(len, viewer.tracks.values())) == len(poses(records[:60]))
+
+
+def follow_on(scene, records):
+    feed(scene, records)
+    return [*scene.news(), *scene.news()]
+
+
+def test_old_tracks_are_forgotten_and_their_number_is_bounded(scene, records):
+    template, pose = [r for r in records if isinstance(r, FieldFrame)][-1], poses(records)[30]
+    stamp = template.stamp_ns
+    for track_id in range(1, 120):
+        for _ in range(400):
+            stamp += NS // 20
+            scene.add_track(replace(pose, id=track_id, stamp_ns=stamp))
+        scene.add_track(replace(pose, id=track_id, stamp_ns=stamp, ended=True))
+        scene.add_smoothed(track_id, np.zeros((400, 3)))
+        scene.add_frame(replace(template, stamp_ns=stamp))
+    late = Viewer()
+    scene.news()
+    rows = scene.news()
+    late.take([*scene.whole()])
+    kept = sum(map(len, late.tracks.values()))
+    assert kept <= MOST_POSES
+    first = min(times[-1] for times in late.tracks.values())
+    last = max(times[-1] for times in late.tracks.values())
+    assert last - first <= KEPT_S
+    # Nobody looked: what was smoothed of forgotten tracks is forgotten, too.
+    assert sum(len(json.loads(m).get('smoothed', ())) for m in rows) == len(late.tracks)
+
+
+def test_numbers_that_are_none_leave_valid_json(scene, records):
+    feed(scene, [replace(r, moment=np.full(3, np.nan), nis=np.nan)
+                 if not isinstance(r, FieldFrame) else r for r in records])
+    scene.news()
+
+    def refuse(text):
+        raise AssertionError(f'{text} is no JSON')
+
+    for message in [*scene.news(), *scene.whole()]:
+        json.loads(message, parse_constant=refuse)
+
+
+def test_fields_are_those_of_the_sensors_that_the_target_passes(records, road_network):
+    """A target moves from the first sensors of a long road to the last ones."""
+    n = 20
+
+    class Road:
+        names = tuple(f'mag_{j}' for j in range(n))
+        positions = np.column_stack([5.0 * np.arange(n), np.zeros((n, 2))])
+        frame = 'map'
+
+        def __len__(self):
+            return n
+
+    scene, pose = LiveScene('road', Road()), poses(records)[30]
+    sent = []
+    for k in range(400):
+        near = np.abs(np.arange(n) - k / 20.0) < 1.5
+        field = np.where(near[:, None], 1e-6, 1e-12) * np.ones((n, 3))
+        frame = FieldFrame(pose.stamp_ns + k * NS // 10, field, np.zeros((n, 3, 3)),
+                           np.ones(n, dtype=int), np.zeros(n))
+        scene.add_frame(frame)
+        scene.add_track(replace(pose, stamp_ns=frame.stamp_ns, predicted=field,
+                                nis_by_sensor=np.zeros(n)))
+        for message in map(json.loads, scene.news()):
+            sent += [{f['sensor'] for f in t['fields']} for t in message.get('tracks', ())]
+    assert {0, 1} <= sent[1] and {18, 19} <= sent[-1]
+    assert {len(sensors) for sensors in sent} == {8}
