@@ -1,13 +1,19 @@
 """The live page of running nodes: over the middleware, in a browser, with the topic's values."""
 
+import json
 import re
 import subprocess
 import sys
 import time
+import urllib.error
+import urllib.request
 
 import numpy as np
+import pytest
 from mag_tracking_msgs.msg import TrackArray
+from websockets.sync.client import connect
 
+from mag_tracking.cli import main
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.stage_node import STREAM
 from support.browser import Page as Opened
@@ -76,6 +82,57 @@ def test_the_page_of_running_nodes_has_the_values_of_the_topic(ros):
             run.communicate(timeout=LONGEST_S)
     finally:
         assert ended(watch) == 0
+
+
+def messages_of(url, until, seconds=LONGEST_S):
+    """Messages of a viewer until `until(message)`."""
+    with connect(url.replace('http', 'ws') + 'stream', max_size=None) as viewer:
+        end = time.monotonic() + seconds
+        while True:
+            message = json.loads(viewer.recv(max(0.1, end - time.monotonic())))
+            yield message
+            if until(message):
+                return
+
+
+def test_a_tracker_of_another_name_is_found_and_may_be_restarted():
+    """Its second run begins again with track 1, at the times of the recording."""
+    watch = command('watch', '--port', 0)
+    try:
+        url = address(watch)
+        for _ in range(2):
+            run = command('run', '--network', NETWORK_FILE, '--recording', RECORDING,
+                          '--rate', '2', '--ros-args', '-r', 'tracker_node:__node:=follower')
+            n = 0
+            for message in messages_of(url, lambda m: any(
+                    t['ended'] and t['doubts'] for t in m.get('tracks', ()))
+                    or any(s for s in m.get('smoothed', ()))):
+                for track in message.get('tracks', ()):
+                    n += len(track['doubts'])
+            assert n > 20
+            run.communicate(timeout=LONGEST_S)
+    finally:
+        assert ended(watch) == 0
+
+
+def test_a_page_ends_with_the_command_that_started_it():
+    """Also where that is killed, and cannot tell its page."""
+    run = command('run', '--network', NETWORK_FILE, '--web', 0)
+    url = address(run)
+    assert urllib.request.urlopen(url, timeout=LONGEST_S).status == 200
+    run.kill()
+    run.wait(LONGEST_S)
+    end = time.monotonic() + LONGEST_S
+    with pytest.raises(urllib.error.URLError):
+        while time.monotonic() < end:
+            urllib.request.urlopen(url, timeout=LONGEST_S).close()
+            time.sleep(0.1)
+    run.stdout.close()
+
+
+def test_a_host_without_a_page_is_refused(capsys):
+    assert main(['run', '--network', str(NETWORK_FILE), '--host', '0.0.0.0']) == 1
+    assert 'add --web' in capsys.readouterr().err
 
 
 def test_run_serves_the_page_and_frees_the_port():

@@ -67,3 +67,9 @@ def sample_dict(sample, frame):
     """sensor_msgs/MagneticField of a `MagSample`."""
     ((_, content),) = magnetic_field_dicts(one(sample), frame)
     return content
+
+
+def field_dict(stamp_ns, sensor, field):
+    """sensor_msgs/MagneticField of one reading, without a covariance."""
+    ((_, content),) = magnetic_field_dicts(Readings.single(sensor, stamp_ns, field), sensor)
+    return content

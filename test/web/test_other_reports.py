@@ -5,11 +5,15 @@ import json
 
 import numpy as np
 import pytest
+import yaml
 
 from mag_tracking.cli import main
+from mag_tracking.messages.types import MAGNETIC_FIELD
+from mag_tracking.recording.writer import RecordingWriter
 from support.browser import Page as Opened
 from support.browser import browser, needs_browser
 from support.bundled import NETWORK_FILE, vehicle_path
+from support.samples import field_dict
 
 pytestmark = needs_browser
 
@@ -100,8 +104,58 @@ def test_the_doctor_shows_its_findings(chromium, tmp_path, capsys):
     closed(page, path)
 
 
-@pytest.mark.parametrize('where', ['missing/health.html', '.'])
+def test_a_plan_at_large_coordinates_keeps_its_digits(chromium, tmp_path):
+    """UTM coordinates have seven digits before the point."""
+    network = yaml.safe_load(NETWORK_FILE.read_text())
+    for sensor in network['sensors'].values():
+        sensor['position'][0] += 6_500_000.0
+    far = tmp_path / 'far.yaml'
+    far.write_text(yaml.safe_dump(network))
+    assert main(['plan', '--target', 'car', '--grid', '15', '--out', str(tmp_path),
+                 '--network', str(far)]) == 0
+    path = tmp_path / 'report.html'
+    page = opened(chromium, path)
+    x = page.value('document.querySelector("#charts .plot").data.find(d => d.type === "heatmap").x')
+    np.testing.assert_allclose(x, json.loads((tmp_path / 'plan.json').read_text())['x'], rtol=1e-9)
+    assert len(set(x)) == len(x)
+    closed(page, path)
+
+
+@pytest.mark.parametrize('words', [
+    ('doctor', TWO[0], '--report', 'the recording'), ('doctor', TWO[0], '--report', 'found.txt')])
+def test_a_report_replaces_no_other_file(tmp_path, capsys, words):
+    theirs = tmp_path / 'recording.mcap'
+    theirs.write_bytes(TWO[0].read_bytes())
+    report = theirs if words[-1] == 'the recording' else tmp_path / words[-1]
+    assert run('doctor', theirs, '--report', report) == 1
+    assert 'does not end in .html' in capsys.readouterr().err
+    assert theirs.read_bytes() == TWO[0].read_bytes()
+
+
+def test_a_network_named_like_a_page_is_not_replaced(tmp_path, capsys):
+    network = tmp_path / 'network.html'
+    network.write_text(NETWORK_FILE.read_text())
+    assert main(['doctor', str(TWO[0]), '--network', str(network), '--report', str(network)]) == 1
+    assert 'another file of this command' in capsys.readouterr().err
+    assert network.read_text() == NETWORK_FILE.read_text()
+
+
+def test_the_doctor_of_a_single_reading_writes_its_report(chromium, tmp_path):
+    recording, path = tmp_path / 'short.mcap', tmp_path / 'health.html'
+    with RecordingWriter(recording) as writer:
+        writer.write('/mag_1/imu/mag', MAGNETIC_FIELD,
+                     field_dict(1_790_000_000_000_000_000, 'mag_1', np.array([2e-6, 1e-5, -4e-5])),
+                     1_790_000_000_000_000_000)
+    assert run('doctor', recording, '--report', path) == 2
+    page = opened(chromium, path)
+    assert 'Wrong' in page.value('getComputedStyle(document.querySelector("#notes .error"), '
+                                 '"::before").content')
+    closed(page, path)
+
+
+@pytest.mark.parametrize('where', ['missing/health.html', 'folder.html'])
 def test_a_report_that_cannot_be_written_is_said_before_the_work(tmp_path, capsys, where):
+    (tmp_path / 'folder.html').mkdir()
     assert run('doctor', TWO[0], '--report', tmp_path / where) == 1
     out = capsys.readouterr()
     assert 'cannot write' in out.err and out.out == ''

@@ -1,0 +1,89 @@
+"""A recording on a live page: its tracks are those of a replay, and bad timestamps stop nothing."""
+
+import json
+import time
+
+import numpy as np
+import pytest
+
+from mag_tracking.apps.track import track
+from mag_tracking.apps.view import view
+from mag_tracking.messages.types import MAGNETIC_FIELD
+from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.web.live_scene import LiveScene
+from support.bundled import NETWORK_FILE, vehicle_path
+from support.samples import field_dict
+
+NAME = 'straight_small_left'
+YEARS_NS = 10 * 365 * 86400 * 1_000_000_000
+
+
+class Scene(LiveScene):
+    """Keeps all that it was given."""
+
+    def __init__(self, network):
+        super().__init__('road', network)
+        self.tracks, self.notes, self.smoothed = [], [], []
+
+    def add_track(self, track):
+        super().add_track(track)
+        self.tracks.append(track)
+
+    def add_smoothed(self, track_id, points):
+        super().add_smoothed(track_id, points)
+        self.smoothed.append(points)
+
+    def set_health(self, notes, tables):
+        super().set_health(notes, tables)
+        self.notes = [note.text for note in notes]
+
+
+def shown(path, network, rate):
+    scene = Scene(network)
+    began = time.monotonic()
+    view(Recording(path), network, settings_for('vehicle'), scene, rate, lambda: False)
+    return scene, time.monotonic() - began
+
+
+def test_tracks_are_those_of_a_replay(road_network):
+    scene, seconds = shown(vehicle_path(NAME), road_network, 4.0)
+    expected = track(vehicle_path(NAME), NETWORK_FILE)
+    poses = [t for t in scene.tracks if not t.ended]
+    np.testing.assert_array_equal([p.stamp_ns for p in poses], expected.poses['stamp_ns'])
+    np.testing.assert_allclose([p.position for p in poses], expected.poses['position'], atol=1e-9)
+    assert scene.tracks[-1].ended and len(scene.smoothed) == 1
+    assert scene.notes == ['end of the recording']
+    recording = Recording(vehicle_path(NAME))
+    assert seconds > 0.9 * (recording.end_ns - recording.start_ns) / 1e9 / 4.0
+    assert json.loads(scene.whole()[-1])['tables'][0]['rows'][0][1] == 'ready'
+
+
+@pytest.mark.parametrize('wrong_ns', [YEARS_NS, -YEARS_NS])
+def test_a_wrong_timestamp_does_not_stop_it(road_network, tmp_path, wrong_ns):
+    path = tmp_path / 'wrong.mcap'
+    reader = SampleReader(Recording(vehicle_path(NAME)), road_network)
+    with RecordingWriter(path) as writer:
+        for k, (readings, log_ns) in enumerate(reader.readings_as_received()):
+            stamp = int(readings.stamp_ns[0]) + (wrong_ns if k == 900 else 0)
+            name = readings.names[0]
+            writer.write(f'/{name}/imu/mag', MAGNETIC_FIELD,
+                         field_dict(stamp, name, readings.field[0]), log_ns)
+    scene, seconds = shown(path, road_network, 20.0)
+    assert seconds < 60.0
+    assert scene.notes[0] == 'end of the recording' and len(scene.notes) > 1
+    assert len([t for t in scene.tracks if not t.ended]) > 20
+
+
+def test_it_ends_when_it_is_told(road_network):
+    asked = []
+
+    def stopped():
+        asked.append(None)
+        return len(asked) > 50
+
+    scene = Scene(road_network)
+    view(Recording(vehicle_path(NAME)), road_network, settings_for('vehicle'), scene, 1.0, stopped)
+    assert 'end of the recording' not in scene.notes
