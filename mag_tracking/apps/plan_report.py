@@ -68,7 +68,7 @@ def plan_page(plan: Plan, lines: list[str]) -> Page:
     """Page of a plan."""
     network = plan.network
     return Page(f'Plan for {len(network)} sensors',
-                f'target of {plan.target.moment:g} A m² at {plan.target.speed:g} m/s',
+                f'target of {plan.target.moment:g} A m^2 at {plan.target.speed:g} m/s',
                 [Note(NOTE, line.strip()) for line in lines], None,
                 [*_maps(plan), *_lanes(plan)],
                 [Table('Sensors', ['sensor', 'x [m]', 'y [m]', 'z [m]'],

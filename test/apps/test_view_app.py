@@ -61,16 +61,29 @@ def test_tracks_are_those_of_a_replay(road_network):
     assert json.loads(scene.whole()[-1])['tables'][0]['rows'][0][1] == 'ready'
 
 
+def test_an_hour_without_messages_is_not_waited_for(road_network, tmp_path):
+    path = tmp_path / 'gap.mcap'
+    rewritten(path, road_network, lambda k, ns: ns + (3600 * 1_000_000_000 if k > 900 else 0),
+              lambda k, ns: ns)
+    assert shown(path, road_network, 20.0)[1] < 60.0
+
+
+def rewritten(path, network, log_time_of, stamp_of):
+    """A copy of the recording with other times of message `k`."""
+    reader = SampleReader(Recording(vehicle_path(NAME)), network)
+    with RecordingWriter(path) as writer:
+        for k, (readings, log_ns) in enumerate(reader.readings_as_received()):
+            name = readings.names[0]
+            writer.write(f'/{name}/imu/mag', MAGNETIC_FIELD, field_dict(
+                stamp_of(k, int(readings.stamp_ns[0])), name, readings.field[0]),
+                log_time_of(k, log_ns))
+
+
 @pytest.mark.parametrize('wrong_ns', [YEARS_NS, -YEARS_NS])
 def test_a_wrong_timestamp_does_not_stop_it(road_network, tmp_path, wrong_ns):
     path = tmp_path / 'wrong.mcap'
-    reader = SampleReader(Recording(vehicle_path(NAME)), road_network)
-    with RecordingWriter(path) as writer:
-        for k, (readings, log_ns) in enumerate(reader.readings_as_received()):
-            stamp = int(readings.stamp_ns[0]) + (wrong_ns if k == 900 else 0)
-            name = readings.names[0]
-            writer.write(f'/{name}/imu/mag', MAGNETIC_FIELD,
-                         field_dict(stamp, name, readings.field[0]), log_ns)
+    rewritten(path, road_network, lambda k, ns: ns,
+              lambda k, ns: ns + (wrong_ns if k == 900 else 0))
     scene, seconds = shown(path, road_network, 20.0)
     assert seconds < 60.0
     assert scene.notes[0] == 'end of the recording' and len(scene.notes) > 1

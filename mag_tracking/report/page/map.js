@@ -8,7 +8,7 @@ const VERMILLION = '#D55E00', BLACK = '#000000';
 const SYMBOLS = ['circle', 'square', 'diamond'];
 // Standard deviations to the edge of a 90 % ellipse and of a 90 % interval.
 const SCALE_2D = Math.sqrt(-2 * Math.log(0.1)), SCALE_1D = 1.645;
-const LEAST_DRAWN = 0.01;
+const LEAST_DRAWN = 0.01, MOST_LABELS = 24;
 const FONT = {size: 13, color: '#1b1b1b'};
 const CONFIG = {responsive: true, displaylogo: false,
   modeBarButtonsToRemove: ['select2d', 'lasso2d', 'sendDataToCloud']};
@@ -38,6 +38,20 @@ function line(xs, ys, name, look, more) {
     hoverinfo: name ? 'name' : 'skip', showlegend: Boolean(name), ...more};
 }
 
+// Labels of the sensors; those one above the other share a label.
+function labelsOf(sensors, factor) {
+  const groups = new Map();
+  sensors.names.forEach((name, j) => {
+    const place = `${(factor * sensors.x[j]).toFixed(1)} ${(factor * sensors.y[j]).toFixed(1)}`;
+    groups.set(place, [...(groups.get(place) || []), j]);
+  });
+  const labels = sensors.names.map(() => '');
+  for (const [first, ...more] of groups.values()) {
+    labels[first] = plain(sensors.names[first]) + (more.length ? ` +${more.length}` : '');
+  }
+  return labels;
+}
+
 function mapTraces(scene, t) {
   const f = scene.scale.factor, scaled = values => Array.from(values, v => f * v);
   const traces = [], current = currentTrack(scene, t);
@@ -64,10 +78,10 @@ function mapTraces(scene, t) {
       marker: {size: 5, color: '#ffffff', line: {color: '#707070', width: 1.2}}});
     if (tracksAt(scene, t).includes(track)) traces.push(...nowTraces(track, k, f, named));
   }
-  traces.push({type: 'scatter', mode: scene.sensors.names.length > 24 ? 'markers'
+  traces.push({type: 'scatter', mode: scene.sensors.names.length > MOST_LABELS ? 'markers'
     : 'markers+text', x: scaled(scene.sensors.x), y: scaled(scene.sensors.y),
-  text: scene.sensors.names.map(plain), textposition: 'top center', hoverinfo: 'text',
-  name: 'magnetometers', cliponaxis: false,
+  text: labelsOf(scene.sensors, f), hovertext: scene.sensors.names.map(plain),
+  textposition: 'top center', hoverinfo: 'text', name: 'magnetometers', cliponaxis: false,
   marker: {symbol: 'triangle-up', size: 11, color: '#333333'}});
   return traces;
 }
