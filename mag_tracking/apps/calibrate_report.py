@@ -12,7 +12,7 @@ from mag_tracking.report.calibration_figures import first_knock
 from mag_tracking.report.figures import SCALE_1D
 from mag_tracking.report.page import ERROR, NOTE, WARNING, Chart, Note, Page, Table, report_html
 from mag_tracking.report.page_charts import axes, curve, plain
-from mag_tracking.report.style import SERIES
+from mag_tracking.report.palette import SERIES
 
 MOST_KNOCKS = 8
 """Maximum number of sensors in the charts of knocks."""

@@ -9,7 +9,7 @@ from mag_tracking.apps.doctor import Doctor
 from mag_tracking.files import replace_text
 from mag_tracking.report.page import ERROR, NOTE, Chart, Note, Page, Table, report_html
 from mag_tracking.report.page_charts import axes, plain
-from mag_tracking.report.style import AXIS_COLOURS
+from mag_tracking.report.palette import AXIS_COLOURS
 from mag_tracking.stages.health.sensor_health import Finding
 
 

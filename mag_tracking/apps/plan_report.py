@@ -8,10 +8,10 @@ import numpy as np
 from mag_tracking.apps.plan import GOOD_PD, Plan
 from mag_tracking.arrays import FloatArray
 from mag_tracking.files import replace_text
-from mag_tracking.report.figures import scale_of
 from mag_tracking.report.page import NOTE, REPORT, Chart, Note, Page, Table, report_html
 from mag_tracking.report.page_charts import axes, curve, heat_map, places
 from mag_tracking.report.plan_figures import LEAST_MISSED, distinct, f_text
+from mag_tracking.report.scales import scale_of
 
 LOW_SHARE = 0.02
 """Quantiles of a bound (this and one minus this) that limit its colour scale."""

@@ -8,7 +8,6 @@ import numpy as np
 from tqdm import tqdm
 
 from mag_tracking.apps.calibrate import Calibration, calibrate
-from mag_tracking.apps.calibrate_report import write_report
 from mag_tracking.cli.options import (
     Commands,
     add_command,
@@ -78,6 +77,9 @@ def _calibrate(args: argparse.Namespace) -> int:
     write_network(args.out, found.network,
                   f'Calibrated from {args.recording.name} and {args.network.name}.')
     if args.report is not None:
+        # It needs matplotlib, which the other commands should not load.
+        from mag_tracking.apps.calibrate_report import write_report
+
         write_report(found, network, args.recording.name, args.report)
     if args.figure is not None:
         # Drawing needs matplotlib, which a run without a figure should not wait for.

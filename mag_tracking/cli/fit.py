@@ -12,7 +12,6 @@ from tqdm import tqdm
 from mag_tracking.analysis.correlated_motion import disagree
 from mag_tracking.analysis.pass_result import Bearing, PassFit
 from mag_tracking.apps.fit import FittedPass, RecordingFit, check_cpa_range, check_orders
-from mag_tracking.apps.fit_report import write_report
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import (
     Commands,
@@ -109,6 +108,9 @@ def _fit(args: argparse.Namespace) -> int:
                 break
         iron = _iron(passes, network) if args.same_vehicle else None
         folder.summary = {'iron': iron, 'interrupted': bool(seen)}
+    # It needs matplotlib, which the other commands should not load.
+    from mag_tracking.apps.fit_report import write_report
+
     write_report(passes, network, warnings, args.out)
     if not passes:
         print('no pass: nothing was detected')

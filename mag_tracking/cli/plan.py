@@ -8,7 +8,6 @@ from tqdm import tqdm
 
 from mag_tracking.apps.plan import Plan
 from mag_tracking.apps.plan_inputs import PlanInputs, plan_inputs
-from mag_tracking.apps.plan_report import answers, write_report
 from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.errors import SettingsError
 from mag_tracking.files import new_text_file, output_folder
@@ -95,6 +94,9 @@ def _plan(args: argparse.Namespace) -> int:
     output_folder(args.out)
     with tqdm(total=inputs.n_parts, desc='plan', disable=None) as bar:
         result = inputs.run(network, settings, bar.update)
+    # Drawing needs matplotlib, which the other commands should not load.
+    from mag_tracking.apps.plan_report import answers, write_report
+
     lines = answers(result)
     for line in lines:
         print(line)

@@ -141,14 +141,21 @@ class PageNode(Node):
     def _take_diagnostics(self, message: DiagnosticArray) -> None:
         """Keep the latest message of each status."""
         now = time.monotonic()
-        self._statuses.update({s.name: (now, s) for s in message.status})
+        self._statuses.update({s.name: (now, s) for s in message.status if self._is_ours(s.name)})
+
+    def _is_ours(self, status: str) -> bool:
+        """True if a diagnostic status belongs to a node of this namespace."""
+        namespace = status.partition(':')[0].rpartition('/')[0]
+        return namespace == self.get_namespace().strip('/')
 
     def _tick(self) -> None:
         """Add received messages to the scene: all frames during a track, otherwise the latest."""
-        if not len(self._places) or not self._frames:
+        if not len(self._places):
             return
-        raw = list(self._frames) if self._tracks else [self._frames[-1]]
+        raw = list(self._frames)
         self._frames.clear()
+        if not self._tracks:
+            raw = raw[-1:]
         for one in raw:
             try:
                 self._scene.add_frame(

@@ -13,7 +13,9 @@ from scipy.special import chdtri
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.report.literal_text import literal
-from mag_tracking.report.style import AXIS_COLOURS, SERIES, VERMILLION, legend_beside
+from mag_tracking.report.palette import AXIS_COLOURS, SERIES, VERMILLION
+from mag_tracking.report.scales import field_unit, scale_of
+from mag_tracking.report.style import legend_beside
 from mag_tracking.report.track_log import TrackLog
 
 SCALE_2D = float(np.sqrt(chdtri(2, 0.1)))
@@ -50,16 +52,6 @@ def _colours(log: TrackLog) -> dict[str, str]:
     """{arrival: colour}, in a fixed order."""
     names = sorted({name for row in log.arrivals for name in row})
     return {name: SERIES[i % len(SERIES)] for i, name in enumerate(names)}
-
-
-def scale_of(extent: float) -> tuple[float, str]:
-    """(factor, unit) that makes a length of `extent` metres readable."""
-    return (1.0, 'm') if extent > 1.0 else (1e3, 'mm')
-
-
-def field_unit(strongest: float) -> tuple[float, str]:
-    """(factor, unit) that makes fields up to `strongest` [T] readable."""
-    return (1e9, 'nT') if strongest < 1e-5 else (1e6, 'µT') if strongest < 1e-2 else (1e3, 'mT')
 
 
 def _without_switches(points: FloatArray, covariances: FloatArray) -> FloatArray:

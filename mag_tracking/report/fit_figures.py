@@ -7,9 +7,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.report.figures import SCALE_1D, field_unit
+from mag_tracking.report.figures import SCALE_1D
 from mag_tracking.report.literal_text import literal
-from mag_tracking.report.style import AXIS_COLOURS, SERIES, legend_beside, plain_log_ticks
+from mag_tracking.report.palette import AXIS_COLOURS, SERIES
+from mag_tracking.report.scales import field_unit
+from mag_tracking.report.style import legend_beside, plain_log_ticks
 
 
 class _Network(Protocol):

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.report.style import SERIES
+from mag_tracking.report.palette import SERIES
 
 DASHES = ('solid', 'dash', 'dot', 'dashdot', 'longdash')
 """Dash styles, one per colour."""

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.report.figures import scale_of
 from mag_tracking.report.packed import Packed, packed
+from mag_tracking.report.scales import scale_of
 from mag_tracking.report.track_log import TrackLog
 from mag_tracking.units import NS
 

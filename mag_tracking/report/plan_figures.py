@@ -9,9 +9,10 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.report.figures import scale_of
 from mag_tracking.report.literal_text import literal
-from mag_tracking.report.style import SERIES, legend_beside, plain_log_ticks
+from mag_tracking.report.palette import SERIES
+from mag_tracking.report.scales import scale_of
+from mag_tracking.report.style import legend_beside, plain_log_ticks
 
 LEAST_MISSED = 1e-6
 """Smaller probabilities of a miss are not drawn."""

@@ -1,15 +1,8 @@
-"""Common style of the figures: a palette safe for colour-blind people, ticks, legends."""
+"""Common style of the figures: ticks and legends."""
 
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-BLUE, VERMILLION, GREEN, ORANGE, PINK, SKY = (
-    '#0072B2', '#D55E00', '#009E73', '#E69F00', '#CC79A7', '#56B4E9')
-"""Okabe and Ito 2008, Color universal design."""
-SERIES = (BLUE, ORANGE, GREEN, PINK, SKY)
-"""Colours of curves, in order; vermillion is kept for smoothed tracks."""
-AXIS_COLOURS = (VERMILLION, GREEN, BLUE)
-"""Colours of the axes x, y, z."""
 FEW_DECADES = 1.5
 """Range below which a logarithmic axis has labels between the powers of ten."""
 

@@ -161,7 +161,7 @@ def test_plan_writes_all_that_it_promises(tmp_path, capsys):
                  '--grid', '9', '--out', str(out)]) == 0
     assert not (tmp_path / 'elsewhere').exists()
     assert {p.name for p in out.iterdir()} == {
-        'plan.json', 'plan_position.png', 'plan_detection.png', 'plan_sensor.png',
+        'plan.json', 'plan_position.png', 'plan_detection.png', 'plan_sensor.png', 'report.html',
         'plan_lanes.png'}
     content = json.loads((out / 'plan.json').read_text())
     assert len(content['position_std']) == len(content['y']) and content['lanes'][0]['along']
