@@ -228,7 +228,7 @@ class ReplayNode(ManagedNode):
 
 
 def _begin_of(recording: Recording) -> int:
-    """[ns] Time of the first message; raises RecordingError if there is none."""
+    """[ns] Time of the first message; raises RecordingError for an empty recording."""
     if recording.start_ns is not None:
         return recording.start_ns
     # A file without an end does not tell: read on until it does.

@@ -84,7 +84,7 @@ def calibration_figure(found: _Calibration, stated: _Network, most: int = 8) -> 
 
 
 def first_knock(shocks: Mapping[str, tuple[FloatArray, FloatArray]]) -> float:
-    """[s] Start of the first strong knock; 0 if there is none.
+    """[s] Start of the first strong knock; 0 without any knock.
 
     `shocks` is {sensor: (times (n,) [s], sizes (n,))}.
     """

@@ -216,7 +216,7 @@ def main():
 
 
 def measure(args):
-    """What `report` gives, or None where it was interrupted at once."""
+    """Result of `report`; None if the run was interrupted before its first row."""
     import rclpy
 
     from mag_tracking.nodes.stage_node import make_executor, spin

@@ -1,4 +1,4 @@
-"""What ten open pages cost the poses of 100 sensors at 100 Hz: `bench.load` with and without.
+"""Cost of ten open pages with 100 sensors at 100 Hz: `bench.load` with and without them.
 
     PYTHONPATH=test python -m bench.pages
 

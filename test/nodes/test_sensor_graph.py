@@ -1,4 +1,4 @@
-"""What is read of the graph, also while it is discovered."""
+"""Names of nodes and topics in the graph, also during discovery."""
 
 from types import SimpleNamespace
 

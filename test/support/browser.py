@@ -50,7 +50,7 @@ class Page:
             self.complaints.append(message.text)
 
     def value(self, expression):
-        """What JavaScript gives."""
+        """Value of a JavaScript expression."""
         return self.page.evaluate(expression)
 
     def wait(self, expression, seconds=60.0):
@@ -72,7 +72,7 @@ class Page:
         self.wait(f'magTracking.drawn > {drawn}')
 
     def pose_on_map(self):
-        """(x, y) of the pose that is drawn, in the units of the map; None where there is none."""
+        """(x, y) of the pose on the map, in map units; None if no pose is shown."""
         return self.value('''(() => {
             const pose = document.getElementById('map').data.find(d => d.meta === 'pose');
             return pose ? [pose.x[0], pose.y[0]] : null; })()''')

@@ -1,4 +1,4 @@
-"""What is drawn on the pages: lines and regions against numbers that are computed elsewhere."""
+"""Lines and regions on the pages against independently computed numbers."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What a live page is told: restarts, late records, forgetting, and invalid numbers."""
+"""Messages of a live scene: restarts, late records, bounded memory, and invalid numbers."""
 
 import base64
 import json
@@ -9,17 +9,7 @@ import pytest
 
 from mag_tracking.records import FieldFrame
 from mag_tracking.web.live_scene import KEPT_S, MOST_POSES, LiveScene
-from support.live_records import NS, feed, later, poses, records_of
-
-
-@pytest.fixture(scope='module')
-def records(road_network):
-    return records_of('straight_car_right', road_network)
-
-
-@pytest.fixture
-def scene(road_network):
-    return LiveScene('road', road_network)
+from support.live_records import NS, feed, later, poses
 
 
 class Viewer:

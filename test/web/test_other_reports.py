@@ -11,19 +11,13 @@ from mag_tracking.cli import main
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.recording.writer import RecordingWriter
 from support.browser import Page as Opened
-from support.browser import browser, needs_browser
+from support.browser import needs_browser
 from support.bundled import NETWORK_FILE, vehicle_path
 from support.samples import field_dict
 
 pytestmark = needs_browser
 
 TWO = [vehicle_path('straight_car_right'), vehicle_path('straight_small_left')]
-
-
-@pytest.fixture(scope='module')
-def chromium():
-    with browser() as found:
-        yield found
 
 
 def run(*words):

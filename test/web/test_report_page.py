@@ -12,7 +12,7 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.report.page import Note, Page, Table, report_html
 from support.browser import Page as Opened
-from support.browser import browser, needs_browser
+from support.browser import needs_browser
 from support.bundled import vehicle_path
 
 pytestmark = needs_browser
@@ -20,12 +20,6 @@ pytestmark = needs_browser
 RECORDING = 'junction_left_turns_to_rear'
 MOST_MB = 10.0
 EVIL = '</script><script>window.broken = true</script><b>left</b>'
-
-
-@pytest.fixture(scope='module')
-def chromium():
-    with browser() as found:
-        yield found
 
 
 @pytest.fixture(scope='module')

@@ -1,0 +1,31 @@
+"""Fixtures of the tests of pages."""
+
+import pytest
+
+from mag_tracking.web.live_scene import LiveScene
+from mag_tracking.web.page_server import PageServer
+from support.browser import browser
+from support.live_records import records_of
+
+
+@pytest.fixture(scope='module')
+def chromium():
+    with browser() as found:
+        yield found
+
+
+@pytest.fixture(scope='module')
+def records(road_network):
+    """Frames and tracks of a recording, in their order."""
+    return records_of('straight_car_right', road_network)
+
+
+@pytest.fixture
+def scene(road_network):
+    return LiveScene('road', road_network)
+
+
+@pytest.fixture
+def server(scene):
+    with PageServer(scene, port=0) as found:
+        yield found

@@ -1,0 +1,243 @@
+"""Server of the live page: slow and vanishing viewers, access, faults."""
+
+import json
+import socket
+import time
+import urllib.error
+import urllib.request
+from contextlib import contextmanager
+from dataclasses import replace
+
+import pytest
+from websockets.exceptions import ConnectionClosedError, InvalidStatus
+from websockets.sync.client import connect
+
+from mag_tracking.errors import DeviceError
+from mag_tracking.records import FieldFrame
+from mag_tracking.web.page_server import PageServer
+from support.live_records import feed, poses
+
+
+def received(url, until, seconds=60.0):
+    """Messages of a viewer until `until(message)`."""
+    out = []
+    with connect(url.replace('http', 'ws') + 'stream', max_size=None) as viewer:
+        end = time.monotonic() + seconds
+        while not (out and until(out[-1])):
+            out.append(json.loads(viewer.recv(max(0.1, end - time.monotonic()))))
+    return out
+
+
+def test_ten_viewers_hear_the_same_and_one_that_goes_away_disturbs_none(scene, server, records):
+    urls = [server.url.replace('http', 'ws') + 'stream'] * 10
+    viewers = [connect(url, max_size=None) for url in urls]
+    quitter = connect(urls[0], max_size=None)
+    feed(scene, records[:len(records) // 2])
+    quitter.socket.close()
+    feed(scene, records[len(records) // 2:])
+    wanted = [p.stamp_ns for p in poses(records)]
+    for viewer in viewers:
+        n = 0
+        while n < len(wanted):
+            message = json.loads(viewer.recv(60.0))
+            for track in message.get('tracks', message.get('scene', {}).get('tracks', ())):
+                n += len(track['doubts'])
+        assert n == len(wanted)
+        viewer.close()
+
+
+def test_a_viewer_that_cannot_follow_gets_the_whole_later(scene, server, records):
+    """Its buffer is bounded, the others are served, and finally it has all poses."""
+    with viewer_of(server) as quick, unread(server) as slow:
+        stamp = publish_until(scene, records, lambda: server.n_behind, quick)
+        assert read_until(slow, b'"type": "scene"', 2) == 2
+        # The scene with all poses is followed by what is new.
+        assert read_until(slow, f'"latest_ns": "{more(scene, records, stamp)}"'.encode()) == 1
+
+
+def viewer_of(server):
+    """A viewer that reads."""
+    return connect(server.url.replace('http', 'ws') + 'stream', max_size=None)
+
+
+def read_until(raw, pattern, n=1, seconds=120.0):
+    """Read until a pattern has come `n` times; how often it came."""
+    found, rest = 0, b''
+    raw.settimeout(seconds)
+    while found < n:
+        part = raw.recv(1 << 20)
+        assert part, 'the server has closed the connection'
+        text = rest + part
+        found += text.count(pattern)
+        rest = text[-(len(pattern) - 1):]
+    return found
+
+
+def more(scene, records, stamp, n=1):
+    """Publish `n` more poses; the time of the last."""
+    template = [r for r in records if isinstance(r, FieldFrame)][-1]
+    for _ in range(n):
+        stamp += 10_000_000
+        scene.add_frame(replace(template, stamp_ns=stamp))
+        scene.add_track(replace(poses(records)[30], stamp_ns=stamp))
+    return stamp
+
+
+def publish_until(scene, records, condition, quick, seconds=60.0):
+    """Publish many poses until the condition holds; the time of the last."""
+    stamp, end = records[-1].stamp_ns, time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        stamp = more(scene, records, stamp, 400)
+        # This one is served all the while.
+        quick.recv(60.0)
+    return stamp
+
+
+@contextmanager
+def unread(server):
+    """A viewer that shakes hands and does not read by itself."""
+    with socket.socket() as raw:
+        raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
+        raw.connect(('127.0.0.1', server.port))
+        raw.sendall((f'GET /stream HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n'
+                     'Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n'
+                     'Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n').encode())
+        yield raw
+
+
+def test_a_viewer_that_never_reads_is_disconnected(scene, records, monkeypatch):
+    monkeypatch.setattr('mag_tracking.web.page_server.GIVE_UP_S', 0.5)
+    with PageServer(scene, port=0) as server, viewer_of(server) as quick, unread(server):
+        stamp = publish_until(scene, records, lambda: server.n_behind, quick)
+        end = time.monotonic() + 60.0
+        while server.n_viewers > 1:
+            stamp = more(scene, records, stamp)
+            quick.recv(60.0)
+            assert time.monotonic() < end
+
+
+def test_a_scene_larger_than_the_buffer_is_followed_by_rows(scene, server, records):
+    """A new viewer of a long session reads megabytes first; it must not be sent them again."""
+    with viewer_of(server) as quick:
+        stamp = more(scene, records, records[-1].stamp_ns, 7_900)
+        while f'"latest_ns": "{stamp}"' not in quick.recv(60.0):
+            pass
+    with unread(server) as slow:
+        received, due = b'', time.monotonic()
+        slow.settimeout(60.0)
+        while b'"type": "rows"' not in received[-300_000:]:
+            # So many ticks pass meanwhile that the server sees the full buffer.
+            due += 0.02
+            time.sleep(max(0.0, due - time.monotonic()))
+            part = slow.recv(100_000)
+            assert part
+            received += part
+            stamp = more(scene, records, stamp)
+        assert received.count(b'"type": "scene"') == 1
+        assert server.n_behind == 0 and len(received) > 1_500_000
+
+
+def test_the_number_of_viewers_is_limited(scene, monkeypatch):
+    monkeypatch.setattr('mag_tracking.web.page_server.MOST_VIEWERS', 2)
+    with PageServer(scene, port=0) as server:
+        url = server.url.replace('http', 'ws') + 'stream'
+        viewers = [connect(url) for _ in range(2)]
+        for viewer in viewers:
+            viewer.recv(60.0)
+        third = connect(url)
+        with pytest.raises(ConnectionClosedError) as closed:
+            third.recv(60.0)
+        assert closed.value.rcvd.code == 1013
+        for viewer in viewers:
+            viewer.close()
+
+
+def test_a_fault_of_the_source_is_said_and_ends_nothing(caplog):
+    class Broken:
+        def whole(self):
+            return ['{"type": "health", "notes": [], "tables": []}']
+
+        def news(self):
+            raise ValueError('broken')
+
+    with PageServer(Broken(), port=0) as server:
+        messages = received(server.url, lambda m: m['type'] == 'fault')
+        assert messages[-1]['text'] == 'ValueError: broken'
+        received(server.url, lambda m: m['type'] == 'fault')
+        assert server.is_serving
+    assert len([r for r in caplog.records if 'fault of the live page' in r.message]) == 1
+    assert not server.is_serving
+
+
+def test_a_looped_bag_begins_anew(scene, server, records):
+    feed(scene, records)
+    messages = received(server.url, lambda m: m['type'] == 'scene')
+    assert messages[-1]['type'] == 'scene'
+    with connect(server.url.replace('http', 'ws') + 'stream', max_size=None) as viewer:
+        feed(scene, records[:50])
+        while True:
+            message = json.loads(viewer.recv(60.0))
+            if message['type'] == 'scene' and message['scene']['tracks'] == []:
+                break
+        begin = [r for r in records[:50] if isinstance(r, FieldFrame)][0].stamp_ns
+        assert int(message['scene']['begin_ns']) == begin
+
+
+def test_a_port_in_use_is_said(scene, server):
+    with pytest.raises(DeviceError, match=f'port {server.port}: Address already in use'):
+        PageServer(scene, port=server.port)
+    for port in (-1, 70000):
+        with pytest.raises(DeviceError, match='cannot be served'):
+            PageServer(scene, port=port)
+    with pytest.raises(DeviceError, match='cannot be served'):
+        PageServer(scene, host='no.such.host.invalid', port=0)
+
+
+def status_of(url, **headers):
+    request = urllib.request.Request(url, headers=headers)
+    try:
+        with urllib.request.urlopen(request, timeout=60.0) as response:
+            return response.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_without_a_token_only_this_machine_sees_it(server):
+    """A page of elsewhere may have its own name point here, or open the socket from its script."""
+    assert 'token' not in server.url
+    assert status_of(server.url) == 200
+    assert status_of(server.url + 'etc/passwd') == 404
+    assert status_of(server.url, Host='evil.example') == 403
+    assert status_of(server.url, Host='[::1') == 403
+    stream = server.url.replace('http', 'ws') + 'stream'
+    with pytest.raises(InvalidStatus) as refused:
+        connect(stream, origin='http://evil.example')
+    assert refused.value.response.status_code == 403
+    connect(stream, origin=server.url.rstrip('/')).close()
+
+
+def test_from_elsewhere_the_token_is_needed(scene):
+    with PageServer(scene, host='0.0.0.0', port=0) as server:
+        address, token = server.url.split('?token=')
+        assert socket.gethostname() in address
+        address = address.replace(socket.gethostname(), '127.0.0.1')
+        assert len(token) > 20
+        for wrong in ('', '?token=', '?token=x', f'?token={token}x', '?token=%C3%A9'):
+            assert status_of(address + wrong) == 403
+            with pytest.raises(InvalidStatus):
+                connect(address.replace('http', 'ws') + 'stream' + wrong)
+        assert status_of(f'{address}?token={token}') == 200
+        connect(f'{address.replace("http", "ws")}stream?token={token}').close()
+
+
+def test_nonsense_does_not_end_the_server(server):
+    for text in (b'\x16\x03\x01garbage\r\n\r\n', b'POST / HTTP/1.1\r\n\r\n', b'', b'A' * 100_000):
+        with socket.create_connection(('127.0.0.1', server.port)) as raw:
+            try:
+                raw.sendall(text)
+                raw.shutdown(socket.SHUT_WR)
+                raw.recv(1000)
+            except OSError:
+                continue
+    assert status_of(server.url) == 200
