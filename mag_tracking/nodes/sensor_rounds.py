@@ -39,13 +39,15 @@ class SensorRounds:
         self._node, self._stage, self._health, self._store = node, stage, health, store
         self._is_live = is_live
         self._publish_status, self._publish_states = publish_status, publish_states
-        self._is_due = self._is_doubtful = False
+        self._is_due = False
+        self._told: set[tuple[int, int]] = set()
         self.begin(network)
 
     def begin(self, network: SensorNetwork) -> None:
         """Begin a round; `network` is the one from now on."""
         self._network = network
         self._steps = self._rounds()
+        self._states = self.states()
 
     def tick(self) -> None:
         """A step is due: it is done after the next readings, or at the next tick."""
@@ -59,13 +61,17 @@ class SensorRounds:
             self._step()
 
     def report_doubts(self) -> None:
-        """Publish before its turn where the first background has become doubtful: a track that
-        waits for the round would be sure meanwhile.
+        """Publish before its turn where a background has become doubtful: a track that waits for
+        the round would be sure meanwhile.
         """
-        is_doubtful = any(b.doubtful for b in self._stage.backgrounds().values())
-        if is_doubtful and not self._is_doubtful:
-            self._publish_states(self.states())
-        self._is_doubtful = is_doubtful
+        backgrounds = self._stage.backgrounds()
+        begun = {(j, begin) for j, name in enumerate(self._network.names)
+                 for begin, end in backgrounds[name].doubtful_times[-1:] if end is None}
+        if news := begun - self._told:
+            for j, _ in news:
+                self._states[j] = self._state(j)
+            self._publish_states(self._states)
+        self._told = begun
 
     def _step(self) -> None:
         """Go on with the round."""
@@ -85,15 +91,14 @@ class SensorRounds:
         while True:
             self._health.begin_round(self._stage)
             yield
-            states = []
             for j in range(len(self._network)):
                 self._health.look(j)
-                states.append(self._state(j))
+                self._states[j] = self._state(j)
                 self._store.update(self._network, j)
                 yield
                 self._publish_status(self._health.status(self._node, j, self._stage))
                 yield
-            self._publish_states(states)
+            self._publish_states(self._states)
             yield
             self._store.write_if_due(self._is_live())
             yield
