@@ -18,7 +18,7 @@ import mag_tracking as mt
 from mag_tracking.cli import main
 from mag_tracking.recording.fit_folder import FIT_COLUMNS, FitFolder
 from mag_tracking.recording.result_folder import DETECTION_COLUMNS, POSE_COLUMNS, SMOOTHED_COLUMNS
-from support.bundled import NETWORK_FILE, ROOT, vehicle_path
+from support.bundled import NETWORK_FILE, QUICK, ROOT, vehicle_path
 
 NAME = 'straight_car_fast_left'
 HEAVY = {'matplotlib', 'mcap', 'numba', 'numpy', 'pandas', 'rclpy', 'scipy', 'yaml'}
@@ -195,7 +195,7 @@ def test_arrays_have_the_fields_of_the_records(result):
 
 def test_a_long_name_is_not_cut(recorded):
     long = 'from the right, where the road comes over the bridge'
-    found = mt.track(recorded, NETWORK_FILE, settings={
+    found = mt.track(recorded, NETWORK_FILE, settings=QUICK | {
         'track.vehicle.arrival_names': ['left', long, 'rear']})
     assert long in found.poses['arrival'] and found.smoothed['complete'].all()
 

@@ -14,7 +14,7 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.web.live_scene import LiveScene
-from support.bundled import NETWORK_FILE, vehicle_path
+from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 from support.samples import field_dict
 
 NAME = 'straight_small_left'
@@ -44,13 +44,13 @@ class Scene(LiveScene):
 def shown(path, network, rate):
     scene = Scene(network)
     began = time.monotonic()
-    view(Recording(path), network, settings_for('vehicle'), scene, rate, lambda: False)
+    view(Recording(path), network, settings_for('vehicle', QUICK), scene, rate, lambda: False)
     return scene, time.monotonic() - began
 
 
 def test_tracks_are_those_of_a_replay(road_network):
     scene, seconds = shown(vehicle_path(NAME), road_network, 4.0)
-    expected = track(vehicle_path(NAME), NETWORK_FILE)
+    expected = track(vehicle_path(NAME), NETWORK_FILE, settings=QUICK)
     poses = [t for t in scene.tracks if not t.ended]
     np.testing.assert_array_equal([p.stamp_ns for p in poses], expected.poses['stamp_ns'])
     np.testing.assert_allclose([p.position for p in poses], expected.poses['position'], atol=1e-9)
@@ -98,5 +98,6 @@ def test_it_ends_when_it_is_told(road_network):
         return len(asked) > 50
 
     scene = Scene(road_network)
-    view(Recording(vehicle_path(NAME)), road_network, settings_for('vehicle'), scene, 1.0, stopped)
+    view(Recording(vehicle_path(NAME)), road_network, settings_for('vehicle', QUICK), scene, 1.0,
+         stopped)
     assert 'end of the recording' not in scene.notes

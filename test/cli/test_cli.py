@@ -13,10 +13,15 @@ import pytest
 from mag_tracking.cli import main
 from mag_tracking.recording.fit_folder import FIT_COLUMNS
 from mag_tracking.recording.result_folder import DETECTION_COLUMNS, POSE_COLUMNS, SMOOTHED_COLUMNS
-from support.bundled import DATA, NETWORK_FILE, vehicle_path
+from support.bundled import DATA, NETWORK_FILE, QUICK, parameter_file, vehicle_path
 from support.permissions import as_files_say
 
 NAME = 'junction_left_to_right'
+
+
+def quick(folder):
+    """A parameter file for tests of what is around the tracker."""
+    return parameter_file(folder / 'quick.yaml', QUICK)
 
 
 def test_replay_writes_all_that_it_promises(tmp_path, capsys):
@@ -61,8 +66,7 @@ def test_a_replay_says_what_it_replaces_and_writes_through_no_link(tmp_path, cap
 
 
 def test_a_track_that_is_too_long_to_smooth_is_said(tmp_path, capsys):
-    params = tmp_path / 'short.yaml'
-    params.write_text('track: {smooth_longest_s: 1.0}')
+    params = parameter_file(tmp_path / 'short.yaml', QUICK | {'track.smooth_longest_s': 1.0})
     assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--params',
                  str(params), '--no-figures', '--out', str(tmp_path / 'out')]) == 0
     assert 'warning: 1 tracks were too long to smooth' in capsys.readouterr().out
@@ -70,10 +74,10 @@ def test_a_track_that_is_too_long_to_smooth_is_said(tmp_path, capsys):
 
 
 def test_several_recordings_get_a_folder_each(tmp_path):
-    names = ['straight_car_right', 'straight_small_left']
+    names, out = ['straight_car_right', 'straight_small_left'], tmp_path / 'out'
     assert main(['replay', *(str(vehicle_path(n)) for n in names), '--network', str(NETWORK_FILE),
-                 '--out', str(tmp_path), '--no-figures']) == 0
-    assert sorted(p.name for p in tmp_path.iterdir()) == names
+                 '--params', str(quick(tmp_path)), '--out', str(out), '--no-figures']) == 0
+    assert sorted(p.name for p in out.iterdir()) == names
 
 
 def test_import_and_replay_of_a_magnet(tmp_path, capsys):
@@ -188,7 +192,7 @@ def test_an_interrupted_replay_keeps_what_is_done(tmp_path):
         path.write_bytes(vehicle_path(NAME).read_bytes())
     process = subprocess.Popen(
         [sys.executable, '-m', 'mag_tracking.cli', 'replay', *map(str, recordings), '--network',
-         str(NETWORK_FILE), '--out', str(out), '--no-figures'],
+         str(NETWORK_FILE), '--params', str(quick(tmp_path)), '--out', str(out), '--no-figures'],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     table = out / f'{NAME}_0' / 'summary.json'
     deadline = time.monotonic() + 120
@@ -217,8 +221,8 @@ def interrupt_feed(monkeypatch, at):
 
 
 def replay_one(out, *options):
-    return main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--out',
-                 str(out), *options])
+    return main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--params',
+                 str(quick(out.parent)), '--out', str(out), *options])
 
 
 def summary_of(out):

@@ -16,7 +16,7 @@ from mag_tracking.network.file import read_network, write_network
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import RecordingWriter
-from support.bundled import DATA, NETWORK_FILE, vehicle_path
+from support.bundled import DATA, NETWORK_FILE, QUICK, parameter_file, vehicle_path
 from support.samples import MagSample, recorded, sample_dict
 
 ROAD = vehicle_path('straight_car_right')
@@ -50,8 +50,9 @@ def test_calibrate_writes_a_network_that_replay_takes(tmp_path, capsys):
     assert abs(found.clock_offset[1]) > 5e-3 and found.calibrated[1].clock_offset_std < 1e-3
     assert all((std < np.deg2rad(5.0)).all() for std in found.orientation_std)
     assert all(1e-9 < std.min() < std.max() < 1e-7 for std in found.noise_std)
-    assert main(['replay', str(ROAD), '--network', str(out), '--out', str(tmp_path / 'run'),
-                 '--no-figures']) == 0
+    params = parameter_file(tmp_path / 'quick.yaml', QUICK)
+    assert main(['replay', str(ROAD), '--network', str(out), '--params', str(params), '--out',
+                 str(tmp_path / 'run'), '--no-figures']) == 0
     assert '1 tracks' in capsys.readouterr().out
 
 

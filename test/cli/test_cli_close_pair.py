@@ -8,6 +8,7 @@ import pytest
 from mag_tracking.cli import main
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.recording.writer import RecordingWriter
+from support.bundled import LINEARISED_ONCE, parameter_file
 from support.close_pairs import readings_of
 from support.samples import sample_dict, samples_of
 
@@ -52,8 +53,9 @@ def test_fit_says_speed_and_direction_twice(pair, tmp_path, capsys):
 
 def test_replay_sets_the_delay_beside_the_track(pair, tmp_path, capsys):
     recording, network, velocity = pair
-    assert main(['replay', recording, '--network', network, '--out', str(tmp_path),
-                 '--no-figures']) == 0
+    params = parameter_file(tmp_path / 'params.yaml', LINEARISED_ONCE)
+    assert main(['replay', recording, '--network', network, '--params', str(params), '--out',
+                 str(tmp_path), '--no-figures']) == 0
     assert 'by the delay between sensors' in capsys.readouterr().out
     summary = json.loads((tmp_path / 'summary.json').read_text())
     assert summary['frames_too_long'] is None
@@ -64,8 +66,8 @@ def test_replay_sets_the_delay_beside_the_track(pair, tmp_path, capsys):
 
 def test_frames_that_are_too_long_are_warned_of(pair, tmp_path, capsys):
     recording, network, _ = pair
-    (tmp_path / 'long.yaml').write_text('align: {period_s: 0.08}\n')
-    options = ['--network', network, '--params', str(tmp_path / 'long.yaml')]
+    params = parameter_file(tmp_path / 'long.yaml', LINEARISED_ONCE | {'align.period_s': 0.08})
+    options = ['--network', network, '--params', str(params)]
     assert main(['replay', recording, *options, '--out', str(tmp_path / 'out'),
                  '--no-figures']) == 0
     assert 'a frame of 80 ms is longer than the 25 ms' in capsys.readouterr().out

@@ -52,7 +52,7 @@ def play(namespace, recording, remapped):
     """The replay of one network."""
     names = [a for one, other in remapped.items() for a in ('-r', f'{one}:={other}')]
     return start('replay_node', *names, *named(namespace, 'replay_node'),
-                 '-p', f'recording:={vehicle_path(recording)}', '-p', 'rate:=1.5',
+                 '-p', f'recording:={vehicle_path(recording)}', '-p', 'rate:=2.5',
                  '-p', 'start_delay:=3.0', '-p', 'wait_for_subscribers:=300.0')
 
 

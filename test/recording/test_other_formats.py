@@ -20,7 +20,7 @@ from mag_tracking.messages.self_described import reader_of
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.recording.field_table import import_field_table
 from mag_tracking.recording.reader import Recording
-from support.bundled import NETWORK_FILE, vehicle_path
+from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 
 NAME = 'straight_car_right'
 HEADER = 'std_msgs/msg/Header'
@@ -33,7 +33,7 @@ def source():
 
 @pytest.fixture(scope='module')
 def expected():
-    return mt.track(vehicle_path(NAME), NETWORK_FILE)
+    return mt.track(vehicle_path(NAME), NETWORK_FILE, settings=QUICK)
 
 
 def written_db3(source, folder):
@@ -83,7 +83,7 @@ def test_a_bag_gives_what_the_mcap_gives(kind, source, expected, tmp_path):
     done = []
     n = sum(1 for _ in found.messages(progress=done.append))
     assert n == source.message_counts.total() and sum(done) == found.size
-    compare(mt.track(path, NETWORK_FILE), expected)
+    compare(mt.track(path, NETWORK_FILE, settings=QUICK), expected)
 
 
 @pytest.mark.parametrize('kind', ['db3', 'bag'])
@@ -154,7 +154,8 @@ def test_json_messages_of_a_magnetic_field_are_read(seconds, nanoseconds, source
         for topic, t, b in fields_of(source)]
     path = mcap_of(tmp_path / 'json.mcap', 'json', ('Magnetic', 'jsonschema', SCHEMA), messages)
     assert set(Recording(path).types.values()) == {MAGNETIC_FIELD}
-    np.testing.assert_array_equal(mt.track(path, NETWORK_FILE).poses, expected.poses)
+    found = mt.track(path, NETWORK_FILE, settings=QUICK)
+    np.testing.assert_array_equal(found.poses, expected.poses)
 
 
 @pytest.mark.parametrize('change, cause', [
@@ -216,7 +217,8 @@ def test_protobuf_messages_of_a_magnetic_field_are_read(source, expected, tmp_pa
         messages.append((topic, t, m.SerializeToString()))
     path = mcap_of(tmp_path / 'p.mcap', 'protobuf', ('lab.Magnetic', 'protobuf', descriptors),
                    messages)
-    np.testing.assert_array_equal(mt.track(path, NETWORK_FILE).poses, expected.poses)
+    found = mt.track(path, NETWORK_FILE, settings=QUICK)
+    np.testing.assert_array_equal(found.poses, expected.poses)
 
 
 def test_a_table_of_readings_becomes_a_recording(source, expected, tmp_path, capsys):
@@ -228,7 +230,7 @@ def test_a_table_of_readings_becomes_a_recording(source, expected, tmp_path, cap
     assert main(['import', str(table), '--columns', 'time=t', 'sensor=id', 'x=bx', 'y=by', 'z=bz',
                  '--unit', 'uT', '--time-unit', 'ns', '--out', str(tmp_path / 'out')]) == 0
     assert '/mag_1/imu/mag  1400' in capsys.readouterr().out
-    result = mt.track(tmp_path / 'out', NETWORK_FILE)
+    result = mt.track(tmp_path / 'out', NETWORK_FILE, settings=QUICK)
     np.testing.assert_allclose(result.poses['position'], expected.poses['position'], rtol=1e-6)
 
 

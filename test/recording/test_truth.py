@@ -16,7 +16,7 @@ from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.truth import read_truth_table
 from mag_tracking.recording.tum_file import write_tum
 from mag_tracking.recording.writer import RecordingWriter
-from support.bundled import vehicle_path
+from support.bundled import QUICK, vehicle_path
 from support.networks import line_network
 from support.samples import MagSample, sample_dict
 
@@ -79,7 +79,7 @@ def test_a_topic_that_cannot_be_truth_is_named(tmp_path, topic, told):
 
 def test_a_table_is_the_same_truth_as_the_topic(tmp_path, road_network):
     """In either unit of time; the errors of the track are those against the topic."""
-    settings = settings_for('vehicle')
+    settings = settings_for('vehicle', QUICK)
     run = replay(Recording(vehicle_path(NAME)), road_network, settings, tmp_path / 'a')
     ((stamps, position, _),) = run.truth.values()
     expected = run.summary['tracks'][0]['truth']

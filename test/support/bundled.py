@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import yaml
+
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / 'test' / 'data'
 VEHICLES = sorted(p.stem for p in (DATA / 'vehicles').glob('*.mcap'))
@@ -12,6 +14,23 @@ POINT = {f'track.vehicle.{name}': [value] for name, value in {
     'difference_stds': 0.0, 'heights': 0.5, 'height_stds': 0.2,
     'near_field_lengths': 1.0}.items()} | {'track.vehicle.turn_acceleration': 0.0}
 """Settings of a tracker that knows only point targets which go straight on."""
+LINEARISED_ONCE = {'track.relinearise_window_s': 0.0}
+"""Settings that take away what takes most of the time of tracking."""
+QUICK = POINT | LINEARISED_ONCE
+"""A third of the time: for tests of all that is around the tracker."""
+
+
+def parameter_file(path, changes):
+    """A parameter file with `changes` ({dotted name: value}); its path."""
+    content = {}
+    for name, value in changes.items():
+        *groups, last = name.split('.')
+        group = content
+        for g in groups:
+            group = group.setdefault(g, {})
+        group[last] = value
+    path.write_text(yaml.safe_dump(content))
+    return path
 
 
 def vehicle_path(name):

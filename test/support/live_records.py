@@ -6,14 +6,14 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import FieldFrame, Track
-from support.bundled import vehicle_path
+from support.bundled import QUICK, vehicle_path
 
 NS = 1_000_000_000
 
 
 def records_of(name, network):
     """Frames and tracks of a recording, in their order."""
-    pipeline, out = Pipeline(network, settings_for('vehicle')), []
+    pipeline, out = Pipeline(network, settings_for('vehicle', QUICK)), []
     for readings in SampleReader(Recording(vehicle_path(name)), network).readings():
         out += pipeline.feed(readings)
     return [r for r in [*out, *pipeline.flush()] if isinstance(r, (FieldFrame, Track))]

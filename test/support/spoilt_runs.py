@@ -51,11 +51,12 @@ class Outcome:
         return self.tracked and self.heading > HEADING
 
 
-def outcome(name, *faults, network=NETWORK_FILE):
+def outcome(name, *faults, network=NETWORK_FILE, settings=None):
     """`Outcome` of the bundled recording `name` with `faults`."""
     source = recorded(name)
     readings = apply(source.readings, *faults)
-    result = mt.track(dataclasses.replace(source, readings=readings), network)
+    result = mt.track(dataclasses.replace(source, readings=readings), network,
+                      settings=settings)
     detected = int(result.detections['onset'].sum())
     errors = {k: e for k in result.tracks if (e := result.errors(k)) is not None}
     if not errors:

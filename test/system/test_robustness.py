@@ -27,7 +27,7 @@ from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.track.manager import TrackManager
-from support.bundled import NETWORK_FILE, vehicle_path
+from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 from support.calibration_runs import EARTH, SIGMA, feed, running, sample, stage
 from support.marks import studied
 from support.networks import line_network
@@ -65,7 +65,7 @@ def test_recordings_of_the_same_name_are_refused(tmp_path, capsys):
 
 def test_a_looped_recording_gives_the_same_track_again(road_network):
     samples = recorded(SampleReader(Recording(vehicle_path(NAME)), road_network))
-    pipeline = Pipeline(road_network, settings_for('vehicle'))
+    pipeline = Pipeline(road_network, settings_for('vehicle', QUICK))
     loops = []
     for _ in range(2):
         tracks = [r for s in samples for r in pipeline.feed(one(s)) if isinstance(r, Track)]
@@ -252,7 +252,7 @@ def test_odometry_is_in_the_childs_frame():
 
 
 def test_detections_have_ids_that_count_the_onsets(road_network):
-    pipeline = Pipeline(road_network, settings_for('vehicle'))
+    pipeline = Pipeline(road_network, settings_for('vehicle', QUICK))
     samples = recorded(SampleReader(Recording(vehicle_path(NAME)), road_network))
     events = [(r.id, r.onset) for s in samples for r in pipeline.feed(one(s))
               if isinstance(r, Detection)]

@@ -68,7 +68,7 @@ def test_a_pose_is_on_the_page_within_200_ms(chromium, scene, server, records):
     thread = threading.Thread(target=publish)
     thread.start()
     try:
-        page.wait('window.delays.length > 120')
+        page.wait('window.delays.length > 80')
     finally:
         stop.set()
         thread.join()

@@ -13,7 +13,7 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.report.page import Note, Page, Table, report_html
 from support.browser import Page as Opened
 from support.browser import needs_browser
-from support.bundled import vehicle_path
+from support.bundled import QUICK, vehicle_path
 
 pytestmark = needs_browser
 
@@ -31,8 +31,9 @@ def report(vehicle_replays, road_network):
         return path, list(csv.DictReader(stream))
 
 
-@pytest.fixture
+@pytest.fixture(scope='module')
 def opened(chromium, report):
+    """The page of several tests; they find its slider wherever it is."""
     page = Opened(chromium, report[0].as_uri())
     page.wait('magTracking.drawn > 0')
     yield page
@@ -91,7 +92,8 @@ def test_the_slider_moves_map_curves_and_text_together(opened, report):
 
 def test_it_needs_nothing_from_outside_and_nothing_is_wrong(opened, report):
     t = columns(opened, 't')
-    for share in np.linspace(0.0, 1.0, 7):
+    # The play goes on from where the slider is.
+    for share in (*np.linspace(0.0, 1.0, 7), 0.8):
         opened.move_slider(t[0] + share * (t[-1] - t[0]))
     opened.page.select_option('#sensors', 'mag_2')
     opened.page.set_viewport_size({'width': 390, 'height': 800})
@@ -148,7 +150,8 @@ def second_track(log):
 
 def test_markup_in_names_is_shown_as_it_is(chromium, road_network, tmp_path):
     """Names of arrivals and of files come from users."""
-    settings = settings_for('vehicle', {'track.vehicle.arrival_names': [EVIL, 'right', 'rear']})
+    settings = settings_for('vehicle', QUICK | {
+        'track.vehicle.arrival_names': [EVIL, 'right', 'rear']})
     recording = Recording(vehicle_path('straight_small_left'))
     run = replay(recording, road_network, settings, tmp_path)
     run.summary['recording'] = EVIL

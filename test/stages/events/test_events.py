@@ -20,7 +20,7 @@ from mag_tracking.stages.events.stage import Events
 from mag_tracking.stages.track.manager import ALONE
 from mag_tracking.units import NS
 from support import spoiler
-from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
+from support.bundled import LINEARISED_ONCE, NETWORK_FILE, VEHICLES, vehicle_path
 from support.marks import studied
 from support.spoilt_runs import recorded
 
@@ -180,9 +180,9 @@ def test_a_track_begins_when_the_second_sensor_is_back_and_is_flagged():
     readings = recorded('straight_car_right').readings
     seconds = (readings.stamp_ns - readings.stamp_ns.min()) / NS
     silent = (np.array(readings.sensor_names()) == 'mag_2') & (seconds > 4.0) & (seconds < 8.5)
-    whole = mt.track(readings, NETWORK).poses['stamp_ns'][0]
+    whole = mt.track(readings, NETWORK, settings=LINEARISED_ONCE).poses['stamp_ns'][0]
     assert whole < readings.stamp_ns[silent].max(), 'nothing passes in that time'
-    result = mt.track(readings.part(~silent), NETWORK)
+    result = mt.track(readings.part(~silent), NETWORK, settings=LINEARISED_ONCE)
     assert result.counts['track'][ALONE] > 0
     assert len(result.poses) and result.poses['ambiguous'].all()
     assert result.poses['stamp_ns'][0] > readings.stamp_ns[silent].max() - 0.1 * NS

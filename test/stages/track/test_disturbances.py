@@ -57,6 +57,7 @@ def test_a_car_is_no_disturbance():
     assert not [r for r in outputs('a car')[1] if isinstance(r, Disturbance)]
 
 
+@pytest.mark.study
 def test_a_car_that_stops_is_no_disturbance():
     assert not [r for r in outputs('stops for 20 s')[1] if isinstance(r, Disturbance)]
 
@@ -67,6 +68,7 @@ def test_disturbances_do_not_depend_on_how_readings_are_split():
         dataclasses.astuple(r) for r in parts if isinstance(r, Disturbance)]
 
 
+@pytest.mark.study
 def test_a_storm_is_one_field_and_a_temperature_one_of_each_sensor():
     def uniform(name, simulator):
         return [r.uniform for r in outputs_of(name, simulator)[1]

@@ -9,14 +9,14 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Readings, SmoothedPose, Track
 from mag_tracking.simulation.scenario import Path, random_vehicle
 from mag_tracking.stages.track.manager import TrackManager
-from support.bundled import NETWORK_FILE, POINT
+from support.bundled import NETWORK_FILE, QUICK
 from support.dense_traffic import after_dense_traffic
 from support.networks import line_network
 from support.samples import one, simulate
 
 SURE_WITHOUT = ('junction_left_to_right', 'junction_left_turns_to_rear')
 DOUBTED = 'tracks of a doubtful background'
-SETTINGS = settings_for('vehicle', POINT)
+SETTINGS = settings_for('vehicle', QUICK)
 """A fast tracker: the doubt does not depend on the model of the target."""
 
 
@@ -34,7 +34,7 @@ def passing():
 def tracked(passing, times, settings=None):
     """(TrackManager, poses), with doubtful times of sensors [s]."""
     network, frames = passing
-    manager = TrackManager(network, settings_for('vehicle', {**POINT, **(settings or {})}).track)
+    manager = TrackManager(network, settings_for('vehicle', {**QUICK, **(settings or {})}).track)
     start = frames[0].stamp_ns
     manager.doubt({name: tuple((start + round(b * 1e9), None if e is None else
                                 start + round(e * 1e9)) for b, e in stretches)
@@ -126,7 +126,7 @@ def test_it_was_sure_before_it_knew_of_doubt(name):
 
 def test_poses_of_a_fixed_lag_are_no_surer():
     pipeline = Pipeline(read_network(NETWORK_FILE),
-                        settings_for('vehicle', {**POINT, 'track.smoothing_lag_s': 0.5}))
+                        settings_for('vehicle', {**QUICK, 'track.smoothing_lag_s': 0.5}))
     records = pipeline.feed(after_dense_traffic(SURE_WITHOUT[0], 7.0)) + pipeline.flush()
     smoothed = [r for r in records if isinstance(r, SmoothedPose)]
     assert len(smoothed) > 10 and all(s.ambiguous for s in smoothed)

@@ -12,6 +12,7 @@ from mag_tracking.stages.track.clock_evidence import ClockEvidence
 from mag_tracking.stages.track.rigid_pass import RigidPass
 from mag_tracking.stages.track.second_opinion import SecondOpinion
 from support import spoiler
+from support.bundled import LINEARISED_ONCE
 from support.passes import network_of
 from support.situation_worlds import ambient_world
 from support.situations import made
@@ -123,7 +124,7 @@ def test_the_third_car_past_a_wrong_clock_is_doubted_from_its_first_pose():
     rng = np.random.default_rng(5)
     a_world = ambient_world(rng, 'clouds', None, 75.0, cars=3)
     readings = spoiler.apply(a_world.readings, spoiler.delayed('mag_2', 0.25))
-    records, pipeline = tracks_of(readings, a_world.network)
+    records, pipeline = tracks_of(readings, a_world.network, **LINEARISED_ONCE)
     tracks = [r for r in records if isinstance(r, Track)]
     last = [r for r in records if isinstance(r, Track | SmoothedPose)
             and r.id == max(t.id for t in tracks)]
@@ -131,7 +132,7 @@ def test_the_third_car_past_a_wrong_clock_is_doubted_from_its_first_pose():
     assert all(t.ambiguous for t in last)
     print(pipeline.track.clocks_apart)
     assert 'the clock of mag_2 seems' in pipeline.track.clocks_apart
-    right, pipeline = tracks_of(a_world.readings, a_world.network)
+    right, pipeline = tracks_of(a_world.readings, a_world.network, **LINEARISED_ONCE)
     assert not any(doubts.CLOCKS_APART in t.doubts for t in right if isinstance(t, Track))
     assert pipeline.track.clocks_apart == ''
 
@@ -201,7 +202,7 @@ def test_what_leads_elsewhere_is_in_the_covariance_of_tracks_and_smoothed_poses(
     away = np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     monkeypatch.setattr(RigidPass, 'difference', lambda *_: away)
     a_world = made('a car', 'clouds', 0)
-    records, _ = tracks_of(a_world.readings, a_world.network)
+    records, _ = tracks_of(a_world.readings, a_world.network, **LINEARISED_ONCE)
     for kind, share in ((Track, 0.3), (SmoothedPose, 1.0)):
         std = np.array([np.sqrt(r.covariance[0, 0]) for r in records if isinstance(r, kind)])
         print(f'{kind.__name__}: {std.round(1)} m')
