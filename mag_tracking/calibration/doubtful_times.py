@@ -31,14 +31,24 @@ def doubted_since(times: DoubtfulTimes, since_ns: int) -> DoubtfulTimes:
 
 def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTimes]
            ) -> dict[str, DoubtfulTimes]:
-    """{sensor: all its stretches}; where one of the latest begins no later than an earlier one and
-    ends after its begin, it takes that one's place.
+    """{sensor: all its stretches}, of which `latest` has the last ones.
+
+    One of the latest takes the place of an earlier one that begins with it or during it. An earlier
+    one whose end was not heard of ends where the next begins; where `latest` has none of a sensor,
+    its background is another one, and nothing is open.
     """
     out = dict(earlier)
     for name, times in latest.items():
         kept = [(begin, end) for begin, end in earlier.get(name, ())
-                if not any(b <= begin and (e is None or begin < e) for b, e in times)]
-        out[name] = tuple(sorted([*kept, *times]))[-MOST:]
+                if not any(b <= begin and (e is None or begin < e or b == begin) for b, e in times)]
+        stretches: list[tuple[int, int | None]] = []
+        for begin, end in sorted([*kept, *times], key=lambda stretch: stretch[0]):
+            if stretches and stretches[-1][1] is None:
+                stretches[-1] = (stretches[-1][0], begin)
+            stretches.append((begin, end))
+        if stretches and stretches[-1][1] is None and not times:
+            stretches.pop()
+        out[name] = tuple(stretches[-MOST:])
     return out
 
 

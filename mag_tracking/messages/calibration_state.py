@@ -65,11 +65,13 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
 
 
 def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
-    """{sensor: when its background was last doubtful} of a message-shaped CalibrationState."""
+    """{sensor: when its background was last doubtful, empty for never} of a message-shaped
+    CalibrationState.
+    """
     times: dict[str, DoubtfulTimes] = {}
     for s in message.sensors:
-        if since := stamp_ns(s.doubtful_since):
-            times[s.sensor] = ((since, None if s.doubtful else stamp_ns(s.doubtful_until)),)
+        since, until = stamp_ns(s.doubtful_since), stamp_ns(s.doubtful_until)
+        times[s.sensor] = ((since, until or None),) if since else ()
     return times
 
 

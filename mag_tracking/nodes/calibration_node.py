@@ -233,7 +233,7 @@ class CalibrationNode(StageNode):
         self._publish_transforms()
         self._health.renew(network)
         self._rounds.begin(network)
-        self._publish_states(self._rounds.states())
+        self._rounds.publish()
         self._store.drop(network.names, self._is_live())
         for text in response.warnings:
             self.get_logger().warning(text)

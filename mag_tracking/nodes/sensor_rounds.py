@@ -29,7 +29,7 @@ class SensorRounds:
     publish_status : function
         Takes the `DiagnosticStatus` of one sensor.
     publish_states : function
-        Takes the `SensorCalibration` of all sensors.
+        Takes the `SensorCalibration` of all sensors, a list that is used again.
     """
 
     def __init__(self, node: str, network: SensorNetwork, stage: Calibrate,
@@ -40,14 +40,14 @@ class SensorRounds:
         self._is_live = is_live
         self._publish_status, self._publish_states = publish_status, publish_states
         self._is_due = False
-        self._told: set[tuple[int, int]] = set()
+        self._reported: set[tuple[int, tuple[int, int | None]]] = set()
         self.begin(network)
 
     def begin(self, network: SensorNetwork) -> None:
         """Begin a round; `network` is the one from now on."""
         self._network = network
         self._steps = self._rounds()
-        self._states = self.states()
+        self._states = [self._state(j) for j in range(len(network))]
 
     def tick(self) -> None:
         """A step is due: it is done after the next readings, or at the next tick."""
@@ -61,26 +61,26 @@ class SensorRounds:
             self._step()
 
     def report_doubts(self) -> None:
-        """Publish before its turn where a background has become doubtful: a track that waits for
-        the round would be sure meanwhile.
+        """Publish as soon as a background becomes doubtful or is no longer: until the tracker hears
+        of it, its tracks are not flagged.
         """
         backgrounds = self._stage.backgrounds()
-        begun = {(j, begin) for j, name in enumerate(self._network.names)
-                 for begin, end in backgrounds[name].doubtful_times[-1:] if end is None}
-        if news := begun - self._told:
-            for j, _ in news:
+        latest = {(j, times[-1]) for j, name in enumerate(self._network.names)
+                  if (times := backgrounds[name].doubtful_times)}
+        if changed := latest - self._reported:
+            for j, _ in changed:
                 self._states[j] = self._state(j)
-            self._publish_states(self._states)
-        self._told = begun
+            self.publish()
+        self._reported = latest
 
     def _step(self) -> None:
         """Go on with the round."""
         self._is_due = False
         next(self._steps)
 
-    def states(self) -> list[SensorCalibration]:
-        """How all sensors are calibrated."""
-        return [self._state(j) for j in range(len(self._network))]
+    def publish(self) -> None:
+        """Publish how all sensors were calibrated when it was last their turn."""
+        self._publish_states(self._states)
 
     def _state(self, j: int) -> SensorCalibration:
         """How sensor `j` is calibrated."""
@@ -98,7 +98,7 @@ class SensorRounds:
                 yield
                 self._publish_status(self._health.status(self._node, j, self._stage))
                 yield
-            self._publish_states(self._states)
+            self.publish()
             yield
             self._store.write_if_due(self._is_live())
             yield

@@ -128,8 +128,7 @@ def over_topics(network_file, settings, recording, rate):
     return holder[0]
 
 
-@pytest.mark.parametrize('name', studied(
-    VEHICLES, ['junction_rear_turns_right']))
+@pytest.mark.parametrize('name', studied(VEHICLES, ['junction_rear_turns_right']))
 def test_nodes_equal_offline_on_vehicles(name, tmp_path, road_network):
     settings = settings_for('vehicle', {**PATIENT, 'track.smoothing_lag_s': 0.3})
     replay(Recording(vehicle_path(name)), road_network, settings, tmp_path)

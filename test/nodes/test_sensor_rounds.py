@@ -1,5 +1,12 @@
-"""What the calibration says before the turn of a sensor comes."""
+"""Doubts of backgrounds as the calibration publishes them between the rounds of its sensors."""
 
+from types import SimpleNamespace
+from unittest.mock import Mock
+
+import pytest
+
+from mag_tracking.calibration.doubtful_times import merged
+from mag_tracking.messages.calibration_state import doubtful_times
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.sensor_rounds import SensorRounds
 from mag_tracking.pipeline import settings_for
@@ -7,26 +14,69 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from support.bundled import NETWORK_FILE
 from support.dense_traffic import after_dense_traffic
 
+READINGS = after_dense_traffic('junction_left_to_right', 7.0)
+"""Both backgrounds become doubtful twice, one of them while the other is."""
+BATCH = 40
 
-def test_each_background_that_becomes_doubtful_is_told_at_once():
-    """While that of another sensor is, too; and once."""
-    network, told = read_network(NETWORK_FILE), []
-    stage = Calibrate(network, settings_for('vehicle').calibrate)
-    rounds = SensorRounds('calibration_node', network, stage, None, None, lambda: True, None,
-                          lambda states: told.append(list(states)))
-    begun = set()
-    readings = after_dense_traffic('junction_left_to_right', 7.0)
-    for i in range(0, len(readings), 40):
-        stage.feed(readings.part(slice(i, i + 40)))
-        doubtful = {name: b.doubtful_times[-1][0] for name, b in stage.backgrounds().items()
-                    if b.doubtful}
-        n = len(told)
-        for _ in range(2):
-            rounds.report_doubts()
-        news = doubtful.items() - begun
-        assert len(told) == n + bool(news)
-        if news:
-            assert {name for name, _ in news} <= {s.sensor for s in told[-1] if s.doubtful}
-        begun |= news
-    # One of them twice, and the second while the first was doubtful.
-    assert len(told) == len(begun) == 4
+
+class Listener:
+    """Keeps the doubts that were published, as a tracker does."""
+
+    def __init__(self):
+        self.network = read_network(NETWORK_FILE)
+        self.stage = Calibrate(self.network, settings_for('vehicle').calibrate)
+        self.rounds = SensorRounds('calibration_node', self.network, self.stage, Mock(), Mock(),
+                                   lambda: True, Mock(), self.hear)
+        self.n, self.times = 0, {}
+
+    def hear(self, states):
+        self.n += 1
+        self.times = merged(self.times, doubtful_times(SimpleNamespace(sensors=states)))
+
+    def feed(self, k):
+        """Batch `k` of the readings."""
+        self.stage.feed(READINGS.part(slice(k * BATCH, (k + 1) * BATCH)))
+        self.rounds.report_doubts()
+
+    @property
+    def is_right(self):
+        """Whether what was heard is what the calibration knows."""
+        return {n: t for n, t in self.times.items() if t} == self.stage.doubtful_stretches()
+
+
+def test_every_doubt_and_its_end_are_reported_at_once_and_once():
+    listener, changes = Listener(), 0
+    for k in range(len(READINGS) // BATCH):
+        before = listener.stage.doubtful_stretches()
+        listener.feed(k)
+        changes += listener.stage.doubtful_stretches() != before
+        listener.rounds.report_doubts()
+        assert listener.is_right and listener.n == changes
+    assert [len(t) for t in listener.times.values()] == [2, 2]
+
+
+@pytest.mark.parametrize('steps', [1, 2, 3, 5])
+@pytest.mark.parametrize('phase', [0, 1, 2])
+def test_rounds_of_any_length_contradict_no_report(steps, phase):
+    """A round publishes what it saw of each sensor at its turn, which may be long ago."""
+    listener = Listener()
+    for k in range(len(READINGS) // BATCH):
+        listener.feed(k)
+        if (k + phase) % steps == 0:
+            listener.rounds.tick()
+            listener.rounds.step_if_due()
+        assert listener.is_right
+
+
+def test_learning_anew_ends_a_doubt():
+    """At once, and also where a reading had just begun it."""
+    listener, n = Listener(), 0
+    while not listener.stage.doubtful_stretches():
+        listener.feed(n)
+        n += 1
+    listener.stage.forget(())
+    listener.rounds.report_doubts()
+    assert listener.is_right and listener.times['mag_1'][-1][1] is not None
+    for k in range(n, len(READINGS) // BATCH):
+        listener.feed(k)
+    assert listener.is_right

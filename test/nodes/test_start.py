@@ -1,5 +1,6 @@
 """A process that is sent a signal at any moment of its start ends with status 0, and silently."""
 
+import ast
 import signal
 import subprocess
 import sys
@@ -93,7 +94,7 @@ def end_of(process, how):
 @pytest.mark.parametrize('how, words', [
     pytest.param(how, words, id=f'{name}-{how.name}',
                  # Commands get SIGINT, as from Ctrl-C; scripts SIGTERM, as from a service manager.
-                 # The nodes all start in the same way.
+                 # The nodes all start alike (the next test).
                  marks=[] if (how is signal.SIGINT) == (words in COMMANDS.values())
                  and name.split()[0] in ('driver_node', 'tracker_node', 'run')
                  else pytest.mark.study)
@@ -106,6 +107,13 @@ def test_a_signal_during_the_imports_ends_it(how, words):
         process = begun(['-c', STRUCK, int(how), module, *words])
         output = process.communicate(timeout=LONGEST_START_S)[0]
         assert (process.returncode, output) == (0, ''), module
+
+
+@pytest.mark.parametrize('name', GIVEN)
+def test_a_node_handles_signals_before_it_imports_anything(name):
+    body = ast.parse((ROOT / 'mag_tracking' / 'nodes' / f'{name}.py').read_text()).body
+    assert ast.unparse(body[1]) == (f"if __name__ == '__main__':\n    from "
+                                    f'mag_tracking.nodes.start import {name}\n    {name}()')
 
 
 @pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])

@@ -15,9 +15,10 @@ POINT = {f'track.vehicle.{name}': [value] for name, value in {
     'near_field_lengths': 1.0}.items()} | {'track.vehicle.turn_acceleration': 0.0}
 """Settings of a tracker that knows only point targets which go straight on."""
 LINEARISED_ONCE = {'track.relinearise_window_s': 0.0}
-"""Settings that take away what takes most of the time of tracking."""
+"""Settings without relinearisation, which takes most of the computing time."""
 QUICK = POINT | LINEARISED_ONCE
-"""A third of the time: for tests of all that is around the tracker."""
+"""Settings of a point target without relinearisation: a third of the computing time, for tests of
+what is around the tracker."""
 
 
 def parameter_file(path, changes):

@@ -65,7 +65,7 @@ def test_recordings_of_the_same_name_are_refused(tmp_path, capsys):
 
 def test_a_looped_recording_gives_the_same_track_again(road_network):
     samples = recorded(SampleReader(Recording(vehicle_path(NAME)), road_network))
-    pipeline = Pipeline(road_network, settings_for('vehicle', QUICK))
+    pipeline = Pipeline(road_network, settings_for('vehicle'))
     loops = []
     for _ in range(2):
         tracks = [r for s in samples for r in pipeline.feed(one(s)) if isinstance(r, Track)]

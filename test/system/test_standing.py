@@ -15,7 +15,7 @@ LEAST_RIGHT = 18
 """The aim is all 20: in the others it takes 3.0 and 3.3 s."""
 
 
-@pytest.mark.parametrize('runs', [1, pytest.param(RUNS, marks=pytest.mark.study)])
+@pytest.mark.parametrize('runs', [2, pytest.param(RUNS, marks=pytest.mark.study)])
 def test_the_track_of_a_vehicle_that_stops_goes_on_and_leaves(runs):
     found = [goes_on(STOPS[run % len(STOPS)], run // len(STOPS)) for run in range(runs)]
     assert sum(found) >= 0.9 * runs

@@ -33,7 +33,7 @@ def report(vehicle_replays, road_network):
 
 @pytest.fixture(scope='module')
 def opened(chromium, report):
-    """The page of several tests; they find its slider wherever it is."""
+    """A page that several tests use; each moves the slider to where it needs it."""
     page = Opened(chromium, report[0].as_uri())
     page.wait('magTracking.drawn > 0')
     yield page
@@ -92,14 +92,19 @@ def test_the_slider_moves_map_curves_and_text_together(opened, report):
 
 def test_it_needs_nothing_from_outside_and_nothing_is_wrong(opened, report):
     t = columns(opened, 't')
-    # The play goes on from where the slider is.
-    for share in (*np.linspace(0.0, 1.0, 7), 0.8):
+    for share in np.linspace(0.0, 1.0, 7):
         opened.move_slider(t[0] + share * (t[-1] - t[0]))
     opened.page.select_option('#sensors', 'mag_2')
     opened.page.set_viewport_size({'width': 390, 'height': 800})
+    # At its end it starts over.
+    opened.page.click('#play')
+    opened.wait(f'magTracking.plays && magTracking.t < {t.mean()}')
+    opened.page.click('#play')
+    opened.wait('!magTracking.plays')
+    opened.move_slider(t[0] + 0.8 * (t[-1] - t[0]))
     opened.page.click('#play')
     opened.wait('magTracking.plays')
-    opened.wait('!magTracking.plays')
+    opened.wait(f'!magTracking.plays && magTracking.t >= {t[-1]}')
     assert opened.complaints == []
     assert opened.requests == [report[0].as_uri()]
     assert report[0].stat().st_size < MOST_MB * 1e6
