@@ -10,7 +10,7 @@ from mag_tracking.cli import main
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.recording.writer import RecordingWriter
 from support import spoiler
-from support.bundled import LINEARISED_ONCE, parameter_file
+from support.bundled import QUICK, parameter_file
 from support.samples import sample_dict, samples_of
 from support.situation_worlds import ambient_world
 
@@ -37,7 +37,7 @@ def replayed(recording, folder, offset, capsys):
     """(what was said, summary) with a `clock_offset` [s] in the network file."""
     folder.mkdir()
     (folder / 'network.yaml').write_text(NETWORK.format(offset))
-    params = parameter_file(folder / 'params.yaml', LINEARISED_ONCE)
+    params = parameter_file(folder / 'params.yaml', QUICK)
     assert main(['replay', recording, '--network', str(folder / 'network.yaml'), '--params',
                  str(params), '--out', str(folder / 'out'), '--no-figures']) == 0
     return capsys.readouterr().out, json.loads((folder / 'out' / 'summary.json').read_text())

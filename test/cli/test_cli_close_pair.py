@@ -8,7 +8,7 @@ import pytest
 from mag_tracking.cli import main
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.recording.writer import RecordingWriter
-from support.bundled import LINEARISED_ONCE, parameter_file
+from support.bundled import QUICK, parameter_file
 from support.close_pairs import readings_of
 from support.samples import sample_dict, samples_of
 
@@ -53,7 +53,7 @@ def test_fit_says_speed_and_direction_twice(pair, tmp_path, capsys):
 
 def test_replay_sets_the_delay_beside_the_track(pair, tmp_path, capsys):
     recording, network, velocity = pair
-    params = parameter_file(tmp_path / 'params.yaml', LINEARISED_ONCE)
+    params = parameter_file(tmp_path / 'params.yaml', QUICK)
     assert main(['replay', recording, '--network', network, '--params', str(params), '--out',
                  str(tmp_path), '--no-figures']) == 0
     assert 'by the delay between sensors' in capsys.readouterr().out
@@ -66,7 +66,7 @@ def test_replay_sets_the_delay_beside_the_track(pair, tmp_path, capsys):
 
 def test_frames_that_are_too_long_are_warned_of(pair, tmp_path, capsys):
     recording, network, _ = pair
-    params = parameter_file(tmp_path / 'long.yaml', LINEARISED_ONCE | {'align.period_s': 0.08})
+    params = parameter_file(tmp_path / 'long.yaml', QUICK | {'align.period_s': 0.08})
     options = ['--network', network, '--params', str(params)]
     assert main(['replay', recording, *options, '--out', str(tmp_path / 'out'),
                  '--no-figures']) == 0

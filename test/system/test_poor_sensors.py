@@ -13,7 +13,7 @@ from mag_tracking.messages.schema import magnetic_field_dicts
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.recording.writer import RecordingWriter
 from support import spoiler
-from support.bundled import LINEARISED_ONCE, NETWORK_FILE, VEHICLES
+from support.bundled import NETWORK_FILE, QUICK, VEHICLES
 from support.marks import studied
 from support.spoilt_runs import ROADS, findings, outcome, recorded
 
@@ -25,9 +25,9 @@ SECOND = spoiler.vehicle_at_start(recorded(CAR).readings, 6.0, 4.0)
 
 @pytest.mark.parametrize('name', studied(VEHICLES, kept=(CAR,)))
 def test_covariances_that_drivers_make_up_change_nothing(name):
-    plain = outcome(name, settings=LINEARISED_ONCE).result
+    plain = outcome(name, settings=QUICK).result
     for variance in MADE_UP:
-        result = outcome(name, spoiler.covariance(variance), settings=LINEARISED_ONCE).result
+        result = outcome(name, spoiler.covariance(variance), settings=QUICK).result
         np.testing.assert_array_equal(result.poses['position'], plain.poses['position'])
         said = [f for f in findings(name, spoiler.covariance(variance)) if 'state a noise' in f]
         assert len(said) == 2, said
@@ -46,9 +46,9 @@ def test_covariances_in_a_recording(stated, tmp_path):
         for k, (name, content) in enumerate(magnetic_field_dicts(readings)):
             content['magnetic_field_covariance'] = [float(v) for v in stated]
             writer.write(f'/{name}/imu/mag', MAGNETIC_FIELD, content, int(readings.stamp_ns[k]))
-    result = mt.track(tmp_path / 'a.mcap', NETWORK_FILE, settings=LINEARISED_ONCE)
+    result = mt.track(tmp_path / 'a.mcap', NETWORK_FILE, settings=QUICK)
     np.testing.assert_array_equal(result.poses['position'], outcome(
-        CAR, settings=LINEARISED_ONCE).result.poses['position'])
+        CAR, settings=QUICK).result.poses['position'])
 
 
 def test_the_doctor_names_topic_sizes_and_cause():
