@@ -2,11 +2,8 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
-import threading
-import time
 
 import pytest
 
@@ -14,14 +11,8 @@ from mag_tracking.cli import main
 from mag_tracking.recording.fit_folder import FIT_COLUMNS
 from mag_tracking.recording.result_folder import DETECTION_COLUMNS, POSE_COLUMNS, SMOOTHED_COLUMNS
 from support.bundled import DATA, NETWORK_FILE, QUICK, parameter_file, vehicle_path
+from support.cli_runs import NAME, quick_file, replay_one
 from support.permissions import as_files_say
-
-NAME = 'junction_left_to_right'
-
-
-def quick(folder):
-    """A parameter file for tests of what is around the tracker."""
-    return parameter_file(folder / 'quick.yaml', QUICK)
 
 
 def test_replay_writes_all_that_it_promises(tmp_path, capsys):
@@ -76,7 +67,7 @@ def test_a_track_that_is_too_long_to_smooth_is_said(tmp_path, capsys):
 def test_several_recordings_get_a_folder_each(tmp_path):
     names, out = ['straight_car_right', 'straight_small_left'], tmp_path / 'out'
     assert main(['replay', *(str(vehicle_path(n)) for n in names), '--network', str(NETWORK_FILE),
-                 '--params', str(quick(tmp_path)), '--out', str(out), '--no-figures']) == 0
+                 '--params', str(quick_file(tmp_path)), '--out', str(out), '--no-figures']) == 0
     assert sorted(p.name for p in out.iterdir()) == names
 
 
@@ -183,125 +174,6 @@ def test_a_sensor_on_its_head_is_named(tmp_path, capsys):
 def test_a_recording_without_a_target_says_so(tmp_path, capsys):
     assert replay_one(tmp_path, '--no-figures', '--target', 'magnet') == 0
     assert 'nothing was detected with the settings for a magnet' in capsys.readouterr().out
-
-
-def test_an_interrupted_replay_keeps_what_is_done(tmp_path):
-    out = tmp_path / 'out'
-    recordings = [tmp_path / f'{NAME}_{k}.mcap' for k in range(40)]
-    for path in recordings:
-        path.write_bytes(vehicle_path(NAME).read_bytes())
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'mag_tracking.cli', 'replay', *map(str, recordings), '--network',
-         str(NETWORK_FILE), '--params', str(quick(tmp_path)), '--out', str(out), '--no-figures'],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    table = out / f'{NAME}_0' / 'summary.json'
-    deadline = time.monotonic() + 120
-    while not table.exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
-    stdout, stderr = process.communicate(timeout=120)
-    assert process.returncode == 130, stderr
-    assert 'Traceback' not in stderr
-    assert json.loads(table.read_text())['recording'] == f'{NAME}_0.mcap'
-
-
-def interrupt_feed(monkeypatch, at):
-    """Let a signal come at one of the pipeline's batches; returns the list of batches fed."""
-    from mag_tracking.pipeline import Pipeline
-    feed, calls = Pipeline.feed, []
-
-    def interrupted(self, readings):
-        calls.append(readings)
-        if len(calls) == at:
-            signal.raise_signal(signal.SIGINT)
-        return feed(self, readings)
-
-    monkeypatch.setattr(Pipeline, 'feed', interrupted)
-    return calls
-
-
-def replay_one(out, *options):
-    return main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--params',
-                 str(quick(out.parent)), '--out', str(out), *options])
-
-
-def summary_of(out):
-    return json.loads((out / 'summary.json').read_text())
-
-
-def test_an_interruption_ends_the_reading_after_the_batch(tmp_path, monkeypatch):
-    calls = interrupt_feed(monkeypatch, 3)
-    before = signal.getsignal(signal.SIGINT)
-    assert replay_one(tmp_path, '--no-figures') == 130
-    assert signal.getsignal(signal.SIGINT) is before
-    assert len(calls) == 3
-    assert summary_of(tmp_path)['interrupted'] is True
-
-
-def test_an_interruption_need_not_wait_for_the_next_batch(tmp_path, monkeypatch):
-    from mag_tracking.recording.sample_reader import SampleReader
-    waited = []
-
-    def no_batch_for_long(self, progress):
-        signal.raise_signal(signal.SIGINT)
-        progress(1)
-        waited.append(True)
-        yield from ()
-
-    monkeypatch.setattr(SampleReader, 'readings', no_batch_for_long)
-    assert replay_one(tmp_path, '--no-figures') == 130
-    assert not waited and summary_of(tmp_path)['interrupted'] is True
-
-
-@pytest.mark.parametrize('step', ['summarise', 'take', 'errors_against_truth', 'write_figures'])
-def test_an_interruption_while_writing_loses_nothing(tmp_path, monkeypatch, capsys, step):
-    """First or second, in the middle of an update or of what is written at the end."""
-    from mag_tracking.apps import replay as app
-    from mag_tracking.cli import replay
-
-    module = {'write_figures': replay, 'take': app.RunCollector}.get(step, app)
-    whole, count = getattr(module, step), []
-
-    def impatient(*args, **named):
-        count.append(step)
-        if len(count) in (1, 2):
-            signal.raise_signal(signal.SIGINT)
-        return whole(*args, **named)
-
-    monkeypatch.setattr(module, step, impatient)
-    assert replay_one(tmp_path) == 130
-    assert summary_of(tmp_path)['interrupted'] is (step == 'take')
-    assert 'interrupted; what was done is in' in capsys.readouterr().out
-    assert not list(tmp_path.glob('*.png'))
-
-
-def test_who_insists_is_obeyed(tmp_path, monkeypatch):
-    from mag_tracking.apps import replay as app
-
-    def hanging(*_):
-        for _ in range(3):
-            signal.raise_signal(signal.SIGINT)
-        raise AssertionError('not reached')
-
-    monkeypatch.setattr(app, 'summarise', hanging)
-    assert replay_one(tmp_path, '--no-figures') == 130
-
-
-def test_a_background_job_ignores_interruptions_as_it_was_told(tmp_path, monkeypatch):
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        interrupt_feed(monkeypatch, 3)
-        assert replay_one(tmp_path, '--no-figures') == 0
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def test_the_command_works_outside_the_main_thread(tmp_path):
-    status = []
-    thread = threading.Thread(target=lambda: status.append(replay_one(tmp_path, '--no-figures')))
-    thread.start()
-    thread.join()
-    assert status == [0]
 
 
 def test_the_example_runs():

@@ -1,0 +1,18 @@
+"""Replays by the command, for tests of what is around the tracker."""
+
+from mag_tracking.cli import main
+from support.bundled import NETWORK_FILE, QUICK, parameter_file, vehicle_path
+
+NAME = 'junction_left_to_right'
+"""The recording that is replayed."""
+
+
+def quick_file(folder):
+    """A parameter file in `folder` with the settings `QUICK`."""
+    return parameter_file(folder / 'quick.yaml', QUICK)
+
+
+def replay_one(out, *options):
+    """Exit status of a replay of one recording with the settings `QUICK`, results in `out`."""
+    return main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--params',
+                 str(quick_file(out.parent)), '--out', str(out), *options])
