@@ -31,11 +31,11 @@ def doubted_since(times: DoubtfulTimes, since_ns: int) -> DoubtfulTimes:
 
 def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTimes]
            ) -> dict[str, DoubtfulTimes]:
-    """{sensor: all its stretches}, of which `latest` has the last ones.
+    """{sensor: all its stretches}; `latest` has the most recent ones.
 
-    One of the latest takes the place of an earlier one that begins with it or during it. An earlier
-    one whose end was not heard of ends where the next begins; where `latest` has none of a sensor,
-    its background is another one, and nothing is open.
+    A stretch in `latest` replaces an earlier one that begins at the same time or during it. If the
+    end of an earlier stretch is missing, it ends where the next begins. If `latest` has no stretch
+    of a sensor, its background was replaced, and an open stretch is dropped.
     """
     out = dict(earlier)
     for name, times in latest.items():

@@ -65,8 +65,9 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
 
 
 def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
-    """{sensor: when its background was last doubtful, empty for never} of a message-shaped
-    CalibrationState.
+    """{sensor: latest doubtful stretch of its background} of a message-shaped CalibrationState.
+
+    The tuple is empty if the background was never doubtful.
     """
     times: dict[str, DoubtfulTimes] = {}
     for s in message.sensors:

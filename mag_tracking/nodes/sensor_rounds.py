@@ -29,7 +29,7 @@ class SensorRounds:
     publish_status : function
         Takes the `DiagnosticStatus` of one sensor.
     publish_states : function
-        Takes the `SensorCalibration` of all sensors, a list that is used again.
+        Takes the `SensorCalibration` of all sensors; the list is reused.
     """
 
     def __init__(self, node: str, network: SensorNetwork, stage: Calibrate,
@@ -61,8 +61,9 @@ class SensorRounds:
             self._step()
 
     def report_doubts(self) -> None:
-        """Publish as soon as a background becomes doubtful or is no longer: until the tracker hears
-        of it, its tracks are not flagged.
+        """Publish immediately if a background becomes doubtful or certain again.
+
+        The tracker flags tracks only after it has received this.
         """
         backgrounds = self._stage.backgrounds()
         latest = {(j, times[-1]) for j, name in enumerate(self._network.names)
@@ -79,7 +80,7 @@ class SensorRounds:
         next(self._steps)
 
     def publish(self) -> None:
-        """Publish how all sensors were calibrated when it was last their turn."""
+        """Publish the latest known calibration of all sensors."""
         self._publish_states(self._states)
 
     def _state(self, j: int) -> SensorCalibration:

@@ -219,10 +219,10 @@ def test_stretches_of_doubt():
     assert doubted_since(((1, 4),), 3) == ((1, None),)
     assert merged({'a': ((1, 2), (4, None))}, {'a': ((4, 6),), 'b': ((3, None),)}) \
         == {'a': ((1, 2), (4, 6)), 'b': ((3, None),)}
-    # An end that was not heard of is not later than the next begin.
+    # A stretch with a missing end closes at the next begin.
     assert merged({'a': ((1, None),)}, {'a': ((4, 6),)}) == {'a': ((1, 4), (4, 6))}
-    # Begun and given up with the same reading; then again.
+    # A stretch that begins and ends with the same reading, and its successor.
     assert merged({'a': ((4, None),)}, {'a': ((4, 4),)}) == {'a': ((4, 4),)}
     assert merged({'a': ((4, 4),)}, {'a': ((4, None),)}) == {'a': ((4, None),)}
-    # A background that was never doubtful took the place of one that was.
+    # The doubtful background was replaced by one that never was.
     assert merged({'a': ((1, 2), (4, None))}, {'a': ()}) == {'a': ((1, 2),)}

@@ -1,4 +1,4 @@
-"""Interrupted commands: what is done is kept, and who insists is obeyed."""
+"""Interrupted commands keep finished results; a repeated signal ends them at once."""
 
 import json
 import signal

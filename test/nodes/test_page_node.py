@@ -24,7 +24,7 @@ from support.node_processes import LONGEST_S, environment
 COMMAND = [sys.executable, '-m', 'mag_tracking.cli']
 RECORDING = vehicle_path('straight_car_right')
 PATIENT = ('--ros-args', '-p', 'align.max_wait_s:=5.0')
-"""Played faster, readings may be late by more of the recording's time than the default."""
+"""At a higher rate, readings are later in recording time than the default allows."""
 
 
 def command(*arguments):

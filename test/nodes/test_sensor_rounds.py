@@ -1,4 +1,4 @@
-"""Doubts of backgrounds as the calibration publishes them between the rounds of its sensors."""
+"""Doubtful backgrounds are published between the rounds of per-sensor work."""
 
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -20,7 +20,7 @@ BATCH = 40
 
 
 class Listener:
-    """Keeps the doubts that were published, as a tracker does."""
+    """Merges the published doubtful stretches, as the tracker does."""
 
     def __init__(self):
         self.network = read_network(NETWORK_FILE)
@@ -40,7 +40,7 @@ class Listener:
 
     @property
     def is_right(self):
-        """Whether what was heard is what the calibration knows."""
+        """True if the received stretches equal those of the calibration."""
         return {n: t for n, t in self.times.items() if t} == self.stage.doubtful_stretches()
 
 
@@ -58,7 +58,7 @@ def test_every_doubt_and_its_end_are_reported_at_once_and_once():
 @pytest.mark.parametrize('steps', [1, 2, 3, 5])
 @pytest.mark.parametrize('phase', [0, 1, 2])
 def test_rounds_of_any_length_contradict_no_report(steps, phase):
-    """A round publishes what it saw of each sensor at its turn, which may be long ago."""
+    """A round publishes per-sensor states of different age."""
     listener = Listener()
     for k in range(len(READINGS) // BATCH):
         listener.feed(k)
@@ -69,7 +69,7 @@ def test_rounds_of_any_length_contradict_no_report(steps, phase):
 
 
 def test_learning_anew_ends_a_doubt():
-    """At once, and also where a reading had just begun it."""
+    """Also if the doubt began with the latest reading."""
     listener, n = Listener(), 0
     while not listener.stage.doubtful_stretches():
         listener.feed(n)

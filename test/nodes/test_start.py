@@ -94,7 +94,7 @@ def end_of(process, how):
 @pytest.mark.parametrize('how, words', [
     pytest.param(how, words, id=f'{name}-{how.name}',
                  # Commands get SIGINT, as from Ctrl-C; scripts SIGTERM, as from a service manager.
-                 # The nodes all start alike (the next test).
+                 # All nodes start in the same way; see the next test.
                  marks=[] if (how is signal.SIGINT) == (words in COMMANDS.values())
                  and name.split()[0] in ('driver_node', 'tracker_node', 'run')
                  else pytest.mark.study)

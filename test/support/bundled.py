@@ -17,12 +17,12 @@ POINT = {f'track.vehicle.{name}': [value] for name, value in {
 LINEARISED_ONCE = {'track.relinearise_window_s': 0.0}
 """Settings without relinearisation, which takes most of the computing time."""
 QUICK = POINT | LINEARISED_ONCE
-"""Settings of a point target without relinearisation: a third of the computing time, for tests of
-what is around the tracker."""
+"""Settings of a point target without relinearisation: a third of the computing time, for tests
+that do not check tracking itself."""
 
 
 def parameter_file(path, changes):
-    """A parameter file with `changes` ({dotted name: value}); its path."""
+    """Write `changes` ({dotted name: value}) as a parameter file; returns its path."""
     content = {}
     for name, value in changes.items():
         *groups, last = name.split('.')

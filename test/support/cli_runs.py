@@ -1,10 +1,10 @@
-"""Replays by the command, for tests of what is around the tracker."""
+"""Replays on the command line with fast settings."""
 
 from mag_tracking.cli import main
 from support.bundled import NETWORK_FILE, QUICK, parameter_file, vehicle_path
 
 NAME = 'junction_left_to_right'
-"""The recording that is replayed."""
+"""Name of the replayed recording."""
 
 
 def quick_file(folder):

@@ -96,7 +96,7 @@ def test_it_needs_nothing_from_outside_and_nothing_is_wrong(opened, report):
         opened.move_slider(t[0] + share * (t[-1] - t[0]))
     opened.page.select_option('#sensors', 'mag_2')
     opened.page.set_viewport_size({'width': 390, 'height': 800})
-    # At its end it starts over.
+    # Playback from the end restarts at the beginning.
     opened.page.click('#play')
     opened.wait(f'magTracking.plays && magTracking.t < {t.mean()}')
     opened.page.click('#play')
