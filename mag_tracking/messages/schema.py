@@ -40,12 +40,12 @@ def reading_of(message: MagneticField, sensor: str) -> Readings:
     A covariance that is all zero, or begins with -1, is unknown.
     """
     f = message.magnetic_field
-    C = _covariances(np.array(message.magnetic_field_covariance, dtype=float).reshape(1, 3, 3))
+    C = known_covariances(np.array(message.magnetic_field_covariance, dtype=float).reshape(1, 3, 3))
     return Readings.single(sensor, stamp_ns(message.header.stamp), np.array([f.x, f.y, f.z]),
                            None if C is None else C[0])
 
 
-def _covariances(C: FloatArray) -> FloatArray | None:
+def known_covariances(C: FloatArray) -> FloatArray | None:
     """(n, 3, 3) covariances of `Readings` from those of messages; None: all are unknown.
 
     NaN says "unknown" in `Readings` only. In a message it is a fault, and becomes a zero that the
@@ -137,7 +137,7 @@ def readings_of(message: FieldReadings) -> Readings:
         raise RecordingError(f'readings of {stamps.min()} to {stamps.max()} ns')
     C: FloatArray | None = None
     if len(message.covariance):
-        C = _covariances(np.array(message.covariance, dtype=float).reshape(n, 3, 3))
+        C = known_covariances(np.array(message.covariance, dtype=float).reshape(n, 3, 3))
     return Readings(names, sensor, stamps, np.array(message.field, dtype=float).reshape(n, 3), C)
 
 

@@ -5,6 +5,7 @@ import functools
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 ROS1_SUFFIX = '.bag'
 BAG_SUFFIXES = ('.db3', ROS1_SUFFIX)
+BLOCK = 256
+"""Messages that are read at once."""
 
 
 class BagFile:
@@ -73,9 +76,9 @@ class BagFile:
 
         return Sqlite3Reader(self._path)
 
-    def messages(self, start_ns: int | None = None,
-                 progress: Progress | None = None) -> Iterator[RawMessage]:
-        """Iterate over the `RawMessage`s, CDR, in order of log time.
+    def blocks(self, start_ns: int | None = None,
+               progress: Progress | None = None) -> Iterator[list[RawMessage]]:
+        """Iterate over the `RawMessage`s, CDR, in order of log time, a block after the other.
 
         Parameters
         ----------
@@ -85,10 +88,12 @@ class BagFile:
             Called with the bytes done since the last call.
         """
         size, total, done, n = self._path.stat().st_size, self.message_counts.total(), 0, 0
-        for topic, kind, log_time_ns, data in self._raw(start_ns):
-            yield RawMessage(topic, kind, log_time_ns,
-                             cdr_of_ros1(data, kind) if self._is_ros1 else data, schema_of(kind))
-            n += 1
+        raw = self._raw(start_ns)
+        while found := list(islice(raw, BLOCK)):
+            yield [RawMessage(topic, kind, log_time_ns,
+                              cdr_of_ros1(data, kind) if self._is_ros1 else data, schema_of(kind))
+                   for topic, kind, log_time_ns, data in found]
+            n += len(found)
             if progress and (here := size * n // total) > done:
                 progress(here - done)
                 done = here

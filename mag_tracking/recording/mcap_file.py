@@ -1,22 +1,32 @@
 """One MCAP file: read chunk by chunk, checked, and as far as it is whole."""
 
-import heapq
 import os
+import struct
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator
+from io import BytesIO
+from operator import attrgetter
 from pathlib import Path
 from typing import BinaryIO
 
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, ChunkIndex, Message, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.self_described import cdr_of, type_of
+from mag_tracking.messages.self_described import SCHEMAS, cdr_of, type_of
 from mag_tracking.messages.types import schema_of
 from mag_tracking.recording.damage import DAMAGE
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.raw_message import RawMessage
+
+_RECORD = struct.Struct('<BQ')
+"""What a record is, and its length."""
+_MESSAGE = struct.Struct('<HIQQ')
+"""Channel, sequence number, log time and time of publication, before the data of a message."""
 
 
 class McapFile:
@@ -64,9 +74,10 @@ class McapFile:
             self.end_ns = statistics.message_end_time
         return sorted(summary.chunk_indexes, key=lambda c: c.message_start_time)
 
-    def messages(self, start_ns: int | None = None,
-                 progress: Progress | None = None) -> Iterator[RawMessage]:
-        """Iterate over the `RawMessage`s in order of log time, where the file has an index.
+    def blocks(self, start_ns: int | None = None,
+               progress: Progress | None = None) -> Iterator[list[RawMessage]]:
+        """Iterate over the `RawMessage`s, chunk by chunk; in order of log time where the file has
+        an index.
 
         Parameters
         ----------
@@ -82,9 +93,9 @@ class McapFile:
                 yield from self._from_stream(stream, progress)
 
     def _from_index(self, stream: BinaryIO, index: list[ChunkIndex], start_ns: int | None,
-                    progress: Progress | None) -> Iterator[RawMessage]:
+                    progress: Progress | None) -> Iterator[list[RawMessage]]:
         """Messages of an intact file, in order of log time across chunks."""
-        heap: list[tuple[int, int, int, RawMessage]] = []
+        waiting: list[RawMessage] = []
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
         for k, entry in enumerate(index):
@@ -96,17 +107,17 @@ class McapFile:
                                                emit_chunks=True).records))
                 if not isinstance(chunk, Chunk):
                     raise ValueError('no chunk where the index says')
-                found = self._of_chunk(chunk, schemas, channels)
+                waiting = sorted(waiting + self._of_chunk(chunk, schemas, channels), key=_log_time)
             except DAMAGE as error:
                 self._lose_chunk(entry, error)
-                found = []
-            for n, message in enumerate(found):
-                heapq.heappush(heap, (message.log_time_ns, k, n, message))
             if progress:
                 progress(entry.chunk_length)
-            horizon = index[k + 1].message_start_time if k + 1 < len(index) else None
-            while heap and (horizon is None or heap[0][0] < horizon):
-                yield heapq.heappop(heap)[3]
+            n = len(waiting)
+            if k + 1 < len(index):
+                n = bisect_left(waiting, index[k + 1].message_start_time, key=_log_time)
+            yield waiting[:n]
+            waiting = waiting[n:]
+        yield waiting
 
     def _lose_chunk(self, entry: ChunkIndex, error: Exception) -> None:
         """Report a chunk that cannot be read."""
@@ -115,7 +126,8 @@ class McapFile:
         self._losses[f'a damaged stretch of {seconds:.1f} s at {after:.1f} s '
                     f'({type(error).__name__})'] += 1
 
-    def _from_stream(self, stream: BinaryIO, progress: Progress | None) -> Iterator[RawMessage]:
+    def _from_stream(self, stream: BinaryIO, progress: Progress | None
+                     ) -> Iterator[list[RawMessage]]:
         """Messages in the order of the file, up to where it breaks off."""
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
@@ -124,7 +136,7 @@ class McapFile:
             for record in StreamReader(stream, emit_chunks=True).records:
                 if isinstance(record, Chunk):
                     try:
-                        yield from self._of_chunk(record, schemas, channels)
+                        yield self._of_chunk(record, schemas, channels)
                     except DAMAGE as error:
                         self._losses[f'a damaged chunk ({type(error).__name__})'] += 1
                 elif isinstance(record, Schema):
@@ -132,7 +144,8 @@ class McapFile:
                 elif isinstance(record, Channel):
                     channels[record.id] = record
                 elif isinstance(record, Message) and _has_schema(record, channels):
-                    yield _raw(record, schemas, channels)
+                    yield [_raw(record.channel_id, record.log_time, record.data, schemas,
+                                channels)]
                 if progress:
                     here = stream.tell()
                     progress(here - done)
@@ -146,15 +159,28 @@ class McapFile:
     def _of_chunk(chunk: Chunk, schemas: dict[int, Schema],
                   channels: dict[int, Channel]) -> list[RawMessage]:
         """The messages of one chunk, sorted by log time; raises where it is damaged."""
-        messages = []
-        for record in breakup_chunk(chunk, validate_crc=True):
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Message) and _has_schema(record, channels):
-                messages.append(_raw(record, schemas, channels))
-        return sorted(messages, key=lambda m: m.log_time_ns)
+        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+        data, at, messages = stream.read(size), 0, []
+        while at < size:
+            kind, length = _RECORD.unpack_from(data, at)
+            begin, at = at + _RECORD.size, at + _RECORD.size + length
+            if at > size:
+                raise EOFError('a record that is longer than its chunk')
+            if kind == Opcode.MESSAGE:
+                channel, _, log_time_ns, _ = _MESSAGE.unpack_from(data, begin)
+                if channels[channel].schema_id:
+                    messages.append(_raw(channel, log_time_ns, data[begin + _MESSAGE.size:at],
+                                         schemas, channels))
+            elif kind == Opcode.SCHEMA:
+                schema = Schema.read(ReadDataStream(BytesIO(data[begin:at])))
+                schemas[schema.id] = schema
+            elif kind == Opcode.CHANNEL:
+                found = Channel.read(ReadDataStream(BytesIO(data[begin:at])))
+                channels[found.id] = found
+        return sorted(messages, key=_log_time)
+
+
+_log_time = attrgetter('log_time_ns')
 
 
 def _has_schema(message: Message, channels: dict[int, Channel]) -> bool:
@@ -162,12 +188,11 @@ def _has_schema(message: Message, channels: dict[int, Channel]) -> bool:
     return channels[message.channel_id].schema_id != 0
 
 
-def _raw(message: Message, schemas: dict[int, Schema],
+def _raw(channel_id: int, log_time_ns: int, data: bytes, schemas: dict[int, Schema],
          channels: dict[int, Channel]) -> RawMessage:
     """The message with its topic and type; a magnetic field in JSON or protobuf as CDR."""
-    channel = channels[message.channel_id]
+    channel = channels[channel_id]
     schema = schemas[channel.schema_id]
-    kind, data = type_of(schema), message.data
-    if kind != schema.name:
-        data, schema = cdr_of(schema, data), schema_of(kind)
-    return RawMessage(channel.topic, kind, message.log_time, data, schema)
+    if schema.encoding in SCHEMAS and (kind := type_of(schema)) != schema.name:
+        return RawMessage(channel.topic, kind, log_time_ns, cdr_of(schema, data), schema_of(kind))
+    return RawMessage(channel.topic, schema.name, log_time_ns, data, schema)

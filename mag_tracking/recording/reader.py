@@ -81,12 +81,23 @@ class Recording:
 
         What could not be read is counted in `losses`.
         """
-        for file in self._opened:
-            for m in file.messages(start_ns, progress):
-                self.types.setdefault(m.topic, m.type)
+        for block in self.blocks(start_ns, progress):
+            for m in block:
                 if (topics is None or m.topic in topics) and (
                         start_ns is None or m.log_time_ns >= start_ns):
                     yield m
+
+    def blocks(self, start_ns: int | None = None, progress: Progress | None = None
+               ) -> Iterator[list[RawMessage]]:
+        """Iterate over the `RawMessage`s, as many at once as are read at once.
+
+        Of those before `start_ns` some are among them; see `messages`.
+        """
+        for file in self._opened:
+            for block in file.blocks(start_ns, progress):
+                for m in block:
+                    self.types.setdefault(m.topic, m.type)
+                yield block
 
 
 def _files(path: Path) -> list[Path]:

@@ -1,11 +1,12 @@
 """From a recording to readings and truth."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
 from mag_tracking.errors import RecordingError
+from mag_tracking.messages.field_arrays import FieldArrays, magnetic_fields
 from mag_tracking.messages.schema import acceleration_of, reading_of, readings_of
 from mag_tracking.messages.types import (
     FIELD_READINGS,
@@ -16,7 +17,8 @@ from mag_tracking.messages.types import (
 )
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.topics import absolute, namespaces_of
-from mag_tracking.recording.interruptible import Progress, ReadingStopped
+from mag_tracking.recording.interruptible import Progress
+from mag_tracking.recording.raw_message import RawMessage
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.truth import TRUTH_TYPES, TruthTopics
 from mag_tracking.records import AccelerationSample, Readings
@@ -25,8 +27,9 @@ from mag_tracking.report.metrics import Truth
 TRUTH_PREFIX = 'ground_truth/'
 """Poses on topics below this, in the namespace of the sensors, are truth: for reports, never for
 tracking."""
-GATHERED = 256
-"""Messages whose readings are gathered in one batch: each batch costs as much as a few readings."""
+GATHERED = 1024
+"""Messages at most whose readings are gathered in one batch: each batch costs as much as a few
+readings, and a reader may want to stop after any."""
 
 
 class SampleReader:
@@ -84,19 +87,39 @@ class SampleReader:
 
     def readings(self, progress: Progress | None = None) -> Iterator[Readings]:
         """Iterate over batches of `Readings` in order of log time; see `Recording.messages`."""
-        waiting: list[Readings] = []
-        try:
-            for readings, _ in self.readings_as_received(progress):
-                waiting.append(readings)
-                if len(waiting) == GATHERED:
-                    yield Readings.joined(waiting)
-                    waiting = []
-        except ReadingStopped:
-            # What was read counts.
-            yield Readings.joined(waiting)
-            raise
-        if waiting:
-            yield Readings.joined(waiting)
+        for block in self._recording.blocks(progress=progress):
+            for first in range(0, len(block), GATHERED):
+                readings = self._of_messages(block[first:first + GATHERED])
+                if len(readings):
+                    yield readings
+
+    def _of_messages(self, messages: Sequence[RawMessage]) -> Readings:
+        """`Readings` of all messages that are of the network's sensors, in their order."""
+        rows = [k for k, m in enumerate(messages) if m.topic in self._sensors
+                and m.type == MAGNETIC_FIELD]
+        fields = magnetic_fields([messages[k].data for k in rows])
+        is_read = dict(zip(rows, fields.is_read.tolist(), strict=True))
+        together = self._readings_of([messages[k] for k in rows], fields)
+        parts, done, n = [], 0, 0
+        for k, message in enumerate(messages):
+            if is_read.get(k):
+                n += 1
+                continue
+            for record, _ in self._records_of([message], {}):
+                if isinstance(record, Readings):
+                    parts += [together.part(slice(done, n)), record]
+                    done = n
+        return Readings.joined([*parts, together.part(slice(done, n))])
+
+    def _readings_of(self, messages: Sequence[RawMessage], fields: FieldArrays) -> Readings:
+        """`Readings` of those of the messages of sensors that are in the arrays."""
+        names = list(dict.fromkeys(self._sensors[m.topic] for m in messages))
+        row = {topic: names.index(name) for topic, name in self._sensors.items() if name in names}
+        which = fields.is_read
+        sensor = np.array([row[m.topic] for m in messages], dtype=np.int64)[which]
+        C = fields.covariance
+        return Readings(tuple(names), sensor, fields.stamp_ns[which], fields.field[which],
+                        None if C is None else C[which])
 
     def readings_as_received(self, progress: Progress | None = None
                              ) -> Iterator[tuple[Readings, int]]:
@@ -113,7 +136,12 @@ class SampleReader:
     def _records(self, imus: Mapping[str, Sequence[str]], progress: Progress | None
                  ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
         """(record, log time) of the sensors, and of the accelerometers {topic: sensors}."""
-        for message in self._recording.messages(progress=progress):
+        return self._records_of(self._recording.messages(progress=progress), imus)
+
+    def _records_of(self, messages: Iterable[RawMessage], imus: Mapping[str, Sequence[str]]
+                    ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
+        """The same of some of the messages; what cannot be used is counted."""
+        for message in messages:
             sensor = self._sensors.get(message.topic)
             truth = self._truth.wants(message.topic, message.type)
             many = message.topic == self._many and message.type == FIELD_READINGS

@@ -1,0 +1,87 @@
+"""Magnetic fields as arrays against the decoder of one message after the other."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from mag_tracking.messages.field_arrays import magnetic_fields
+from mag_tracking.messages.schema import magnetic_field_dicts, reading_of
+from mag_tracking.messages.types import MAGNETIC_FIELD, decode, encoder, schema_of
+from mag_tracking.recording.raw_message import RawMessage
+from mag_tracking.records import Readings
+
+
+def message(k, frame='mag_1', covariance=None):
+    """CDR bytes of one message, which differs from the others."""
+    rng = np.random.default_rng(k)
+    readings = Readings.single('mag_1', 1_790_000_000_000_000_000 + 12_345_678 * k,
+                               1e-5 * rng.standard_normal(3), covariance)
+    (_, content), = magnetic_field_dicts(readings, frame)
+    return encoder(MAGNETIC_FIELD)(content)
+
+
+def decoded(data):
+    """`Readings` of one message, by the library."""
+    return reading_of(decode(RawMessage('/mag', MAGNETIC_FIELD, 0, data,
+                                        schema_of(MAGNETIC_FIELD))), 'mag_1')
+
+
+@pytest.mark.parametrize('frames', [['mag_1'], ['', 'a', 'ab', 'abc', 'abcd', 'a much longer name']])
+@pytest.mark.parametrize('known', ['none', 'all', 'some'])
+def test_all_that_the_decoder_reads_is_read_the_same(frames, known):
+    C = [None if known == 'none' or known == 'some' and k % 3 else (k + 1.0) * 1e-16 * np.eye(3)
+         for k in range(40)]
+    data = [message(k, frames[k % len(frames)], C[k]) for k in range(40)]
+    found, expected = magnetic_fields(data), Readings.joined(decoded(m) for m in data)
+    assert found.is_read.all()
+    np.testing.assert_array_equal(found.stamp_ns, expected.stamp_ns)
+    np.testing.assert_array_equal(found.field, expected.field)
+    assert (found.covariance is None) == (expected.covariance is None)
+    if expected.covariance is not None:
+        np.testing.assert_array_equal(found.covariance, expected.covariance)
+
+
+def test_a_covariance_that_is_unknown_and_nan_in_a_message_stay_apart():
+    unknown, nan = np.zeros((3, 3)), np.full((3, 3), np.nan)
+    unknown[0, 0] = -1.0
+    # In `Readings` NaN is an unknown covariance; in a message it is a fault.
+    data = [message(0, covariance=1e-16 * np.eye(3)), message(1, covariance=unknown),
+            message(2)[:-72] + nan.tobytes()]
+    found, expected = magnetic_fields(data), Readings.joined(decoded(m) for m in data)
+    np.testing.assert_array_equal(found.covariance, expected.covariance)
+    assert np.isnan(found.covariance[1]).all() and not found.covariance[2].any()
+
+
+@pytest.mark.parametrize('spoil', [
+    lambda m: b'', lambda m: m[:3], lambda m: m[:15], lambda m: m[:40], lambda m: m[:-1],
+    lambda m: b'\x00\x00' + m[2:], lambda m: b'\x07' + m[1:],
+    lambda m: m[:12] + struct.pack('<I', 2**31 + 5) + m[16:],
+    lambda m: m[:12] + struct.pack('<I', 0) + m[16:],
+    lambda m: m[:16] + b'\xff' + m[17:], lambda m: m[:21] + b'x' + m[22:]])
+def test_what_is_damaged_or_unusual_is_left_to_the_decoder(spoil):
+    data = [message(k) for k in range(5)]
+    good = magnetic_fields(data)
+    data[2] = spoil(data[2])
+    found = magnetic_fields(data)
+    assert found.is_read.tolist() == [True, True, False, True, True]
+    others = found.is_read
+    np.testing.assert_array_equal(found.field[others], good.field[others])
+    np.testing.assert_array_equal(found.stamp_ns[others], good.stamp_ns[others])
+
+
+def test_of_no_message_nothing_is_read():
+    found = magnetic_fields([])
+    assert found.is_read.shape == (0,) and found.field.shape == (0, 3)
+    assert found.covariance is None
+
+
+def test_any_bytes_are_read_or_left_out():
+    """Garbage behind a true head, of any length: never an error, never beyond a message."""
+    rng = np.random.default_rng(3)
+    data = [message(k)[:rng.integers(0, 130)] + rng.bytes(int(rng.integers(0, 40)))
+            for k in range(2000)]
+    found = magnetic_fields(data)
+    for m, is_read, field in zip(data, found.is_read, found.field, strict=True):
+        if is_read:
+            np.testing.assert_array_equal(field, decoded(m).field[0])
