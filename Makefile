@@ -13,7 +13,8 @@ STAMP := $(VENV)/.stamp
 SOURCES := constraints.txt setup.py setup.cfg pyproject.toml package.xml \
 	msg_defs msg_defs/CMakeLists.txt msg_defs/package.xml msg_defs/pyproject.toml msg_defs/setup.py \
 	msg_defs/msg msg_defs/srv $(wildcard msg_defs/msg/*.msg msg_defs/srv/*.srv \
-	msg_defs/cmake/*.cmake msg_defs/standard/*/* msg_defs/standard/*/msg/*.msg)
+	msg_defs/cmake/*.cmake msg_defs/standard/*/* msg_defs/standard/*/msg/*.msg) \
+	$(wildcard mag_tracking/*.hpp mag_tracking/*/*.hpp mag_tracking/*/*/*.hpp mag_tracking/*/*/*.cpp)
 LOCK := build/lock/bin/python -m pip --quiet --disable-pip-version-check --no-input
 
 # setuptools warns of every editable package that is not below src/, through pip's --quiet too.
@@ -42,7 +43,7 @@ $(STAMP): $(SOURCES)
 	@$(PIP) install -c constraints.txt --upgrade pip
 	@echo 'Setting up: ROS messages (compiled here, about a minute)'
 	@$(PIP) install $(PINS) ./msg_defs
-	@echo 'Setting up: mag_tracking and what it needs'
+	@echo 'Setting up: mag_tracking (its core is compiled) and what it needs'
 	@$(QUIET_EDITABLE) $(PIP) install $(PINS) -e '.[ros,test]'
 	@touch $@
 	@echo 'Setting up: done'

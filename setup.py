@@ -1,5 +1,6 @@
 from glob import glob
 
+from pybind11.setup_helpers import Pybind11Extension
 from setuptools import Distribution, find_packages, setup
 
 NAME = 'mag_tracking'
@@ -13,6 +14,13 @@ class DataFilesDistribution(Distribution):
     def has_data(self):
         return self.has_data_files()
 
+# What a frame of a track spends its time in. It may be copied to another machine, so it is not made
+# for this processor alone: the module chooses by itself.
+CORE = Pybind11Extension(
+    f'{NAME}.stages.track.core', [f'{NAME}/stages/track/core.cpp'], cxx_std=17,
+    extra_compile_args=['-O3', '-Wall', '-Wextra', '-Wno-psabi'],
+    depends=sorted(glob(f'{NAME}/**/*.hpp', recursive=True)))
+
 setup(
     name=NAME,
     distclass=DataFilesDistribution,
@@ -22,7 +30,8 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', 'nodes/*.xml', 'report/page/*']},
+    ext_modules=[CORE],
+    package_data={NAME: ['py.typed', 'nodes/*.xml', 'report/page/*', 'stages/track/core.pyi']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
@@ -75,6 +84,7 @@ setup(
             'pandas',
             'pandas-stubs',
             'playwright',
+            'pybind11',
             'pytest',
             'pytest-timeout',
             'pytest-xdist',

@@ -43,6 +43,21 @@ def test_every_module_has_a_floor():
     assert rooms - {'__init__'} == set.union(*layers())
 
 
+def test_compiled_sources_include_only_what_is_below_their_floor():
+    floor = {room: -k for k, rooms in enumerate(layers()) for room in rooms}
+    sources = [*PACKAGE.rglob('*.hpp'), *PACKAGE.rglob('*.cpp')]
+    assert sources
+    for source in sources:
+        text = source.read_text()
+        assert text.count('\n') <= LARGEST_FILE, source
+        for name in re.findall(r'^#include "(.+)"$', text, re.M):
+            included = (source.parent / name).resolve()
+            own, other = (p.relative_to(PACKAGE).parts[0].removesuffix('.hpp')
+                          for p in (source, included))
+            assert included.is_file(), (source, name)
+            assert own == other or floor[other] < floor[own], (source, name)
+
+
 def test_no_two_modules_import_each_other():
     graph = grimp.build_graph('mag_tracking')
     imports = {m: graph.find_modules_directly_imported_by(m) for m in graph.modules}

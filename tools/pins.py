@@ -9,12 +9,14 @@ try:
 except ModuleNotFoundError:  # Python 3.10 has none; it can go when 3.11 is the oldest
     from pip._vendor import tomli as tomllib
 
-MESSAGES = Path(__file__).resolve().parents[1] / 'msg_defs' / 'pyproject.toml'
+ROOT = Path(__file__).resolve().parents[1]
+PROJECTS = ROOT / 'msg_defs' / 'pyproject.toml', ROOT / 'pyproject.toml'
 
 
 def build_requires():
-    """The requirements for building the messages, for those who build without isolation."""
-    return tomllib.loads(MESSAGES.read_text())['build-system']['requires']
+    """The requirements for building both packages, for those who build without isolation."""
+    systems = [tomllib.loads(project.read_text())['build-system'] for project in PROJECTS]
+    return sorted({requirement for system in systems for requirement in system['requires']})
 
 
 def freeze():

@@ -159,7 +159,7 @@ class RowVehicle:
                 *(('w',) if self.turn_acceleration else ()))
 
     @cached_property
-    def _induction(self) -> FloatArray:
+    def induction(self) -> FloatArray:
         """(3,) [A/m] B0/mu0."""
         return np.asarray(self.earth_field, dtype=float) / MU0
 
@@ -188,7 +188,7 @@ class RowVehicle:
         shape = len(x), self.n_dipoles, 3
         r, m = np.empty(shape), np.empty(shape)
         dr_dx, dm_dx = np.zeros((2, *shape, x.shape[1]))
-        _row_dipoles(np.asarray(x, dtype=float), self._places, self._induction, r, m, dr_dx, dm_dx)
+        _row_dipoles(np.asarray(x, dtype=float), self._places, self.induction, r, m, dr_dx, dm_dx)
         return Dipoles(r, m, dr_dx, dm_dx)
 
     def propagate(self, x: FloatArray, dt: float, P: FloatArray | None = None
@@ -202,7 +202,7 @@ class RowVehicle:
         n = x.shape[1]
         Q = np.zeros((len(x), n, n))
         Q[:, :6, :6] = integrator_noise(dt, self.acceleration_density)
-        _moment_noise(x, abs(dt) * self._walk, float(self._induction @ self._induction), Q)
+        _moment_noise(x, abs(dt) * self._walk, float(self.induction @ self.induction), Q)
         if not self.turn_acceleration:
             F = np.eye(n)
             F[:6, :6] = constant_velocity(dt)

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from mag_tracking.inference import kalman
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
-from mag_tracking.inference.time_update import predict
 from mag_tracking.physics.dipole import MU0, sensor_fields
 from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.stages.track.initiation_vehicle import moment_directions
 from mag_tracking.stages.track.published_pose import published_track, vehicle_orientation
+from support import plain_kalman
 from support.networks import line_network
 
 
@@ -165,12 +164,12 @@ def matched_run(rng, network, model, sigma):
             truth[:n_t] = moved[0] + rng.multivariate_normal(np.zeros(n_t), Q[0])
             truth[n_t:] += 1e-9 * np.sqrt(dt) * rng.standard_normal(n_x - n_t)
             x_target, F, Q = model.propagate(bank.x[:, :n_t], dt)
-            predict(bank.x, bank.P, x_target, F, Q, 1e-18 * dt)
+            plain_kalman.predict(bank.x, bank.P, x_target, F, Q, 1e-18 * dt)
         h = sensor_fields(network.positions, network.R_sw, *model.dipoles(truth[None, :n_t]))[0][0]
         y = h + truth[n_t:].reshape(-1, 3) + sigma * rng.standard_normal(h.shape)
         h, H, _ = sensor_fields(network.positions, network.R_sw, *model.dipoles(bank.x[:, :n_t]))
-        log_likelihood, _ = kalman.update(bank.x, bank.P, y, h, H, C,
-                                          np.zeros((len(bank), len(network))))
+        log_likelihood, *_ = plain_kalman.update(bank.x, bank.P, y, h, H, C,
+                                                 np.zeros((len(bank), len(network))))
         bank.reweight(log_likelihood)
         bank.prune(-np.log(1e-12), 600)
     i = bank.best()

@@ -1,16 +1,17 @@
-"""The compiled update against the dense filter and filterpy, and its statistics."""
+"""The plain filter, an oracle of the compiled one: against the dense filter and filterpy, and its
+statistics.
+"""
 
 import numpy as np
 import pytest
 from filterpy.kalman import ExtendedKalmanFilter
 from scipy.stats import chi2, multivariate_normal
 
-from mag_tracking.inference import kalman
-from mag_tracking.inference.time_update import predict
 from mag_tracking.physics.dipole import sensor_fields
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.simulation.scenario import Path, point_body
 from mag_tracking.stages.track.target import target_of
+from support import plain_kalman
 from support.bundled import POINT
 from support.marks import studied
 from support.networks import line_network
@@ -83,7 +84,7 @@ def compare(n_sensors, missing=False, shift=0.0):
     x, P, y, h, H, C, inflation = tracked(n_sensors, missing)
     x_lin = x + shift * np.sqrt(np.einsum('nii->ni', P))
     new_x, new_P = x.copy(), P.copy()
-    log_likelihood, nis = kalman.update(new_x, new_P, y, h, H, C, inflation, x_lin)
+    log_likelihood, nis, _ = plain_kalman.update(new_x, new_P, y, h, H, C, inflation, x_lin)
     worst = np.zeros(4)
     for p in range(len(x)):
         ox, oP, oll, onis, (A, z, _) = dense_update(x[p], P[p], y, h[p], H[p], C, inflation[p],
@@ -114,44 +115,6 @@ def test_update_with_missing_axes_and_sensors():
     assert max(compare(3, missing=True)) <= 1e-8
 
 
-@pytest.mark.parametrize('fades', [True, False])
-@pytest.mark.parametrize('moving', [0.0, 0.4, 1.0])
-@pytest.mark.parametrize('shared', [True, False])
-def test_prediction_equals_the_dense_oracle(shared, moving, fades):
-    """x = A x, P = A P A' + Q with A of the target's Jacobian and of what decays."""
-    rng = np.random.default_rng(3)
-    n_hyp, n_t, n_rest = 4, 5, 7
-    root = rng.standard_normal((n_hyp, n_t + n_rest, n_t + n_rest))
-    P, x = root @ np.swapaxes(root, 1, 2), rng.standard_normal((n_hyp, n_t + n_rest))
-    F, Q = rng.standard_normal((2, n_hyp, n_t, n_t))
-    # In some rows nothing but what is there already; of each hypothesis in others.
-    dense, F = F, np.where(rng.random((n_hyp, n_t, 1)) < moving, F, np.eye(n_t))
-    F[0, 0] = np.where(np.arange(n_t) == 0, 1.0, dense[0, 0])  # a place and its velocity
-    F[0, 1] = 0.5 * np.eye(n_t)[1]  # what fades
-    F, Q = (F[0], Q[0] @ Q[0].T) if shared else (F, Q @ np.swapaxes(Q, 1, 2))
-    decay, variance = np.ones(n_rest), rng.uniform(0.1, 1.0, n_rest)
-    if fades:
-        decay = rng.uniform(0.2, 1.0, n_rest)
-    A, noise = np.zeros((2, n_hyp, n_t + n_rest, n_t + n_rest))
-    A[:, :n_t, :n_t], noise[:, :n_t, :n_t] = F, Q
-    rest = np.arange(n_t, n_t + n_rest)
-    A[:, rest, rest], noise[:, rest, rest] = decay, variance
-    x_target = rng.standard_normal((n_hyp, n_t))
-    expected = A @ P @ np.swapaxes(A, 1, 2) + noise
-    x_rest = x[:, n_t:] * decay
-    F.flags.writeable = False
-    predict(x, P, x_target, F, Q, variance, decay)
-    np.testing.assert_array_equal(x, np.concatenate([x_target, x_rest], axis=1))
-    np.testing.assert_allclose(P, expected, rtol=1e-12, atol=1e-12)
-    np.testing.assert_array_equal(P, np.swapaxes(P, 1, 2))
-    with pytest.raises(ValueError, match='covariances of shape'):
-        predict(x, P[:2], x_target, F, Q, variance, decay)
-    with pytest.raises(ValueError, match='states of shape'):
-        predict(x, P[:1], x_target[:1], F[:1] if F.ndim == 3 else F, Q, variance, decay)
-    with pytest.raises(ValueError, match='Jacobian of shape'):
-        predict(x, P, x_target, F[..., :1], Q, variance, decay)
-
-
 @pytest.mark.parametrize('n_own', [0, 2, 3])
 @pytest.mark.parametrize('n_t', [0, 3, 5, 7, 12])
 def test_update_in_numbers_near_one_with_any_axes_missing(n_t, n_own):
@@ -172,7 +135,7 @@ def test_update_in_numbers_near_one_with_any_axes_missing(n_t, n_own):
     C[patterns] = np.nan
     C[np.broadcast_to(patterns[:, None, :], C.shape)] = np.nan
     new_x, new_P = x.copy(), P.copy()
-    log_likelihood, nis = kalman.update(new_x, new_P, y, h, H, C, inflation, x_lin, n_own)
+    log_likelihood, nis, _ = plain_kalman.update(new_x, new_P, y, h, H, C, inflation, x_lin, n_own)
     filled = np.where(np.isnan(C), np.eye(3), C)
     ox, oP, oll, onis, _ = dense_update(x[0], P[0], y, h[0], H[0], filled, inflation[0], x_lin[0],
                                         n_own)
@@ -183,39 +146,6 @@ def test_update_in_numbers_near_one_with_any_axes_missing(n_t, n_own):
 
 def test_update_linearised_elsewhere():
     assert max(compare(2, shift=0.3)[:2]) <= 1e-8
-
-
-def test_covariance_stays_exactly_symmetric():
-    x, P, y, h, H, C, inflation = tracked(2)
-    kalman.update(x, P, y, h, H, C, inflation)
-    np.testing.assert_array_equal(P, np.swapaxes(P, 1, 2))
-
-
-@pytest.mark.parametrize('bad', [np.zeros((3, 3)), np.diag([-1.0, 1.0, 1.0]),
-                                 [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
-                                 [[1.0, 0.0, 2.0], [0.0, 1.0, 0.0], [2.0, 0.0, 1.0]]])
-def test_a_noise_that_is_not_positive_definite_is_refused(bad):
-    x, P, y, h, H, C, inflation = tracked(2)
-    before = x.copy()
-    C[1] = 1.44e-16 * np.array(bad)
-    with pytest.raises(ValueError, match='not positive definite'):
-        kalman.update(x, P, y, h, H, C, 0.0 * inflation)
-    np.testing.assert_array_equal(x, before)
-
-
-def test_states_that_do_not_fit_the_sensors_are_refused():
-    x, P, y, h, H, C, inflation = tracked(2)
-    with pytest.raises(ValueError, match='shapes that do not fit'):
-        kalman.update(x, P, y, h, H, C, inflation, n_own=3)
-    arguments = {'P': P, 'y': y, 'h': h, 'C': C, 'inflation': inflation, 'x_lin': x.copy()}
-    for name, array in arguments.items():
-        for bad in (array[..., :-1], array[:-1]):
-            with pytest.raises(ValueError, match='shapes that do not fit'):
-                kalman.update(x, H=H, **{**arguments, name: bad.copy()})
-        with pytest.raises(ValueError, match='C-contiguous'):
-            kalman.update(x, H=H, **{**arguments, name: np.asfortranarray(array)})
-    with pytest.raises(ValueError, match='shapes that do not fit'):
-        kalman.update(x, H=H[:, :, :2].copy(), **arguments)
 
 
 def test_nees_of_a_linear_gaussian_case_is_chi_square():
@@ -235,14 +165,14 @@ def test_nees_of_a_linear_gaussian_case_is_chi_square():
         if k:
             truth[:, :n_t] = truth[:, :n_t] @ F.T + rng.multivariate_normal(np.zeros(6), Q, runs)
             truth[:, n_t:] += np.sqrt(0.01) * rng.standard_normal((runs, n_x - n_t))
-            predict(x, P, x[:, :n_t] @ F.T, F, Q, 0.01)
+            plain_kalman.predict(x, P, x[:, :n_t] @ F.T, F, Q, 0.01)
         noise = rng.standard_normal((runs, n_sensors, 3)) * np.sqrt([0.5, 1.0, 2.0])
         y = np.einsum('pjic,pc->pji', H, truth[:, :n_t]) \
             + truth[:, n_t:].reshape(runs, n_sensors, 3) + noise
         # The measurement differs from run to run, so each is an update of its own.
         for p in range(runs):
             h = np.einsum('jic,c->ji', H[p], x[p, :n_t])[None]
-            nis.append(kalman.update(x[p:p + 1], P[p:p + 1], y[p], h, H[p:p + 1], C,
+            nis.append(plain_kalman.update(x[p:p + 1], P[p:p + 1], y[p], h, H[p:p + 1], C,
                                      np.zeros((1, n_sensors)))[1][0])
     e = truth - x
     nees = np.einsum('pi,pij,pj->p', e, np.linalg.inv(P), e)

@@ -1,15 +1,18 @@
 """Prediction and update of a bank: where the target's physics meets the filter."""
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.inference import kalman
 from mag_tracking.inference.filter_bank import FilterBank
-from mag_tracking.inference.time_update import predict
 from mag_tracking.network import SensorNetwork
-from mag_tracking.physics.sources import SourceModel
+from mag_tracking.physics.sources import Magnet, SourceModel
+from mag_tracking.physics.vehicles import FASTEST_TURN, RowVehicle
 from mag_tracking.records import FieldFrame
-from mag_tracking.stages.track.observation import Observation
+from mag_tracking.stages.track import core
+from mag_tracking.stages.track.observation import SAME_TIME_S, Observation
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.unseen_length import CAR_ROW
 
@@ -22,6 +25,33 @@ ONE_TIME = 0.05
 is the first of a track: velocities are better learnt from frame to frame than within one."""
 
 
+class Along(NamedTuple):
+    """What came of `BankFilter.run_along`, for each hypothesis."""
+
+    log_likelihood: FloatArray
+    """(n_hyp,) of all frames along the path; -inf where it is of no use."""
+    unsettled: FloatArray
+    """(n_hyp,) how far the last pass moved a path at most, in deviations of its position."""
+    used: BoolArray
+    """(n_hyp, n) whether it was updated with a frame."""
+    covariances: FloatArray
+    """(n_hyp, n, n_x, n_x) at each frame given all of them; empty where nobody wants them."""
+
+
+def compiled_filter(model: SourceModel, observation: Observation
+                    ) -> core.RowVehicleFilter | core.MagnetFilter:
+    """The compiled filter of a target that is seen as `observation` says."""
+    sensors = (observation.positions, observation.R_sw, observation.n_angles,
+               observation.n_own - observation.n_angles)
+    if isinstance(model, RowVehicle):
+        return core.RowVehicleFilter(
+            *sensors, len(model.state_names), model.n_dipoles, list(model.acceleration_density),
+            list(model.induction), model.moment_drift, model.difference_drift,
+            model.turn_acceleration, model.turn_time, FASTEST_TURN)
+    assert isinstance(model, Magnet)
+    return core.MagnetFilter(*sensors, list(model.acceleration_density), model.angular_density)
+
+
 class BankFilter:
     """Moves a `FilterBank` through frames; has no memory of its own."""
 
@@ -29,9 +59,9 @@ class BankFilter:
                  settings: TrackSettings) -> None:
         """`settings` is a `TrackSettings`; the live ones may be changed by `configure`."""
         self._n_sensors = len(network)
-        self._model = model
         self.observation = Observation(network, model, np.deg2rad(settings.mounting_std_deg),
                                        settings.model_error_time_s)
+        self._compiled = compiled_filter(model, self.observation)
         self.configure(settings)
 
     def configure(self, settings: TrackSettings) -> None:
@@ -40,42 +70,107 @@ class BankFilter:
         is_vehicle = settings.target == 'vehicle'
         self._near_field_lengths: FloatArray = np.atleast_1d(
             settings.vehicle.near_field_lengths if is_vehicle
-            else settings.magnet.near_field_length)
+            else settings.magnet.near_field_length).astype(float)
         self._are_long: BoolArray = np.array(
             settings.vehicle.lengths if is_vehicle else [0.0]) > CAR_ROW
 
-    def predict(self, bank: FilterBank, dt: float, x_lin: FloatArray | None = None
-                ) -> tuple[FloatArray, FloatArray]:
-        """Time update in place; backwards in time without process noise.
+    def move(self, bank: FilterBank, dt: float) -> None:
+        """Time update over `dt` [s]; backwards in time without process noise.
 
-        It is linearised at `x_lin` (n_hyp, n_x), states before it, or at those of the bank.
+        The arrays that `bank.x` and `bank.P` were stay as they are.
+        """
+        n = self._n_sensors
+        nowhere = FieldFrame(0, np.full((n, 3), np.nan), np.tile(np.eye(3), (n, 1, 1)),
+                             np.zeros(n, dtype=np.int64), np.zeros(n))
+        self._advance(bank, nowhere, dt, True, 0)
+
+    def advance(self, bank: FilterBank, frame: FieldFrame, dt: float
+                ) -> tuple[FloatArray, FloatArray]:
+        """Time update to a frame that comes `dt` [s] after the one before, and update with it.
+
+        The update is linearised as often as the settings say. The arrays that `bank.x` and
+        `bank.P` were stay as they are.
 
         Returns
         -------
-        F : (n_hyp, n_t, n_t) or (n_t, n_t)
-            Jacobian of the target's motion.
-        decay : (n_x - n_t,)
-            What the other states were multiplied by.
+        predicted : (n_hyp, n_x)
+            The states before the update.
+        log_likelihood : (n_hyp,)
+            Of the frame; -inf where a dipole sits on a sensor.
         """
-        n_t = self.observation.n_target
-        at = (bank.x if x_lin is None else x_lin)[:, :n_t]
-        x_target, F, Q = self._model.propagate(at, dt, bank.P[:, :n_t, :n_t])
-        if x_lin is not None:
-            x_target = x_target + (F @ (bank.x[:, :n_t] - at)[:, :, None])[:, :, 0]
+        return self._advance(bank, frame, dt, dt > 0.0, self._settings.iterations)
+
+    def _advance(self, bank: FilterBank, frame: FieldFrame, dt: float, moves: bool,
+                 iterations: int) -> tuple[FloatArray, FloatArray]:
+        """(predicted (n_hyp, n_x), log-likelihood (n_hyp,)); without iterations it only moves."""
+        frames = self._frames([frame], [dt])
+        new_x, new_P, predicted = np.empty_like(bank.x), np.empty_like(bank.P), \
+            np.empty_like(bank.x)
+        log_likelihood, nis = np.zeros(len(bank)), np.full((len(bank), self._n_sensors), np.nan)
+        self._compiled.advance(
+            **{name: values[0] for name, values in frames.items()}, moves=moves,
+            iterations=iterations, field_error=self._settings.field_error,
+            near_field_length=self._near_field_lengths[bank.kind], x=bank.x, P=bank.P,
+            new_x=new_x, new_P=new_P, predicted=predicted, log_likelihood=log_likelihood, nis=nis)
+        bank.x, bank.P, bank.nis = new_x, new_P, nis
+        return predicted, log_likelihood
+
+    def run_along(self, bank: FilterBank, frames: Sequence[FieldFrame],
+                  intervals: Sequence[float], paths: FloatArray, *, passes: int, step: float,
+                  first_is_updated: bool, leaves_out: bool = False,
+                  wants_covariances: bool = False) -> Along:
+        """Filter and smooth each hypothesis along its path, and end with the last frame.
+
+        Parameters
+        ----------
+        bank : FilterBank
+            At the first frame; `bank.x` and `bank.P` are replaced by those at the last one.
+        frames : list of n FieldFrame
+        intervals : list of n float [s]
+            Time from the frame before.
+        paths : (n_hyp, n, n_x)
+            Where they are linearised; NaN: at the predictions. Moved, in place.
+        passes : int
+            How often it is done; each time it is linearised where the time before led.
+        step : float
+            The share of the way that a path is moved to where the smoother has it.
+        first_is_updated : bool
+            The bank has been updated with the first frame.
+        leaves_out : bool
+            Frames that contradict a hypothesis are left out.
+        wants_covariances : bool
+        """
+        n_hyp, n, n_x = paths.shape
+        out = Along(np.empty(n_hyp), np.empty(n_hyp), np.empty((n_hyp, n), dtype=bool),
+                    np.empty((n_hyp, n, n_x, n_x) if wants_covariances else 0))
+        new_x, new_P = np.empty_like(bank.x), np.empty_like(bank.P)
+        self._compiled.run_along(
+            **self._frames(frames, intervals), first_is_updated=first_is_updated,
+            strange=self._settings.end_nis if leaves_out else np.inf, passes=passes, step=step,
+            field_error=self._settings.field_error,
+            near_field_length=self._near_field_lengths[bank.kind], x=bank.x, P=bank.P,
+            new_x=new_x, new_P=new_P, paths=paths, log_likelihood=out.log_likelihood,
+            unsettled=out.unsettled, covariances=out.covariances, used=out.used)
+        bank.x, bank.P = new_x, new_P
+        return out
+
+    def _frames(self, frames: Sequence[FieldFrame], intervals: Sequence[float]
+                ) -> dict[str, FloatArray]:
+        """Frames as compiled code takes them, one after the other."""
+        dt = np.array(intervals, dtype=float)
         decay, variance = self.observation.drift(dt, self._settings.background_drift)
-        predict(bank.x, bank.P, x_target, F, Q if dt > 0.0 else 0.0 * Q, variance, decay)
-        return F, decay
+        return {'field': np.array([frame.field for frame in frames]),
+                'covariance': known_covariance(np.array([f.covariance for f in frames])),
+                'offset': np.array([self.time_offset(f, t)
+                                    for f, t in zip(frames, intervals, strict=True)]),
+                'dt': dt, 'decay': decay, 'variance': variance}
 
-    def fields(self, x: FloatArray, kind: IntArray, frame: FieldFrame, dt: float
-               ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Fields of the states `x` (n_hyp, n_x) of the kinds `kind`; see `Observation.fields`.
-
-        `dt` [s] since the frame before says whether the frame is one time.
-        """
+    def time_offset(self, frame: FieldFrame, dt: float) -> FloatArray:
+        """(n_sensors,) [s] of the samples of a frame that comes `dt` [s] after the one before."""
         one_time = dt <= 0.0 or np.ptp(frame.time_offset) < ONE_TIME * dt
-        offset = np.zeros(self._n_sensors) if one_time else frame.time_offset
-        return self.observation.fields(x, offset, self._near_field_lengths[kind],
-                                       self._settings.field_error)
+        offset: FloatArray = np.zeros(self._n_sensors) if one_time else (
+            np.round(frame.time_offset / SAME_TIME_S) * SAME_TIME_S)
+        return offset
 
     def model_error(self, bank: FilterBank, i: int, dt: float) -> FloatArray:
         """(n_sensors,) [T^2] variance of what the model of hypothesis `i` leaves out of a field.
@@ -95,49 +190,11 @@ class BankFilter:
         Without what it takes for errors of its model: with them anything would seem to fit.
         """
         x = self.observation.without_errors(bank.x[i:i + 1])
-        h, _, _ = self.fields(x, bank.kind[i:i + 1], frame, dt)
+        h, _, _ = self.observation.fields(
+            x, self.time_offset(frame, dt), self._near_field_lengths[bank.kind[i:i + 1]],
+            self._settings.field_error)
         field: FloatArray = h[0] + x[0, -3 * self._n_sensors:].reshape(-1, 3)
         return field
-
-    def update(self, bank: FilterBank, frame: FieldFrame, dt: float,
-               x_lin: FloatArray | None = None) -> FloatArray:
-        """Measurement update in place; the arrays that `bank.x` and `bank.P` were stay as they are.
-
-        It is linearised at `x_lin` (n_hyp, n_x), or if that is left out at the prediction and
-        then again as often as the settings say. Returns the log-likelihood (n_hyp,) of the frame.
-        """
-        return self._update(bank, frame, dt, x_lin)[0]
-
-    def update_with_gains(self, bank: FilterBank, frame: FieldFrame, dt: float,
-                          x_lin: FloatArray | None = None) -> tuple[FloatArray, kalman.Gains]:
-        """The same, for a backward pass: (log-likelihood (n_hyp,), `kalman.Gains`)."""
-        log_likelihood, gains = self._update(bank, frame, dt, x_lin, wants_gains=True)
-        assert gains is not None
-        return log_likelihood, gains
-
-    def _update(self, bank: FilterBank, frame: FieldFrame, dt: float, x_lin: FloatArray | None,
-                wants_gains: bool = False) -> tuple[FloatArray, kalman.Gains | None]:
-        """Log-likelihood (n_hyp,), and the `kalman.Gains` or None."""
-        covariance = known_covariance(frame)
-        x_prior, P_prior = bank.x, bank.P
-        iterations = self._settings.iterations if x_lin is None else 1
-        x_lin = bank.x.copy() if x_lin is None else x_lin
-        for _ in range(iterations):
-            bank.x, bank.P = x_prior.copy(), P_prior.copy()
-            h, H, inflation = self.fields(x_lin, bank.kind, frame, dt)
-            # A dipole on a sensor has no field: such a hypothesis is as good as ruled out.
-            lost = ~(np.isfinite(h).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3))
-                     & np.isfinite(inflation).all(axis=1))
-            h[lost], H[lost], inflation[lost] = 0.0, 0.0, 0.0
-            gains = kalman.Gains.of(H, self.observation.n_own, bank.x.shape[1]) \
-                if wants_gains else None
-            log_likelihood, bank.nis = kalman.update(
-                bank.x, bank.P, frame.field, h, H, covariance, inflation, x_lin,
-                self.observation.n_own, gains)
-            log_likelihood[lost] = -np.inf
-            x_lin = bank.x.copy()
-        bank.nis[:, np.isnan(frame.field).all(axis=1)] = np.nan
-        return log_likelihood, gains
 
     def are_long(self, kind: IntArray) -> BoolArray:
         """(n,) whether targets of the kinds `kind` (n,) are longer than a car."""
@@ -158,21 +215,27 @@ class NoTarget:
     """The filter of no target at all, only backgrounds that wander: what evidence is against."""
 
     def __init__(self, n_sensors: int, background_std: float) -> None:
-        self._x = np.zeros((1, 3 * n_sensors))
-        self._P = background_std**2 * np.eye(3 * n_sensors)[None]
+        self._x = np.zeros((n_sensors, 3))
+        self._P = np.tile(background_std**2 * np.eye(3), (n_sensors, 1, 1))
 
     def log_density(self, frame: FieldFrame, dt: float, background_drift: float) -> float:
         """Log-density of the frame given those before; `dt` [s] since the last one."""
-        n = len(frame.field)
-        i = np.arange(3 * n)
-        self._P[0, i, i] += background_drift**2 * dt
-        log_likelihood, _ = kalman.update(
-            self._x, self._P, frame.field, np.zeros((1, n, 3)), np.zeros((1, n, 3, 0)),
-            known_covariance(frame), np.zeros((1, n)))
-        return float(log_likelihood[0])
+        self._P += background_drift**2 * dt * np.eye(3)
+        there = ~np.isnan(frame.field)
+        both = there[:, :, None] & there[:, None, :]
+        # An axis that is missing has no innovation, and a variance of its own.
+        u = np.where(there, frame.field - self._x, 0.0)
+        S = np.where(both, self._P + frame.covariance, np.eye(3))
+        L = np.linalg.cholesky(S)
+        whitened = np.linalg.solve(L, np.concatenate(
+            [u[:, :, None], np.where(there[:, :, None], self._P, 0.0)], axis=2))
+        z, G = whitened[:, :, 0], whitened[:, :, 1:]
+        self._x += np.einsum('jai,ja->ji', G, z)
+        self._P -= np.swapaxes(G, 1, 2) @ G
+        return float(-0.5 * (np.square(z).sum() + np.count_nonzero(there) * np.log(2.0 * np.pi))
+                     - np.log(np.einsum('jaa->ja', L)).sum())
 
 
-def known_covariance(frame: FieldFrame) -> FloatArray:
-    """(n_sensors, 3, 3) [T^2]; identity where an axis is missing."""
-    return np.where(np.isnan(frame.covariance), np.eye(3), frame.covariance)
-
+def known_covariance(covariance: FloatArray) -> FloatArray:
+    """(..., 3, 3) [T^2] those of frames; identity where an axis is missing."""
+    return np.where(np.isnan(covariance), np.eye(3), covariance)

@@ -1,7 +1,5 @@
 """What the sensors see of a bank's states: where the target's physics meets the filter's states."""
 
-import math
-
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
@@ -27,13 +25,14 @@ def angle_priors(network: SensorNetwork, mounting_std: float) -> FloatArray:
            for s in network.orientation_std]
     # The angles are about the sensor's axes, what is known of them about the world's.
     priors: FloatArray = np.einsum('jik,jk,jlk->jil', network.R_sw, np.square(std), network.R_sw)
-    return priors
+    # Exactly symmetric, and so stays all that comes of it.
+    return 0.5 * (priors + np.swapaxes(priors, 1, 2))
 
 
 class Observation:
     """The field that a network has of hypotheses, and the states that belong to its sensors.
 
-    A state is as on top of `inference.kalman`. Behind the target's states come each sensor's
+    A state is as on top of `inference/hypothesis.hpp`. Behind the target's states come each sensor's
     own: three mounting angles [rad] where they are estimated, and three model errors, in units
     of their size, where those last. They are what the target model leaves out near a
     vehicle, and stay alike for `error_time` (first-order Gauss-Markov), so that what is counted
@@ -45,15 +44,17 @@ class Observation:
         """`mounting_std` [rad] is that of a sensor whose `orientation_std` is not known."""
         self.positions: FloatArray = np.ascontiguousarray(network.positions, dtype=float)
         """(n_sensors, 3) [m]"""
-        self._R_sw = network.R_sw
+        self.R_sw: FloatArray = np.ascontiguousarray(network.R_sw, dtype=float)
+        """(n_sensors, 3, 3) world to sensor."""
         self._model = model
         self._error_time = error_time
-        self._n_angles = 3 if mounting_std else 0
+        self.n_angles = 3 if mounting_std else 0
+        """States of each sensor for how it is mounted."""
         self.n_target = len(model.state_names)
-        n_own = self._n_angles + (3 if error_time else 0)
+        n_own = self.n_angles + (3 if error_time else 0)
         self.own_covariance = np.zeros((len(network), n_own, n_own))
         """(n_sensors, n_own, n_own) of the sensors' own states when a track begins."""
-        errors = np.arange(self._n_angles, n_own)
+        errors = np.arange(self.n_angles, n_own)
         self.own_covariance[:, errors, errors] = 1.0
         if mounting_std:
             self.own_covariance[:, :3, :3] = angle_priors(network, mounting_std)
@@ -71,18 +72,18 @@ class Observation:
 
     def angles(self, x: FloatArray) -> FloatArray:
         """(..., n_sensors, 3) [rad] mounting angles; (..., 0, 3) where they are not estimated."""
-        return self.own(x)[..., :3] if self._n_angles else np.zeros((*x.shape[:-1], 0, 3))
+        return self.own(x)[..., :3] if self.n_angles else np.zeros((*x.shape[:-1], 0, 3))
 
     def angle_covariances(self, P: FloatArray) -> FloatArray:
         """(n_sensors, 3, 3) [rad^2] of the mounting angles, among `P` (n_x, n_x); or (0, 3, 3)."""
         first = self.n_target + self.n_own * np.arange(len(self.positions))
         rows = first[:, None] + np.arange(3)
-        return P[rows[:, :, None], rows[:, None, :]] if self._n_angles else np.zeros((0, 3, 3))
+        return P[rows[:, :, None], rows[:, None, :]] if self.n_angles else np.zeros((0, 3, 3))
 
     def without_errors(self, x: FloatArray) -> FloatArray:
         """The states `x` (n_hyp, n_x), copied, with model errors of zero."""
         x = x.copy()
-        self.own(x)[..., self._n_angles:] = 0.0
+        self.own(x)[..., self.n_angles:] = 0.0
         return x
 
     def nearest(self, x: FloatArray) -> FloatArray:
@@ -91,28 +92,29 @@ class Observation:
         nearest: FloatArray = away.min(axis=1)
         return nearest
 
-    def drift(self, dt: float, background_density: float) -> tuple[FloatArray, FloatArray]:
-        """What becomes of the sensors' states over `dt` seconds.
+    def drift(self, dt: FloatArray, background_density: float) -> tuple[FloatArray, FloatArray]:
+        """What becomes of the sensors' states over the times `dt` (n,) [s].
 
         Returns
         -------
-        decay, variance : (n_own + 3) n_sensors
+        decay, variance : (n, (n_own + 3) n_sensors)
             They are multiplied by the one, and the other is added.
         """
-        n = len(self.positions)
-        fading = math.exp(-abs(dt) / self._error_time) if self._error_time else 1.0
-        decay, variance = np.ones((self.n_own + 3) * n), np.zeros((self.n_own + 3) * n)
-        decay[:-3 * n].reshape(n, self.n_own)[:, self._n_angles:] = fading
-        variance[:-3 * n].reshape(n, self.n_own)[:, self._n_angles:] = 1.0 - fading**2
-        variance[-3 * n:] = background_density**2 * max(dt, 0.0)
-        return decay, variance
+        m, n = len(dt), len(self.positions)
+        fading = np.exp(-np.abs(dt) / self._error_time) if self._error_time else np.ones(m)
+        decay, variance = np.ones((m, n, self.n_own)), np.zeros((m, n, self.n_own))
+        decay[:, :, self.n_angles:] = fading[:, None, None]
+        variance[:, :, self.n_angles:] = 1.0 - np.square(fading)[:, None, None]
+        of_backgrounds = np.repeat(background_density**2 * np.maximum(dt, 0.0)[:, None], 3 * n, 1)
+        return (np.concatenate([decay.reshape(m, -1), np.ones((m, 3 * n))], axis=1),
+                np.concatenate([variance.reshape(m, -1), of_backgrounds], axis=1))
 
     def target_fields(self, x: FloatArray, time_offset: FloatArray
                       ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Field of the target alone, at each sensor's own time; see `sensor_fields`."""
         n_hyp, n, n_t = len(x), len(self.positions), self.n_target
         if not time_offset.any():
-            return sensor_fields(self.positions, self._R_sw, *self._model.dipoles(x[:, :n_t]))
+            return sensor_fields(self.positions, self.R_sw, *self._model.dipoles(x[:, :n_t]))
         h, H = np.empty((n_hyp, n, 3)), np.empty((n_hyp, n, 3, n_t))
         gradient = np.empty((n_hyp, n))
         steps = np.round(time_offset / SAME_TIME_S)
@@ -120,7 +122,7 @@ class Observation:
             j = np.flatnonzero(steps == step)
             moved, F, _ = self._model.propagate(x[:, :n_t], step * SAME_TIME_S)
             h[:, j], H_moved, gradient[:, j] = sensor_fields(
-                self.positions[j], self._R_sw[j], *self._model.dipoles(moved))
+                self.positions[j], self.R_sw[j], *self._model.dipoles(moved))
             H[:, j] = H_moved @ (F if F.ndim == 2 else F[:, None])
         return h, H, gradient
 
@@ -150,7 +152,7 @@ class Observation:
         h, H, gradient = self.target_fields(x, time_offset)
         variance = _model_error(h, gradient, near_field_length, field_error)
         own = self.own(x)
-        if self._n_angles:
+        if self.n_angles:
             h, H = turned_fields(h, H, np.ascontiguousarray(own[..., :3]))
         if not self._error_time:
             return h, H, variance

@@ -79,7 +79,7 @@ class PassSamples:
         order = np.argsort(-energy.max(axis=0), kind='stable')
         compared = order[measured[order] > len(frames) // 2][:MOST_SENSORS]
         n = len(compared)
-        C = np.array([known_covariance(f)[compared] for f in frames]).reshape(-1, 3, 3)
+        C = np.array([known_covariance(f.covariance)[compared] for f in frames]).reshape(-1, 3, 3)
         t = np.array([(f.stamp_ns - stamp_ns) / NS + f.time_offset[compared] for f in frames])
         y = field[:, compared].reshape(-1, 3)
         there = ~np.isnan(y)

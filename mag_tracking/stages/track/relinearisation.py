@@ -20,20 +20,15 @@ Source: Bell 1994, The iterated Kalman smoother as a Gauss-Newton method.
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from collections.abc import Callable
 
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank
-from mag_tracking.inference.smoother import Step, smoothed_states
 from mag_tracking.records import FieldFrame
-from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.bank_filter import Along, BankFilter
 from mag_tracking.units import NS
-
-_Smoothed: TypeAlias = tuple[FloatArray, FloatArray]
-"""States (n_rows, n_x) at a frame, and the standard deviation (n_rows,) of their position."""
 
 LEADING = np.log(1e3)
 """A hypothesis leads that is not lighter than the heaviest by more than this."""
@@ -138,19 +133,18 @@ class Relinearisation:
             return Counter()
         leading = self._leading(bank)
         rows = _rows(anchor, bank)[leading]
-        paths = [path[rows] for path in self._paths]
-        for _ in range(PASSES):
-            last, log_likelihood, new = self._pass(bank_filter, anchor.rows(rows), paths)
-            settled = _settled(paths, new)
-            paths = [path + STEP * (x - path) for path, (x, _) in zip(paths, new, strict=True)]
-        finite = np.isfinite(log_likelihood) & np.isfinite(paths).all(axis=(0, 2))
-        for path, improved in zip(self._paths, paths, strict=True):
+        last = anchor.rows(rows)
+        paths = np.stack([path[rows] for path in self._paths], axis=1)
+        along = self._run_along(bank_filter, last, paths, PASSES)
+        finite = np.isfinite(along.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
+        for path, improved in zip(self._paths, np.swapaxes(paths, 0, 1), strict=True):
             path[rows[finite]] = improved[finite]
         filtered = np.sum(self._log_likelihoods[int(self._updated):], axis=0)[rows]
-        gain = np.subtract(log_likelihood, filtered, where=finite,
+        gain = np.subtract(along.log_likelihood, filtered, where=finite,
                            out=np.full(len(rows), -np.inf))
         self._gain = dict(zip(anchor.origin[rows[finite]].tolist(), gain[finite].tolist(),
                               strict=True))
+        settled = along.unsettled <= SETTLED
         taken = finite & settled & ((gain >= 0.0) | ~bank_filter.are_long(bank.kind[leading]))
         _take(bank, leading[taken], last.x[taken], last.P[taken])
         rest = finite & ~taken
@@ -178,41 +172,20 @@ class Relinearisation:
         self._keep(anchor, np.isin(anchor.origin, bank.origin))
         n = next(k for k, f in enumerate(self._frames) if now - f.stamp_ns <= self._window_ns
                  and n_frames - k <= MOST_FRAMES // 2)
-        for k in range(n + 1):
-            self._forward(bank_filter, anchor, k, self._paths)
+        self._run_along(bank_filter, anchor, np.stack(self._paths[:n + 1], axis=1), 1)
         self._frames, self._intervals = self._frames[n:], self._intervals[n:]
         self._paths, self._log_likelihoods = self._paths[n:], self._log_likelihoods[n:]
         self._updated = True
 
-    def _forward(self, bank_filter: BankFilter, bank: FilterBank, k: int,
-                 paths: Sequence[FloatArray]) -> tuple[FloatArray | float, Step]:
-        """`bank` through frame k, linearised at `paths`; its log-likelihood and the `Step`."""
-        F, decay = None, None
-        if k:
-            F, decay = bank_filter.predict(bank, self._intervals[k], paths[k - 1])
-        if k == 0 and self._updated:
-            return 0.0, Step(bank.x.copy(), bank.P.copy(), None)
-        log_likelihood, gains = bank_filter.update_with_gains(
-            bank, self._frames[k], self._intervals[k], paths[k])
-        return log_likelihood, Step(bank.x.copy(), bank.P.copy(), gains, F, decay)
-
-    def _pass(self, bank_filter: BankFilter, bank: FilterBank, paths: Sequence[FloatArray]
-              ) -> tuple[Step, FloatArray, list[_Smoothed]]:
-        """Last `Step`, log-likelihood (n_rows,) and smoothed states of rows of the anchor.
-
-        `bank` are copies of those rows; they are moved.
+    def _run_along(self, bank_filter: BankFilter, bank: FilterBank, paths: FloatArray,
+                   passes: int) -> Along:
+        """Run rows of the anchor, `bank`, along their `paths` (n_rows, n, n_x) through the first n
+        of the frames; both are moved.
         """
-        log_likelihood: FloatArray = np.zeros(len(bank))
-        steps: list[Step] = []
-        for k in range(len(paths)):
-            of_frame, step = self._forward(bank_filter, bank, k, paths)
-            log_likelihood = log_likelihood + of_frame
-            steps.append(step)
-        variance = np.array([np.einsum('pii->p', step.P[:, :3, :3]) for step in steps])
-        # A path that runs over a sensor may end in rounding errors: it is of no use.
-        log_likelihood[~(variance >= 0.0).all(axis=0)] = -np.inf
-        std = np.sqrt(np.where(variance >= 0.0, variance, np.nan))
-        return steps[-1], log_likelihood, list(zip(smoothed_states(steps), std, strict=True))
+        n = paths.shape[1]
+        return bank_filter.run_along(
+            bank, self._frames[:n], self._intervals[:n], paths, passes=passes, step=STEP,
+            first_is_updated=self._updated)
 
 
 def _take(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray) -> None:
@@ -241,10 +214,3 @@ def _widen(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,
 def _rows(anchor: FilterBank, bank: FilterBank) -> IntArray:
     """Rows of the `anchor` that the hypotheses of `bank` started from."""
     return np.searchsorted(anchor.origin, bank.origin)
-
-
-def _settled(paths: Sequence[FloatArray], new: Sequence[_Smoothed]) -> BoolArray:
-    """(n_rows,) whether the `new` [(states, deviation of the position)] are where `paths` are."""
-    settled: BoolArray = np.all([np.linalg.norm((x - path)[:, :3], axis=1) <= SETTLED * std
-                                 for path, (x, std) in zip(paths, new, strict=True)], axis=0)
-    return settled

@@ -124,7 +124,7 @@ class RunningTrack:
             self._evidence.doubt(doubts.SENSORS_AT_ONE_PLACE)
         self._begin_ns = frame.stamp_ns
         if recent:
-            self._filter.predict(self.bank, (recent[0].stamp_ns - frame.stamp_ns) / NS)
+            self._filter.move(self.bank, (recent[0].stamp_ns - frame.stamp_ns) / NS)
         self._whole.begin(self.bank, self._filter)
         if self._settings.relinearise_window_s:
             self._relinearisation.begin(self.bank)
@@ -157,10 +157,8 @@ class RunningTrack:
         s, bank = self._settings, self.bank
         if not self._target.starts_anywhere:
             self._evidence.watch(frame)
-        if dt > 0.0:
-            self._filter.predict(bank, dt)
-        predicted = bank.x.copy()
-        log_likelihood, frame, rejected = self._rejection.update(self._filter, bank, frame, dt)
+        predicted, log_likelihood, frame, rejected = self._rejection.advance(
+            self._filter, bank, frame, dt)
         self.counts.update(rejected)
         # Where no majority is left the track may as well be wrong.
         if rejected and np.count_nonzero(frame.n_samples) <= len(rejected):

@@ -36,9 +36,9 @@ class SensorRejection:
         """No track is running."""
         self._left_out: tuple[int, ...] = ()
 
-    def update(self, bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame, dt: float
-               ) -> 'tuple[FloatArray, FieldFrame, Counter[str]]':
-        """Measurement update of the `FilterBank` in place, without sensors that contradict.
+    def advance(self, bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame, dt: float
+                ) -> 'tuple[FloatArray, FloatArray, FieldFrame, Counter[str]]':
+        """Move the `FilterBank` through a frame, without sensors that contradict.
 
         Parameters
         ----------
@@ -49,28 +49,30 @@ class SensorRejection:
 
         Returns
         -------
+        predicted : (n_hyp, n_x)
+            The states before the update.
         log_likelihood : (n_hyp,)
         frame : FieldFrame
             What was used: sensors that were left out are missing.
         counts : Counter
             {what: number}, of the sensors that were left out.
         """
-        # The update replaces these arrays, it does not write into them.
+        # The filter replaces these arrays, it does not write into them.
         before = bank.x, bank.P
-        log_likelihood = bank_filter.update(bank, frame, dt)
+        predicted, log_likelihood = bank_filter.advance(bank, frame, dt)
         if self._fits(bank_filter, bank, frame, log_likelihood):
             self._left_out = ()
-            return log_likelihood, frame, Counter()
+            return predicted, log_likelihood, frame, Counter()
         whole = bank.x, bank.P, bank.nis, log_likelihood
         for left_out in self._suspicions(bank_filter, bank, before, frame, dt):
             log_likelihood, less = self._without(bank_filter, bank, before, frame, dt, left_out)
             if self._fits(bank_filter, bank, less, log_likelihood):
                 self._left_out = left_out
-                return log_likelihood, less, Counter(
+                return predicted, log_likelihood, less, Counter(
                     {f'frames that {self._names[j]} contradicted': 1 for j in left_out})
         self._left_out = ()
         bank.x, bank.P, bank.nis, log_likelihood = whole
-        return log_likelihood, frame, Counter()
+        return predicted, log_likelihood, frame, Counter()
 
     def _suspicions(self, bank_filter: BankFilter, bank: FilterBank, before: _States,
                     frame: FieldFrame, dt: float) -> Iterator[tuple[int, ...]]:
@@ -97,14 +99,14 @@ class SensorRejection:
     @staticmethod
     def _without(bank_filter: BankFilter, bank: FilterBank, before: _States, frame: FieldFrame,
                  dt: float, left_out: tuple[int, ...]) -> tuple[FloatArray, FieldFrame]:
-        """The update once more, as if some sensors were missing: (log-likelihood, frame)."""
+        """The frame once more, as if some sensors were missing: (log-likelihood, frame)."""
         missing = np.isin(np.arange(len(frame.field)), left_out)
         less = replace(frame, field=np.where(missing[:, None], np.nan, frame.field),
                        covariance=np.where(missing[:, None, None], np.nan, frame.covariance),
                        n_samples=np.where(missing, 0, frame.n_samples),
                        time_offset=np.where(missing, 0.0, frame.time_offset))
         bank.x, bank.P = before
-        return bank_filter.update(bank, less, dt), less
+        return bank_filter.advance(bank, less, dt)[1], less
 
     @staticmethod
     def _fits(bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame,

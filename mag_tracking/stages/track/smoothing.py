@@ -16,7 +16,6 @@ import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank
-from mag_tracking.inference.smoother import Step, smoothed_covariances, smoothed_states
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.units import NS
@@ -59,35 +58,12 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
     left_out : int
         Frames that the hypothesis contradicted; it coasted through them.
     """
-    x_lin: Sequence[FloatArray | None] = [None] * len(frames)
-    for _ in range(relinearisations + 1):
-        steps, left_out = _filtered(bank_filter, bank.alone(0), frames, intervals, updated, x_lin)
-        states = smoothed_states(steps)
-        x_lin = states
-    return [(x[0], P[0]) for x, P in zip(states, smoothed_covariances(steps),
-                                         strict=True)], left_out
-
-
-def _filtered(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[FieldFrame],
-              intervals: Sequence[float], updated: bool, x_lin: Sequence[FloatArray | None]
-              ) -> tuple[list[Step], int]:
-    """Steps of the filter, linearised at `x_lin` (None = at the predictions), and how many frames
-    were left out.
-    """
-    steps: list[Step] = []
-    left_out = 0
-    for k, (frame, dt) in enumerate(zip(frames, intervals, strict=True)):
-        F, decay = bank_filter.predict(bank, dt, x_lin[k - 1]) if k else (None, None)
-        gains = None
-        if k or not updated:
-            before = bank.x.copy(), bank.P.copy()
-            _, gains = bank_filter.update_with_gains(bank, frame, dt, x_lin[k])
-            if bank_filter.is_strange(bank, 0, frame):
-                bank.x, bank.P = before
-                gains = None
-                left_out += 1
-        steps.append(Step(bank.x.copy(), bank.P.copy(), gains, F, decay))
-    return steps, left_out
+    paths = np.full((1, len(frames), bank.x.shape[1]), np.nan)
+    along = bank_filter.run_along(
+        bank.alone(0), frames, intervals, paths, passes=relinearisations + 1, step=1.0,
+        first_is_updated=updated, leaves_out=True, wants_covariances=True)
+    left_out = np.count_nonzero(~along.used[0, int(updated):])
+    return list(zip(paths[0], along.covariances[0], strict=True)), int(left_out)
 
 
 @dataclass

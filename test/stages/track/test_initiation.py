@@ -192,7 +192,7 @@ def test_backgrounds_wander_between_frames_and_angles_do_not(road_network):
     stage.feed(FieldFrame(0, np.full((2, 3), 1e-7), C, np.full(2, 8), np.zeros(2), True, 1e3, 6))
     before = np.diagonal(stage.bank.P, axis1=1, axis2=2).copy()
     model = target_of(settings, road_network).model
-    BankFilter(road_network, model, settings).predict(stage.bank, dt)
+    BankFilter(road_network, model, settings).move(stage.bank, dt)
     after, n_t = np.diagonal(stage.bank.P, axis1=1, axis2=2), len(model.state_names)
     own, grown = (a[:, n_t:n_t + 12].reshape(-1, 2, 6) for a in (before, after))
     np.testing.assert_array_equal(grown[:, :, :3], own[:, :, :3])

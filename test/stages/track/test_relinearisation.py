@@ -9,9 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from bench import matched
-from mag_tracking.inference import kalman
 from mag_tracking.inference.filter_bank import FilterBank
-from mag_tracking.inference.time_update import predict
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.simulation.scenario import Path, random_vehicle
@@ -22,7 +20,9 @@ from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.relinearisation import Relinearisation
 from mag_tracking.stages.track.smoothing import smoothed_track
 from mag_tracking.units import NS
+from support import plain_kalman
 from support.networks import line_network
+from support.plain_filter import StepByStep
 from support.samples import one, simulate
 
 N_T, PERIOD = 3, 0.08
@@ -30,7 +30,7 @@ LATE = 22.5 * PERIOD
 """[s] Done so often it is done once in 24 frames, with the last of them."""
 
 
-class LinearFilter:
+class LinearFilter(StepByStep):
     """As a `BankFilter`, of a target whose field is linear in its states; one sensor."""
 
     linear = np.inf
@@ -50,21 +50,20 @@ class LinearFilter:
 
     def predict(self, bank, dt, x_lin=None):
         F = np.array([[1.0, dt, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-        predict(bank.x, bank.P, bank.x[:, :N_T] @ F.T, F, np.diag([0.1, 0.2, 0.3]) * dt,
-                       0.1 * dt)
+        plain_kalman.predict(bank.x, bank.P, bank.x[:, :N_T] @ F.T, F,
+                             np.diag([0.1, 0.2, 0.3]) * dt, 0.1 * dt)
         return F, np.ones(3)
 
-    def update_with_gains(self, bank, frame, dt, x_lin=None):
+    def update(self, bank, frame, dt, x_lin=None):
         better = 0.0 if x_lin is None else self.better
         self.lengths[-1] += x_lin is not None
         self.origins |= set() if x_lin is None else set(bank.origin)
         x_lin = bank.x.copy() if x_lin is None else x_lin
         H = np.tile(np.random.default_rng(frame.stamp_ns).standard_normal((3, N_T)),
                     (len(bank), 1, 1, 1))
-        gains = kalman.Gains.of(H, 0, bank.x.shape[1])
-        log_likelihood, bank.nis = kalman.update(
+        log_likelihood, bank.nis, gains = plain_kalman.update(
             bank.x, bank.P, frame.field, np.einsum('pjai,pi->pja', H, x_lin[:, :N_T]), H,
-            frame.covariance, np.zeros((len(bank), 1)), x_lin, gains=gains)
+            frame.covariance, np.zeros((len(bank), 1)), x_lin)
         return log_likelihood + better, gains
 
 
@@ -84,7 +83,7 @@ def followed_beside_plain(filter_, anew, n=40, anew_at=(), prune=True):
             if k:
                 filter_.predict(b, dt)
             predicted = b.x.copy()
-            log_likelihood, _ = filter_.update_with_gains(b, frame, dt)
+            log_likelihood, _ = filter_.update(b, frame, dt)
             b.reweight(log_likelihood)
         if k in anew_at:
             anew.begin_anew()
@@ -134,8 +133,8 @@ class LessSure(LinearFilter):
 
     more = 0.0
 
-    def update_with_gains(self, bank, frame, dt, x_lin=None):
-        found = super().update_with_gains(bank, frame, dt, x_lin)
+    def update(self, bank, frame, dt, x_lin=None):
+        found = super().update(bank, frame, dt, x_lin)
         if x_lin is not None:
             bank.P[:, 0, 0] += self.more
             bank.x[:, 1] += 0.1
@@ -152,7 +151,7 @@ def less_sure(more, linear):
     frame = FieldFrame(0, rng.standard_normal((1, 3)), np.eye(3)[None], np.full(1, 8), np.zeros(1),
                        True)
     predicted = bank.x.copy()
-    log_likelihood, _ = filter_.update_with_gains(bank, frame, 0.0)
+    log_likelihood, _ = filter_.update(bank, frame, 0.0)
     relinearisation.add(bank, predicted, log_likelihood, frame, 0.0)
     return filter_, bank, relinearisation
 
@@ -259,10 +258,8 @@ def followed(filter_, bank, y, anew):
     """`bank` through the measurements `y` (n, n_sensors, 3); (tried, in vain) with the last one."""
     anew.begin(bank)
     for k, frame in enumerate(frames_of(y)):
-        if k:
-            filter_.predict(bank, PERIOD)
-        predicted, dt = bank.x.copy(), PERIOD if k else 0.0
-        anew.add(bank, predicted, filter_.update(bank, frame, dt), frame, dt)
+        dt = PERIOD if k else 0.0
+        anew.add(bank, *filter_.advance(bank, frame, dt), frame, dt)
         counts = anew.improve(filter_, bank)
     return counts[relinearise.TRIED], counts[relinearise.IN_VAIN]
 

@@ -35,9 +35,9 @@ class Counted(BankFilter):
 
     n = 0
 
-    def update(self, *args, **kwargs):
+    def advance(self, *args, **kwargs):
         self.n += 1
-        return super().update(*args, **kwargs)
+        return super().advance(*args, **kwargs)
 
 
 def situation(n=6, seed=0, spread=0.3, n_hyp=5):
@@ -92,7 +92,7 @@ def same_frame(a, b):
 def plain(bank_filter, bank, frame):
     """(log-likelihood, state) of the update alone."""
     bank = copy.deepcopy(bank)
-    return bank_filter.update(bank, frame, DT), state(bank)
+    return bank_filter.advance(bank, frame, DT)[1], state(bank)
 
 
 @pytest.mark.parametrize('n', [1, 2, 3, 6, 12])
@@ -100,7 +100,7 @@ def test_where_all_fits_nothing_changes_and_one_update_is_all_it_costs(n):
     bank_filter, bank, frame, names = situation(n)
     expected, after = plain(bank_filter, bank, frame)
     bank_filter.n = 0
-    got, used, counts = SensorRejection(names).update(bank_filter, bank, frame, DT)
+    _, got, used, counts = SensorRejection(names).advance(bank_filter, bank, frame, DT)
     assert bank_filter.n == 1
     assert used is frame and not counts
     assert got.tobytes() == expected.tobytes() and state(bank) == after
@@ -113,13 +113,14 @@ def test_one_that_is_wrong_is_left_out_as_if_it_were_missing(n, seed):
     for j in range(n) if n > 2 else ():
         mine = copy.deepcopy(bank)
         expected, after = plain(bank_filter, bank, without(frame, j))
-        got, used, counts = SensorRejection(names).update(bank_filter, mine, spoilt(frame, j), DT)
+        _, got, used, counts = SensorRejection(names).advance(
+            bank_filter, mine, spoilt(frame, j), DT)
         assert counts == {f'frames that {names[j]} contradicted': 1}
         assert got.tobytes() == expected.tobytes() and state(mine) == after
         assert same_frame(used, without(frame, j))
     if n == 2:
         # Which of two it is cannot be told, but one is left out and the other used.
-        _, used, counts = SensorRejection(names).update(bank_filter, bank, spoilt(frame, 1), DT)
+        *_, used, counts = SensorRejection(names).advance(bank_filter, bank, spoilt(frame, 1), DT)
         assert sum(counts.values()) == 1 and np.count_nonzero(used.n_samples) == 1
 
 
@@ -128,7 +129,7 @@ def test_the_frame_and_the_prior_are_not_written_into():
     wrong = spoilt(frame, 2)
     kept = copy.deepcopy(wrong)
     before, prior = (bank.x, bank.P), (bank.x.copy(), bank.P.copy())
-    SensorRejection(names).update(bank_filter, bank, wrong, DT)
+    SensorRejection(names).advance(bank_filter, bank, wrong, DT)
     assert same_frame(wrong, kept)
     assert all(np.array_equal(a, b) for a, b in zip(before, prior, strict=True))
 
@@ -142,7 +143,7 @@ def test_never_more_than_one_in_eight_but_always_one(n, most):
         near = np.argsort(np.linalg.norm(frame.field, axis=1))[-wrong:].tolist()
         bad = spoilt(frame, *near)
         whole, after = plain(bank_filter, bank, bad)
-        got, used, counts = SensorRejection(names).update(bank_filter, bank, bad, DT)
+        _, got, used, counts = SensorRejection(names).advance(bank_filter, bank, bad, DT)
         if wrong == most and n > 2:
             assert set(counts) == {f'frames that {names[j]} contradicted' for j in near}
             assert same_frame(used, without(frame, *near))
@@ -156,7 +157,7 @@ def test_all_wrong_is_a_track_that_is_lost():
     bank_filter, bank, frame, names = situation()
     lost = dataclasses.replace(frame, field=-3.0 * frame.field[::-1])
     expected, after = plain(bank_filter, bank, lost)
-    got, used, counts = SensorRejection(names).update(bank_filter, bank, lost, DT)
+    _, got, used, counts = SensorRejection(names).advance(bank_filter, bank, lost, DT)
     assert used is lost and not counts
     assert got.tobytes() == expected.tobytes() and state(bank) == after
     best = int(np.argmax(bank.log_w + got))
@@ -168,7 +169,7 @@ def test_one_sensor_alone_is_never_left_out():
         bank_filter, bank, frame, names = situation(n)
         alone = spoilt(without(frame, *range(1, n)), 0)
         bank_filter.n = 0
-        _, used, counts = SensorRejection(names).update(bank_filter, bank, alone, DT)
+        *_, used, counts = SensorRejection(names).advance(bank_filter, bank, alone, DT)
         assert used is alone and not counts and bank_filter.n == 1
 
 
@@ -176,7 +177,7 @@ def test_of_how_many_counts_who_is_there():
     bank_filter, bank, frame, names = situation(16, n_hyp=2)
     near = np.argsort(np.linalg.norm(frame.field, axis=1)).tolist()
     bad = spoilt(without(frame, near[0]), *near[-2:])
-    _, used, counts = SensorRejection(names).update(bank_filter, bank, bad, DT)
+    *_, used, counts = SensorRejection(names).advance(bank_filter, bank, bad, DT)
     assert used is bad and not counts
 
 
@@ -185,7 +186,7 @@ def test_an_axis_that_is_missing_leaves_a_sensor_there():
     field = frame.field.copy()
     field[:, 2] = np.nan
     bad = spoilt(dataclasses.replace(frame, field=field), 3)
-    _, used, counts = SensorRejection(names).update(bank_filter, bank, bad, DT)
+    *_, used, counts = SensorRejection(names).advance(bank_filter, bank, bad, DT)
     assert counts == {f'frames that {names[3]} contradicted': 1}
     assert np.isnan(used.field[3]).all() and not np.isnan(used.field[2, :2]).any()
 
@@ -193,7 +194,7 @@ def test_an_axis_that_is_missing_leaves_a_sensor_there():
 def cost(bank_filter, found, bank, frame):
     """Updates that it takes, and who is left out; the bank stays as it is."""
     bank_filter.n = 0
-    _, used, _ = found.update(bank_filter, copy.deepcopy(bank), frame, DT)
+    *_, used, _ = found.advance(bank_filter, copy.deepcopy(bank), frame, DT)
     return bank_filter.n, np.flatnonzero(used.n_samples == 0).tolist()
 
 
@@ -249,9 +250,10 @@ class Ruled(BankFilter):
         super().__init__(*args)
         self._row = row
 
-    def update(self, bank, frame, dt, x_lin=None):
-        out = super().update(bank, frame, dt, x_lin)
-        return out if np.isnan(frame.field[self._row]).all() else np.full(len(out), -np.inf)
+    def advance(self, bank, frame, dt):
+        predicted, out = super().advance(bank, frame, dt)
+        there = ~np.isnan(frame.field[self._row]).all()
+        return predicted, np.full(len(out), -np.inf) if there else out
 
 
 def test_a_sensor_that_rules_out_every_hypothesis_is_left_out():
@@ -259,7 +261,7 @@ def test_a_sensor_that_rules_out_every_hypothesis_is_left_out():
     network = line_network(6, spacing=4.0, tilt=0.2)
     ruled = Ruled(3, network, vehicle_model(SETTINGS.vehicle, network), SETTINGS)
     _, after = plain(plain_filter, bank, without(frame, 3))
-    got, _, counts = SensorRejection(names).update(ruled, bank, frame, DT)
+    _, got, _, counts = SensorRejection(names).advance(ruled, bank, frame, DT)
     assert counts == {f'frames that {names[3]} contradicted': 1}
     assert np.isfinite(got).all() and state(bank) == after
 

@@ -7,17 +7,16 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from mag_tracking.inference import kalman
-from mag_tracking.inference.smoother import Step, smoothed_covariances, smoothed_states
-from mag_tracking.inference.time_update import predict
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.simulation.scenario import Path, point_body, random_vehicle
 from mag_tracking.stages.track import smoothing as smooth_module
 from mag_tracking.stages.track.manager import TrackManager
+from support import plain_kalman
 from support.bundled import POINT
 from support.marks import studied
 from support.networks import line_network
+from support.plain_smoother import Step, smoothed_covariances, smoothed_states
 from support.samples import one, simulate
 
 
@@ -51,7 +50,7 @@ N_X = N_T + (N_OWN + 3) * N_SENSORS
 
 
 def whole_derivative(H):
-    """(3 n_sensors, n_x) of what `kalman.update` takes sensor by sensor."""
+    """(3 n_sensors, n_x) of what `plain_kalman.update` takes sensor by sensor."""
     out = np.zeros((3 * N_SENSORS, N_X))
     for j in range(N_SENSORS):
         rows = slice(3 * j, 3 * j + 3)
@@ -80,16 +79,15 @@ def steps_of(F, decay, Q, C, H, y, x, P, without=()):
     steps, n_hyp = [], len(x)
     for k in range(len(y)):
         if k:
-            predict(x, P, x[:, :N_T] @ F.T, F, np.diag(Q[:N_T]), Q[N_T:], decay)
+            plain_kalman.predict(x, P, x[:, :N_T] @ F.T, F, np.diag(Q[:N_T]), Q[N_T:], decay)
         gains = None
         if k not in without:
             H_k = np.ascontiguousarray(np.tile(H[k], (n_hyp, 1, 1, 1)))
-            gains = kalman.Gains.of(H_k, N_OWN, N_X)
             own = x[:, N_T:N_X - 3 * N_SENSORS].reshape(n_hyp, N_SENSORS, N_OWN)
             h = np.einsum('jai,pi->pja', H[k][:, :, :N_T], x[:, :N_T]) + np.einsum(
                 'jai,pji->pja', H[k][:, :, N_T:], own)
-            kalman.update(x, P, y[k], h, H_k, C, np.zeros((n_hyp, N_SENSORS)), n_own=N_OWN,
-                          gains=gains)
+            *_, gains = plain_kalman.update(
+                x, P, y[k], h, H_k, C, np.zeros((n_hyp, N_SENSORS)), n_own=N_OWN)
         steps.append(Step(x.copy(), P.copy(), gains, *((F, decay) if k else ())))
     return steps
 

@@ -1,0 +1,294 @@
+// What of the tracker is compiled, as a Python module. `bank_filter.py` is its only user.
+
+#include <pybind11/numpy.h>
+#include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
+
+#include <array>
+#include <string>
+
+#include "../../physics/targets.hpp"
+#include "filter.hpp"
+
+namespace py = pybind11;
+
+// One function for each generation of processors; the loader takes the best that there is.
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12
+#define FOR_PROCESSORS \
+    __attribute__((target_clones("default", "arch=x86-64-v3", "arch=x86-64-v4")))
+#else
+#define FOR_PROCESSORS
+#endif
+
+namespace mag_tracking {
+namespace {
+
+using Array = py::array_t<double, py::array::c_style>;
+
+struct Bank {
+    int n_hyp;
+    const double *near_field_length, *x, *P;
+};
+
+struct Advanced {
+    double *x, *P, *predicted, *log_likelihood, *nis;
+};
+
+struct Along {
+    bool first_is_updated;
+    double strange;
+    int passes;
+    double step;
+    double *paths, *log_likelihood, *unsettled, *covariances;
+    bool* used;
+};
+
+template <class Target>
+INLINE void advance_all(const Target& target, const Sensors& sensors, const Sizes& n,
+                        const Frame& frame, bool moves, int iterations, const Bank& bank,
+                        const Advanced& out) {
+    Filter<Target> filter(target, sensors, n);
+    Path scratch(1, n);
+    Numbers x(n.wide), P(n.square()), x_lin(n.wide), prior(iterations > 1 ? n.square() : 0);
+    const int n_x = n.n_x;
+    const std::size_t square = std::size_t(n_x) * n_x;
+    for (int p = 0; p < bank.n_hyp; ++p) {
+        const double* before = bank.x + p * n_x;
+        double* predicted = out.predicted + p * n_x;
+        std::copy(before, before + n_x, x.data());
+        to_wide(bank.P + p * square, n, P.data());
+        if (moves) filter.predict(frame, before, x.data(), P.data(), scratch.motion[0]);
+        std::copy(x.data(), x.data() + n_x, predicted);
+        for (int k = 0; k < iterations; ++k) {
+            std::copy(x.data(), x.data() + n_x, x_lin.data());
+            if (k) {
+                std::copy(predicted, predicted + n_x, x.data());
+                std::memcpy(P.data(), prior.data(), n.square() * sizeof(double));
+            } else if (iterations > 1) {
+                std::memcpy(prior.data(), P.data(), n.square() * sizeof(double));
+            }
+            out.log_likelihood[p] = filter.update(
+                frame, x_lin.data(), bank.near_field_length[p], x.data(), P.data(),
+                scratch.gains(0, n), out.nis + p * n.n_sensors);
+        }
+        std::copy(x.data(), x.data() + n_x, out.x + p * n_x);
+        from_wide(P.data(), n, out.P + p * square);
+    }
+}
+
+template <class Target>
+INLINE void run_along_all(const Target& target, const Sensors& sensors, const Sizes& n,
+                          const Frames& frames, const Bank& bank, const Along& along,
+                          const Advanced& out) {
+    Filter<Target> filter(target, sensors, n);
+    Path path(frames.n, n);
+    const int n_x = n.n_x;
+    const std::size_t square = std::size_t(n_x) * n_x;
+    Numbers x(n.wide), P(n.square());
+    std::vector<double> smoothed(frames.n * n_x), std(frames.n);
+    for (int p = 0; p < bank.n_hyp; ++p) {
+        double* at = along.paths + std::size_t(p) * frames.n * n_x;
+        for (int pass = 0; pass < along.passes; ++pass) {
+            std::copy(bank.x + p * n_x, bank.x + (p + 1) * n_x, x.data());
+            to_wide(bank.P + p * square, n, P.data());
+            along.log_likelihood[p] = filter.run(
+                frames, along.first_is_updated, along.strange, bank.near_field_length[p], at,
+                x.data(), P.data(), path);
+            if (!filter.smooth(frames, path, smoothed.data(), std.data()))
+                along.log_likelihood[p] = -std::numeric_limits<double>::infinity();
+            double unsettled = 0.0;
+            for (int k = 0; k < frames.n; ++k) {
+                double square = 0.0;
+                for (int i = 0; i < 3; ++i) {
+                    const double moved = smoothed[k * n_x + i] - at[k * n_x + i];
+                    square += moved * moved;
+                }
+                const double moved = std::sqrt(square) / std[k];
+                if (!(moved <= unsettled)) unsettled = moved;  // Also where it is NaN.
+            }
+            along.unsettled[p] = unsettled;
+            for (int i = 0; i < frames.n * n_x; ++i)
+                at[i] = std::isnan(at[i]) ? smoothed[i]
+                                          : at[i] + along.step * (smoothed[i] - at[i]);
+        }
+        std::copy(x.data(), x.data() + n_x, out.x + p * n_x);
+        from_wide(P.data(), n, out.P + p * square);
+        if (along.covariances != nullptr)
+            filter.smooth_covariances(frames, path, along.covariances + p * frames.n * square);
+        if (along.used != nullptr)
+            std::copy(path.used.begin(), path.used.end(), along.used + p * frames.n);
+    }
+}
+
+// The compiler does not make templates for several processors, so each target has functions.
+FOR_PROCESSORS void advance(const RowVehicle& target, const Sensors& sensors, const Sizes& n,
+                            const Frame& frame, bool moves, int iterations, const Bank& bank,
+                            const Advanced& out) {
+    advance_all(target, sensors, n, frame, moves, iterations, bank, out);
+}
+
+FOR_PROCESSORS void advance(const Magnet& target, const Sensors& sensors, const Sizes& n,
+                            const Frame& frame, bool moves, int iterations, const Bank& bank,
+                            const Advanced& out) {
+    advance_all(target, sensors, n, frame, moves, iterations, bank, out);
+}
+
+FOR_PROCESSORS void run_along(const RowVehicle& target, const Sensors& sensors, const Sizes& n,
+                              const Frames& frames, const Bank& bank, const Along& along,
+                              const Advanced& out) {
+    run_along_all(target, sensors, n, frames, bank, along, out);
+}
+
+FOR_PROCESSORS void run_along(const Magnet& target, const Sensors& sensors, const Sizes& n,
+                              const Frames& frames, const Bank& bank, const Along& along,
+                              const Advanced& out) {
+    run_along_all(target, sensors, n, frames, bank, along, out);
+}
+
+// The data of an array of the shape `shape`; raises ValueError for another one.
+template <class T, int flags>
+T* data_of(py::array_t<T, flags>& array, const char* name, std::vector<py::ssize_t> shape) {
+    if (std::vector<py::ssize_t>(array.shape(), array.shape() + array.ndim()) != shape)
+        throw py::value_error(std::string(name) + ": not of the shape that the others ask for");
+    return array.size() ? array.mutable_data() : nullptr;
+}
+
+template <class Target>
+class CompiledFilter {
+  public:
+    CompiledFilter(const Target& target, Array positions, Array R_sw, int n_angles, int n_errors)
+        : target_(target), n_sensors_(int(positions.shape(0))), n_angles_(n_angles),
+          n_errors_(n_errors) {
+        const auto n = positions.shape(0);
+        const double* p = data_of(positions, "positions", {n, 3});
+        const double* r = data_of(R_sw, "R_sw", {n, 3, 3});
+        positions_.assign(p, p + 3 * n);
+        R_sw_.assign(r, r + 9 * n);
+        if (target.n() > MOST_TARGET_STATES)
+            throw py::value_error("more states of a target than " +
+                                  std::to_string(MOST_TARGET_STATES));
+    }
+
+    void advance(Array field, Array covariance, Array offset, double dt, Array decay,
+                 Array variance, bool moves, int iterations, double field_error,
+                 Array near_field_length, Array x, Array P, Array new_x, Array new_P,
+                 Array predicted, Array log_likelihood, Array nis) const {
+        const Sizes n = sizes();
+        const py::ssize_t n_hyp = near_field_length.shape(0), n_s = n_sensors_, n_x = n.n_x;
+        const Frame frame{data_of(field, "field", {n_s, 3}),
+                          data_of(covariance, "covariance", {n_s, 3, 3}),
+                          data_of(offset, "offset", {n_s}),
+                          dt,
+                          data_of(decay, "decay", {n_x - n.n_t}),
+                          data_of(variance, "variance", {n_x - n.n_t})};
+        const Bank bank{int(n_hyp), near_field_length.data(), data_of(x, "x", {n_hyp, n_x}),
+                        data_of(P, "P", {n_hyp, n_x, n_x})};
+        const Advanced out{data_of(new_x, "new_x", {n_hyp, n_x}),
+                           data_of(new_P, "new_P", {n_hyp, n_x, n_x}),
+                           data_of(predicted, "predicted", {n_hyp, n_x}),
+                           data_of(log_likelihood, "log_likelihood", {n_hyp}),
+                           data_of(nis, "nis", {n_hyp, n_s})};
+        check_noise(frame.covariance, n_s);
+        py::gil_scoped_release release;
+        mag_tracking::advance(target_, sensors(field_error), n, frame, moves, iterations, bank,
+                              out);
+    }
+
+    void run_along(Array field, Array covariance, Array offset, Array dt, Array decay,
+                   Array variance, bool first_is_updated, double strange, int passes, double step,
+                   double field_error, Array near_field_length, Array x, Array P, Array new_x,
+                   Array new_P, Array paths, Array log_likelihood, Array unsettled,
+                   Array covariances, py::array_t<bool, py::array::c_style> used) const {
+        const Sizes n = sizes();
+        const py::ssize_t n_hyp = near_field_length.shape(0), n_s = n_sensors_, n_x = n.n_x;
+        const py::ssize_t n_frames = dt.shape(0);
+        const Frames frames{int(n_frames),
+                            data_of(field, "field", {n_frames, n_s, 3}),
+                            data_of(covariance, "covariance", {n_frames, n_s, 3, 3}),
+                            data_of(offset, "offset", {n_frames, n_s}),
+                            dt.data(),
+                            data_of(decay, "decay", {n_frames, n_x - n.n_t}),
+                            data_of(variance, "variance", {n_frames, n_x - n.n_t})};
+        const Bank bank{int(n_hyp), near_field_length.data(), data_of(x, "x", {n_hyp, n_x}),
+                        data_of(P, "P", {n_hyp, n_x, n_x})};
+        const Advanced out{data_of(new_x, "new_x", {n_hyp, n_x}),
+                           data_of(new_P, "new_P", {n_hyp, n_x, n_x}), nullptr, nullptr, nullptr};
+        const bool wants_covariances = covariances.size() > 0;
+        const Along along{
+            first_is_updated, strange, passes, step,
+            data_of(paths, "paths", {n_hyp, n_frames, n_x}),
+            data_of(log_likelihood, "log_likelihood", {n_hyp}),
+            data_of(unsettled, "unsettled", {n_hyp}),
+            wants_covariances ? data_of(covariances, "covariances", {n_hyp, n_frames, n_x, n_x})
+                              : nullptr,
+            data_of(used, "used", {n_hyp, n_frames})};
+        check_noise(frames.covariance, n_frames * n_s);
+        py::gil_scoped_release release;
+        mag_tracking::run_along(target_, sensors(field_error), n, frames, bank, along, out);
+    }
+
+  private:
+    Sizes sizes() const { return {target_.n(), n_angles_ + n_errors_, n_sensors_}; }
+
+    Sensors sensors(double field_error) const {
+        return {n_angles_, n_errors_, positions_.data(), R_sw_.data(), field_error};
+    }
+
+    // Raises ValueError where one of n covariances C (3, 3) is not positive definite.
+    static void check_noise(const double* C, py::ssize_t n) {
+        for (; n; --n, C += 9) {
+            const double l10 = C[3] / C[0], l20 = C[6] / C[0], e1 = C[4] - l10 * C[3];
+            const double e21 = C[7] - l20 * C[3];
+            if (!(C[0] > 0.0 && e1 > 0.0 && C[8] - l20 * C[6] - e21 / e1 * e21 > 0.0))
+                throw py::value_error("the noise of a sensor is not positive definite");
+        }
+    }
+
+    Target target_;
+    int n_sensors_, n_angles_, n_errors_;
+    std::vector<double> positions_, R_sw_;
+};
+
+// Taken as it is: what is written into a copy would be lost.
+#define IN(name) py::arg(#name).noconvert()
+
+// What both filters have in common, `name`d for Python.
+template <class Target, class... Numbers>
+void add_filter(py::module_& module, const char* name, Target (*target)(Numbers...)) {
+    using Class = CompiledFilter<Target>;
+    py::class_<Class>(module, name)
+        .def(py::init([target](Array positions, Array R_sw, int n_angles, int n_errors,
+                               Numbers... numbers) {
+            return Class(target(numbers...), positions, R_sw, n_angles, n_errors);
+        }))
+        .def("advance", &Class::advance, IN(field), IN(covariance), IN(offset), IN(dt), IN(decay),
+             IN(variance), IN(moves), IN(iterations), IN(field_error), IN(near_field_length),
+             IN(x), IN(P), IN(new_x), IN(new_P), IN(predicted), IN(log_likelihood), IN(nis))
+        .def("run_along", &Class::run_along, IN(field), IN(covariance), IN(offset), IN(dt),
+             IN(decay), IN(variance), IN(first_is_updated), IN(strange), IN(passes), IN(step),
+             IN(field_error), IN(near_field_length), IN(x), IN(P), IN(new_x), IN(new_P),
+             IN(paths), IN(log_likelihood), IN(unsettled), IN(covariances), IN(used));
+}
+
+using Vector = std::array<double, 3>;
+
+RowVehicle row_vehicle(int n_states, int n_dipoles, Vector density, Vector induction,
+                       double moment_drift, double difference_drift, double turn_acceleration,
+                       double turn_time, double fastest_turn) {
+    return {n_states, n_dipoles, {density[0], density[1], density[2]},
+            {induction[0], induction[1], induction[2]}, moment_drift, difference_drift,
+            turn_acceleration, turn_time, fastest_turn};
+}
+
+Magnet magnet(Vector density, double angular_density) {
+    return {{density[0], density[1], density[2]}, angular_density};
+}
+
+}  // namespace
+}  // namespace mag_tracking
+
+PYBIND11_MODULE(core, module) {
+    module.doc() = "The filters of the tracker, compiled; see bank_filter.py.";
+    mag_tracking::add_filter(module, "RowVehicleFilter", mag_tracking::row_vehicle);
+    mag_tracking::add_filter(module, "MagnetFilter", mag_tracking::magnet);
+}

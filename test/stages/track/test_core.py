@@ -1,0 +1,172 @@
+"""The compiled filters against the same in NumPy, step by step, and what they refuse."""
+
+import numpy as np
+import pytest
+
+from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.pipeline import settings_for
+from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.target import target_of
+from support.bundled import POINT
+from support.networks import line_network
+from support.plain_filter import PlainFilter
+
+SIGMA = 4e-9
+CASES = {
+    'row that turns': ('vehicle', {}),
+    'row, straight on': ('vehicle', {'track.vehicle.turn_acceleration': 0.0}),
+    'point': ('vehicle', POINT),
+    'backgrounds alone': ('vehicle', {'track.mounting_std_deg': 0.0,
+                                      'track.model_error_time_s': 0.0}),
+    'mounting': ('vehicle', {'track.model_error_time_s': 0.0}),
+    'model errors': ('vehicle', {'track.mounting_std_deg': 0.0}),
+    'magnet': ('magnet', {}),
+    'magnet, linearised three times': ('magnet', {'track.iterations': 3}),
+    'magnet, with all states': ('magnet', {'track.mounting_std_deg': 3.0,
+                                           'track.model_error_time_s': 0.3})}
+
+
+def case(name, n_sensors=3, n_hyp=6, seed=0):
+    """(compiled filter, plain filter, bank near the sensors, frames, intervals)."""
+    target, changes = CASES[name]
+    settings = settings_for(target, changes).track
+    network, rng = line_network(n_sensors), np.random.default_rng(seed)
+    model = target_of(settings, network).model
+    filters = BankFilter(network, model, settings), PlainFilter(network, model, settings)
+    names = model.state_names
+    size = np.array([{'x': 3.0, 'y': 1.0, 'z': 0.3, 'v': 2.0, 'm': 50.0, 'D': 2.0, 'L': 1.0,
+                      'w': 0.3}[n[0]] for n in names])
+    if target == 'magnet':
+        size[6:9], size[9:] = 0.5, 2.0
+    P = np.array([(root := rng.standard_normal((len(names), len(names)))) @ root.T
+                  for _ in range(n_hyp)]) * 0.02 + 0.2 * np.eye(len(names))
+    P = 0.5 * (P + np.swapaxes(P, 1, 2))
+    bank = FilterBank.of_targets(
+        size * rng.standard_normal((n_hyp, len(names))) + np.eye(len(names))[2] * 2.0,
+        P * np.outer(size, size), np.zeros(n_hyp, dtype=int), n_sensors, 1e-8,
+        filters[0].observation.own_covariance,
+        rng.integers(0, len(np.atleast_1d(settings.vehicle.lengths)), n_hyp)
+        if target == 'vehicle' else None)
+    if settings.vehicle.turn_acceleration and target == 'vehicle':
+        # Half of them go straight on.
+        bank.x[::2, len(names) - 1] = 0.0
+        bank.P[::2, len(names) - 1] = bank.P[::2, :, len(names) - 1] = 0.0
+    frames = []
+    for k in range(7):
+        field = 3e-8 * rng.standard_normal((n_sensors, 3))
+        A = rng.standard_normal((n_sensors, 3, 3))
+        C = SIGMA**2 * (A @ np.swapaxes(A, 1, 2) + np.eye(3))
+        if k == 2:
+            field[0, 1], C[0, 1], C[0, :, 1] = np.nan, np.nan, np.nan
+        if k == 4:
+            field[1], C[1] = np.nan, np.nan
+        offset = 0.03 * rng.standard_normal(n_sensors) if k in (3, 5) else np.zeros(n_sensors)
+        frames.append(FieldFrame(k, field, C, np.full(n_sensors, 4), offset, True))
+    return *filters, bank, frames, [0.0, 0.1, 0.07, 0.1, 0.2, 0.1, 0.1]
+
+
+def assert_same(a, b, tolerance=1e-9):
+    """States and covariances of two banks, in standard deviations of the second one."""
+    std = np.sqrt(np.einsum('pii->pi', b.P))
+    std = np.where(std > 0.0, std, 1.0)
+    assert np.abs((a.x - b.x) / std).max() <= tolerance
+    assert np.abs((a.P - b.P) / std[:, :, None] / std[:, None]).max() <= tolerance
+
+
+@pytest.mark.parametrize('name', CASES)
+def test_a_bank_moves_through_frames_as_step_by_step(name):
+    """With axes and a sensor missing, and sensors that are read at other times."""
+    compiled, plain, bank, frames, intervals = case(name)
+    other = bank.copy()
+    for filter_, b in ((compiled, bank), (plain, other)):
+        filter_.move(b, -0.3)
+    assert_same(bank, other)
+    for frame, dt in zip(frames, intervals, strict=True):
+        other.x, other.P = bank.x.copy(), bank.P.copy()
+        predicted, log_likelihood = compiled.advance(bank, frame, dt)
+        expected, of_plain = plain.advance(other, frame, dt)
+        assert_same(bank, other)
+        np.testing.assert_allclose(bank.nis, other.nis, rtol=1e-9)
+        np.testing.assert_allclose(predicted, expected, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(log_likelihood, of_plain, rtol=1e-9, atol=1e-9)
+        np.testing.assert_array_equal(bank.P, np.swapaxes(bank.P, 1, 2))
+
+
+@pytest.mark.parametrize('first_is_updated', [False, True])
+@pytest.mark.parametrize('passes, step, leaves_out, at_predictions', [
+    (1, 0.5, False, False), (3, 0.5, False, False), (2, 1.0, True, True)])
+@pytest.mark.parametrize('name', CASES)
+def test_paths_are_filtered_and_smoothed_as_step_by_step(
+        name, passes, step, leaves_out, at_predictions, first_is_updated):
+    compiled, plain, bank, frames, intervals = case(name, n_hyp=1 if leaves_out else 4)
+    paths = np.repeat(bank.x[:, None], len(frames), axis=1)
+    if at_predictions:
+        paths[:] = np.nan
+    other, other_paths = bank.copy(), paths.copy()
+    with np.errstate(invalid='ignore'):
+        got, expected = (filter_.run_along(
+            b, frames, intervals, p, passes=passes, step=step, first_is_updated=first_is_updated,
+            leaves_out=leaves_out, wants_covariances=True)
+            for filter_, b, p in ((compiled, bank, paths), (plain, other, other_paths)))
+    std = np.sqrt(np.einsum('pkii->pki', expected.covariances))
+    std = np.where(std > 0.0, std, 1.0)
+    assert_same(bank, other, 1e-6)
+    assert np.abs((paths - other_paths) / std).max() <= 1e-6
+    difference = (got.covariances - expected.covariances) / std[..., :, None] / std[..., None, :]
+    assert np.abs(difference).max() <= 1e-6
+    np.testing.assert_array_equal(got.used, expected.used)
+    np.testing.assert_allclose(got.log_likelihood, expected.log_likelihood, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(got.unsettled, expected.unsettled, rtol=1e-5, atol=1e-6)
+
+
+def test_a_hypothesis_on_a_sensor_is_ruled_out_and_the_others_are_not():
+    compiled, _, bank, frames, _ = case('point')
+    alone = bank.alone(0)
+    bank.x[1, :3] = compiled.observation.positions[1]
+    _, log_likelihood = compiled.advance(bank, frames[0], 0.0)
+    _, of_one = compiled.advance(alone, frames[0], 0.0)
+    assert log_likelihood[1] == -np.inf and np.isfinite(np.delete(log_likelihood, 1)).all()
+    np.testing.assert_array_equal(alone.P[0], bank.P[0])
+    assert log_likelihood[0] == of_one[0]
+    assert np.isfinite(bank.x).all() and np.isfinite(bank.P).all()
+
+
+@pytest.mark.parametrize('bad', [
+    np.zeros((3, 3)), np.diag([-1.0, 1.0, 1.0]),
+    [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+    [[1.0, 0.0, 2.0], [0.0, 1.0, 0.0], [2.0, 0.0, 1.0]]])
+def test_a_noise_that_is_not_positive_definite_is_refused(bad):
+    compiled, _, bank, frames, intervals = case('point')
+    x, paths = bank.x.copy(), np.repeat(bank.x[:, None], 7, axis=1)
+    frames[0].covariance[1] = SIGMA**2 * np.array(bad)
+    with pytest.raises(ValueError, match='not positive definite'):
+        compiled.advance(bank, frames[0], 0.0)
+    with pytest.raises(ValueError, match='not positive definite'):
+        compiled.run_along(bank, frames, intervals, paths, passes=1, step=0.5,
+                           first_is_updated=False)
+    np.testing.assert_array_equal(bank.x, x)
+
+
+@pytest.mark.parametrize('spoil, error', [
+    (lambda b: setattr(b, 'x', b.x[:, :-1].copy()), 'x: not of the shape'),
+    (lambda b: setattr(b, 'P', b.P[:, :-1].copy()), 'P: not of the shape'),
+    (lambda b: setattr(b, 'P', b.P[:-1].copy()), 'P: not of the shape')])
+def test_arrays_of_other_sizes_are_refused(spoil, error):
+    compiled, _, bank, frames, _ = case('point')
+    spoil(bank)
+    with pytest.raises(ValueError, match=error):
+        compiled.advance(bank, frames[0], 0.0)
+
+
+def test_no_array_is_copied_that_would_be_written_to():
+    """A copy would take what is written, and nobody would see it."""
+    compiled, _, bank, frames, intervals = case('point')
+    paths = np.repeat(bank.x[:, None], 7, axis=1)
+    for bad in (np.asfortranarray(paths), paths.astype(np.float32)):
+        with pytest.raises(TypeError, match='incompatible'):
+            compiled.run_along(bank, frames, intervals, bad, passes=1, step=0.5,
+                               first_is_updated=False)
+    bank.P.flags.writeable = False
+    with pytest.raises(ValueError, match='read-only|not writeable'):
+        compiled.advance(bank, frames[0], 0.0)

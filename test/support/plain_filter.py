@@ -1,0 +1,104 @@
+"""The filters of a bank step by step in NumPy, as an oracle for the compiled ones."""
+
+import numpy as np
+
+from mag_tracking.stages.track.bank_filter import Along, BankFilter
+from support import plain_kalman
+from support.plain_smoother import Step, smoothed_covariances, smoothed_states
+
+
+class StepByStep:
+    """Runs a bank along paths, by its `predict` and `update`; see `BankFilter.run_along`."""
+
+    def run_along(self, bank, frames, intervals, paths, *, passes, step, first_is_updated,
+                  leaves_out=False, wants_covariances=False):
+        start = bank.copy()
+        for _ in range(passes):
+            bank.x, bank.P = start.x.copy(), start.P.copy()
+            steps, log_likelihood, used = self.filtered(
+                bank, frames, intervals, paths, first_is_updated, leaves_out)
+            smoothed = np.stack(smoothed_states(steps), axis=1)
+            variance = np.array([np.einsum('pii->p', step.P[:, :3, :3]) for step in steps]).T
+            log_likelihood[~(variance >= 0.0).all(axis=1)] = -np.inf
+            std = np.sqrt(np.where(variance >= 0.0, variance, np.nan))
+            away = np.linalg.norm((smoothed - paths)[:, :, :3], axis=2) / std
+            new = np.isnan(paths)
+            paths += step * (smoothed - paths)
+            paths[new] = smoothed[new]
+        covariances = np.stack(smoothed_covariances(steps), axis=1) if wants_covariances \
+            else np.empty(0)
+        return Along(log_likelihood, away.max(axis=1), used, covariances)
+
+    def filtered(self, bank, frames, intervals, paths, first_is_updated, leaves_out):
+        """(`Step`s, log-likelihood, which frames were used) of one way through the frames."""
+        steps, total = [], np.zeros(len(bank))
+        used = np.ones((len(bank), len(frames)), dtype=bool)
+        for k, (frame, dt) in enumerate(zip(frames, intervals, strict=True)):
+            before, at = (None if np.isnan(path).any() else path
+                          for path in (paths[:, k - 1], paths[:, k]))
+            F, decay = self.predict(bank, dt, before) if k else (None, None)
+            gains = None
+            if k == 0 and first_is_updated:
+                used[:, k] = False
+            else:
+                prior = bank.x.copy(), bank.P.copy()
+                of_frame, gains = self.update(bank, frame, dt, at)
+                if leaves_out and self.is_strange(bank, 0, frame):
+                    bank.x, bank.P = prior
+                    gains, used[:, k] = None, False
+                else:
+                    total = total + of_frame
+            steps.append(Step(bank.x.copy(), bank.P.copy(), gains, F, decay))
+        return steps, total, used
+
+
+class PlainFilter(StepByStep, BankFilter):
+    """A `BankFilter` whose steps are taken one after the other, each for the whole bank."""
+
+    def __init__(self, network, model, settings):
+        super().__init__(network, model, settings)
+        self.model = model
+
+    def predict(self, bank, dt, x_lin=None):
+        """Time update in place, linearised at `x_lin` or the bank; (Jacobian, decay)."""
+        n_t = self.observation.n_target
+        at = (bank.x if x_lin is None else x_lin)[:, :n_t]
+        x_target, F, Q = self.model.propagate(at, dt, bank.P[:, :n_t, :n_t])
+        if x_lin is not None:
+            x_target = x_target + (F @ (bank.x[:, :n_t] - at)[:, :, None])[:, :, 0]
+        decay, variance = (v[0] for v in self.observation.drift(
+            np.array([dt]), self._settings.background_drift))
+        plain_kalman.predict(bank.x, bank.P, x_target, F, Q if dt > 0.0 else 0.0 * Q, variance,
+                             decay)
+        return F, decay
+
+    def update(self, bank, frame, dt, x_lin=None, iterations=1):
+        """Measurement update in place; (log-likelihood, `plain_kalman.Gains`)."""
+        covariance = np.where(np.isnan(frame.covariance), np.eye(3), frame.covariance)
+        x_prior, P_prior = bank.x, bank.P
+        x_lin = bank.x.copy() if x_lin is None else x_lin
+        for _ in range(iterations):
+            bank.x, bank.P = x_prior.copy(), P_prior.copy()
+            h, H, inflation = self.observation.fields(
+                x_lin, self.time_offset(frame, dt), self._near_field_lengths[bank.kind],
+                self._settings.field_error)
+            lost = ~(np.isfinite(h).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3)))
+            h[lost], H[lost], inflation[lost] = 0.0, 0.0, 0.0
+            log_likelihood, bank.nis, gains = plain_kalman.update(
+                bank.x, bank.P, frame.field, h, H, covariance, inflation, x_lin,
+                self.observation.n_own)
+            log_likelihood[lost] = -np.inf
+            x_lin = bank.x.copy()
+        bank.nis[:, np.isnan(frame.field).all(axis=1)] = np.nan
+        return log_likelihood, gains
+
+    def move(self, bank, dt):
+        bank.x, bank.P = bank.x.copy(), bank.P.copy()
+        self.predict(bank, dt)
+
+    def advance(self, bank, frame, dt):
+        bank.x, bank.P = bank.x.copy(), bank.P.copy()
+        if dt > 0.0:
+            self.predict(bank, dt)
+        predicted = bank.x.copy()
+        return predicted, self.update(bank, frame, dt, iterations=self._settings.iterations)[0]
