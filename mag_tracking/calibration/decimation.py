@@ -7,7 +7,6 @@ Source: T10 section 6.3 (low-pass filter before 100 Hz becomes 12.5 Hz); the fil
 from collections import deque
 
 import numpy as np
-from scipy.signal import firwin, kaiserord
 
 from mag_tracking.arrays import FloatArray
 
@@ -24,6 +23,9 @@ RATE_SAMPLES = 32
 
 def lowpass(factor: int) -> FloatArray:
     """(n,) taps, n odd, that sum to one: what `factor` times fewer samples need."""
+    # It takes a third of a second to import, and most sensors need no filter.
+    from scipy.signal import firwin, kaiserord
+
     width = 2.0 * (1.0 - PASS_SHARE) / factor
     n, beta = kaiserord(ATTENUATION_DB, width)
     taps: FloatArray = firwin(n | 1, 1.0 / factor, window=('kaiser', beta))

@@ -52,8 +52,7 @@ def add(commands: Commands) -> None:
     settings = '\n'.join(f'  {p.name}: {p.value}  # {p.doc}{f" [{p.unit}]" if p.unit else ""}'
                          for p in flatten(GeometrySettings()))
     p = add_command(commands, 'board-geometry', _geometry,
-                    'Find where the sensors of a board are, from poses of a magnet.',
-                    _GEOMETRY.replace('{settings}', settings), aliases=('geometry',))
+                    _GEOMETRY.replace('{settings}', settings))
     p.add_argument('table', type=Path, metavar='TABLE', help='readings and poses (.csv)')
     stated = p.add_mutually_exclusive_group(required=True)
     stated.add_argument('--sensors', type=Path, metavar='FILE',

@@ -13,13 +13,12 @@ from mag_tracking.cli.options import (
     add_command,
     add_recorded_network,
     add_report,
-    add_settings,
     check_outputs,
     check_report,
     now,
     recorded_network,
-    settings_of,
 )
+from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.network.file import write_network
 from mag_tracking.recording.reader import Recording
@@ -45,8 +44,7 @@ example:
 
 def add(commands: Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'calibrate', _calibrate,
-                    'Find how sensors are turned and their clocks are off.', _CALIBRATE)
+    p = add_command(commands, 'calibrate', _calibrate, _CALIBRATE)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
     add_recorded_network(p)

@@ -14,11 +14,10 @@ from mag_tracking.cli.options import (
     add_command,
     add_recorded_network,
     add_report,
-    add_settings,
     check_report,
     recorded_network,
-    settings_of,
 )
+from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.recording.reader import Recording
@@ -39,7 +38,7 @@ examples:
 
 def add(commands: Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'doctor', _doctor, 'Say what is wrong with the sensors.', _DOCTOR)
+    p = add_command(commands, 'doctor', _doctor, _DOCTOR)
     p.add_argument('recording', nargs='?', type=Path, metavar='RECORDING',
                    help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
     p.add_argument('--live', type=float, metavar='SECONDS',

@@ -9,14 +9,8 @@ import numpy as np
 from tqdm import tqdm
 
 from mag_tracking.apps.events import EventsResult, find_events
-from mag_tracking.cli.options import (
-    Commands,
-    add_command,
-    add_recorded_network,
-    add_settings,
-    recorded_network,
-    settings_of,
-)
+from mag_tracking.cli.options import Commands, add_command, add_recorded_network, recorded_network
+from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import PassEvent
 from mag_tracking.interrupts import noted_signals
@@ -40,8 +34,7 @@ examples:
 
 def add(commands: Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'events', _events, 'Count and describe passes, sensor by sensor.',
-                    _EVENTS)
+    p = add_command(commands, 'events', _events, _EVENTS)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
     add_recorded_network(p)

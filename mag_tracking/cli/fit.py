@@ -61,7 +61,7 @@ POOR = 2.0
 
 def add(commands: Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'fit', _fit, 'Fit whole passes at constant velocity, offline.', _FIT)
+    p = add_command(commands, 'fit', _fit, _FIT)
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
                    help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
     add_recorded_network(p)

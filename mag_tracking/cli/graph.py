@@ -17,17 +17,15 @@ and more. Names are relative to the namespace given by --ros-args -r __ns:=/NAME
 
 def add(commands: Commands) -> None:
     """Register the commands."""
-    add_command(commands, 'topics', _topics, 'List the topics of the graph (needs ROS 2).', _NOTE)
-    p = add_command(commands, 'echo', _echo, 'Print the messages of a topic (needs ROS 2).', _NOTE)
+    add_command(commands, 'topics', _topics, _NOTE)
+    p = add_command(commands, 'echo', _echo, _NOTE)
     p.add_argument('topic', metavar='TOPIC')
     p.add_argument('--count', type=int, metavar='N', help='end after so many messages')
-    p = add_command(commands, 'param', _param, 'Show or set parameters of a node (needs ROS 2).',
-                    _NOTE)
+    p = add_command(commands, 'param', _param, _NOTE)
     p.add_argument('node', metavar='NODE')
     p.add_argument('name', nargs='?', metavar='NAME', help='all of them if left out')
     p.add_argument('value', nargs='?', metavar='VALUE', help='set it to this (YAML)')
-    p = add_command(commands, 'lifecycle', _lifecycle,
-                    'Show or change the state of a lifecycle node (needs ROS 2).', _NOTE)
+    p = add_command(commands, 'lifecycle', _lifecycle, _NOTE)
     p.add_argument('node', metavar='NODE')
     p.add_argument('transition', nargs='?', metavar='TRANSITION',
                    help='configure, activate, deactivate, cleanup or shutdown')

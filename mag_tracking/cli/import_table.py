@@ -28,7 +28,7 @@ and the background per sensor [uT] become a recording and a network.yaml.
 
 def add(commands: Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'import', _import, 'Turn a table into a recording.', _IMPORT)
+    p = add_command(commands, 'import', _import, _IMPORT)
     p.add_argument('table', type=Path, metavar='TABLE.csv')
     p.add_argument('--columns', nargs='+', metavar='WHAT=COLUMN',
                    help='time=, and sensor= x= y= z=, or NAME.x= NAME.y= NAME.z= of each sensor')

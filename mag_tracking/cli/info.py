@@ -11,7 +11,7 @@ from mag_tracking.recording.reader import Recording
 
 def add(commands: Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'info', _info, 'Tell what is in a recording.')
+    p = add_command(commands, 'info', _info)
     p.add_argument('recording', type=Path, metavar='RECORDING')
     add_network(p, False, 'compare with its topics')
 

@@ -41,8 +41,7 @@ LARGE = 1e-3
 
 def add(commands: Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'listen', _listen, 'Print what the devices of a drivers file say.',
-                    _LISTEN)
+    p = add_command(commands, 'listen', _listen, _LISTEN)
     p.add_argument('drivers', type=Path, metavar='DRIVERS', help='which devices there are')
     add_network(p, False, 'compare with its sensors')
     p.add_argument('--seconds', type=float, default=math.inf, metavar='N',

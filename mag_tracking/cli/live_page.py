@@ -11,14 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from mag_tracking.apps.view import view
-from mag_tracking.cli.options import (
-    Commands,
-    add_command,
-    add_recorded_network,
-    add_settings,
-    recorded_network,
-    settings_of,
-)
+from mag_tracking.cli.options import Commands, add_command, add_recorded_network, recorded_network
+from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.recording.reader import Recording
@@ -48,15 +42,14 @@ examples:
 
 def add(commands: Commands) -> None:
     """Register the commands."""
-    p = add_command(commands, 'view', _view, 'Show a recording on a live page.', _VIEW)
+    p = add_command(commands, 'view', _view, _VIEW)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
     add_recorded_network(p)
     add_settings(p)
     p.add_argument('--rate', type=float, default=1.0, help='playback speed (default: 1)')
     add_page(p)
-    p = add_command(commands, 'watch', _watch, 'Show running nodes on a live page (needs ROS 2).',
-                    _WATCH)
+    p = add_command(commands, 'watch', _watch, _WATCH)
     add_page(p)
     p.add_argument('--until-eof', action='store_true', help=argparse.SUPPRESS)
 

@@ -1,18 +1,17 @@
-"""What several commands share: options and settings."""
+"""Options that several commands share; `tracking_options` has those of the tracker."""
 
 import argparse
 import dataclasses
 import datetime
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeAlias
 
+from mag_tracking.cli.commands import COMMANDS
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
 from mag_tracking.network.topics import checked_namespace
-from mag_tracking.pipeline import TARGET_DEFAULTS, Settings, settings_for
-from mag_tracking.settings import read_parameter_file
 
 # Quoted: at run time the class takes no type arguments.
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
@@ -22,8 +21,9 @@ FIGURES = ('.png', '.pdf', '.svg')
 
 
 def add_command(commands: Commands, name: str, run: Callable[[argparse.Namespace], int],
-                short: str, text: str = '', aliases: Sequence[str] = ()) -> argparse.ArgumentParser:
+                text: str = '') -> argparse.ArgumentParser:
     """A command's parser; `run` takes the parsed arguments and returns the exit status."""
+    _, short, aliases = COMMANDS[name]
     parser = commands.add_parser(name, aliases=aliases, help=short, description=short, epilog=text,
                                  formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.set_defaults(run_command=run, ros_arguments=[])
@@ -51,13 +51,6 @@ def recorded_network(args: argparse.Namespace) -> SensorNetwork:
     return dataclasses.replace(network, namespace=checked_namespace(args.namespace))
 
 
-def add_settings(parser: argparse.ArgumentParser) -> None:
-    """--target and --params."""
-    parser.add_argument('--params', type=Path, metavar='FILE', help='settings that differ')
-    parser.add_argument('--target', choices=list(TARGET_DEFAULTS), default='vehicle',
-                        help='what moves (default: vehicle)')
-
-
 def distinct_names(paths: Iterable[Path]) -> list[str]:
     """Stems of recordings; raises OutputError where results would overwrite each other."""
     names = [path.resolve().stem for path in paths]
@@ -66,12 +59,6 @@ def distinct_names(paths: Iterable[Path]) -> list[str]:
         raise OutputError(f'two recordings are named {twice[0]}: their results would overwrite '
                           'each other; take them one by one')
     return names
-
-
-def settings_of(args: argparse.Namespace) -> Settings:
-    """Settings of the command line's target and parameter file."""
-    changes = read_parameter_file(args.params) if args.params else {}
-    return settings_for(args.target, changes)
 
 
 def now() -> str:

@@ -42,8 +42,7 @@ examples:
 
 def add(commands: Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'plan', _plan, 'What a network of sensors will be able to tell.',
-                    _PLAN)
+    p = add_command(commands, 'plan', _plan, _PLAN)
     add_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder for the results')
     p.add_argument('--target', metavar='KIND', help='a kind of vehicle of the settings: small, '

@@ -28,7 +28,7 @@ examples:
 
 def add(commands: Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'record', _record, 'Record the sensors (needs ROS 2).', _RECORD)
+    p = add_command(commands, 'record', _record, _RECORD)
     add_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR',
                    help='folder for the recording')

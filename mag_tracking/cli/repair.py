@@ -18,8 +18,7 @@ example:
 
 def add(commands: Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'repair', _repair, 'Make a recording whole that was cut off.',
-                    _REPAIR)
+    p = add_command(commands, 'repair', _repair, _REPAIR)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='an .mcap file or a rosbag2 folder')
 

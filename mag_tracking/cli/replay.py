@@ -15,11 +15,10 @@ from mag_tracking.cli.options import (
     Commands,
     add_command,
     add_recorded_network,
-    add_settings,
     distinct_names,
     recorded_network,
-    settings_of,
 )
+from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
@@ -74,7 +73,7 @@ TRUTH_METRICS = {
 
 def add(commands: Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'replay', _replay, 'Track what is in recordings, offline.', _REPLAY)
+    p = add_command(commands, 'replay', _replay, _REPLAY)
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
                    help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
     add_recorded_network(p)

@@ -5,13 +5,8 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from mag_tracking.cli.live_page import add_page, page_process
-from mag_tracking.cli.options import (
-    Commands,
-    add_command,
-    add_network,
-    add_settings,
-    settings_of,
-)
+from mag_tracking.cli.options import Commands, add_command, add_network
+from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.network.file import read_network
 from mag_tracking.recording.reader import Recording
@@ -33,7 +28,7 @@ examples:
 
 def add(commands: Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'run', _run, 'Run the nodes in one process (needs ROS 2).', _RUN)
+    p = add_command(commands, 'run', _run, _RUN)
     add_network(p)
     add_settings(p)
     p.add_argument('--recording', type=Path, metavar='RECORDING', help='replay this, too')

@@ -35,8 +35,7 @@ example:
 
 def add(commands: Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'tumble', _tumble,
-                    'Find the hard and soft iron of sensors that were turned about.', _TUMBLE)
+    p = add_command(commands, 'tumble', _tumble, _TUMBLE)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
     add_recorded_network(p)
