@@ -1,6 +1,5 @@
 """Many sensor_msgs/MagneticField messages at once, from their CDR bytes."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,18 +29,17 @@ class FieldArrays(NamedTuple):
     """(n, 3, 3) [T^2] as in `Readings`."""
 
 
-def magnetic_fields(messages: Sequence[bytes]) -> FieldArrays:
-    """Read the CDR bytes of sensor_msgs/MagneticField.
+def magnetic_fields(content: bytes, begins: IntArray, ends: IntArray) -> FieldArrays:
+    """Read the CDR bytes of sensor_msgs/MagneticField, which begin and end there in `content`.
 
     Messages of fields have a fixed size but for the name of their frame, so that they can be read
     as arrays, twenty times faster than one by one.
     """
-    n = len(messages)
-    sizes = np.fromiter(map(len, messages), np.int64, n)
-    begins = np.cumsum(sizes) - sizes
-    # The room behind is for the heads of messages that are cut off.
-    data = np.frombuffer(b''.join([*messages, bytes(_HEAD.itemsize)]), np.uint8)
-    head = data[begins[:, None] + np.arange(_HEAD.itemsize)].view(_HEAD)[:, 0]
+    n, sizes = len(begins), ends - begins
+    data = np.frombuffer(content, np.uint8)
+    # Of a message that is cut off the head may lie beyond the end.
+    head = data.take(begins[:, None] + np.arange(_HEAD.itemsize), mode='clip').view(_HEAD)[:, 0] \
+        if len(data) else np.zeros(n, dtype=_HEAD)
     length = head['length'].astype(np.int64)
     # Numbers of eight bytes are aligned from behind the encapsulation on.
     first = (_HEAD.itemsize - 4 + length + 7) // 8 * 8 + 4

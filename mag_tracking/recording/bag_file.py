@@ -16,6 +16,7 @@ from mag_tracking.messages.definitions import DEFINITIONS
 from mag_tracking.messages.types import encoder, schema_of
 from mag_tracking.recording.damage import DAMAGE
 from mag_tracking.recording.interruptible import Progress
+from mag_tracking.recording.message_block import MessageBlock
 from mag_tracking.recording.raw_message import RawMessage
 
 if TYPE_CHECKING:
@@ -77,8 +78,8 @@ class BagFile:
         return Sqlite3Reader(self._path)
 
     def blocks(self, start_ns: int | None = None,
-               progress: Progress | None = None) -> Iterator[list[RawMessage]]:
-        """Iterate over the `RawMessage`s, CDR, in order of log time, a block after the other.
+               progress: Progress | None = None) -> Iterator[MessageBlock]:
+        """Iterate over the messages, CDR, in order of log time, a block after the other.
 
         Parameters
         ----------
@@ -90,9 +91,10 @@ class BagFile:
         size, total, done, n = self._path.stat().st_size, self.message_counts.total(), 0, 0
         raw = self._raw(start_ns)
         while found := list(islice(raw, BLOCK)):
-            yield [RawMessage(topic, kind, log_time_ns,
-                              cdr_of_ros1(data, kind) if self._is_ros1 else data, schema_of(kind))
-                   for topic, kind, log_time_ns, data in found]
+            yield MessageBlock.of_messages([
+                RawMessage(topic, kind, log_time_ns,
+                           cdr_of_ros1(data, kind) if self._is_ros1 else data, schema_of(kind))
+                for topic, kind, log_time_ns, data in found])
             n += len(found)
             if progress and (here := size * n // total) > done:
                 progress(here - done)

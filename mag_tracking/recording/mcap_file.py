@@ -2,14 +2,13 @@
 
 import os
 import struct
-from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator
 from io import BytesIO
-from operator import attrgetter
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
@@ -17,16 +16,17 @@ from mcap.records import Channel, Chunk, ChunkIndex, Message, Schema
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.self_described import SCHEMAS, cdr_of, type_of
-from mag_tracking.messages.types import schema_of
+from mag_tracking.messages.self_described import type_of
 from mag_tracking.recording.damage import DAMAGE
 from mag_tracking.recording.interruptible import Progress
-from mag_tracking.recording.raw_message import RawMessage
+from mag_tracking.recording.message_block import ChannelKind, MessageBlock
 
 _RECORD = struct.Struct('<BQ')
 """What a record is, and its length."""
 _MESSAGE = struct.Struct('<HIQQ')
 """Channel, sequence number, log time and time of publication, before the data of a message."""
+_DEFINITIONS: dict[int, type[Schema] | type[Channel]] = {
+    Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
 
 
 class McapFile:
@@ -75,9 +75,9 @@ class McapFile:
         return sorted(summary.chunk_indexes, key=lambda c: c.message_start_time)
 
     def blocks(self, start_ns: int | None = None,
-               progress: Progress | None = None) -> Iterator[list[RawMessage]]:
-        """Iterate over the `RawMessage`s, chunk by chunk; in order of log time where the file has
-        an index.
+               progress: Progress | None = None) -> Iterator[MessageBlock]:
+        """Iterate over the messages, chunk by chunk; in order of log time where the file has an
+        index.
 
         Parameters
         ----------
@@ -93,11 +93,10 @@ class McapFile:
                 yield from self._from_stream(stream, progress)
 
     def _from_index(self, stream: BinaryIO, index: list[ChunkIndex], start_ns: int | None,
-                    progress: Progress | None) -> Iterator[list[RawMessage]]:
+                    progress: Progress | None) -> Iterator[MessageBlock]:
         """Messages of an intact file, in order of log time across chunks."""
-        waiting: list[RawMessage] = []
-        schemas: dict[int, Schema] = {}
-        channels: dict[int, Channel] = {}
+        channels = _Channels()
+        waiting = MessageBlock.of_messages([])
         for k, entry in enumerate(index):
             if start_ns is not None and entry.message_end_time < start_ns:
                 continue
@@ -107,16 +106,16 @@ class McapFile:
                                                emit_chunks=True).records))
                 if not isinstance(chunk, Chunk):
                     raise ValueError('no chunk where the index says')
-                waiting = sorted(waiting + self._of_chunk(chunk, schemas, channels), key=_log_time)
+                waiting = waiting.merged(channels.block_of(chunk))
             except DAMAGE as error:
                 self._lose_chunk(entry, error)
             if progress:
                 progress(entry.chunk_length)
             n = len(waiting)
             if k + 1 < len(index):
-                n = bisect_left(waiting, index[k + 1].message_start_time, key=_log_time)
-            yield waiting[:n]
-            waiting = waiting[n:]
+                n = int(np.searchsorted(waiting.log_time_ns, index[k + 1].message_start_time))
+            yield waiting.part(slice(n))
+            waiting = waiting.part(slice(n, None))
         yield waiting
 
     def _lose_chunk(self, entry: ChunkIndex, error: Exception) -> None:
@@ -127,25 +126,22 @@ class McapFile:
                     f'({type(error).__name__})'] += 1
 
     def _from_stream(self, stream: BinaryIO, progress: Progress | None
-                     ) -> Iterator[list[RawMessage]]:
+                     ) -> Iterator[MessageBlock]:
         """Messages in the order of the file, up to where it breaks off."""
-        schemas: dict[int, Schema] = {}
-        channels: dict[int, Channel] = {}
+        channels = _Channels()
         done = 0
         try:
             for record in StreamReader(stream, emit_chunks=True).records:
                 if isinstance(record, Chunk):
                     try:
-                        yield self._of_chunk(record, schemas, channels)
+                        yield channels.block_of(record)
                     except DAMAGE as error:
                         self._losses[f'a damaged chunk ({type(error).__name__})'] += 1
-                elif isinstance(record, Schema):
-                    schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    channels[record.id] = record
-                elif isinstance(record, Message) and _has_schema(record, channels):
-                    yield [_raw(record.channel_id, record.log_time, record.data, schemas,
-                                channels)]
+                elif isinstance(record, Schema | Channel):
+                    channels.add(record)
+                elif isinstance(record, Message) and channels.has_schema(record.channel_id):
+                    yield MessageBlock.of_rows(record.data, channels.kinds, [
+                        (record.channel_id, record.log_time, 0, len(record.data))])
                 if progress:
                     here = stream.tell()
                     progress(here - done)
@@ -155,12 +151,36 @@ class McapFile:
                         f'{stream.tell()} of {os.fstat(stream.fileno()).st_size} '
                         f'({type(error).__name__})'] += 1
 
-    @staticmethod
-    def _of_chunk(chunk: Chunk, schemas: dict[int, Schema],
-                  channels: dict[int, Channel]) -> list[RawMessage]:
-        """The messages of one chunk, sorted by log time; raises where it is damaged."""
+
+class _Channels:
+    """The channels of a file that are known by now."""
+
+    def __init__(self) -> None:
+        self._schemas: dict[int, Schema] = {}
+        self._schema_of: dict[int, int] = {}
+        self.kinds: dict[int, ChannelKind] = {}
+
+    def add(self, record: Schema | Channel) -> None:
+        """A record of the file; raises KeyError where the schema of a channel is not known."""
+        if isinstance(record, Schema):
+            self._schemas[record.id] = record
+        else:
+            self._schema_of[record.id] = record.schema_id
+            if record.schema_id:
+                self.kinds[record.id] = ChannelKind.of(record.topic,
+                                                       self._schemas[record.schema_id])
+
+    def has_schema(self, channel: int) -> bool:
+        """Whether its messages have a type at all; MCAP allows channels without (id 0), ROS does
+        not. Raises KeyError for an unknown channel.
+        """
+        return self._schema_of[channel] != 0
+
+    def block_of(self, chunk: Chunk) -> MessageBlock:
+        """The messages of one chunk; raises where it is damaged."""
         stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-        data, at, messages = stream.read(size), 0, []
+        data, at = stream.read(size), 0
+        rows: list[tuple[int, int, int, int]] = []
         while at < size:
             kind, length = _RECORD.unpack_from(data, at)
             begin, at = at + _RECORD.size, at + _RECORD.size + length
@@ -168,31 +188,8 @@ class McapFile:
                 raise EOFError('a record that is longer than its chunk')
             if kind == Opcode.MESSAGE:
                 channel, _, log_time_ns, _ = _MESSAGE.unpack_from(data, begin)
-                if channels[channel].schema_id:
-                    messages.append(_raw(channel, log_time_ns, data[begin + _MESSAGE.size:at],
-                                         schemas, channels))
-            elif kind == Opcode.SCHEMA:
-                schema = Schema.read(ReadDataStream(BytesIO(data[begin:at])))
-                schemas[schema.id] = schema
-            elif kind == Opcode.CHANNEL:
-                found = Channel.read(ReadDataStream(BytesIO(data[begin:at])))
-                channels[found.id] = found
-        return sorted(messages, key=_log_time)
-
-
-_log_time = attrgetter('log_time_ns')
-
-
-def _has_schema(message: Message, channels: dict[int, Channel]) -> bool:
-    """Whether the message has a type at all; MCAP allows channels without (id 0), ROS does not."""
-    return channels[message.channel_id].schema_id != 0
-
-
-def _raw(channel_id: int, log_time_ns: int, data: bytes, schemas: dict[int, Schema],
-         channels: dict[int, Channel]) -> RawMessage:
-    """The message with its topic and type; a magnetic field in JSON or protobuf as CDR."""
-    channel = channels[channel_id]
-    schema = schemas[channel.schema_id]
-    if schema.encoding in SCHEMAS and (kind := type_of(schema)) != schema.name:
-        return RawMessage(channel.topic, kind, log_time_ns, cdr_of(schema, data), schema_of(kind))
-    return RawMessage(channel.topic, schema.name, log_time_ns, data, schema)
+                if self._schema_of[channel]:
+                    rows.append((channel, log_time_ns, begin + _MESSAGE.size, at))
+            elif kind in _DEFINITIONS:
+                self.add(_DEFINITIONS[kind].read(ReadDataStream(BytesIO(data[begin:at]))))
+        return MessageBlock.of_rows(data, self.kinds, rows)

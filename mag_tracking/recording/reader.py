@@ -14,6 +14,7 @@ from mag_tracking.files import checked_path
 from mag_tracking.recording.bag_file import BAG_SUFFIXES, BagFile
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.mcap_file import McapFile
+from mag_tracking.recording.message_block import MessageBlock
 from mag_tracking.recording.raw_message import RawMessage
 from mag_tracking.yaml_file import read_yaml
 
@@ -88,15 +89,15 @@ class Recording:
                     yield m
 
     def blocks(self, start_ns: int | None = None, progress: Progress | None = None
-               ) -> Iterator[list[RawMessage]]:
-        """Iterate over the `RawMessage`s, as many at once as are read at once.
+               ) -> Iterator[MessageBlock]:
+        """Iterate over the messages, as many at once as are read at once.
 
         Of those before `start_ns` some are among them; see `messages`.
         """
         for file in self._opened:
             for block in file.blocks(start_ns, progress):
-                for m in block:
-                    self.types.setdefault(m.topic, m.type)
+                for kind in block.kinds.values():
+                    self.types.setdefault(kind.topic, kind.type)
                 yield block
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.field_arrays import FieldArrays, magnetic_fields
+from mag_tracking.messages.field_arrays import magnetic_fields
 from mag_tracking.messages.schema import acceleration_of, reading_of, readings_of
 from mag_tracking.messages.types import (
     FIELD_READINGS,
@@ -18,6 +18,7 @@ from mag_tracking.messages.types import (
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.topics import absolute, namespaces_of
 from mag_tracking.recording.interruptible import Progress
+from mag_tracking.recording.message_block import MessageBlock
 from mag_tracking.recording.raw_message import RawMessage
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.truth import TRUTH_TYPES, TruthTopics
@@ -27,7 +28,7 @@ from mag_tracking.report.metrics import Truth
 TRUTH_PREFIX = 'ground_truth/'
 """Poses on topics below this, in the namespace of the sensors, are truth: for reports, never for
 tracking."""
-GATHERED = 1024
+GATHERED = 256
 """Messages at most whose readings are gathered in one batch: each batch costs as much as a few
 readings, and a reader may want to stop after any."""
 
@@ -89,37 +90,34 @@ class SampleReader:
         """Iterate over batches of `Readings` in order of log time; see `Recording.messages`."""
         for block in self._recording.blocks(progress=progress):
             for first in range(0, len(block), GATHERED):
-                readings = self._of_messages(block[first:first + GATHERED])
+                readings = self._of_block(block.part(slice(first, first + GATHERED)))
                 if len(readings):
                     yield readings
 
-    def _of_messages(self, messages: Sequence[RawMessage]) -> Readings:
+    def _of_block(self, block: MessageBlock) -> Readings:
         """`Readings` of all messages that are of the network's sensors, in their order."""
-        rows = [k for k, m in enumerate(messages) if m.topic in self._sensors
-                and m.type == MAGNETIC_FIELD]
-        fields = magnetic_fields([messages[k].data for k in rows])
-        is_read = dict(zip(rows, fields.is_read.tolist(), strict=True))
-        together = self._readings_of([messages[k] for k in rows], fields)
-        parts, done, n = [], 0, 0
-        for k, message in enumerate(messages):
-            if is_read.get(k):
-                n += 1
-                continue
-            for record, _ in self._records_of([message], {}):
+        names = {number: self._sensors[kind.topic] for number, kind in block.kinds.items()
+                 if kind.topic in self._sensors and kind.type == MAGNETIC_FIELD and kind.is_cdr}
+        rows = np.flatnonzero(np.isin(block.channel, list(names)))
+        fields = magnetic_fields(block.data, block.begin[rows], block.end[rows])
+        rows = rows[fields.is_read]
+        # A sensor may have several channels.
+        sensors = tuple(dict.fromkeys(names.values()))
+        place = np.zeros(max(names, default=0) + 1, dtype=np.int64)
+        place[list(names)] = [sensors.index(name) for name in names.values()]
+        C = fields.covariance
+        together = Readings(
+            sensors, place[block.channel[rows]], fields.stamp_ns[fields.is_read],
+            fields.field[fields.is_read], None if C is None else C[fields.is_read])
+        others = np.setdiff1d(np.arange(len(block)), rows)
+        parts, done = [], 0
+        for k in others:
+            for record, _ in self._records_of([block.message(k)], {}):
                 if isinstance(record, Readings):
+                    n = int(np.searchsorted(rows, k))
                     parts += [together.part(slice(done, n)), record]
                     done = n
-        return Readings.joined([*parts, together.part(slice(done, n))])
-
-    def _readings_of(self, messages: Sequence[RawMessage], fields: FieldArrays) -> Readings:
-        """`Readings` of those of the messages of sensors that are in the arrays."""
-        names = list(dict.fromkeys(self._sensors[m.topic] for m in messages))
-        row = {topic: names.index(name) for topic, name in self._sensors.items() if name in names}
-        which = fields.is_read
-        sensor = np.array([row[m.topic] for m in messages], dtype=np.int64)[which]
-        C = fields.covariance
-        return Readings(tuple(names), sensor, fields.stamp_ns[which], fields.field[which],
-                        None if C is None else C[which])
+        return Readings.joined([*parts, together.part(slice(done, None))])
 
     def readings_as_received(self, progress: Progress | None = None
                              ) -> Iterator[tuple[Readings, int]]:

@@ -21,19 +21,26 @@ def message(k, frame='mag_1', covariance=None):
     return encoder(MAGNETIC_FIELD)(content)
 
 
+def read(messages):
+    """What is read of the bytes of `messages`, which stand one after the other."""
+    ends = np.cumsum([len(m) for m in messages], dtype=np.int64)
+    return magnetic_fields(b''.join(messages), ends - [len(m) for m in messages], ends)
+
+
 def decoded(data):
     """`Readings` of one message, by the library."""
     return reading_of(decode(RawMessage('/mag', MAGNETIC_FIELD, 0, data,
                                         schema_of(MAGNETIC_FIELD))), 'mag_1')
 
 
-@pytest.mark.parametrize('frames', [['mag_1'], ['', 'a', 'ab', 'abc', 'abcd', 'a much longer name']])
+@pytest.mark.parametrize('frames', [
+    ['mag_1'], ['', 'a', 'ab', 'abc', 'abcd', 'a much longer name']])
 @pytest.mark.parametrize('known', ['none', 'all', 'some'])
 def test_all_that_the_decoder_reads_is_read_the_same(frames, known):
     C = [None if known == 'none' or known == 'some' and k % 3 else (k + 1.0) * 1e-16 * np.eye(3)
          for k in range(40)]
     data = [message(k, frames[k % len(frames)], C[k]) for k in range(40)]
-    found, expected = magnetic_fields(data), Readings.joined(decoded(m) for m in data)
+    found, expected = read(data), Readings.joined(decoded(m) for m in data)
     assert found.is_read.all()
     np.testing.assert_array_equal(found.stamp_ns, expected.stamp_ns)
     np.testing.assert_array_equal(found.field, expected.field)
@@ -48,7 +55,7 @@ def test_a_covariance_that_is_unknown_and_nan_in_a_message_stay_apart():
     # In `Readings` NaN is an unknown covariance; in a message it is a fault.
     data = [message(0, covariance=1e-16 * np.eye(3)), message(1, covariance=unknown),
             message(2)[:-72] + nan.tobytes()]
-    found, expected = magnetic_fields(data), Readings.joined(decoded(m) for m in data)
+    found, expected = read(data), Readings.joined(decoded(m) for m in data)
     np.testing.assert_array_equal(found.covariance, expected.covariance)
     assert np.isnan(found.covariance[1]).all() and not found.covariance[2].any()
 
@@ -61,9 +68,9 @@ def test_a_covariance_that_is_unknown_and_nan_in_a_message_stay_apart():
     lambda m: m[:16] + b'\xff' + m[17:], lambda m: m[:21] + b'x' + m[22:]])
 def test_what_is_damaged_or_unusual_is_left_to_the_decoder(spoil):
     data = [message(k) for k in range(5)]
-    good = magnetic_fields(data)
+    good = read(data)
     data[2] = spoil(data[2])
-    found = magnetic_fields(data)
+    found = read(data)
     assert found.is_read.tolist() == [True, True, False, True, True]
     others = found.is_read
     np.testing.assert_array_equal(found.field[others], good.field[others])
@@ -71,7 +78,7 @@ def test_what_is_damaged_or_unusual_is_left_to_the_decoder(spoil):
 
 
 def test_of_no_message_nothing_is_read():
-    found = magnetic_fields([])
+    found = read([])
     assert found.is_read.shape == (0,) and found.field.shape == (0, 3)
     assert found.covariance is None
 
@@ -81,7 +88,7 @@ def test_any_bytes_are_read_or_left_out():
     rng = np.random.default_rng(3)
     data = [message(k)[:rng.integers(0, 130)] + rng.bytes(int(rng.integers(0, 40)))
             for k in range(2000)]
-    found = magnetic_fields(data)
+    found = read(data)
     for m, is_read, field in zip(data, found.is_read, found.field, strict=True):
         if is_read:
             np.testing.assert_array_equal(field, decoded(m).field[0])
