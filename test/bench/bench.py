@@ -1,4 +1,4 @@
-"""`make bench`: ratios against named peers, measured alternately in one run, and time to a pose.
+"""`make bench`: ratios against named peers, measured alternately in one run.
 
 One thread everywhere. Each ratio is the median over rounds of (peer / ours).
 """
@@ -8,17 +8,13 @@ import os
 for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'NUMBA_NUM_THREADS'):
     os.environ[_name] = '1'
 
-import shutil  # noqa: E402  (the thread counts have to be set before NumPy is loaded)
-import subprocess  # noqa: E402
-import sys  # noqa: E402
-import tempfile  # noqa: E402
+import sys  # noqa: E402  (the thread counts have to be set before NumPy is loaded)
 import time  # noqa: E402
-from pathlib import Path  # noqa: E402
 
 import numpy as np  # noqa: E402
 from filterpy.kalman import ExtendedKalmanFilter  # noqa: E402
-from tqdm import tqdm  # noqa: E402
 
+from bench.figures import Figures  # noqa: E402
 from mag_tracking.geometry import (  # noqa: E402
     cross_matrix,
     quaternion_from_rotation_vector,
@@ -33,8 +29,6 @@ from mag_tracking.records import FieldFrame  # noqa: E402
 from mag_tracking.stages.track.bank_filter import BankFilter  # noqa: E402
 from support.bundled import POINT  # noqa: E402
 
-HERE = Path(__file__).resolve().parent
-ROOT = HERE.parents[1]
 EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
 SIGMA = 4e-9
 
@@ -223,70 +217,23 @@ def bank_ratio(peer_class, n_sensors, turned, n_hyp=64, rounds=12, repeats=100):
             1e6 * np.median(theirs))
 
 
-FIRST_POSE = '''
-import sys, time
-start = float(sys.argv[1])
-from mag_tracking.recording.reader import Recording
-from mag_tracking.network.file import read_network
-from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.pipeline import Pipeline, settings_for
-from mag_tracking.records import Track
-network = read_network(sys.argv[2])
-pipeline = Pipeline(network, settings_for('vehicle'))
-for readings in SampleReader(Recording(sys.argv[3]), network).readings():
-    if any(isinstance(r, Track) for r in pipeline.feed(readings)):
-        print(time.time() - start)
-        break
-'''
-
-
-def first_pose(cache):
-    """Seconds from the start of a process to its first pose, with the compiled cache in `cache`."""
-    environment = {**os.environ, 'NUMBA_CACHE_DIR': str(cache)}
-    out = subprocess.run(
-        [sys.executable, '-c', FIRST_POSE, str(time.time()), str(ROOT / 'config/network.yaml'),
-         str(ROOT / 'test/data/vehicles/straight_car_right.mcap')],
-        env=environment, check=True, capture_output=True, text=True)
-    return float(out.stdout)
-
-
-def first_pose_times(rounds=5):
-    """(cold, warm) lists of seconds, taken alternately."""
-    cold, warm = [], []
-    for _ in tqdm(range(rounds), desc='first pose', disable=None):
-        cache = Path(tempfile.mkdtemp())
-        cold.append(first_pose(cache))
-        warm.append(first_pose(cache))
-        shutil.rmtree(cache)
-    return cold, warm
-
-
 def main():
-    """Print the figures; exit status 1 where a target is missed."""
-    missed = 0
+    """Print the figures; exit status 1 where an aim is missed."""
+    figures = Figures('bank')
     print('bank update against a loop of filterpy EKFs, one thread')
-    for n_sensors, n_hyp, turned, target in (
+    for n_sensors, n_hyp, turned, aim in (
             (2, 64, False, 350.0), (8, 64, False, 120.0), (32, 64, False, 40.0),
             (100, 16, False, 25.0), (2, 64, True, None), (8, 64, True, None)):
-        for peer, goal in ((Peer, target), (VectorPeer, None)):
+        for peer, goal in ((Peer, aim), (VectorPeer, None)):
             rounds, repeats = (12, 100) if n_sensors <= 8 else (4, 3)
             ratio, low, high, ours, theirs = bank_ratio(peer, n_sensors, turned, n_hyp, rounds,
                                                         repeats)
-            missed += goal is not None and ratio < goal
             state = 'target, backgrounds' + (', mounting' if turned else '')
             kind = 'a model from sensor to sensor' if peer is Peer else 'a vectorised model'
-            print(f'  {n_sensors} sensors x {n_hyp} hypotheses; {state}; {kind}: '
-                  f'{ratio:.0f}x  ({low:.0f} .. {high:.0f}; {ours:.0f} us against {theirs:.0f} us'
-                  + (f'; target {goal:.0f}x)' if goal else ')'), flush=True)
-    cold, warm = first_pose_times()
-    missed += np.median(warm) >= 1.0
-    missed += np.median(cold) >= 5.0
-    print('first pose after the start of the process (6 s of recording as fast as it goes)')
-    print(f'  compiled cache warm: {np.median(warm):.2f} s  ({min(warm):.2f} .. {max(warm):.2f}; '
-          'target < 1 s)')
-    print(f'  compiled cache cold: {np.median(cold):.2f} s  ({min(cold):.2f} .. {max(cold):.2f}; '
-          'target < 5 s)')
-    return int(missed > 0)
+            figures.add(f'{n_sensors} sensors x {n_hyp} hypotheses; {state}; {kind}', ratio,
+                        'times', goal, True,
+                        f'  ({low:.0f} .. {high:.0f}; {ours:.0f} us against {theirs:.0f} us)')
+    return figures.save()
 
 
 if __name__ == '__main__':

@@ -1,0 +1,108 @@
+"""Figures that are remembered: what a benchmark measured, and what it was in the runs before.
+
+    PYTHONPATH=test python -m bench.figures
+
+Each benchmark puts its figures into `benchmarks/latest.json`. This command, the last of
+`make bench`, adds them to `benchmarks/history.jsonl`, one line a run, and names those that are
+worse than the best of the latest five runs by more than 15 %.
+"""
+
+import datetime
+import json
+import os
+import platform
+import subprocess
+import sys
+
+from support.bundled import ROOT
+
+FOLDER = ROOT / 'benchmarks'
+LATEST, HISTORY = FOLDER / 'latest.json', FOLDER / 'history.jsonl'
+WORSE = 1.15
+"""A figure that is worse by this factor is named."""
+RUNS = 5
+RED, PLAIN = '\033[31m', '\033[0m'
+
+
+class Figures:
+    """The figures of one benchmark, by their names."""
+
+    def __init__(self, benchmark):
+        self._benchmark, self._figures, self.missed = benchmark, {}, 0
+
+    def add(self, name, value, unit, aim=None, more_is_better=False, note=''):
+        """Print a figure and keep it; `aim` is the worst that is good enough."""
+        is_missed = aim is not None and (value < aim if more_is_better else value > aim)
+        self.missed += is_missed
+        self._figures[name] = {'value': float(value), 'unit': unit, 'aim': aim,
+                               'more_is_better': more_is_better}
+        text = '' if aim is None else f'; aim {"at least" if more_is_better else "at most"} {aim:g}'
+        print(f'  {name}: {value:.4g} {unit}'.rstrip() + note + text
+              + (' (missed)' if is_missed else ''), flush=True)
+
+    def save(self):
+        """Put them to those of the other benchmarks; 1 where an aim is missed, else 0."""
+        FOLDER.mkdir(exist_ok=True)
+        found = json.loads(LATEST.read_text()) if LATEST.exists() else {}
+        found[self._benchmark] = self._figures
+        LATEST.write_text(json.dumps(found, indent=1, sort_keys=True) + '\n')
+        return int(self.missed > 0)
+
+
+def read_history():
+    """The runs before, oldest first."""
+    if not HISTORY.exists():
+        return []
+    return [json.loads(line) for line in HISTORY.read_text().splitlines()]
+
+
+def worse(run, before):
+    """[(benchmark, name, figure, best of before)] of a run's figures that got worse."""
+    out = []
+    for benchmark, figures in run.items():
+        for name, figure in figures.items():
+            earlier = [r['figures'][benchmark][name]['value'] for r in before[-RUNS:]
+                       if name in r['figures'].get(benchmark, {})]
+            if not earlier:
+                continue
+            more = figure['more_is_better']
+            best = max(earlier) if more else min(earlier)
+            if figure['value'] * WORSE < best if more else figure['value'] > WORSE * best:
+                out.append((benchmark, name, figure, best))
+    return out
+
+
+def commit():
+    """The commit that was measured, with a + where the tree differs from it."""
+    def git(*words):
+        return subprocess.run(['git', *words], cwd=ROOT, capture_output=True, text=True,
+                              check=True).stdout.strip()
+    try:
+        return git('rev-parse', '--short', 'HEAD') + (
+            '+' if git('status', '--porcelain', '--', 'mag_tracking') else '')
+    except (OSError, subprocess.CalledProcessError):
+        return 'unknown'
+
+
+def main():
+    """Add the run to the history; what got worse in red."""
+    if not LATEST.exists():
+        print('no benchmark has been run: there is no benchmarks/latest.json')
+        return 1
+    figures, before = json.loads(LATEST.read_text()), read_history()
+    found = worse(figures, before)
+    for benchmark, name, figure, best in found:
+        print(f'{RED}worse: {benchmark}: {name}: {figure["value"]:.4g} {figure["unit"]}, the best '
+              f'of the latest runs was {best:.4g}{PLAIN}')
+    run = {'date': datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds'),
+           'commit': commit(), 'machine': f'{platform.machine()}, {os.cpu_count()} cores',
+           'python': platform.python_version(), 'figures': figures}
+    with HISTORY.open('a') as stream:
+        stream.write(json.dumps(run, sort_keys=True) + '\n')
+    print(f'{sum(map(len, figures.values()))} figures are kept in {HISTORY.relative_to(ROOT)}; '
+          f'{len(found)} got worse')
+    return int(bool(found))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,100 @@
+"""How many times faster than real time recordings are replayed, on one thread.
+
+    PYTHONPATH=test python -m bench.replay [--minutes 60]
+
+A road of five minutes with thirty vehicles and two sensors, by the command; a quiet road of two
+sensors at 100 Hz; and how long each frame of a track takes.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from bench.start import COMMAND, ONE_THREAD
+
+os.environ.update(ONE_THREAD)
+
+import numpy as np  # noqa: E402  (the thread counts have to be set before NumPy is loaded)
+
+from bench.figures import Figures  # noqa: E402
+from mag_tracking.network.file import read_network  # noqa: E402
+from mag_tracking.pipeline import Pipeline, settings_for  # noqa: E402
+from mag_tracking.recording.reader import Recording  # noqa: E402
+from mag_tracking.recording.sample_reader import SampleReader  # noqa: E402
+from support.bundled import DATA, NETWORK_FILE, VEHICLES, vehicle_path  # noqa: E402
+from support.quiet_road import write_quiet_road  # noqa: E402
+
+ROAD = DATA / 'two_way_road' / 'two_way_road.mcap'
+
+
+def road_network(folder):
+    """The network file of the road, whose sensors stand farther apart."""
+    path = folder / 'network.yaml'
+    path.write_text(NETWORK_FILE.read_text().replace('4.5', '5.5'))
+    assert np.abs(read_network(path).positions[:, 1]).tolist() == [5.5, 5.5]
+    return path
+
+
+def real_time(recording, network_file, folder):
+    """How many times faster than real time the command replays a recording, without figures."""
+    start = time.perf_counter()
+    subprocess.run([*COMMAND, 'replay', str(recording), '--network', str(network_file), '--out',
+                    str(folder / 'out'), '--no-figures'], check=True, capture_output=True)
+    taken, opened = time.perf_counter() - start, Recording(recording)
+    return (opened.end_ns - opened.start_ns) / 1e9 / taken
+
+
+def frame_times():
+    """(frames of running tracks, starts of tracks) [s], over the bundled vehicles."""
+    network, frames, starts = read_network(NETWORK_FILE), [], []
+    for name in VEHICLES:
+        pipeline = Pipeline(network, settings_for('vehicle'))
+        feed = pipeline.track.feed
+
+        def timed(frame, feed=feed, pipeline=pipeline):
+            was_running, begun = pipeline.track.bank is not None, pipeline.track.counts['tracks']
+            start = time.perf_counter()
+            out = feed(frame)
+            taken = time.perf_counter() - start
+            if was_running:
+                frames.append(taken)
+            elif pipeline.track.counts['tracks'] > begun:
+                starts.append(taken)
+            return out
+        pipeline.track.feed = timed
+        for readings in SampleReader(Recording(vehicle_path(name)), network).readings():
+            pipeline.feed(readings)
+        pipeline.flush()
+    return np.array(frames), np.array(starts)
+
+
+def main():
+    """Print the figures; exit status 1 where an aim is missed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--minutes', type=float, default=60.0, help='of the quiet road')
+    args = parser.parse_args()
+    figures = Figures('replay')
+    print('times real time, one thread, mag-tracking replay --no-figures')
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        times = [real_time(ROAD, road_network(folder), folder) for _ in range(3)]
+        figures.add('a road with 30 vehicles in 5 minutes', np.median(times), '', 40.0, True,
+                    f'  ({min(times):.1f} .. {max(times):.1f})')
+        quiet = folder / 'quiet' / 'quiet.mcap'
+        write_quiet_road(quiet, read_network(NETWORK_FILE), 60.0 * args.minutes)
+        figures.add('a quiet road, two sensors at 100 Hz', real_time(quiet, NETWORK_FILE, folder),
+                    '', 600.0, True, f'  ({args.minutes:g} minutes)')
+    frames, starts = frame_times()
+    print(f'frames of tracks of two sensors ({len(frames)}), and starts of tracks ({len(starts)})')
+    figures.add('a frame, mean', 1e3 * frames.mean(), 'ms', 5.0)
+    figures.add('a frame, longest', 1e3 * frames.max(), 'ms', 15.0)
+    figures.add('a start, mean', 1e3 * starts.mean(), 'ms')
+    return figures.save()
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,87 @@
+"""How long commands take to start, and how long it takes to the first pose.
+
+    PYTHONPATH=test python -m bench.start
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from bench.figures import Figures
+from support.bundled import NETWORK_FILE, vehicle_path
+
+COMMAND = [sys.executable, '-m', 'mag_tracking.cli']
+RECORDING = vehicle_path('straight_car_right')
+ONE_THREAD = {name: '1' for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS',
+                                     'NUMBA_NUM_THREADS')}
+FIRST_POSE = '''
+import sys, time
+start = float(sys.argv[1])
+from mag_tracking.recording.reader import Recording
+from mag_tracking.network.file import read_network
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.records import Track
+network = read_network(sys.argv[2])
+pipeline = Pipeline(network, settings_for('vehicle'))
+for readings in SampleReader(Recording(sys.argv[3]), network).readings():
+    if any(isinstance(r, Track) for r in pipeline.feed(readings)):
+        print(time.time() - start)
+        break
+'''
+
+
+def seconds_of(*words, rounds=7):
+    """Median time of a command."""
+    times = []
+    for _ in range(rounds):
+        start = time.perf_counter()
+        subprocess.run([*COMMAND, *words], check=True, capture_output=True)
+        times.append(time.perf_counter() - start)
+    return float(np.median(times))
+
+
+def first_pose(cache):
+    """Seconds from the start of a process to its first pose, with the compiled cache in `cache`."""
+    out = subprocess.run(
+        [sys.executable, '-c', FIRST_POSE, str(time.time()), str(NETWORK_FILE), str(RECORDING)],
+        env={**os.environ, **ONE_THREAD, 'NUMBA_CACHE_DIR': str(cache)}, check=True,
+        capture_output=True, text=True)
+    return float(out.stdout)
+
+
+def first_pose_times(rounds):
+    """(cold, warm) lists of seconds, taken alternately."""
+    cold, warm = [], []
+    for _ in tqdm(range(rounds), desc='first pose', disable=None):
+        cache = Path(tempfile.mkdtemp())
+        cold.append(first_pose(cache))
+        warm += [first_pose(cache) for _ in range(2)]
+        shutil.rmtree(cache)
+    return cold, warm
+
+
+def main():
+    """Print the figures; exit status 1 where an aim is missed."""
+    figures = Figures('start')
+    print('from the start of a process')
+    figures.add('mag-tracking --help', seconds_of('--help'), 's', 0.3)
+    figures.add('mag-tracking info', seconds_of('info', str(RECORDING)), 's', 0.8)
+    cold, warm = first_pose_times(3)
+    spread = '  ({:.2f} .. {:.2f})'
+    figures.add('first pose, compiled cache warm', np.median(warm), 's', 1.0,
+                note=spread.format(min(warm), max(warm)))
+    figures.add('first pose, compiled cache cold', np.median(cold), 's', 6.0,
+                note=spread.format(min(cold), max(cold)))
+    return figures.save()
+
+
+if __name__ == '__main__':
+    sys.exit(main())

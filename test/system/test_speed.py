@@ -1,0 +1,84 @@
+"""The quick part of the benchmarks, ratios and counts; `make bench` measures the rest."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from bench import figures
+from bench.bench import Peer, bank_ratio
+from support.bundled import NETWORK_FILE, vehicle_path
+
+HEAVY = ('numba', 'scipy', 'matplotlib', 'rclpy', 'google.protobuf', 'rosbags', 'plotly')
+RECORDING = str(vehicle_path('straight_car_right'))
+IMPORTED = '''
+import contextlib, io, json, sys
+from mag_tracking.cli import main
+with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+    main(sys.argv[1:])
+print(json.dumps(sorted(sys.modules)))
+'''
+
+
+@pytest.mark.parametrize('words, also', [
+    (['--help'], ('numpy',)), (['--version'], ('numpy',)), (['info', '--help'], ()),
+    (['info', RECORDING], ()), (['info', RECORDING, '--network', str(NETWORK_FILE)], ()),
+    (['topics', '--help'], ())])
+def test_a_command_imports_what_it_needs_and_no_more(words, also):
+    done = subprocess.run([sys.executable, '-c', IMPORTED, *words], capture_output=True, text=True,
+                          check=True)
+    imported = json.loads(done.stdout)
+    assert [m for m in imported if m.startswith((*HEAVY, *also))] == []
+
+
+def test_the_tracker_does_not_wait_for_what_it_rarely_needs():
+    done = subprocess.run(
+        [sys.executable, '-c', 'import sys, mag_tracking.pipeline; print("\\n".join(sys.modules))'],
+        capture_output=True, text=True, check=True)
+    imported = done.stdout.split()
+    assert 'mag_tracking.stages.track.core' in imported
+    assert not {'scipy.stats', 'scipy.signal', 'scipy.optimize', 'matplotlib'} & {*imported}
+
+
+@pytest.mark.parametrize('n_sensors, least', [(2, 80.0), (8, 40.0)])
+def test_the_bank_is_many_times_faster_than_a_loop_of_filterpy(n_sensors, least):
+    """The aims are 350 and 120 (`bench.bench`); beside other tests half of what is reached."""
+    _, _, highest, *_ = bank_ratio(Peer, n_sensors, False, rounds=4, repeats=20)
+    assert highest >= least
+
+
+def run(value, more_is_better=False, name='a frame, mean'):
+    """The figures of a run."""
+    return {'replay': {name: {'value': value, 'unit': 'ms', 'aim': None,
+                              'more_is_better': more_is_better}}}
+
+
+@pytest.mark.parametrize('more, values, now, is_worse', [
+    (False, [5.0, 4.0, 6.0], 4.5, False), (False, [5.0, 4.0, 6.0], 4.7, True),
+    (True, [50.0, 40.0], 44.0, False), (True, [50.0, 40.0], 43.0, True),
+    # Older than five runs.
+    (False, [1.0, 5.0, 5.0, 5.0, 5.0, 5.0], 5.5, False), (False, [], 9.0, False)])
+def test_a_figure_is_compared_with_the_best_of_the_latest_runs(more, values, now, is_worse):
+    before = [{'figures': run(v, more)} for v in values]
+    found = figures.worse(run(now, more), before)
+    assert bool(found) == is_worse
+    assert figures.worse(run(now, more, 'a new one'), before) == []
+
+
+def test_figures_are_kept_and_what_got_worse_is_said(tmp_path, monkeypatch, capsys):
+    for name in ('FOLDER', 'LATEST', 'HISTORY'):
+        monkeypatch.setattr(figures, name, tmp_path / getattr(figures, name).name)
+    monkeypatch.setattr(figures, 'ROOT', tmp_path)
+    monkeypatch.setattr(figures, 'FOLDER', tmp_path)
+    assert figures.main() == 1 and 'no benchmark has been run' in capsys.readouterr().out
+    for value, status in ((4.0, 0), (4.4, 0), (5.0, 1)):
+        kept = figures.Figures('replay')
+        kept.add('a frame, mean', value, 'ms', 4.5)
+        kept.add('times real time', 40.0, '', 50.0, True)
+        assert kept.missed == 1 + (value > 4.5) and kept.save() == 1
+        assert figures.main() == status
+    out = capsys.readouterr().out
+    assert 'worse: replay: a frame, mean: 5 ms, the best of the latest runs was 4' in out
+    assert [r['figures']['replay']['a frame, mean']['value']
+            for r in figures.read_history()] == [4.0, 4.4, 5.0]
