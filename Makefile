@@ -45,6 +45,8 @@ $(STAMP): $(SOURCES)
 	@$(PIP) install $(PINS) ./msg_defs
 	@echo 'Setting up: mag_tracking (its core is compiled) and what it needs'
 	@$(QUIET_EDITABLE) $(PIP) install $(PINS) -e '.[ros,test]'
+	@echo 'Setting up: what is compiled at first use'
+	@$(BIN)/mag-tracking warm-up
 	@touch $@
 	@echo 'Setting up: done'
 
@@ -71,9 +73,10 @@ studies: $(STAMP)  ## the tests that take many runs or all of the recordings
 
 # All of them run, also where one misses an aim.
 bench: $(STAMP)  ## measure times and accuracies
-	@status=0; for figures in bench recordings matched ambiguous_poses extended_target two_simulators spoilt_passes \
+	@rm -f benchmarks/latest.json
+	@status=0; for figures in start replay bench recordings matched ambiguous_poses extended_target two_simulators spoilt_passes \
 		situations standing junction_error pass_search load pages 'load --sensors 2 --lean --minutes 2' \
-		'load --sensors 2 --lean --minutes 2 --one-process --batches' chain; do \
+		'load --sensors 2 --lean --minutes 2 --one-process --batches' chain figures; do \
 		echo "PYTHONPATH=test $(BIN)/python -m bench.$$figures"; \
 		PYTHONPATH=test $(BIN)/python -m bench.$$figures || status=1; \
 	done; exit $$status

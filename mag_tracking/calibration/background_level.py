@@ -16,12 +16,13 @@ from mag_tracking.calibration.resolution import (
     corrected_steps,
 )
 from mag_tracking.calibration.sensor_state import SENSORS
+from mag_tracking.compiled import compiled_when_used
 
 _Line: TypeAlias = tuple[float, FloatArray, FloatArray, float]
 """Centre [s], mean (3,) [T], slope (3,) [T/s] and horizon [s]."""
 
 
-@njit(cache=True, inline='always')
+@njit(inline='always')
 def subtract_background(s: Record, time: float, field: FloatArray, out: FloatArray) -> None:
     """Field without the background at `time` [s]: from `field` (3,) [T] into `out` (3,).
 
@@ -33,7 +34,7 @@ def subtract_background(s: Record, time: float, field: FloatArray, out: FloatArr
         out[a] = field[a] - s.mean[a] - since * s.slope[a]
 
 
-@njit(void(SENSORS, int64, float64, float64[::1], float64[::1]), cache=True)
+@compiled_when_used(void(SENSORS, int64, float64, float64[::1], float64[::1]))
 def _subtract(sensors: StructArray, j: int, time: float, field: FloatArray,
               out: FloatArray) -> None:
     """`subtract_background` of sensor `j`."""

@@ -8,6 +8,7 @@ import numpy as np
 from numba import float64, njit, void
 
 from mag_tracking.arrays import FloatArray, Record
+from mag_tracking.compiled import compiled_when_used
 
 LEAST_SAMPLES = 8
 """A block has at least so many readings, however slow the sensor: fewer tell nothing of noise."""
@@ -41,7 +42,7 @@ def block_of(sensor: np.void) -> Block:
                  count.diagonal().copy())
 
 
-@njit(cache=True, inline='always')
+@njit(inline='always')
 def begin_block_if_due(s: Record, time: float) -> None:
     """Begin the next block where a reading at `time` [s] is the first after the present one.
 
@@ -62,7 +63,7 @@ def begin_block_if_due(s: Record, time: float) -> None:
         s.end += ((time - s.end) // s.length + 1.0) * s.length
 
 
-@njit(cache=True, inline='always')
+@njit(inline='always')
 def collect(s: Record, time: float, field: FloatArray) -> None:
     """Add a reading, `field` (3,) [T] at `time` [s], to the present block."""
     k = s.now
@@ -89,8 +90,9 @@ def collect(s: Record, time: float, field: FloatArray) -> None:
                 s.product[k, a, b] += d * e
 
 
-@njit(void(float64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1],
-           float64[:, ::1]), cache=True)
+@compiled_when_used(
+    void(float64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1], float64[:,
+    ::1]))
 def _moments(origin: FloatArray, count: FloatArray, total: FloatArray, product: FloatArray,
              mean: FloatArray, scatter: FloatArray) -> None:
     """Mean and sum of squared deviations; an axis that is missing is so in its products only."""
@@ -152,8 +154,9 @@ def line_through(blocks: Blocks) -> tuple[float, FloatArray, FloatArray]:
     return centre, mean, slope
 
 
-@njit(void(float64[::1], float64[:, ::1], float64[:, ::1], float64, float64[::1], float64[::1]),
-      cache=True, error_model='numpy')
+@compiled_when_used(
+    void(float64[::1], float64[:, ::1], float64[:, ::1], float64, float64[::1], float64[::1]),
+    error_model='numpy')
 def _line(time: FloatArray, n: FloatArray, y: FloatArray, centre: float, mean: FloatArray,
           slope: FloatArray) -> None:
     """`line_through`; `y` (k, 3) are the means of the blocks."""

@@ -9,6 +9,7 @@ from numba import float64, njit, void
 
 from mag_tracking.arrays import FloatArray, Record, StructArray
 from mag_tracking.calibration.sensor_state import SENSORS
+from mag_tracking.compiled import compiled_when_used
 from mag_tracking.records import plain
 
 SAME = 3e-7
@@ -32,7 +33,7 @@ LONGEST_REST_NS = 300_000_000
 """Readings that stay the same for longer count as several measurements, one in each such time."""
 
 
-@njit(cache=True)
+@njit()
 def note_step(s: Record, stamp: int, raw: FloatArray) -> None:
     """Update the steps of a sensor, and since when each axis rests on one value.
 
@@ -62,7 +63,7 @@ def note_step(s: Record, stamp: int, raw: FloatArray) -> None:
         s.raw[a], s.rest_since_ns[a], s.n_rest[a] = value, stamp, 1
 
 
-@njit(cache=True)
+@njit()
 def _seen_step(s: Record, a: int) -> float:
     """Step [T] of raw axis `a`; 0 where it is too fine to be seen.
 
@@ -72,7 +73,7 @@ def _seen_step(s: Record, a: int) -> float:
     return s.step[a] if s.n_same[a] >= REPEATS * s.n_changed[a] else 0.0
 
 
-@njit(cache=True)
+@njit()
 def _corrected_steps(s: Record, out: FloatArray) -> None:
     """Steps of the axes after the soft-iron correction, into `out` (3,)."""
     for a in range(3):
@@ -88,7 +89,7 @@ def _corrected_steps(s: Record, out: FloatArray) -> None:
         out[a] = np.sqrt(total) if is_known else np.inf
 
 
-@njit(cache=True)
+@njit()
 def rest_of(s: Record, a: int) -> float:
     """For how many readings axis `a` rests, after the correction: the raw axes count by what their
     steps add.
@@ -104,7 +105,7 @@ def rest_of(s: Record, a: int) -> float:
     return weighted / total if total > 0.0 else 1.0
 
 
-@njit(float64[::1](SENSORS), cache=True)
+@compiled_when_used(float64[::1](SENSORS))
 def corrected_steps(sensors: StructArray) -> FloatArray:
     """Steps of a sensor's axes after the soft-iron correction.
 
@@ -122,7 +123,7 @@ def corrected_steps(sensors: StructArray) -> FloatArray:
     return out
 
 
-@njit(cache=True)
+@compiled_when_used(float64[::1](SENSORS))
 def raw_steps(sensors: StructArray) -> FloatArray:
     """As `corrected_steps`, before the correction."""
     out = np.empty(3)
@@ -131,13 +132,13 @@ def raw_steps(sensors: StructArray) -> FloatArray:
     return out
 
 
-@njit(cache=True)
+@njit()
 def _rests(variance: float, step: float) -> bool:
     """Whether a step [T] is larger than a noise of this variance [T^2], which may be NaN."""
     return bool(variance <= DITHERED * step**2)
 
 
-@njit(cache=True)
+@njit()
 def _complete(variance: FloatArray, steps: FloatArray) -> None:
     """`completed_steps`, in place."""
     largest, is_known = 0.0, False
@@ -174,7 +175,7 @@ def completed_steps(variance: FloatArray, steps: FloatArray) -> FloatArray:
     return out
 
 
-@njit(void(SENSORS, float64, float64[::1]), cache=True)
+@compiled_when_used(void(SENSORS, float64, float64[::1]))
 def apply_steps(sensors: StructArray, freeze_std: float, limits: FloatArray) -> None:
     """Add what the steps of a sensor do to its noise.
 

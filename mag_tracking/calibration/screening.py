@@ -45,7 +45,7 @@ PASSES, HELD, SPIKE, RELEASED = range(4)
 again for the reading itself); the held readings and this one pass, in order."""
 
 
-@njit(cache=True)
+@njit()
 def _is_too_long(s: Record) -> bool:
     """Whether the present run of equal readings is longer than chance makes it."""
     if s.run < SHORTEST_RUN or s.changes < LEAST_CHANGES:
@@ -54,7 +54,7 @@ def _is_too_long(s: Record) -> bool:
     return bool(usual < COARSE and s.run * math.log(usual) < LIKELY)
 
 
-@njit(cache=True)
+@njit()
 def is_stuck(s: Record, field: FloatArray) -> bool:
     """Whether a reading repeats the one before for longer than chance, or coarse steps, allow.
 
@@ -84,7 +84,7 @@ def is_stuck(s: Record, field: FloatArray) -> bool:
     return False
 
 
-@njit(cache=True)
+@njit()
 def _largest_recent(s: Record, a: int) -> float:
     """Largest recent difference [T] of axis `a` between readings; NaN if none is known."""
     largest, is_known = 0.0, False
@@ -94,7 +94,7 @@ def _largest_recent(s: Record, a: int) -> float:
     return largest if is_known else np.nan
 
 
-@njit(cache=True)
+@njit()
 def _usual_noise(s: Record, a: int) -> float:
     """Standard deviation [T] of axis `a`; before the noise is known, from recent differences."""
     if s.is_ready:
@@ -104,7 +104,7 @@ def _usual_noise(s: Record, a: int) -> float:
     return float(max(_largest_recent(s, a) / LARGEST_OF_RECENT, step / math.sqrt(12.0)))
 
 
-@njit(cache=True)
+@njit()
 def _is_off(s: Record, threshold: float, stamp: int, steps: FloatArray) -> bool:
     """Whether `steps` (3,) [T] from the reading before are steeper than any target makes them."""
     # A comparison with NaN is false: a missing axis is no spike.
@@ -125,7 +125,7 @@ def _is_off(s: Record, threshold: float, stamp: int, steps: FloatArray) -> bool:
     return False
 
 
-@njit(cache=True)
+@njit()
 def _hold(s: Record, stamp: int, field: FloatArray, steps: FloatArray, own: int,
           covariance: FloatArray) -> None:
     """Append a reading to those that are held."""
@@ -139,7 +139,7 @@ def _hold(s: Record, stamp: int, field: FloatArray, steps: FloatArray, own: int,
     s.n_held += 1
 
 
-@njit(cache=True)
+@njit()
 def _pass(s: Record, stamp: int, field: FloatArray, steps: FloatArray, has_steps: bool) -> None:
     """Note a reading that passes; the next one is compared with it."""
     place = s.n_steps % RECENT
@@ -151,7 +151,7 @@ def _pass(s: Record, stamp: int, field: FloatArray, steps: FloatArray, has_steps
     s.n_steps += has_steps
 
 
-@njit(cache=True)
+@njit()
 def _is_back(s: Record, steps: FloatArray) -> bool:
     """Whether the field is again where it was before the held readings."""
     # The axis in which they are highest decides.
@@ -166,7 +166,7 @@ def _is_back(s: Record, steps: FloatArray) -> bool:
     return bool(steps[axis] <= BACK * highest)
 
 
-@njit(cache=True)
+@njit()
 def screen_spike(s: Record, threshold: float, stamp: int, field: FloatArray, own: int,
                  covariance: FloatArray, steps: FloatArray) -> int:
     """Decide on a reading and on those that are held before it.

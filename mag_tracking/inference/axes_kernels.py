@@ -10,6 +10,7 @@ import numpy as np
 from numba import int64, njit
 
 from mag_tracking.arrays import CompileOptions, FloatArray, IntArray
+from mag_tracking.compiled import compiled_when_used
 
 _INLINE: CompileOptions = {'error_model': 'numpy', 'fastmath': {'contract'}, 'forceinline': True}
 
@@ -47,8 +48,8 @@ def _factor(s00: float, s10: float, s11: float, s20: float, s21: float, s22: flo
     return l10, l20, l21, s00, e1, s22 - l20 * s20 - l21 * e21
 
 
-@njit('boolean(float64[:,::1], float64[:,:,::1], float64[::1], int64[::1])', cache=True,
-      error_model='numpy')
+@compiled_when_used(
+    'boolean(float64[:,::1], float64[:,:,::1], float64[::1], int64[::1])', error_model='numpy')
 def energies(y: FloatArray, C: FloatArray, energy: FloatArray, axes: IntArray) -> bool:
     """`axes.whitened_energy`; False where a covariance is not positive definite."""
     for j in range(len(y)):
@@ -65,7 +66,7 @@ def energies(y: FloatArray, C: FloatArray, energy: FloatArray, axes: IntArray) -
     return True
 
 
-@njit('void(float64[:,::1], float64[:,:,::1], float64[::1])', cache=True, error_model='numpy')
+@compiled_when_used('void(float64[:,::1], float64[:,:,::1], float64[::1])', error_model='numpy')
 def smallest_pivots(y: FloatArray, C: FloatArray, out: FloatArray) -> None:
     """`axes.smallest_pivots`."""
     for j in range(len(y)):

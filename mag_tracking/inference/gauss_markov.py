@@ -13,6 +13,7 @@ import numpy as np
 from numba import float64, int64, njit, void
 
 from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.compiled import compiled_when_used
 
 STRENGTHS = np.logspace(-1.5, 4.5, 13)
 """[1/s^1.5] Root spectral densities of the bank, in units of a vector's scale."""
@@ -68,7 +69,7 @@ class GaussMarkovVectors:
         return float(out[0])
 
 
-@njit(cache=True)
+@njit()
 def _predict(x: FloatArray, P: FloatArray, q: FloatArray, dt: float) -> None:
     """Move levels and rates (2 m,) and their covariance on by `dt`, in place."""
     m = len(q)
@@ -86,7 +87,7 @@ def _predict(x: FloatArray, P: FloatArray, q: FloatArray, dt: float) -> None:
         P[m + i, m + i] += q[i] * dt
 
 
-@njit(cache=True)
+@njit()
 def _update(x: FloatArray, P: FloatArray, h: FloatArray, y: float, variance: float,
             PH: FloatArray) -> float:
     """Update with a scalar measurement, in place; its log-density. `PH` (2 m,) is overwritten."""
@@ -120,8 +121,9 @@ def _update(x: FloatArray, P: FloatArray, h: FloatArray, y: float, variance: flo
     return float(-0.5 * (nu * nu / S + np.log(2.0 * np.pi * S)))
 
 
-@njit(void(_M, _B, float64[:, ::1], float64[:, ::1], int64[::1], float64[:, ::1], float64[::1],
-           float64[::1], float64, float64[::1]), cache=True)
+@compiled_when_used(
+    void(_M, _B, float64[:, ::1], float64[:, ::1], int64[::1], float64[:, ::1], float64[::1],
+    float64[::1], float64, float64[::1]))
 def _step(x: FloatArray, P: FloatArray, log_w: FloatArray, densities: FloatArray,
           vector: IntArray, H: FloatArray, y: FloatArray, variance: FloatArray, dt: float,
           out: FloatArray) -> None:

@@ -33,15 +33,26 @@ struct Sizes {
     INLINE std::size_t square() const { return std::size_t(n_x) * wide; }
 };
 
-// A covariance (n_x, n_x) of others into one of rows that are `wide`, and back.
+// A covariance (n_x, n_x) of others into one of rows that are `wide`, and back. Rows are too short
+// for a call of memcpy.
+INLINE void copy_rows(const double* from, int from_row, double* to, int to_row, int n) {
+    for (int i = 0; i < n; ++i, from += from_row, to += to_row) {
+        int k = 0;
+        for (; k + EIGHT <= n; k += EIGHT) std::memcpy(to + k, from + k, sizeof(Eight));
+        // The rest, once more with what is before it.
+        if (k < n && n >= EIGHT)
+            std::memcpy(to + n - EIGHT, from + n - EIGHT, sizeof(Eight));
+        else
+            for (; k < n; ++k) to[k] = from[k];
+    }
+}
+
 INLINE void to_wide(const double* from, const Sizes& n, double* to) {
-    for (int i = 0; i < n.n_x; ++i)
-        std::memcpy(to + i * n.wide, from + i * n.n_x, n.n_x * sizeof(double));
+    copy_rows(from, n.n_x, to, n.wide, n.n_x);
 }
 
 INLINE void from_wide(const double* from, const Sizes& n, double* to) {
-    for (int i = 0; i < n.n_x; ++i)
-        std::memcpy(to + i * n.n_x, from + i * n.wide, n.n_x * sizeof(double));
+    copy_rows(from, n.wide, to, n.n_x, n.n_x);
 }
 
 // What an update did, sensor after sensor. Of each given those before it: z = W u whitens its
@@ -66,7 +77,8 @@ INLINE void move_covariance(double* __restrict P, const Sizes& n, const Motion& 
         }
     }
     for (int r = 0; r < motion.n; ++r)
-        std::memcpy(P + motion.rows[r] * n.wide, T + r * n.wide, n.wide * sizeof(double));
+        for (int v = 0; v < n.n_eights; ++v)
+            eights(P + motion.rows[r] * n.wide)[v] = eights(T + r * n.wide)[v];
     for (int i = 0; i < n.n_x; ++i)
         for (int r = 0; r < motion.n; ++r) P[i * n.wide + motion.rows[r]] = T[r * n.wide + i];
     for (int r = 0; r < motion.n; ++r)
@@ -99,7 +111,8 @@ INLINE void gain_rows(const double* __restrict P, const double* H, const Sizes& 
                       double* __restrict G) {
     Eight *g0 = eights(G), *g1 = g0 + n.n_eights, *g2 = g1 + n.n_eights;
     const double *h0 = H, *h1 = h0 + n.n_seen(), *h2 = h1 + n.n_seen();
-    std::memcpy(G, P + n.background(j) * n.wide, 3 * n.wide * sizeof(double));
+    const Eight* own = eights(P + n.background(j) * n.wide);
+    for (int v = 0; v < 3 * n.n_eights; ++v) g0[v] = own[v];
     int c = 0;
     for (; c + 4 <= n.n_t; c += 4) {
         const Eight* p = eights(P + c * n.wide);

@@ -116,13 +116,32 @@ def _inverse(A: FloatArray, rank: float = 1e-15) -> FloatArray:
         A = np.where(finite[:, None, None], A, np.eye(A.shape[1]))
     scale = np.sqrt(np.einsum('nii->ni', A))
     scale = np.where(scale > 0.0, scale, 1.0)
-    w, V = np.linalg.eigh(A / (scale[:, :, None] * scale[:, None, :]))
+    unit = A / (scale[:, :, None] * scale[:, None, :])
+    if finite.all() and _have_full_rank(unit):
+        full: FloatArray = np.linalg.inv(unit) / (scale[:, :, None] * scale[:, None, :])
+        return full
+    w, V = np.linalg.eigh(unit)
     w = np.where(w > rank * w[:, -1:], w, np.inf)
     V = V / scale[:, :, None]
     with _running_away():
         inverse: FloatArray = (V / w[:, None, :]) @ np.swapaxes(V, 1, 2)
     inverse[~finite] = np.nan
     return inverse
+
+
+def _have_full_rank(A: FloatArray) -> bool:
+    """Whether all of the symmetric `A` (n, k, k) of unit diagonal have far more than the rank that
+    a pseudo-inverse asks for. It takes a tenth of the time of their eigenvalues.
+    """
+    try:
+        L = np.linalg.cholesky(A)
+    except np.linalg.LinAlgError:
+        return False
+    return bool(np.einsum('nii->ni', L).min() > FULL_RANK)
+
+
+FULL_RANK = 1e-3
+"""The least root of a pivot that is left to a matrix whose inverse needs no care."""
 
 
 def project_out_linear(A: FloatArray, y: FloatArray

@@ -12,6 +12,7 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import CompileOptions, FloatArray
+from mag_tracking.compiled import compiled_when_used
 
 MU0 = 4e-7 * math.pi
 """Vacuum permeability [T m / A], the value of the source documents."""
@@ -19,7 +20,7 @@ MU0 = 4e-7 * math.pi
 K_DIPOLE = 1e-7
 """mu0 / 4 pi [T m / A]."""
 
-_COMPILE: CompileOptions = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}
+_COMPILE: CompileOptions = {'error_model': 'numpy', 'fastmath': {'contract'}}
 """Fused multiply-add is allowed, nothing else that would change a result."""
 
 
@@ -65,8 +66,9 @@ def _row_times_symmetric(a: float, b: float, c: float, S: Symmetric) -> Vector:
     return a * s00 + b * s01 + c * s02, a * s01 + b * s11 + c * s12, a * s02 + b * s12 + c * s22
 
 
-@njit('void(float64[:,::1], float64[:,::1], float64[:,::1], float64[:,:,::1], '
-      'float64[:,:,::1])', **_COMPILE)
+@compiled_when_used(
+    'void(float64[:,::1], float64[:,::1], float64[:,::1], float64[:,:,::1], float64[:,:,::1])',
+    **_COMPILE)
 def _field_and_jacobians_rows(d: FloatArray, m: FloatArray, B: FloatArray, dB_dd: FloatArray,
                               dB_dm: FloatArray) -> None:
     """Loop of `field_and_jacobians` over rows."""
@@ -79,9 +81,10 @@ def _field_and_jacobians_rows(d: FloatArray, m: FloatArray, B: FloatArray, dB_dd
             J[i, 2, 0], J[i, 2, 1], J[i, 2, 2] = j02, j12, j22
 
 
-@njit('void(float64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[:,:,::1], '
-      'float64[:,:,:,::1], float64[:,:,:,::1], float64[:,:,::1], float64[:,:,:,::1], '
-      'float64[:,::1])', **_COMPILE)
+@compiled_when_used(
+    'void(float64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[:,:,::1], '
+    'float64[:,:,:,::1], float64[:,:,:,::1], float64[:,:,::1], float64[:,:,:,::1], '
+    'float64[:,::1])', **_COMPILE)
 def _sensor_fields(positions: FloatArray, R_sw: FloatArray, r: FloatArray, m: FloatArray,
                    dr_dx: FloatArray, dm_dx: FloatArray, h: FloatArray, H: FloatArray,
                    gradient: FloatArray) -> None:

@@ -8,10 +8,10 @@ hold it constant over a sample, and PHD15 Paper A eq. (18) is misprinted.)
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.compiled import compiled_when_used
 
 SMALL = 1e-4
 """[rad] Below it the chord of an arc is taken from its series."""
@@ -74,7 +74,7 @@ def coordinated_turn(x: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
     return moved, F
 
 
-@njit('void(float64[:,::1], float64, float64[:,:,::1])', cache=True, error_model='numpy')
+@compiled_when_used('void(float64[:,::1], float64, float64[:,:,::1])', error_model='numpy')
 def _turn(x: FloatArray, dt: float, F: FloatArray) -> None:
     """The same, in place; the derivative comes as zeros."""
     n_x = x.shape[1]

@@ -1,13 +1,14 @@
 """Sensors that are not turned quite as the network says."""
 
 import numpy as np
-from numba import njit
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.compiled import compiled_when_used
 
 
-@njit('void(float64[:,:,::1], float64[:,:,:,::1], float64[:,:,:], float64[:,:,::1], '
-      'float64[:,:,:,::1])', cache=True, error_model='numpy', fastmath={'contract'})
+@compiled_when_used(
+    'void(float64[:,:,::1], float64[:,:,:,::1], float64[:,:,:], float64[:,:,::1], '
+    'float64[:,:,:,::1])', error_model='numpy', fastmath={'contract'})
 def _turned_fields(h: FloatArray, H: FloatArray, angles: FloatArray, out_h: FloatArray,
                    out_H: FloatArray) -> None:
     """Loop of `turned_fields` over hypotheses and sensors."""

@@ -27,9 +27,10 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import CompileOptions, FloatArray
+from mag_tracking.compiled import compiled_when_used
 from mag_tracking.physics.dipole import K_DIPOLE, Symmetric, Vector
 
-_COMPILE: CompileOptions = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}
+_COMPILE: CompileOptions = {'error_model': 'numpy', 'fastmath': {'contract'}}
 _INLINE: CompileOptions = {'error_model': 'numpy', 'fastmath': {'contract'}, 'forceinline': True}
 
 
@@ -128,8 +129,9 @@ def field_and_jacobians(d0: float, d1: float, d2: float, m: FloatArray, B: Float
         _add_octupole(d, m, s * inv2 * inv2, inv2, B, dB_dd, dB_dm)
 
 
-@njit('void(float64[:,::1], float64[:,::1], float64[:,::1], float64[:,:,::1], '
-      'float64[:,:,::1])', **_COMPILE)
+@compiled_when_used(
+    'void(float64[:,::1], float64[:,::1], float64[:,::1], float64[:,:,::1], float64[:,:,::1])',
+    **_COMPILE)
 def _field_and_jacobians_rows(d: FloatArray, m: FloatArray, B: FloatArray, dB_dd: FloatArray,
                               dB_dm: FloatArray) -> None:
     """Loop of `field_and_jacobians` over rows."""

@@ -8,16 +8,17 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 
 from mag_tracking.arrays import CompileOptions, FloatArray
+from mag_tracking.compiled import compiled_when_used
 from mag_tracking.physics.dipole import field_and_jacobians
 
-_COMPILE: CompileOptions = {'cache': True, 'error_model': 'numpy', 'fastmath': {'contract'}}
+_COMPILE: CompileOptions = {'error_model': 'numpy', 'fastmath': {'contract'}}
 
 
-@njit('void(float64[:,:], float64[:], float64[:,::1], float64[::1], float64[:,:,::1], '
-      'float64[:,:,::1])', **_COMPILE)
+@compiled_when_used(
+    'void(float64[:,:], float64[:], float64[:,::1], float64[::1], float64[:,:,::1], '
+    'float64[:,:,::1])', **_COMPILE)
 def _row_basis(theta: FloatArray, places: FloatArray, positions: FloatArray, t: FloatArray,
                M: FloatArray, A: FloatArray) -> None:
     """Fields of unit moments: A (n, 3 n_samples, 3 d), each sample's turned by its M."""
@@ -41,8 +42,9 @@ def _row_basis(theta: FloatArray, places: FloatArray, positions: FloatArray, t: 
                     A[p, 3 * s + a, 3 * i + 2] = m0 * j02 + m1 * j12 + m2 * j22
 
 
-@njit('void(float64[:,:], float64[:,:], float64[:], float64[:,::1], float64[::1], '
-      'float64[:,:,::1], float64[:,:,::1])', **_COMPILE)
+@compiled_when_used(
+    'void(float64[:,:], float64[:,:], float64[:], float64[:,::1], float64[::1], '
+    'float64[:,:,::1], float64[:,:,::1])', **_COMPILE)
 def _row_derivative(theta: FloatArray, moments: FloatArray, places: FloatArray,
                     positions: FloatArray, t: FloatArray, M: FloatArray, D: FloatArray) -> None:
     """Derivatives by theta of the field of the moments: adds to D (n, 3 n_samples, 6 or 7)."""

@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from mag_tracking.arrays import CompileOptions, FloatArray, IntArray
+from mag_tracking.compiled import compiled_when_used
 from mag_tracking.physics.dipole import field_and_jacobians
 
 PATH = ('x', 'y', 'z', 'speed', 'heading', 'climb', 'length', 'acceleration', 'turn_rate',
@@ -65,7 +66,8 @@ def _moves(theta: FloatArray, p: int, time: float, clock: int, nodes: FloatArray
     """Derivatives by path and clocks: dc (n, 3) of the row's middle, da (n,) of its heading."""
     v, heading, gain = theta[p, _SPEED], theta[p, _HEADING], theta[p, _GAIN]
     rate, more = theta[p, _RATE], theta[p, _MORE]
-    dc[:], da[:] = 0.0, 0.0
+    for k in range(len(da)):
+        dc[k, 0] = dc[k, 1] = dc[k, 2] = da[k] = 0.0
     dc[_X, 0], dc[_Y, 1], dc[_Z, 2], dc[_CLIMB, 2] = 1.0, 1.0, 1.0, time
     for g in range(nodes.shape[0]):
         at = 0.5 * time * (nodes[g] + 1.0)
@@ -90,9 +92,9 @@ def _moves(theta: FloatArray, p: int, time: float, clock: int, nodes: FloatArray
         dc[k, 2], da[k] = -theta[p, _CLIMB], -rate - more * time
 
 
-@njit('void(float64[:,::1], float64[::1], float64[:,::1], float64[::1], int64[::1], '
-      'float64[:,:,::1], float64[::1], float64[::1], float64[:,:,::1])', cache=True,
-      error_model='numpy')
+@compiled_when_used(
+    'void(float64[:,::1], float64[::1], float64[:,::1], float64[::1], int64[::1], '
+    'float64[:,:,::1], float64[::1], float64[::1], float64[:,:,::1])', error_model='numpy')
 def _basis(theta: FloatArray, places: FloatArray, positions: FloatArray, t: FloatArray,
            clock: IntArray, M: FloatArray, nodes: FloatArray, weights: FloatArray,
            A: FloatArray) -> None:
@@ -114,9 +116,10 @@ def _basis(theta: FloatArray, places: FloatArray, positions: FloatArray, t: Floa
                     A[p, 3 * k + a, 3 * i + 2] = m0 * j02 + m1 * j12 + m2 * j22
 
 
-@njit('void(float64[:,::1], float64[:,::1], float64[::1], float64[:,::1], float64[::1], '
-      'int64[::1], float64[:,:,::1], float64[::1], float64[::1], float64[:,:,::1])', cache=True,
-      error_model='numpy')
+@compiled_when_used(
+    'void(float64[:,::1], float64[:,::1], float64[::1], float64[:,::1], float64[::1], '
+    'int64[::1], float64[:,:,::1], float64[::1], float64[::1], float64[:,:,::1])',
+    error_model='numpy')
 def _derivative(theta: FloatArray, moments: FloatArray, places: FloatArray,
                 positions: FloatArray, t: FloatArray, clock: IntArray, M: FloatArray,
                 nodes: FloatArray, weights: FloatArray, D: FloatArray) -> None:

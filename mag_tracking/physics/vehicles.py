@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.compiled import compiled_when_used
 from mag_tracking.physics.dipole import MU0
 from mag_tracking.physics.motion import constant_velocity, coordinated_turn, integrator_noise
 from mag_tracking.physics.sources import Dipoles
@@ -47,8 +48,9 @@ def _induced(soft_x: float, soft_y: float, ahead: float, left: float, c: float, 
             c * dm_ahead - s * dm_left, s * dm_ahead + c * dm_left)
 
 
-@njit('void(float64[:,:], float64[:], float64[:], float64[:,:,::1], float64[:,:,::1], '
-      'float64[:,:,:,::1], float64[:,:,:,::1])', cache=True, error_model='numpy')
+@compiled_when_used(
+    'void(float64[:,:], float64[:], float64[:], float64[:,:,::1], float64[:,:,::1], '
+    'float64[:,:,:,::1], float64[:,:,:,::1])', error_model='numpy')
 def _row_dipoles(x: FloatArray, places: FloatArray, induction: FloatArray, r: FloatArray,
                  m: FloatArray, dr_dx: FloatArray, dm_dx: FloatArray) -> None:
     """TSP14 eq. (10b) and ICASSP11 eq. (8), a row a hypothesis; the derivatives come as zeros.
@@ -88,8 +90,8 @@ def _row_dipoles(x: FloatArray, places: FloatArray, induction: FloatArray, r: Fl
             _position(x, p, i, places[i], c, s, turn_x, turn_y, r, dr_dx)
 
 
-@njit('void(float64[:,:], float64[:,::1], float64, float64[:,:,::1])', cache=True,
-      error_model='numpy')
+@compiled_when_used(
+    'void(float64[:,:], float64[:,::1], float64, float64[:,:,::1])', error_model='numpy')
 def _moment_noise(x: FloatArray, walk: FloatArray, induction2: float, Q: FloatArray) -> None:
     """Write the process noise of the hard iron moments into `Q`.
 

@@ -131,7 +131,7 @@ def test_separated_weight_counts_only_what_is_apart():
     b = bank(3, spread=1.0)
     b.x[2, 0] = 30.0
     b.log_w = np.log([0.6, 0.3, 0.1])
-    assert b.separated_weight(0) == pytest.approx(0.1)
+    assert b.weight(b.apart(0)) == pytest.approx(0.1)
 
 
 def starts(network, earth, offset_std=0.5):

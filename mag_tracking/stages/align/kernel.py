@@ -8,6 +8,7 @@ import numpy as np
 from numba import boolean, float64, from_dtype, int64, njit, void
 
 from mag_tracking.arrays import FloatArray, IntArray, Record, StructArray
+from mag_tracking.compiled import compiled_when_used
 from mag_tracking.units import NEVER
 
 (DONE, UNKNOWN_SENSOR, NO_FIELD, NO_COVARIANCE, DUPLICATE, OUT_OF_ORDER, LATE) = range(7)
@@ -33,7 +34,7 @@ _I, _II = int64[::1], int64[:, ::1]
 _V, _M = float64[:, ::1], float64[:, :, ::1]
 
 
-@njit(cache=True)
+@njit()
 def _is_behind(c: Record, latest: int) -> bool:
     """Whether a sensor is alive, and may still give a sample of before the end of the frame."""
     if latest == NEVER:
@@ -41,7 +42,7 @@ def _is_behind(c: Record, latest: int) -> bool:
     return bool(c.newest - c.wait <= latest and latest < c.due)
 
 
-@njit(cache=True)
+@njit()
 def _is_one_behind(c: Record, latest: IntArray) -> bool:
     """Whether there is one; it is watched from now on, until it is behind no more."""
     if c.watch >= 0 and _is_behind(c, latest[c.watch]):
@@ -53,13 +54,13 @@ def _is_one_behind(c: Record, latest: IntArray) -> bool:
     return False
 
 
-@njit(boolean(CLOCKS, _I), cache=True)
+@compiled_when_used(boolean(CLOCKS, _I))
 def is_one_behind(clocks: StructArray, latest: IntArray) -> bool:
     """Whether the next frame has to wait for a sensor; `latest` (n_sensors,) [ns] timestamps."""
     return bool(_is_one_behind(clocks[0], latest))
 
 
-@njit(cache=True)
+@njit()
 def _bring_forward(c: Record, stamp: int, taken: int) -> None:
     """`bring_forward`."""
     if c.is_burst:
@@ -72,7 +73,7 @@ def _bring_forward(c: Record, stamp: int, taken: int) -> None:
     c.due = c.start + c.window
 
 
-@njit(void(CLOCKS, int64, int64), cache=True)
+@compiled_when_used(void(CLOCKS, int64, int64))
 def bring_forward(clocks: StructArray, stamp: int, taken: int) -> None:
     """Have the next frame end early enough for the oldest pending sample of a sensor.
 
@@ -88,7 +89,7 @@ def bring_forward(clocks: StructArray, stamp: int, taken: int) -> None:
     _bring_forward(clocks[0], stamp, taken)
 
 
-@njit(cache=True)
+@njit()
 def _fault(field: FloatArray, covariance: FloatArray) -> int:
     """Why a sample cannot be used, or DONE."""
     n_missing = 0
@@ -98,12 +99,14 @@ def _fault(field: FloatArray, covariance: FloatArray) -> int:
         n_missing += np.isnan(field[a])
     if n_missing == 3:
         return NO_FIELD
-    if np.isnan(covariance[0, 0]) and np.isnan(covariance).all():
-        return NO_COVARIANCE
-    return DONE
+    for a in range(3):
+        for b in range(3):
+            if not np.isnan(covariance[a, b]):
+                return DONE
+    return NO_COVARIANCE
 
 
-@njit(cache=True)
+@njit()
 def _place(c: Record, latest: IntArray, i: int, stamp: int) -> int:
     """Why the timestamp of a sample of sensor `i` cannot be used, or DONE."""
     last = latest[i]
@@ -119,8 +122,21 @@ def _place(c: Record, latest: IntArray, i: int, stamp: int) -> int:
     return DONE
 
 
-@njit(int64(CLOCKS, boolean, _I, _I, _I, _I, _I, _II, _M, float64[:, :, :, ::1], _I, _I, _V, _M),
-      cache=True)
+@njit()
+def _store(fields: FloatArray, covariances: FloatArray, i: int, place: int, field: FloatArray,
+           covariance: FloatArray) -> None:
+    """Put a field (3,) and its covariance (3, 3) to a place of sensor `i`.
+
+    Numba would take two seconds to compile the text of the error of a slice that does not fit.
+    """
+    for a in range(3):
+        fields[i, place, a] = field[a]
+        for b in range(3):
+            covariances[i, place, a, b] = covariance[a, b]
+
+
+@compiled_when_used(
+    int64(CLOCKS, boolean, _I, _I, _I, _I, _I, _II, _M, float64[:, :, :, ::1], _I, _I, _V, _M))
 def hold_samples(clocks: StructArray, is_checked: bool, latest: IntArray, passed: IntArray,
                  taken: IntArray, first: IntArray, count: IntArray, stamp: IntArray,
                  field: FloatArray, covariance: FloatArray, rows: IntArray, stamps: IntArray,
@@ -173,8 +189,7 @@ def hold_samples(clocks: StructArray, is_checked: bool, latest: IntArray, passed
             _bring_forward(c, t, taken[i])
         place = (first[i] + count[i]) % room
         stamp[i, place] = t
-        field[i, place] = fields[k]
-        covariance[i, place] = covariances[k]
+        _store(field, covariance, i, place, fields[k], covariances[k])
         count[i] += 1
         if count[i] > c.most:
             return TOO_MANY

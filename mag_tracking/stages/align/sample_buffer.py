@@ -3,9 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import boolean, float64, int64, njit, void
+from numba import boolean, float64, int64, void
 
 from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.compiled import compiled_when_used
 from mag_tracking.units import NEVER
 
 ROOM = 32
@@ -84,8 +85,9 @@ class SampleBuffer:
         self.first[:] = 0
 
 
-@njit(void(int64, boolean, _I, _I, _II, float64[:, :, ::1], float64[:, :, :, ::1],
-                 _I, float64[:, ::1], float64[:, ::1], float64[:, :, ::1], _I, _I), cache=True)
+@compiled_when_used(
+    void(int64, boolean, _I, _I, _II, float64[:, :, ::1], float64[:, :, :, ::1], _I, float64[:,
+    ::1], float64[:, ::1], float64[:, :, ::1], _I, _I))
 def _take(end: int, one_each: bool, first: IntArray, count: IntArray, stamp: IntArray,
           field: FloatArray, covariance: FloatArray, n: IntArray, n_axis: FloatArray,
           total: FloatArray, total_covariance: FloatArray, since: IntArray,

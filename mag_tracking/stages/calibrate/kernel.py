@@ -21,6 +21,7 @@ from mag_tracking.calibration.screening import (
     screen_spike,
 )
 from mag_tracking.calibration.sensor_state import SENSORS
+from mag_tracking.compiled import compiled_when_used
 from mag_tracking.units import NEVER
 
 (DONE, UNKNOWN_SENSOR, NO_AXIS, INFINITE, TOO_LARGE, BAD_COVARIANCE, AXIS_MISSING, TOO_FAR_AHEAD,
@@ -58,7 +59,7 @@ _LIMITS, _BATCH = from_dtype(LIMITS)[::1], from_dtype(BATCH)[::1]
 _I, _V, _M = int64[::1], float64[:, ::1], float64[:, :, ::1]
 
 
-@njit(cache=True)
+@njit()
 def _fault(limits: Record, raw: FloatArray, own: int) -> int:
     """Why a raw reading cannot be used, or DONE."""
     largest, is_known = 0.0, False
@@ -74,7 +75,7 @@ def _fault(limits: Record, raw: FloatArray, own: int) -> int:
     return BAD_COVARIANCE if own == INVALID and limits.trust_covariances else DONE
 
 
-@njit(cache=True)
+@njit()
 def _remove_iron(s: Record, raw: FloatArray, field: FloatArray) -> bool:
     """Remove the sensor's own hard and soft iron: from `raw` into `field`; False: no axis is left.
 
@@ -98,7 +99,7 @@ def _remove_iron(s: Record, raw: FloatArray, field: FloatArray) -> bool:
     return is_known
 
 
-@njit(cache=True)
+@njit()
 def _misplaced(s: Record, limits: Record, stamp: int) -> int:
     """Why a timestamp cannot be used, or DONE."""
     if s.last_ns != NEVER:
@@ -121,7 +122,7 @@ def _misplaced(s: Record, limits: Record, stamp: int) -> int:
     return DONE
 
 
-@njit(cache=True)
+@njit()
 def _check(s: Record, limits: Record, stamp: int, raw: FloatArray, own: int,
            field: FloatArray) -> int:
     """Why a reading cannot be used, or is not used yet, or DONE; without iron it is in `field`."""
@@ -138,7 +139,7 @@ def _check(s: Record, limits: Record, stamp: int, raw: FloatArray, own: int,
     return STUCK if limits.reject_stuck and is_stuck(s, field) else DONE
 
 
-@njit(cache=True)
+@njit()
 def _screen(s: Record, limits: Record, batch: Record, stamp: int, field: FloatArray, own: int,
             covariance: FloatArray, steps: FloatArray) -> int:
     """`screen_spike`, with the number of spikes noted."""
@@ -152,7 +153,7 @@ def _screen(s: Record, limits: Record, batch: Record, stamp: int, field: FloatAr
     return verdict
 
 
-@njit(cache=True)
+@njit()
 def _queue(s: Record, stamp: int, field: FloatArray, own: int, covariance: FloatArray) -> None:
     """Store a reading that passes and cannot be used before Python has done something."""
     s.n_held = s.n_released = 1
@@ -163,7 +164,7 @@ def _queue(s: Record, stamp: int, field: FloatArray, own: int, covariance: Float
             s.held_covariance[0, a, b] = covariance[a, b]
 
 
-@njit(cache=True)
+@njit()
 def _is_credible(s: Record, covariance: FloatArray) -> bool:
     """Whether the covariance of a message agrees with the noise of the sensor."""
     for a in range(3):
@@ -180,7 +181,7 @@ def _is_credible(s: Record, covariance: FloatArray) -> bool:
     return True
 
 
-@njit(cache=True)
+@njit()
 def _attach_covariance(s: Record, limits: Record, batch: Record, own: int,
                        covariance: FloatArray, out: FloatArray) -> None:
     """Covariance of a reading: its own where that is credible, else that of the sensor.
@@ -202,7 +203,7 @@ def _attach_covariance(s: Record, limits: Record, batch: Record, own: int,
         out[a, a] += s.level_variance[a]
 
 
-@njit(cache=True)
+@njit()
 def _use(s: Record, limits: Record, batch: Record, row: int, stamp: int, field: FloatArray,
          own: int, covariance: FloatArray, out_rows: IntArray, out_stamps: IntArray,
          out_fields: FloatArray, out_covariances: FloatArray) -> bool:
@@ -237,11 +238,13 @@ def _use(s: Record, limits: Record, batch: Record, row: int, stamp: int, field: 
     return True
 
 
-@njit(cache=True)
+@njit()
 def _correct_covariance(s: Record, C: FloatArray, out: FloatArray) -> None:
     """Covariance `C` (3, 3) of a raw reading after the soft-iron correction, into `out`."""
     if not s.has_correction:
-        out[:] = C
+        for a in range(3):
+            for b in range(3):
+                out[a, b] = C[a, b]
         return
     for a in range(3):
         for b in range(3):
@@ -254,7 +257,7 @@ def _correct_covariance(s: Record, C: FloatArray, out: FloatArray) -> None:
                         out[a, b] += weight * C[c, d]
 
 
-@njit(int64(SENSORS, _LIMITS, _I, _I, _V, _I, _M, _BATCH, _I, _I, _V, _M), cache=True)
+@compiled_when_used(int64(SENSORS, _LIMITS, _I, _I, _V, _I, _M, _BATCH, _I, _I, _V, _M))
 def calibrate_readings(sensors: StructArray, limits: StructArray, rows: IntArray,
                        stamps: IntArray, fields: FloatArray, own: IntArray,
                        covariances: FloatArray, batches: StructArray, out_rows: IntArray,
@@ -318,8 +321,9 @@ def calibrate_readings(sensors: StructArray, limits: StructArray, rows: IntArray
     return DONE
 
 
-@njit(boolean(SENSORS, _LIMITS, _BATCH, int64, int64, float64[::1], int64, float64[:, ::1], _I, _I,
-              _V, _M), cache=True)
+@compiled_when_used(
+    boolean(SENSORS, _LIMITS, _BATCH, int64, int64, float64[::1], int64, float64[:, ::1], _I, _I,
+    _V, _M))
 def use_reading(sensors: StructArray, limits: StructArray, batches: StructArray, row: int,
                 stamp: int, field: FloatArray, own: int, covariance: FloatArray, out_rows: IntArray,
                 out_stamps: IntArray, out_fields: FloatArray,

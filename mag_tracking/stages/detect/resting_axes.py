@@ -5,9 +5,10 @@ it does not move at all, so that two axes that move by one step each are no nois
 """
 
 import numpy as np
-from numba import float64, njit, void
+from numba import float64, void
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.compiled import compiled_when_used
 from mag_tracking.records import plain
 
 MEMORY_FRAMES = 100
@@ -53,7 +54,7 @@ class RestingAxes:
         return out
 
 
-@njit(void(_V, _V, _V), cache=True)
+@compiled_when_used(void(_V, _V, _V))
 def _learn(field: FloatArray, n: FloatArray, square: FloatArray) -> None:
     """`RestingAxes.learn`."""
     for j in range(len(field)):
@@ -63,7 +64,7 @@ def _learn(field: FloatArray, n: FloatArray, square: FloatArray) -> None:
                 square[j, a] += (field[j, a]**2 - square[j, a]) / n[j, a]
 
 
-@njit(void(_M, _V, _V, float64, _M), cache=True)
+@compiled_when_used(void(_M, _V, _V, float64, _M))
 def _scale(covariance: FloatArray, n: FloatArray, square: FloatArray, allowance: float,
            out: FloatArray) -> None:
     """`RestingAxes.covariance`."""

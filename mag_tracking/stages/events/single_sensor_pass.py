@@ -3,11 +3,12 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import float64, njit
+from numba import float64
 from scipy.optimize import minimize
 from scipy.special import ndtr
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.compiled import compiled_when_used
 from mag_tracking.records import plain
 
 MOST_SAMPLES = 200
@@ -105,7 +106,7 @@ def _averaged(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return t[:k * n].reshape(k, n).mean(axis=1), y[:k * n].reshape(k, n, -1).mean(axis=1)
 
 
-@njit(float64(float64[::1], float64[:, ::1], float64, float64), cache=True)
+@compiled_when_used(float64(float64[::1], float64[:, ::1], float64, float64))
 def _cost(t: FloatArray, y: FloatArray, time: float, scale: float) -> float:
     """Sum of squares of (n, k) `y` that a pass with this time and time scale leaves over.
 

@@ -4,9 +4,10 @@ Who looks at ten thousand readings a second one by one does nothing else.
 """
 
 import numpy as np
-from numba import float64, int64, njit
+from numba import float64, int64
 
 from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.compiled import compiled_when_used
 
 
 class ReadingBuffer:
@@ -52,7 +53,7 @@ class ReadingBuffer:
 _I, _II = int64[::1], int64[:, ::1]
 
 
-@njit(int64(_I, _I, float64[:, ::1], int64, int64, _I, _II, _II, float64[:, :, ::1]), cache=True)
+@compiled_when_used(int64(_I, _I, float64[:, ::1], int64, int64, _I, _II, _II, float64[:, :, ::1]))
 def _add(rows: IntArray, stamps: IntArray, fields: FloatArray, received_ns: int, first: int,
          count: IntArray, stamp: IntArray, received: IntArray, field: FloatArray) -> int:
     """`ReadingBuffer.add`."""

@@ -10,7 +10,7 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.sources import Magnet, SourceModel
 from mag_tracking.physics.vehicles import FASTEST_TURN, RowVehicle
-from mag_tracking.records import FieldFrame
+from mag_tracking.records import FieldFrame, plain
 from mag_tracking.stages.track import core
 from mag_tracking.stages.track.observation import SAME_TIME_S, Observation
 from mag_tracking.stages.track.settings import TrackSettings
@@ -59,6 +59,7 @@ class BankFilter:
                  settings: TrackSettings) -> None:
         """`settings` is a `TrackSettings`; the live ones may be changed by `configure`."""
         self._n_sensors = len(network)
+        self._no_offset = np.zeros(len(network))
         self.observation = Observation(network, model, np.deg2rad(settings.mounting_std_deg),
                                        settings.model_error_time_s)
         self._compiled = compiled_filter(model, self.observation)
@@ -103,15 +104,17 @@ class BankFilter:
     def _advance(self, bank: FilterBank, frame: FieldFrame, dt: float, moves: bool,
                  iterations: int) -> tuple[FloatArray, FloatArray]:
         """(predicted (n_hyp, n_x), log-likelihood (n_hyp,)); without iterations it only moves."""
-        frames = self._frames([frame], [dt])
+        n_hyp = len(bank)
+        decay, variance = self.observation.drift(np.asarray(dt), self._settings.background_drift)
         new_x, new_P, predicted = np.empty_like(bank.x), np.empty_like(bank.P), \
             np.empty_like(bank.x)
-        log_likelihood, nis = np.zeros(len(bank)), np.full((len(bank), self._n_sensors), np.nan)
+        log_likelihood, nis = np.zeros(n_hyp), np.full((n_hyp, self._n_sensors), np.nan)
+        # By position: names of so many arguments would take as long as a few hypotheses.
         self._compiled.advance(
-            **{name: values[0] for name, values in frames.items()}, moves=moves,
-            iterations=iterations, field_error=self._settings.field_error,
-            near_field_length=self._near_field_lengths[bank.kind], x=bank.x, P=bank.P,
-            new_x=new_x, new_P=new_P, predicted=predicted, log_likelihood=log_likelihood, nis=nis)
+            plain(frame.field), plain(known_covariance(frame.covariance)),
+            self.time_offset(frame, dt), dt, decay, variance, moves, iterations,
+            self._settings.field_error, self._near_field_lengths[bank.kind], bank.x, bank.P, new_x,
+            new_P, predicted, log_likelihood, nis)
         bank.x, bank.P, bank.nis = new_x, new_P, nis
         return predicted, log_likelihood
 
@@ -167,10 +170,10 @@ class BankFilter:
 
     def time_offset(self, frame: FieldFrame, dt: float) -> FloatArray:
         """(n_sensors,) [s] of the samples of a frame that comes `dt` [s] after the one before."""
-        one_time = dt <= 0.0 or np.ptp(frame.time_offset) < ONE_TIME * dt
-        offset: FloatArray = np.zeros(self._n_sensors) if one_time else (
-            np.round(frame.time_offset / SAME_TIME_S) * SAME_TIME_S)
-        return offset
+        offset: FloatArray = frame.time_offset
+        if dt <= 0.0 or offset.max() - offset.min() < ONE_TIME * dt:
+            return self._no_offset
+        return np.round(offset / SAME_TIME_S) * SAME_TIME_S
 
     def model_error(self, bank: FilterBank, i: int, dt: float) -> FloatArray:
         """(n_sensors,) [T^2] variance of what the model of hypothesis `i` leaves out of a field.
@@ -238,4 +241,5 @@ class NoTarget:
 
 def known_covariance(covariance: FloatArray) -> FloatArray:
     """(..., 3, 3) [T^2] those of frames; identity where an axis is missing."""
-    return np.where(np.isnan(covariance), np.eye(3), covariance)
+    missing = np.isnan(covariance)
+    return np.where(missing, np.eye(3), covariance) if missing.any() else covariance

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from mag_tracking.arrays import BoolArray, FloatArray
 
 class _Filter:
-    def advance(self, *, field: FloatArray, covariance: FloatArray, offset: FloatArray, dt: float,
+    def advance(self, field: FloatArray, covariance: FloatArray, offset: FloatArray, dt: float,
                 decay: FloatArray, variance: FloatArray, moves: bool, iterations: int,
                 field_error: float, near_field_length: FloatArray, x: FloatArray, P: FloatArray,
                 new_x: FloatArray, new_P: FloatArray, predicted: FloatArray,

@@ -226,20 +226,19 @@ class Filter {
 
     // Fields h_, derivative `H` and inflation_ of the state `x`; false where they are not finite.
     INLINE bool see(const Frame& frame, const double* x, double near_field_length, double* H) {
-        Motion motion;
         double at[MOST_TARGET_STATES], total = 0.0;
         std::copy(x, x + n_.n_t, at);
         for (int j = 0; j < n_.n_sensors; ++j, H += 3 * n_.n_seen()) {
-            double R[9], world[3];
+            const double* position = sensors_.positions + 3 * j;
+            double R[9], world[3], gradient;
             turn(j, x + n_.own(j), R);
-            const bool is_later = frame.offset[j] != 0.0;
-            if (is_later) {
+            if (frame.offset[j] == 0.0) {
+                gradient = target_.field(at, position, R, world, H, n_.n_seen());
+            } else {
+                Motion motion;
                 target_.move(x, frame.offset[j], motion);
                 for (int r = 0; r < motion.n; ++r) at[motion.rows[r]] = motion.moved[r];
-            }
-            const double gradient = target_.field(at, sensors_.positions + 3 * j, R, world, H,
-                                                  n_.n_seen());
-            if (is_later) {
+                gradient = target_.field(at, position, R, world, H, n_.n_seen());
                 to_before(motion, H);
                 for (int r = 0; r < motion.n; ++r) at[motion.rows[r]] = x[motion.rows[r]];
             }

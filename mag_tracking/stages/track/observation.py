@@ -32,9 +32,9 @@ def angle_priors(network: SensorNetwork, mounting_std: float) -> FloatArray:
 class Observation:
     """The field that a network has of hypotheses, and the states that belong to its sensors.
 
-    A state is as on top of `inference/hypothesis.hpp`. Behind the target's states come each sensor's
-    own: three mounting angles [rad] where they are estimated, and three model errors, in units
-    of their size, where those last. They are what the target model leaves out near a
+    A state is as on top of `inference/hypothesis.hpp`. Behind the target's states come each
+    sensor's own: three mounting angles [rad] where they are estimated, and three model errors, in
+    units of their size, where those last. They are what the target model leaves out near a
     vehicle, and stay alike for `error_time` (first-order Gauss-Markov), so that what is counted
     of them does not depend on the frame period. Without an `error_time` they are new every frame.
     """
@@ -58,6 +58,10 @@ class Observation:
         self.own_covariance[:, errors, errors] = 1.0
         if mounting_std:
             self.own_covariance[:, :3, :3] = angle_priors(network, mounting_std)
+        # Of the states behind the target's: 1 where it is one of these, else 0.
+        is_error = np.tile(np.arange(n_own) >= self.n_angles, len(network))
+        self._is_error: FloatArray = np.append(is_error, np.zeros(3 * len(network)))
+        self._is_background: FloatArray = np.append(0.0 * is_error, np.ones(3 * len(network)))
 
     @property
     def n_own(self) -> int:
@@ -93,21 +97,17 @@ class Observation:
         return nearest
 
     def drift(self, dt: FloatArray, background_density: float) -> tuple[FloatArray, FloatArray]:
-        """What becomes of the sensors' states over the times `dt` (n,) [s].
+        """What becomes of the sensors' states over the times `dt` (...) [s].
 
         Returns
         -------
-        decay, variance : (n, (n_own + 3) n_sensors)
+        decay, variance : (..., (n_own + 3) n_sensors)
             They are multiplied by the one, and the other is added.
         """
-        m, n = len(dt), len(self.positions)
-        fading = np.exp(-np.abs(dt) / self._error_time) if self._error_time else np.ones(m)
-        decay, variance = np.ones((m, n, self.n_own)), np.zeros((m, n, self.n_own))
-        decay[:, :, self.n_angles:] = fading[:, None, None]
-        variance[:, :, self.n_angles:] = 1.0 - np.square(fading)[:, None, None]
-        of_backgrounds = np.repeat(background_density**2 * np.maximum(dt, 0.0)[:, None], 3 * n, 1)
-        return (np.concatenate([decay.reshape(m, -1), np.ones((m, 3 * n))], axis=1),
-                np.concatenate([variance.reshape(m, -1), of_backgrounds], axis=1))
+        fading = np.exp(-np.abs(dt) / self._error_time) if self._error_time else np.ones(dt.shape)
+        variance: FloatArray = np.multiply.outer(1.0 - fading**2, self._is_error) \
+            + np.multiply.outer(background_density**2 * np.maximum(dt, 0.0), self._is_background)
+        return 1.0 - np.multiply.outer(1.0 - fading, self._is_error), variance
 
     def target_fields(self, x: FloatArray, time_offset: FloatArray
                       ) -> tuple[FloatArray, FloatArray, FloatArray]:

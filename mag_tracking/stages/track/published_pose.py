@@ -5,7 +5,7 @@ from typing import Protocol, TypeAlias, TypedDict
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray
+from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.geometry import (
     cross_matrix,
     quaternion_between,
@@ -143,13 +143,14 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
         Fields of `Track` that the bank does not know.
     """
     n_t = len(model.state_names)
-    P = covariance_about(bank, best, model)
+    apart = bank.apart(best)
+    P = covariance_about(bank, best, model, apart)
     said, flags = _said_of(model, orientation, bank.x[best, :n_t], excess * P,
                            int(bank.kind[best]), unseen, difference)
-    reasons = doubts.listed({*found, *ambiguities(bank, best)})
+    reasons = doubts.listed({*found, *ambiguities(bank, best, apart)})
     uncertainty: PoseUncertainty | None = own_uncertainty(said)
     if reasons and ambiguous_poses != BEST:
-        uncertainty = mixture_uncertainty(bank, best, model, orientation, said, P, excess) \
+        uncertainty = mixture_uncertainty(bank, best, apart, model, orientation, said, P, excess) \
             if ambiguous_poses == MIXTURE else None
     weights = np.exp(bank.log_w)
     moments = model.dipoles(bank.x[:, :n_t]).m.sum(axis=1)
@@ -171,13 +172,14 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
         topic_uncertainty=uncertainty, **said)
 
 
-def covariance_about(bank: FilterBank, best: int, model: SourceModel) -> FloatArray:
-    """Covariance (n_t, n_t) about the state of hypothesis `best`, of all at its place.
+def covariance_about(bank: FilterBank, best: int, model: SourceModel, apart: BoolArray
+                     ) -> FloatArray:
+    """Covariance (n_t, n_t) about the state of hypothesis `best`, of all that are not `apart`.
 
     Hypotheses that are not apart differ by where each was linearised, by the kind of target and by
     its motion; that they do is part of the error. Those that are apart make the track ambiguous.
     """
-    return _second_moment(bank, best, model, np.where(bank.apart(best), -np.inf, bank.log_w))
+    return _second_moment(bank, best, model, np.where(apart, -np.inf, bank.log_w))
 
 
 def _second_moment(bank: FilterBank, best: int, model: SourceModel,
@@ -195,8 +197,8 @@ def _second_moment(bank: FilterBank, best: int, model: SourceModel,
     return second_moment(weight[rows], difference, bank.P[rows, :n_t, :n_t])
 
 
-def mixture_uncertainty(bank: FilterBank, best: int, model: SourceModel, orientation: Orientation,
-                        here: PoseFields, P_here: FloatArray,
+def mixture_uncertainty(bank: FilterBank, best: int, apart: BoolArray, model: SourceModel,
+                        orientation: Orientation, here: PoseFields, P_here: FloatArray,
                         excess: float = 1.0) -> PoseUncertainty:
     """Uncertainty about the pose of hypothesis `best`, where each hypothesis may be right.
 
@@ -204,6 +206,8 @@ def mixture_uncertainty(bank: FilterBank, best: int, model: SourceModel, orienta
     ----------
     bank : FilterBank
     best : int
+    apart : (n_hyp,) bool
+        `FilterBank.apart` of it.
     model : SourceModel
     orientation : function
     here : PoseFields
@@ -217,7 +221,7 @@ def mixture_uncertainty(bank: FilterBank, best: int, model: SourceModel, orienta
     widening = here['covariance'] - excess * P_here[:6, :6]
     covariance = widening + excess * _second_moment(bank, best, model, bank.log_w)[:6, :6]
     # Headings may be opposite, and are too far apart for a derivative.
-    log_w = np.where(bank.apart(best), bank.log_w, -np.inf)
+    log_w = np.where(apart, bank.log_w, -np.inf)
     rows = np.flatnonzero(log_w >= bank.log_w.max() + np.log(NO_WEIGHT))
     if not len(rows):
         return PoseUncertainty(covariance, here['orientation_covariance'],
@@ -239,10 +243,13 @@ def own_uncertainty(said: PoseFields) -> PoseUncertainty:
                            said['position_orientation_covariance'])
 
 
-def ambiguities(bank: FilterBank, best: int) -> set[str]:
-    """Whether another place, or another arrival, than that of hypothesis `best` is possible."""
+def ambiguities(bank: FilterBank, best: int, apart: BoolArray) -> set[str]:
+    """Whether another place, or another arrival, than that of hypothesis `best` is possible.
+
+    `apart` (n_hyp,) is `FilterBank.apart` of it.
+    """
     found = set()
-    if bank.separated_weight(best) > DOUBT:
+    if bank.weight(apart) > DOUBT:
         found.add(doubts.ANOTHER_PLACE)
     if 1.0 - np.exp(bank.log_w).sum(where=bank.label == bank.label[best]) > DOUBT:
         found.add(doubts.ANOTHER_ARRIVAL)

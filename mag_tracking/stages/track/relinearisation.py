@@ -70,9 +70,10 @@ class Relinearisation:
     def begin(self, bank: FilterBank) -> None:
         """A track begins with the `FilterBank`, which is not yet updated with its first frame.
 
-        A copy of it is the anchor: where the passes start from.
+        As it is now it is the anchor: where the passes start from.
         """
-        self._anchor, self._updated = bank.copy(), False
+        # The filter replaces its arrays, and what is written into is new by then.
+        self._anchor, self._updated = bank.same(), False
         self._frames: list[FieldFrame] = []
         self._intervals: list[float] = []
         # At each frame, and of each hypothesis of the anchor: where it is linearised, and the
@@ -97,7 +98,7 @@ class Relinearisation:
         if self._anchor is None:
             return
         if self._stale:
-            self.begin(bank)
+            self.begin(bank.copy())
             self._updated = True
         if len(bank) < len(self._anchor) // 2:
             self._keep(self._anchor, np.isin(self._anchor.origin, bank.origin))

@@ -297,7 +297,7 @@ class RunningTrack:
 
         Smoothing removes the doubts about its filter only in part.
         """
-        ambiguous = doubtful or bool(ambiguities(self.bank, best))
+        ambiguous = doubtful or bool(ambiguities(self.bank, best, self.bank.apart(best)))
         kind = int(self.bank.kind[best])
         return [smoothed_pose(
             self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,

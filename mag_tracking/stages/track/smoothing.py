@@ -102,7 +102,8 @@ class WholeTrack:
         """A track begins with `bank`, before its first frame; its settings stay those of now."""
         self.clear()
         if self._longest_s:
-            self._start = _Start(copy(bank_filter), bank.x.copy(), bank.P.copy(), bank.origin)
+            # The filter replaces these arrays, it does not write into them.
+            self._start = _Start(copy(bank_filter), bank.x, bank.P, bank.origin)
 
     def give_up(self) -> None:
         """It cannot be smoothed as a whole."""

@@ -94,20 +94,20 @@ def test_hypotheses_at_one_place_are_one_distribution():
     rng = np.random.default_rng(1)
     which = rng.choice(3, 400_000, p=[0.5, 0.3, 0.2])
     samples = bank.x[which, 0] + 0.5 * rng.standard_normal(len(which))
-    assert covariance_about(bank, 0, model)[0, 0] == pytest.approx(np.square(samples).mean(),
-                                                                   rel=0.01)
+    assert covariance_about(bank, 0, model, bank.apart(0))[0, 0] == pytest.approx(
+        np.square(samples).mean(), rel=0.01)
 
 
 def test_other_places_make_a_track_ambiguous_but_its_covariance_no_wider():
     bank, model = bank_of([0.0, 40.0], [0.9, 0.1])
-    np.testing.assert_allclose(covariance_about(bank, 0, model),
+    np.testing.assert_allclose(covariance_about(bank, 0, model, bank.apart(0)),
                                0.25 * np.eye(len(model.state_names)))
-    assert bank.separated_weight(0) == pytest.approx(0.1)
+    assert bank.weight(bank.apart(0)) == pytest.approx(0.1)
 
 
 def test_the_same_row_from_its_other_end_is_as_long():
     bank, model = bank_of([0.0, 0.0], [0.5, 0.5], lengths=np.array([3.0, -3.0]))
-    assert covariance_about(bank, 0, model)[-1, -1] == pytest.approx(0.25)
+    assert covariance_about(bank, 0, model, bank.apart(0))[-1, -1] == pytest.approx(0.25)
 
 
 def frame(field, noise=1e-8):

@@ -80,6 +80,8 @@ def followed_beside_plain(filter_, anew, n=40, anew_at=(), prune=True):
         frame = FieldFrame(stamp_ns, 3.0 * rng.standard_normal((1, 3)), np.eye(3)[None],
                            np.full(1, 8), np.zeros(1), True)
         for b in (plain, bank):
+            # As a `BankFilter` does: the anchor has the arrays that were.
+            b.x, b.P = b.x.copy(), b.P.copy()
             if k:
                 filter_.predict(b, dt)
             predicted = b.x.copy()
@@ -151,6 +153,7 @@ def less_sure(more, linear):
     frame = FieldFrame(0, rng.standard_normal((1, 3)), np.eye(3)[None], np.full(1, 8), np.zeros(1),
                        True)
     predicted = bank.x.copy()
+    bank.x, bank.P = bank.x.copy(), bank.P.copy()
     log_likelihood, _ = filter_.update(bank, frame, 0.0)
     relinearisation.add(bank, predicted, log_likelihood, frame, 0.0)
     return filter_, bank, relinearisation
