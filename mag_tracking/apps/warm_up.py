@@ -6,7 +6,6 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-import mag_tracking
 from mag_tracking.compiled import prepare_module
 
 ROOMS = ('physics', 'inference', 'calibration', 'stages')
@@ -18,8 +17,8 @@ def compiled_modules() -> list[str]:
     """Names of the modules that have compiled functions, the largest first."""
     found: list[tuple[int, str]] = []
     for room in ROOMS:
-        folder = f'{Path(mag_tracking.__file__).parent}/{room}'
-        for module in pkgutil.walk_packages([folder], f'mag_tracking.{room}.'):
+        folder = Path(__file__).parents[1] / room
+        for module in pkgutil.walk_packages([str(folder)], f'mag_tracking.{room}.'):
             spec = module.module_finder.find_spec(module.name, None)
             path = Path(spec.origin or '') if spec is not None else Path()
             if path.suffix == '.py' and _MARK in (text := path.read_text(encoding='utf-8')):

@@ -4,7 +4,6 @@ The model comes in as a function or an object, so that this file is mathematics 
 """
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
@@ -12,19 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import BoolArray, FloatArray
+from mag_tracking.inference.matrices import pseudo_inverse, running_away
 
 ResidualAndJacobian: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Takes points (n, n_x), returns residuals (n, n_y) and Jacobians (n, n_y, n_x)."""
 
 CORRELATED_S = 0.2
 """[s] What a model leaves out of a vehicle is alike for so long: a car's length at 20 m/s."""
-
-
-def _running_away() -> AbstractContextManager[None]:
-    """Start of a block in which numbers may grow beyond all bounds: a search that does so costs
-    infinity.
-    """
-    return np.errstate(over='ignore', invalid='ignore')
 
 
 def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iterations: int = 40,
@@ -75,7 +68,7 @@ def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iteration
         damping[busy] *= np.where(better, 0.2, 5.0)
         converged[busy[done]] = True
         busy = busy[~done & (damping[busy] < MOST_DAMPING)]
-    return x, cost, _inverse(np.einsum('nyi,nyj->nij', J, J)), converged
+    return x, cost, pseudo_inverse(np.einsum('nyi,nyj->nij', J, J)), converged
 
 
 MOST_DAMPING = 1e12
@@ -89,7 +82,7 @@ def _damped_step(J: FloatArray, residual: FloatArray, damping: FloatArray) -> Fl
     # Marquardt's scaling: damping is relative to each parameter's own information.
     diagonal = np.einsum('nii->ni', information)
     A = information + (damping[:, None] * diagonal)[:, :, None] * np.eye(J.shape[2])
-    step: FloatArray = np.einsum('nij,nj->ni', _inverse(A),
+    step: FloatArray = np.einsum('nij,nj->ni', pseudo_inverse(A),
                                  np.einsum('nij,nj->ni', Jt, residual))
     return step
 
@@ -97,51 +90,12 @@ def _damped_step(J: FloatArray, residual: FloatArray, damping: FloatArray) -> Fl
 def _evaluate(residual_and_jacobian: ResidualAndJacobian, x: FloatArray
               ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Residuals, Jacobians and costs; an unusable point costs infinity."""
-    with _running_away():
+    with running_away():
         residual, J = residual_and_jacobian(x)
         cost = np.einsum('ni,ni->n', residual, residual)
     bad = ~(np.isfinite(cost) & np.isfinite(J).all(axis=(1, 2)))
     residual[bad], J[bad], cost[bad] = 0.0, 0.0, np.inf
     return residual, J, cost
-
-
-def _inverse(A: FloatArray, rank: float = 1e-15) -> FloatArray:
-    """Pseudo-inverses (n, k, k), scaled to unit diagonal first: units differ by decades.
-
-    Directions whose eigenvalue is then below the share `rank` of the largest are left out. A
-    matrix that is not finite, of a search that ran away, has an inverse of NaN.
-    """
-    finite: BoolArray = np.all(np.isfinite(A), axis=(1, 2))
-    if not finite.all():
-        A = np.where(finite[:, None, None], A, np.eye(A.shape[1]))
-    scale = np.sqrt(np.einsum('nii->ni', A))
-    scale = np.where(scale > 0.0, scale, 1.0)
-    unit = A / (scale[:, :, None] * scale[:, None, :])
-    if finite.all() and _have_full_rank(unit):
-        full: FloatArray = np.linalg.inv(unit) / (scale[:, :, None] * scale[:, None, :])
-        return full
-    w, V = np.linalg.eigh(unit)
-    w = np.where(w > rank * w[:, -1:], w, np.inf)
-    V = V / scale[:, :, None]
-    with _running_away():
-        inverse: FloatArray = (V / w[:, None, :]) @ np.swapaxes(V, 1, 2)
-    inverse[~finite] = np.nan
-    return inverse
-
-
-def _have_full_rank(A: FloatArray) -> bool:
-    """Whether all of the symmetric `A` (n, k, k) of unit diagonal have far more than the rank that
-    a pseudo-inverse asks for. It takes a tenth of the time of their eigenvalues.
-    """
-    try:
-        L = np.linalg.cholesky(A)
-    except np.linalg.LinAlgError:
-        return False
-    return bool(np.einsum('nii->ni', L).min() > FULL_RANK)
-
-
-FULL_RANK = 1e-3
-"""The least root of a pivot that is left to a matrix whose inverse needs no care."""
 
 
 def project_out_linear(A: FloatArray, y: FloatArray
@@ -163,7 +117,7 @@ def project_out_linear(A: FloatArray, y: FloatArray
         Pseudo-inverse of A'A.
     """
     At = np.swapaxes(A, 1, 2)
-    inverse = _inverse(At @ A, LINEAR_RANK)
+    inverse = pseudo_inverse(At @ A, LINEAR_RANK)
     p = np.einsum('nij,nj->ni', inverse, At @ y)
     return p, y - np.einsum('nyi,ni->ny', A, p), inverse
 
@@ -270,7 +224,7 @@ class SeparableProblem:
 
     def cost(self, theta: FloatArray) -> FloatArray:
         """(n,) least sum of squares for theta (n, n_theta); infinite where it is no number."""
-        with _running_away():
+        with running_away():
             A = self._without_nuisance(self._model.basis(theta))
             p, _, _ = project_out_linear(A, self._y)
             # Not from the residuals: a grid of starts has many, and digits enough.

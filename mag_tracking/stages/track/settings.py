@@ -69,10 +69,10 @@ class TrackSettings:
     relinearise_window_s: float = param(
         2.0, 'While a track runs, its leading hypotheses are linearised anew along what is now '
         'known of their path, over the latest frames (64 at most) of once to twice so much time. '
-        '0 = never, which is two to three times faster.', 's', (0.0, 60.0))
+        '0 = never, which takes a fifth less time.', 's', (0.0, 60.0))
     relinearise_interval_s: float = param(
-        0.15, 'How often that is done. It takes most of the time of tracking, and grows with the '
-        'number of sensors; with frames of 100 Hz rather choose 0.5.', 's', (0.0, 60.0))
+        0.15, 'How often that is done. What it takes grows with the number of sensors; with frames '
+        'of 100 Hz rather choose 0.5.', 's', (0.0, 60.0))
     relinearise_most: int = param(
         20, 'For how many hypotheses it is done at most.', '', (1, 100000))
     second_opinion: bool = param(
@@ -96,12 +96,12 @@ class TrackSettings:
         2.0, 'A track ends where the frames have a longer gap than this.', 's', (1e-3, 86400.0))
     smooth_longest_s: float = param(
         60.0, 'A track that is no longer than this is smoothed when it ends, over all of its '
-        'frames, which takes about two milliseconds a frame (more with many sensors); 0 = never.',
-        's', (0.0, 86400.0))
+        'frames, which takes a twentieth of a millisecond a frame (more with many sensors); 0 = '
+        'never.', 's', (0.0, 86400.0))
     smoothing_lag_s: float = param(
         0.0, 'While a track runs, each pose is given once more when so much time has passed, by '
-        'what came since; every frame then costs a quarter of a millisecond for each frame of the '
-        'lag. 0 = no.', 's', (0.0, 10.0))
+        'what came since; every frame then costs a twentieth of a millisecond for each frame of '
+        'the lag. 0 = no.', 's', (0.0, 10.0))
     vehicle: VehicleSettings = field(default_factory=VehicleSettings)
     magnet: MagnetSettings = field(default_factory=MagnetSettings)
 

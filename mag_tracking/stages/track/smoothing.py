@@ -32,7 +32,7 @@ filter did not yet know where to linearise. It has not settled then: four times 
 and trucks nearer, but the car along a corridor further off."""
 
 MOST_NUMBERS = 10_000_000
-"""Frames times states squared that are smoothed at most: 80 MB, and about ten seconds."""
+"""Frames times states squared that are smoothed at most: 80 MB, and less than a second."""
 
 
 def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[FieldFrame],
