@@ -86,7 +86,8 @@ def pseudo_inverse(A: FloatArray, rank: float = 1e-15) -> FloatArray:
     scale = np.where(scale > 0.0, scale, 1.0)
     unit = A / (scale[:, :, None] * scale[:, None, :])
     if finite.all() and _have_full_rank(unit):
-        full: FloatArray = np.linalg.inv(unit) / (scale[:, :, None] * scale[:, None, :])
+        with running_away():
+            full: FloatArray = np.linalg.inv(unit) / scale[:, :, None] / scale[:, None, :]
         return full
     w, V = np.linalg.eigh(unit)
     w = np.where(w > rank * w[:, -1:], w, np.inf)

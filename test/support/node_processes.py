@@ -38,7 +38,12 @@ def stop(processes):
     """End them as Ctrl-C does; (exit codes, outputs)."""
     for p in processes:
         p.send_signal(signal.SIGINT)
-    outputs = [p.communicate(timeout=LONGEST_S)[0] for p in processes]
+    try:
+        outputs = [p.communicate(timeout=LONGEST_S)[0] for p in processes]
+    finally:
+        # One that hangs would compute beside all that comes after.
+        for p in processes:
+            p.kill()
     return [p.returncode for p in processes], outputs
 
 
