@@ -14,12 +14,14 @@ class DataFilesDistribution(Distribution):
     def has_data(self):
         return self.has_data_files()
 
-# What a frame of a track spends its time in. It may be copied to another machine, so it is not made
-# for this processor alone: the module chooses by itself.
-CORE = Pybind11Extension(
-    f'{NAME}.stages.track.core', [f'{NAME}/stages/track/core.cpp'], cxx_std=17,
-    extra_compile_args=['-O3', '-Wall', '-Wextra', '-Wno-psabi'],
-    depends=sorted(glob(f'{NAME}/**/*.hpp', recursive=True)))
+# What is computed for every reading and every frame. It may be copied to another machine, so it is
+# not made for this processor alone: where that matters the module chooses by itself.
+CORES = [
+    Pybind11Extension(
+        source.removesuffix('.cpp').replace('/', '.'), [source], cxx_std=17,
+        extra_compile_args=['-O3', '-Wall', '-Wextra', '-Wno-psabi'],
+        depends=sorted(glob(f'{NAME}/**/*.hpp', recursive=True)))
+    for source in sorted(glob(f'{NAME}/**/core.cpp', recursive=True))]
 
 setup(
     name=NAME,
@@ -30,8 +32,8 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    ext_modules=[CORE],
-    package_data={NAME: ['py.typed', 'nodes/*.xml', 'report/page/*', 'stages/track/core.pyi']},
+    ext_modules=CORES,
+    package_data={NAME: ['py.typed', 'nodes/*.xml', 'report/page/*', '*/core.pyi', 'stages/*/core.pyi']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),

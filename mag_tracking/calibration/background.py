@@ -173,7 +173,7 @@ class RunningBackground:
         """Judge the block that the latest sample has shown to be complete."""
         if not self._state['is_full']:
             return
-        block = block_of(self._state)
+        block = block_of(self._sensors)
         self._state['is_full'] = False
         still = (block.n > 1) & (block.scatter.diagonal() < LEAST_STD**2 * (block.n - 1))
         if self.ready and not self._level.is_provisional:

@@ -5,40 +5,15 @@ from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
-from numba import float64, int64, njit, void
 
-from mag_tracking.arrays import FloatArray, Record, StructArray
+from mag_tracking.arrays import FloatArray, StructArray
+from mag_tracking.calibration import core
 from mag_tracking.calibration.blocks import Block, Blocks, line_through, one_is_loud, stacked
-from mag_tracking.calibration.resolution import (
-    LEAST_STD,
-    apply_steps,
-    completed_steps,
-    corrected_steps,
-)
-from mag_tracking.calibration.sensor_state import SENSORS
-from mag_tracking.compiled import compiled_when_used
+from mag_tracking.calibration.resolution import LEAST_STD, completed_steps, corrected_steps
+from mag_tracking.records import plain
 
 _Line: TypeAlias = tuple[float, FloatArray, FloatArray, float]
 """Centre [s], mean (3,) [T], slope (3,) [T/s] and horizon [s]."""
-
-
-@njit(inline='always')
-def subtract_background(s: Record, time: float, field: FloatArray, out: FloatArray) -> None:
-    """Field without the background at `time` [s]: from `field` (3,) [T] into `out` (3,).
-
-    The drift is extrapolated over at most twice the stretch that it was fitted to: a drift
-    learnt from three seconds does not hold for twenty.
-    """
-    since = min(time, s.horizon) - s.centre
-    for a in range(3):
-        out[a] = field[a] - s.mean[a] - since * s.slope[a]
-
-
-@compiled_when_used(void(SENSORS, int64, float64, float64[::1], float64[::1]))
-def _subtract(sensors: StructArray, j: int, time: float, field: FloatArray,
-              out: FloatArray) -> None:
-    """`subtract_background` of sensor `j`."""
-    subtract_background(sensors[j], time, field, out)
 
 
 class BackgroundLevel:
@@ -81,7 +56,7 @@ class BackgroundLevel:
 
     def apply_steps(self) -> None:
         """Add what the sensor's steps do to the noise; its steps may have been found meanwhile."""
-        apply_steps(self._sensors, self._freeze_std, self.limits)
+        core.apply_steps(self._sensors, self._freeze_std, self.limits)
 
     def without_dead_axes(self, noise: FloatArray) -> FloatArray:
         """(3, 3) [T^2] `noise` with NaN for an axis that has not changed and does not rest."""
@@ -137,7 +112,7 @@ class BackgroundLevel:
         if self.line is None:
             raise ValueError('the background has not been learnt yet')
         out = np.empty(3)
-        _subtract(self._sensors, 0, time, field, out)
+        core.subtract(self._sensors, time, plain(field), out)
         return out
 
     def steady_end(self, blocks: Sequence[Block], length: float) -> deque[Block] | None:

@@ -33,7 +33,7 @@ class BlockRecorder(RunningBackground):
     def judge_block(self) -> None:
         """Keep the block that is complete."""
         if self._state['is_full']:
-            self._blocks.append(block_of(self._state))
+            self._blocks.append(block_of(self._sensors))
             self._state['is_full'] = False
 
     def forget(self) -> None:

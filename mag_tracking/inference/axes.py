@@ -3,7 +3,7 @@
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.inference import axes_kernels
+from mag_tracking.inference import core
 from mag_tracking.records import plain
 
 LEAST_PIVOT = 1e-12
@@ -32,7 +32,7 @@ def whitened_energy(y: FloatArray, C: FloatArray) -> tuple[FloatArray, IntArray]
     """
     y, C = _checked(y, C)
     energy, axes = np.empty(len(y)), np.empty(len(y), dtype=np.int64)
-    if not axes_kernels.energies(y, C, energy, axes):
+    if not core.energies(y, C, energy, axes):
         raise np.linalg.LinAlgError('a covariance is not positive definite')
     return energy, axes
 
@@ -46,7 +46,7 @@ def smallest_pivots(y: FloatArray, C: FloatArray) -> FloatArray:
     """
     y, C = _checked(y, C)
     out = np.empty(len(y))
-    axes_kernels.smallest_pivots(y, C, out)
+    core.smallest_pivots(y, C, out)
     return out
 
 

@@ -32,7 +32,7 @@ def test_every_module_with_a_compiled_function_is_found():
 def test_the_command_says_how_many_there_are(capsys):
     assert main(['warm-up']) == 0
     n = sum(prepare_module(name) for name in compiled_modules())
-    assert capsys.readouterr().out == f'{n} functions are compiled\n' and n >= 29
+    assert capsys.readouterr().out == f'{n} functions are compiled\n' and n > 0
 
 
 def test_a_function_is_compiled_for_one_signature_when_it_is_called():

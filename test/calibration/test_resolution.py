@@ -2,33 +2,25 @@
 
 import numpy as np
 import pytest
-from numba import njit
 
+from mag_tracking.calibration import core
+from mag_tracking.calibration.core import DITHERED, LONGEST_REST_NS
 from mag_tracking.calibration.resolution import (
-    DITHERED,
-    LONGEST_REST_NS,
-    apply_steps,
     completed_steps,
-    note_step,
     raw_steps,
     smallest_steps,
 )
 from mag_tracking.calibration.sensor_state import new_sensors
-from support.sensor_kernels import FedBackground
+from support.fed_background import FedBackground
 
 MS = 1_000_000
-
-
-@njit
-def _note(sensors, stamp, raw):
-    note_step(sensors[0], stamp, raw)
 
 
 def noted(fields, interval=10 * MS):
     """(1,) SENSOR after `fields` (n, 3)."""
     sensors = new_sensors(1)
     for k, field in enumerate(fields):
-        _note(sensors, k * interval, np.array(field, dtype=float))
+        core.note_step(sensors, k * interval, np.array(field, dtype=float))
     return sensors
 
 
@@ -72,7 +64,7 @@ def test_the_compiled_rule_agrees_with_the_plain_one():
     sensors = new_sensors(1)
     for stamp, field in zip(stamps.tolist(), y, strict=True):
         background.note(stamp, field)
-        _note(sensors, stamp, field)
+        core.note_step(sensors, stamp, field)
         for name in ('step', 'raw', 'rest_since_ns', 'n_rest', 'n_same', 'n_changed'):
             np.testing.assert_array_equal(sensors[0][name], background.sensors[0][name], name)
 
@@ -121,9 +113,9 @@ def test_an_axis_that_rests_keeps_its_steps_when_another_gets_loud():
     sensors = new_sensors(1)
     sensors['noise'], sensors['step'] = np.zeros((3, 3)), [np.inf, 1e-6, np.inf]
     limits = np.empty(3)
-    apply_steps(sensors, 5.0, limits)
+    core.apply_steps(sensors, 5.0, limits)
     np.testing.assert_allclose(sensors[0]['step_variance'], 1e-12 / 12.0)
     sensors['noise'][0, 1, 1] = 9e-12
-    apply_steps(sensors, 5.0, limits)
+    core.apply_steps(sensors, 5.0, limits)
     np.testing.assert_allclose(sensors[0]['step_variance'][[0, 2]], 1e-12 / 12.0)
     assert sensors[0]['step_variance'][1] == 0.0

@@ -9,17 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mag_tracking.calibration.screening import (
-    HELD,
-    PASSES,
-    RELEASED,
-    SPIKE,
-)
+from mag_tracking.calibration import core
+from mag_tracking.calibration.screening import HELD, PASSES, RELEASED, SPIKE
 from mag_tracking.calibration.sensor_state import MOST_HELD, new_sensors
 from mag_tracking.simulation.scenario import Path, point_body, random_vehicle
 from support.networks import line_network
 from support.samples import simulate
-from support.sensor_kernels import find_repetition, find_spike
 from support.sensor_noise import EARTH, NS, SIGMA, noise
 
 
@@ -29,7 +24,7 @@ def in_steps(fields, step):
 
 
 class SpikeScreen:
-    """Follows which readings `find_spike` holds and releases."""
+    """Follows which readings `core.screen_spike` holds and releases."""
 
     def __init__(self, threshold, std=SIGMA, step=np.inf):
         self.sensors, self._threshold, self._held = new_sensors(1), threshold, []
@@ -38,11 +33,11 @@ class SpikeScreen:
 
     def feed(self, row, stamp, field):
         """[(row, whether it is a spike)] of what is known by now."""
-        verdict, out = find_spike(self.sensors, 0, self._threshold, stamp, field), []
+        verdict, out = core.screen_spike(self.sensors, self._threshold, stamp, field), []
         if verdict == SPIKE:
             assert self.sensors['n_held'][0] == len(self._held)
             out, self._held, self.sensors['n_held'] = [(r, True) for r in self._held], [], 0
-            verdict = find_spike(self.sensors, 0, self._threshold, stamp, field)
+            verdict = core.screen_spike(self.sensors, self._threshold, stamp, field)
         self._held.append(row)
         if verdict == HELD:
             return out
@@ -75,7 +70,7 @@ def screened(fields, rate=100.0, std=SIGMA, threshold=30.0, step=np.inf):
 def stuck(fields):
     """[row that was taken for a repetition]."""
     sensors = new_sensors(1)
-    return [k for k, field in enumerate(fields) if find_repetition(sensors, 0, field)]
+    return [k for k, field in enumerate(fields) if core.is_stuck(sensors, field)]
 
 
 # Nothing is found where nothing is.

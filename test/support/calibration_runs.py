@@ -7,9 +7,9 @@ import numpy as np
 from mag_tracking.settings import replace
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
+from support.fed_background import FedBackground
 from support.networks import line_network
 from support.samples import MagSample
-from support.sensor_kernels import FedBackground
 
 SIGMA = np.array([1.0e-8, 1.2e-8, 1.5e-8])
 

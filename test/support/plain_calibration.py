@@ -9,8 +9,8 @@ import numpy as np
 
 from mag_tracking.calibration.decimation import Decimator
 from mag_tracking.stages.calibrate import stage as calibrate
+from support.fed_background import FedBackground
 from support.samples import MagSample
-from support.sensor_kernels import FedBackground
 
 NS = 1_000_000_000
 

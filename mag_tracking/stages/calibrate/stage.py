@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray, Record
+from mag_tracking.calibration import core
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.decimation import Decimator
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, shifted
@@ -18,7 +19,6 @@ from mag_tracking.errors import NetworkError
 from mag_tracking.inference.axes import are_covariances
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings, plain
-from mag_tracking.stages.calibrate import kernel
 from mag_tracking.stages.calibrate.output_buffer import OutputBuffer
 from mag_tracking.stages.calibrate.restoration import (
     BackgroundRestoration,
@@ -34,14 +34,14 @@ AT_ONCE = 16
 OVERRULED = 'covariances of messages overruled by the measured noise'
 
 CAUSES = {
-    kernel.NO_AXIS: 'no axis reported (all NaN)',
-    kernel.INFINITE: 'infinite value',
-    kernel.BAD_COVARIANCE: 'covariance is not positive definite',
-    kernel.AXIS_MISSING: 'an axis is missing that the correction needs',
-    kernel.TOO_FAR_AHEAD: 'stamp too far ahead',
-    kernel.DUPLICATE: 'duplicate stamp',
-    kernel.OUT_OF_ORDER: 'out of order',
-    kernel.STUCK: 'the same reading over and over',
+    core.NO_AXIS: 'no axis reported (all NaN)',
+    core.INFINITE: 'infinite value',
+    core.BAD_COVARIANCE: 'covariance is not positive definite',
+    core.AXIS_MISSING: 'an axis is missing that the correction needs',
+    core.TOO_FAR_AHEAD: 'stamp too far ahead',
+    core.DUPLICATE: 'duplicate stamp',
+    core.OUT_OF_ORDER: 'out of order',
+    core.STUCK: 'the same reading over and over',
 }
 """{reason code: why a reading is rejected}, apart from those that name a value."""
 
@@ -53,7 +53,7 @@ class Calibrate:
     stays in the sensor's frame. The covariance is the reading's own if it has one, else the
     configured one, else the estimated one.
 
-    `kernel.calibrate_readings` has the rules; here is what it reports.
+    `calibration/readings.hpp` has the rules; here is what it reports.
     """
 
     def __init__(self, network: SensorNetwork, settings: CalibrateSettings,
@@ -62,12 +62,12 @@ class Calibrate:
         self.counts: Counter[str] = Counter()
         self._per_sensor: dict[str, Counter[str]] = {name: Counter() for name in network.names}
         self._settings, self._sensors = settings, new_sensors(len(network))
-        self._batches = np.zeros(1, kernel.BATCH)
+        self._batches = np.zeros(1, core.BATCH)
         self._limits = np.array([(
             settings.max_field, settings.jump_ahead_s * NS, settings.jump_back_s * NS,
             settings.reject_stuck, settings.spike_std, settings.decimate_to_hz > 0.0,
-            settings.trust_covariances)], kernel.LIMITS)
-        self._causes = {**CAUSES, kernel.TOO_LARGE: f'above {settings.max_field:g} T (gauss or '
+            settings.trust_covariances)], core.LIMITS)
+        self._causes = {**CAUSES, core.TOO_LARGE: f'above {settings.max_field:g} T (gauss or '
                         'microtesla as tesla?)'}
         self._network, self._background_type = network, background_type
         self._index = {name: i for i, name in enumerate(network.names)}
@@ -150,10 +150,10 @@ class Calibrate:
         stamps, fields = plain(readings.stamp_ns, np.int64), plain(readings.field)
         out, batch = self._output(len(readings)), self._batches[0]
         batch['next'] = 0
-        while reason := kernel.calibrate_readings(
+        while reason := core.calibrate_readings(
                 self._sensors, self._limits, rows, stamps, fields, own, covariances,
                 self._batches, *out.arrays):
-            if reason == kernel.UNKNOWN_SENSOR:
+            if reason == core.UNKNOWN_SENSOR:
                 name = readings.names[readings.sensor[batch['next'] - 1]]
                 self.counts[f'rejected: unknown sensor {name}'] += 1
             else:
@@ -170,25 +170,25 @@ class Calibrate:
         return OutputBuffer(self._network.names, room)
 
     def _handle(self, reason: int, i: int, out: OutputBuffer) -> None:
-        """Do what the kernel asks for, or count a rejection; it is about sensor `i`."""
+        """Do what compiled code asks for, or count a rejection; it is about sensor `i`."""
         batch, name = self._batches[0], self._network.names[i]
         if batch['n_spikes']:
             self._reject(name, 'spike', int(batch['n_spikes']))
             batch['n_spikes'] = 0
-        if reason == kernel.BLOCK_COMPLETE:
+        if reason == core.BLOCK_COMPLETE:
             self._background[name].judge_block()
-        elif reason == kernel.JUMPED_BACK:
+        elif reason == core.JUMPED_BACK:
             self._background[name].forget()
             self._give_up(i, 'time jumped back')
             self.counts['time jumped back'] += 1
             self._sensors[i]['first_ns'] = self._sensors[i]['last_ns'] = NEVER
-        elif reason == kernel.RESTORABLE:
+        elif reason == core.RESTORABLE:
             self.counts[self._restoration.restore(name, int(batch['stamp_ns']),
                                                   self._background[name])] += 1
             self._sensors[i]['is_restorable'] = False
-        elif reason == kernel.PASSED:
+        elif reason == core.PASSED:
             self._use_passed(i, out)
-        elif reason != kernel.SPIKES:
+        elif reason != core.SPIKES:
             self._reject(name, self._causes[reason])
 
     def _use_passed(self, i: int, out: OutputBuffer) -> None:
@@ -213,7 +213,7 @@ class Calibrate:
         """Calibrate a reading of sensor `i` that has passed."""
         background = self._background[self._network.names[i]]
         background.judge_block()
-        while not kernel.use_reading(self._sensors, self._limits, self._batches, i, stamp,
+        while not core.use_reading(self._sensors, self._limits, self._batches, i, stamp,
                                      plain(field), own, plain(covariance), *out.arrays):
             background.judge_block()
 
@@ -259,7 +259,7 @@ class Calibrate:
         self._note_restorable()
 
     def _note_restorable(self) -> None:
-        """Have the kernel report the first reading of each sensor with a stored background."""
+        """Have compiled code report the first reading of each sensor with a stored background."""
         self._sensors['is_restorable'] = [name in self._restoration for name in self._index]
 
     def stored(self, sensor: str) -> StoredBackground | None:
@@ -337,12 +337,12 @@ class Calibrate:
 
 
 def _own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
-    """(n,) NONE, VALID or INVALID and (n, 3, 3) [T^2] of readings; as the kernel has them."""
+    """(n,) NONE, VALID or INVALID and (n, 3, 3) [T^2] of readings; as compiled code has them."""
     if readings.covariance is None:
         return np.zeros(len(readings), dtype=np.int64), np.empty((0, 3, 3))
     C = plain(readings.covariance)
-    valid = np.where(are_covariances(plain(readings.field), C), kernel.VALID, kernel.INVALID)
-    return np.where(readings.without_covariance(), kernel.NONE, valid), C
+    valid = np.where(are_covariances(plain(readings.field), C), core.VALID, core.INVALID)
+    return np.where(readings.without_covariance(), core.NONE, valid), C
 
 
 def _same(a: FloatArray | None, b: FloatArray | None) -> bool:

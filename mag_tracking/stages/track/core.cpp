@@ -1,16 +1,11 @@
 // What of the tracker is compiled, as a Python module. `bank_filter.py` is its only user.
 
-#include <pybind11/numpy.h>
-#include <pybind11/pybind11.h>
-#include <pybind11/stl.h>
-
 #include <array>
 #include <string>
 
 #include "../../physics/targets.hpp"
+#include "../../python.hpp"
 #include "filter.hpp"
-
-namespace py = pybind11;
 
 // One function for each generation of processors; the loader takes the best that there is.
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12
@@ -22,8 +17,6 @@ namespace py = pybind11;
 
 namespace mag_tracking {
 namespace {
-
-using Array = py::array_t<double, py::array::c_style>;
 
 struct Bank {
     int n_hyp;
@@ -145,14 +138,6 @@ FOR_PROCESSORS void run_along(const Magnet& target, const Sensors& sensors, cons
     run_along_all(target, sensors, n, frames, bank, along, out);
 }
 
-// The data of an array of the shape `shape`; raises ValueError for another one.
-template <class T, int flags>
-T* data_of(py::array_t<T, flags>& array, const char* name, std::vector<py::ssize_t> shape) {
-    if (std::vector<py::ssize_t>(array.shape(), array.shape() + array.ndim()) != shape)
-        throw py::value_error(std::string(name) + ": not of the shape that the others ask for");
-    return array.size() ? array.mutable_data() : nullptr;
-}
-
 template <class Target>
 class CompiledFilter {
   public:
@@ -198,7 +183,7 @@ class CompiledFilter {
                    Array variance, bool first_is_updated, double strange, int passes, double step,
                    double field_error, Array near_field_length, Array x, Array P, Array new_x,
                    Array new_P, Array paths, Array log_likelihood, Array unsettled,
-                   Array covariances, py::array_t<bool, py::array::c_style> used) const {
+                   Array covariances, ArrayOf<bool> used) const {
         const Sizes n = sizes();
         const py::ssize_t n_hyp = near_field_length.shape(0), n_s = n_sensors_, n_x = n.n_x;
         const py::ssize_t n_frames = dt.shape(0);
@@ -248,9 +233,6 @@ class CompiledFilter {
     int n_sensors_, n_angles_, n_errors_;
     std::vector<double> positions_, R_sw_;
 };
-
-// Taken as it is: what is written into a copy would be lost.
-#define IN(name) py::arg(#name).noconvert()
 
 // What both filters have in common, `name`d for Python.
 template <class Target, class... Numbers>

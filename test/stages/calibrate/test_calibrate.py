@@ -10,9 +10,9 @@ from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import OVERRULED, Calibrate
 from mag_tracking.stages.stage import rejected
 from support.calibration_runs import EARTH, SIGMA, feed, running, sample, stage
+from support.fed_background import FedBackground
 from support.networks import line_network
 from support.samples import MagSample, fed
-from support.sensor_kernels import FedBackground
 
 
 def test_level_noise_and_drift_are_learnt():

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from mag_tracking.calibration import core
 from mag_tracking.records import Readings
-from mag_tracking.stages.calibrate import kernel
 from mag_tracking.stages.calibrate import stage as calibrate
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import OVERRULED, Calibrate
@@ -136,13 +136,13 @@ def test_clean_readings_need_python_once_a_block(monkeypatch):
     """A block has 25 readings at 100 Hz; only its end needs Python."""
     network, samples, *_ = stream(2, 3)
     stage, reasons, compiled = Calibrate(network, CalibrateSettings()), [], \
-        kernel.calibrate_readings
-    monkeypatch.setattr(kernel, 'calibrate_readings',
+        core.calibrate_readings
+    monkeypatch.setattr(core, 'calibrate_readings',
                         lambda *a: reasons.append(compiled(*a)) or reasons[-1])
     parts = batches(samples, 100, np.random.default_rng(0))
     for b in parts:
         stage.feed(b)
-    assert reasons.count(kernel.DONE) == len(parts)
+    assert reasons.count(core.DONE) == len(parts)
     assert len(reasons) - len(parts) <= len(samples) / 25
 
 

@@ -1,31 +1,10 @@
-"""Compiled functions on the state of one sensor, callable from Python."""
+"""A background that is fed reading by reading, as the calibration does it."""
 
 import numpy as np
-from numba import njit
 
+from mag_tracking.calibration import core
 from mag_tracking.calibration.background import RunningBackground
-from mag_tracking.calibration.blocks import begin_block_if_due, collect
-from mag_tracking.calibration.resolution import LONGEST_REST_NS
-from mag_tracking.calibration.screening import is_stuck, screen_spike
 from mag_tracking.calibration.sensor_state import new_sensors
-
-
-@njit
-def find_repetition(sensors, j, field):
-    """`is_stuck` of sensor `j` of (n,) SENSOR."""
-    return is_stuck(sensors[j], field)
-
-
-@njit
-def find_spike(sensors, j, threshold, stamp, field):
-    """`screen_spike` of a reading without its own covariance."""
-    return screen_spike(sensors[j], threshold, stamp, field, 0, np.empty((3, 3)), np.empty(3))
-
-
-@njit
-def _add(sensors, time, field):
-    begin_block_if_due(sensors[0], time)
-    collect(sensors[0], time, field)
 
 
 class FedBackground(RunningBackground):
@@ -44,17 +23,17 @@ class FedBackground(RunningBackground):
     def collect(self, time, field):
         """Take a reading whose steps are noted."""
         self.judge_block()
-        _add(self.sensors, time, np.array(field, dtype=float))
+        core.collect(self.sensors, time, np.array(field, dtype=float))
         if np.isnan(self.sensors[0]['phase']):
             self.judge_block()
 
     def note(self, stamp, raw):
-        """`resolution.note_step` in plain Python."""
+        """`core.note_step` in plain Python."""
         s = self.sensors[0]
         for a in np.flatnonzero(~np.isnan(raw)):
             change = abs(raw[a] - s['raw'][a])
             if change <= 3e-7 * abs(raw[a]) and stamp >= s['rest_since_ns'][a]:
-                s['n_rest'][a] += stamp - s['rest_since_ns'][a] <= LONGEST_REST_NS
+                s['n_rest'][a] += stamp - s['rest_since_ns'][a] <= core.LONGEST_REST_NS
                 continue
             if change >= 0.0:
                 s['n_same'][a] += s['n_rest'][a] - 1

@@ -1,0 +1,108 @@
+// Readings in short stretches, and the background line that is fitted to them (blocks.py,
+// background_level.py).
+
+#pragma once
+
+#include <cmath>
+
+#include "sensor.hpp"
+
+namespace mag_tracking {
+
+// A block has at least so many readings, however slow the sensor: fewer tell nothing of noise.
+constexpr int LEAST_SAMPLES = 8;
+
+// Field without the background at `time` [s]: from `field` (3) [T] into `out` (3).
+//
+// The drift is extrapolated over at most twice the stretch that it was fitted to: a drift learnt
+// from three seconds does not hold for twenty.
+inline void subtract_background(const Sensor& s, double time, const double* field, double* out) {
+    const double since = (s.horizon < time ? s.horizon : time) - s.centre;
+    for (int a = 0; a < 3; ++a) out[a] = field[a] - s.mean[a] - since * s.slope[a];
+}
+
+// Begin the next block where a reading at `time` [s] is the first after the present one. What was
+// complete before (`is_full`) must have been used by now.
+inline void begin_block_if_due(Sensor& s, double time) {
+    if (std::isnan(s.end)) {
+        s.end = time + s.length * (std::isnan(s.phase) ? 1.0 : 1.0 + s.phase);
+        return;
+    }
+    if (!(time >= s.end && s.n[s.now] >= LEAST_SAMPLES)) return;
+    s.now = 1 - s.now, s.is_full = 1;
+    s.n[s.now] = 0;
+    if (std::isnan(s.phase))
+        s.end = time + s.length;
+    else
+        // With jittering timestamps the blocks of all sensors would sooner or later end with the
+        // same reading, and from then on always.
+        s.end += (std::floor((time - s.end) / s.length) + 1.0) * s.length;
+}
+
+// Add a reading, `field` (3) [T] at `time` [s], to the present block.
+inline void collect(Sensor& s, double time, const double* field) {
+    const auto k = s.now;
+    double* origin = s.origin[k];
+    if (s.n[k] == 0) {
+        s.time[k] = 0.0;
+        for (int a = 0; a < 3; ++a) {
+            origin[a] = NAN;
+            for (int b = 0; b < 3; ++b)
+                s.count[k][a][b] = s.sum[k][a][b] = s.product[k][a][b] = 0.0;
+        }
+    }
+    ++s.n[k];
+    s.time[k] += time;
+    for (int a = 0; a < 3; ++a) {
+        if (std::isnan(field[a])) continue;
+        if (std::isnan(origin[a])) origin[a] = field[a];
+        const double d = field[a] - origin[a];
+        for (int b = 0; b < 3; ++b) {
+            if (std::isnan(field[b])) continue;
+            // Where it has not been heard before, this reading is the origin of that axis.
+            const double e = std::isnan(origin[b]) ? 0.0 : field[b] - origin[b];
+            s.count[k][a][b] += 1.0;
+            s.sum[k][a][b] += d;
+            s.product[k][a][b] += d * e;
+        }
+    }
+}
+
+// Mean (3) [T] and sum of squared deviations (3, 3) [T^2] of block `k`; an axis that is missing is so
+// in its products only.
+inline void moments(const Sensor& s, int64_t k, double* mean, double* scatter) {
+    const auto &count = s.count[k], &sum = s.sum[k];
+    for (int a = 0; a < 3; ++a) mean[a] = count[a][a] > 0.0 ? sum[a][a] / count[a][a] : NAN;
+    for (int a = 0; a < 3; ++a)
+        for (int b = 0; b < 3; ++b)
+            scatter[3 * a + b] =
+                count[a][b] > 0.0 ? s.product[k][a][b] - sum[a][b] * mean[b] - sum[b][a] * mean[a]
+                                        + count[a][b] * mean[a] * mean[b]
+                                  : 0.0;
+    for (int a = 0; a < 3; ++a) mean[a] += s.origin[k][a];
+}
+
+// Weighted least-squares line of one axis through the means `y` [T] of k blocks of `n` readings at
+// `time` [s], all strided by three but for the time: its value and slope at `centre`. NaN where no
+// block has the axis.
+inline void line(int64_t k, const double* time, const double* n, const double* y, double centre,
+                 double& mean, double& slope) {
+    double total = 0.0, mean_t = 0.0, mean_y = 0.0, spread = 0.0, along = 0.0;
+    for (int64_t i = 0; i < k; ++i) {
+        if (!(n[3 * i] > 0.0)) continue;
+        total += n[3 * i];
+        mean_t += n[3 * i] * time[i];
+        mean_y += n[3 * i] * y[3 * i];
+    }
+    mean_t /= total, mean_y /= total;
+    for (int64_t i = 0; i < k; ++i) {
+        if (!(n[3 * i] > 0.0)) continue;
+        const double d = time[i] - mean_t;
+        spread += n[3 * i] * d * d;
+        along += n[3 * i] * d * (y[3 * i] - mean_y);
+    }
+    slope = spread > 0.0 ? along / spread : 0.0;
+    mean = mean_y + slope * (centre - mean_t);
+}
+
+}  // namespace mag_tracking

@@ -1,0 +1,163 @@
+// What is done for every reading, as a Python module; core.pyi says what the arguments are.
+
+#include "../python.hpp"
+#include "readings.hpp"
+
+namespace mag_tracking {
+namespace {
+
+using Sensors = ArrayOf<Sensor>;
+
+// The only element of an array, to be changed.
+template <class T>
+T& only(ArrayOf<T>& array, const char* name) {
+    return *data_of(array, name, {1});
+}
+
+Calibrated room_of(Integers& rows, Integers& stamps, Array& fields, Array& covariances) {
+    const Size n = length_of(rows, "out_rows", 1);
+    return {n, data_of(rows, "out_rows", {n}), data_of(stamps, "out_stamps", {n}),
+            data_of(fields, "out_fields", {n, 3}), data_of(covariances, "out_covariances", {n, 3, 3})};
+}
+
+int calibrate_readings(Sensors sensors, ArrayOf<Limits> limits, Integers rows, Integers stamps,
+                       Array fields, Integers own, Array covariances, ArrayOf<Batch> batches,
+                       Integers out_rows, Integers out_stamps, Array out_fields,
+                       Array out_covariances) {
+    const Size n = length_of(rows, "rows", 1), n_sensors = length_of(sensors, "sensors", 1);
+    const RawReadings in{n, input_of(rows, "rows", {n}), input_of(stamps, "stamps", {n}),
+                         input_of(fields, "fields", {n, 3}), input_of(own, "own", {n}),
+                         covariances.data()};
+    Batch& batch = only(batches, "batches");
+    if (batch.next < 0) throw py::index_error("next: negative");
+    for (Size i = batch.next; i < n; ++i) {
+        if (in.rows[i] >= n_sensors) throw py::index_error("rows: there is no such sensor");
+        if (in.own[i]) input_of(covariances, "covariances", {n, 3, 3});
+    }
+    return calibrate(data_of(sensors, "sensors", {n_sensors}), only(limits, "limits"), in, batch,
+                     room_of(out_rows, out_stamps, out_fields, out_covariances));
+}
+
+bool use_reading(Sensors sensors, ArrayOf<Limits> limits, ArrayOf<Batch> batches, int64_t row,
+                 int64_t stamp, Array field, int64_t own, Array covariance, Integers out_rows,
+                 Integers out_stamps, Array out_fields, Array out_covariances) {
+    if (row < 0 || row >= length_of(sensors, "sensors", 1))
+        throw py::index_error("row: there is no such sensor");
+    const Reading reading{stamp, input_of(field, "field", {3}), own,
+                          input_of(covariance, "covariance", {3, 3})};
+    return use(sensors.mutable_data()[row], only(limits, "limits"), only(batches, "batches"), row,
+               reading, room_of(out_rows, out_stamps, out_fields, out_covariances));
+}
+
+void subtract(Sensors sensors, double time, Array field, Array out) {
+    subtract_background(only(sensors, "sensors"), time, input_of(field, "field", {3}),
+                        data_of(out, "out", {3}));
+}
+
+Array steps_of(Sensors sensors, bool are_corrected) {
+    const Sensor& s = only(sensors, "sensors");
+    Array out(3);
+    double* steps = out.mutable_data();
+    if (are_corrected)
+        corrected_steps(s, steps);
+    else
+        for (int a = 0; a < 3; ++a) steps[a] = seen_step(s, a);
+    return out;
+}
+
+py::tuple block_moments(Sensors sensors) {
+    const Sensor& s = only(sensors, "sensors");
+    Array mean(3), scatter({3, 3}), n(3);
+    const int64_t k = 1 - s.now;
+    moments(s, k, mean.mutable_data(), scatter.mutable_data());
+    for (int a = 0; a < 3; ++a) n.mutable_data()[a] = s.count[k][a][a];
+    return py::make_tuple(s.time[k] / double(s.n[k]), mean, scatter, n);
+}
+
+py::tuple line_through(Array time, Array n, Array y, double centre) {
+    const Size k = length_of(time, "time", 1);
+    const double *t = input_of(time, "time", {k}), *weight = input_of(n, "n", {k, 3});
+    const double* values = input_of(y, "y", {k, 3});
+    Array mean(3), slope(3);
+    for (int a = 0; a < 3; ++a)
+        line(k, t, weight + a, values + a, centre, mean.mutable_data()[a], slope.mutable_data()[a]);
+    return py::make_tuple(mean, slope);
+}
+
+void add_constants(py::module_& m) {
+    m.attr("RECENT") = RECENT;
+    m.attr("MOST_HELD") = MOST_HELD;
+    m.attr("COARSE") = COARSE;
+    m.attr("LEAST_CHANGES") = LEAST_CHANGES;
+    m.attr("SAME") = SAME;
+    m.attr("DITHERED") = DITHERED;
+    m.attr("LEAST_STD") = LEAST_STD;
+    m.attr("TOGGLE") = TOGGLE;
+    m.attr("LONGEST_REST_NS") = LONGEST_REST_NS;
+#define CODE(name) m.attr(#name) = int(name)
+    CODE(DONE), CODE(UNKNOWN_SENSOR), CODE(NO_AXIS), CODE(INFINITE), CODE(TOO_LARGE);
+    CODE(BAD_COVARIANCE), CODE(AXIS_MISSING), CODE(TOO_FAR_AHEAD), CODE(DUPLICATE);
+    CODE(OUT_OF_ORDER), CODE(STUCK), CODE(BLOCK_COMPLETE), CODE(JUMPED_BACK), CODE(RESTORABLE);
+    CODE(SPIKES), CODE(PASSED), CODE(NONE), CODE(VALID), CODE(INVALID);
+    CODE(PASSES), CODE(HELD), CODE(SPIKE), CODE(RELEASED);
+#undef CODE
+}
+
+// Structured arrays of Python whose elements are these.
+void add_types(py::module_& m) {
+    PYBIND11_NUMPY_DTYPE(
+        Sensor, clock_offset_ns, offset, has_correction, correction, is_ready, centre, mean, slope,
+        horizon, noise, noise_std, level_variance, first_ns, last_ns, unconfirmed_ns, is_restorable,
+        accepted, last, run, repeats, changes, raw, rest_since_ns, n_rest, n_same, n_changed, step,
+        step_variance, n_averaged, stated_std, n_overruled, before_ns, before, n_steps, steps,
+        n_held, n_released, held_ns, held_field, held_steps, held_own, held_covariance, length,
+        phase, end, now, is_full, n, time, origin, count, sum, product);
+    PYBIND11_NUMPY_DTYPE(Limits, max_field, longest_jump_ns, jump_back_ns, reject_stuck, spike_std,
+                         is_decimated, trust_covariances);
+    PYBIND11_NUMPY_DTYPE(Batch, next, row, n_out, n_spikes, n_learning, n_partly_learning,
+                         n_overruled, stamp_ns);
+    m.attr("SENSOR") = py::dtype::of<Sensor>();
+    m.attr("LIMITS") = py::dtype::of<Limits>();
+    m.attr("BATCH") = py::dtype::of<Batch>();
+}
+
+}  // namespace
+}  // namespace mag_tracking
+
+PYBIND11_MODULE(core, m) {
+    using namespace mag_tracking;
+    m.doc() = "The calibration of one reading after the other, compiled.";
+    add_constants(m);
+    add_types(m);
+    m.def("calibrate_readings", &calibrate_readings, IN(sensors), IN(limits), IN(rows), IN(stamps),
+          IN(fields), IN(own), IN(covariances), IN(batches), IN(out_rows), IN(out_stamps),
+          IN(out_fields), IN(out_covariances));
+    m.def("use_reading", &use_reading, IN(sensors), IN(limits), IN(batches), py::arg("row"),
+          py::arg("stamp"), IN(field), py::arg("own"), IN(covariance), IN(out_rows), IN(out_stamps),
+          IN(out_fields), IN(out_covariances));
+    m.def("subtract", &subtract, IN(sensors), py::arg("time"), IN(field), IN(out));
+    m.def("steps_of", &steps_of, IN(sensors), py::arg("are_corrected"));
+    m.def("block_moments", &block_moments, IN(sensors));
+    m.def("line_through", &line_through, IN(time), IN(n), IN(y), py::arg("centre"));
+    m.def("complete_steps", [](Array variance, Array steps) {
+        complete_steps(input_of(variance, "variance", {3}), data_of(steps, "steps", {3}));
+    }, IN(variance), IN(steps));
+    m.def("apply_steps", [](Sensors sensors, double freeze_std, Array limits) {
+        apply_steps(only(sensors, "sensors"), freeze_std, data_of(limits, "limits", {3}));
+    }, IN(sensors), py::arg("freeze_std"), IN(limits));
+    // For one sensor and reading, as the tests have them.
+    m.def("note_step", [](Sensors sensors, int64_t stamp, Array raw) {
+        note_step(only(sensors, "sensors"), stamp, input_of(raw, "raw", {3}));
+    }, IN(sensors), py::arg("stamp"), IN(raw));
+    m.def("is_stuck", [](Sensors sensors, Array field) {
+        return is_stuck(only(sensors, "sensors"), input_of(field, "field", {3}));
+    }, IN(sensors), IN(field));
+    m.def("screen_spike", [](Sensors sensors, double threshold, int64_t stamp, Array field) {
+        return int(screen_spike(only(sensors, "sensors"), threshold,
+                                {stamp, input_of(field, "field", {3}), NONE, nullptr}));
+    }, IN(sensors), py::arg("threshold"), py::arg("stamp"), IN(field));
+    m.def("collect", [](Sensors sensors, double time, Array field) {
+        begin_block_if_due(only(sensors, "sensors"), time);
+        collect(only(sensors, "sensors"), time, input_of(field, "field", {3}));
+    }, IN(sensors), py::arg("time"), IN(field));
+}

@@ -1,0 +1,266 @@
+// The calibration of one reading after the other.
+//
+// Every rule for a reading stands here once. What needs Python (a rejection that is counted by name,
+// a block to be judged, a clock that jumped back, ...) is returned as a reason, and `calibrate`
+// continues where it stopped.
+
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+
+#include "blocks.hpp"
+#include "resolution.hpp"
+#include "screening.hpp"
+
+namespace mag_tracking {
+
+enum Reason {
+    // The batch is finished, or the reading is rejected.
+    DONE, UNKNOWN_SENSOR, NO_AXIS, INFINITE, TOO_LARGE, BAD_COVARIANCE, AXIS_MISSING, TOO_FAR_AHEAD,
+    DUPLICATE, OUT_OF_ORDER, STUCK,
+    // To be handled before the same reading is taken again.
+    BLOCK_COMPLETE = 20, JUMPED_BACK, RESTORABLE,
+    // The `n_spikes` readings before are rejected, or the `n_released` held readings are to be used.
+    SPIKES = 30, PASSED
+};
+
+// The correlation of two axes that a message states may differ by this from the measured one.
+constexpr double MOST_ALIKE = 0.7;
+// The variance that a message states is used where it differs from the measured one by less than
+// this factor.
+constexpr double CREDIBLE = 25.0;
+
+// Whether a reading has its own covariance.
+enum Own { NONE, VALID, INVALID };
+
+// As in `CalibrateSettings`.
+struct Limits {
+    double max_field, longest_jump_ns, jump_back_ns;
+    int64_t reject_stuck;
+    double spike_std;
+    int64_t is_decimated, trust_covariances;
+};
+
+// Progress within a batch: the next reading; sensor and timestamp of the one that a reason is about;
+// how many calibrated readings there are; how many were spikes; of how many the background, or that
+// of one axis, is not known yet; of how many the covariance was overruled.
+struct Batch {
+    int64_t next, row, n_out, n_spikes, n_learning, n_partly_learning, n_overruled, stamp_ns;
+};
+
+// n readings: their sensors (negative: unknown), timestamps [ns], raw fields (n, 3) [T], `Own`, and
+// covariances (n, 3, 3) [T^2], which are read where `own` is not NONE.
+struct RawReadings {
+    int64_t n;
+    const int64_t *rows, *stamps;
+    const double* fields;
+    const int64_t* own;
+    const double* covariances;
+};
+
+// Where calibrated readings are appended; there is room for n.
+struct Calibrated {
+    int64_t n;
+    int64_t *rows, *stamps;
+    double *fields, *covariances;
+};
+
+// Why a raw reading cannot be used, or DONE.
+inline Reason fault(const Limits& limits, const double* raw, int64_t own) {
+    double largest = 0.0;
+    bool is_known = false;
+    for (int a = 0; a < 3; ++a)
+        if (!std::isnan(raw[a])) largest = std::max(largest, std::abs(raw[a])), is_known = true;
+    if (!is_known) return NO_AXIS;
+    if (std::isinf(largest)) return INFINITE;
+    if (largest > limits.max_field) return TOO_LARGE;
+    return own == INVALID && limits.trust_covariances ? BAD_COVARIANCE : DONE;
+}
+
+// A coefficient of zero needs no axis.
+inline double needed(double coefficient, double value) {
+    return coefficient == 0.0 ? 0.0 : coefficient * value;
+}
+
+// Remove the sensor's own hard and soft iron: from `raw` into `field`; false: no axis is left.
+//
+// An axis that the correction needs and that is missing makes those missing that need it.
+inline bool remove_iron(const Sensor& s, const double* raw, double* field) {
+    double v[3];
+    bool is_known = false;
+    for (int a = 0; a < 3; ++a) v[a] = field[a] = raw[a] - s.offset[a];
+    for (int a = 0; a < 3; ++a) {
+        const auto& c = s.correction[a];
+        if (s.has_correction) field[a] = needed(c[0], v[0]) + needed(c[1], v[1]) + needed(c[2], v[2]);
+        is_known |= !std::isnan(field[a]);
+    }
+    return is_known;
+}
+
+// Why a timestamp cannot be used, or DONE.
+inline Reason misplaced(Sensor& s, const Limits& limits, int64_t stamp) {
+    if (s.last_ns != NEVER) {
+        if (double(stamp - s.last_ns) > limits.longest_jump_ns) {
+            const int64_t before = s.unconfirmed_ns;
+            if (before == NEVER || stamp <= before
+                || double(stamp - before) > limits.longest_jump_ns) {
+                s.unconfirmed_ns = stamp;
+                return TOO_FAR_AHEAD;
+            }
+        } else {
+            s.unconfirmed_ns = NEVER;
+        }
+        if (stamp <= s.last_ns) {
+            if (double(s.last_ns - stamp) > limits.jump_back_ns) return JUMPED_BACK;
+            return stamp == s.last_ns ? DUPLICATE : OUT_OF_ORDER;
+        }
+    }
+    if (s.is_restorable) return RESTORABLE;
+    s.last_ns = stamp;
+    if (s.first_ns == NEVER) s.first_ns = stamp;
+    return DONE;
+}
+
+// Why a reading cannot be used, or is not used yet, or DONE; without iron it is in `field`.
+inline Reason check(Sensor& s, const Limits& limits, int64_t stamp, const double* raw, int64_t own,
+                    double* field) {
+    if (s.is_full) return BLOCK_COMPLETE;
+    Reason reason = fault(limits, raw, own);
+    if (reason != DONE) return reason;
+    if (!remove_iron(s, raw, field)) return AXIS_MISSING;
+    reason = misplaced(s, limits, stamp);
+    if (reason != DONE) return reason;
+    return limits.reject_stuck && is_stuck(s, field) ? STUCK : DONE;
+}
+
+// `screen_spike`, with the number of spikes noted.
+inline Verdict screen(Sensor& s, const Limits& limits, Batch& batch, const Reading& reading) {
+    if (limits.spike_std <= 0.0) return PASSES;
+    const Verdict verdict = screen_spike(s, limits.spike_std, reading);
+    if (verdict != SPIKE) return verdict;
+    batch.n_spikes += s.n_held;
+    s.n_held = 0;
+    return screen_spike(s, limits.spike_std, reading);
+}
+
+// Whether the covariance `C` (3, 3) of a message agrees with the noise of the sensor.
+inline bool is_credible(const Sensor& s, const double* C) {
+    for (int a = 0; a < 3; ++a) {
+        const double stated = C[4 * a], known = s.noise[a][a] + s.step_variance[a];
+        // A comparison with NaN is false: an axis that is missing contradicts nothing.
+        if (stated > CREDIBLE * known || known > CREDIBLE * stated) return false;
+        for (int b = 0; b < a; ++b) {
+            // Axes that are said to err together, and do not.
+            const double both = std::sqrt(stated * C[4 * b]);
+            const double measured = s.noise[a][b]
+                                    / std::sqrt(known * (s.noise[b][b] + s.step_variance[b]));
+            if (std::abs(C[3 * a + b] / both - measured) > MOST_ALIKE) return false;
+        }
+    }
+    return true;
+}
+
+// Covariance of a reading, into `out` (3, 3): its own where that is credible, else that of the
+// sensor. Either with that of a provisional background.
+inline void attach_covariance(Sensor& s, const Limits& limits, Batch& batch, const Reading& reading,
+                              double* out) {
+    const double* C = reading.covariance;
+    bool own = reading.own != NONE;
+    if (own && !limits.trust_covariances && (reading.own == INVALID || !is_credible(s, C))) {
+        own = false;
+        ++s.n_overruled, ++batch.n_overruled;
+        for (int a = 0; a < 3; ++a)
+            s.stated_std[a] = C[4 * a] >= 0.0 ? std::sqrt(C[4 * a]) : NAN;
+    }
+    for (int a = 0; a < 3; ++a) {
+        for (int b = 0; b < 3; ++b) out[3 * a + b] = own ? C[3 * a + b] : s.noise[a][b];
+        if (!(own && limits.trust_covariances))
+            out[4 * a] += s.step_variance[a] * rest_of(s, a) / s.n_averaged;
+        out[4 * a] += s.level_variance[a];
+    }
+}
+
+// Calibrate a reading of the sensor of `row`; false if a block has to be judged first.
+inline bool use(Sensor& s, const Limits& limits, Batch& batch, int64_t row, const Reading& reading,
+                const Calibrated& out) {
+    const double time = double(reading.stamp - s.first_ns) / 1e9;
+    begin_block_if_due(s, time);
+    if (s.is_full && std::isnan(s.phase)) return false;
+    collect(s, time, reading.field);
+    if (!s.is_ready) {
+        ++batch.n_learning;
+        return true;
+    }
+    const int64_t k = batch.n_out;
+    if (k < 0 || k >= out.n) throw std::out_of_range("no room for the calibrated readings");
+    double *field = out.fields + 3 * k, *C = out.covariances + 9 * k;
+    subtract_background(s, time, reading.field, field);
+    attach_covariance(s, limits, batch, reading, C);
+    int n_missing = 0;
+    bool is_new = false;
+    for (int a = 0; a < 3; ++a) {
+        // An axis that has only just begun to report: nothing is known of it yet.
+        if (!std::isnan(reading.field[a]) && (std::isnan(field[a]) || !(C[4 * a] > 0.0))) {
+            is_new = true;
+            field[a] = NAN;
+            for (int b = 0; b < 3; ++b) C[3 * a + b] = C[3 * b + a] = NAN;
+        }
+        n_missing += std::isnan(field[a]);
+    }
+    batch.n_partly_learning += is_new;
+    if (n_missing < 3) {
+        out.rows[k] = row, out.stamps[k] = reading.stamp;
+        ++batch.n_out;
+    }
+    return true;
+}
+
+// Covariance `C` (3, 3) of a raw reading after the soft-iron correction, into `out`.
+inline void correct_covariance(const Sensor& s, const double* C, double* out) {
+    for (int i = 0; i < 9; ++i) out[i] = s.has_correction ? 0.0 : C[i];
+    if (!s.has_correction) return;
+    for (int a = 0; a < 3; ++a)
+        for (int b = 0; b < 3; ++b)
+            for (int c = 0; c < 3; ++c)
+                for (int d = 0; d < 3; ++d)
+                    out[3 * a + b] += needed(s.correction[a][c] * s.correction[b][d], C[3 * c + d]);
+}
+
+// Calibrate readings from `next` on, until the batch is finished or Python has to do something.
+inline Reason calibrate(Sensor* sensors, const Limits& limits, const RawReadings& in, Batch& batch,
+                        const Calibrated& out) {
+    double field[3], C[9];
+    while (batch.next < in.n) {
+        const int64_t i = batch.next++, row = batch.row = in.rows[i];
+        if (row < 0) return UNKNOWN_SENSOR;
+        Sensor& s = sensors[row];
+        const int64_t stamp = batch.stamp_ns = in.stamps[i] - s.clock_offset_ns;
+        const Reason reason = check(s, limits, stamp, in.fields + 3 * i, in.own[i], field);
+        if (reason >= BLOCK_COMPLETE) batch.next = i;
+        if (reason != DONE) return reason;
+        if (in.own[i]) correct_covariance(s, in.covariances + 9 * i, C);
+        const Reading reading{stamp, field, in.own[i], C};
+        const Verdict verdict = screen(s, limits, batch, reading);
+        // A spike is no step of the sensor.
+        if (verdict == PASSES || verdict == RELEASED) note_step(s, stamp, in.fields + 3 * i);
+        if (verdict == PASSES) {
+            ++s.accepted;
+            if (!limits.is_decimated && use(s, limits, batch, row, reading, out)) {
+                if (batch.n_spikes) return SPIKES;
+                continue;
+            }
+            // It passes, and cannot be used before Python has done something.
+            store(s, 0, reading);
+            s.n_held = s.n_released = 1;
+        } else if (verdict != HELD) {
+            s.accepted += s.n_released;
+        }
+        if (s.n_released) return PASSED;
+        if (batch.n_spikes) return SPIKES;
+    }
+    return DONE;
+}
+
+}  // namespace mag_tracking

@@ -1,0 +1,50 @@
+// What of inference is computed for every frame, as a Python module.
+
+#include "../python.hpp"
+#include "axes.hpp"
+#include "gauss_markov.hpp"
+
+namespace mag_tracking {
+namespace {
+
+bool energies(Array y, Array C, Array energy, Integers axes) {
+    const Size n = length_of(y, "y", 2);
+    const double *values = input_of(y, "y", {n, 3}), *covariances = input_of(C, "C", {n, 3, 3});
+    double* out = data_of(energy, "energy", {n});
+    std::int64_t* n_axes = data_of(axes, "axes", {n});
+    for (Size j = 0; j < n; ++j)
+        if (!whitened_energy(values + 3 * j, covariances + 9 * j, out[j], n_axes[j])) return false;
+    return true;
+}
+
+void smallest_pivots(Array y, Array C, Array out) {
+    const Size n = length_of(y, "y", 2);
+    const double *values = input_of(y, "y", {n, 3}), *covariances = input_of(C, "C", {n, 3, 3});
+    double* pivots = data_of(out, "out", {n});
+    for (Size j = 0; j < n; ++j) pivots[j] = smallest_pivot(values + 3 * j, covariances + 9 * j);
+}
+
+double step_vectors(Array x, Array P, Array log_w, Array densities, Integers vector, Array H,
+                    Array y, Array variance, double dt, double switch_s) {
+    const Size n = length_of(log_w, "log_w", 2), n_strengths = log_w.shape(1);
+    const Size n_y = length_of(y, "y", 1), m = length_of(densities, "densities", 2)
+                                                   ? densities.shape(1) : 0;
+    const VectorBank bank{int(n), int(n_strengths), int(m),
+                          data_of(x, "x", {n, n_strengths, 2 * m}),
+                          data_of(P, "P", {n, n_strengths, 2 * m, 2 * m}), log_w.mutable_data(),
+                          input_of(densities, "densities", {n_strengths, m})};
+    return step(bank, {int(n_y), input_of(vector, "vector", {n_y}), input_of(H, "H", {n_y, m}),
+                       y.data(), input_of(variance, "variance", {n_y})}, dt, switch_s);
+}
+
+}  // namespace
+}  // namespace mag_tracking
+
+PYBIND11_MODULE(core, m) {
+    using namespace mag_tracking;
+    m.doc() = "What of inference is computed for every frame, compiled.";
+    m.def("energies", &energies, IN(y), IN(C), IN(energy), IN(axes));
+    m.def("smallest_pivots", &smallest_pivots, IN(y), IN(C), IN(out));
+    m.def("step_vectors", &step_vectors, IN(x), IN(P), IN(log_w), IN(densities), IN(vector), IN(H),
+          IN(y), IN(variance), py::arg("dt"), py::arg("switch_s"));
+}

@@ -1,0 +1,309 @@
+// The alignment of one sample after the other, and the frames that samples complete.
+//
+// Every rule for a sample stands here once. What needs Python (a rejection that is counted by name,
+// a clock that stepped, a frame that is complete, ...) is returned as a reason.
+
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <vector>
+
+#include "../../units.hpp"
+
+namespace mag_tracking {
+
+enum Reason {
+    // The batch is finished, or the sample is rejected.
+    DONE, UNKNOWN_SENSOR, NO_FIELD, NO_COVARIANCE, DUPLICATE, OUT_OF_ORDER, LATE,
+    // To be handled before the same sample is taken again.
+    JUMPED_BACK,
+    // The sample may be from a clock that stepped, and nothing was done with it; the sensor has more
+    // samples pending than allowed; the next frame is complete.
+    CLOCK_STEP, TOO_MANY, COMPLETE
+};
+
+// Later than anything.
+constexpr int64_t FAR = std::numeric_limits<int64_t>::max();
+
+// [ns] Length of a frame, how long a sensor may be silent, how far ahead a timestamp may be, how far
+// back is a restart; how many samples of a sensor may be pending; whether sensors are read in turn.
+struct AlignmentSettings {
+    int64_t period, wait, limit, jump_back, most;
+    bool is_burst;
+};
+
+struct Sample {
+    int64_t stamp;
+    double field[3], covariance[9];
+};
+
+// The samples of a sensor that wait for their frame, in the order of their stamps.
+class Queue {
+  public:
+    int64_t size() const { return count_; }
+    const Sample& oldest() const { return ring_[first_]; }
+
+    void push(int64_t stamp, const double* field, const double* covariance) {
+        if (count_ == int64_t(ring_.size())) grow();
+        Sample& sample = ring_[(first_ + count_++) % ring_.size()];
+        sample.stamp = stamp;
+        std::copy(field, field + 3, sample.field);
+        std::copy(covariance, covariance + 9, sample.covariance);
+    }
+
+    void pop() {
+        first_ = (first_ + 1) % ring_.size();
+        --count_;
+    }
+
+  private:
+    void grow() {
+        std::vector<Sample> ring(std::max<std::size_t>(8, 2 * ring_.size()));
+        for (int64_t k = 0; k < count_; ++k) ring[k] = ring_[(first_ + k) % ring_.size()];
+        ring_.swap(ring);
+        first_ = 0;
+    }
+
+    std::vector<Sample> ring_;
+    std::size_t first_ = 0;
+    int64_t count_ = 0;
+};
+
+// Samples of a batch: their sensors (negative: unknown), timestamps, fields and covariances.
+struct Samples {
+    int64_t n;
+    const int64_t *rows, *stamps;
+    const double *fields, *covariances;
+};
+
+// Where a frame is written: (n, 3), (n, 3, 3), (n,), (n,); zero at first.
+struct FrameArrays {
+    double *field, *covariance;
+    int64_t* n_samples;
+    double* time_offset;
+};
+
+// Why a sample, field (3) and covariance (3, 3), cannot be used, or DONE.
+inline Reason fault(const double* field, const double* covariance) {
+    int n_missing = 0;
+    for (int a = 0; a < 3; ++a) {
+        if (std::isinf(field[a])) return NO_FIELD;
+        n_missing += std::isnan(field[a]);
+    }
+    if (n_missing == 3) return NO_FIELD;
+    for (int i = 0; i < 9; ++i)
+        if (!std::isnan(covariance[i])) return DONE;
+    return NO_COVARIANCE;
+}
+
+class Alignment {
+  public:
+    Alignment(std::size_t n_sensors, const AlignmentSettings& settings)
+        : settings_(settings), queues_(n_sensors), latest_(n_sensors, NEVER),
+          taken_(n_sensors, NEVER) {
+        look_ahead();
+    }
+
+    // The next sample of the batch, and the sensor of the one that a reason is about; the newest
+    // timestamp that was not ahead of all others, and whether no clock has stepped.
+    int64_t next = 0, row = 0, passed = NEVER;
+    bool is_calm = true;
+
+    int64_t n_sensors() const { return int64_t(queues_.size()); }
+
+    int64_t n_pending() const {
+        int64_t n = 0;
+        for (const Queue& queue : queues_) n += queue.size();
+        return n;
+    }
+
+    // Without the oldest sample of a sensor, where it has one.
+    void drop(int64_t i) {
+        if (queues_[i].size()) queues_[i].pop();
+        look_ahead();
+    }
+
+    // Put samples to the pending ones, from `next` on, until Python has to do something. With
+    // `is_checked` it is known that they are not from clocks that stepped; `passed_latest` (n) [ns]
+    // are of each sensor's samples that were not ahead of all others.
+    Reason hold(bool is_checked, int64_t* passed_latest, const Samples& in) {
+        while (next < in.n) {
+            const int64_t k = next++, i = row = in.rows[k], t = in.stamps[k];
+            if (i < 0) return UNKNOWN_SENSOR;
+            const double *field = in.fields + 3 * k, *covariance = in.covariances + 9 * k;
+            Reason reason = fault(field, covariance);
+            if (reason != DONE) return reason;
+            if (!is_checked) {
+                if (!is_calm || (passed != NEVER && t - passed > settings_.limit))
+                    return CLOCK_STEP;
+                passed_latest[i] = t;
+                passed = std::max(passed, t);
+            }
+            reason = place(latest_[i], t);
+            if (reason == JUMPED_BACK) next = k;
+            if (reason != DONE) return reason;
+            if (queues_[i].size() == 0) bring_forward(t, taken_[i]);
+            queues_[i].push(t, field, covariance);
+            if (queues_[i].size() > settings_.most) return TOO_MANY;
+            if (!waits()) return COMPLETE;
+        }
+        return DONE;
+    }
+
+    // Whether there is a sensor that the next frame has to wait for.
+    bool waits() {
+        const bool is_young = newest_ - first_ < settings_.wait;
+        // Who was never heard counts as heard up to -1: frames that end before are not held up.
+        if (due_ < 0 && is_young && std::find(latest_.begin(), latest_.end(), NEVER) != latest_.end())
+            return false;
+        return is_one_behind() && (!settings_.is_burst || is_one_missing(is_young));
+    }
+
+    // Find the end of the next frame; any sensor may be one to wait for. False: nothing is pending.
+    bool look_ahead() {
+        window_ = settings_.period;
+        start_ = due_ = FAR;
+        watch_ = -1;
+        int64_t earliest = FAR;
+        for (std::size_t i = 0; i < queues_.size(); ++i) {
+            if (queues_[i].size() == 0) continue;
+            const int64_t oldest = queues_[i].oldest().stamp;
+            if (settings_.is_burst) bring_forward(oldest, taken_[i]);
+            earliest = std::min(earliest, oldest);
+        }
+        // Where sensors are not read in turn the oldest sample alone decides.
+        if (!settings_.is_burst && earliest != FAR) bring_forward(earliest, NEVER);
+        return due_ != FAR;
+    }
+
+    // Average the samples before the end of the next frame (in burst mode one each), which there
+    // are; its timestamp.
+    int64_t frame(const FrameArrays& out) {
+        const int64_t end = due_;
+        int64_t first = FAR, newest = NEVER, n_all = 0, since_all = 0;
+        std::vector<int64_t> since(queues_.size(), 0);
+        for (std::size_t i = 0; i < queues_.size(); ++i) {
+            Queue& queue = queues_[i];
+            int64_t& n = out.n_samples[i];
+            double n_axis[3] = {0.0, 0.0, 0.0};
+            if (queue.size() && queue.oldest().stamp < end) first = std::min(first, queue.oldest().stamp);
+            while (queue.size() && queue.oldest().stamp < end && !(settings_.is_burst && n)) {
+                const Sample& sample = queue.oldest();
+                ++n;
+                since[i] += sample.stamp - end;
+                taken_[i] = sample.stamp;
+                newest = std::max(newest, sample.stamp);
+                add(sample, n_axis, out.field + 3 * i, out.covariance + 9 * i);
+                queue.pop();
+            }
+            average(n, n_axis, out.field + 3 * i, out.covariance + 9 * i);
+            n_all += n, since_all += since[i];
+        }
+        last_taken_ = std::max(last_taken_, newest);
+        end_ = settings_.is_burst ? newest + 1 : end;
+        // Rounds of sensors with different rates overlap; the offsets keep their true times.
+        const double mean = double(since_all + n_all * (end - first)) / double(n_all);
+        stamp_ = std::max(first + int64_t(std::nearbyint(mean)), stamp_ == NEVER ? NEVER : stamp_ + 1);
+        for (std::size_t i = 0; i < queues_.size(); ++i) {
+            const int64_t n = out.n_samples[i];
+            out.time_offset[i] = double(since[i] + n * (end - stamp_))
+                                 / double(std::max<int64_t>(n, 1)) / 1e9;
+        }
+        return stamp_;
+    }
+
+  private:
+    static void add(const Sample& sample, double* n_axis, double* field, double* covariance) {
+        for (int a = 0; a < 3; ++a) {
+            if (std::isnan(sample.field[a])) continue;
+            n_axis[a] += 1.0;
+            field[a] += sample.field[a];
+        }
+        for (int a = 0; a < 9; ++a) covariance[a] += sample.covariance[a];
+    }
+
+    // Of the sums over n samples; an axis that none has is NaN.
+    static void average(int64_t n, const double* n_axis, double* field, double* covariance) {
+        double fewest = NAN;
+        for (int a = 0; a < 3; ++a) {
+            field[a] = n_axis[a] > 0.0 ? field[a] / n_axis[a] : NAN;
+            if (n_axis[a] > 0.0) fewest = std::fmin(fewest, n_axis[a]);
+        }
+        // The fewest per axis counts for all: never better than it is.
+        const double divisor = double(std::max<int64_t>(n, 1)) * fewest;
+        for (int a = 0; a < 9; ++a) covariance[a] /= divisor;
+    }
+
+    // Whether a sensor is alive, and may still give a sample of before the end of the frame.
+    bool is_behind(int64_t latest) const {
+        if (latest == NEVER) return newest_ - first_ < settings_.wait;
+        return newest_ - settings_.wait <= latest && latest < due_;
+    }
+
+    // Whether there is one; it is watched from now on, until it is behind no more.
+    bool is_one_behind() {
+        if (watch_ >= 0 && is_behind(latest_[watch_])) return true;
+        for (std::size_t j = 0; j < latest_.size(); ++j)
+            if (is_behind(latest_[j])) {
+                watch_ = int64_t(j);
+                return true;
+            }
+        return false;
+    }
+
+    // Whether a sensor may still answer in this round, where its next is not of another.
+    bool is_one_missing(bool is_young) const {
+        for (std::size_t i = 0; i < queues_.size(); ++i) {
+            if (queues_[i].size()) {
+                if (queues_[i].oldest().stamp >= due_) return true;
+            } else if (latest_[i] == NEVER) {
+                if (is_young) return true;
+            // It was heard and is not pending, so frames were taken. At the head of a new round the
+            // others' latest samples are a round old.
+            } else if (last_taken_ == NEVER || latest_[i] >= last_taken_ - settings_.wait) {
+                return true;
+            }
+        }
+        return false;
+    }
+
+    // Have the next frame end early enough for the oldest pending sample of a sensor; `taken` is its
+    // latest in a frame, or NEVER.
+    void bring_forward(int64_t stamp, int64_t taken) {
+        if (settings_.is_burst) {
+            // A round spreads over the period, or half of any sensor's sample interval.
+            if (taken != NEVER)
+                window_ = std::min(window_, std::max<int64_t>(1, (stamp - taken) / 2));
+        } else if (end_ != NEVER && stamp < end_ + settings_.period) {
+            stamp = end_;
+        }
+        start_ = std::min(start_, stamp);
+        due_ = start_ + window_;
+    }
+
+    // Why the timestamp of a sample cannot be used, or DONE; `latest` is its sensor's.
+    Reason place(int64_t& latest, int64_t stamp) {
+        if (latest != NEVER && stamp <= latest) {
+            if (latest - stamp > settings_.jump_back) return JUMPED_BACK;
+            return stamp == latest ? DUPLICATE : OUT_OF_ORDER;
+        }
+        latest = stamp;
+        if (stamp < end_) return LATE;
+        first_ = newest_ == NEVER ? stamp : std::min(first_, stamp);
+        newest_ = std::max(newest_, stamp);
+        return DONE;
+    }
+
+    AlignmentSettings settings_;
+    std::vector<Queue> queues_;
+    // [ns] Of each sensor the latest timestamp, and that of its samples in frames.
+    std::vector<int64_t> latest_, taken_;
+    // Oldest and newest timestamp; end and timestamp of the latest frame, and the newest sample in
+    // any; of the next one the earliest start, the end and the length; a sensor it has to wait for.
+    int64_t first_ = NEVER, newest_ = NEVER, end_ = NEVER, stamp_ = NEVER, last_taken_ = NEVER;
+    int64_t start_ = FAR, due_ = FAR, window_ = 0, watch_ = -1;
+};
+
+}  // namespace mag_tracking
