@@ -14,7 +14,7 @@ SOURCES := constraints.txt setup.py setup.cfg pyproject.toml package.xml \
 	msg_defs msg_defs/CMakeLists.txt msg_defs/package.xml msg_defs/pyproject.toml msg_defs/setup.py \
 	msg_defs/msg msg_defs/srv $(wildcard msg_defs/msg/*.msg msg_defs/srv/*.srv \
 	msg_defs/cmake/*.cmake msg_defs/standard/*/* msg_defs/standard/*/msg/*.msg) \
-	$(wildcard mag_tracking/*.hpp mag_tracking/*/*.hpp mag_tracking/*/*/*.hpp mag_tracking/*/*/*.cpp)
+	$(wildcard mag_tracking/*.hpp mag_tracking/*/*.[ch]pp mag_tracking/*/*/*.[ch]pp)
 LOCK := build/lock/bin/python -m pip --quiet --disable-pip-version-check --no-input
 
 # setuptools warns of every editable package that is not below src/, through pip's --quiet too.
@@ -43,10 +43,8 @@ $(STAMP): $(SOURCES)
 	@$(PIP) install -c constraints.txt --upgrade pip
 	@echo 'Setting up: ROS messages (compiled here, about a minute)'
 	@$(PIP) install $(PINS) ./msg_defs
-	@echo 'Setting up: mag_tracking (its core is compiled) and what it needs'
-	@$(QUIET_EDITABLE) $(PIP) install $(PINS) -e '.[ros,test]'
-	@echo 'Setting up: what is compiled at first use'
-	@$(BIN)/mag-tracking warm-up
+	@echo 'Setting up: mag_tracking and what it needs (compiled in part, about a minute)'
+	@$(QUIET_EDITABLE) $(PIP) install $(PINS) -e '.[ros,archive,test]'
 	@touch $@
 	@echo 'Setting up: done'
 
@@ -100,7 +98,7 @@ lock:  ## write constraints.txt anew, with the newest that there is (needs LOCK_
 	@echo 'Locking: installing the newest of everything'
 	@$(LOCK) install --upgrade pip
 	@$(LOCK) install --upgrade setuptools wheel colcon-common-extensions \
-		$$(build/lock/bin/python tools/pins.py build-requires) '.[ros,test]'
+		$$(build/lock/bin/python tools/pins.py build-requires) '.[ros,archive,test]'
 	@{ printf '# %s\n' \
 		'Exact versions of all that pip installs here: to run, to test, to build the messages, and colcon.' \
 		'Written by `make lock`, with the oldest Python that is supported so that newer ones find wheels' \

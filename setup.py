@@ -33,7 +33,8 @@ setup(
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     ext_modules=CORES,
-    package_data={NAME: ['py.typed', 'nodes/*.xml', 'report/page/*', '*/core.pyi', 'stages/*/core.pyi']},
+    package_data={NAME: ['py.typed', 'nodes/*.xml', 'report/page/*', '*/core.pyi',
+                         'stages/*/core.pyi']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
@@ -49,7 +50,6 @@ setup(
         'mcap',
         'mcap-protobuf-support',
         'mcap-ros2-support',
-        'numba',
         'numpy',
         'paho-mqtt>=2',
         'plotly',
@@ -71,6 +71,7 @@ setup(
             # rclpy's wheel does not ask for a middleware and cannot be imported without one.
             'ros-jazzy-rmw-fastrtps-cpp',
         ],
+        'archive': ['dask', 'distributed', 'pyarrow'],
         'pandas': ['pandas'],
         'rerun': ['rerun-sdk'],
         # `colcon test` runs pytest only where the extra "test" names it.
@@ -78,6 +79,8 @@ setup(
             # Drivers for CircuitPython, as users have them.
             'adafruit-circuitpython-lis3mdl',
             'adafruit-circuitpython-mmc56x3',
+            # What reads archives.
+            'duckdb',
             'filterpy',
             'hypothesis',
             'import-linter',

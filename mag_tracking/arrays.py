@@ -1,6 +1,6 @@
-"""Types of arrays, and of compiled functions on them; shapes and units stand in docstrings."""
+"""Types of arrays; shapes and units stand in docstrings."""
 
-from typing import Any, Literal, TypeAlias, TypedDict
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +11,4 @@ BoolArray: TypeAlias = NDArray[np.bool_]
 StructArray: TypeAlias = NDArray[np.void]
 """A structured array: one record an element."""
 Record: TypeAlias = Any
-"""One element of a structured array. In compiled code its fields are attributes; NumPy's types know
-of no such."""
-
-
-class CompileOptions(TypedDict, total=False):
-    """Options of `numba.njit` that a module's kernels share."""
-
-    cache: bool
-    error_model: Literal['numpy']
-    fastmath: set[str]
-    forceinline: bool
+"""One element of a structured array."""

@@ -21,7 +21,7 @@ from mag_tracking.recording.result_folder import DETECTION_COLUMNS, POSE_COLUMNS
 from support.bundled import NETWORK_FILE, QUICK, ROOT, vehicle_path
 
 NAME = 'straight_car_fast_left'
-HEAVY = {'matplotlib', 'mcap', 'numba', 'numpy', 'pandas', 'rclpy', 'scipy', 'yaml'}
+HEAVY = {'matplotlib', 'dask', 'mcap', 'numpy', 'pandas', 'rclpy', 'scipy', 'yaml'}
 
 
 @pytest.fixture(scope='module')

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.physics import core
 from mag_tracking.physics.dipole import K_DIPOLE
 
 
@@ -141,6 +142,29 @@ def anderson_field(t: ArrayLike, r0: ArrayLike, v0: ArrayLike, m: ArrayLike) -> 
         return np.full(np.shape(t) + (3,), np.nan)
     tau = (np.asarray(t, dtype=float) - t_cpa) * (np.linalg.norm(v0) / distance)
     return anderson_functions(tau) @ C.T
+
+
+def anderson_residual(t: FloatArray, y: FloatArray, time: float, scale: float) -> float:
+    """What is left of a measured field without the Anderson functions of a pass and a constant.
+
+    Parameters
+    ----------
+    t : (n,) [s]
+    y : (n, k)
+        Fields, whitened; contiguous.
+    time : float [s]
+        Of the closest approach.
+    scale : float [s]
+        Range at the closest approach over the speed.
+
+    Returns
+    -------
+    float
+        Sum of squares of `y`, where the functions are fitted to each of its columns.
+
+    Source: TSP14 eq. (22), (23), with the exponent 5/2.
+    """
+    return core.anderson_residual(t, y, time, scale)
 
 
 def _vector(name: str, value: ArrayLike) -> FloatArray:

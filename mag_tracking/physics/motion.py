@@ -5,16 +5,11 @@ highest derivative in continuous time. (T10 eq. (4.2) and ICASSP11 eq. (2)
 hold it constant over a sample, and PHD15 Paper A eq. (18) is misprinted.)
 """
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.compiled import compiled_when_used
-
-SMALL = 1e-4
-"""[rad] Below it the chord of an arc is taken from its series."""
+from mag_tracking.physics import core
 
 _INTEGRAL, _RATE = np.arange(3), np.arange(3, 6)
 
@@ -68,40 +63,13 @@ def coordinated_turn(x: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
     Source: Bar-Shalom, Li and Kirubarajan 2001, Estimation with Applications to Tracking and
     Navigation, section 11.7.
     """
-    moved = np.array(x, dtype=float, order='C')
-    F = np.zeros((*x.shape, x.shape[1]))
-    _turn(moved, dt, F)
-    return moved, F
+    return fading_turn(x, dt, 1.0, 1.0)
 
 
-@compiled_when_used('void(float64[:,::1], float64, float64[:,:,::1])', error_model='numpy')
-def _turn(x: FloatArray, dt: float, F: FloatArray) -> None:
-    """The same, in place; the derivative comes as zeros."""
-    n_x = x.shape[1]
-    w = n_x - 1
-    for p in range(len(x)):
-        vx, vy, half = x[p, 3], x[p, 4], 0.5 * dt * x[p, w]
-        # The chord of the arc: half the angle off the velocity, and a little shorter than the way.
-        c, s = math.cos(half), math.sin(half)
-        chord, slope = 1.0 - half * half / 6.0, -half / 3.0
-        if abs(half) > SMALL:
-            chord = s / half
-            slope = (c - chord) / half
-        along_x, along_y = c * vx - s * vy, s * vx + c * vy
-        turned_x, turned_y = c * along_x - s * along_y, s * along_x + c * along_y
-        for a in range(n_x):
-            F[p, a, a] = 1.0
-        F[p, 0, 3] = F[p, 1, 4] = dt * chord * c
-        F[p, 1, 3] = dt * chord * s
-        F[p, 0, 4] = -F[p, 1, 3]
-        F[p, 2, 5] = dt
-        F[p, 3, 3] = F[p, 4, 4] = c * c - s * s
-        F[p, 4, 3] = 2.0 * s * c
-        F[p, 3, 4] = -F[p, 4, 3]
-        F[p, 0, w] = 0.5 * dt * dt * (slope * along_x - chord * along_y)
-        F[p, 1, w] = 0.5 * dt * dt * (slope * along_y + chord * along_x)
-        F[p, 3, w], F[p, 4, w] = -dt * turned_y, dt * turned_x
-        x[p, 0] += dt * chord * along_x
-        x[p, 1] += dt * chord * along_y
-        x[p, 2] += dt * x[p, 5]
-        x[p, 3], x[p, 4] = turned_x, turned_y
+def fading_turn(x: FloatArray, dt: float, mean: float, fading: float
+                ) -> tuple[FloatArray, FloatArray]:
+    """As `coordinated_turn`, at a rate that changes.
+
+    Over `dt` its mean is `mean` times that at the beginning; at the end it is `fading` times that.
+    """
+    return core.turned(np.ascontiguousarray(x, dtype=float), dt, mean, fading)

@@ -3,32 +3,7 @@
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.compiled import compiled_when_used
-
-
-@compiled_when_used(
-    'void(float64[:,:,::1], float64[:,:,:,::1], float64[:,:,:], float64[:,:,::1], '
-    'float64[:,:,:,::1])', error_model='numpy', fastmath={'contract'})
-def _turned_fields(h: FloatArray, H: FloatArray, angles: FloatArray, out_h: FloatArray,
-                   out_H: FloatArray) -> None:
-    """Loop of `turned_fields` over hypotheses and sensors."""
-    n_hyp, n_sensors, _, n_t = H.shape
-    for p in range(n_hyp):
-        for j in range(n_sensors):
-            a0, a1, a2 = angles[p, j, 0], angles[p, j, 1], angles[p, j, 2]
-            h0, h1, h2 = h[p, j, 0], h[p, j, 1], h[p, j, 2]
-            out_h[p, j, 0] = h0 + a1 * h2 - a2 * h1
-            out_h[p, j, 1] = h1 + a2 * h0 - a0 * h2
-            out_h[p, j, 2] = h2 + a0 * h1 - a1 * h0
-            for c in range(n_t):
-                c0, c1, c2 = H[p, j, 0, c], H[p, j, 1, c], H[p, j, 2, c]
-                out_H[p, j, 0, c] = c0 + a1 * c2 - a2 * c1
-                out_H[p, j, 1, c] = c1 + a2 * c0 - a0 * c2
-                out_H[p, j, 2, c] = c2 + a0 * c1 - a1 * c0
-            # a x h = -[h]x a
-            out_H[p, j, 0, n_t], out_H[p, j, 0, n_t + 1], out_H[p, j, 0, n_t + 2] = 0.0, h2, -h1
-            out_H[p, j, 1, n_t], out_H[p, j, 1, n_t + 1], out_H[p, j, 1, n_t + 2] = -h2, 0.0, h0
-            out_H[p, j, 2, n_t], out_H[p, j, 2, n_t + 1], out_H[p, j, 2, n_t + 2] = h1, -h0, 0.0
+from mag_tracking.physics import core
 
 
 def turned_fields(h: FloatArray, H: FloatArray, angles: FloatArray
@@ -54,7 +29,4 @@ def turned_fields(h: FloatArray, H: FloatArray, angles: FloatArray
     at fifteen 3.4 %. Source: the small-angle rotation; T10 section 6.3 for
     why it is needed.
     """
-    n_hyp, n_sensors, _, n_t = H.shape
-    out_h, out_H = np.empty((n_hyp, n_sensors, 3)), np.empty((n_hyp, n_sensors, 3, n_t + 3))
-    _turned_fields(np.ascontiguousarray(h), np.ascontiguousarray(H), angles, out_h, out_H)
-    return out_h, out_H
+    return core.turned_fields(*(np.ascontiguousarray(a, dtype=float) for a in (h, H, angles)))

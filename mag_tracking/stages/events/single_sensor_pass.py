@@ -3,12 +3,11 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import float64
 from scipy.optimize import minimize
 from scipy.special import ndtr
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.compiled import compiled_when_used
+from mag_tracking.physics.anderson import anderson_residual
 from mag_tracking.records import plain
 
 MOST_SAMPLES = 200
@@ -76,14 +75,18 @@ def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> Cl
         return ClosestPoint(float(t.mean()) if len(t) else np.nan, np.inf, np.nan)
     loudest = float(t[np.argmax(np.sum(y**2, axis=1))])
     interval = span / (len(t) - 1)
-    starts = sorted((_cost(t, y, time, scale), time, scale)
+
+    def cost(time: float, scale: float) -> float:
+        return anderson_residual(t, y, time, scale)
+
+    starts = sorted((cost(time, scale), time, scale)
                     for scale in np.geomspace(1.5 * interval, span, 24).tolist()
                     for time in np.arange(t[0], t[-1], max(0.3 * scale, interval)).tolist())
 
-    def cost(x: FloatArray) -> float:
-        return _cost(t, y, float(x[0]), float(np.exp(x[1])))
+    def cost_of(x: FloatArray) -> float:
+        return cost(float(x[0]), float(np.exp(x[1])))
 
-    found = min((minimize(cost, np.array([time, np.log(scale)]), method='Nelder-Mead', options={
+    found = min((minimize(cost_of, np.array([time, np.log(scale)]), method='Nelder-Mead', options={
         'xatol': 1e-4 * interval, 'fatol': 1e-9 * (1.0 + at_start), 'maxiter': 200})
         for at_start, time, scale in starts[:MOST_STARTS]), key=lambda result: float(result.fun))
     time, scale = float(found.x[0]), float(np.exp(found.x[1]))
@@ -91,8 +94,7 @@ def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> Cl
     left = max(found.fun / max(y.size - 4 * y.shape[1] - 2, 1), 0.0)
     alike = max(1.0, CORRELATED * scale / interval)
     step = 0.05 * scale
-    curvature = (_cost(t, y, time + step, scale) + _cost(t, y, time - step, scale)
-                 - 2.0 * found.fun) / step**2
+    curvature = (cost(time + step, scale) + cost(time - step, scale) - 2.0 * found.fun) / step**2
     std = np.sqrt(2.0 * left * alike / curvature) if curvature > 0.0 else np.inf
     if not (t[0] <= time <= t[-1] and scale <= span and np.isfinite(std)):
         return ClosestPoint(loudest, np.inf, np.nan)
@@ -104,54 +106,6 @@ def _averaged(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     n = -(-len(t) // MOST_SAMPLES) or 1
     k = len(t) // n
     return t[:k * n].reshape(k, n).mean(axis=1), y[:k * n].reshape(k, n, -1).mean(axis=1)
-
-
-@compiled_when_used(float64(float64[::1], float64[:, ::1], float64, float64))
-def _cost(t: FloatArray, y: FloatArray, time: float, scale: float) -> float:
-    """Sum of squares of (n, k) `y` that a pass with this time and time scale leaves over.
-
-    `physics.anderson` has the functions; here they are made orthogonal one after the other, with a
-    constant.
-    """
-    n = len(t)
-    basis = np.empty((4, n))
-    for i in range(n):
-        tau = (t[i] - time) / scale
-        cosine = 1.0 / np.sqrt(tau * tau + 1.0)
-        sine = tau * cosine
-        basis[0, i] = 1.0
-        basis[1, i] = cosine**5
-        basis[2, i] = sine * cosine**4
-        basis[3, i] = sine**2 * cosine**3
-    left = 0.0
-    for i in range(n):
-        for k in range(y.shape[1]):
-            left += y[i, k]**2
-    for m in range(4):
-        size = 0.0
-        for i in range(n):
-            size += basis[m, i]**2
-        # Twice: once leaves what rounding adds.
-        for _ in range(2):
-            for earlier in range(m):
-                along = 0.0
-                for i in range(n):
-                    along += basis[m, i] * basis[earlier, i]
-                for i in range(n):
-                    basis[m, i] -= along * basis[earlier, i]
-        rest = 0.0
-        for i in range(n):
-            rest += basis[m, i]**2
-        # A function that the others make up adds nothing.
-        factor = 1.0 / np.sqrt(rest) if rest > 1e-20 * size else 0.0
-        for i in range(n):
-            basis[m, i] *= factor
-        for k in range(y.shape[1]):
-            along = 0.0
-            for i in range(n):
-                along += basis[m, i] * y[i, k]
-            left -= along**2
-    return left
 
 
 def turning(field: FloatArray, noise_std: float, n_quiet: int) -> tuple[float, float]:

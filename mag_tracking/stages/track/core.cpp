@@ -4,16 +4,9 @@
 #include <string>
 
 #include "../../physics/targets.hpp"
+#include "../../processors.hpp"
 #include "../../python.hpp"
 #include "filter.hpp"
-
-// One function for each generation of processors; the loader takes the best that there is.
-#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12
-#define FOR_PROCESSORS \
-    __attribute__((target_clones("default", "arch=x86-64-v3", "arch=x86-64-v4")))
-#else
-#define FOR_PROCESSORS
-#endif
 
 namespace mag_tracking {
 namespace {
@@ -97,7 +90,8 @@ INLINE void run_along_all(const Target& target, const Sensors& sensors, const Si
                     square += moved * moved;
                 }
                 const double moved = std::sqrt(square) / std[k];
-                if (!(moved <= unsettled)) unsettled = moved;  // Also where it is NaN.
+                // NaN stays: of such a path nothing is settled.
+                if (!(moved <= unsettled) && !std::isnan(unsettled)) unsettled = moved;
             }
             along.unsettled[p] = unsettled;
             for (int i = 0; i < frames.n * n_x; ++i)
@@ -142,13 +136,15 @@ template <class Target>
 class CompiledFilter {
   public:
     CompiledFilter(const Target& target, Array positions, Array R_sw, int n_angles, int n_errors)
-        : target_(target), n_sensors_(int(positions.shape(0))), n_angles_(n_angles),
+        : target_(target), n_sensors_(int(length_of(positions, "positions", 2))), n_angles_(n_angles),
           n_errors_(n_errors) {
-        const auto n = positions.shape(0);
+        const auto n = length_of(positions, "positions", 2);
         const double* p = data_of(positions, "positions", {n, 3});
         const double* r = data_of(R_sw, "R_sw", {n, 3, 3});
         positions_.assign(p, p + 3 * n);
         R_sw_.assign(r, r + 9 * n);
+        if ((n_angles != 0 && n_angles != 3) || (n_errors != 0 && n_errors != 3))
+            throw py::value_error("a sensor has no own angles and errors, or three");
         if (target.n() > MOST_TARGET_STATES)
             throw py::value_error("more states of a target than " +
                                   std::to_string(MOST_TARGET_STATES));
@@ -159,14 +155,16 @@ class CompiledFilter {
                  Array near_field_length, Array x, Array P, Array new_x, Array new_P,
                  Array predicted, Array log_likelihood, Array nis) const {
         const Sizes n = sizes();
-        const py::ssize_t n_hyp = near_field_length.shape(0), n_s = n_sensors_, n_x = n.n_x;
+        const Size n_hyp = length_of(near_field_length, "near_field_length", 1);
+        const Size n_s = n_sensors_, n_x = n.n_x;
         const Frame frame{data_of(field, "field", {n_s, 3}),
                           data_of(covariance, "covariance", {n_s, 3, 3}),
                           data_of(offset, "offset", {n_s}),
                           dt,
                           data_of(decay, "decay", {n_x - n.n_t}),
                           data_of(variance, "variance", {n_x - n.n_t})};
-        const Bank bank{int(n_hyp), near_field_length.data(), data_of(x, "x", {n_hyp, n_x}),
+        const Bank bank{int(n_hyp), input_of(near_field_length, "near_field_length", {n_hyp}),
+                        data_of(x, "x", {n_hyp, n_x}),
                         data_of(P, "P", {n_hyp, n_x, n_x})};
         const Advanced out{data_of(new_x, "new_x", {n_hyp, n_x}),
                            data_of(new_P, "new_P", {n_hyp, n_x, n_x}),
@@ -185,8 +183,9 @@ class CompiledFilter {
                    Array new_P, Array paths, Array log_likelihood, Array unsettled,
                    Array covariances, ArrayOf<bool> used) const {
         const Sizes n = sizes();
-        const py::ssize_t n_hyp = near_field_length.shape(0), n_s = n_sensors_, n_x = n.n_x;
-        const py::ssize_t n_frames = dt.shape(0);
+        const Size n_hyp = length_of(near_field_length, "near_field_length", 1);
+        const Size n_s = n_sensors_, n_x = n.n_x;
+        const Size n_frames = length_of(dt, "dt", 1);
         const Frames frames{int(n_frames),
                             data_of(field, "field", {n_frames, n_s, 3}),
                             data_of(covariance, "covariance", {n_frames, n_s, 3, 3}),
@@ -194,7 +193,8 @@ class CompiledFilter {
                             dt.data(),
                             data_of(decay, "decay", {n_frames, n_x - n.n_t}),
                             data_of(variance, "variance", {n_frames, n_x - n.n_t})};
-        const Bank bank{int(n_hyp), near_field_length.data(), data_of(x, "x", {n_hyp, n_x}),
+        const Bank bank{int(n_hyp), input_of(near_field_length, "near_field_length", {n_hyp}),
+                        data_of(x, "x", {n_hyp, n_x}),
                         data_of(P, "P", {n_hyp, n_x, n_x})};
         const Advanced out{data_of(new_x, "new_x", {n_hyp, n_x}),
                            data_of(new_P, "new_P", {n_hyp, n_x, n_x}), nullptr, nullptr, nullptr};
@@ -220,7 +220,7 @@ class CompiledFilter {
     }
 
     // Raises ValueError where one of n covariances C (3, 3) is not positive definite.
-    static void check_noise(const double* C, py::ssize_t n) {
+    static void check_noise(const double* C, Size n) {
         for (; n; --n, C += 9) {
             const double l10 = C[3] / C[0], l20 = C[6] / C[0], e1 = C[4] - l10 * C[3];
             const double e21 = C[7] - l20 * C[3];
@@ -257,6 +257,8 @@ using Vector = std::array<double, 3>;
 RowVehicle row_vehicle(int n_states, int n_dipoles, Vector density, Vector induction,
                        double moment_drift, double difference_drift, double turn_acceleration,
                        double turn_time, double fastest_turn) {
+    if (n_dipoles < 1 || n_states != 9 + 3 * n_dipoles + (n_dipoles > 1) + (turn_acceleration != 0.0))
+        throw py::value_error("n_states: not those of a row of so many dipoles");
     return {n_states, n_dipoles, {density[0], density[1], density[2]},
             {induction[0], induction[1], induction[2]}, moment_drift, difference_drift,
             turn_acceleration, turn_time, fastest_turn};

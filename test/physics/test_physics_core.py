@@ -1,0 +1,122 @@
+"""Compiled functions refuse arrays that do not fit each other, and only read their arguments."""
+
+import numpy as np
+import pytest
+
+from mag_tracking.physics import core
+from mag_tracking.physics.dipole import K_DIPOLE, MU0
+from mag_tracking.physics.steady_pass import N_PATH
+
+RNG = np.random.default_rng(3)
+HYPOTHESES, SENSORS, DIPOLES, STATES, SAMPLES = 2, 4, 3, 19, 5
+
+
+def numbers(*shape):
+    return RNG.standard_normal(shape)
+
+
+PASS = {'places': np.linspace(-0.5, 0.5, DIPOLES), 't': numbers(SAMPLES),
+        'positions': numbers(SAMPLES, 3), 'M': numbers(SAMPLES, 3, 3)}
+MOMENTS = numbers(HYPOTHESES, 3 * DIPOLES)
+CLOCK = np.array([-1, 0, 1, -1, 0])
+BENT = numbers(HYPOTHESES, N_PATH + 2)
+CALLS = {
+    'dipole_field': {'d': numbers(4, 3), 'm': numbers(4, 3)},
+    'dipole_jacobians': {'d': numbers(4, 3), 'm': numbers(4, 3)},
+    'sensor_fields': {
+        'positions': numbers(SENSORS, 3), 'R_sw': numbers(SENSORS, 3, 3),
+        'r': numbers(HYPOTHESES, DIPOLES, 3), 'm': numbers(HYPOTHESES, DIPOLES, 3),
+        'dr_dx': numbers(HYPOTHESES, DIPOLES, 3, STATES),
+        'dm_dx': numbers(HYPOTHESES, DIPOLES, 3, STATES)},
+    'multipoles': {'d': numbers(4, 3), 'moments': numbers(4, 15)},
+    'turned_fields': {
+        'h': numbers(HYPOTHESES, SENSORS, 3), 'H': numbers(HYPOTHESES, SENSORS, 3, STATES),
+        'angles': numbers(HYPOTHESES, SENSORS, 3)},
+    'turned': {'x': numbers(HYPOTHESES, STATES), 'dt': 0.1, 'mean': 1.0, 'fading': 1.0},
+    'row_dipoles': {'x': numbers(HYPOTHESES, STATES), 'n_dipoles': DIPOLES,
+                    'induction': numbers(3)},
+    'set_moment_noise': {'x': numbers(HYPOTHESES, STATES), 'walk': numbers(9, 9),
+                         'induction2': 1.0, 'Q': np.zeros((HYPOTHESES, STATES, STATES))},
+    'row_bases': {'theta': numbers(HYPOTHESES, 7), **PASS},
+    'row_derivatives': {'theta': numbers(HYPOTHESES, 7), 'moments': MOMENTS, **PASS},
+    'steady_bases': {'theta': BENT, **PASS, 'clock': CLOCK},
+    'steady_derivatives': {'theta': BENT, 'moments': MOMENTS, **PASS, 'clock': CLOCK},
+    'anderson_residual': {'t': numbers(20), 'y': numbers(20, 2), 'time': 0.1, 'scale': 1.0},
+}
+FREE = {
+    ('turned_fields', 'H', 3), ('turned', 'x', 0), ('turned', 'x', 1),
+    ('row_dipoles', 'x', 0), ('row_dipoles', 'x', 1), ('row_bases', 'theta', 0),
+    ('row_bases', 'places', 0), ('steady_bases', 'theta', 0), ('steady_bases', 'theta', 1),
+    ('steady_bases', 'places', 0), ('steady_derivatives', 'theta', 1),
+    ('anderson_residual', 'y', 1)}
+"""(function, argument, axis) that may be longer, whatever the other arguments are."""
+
+ARRAYS = [(name, argument) for name, call in CALLS.items() for argument, value in call.items()
+          if isinstance(value, np.ndarray)]
+
+
+def test_every_function_has_an_example():
+    assert set(CALLS) == {name for name, value in vars(core).items()
+                          if callable(value) and not name.startswith('_')}
+
+
+@pytest.mark.parametrize(('name', 'argument'), ARRAYS)
+def test_an_array_of_another_shape_is_refused(name, argument):
+    value = CALLS[name][argument]
+    others = [np.repeat(value, 2, axis=axis) for axis in range(value.ndim)
+              if (name, argument, axis) not in FREE]
+    for other in (*others, value[None].copy(), value[0].copy()):
+        with pytest.raises((ValueError, TypeError)):
+            getattr(core, name)(**{**CALLS[name], argument: other})
+
+
+@pytest.mark.parametrize(('name', 'argument'), ARRAYS)
+def test_an_array_of_another_kind_is_refused(name, argument):
+    value = CALLS[name][argument]
+    wide = np.repeat(value, 2, axis=-1)[..., ::2]
+    for other in (value.astype(np.float32), value.astype(np.complex128), wide):
+        with pytest.raises(TypeError):
+            getattr(core, name)(**{**CALLS[name], argument: other})
+
+
+@pytest.mark.parametrize('name', CALLS)
+def test_arguments_are_only_read(name):
+    call = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in CALLS[name].items()}
+    for argument, value in call.items():
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = argument == 'Q'
+    results = [getattr(core, name)(**arguments) for arguments in (call, CALLS[name])]
+    for a, b in zip(*(r if isinstance(r, tuple) else (r,) for r in results), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize('name', ['steady_bases', 'steady_derivatives'])
+def test_a_clock_that_theta_does_not_hold_is_refused(name):
+    with pytest.raises(ValueError, match='clock'):
+        getattr(core, name)(**{**CALLS[name], 'clock': np.array([0, 1, 2, 0, 0])})
+    with pytest.raises(ValueError, match='theta'):
+        getattr(core, name)(**{**CALLS[name], 'theta': BENT[:, :N_PATH - 1].copy()})
+
+
+@pytest.mark.parametrize('n_dipoles', [-1, 0, 4])
+def test_states_of_other_dipoles_are_refused(n_dipoles):
+    with pytest.raises(ValueError, match='dipoles'):
+        core.row_dipoles(**{**CALLS['row_dipoles'], 'n_dipoles': n_dipoles})
+    k = 3 * max(n_dipoles, 0)
+    with pytest.raises(ValueError, match='dipoles'):
+        core.set_moment_noise(**{**CALLS['set_moment_noise'], 'walk': np.zeros((k, k))})
+
+
+@pytest.mark.parametrize('k', [4, 8, 10])
+def test_a_walk_that_is_not_of_whole_moments_is_refused(k):
+    with pytest.raises(ValueError, match='walk'):
+        core.set_moment_noise(**{**CALLS['set_moment_noise'], 'walk': np.zeros((k, k))})
+
+
+def test_a_state_without_turn_rate_is_refused():
+    with pytest.raises(ValueError, match='turn rate'):
+        core.turned(numbers(2, 6), 0.1, 1.0, 1.0)
+
+
+def test_the_constants_agree():
+    assert pytest.approx(MU0 / (4.0 * np.pi), rel=1e-15) == K_DIPOLE
