@@ -48,6 +48,8 @@ INLINE void copy_rows(const double* from, int from_row, double* to, int to_row, 
 }
 
 INLINE void to_wide(const double* from, const Sizes& n, double* to) {
+    // What is beyond the states takes part in sums: NaN that a hypothesis before left is not zero.
+    std::memset(to, 0, n.square() * sizeof(double));
     copy_rows(from, n.n_x, to, n.wide, n.n_x);
 }
 

@@ -5,6 +5,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterator
 from io import BytesIO
+from itertools import accumulate
 from pathlib import Path
 from typing import BinaryIO
 
@@ -25,6 +26,8 @@ _RECORD = struct.Struct('<BQ')
 """What a record is, and its length."""
 _MESSAGE = struct.Struct('<HIQQ')
 """Channel, sequence number, log time and time of publication, before the data of a message."""
+GATHERED = 256
+"""Messages without a chunk that are read at once."""
 _DEFINITIONS: dict[int, type[Schema] | type[Channel]] = {
     Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
 
@@ -128,11 +131,12 @@ class McapFile:
     def _from_stream(self, stream: BinaryIO, progress: Progress | None
                      ) -> Iterator[MessageBlock]:
         """Messages in the order of the file, up to where it breaks off."""
-        channels = _Channels()
+        channels, loose = _Channels(), _LooseMessages()
         done = 0
         try:
             for record in StreamReader(stream, emit_chunks=True).records:
                 if isinstance(record, Chunk):
+                    yield from loose.taken(channels)
                     try:
                         yield channels.block_of(record)
                     except DAMAGE as error:
@@ -140,16 +144,43 @@ class McapFile:
                 elif isinstance(record, Schema | Channel):
                     channels.add(record)
                 elif isinstance(record, Message) and channels.has_schema(record.channel_id):
-                    yield MessageBlock.of_rows(record.data, channels.kinds, [
-                        (record.channel_id, record.log_time, 0, len(record.data))])
+                    loose.add(record)
+                    if len(loose) >= GATHERED:
+                        yield from loose.taken(channels)
                 if progress:
                     here = stream.tell()
                     progress(here - done)
                     done = here
+            yield from loose.taken(channels)
         except DAMAGE as error:
+            yield from loose.taken(channels)
             self._losses[f'{os.path.basename(stream.name)}: nothing readable after byte '
                         f'{stream.tell()} of {os.fstat(stream.fileno()).st_size} '
                         f'({type(error).__name__})'] += 1
+
+
+class _LooseMessages:
+    """Messages that are in no chunk, gathered: one by one each would cost as much as many."""
+
+    def __init__(self) -> None:
+        self._messages: list[Message] = []
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    def add(self, message: Message) -> None:
+        """Take one more."""
+        self._messages.append(message)
+
+    def taken(self, channels: '_Channels') -> Iterator[MessageBlock]:
+        """What was gathered, if anything was; nothing is left."""
+        messages, self._messages = self._messages, []
+        if not messages:
+            return
+        ends = list(accumulate(len(m.data) for m in messages))
+        yield MessageBlock.of_rows(b''.join(m.data for m in messages), dict(channels.kinds), [
+            (m.channel_id, m.log_time, end - len(m.data), end)
+            for m, end in zip(messages, ends, strict=True)])
 
 
 class _Channels:

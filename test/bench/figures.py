@@ -9,6 +9,7 @@ worse than the best of the latest five runs by more than 15 %.
 
 import datetime
 import json
+import math
 import os
 import platform
 import subprocess
@@ -32,7 +33,8 @@ class Figures:
 
     def add(self, name, value, unit, aim=None, more_is_better=False, note=''):
         """Print a figure and keep it; `aim` is the worst that is good enough."""
-        is_missed = aim is not None and (value < aim if more_is_better else value > aim)
+        # NaN reaches no aim.
+        is_missed = aim is not None and not (value >= aim if more_is_better else value <= aim)
         self.missed += is_missed
         self._figures[name] = {'value': float(value), 'unit': unit, 'aim': aim,
                                'more_is_better': more_is_better}
@@ -56,18 +58,33 @@ def read_history():
     return [json.loads(line) for line in HISTORY.read_text().splitlines()]
 
 
+def machine():
+    """What the figures of two runs have to have in common to be compared."""
+    try:
+        with open('/proc/cpuinfo') as stream:
+            models = {line.partition(':')[2].strip() for line in stream
+                      if line.startswith('model name')}
+    except OSError:
+        models = set()
+    return ', '.join([platform.machine(), f'{os.cpu_count()} cores', *sorted(models)])
+
+
 def worse(run, before):
-    """[(benchmark, name, figure, best of before)] of a run's figures that got worse."""
+    """[(benchmark, name, figure, best of before)] of a run's figures that got worse, or are NaN.
+
+    `before` are the earlier runs on such a machine.
+    """
     out = []
     for benchmark, figures in run.items():
         for name, figure in figures.items():
-            earlier = [r['figures'][benchmark][name]['value'] for r in before[-RUNS:]
-                       if name in r['figures'].get(benchmark, {})]
+            earlier = [value for r in before[-RUNS:] if name in r['figures'].get(benchmark, {})
+                       and not math.isnan(value := r['figures'][benchmark][name]['value'])]
             if not earlier:
                 continue
             more = figure['more_is_better']
             best = max(earlier) if more else min(earlier)
-            if figure['value'] * WORSE < best if more else figure['value'] > WORSE * best:
+            value = figure['value']
+            if not (value * WORSE >= best if more else value <= WORSE * best):
                 out.append((benchmark, name, figure, best))
     return out
 
@@ -89,13 +106,14 @@ def main():
     if not LATEST.exists():
         print('no benchmark has been run: there is no benchmarks/latest.json')
         return 1
-    figures, before = json.loads(LATEST.read_text()), read_history()
+    figures = json.loads(LATEST.read_text())
+    before = [run for run in read_history() if run['machine'] == machine()]
     found = worse(figures, before)
     for benchmark, name, figure, best in found:
         print(f'{RED}worse: {benchmark}: {name}: {figure["value"]:.4g} {figure["unit"]}, the best '
               f'of the latest runs was {best:.4g}{PLAIN}')
     run = {'date': datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds'),
-           'commit': commit(), 'machine': f'{platform.machine()}, {os.cpu_count()} cores',
+           'commit': commit(), 'machine': machine(),
            'python': platform.python_version(), 'figures': figures}
     with HISTORY.open('a') as stream:
         stream.write(json.dumps(run, sort_keys=True) + '\n')

@@ -6,6 +6,7 @@ import tracemalloc
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -16,6 +17,7 @@ from mag_tracking.messages.types import MAGNETIC_FIELD, TRACK_ARRAY, decode
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.units import LATEST_NS
 from support.bundled import ROOT, vehicle_path
 from support.samples import MagSample, recorded, sample_dict, samples_of
 
@@ -250,3 +252,36 @@ def test_an_unwritable_place_is_named(tmp_path):
     (tmp_path / 'file').write_text('')
     with pytest.raises(OutputError, match='cannot write'):
         RecordingWriter(tmp_path / 'file' / 'a.mcap')
+
+
+def write_raw(path, log_times, use_chunking=True):
+    """A recording of one topic whose messages have these log times, which may be any."""
+    with open(path, 'wb') as stream:
+        writer = Writer(stream, use_chunking=use_chunking)
+        writer.start('ros2', 'test')
+        schema = writer.register_schema(MAGNETIC_FIELD, 'ros2msg', b'x')
+        channel = writer.register_channel('/mag_1/imu/mag', 'cdr', schema)
+        for k, log_time in enumerate(log_times):
+            writer.add_message(channel, log_time, b'message %d' % k, log_time)
+        writer.finish()
+
+
+@pytest.mark.parametrize('use_chunking', [True, False])
+def test_a_log_time_that_no_clock_shows_costs_nothing(tmp_path, use_chunking):
+    """MCAP has 64 bits without a sign for it."""
+    write_raw(tmp_path / 'a.mcap', [1, 2, 2**63, 2**64 - 1], use_chunking)
+    messages, recording = read(tmp_path / 'a.mcap')
+    assert [m.data for m in messages] == [b'message %d' % k for k in range(4)]
+    assert messages[-1].log_time_ns == LATEST_NS and not recording.losses
+
+
+def test_messages_without_chunks_are_read_together(tmp_path):
+    """And those before the place where a file is cut are kept."""
+    write_raw(tmp_path / 'a.mcap', range(1000), use_chunking=False)
+    blocks = list(Recording(tmp_path / 'a.mcap').blocks())
+    assert sum(map(len, blocks)) == 1000 and len(blocks) <= 5
+    data = (tmp_path / 'a.mcap').read_bytes()
+    (tmp_path / 'cut.mcap').write_bytes(data[:data.index(b'message 700') + 3])
+    messages, recording = read(tmp_path / 'cut.mcap')
+    assert [m.data for m in messages] == [b'message %d' % k for k in range(700)]
+    assert recording.losses

@@ -6,6 +6,7 @@ import pytest
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track import core
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.target import target_of
 from support.bundled import POINT
@@ -170,3 +171,45 @@ def test_no_array_is_copied_that_would_be_written_to():
     bank.P.flags.writeable = False
     with pytest.raises(ValueError, match='read-only|not writeable'):
         compiled.advance(bank, frames[0], 0.0)
+
+
+@pytest.mark.parametrize('name', ['row that turns', 'point', 'magnet'])
+def test_a_hypothesis_that_is_spoilt_does_not_spoil_the_others(name):
+    """Rounding may make a covariance indefinite; NaN has to stay where it began."""
+    compiled, _, bank, frames, intervals = case(name, n_hyp=4)
+    paths = np.repeat(bank.x[:, None], len(frames), axis=1)
+    found = []
+    for spoilt in (False, True):
+        b, p = bank.copy(), paths.copy()
+        if spoilt:
+            b.P[0] *= -1.0
+        along = compiled.run_along(b, frames, intervals, p, passes=3, step=0.5,
+                                   first_is_updated=False, wants_covariances=True)
+        found.append((b.x[1:], b.P[1:], p[1:], along.covariances[1:], along.log_likelihood[1:],
+                      along.unsettled[1:]))
+    assert along.log_likelihood[0] == -np.inf
+    for expected, got in zip(*found, strict=True):
+        np.testing.assert_array_equal(got, expected)
+
+
+def test_of_a_path_that_is_nowhere_nothing_is_settled():
+    compiled, _, bank, frames, intervals = case('point', n_hyp=2)
+    paths = np.repeat(bank.x[:, None], len(frames), axis=1)
+    paths[0, 2] = np.inf
+    along = compiled.run_along(bank, frames, intervals, paths, passes=1, step=0.5,
+                               first_is_updated=False)
+    assert np.isnan(along.unsettled[0]) and np.isfinite(along.unsettled[1])
+
+
+ROW = (1, [1.0] * 3, [1.0] * 3, 0.1, 0.1, 0.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize('n_angles, n_errors, n_states, row, error', [
+    (1, 0, 12, ROW, 'three'), (0, 2, 12, ROW, 'three'), (0, 0, 9, ROW, 'n_states'),
+    (0, 0, 0, ROW, 'n_states'), (0, 0, 9, (0, *ROW[1:]), 'n_states'),
+    (0, 0, 9, (50, *ROW[1:]), 'n_states'),
+    (0, 0, 9 + 3 * 90 + 1, (90, *ROW[1:]), 'more states')])
+def test_a_filter_of_a_target_that_cannot_be_is_refused(n_angles, n_errors, n_states, row, error):
+    with pytest.raises(ValueError, match=error):
+        core.RowVehicleFilter(np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), n_angles, n_errors,
+                              n_states, *row)
