@@ -39,3 +39,7 @@ class MissingDependencyError(MagTrackingError, ImportError):
 
 class GraphError(MagTrackingError):
     """A topic, service or node of the ROS graph is missing, refuses, or does not answer."""
+
+
+class ClusterError(MagTrackingError):
+    """A Dask scheduler does not answer, has no worker, or is gone."""

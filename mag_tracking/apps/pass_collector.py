@@ -1,7 +1,7 @@
 """Cut the passes out of a recording: what the network measured around each detection."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -27,8 +27,10 @@ LONGEST_S = 60.0
 class PassCollector:
     """Readings to passes: what the network measured from before a detection until it ended."""
 
-    def __init__(self, network: SensorNetwork, settings: Settings) -> None:
-        self._network, self._settings = network, settings
+    def __init__(self, network: SensorNetwork, settings: Settings,
+                 seen: Callable[[FieldFrame], object] | None = None) -> None:
+        """`seen` is called with every frame, with its verdict."""
+        self._network, self._settings, self._seen = network, settings, seen
         self._max_field = settings.calibrate.max_field
         self._stages = (Calibrate(network, settings.calibrate), Align(network, settings.align),
                         Detect(network, settings.detect))
@@ -97,6 +99,8 @@ class PassCollector:
         out = []
         for record in self._stages[2].feed(frame):
             if not isinstance(record, Detection):
+                if self._seen is not None:
+                    self._seen(record)
                 continue
             if record.onset:
                 self._onset_ns = record.stamp_ns

@@ -37,6 +37,7 @@ COMMANDS = {
     'repair': Command('repair', 'Make a recording whole that was cut off.'),
     'run': Command('run', 'Run the nodes in one process (needs ROS 2).'),
     'info': Command('info', 'Tell what is in a recording.'),
+    'archive': Command('archive', 'Track many recordings into one dataset, on a cluster.'),
     'import': Command('import_table', 'Turn a table into a recording.'),
     'topics': Command('graph', 'List the topics of the graph (needs ROS 2).'),
     'echo': Command('graph', 'Print the messages of a topic (needs ROS 2).'),

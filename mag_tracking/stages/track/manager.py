@@ -44,15 +44,23 @@ class TrackManager:
     one track is started at a time; all that run are maintained alike.
     """
 
-    def __init__(self, network: SensorNetwork, settings: TrackSettings) -> None:
+    def __init__(self, network: SensorNetwork, settings: TrackSettings,
+                 clocks: ClockEvidence | None = None) -> None:
         """
+        Parameters
+        ----------
+        network : SensorNetwork
+        settings : TrackSettings
+        clocks : ClockEvidence, optional
+            Of passes before; goes on with those of the tracks.
+
         Raises
         ------
         SettingsError
             If the settings contradict each other.
         """
         self.counts: Counter[str] = Counter()
-        self._clocks = ClockEvidence(len(network))
+        self._clocks = clocks or ClockEvidence(len(network))
         self._network, self._settings = network, settings
         self._target = target_of(settings, network)
         self._tracks: list[RunningTrack] = []

@@ -1,0 +1,218 @@
+"""Many recordings, or long ones, tracked on a cluster into one dataset."""
+
+import dataclasses
+import glob
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from mag_tracking.apps.archive_work import N_DIPOLES, Job, cut, join, track_stretch
+from mag_tracking.apps.cluster import Cluster, LostWorkersError
+from mag_tracking.apps.readings import network_of
+from mag_tracking.errors import ClusterError, MagTrackingError, OutputError, RecordingError
+from mag_tracking.files import checked_path
+from mag_tracking.network import SensorNetwork
+from mag_tracking.pipeline import Settings
+from mag_tracking.recording.archive_folder import ArchiveFolder, import_pyarrow, stamped
+from mag_tracking.recording.reader import SUFFIXES
+
+_Cluster = Cluster[tuple[str, Job]]
+
+METADATA = 'metadata.yaml'
+"""What makes a folder a recording."""
+
+
+@dataclass
+class ArchiveRun:
+    """What came of a run."""
+
+    done: list[Path] = field(default_factory=list)
+    """Recordings that were tracked."""
+    were_done: list[Path] = field(default_factory=list)
+    """Those that an earlier run had tracked."""
+    failed: dict[Path, str] = field(default_factory=dict)
+    """{recording: why it was not tracked}."""
+    tracks: int = 0
+    passes: int = 0
+    """Numbers of tracks and fitted passes, of the recordings that were tracked now."""
+    lost_workers: int = 0
+    """How often a worker was lost; its tasks were run again."""
+    interrupted: bool = False
+
+
+def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
+    """The recordings that folders, patterns and paths name, each once, in order.
+
+    A folder is searched with all that are in it; one with a metadata.yaml is a recording.
+
+    Raises
+    ------
+    RecordingError
+        If a name has no recording.
+    """
+    found: dict[Path, None] = {}
+    for name in names:
+        path = checked_path(name, RecordingError)
+        here = [path] if path.exists() else [Path(p) for p in sorted(
+            glob.glob(str(path), recursive=True))]
+        recordings = [r for p in here for r in _recordings_at(p)]
+        if not recordings:
+            raise RecordingError(f'{path}: there is no recording ({", ".join(SUFFIXES)})')
+        found.update(dict.fromkeys(r.resolve() for r in recordings))
+    return list(found)
+
+
+def _recordings_at(path: Path) -> list[Path]:
+    """The recordings at a path: itself, or what is in it."""
+    if path.is_file():
+        return [path] if path.suffix in SUFFIXES else []
+    if (path / METADATA).exists():
+        return [path]
+    return [r for p in sorted(path.iterdir()) if not p.name.startswith('.')
+            for r in _recordings_at(p)]
+
+
+def archive(recordings: Iterable[str | PathLike[str]],
+            network: SensorNetwork | str | PathLike[str], settings: Settings,
+            out: str | PathLike[str], workers: int = 1, scheduler: str | None = None,
+            progress: Callable[[int], object] | None = None,
+            stopped: Callable[[], bool] | None = None,
+            report: Callable[[str], object] | None = None) -> ArchiveRun:
+    """Track recordings into a dataset; those that an earlier run has tracked are left alone.
+
+    The rows are those of a replay of each recording by itself.
+
+    Parameters
+    ----------
+    recordings : iterable of str or path
+        Recordings, folders of them, and patterns.
+    network : SensorNetwork or path of a network file
+    settings : Settings
+    out : path
+        The folder of the dataset; `recording.archive_folder` says what is in it.
+    workers : int
+        Processes on this machine.
+    scheduler : str, optional
+        Address of a Dask scheduler, such as tcp://10.0.0.5:8786, whose workers have this package,
+        and see the recordings and `out` under the same paths; in place of `workers`.
+    progress : function, optional
+        Called with the bytes of each recording when it is done.
+    stopped : function, optional
+        Asked several times a second; when it is true the run ends, and another one goes on.
+    report : function, optional
+        Takes a line for the user, of each recording that fails.
+
+    Returns
+    -------
+    ArchiveRun
+
+    Raises
+    ------
+    RecordingError
+        If there is no recording.
+    OutputError
+        If the dataset cannot be written, is of other settings, or of another version.
+    ClusterError
+        If the scheduler does not answer, or has no worker.
+    MissingDependencyError
+        If Dask or pyarrow is not installed.
+    """
+    import_pyarrow()
+    network, paths, run = network_of(network), recordings_of(recordings), ArchiveRun()
+    folder = checked_path(out, OutputError).resolve()
+    paths = [path for path in paths if folder not in path.parents]
+    with ArchiveFolder(folder, _head(network, settings)) as dataset:
+        todo: list[Path] = []
+        for path in paths:
+            (todo if dataset.done(path) is None else run.were_done).append(path)
+        if todo:
+            with _Cluster(workers, scheduler) as cluster:
+                _Director(dataset, cluster, network, settings, run, progress, report).work(
+                    todo, stopped or (lambda: False))
+                run.lost_workers = cluster.n_lost
+        dataset.write_recordings([*dataset.known(), *(
+            stamped(path, 0) | {'time': None, 'error': why} for path, why in run.failed.items())])
+    return run
+
+
+def _head(network: SensorNetwork, settings: Settings) -> dict[str, Any]:
+    """What all runs into a folder have to have in common, JSON-ready."""
+    def plain(value: Any) -> Any:
+        return value.tolist() if hasattr(value, 'tolist') else str(value)
+    text = json.dumps(dataclasses.asdict(network), default=plain, sort_keys=True)
+    return {'network': hashlib.sha256(text.encode()).hexdigest(), 'n_dipoles': N_DIPOLES,
+            'settings': dataclasses.asdict(settings)}
+
+
+class _Director:
+    """Gives the tasks of all recordings to a cluster, each when those before it are done."""
+
+    def __init__(self, dataset: ArchiveFolder, cluster: _Cluster, network: SensorNetwork,
+                 settings: Settings, run: ArchiveRun, progress: Callable[[int], object] | None,
+                 report: Callable[[str], object] | None) -> None:
+        self._dataset, self._cluster, self._run = dataset, cluster, run
+        self._network, self._settings = network, settings
+        self._progress, self._report = progress or (lambda _: None), report or (lambda _: None)
+        self._stretches: Counter[Path] = Counter()
+
+    def work(self, todo: Sequence[Path], stopped: Callable[[], bool]) -> None:
+        """Track the recordings; a few at a time, which bounds the files that wait."""
+        waiting = list(reversed(todo))
+        while waiting or self._cluster.n_running:
+            while waiting and self._n_begun() < 2 * self._cluster.n_workers + 1:
+                self._begin(waiting.pop())
+            if stopped():
+                self._run.interrupted = True
+                return
+            for (kind, job), result in self._cluster.finished():
+                self._take(kind, job, result)
+
+    def _n_begun(self) -> int:
+        """Recordings that have tasks."""
+        return len({job.recording for _, job in self._cluster.keys()})
+
+    def _begin(self, path: Path) -> None:
+        """Cut a recording."""
+        try:
+            job = Job(path, self._dataset.begin(path), self._dataset.path, self._network,
+                      self._settings)
+        except OSError as error:
+            self._fail(path, f'cannot read it: {error.strerror}')
+            return
+        self._cluster.submit(('cut', job), 0, cut, job)
+
+    def _take(self, kind: str, job: Job, result: Any) -> None:
+        """A task is done: what follows from it."""
+        path = job.recording
+        if isinstance(result, OutputError | ClusterError):
+            raise result
+        if path in self._run.failed:
+            return
+        if isinstance(result, BaseException):
+            self._fail(path, str(result) if isinstance(result, MagTrackingError | LostWorkersError)
+                       else f'{type(result).__name__}: {result}')
+        elif kind == 'join':
+            self._dataset.complete(path, result)
+            self._run.done.append(path)
+            self._run.tracks += result['tracks']
+            self._run.passes += result['passes']
+            self._progress(result['size'])
+        else:
+            if kind == 'cut':
+                self._stretches[path] = result['stretches']
+                for k in range(result['stretches']):
+                    self._cluster.submit(('track', job), 1, track_stretch, job, k)
+            else:
+                self._stretches[path] -= 1
+            if not self._stretches[path]:
+                self._cluster.submit(('join', job), 2, join, job)
+
+    def _fail(self, path: Path, why: str) -> None:
+        """A recording that cannot be tracked stops nobody."""
+        self._run.failed[path] = why
+        self._report(f'{path.name}: {why}')

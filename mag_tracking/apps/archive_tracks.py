@@ -1,0 +1,140 @@
+"""The tracks of one stretch of a recording, as rows of the tables of an archive."""
+
+import math
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mag_tracking.analysis.correlated_motion import correlated_motion
+from mag_tracking.analysis.pass_data import PassData
+from mag_tracking.analysis.pass_fit import fit_pass
+from mag_tracking.apps.archive_stretches import Piece
+from mag_tracking.apps.fit import FittedPass
+from mag_tracking.apps.replay import RunCollector
+from mag_tracking.event_records import Disturbance
+from mag_tracking.recording.archive_folder import TableWriter, stamped
+from mag_tracking.recording.fit_folder import pass_rows
+from mag_tracking.records import Detection, FieldFrame, SmoothedPose, Track
+from mag_tracking.report.track_log import SmoothedLog, TrackLog
+from mag_tracking.stages.track.manager import TrackManager
+
+TRACKED = ('tracks', 'poses', 'smoothed', 'passes')
+"""The tables that a stretch has rows of."""
+
+
+class StretchTables:
+    """Takes what a tracker and the passes of a stretch give; a context manager.
+
+    Attributes
+    ----------
+    n_tracks, n_passes : int
+    """
+
+    def __init__(self, recording: Path, paths: dict[str, Path], n_dipoles: int) -> None:
+        """`paths` of the tables `TRACKED`; passes are fitted with rows of `n_dipoles`."""
+        self._recording, self._n_dipoles = recording, n_dipoles
+        self._files = ExitStack()
+        self._tables = {name: self._files.enter_context(TableWriter(paths[name], name))
+                        for name in TRACKED}
+        self._collector = RunCollector(self)
+        self.n_tracks = self.n_passes = 0
+
+    def __enter__(self) -> 'StretchTables':
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._files.__exit__(*error)
+
+    def track(self, piece: Piece, tracker: TrackManager) -> None:
+        """Run the tracker over a piece of the stretch, and fit the passes of it."""
+        for frame, doubts in piece.frames():
+            if doubts is not None:
+                tracker.doubt(doubts)
+            self._collector.take([frame, *tracker.feed(frame)])
+        for log in [log for log in self._collector.logs.values() if log.ended]:
+            self._add_track_row(log)
+        for one in piece.passes:
+            self._add_pass(*one)
+
+    def finish(self, tracker: TrackManager) -> None:
+        """The stretch has ended."""
+        self._collector.take(tracker.flush())
+        for log in list(self._collector.logs.values()):
+            self._add_track_row(log)
+
+    def add_frame(self, frame: FieldFrame) -> None:
+        """Frames have no table."""
+
+    def add_detection(self, detection: Detection) -> None:
+        """Detections have no table."""
+
+    def add_disturbance(self, disturbance: Disturbance) -> None:
+        """Disturbances have no table."""
+
+    def add_track(self, track: Track) -> None:
+        """One row a pose; the closing record of a track has no row."""
+        if not track.ended:
+            self._tables['poses'].add(self._pose(track) | {
+                'weight': track.weight, 'kind_weight': _number(track.kind_weight),
+                'arrival': track.arrival, 'doubts': ' '.join(track.doubts)})
+
+    def add_smoothed(self, pose: SmoothedPose) -> None:
+        """One row for a pose of a whole track; those of a fixed lag have none."""
+        if pose.complete:
+            self._tables['smoothed'].add(self._pose(pose))
+
+    def _pose(self, pose: Track | SmoothedPose) -> dict[str, Any]:
+        """The columns of any pose."""
+        sd = np.sqrt(np.diagonal(pose.covariance))
+        values = np.concatenate([pose.position, pose.velocity, sd, pose.moment]).tolist()
+        return {**stamped(self._recording, pose.stamp_ns), 'track_id': pose.id,
+                **dict(zip(_STATE, map(_number, values), strict=True)),
+                'covariance': pose.covariance.ravel().tolist(), 'kind': pose.kind,
+                'length': _number(pose.length), 'ambiguous': pose.ambiguous}
+
+    def _add_track_row(self, log: TrackLog) -> None:
+        """The row of a track that has ended; nothing of it is kept."""
+        del self._collector.logs[log.id]
+        smoothed = self._collector.smoothed.pop(log.id, None)
+        self.n_tracks += 1
+        self._tables['tracks'].add(
+            stamped(self._recording, log.stamp_ns[0]) | {'track_id': log.id}
+            | _track_columns(log, smoothed))
+
+    def _add_pass(self, number: int, data: PassData, notes: tuple[str, ...]) -> None:
+        """The row of a pass, fitted as a whole."""
+        fitted = FittedPass(self._recording.stem, number, (fit_pass(data, self._n_dipoles),), notes,
+                            correlated_motion(data))
+        row = pass_rows(fitted)[0]
+        self.n_passes += 1
+        self._tables['passes'].add(
+            {name: _number(value) if isinstance(value, float) else value
+             for name, value in row.items() if name not in ('recording', 'pass')}
+            | stamped(self._recording, row['stamp_ns'])
+            | {'number': number, 'notes': '; '.join(notes)})
+
+
+_STATE = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz', 'mx',
+          'my', 'mz')
+
+
+def _track_columns(log: TrackLog, smoothed: SmoothedLog | None) -> dict[str, Any]:
+    """The numbers of a track."""
+    summary = log.summary()
+    out = {name: summary[name] for name in (
+        'end_ns', 'poses', 'arrival', 'kind', 'verdict', 'kind_weight', 'ambiguous_share',
+        'nis_per_axis', 'length', 'smallest_sd', 'speed', 'heading_deg', 'moment_size')}
+    out |= dict(zip(('mx', 'my', 'mz'), summary['moment'], strict=True))
+    out |= {'doubts': ' '.join(summary['doubts']),
+            'arrival_weight': summary['arrival_weights'][summary['arrival']]}
+    if smoothed is not None:
+        of = smoothed.summary()
+        out |= {'smoothed_speed': of['speed'], 'smoothed_moment_size': of['moment_size']}
+    return {name: _number(v) if isinstance(v, float) else v for name, v in out.items()}
+
+
+def _number(value: float) -> float | None:
+    """None in place of NaN: a table has a null for what is not known."""
+    return None if math.isnan(value) else value

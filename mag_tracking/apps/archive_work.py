@@ -1,0 +1,229 @@
+"""What workers do for an archive: cut a recording, track its stretches, join the tables.
+
+Each task leaves files in the folder of its recording and does nothing where they are complete, so
+that it may be run again at any time.
+"""
+
+import copy
+import json
+import pickle
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mag_tracking.analysis.pass_data import PassData
+from mag_tracking.apps.archive_health import HealthRows
+from mag_tracking.apps.archive_stretches import StretchWriter, read_stretch
+from mag_tracking.apps.archive_tracks import TRACKED, StretchTables
+from mag_tracking.apps.first_pass import first_pass_of
+from mag_tracking.apps.pass_collector import PassCollector
+from mag_tracking.arrays import IntArray
+from mag_tracking.errors import OutputError
+from mag_tracking.files import new_binary_file, replace_text
+from mag_tracking.network import SensorNetwork
+from mag_tracking.pipeline import Settings
+from mag_tracking.recording.archive_folder import TableWriter, join_tables, name_of, stamped
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track.clock_evidence import ClockEvidence
+from mag_tracking.stages.track.manager import TrackManager
+from mag_tracking.stages.track.rigid_pass import RigidPass
+
+N_DIPOLES = 3
+"""Of the rows that passes are fitted with."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One recording of an archive."""
+
+    recording: Path
+    work: Path
+    """The folder of what is not complete."""
+    folder: Path
+    """The folder of the archive."""
+    network: SensorNetwork
+    settings: Settings
+
+    def path(self, k: int, table: str) -> Path:
+        """A table of a stretch."""
+        return self.work / f'stretch-{k}.{table}.parquet'
+
+
+class NotedEvidence(ClockEvidence):
+    """Notes the passes that it counts.
+
+    Attributes
+    ----------
+    passes : list of (RigidPass, IntArray)
+    was_apart : bool
+        Whether clocks were ever apart: then what was tracked depends on the passes before.
+    """
+
+    def __init__(self, n_sensors: int) -> None:
+        super().__init__(n_sensors)
+        self.passes: list[tuple[RigidPass, IntArray]] = []
+        self.was_apart = False
+
+    def add(self, found: RigidPass, rows: IntArray) -> None:
+        """Count a pass of the sensors `rows`."""
+        super().add(found, rows)
+        self.passes.append((found, rows))
+        self.was_apart |= self.apart is not None
+
+
+@dataclass
+class _Tracked:
+    """What is known of a stretch beside its tables."""
+
+    n_tracks: int
+    n_passes: int
+    evidence: NotedEvidence = field(repr=False)
+
+
+def cut(job: Job) -> dict[str, Any]:
+    """Read the recording: its stretches into files, the table `health`; what is known of it.
+
+    Raises
+    ------
+    MagTrackingError
+        If the recording cannot be read, or something cannot be written.
+    """
+    done = job.work / 'cut.json'
+    if done.exists():
+        known: dict[str, Any] = json.loads(done.read_text())
+        return known
+    with TableWriter(job.work / 'health.parquet', 'health') as table:
+        known = _Cut(job, table).read()
+    replace_text(done, json.dumps(known))
+    return known
+
+
+class _Cut:
+    """Reads a recording once, with the stages before the tracker."""
+
+    def __init__(self, job: Job, health: TableWriter) -> None:
+        self._recording, self._path = Recording(job.recording), job.recording
+        self._reader = SampleReader(self._recording, job.network)
+        self._passes = PassCollector(job.network, job.settings, self._see)
+        first_pass_of(self._recording, job.network, job.settings.calibrate).apply(
+            self._passes.calibrate)
+        self._writer = StretchWriter(job.work, job.settings.track.lookback_s)
+        self._health, self._health_table = HealthRows(job.recording, job.network), health
+        self._first_ns: int | None = None
+        self._last_ns: int | None = None
+        self._n_passes = 0
+
+    def read(self) -> dict[str, Any]:
+        """What is known of the recording; stretches and health are written."""
+        for readings in self._reader.readings():
+            self._add(self._passes.feed(readings))
+        self._add(self._passes.flush())
+        self._writer.close()
+        if self._last_ns is not None:
+            self._add_health(self._health.rows(self._last_ns, self._passes.calibrate))
+        missing = self._reader.missing_topics()
+        return {
+            **stamped(self._path, self._first_ns or 0), 'end_ns': self._last_ns,
+            'frames': self._writer.n_frames, 'stretches': self._writer.n_stretches,
+            'size': self._recording.size, 'lost': _text(self._recording.losses),
+            'rejected': _text(self._reader.rejected + Counter(self._passes.rejected)),
+            'missing_topics': ' '.join(missing),
+            'why_no_detection': self._passes.why_no_detection(missing) or ''}
+
+    def _see(self, frame: FieldFrame) -> None:
+        """Take a frame with its verdict."""
+        self._first_ns = frame.stamp_ns if self._first_ns is None else self._first_ns
+        self._last_ns = frame.stamp_ns
+        self._writer.add_frame(frame, self._passes.calibrate.doubtful_stretches())
+        self._add_health(self._health.due(frame.stamp_ns, self._passes.calibrate))
+
+    def _add(self, passes: Iterable[tuple[PassData, tuple[str, ...]]]) -> None:
+        """Take the passes that are over."""
+        for data, notes in passes:
+            self._n_passes += 1
+            self._writer.add_pass(self._n_passes, data, notes)
+
+    def _add_health(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Take rows of the sensors."""
+        for row in rows:
+            self._health_table.add(row)
+
+
+def track_stretch(job: Job, k: int, evidence: NotedEvidence | None = None) -> None:
+    """Track a stretch and fit its passes: its tables.
+
+    Parameters
+    ----------
+    job : Job
+    k : int
+    evidence : NotedEvidence, optional
+        On the clocks, of the stretches before; without, the tables are left where they are.
+
+    Raises OutputError.
+    """
+    done = job.work / f'stretch-{k}.done'
+    if evidence is None and done.exists():
+        return
+    done.unlink(missing_ok=True)
+    evidence = evidence or NotedEvidence(len(job.network))
+    tracker = TrackManager(job.network, job.settings.track, evidence)
+    with StretchTables(job.recording, {name: job.path(k, name) for name in TRACKED},
+                       N_DIPOLES) as tables:
+        for piece in read_stretch(job.work / f'stretch-{k}.pickle'):
+            tables.track(piece, tracker)
+        tables.finish(tracker)
+    draft = done.with_suffix('.part')
+    try:
+        with new_binary_file(draft) as stream:
+            pickle.dump(_Tracked(tables.n_tracks, tables.n_passes, evidence), stream)
+        draft.replace(done)
+    except OSError as error:
+        raise OutputError(f'cannot write {done}: {error.strerror}') from error
+
+
+def join(job: Job) -> dict[str, Any]:
+    """Put the tables of the stretches together; what is known of the recording.
+
+    Where the clocks of the sensors are apart, a stretch depends on the passes of those before it,
+    and is tracked once more.
+
+    Raises OutputError.
+    """
+    known = cut(job)
+    name, evidence = name_of(job.recording), NotedEvidence(len(job.network))
+    shifts, n_tracks, n_passes = [], 0, 0
+    for k in range(known['stretches']):
+        found = _tracked(job, k)
+        together = copy.deepcopy(evidence)
+        for one in found.evidence.passes:
+            together.add(*one)
+        if k and (together.was_apart or found.evidence.was_apart):
+            evidence.passes = []
+            track_stretch(job, k, evidence)
+            found = _tracked(job, k)
+            together = found.evidence
+        evidence = together
+        shifts.append(n_tracks)
+        n_tracks += found.n_tracks
+        n_passes += found.n_passes
+    for table in TRACKED:
+        join_tables([job.path(k, table) for k in range(known['stretches'])],
+                    shifts if table != 'passes' else [0] * len(shifts), table, job.folder, name)
+    join_tables([job.work / 'health.parquet'], [0], 'health', job.folder, name)
+    return {**known, 'tracks': n_tracks, 'passes': n_passes, 'error': ''}
+
+
+def _tracked(job: Job, k: int) -> _Tracked:
+    """What `track_stretch` has left of a stretch."""
+    with open(job.work / f'stretch-{k}.done', 'rb') as stream:
+        tracked: _Tracked = pickle.load(stream)
+    return tracked
+
+
+def _text(counts: Mapping[str, int]) -> str:
+    """Causes and numbers."""
+    return '; '.join(f'{n} {cause}' for cause, n in counts.items())

@@ -1,0 +1,145 @@
+"""A Dask cluster, of this machine or any other, that runs tasks and says what came of each."""
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from mag_tracking.errors import ClusterError, MissingDependencyError
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+PATIENCE_S = 15.0
+"""[s] A scheduler that has not answered by then, or has no worker, does not."""
+LOOK_S = 0.3
+"""[s] So long is waited for a task before the caller is asked whether to go on."""
+
+_Key = TypeVar('_Key')
+
+
+class LostWorkersError(ClusterError):
+    """A task took several workers with it."""
+
+
+class Cluster(Generic[_Key]):
+    """Runs tasks; a context manager, which ends what is still running."""
+
+    def __init__(self, workers: int, scheduler: str | None) -> None:
+        """
+        Parameters
+        ----------
+        workers : int
+            Processes on this machine.
+        scheduler : str or None
+            Address of a Dask scheduler, in place of `workers`.
+
+        Raises
+        ------
+        MissingDependencyError
+        ClusterError
+        """
+        try:
+            import distributed
+        except ImportError as error:
+            raise MissingDependencyError(
+                'archives need pyarrow and Dask: pip install "mag_tracking[archive]"') from error
+        # What it has to say is said by us: each lost worker fills pages.
+        logging.getLogger('distributed').setLevel(logging.CRITICAL)
+        self._stack = ExitStack()
+        self._running: dict[Future[Any], _Key] = {}
+        self._seen: set[str] = set()
+        self.n_lost = 0
+        try:
+            self._client = self._stack.enter_context(
+                _local(distributed, self._stack, workers) if scheduler is None
+                else _remote(distributed, scheduler))
+        except BaseException:
+            self._stack.close()
+            raise
+        self._count_lost()
+
+    def __enter__(self) -> 'Cluster[_Key]':
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._client.cancel(list(self._running), force=True)
+        self._stack.close()
+
+    @property
+    def n_running(self) -> int:
+        """How many tasks are not finished."""
+        return len(self._running)
+
+    @property
+    def n_workers(self) -> int:
+        """How many processes there are."""
+        return max(1, len(self._seen))
+
+    def keys(self) -> list[_Key]:
+        """Of the tasks that are not finished."""
+        return list(self._running.values())
+
+    def submit(self, key: _Key, priority: int, task: Callable[..., Any], *arguments: Any) -> None:
+        """Run `task(*arguments)`; those of a higher priority come first."""
+        future = self._client.submit(task, *arguments, pure=False, priority=priority)
+        self._running[future] = key
+
+    def finished(self) -> Iterator[tuple[_Key, Any]]:
+        """The tasks that have finished since, with what they returned or raised; waits a moment.
+
+        Raises ClusterError where the scheduler is gone.
+        """
+        from distributed import wait
+
+        try:
+            wait(list(self._running), timeout=LOOK_S, return_when='FIRST_COMPLETED')
+        except TimeoutError:
+            pass
+        self._count_lost()
+        for future in [f for f in self._running if f.done()]:
+            yield self._running.pop(future), self._result_of(future)
+
+    def _result_of(self, future: 'Future[Any]') -> Any:
+        """What a task returned, or its error."""
+        from distributed import KilledWorker
+
+        if future.status == 'finished':
+            return future.result()
+        error = future.exception() if future.status == 'error' else None
+        if isinstance(error, KilledWorker):
+            return LostWorkersError('its worker was lost several times (killed, or out of memory)')
+        return error or ClusterError('the scheduler gave up a task, or is gone; run it again')
+
+    def _count_lost(self) -> None:
+        """Count the workers that were there and are no more."""
+        try:
+            there = set(self._client.scheduler_info(n_workers=-1)['workers'])
+        except OSError as error:
+            raise ClusterError(f'the scheduler is gone: {error}; run it again') from error
+        self.n_lost += len(self._seen - there)
+        self._seen = there
+
+
+def _local(distributed: Any, stack: ExitStack, workers: int) -> 'Client':
+    """The client of processes on this machine."""
+    cluster = stack.enter_context(distributed.LocalCluster(
+        n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None,
+        # Each has a core for itself.
+        env={'OPENBLAS_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1'}))
+    client: Client = distributed.Client(cluster)
+    return client
+
+
+def _remote(distributed: Any, address: str) -> 'Client':
+    """The client of a scheduler that runs somewhere; raises ClusterError."""
+    try:
+        client: Client = distributed.Client(address, timeout=PATIENCE_S)
+    except (OSError, ValueError) as error:
+        raise ClusterError(f'{address}: no Dask scheduler answers ({error})') from error
+    try:
+        client.wait_for_workers(1, timeout=PATIENCE_S)
+    except TimeoutError as error:
+        client.close()
+        raise ClusterError(f'{address}: the scheduler has no worker') from error
+    return client

@@ -1,0 +1,103 @@
+"""The tables of an archive: their columns, with kind, unit and meaning."""
+
+from typing import NamedTuple
+
+VERSION = 1
+"""Of the tables. A folder with another one is refused: its rows would not be comparable."""
+
+
+class Column(NamedTuple):
+    """A column of a table."""
+
+    name: str
+    kind: str
+    """t: time of UTC, i: whole number, f: number, s: text, b: yes or no, C: (6, 6) row by row."""
+    unit: str
+    meaning: str
+
+
+def _columns(kind: str, unit: str, /, **meanings: str) -> tuple[Column, ...]:
+    """Of one kind and unit: {name: meaning}."""
+    return tuple(Column(name, kind, unit, meaning) for name, meaning in meanings.items())
+
+
+def _axes(prefix: str, unit: str, meaning: str) -> tuple[Column, ...]:
+    """Three, x y z."""
+    return tuple(Column(f'{prefix}{axis}', 'f', unit, f'{meaning}, {axis}') for axis in 'xyz')
+
+
+_WHERE = (
+    Column('recording', 's', '', 'name of the recording: the stem of its file'),
+    Column('source', 's', '', 'path of the recording'),
+    Column('stamp_ns', 'i', 'ns', 'timestamp, since 1970'),
+    Column('time', 't', '', 'the same as a time of UTC'))
+_TRACK = (Column('track_id', 'i', '', 'number of the track within the recording'),)
+_STATE = (*_axes('', 'm', 'position in the frame of the network'), *_axes('v', 'm/s', 'velocity'))
+_STATE_SD = (*_axes('sd_', 'm', 'standard deviation of the position'),
+             *_axes('sd_v', 'm/s', 'standard deviation of the velocity'))
+_MOMENT = _axes('m', 'A m^2', 'magnetic moment')
+_KIND = (Column('kind', 's', '', 'car or truck; empty for magnets'),)
+
+_POSES = (
+    *_WHERE, *_TRACK, *_STATE, *_STATE_SD, *_MOMENT,
+    Column('covariance', 'C', 'm, m/s', 'of position and velocity'),
+    *_KIND, Column('length', 'f', 'm', 'of the row of dipoles'),
+    Column('ambiguous', 'b', '', 'whether the pose is not to be relied on'))
+
+TABLES: dict[str, tuple[Column, ...]] = {
+    'tracks': (
+        *_WHERE, *_TRACK, Column('end_ns', 'i', 'ns', 'of the last pose'),
+        *_columns('i', '', poses='number of published poses'),
+        *_columns('s', '', arrival='most probable arrival', kind='most probable kind',
+                  verdict='unique or ambiguous', doubts='all doubts that there were'),
+        *_columns('f', '', arrival_weight='its probability', kind_weight='its probability',
+                  ambiguous_share='share of poses that are ambiguous',
+                  nis_per_axis='mean normalised innovation squared; about one is right'),
+        *_columns('f', 'm', length='of the row of dipoles', smallest_sd='deviation where surest'),
+        *_columns('f', 'm/s', speed='where the velocity is surest'),
+        *_columns('f', 'deg', heading_deg='the same, from x towards y'),
+        *_MOMENT, *_columns('f', 'A m^2', moment_size='length of the moment'),
+        *_columns('f', 'm/s', smoothed_speed='of the smoothed track; null without one'),
+        *_columns('f', 'A m^2', smoothed_moment_size='the same of the moment')),
+    'poses': (
+        *_POSES, *_columns('f', '', weight='of the arrival', kind_weight='of the kind'),
+        *_columns('s', '', arrival='of the pose', doubts='names of the doubts')),
+    'smoothed': _POSES,
+    'passes': (
+        *_WHERE, *_columns('i', '', number='of the detection in the recording',
+                           n_dipoles='of the row', n_values='measurements'),
+        *_columns('s', '', reason='why the fit is not to be believed; empty where it is',
+                  trusted='what is to be believed all the same',
+                  notes='what was left out of the measurements'),
+        *_columns('f', '', normalised_cost='about one where the model is right',
+                  explained='share of the energy that the fit explains'),
+        *_STATE, *_STATE_SD,
+        *_columns('f', 'm/s', speed='of the fit', sd_speed='its deviation'),
+        *_columns('f', 'deg', heading_deg='of the fit', sd_heading_deg='its deviation'),
+        *_columns('f', 'm', length='of the row', sd_length='its deviation'),
+        *_MOMENT, *_axes('sd_m', 'A m^2', 'standard deviation of the moment'),
+        *_columns('f', 'm/s', delay_speed='by the delay between sensors, without a model',
+                  sd_delay_speed='its deviation'),
+        *_columns('f', 'deg', delay_heading_deg='the same of the direction',
+                  sd_delay_heading_deg='its deviation')),
+    'health': (
+        *_WHERE, *_columns('s', '', sensor='name of the sensor'),
+        *_columns('i', '', accepted='readings used since the row before',
+                  rejected='readings rejected since then', times_relearnt='of the background'),
+        *_columns('b', '', ready='whether the background is known',
+                  stuck='whether the sensor repeats itself',
+                  doubtful='whether the background is doubtful'),
+        *_axes('background_', 'T', 'background, sensor frame'),
+        *_axes('drift_', 'T/s', 'drift of the background'),
+        *_axes('noise_', 'T', 'standard deviation of one reading')),
+    'recordings': (
+        *_WHERE, *_columns('s', '', error='why the recording failed; empty where it did not',
+                           lost='what could not be read', rejected='readings that were not used',
+                           missing_topics='topics of the network that are not in it',
+                           why_no_detection='one sentence where nothing was detected'),
+        *_columns('i', 'ns', end_ns='of the last frame'),
+        *_columns('i', '', frames='of the network', tracks='number of tracks',
+                  passes='number of fitted passes', stretches='in which a target was near'),
+        *_columns('i', 'bytes', size='of the recording')),
+}
+"""{table: columns}. Values that are not known are null."""
