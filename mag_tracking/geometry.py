@@ -86,9 +86,10 @@ def left_jacobian(v: ArrayLike) -> FloatArray:
     return J
 
 
-def quaternion_from_yaw(yaw: float) -> FloatArray:
-    """Quaternion xyzw (4,) of a rotation about z by `yaw` [rad]."""
-    return np.array([0.0, 0.0, np.sin(0.5 * yaw), np.cos(0.5 * yaw)])
+def quaternions_from_yaw(yaw: FloatArray) -> FloatArray:
+    """Quaternions xyzw (n, 4) of rotations about z by `yaw` (n,) [rad]."""
+    zero = np.zeros(len(yaw))
+    return np.stack([zero, zero, np.sin(0.5 * yaw), np.cos(0.5 * yaw)], axis=1)
 
 
 def rotation_about_z(angle: float) -> FloatArray:

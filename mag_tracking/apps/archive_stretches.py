@@ -17,6 +17,7 @@ import numpy as np
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes
+from mag_tracking.errors import OutputError
 from mag_tracking.records import FieldFrame
 from mag_tracking.units import NS
 
@@ -118,7 +119,7 @@ class StretchWriter:
         self._n_written, self._is_open = 0, False
 
     def _write(self) -> None:
-        """Append what is kept to the file of the stretch."""
+        """Append what is kept to the file of the stretch; raises OutputError."""
         frames = [frame for frame, _ in self._kept]
         doubts: dict[int, Doubts] = {}
         known: Doubts | None = None
@@ -130,8 +131,11 @@ class StretchWriter:
             'stamp_ns', 'field', 'covariance', 'n_samples', 'time_offset', 'target_present',
             'statistic', 'degrees_of_freedom')}
         piece = Piece(**arrays, doubts=doubts, passes=tuple(self._passes))
-        with open(self._folder / f'stretch-{self.n_stretches}.pickle',
-                  'ab' if self._is_open else 'wb') as stream:
-            pickle.dump(piece, stream)
+        path = self._folder / f'stretch-{self.n_stretches}.pickle'
+        try:
+            with open(path, 'ab' if self._is_open else 'wb') as stream:
+                pickle.dump(piece, stream)
+        except OSError as error:
+            raise OutputError(f'cannot write {path}: {error.strerror}') from error
         self._n_written += len(frames)
         self._is_open, self._kept, self._passes = True, [], []

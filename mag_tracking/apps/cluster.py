@@ -1,8 +1,10 @@
 """A Dask cluster, of this machine or any other, that runs tasks and says what came of each."""
 
 import logging
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from mag_tracking.errors import ClusterError, MissingDependencyError
@@ -123,10 +125,20 @@ class Cluster(Generic[_Key]):
 
 def _local(distributed: Any, stack: ExitStack, workers: int) -> 'Client':
     """The client of processes on this machine."""
-    cluster = stack.enter_context(distributed.LocalCluster(
-        n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None,
-        # Each has a core for itself.
-        env={'OPENBLAS_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1'}))
+    # A terminal sends Ctrl-C to all processes. Only this one is to hear it, and ends the others,
+    # which inherit what is blocked, by way of the threads that are made here.
+    # Where Python's tracker of resources is started, SIGINT is not blocked any more after it.
+    resource_tracker.ensure_running()
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        cluster = stack.enter_context(distributed.LocalCluster(
+            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None,
+            # What a task raises comes back as its result.
+            silence_logs=logging.CRITICAL,
+            # Each has a core for itself.
+            env={'OPENBLAS_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1'}))
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
     client: Client = distributed.Client(cluster)
     return client
 

@@ -82,6 +82,24 @@ inline void moments(const Sensor& s, int64_t k, double* mean, double* scatter) {
     for (int a = 0; a < 3; ++a) mean[a] += s.origin[k][a];
 }
 
+// Scatter within k blocks, pooled: of their sums of squared deviations `scatter` (k, 3, 3) and
+// numbers of samples `n` (k, 3), into `out` (3, 3); NaN where an axis is not reported. False: too few
+// samples.
+inline bool pool(int64_t k, const double* scatter, const double* n, double* out) {
+    double freedom[3] = {0.0, 0.0, 0.0}, sum[9] = {};
+    for (int64_t i = 0; i < k; ++i) {
+        for (int a = 0; a < 3; ++a) freedom[a] += n[3 * i + a] - (n[3 * i + a] != 0.0);
+        for (int a = 0; a < 9; ++a) sum[a] += scatter[9 * i + a];
+    }
+    bool is_enough = false;
+    for (double& f : freedom) {
+        is_enough |= f > 3.0;
+        if (!(f > 3.0)) f = NAN;
+    }
+    for (int a = 0; a < 9; ++a) out[a] = sum[a] / std::sqrt(freedom[a / 3] * freedom[a % 3]);
+    return is_enough;
+}
+
 // Weighted least-squares line of one axis through the means `y` [T] of k blocks of `n` readings at
 // `time` [s], all strided by three but for the time: its value and slope at `centre`. NaN where no
 // block has the axis.

@@ -102,10 +102,4 @@ def one_is_loud(blocks: Blocks, step_variance: FloatArray) -> bool:
 
 def pooled_covariance(blocks: Blocks) -> FloatArray | None:
     """(3, 3) scatter within blocks, pooled; None = too few samples, NaN = axis not reported."""
-    freedom = blocks.n.sum(axis=0) - np.count_nonzero(blocks.n, axis=0)
-    if freedom.max() <= 3:
-        return None
-    freedom = np.where(freedom > 3, freedom, np.nan)
-    covariance: FloatArray = \
-        blocks.scatter.sum(axis=0) / np.sqrt(freedom[:, None] * freedom[None, :])
-    return covariance
+    return core.pooled_covariance(plain(blocks.scatter), plain(blocks.n))

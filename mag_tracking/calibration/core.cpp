@@ -6,13 +6,10 @@
 namespace mag_tracking {
 namespace {
 
-using Sensors = ArrayOf<Sensor>;
+// Arrays of `Sensor`, `Limits`, `Batch`.
+using Structured = py::array;
 
-// The only element of an array, to be changed.
-template <class T>
-T& only(ArrayOf<T>& array, const char* name) {
-    return *data_of(array, name, {1});
-}
+Sensor& sensor_of(Structured& sensors) { return Structs<Sensor>(sensors).only(); }
 
 Calibrated room_of(Integers& rows, Integers& stamps, Array& fields, Array& covariances) {
     const Size n = length_of(rows, "out_rows", 1);
@@ -20,42 +17,44 @@ Calibrated room_of(Integers& rows, Integers& stamps, Array& fields, Array& covar
             data_of(fields, "out_fields", {n, 3}), data_of(covariances, "out_covariances", {n, 3, 3})};
 }
 
-int calibrate_readings(Sensors sensors, ArrayOf<Limits> limits, Integers rows, Integers stamps,
-                       Array fields, Integers own, Array covariances, ArrayOf<Batch> batches,
+int calibrate_readings(Structured sensors, Structured limits, Integers rows, Integers stamps,
+                       Array fields, Integers own, Array covariances, Structured batches,
                        Integers out_rows, Integers out_stamps, Array out_fields,
                        Array out_covariances) {
-    const Size n = length_of(rows, "rows", 1), n_sensors = length_of(sensors, "sensors", 1);
+    const Size n = length_of(rows, "rows", 1);
+    Structs<Sensor> all(sensors);
     const RawReadings in{n, input_of(rows, "rows", {n}), input_of(stamps, "stamps", {n}),
                          input_of(fields, "fields", {n, 3}), input_of(own, "own", {n}),
                          covariances.data()};
-    Batch& batch = only(batches, "batches");
+    Batch& batch = Structs<Batch>(batches).only();
     if (batch.next < 0) throw py::index_error("next: negative");
     for (Size i = batch.next; i < n; ++i) {
-        if (in.rows[i] >= n_sensors) throw py::index_error("rows: there is no such sensor");
+        if (in.rows[i] >= all.size()) throw py::index_error("rows: there is no such sensor");
         if (in.own[i]) input_of(covariances, "covariances", {n, 3, 3});
     }
-    return calibrate(data_of(sensors, "sensors", {n_sensors}), only(limits, "limits"), in, batch,
+    return calibrate(all.data(), Structs<Limits>(limits).only(), in, batch,
                      room_of(out_rows, out_stamps, out_fields, out_covariances));
 }
 
-bool use_reading(Sensors sensors, ArrayOf<Limits> limits, ArrayOf<Batch> batches, int64_t row,
+bool use_reading(Structured sensors, Structured limits, Structured batches, int64_t row,
                  int64_t stamp, Array field, int64_t own, Array covariance, Integers out_rows,
                  Integers out_stamps, Array out_fields, Array out_covariances) {
-    if (row < 0 || row >= length_of(sensors, "sensors", 1))
+    Structs<Sensor> all(sensors);
+    if (row < 0 || row >= all.size())
         throw py::index_error("row: there is no such sensor");
     const Reading reading{stamp, input_of(field, "field", {3}), own,
                           input_of(covariance, "covariance", {3, 3})};
-    return use(sensors.mutable_data()[row], only(limits, "limits"), only(batches, "batches"), row,
+    return use(all.data()[row], Structs<Limits>(limits).only(), Structs<Batch>(batches).only(), row,
                reading, room_of(out_rows, out_stamps, out_fields, out_covariances));
 }
 
-void subtract(Sensors sensors, double time, Array field, Array out) {
-    subtract_background(only(sensors, "sensors"), time, input_of(field, "field", {3}),
+void subtract(Structured sensors, double time, Array field, Array out) {
+    subtract_background(sensor_of(sensors), time, input_of(field, "field", {3}),
                         data_of(out, "out", {3}));
 }
 
-Array steps_of(Sensors sensors, bool are_corrected) {
-    const Sensor& s = only(sensors, "sensors");
+Array steps_of(Structured sensors, bool are_corrected) {
+    const Sensor& s = sensor_of(sensors);
     Array out(3);
     double* steps = out.mutable_data();
     if (are_corrected)
@@ -65,8 +64,8 @@ Array steps_of(Sensors sensors, bool are_corrected) {
     return out;
 }
 
-py::tuple block_moments(Sensors sensors) {
-    const Sensor& s = only(sensors, "sensors");
+py::tuple block_moments(Structured sensors) {
+    const Sensor& s = sensor_of(sensors);
     Array mean(3), scatter({3, 3}), n(3);
     const int64_t k = 1 - s.now;
     moments(s, k, mean.mutable_data(), scatter.mutable_data());
@@ -82,6 +81,14 @@ py::tuple line_through(Array time, Array n, Array y, double centre) {
     for (int a = 0; a < 3; ++a)
         line(k, t, weight + a, values + a, centre, mean.mutable_data()[a], slope.mutable_data()[a]);
     return py::make_tuple(mean, slope);
+}
+
+py::object pooled_covariance(Array scatter, Array n) {
+    const Size k = length_of(scatter, "scatter", 3);
+    Array out({3, 3});
+    const bool is_enough = pool(k, input_of(scatter, "scatter", {k, 3, 3}), input_of(n, "n", {k, 3}),
+                                out.mutable_data());
+    return is_enough ? py::object(out) : py::none();
 }
 
 void add_constants(py::module_& m) {
@@ -139,25 +146,26 @@ PYBIND11_MODULE(core, m) {
     m.def("steps_of", &steps_of, IN(sensors), py::arg("are_corrected"));
     m.def("block_moments", &block_moments, IN(sensors));
     m.def("line_through", &line_through, IN(time), IN(n), IN(y), py::arg("centre"));
+    m.def("pooled_covariance", &pooled_covariance, IN(scatter), IN(n));
     m.def("complete_steps", [](Array variance, Array steps) {
         complete_steps(input_of(variance, "variance", {3}), data_of(steps, "steps", {3}));
     }, IN(variance), IN(steps));
-    m.def("apply_steps", [](Sensors sensors, double freeze_std, Array limits) {
-        apply_steps(only(sensors, "sensors"), freeze_std, data_of(limits, "limits", {3}));
+    m.def("apply_steps", [](Structured sensors, double freeze_std, Array limits) {
+        apply_steps(sensor_of(sensors), freeze_std, data_of(limits, "limits", {3}));
     }, IN(sensors), py::arg("freeze_std"), IN(limits));
     // For one sensor and reading, as the tests have them.
-    m.def("note_step", [](Sensors sensors, int64_t stamp, Array raw) {
-        note_step(only(sensors, "sensors"), stamp, input_of(raw, "raw", {3}));
+    m.def("note_step", [](Structured sensors, int64_t stamp, Array raw) {
+        note_step(sensor_of(sensors), stamp, input_of(raw, "raw", {3}));
     }, IN(sensors), py::arg("stamp"), IN(raw));
-    m.def("is_stuck", [](Sensors sensors, Array field) {
-        return is_stuck(only(sensors, "sensors"), input_of(field, "field", {3}));
+    m.def("is_stuck", [](Structured sensors, Array field) {
+        return is_stuck(sensor_of(sensors), input_of(field, "field", {3}));
     }, IN(sensors), IN(field));
-    m.def("screen_spike", [](Sensors sensors, double threshold, int64_t stamp, Array field) {
-        return int(screen_spike(only(sensors, "sensors"), threshold,
+    m.def("screen_spike", [](Structured sensors, double threshold, int64_t stamp, Array field) {
+        return int(screen_spike(sensor_of(sensors), threshold,
                                 {stamp, input_of(field, "field", {3}), NONE, nullptr}));
     }, IN(sensors), py::arg("threshold"), py::arg("stamp"), IN(field));
-    m.def("collect", [](Sensors sensors, double time, Array field) {
-        begin_block_if_due(only(sensors, "sensors"), time);
-        collect(only(sensors, "sensors"), time, input_of(field, "field", {3}));
+    m.def("collect", [](Structured sensors, double time, Array field) {
+        begin_block_if_due(sensor_of(sensors), time);
+        collect(sensor_of(sensors), time, input_of(field, "field", {3}));
     }, IN(sensors), py::arg("time"), IN(field));
 }

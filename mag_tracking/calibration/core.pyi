@@ -108,6 +108,9 @@ def line_through(time: FloatArray, n: FloatArray, y: FloatArray, centre: float
                  ) -> tuple[FloatArray, FloatArray]:
     """Mean (3,) and slope (3,) at `centre`: `blocks.line_through`."""
 
+def pooled_covariance(scatter: FloatArray, n: FloatArray) -> FloatArray | None:
+    """`blocks.pooled_covariance`, of `scatter` (k, 3, 3) and `n` (k, 3)."""
+
 def note_step(sensors: StructArray, stamp: int, raw: FloatArray) -> None:
     """Update the steps of a sensor by a raw reading (3,) [T], and since when each axis rests."""
 

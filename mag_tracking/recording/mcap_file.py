@@ -1,7 +1,6 @@
 """One MCAP file: read chunk by chunk, checked, and as far as it is whole."""
 
 import os
-import struct
 from collections import Counter
 from collections.abc import Iterator
 from io import BytesIO
@@ -18,14 +17,12 @@ from mcap.stream_reader import StreamReader, get_chunk_data_stream
 
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.self_described import type_of
+from mag_tracking.recording import core
 from mag_tracking.recording.damage import DAMAGE
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.message_block import ChannelKind, MessageBlock
+from mag_tracking.units import LATEST_NS
 
-_RECORD = struct.Struct('<BQ')
-"""What a record is, and its length."""
-_MESSAGE = struct.Struct('<HIQQ')
-"""Channel, sequence number, log time and time of publication, before the data of a message."""
 GATHERED = 256
 """Messages without a chunk that are read at once."""
 _DEFINITIONS: dict[int, type[Schema] | type[Channel]] = {
@@ -178,9 +175,9 @@ class _LooseMessages:
         if not messages:
             return
         ends = list(accumulate(len(m.data) for m in messages))
-        yield MessageBlock.of_rows(b''.join(m.data for m in messages), dict(channels.kinds), [
-            (m.channel_id, m.log_time, end - len(m.data), end)
-            for m, end in zip(messages, ends, strict=True)])
+        rows = np.array([(m.channel_id, min(m.log_time, LATEST_NS), end - len(m.data), end)
+                         for m, end in zip(messages, ends, strict=True)], dtype=np.int64)
+        yield MessageBlock.of_rows(b''.join(m.data for m in messages), dict(channels.kinds), rows)
 
 
 class _Channels:
@@ -210,17 +207,11 @@ class _Channels:
     def block_of(self, chunk: Chunk) -> MessageBlock:
         """The messages of one chunk; raises where it is damaged."""
         stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-        data, at = stream.read(size), 0
-        rows: list[tuple[int, int, int, int]] = []
-        while at < size:
-            kind, length = _RECORD.unpack_from(data, at)
-            begin, at = at + _RECORD.size, at + _RECORD.size + length
-            if at > size:
-                raise EOFError('a record that is longer than its chunk')
-            if kind == Opcode.MESSAGE:
-                channel, _, log_time_ns, _ = _MESSAGE.unpack_from(data, begin)
-                if self._schema_of[channel]:
-                    rows.append((channel, log_time_ns, begin + _MESSAGE.size, at))
-            elif kind in _DEFINITIONS:
-                self.add(_DEFINITIONS[kind].read(ReadDataStream(BytesIO(data[begin:at]))))
+        data = stream.read(size)
+        rows, definitions = core.records_of(data, LATEST_NS)
+        for kind, begin, end in definitions:
+            self.add(_DEFINITIONS[kind].read(ReadDataStream(BytesIO(data[begin:end]))))
+        untyped = [c for c in np.unique(rows[:, 0]).tolist() if not self.has_schema(c)]
+        if untyped:
+            rows = rows[~np.isin(rows[:, 0], untyped)]
         return MessageBlock.of_rows(data, self.kinds, rows)

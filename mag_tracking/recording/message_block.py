@@ -11,7 +11,6 @@ from mag_tracking.arrays import IntArray
 from mag_tracking.messages.self_described import SCHEMAS, cdr_of, type_of
 from mag_tracking.messages.types import schema_of
 from mag_tracking.recording.raw_message import RawMessage
-from mag_tracking.units import LATEST_NS
 
 
 class ChannelKind(NamedTuple):
@@ -48,19 +47,10 @@ class MessageBlock:
 
     @classmethod
     def of_rows(cls, data: bytes, kinds: Mapping[int, ChannelKind],
-                rows: Sequence[tuple[int, int, int, int]]) -> 'MessageBlock':
-        """Of (channel, log time, begin, end) in any order.
-
-        MCAP has log times of 64 bits without sign: what is later than `LATEST_NS` counts as that.
-        """
-        try:
-            columns = np.array(rows, dtype=np.int64)
-        except OverflowError:
-            columns = np.array([(channel, min(log_time, LATEST_NS), *where)
-                                for channel, log_time, *where in rows], dtype=np.int64)
-        columns = columns.reshape(-1, 4)
-        block = cls(data, kinds, *np.ascontiguousarray(columns.T))
-        if np.all(columns[1:, 1] >= columns[:-1, 1]):
+                rows: IntArray) -> 'MessageBlock':
+        """Of (n, 4) channel, log time, begin and end, in any order."""
+        block = cls(data, kinds, *np.ascontiguousarray(rows.T))
+        if np.all(rows[1:, 1] >= rows[:-1, 1]):
             return block
         return block.part(np.argsort(block.log_time_ns, kind='stable'))
 

@@ -8,7 +8,7 @@ from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
 from mag_tracking.physics.dipole import MU0, sensor_fields
 from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.stages.track.initiation_vehicle import moment_directions
-from mag_tracking.stages.track.published_pose import published_track, vehicle_orientation
+from mag_tracking.stages.track.published_pose import VehicleOrientation, published_track
 from support import plain_kalman
 from support.networks import line_network
 
@@ -42,7 +42,7 @@ def test_another_arrival_makes_a_track_ambiguous_even_where_the_places_agree(
                    np.array([label, 0]), np.array([0, 1]), np.arange(2),
                    np.array([[7.0, np.nan], [1.0, 2.0]]))
     track = published_track(
-        b, 1, model, vehicle_orientation, ('left', 'right'), ('car', 'truck'),
+        b, 1, model, VehicleOrientation(), ('left', 'right'), ('car', 'truck'),
         set(), None, difference=np.zeros(6), stamp_ns=1, id=1, ended=False,
         existence=1.0, degrees_of_freedom=6, predicted=np.zeros((2, 3)),
         mounting=np.zeros((0, 3)), mounting_covariance=np.zeros((0, 3, 3)))

@@ -79,8 +79,7 @@ class Detect:
         self.counts['frames'] += 1
         if n:
             self._note(energy, axes, statistic, n)
-            per_axis = np.divide(energy, axes, out=np.zeros(len(energy)), where=axes > 0)
-            out += self._judge(frame.stamp_ns, statistic, n, self._names[int(per_axis.argmax())])
+            out += self._judge(frame.stamp_ns, statistic, n, energy / np.maximum(axes, 1))
         else:
             self.counts['frames without a measurement'] += 1
         if not self._present and not self._above:
@@ -113,7 +112,8 @@ class Detect:
         s = self._settings
         return (s.background_std + s.background_drift * self._unlearnt_s) ** 2
 
-    def _judge(self, stamp_ns: int, statistic: float, n: int, strongest: str) -> list[Detection]:
+    def _judge(self, stamp_ns: int, statistic: float, n: int,
+               per_axis: FloatArray) -> list[Detection]:
         """Onset, hold and release; the detections that follow."""
         s = self._settings
         if statistic > self.threshold(s.false_alarm_probability, n):
@@ -129,11 +129,15 @@ class Detect:
             # What was not learnt for an earlier target is still not learnt.
             self._onset_ns = stamp_ns - int(self._unlearnt_s * NS)
             self.counts['onsets'] += 1
-            return [self._detection(stamp_ns, True, statistic, n, strongest)]
+            return [self._detection(stamp_ns, True, statistic, n, self._strongest(per_axis))]
         if self._present and self._loud_ns is not None \
                 and stamp_ns - self._loud_ns > s.hold_s * NS:
-            return self._release(stamp_ns, statistic, n, strongest)
+            return self._release(stamp_ns, statistic, n, self._strongest(per_axis))
         return []
+
+    def _strongest(self, per_axis: FloatArray) -> str:
+        """The sensor with most energy an axis (n_sensors,)."""
+        return self._names[int(per_axis.argmax())]
 
     def _release(self, stamp_ns: int, statistic: float, n: int, strongest: str) -> list[Detection]:
         """End the detection, if there is one."""

@@ -1,6 +1,7 @@
 """From a bank to what is published: the best hypothesis, its pose and its honest doubts."""
 
 from collections.abc import Sequence, Set
+from dataclasses import dataclass
 from typing import Protocol, TypeAlias, TypedDict
 
 import numpy as np
@@ -9,7 +10,7 @@ from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.geometry import (
     cross_matrix,
     quaternion_between,
-    quaternion_from_yaw,
+    quaternions_from_yaw,
     rotation_vectors_between,
 )
 from mag_tracking.inference.covariance_union import widened_to_cover
@@ -35,14 +36,17 @@ Flags: TypeAlias = tuple[bool, bool, bool]
 """Which rotations about the body's x, y, z are not observed."""
 
 OrientationEstimate: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, Flags]
-"""Quaternion, derivative, unobserved variance and flags; see `vehicle_orientation`."""
+"""Quaternion, derivative, unobserved variance and flags; see `VehicleOrientation`."""
 
 
 class Orientation(Protocol):
-    """How a target's orientation follows from its state; see `vehicle_orientation`."""
+    """How a target's orientation follows from its state; see `VehicleOrientation`."""
 
     def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
         """Quaternion, derivative, unobserved variance and flags."""
+
+    def quaternions(self, x: FloatArray) -> FloatArray:
+        """Quaternions (n, 4) of states (n, n_t)."""
 
 
 class PoseFields(TypedDict):
@@ -60,51 +64,65 @@ class PoseFields(TypedDict):
     length_std: float
 
 
-def vehicle_orientation(x: FloatArray, P: FloatArray) -> OrientationEstimate:
-    """Heading of the velocity; roll and pitch are not observed.
+class VehicleOrientation:
+    """Heading of the velocity; roll and pitch are not observed."""
 
-    Parameters
-    ----------
-    x : (n_t,), P : (n_t, n_t)
-        A target state that begins with position and velocity.
+    def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
+        """Of one state.
 
-    Returns
-    -------
-    q : (4,) xyzw
-    T : (3, n_t)
-        Derivative of the small rotation about world axes by the state.
-    unobserved : (3, 3)
-        Variance of what is not observed, to be added.
-    flags : (3,) bool
-        Body x, y, z.
-    """
-    speed2 = x[3] ** 2 + x[4] ** 2
-    T = np.zeros((3, len(x)))
-    if speed2 > 0.0:
-        T[2, 3], T[2, 4] = -x[4] / speed2, x[3] / speed2
-    yaw_known = speed2 > 0.0 and T[2] @ P @ T[2] < UNOBSERVED_VARIANCE
-    if not yaw_known:
-        T[:] = 0.0
-    unobserved = np.diag([1.0, 1.0, 0.0 if yaw_known else 1.0]) * UNOBSERVED_VARIANCE
-    return (quaternion_from_yaw(np.arctan2(x[4], x[3])), T, unobserved,
-            (True, True, not yaw_known))
+        Parameters
+        ----------
+        x : (n_t,), P : (n_t, n_t)
+            A target state that begins with position and velocity.
+
+        Returns
+        -------
+        q : (4,) xyzw
+        T : (3, n_t)
+            Derivative of the small rotation about world axes by the state.
+        unobserved : (3, 3)
+            Variance of what is not observed, to be added.
+        flags : (3,) bool
+            Body x, y, z.
+        """
+        speed2 = x[3] ** 2 + x[4] ** 2
+        T = np.zeros((3, len(x)))
+        if speed2 > 0.0:
+            T[2, 3], T[2, 4] = -x[4] / speed2, x[3] / speed2
+        yaw_known = speed2 > 0.0 and T[2] @ P @ T[2] < UNOBSERVED_VARIANCE
+        if not yaw_known:
+            T[:] = 0.0
+        unobserved = np.diag([1.0, 1.0, 0.0 if yaw_known else 1.0]) * UNOBSERVED_VARIANCE
+        return self.quaternions(x[None])[0], T, unobserved, (True, True, not yaw_known)
+
+    def quaternions(self, x: FloatArray) -> FloatArray:
+        """Quaternions (n, 4) of states (n, n_t)."""
+        return quaternions_from_yaw(np.arctan2(x[:, 4], x[:, 3]))
 
 
-def magnet_orientation(x: FloatArray, P: FloatArray, axis: FloatArray) -> OrientationEstimate:
-    """Direction of the moment; the roll about it is not observed.
+@dataclass(frozen=True)
+class MagnetOrientation:
+    """Direction of the moment; the roll about it is not observed."""
 
-    As `vehicle_orientation`; `axis` (3,) is the moment's direction in the
-    magnet's own frame. The flag goes to the body axis nearest to it.
-    """
-    m = x[6:9]
-    size2 = m @ m
-    T = np.zeros((3, len(x)))
-    # dm = w x m gives the part of w across m: w = m x dm / |m|^2.
-    T[:, 6:9] = cross_matrix(m) / size2
-    along = np.outer(m, m) / size2
-    nearest = int(np.argmax(np.abs(axis)))
-    return (quaternion_between(axis, m), T, UNOBSERVED_VARIANCE * along,
-            (nearest == 0, nearest == 1, nearest == 2))
+    axis: FloatArray
+    """(3,) direction of the moment in the magnet's own frame. The flag of what is not observed goes
+    to the body axis nearest to it."""
+
+    def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
+        """Of one state, as that of a vehicle."""
+        m = x[6:9]
+        size2 = m @ m
+        T = np.zeros((3, len(x)))
+        # dm = w x m gives the part of w across m: w = m x dm / |m|^2.
+        T[:, 6:9] = cross_matrix(m) / size2
+        along = np.outer(m, m) / size2
+        nearest = int(np.argmax(np.abs(self.axis)))
+        return (quaternion_between(self.axis, m), T, UNOBSERVED_VARIANCE * along,
+                (nearest == 0, nearest == 1, nearest == 2))
+
+    def quaternions(self, x: FloatArray) -> FloatArray:
+        """Quaternions (n, 4) of states (n, n_t)."""
+        return np.array([quaternion_between(self.axis, m) for m in x[:, 6:9]])
 
 
 def published_track(bank: FilterBank, best: int, model: SourceModel, orientation: Orientation,
@@ -123,7 +141,7 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
         Row of the hypothesis to publish.
     model : SourceModel
     orientation : function
-        Takes state and covariance of the target, as `vehicle_orientation`.
+        Takes state and covariance of the target, as `VehicleOrientation`.
     names : sequence of str
         The arrival of each label.
     kinds : sequence of str
@@ -227,8 +245,8 @@ def mixture_uncertainty(bank: FilterBank, best: int, apart: BoolArray, model: So
         return PoseUncertainty(covariance, here['orientation_covariance'],
                                here['position_orientation_covariance'])
     weight = np.exp(log_w[rows])
-    turned = rotation_vectors_between(here['orientation'], np.array(
-        [orientation(bank.x[i, :n_t], bank.P[i, :n_t, :n_t])[0] for i in rows]))
+    turned = rotation_vectors_between(here['orientation'],
+                                      orientation.quaternions(bank.x[rows, :n_t]))
     moved = bank.x[rows, :3] - bank.x[best, :3]
     return PoseUncertainty(
         covariance, here['orientation_covariance'] + np.einsum('n,ni,nj->ij', weight, turned,

@@ -16,9 +16,9 @@ from mag_tracking.stages.track.bank_size import check_magnet_bank, check_vehicle
 from mag_tracking.stages.track.initiation_magnet import magnet_model, start_magnet
 from mag_tracking.stages.track.initiation_vehicle import start_vehicle, vehicle_model
 from mag_tracking.stages.track.published_pose import (
+    MagnetOrientation,
     Orientation,
-    magnet_orientation,
-    vehicle_orientation,
+    VehicleOrientation,
 )
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.unseen_length import UnseenLength
@@ -56,7 +56,7 @@ def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
         vehicle = settings.vehicle
         row = vehicle_model(vehicle, network)
         check_vehicle_bank(settings, network, row)
-        return Target(row, vehicle_orientation, vehicle.arrival_names,
+        return Target(row, VehicleOrientation(), vehicle.arrival_names,
                       vehicle.kinds, partial(UnseenLength, vehicle.lengths, vehicle.length_stds),
                       False, _start_vehicle)
     if settings.target == 'magnet':
@@ -66,7 +66,7 @@ def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
         model = magnet_model(magnet)
         check_magnet_bank(settings, network, model)
         return Target(model,
-                      partial(magnet_orientation, axis=np.array(magnet.axis)),
+                      MagnetOrientation(np.array(magnet.axis)),
                       ('',), ('',), lambda: None, True, _start_magnet)
     raise SettingsError(f'track.target: expected vehicle or magnet, got {settings.target!r}')
 

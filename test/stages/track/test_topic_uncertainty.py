@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mag_tracking.geometry import (
     quaternion_from_rotation_vector,
-    quaternion_from_yaw,
+    quaternions_from_yaw,
     rotation_from_quaternion,
     rotation_vectors_between,
 )
@@ -17,7 +17,7 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.inference.mixture import second_moment
 from mag_tracking.messages.schema import odometry_dict, pose_covariance, pose_message_dict
 from mag_tracking.physics.vehicles import RowVehicle
-from mag_tracking.stages.track.published_pose import published_track, vehicle_orientation
+from mag_tracking.stages.track.published_pose import VehicleOrientation, published_track
 from mag_tracking.stages.track.settings import BEST, HOLD, MIXTURE
 from support.random_passes import KINDS, SIMULATORS, one_random_pass
 
@@ -37,7 +37,7 @@ def track_of(weights, places, headings, policy=MIXTURE, std=0.5, **more):
     arguments = {'difference': np.zeros(6), 'stamp_ns': 10**9, 'id': 1, 'ended': False,
                  'existence': 1.0, 'degrees_of_freedom': 6, 'predicted': np.zeros((2, 3)),
                  'mounting': np.zeros((0, 3)), 'mounting_covariance': np.zeros((0, 3, 3))}
-    return published_track(bank, 0, model, vehicle_orientation, [f'{k}' for k in range(n)],
+    return published_track(bank, 0, model, VehicleOrientation(), [f'{k}' for k in range(n)],
                            ('car',), set(), None, ambiguous_poses=policy, **{**arguments, **more})
 
 
@@ -102,10 +102,10 @@ def test_the_rotation_between_two_orientations_takes_one_to_the_other(a, b):
 
 
 def test_the_rotation_between_two_headings_is_about_z():
-    v = rotation_vectors_between(quaternion_from_yaw(0.1), quaternion_from_yaw(2.9))
+    v = rotation_vectors_between(*quaternions_from_yaw(np.array([0.1, 2.9])))
     np.testing.assert_allclose(v, [0.0, 0.0, 2.8], atol=1e-12)
-    np.testing.assert_array_equal(rotation_vectors_between(
-        quaternion_from_yaw(0.1), quaternion_from_yaw(0.1)), np.zeros(3))
+    np.testing.assert_array_equal(
+        rotation_vectors_between(*quaternions_from_yaw(np.array([0.1, 0.1]))), np.zeros(3))
 
 
 @pytest.mark.study

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mag_tracking.physics.vehicles import RowVehicle
-from mag_tracking.stages.track.published_pose import smoothed_pose, vehicle_orientation
+from mag_tracking.stages.track.published_pose import VehicleOrientation, smoothed_pose
 from mag_tracking.stages.track.unseen_length import UnseenLength
 
 SENSORS = np.array([[0.0, 4.0, 0.0], [1.0, -4.0, 0.0]])
@@ -37,7 +37,7 @@ def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(comp
     x[18] = length
     for kind, usual, std in (('car', 3.0, 1.0), ('truck', 9.0, 3.0)):
         said[kind] = smoothed_pose(
-            model, vehicle_orientation, x, P, unseen=UnseenLength([usual], [std]),
+            model, VehicleOrientation(), x, P, unseen=UnseenLength([usual], [std]),
             difference=np.zeros(6), stamp_ns=0, id=1, kind=0, kinds=(kind,), ambiguous=False,
             complete=complete).covariance - P[:6, :6]
     assert not said['car'].any()
@@ -127,7 +127,7 @@ def test_what_is_not_seen_and_where_else_it_may_be_are_covered_together():
     said = {}
     for name, difference in (('here', np.zeros(6)), ('apart', np.array([6.0, 0, 0, 2.0, 0, 0]))):
         said[name] = smoothed_pose(
-            model, vehicle_orientation, x, P, unseen=None, difference=difference, stamp_ns=0, id=1,
+            model, VehicleOrientation(), x, P, unseen=None, difference=difference, stamp_ns=0, id=1,
             kind=0, kinds=('car',), ambiguous=False, complete=True)
     here, apart = said['here'], said['apart']
     assert apart.covariance[0, 0] == pytest.approx(36.0)

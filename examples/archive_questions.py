@@ -1,0 +1,77 @@
+"""Questions to an archive: vehicles an hour, speeds by kind, one vehicle again, sensors that drift.
+
+    mag-tracking archive recordings/ --network site.yaml --out archive
+    python examples/archive_questions.py archive
+
+Without a folder it makes an archive of the bundled recordings. DuckDB is asked here; pandas and
+polars read the same files.
+"""
+
+import argparse
+from pathlib import Path
+
+import duckdb
+
+import mag_tracking as mt
+from mag_tracking.apps.archive import archive
+from mag_tracking.pipeline import settings_for
+
+ROOT = Path(__file__).resolve().parents[1]
+
+QUESTIONS = {
+    'vehicles an hour': '''
+        SELECT date_trunc('hour', time) AS hour, kind, count(*) AS vehicles
+        FROM tracks GROUP BY ALL ORDER BY ALL''',
+    'speeds by kind [m/s], of tracks that are to be relied on': '''
+        SELECT kind, count(*) AS vehicles, round(quantile_cont(speed, 0.15), 1) AS slow,
+               round(median(speed), 1) AS median, round(quantile_cont(speed, 0.85), 1) AS fast
+        FROM tracks WHERE verdict = 'unique' GROUP BY kind ORDER BY kind''',
+    'the vehicle whose passes are most alike by length and moment': '''
+        WITH one AS (
+            SELECT recording, number, length, sqrt(mx * mx + my * my + mz * mz) AS moment
+            FROM passes WHERE reason = '')
+        SELECT a.recording AS recording, a.number AS number, b.recording AS again,
+               b.number AS again_number, round(a.moment) AS moment, round(b.moment) AS moment_again,
+               round(a.length, 1) AS length, round(b.length, 1) AS length_again
+        FROM one a JOIN one b ON (a.recording, a.number) < (b.recording, b.number)
+        ORDER BY abs(ln(a.moment / b.moment)) + abs(ln(abs(a.length) / abs(b.length)))
+        LIMIT 3''',
+    'sensors that drift most [nT/min], and their noise [nT]': '''
+        SELECT sensor, round(60e9 * max(greatest(abs(coalesce(drift_x, 0)),
+               abs(coalesce(drift_y, 0)), abs(coalesce(drift_z, 0)))), 2) AS drift,
+               round(1e9 * median(noise_x), 1) AS noise, sum(rejected) AS rejected
+        FROM health GROUP BY sensor ORDER BY drift DESC''',
+}
+"""{question: SQL over the tables of an archive}."""
+
+
+def tables_of(folder):
+    """A connection of DuckDB that has the tables of an archive as views."""
+    connection = duckdb.connect()
+    for table in ('tracks', 'poses', 'smoothed', 'passes', 'health'):
+        connection.sql(f"CREATE VIEW {table} AS SELECT * FROM read_parquet("
+                       f"'{folder}/{table}/**/*.parquet')")
+    return connection
+
+
+def main():
+    """Answer the questions."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('folder', nargs='?', type=Path, help='of an archive')
+    parser.add_argument('--out', type=Path, default=Path('out/archive'),
+                        help='where the archive of the bundled recordings is made')
+    args = parser.parse_args()
+    folder = args.folder
+    if folder is None:
+        folder = args.out
+        run = archive([ROOT / 'test' / 'data' / 'vehicles'],
+                      mt.read_network(ROOT / 'config' / 'network.yaml'), settings_for('vehicle'),
+                      folder, workers=2, report=print)
+        print(f'{len(run.done)} recordings tracked into {folder}, {len(run.were_done)} were there')
+    connection = tables_of(folder)
+    for question, sql in QUESTIONS.items():
+        print(f'\n{question}\n{connection.sql(sql)}')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,67 @@
+// The records of an MCAP chunk, as a Python module; core.pyi says what the arguments are.
+
+#include <algorithm>
+#include <cstring>
+#include <string_view>
+
+#include "../python.hpp"
+
+namespace mag_tracking {
+namespace {
+
+constexpr std::uint8_t SCHEMA = 3, CHANNEL = 4, MESSAGE = 5;
+// Kind and length before a record; channel, sequence number, log time and time of publication before
+// the data of a message.
+constexpr std::size_t RECORD = 9, HEAD = 22;
+
+// MCAP is little-endian.
+template <class T>
+T number_at(const char* p) {
+    T value = 0;
+    for (std::size_t i = 0; i < sizeof(T); ++i)
+        value |= T(static_cast<unsigned char>(p[i])) << (8 * i);
+    return value;
+}
+
+[[noreturn]] void damaged(const char* what) {
+    PyErr_SetString(PyExc_EOFError, what);
+    throw py::error_already_set();
+}
+
+py::tuple records_of(const py::bytes& data, std::int64_t latest_ns) {
+    const std::string_view all = data;
+    std::vector<std::int64_t> rows;
+    py::list definitions;
+    for (std::size_t at = 0; at < all.size();) {
+        if (all.size() - at < RECORD) damaged("a chunk that ends in the middle of a record");
+        const auto kind = static_cast<std::uint8_t>(all[at]);
+        const auto length = number_at<std::uint64_t>(all.data() + at + 1);
+        const std::size_t begin = at + RECORD;
+        if (length > all.size() - begin) damaged("a record that is longer than its chunk");
+        const std::size_t end = begin + length;
+        if (kind == MESSAGE) {
+            if (length < HEAD) damaged("a message that is shorter than its head");
+            const char* p = all.data() + begin;
+            const auto log_time = number_at<std::uint64_t>(p + 6);
+            rows.insert(rows.end(), {std::int64_t(number_at<std::uint16_t>(p)),
+                                     std::int64_t(std::min<std::uint64_t>(log_time, latest_ns)),
+                                     std::int64_t(begin + HEAD), std::int64_t(end)});
+        } else if (kind == SCHEMA || kind == CHANNEL) {
+            definitions.append(py::make_tuple(int(kind), begin, end));
+        }
+        at = end;
+    }
+    const Size n = Size(rows.size() / 4);
+    Integers out({n, Size(4)});
+    std::copy(rows.begin(), rows.end(), out.mutable_data());
+    return py::make_tuple(out, definitions);
+}
+
+}  // namespace
+}  // namespace mag_tracking
+
+PYBIND11_MODULE(core, m) {
+    using namespace mag_tracking;
+    m.doc() = "The records of an MCAP chunk, compiled.";
+    m.def("records_of", &records_of, py::arg("data"), py::arg("latest_ns"));
+}

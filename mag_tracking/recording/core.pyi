@@ -1,0 +1,23 @@
+"""The records of an MCAP chunk, compiled."""
+
+from mag_tracking.arrays import IntArray
+
+def records_of(data: bytes, latest_ns: int) -> tuple[IntArray, list[tuple[int, int, int]]]:
+    """The messages, and the schemas and channels.
+
+    Parameters
+    ----------
+    data : bytes
+        The records of a chunk, as they are in the file.
+    latest_ns : int
+        Later log times, which MCAP may have, count as this.
+
+    Returns
+    -------
+    messages : (n, 4) int array
+        Channel, log time [ns], and where the bytes of each begin and end.
+    definitions : list of (int, int, int)
+        The kind of each record, and where it begins and ends.
+
+    Raises EOFError where the chunk is damaged.
+    """

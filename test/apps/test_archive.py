@@ -1,0 +1,411 @@
+"""Archives: rows are those of replays, nothing is lost or done twice, bad input is named."""
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import duckdb
+import numpy as np
+import psutil
+import pyarrow.parquet as pq
+import pytest
+
+import mag_tracking as mt
+from mag_tracking.apps import archive_stretches, archive_work, cluster
+from mag_tracking.apps.archive import archive, recordings_of
+from mag_tracking.apps.archive_stretches import StretchWriter, read_stretch
+from mag_tracking.apps.archive_work import Job, cut, join, track_stretch
+from mag_tracking.cli import main
+from mag_tracking.errors import ClusterError, OutputError, RecordingError
+from mag_tracking.network.file import read_network
+from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.archive_folder import TableWriter
+from mag_tracking.recording.archive_tables import TABLES
+from mag_tracking.records import FieldFrame
+from support.bundled import DATA, NETWORK_FILE, QUICK, parameter_file, vehicle_path
+from support.mqtt_broker import free_port
+
+ROAD = DATA / 'two_way_road' / 'two_way_road.mcap'
+NAMES = ('straight_car_right', 'straight_small_left', 'junction_left_to_right')
+TRACKED = ('tracks', 'poses', 'smoothed', 'passes')
+
+
+@pytest.fixture(scope='module')
+def road_network_file(tmp_path_factory):
+    """That of the road, whose sensors stand farther apart."""
+    path = tmp_path_factory.mktemp('road') / 'network.yaml'
+    path.write_text(NETWORK_FILE.read_text().replace('4.5', '5.5'))
+    return path
+
+
+@pytest.fixture(scope='module')
+def recordings(tmp_path_factory):
+    """A folder with three recordings, one in a folder below, and one that is none."""
+    folder = tmp_path_factory.mktemp('recordings')
+    (folder / 'below').mkdir()
+    for name in NAMES:
+        shutil.copy(vehicle_path(name), folder / ('below' if 'junction' in name else '.'))
+    (folder / 'damaged.mcap').write_text('this is no recording')
+    (folder / 'notes.txt').write_text('of the installer')
+    return folder
+
+
+def rows(folder, table):
+    """All rows of a table, in order."""
+    # DuckDB needs another library for times with a zone.
+    columns = [c.name for c in TABLES[table] if c.kind != 't']
+    files = folder / ('recordings.parquet' if table == 'recordings' else f'{table}/**/*.parquet')
+    # Of equal names and stamps the number decides.
+    order = [n for n in ('source', 'track_id', 'number', 'stamp_ns', 'sensor') if n in columns]
+    return duckdb.sql(f"SELECT {', '.join(columns)} FROM read_parquet('{files}') "
+                      f"ORDER BY {', '.join(order)}").fetchall()
+
+
+def same_tables(a, b):
+    """Whether two archives have the same rows; NULL is no NaN."""
+    return all(rows(a, table) == rows(b, table) for table in (*TRACKED, 'health', 'recordings'))
+
+
+def archived(folder, recording, network, settings, in_order=True):
+    """An archive of one recording without a cluster."""
+    work = folder / 'work'
+    work.mkdir(parents=True)
+    job = Job(recording, work, folder, network, settings)
+    stretches = range(cut(job)['stretches'])
+    for k in stretches if in_order else reversed(stretches):
+        track_stretch(job, k)
+    return join(job), len(stretches)
+
+
+def assert_rows_of_replay(folder, result):
+    """The tables hold the poses and tracks of a result, in order."""
+    for table, poses in (('poses', result.poses),
+                         ('smoothed', result.smoothed[result.smoothed['complete']])):
+        files = pq.read_table(folder / table).to_pandas()
+        np.testing.assert_array_equal(files[['stamp_ns', 'track_id']].values,
+                                      np.array([poses['stamp_ns'], poses['track_id']]).T)
+        np.testing.assert_array_equal(files[['x', 'y', 'z']].values, poses['position'])
+        np.testing.assert_array_equal(np.stack(files['covariance']).reshape(-1, 6, 6),
+                                      poses['covariance'])
+        np.testing.assert_array_equal(files['ambiguous'].values, poses['ambiguous'])
+        if table == 'poses':
+            assert files['doubts'].tolist() == poses['doubts'].tolist()
+    tracks = pq.read_table(folder / 'tracks').to_pylist()
+    assert [t['track_id'] for t in tracks] == list(result.tracks)
+    for row, log in zip(tracks, result.tracks.values(), strict=True):
+        summary = log.summary()
+        assert {n: row[n] for n in ('poses', 'arrival', 'speed', 'verdict', 'end_ns')} \
+            == {n: summary[n] for n in ('poses', 'arrival', 'speed', 'verdict', 'end_ns')}
+
+
+def test_a_recording_that_is_cut_gives_the_rows_of_one_that_is_not(
+        tmp_path, monkeypatch, road_network_file):
+    monkeypatch.setattr(archive_stretches, 'FEWEST', 60)
+    monkeypatch.setattr(archive_stretches, 'PIECE', 50)
+    settings, network = settings_for('vehicle', QUICK), read_network(road_network_file)
+    known, n = archived(tmp_path, ROAD, network, settings, in_order=False)
+    result = mt.track(ROAD, network, settings=QUICK)
+    assert n > 8 and known['tracks'] == len(result.tracks) >= 20
+    assert known['passes'] == pq.read_table(tmp_path / 'passes').num_rows >= 20
+    assert_rows_of_replay(tmp_path, result)
+
+
+@pytest.mark.study
+@pytest.mark.parametrize('ahead_s', [0.0, 0.2])
+def test_clocks_that_are_apart_are_remembered_from_stretch_to_stretch(
+        tmp_path, monkeypatch, road_network_file, ahead_s):
+    """Tracks are doubted then, by the passes of all stretches before."""
+    monkeypatch.setattr(archive_stretches, 'FEWEST', 60)
+    path = tmp_path / 'network.yaml'
+    text = road_network_file.read_text()
+    path.write_text(text.replace('mag_2:', f'mag_2:\n    clock_offset: {ahead_s}'))
+    network = read_network(path)
+    assert network.clock_offset.tolist() == [0.0, ahead_s]
+    alone = []
+    track = archive_work.track_stretch
+    monkeypatch.setattr(archive_work, 'track_stretch',
+                        lambda *a: alone.append(a) or track(*a))
+    archived(tmp_path / 'archive', ROAD, network, settings_for('vehicle'))
+    result = mt.track(ROAD, network)
+    assert_rows_of_replay(tmp_path / 'archive', result)
+    # Those that the evidence of others could have changed were tracked once more.
+    assert bool(alone) == bool(ahead_s)
+    assert any('clocks apart' in d for d in result.poses['doubts']) == bool(ahead_s)
+
+
+def test_an_archive_of_recordings(tmp_path, recordings, capsys):
+    """On two processes; one that is none is named and stops nobody; a second run does nothing."""
+    out, lines = tmp_path / 'out', []
+    settings = settings_for('vehicle', QUICK)
+    run = archive([recordings], NETWORK_FILE, settings, out, workers=2, report=lines.append)
+    damaged = (recordings / 'damaged.mcap').resolve()
+    assert len(run.done) == 3 and list(run.failed) == [damaged] and not run.interrupted
+    assert lines == [f'damaged.mcap: {damaged} is not an MCAP file']
+    assert not list((out / 'work').iterdir()) or [p.name[:7] for p in (out / 'work').iterdir()] \
+        == ['damaged']
+    for path in run.done:
+        result = mt.track(path, NETWORK_FILE, settings=QUICK)
+        found = pq.read_table(out / 'poses', filters=[('source', '=', str(path))]).to_pandas()
+        np.testing.assert_array_equal(found.sort_values('stamp_ns')[['x', 'y']].values,
+                                      result.poses['position'][:, :2])
+    known = {row[1]: row for row in rows(out, 'recordings')}
+    assert len(known) == 4 and 'not an MCAP file' in known[str(damaged)][3]
+    sensors = duckdb.sql(f"SELECT DISTINCT sensor, accepted > 500, noise_x BETWEEN 1e-9 AND 1e-7 "
+                         f"FROM read_parquet('{out}/health/**/*.parquet') ORDER BY 1").fetchall()
+    assert sensors == [('mag_1', True, True), ('mag_2', True, True)]
+
+    written = {p: p.stat().st_mtime_ns for p in out.rglob('*-*.parquet')}
+    again = archive([recordings / '*.mcap', recordings / 'below'], NETWORK_FILE, settings, out)
+    assert sorted(again.were_done) == sorted(run.done) and not again.done
+    assert {p: p.stat().st_mtime_ns for p in out.rglob('*-*.parquet')} == written
+    assert len(rows(out, 'recordings')) == 4
+
+
+def test_a_recording_that_changed_is_tracked_again(tmp_path, recordings):
+    copy, settings = tmp_path / 'copy', settings_for('vehicle', QUICK)
+    copy.mkdir()
+    shutil.copy(recordings / 'straight_car_right.mcap', copy / 'a.mcap')
+    archive([copy], NETWORK_FILE, settings, tmp_path / 'out')
+    before = rows(tmp_path / 'out', 'poses')
+    shutil.copy(recordings / 'straight_small_left.mcap', copy / 'a.mcap')
+    run = archive([copy], NETWORK_FILE, settings, tmp_path / 'out')
+    after = rows(tmp_path / 'out', 'poses')
+    assert len(run.done) == 1 and before and after and not any(row in before for row in after)
+    assert len(rows(tmp_path / 'out', 'recordings')) == 1
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory, recordings):
+    """The archive that nobody interrupted."""
+    out = tmp_path_factory.mktemp('whole') / 'out'
+    archive([recordings], NETWORK_FILE, settings_for('vehicle', QUICK), out)
+    return out
+
+
+def test_a_run_that_is_stopped_is_gone_on_with(tmp_path, recordings, whole):
+    out, settings = tmp_path / 'out', settings_for('vehicle', QUICK)
+    seen = []
+    first = archive([recordings], NETWORK_FILE, settings, out, progress=seen.append,
+                    stopped=lambda: bool(seen))
+    assert first.interrupted and 1 <= len(first.done) < 3
+    second = archive([recordings], NETWORK_FILE, settings, out)
+    assert not second.interrupted and len(second.done) + len(first.done) == 3
+    assert sorted(second.were_done) == sorted(first.done)
+    assert same_tables(out, whole)
+
+
+def command(recordings, out, folder, *options):
+    """The command with fast settings."""
+    return [sys.executable, '-m', 'mag_tracking.cli', 'archive', str(recordings), '--network',
+            str(NETWORK_FILE), '--params', str(parameter_file(folder / 'quick.yaml', QUICK)),
+            '--out', str(out), *options]
+
+
+def wait_for(condition, seconds=120.0):
+    """Wait until it holds."""
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+def test_a_run_that_is_killed_is_gone_on_with(tmp_path, recordings, whole):
+    out = tmp_path / 'out'
+    words = command(recordings, out, tmp_path, '--workers', '1')
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    wait_for(lambda: list(out.glob('done/*.json')))
+    for child in psutil.Process(process.pid).children(recursive=True):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            child.kill()
+    process.kill()
+    process.communicate()
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 1 and '1 failed' in done.stdout, done.stderr
+    assert same_tables(out, whole)
+
+
+def test_ctrl_c_keeps_what_is_done(tmp_path, recordings):
+    out = tmp_path / 'out'
+    process = subprocess.Popen(command(recordings, out, tmp_path, '--workers', '1'),
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                               start_new_session=True)
+    wait_for(lambda: list(out.glob('work/*/state.json')))
+    # As a terminal does it: to all processes.
+    os.killpg(process.pid, signal.SIGINT)
+    text, errors = process.communicate(timeout=60)
+    assert process.returncode == 130 and 'the same command goes on' in text, errors
+    assert 'Traceback' not in errors
+
+
+def test_a_lost_worker_costs_nothing_but_time(tmp_path, recordings, whole):
+    out, runs = tmp_path / 'out', []
+    before = {*psutil.Process().children(recursive=True)}
+    thread = threading.Thread(target=lambda: runs.append(archive(
+        [recordings], NETWORK_FILE, settings_for('vehicle', QUICK), out)))
+    thread.start()
+    wait_for(lambda: list(out.glob('work/*/cut.json')))
+    # The youngest are the workers; the others look after them.
+    workers = [p for p in psutil.Process().children(recursive=True) if p not in before
+               and not p.children()]
+    for worker in workers:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            if worker.memory_info().rss > 100e6:
+                worker.kill()
+    thread.join(120)
+    assert runs and len(runs[0].done) == 3 and runs[0].lost_workers >= 1
+    assert same_tables(out, whole)
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path, recordings, whole):
+    settings = settings_for('vehicle', QUICK)
+    some = [recordings / 'straight_car_right.mcap']
+    (tmp_path / 'taken').mkdir()
+    (tmp_path / 'taken' / 'photo.jpg').write_text('')
+    with pytest.raises(OutputError, match='is not empty and is no archive'):
+        archive(some, NETWORK_FILE, settings, tmp_path / 'taken')
+    with pytest.raises(OutputError, match='begun with another settings'):
+        archive(some, NETWORK_FILE, settings_for('vehicle'), whole)
+    other = tmp_path / 'network.yaml'
+    other.write_text(NETWORK_FILE.read_text().replace('4.5', '4.6'))
+    with pytest.raises(OutputError, match='begun with another network'):
+        archive(some, other, settings, whole)
+    old = tmp_path / 'old'
+    shutil.copytree(whole, old)
+    head = json.loads((old / 'archive.json').read_text())
+    (old / 'archive.json').write_text(json.dumps({**head, 'schema': 0}))
+    with pytest.raises(OutputError, match='tables of version 0; this program writes version 1'):
+        archive(some, NETWORK_FILE, settings, old)
+    (old / 'archive.json').write_text('{"schema"')
+    with pytest.raises(OutputError, match='cannot read'):
+        archive(some, NETWORK_FILE, settings, old)
+
+
+def test_two_archives_into_one_folder(tmp_path, recordings):
+    out, lines = tmp_path / 'out', []
+    settings = settings_for('vehicle', QUICK)
+
+    def second():
+        if not lines:
+            with pytest.raises(OutputError, match='another archive is being written into'):
+                archive([recordings], NETWORK_FILE, settings, out)
+            lines.append('refused')
+        return True
+    assert archive([recordings], NETWORK_FILE, settings, out, stopped=second).interrupted
+    assert lines == ['refused']
+
+
+def test_a_scheduler_that_does_not_answer(tmp_path, recordings, monkeypatch):
+    monkeypatch.setattr(cluster, 'PATIENCE_S', 1.0)
+    settings = settings_for('vehicle', QUICK)
+    for address, why in ((f'tcp://127.0.0.1:{free_port()}', 'no Dask scheduler answers'),
+                         ('nonsense://x', 'no Dask scheduler answers')):
+        with pytest.raises(ClusterError, match=why):
+            archive([recordings], NETWORK_FILE, settings, tmp_path / 'out', scheduler=address)
+
+
+def test_a_scheduler_without_workers_and_with(tmp_path, recordings, monkeypatch):
+    from distributed import LocalCluster
+
+    settings = settings_for('vehicle', QUICK)
+    with LocalCluster(n_workers=0, processes=True, dashboard_address=None,
+                      threads_per_worker=1) as there:
+        monkeypatch.setattr(cluster, 'PATIENCE_S', 1.0)
+        with pytest.raises(ClusterError, match='the scheduler has no worker'):
+            archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
+                    scheduler=there.scheduler_address)
+        monkeypatch.undo()
+        there.scale(1)
+        run = archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
+                      scheduler=there.scheduler_address)
+        assert len(run.done) == 3
+
+
+def test_a_full_disk_stops_the_run_and_another_goes_on(tmp_path, recordings, whole):
+    """A limit on the size of a file stands for the disk."""
+    out = tmp_path / 'out'
+    words = command(recordings, out, tmp_path, '--workers', '1')
+    done = subprocess.run(['bash', '-c', 'ulimit -f 30; exec "$@"', '-', *words],
+                          capture_output=True, text=True)
+    assert done.returncode == 1 and 'mag-tracking: cannot write' in done.stderr
+    assert 'Traceback' not in done.stderr and not list(out.glob('done/*.json'))
+    assert subprocess.run(words, capture_output=True).returncode == 1
+    assert same_tables(out, whole)
+
+
+def test_a_table_is_whole_or_not_there(tmp_path):
+    with pytest.raises(RuntimeError), TableWriter(tmp_path / 'a.parquet', 'health') as table:
+        table.add({'stamp_ns': 1})
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(OutputError, match='cannot write'):
+        TableWriter(tmp_path / 'file' / 'c.parquet', 'health')
+
+
+def test_names_of_recordings(tmp_path, recordings):
+    found = recordings_of([recordings, recordings / 'straight_*.mcap'])
+    assert [p.name for p in found] == ['junction_left_to_right.mcap', 'damaged.mcap',
+                                       'straight_car_right.mcap', 'straight_small_left.mcap']
+    (tmp_path / 'bag').mkdir()
+    shutil.copy(recordings / 'straight_car_right.mcap', tmp_path / 'bag' / 'a_0.mcap')
+    (tmp_path / 'bag' / 'metadata.yaml').write_text('')
+    assert recordings_of([tmp_path]) == [(tmp_path / 'bag').resolve()]
+    for nothing in (tmp_path / 'none', tmp_path / '*.bag', recordings / 'notes.txt'):
+        with pytest.raises(RecordingError, match='there is no recording'):
+            recordings_of([nothing])
+
+
+def test_command_line_errors(tmp_path, recordings, capsys):
+    words = ['archive', str(recordings), '--network', str(NETWORK_FILE), '--out',
+             str(tmp_path / 'out')]
+    assert main([*words, '--workers', '0']) == 1
+    assert '--workers: expected 1 or more' in capsys.readouterr().err
+    assert main(['archive', str(tmp_path / 'none'), *words[2:]]) == 1
+    assert 'there is no recording' in capsys.readouterr().err
+
+
+def frames(*stretches):
+    """Frames every 0.1 s: (seconds, whether a target is near) one after the other."""
+    out = []
+    for seconds, present in stretches:
+        for _ in range(round(10 * seconds)):
+            out.append(FieldFrame(len(out) * 100_000_000, np.zeros((1, 3)), np.eye(3)[None],
+                                  np.ones(1, dtype=np.int64), np.zeros(1), present))
+    return out
+
+
+@pytest.mark.parametrize('quiet_s, n', [(0.5, 1), (2.5, 1), (3.5, 2), (30.0, 2)])
+def test_stretches_are_cut_where_no_track_looks_back(tmp_path, monkeypatch, quiet_s, n):
+    monkeypatch.setattr(archive_stretches, 'FEWEST', 10)
+    monkeypatch.setattr(archive_stretches, 'PIECE', 7)
+    given = frames((20.0, False), (2.0, True), (quiet_s, False), (2.0, True), (9.0, False))
+    writer = StretchWriter(tmp_path, 3.0)
+    for f in given:
+        writer.add_frame(f, {})
+    writer.close()
+    assert writer.n_stretches == n
+    for k in range(n):
+        kept = [f for piece in read_stretch(tmp_path / f'stretch-{k}.pickle')
+                for f, _ in piece.frames()]
+        first = next(i for i, f in enumerate(kept) if f.target_present)
+        # All frames that a track may look back to, and the one that ends it.
+        assert kept[first].stamp_ns - kept[0].stamp_ns in (3_000_000_000, 3_100_000_000)
+        assert not kept[-1].target_present
+    assert max(len(p.stamp_ns) for k in range(n) for p in read_stretch(
+        tmp_path / f'stretch-{k}.pickle')) <= 7 + 31
+
+
+def test_a_time_that_jumps_back_between_stretches_blocks_nothing(tmp_path):
+    writer = StretchWriter(tmp_path, 3.0)
+    for f in frames((60.0, False)) + frames((60.0, False), (2.0, True), (9.0, False)):
+        writer.add_frame(f, {})
+    writer.close()
+    kept = [f for p in read_stretch(tmp_path / 'stretch-0.pickle') for f, _ in p.frames()]
+    assert len(kept) == 31 + 20 + 1
+    assert not (tmp_path / 'stretch-1.pickle').exists()
