@@ -1,7 +1,9 @@
-// The records of an MCAP chunk, as a Python module; core.pyi says what the arguments are.
+// What is read and written many thousand times, as a Python module; core.pyi says what the arguments
+// are.
 
 #include <algorithm>
-#include <cstring>
+#include <charconv>
+#include <cmath>
 #include <string_view>
 
 #include "../python.hpp"
@@ -57,11 +59,38 @@ py::tuple records_of(const py::bytes& data, std::int64_t latest_ns) {
     return py::make_tuple(out, definitions);
 }
 
+// The shortest text that reads back as the same number.
+void append(std::string& text, double value) {
+    if (std::isnan(value)) {
+        text += "nan";
+        return;
+    }
+    char digits[32];
+    text.append(digits, std::to_chars(digits, digits + sizeof digits, value).ptr);
+}
+
+py::list number_rows(Array values) {
+    const Size n = length_of(values, "values", 2), m = values.shape(1);
+    const double* v = input_of(values, "values", {n, m});
+    py::list rows(n);
+    std::string row;
+    for (Size i = 0; i < n; ++i, v += m) {
+        row.clear();
+        for (Size k = 0; k < m; ++k) {
+            if (k) row += ',';
+            append(row, v[k]);
+        }
+        rows[i] = py::str(row);
+    }
+    return rows;
+}
+
 }  // namespace
 }  // namespace mag_tracking
 
 PYBIND11_MODULE(core, m) {
     using namespace mag_tracking;
-    m.doc() = "The records of an MCAP chunk, compiled.";
+    m.doc() = "What is read and written many thousand times, compiled.";
+    m.def("number_rows", &number_rows, IN(values));
     m.def("records_of", &records_of, py::arg("data"), py::arg("latest_ns"));
 }

@@ -1,6 +1,9 @@
-"""The records of an MCAP chunk, compiled."""
+"""What is read and written many thousand times, compiled."""
 
-from mag_tracking.arrays import IntArray
+from mag_tracking.arrays import FloatArray, IntArray
+
+def number_rows(values: FloatArray) -> list[str]:
+    """Each row of `values` (n, m) as m numbers with commas, which read back as the same."""
 
 def records_of(data: bytes, latest_ns: int) -> tuple[IntArray, list[tuple[int, int, int]]]:
     """The messages, and the schemas and channels.

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from os import PathLike
-from typing import Any, Protocol
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -14,9 +14,10 @@ from mag_tracking.errors import OutputError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.files import new_text_file, output_folder
 from mag_tracking.network import SensorNetwork
+from mag_tracking.recording import core
 from mag_tracking.recording.track_recording import TrackRecording
 from mag_tracking.recording.writer import refuse_other_recording
-from mag_tracking.records import Detection, FieldFrame, SmoothedPose, Track
+from mag_tracking.records import Detection, FieldFrame, Hypotheses, SmoothedPose, Track
 from mag_tracking.report.json_text import without_nan
 from mag_tracking.report.page import REPORT
 from mag_tracking.report.rerun_file import RERUN_FILE
@@ -37,6 +38,7 @@ HYPOTHESIS_COLUMNS = ('stamp_ns', 'track_id', 'arrival', 'kind', 'weight', 'x', 
 _TABLES = {'poses.csv': POSE_COLUMNS, 'poses_smoothed.csv': SMOOTHED_COLUMNS,
            'detections.csv': DETECTION_COLUMNS, 'disturbances.csv': DISTURBANCE_COLUMNS,
            'hypotheses.csv': HYPOTHESIS_COLUMNS}
+_QUOTE, _SPECIAL = '"', {'"', ',', '\r', '\n'}
 _SUMMARY, _RECORDING = 'summary.json', 'tracks.mcap'
 _RESULTS = (*_TABLES, _SUMMARY, _RECORDING, 'metadata.yaml', REPORT, RERUN_FILE)
 _OF_A_TRACK = re.compile(r'(map|weights|field)_track_[0-9]+\.png|track_[0-9]+(_smoothed)?\.tum')
@@ -45,12 +47,6 @@ _OF_A_TRACK = re.compile(r'(map|weights|field)_track_[0-9]+\.png|track_[0-9]+(_s
 def figure_name(kind: str, track_id: int) -> str:
     """File name of a figure, 'map', 'weights' or 'field', of a track."""
     return f'{kind}_track_{track_id}.png'
-
-
-class _Table(Protocol):
-    """What `csv.writer` gives."""
-
-    def writerow(self, row: Iterable[object], /) -> object: ...
 
 
 class ResultFolder:
@@ -72,9 +68,10 @@ class ResultFolder:
         self._files = ExitStack()
         try:
             self.replaces_earlier = self._remove_earlier()
-            (self._poses, self._smoothed, self._detections, self._disturbances,
-             self._hypotheses) = (
-                self._table(name, columns) for name, columns in _TABLES.items())
+            *streams, self._hypotheses = (
+                self._stream(name, columns) for name, columns in _TABLES.items())
+            self._poses, self._smoothed, self._detections, self._disturbances = (
+                csv.writer(stream) for stream in streams)
             self._recording = TrackRecording(self.folder / _RECORDING, network)
         except OutputError:
             self._files.close()
@@ -93,12 +90,11 @@ class ResultFolder:
             path.unlink()
         return bool(earlier)
 
-    def _table(self, name: str, columns: tuple[str, ...]) -> _Table:
+    def _stream(self, name: str, columns: tuple[str, ...]) -> TextIO:
         """Open one CSV file and write its head."""
         stream = self._files.enter_context(new_text_file(self.folder / name, newline=''))
-        writer = csv.writer(stream)
-        writer.writerow(columns)
-        return writer
+        csv.writer(stream).writerow(columns)
+        return stream
 
     def __enter__(self) -> 'ResultFolder':
         return self
@@ -131,10 +127,18 @@ class ResultFolder:
             track.position, track.velocity, sd, track.moment, [track.weight]),
             int(track.ambiguous), track.kind, *_floats(
                 [track.kind_weight, track.length, track.length_std]), ' '.join(track.doubts)])
-        for h in track.hypotheses:
-            sd = np.sqrt(np.diagonal(h.covariance))
-            self._hypotheses.writerow([track.stamp_ns, track.id, h.arrival, h.kind, *_floats(
-                [h.weight], h.position, h.velocity, sd, h.moment)])
+        self._add_hypotheses(track)
+
+    def _add_hypotheses(self, track: Track) -> None:
+        """One row a hypothesis."""
+        h = Hypotheses.of(track.hypotheses)
+        sd = np.sqrt(np.diagonal(h.covariances, axis1=1, axis2=2))
+        rows = core.number_rows(np.column_stack([h.weights, h.states, sd, h.moments]))
+        begin = f'{track.stamp_ns},{track.id},'
+        pairs = [*zip(h.arrivals, h.kinds, strict=True)]
+        names = {pair: ','.join(map(_quoted, pair)) for pair in {*pairs}}
+        self._hypotheses.write(''.join(
+            f'{begin}{names[pair]},{row}\r\n' for pair, row in zip(pairs, rows, strict=True)))
 
     def add_disturbance(self, d: Disturbance) -> None:
         """One row when a `Disturbance` is found, and one when it has ended."""
@@ -157,6 +161,11 @@ class ResultFolder:
         with new_text_file(self.folder / _SUMMARY) as stream:
             json.dump(without_nan(summary), stream, indent=1, allow_nan=False)
             stream.write('\n')
+
+
+def _quoted(text: str) -> str:
+    """As one field of a CSV file."""
+    return f'"{text.replace(_QUOTE, 2 * _QUOTE)}"' if _SPECIAL & {*text} else text
 
 
 def _floats(*groups: Iterable[float]) -> list[str]:

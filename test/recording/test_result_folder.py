@@ -1,9 +1,18 @@
 """The folder of one run: results of an earlier one are replaced, and nothing else."""
 
+import csv
+
+import numpy as np
 import pytest
 
+from mag_tracking.apps.replay import replay
 from mag_tracking.errors import OutputError
+from mag_tracking.network.file import read_network
+from mag_tracking.pipeline import settings_for
+from mag_tracking.recording import core
+from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.result_folder import ResultFolder, figure_name
+from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 from support.networks import line_network
 
 
@@ -49,3 +58,32 @@ def test_another_recording_is_left_as_it_is(tmp_path):
         ResultFolder(tmp_path, line_network(2))
     assert (tmp_path / 'poses.csv').read_text() == 'theirs'
     assert len(list(tmp_path.iterdir())) == 2
+
+
+NUMBERS = [0.0, -0.0, 1.0, 1e5, 1e-5, 0.1, -2.5e-17, 1e22, 5e-324, 1.7976931348623157e308, np.inf,
+           -np.inf, np.nan, 123456789.12345678]
+
+
+def test_rows_of_numbers_read_back_as_the_same():
+    values = np.array(NUMBERS).reshape(2, -1)
+    rows = core.number_rows(values)
+    back = np.array([[float(text) for text in row.split(',')] for row in rows])
+    np.testing.assert_array_equal(back, values)
+    np.testing.assert_array_equal(np.signbit(back), np.signbit(values))
+    assert core.number_rows(np.zeros((0, 3))) == [] and core.number_rows(np.zeros((1, 0))) == ['']
+
+
+def test_names_of_arrivals_may_have_commas(tmp_path):
+    names = ('from "A", left', 'right', 'rear')
+    settings = settings_for('vehicle', {**QUICK, 'track.vehicle.arrival_names': names})
+    replay(Recording(vehicle_path('straight_car_right')), read_network(NETWORK_FILE), settings,
+           tmp_path)
+    with open(tmp_path / 'hypotheses.csv', newline='') as stream:
+        rows = list(csv.DictReader(stream))
+    assert names[0] in {row['arrival'] for row in rows} <= {*names}
+    # The heaviest hypotheses of the last frame are near the published pose.
+    with open(tmp_path / 'poses.csv', newline='') as stream:
+        *_, pose = csv.DictReader(stream)
+    best = max((row for row in rows if row['stamp_ns'] == pose['stamp_ns']),
+               key=lambda row: float(row['weight']))
+    assert abs(float(best['x']) - float(pose['x'])) < 3.0 * float(pose['sd_x'])
