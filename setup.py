@@ -1,3 +1,4 @@
+import os
 from glob import glob
 
 from pybind11.setup_helpers import Pybind11Extension
@@ -33,6 +34,7 @@ setup(
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     ext_modules=CORES,
+    options={'build_ext': {'parallel': os.cpu_count()}},
     package_data={NAME: ['py.typed', 'nodes/*.xml', 'report/page/*', '*/core.pyi',
                          'stages/*/core.pyi']},
     data_files=[

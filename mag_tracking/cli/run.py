@@ -14,7 +14,9 @@ from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK
 
 _RUN = '''
 Starts calibration, detection and tracker nodes in one process, and with a
-RECORDING the replay node, with DRIVERS the driver node as well. Drivers of your
+RECORDING the replay node, with DRIVERS the driver node as well. The nodes call each
+other, without messages between them; what they publish comes after the pose, and what
+is only between them, calibrated fields and frames, where somebody listens. Drivers of your
 own publish sensor_msgs/MagneticField on the topics of the network file. Ctrl-C
 ends it. Arguments of ROS (--ros-args ...) come last.
 

@@ -28,15 +28,17 @@ from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.background_store import BackgroundStore
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.deferred import Deferred
+from mag_tracking.nodes.detection_node import DetectionNode
 from mag_tracking.nodes.paced_service import paced_service
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
 from mag_tracking.nodes.sensor_graph import shortened
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.sensor_rounds import SensorRounds
 from mag_tracking.nodes.sensor_transforms import SensorTransforms
-from mag_tracking.nodes.stage_node import LATCHED, READY, SENT, STREAM, StageNode
+from mag_tracking.nodes.stage_node import LATCHED, READY, SENT, STREAM, StageNode, is_heard
 from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.nodes.survey_service import SurveyService
+from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.recording.background_file import (
     is_background_file,
     state_folder,
@@ -58,8 +60,11 @@ about that long: until then the processes that compute it need the cores."""
 class CalibrationNode(StageNode):
     """Subscribes to each sensor's topic; publishes it with `_calibrated` appended to its name."""
 
-    def __init__(self, **node_arguments: Any) -> None:
+    def __init__(self, next_steps: tuple[DetectionNode, TrackerNode] | None = None,
+                 **node_arguments: Any) -> None:
+        """`next_steps` in the same process take calibrated readings and doubtful times directly."""
         super().__init__('calibration_node', 'calibrate', **node_arguments)
+        self._next_steps = next_steps
         self.settings = declare_settings(self, self.settings, 'survey')
         self._stage = Calibrate(self.network, self.settings.calibrate)
         self._store = BackgroundStore(self._state_path(), self._stage, self.settings.calibrate,
@@ -97,7 +102,8 @@ class CalibrationNode(StageNode):
         self._readings = self.publisher(FieldReadings, CALIBRATED_READINGS, SENT)
         self.subscription(FieldReadings, RAW_READINGS, self._take_many, STREAM, source='sensors',
                           batches=True)
-        self.expect('detection', CALIBRATED_READINGS, 'mag_tracking_msgs/msg/NetworkFrame')
+        if self._next_steps is None:
+            self.expect('detection', CALIBRATED_READINGS, 'mag_tracking_msgs/msg/NetworkFrame')
         self._state = self.publisher(CalibrationState, CALIBRATION_STATE, LATCHED)
         self._tf = SensorTransforms(self) if fixed_parameter(
             self, 'publish_sensor_tf', True, 'Publish where the sensors are as static '
@@ -173,9 +179,11 @@ class CalibrationNode(StageNode):
     def _take(self, sensor: str, message: MagneticField) -> None:
         """One raw reading."""
         raw = reading_of(message, sensor)
-        for calibrated in self._stage.feed(raw):
-            for _, content in magnetic_field_dicts(calibrated, message.header.frame_id):
-                self._publishers_by_sensor[sensor].publish(to_message(MagneticField, content))
+        publisher = self._publishers_by_sensor[sensor]
+        for calibrated in self._calibrated(raw):
+            if self._next_steps is None or is_heard(publisher):
+                for _, content in magnetic_field_dicts(calibrated, message.header.frame_id):
+                    publisher.publish(to_message(MagneticField, content))
         self._unseen.append((raw, self.now_ns))
         self._do_deferred_work()
 
@@ -184,14 +192,27 @@ class CalibrationNode(StageNode):
         raw = self.readings_of(message, self._stage)
         if raw is None:
             return
-        for calibrated in self._stage.feed(raw):
-            self._readings.publish(to_message(FieldReadings, readings_dict(calibrated)))
+        for calibrated in self._calibrated(raw):
+            if self._next_steps is None or is_heard(self._readings):
+                self._readings.publish(to_message(FieldReadings, readings_dict(calibrated)))
         self._unseen.append((raw, self.now_ns))
         self._deferred.request()
+
+    def _calibrated(self, raw: Readings) -> list[Readings]:
+        """Calibrated readings; the next steps in this process have taken them."""
+        calibrated = self._stage.feed(raw)
+        if self._next_steps is not None:
+            detection, tracker = self._next_steps
+            tracker.doubt(self._stage.doubtful_stretches())
+            for readings in calibrated:
+                detection.take_readings(readings)
+        return calibrated
 
     def _do_deferred_work(self) -> None:
         """Learn from what has come, update the health, and do a step of the round if it is due."""
         self._stage.idle()
+        if self._next_steps is not None:
+            self._next_steps[1].idle()
         unseen, self._unseen = self._unseen, []
         for raw, now_ns in unseen:
             self._health.add(raw, now_ns)

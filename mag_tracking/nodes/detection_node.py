@@ -20,7 +20,8 @@ from mag_tracking.messages.types import CALIBRATED_READINGS, NETWORK_FRAME, TRAC
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
-from mag_tracking.nodes.stage_node import RESULTS, SENT, STREAM, StageNode
+from mag_tracking.nodes.stage_node import RESULTS, SENT, STREAM, StageNode, is_heard
+from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.records import Detection, FieldFrame, Readings
 from mag_tracking.stages.align.frame_period import too_long
 from mag_tracking.stages.align.stage import Align
@@ -32,8 +33,12 @@ from mag_tracking.stages.stage import Stage
 class DetectionNode(StageNode):
     """Aligns the sensors to frames and tests each for a target."""
 
-    def __init__(self, **node_arguments: Any) -> None:
+    def __init__(self, tracker: TrackerNode | None = None, **node_arguments: Any) -> None:
+        """With a `tracker` in the same process, which takes the frames, calibrated readings come by
+        `take_readings`.
+        """
         super().__init__('detection_node', 'align', **node_arguments)
+        self._tracker = tracker
         self.settings = declare_settings(self, self.settings, 'detect')
         self.settings = declare_settings(self, self.settings, 'events')
         self._align = Align(self.network, self.settings.align)
@@ -46,13 +51,21 @@ class DetectionNode(StageNode):
         self._detect = Detect(self.network, self.settings.detect)
         self._frames = self.publisher(NetworkFrame, NETWORK_FRAME, SENT)
         self._detections = self.publisher(DetectionMessage, '~/detections', RESULTS)
+        if tracker is None:
+            self._subscribe()
+        else:
+            self.take_readings = self.direct('calibration', [CALIBRATED_READINGS], self._feed,
+                                             lambda readings: int(readings.stamp_ns[-1]))
+        self.report_state()
+
+    def _subscribe(self) -> None:
+        """Listen to the calibration, as a process of its own."""
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self.subscription(MagneticField, f'{topic}_calibrated', partial(self._take, sensor),
                               STREAM, source='calibration')
         self.subscription(FieldReadings, CALIBRATED_READINGS, self._take_many, STREAM,
                           source='calibration', batches=True)
         self.expect('tracker', NETWORK_FRAME, TRACK_ARRAY)
-        self.report_state()
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
         """{name: stage} whose counts are published."""
@@ -87,9 +100,17 @@ class DetectionNode(StageNode):
                 if isinstance(record, Detection):
                     self._detections.publish(to_message(
                         DetectionMessage, detection_dict(record, self.network.frame)))
+                elif self._tracker is None:
+                    self._publish_frame(record)
                 else:
-                    self._frames.publish(to_message(
-                        NetworkFrame, frame_dict(record, self.network)))
+                    # The pose comes first.
+                    self._tracker.take_frame(record)
+                    if is_heard(self._frames):
+                        self._publish_frame(record)
+
+    def _publish_frame(self, frame: FieldFrame) -> None:
+        """Publish a frame with its verdict."""
+        self._frames.publish(to_message(NetworkFrame, frame_dict(frame, self.network)))
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -16,7 +16,7 @@ from rclpy.parameter import Parameter
 
 from mag_tracking.errors import MagTrackingError
 from mag_tracking.interrupts import noted_signals
-from mag_tracking.messages.types import NETWORK_FRAME, RAW_READINGS
+from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.network.topics import namespaces_of
 from mag_tracking.nodes.calibration_node import CalibrationNode
 from mag_tracking.nodes.convert import track_of
@@ -24,7 +24,7 @@ from mag_tracking.nodes.detection_node import DetectionNode
 from mag_tracking.nodes.driver_node import DriverNode
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.replay_node import ReplayNode
-from mag_tracking.nodes.stage_node import STREAM, StageNode, make_executor, spin
+from mag_tracking.nodes.stage_node import STREAM, StageNode, freeze, make_executor, spin
 from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.records import Track
@@ -98,11 +98,14 @@ def make_nodes(network_path: PathLike, settings: Settings, recording: PathLike |
                ) -> tuple[list[StageNode], ReplayNode | None]:
     """(stage nodes, replay node or None), ready to be added to an executor.
 
-    The replay waits, paused, until `all_connected`.
+    Each stage calls the next one, without a message between them, and publishes when the pose is
+    out. The replay waits, paused, until `all_connected`.
     """
     overrides = parameters(network_path, settings, reliable=recording is not None)
-    stages: list[StageNode] = [cls(parameter_overrides=overrides)
-              for cls in (CalibrationNode, DetectionNode, TrackerNode)]
+    tracker = TrackerNode(is_fed=True, parameter_overrides=overrides)
+    detection = DetectionNode(tracker, parameter_overrides=overrides)
+    stages: list[StageNode] = [
+        CalibrationNode((detection, tracker), parameter_overrides=overrides), detection, tracker]
     if recording is None:
         return stages, None
     replay = ReplayNode(parameter_overrides=[
@@ -112,13 +115,10 @@ def make_nodes(network_path: PathLike, settings: Settings, recording: PathLike |
 
 
 def all_connected(stages: list[StageNode], replay: ReplayNode) -> bool:
-    """Whether every topic of the way has found its subscriber."""
+    """Whether all that is played of the sensors has found its subscriber."""
     raw = [p for p in replay.publishers_by_topic.values()
            if p.topic_name in stages[0].sensor_topics]
-    calibrated = [p for p in stages[0].publishers if p.topic_name.endswith('_calibrated')]
-    frame = stages[1].resolve_topic_name(NETWORK_FRAME)
-    frames = [p for p in stages[1].publishers if p.topic_name == frame]
-    return all(p.get_subscription_count() > 0 for p in raw + calibrated + frames)
+    return all(p.get_subscription_count() > 0 for p in raw)
 
 
 def run(network_path: PathLike, settings: Settings, recording: PathLike | None = None,
@@ -170,6 +170,7 @@ def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Se
         nodes += [replay] if replay else []
         for node in nodes:
             executor.add_node(node)
+        freeze()
         if replay is None:
             spin(executor, stopped)
             return 0

@@ -3,10 +3,10 @@
 import gc
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -52,6 +52,8 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
 TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of /tf, that of tf2."""
 READY = 'ready'
+
+_Record = TypeVar('_Record')
 
 
 class StageNode(Node):
@@ -158,6 +160,24 @@ class StageNode(Node):
             message_type, topic, callback if flow is None else take, qos,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=unfit, message_lost=lost))
 
+    def direct(self, source: str, topics: Sequence[str], callback: Callable[[_Record], None],
+               stamp_of: Callable[[_Record], int]) -> Callable[[_Record], None]:
+        """A function that takes records of the step before, in place of subscriptions.
+
+        Diagnostics tell the same of them: `source` is that step, which publishes on the `topics`;
+        `stamp_of` gives the timestamp [ns] of a record.
+        """
+        flow = self.flows.setdefault(source, Flow(source))
+        flow.topics += map(self.resolve_topic_name, topics)
+
+        def take(record: _Record) -> None:
+            began = time.monotonic()
+            self.now_ns = self.get_clock().now().nanoseconds
+            callback(record)
+            flow.note(stamp_of(record), self.now_ns, began)
+
+        return take
+
     def readings_of(self, message: FieldReadings, stage: Stage[Any, Any]) -> Readings | None:
         """`Readings` of a FieldReadings; one that is none is a rejection of `stage`, and None."""
         try:
@@ -229,6 +249,11 @@ class StageNode(Node):
             self._diagnostics.publish(array)
 
 
+def is_heard(publisher: Publisher) -> bool:
+    """Whether somebody listens: what is large is made for nobody else."""
+    return publisher.get_subscription_count() > 0
+
+
 def title_of(node: Node) -> str:
     """The name of a node in diagnostics: with its namespace, where it has one."""
     return node.get_fully_qualified_name().removeprefix('/')
@@ -241,6 +266,14 @@ def make_executor() -> Executor:
     except ImportError:
         return SingleThreadedExecutor()
     return EventsExecutor()
+
+
+def freeze() -> None:
+    """Keep what was loaded for good: to look through it again and again for garbage takes longer
+    than a reading may be late.
+    """
+    gc.collect()
+    gc.freeze()
 
 
 def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:
@@ -272,10 +305,7 @@ def _run_until(seen: list[int], node_class: Callable[[], Node],
     try:
         node = node_class()
         executor.add_node(node)
-        # What was loaded stays for good: to look through it again and again for garbage takes
-        # longer than a reading may be late.
-        gc.collect()
-        gc.freeze()
+        freeze()
         spin(executor, lambda: bool(seen))
     except (MagTrackingError, ParameterException) as error:
         rclpy.logging.get_logger(node_class.__name__).fatal(str(error))

@@ -8,6 +8,7 @@ if __name__ == '__main__':
 
 import time
 from collections import deque
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -56,9 +57,10 @@ from mag_tracking.nodes.stage_node import (
     STREAM,
     TRANSFORMS,
     StageNode,
+    is_heard,
 )
 from mag_tracking.nodes.steady_timer import steady_timer
-from mag_tracking.records import SmoothedPose, Track
+from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.stage import Stage
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.running_track import TrackRecord
@@ -73,8 +75,10 @@ LONGEST_PATH = 2000
 class TrackerNode(StageNode):
     """The bank of filters behind a topic."""
 
-    def __init__(self, **node_arguments: Any) -> None:
+    def __init__(self, is_fed: bool = False, **node_arguments: Any) -> None:
+        """`is_fed`: frames come by `take_frame`, in the process of the other nodes."""
         super().__init__('tracker_node', 'track', **node_arguments)
+        self._is_fed = is_fed
         self._stage = TrackManager(self.network, self.settings.track)
         follow_changes(self, self.settings, lambda s: self._stage.configure(s.track))
         self._child_frame = fixed_parameter(
@@ -100,8 +104,11 @@ class TrackerNode(StageNode):
         self._path: deque[PoseStamped] = deque(maxlen=LONGEST_PATH)
         self._is_silent, self._latest_id = False, -1
         self._doubtful: dict[str, DoubtfulTimes] = {}
-        self.subscription(NetworkFrame, NETWORK_FRAME, self._take, STREAM,
-                          source='detection')
+        if is_fed:
+            self.take_frame = self.direct('detection', [NETWORK_FRAME], self._feed,
+                                          lambda frame: frame.stamp_ns)
+        else:
+            self.subscription(NetworkFrame, NETWORK_FRAME, self._take, STREAM, source='detection')
         steady_timer(self, 0.25, self.end_without_frames)
         self.subscription(CalibrationState, CALIBRATION_STATE, self._calibrated, LATCHED)
         self.report_state()
@@ -135,9 +142,11 @@ class TrackerNode(StageNode):
             self._stage.counts['rejected: bad calibration'] += 1
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return
-        # The message has the latest stretch of each sensor; frames of others may be on their way.
-        self._doubtful = merged(self._doubtful, doubtful_times(message))
-        self._stage.doubt(self._doubtful)
+        if not self._is_fed:
+            # The message has the latest stretch of each sensor; frames of others may be on their
+            # way.
+            self._doubtful = merged(self._doubtful, doubtful_times(message))
+            self._stage.doubt(self._doubtful)
         if _same_orientations(network, self.network):
             return
         self.network = network
@@ -153,8 +162,23 @@ class TrackerNode(StageNode):
             self._stage.counts['rejected: bad frame'] += 1
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return
-        self._publish_all(self._stage.feed(frame))
+        self._feed(frame)
         self._stage.idle()
+
+    def doubt(self, times: Mapping[str, DoubtfulTimes]) -> None:
+        """Doubt tracks of frames in which the background of a sensor is doubtful.
+
+        `times` {sensor: ((begin, end) [ns], ...)} of all, as `calibration.doubtful_times` has them.
+        """
+        self._stage.doubt(times)
+
+    def idle(self) -> None:
+        """Do what may wait until the step before has published its results."""
+        self._stage.idle()
+
+    def _feed(self, frame: FieldFrame) -> None:
+        """What follows from a frame, published."""
+        self._publish_all(self._stage.feed(frame))
         if self._stage.clocks_apart:
             self.get_logger().warning(self._stage.clocks_apart, throttle_duration_sec=60.0)
 
@@ -236,11 +260,6 @@ def publish_if_any(publisher: Publisher, cls: Any, content: MessageDict | None) 
     """Publish a message of class `cls`, unless it is held back."""
     if content is not None:
         publisher.publish(to_message(cls, content))
-
-
-def is_heard(publisher: Publisher) -> bool:
-    """Whether somebody listens: what is large is made for nobody else."""
-    return publisher.get_subscription_count() > 0
 
 
 def _same_orientations(one: SensorNetwork, other: SensorNetwork) -> bool:

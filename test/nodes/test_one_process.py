@@ -1,0 +1,62 @@
+"""`mag-tracking run`: the steps call each other, and their topics are there for who listens."""
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from mag_tracking_msgs.msg import NetworkFrame
+from rclpy.node import Node
+from sensor_msgs.msg import MagneticField
+
+from mag_tracking.messages.schema import stamp_ns
+from mag_tracking.messages.types import NETWORK_FRAME
+from mag_tracking.nodes.runner import make_nodes, run
+from mag_tracking.nodes.stage_node import RESULTS, STREAM
+from mag_tracking.pipeline import settings_for
+from support.bundled import NETWORK_FILE, QUICK, vehicle_path
+
+pytestmark = pytest.mark.timeout(600)
+
+
+class Listener(Node):
+    """Keeps what comes between the steps, in the order in which it comes."""
+
+    def __init__(self):
+        super().__init__('listener')
+        self.frames, self.poses, self.fields, self.statuses = [], [], [], {}
+        self.create_subscription(NetworkFrame, NETWORK_FRAME, self.frames.append, STREAM)
+        self.create_subscription(MagneticField, '/mag_1/imu/mag_calibrated', self.fields.append,
+                                 STREAM)
+        self.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose',
+                                 self.poses.append, STREAM)
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._note, RESULTS)
+
+    def _note(self, message):
+        self.statuses |= {s.name: s for s in message.status}
+
+
+def test_topics_between_the_steps_are_there_for_those_who_listen():
+    holder = []
+    run(NETWORK_FILE, settings_for('vehicle', {**QUICK, 'align.max_wait_s': 5.0}),
+        vehicle_path('straight_car_right'), 4.0,
+        observers=[lambda: holder.append(Listener()) or holder[-1]])
+    (heard,) = holder
+    stamps = [stamp_ns(f.header.stamp) for f in heard.frames]
+    assert len(stamps) > 100 and (np.diff(stamps) > 0).all()
+    assert {stamp_ns(p.header.stamp) for p in heard.poses} <= {*stamps} and len(heard.poses) > 10
+    assert len(heard.fields) > 900
+    # Diagnostics tell of what goes from step to step as if it were messages.
+    for name in ('detection_node: from calibration', 'tracker_node: from detection'):
+        found = [s for key, s in heard.statuses.items() if key == name]
+        assert found and all(s.level == b'\x00' for s in found), (name, found)
+
+
+def test_no_step_listens_to_another_one(ros):
+    stages, _ = make_nodes(NETWORK_FILE, settings_for('vehicle', QUICK))
+    try:
+        for node in stages:
+            topics = {s.topic_name for s in node.subscriptions}
+            assert not any('calibrated' in t or NETWORK_FRAME in t for t in topics), topics
+    finally:
+        for node in stages:
+            node.destroy_node()
