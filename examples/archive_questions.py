@@ -15,6 +15,7 @@ import duckdb
 import mag_tracking as mt
 from mag_tracking.apps.archive import archive
 from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.archive_folder import schema_of
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -49,6 +50,10 @@ def tables_of(folder):
     """A connection of DuckDB that has the tables of an archive as views."""
     connection = duckdb.connect()
     for table in ('tracks', 'poses', 'smoothed', 'passes', 'health'):
+        if not any((folder / table).glob('**/*.parquet')):
+            # Nothing was detected in any recording.
+            connection.register(table, schema_of(table).empty_table())
+            continue
         connection.sql(f"CREATE VIEW {table} AS SELECT * FROM read_parquet("
                        f"'{folder}/{table}/**/*.parquet')")
     return connection

@@ -12,19 +12,19 @@ from pathlib import Path
 from typing import Any
 
 from mag_tracking.apps.archive_work import N_DIPOLES, Job, cut, join, track_stretch
-from mag_tracking.apps.cluster import Cluster, LostWorkersError
+from mag_tracking.apps.cluster import Cluster
 from mag_tracking.apps.readings import network_of
 from mag_tracking.errors import ClusterError, MagTrackingError, OutputError, RecordingError
 from mag_tracking.files import checked_path
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
-from mag_tracking.recording.archive_folder import ArchiveFolder, import_pyarrow, stamped
+from mag_tracking.recording.archive_folder import ArchiveFolder, import_pyarrow, stamped, state_of
 from mag_tracking.recording.reader import SUFFIXES
 
 _Cluster = Cluster[tuple[str, Job]]
 
 METADATA = 'metadata.yaml'
-"""What makes a folder a recording."""
+"""A folder that has one is a recording."""
 
 
 @dataclass
@@ -60,21 +60,32 @@ def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
         path = checked_path(name, RecordingError)
         here = [path] if path.exists() else [Path(p) for p in sorted(
             glob.glob(str(path), recursive=True))]
-        recordings = [r for p in here for r in _recordings_at(p)]
+        recordings = [r for p in here for r in _recordings_at(p, set())]
         if not recordings:
             raise RecordingError(f'{path}: there is no recording ({", ".join(SUFFIXES)})')
-        found.update(dict.fromkeys(r.resolve() for r in recordings))
-    return list(found)
+        found.update(dict.fromkeys(recordings))
+    # A pattern may name a recording and the files in it.
+    return [path for path in found if path.parent not in found]
 
 
-def _recordings_at(path: Path) -> list[Path]:
-    """The recordings at a path: itself, or what is in it."""
-    if path.is_file():
-        return [path] if path.suffix in SUFFIXES else []
-    if (path / METADATA).exists():
+def _recordings_at(path: Path, seen: set[Path]) -> list[Path]:
+    """The recordings at a path: itself, or what is in it; folders that were `seen` are left out.
+
+    A folder that cannot be read is among them, and fails as one.
+    """
+    path = path.resolve()
+    if not path.is_dir():
+        return [path] if path.is_file() and path.suffix.lower() in SUFFIXES else []
+    if path in seen:
+        return []
+    seen.add(path)
+    try:
+        entries = sorted(path.iterdir())
+        if (path / METADATA).exists():
+            return [path]
+    except OSError:
         return [path]
-    return [r for p in sorted(path.iterdir()) if not p.name.startswith('.')
-            for r in _recordings_at(p)]
+    return [r for p in entries if not p.name.startswith('.') for r in _recordings_at(p, seen)]
 
 
 def archive(recordings: Iterable[str | PathLike[str]],
@@ -130,13 +141,15 @@ def archive(recordings: Iterable[str | PathLike[str]],
         todo: list[Path] = []
         for path in paths:
             (todo if dataset.done(path) is None else run.were_done).append(path)
-        if todo:
-            with _Cluster(workers, scheduler) as cluster:
-                _Director(dataset, cluster, network, settings, run, progress, report).work(
-                    todo, stopped or (lambda: False))
-                run.lost_workers = cluster.n_lost
-        dataset.write_recordings([*dataset.known(), *(
-            stamped(path, 0) | {'time': None, 'error': why} for path, why in run.failed.items())])
+        try:
+            if todo:
+                with _Cluster(workers, scheduler) as cluster:
+                    _Director(dataset, cluster, network, settings, run, progress, report).work(
+                        todo, stopped or (lambda: False))
+                    run.lost_workers = cluster.n_lost
+        finally:
+            dataset.write_recordings([*dataset.known(), *(
+                stamped(path, None) | {'error': why} for path, why in run.failed.items())])
     return run
 
 
@@ -159,6 +172,7 @@ class _Director:
         self._network, self._settings = network, settings
         self._progress, self._report = progress or (lambda _: None), report or (lambda _: None)
         self._stretches: Counter[Path] = Counter()
+        self._states: dict[Path, list[list[Any]]] = {}
 
     def work(self, todo: Sequence[Path], stopped: Callable[[], bool]) -> None:
         """Track the recordings; a few at a time, which bounds the files that wait."""
@@ -179,11 +193,12 @@ class _Director:
     def _begin(self, path: Path) -> None:
         """Cut a recording."""
         try:
-            job = Job(path, self._dataset.begin(path), self._dataset.path, self._network,
-                      self._settings)
+            self._states[path] = state_of(path)
         except OSError as error:
             self._fail(path, f'cannot read it: {error.strerror}')
             return
+        job = Job(path, self._dataset.begin(path, self._states[path]), self._dataset.path,
+                  self._network, self._settings)
         self._cluster.submit(('cut', job), 0, cut, job)
 
     def _take(self, kind: str, job: Job, result: Any) -> None:
@@ -194,10 +209,10 @@ class _Director:
         if path in self._run.failed:
             return
         if isinstance(result, BaseException):
-            self._fail(path, str(result) if isinstance(result, MagTrackingError | LostWorkersError)
+            self._fail(path, str(result) if isinstance(result, MagTrackingError)
                        else f'{type(result).__name__}: {result}')
         elif kind == 'join':
-            self._dataset.complete(path, result)
+            self._dataset.complete(path, job.work, self._states[path], result)
             self._run.done.append(path)
             self._run.tracks += result['tracks']
             self._run.passes += result['passes']

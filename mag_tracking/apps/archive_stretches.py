@@ -86,7 +86,10 @@ class StretchWriter:
         last, self._last = self._last, frame
         self.n_frames += 1
         if last is not None and frame.stamp_ns <= last.stamp_ns:
-            # The time jumped back: a track looks back to nothing of before.
+            # The time jumped back: a track looks back to nothing of before. Where frames were left
+            # out, the tracker of the stretch would not see it.
+            if not last.target_present:
+                self.close()
             self._recent.clear()
             self._quiet_since_ns = frame.stamp_ns
         if frame.target_present:

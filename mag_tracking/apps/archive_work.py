@@ -1,14 +1,18 @@
 """What workers do for an archive: cut a recording, track its stretches, join the tables.
 
-Each task leaves files in the folder of its recording and does nothing where they are complete, so
-that it may be run again at any time.
+Each task leaves a folder in that of its recording and does nothing where it is there, so that it
+may be run again at any time.
 """
 
 import copy
 import json
 import pickle
+import secrets
+import shutil
+import tempfile
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,7 +25,7 @@ from mag_tracking.apps.first_pass import first_pass_of
 from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.arrays import IntArray
 from mag_tracking.errors import OutputError
-from mag_tracking.files import new_binary_file, replace_text
+from mag_tracking.files import replace_text
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.archive_folder import TableWriter, join_tables, name_of, stamped
@@ -34,6 +38,9 @@ from mag_tracking.stages.track.rigid_pass import RigidPass
 
 N_DIPOLES = 3
 """Of the rows that passes are fitted with."""
+
+KNOWN, TRACKED_FILE = 'known.json', 'tracked.pickle'
+"""What the tasks tell each other, beside the tables."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +55,14 @@ class Job:
     network: SensorNetwork
     settings: Settings
 
-    def path(self, k: int, table: str) -> Path:
-        """A table of a stretch."""
-        return self.work / f'stretch-{k}.{table}.parquet'
+    @property
+    def cut(self) -> Path:
+        """The folder of what `cut` leaves: stretches, health, and what is known."""
+        return self.work / 'cut'
+
+    def stretch(self, k: int) -> Path:
+        """The folder of what `track_stretch` leaves."""
+        return self.work / f'stretch-{k}'
 
 
 class NotedEvidence(ClockEvidence):
@@ -92,26 +104,54 @@ def cut(job: Job) -> dict[str, Any]:
     MagTrackingError
         If the recording cannot be read, or something cannot be written.
     """
-    done = job.work / 'cut.json'
-    if done.exists():
-        known: dict[str, Any] = json.loads(done.read_text())
-        return known
-    with TableWriter(job.work / 'health.parquet', 'health') as table:
-        known = _Cut(job, table).read()
-    replace_text(done, json.dumps(known))
-    return known
+    if not job.cut.exists():
+        with _attempt(job.cut) as folder:
+            with TableWriter(folder / 'health.parquet', 'health') as table:
+                known = _Cut(job, folder, table).read()
+            replace_text(folder / KNOWN, json.dumps(known))
+    read: dict[str, Any] = json.loads((job.cut / KNOWN).read_text())
+    return read
+
+
+@contextmanager
+def _attempt(final: Path) -> Iterator[Path]:
+    """A folder to write to, which gets the name `final` when all is in it.
+
+    Another attempt at the same task may be going on, on a worker that was taken for lost or for a
+    run that was killed: whichever is the first counts, and both have the same. Raises OutputError.
+    """
+    draft = final.with_name(f'.{secrets.token_hex(8)}.{final.name}')
+    with _written(final):
+        draft.mkdir()
+    try:
+        yield draft
+        if not final.exists():
+            with _written(final):
+                draft.rename(final)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+@contextmanager
+def _written(path: Path) -> Iterator[None]:
+    """Errors of the system name what could not be written, unless it is there by now."""
+    try:
+        yield
+    except OSError as error:
+        if not path.exists():
+            raise OutputError(f'cannot write {path}: {error.strerror}') from error
 
 
 class _Cut:
     """Reads a recording once, with the stages before the tracker."""
 
-    def __init__(self, job: Job, health: TableWriter) -> None:
+    def __init__(self, job: Job, folder: Path, health: TableWriter) -> None:
         self._recording, self._path = Recording(job.recording), job.recording
         self._reader = SampleReader(self._recording, job.network)
         self._passes = PassCollector(job.network, job.settings, self._see)
         first_pass_of(self._recording, job.network, job.settings.calibrate).apply(
             self._passes.calibrate)
-        self._writer = StretchWriter(job.work, job.settings.track.lookback_s)
+        self._writer = StretchWriter(folder, job.settings.track.lookback_s)
         self._health, self._health_table = HealthRows(job.recording, job.network), health
         self._first_ns: int | None = None
         self._last_ns: int | None = None
@@ -127,7 +167,7 @@ class _Cut:
             self._add_health(self._health.rows(self._last_ns, self._passes.calibrate))
         missing = self._reader.missing_topics()
         return {
-            **stamped(self._path, self._first_ns or 0), 'end_ns': self._last_ns,
+            **stamped(self._path, self._first_ns), 'end_ns': self._last_ns,
             'frames': self._writer.n_frames, 'stretches': self._writer.n_stretches,
             'size': self._recording.size, 'lost': _text(self._recording.losses),
             'rejected': _text(self._reader.rejected + Counter(self._passes.rejected)),
@@ -153,36 +193,23 @@ class _Cut:
             self._health_table.add(row)
 
 
-def track_stretch(job: Job, k: int, evidence: NotedEvidence | None = None) -> None:
-    """Track a stretch and fit its passes: its tables.
+def track_stretch(job: Job, k: int) -> None:
+    """Track a stretch and fit its passes: its tables. Raises OutputError."""
+    if not job.stretch(k).exists():
+        with _attempt(job.stretch(k)) as folder:
+            _track_into(folder, job, k, NotedEvidence(len(job.network)))
 
-    Parameters
-    ----------
-    job : Job
-    k : int
-    evidence : NotedEvidence, optional
-        On the clocks, of the stretches before; without, the tables are left where they are.
 
-    Raises OutputError.
-    """
-    done = job.work / f'stretch-{k}.done'
-    if evidence is None and done.exists():
-        return
-    done.unlink(missing_ok=True)
-    evidence = evidence or NotedEvidence(len(job.network))
+def _track_into(folder: Path, job: Job, k: int, evidence: NotedEvidence) -> None:
+    """Track a stretch by the `evidence` on the clocks of those before it; its tables."""
     tracker = TrackManager(job.network, job.settings.track, evidence)
-    with StretchTables(job.recording, {name: job.path(k, name) for name in TRACKED},
+    with StretchTables(job.recording, {name: folder / f'{name}.parquet' for name in TRACKED},
                        N_DIPOLES) as tables:
-        for piece in read_stretch(job.work / f'stretch-{k}.pickle'):
+        for piece in read_stretch(job.cut / f'stretch-{k}.pickle'):
             tables.track(piece, tracker)
         tables.finish(tracker)
-    draft = done.with_suffix('.part')
-    try:
-        with new_binary_file(draft) as stream:
-            pickle.dump(_Tracked(tables.n_tracks, tables.n_passes, evidence), stream)
-        draft.replace(done)
-    except OSError as error:
-        raise OutputError(f'cannot write {done}: {error.strerror}') from error
+    with _written(folder / TRACKED_FILE), open(folder / TRACKED_FILE, 'wb') as stream:
+        pickle.dump(_Tracked(tables.n_tracks, tables.n_passes, evidence), stream)
 
 
 def join(job: Job) -> dict[str, Any]:
@@ -195,31 +222,36 @@ def join(job: Job) -> dict[str, Any]:
     """
     known = cut(job)
     name, evidence = name_of(job.recording), NotedEvidence(len(job.network))
-    shifts, n_tracks, n_passes = [], 0, 0
-    for k in range(known['stretches']):
-        found = _tracked(job, k)
-        together = copy.deepcopy(evidence)
-        for one in found.evidence.passes:
-            together.add(*one)
-        if k and (together.was_apart or found.evidence.was_apart):
+    folders, shifts, n_tracks, n_passes = [], [], 0, 0
+    with tempfile.TemporaryDirectory(dir=job.work, prefix='.again.') as again:
+        for k in range(known['stretches']):
+            folder = job.stretch(k)
+            found = _tracked(folder)
             evidence.passes = []
-            track_stretch(job, k, evidence)
-            found = _tracked(job, k)
-            together = found.evidence
-        evidence = together
-        shifts.append(n_tracks)
-        n_tracks += found.n_tracks
-        n_passes += found.n_passes
-    for table in TRACKED:
-        join_tables([job.path(k, table) for k in range(known['stretches'])],
-                    shifts if table != 'passes' else [0] * len(shifts), table, job.folder, name)
-    join_tables([job.work / 'health.parquet'], [0], 'health', job.folder, name)
+            together = copy.deepcopy(evidence)
+            for one in found.evidence.passes:
+                together.add(*one)
+            if k and (together.was_apart or found.evidence.was_apart):
+                folder = Path(again) / f'stretch-{k}'
+                folder.mkdir()
+                _track_into(folder, job, k, evidence)
+                found = _tracked(folder)
+                together = found.evidence
+            evidence = together
+            folders.append(folder)
+            shifts.append(n_tracks)
+            n_tracks += found.n_tracks
+            n_passes += found.n_passes
+        for table in TRACKED:
+            join_tables([folder / f'{table}.parquet' for folder in folders],
+                        shifts if table != 'passes' else [0] * len(shifts), table, job.folder, name)
+    join_tables([job.cut / 'health.parquet'], [0], 'health', job.folder, name)
     return {**known, 'tracks': n_tracks, 'passes': n_passes, 'error': ''}
 
 
-def _tracked(job: Job, k: int) -> _Tracked:
-    """What `track_stretch` has left of a stretch."""
-    with open(job.work / f'stretch-{k}.done', 'rb') as stream:
+def _tracked(folder: Path) -> _Tracked:
+    """What is left of a stretch beside its tables."""
+    with open(folder / TRACKED_FILE, 'rb') as stream:
         tracked: _Tracked = pickle.load(stream)
     return tracked
 

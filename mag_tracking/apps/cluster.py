@@ -1,26 +1,31 @@
 """A Dask cluster, of this machine or any other, that runs tasks and says what came of each."""
 
+import asyncio
 import logging
 import signal
+import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from concurrent.futures import CancelledError
+from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from mag_tracking.errors import ClusterError, MissingDependencyError
+from mag_tracking.errors import ClusterError, MagTrackingError, MissingDependencyError
 
 if TYPE_CHECKING:
     from distributed import Client, Future
 
 PATIENCE_S = 15.0
 """[s] A scheduler that has not answered by then, or has no worker, does not."""
+ALONE_S = 60.0
+"""[s] A scheduler whose workers are all gone gets others by then, or never."""
 LOOK_S = 0.3
-"""[s] So long is waited for a task before the caller is asked whether to go on."""
+"""[s] Time for which a task is waited for before the caller is asked whether to stop."""
 
 _Key = TypeVar('_Key')
 
 
-class LostWorkersError(ClusterError):
+class LostWorkersError(MagTrackingError):
     """A task took several workers with it."""
 
 
@@ -46,12 +51,13 @@ class Cluster(Generic[_Key]):
         except ImportError as error:
             raise MissingDependencyError(
                 'archives need pyarrow and Dask: pip install "mag_tracking[archive]"') from error
-        # What it has to say is said by us: each lost worker fills pages.
+        # It would fill pages for each worker that is lost.
         logging.getLogger('distributed').setLevel(logging.CRITICAL)
         self._stack = ExitStack()
         self._running: dict[Future[Any], _Key] = {}
         self._seen: set[str] = set()
         self.n_lost = 0
+        self._worked = time.monotonic()
         try:
             self._client = self._stack.enter_context(
                 _local(distributed, self._stack, workers) if scheduler is None
@@ -70,12 +76,12 @@ class Cluster(Generic[_Key]):
 
     @property
     def n_running(self) -> int:
-        """How many tasks are not finished."""
+        """Number of tasks that are not finished."""
         return len(self._running)
 
     @property
     def n_workers(self) -> int:
-        """How many processes there are."""
+        """Number of workers, at least one."""
         return max(1, len(self._seen))
 
     def keys(self) -> list[_Key]:
@@ -94,10 +100,8 @@ class Cluster(Generic[_Key]):
         """
         from distributed import wait
 
-        try:
+        with suppress(TimeoutError), self._scheduler_named():
             wait(list(self._running), timeout=LOOK_S, return_when='FIRST_COMPLETED')
-        except TimeoutError:
-            pass
         self._count_lost()
         for future in [f for f in self._running if f.done()]:
             yield self._running.pop(future), self._result_of(future)
@@ -114,13 +118,27 @@ class Cluster(Generic[_Key]):
         return error or ClusterError('the scheduler gave up a task, or is gone; run it again')
 
     def _count_lost(self) -> None:
-        """Count the workers that were there and are no more."""
-        try:
-            there = set(self._client.scheduler_info(n_workers=-1)['workers'])
-        except OSError as error:
-            raise ClusterError(f'the scheduler is gone: {error}; run it again') from error
+        """Count the workers that were there and are no more; ClusterError where none has come."""
+        with self._scheduler_named():
+            there = set(self._client.nthreads())
         self.n_lost += len(self._seen - there)
         self._seen = there
+        now = time.monotonic()
+        if there:
+            self._worked = now
+        elif now - self._worked > ALONE_S:
+            raise ClusterError('all workers of the scheduler are gone, and no other has come; run '
+                               'it again')
+
+    @contextmanager
+    def _scheduler_named(self) -> Iterator[None]:
+        """Errors of a connection that is gone are those of the scheduler."""
+        try:
+            yield
+        except TimeoutError:
+            raise
+        except (OSError, CancelledError, asyncio.CancelledError) as error:
+            raise ClusterError(f'the scheduler is gone ({error}); run it again') from error
 
 
 def _local(distributed: Any, stack: ExitStack, workers: int) -> 'Client':
@@ -132,7 +150,7 @@ def _local(distributed: Any, stack: ExitStack, workers: int) -> 'Client':
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         cluster = stack.enter_context(distributed.LocalCluster(
-            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None,
+            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=':0',
             # What a task raises comes back as its result.
             silence_logs=logging.CRITICAL,
             # Each has a core for itself.

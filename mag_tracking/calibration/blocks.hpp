@@ -21,6 +21,9 @@ inline void subtract_background(const Sensor& s, double time, const double* fiel
     for (int a = 0; a < 3; ++a) out[a] = field[a] - s.mean[a] - since * s.slope[a];
 }
 
+// How often `b` > 0 fits into `a` >= 0; the quotient may be rounded up to the next whole number.
+inline double whole_times(double a, double b) { return std::round((a - std::fmod(a, b)) / b); }
+
 // Begin the next block where a reading at `time` [s] is the first after the present one. What was
 // complete before (`is_full`) must have been used by now.
 inline void begin_block_if_due(Sensor& s, double time) {
@@ -36,7 +39,7 @@ inline void begin_block_if_due(Sensor& s, double time) {
     else
         // With jittering timestamps the blocks of all sensors would sooner or later end with the
         // same reading, and from then on always.
-        s.end += (std::floor((time - s.end) / s.length) + 1.0) * s.length;
+        s.end += (whole_times(time - s.end, s.length) + 1.0) * s.length;
 }
 
 // Add a reading, `field` (3) [T] at `time` [s], to the present block.

@@ -9,7 +9,14 @@ namespace {
 // Arrays of `Sensor`, `Limits`, `Batch`.
 using Structured = py::array;
 
-Sensor& sensor_of(Structured& sensors) { return Structs<Sensor>(sensors).only(); }
+// Python may have changed what is used as an index.
+Sensor& checked(Sensor& s) {
+    if (s.now < 0 || s.now > 1 || s.n_held < 0 || s.n_held > MOST_HELD + 1 || s.n_steps < 0)
+        throw py::value_error("now, n_held or n_steps of a sensor: out of range");
+    return s;
+}
+
+Sensor& sensor_of(Structured& sensors) { return checked(Structs<Sensor>(sensors).only()); }
 
 Calibrated room_of(Integers& rows, Integers& stamps, Array& fields, Array& covariances) {
     const Size n = length_of(rows, "out_rows", 1);
@@ -30,6 +37,7 @@ int calibrate_readings(Structured sensors, Structured limits, Integers rows, Int
     if (batch.next < 0) throw py::index_error("next: negative");
     for (Size i = batch.next; i < n; ++i) {
         if (in.rows[i] >= all.size()) throw py::index_error("rows: there is no such sensor");
+        if (in.rows[i] >= 0) checked(all.data()[in.rows[i]]);
         if (in.own[i]) input_of(covariances, "covariances", {n, 3, 3});
     }
     return calibrate(all.data(), Structs<Limits>(limits).only(), in, batch,
@@ -44,7 +52,7 @@ bool use_reading(Structured sensors, Structured limits, Structured batches, int6
         throw py::index_error("row: there is no such sensor");
     const Reading reading{stamp, input_of(field, "field", {3}), own,
                           input_of(covariance, "covariance", {3, 3})};
-    return use(all.data()[row], Structs<Limits>(limits).only(), Structs<Batch>(batches).only(), row,
+    return use(checked(all.data()[row]), Structs<Limits>(limits).only(), Structs<Batch>(batches).only(), row,
                reading, room_of(out_rows, out_stamps, out_fields, out_covariances));
 }
 

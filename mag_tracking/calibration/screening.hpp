@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <stdexcept>
 
 #include "sensor.hpp"
 
@@ -170,6 +171,8 @@ inline bool is_back(const Sensor& s, const double* steps) {
 // Before the noise is known (not `is_ready`), recent differences are its measure.
 inline Verdict screen_spike(Sensor& s, double threshold, const Reading& reading) {
     double steps[3] = {NAN, NAN, NAN};
+    // More are never held when a reading comes.
+    if (s.n_held > MOST_HELD) throw std::out_of_range("n_held of a sensor: no room for another");
     if (s.before_ns == NEVER) {
         if (s.n_held) {
             hold(s, reading, steps);

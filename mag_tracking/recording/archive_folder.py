@@ -3,19 +3,22 @@
     DIR/archive.json                    schema, network and settings
     DIR/TABLE/date=2026-03-01/NAME.parquet
     DIR/done/NAME.json                  written last: the recording is complete
-    DIR/work/NAME/                      what an interrupted run goes on with
+    DIR/work/NAME.STATE/                what the next run continues with
 
-NAME is the stem of the recording and a hash of its path. pyarrow is imported when a table is
-written or read.
+NAME is the stem of the recording and a hash of its path, STATE a hash of what its files are.
+pyarrow is imported when a table is written or read.
 """
 
 import datetime
+import glob
 import hashlib
 import json
 import os
+import secrets
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +33,10 @@ if TYPE_CHECKING:
 ROWS = 5000
 """Rows that are kept in memory at once."""
 
+MOST_BYTES = 100
+"""Of the stem of a recording, in the names of its files."""
+
+_PACKAGE = 'mag_tracking'
 _HEAD, _DONE, _WORK, _LOCK = 'archive.json', 'done', 'work', '.lock'
 
 
@@ -56,7 +63,8 @@ def schema_of(table: str) -> 'pa.Schema':
 def name_of(recording: Path) -> str:
     """What the files of a recording are named: the same in every run."""
     path = recording.resolve()
-    return f'{path.stem}-{hashlib.sha256(str(path).encode(errors="replace")).hexdigest()[:8]}'
+    stem = path.stem.encode(errors='replace')[:MOST_BYTES].decode(errors='ignore')
+    return f'{stem}-{_hash(str(path))}'
 
 
 def state_of(recording: Path) -> list[list[Any]]:
@@ -66,6 +74,11 @@ def state_of(recording: Path) -> list[list[Any]]:
     """
     files = sorted(recording.iterdir()) if recording.is_dir() else [recording]
     return [[f.name, f.stat().st_size, f.stat().st_mtime_ns] for f in files if f.is_file()]
+
+
+def _hash(text: str) -> str:
+    """Eight digits that hardly any two texts share."""
+    return hashlib.sha256(text.encode(errors='backslashreplace')).hexdigest()[:8]
 
 
 class ArchiveFolder:
@@ -78,6 +91,8 @@ class ArchiveFolder:
         to a run that is still going on.
         """
         self.path = output_folder(folder)
+        if not (self.path / _HEAD).exists() and any(p.name != _LOCK for p in self.path.iterdir()):
+            raise OutputError(f'{self.path} is not empty and is no archive; take another folder')
         self._lock = self._locked()
         try:
             self._check_head({'schema': VERSION, **head})
@@ -118,9 +133,6 @@ class ArchiveFolder:
         """Compare with those before, or write it; raises OutputError."""
         path = self.path / _HEAD
         if not path.exists():
-            if any(p.name != _LOCK for p in self.path.iterdir()):
-                raise OutputError(f'{self.path} is not empty and is no archive; take another '
-                                  'folder')
             replace_text(path, json.dumps(head, indent=1, sort_keys=True) + '\n')
             return
         before = _read_json(path)
@@ -142,25 +154,34 @@ class ArchiveFolder:
         known = _read_json(path)
         return known if known.get('state') == state_of(recording) else None
 
-    def begin(self, recording: Path) -> Path:
-        """The folder of what is not complete; results of an earlier state of it are removed."""
-        name, state = name_of(recording), json.dumps(state_of(recording))
-        (self.path / _DONE / f'{name}.json').unlink(missing_ok=True)
-        for path in self.path.glob(f'*/date=*/{name}.parquet'):
-            path.unlink()
-        work = self.path / _WORK / name
-        if (work / 'state.json').exists() and (work / 'state.json').read_text() != state:
-            shutil.rmtree(work)
-        output_folder(work)
-        replace_text(work / 'state.json', state)
-        return work
+    def begin(self, recording: Path, state: list[list[Any]]) -> Path:
+        """The folder of what is not complete; results of another state of it are removed.
 
-    def complete(self, recording: Path, known: Mapping[str, Any]) -> None:
-        """All tables of a recording are written: note what is `known` of it."""
-        name = name_of(recording)
-        replace_text(self.path / _DONE / f'{name}.json',
-                     json.dumps({**known, 'state': state_of(recording)}, indent=1) + '\n')
-        shutil.rmtree(self.path / _WORK / name, ignore_errors=True)
+        Raises OutputError.
+        """
+        name, work = name_of(recording), self.path / _WORK
+        own = work / f'{name}.{_hash(json.dumps([VERSION, version(_PACKAGE), state]))}'
+        try:
+            (self.path / _DONE / f'{name}.json').unlink(missing_ok=True)
+            for path in self.path.glob(f'*/date=*/{glob.escape(name)}.parquet'):
+                path.unlink()
+            for path in work.glob(f'*{glob.escape(name)}.*'):
+                if path != own:
+                    _remove(path)
+        except OSError as error:
+            raise OutputError(f'cannot write to {self.path}: {error.strerror}') from error
+        return output_folder(own)
+
+    def complete(self, recording: Path, work: Path, state: list[list[Any]],
+                 known: Mapping[str, Any]) -> None:
+        """All tables of a recording are written: note what is `known` of it.
+
+        `state` is that of the time when it was begun: had it changed meanwhile, the next run would
+        track it again.
+        """
+        replace_text(self.path / _DONE / f'{name_of(recording)}.json',
+                     json.dumps({**known, 'state': state}, indent=1) + '\n')
+        _remove(work)
 
     def write_recordings(self, rows: Iterable[Mapping[str, Any]]) -> None:
         """The table `recordings`, as a whole."""
@@ -181,7 +202,8 @@ class TableWriter:
 
     def __init__(self, path: Path, table: str) -> None:
         self._path, self._schema = path, schema_of(table)
-        self._draft = path.with_name(f'.{path.name}.part')
+        # Another attempt at the same table may be going on, on a worker that was taken for lost.
+        self._draft = path.with_name(f'.{secrets.token_hex(8)}.part')
         self._rows: list[Mapping[str, Any]] = []
         with self._errors_named():
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -212,6 +234,10 @@ class TableWriter:
         """Write the rows."""
         rows, self._rows = self._rows, []
         if rows:
+            # A path need not be UTF-8, and Parquet has no other text.
+            rows = [{name: value.encode(errors='backslashreplace').decode()
+                     if isinstance(value, str) else value for name, value in row.items()}
+                    for row in rows]
             with self._errors_named():
                 self._writer.write_table(
                     import_pyarrow().Table.from_pylist(rows, self._schema))
@@ -229,6 +255,13 @@ class TableWriter:
                     self._draft.replace(self._path)
         finally:
             self._draft.unlink(missing_ok=True)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder; a part of it is never found under its name."""
+    away = folder.with_name(f'.{secrets.token_hex(8)}.{folder.name}')
+    folder.rename(away)
+    shutil.rmtree(away, ignore_errors=True)
 
 
 def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder: Path,
@@ -268,7 +301,7 @@ def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder
     return n
 
 
-def stamped(recording: Path, stamp_ns: int) -> dict[str, Any]:
+def stamped(recording: Path, stamp_ns: int | None) -> dict[str, Any]:
     """The columns that every row begins with."""
     return {'recording': recording.stem, 'source': str(recording), 'stamp_ns': stamp_ns,
             'time': stamp_ns}

@@ -1,14 +1,10 @@
 """Archives: rows are those of replays, nothing is lost or done twice, bad input is named."""
 
 import contextlib
-import json
 import os
 import shutil
 import signal
 import subprocess
-import sys
-import threading
-import time
 
 import duckdb
 import numpy as np
@@ -17,19 +13,15 @@ import pyarrow.parquet as pq
 import pytest
 
 import mag_tracking as mt
-from mag_tracking.apps import archive_stretches, archive_work, cluster
-from mag_tracking.apps.archive import archive, recordings_of
+from mag_tracking.apps import archive_stretches, archive_work
+from mag_tracking.apps.archive import archive
 from mag_tracking.apps.archive_stretches import StretchWriter, read_stretch
 from mag_tracking.apps.archive_work import Job, cut, join, track_stretch
-from mag_tracking.cli import main
-from mag_tracking.errors import ClusterError, OutputError, RecordingError
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
-from mag_tracking.recording.archive_folder import TableWriter
-from mag_tracking.recording.archive_tables import TABLES
 from mag_tracking.records import FieldFrame
-from support.bundled import DATA, NETWORK_FILE, QUICK, parameter_file, vehicle_path
-from support.mqtt_broker import free_port
+from support.archives import archive_recordings, command, rows, same_tables, wait_for
+from support.bundled import DATA, NETWORK_FILE, QUICK
 
 ROAD = DATA / 'two_way_road' / 'two_way_road.mcap'
 NAMES = ('straight_car_right', 'straight_small_left', 'junction_left_to_right')
@@ -46,30 +38,8 @@ def road_network_file(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def recordings(tmp_path_factory):
-    """A folder with three recordings, one in a folder below, and one that is none."""
-    folder = tmp_path_factory.mktemp('recordings')
-    (folder / 'below').mkdir()
-    for name in NAMES:
-        shutil.copy(vehicle_path(name), folder / ('below' if 'junction' in name else '.'))
-    (folder / 'damaged.mcap').write_text('this is no recording')
-    (folder / 'notes.txt').write_text('of the installer')
-    return folder
-
-
-def rows(folder, table):
-    """All rows of a table, in order."""
-    # DuckDB needs another library for times with a zone.
-    columns = [c.name for c in TABLES[table] if c.kind != 't']
-    files = folder / ('recordings.parquet' if table == 'recordings' else f'{table}/**/*.parquet')
-    # Of equal names and stamps the number decides.
-    order = [n for n in ('source', 'track_id', 'number', 'stamp_ns', 'sensor') if n in columns]
-    return duckdb.sql(f"SELECT {', '.join(columns)} FROM read_parquet('{files}') "
-                      f"ORDER BY {', '.join(order)}").fetchall()
-
-
-def same_tables(a, b):
-    """Whether two archives have the same rows; NULL is no NaN."""
-    return all(rows(a, table) == rows(b, table) for table in (*TRACKED, 'health', 'recordings'))
+    """Three recordings and a file that is none."""
+    return archive_recordings(tmp_path_factory.mktemp('recordings'))
 
 
 def archived(folder, recording, network, settings, in_order=True):
@@ -200,21 +170,6 @@ def test_a_run_that_is_stopped_is_gone_on_with(tmp_path, recordings, whole):
     assert same_tables(out, whole)
 
 
-def command(recordings, out, folder, *options):
-    """The command with fast settings."""
-    return [sys.executable, '-m', 'mag_tracking.cli', 'archive', str(recordings), '--network',
-            str(NETWORK_FILE), '--params', str(parameter_file(folder / 'quick.yaml', QUICK)),
-            '--out', str(out), *options]
-
-
-def wait_for(condition, seconds=120.0):
-    """Wait until it holds."""
-    until = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.02)
-
-
 def test_a_run_that_is_killed_is_gone_on_with(tmp_path, recordings, whole):
     out = tmp_path / 'out'
     words = command(recordings, out, tmp_path, '--workers', '1')
@@ -235,139 +190,12 @@ def test_ctrl_c_keeps_what_is_done(tmp_path, recordings):
     process = subprocess.Popen(command(recordings, out, tmp_path, '--workers', '1'),
                                stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
                                start_new_session=True)
-    wait_for(lambda: list(out.glob('work/*/state.json')))
+    wait_for(lambda: list(out.glob('work/*/.*.cut')))
     # As a terminal does it: to all processes.
     os.killpg(process.pid, signal.SIGINT)
     text, errors = process.communicate(timeout=60)
     assert process.returncode == 130 and 'the same command goes on' in text, errors
     assert 'Traceback' not in errors
-
-
-def test_a_lost_worker_costs_nothing_but_time(tmp_path, recordings, whole):
-    out, runs = tmp_path / 'out', []
-    before = {*psutil.Process().children(recursive=True)}
-    thread = threading.Thread(target=lambda: runs.append(archive(
-        [recordings], NETWORK_FILE, settings_for('vehicle', QUICK), out)))
-    thread.start()
-    wait_for(lambda: list(out.glob('work/*/cut.json')))
-    # The youngest are the workers; the others look after them.
-    workers = [p for p in psutil.Process().children(recursive=True) if p not in before
-               and not p.children()]
-    for worker in workers:
-        with contextlib.suppress(psutil.NoSuchProcess):
-            if worker.memory_info().rss > 100e6:
-                worker.kill()
-    thread.join(120)
-    assert runs and len(runs[0].done) == 3 and runs[0].lost_workers >= 1
-    assert same_tables(out, whole)
-
-
-def test_a_folder_of_something_else_is_refused(tmp_path, recordings, whole):
-    settings = settings_for('vehicle', QUICK)
-    some = [recordings / 'straight_car_right.mcap']
-    (tmp_path / 'taken').mkdir()
-    (tmp_path / 'taken' / 'photo.jpg').write_text('')
-    with pytest.raises(OutputError, match='is not empty and is no archive'):
-        archive(some, NETWORK_FILE, settings, tmp_path / 'taken')
-    with pytest.raises(OutputError, match='begun with another settings'):
-        archive(some, NETWORK_FILE, settings_for('vehicle'), whole)
-    other = tmp_path / 'network.yaml'
-    other.write_text(NETWORK_FILE.read_text().replace('4.5', '4.6'))
-    with pytest.raises(OutputError, match='begun with another network'):
-        archive(some, other, settings, whole)
-    old = tmp_path / 'old'
-    shutil.copytree(whole, old)
-    head = json.loads((old / 'archive.json').read_text())
-    (old / 'archive.json').write_text(json.dumps({**head, 'schema': 0}))
-    with pytest.raises(OutputError, match='tables of version 0; this program writes version 1'):
-        archive(some, NETWORK_FILE, settings, old)
-    (old / 'archive.json').write_text('{"schema"')
-    with pytest.raises(OutputError, match='cannot read'):
-        archive(some, NETWORK_FILE, settings, old)
-
-
-def test_two_archives_into_one_folder(tmp_path, recordings):
-    out, lines = tmp_path / 'out', []
-    settings = settings_for('vehicle', QUICK)
-
-    def second():
-        if not lines:
-            with pytest.raises(OutputError, match='another archive is being written into'):
-                archive([recordings], NETWORK_FILE, settings, out)
-            lines.append('refused')
-        return True
-    assert archive([recordings], NETWORK_FILE, settings, out, stopped=second).interrupted
-    assert lines == ['refused']
-
-
-def test_a_scheduler_that_does_not_answer(tmp_path, recordings, monkeypatch):
-    monkeypatch.setattr(cluster, 'PATIENCE_S', 1.0)
-    settings = settings_for('vehicle', QUICK)
-    for address, why in ((f'tcp://127.0.0.1:{free_port()}', 'no Dask scheduler answers'),
-                         ('nonsense://x', 'no Dask scheduler answers')):
-        with pytest.raises(ClusterError, match=why):
-            archive([recordings], NETWORK_FILE, settings, tmp_path / 'out', scheduler=address)
-
-
-def test_a_scheduler_without_workers_and_with(tmp_path, recordings, monkeypatch):
-    from distributed import LocalCluster
-
-    settings = settings_for('vehicle', QUICK)
-    with LocalCluster(n_workers=0, processes=True, dashboard_address=None,
-                      threads_per_worker=1) as there:
-        monkeypatch.setattr(cluster, 'PATIENCE_S', 1.0)
-        with pytest.raises(ClusterError, match='the scheduler has no worker'):
-            archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
-                    scheduler=there.scheduler_address)
-        monkeypatch.undo()
-        there.scale(1)
-        run = archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
-                      scheduler=there.scheduler_address)
-        assert len(run.done) == 3
-
-
-def test_a_full_disk_stops_the_run_and_another_goes_on(tmp_path, recordings, whole):
-    """A limit on the size of a file stands for the disk."""
-    out = tmp_path / 'out'
-    words = command(recordings, out, tmp_path, '--workers', '1')
-    done = subprocess.run(['bash', '-c', 'ulimit -f 30; exec "$@"', '-', *words],
-                          capture_output=True, text=True)
-    assert done.returncode == 1 and 'mag-tracking: cannot write' in done.stderr
-    assert 'Traceback' not in done.stderr and not list(out.glob('done/*.json'))
-    assert subprocess.run(words, capture_output=True).returncode == 1
-    assert same_tables(out, whole)
-
-
-def test_a_table_is_whole_or_not_there(tmp_path):
-    with pytest.raises(RuntimeError), TableWriter(tmp_path / 'a.parquet', 'health') as table:
-        table.add({'stamp_ns': 1})
-        raise RuntimeError
-    assert list(tmp_path.iterdir()) == []
-    (tmp_path / 'file').write_text('')
-    with pytest.raises(OutputError, match='cannot write'):
-        TableWriter(tmp_path / 'file' / 'c.parquet', 'health')
-
-
-def test_names_of_recordings(tmp_path, recordings):
-    found = recordings_of([recordings, recordings / 'straight_*.mcap'])
-    assert [p.name for p in found] == ['junction_left_to_right.mcap', 'damaged.mcap',
-                                       'straight_car_right.mcap', 'straight_small_left.mcap']
-    (tmp_path / 'bag').mkdir()
-    shutil.copy(recordings / 'straight_car_right.mcap', tmp_path / 'bag' / 'a_0.mcap')
-    (tmp_path / 'bag' / 'metadata.yaml').write_text('')
-    assert recordings_of([tmp_path]) == [(tmp_path / 'bag').resolve()]
-    for nothing in (tmp_path / 'none', tmp_path / '*.bag', recordings / 'notes.txt'):
-        with pytest.raises(RecordingError, match='there is no recording'):
-            recordings_of([nothing])
-
-
-def test_command_line_errors(tmp_path, recordings, capsys):
-    words = ['archive', str(recordings), '--network', str(NETWORK_FILE), '--out',
-             str(tmp_path / 'out')]
-    assert main([*words, '--workers', '0']) == 1
-    assert '--workers: expected 1 or more' in capsys.readouterr().err
-    assert main(['archive', str(tmp_path / 'none'), *words[2:]]) == 1
-    assert 'there is no recording' in capsys.readouterr().err
 
 
 def frames(*stretches):

@@ -1,0 +1,257 @@
+"""Archives: what is bad or missing is named, and what is lost is done again."""
+
+import contextlib
+import json
+import os
+import shutil
+import subprocess
+import threading
+
+import psutil
+import pytest
+
+from mag_tracking.apps import cluster
+from mag_tracking.apps.archive import archive, recordings_of
+from mag_tracking.cli import main
+from mag_tracking.errors import ClusterError, OutputError, RecordingError
+from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.archive_folder import ArchiveFolder, TableWriter, name_of, state_of
+from support.archives import archive_recordings, command, rows, same_tables, wait_for
+from support.bundled import NETWORK_FILE, QUICK, vehicle_path
+from support.mqtt_broker import free_port
+
+
+@pytest.fixture(scope='module')
+def recordings(tmp_path_factory):
+    """Three recordings and a file that is none."""
+    return archive_recordings(tmp_path_factory.mktemp('recordings'))
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory, recordings):
+    """The archive that nobody interrupted."""
+    out = tmp_path_factory.mktemp('whole') / 'out'
+    archive([recordings], NETWORK_FILE, settings_for('vehicle', QUICK), out)
+    return out
+
+
+def test_a_lost_worker_costs_nothing_but_time(tmp_path, recordings, whole):
+    out, runs = tmp_path / 'out', []
+    before = {*psutil.Process().children(recursive=True)}
+    thread = threading.Thread(target=lambda: runs.append(archive(
+        [recordings], NETWORK_FILE, settings_for('vehicle', QUICK), out)))
+    thread.start()
+    wait_for(lambda: list(out.glob('work/*/cut')))
+    # The youngest are the workers; the others look after them.
+    workers = [p for p in psutil.Process().children(recursive=True) if p not in before
+               and not p.children()]
+    for worker in workers:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            if worker.memory_info().rss > 100e6:
+                worker.kill()
+    thread.join(120)
+    assert runs and len(runs[0].done) == 3 and runs[0].lost_workers >= 1
+    assert same_tables(out, whole)
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path, recordings, whole):
+    settings = settings_for('vehicle', QUICK)
+    some = [recordings / 'straight_car_right.mcap']
+    (tmp_path / 'taken').mkdir()
+    (tmp_path / 'taken' / 'photo.jpg').write_text('')
+    with pytest.raises(OutputError, match='is not empty and is no archive'):
+        archive(some, NETWORK_FILE, settings, tmp_path / 'taken')
+    with pytest.raises(OutputError, match='begun with another settings'):
+        archive(some, NETWORK_FILE, settings_for('vehicle'), whole)
+    other = tmp_path / 'network.yaml'
+    other.write_text(NETWORK_FILE.read_text().replace('4.5', '4.6'))
+    with pytest.raises(OutputError, match='begun with another network'):
+        archive(some, other, settings, whole)
+    old = tmp_path / 'old'
+    shutil.copytree(whole, old)
+    head = json.loads((old / 'archive.json').read_text())
+    (old / 'archive.json').write_text(json.dumps({**head, 'schema': 0}))
+    with pytest.raises(OutputError, match='tables of version 0; this program writes version 1'):
+        archive(some, NETWORK_FILE, settings, old)
+    (old / 'archive.json').write_text('{"schema"')
+    with pytest.raises(OutputError, match='cannot read'):
+        archive(some, NETWORK_FILE, settings, old)
+
+
+def test_two_archives_into_one_folder(tmp_path, recordings):
+    out, lines = tmp_path / 'out', []
+    settings = settings_for('vehicle', QUICK)
+
+    def second():
+        if not lines:
+            with pytest.raises(OutputError, match='another archive is being written into'):
+                archive([recordings], NETWORK_FILE, settings, out)
+            lines.append('refused')
+        return True
+    assert archive([recordings], NETWORK_FILE, settings, out, stopped=second).interrupted
+    assert lines == ['refused']
+
+
+def test_a_scheduler_that_does_not_answer(tmp_path, recordings, monkeypatch):
+    monkeypatch.setattr(cluster, 'PATIENCE_S', 1.0)
+    settings = settings_for('vehicle', QUICK)
+    for address, why in ((f'tcp://127.0.0.1:{free_port()}', 'no Dask scheduler answers'),
+                         ('nonsense://x', 'no Dask scheduler answers')):
+        with pytest.raises(ClusterError, match=why):
+            archive([recordings], NETWORK_FILE, settings, tmp_path / 'out', scheduler=address)
+
+
+def test_a_scheduler_without_workers_and_with(tmp_path, recordings, monkeypatch):
+    from distributed import LocalCluster
+
+    settings = settings_for('vehicle', QUICK)
+    with LocalCluster(n_workers=0, processes=True, dashboard_address=None,
+                      threads_per_worker=1) as there:
+        monkeypatch.setattr(cluster, 'PATIENCE_S', 1.0)
+        with pytest.raises(ClusterError, match='the scheduler has no worker'):
+            archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
+                    scheduler=there.scheduler_address)
+        monkeypatch.undo()
+        there.scale(1)
+        run = archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
+                      scheduler=there.scheduler_address)
+        assert len(run.done) == 3
+
+
+def test_a_full_disk_stops_the_run_and_another_goes_on(tmp_path, recordings, whole):
+    """A limit on the size of a file stands for the disk."""
+    out = tmp_path / 'out'
+    words = command(recordings, out, tmp_path, '--workers', '1')
+    done = subprocess.run(['bash', '-c', 'ulimit -f 30; exec "$@"', '-', *words],
+                          capture_output=True, text=True)
+    assert done.returncode == 1 and 'mag-tracking: cannot write' in done.stderr
+    assert 'Traceback' not in done.stderr and not list(out.glob('done/*.json'))
+    assert subprocess.run(words, capture_output=True).returncode == 1
+    assert same_tables(out, whole)
+
+
+def test_a_table_is_whole_or_not_there(tmp_path):
+    with pytest.raises(RuntimeError), TableWriter(tmp_path / 'a.parquet', 'health') as table:
+        table.add({'stamp_ns': 1})
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(OutputError, match='cannot write'):
+        TableWriter(tmp_path / 'file' / 'c.parquet', 'health')
+
+
+def test_names_of_recordings(tmp_path, recordings):
+    found = recordings_of([recordings, recordings / 'straight_*.mcap'])
+    assert [p.name for p in found] == ['junction_left_to_right.mcap', 'damaged.mcap',
+                                       'straight_car_right.mcap', 'straight_small_left.mcap']
+    (tmp_path / 'bag').mkdir()
+    shutil.copy(recordings / 'straight_car_right.mcap', tmp_path / 'bag' / 'a_0.mcap')
+    (tmp_path / 'bag' / 'metadata.yaml').write_text('')
+    assert recordings_of([tmp_path]) == [(tmp_path / 'bag').resolve()]
+    for nothing in (tmp_path / 'none', tmp_path / '*.bag', recordings / 'notes.txt'):
+        with pytest.raises(RecordingError, match='there is no recording'):
+            recordings_of([nothing])
+
+
+def test_command_line_errors(tmp_path, recordings, capsys):
+    words = ['archive', str(recordings), '--network', str(NETWORK_FILE), '--out',
+             str(tmp_path / 'out')]
+    assert main([*words, '--workers', '0']) == 1
+    assert '--workers: expected 1 or more' in capsys.readouterr().err
+    assert main(['archive', str(tmp_path / 'none'), *words[2:]]) == 1
+    assert 'there is no recording' in capsys.readouterr().err
+
+
+def test_a_recording_that_grows_while_it_is_tracked_is_tracked_again(tmp_path):
+    """As one that is still being written."""
+    path, out, settings = tmp_path / 'a.mcap', tmp_path / 'out', settings_for('vehicle', QUICK)
+    data = vehicle_path('straight_car_right').read_bytes()
+    path.write_bytes(data[:len(data) // 2])
+
+    def grows():
+        if list(out.glob('work/*')):
+            path.write_bytes(data)
+        return False
+    archive([path], NETWORK_FILE, settings, out, stopped=grows)
+    second = archive([path], NETWORK_FILE, settings, out)
+    assert len(second.done) == 1 and second.tracks == 1
+    assert archive([path], NETWORK_FILE, settings, out).were_done == [path]
+
+
+def test_nothing_of_another_state_of_a_recording_is_used(tmp_path):
+    """Neither tables nor what a run that was killed has left."""
+    path = tmp_path / 'a[1] = ö.mcap'
+    shutil.copy(vehicle_path('straight_car_right'), path)
+    with ArchiveFolder(tmp_path / 'out', {}) as dataset:
+        work = dataset.begin(path, state_of(path))
+        (work / 'cut').mkdir()
+        table = tmp_path / 'out' / 'poses' / 'date=2026-01-01' / f'{name_of(path)}.parquet'
+        table.parent.mkdir(parents=True)
+        table.write_text('')
+        assert dataset.begin(path, state_of(path)) == work and (work / 'cut').is_dir()
+        assert not table.exists()
+        shutil.copy(vehicle_path('straight_small_left'), path)
+        other = dataset.begin(path, state_of(path))
+        assert other != work and not work.exists() and not list(other.iterdir())
+
+
+def test_a_recording_that_kills_its_workers_stops_nobody(tmp_path, recordings, monkeypatch):
+    """A file name that makes a worker end stands for one that needs too much memory."""
+    folder = tmp_path / 'recordings'
+    folder.mkdir()
+    shutil.copy(recordings / 'straight_car_right.mcap', folder / 'good.mcap')
+    shutil.copy(recordings / 'straight_car_right.mcap', folder / 'deadly.mcap')
+    site = tmp_path / 'site'
+    site.mkdir()
+    (site / 'sitecustomize.py').write_text(DEADLY)
+    monkeypatch.setenv('PYTHONPATH', f'{site}:{os.environ.get("PYTHONPATH", "")}')
+    lines = []
+    run = archive([folder], NETWORK_FILE, settings_for('vehicle', QUICK), tmp_path / 'out',
+                  report=lines.append)
+    assert [p.name for p in run.done] == ['good.mcap'] and run.lost_workers >= 1
+    assert 'its worker was lost several times' in run.failed[folder / 'deadly.mcap']
+    assert len(rows(tmp_path / 'out', 'recordings')) == 2
+
+
+DEADLY = '''
+import builtins, os, sys
+if any('spawn' in word for word in sys.argv) or '--multiprocessing-fork' in sys.argv:
+    opened = builtins.open
+    def guarded(file, *arguments, **named):
+        if str(file).endswith('deadly.mcap'):
+            os._exit(1)
+        return opened(file, *arguments, **named)
+    builtins.open = guarded
+'''
+
+
+def test_names_that_parquet_or_the_disk_do_not_like(tmp_path):
+    folder, settings = tmp_path / 'recordings', settings_for('vehicle', QUICK)
+    folder.mkdir()
+    names = ['n' * 245 + '.mcap', os.fsdecode(b'caf\xe9.mcap'), 'a = b, ü.MCAP']
+    for name in names:
+        shutil.copy(vehicle_path('straight_car_right'), folder / name)
+    run = archive([folder], NETWORK_FILE, settings, tmp_path / 'out')
+    assert len(run.done) == 3 and len(rows(tmp_path / 'out', 'tracks')) == 3
+    assert 'caf\\udce9' in {row[0] for row in rows(tmp_path / 'out', 'recordings')}
+
+
+def test_what_is_no_file_is_left_out_and_nothing_is_found_twice(tmp_path):
+    (tmp_path / 'dangling.mcap').symlink_to('nowhere')
+    (tmp_path / 'loop').symlink_to(tmp_path)
+    os.mkfifo(tmp_path / 'pipe.mcap')
+    bag = tmp_path / 'bag'
+    bag.mkdir()
+    shutil.copy(vehicle_path('straight_car_right'), bag / 'bag_0.mcap')
+    (bag / 'metadata.yaml').write_text('')
+    for names in ([tmp_path], [tmp_path / '**'], [bag / '*.mcap', bag], [tmp_path, bag]):
+        assert recordings_of(names) == [bag]
+    assert recordings_of([bag / '*.mcap']) == [bag / 'bag_0.mcap']
+
+
+def test_rows_of_nothing_are_null(tmp_path):
+    (tmp_path / 'empty.mcap').write_bytes(
+        vehicle_path('straight_car_right').read_bytes()[:500])
+    archive([tmp_path], NETWORK_FILE, settings_for('vehicle', QUICK), tmp_path / 'out')
+    (row,) = rows(tmp_path / 'out', 'recordings')
+    assert row[2] is None and row[3] == ''

@@ -1,0 +1,53 @@
+"""Archives of a few bundled recordings."""
+
+import shutil
+import sys
+import time
+
+import duckdb
+
+from mag_tracking.recording.archive_tables import TABLES
+from support.bundled import NETWORK_FILE, QUICK, parameter_file, vehicle_path
+
+NAMES = ('straight_car_right', 'straight_small_left', 'junction_left_to_right')
+
+
+def archive_recordings(folder):
+    """The folder with three recordings, one in a folder below, and one that is none."""
+    (folder / 'below').mkdir()
+    for name in NAMES:
+        shutil.copy(vehicle_path(name), folder / ('below' if 'junction' in name else '.'))
+    (folder / 'damaged.mcap').write_text('this is no recording')
+    (folder / 'notes.txt').write_text('of the installer')
+    return folder
+
+
+def rows(folder, table):
+    """All rows of a table, in order."""
+    # DuckDB needs another library for times with a zone.
+    columns = [c.name for c in TABLES[table] if c.kind != 't']
+    files = folder / ('recordings.parquet' if table == 'recordings' else f'{table}/**/*.parquet')
+    # Of equal names and stamps the number decides.
+    order = [n for n in ('source', 'track_id', 'number', 'stamp_ns', 'sensor') if n in columns]
+    return duckdb.sql(f"SELECT {', '.join(columns)} FROM read_parquet('{files}') "
+                      f"ORDER BY {', '.join(order)}").fetchall()
+
+
+def same_tables(a, b):
+    """Whether two archives have the same rows; NULL is no NaN."""
+    return all(rows(a, table) == rows(b, table) for table in TABLES)
+
+
+def command(recordings, out, folder, *options):
+    """The command with fast settings."""
+    return [sys.executable, '-m', 'mag_tracking.cli', 'archive', str(recordings), '--network',
+            str(NETWORK_FILE), '--params', str(parameter_file(folder / 'quick.yaml', QUICK)),
+            '--out', str(out), *options]
+
+
+def wait_for(condition, seconds=120.0):
+    """Wait until it holds."""
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.02)
