@@ -42,7 +42,8 @@ class StepByStep:
                 used[:, k] = False
             else:
                 prior = bank.x.copy(), bank.P.copy()
-                of_frame, gains = self.update(bank, frame, dt, at)
+                of_frame, gains = self.update(
+                    bank, frame, dt, at, self._settings.iterations if at is None else 1)
                 if leaves_out and self.is_strange(bank, 0, frame):
                     bank.x, bank.P = prior
                     gains, used[:, k] = None, False

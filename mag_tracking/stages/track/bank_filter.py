@@ -132,7 +132,8 @@ class BankFilter:
         intervals : list of n float [s]
             Time from the frame before.
         paths : (n_hyp, n, n_x)
-            Where they are linearised; NaN: at the predictions. Moved, in place.
+            Where they are linearised; NaN: at the predictions, iterated as `advance` does. Moved,
+            in place.
         passes : int
             How often it is done; each time it is linearised where the time before led.
         step : float
@@ -149,7 +150,8 @@ class BankFilter:
         new_x, new_P = np.empty_like(bank.x), np.empty_like(bank.P)
         self._compiled.run_along(
             **self._frames(frames, intervals), first_is_updated=first_is_updated,
-            strange=self._settings.end_nis if leaves_out else np.inf, passes=passes, step=step,
+            strange=self._settings.end_nis if leaves_out else np.inf,
+            iterations=self._settings.iterations, passes=passes, step=step,
             field_error=self._settings.field_error,
             near_field_length=self._near_field_lengths[bank.kind], x=bank.x, P=bank.P,
             new_x=new_x, new_P=new_P, paths=paths, log_likelihood=out.log_likelihood,

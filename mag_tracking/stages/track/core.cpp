@@ -23,7 +23,7 @@ struct Advanced {
 struct Along {
     bool first_is_updated;
     double strange;
-    int passes;
+    int iterations, passes;
     double step;
     double *paths, *log_likelihood, *unsettled, *covariances;
     bool* used;
@@ -78,7 +78,8 @@ INLINE void run_along_all(const Target& target, const Sensors& sensors, const Si
             std::copy(bank.x + p * n_x, bank.x + (p + 1) * n_x, x.data());
             to_wide(bank.P + p * square, n, P.data());
             along.log_likelihood[p] = filter.run(
-                frames, along.first_is_updated, along.strange, bank.near_field_length[p], at,
+                frames, along.first_is_updated, along.strange, along.iterations,
+                bank.near_field_length[p], at,
                 x.data(), P.data(), path);
             if (!filter.smooth(frames, path, smoothed.data(), std.data()))
                 along.log_likelihood[p] = -std::numeric_limits<double>::infinity();
@@ -178,7 +179,8 @@ class CompiledFilter {
     }
 
     void run_along(Array field, Array covariance, Array offset, Array dt, Array decay,
-                   Array variance, bool first_is_updated, double strange, int passes, double step,
+                   Array variance, bool first_is_updated, double strange, int iterations,
+                   int passes, double step,
                    double field_error, Array near_field_length, Array x, Array P, Array new_x,
                    Array new_P, Array paths, Array log_likelihood, Array unsettled,
                    Array covariances, ArrayOf<bool> used) const {
@@ -200,7 +202,7 @@ class CompiledFilter {
                            data_of(new_P, "new_P", {n_hyp, n_x, n_x}), nullptr, nullptr, nullptr};
         const bool wants_covariances = covariances.size() > 0;
         const Along along{
-            first_is_updated, strange, passes, step,
+            first_is_updated, strange, iterations, passes, step,
             data_of(paths, "paths", {n_hyp, n_frames, n_x}),
             data_of(log_likelihood, "log_likelihood", {n_hyp}),
             data_of(unsettled, "unsettled", {n_hyp}),
@@ -247,7 +249,8 @@ void add_filter(py::module_& module, const char* name, Target (*target)(Numbers.
              IN(variance), IN(moves), IN(iterations), IN(field_error), IN(near_field_length),
              IN(x), IN(P), IN(new_x), IN(new_P), IN(predicted), IN(log_likelihood), IN(nis))
         .def("run_along", &Class::run_along, IN(field), IN(covariance), IN(offset), IN(dt),
-             IN(decay), IN(variance), IN(first_is_updated), IN(strange), IN(passes), IN(step),
+             IN(decay), IN(variance), IN(first_is_updated), IN(strange), IN(iterations),
+             IN(passes), IN(step),
              IN(field_error), IN(near_field_length), IN(x), IN(P), IN(new_x), IN(new_P),
              IN(paths), IN(log_likelihood), IN(unsettled), IN(covariances), IN(used));
 }

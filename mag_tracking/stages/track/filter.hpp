@@ -114,24 +114,30 @@ class Filter {
     }
 
     // A hypothesis, `x` (wide) and `P` (n_x, wide), through all frames; the log-likelihood.
-    // Linearised along `path` (n, n_x), or where that is NaN at the predictions. A frame whose
-    // normalised innovation is larger than `strange` per axis is left out.
-    INLINE double run(const Frames& frames, bool first_is_updated, double strange,
+    // Linearised along `path` (n, n_x), or where that is NaN at the predictions and then, in all
+    // `iterations` times, at what came of that. A frame whose normalised innovation is larger than
+    // `strange` per axis is left out.
+    INLINE double run(const Frames& frames, bool first_is_updated, double strange, int iterations,
                       double near_field_length, const double* path, double* x, double* P,
                       Path& out) {
         double total = 0.0;
         std::vector<double> nis(n_.n_sensors);
-        const bool leaves_out = std::isfinite(strange);
-        Numbers prior_x(n_.wide), prior_P(leaves_out ? n_.square() : 0);
+        const bool leaves_out = std::isfinite(strange), goes_back = leaves_out || iterations > 1;
+        Numbers prior_x(n_.wide), prior_P(goes_back ? n_.square() : 0);
         for (int k = 0; k < frames.n; ++k) {
             const Frame frame = frames.at(k, n_);
             if (k) predict(frame, linearised_at(path + (k - 1) * n_.n_x, x), x, P, out.motion[k]);
             out.used[k] = k || !first_is_updated;
             if (out.used[k]) {
-                if (leaves_out) copy(x, P, prior_x.data(), prior_P.data());
-                const double of_frame = update(frame, linearised_at(path + k * n_.n_x, x),
-                                               near_field_length, x, P, out.gains(k, n_),
-                                               nis.data());
+                if (goes_back) copy(x, P, prior_x.data(), prior_P.data());
+                const double* at = path + k * n_.n_x;
+                double of_frame = 0.0;
+                for (int i = 0; i < (std::isnan(at[0]) ? iterations : 1); ++i) {
+                    const double* x_lin = linearised_at(at, x);
+                    if (i) copy(prior_x.data(), prior_P.data(), x, P);
+                    of_frame = update(frame, x_lin, near_field_length, x, P, out.gains(k, n_),
+                                      nis.data());
+                }
                 if (leaves_out && is_strange(frame.field, nis, strange)) {
                     copy(prior_x.data(), prior_P.data(), x, P);
                     out.used[k] = false;
