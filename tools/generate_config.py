@@ -29,17 +29,19 @@ too. DuckDB reads a table with `read_parquet('DIR/tracks/**/*.parquet')`, pandas
 asks how many vehicles an hour there were, how fast they went, which one came again, and which
 sensor drifts.
 
-- **The rows are those of a replay** of each recording by itself, to the last bit. A long
+- **The rows are those of a replay** of each recording by itself, on the same kind of processor to
+  the last bit. A long
   recording is read once, and cut where no target is near for longer than a track looks back; its
   stretches are tracked at the same time. What a track knows of earlier ones (clocks that are
   apart) is added when all are done, and stretches that it changes are tracked once more.
-- **A run goes on where the last one stopped**, however that was. A recording is complete when its
-  tables are; one whose file has changed since is done anew. Another network, other settings or
-  another version of the tables are refused: rows would not be comparable.
-- **A recording that fails stops nobody**; its reason is in `recordings.parquet`, and the next run
-  tries it again. A lost worker costs time only: its tasks are run again, up to three times.
+- **A run continues where the last one stopped**, however that was. A recording is complete when its
+  tables are; one whose file has changed since then is tracked again. Another network, other
+  settings or another version of the tables are refused: rows would not be comparable.
+- **A recording that fails does not stop the others**; its reason is in `recordings.parquet`, and
+  the next run tries it again. A lost worker costs time only: its tasks are run again, up to three
+  times.
 - **A full disk stops the run**: what is complete stays.
-- Memory of a worker does not grow with the recording.
+- Memory of a worker grows with a stretch and with a track, not with the recording.
 
 '''
 

@@ -228,6 +228,6 @@ class _Director:
                 self._cluster.submit(('join', job), 2, join, job)
 
     def _fail(self, path: Path, why: str) -> None:
-        """A recording that cannot be tracked stops nobody."""
+        """A recording that cannot be tracked: the others go on."""
         self._run.failed[path] = why
         self._report(f'{path.name}: {why}')

@@ -17,7 +17,7 @@ _ARCHIVE = '''
 Tracks what is in many recordings, or in long ones, on several processors or machines. The
 rows are those of `mag-tracking replay` of each recording by itself: a long one is cut where no
 target is near. Run it again, and it goes on where it stopped; recordings that are done are left
-alone. One that fails is listed with its reason and stops nobody.
+alone. One that fails is listed with its reason, and the others go on.
 
 Writes to DIR, as Parquet that pandas, DuckDB and polars read (docs/archive.md has the columns):
   tracks/      one row a track          passes/      one row a fitted pass

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 VERSION = 1
-"""Of the tables. A folder with another one is refused: its rows would not be comparable."""
+"""Version of the tables. A folder with another one is refused: rows would not be comparable."""
 
 
 class Column(NamedTuple):
@@ -30,7 +30,7 @@ _WHERE = (
     Column('recording', 's', '', 'name of the recording: the stem of its file'),
     Column('source', 's', '', 'path of the recording'),
     Column('stamp_ns', 'i', 'ns', 'timestamp, since 1970'),
-    Column('time', 't', '', 'the same as a time of UTC'))
+    Column('time', 't', '', 'the timestamp as a time of UTC'))
 _TRACK = (Column('track_id', 'i', '', 'number of the track within the recording'),)
 _STATE = (*_axes('', 'm', 'position in the frame of the network'), *_axes('v', 'm/s', 'velocity'))
 _STATE_SD = (*_axes('sd_', 'm', 'standard deviation of the position'),
@@ -40,46 +40,51 @@ _KIND = (Column('kind', 's', '', 'car or truck; empty for magnets'),)
 
 _POSES = (
     *_WHERE, *_TRACK, *_STATE, *_STATE_SD, *_MOMENT,
-    Column('covariance', 'C', 'm, m/s', 'of position and velocity'),
-    *_KIND, Column('length', 'f', 'm', 'of the row of dipoles'),
+    Column('covariance', 'C', 'm, m/s', 'covariance of position and velocity'),
+    *_KIND, Column('length', 'f', 'm', 'length of the row of dipoles'),
     Column('ambiguous', 'b', '', 'whether the pose is not to be relied on'))
 
 TABLES: dict[str, tuple[Column, ...]] = {
     'tracks': (
-        *_WHERE, *_TRACK, Column('end_ns', 'i', 'ns', 'of the last pose'),
+        *_WHERE, *_TRACK, Column('end_ns', 'i', 'ns', 'timestamp of the last pose'),
         *_columns('i', '', poses='number of published poses'),
         *_columns('s', '', arrival='most probable arrival', kind='most probable kind',
                   verdict='unique or ambiguous', doubts='all doubts that there were'),
-        *_columns('f', '', arrival_weight='its probability', kind_weight='its probability',
+        *_columns('f', '', arrival_weight='probability of the arrival',
+                  kind_weight='probability of the kind',
                   ambiguous_share='share of poses that are ambiguous',
                   nis_per_axis='mean normalised innovation squared; about one is right'),
-        *_columns('f', 'm', length='of the row of dipoles', smallest_sd='deviation where surest'),
-        *_columns('f', 'm/s', speed='where the velocity is surest'),
-        *_columns('f', 'deg', heading_deg='the same, from x towards y'),
+        *_columns('f', 'm', length='length of the row of dipoles',
+                  smallest_sd='smallest standard deviation of the position'),
+        *_columns('f', 'm/s', speed='speed at the surest pose'),
+        *_columns('f', 'deg', heading_deg='direction there, from x towards y'),
         *_MOMENT, *_columns('f', 'A m^2', moment_size='length of the moment'),
-        *_columns('f', 'm/s', smoothed_speed='of the smoothed track; null without one'),
-        *_columns('f', 'A m^2', smoothed_moment_size='the same of the moment')),
+        *_columns('f', 'm/s', smoothed_speed='speed of the smoothed track; null without one'),
+        *_columns('f', 'A m^2', smoothed_moment_size='length of the moment of the smoothed track')),
     'poses': (
-        *_POSES, *_columns('f', '', weight='of the arrival', kind_weight='of the kind'),
-        *_columns('s', '', arrival='of the pose', doubts='names of the doubts')),
+        *_POSES, *_columns('f', '', weight='weight of the hypothesis',
+                  kind_weight='probability of the kind'),
+        *_columns('s', '', arrival='arrival that it assumes', doubts='names of the doubts')),
     'smoothed': _POSES,
     'passes': (
-        *_WHERE, *_columns('i', '', number='of the detection in the recording',
-                           n_dipoles='of the row', n_values='measurements'),
+        *_WHERE, *_columns('i', '', number='number of the detection in the recording',
+                           n_dipoles='dipoles of the fitted row', n_values='measurements'),
         *_columns('s', '', reason='why the fit is not to be believed; empty where it is',
                   trusted='what is to be believed all the same',
                   notes='what was left out of the measurements'),
         *_columns('f', '', normalised_cost='about one where the model is right',
                   explained='share of the energy that the fit explains'),
         *_STATE, *_STATE_SD,
-        *_columns('f', 'm/s', speed='of the fit', sd_speed='its deviation'),
-        *_columns('f', 'deg', heading_deg='of the fit', sd_heading_deg='its deviation'),
-        *_columns('f', 'm', length='of the row', sd_length='its deviation'),
+        *_columns('f', 'm/s', speed='speed of the fit', sd_speed='its standard deviation'),
+        *_columns('f', 'deg', heading_deg='direction of the fit',
+                  sd_heading_deg='its standard deviation'),
+        *_columns('f', 'm', length='length of the row of dipoles',
+                  sd_length='its standard deviation'),
         *_MOMENT, *_axes('sd_m', 'A m^2', 'standard deviation of the moment'),
-        *_columns('f', 'm/s', delay_speed='by the delay between sensors, without a model',
-                  sd_delay_speed='its deviation'),
-        *_columns('f', 'deg', delay_heading_deg='the same of the direction',
-                  sd_delay_heading_deg='its deviation')),
+        *_columns('f', 'm/s', delay_speed='speed by the delay between sensors, without a model',
+                  sd_delay_speed='its standard deviation'),
+        *_columns('f', 'deg', delay_heading_deg='direction by the delay',
+                  sd_delay_heading_deg='its standard deviation')),
     'health': (
         *_WHERE, *_columns('s', '', sensor='name of the sensor'),
         *_columns('i', '', accepted='readings used since the row before',
@@ -95,9 +100,10 @@ TABLES: dict[str, tuple[Column, ...]] = {
                            lost='what could not be read', rejected='readings that were not used',
                            missing_topics='topics of the network that are not in it',
                            why_no_detection='one sentence where nothing was detected'),
-        *_columns('i', 'ns', end_ns='of the last frame'),
-        *_columns('i', '', frames='of the network', tracks='number of tracks',
-                  passes='number of fitted passes', stretches='in which a target was near'),
-        *_columns('i', 'bytes', size='of the recording')),
+        *_columns('i', 'ns', end_ns='timestamp of the last frame'),
+        *_columns('i', '', frames='frames of the network', tracks='number of tracks',
+                  passes='number of fitted passes',
+                  stretches='stretches in which a target was near'),
+        *_columns('i', 'bytes', size='size of the recording')),
 }
 """{table: columns}. Values that are not known are null."""
