@@ -200,18 +200,6 @@ class Hypotheses(Sequence[Hypothesis]):
     """(n, 3)"""
     kinds: tuple[str, ...]
 
-    @classmethod
-    def of(cls, members: Sequence[Hypothesis]) -> 'Hypotheses':
-        """Those of any sequence."""
-        if isinstance(members, Hypotheses):
-            return members
-        states = [[*h.position, *h.velocity] for h in members]
-        return cls(tuple(h.arrival for h in members), np.array([h.weight for h in members]),
-                   np.reshape(states, (-1, 6)).astype(float),
-                   np.reshape([h.covariance for h in members], (-1, 6, 6)).astype(float),
-                   np.reshape([h.moment for h in members], (-1, 3)).astype(float),
-                   tuple(h.kind for h in members))
-
     def __len__(self) -> int:
         return len(self.weights)
 

@@ -131,7 +131,10 @@ class ResultFolder:
 
     def _add_hypotheses(self, track: Track) -> None:
         """One row a hypothesis."""
-        h = Hypotheses.of(track.hypotheses)
+        h = track.hypotheses
+        if not isinstance(h, Hypotheses):
+            assert not h, 'those of a bank come as arrays'
+            return
         sd = np.sqrt(np.diagonal(h.covariances, axis1=1, axis2=2))
         rows = core.number_rows(np.column_stack([h.weights, h.states, sd, h.moments]))
         begin = f'{track.stamp_ns},{track.id},'
