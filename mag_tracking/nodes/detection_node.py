@@ -39,6 +39,7 @@ class DetectionNode(StageNode):
         """
         super().__init__('detection_node', 'align', **node_arguments)
         self._tracker = tracker
+        self._unpublished: FieldFrame | None = None
         self.settings = declare_settings(self, self.settings, 'detect')
         self.settings = declare_settings(self, self.settings, 'events')
         self._align = Align(self.network, self.settings.align)
@@ -54,6 +55,7 @@ class DetectionNode(StageNode):
         if tracker is None:
             self._subscribe()
         else:
+            tracker.behind_pose = self._publish_frame_behind
             self.take_readings = self.direct('calibration', [CALIBRATED_READINGS], self._feed,
                                              lambda readings: int(readings.stamp_ns[-1]))
         self.report_state()
@@ -103,10 +105,15 @@ class DetectionNode(StageNode):
                 elif self._tracker is None:
                     self._publish_frame(record)
                 else:
-                    # The pose comes first.
+                    self._unpublished = record
                     self._tracker.take_frame(record)
-                    if is_heard(self._frames):
-                        self._publish_frame(record)
+                    self._publish_frame_behind()
+
+    def _publish_frame_behind(self) -> None:
+        """Publish the frame that the tracker has, once, where somebody listens."""
+        frame, self._unpublished = self._unpublished, None
+        if frame is not None and is_heard(self._frames):
+            self._publish_frame(frame)
 
     def _publish_frame(self, frame: FieldFrame) -> None:
         """Publish a frame with its verdict."""

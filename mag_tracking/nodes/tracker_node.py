@@ -8,7 +8,7 @@ if __name__ == '__main__':
 
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -79,6 +79,8 @@ class TrackerNode(StageNode):
         """`is_fed`: frames come by `take_frame`, in the process of the other nodes."""
         super().__init__('tracker_node', 'track', **node_arguments)
         self._is_fed = is_fed
+        self.behind_pose: Callable[[], None] | None = None
+        """Called when a pose is out, before all else: a track follows the frame it is of."""
         self._stage = TrackManager(self.network, self.settings.track)
         follow_changes(self, self.settings, lambda s: self._stage.configure(s.track))
         self._child_frame = fixed_parameter(
@@ -214,6 +216,9 @@ class TrackerNode(StageNode):
         if not track.ended:
             # The pose first: it may be steered by.
             publish_if_any(self._pose, PoseWithCovarianceStamped, pose_message_dict(track, frame))
+        if self.behind_pose is not None:
+            self.behind_pose()
+        if not track.ended:
             # Then the hypotheses: a subscriber of the track has them already.
             if is_heard(self._hypotheses):
                 self._hypotheses.publish(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from mag_tracking_msgs.msg import NetworkFrame
+from mag_tracking_msgs.msg import NetworkFrame, TrackArray
 from rclpy.node import Node
 from sensor_msgs.msg import MagneticField
 
@@ -29,7 +29,14 @@ class Listener(Node):
                                  STREAM)
         self.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose',
                                  self.poses.append, STREAM)
+        self.early = 0
+        self.create_subscription(TrackArray, '/tracker_node/tracks', self._track, STREAM)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._note, RESULTS)
+
+    def _track(self, message):
+        """Who draws a track needs its frame."""
+        stamps = {stamp_ns(f.header.stamp) for f in self.frames}
+        self.early += any(stamp_ns(t.header.stamp) not in stamps for t in message.tracks)
 
     def _note(self, message):
         self.statuses |= {s.name: s for s in message.status}
@@ -44,7 +51,7 @@ def test_topics_between_the_steps_are_there_for_those_who_listen():
     stamps = [stamp_ns(f.header.stamp) for f in heard.frames]
     assert len(stamps) > 100 and (np.diff(stamps) > 0).all()
     assert {stamp_ns(p.header.stamp) for p in heard.poses} <= {*stamps} and len(heard.poses) > 10
-    assert len(heard.fields) > 900
+    assert len(heard.fields) > 900 and heard.early == 0
     # Diagnostics tell of what goes from step to step as if it were messages.
     for name in ('detection_node: from calibration', 'tracker_node: from detection'):
         found = [s for key, s in heard.statuses.items() if key == name]

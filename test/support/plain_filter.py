@@ -42,8 +42,7 @@ class StepByStep:
                 used[:, k] = False
             else:
                 prior = bank.x.copy(), bank.P.copy()
-                of_frame, gains = self.update(
-                    bank, frame, dt, at, self._settings.iterations if at is None else 1)
+                of_frame, gains = self.update(bank, frame, dt, at)
                 if leaves_out and self.is_strange(bank, 0, frame):
                     bank.x, bank.P = prior
                     gains, used[:, k] = None, False
@@ -73,8 +72,11 @@ class PlainFilter(StepByStep, BankFilter):
                              decay)
         return F, decay
 
-    def update(self, bank, frame, dt, x_lin=None, iterations=1):
-        """Measurement update in place; (log-likelihood, `plain_kalman.Gains`)."""
+    def update(self, bank, frame, dt, x_lin=None):
+        """Measurement update in place, linearised at `x_lin`, or iterated from the bank;
+        (log-likelihood, `plain_kalman.Gains`).
+        """
+        iterations = self._settings.iterations if x_lin is None else 1
         covariance = np.where(np.isnan(frame.covariance), np.eye(3), frame.covariance)
         x_prior, P_prior = bank.x, bank.P
         x_lin = bank.x.copy() if x_lin is None else x_lin
@@ -102,4 +104,4 @@ class PlainFilter(StepByStep, BankFilter):
         if dt > 0.0:
             self.predict(bank, dt)
         predicted = bank.x.copy()
-        return predicted, self.update(bank, frame, dt, iterations=self._settings.iterations)[0]
+        return predicted, self.update(bank, frame, dt)[0]
