@@ -29,7 +29,7 @@ METADATA = 'metadata.yaml'
 
 @dataclass
 class ArchiveRun:
-    """What came of a run."""
+    """The results of a run."""
 
     done: list[Path] = field(default_factory=list)
     """Recordings that were tracked."""
@@ -88,6 +88,14 @@ def _recordings_at(path: Path, seen: set[Path]) -> list[Path]:
     return [r for p in entries if not p.name.startswith('.') for r in _recordings_at(p, seen)]
 
 
+def size_of(recording: Path) -> int:
+    """Bytes of the files of a recording; 0 where it cannot be read, and will fail."""
+    try:
+        return sum(size for _, size, _ in state_of(recording))
+    except OSError:
+        return 0
+
+
 def archive(recordings: Iterable[str | PathLike[str]],
             network: SensorNetwork | str | PathLike[str], settings: Settings,
             out: str | PathLike[str], workers: int = 1, scheduler: str | None = None,
@@ -140,7 +148,13 @@ def archive(recordings: Iterable[str | PathLike[str]],
     with ArchiveFolder(folder, _head(network, settings)) as dataset:
         todo: list[Path] = []
         for path in paths:
-            (todo if dataset.done(path) is None else run.were_done).append(path)
+            known = dataset.done(path)
+            if known is None:
+                todo.append(path)
+            else:
+                run.were_done.append(path)
+                if progress is not None:
+                    progress(known['size'])
         try:
             if todo:
                 with _Cluster(workers, scheduler) as cluster:
@@ -154,7 +168,7 @@ def archive(recordings: Iterable[str | PathLike[str]],
 
 
 def _head(network: SensorNetwork, settings: Settings) -> dict[str, Any]:
-    """What all runs into a folder have to have in common, JSON-ready."""
+    """The settings that all runs into a folder share, JSON-ready."""
     def plain(value: Any) -> Any:
         return value.tolist() if hasattr(value, 'tolist') else str(value)
     text = json.dumps(dataclasses.asdict(network), default=plain, sort_keys=True)

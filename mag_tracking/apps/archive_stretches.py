@@ -1,9 +1,9 @@
-"""What the tracker needs of a long recording: the stretches in which a target is near.
+"""Cut a long recording into the stretches in which a target is near, for the tracker.
 
-A recording is read once, from its beginning to its end, by all stages before the tracker: their
-backgrounds go on from stretch to stretch. The tracker begins anew in each, and finds what it would
-have found in the whole: a stretch begins with the frames that a track looks back to, and ends where
-it is quiet for longer than that.
+A recording is read once, from its beginning to its end, by all stages before the tracker, which
+keep their backgrounds from stretch to stretch. The tracker starts without memory in each, and finds
+the same as in the whole recording: a stretch begins with the frames that a track looks back to, and
+ends where it is quiet for longer than that.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""What workers do for an archive: cut a recording, track its stretches, join the tables.
+"""The tasks of an archive: cut a recording, track its stretches, join the tables.
 
 Each task leaves a folder in that of its recording and does nothing where it is there, so that it
 may be run again at any time.
@@ -37,10 +37,10 @@ from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.rigid_pass import RigidPass
 
 N_DIPOLES = 3
-"""Of the rows that passes are fitted with."""
+"""Number of dipoles of the rows that passes are fitted with."""
 
 KNOWN, TRACKED_FILE = 'known.json', 'tracked.pickle'
-"""What the tasks tell each other, beside the tables."""
+"""Files in which a task leaves its result for the next one, beside the tables."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Job:
 
     recording: Path
     work: Path
-    """The folder of what is not complete."""
+    """The folder of results that are not complete."""
     folder: Path
     """The folder of the archive."""
     network: SensorNetwork
@@ -89,7 +89,7 @@ class NotedEvidence(ClockEvidence):
 
 @dataclass
 class _Tracked:
-    """What is known of a stretch beside its tables."""
+    """The result of `track_stretch` beside its tables."""
 
     n_tracks: int
     n_passes: int
@@ -97,7 +97,9 @@ class _Tracked:
 
 
 def cut(job: Job) -> dict[str, Any]:
-    """Read the recording: its stretches into files, the table `health`; what is known of it.
+    """Read the recording: its stretches go to files, its health to a table.
+
+    Returns the columns of the recording itself.
 
     Raises
     ------
@@ -158,7 +160,7 @@ class _Cut:
         self._n_passes = 0
 
     def read(self) -> dict[str, Any]:
-        """What is known of the recording; stretches and health are written."""
+        """Write stretches and health; the columns of the recording itself."""
         for readings in self._reader.readings():
             self._add(self._passes.feed(readings))
         self._add(self._passes.flush())
@@ -250,7 +252,7 @@ def join(job: Job) -> dict[str, Any]:
 
 
 def _tracked(folder: Path) -> _Tracked:
-    """What is left of a stretch beside its tables."""
+    """The result of `track_stretch` in a folder, beside its tables."""
     with open(folder / TRACKED_FILE, 'rb') as stream:
         tracked: _Tracked = pickle.load(stream)
     return tracked

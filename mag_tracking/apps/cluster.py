@@ -23,6 +23,8 @@ LOOK_S = 0.3
 """[s] Time for which a task is waited for before the caller is asked whether to stop."""
 
 _Key = TypeVar('_Key')
+# Two classes before Python 3.11.
+_TIME_OUT = (TimeoutError, asyncio.TimeoutError)
 
 
 class LostWorkersError(MagTrackingError):
@@ -85,7 +87,7 @@ class Cluster(Generic[_Key]):
         return max(1, len(self._seen))
 
     def keys(self) -> list[_Key]:
-        """Of the tasks that are not finished."""
+        """The keys of the tasks that are not finished."""
         return list(self._running.values())
 
     def submit(self, key: _Key, priority: int, task: Callable[..., Any], *arguments: Any) -> None:
@@ -100,7 +102,7 @@ class Cluster(Generic[_Key]):
         """
         from distributed import wait
 
-        with suppress(TimeoutError), self._scheduler_named():
+        with suppress(*_TIME_OUT), self._scheduler_named():
             wait(list(self._running), timeout=LOOK_S, return_when='FIRST_COMPLETED')
         self._count_lost()
         for future in [f for f in self._running if f.done()]:
@@ -135,7 +137,7 @@ class Cluster(Generic[_Key]):
         """Errors of a connection that is gone are those of the scheduler."""
         try:
             yield
-        except TimeoutError:
+        except _TIME_OUT:
             raise
         except (OSError, CancelledError, asyncio.CancelledError) as error:
             raise ClusterError(f'the scheduler is gone ({error}); run it again') from error
@@ -169,7 +171,7 @@ def _remote(distributed: Any, address: str) -> 'Client':
         raise ClusterError(f'{address}: no Dask scheduler answers ({error})') from error
     try:
         client.wait_for_workers(1, timeout=PATIENCE_S)
-    except TimeoutError as error:
+    except _TIME_OUT as error:
         client.close()
         raise ClusterError(f'{address}: the scheduler has no worker') from error
     return client

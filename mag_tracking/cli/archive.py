@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from mag_tracking.apps.archive import archive, recordings_of
+from mag_tracking.apps.archive import archive, recordings_of, size_of
 from mag_tracking.cli.options import Commands, add_command, add_recorded_network, recorded_network
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
@@ -55,11 +55,11 @@ def _archive(args: argparse.Namespace) -> int:
     if args.workers < 1:
         raise SettingsError(f'--workers: expected 1 or more, got {args.workers}')
     network, settings = recorded_network(args), settings_of(args)
-    size = sum(f.stat().st_size for path in recordings_of(args.recordings)
-               for f in (path.rglob('*') if path.is_dir() else [path]) if f.is_file())
+    recordings = recordings_of(args.recordings)
     with noted_signals(signal.SIGINT) as seen, \
-            tqdm(total=size, unit='B', unit_scale=True, desc='archive', disable=None) as bar:
-        run = archive(args.recordings, network, settings, args.out, args.workers, args.scheduler,
+            tqdm(total=sum(map(size_of, recordings)), unit='B', unit_scale=True, desc='archive',
+                 disable=None) as bar:
+        run = archive(recordings, network, settings, args.out, args.workers, args.scheduler,
                       bar.update, lambda: bool(seen), tqdm.write)
     print(f'{len(run.done)} recordings tracked: {run.tracks} tracks, {run.passes} passes'
           + (f'; {len(run.were_done)} were done before' if run.were_done else ''))

@@ -3,7 +3,7 @@
     DIR/archive.json                    schema, network and settings
     DIR/TABLE/date=2026-03-01/NAME.parquet
     DIR/done/NAME.json                  written last: the recording is complete
-    DIR/work/NAME.STATE/                what the next run continues with
+    DIR/unfinished/NAME.STATE/          what the next run continues with
 
 NAME is the stem of the recording and a hash of its path, STATE a hash of what its files are.
 pyarrow is imported when a table is written or read.
@@ -37,7 +37,7 @@ MOST_BYTES = 100
 """Of the stem of a recording, in the names of its files."""
 
 _PACKAGE = 'mag_tracking'
-_HEAD, _DONE, _WORK, _LOCK = 'archive.json', 'done', 'work', '.lock'
+_HEAD, _DONE, _WORK, _LOCK = 'archive.json', 'done', 'unfinished', '.lock'
 
 
 def import_pyarrow() -> Any:

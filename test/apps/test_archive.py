@@ -19,8 +19,9 @@ from mag_tracking.apps.archive_stretches import StretchWriter, read_stretch
 from mag_tracking.apps.archive_work import Job, cut, join, track_stretch
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.archive_folder import TableWriter, join_tables, stamped
 from mag_tracking.records import FieldFrame
-from support.archives import archive_recordings, command, rows, same_tables, wait_for
+from support.archives import command, rows, same_tables, wait_for
 from support.bundled import DATA, NETWORK_FILE, QUICK
 
 ROAD = DATA / 'two_way_road' / 'two_way_road.mcap'
@@ -36,15 +37,9 @@ def road_network_file(tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope='module')
-def recordings(tmp_path_factory):
-    """Three recordings and a file that is none."""
-    return archive_recordings(tmp_path_factory.mktemp('recordings'))
-
-
 def archived(folder, recording, network, settings, in_order=True):
     """An archive of one recording without a cluster."""
-    work = folder / 'work'
+    work = folder / 'unfinished'
     work.mkdir(parents=True)
     job = Job(recording, work, folder, network, settings)
     stretches = range(cut(job)['stretches'])
@@ -117,8 +112,7 @@ def test_an_archive_of_recordings(tmp_path, recordings, capsys):
     damaged = (recordings / 'damaged.mcap').resolve()
     assert len(run.done) == 3 and list(run.failed) == [damaged] and not run.interrupted
     assert lines == [f'damaged.mcap: {damaged} is not an MCAP file']
-    assert not list((out / 'work').iterdir()) or [p.name[:7] for p in (out / 'work').iterdir()] \
-        == ['damaged']
+    assert [p.name[:7] for p in (out / 'unfinished').iterdir()] == ['damaged']
     for path in run.done:
         result = mt.track(path, NETWORK_FILE, settings=QUICK)
         found = pq.read_table(out / 'poses', filters=[('source', '=', str(path))]).to_pandas()
@@ -148,14 +142,6 @@ def test_a_recording_that_changed_is_tracked_again(tmp_path, recordings):
     after = rows(tmp_path / 'out', 'poses')
     assert len(run.done) == 1 and before and after and not any(row in before for row in after)
     assert len(rows(tmp_path / 'out', 'recordings')) == 1
-
-
-@pytest.fixture(scope='module')
-def whole(tmp_path_factory, recordings):
-    """The archive that nobody interrupted."""
-    out = tmp_path_factory.mktemp('whole') / 'out'
-    archive([recordings], NETWORK_FILE, settings_for('vehicle', QUICK), out)
-    return out
 
 
 def test_a_run_that_is_stopped_is_gone_on_with(tmp_path, recordings, whole):
@@ -190,7 +176,7 @@ def test_ctrl_c_keeps_what_is_done(tmp_path, recordings):
     process = subprocess.Popen(command(recordings, out, tmp_path, '--workers', '1'),
                                stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
                                start_new_session=True)
-    wait_for(lambda: list(out.glob('work/*/.*.cut')))
+    wait_for(lambda: list(out.glob('unfinished/*/.*.cut')))
     # As a terminal does it: to all processes.
     os.killpg(process.pid, signal.SIGINT)
     text, errors = process.communicate(timeout=60)
@@ -237,3 +223,37 @@ def test_a_time_that_jumps_back_between_stretches_blocks_nothing(tmp_path):
     kept = [f for p in read_stretch(tmp_path / 'stretch-0.pickle') for f, _ in p.frames()]
     assert len(kept) == 31 + 20 + 1
     assert not (tmp_path / 'stretch-1.pickle').exists()
+
+
+def test_doubts_go_with_the_frames_of_a_stretch(tmp_path):
+    """Whenever they change, and at the beginning of each stretch."""
+    writer = StretchWriter(tmp_path, 3.0)
+    first, second = {'mag_1': ((1, None),)}, {'mag_1': ((1, 5),)}
+    for k, f in enumerate(frames((5.0, False), (2.0, True), (9.0, False))):
+        writer.add_frame(f, first if k < 60 else second)
+    writer.close()
+    found = [(f.stamp_ns, doubts) for piece in read_stretch(tmp_path / 'stretch-0.pickle')
+             for f, doubts in piece.frames() if doubts is not None]
+    assert [doubts for _, doubts in found] == [first, second]
+    assert found[0][0] < 5_000_000_000 and found[1][0] == 6_000_000_000
+
+
+def test_rows_are_by_the_day_and_what_is_not_known_is_null(whole):
+    for path in whole.rglob('*-*.parquet'):
+        table = pq.read_table(path, partitioning=None)
+        days = {str(t.date()) for t in table['time'].to_pandas()}
+        assert days == {path.parent.name.removeprefix('date=')}
+        for name, kind in zip(table.schema.names, table.schema.types, strict=True):
+            if str(kind) == 'double':
+                assert not np.isnan(table[name].drop_null().to_numpy()).any(), (path, name)
+
+
+def test_a_recording_over_midnight_is_in_two_days(tmp_path):
+    midnight = 20_000 * 86_400 * 10**9
+    with TableWriter(tmp_path / 'part.parquet', 'health') as table:
+        for k in (-2, -1, 0, 1):
+            table.add({**stamped(tmp_path / 'a.mcap', midnight + k), 'sensor': 'mag_1'})
+    assert join_tables([tmp_path / 'part.parquet'], [0], 'health', tmp_path, 'a') == 4
+    assert {p.parent.name: pq.read_table(p, partitioning=None).num_rows
+            for p in tmp_path.glob('health/*/a.parquet')} == {
+        'date=2024-10-03': 2, 'date=2024-10-04': 2}

@@ -16,23 +16,9 @@ from mag_tracking.cli import main
 from mag_tracking.errors import ClusterError, OutputError, RecordingError
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.archive_folder import ArchiveFolder, TableWriter, name_of, state_of
-from support.archives import archive_recordings, command, rows, same_tables, wait_for
+from support.archives import command, rows, same_tables, wait_for
 from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 from support.mqtt_broker import free_port
-
-
-@pytest.fixture(scope='module')
-def recordings(tmp_path_factory):
-    """Three recordings and a file that is none."""
-    return archive_recordings(tmp_path_factory.mktemp('recordings'))
-
-
-@pytest.fixture(scope='module')
-def whole(tmp_path_factory, recordings):
-    """The archive that nobody interrupted."""
-    out = tmp_path_factory.mktemp('whole') / 'out'
-    archive([recordings], NETWORK_FILE, settings_for('vehicle', QUICK), out)
-    return out
 
 
 def test_a_lost_worker_costs_nothing_but_time(tmp_path, recordings, whole):
@@ -41,7 +27,7 @@ def test_a_lost_worker_costs_nothing_but_time(tmp_path, recordings, whole):
     thread = threading.Thread(target=lambda: runs.append(archive(
         [recordings], NETWORK_FILE, settings_for('vehicle', QUICK), out)))
     thread.start()
-    wait_for(lambda: list(out.glob('work/*/cut')))
+    wait_for(lambda: list(out.glob('unfinished/*/cut')))
     # The youngest are the workers; the others look after them.
     workers = [p for p in psutil.Process().children(recursive=True) if p not in before
                and not p.children()]
@@ -169,7 +155,7 @@ def test_a_recording_that_grows_while_it_is_tracked_is_tracked_again(tmp_path):
     path.write_bytes(data[:len(data) // 2])
 
     def grows():
-        if list(out.glob('work/*')):
+        if list(out.glob('unfinished/*')):
             path.write_bytes(data)
         return False
     archive([path], NETWORK_FILE, settings, out, stopped=grows)
