@@ -62,6 +62,23 @@ INLINE void advance_all(const Target& target, const Sensors& sensors, const Size
     }
 }
 
+// How far smoothed positions are from those of a path `at`, both (n, n_x): the largest distance in
+// deviations `deviation` (n). NaN stays: of such a path nothing is settled.
+INLINE double farthest(const double* smoothed, const double* at, const double* deviation,
+                       int n, int n_x) {
+    double farthest = 0.0;
+    for (int k = 0; k < n; ++k) {
+        double square = 0.0;
+        for (int i = 0; i < 3; ++i) {
+            const double moved = smoothed[k * n_x + i] - at[k * n_x + i];
+            square += moved * moved;
+        }
+        const double moved = std::sqrt(square) / deviation[k];
+        if (!(moved <= farthest) && !std::isnan(farthest)) farthest = moved;
+    }
+    return farthest;
+}
+
 template <class Target>
 INLINE void run_along_all(const Target& target, const Sensors& sensors, const Sizes& n,
                           const Frames& frames, const Bank& bank, const Along& along,
@@ -79,22 +96,10 @@ INLINE void run_along_all(const Target& target, const Sensors& sensors, const Si
             to_wide(bank.P + p * square, n, P.data());
             along.log_likelihood[p] = filter.run(
                 frames, along.first_is_updated, along.strange, along.iterations,
-                bank.near_field_length[p], at,
-                x.data(), P.data(), path);
+                bank.near_field_length[p], at, x.data(), P.data(), path);
             if (!filter.smooth(frames, path, smoothed.data(), std.data()))
                 along.log_likelihood[p] = -std::numeric_limits<double>::infinity();
-            double unsettled = 0.0;
-            for (int k = 0; k < frames.n; ++k) {
-                double square = 0.0;
-                for (int i = 0; i < 3; ++i) {
-                    const double moved = smoothed[k * n_x + i] - at[k * n_x + i];
-                    square += moved * moved;
-                }
-                const double moved = std::sqrt(square) / std[k];
-                // NaN stays: of such a path nothing is settled.
-                if (!(moved <= unsettled) && !std::isnan(unsettled)) unsettled = moved;
-            }
-            along.unsettled[p] = unsettled;
+            along.unsettled[p] = farthest(smoothed.data(), at, std.data(), frames.n, n_x);
             for (int i = 0; i < frames.n * n_x; ++i)
                 at[i] = std::isnan(at[i]) ? smoothed[i]
                                           : at[i] + along.step * (smoothed[i] - at[i]);
