@@ -6,18 +6,18 @@ The texts are those of `definitions`; a recording carries them.
 import functools
 import re
 import struct
+from ast import literal_eval
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Protocol
 
 from mcap.exceptions import McapError
 from mcap.records import Schema
-from mcap_ros2 import _dynamic
 from mcap_ros2.decoder import DecoderFactory
 
 from mag_tracking.errors import RecordingError
+from mag_tracking.messages import core
 from mag_tracking.messages.definitions import DEFINITIONS
-from mag_tracking.messages.shapes import MessageDict
 
 MAGNETIC_FIELD = 'sensor_msgs/msg/MagneticField'
 IMU = 'sensor_msgs/msg/Imu'
@@ -44,7 +44,14 @@ NETWORK_FRAME = 'network_frame'
 
 _BUILT_IN = {'bool', 'byte', 'char', 'string', 'wstring', 'float32', 'float64',
              *(f'{u}int{n}' for u in ('', 'u') for n in (8, 16, 32, 64))}
-_FIELD = re.compile(r'\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[(?:<=)?\d*\])?\s+[A-Za-z]\w*\s*(=?)')
+_FIELD = re.compile(r'\s*(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?:\[(?P<array>(?:<=)?\d*)\])?'
+                    r'\s+(?P<name>[A-Za-z]\w*)\s*(?P<is_constant>=?)(?P<default>[^#]*)')
+
+
+def _full_name(kind: str, package: str) -> str:
+    """The name of a type that a definition of a `package` names."""
+    owner, _, leaf = kind.rpartition('/')
+    return f'{(owner or package).partition("/")[0]}/msg/{leaf}'
 
 
 def named_in(text: str, package: str) -> list[str]:
@@ -52,9 +59,8 @@ def named_in(text: str, package: str) -> list[str]:
     out: list[str] = []
     for line in text.splitlines():
         field = _FIELD.match(line.partition('#')[0])
-        if field and not field[2] and field[1] not in _BUILT_IN:
-            owner, _, leaf = field[1].rpartition('/')
-            name = f'{(owner or package).partition("/")[0]}/msg/{leaf}'
+        if field and not field['is_constant'] and field['type'] not in _BUILT_IN:
+            name = _full_name(field['type'], package)
             if name not in out:
                 out.append(name)
     return out
@@ -95,11 +101,25 @@ def schema_of(type_name: str) -> Schema:
 
 
 @functools.cache
-def encoder(type_name: str) -> Callable[[MessageDict], bytes]:
-    """Function from nested dicts to CDR bytes."""
-    # The library offers this function only through its own writer, which cannot
-    # write channel metadata; the version is pinned, so this private name is safe.
-    return _dynamic.serialize_dynamic(type_name, definition(type_name))[type_name]
+def encoder(type_name: str) -> core.Encoder:
+    """Function from nested dicts to CDR bytes.
+
+    Raises RecordingError for a type that is not defined here.
+    """
+    if type_name not in DEFINITIONS:
+        raise RecordingError(f'no definition of {type_name} to write it with')
+    package, fields = type_name.partition('/')[0], []
+    for line in DEFINITIONS[type_name].splitlines():
+        field = _FIELD.match(line)
+        if field is None or field['is_constant']:
+            continue
+        kind, array = field['type'], field['array']
+        length = core.ONE if array is None else int(array) if array.isdecimal() \
+            else core.SEQUENCE
+        fields.append((field['name'], length,
+                       kind if kind in _BUILT_IN else encoder(_full_name(kind, package)),
+                       literal_eval(field['default']) if field['default'] else None))
+    return core.Encoder(fields)
 
 
 class _Raw(Protocol):

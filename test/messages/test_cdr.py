@@ -1,0 +1,105 @@
+"""The compiled encoder of messages, beside that of another library."""
+
+import io
+import math
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.writer import Writer
+
+from mag_tracking.messages.definitions import DEFINITIONS
+from mag_tracking.messages.types import decode, definition, encoder, schema_of
+from mag_tracking.recording.raw_message import RawMessage
+
+MARKER = 'visualization_msgs/msg/Marker'
+HEADER = 'std_msgs/msg/Header'
+TEXTS = ['', 'a', 'märz', 'sensor_12', '磁力計']
+RANGES = {'bool': (0, 1), 'byte': (0, 255), **{
+    f'{u}int{n}': (0, 2**n - 1) if u else (-2**(n - 1), 2**(n - 1) - 1)
+    for u in ('', 'u') for n in (8, 16, 32, 64)}}
+
+
+def some_value(kind, package, rng):
+    """A value of a type that is named in a definition of a `package`."""
+    if kind == 'string':
+        return TEXTS[rng.integers(len(TEXTS))]
+    if kind.startswith('float'):
+        value = rng.choice([0.0, 1.5, -2.25e-8, math.inf, math.nan, rng.standard_normal()])
+        return float(np.float32(value) if kind == 'float32' else value)
+    if kind in RANGES:
+        low, high = RANGES[kind]
+        value = rng.choice([low, high, (low + high) // 3 + 1])
+        return bool(value) if kind == 'bool' else int(value)
+    owner, _, leaf = kind.rpartition('/')
+    return some_message(f'{owner or package}/msg/{leaf}', rng)
+
+
+def some_message(name, rng):
+    """A message as nested dicts, some of whose fields are missing."""
+    content = {}
+    for line in DEFINITIONS[name].splitlines():
+        kind, field = line.split()[:2]
+        if '=' in line or rng.uniform() < 0.15:
+            continue
+        base, bracket, length = kind.partition('[')
+        n = int(length[:-1] or rng.integers(4)) if bracket else None
+        values = [some_value(base, name.partition('/')[0], rng) for _ in range(n or 1)]
+        content[field] = values[0] if n is None else values[:n]
+    return content
+
+
+def by_the_library(name, messages):
+    """The CDR bytes of each message, as the writer of mcap_ros2 has them."""
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    schema = writer.register_msgdef(name, definition(name))
+    for k, message in enumerate(messages):
+        writer.write_message('/topic', schema, message, log_time=k)
+    writer.finish()
+    stream.seek(0)
+    return [message.data for _, _, message in make_reader(stream).iter_messages()]
+
+
+@pytest.mark.parametrize('name', DEFINITIONS)
+def test_the_bytes_are_those_of_another_library(name):
+    rng = np.random.default_rng(len(name))
+    messages = [some_message(name, rng) for _ in range(12)]
+    assert [encoder(name)(message) for message in messages] == by_the_library(name, messages)
+
+
+def test_what_is_missing_has_its_default():
+    empty = decode(RawMessage('/markers', MARKER, 0, encoder(MARKER)({'pose': None}),
+                              schema_of(MARKER)))
+    orientation = empty.pose.orientation
+    assert (orientation.x, orientation.w) == (0.0, 1.0)
+    assert empty.text == '' and empty.points == [] and empty.frame_locked is False
+
+
+@pytest.mark.parametrize('name, message, error', [
+    (HEADER, {'stamp': {'sec': 2**31}}, ValueError),
+    (HEADER, {'stamp': {'sec': -2**31 - 1}}, ValueError),
+    (HEADER, {'stamp': {'sec': 2**80}}, OverflowError),
+    (HEADER, {'stamp': {'nanosec': -1}}, OverflowError),
+    (HEADER, {'stamp': {'sec': 'soon'}}, ValueError),
+    (HEADER, {'stamp': 7}, TypeError),
+    (HEADER, {'stamp': {'sec': []}}, TypeError),
+    (HEADER, {'frame_id': '\ud800'}, UnicodeEncodeError),
+    ('geometry_msgs/msg/Point', {'x': 'far'}, ValueError),
+    ('geometry_msgs/msg/Point', {'x': {}}, TypeError),
+    ('geometry_msgs/msg/PoseWithCovariance', {'covariance': [0.0] * 35}, ValueError),
+    ('geometry_msgs/msg/PoseWithCovariance', {'covariance': 'nothing'}, TypeError),
+    ('nav_msgs/msg/Path', {'poses': {'x': 1.0}}, TypeError),
+    ('nav_msgs/msg/Path', {'poses': 3}, TypeError)])
+def test_what_does_not_fit_the_type_is_refused(name, message, error):
+    with pytest.raises(error):
+        encoder(name)(message)
+
+
+def test_values_are_taken_as_python_would_take_them():
+    point = encoder('geometry_msgs/msg/Point')
+    assert point({'x': '1.5', 'y': 2, 'z': True}) == point({'x': 1.5, 'y': 2.0, 'z': 1.0})
+    time = encoder('builtin_interfaces/msg/Time')
+    assert time({'sec': np.int32(5), 'nanosec': 7.9}) == time({'sec': 5, 'nanosec': 7})
+    header = encoder(HEADER)
+    assert header({'frame_id': 12}) == header({'frame_id': '12'})
