@@ -4,7 +4,7 @@ Source: T10 section 2.6 and Alg. 3; weights live in logarithms because two
 hypotheses may be thousands of nats apart.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +15,8 @@ _NEGLIGIBLE = np.log(100.0)
 """Hypotheses lighter than the heaviest by more than this have no say in which is published."""
 _SINGULAR = 1e-15
 """A variance that is less than this share of the largest is none, as in `numpy.linalg.pinv`."""
+
+_ARRAYS = ('x', 'P', 'log_w', 'label', 'kind', 'origin', 'nis')
 
 
 def log_sum_exp(a: ArrayLike, axis: int | None = None) -> FloatArray:
@@ -47,6 +49,8 @@ class FilterBank:
     nis: FloatArray
     """(n_hyp, n_sensors) normalised innovation squared of the latest measurement; NaN before it,
     and of a sensor that is missing."""
+    is_shared: bool = field(default=False, init=False)
+    """Another bank has the same arrays: nobody may write into them."""
 
     @classmethod
     def of_targets(cls, x: FloatArray, P: FloatArray, label: IntArray, n_sensors: int,
@@ -103,16 +107,18 @@ class FilterBank:
 
     def copy(self) -> 'FilterBank':
         """The same bank with arrays of its own."""
-        return FilterBank(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
+        return FilterBank(**{name: getattr(self, name).copy() for name in _ARRAYS})
 
     def rows(self, rows: IntArray) -> 'FilterBank':
         """A bank of the hypotheses `rows` (n,) int, weighted alike; its arrays are its own."""
-        chosen = {f.name: np.ascontiguousarray(getattr(self, f.name)[rows]) for f in fields(self)}
+        chosen = {name: np.ascontiguousarray(getattr(self, name)[rows]) for name in _ARRAYS}
         return FilterBank(**{**chosen, 'log_w': np.full(len(rows), -np.log(len(rows)))})
 
     def same(self) -> 'FilterBank':
-        """The same bank with the same arrays, for those who replace them and write into none."""
-        return FilterBank(**{f.name: getattr(self, f.name) for f in fields(self)})
+        """The same bank with the same arrays, which from now on nobody may write into."""
+        out = replace(self)
+        self.is_shared = out.is_shared = True
+        return out
 
     def alone(self, i: int) -> 'FilterBank':
         """A bank of the hypothesis `i` alone; its arrays are its own."""
@@ -175,6 +181,7 @@ class FilterBank:
             self.log_w = self.log_w[mask] - log_sum_exp(self.log_w[mask])
             for name in ('label', 'kind', 'origin', 'nis'):
                 setattr(self, name, getattr(self, name)[mask])
+            self.is_shared = False
         return gone
 
     def prune(self, log_ratio: float, most: int) -> int:

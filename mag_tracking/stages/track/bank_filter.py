@@ -76,21 +76,18 @@ class BankFilter:
             settings.vehicle.lengths if is_vehicle else [0.0]) > CAR_ROW
 
     def move(self, bank: FilterBank, dt: float) -> None:
-        """Time update over `dt` [s]; backwards in time without process noise.
-
-        The arrays that `bank.x` and `bank.P` were stay as they are.
-        """
+        """Time update over `dt` [s]; backwards in time without process noise."""
         n = self._n_sensors
         nowhere = FieldFrame(0, np.full((n, 3), np.nan), np.tile(np.eye(3), (n, 1, 1)),
                              np.zeros(n, dtype=np.int64), np.zeros(n))
         self._advance(bank, nowhere, dt, True, 0)
 
-    def advance(self, bank: FilterBank, frame: FieldFrame, dt: float
+    def advance(self, bank: FilterBank, frame: FieldFrame, dt: float, keeps_prior: bool = False
                 ) -> tuple[FloatArray, FloatArray]:
         """Time update to a frame that comes `dt` [s] after the one before, and update with it.
 
-        The update is linearised as often as the settings say. The arrays that `bank.x` and
-        `bank.P` were stay as they are.
+        The update is linearised as often as the settings say. With `keeps_prior` the arrays that
+        `bank.x` and `bank.P` were stay as they are, which takes longer.
 
         Returns
         -------
@@ -99,15 +96,18 @@ class BankFilter:
         log_likelihood : (n_hyp,)
             Of the frame; -inf where a dipole sits on a sensor.
         """
-        return self._advance(bank, frame, dt, dt > 0.0, self._settings.iterations)
+        return self._advance(bank, frame, dt, dt > 0.0, self._settings.iterations, keeps_prior)
 
     def _advance(self, bank: FilterBank, frame: FieldFrame, dt: float, moves: bool,
-                 iterations: int) -> tuple[FloatArray, FloatArray]:
+                 iterations: int, keeps_prior: bool = False) -> tuple[FloatArray, FloatArray]:
         """(predicted (n_hyp, n_x), log-likelihood (n_hyp,)); without iterations it only moves."""
         n_hyp = len(bank)
         decay, variance = self.observation.drift(np.asarray(dt), self._settings.background_drift)
-        new_x, new_P, predicted = np.empty_like(bank.x), np.empty_like(bank.P), \
-            np.empty_like(bank.x)
+        # Of thousand hypotheses the covariances are read and written at the speed of memory: new
+        # ones would take twice as long.
+        new_x, new_P = (np.empty_like(a) if keeps_prior or bank.is_shared else a
+                        for a in (bank.x, bank.P))
+        predicted = np.empty_like(bank.x)
         log_likelihood, nis = np.zeros(n_hyp), np.full((n_hyp, self._n_sensors), np.nan)
         # By position: names of so many arguments would take as long as a few hypotheses.
         self._compiled.advance(
@@ -115,12 +115,12 @@ class BankFilter:
             self.time_offset(frame, dt), dt, decay, variance, moves, iterations,
             self._settings.field_error, self._near_field_lengths[bank.kind], bank.x, bank.P, new_x,
             new_P, predicted, log_likelihood, nis)
-        bank.x, bank.P, bank.nis = new_x, new_P, nis
+        bank.x, bank.P, bank.nis, bank.is_shared = new_x, new_P, nis, False
         return predicted, log_likelihood
 
     def run_along(self, bank: FilterBank, frames: Sequence[FieldFrame],
                   intervals: Sequence[float], paths: FloatArray, *, passes: int, step: float,
-                  first_is_updated: bool, leaves_out: bool = False,
+                  first_is_updated: bool, enough: float = 0.0, leaves_out: bool = False,
                   wants_covariances: bool = False) -> Along:
         """Filter and smooth each hypothesis along its path, and end with the last frame.
 
@@ -135,11 +135,13 @@ class BankFilter:
             Where they are linearised; NaN: at the predictions, iterated as `advance` does. Moved,
             in place.
         passes : int
-            How often it is done; each time it is linearised where the time before led.
+            How often it is done at most; each time it is linearised where the time before led.
         step : float
             The share of the way that a path is moved to where the smoother has it.
         first_is_updated : bool
             The bank has been updated with the first frame.
+        enough : float
+            A path is done that a pass moved no more than this, in deviations of its position.
         leaves_out : bool
             Frames that contradict a hypothesis are left out.
         wants_covariances : bool
@@ -152,7 +154,7 @@ class BankFilter:
             **self._frames(frames, intervals), first_is_updated=first_is_updated,
             strange=self._settings.end_nis if leaves_out else np.inf,
             iterations=self._settings.iterations, passes=passes, step=step,
-            field_error=self._settings.field_error,
+            enough=enough, field_error=self._settings.field_error,
             near_field_length=self._near_field_lengths[bank.kind], x=bank.x, P=bank.P,
             new_x=new_x, new_P=new_P, paths=paths, log_likelihood=out.log_likelihood,
             unsettled=out.unsettled, covariances=out.covariances, used=out.used)

@@ -34,7 +34,7 @@ LEADING = np.log(1e3)
 """A hypothesis leads that is not lighter than the heaviest by more than this."""
 
 PASSES = 3
-"""Gauss-Newton steps each time; the next time goes on from where they led."""
+"""Gauss-Newton steps each time at most; the next time goes on from where they led."""
 
 STEP = 0.5
 """Each goes so far. Whole ones overshoot where the field is far from linear, and run away."""
@@ -42,6 +42,9 @@ STEP = 0.5
 SETTLED = 0.3
 """In deviations of the position: a path has settled that the last step moved no more than this
 anywhere."""
+
+ENOUGH = 0.1
+"""In the same units: a step that would be shorter is the last one."""
 
 TRIED, IN_VAIN = 'paths linearised anew', 'paths linearised anew in vain'
 """What is counted."""
@@ -72,7 +75,6 @@ class Relinearisation:
 
         As it is now it is the anchor: where the passes start from.
         """
-        # The filter replaces its arrays, and what is written into is new by then.
         self._anchor, self._updated = bank.same(), False
         self._frames: list[FieldFrame] = []
         self._intervals: list[float] = []
@@ -186,7 +188,7 @@ class Relinearisation:
         n = paths.shape[1]
         return bank_filter.run_along(
             bank, self._frames[:n], self._intervals[:n], paths, passes=passes, step=STEP,
-            first_is_updated=self._updated)
+            enough=ENOUGH, first_is_updated=self._updated)
 
 
 def _take(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray) -> None:

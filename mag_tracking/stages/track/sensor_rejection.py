@@ -57,10 +57,12 @@ class SensorRejection:
         counts : Counter
             {what: number}, of the sensors that were left out.
         """
-        # The filter replaces these arrays, it does not write into them.
+        # To keep all states takes as long as the update. Where the leader fits before it, one that
+        # does not will hardly lead after it.
+        may_contradict = not self._fits_leader(bank_filter, bank, frame, dt)
         before = bank.x, bank.P
-        predicted, log_likelihood = bank_filter.advance(bank, frame, dt)
-        if self._fits(bank_filter, bank, frame, log_likelihood):
+        predicted, log_likelihood = bank_filter.advance(bank, frame, dt, keeps_prior=may_contradict)
+        if not may_contradict or self._fits(bank_filter, bank, frame, log_likelihood):
             self._left_out = ()
             return predicted, log_likelihood, frame, Counter()
         whole = bank.x, bank.P, bank.nis, log_likelihood
@@ -106,7 +108,14 @@ class SensorRejection:
                        n_samples=np.where(missing, 0, frame.n_samples),
                        time_offset=np.where(missing, 0.0, frame.time_offset))
         bank.x, bank.P = before
-        return bank_filter.advance(bank, less, dt)[1], less
+        return bank_filter.advance(bank, less, dt, keeps_prior=True)[1], less
+
+    @classmethod
+    def _fits_leader(cls, bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame,
+                     dt: float) -> bool:
+        """Whether the frame will fit the hypothesis that leads before it."""
+        leader = bank.alone(int(np.argmax(bank.log_w)))
+        return cls._fits(bank_filter, leader, frame, bank_filter.advance(leader, frame, dt)[1])
 
     @staticmethod
     def _fits(bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame,

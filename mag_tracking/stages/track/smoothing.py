@@ -102,8 +102,8 @@ class WholeTrack:
         """A track begins with `bank`, before its first frame; its settings stay those of now."""
         self.clear()
         if self._longest_s:
-            # The filter replaces these arrays, it does not write into them.
-            self._start = _Start(copy(bank_filter), bank.x, bank.P, bank.origin)
+            same = bank.same()
+            self._start = _Start(copy(bank_filter), same.x, same.P, same.origin)
 
     def give_up(self) -> None:
         """It cannot be smoothed as a whole."""

@@ -31,13 +31,13 @@ DT = 0.08
 
 
 class Counted(BankFilter):
-    """Counts its updates."""
+    """Counts its updates of whole banks."""
 
     n = 0
 
-    def advance(self, *args, **kwargs):
-        self.n += 1
-        return super().advance(*args, **kwargs)
+    def advance(self, bank, *args, **kwargs):
+        self.n += len(bank) > 1
+        return super().advance(bank, *args, **kwargs)
 
 
 def situation(n=6, seed=0, spread=0.3, n_hyp=5):
@@ -250,8 +250,8 @@ class Ruled(BankFilter):
         super().__init__(*args)
         self._row = row
 
-    def advance(self, bank, frame, dt):
-        predicted, out = super().advance(bank, frame, dt)
+    def advance(self, bank, frame, *args, **kwargs):
+        predicted, out = super().advance(bank, frame, *args, **kwargs)
         there = ~np.isnan(frame.field[self._row]).all()
         return predicted, np.full(len(out), -np.inf) if there else out
 
