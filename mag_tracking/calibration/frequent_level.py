@@ -115,10 +115,9 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, most: int) -> QuietLe
 
 def _densest(means: FloatArray, width: FloatArray) -> IntArray:
     """Rows of (n, k) `means` that are within `width` (k,) of the one with the most such rows."""
-    best: BoolArray = np.zeros(len(means), dtype=bool)
-    for mean in means:
-        near = (np.abs(means - mean) <= width).all(axis=1)
-        if near.sum() > best.sum():
-            best = near
+    near: BoolArray = np.ones((len(means), len(means)), dtype=bool)
+    for axis, widest in zip(means.T, width, strict=True):
+        near &= np.abs(axis[:, None] - axis) <= widest
+    best = near[np.argmax(np.count_nonzero(near, axis=1))]
     centre = np.median(means[best], axis=0)
     return np.flatnonzero((np.abs(means - centre) <= width).all(axis=1))

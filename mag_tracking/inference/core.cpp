@@ -2,7 +2,9 @@
 
 #include "../python.hpp"
 #include "axes.hpp"
+#include "densest.hpp"
 #include "gauss_markov.hpp"
+#include "matrices.hpp"
 
 namespace mag_tracking {
 namespace {
@@ -37,6 +39,22 @@ double step_vectors(Array x, Array P, Array log_w, Array densities, Integers vec
                        y.data(), input_of(variance, "variance", {n_y})}, dt, switch_s);
 }
 
+bool inverses(Array A, double least, Array out) {
+    const Size n = length_of(A, "A", 3), k = A.shape(1);
+    const double* matrices = input_of(A, "A", {n, k, k});
+    double* found = data_of(out, "out", {n, k, k});
+    Inverter inverter(k);
+    for (Size i = 0; i < n; ++i)
+        if (!inverter.invert(matrices + i * k * k, least, found + i * k * k)) return false;
+    return true;
+}
+
+Size densest_of(Array mean, Array covariance, Array log_w) {
+    const Size n = length_of(log_w, "log_w", 1);
+    return densest(n, input_of(mean, "mean", {n, 3}), input_of(covariance, "covariance", {n, 3, 3}),
+                   input_of(log_w, "log_w", {n}));
+}
+
 }  // namespace
 }  // namespace mag_tracking
 
@@ -47,4 +65,6 @@ PYBIND11_MODULE(core, m) {
     m.def("smallest_pivots", &smallest_pivots, IN(y), IN(C), IN(out));
     m.def("step_vectors", &step_vectors, IN(x), IN(P), IN(log_w), IN(densities), IN(vector), IN(H),
           IN(y), IN(variance), py::arg("dt"), py::arg("switch_s"));
+    m.def("inverses", &inverses, IN(A), IN(least), IN(out));
+    m.def("densest", &densest_of, IN(mean), IN(covariance), IN(log_w));
 }

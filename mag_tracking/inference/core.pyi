@@ -13,3 +13,11 @@ def step_vectors(x: FloatArray, P: FloatArray, log_w: FloatArray, densities: Flo
                  switch_s: float) -> float:
     """`GaussMarkovVectors.log_density`; the states (n, n_strengths, 2 m), their covariances and the
     log weights (n, n_strengths) are changed."""
+
+def inverses(A: FloatArray, least: float, out: FloatArray) -> bool:
+    """Inverses of the symmetric `A` (n, k, k) into `out`; False where the least root of a pivot of
+    one, scaled to unit diagonal, is not larger than `least`, or one is not finite."""
+
+def densest(mean: FloatArray, covariance: FloatArray, log_w: FloatArray) -> int:
+    """Which of the means (n, 3) of Gaussians with covariances (n, 3, 3) and weights (n,) their
+    mixture is densest at; -1 where a covariance is not positive definite."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.inference import core
 
 _NEGLIGIBLE = np.log(100.0)
 """Hypotheses lighter than the heaviest by more than this have no say in which is published."""
@@ -91,19 +92,9 @@ class FilterBank:
         rows = self._heaviest(self.label, np.arange(len(self)))
         rows = self._heaviest(self.kind, rows)
         rows = rows[self.log_w[rows] >= self.log_w[rows].max() - _NEGLIGIBLE]
-        try:
-            root = np.linalg.cholesky(self.P[rows, :3, :3])
-        except np.linalg.LinAlgError:
-            root = np.full(1, np.nan)
-        if not np.isfinite(root).all():
-            return int(rows[np.argmax(self.log_w[rows])])
-        # [j, :, i]: position of i in units of hypothesis j.
-        at = np.linalg.inv(root) @ self.x[rows, :3].T
-        each = np.arange(len(rows))
-        d2 = np.square(at - at[each, :, each][:, :, None]).sum(axis=1)
-        log_density = -0.5 * d2 + (self.log_w[rows] - np.log(
-            np.einsum('jii->ji', root)).sum(axis=1))[:, None]
-        return int(rows[np.argmax(log_sum_exp(log_density, axis=0))])
+        densest = core.densest(np.ascontiguousarray(self.x[rows, :3]),
+                               np.ascontiguousarray(self.P[rows, :3, :3]), self.log_w[rows])
+        return int(rows[np.argmax(self.log_w[rows]) if densest < 0 else densest])
 
     def copy(self) -> 'FilterBank':
         """The same bank with arrays of its own."""
@@ -174,10 +165,13 @@ class FilterBank:
 
     def keep(self, mask: BoolArray) -> int:
         """Keep the hypotheses of `mask` and normalise; returns how many went."""
-        gone = int(np.count_nonzero(~mask))
+        rows = np.flatnonzero(mask)
+        gone = len(mask) - len(rows)
         if gone:
-            self.x = np.ascontiguousarray(self.x[mask])
-            self.P = np.ascontiguousarray(self.P[mask])
+            if self.is_shared or len(rows) < len(mask) // 2:
+                self.x, self.P = self.x[rows], self.P[rows]
+            else:
+                self.x, self.P = (_moved_up(a, rows) for a in (self.x, self.P))
             self.log_w = self.log_w[mask] - log_sum_exp(self.log_w[mask])
             for name in ('label', 'kind', 'origin', 'nis'):
                 setattr(self, name, getattr(self, name)[mask])
@@ -192,3 +186,11 @@ class FilterBank:
             mask = np.zeros(len(self), dtype=bool)
             mask[order[:most]] = True
         return self.keep(mask)
+
+
+def _moved_up(a: FloatArray, rows: IntArray) -> FloatArray:
+    """The `rows` (n,), ascending, of an array, at its beginning: what is new takes longer."""
+    for new, old in enumerate(rows.tolist()):
+        if new != old:
+            a[new] = a[old]
+    return a[:len(rows)]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 from scipy.special import logsumexp
 
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
@@ -127,6 +128,21 @@ def test_the_best_is_where_the_mixture_is_densest():
         assert b.best() == 2
 
 
+@pytest.mark.parametrize('spread', [0.5, 5.0, 500.0])
+@pytest.mark.parametrize('n', [1, 2, 60])
+def test_the_densest_mean_is_that_of_the_densities_one_by_one(n, spread):
+    rng = np.random.default_rng(n)
+    for _ in range(20):
+        A = rng.standard_normal((n, 3, 3))
+        b = FilterBank(spread * rng.standard_normal((n, 3)), A @ np.swapaxes(A, 1, 2),
+                       np.log(rng.dirichlet(np.full(n, 3.0))), np.zeros(n, dtype=int),
+                       np.zeros(n, dtype=int), np.arange(n), np.zeros((n, 1)))
+        able = np.flatnonzero(b.log_w >= b.log_w.max() - np.log(100.0))
+        density = sum(np.exp(b.log_w[i]) * multivariate_normal.pdf(b.x[able], b.x[i], b.P[i])
+                      for i in able)
+        assert b.best() == able[np.argmax(density)]
+
+
 def test_separated_weight_counts_only_what_is_apart():
     b = bank(3, spread=1.0)
     b.x[2, 0] = 30.0
@@ -189,3 +205,24 @@ def test_anees_of_the_matched_case():
     assert nees.mean() <= 1.3
     # A covariance that says nothing would pass from below: it must also not be far too wide.
     assert nees.mean() >= 0.7
+
+
+@pytest.mark.parametrize('gone', [[2], [0, 5], [0, 1, 2, 4]])
+@pytest.mark.parametrize('is_shared', [False, True])
+def test_what_is_kept_is_as_it_was_and_a_bank_that_shares_its_arrays_is_not_touched(
+        gone, is_shared):
+    rng = np.random.default_rng(5)
+    x, P = rng.standard_normal((6, 3)), rng.standard_normal((6, 3, 3))
+    bank = FilterBank(x.copy(), P.copy(), np.log(np.arange(1.0, 7.0) / 21.0), np.arange(6),
+                      np.arange(6), np.arange(6), np.zeros((6, 1)))
+    other = bank.same() if is_shared else None
+    mask = ~np.isin(np.arange(6), gone)
+    assert bank.keep(mask) == len(gone)
+    np.testing.assert_array_equal(bank.x, x[mask])
+    np.testing.assert_array_equal(bank.P, P[mask])
+    assert bank.x.flags.c_contiguous and bank.P.flags.c_contiguous
+    np.testing.assert_array_equal(bank.origin, np.flatnonzero(mask))
+    np.testing.assert_allclose(np.exp(bank.log_w).sum(), 1.0)
+    if other is not None:
+        np.testing.assert_array_equal(other.x, x)
+        np.testing.assert_array_equal(other.P, P)

@@ -43,7 +43,7 @@ SETTLED = 0.3
 """In deviations of the position: a path has settled that the last step moved no more than this
 anywhere."""
 
-ENOUGH = 0.1
+ENOUGH = 0.03
 """In the same units: a step that would be shorter is the last one."""
 
 TRIED, IN_VAIN = 'paths linearised anew', 'paths linearised anew in vain'

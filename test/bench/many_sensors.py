@@ -1,0 +1,81 @@
+"""What the start of a track takes where 32 sensors see the target: time, and memory.
+
+    PYTHONPATH=test python -m bench.many_sensors
+
+A car passes along 32 sensors, whose mounting and model error are estimated: with as many of them
+as a track uses by default, and with all. One thread; each in a process of its own.
+"""
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+
+from bench.start import ONE_THREAD
+
+os.environ.update(ONE_THREAD)
+
+import numpy as np  # noqa: E402  (the thread counts have to be set before NumPy is loaded)
+
+from bench.figures import Figures  # noqa: E402
+from mag_tracking.pipeline import Pipeline, settings_for  # noqa: E402
+from mag_tracking.simulation.scenario import Path, point_body  # noqa: E402
+from support.networks import line_network  # noqa: E402
+from support.samples import one, simulate  # noqa: E402
+
+N_SENSORS, SPEED = 32, 15.0
+FRAMES = 20
+"""After so many frames of the track it is enough."""
+
+
+def measured(most_sensors):
+    """Print what a pass took: [s] of the start and of each frame, [MB] at most."""
+    network = line_network(N_SENSORS, tilt=0.02)
+    path = Path(np.array([-60.0, -1.5]), 0.0, SPEED)
+    samples, *_ = simulate(network, point_body([200.0, -150.0, 80.0], 5.0, 0.5), path, 50.0,
+                           12.0, np.random.default_rng(1))
+    pipeline = Pipeline(network, settings_for('vehicle', {
+        'track.most_sensors': most_sensors} if most_sensors else {}))
+    track, starts, frames = pipeline.track, [], []
+    feed = track.feed
+
+    def timed(frame):
+        was_running, begun = track.bank is not None, track.counts['tracks']
+        start = time.perf_counter()
+        out = feed(frame)
+        taken = time.perf_counter() - start
+        if was_running:
+            frames.append(taken)
+        elif track.counts['tracks'] > begun:
+            starts.append(taken)
+        return out
+    track.feed = timed
+    for sample in samples:
+        pipeline.feed(one(sample))
+        if len(frames) >= FRAMES:
+            break
+    megabytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    print(json.dumps({'start': starts[0], 'frame': float(np.mean(frames)), 'memory': megabytes}))
+
+
+def main():
+    """Print the figures; exit status 1 where an aim is missed."""
+    if len(sys.argv) > 1:
+        measured(int(sys.argv[1]))
+        return 0
+    figures = Figures('many_sensors')
+    print(f'a car along {N_SENSORS} sensors, mounting and model error estimated')
+    for name, most in (('those that a track uses by default', 0), ('all', N_SENSORS)):
+        found = json.loads(subprocess.run(
+            [sys.executable, '-m', 'bench.many_sensors', str(most)], check=True,
+            capture_output=True, text=True).stdout)
+        figures.add(f'{name}: start', found['start'], 's', 2.0)
+        figures.add(f'{name}: memory of the process at most', found['memory'], 'MB', 500.0)
+        figures.add(f'{name}: frame, mean', 1e3 * found['frame'], 'ms')
+    return figures.save()
+
+
+if __name__ == '__main__':
+    sys.exit(main())
