@@ -4,7 +4,7 @@ Source: T10 section 2.6 and Alg. 3; weights live in logarithms because two
 hypotheses may be thousands of nats apart.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,8 +16,6 @@ _NEGLIGIBLE = np.log(100.0)
 """Hypotheses lighter than the heaviest by more than this have no say in which is published."""
 _SINGULAR = 1e-15
 """A variance that is less than this share of the largest is none, as in `numpy.linalg.pinv`."""
-
-_ARRAYS = ('x', 'P', 'log_w', 'label', 'kind', 'origin', 'nis')
 
 
 def log_sum_exp(a: ArrayLike, axis: int | None = None) -> FloatArray:
@@ -50,8 +48,6 @@ class FilterBank:
     nis: FloatArray
     """(n_hyp, n_sensors) normalised innovation squared of the latest measurement; NaN before it,
     and of a sensor that is missing."""
-    is_shared: bool = field(default=False, init=False)
-    """Another bank has the same arrays: nobody may write into them."""
 
     @classmethod
     def of_targets(cls, x: FloatArray, P: FloatArray, label: IntArray, n_sensors: int,
@@ -98,18 +94,12 @@ class FilterBank:
 
     def copy(self) -> 'FilterBank':
         """The same bank with arrays of its own."""
-        return FilterBank(**{name: getattr(self, name).copy() for name in _ARRAYS})
+        return FilterBank(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
 
     def rows(self, rows: IntArray) -> 'FilterBank':
         """A bank of the hypotheses `rows` (n,) int, weighted alike; its arrays are its own."""
-        chosen = {name: np.ascontiguousarray(getattr(self, name)[rows]) for name in _ARRAYS}
+        chosen = {f.name: np.ascontiguousarray(getattr(self, f.name)[rows]) for f in fields(self)}
         return FilterBank(**{**chosen, 'log_w': np.full(len(rows), -np.log(len(rows)))})
-
-    def same(self) -> 'FilterBank':
-        """The same bank with the same arrays, which from now on nobody may write into."""
-        out = replace(self)
-        self.is_shared = out.is_shared = True
-        return out
 
     def alone(self, i: int) -> 'FilterBank':
         """A bank of the hypothesis `i` alone; its arrays are its own."""
@@ -164,18 +154,20 @@ class FilterBank:
         return evidence
 
     def keep(self, mask: BoolArray) -> int:
-        """Keep the hypotheses of `mask` and normalise; returns how many went."""
+        """Keep the hypotheses of `mask` and normalise; returns how many went.
+
+        The arrays `x` and `P` may be written into.
+        """
         rows = np.flatnonzero(mask)
         gone = len(mask) - len(rows)
         if gone:
-            if self.is_shared or len(rows) < len(mask) // 2:
+            if len(rows) < len(mask) // 2:
                 self.x, self.P = self.x[rows], self.P[rows]
             else:
                 self.x, self.P = (_moved_up(a, rows) for a in (self.x, self.P))
             self.log_w = self.log_w[mask] - log_sum_exp(self.log_w[mask])
             for name in ('label', 'kind', 'origin', 'nis'):
                 setattr(self, name, getattr(self, name)[mask])
-            self.is_shared = False
         return gone
 
     def prune(self, log_ratio: float, most: int) -> int:

@@ -1,11 +1,14 @@
 """The filter bank: weights in logarithms, pruning, merging, the verdict, and its statistics."""
 
+from copy import copy
+
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
 from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
 
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
+from mag_tracking.inference.starting_bank import StartingBank
 from mag_tracking.physics.dipole import MU0, sensor_fields
 from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.stages.track.initiation_vehicle import moment_directions
@@ -207,22 +210,38 @@ def test_anees_of_the_matched_case():
     assert nees.mean() >= 0.7
 
 
+def random_bank(n, n_x, n_sensors=1):
+    rng = np.random.default_rng(n)
+    A = rng.standard_normal((n, n_x, n_x))
+    return FilterBank(rng.standard_normal((n, n_x)), A @ np.swapaxes(A, 1, 2),
+                      np.log(rng.dirichlet(np.ones(n))), np.arange(n) % 2, np.arange(n) % 3,
+                      np.arange(n), np.zeros((n, n_sensors)))
+
+
 @pytest.mark.parametrize('gone', [[2], [0, 5], [0, 1, 2, 4]])
-@pytest.mark.parametrize('is_shared', [False, True])
-def test_what_is_kept_is_as_it_was_and_a_bank_that_shares_its_arrays_is_not_touched(
-        gone, is_shared):
-    rng = np.random.default_rng(5)
-    x, P = rng.standard_normal((6, 3)), rng.standard_normal((6, 3, 3))
-    bank = FilterBank(x.copy(), P.copy(), np.log(np.arange(1.0, 7.0) / 21.0), np.arange(6),
-                      np.arange(6), np.arange(6), np.zeros((6, 1)))
-    other = bank.same() if is_shared else None
-    mask = ~np.isin(np.arange(6), gone)
+def test_what_is_kept_is_as_it_was(gone):
+    bank = random_bank(6, 3)
+    before, mask = bank.copy(), ~np.isin(np.arange(6), gone)
     assert bank.keep(mask) == len(gone)
-    np.testing.assert_array_equal(bank.x, x[mask])
-    np.testing.assert_array_equal(bank.P, P[mask])
+    np.testing.assert_array_equal(bank.x, before.x[mask])
+    np.testing.assert_array_equal(bank.P, before.P[mask])
     assert bank.x.flags.c_contiguous and bank.P.flags.c_contiguous
     np.testing.assert_array_equal(bank.origin, np.flatnonzero(mask))
     np.testing.assert_allclose(np.exp(bank.log_w).sum(), 1.0)
-    if other is not None:
-        np.testing.assert_array_equal(other.x, x)
-        np.testing.assert_array_equal(other.P, P)
+
+
+def test_a_start_gives_the_rows_of_the_bank_that_it_was_made_of():
+    """Whatever has become of that bank, and of a start that has the same arrays."""
+    of_targets = random_bank(5, 4)
+    own = np.array([np.diag([1.0, 2.0]), np.diag([3.0, 4.0])])
+    bank = FilterBank.of_targets(of_targets.x, of_targets.P, of_targets.label, 2, 1e-8, own,
+                                 of_targets.kind)
+    before, start = bank.copy(), StartingBank.of(bank, 4)
+    other = copy(start)
+    bank.x[:], bank.P[:] = np.nan, np.nan
+    other.keep(np.array([False, False, True, False, True]))
+    for made, rows in ((start.rows(np.array([4, 1])), [4, 1]), (other.rows(np.arange(2)), [2, 4])):
+        for name in ('x', 'P', 'label', 'kind', 'origin', 'nis'):
+            np.testing.assert_array_equal(getattr(made, name), getattr(before, name)[rows])
+        np.testing.assert_allclose(np.exp(made.log_w), 0.5)
+    assert len(start) == 5 and len(other) == 2

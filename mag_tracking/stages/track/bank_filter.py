@@ -87,7 +87,7 @@ class BankFilter:
         """Time update to a frame that comes `dt` [s] after the one before, and update with it.
 
         The update is linearised as often as the settings say. With `keeps_prior` the arrays that
-        `bank.x` and `bank.P` were stay as they are, which takes longer.
+        `bank.x` and `bank.P` were stay as they are, which takes longer; else they are written into.
 
         Returns
         -------
@@ -105,7 +105,7 @@ class BankFilter:
         decay, variance = self.observation.drift(np.asarray(dt), self._settings.background_drift)
         # Of thousand hypotheses the covariances are read and written at the speed of memory: new
         # ones would take twice as long.
-        new_x, new_P = (np.empty_like(a) if keeps_prior or bank.is_shared else a
+        new_x, new_P = (np.empty_like(a) if keeps_prior else a
                         for a in (bank.x, bank.P))
         predicted = np.empty_like(bank.x)
         log_likelihood, nis = np.zeros(n_hyp), np.full((n_hyp, self._n_sensors), np.nan)
@@ -115,7 +115,7 @@ class BankFilter:
             self.time_offset(frame, dt), dt, decay, variance, moves, iterations,
             self._settings.field_error, self._near_field_lengths[bank.kind], bank.x, bank.P, new_x,
             new_P, predicted, log_likelihood, nis)
-        bank.x, bank.P, bank.nis, bank.is_shared = new_x, new_P, nis, False
+        bank.x, bank.P, bank.nis = new_x, new_P, nis
         return predicted, log_likelihood
 
     def run_along(self, bank: FilterBank, frames: Sequence[FieldFrame],

@@ -12,18 +12,46 @@ from mag_tracking.stages.track.settings import TrackSettings
 MOST_BYTES = 4 << 30
 """Limit for the covariances of all starting hypotheses, and for the grid of a magnet. Peak memory
 is 1.5 times as much."""
+START_BYTES = 250_000_000
+"""The covariances of all starting hypotheses take no more than this, if need be with fewer sensors;
+the others come in when the track has run through the frames before its detection."""
+LEAST_AT_START = 4
+"""Those nearest to the strongest, with which every track starts."""
+WIDER_BYTES = 100_000_000
+"""Then so many hypotheses are kept that their covariances take no more than this."""
 _FLOAT_BYTES = 8
 
 
 def check_vehicle_bank(settings: TrackSettings, network: SensorNetwork,
                        model: SourceModel) -> None:
     """Raise SettingsError where the starting hypotheses of a vehicle take too much memory."""
+    _check_bank('track.vehicle', _vehicle_factors(settings), settings,
+                sensors_at_start(settings, network, model), model)
+
+
+def _vehicle_factors(settings: TrackSettings) -> dict[str, int]:
+    """What the starting hypotheses of a vehicle are the product of."""
     vehicle = settings.vehicle
-    _check_bank('track.vehicle', {
-        **{name: len(getattr(vehicle, name))
-           for name in ('kinds', 'arrival_names', 'lateral_offsets', 'speeds')},
-        'moment directions': len(moment_directions()),
-        'turning or not': 2 if vehicle.turn_acceleration else 1}, settings, network, model)
+    return {**{name: len(getattr(vehicle, name))
+               for name in ('kinds', 'arrival_names', 'lateral_offsets', 'speeds')},
+            'moment directions': len(moment_directions()),
+            'turning or not': 2 if vehicle.turn_acceleration else 1}
+
+
+def sensors_at_start(settings: TrackSettings, network: SensorNetwork, model: SourceModel) -> int:
+    """How many sensors a track starts with."""
+    most = _n_sensors(settings, network)
+    if settings.target != 'vehicle':
+        return most
+    n_hyp = math.prod(_vehicle_factors(settings).values())
+    n_states = math.isqrt(START_BYTES // (_FLOAT_BYTES * n_hyp))
+    affordable = (n_states - len(model.state_names)) // _states_per_sensor(settings)
+    return min(most, max(affordable, LEAST_AT_START))
+
+
+def most_hypotheses(n_states: int) -> int:
+    """How many are kept of a track that from now on has states of more sensors."""
+    return max(1, WIDER_BYTES // (_FLOAT_BYTES * n_states**2))
 
 
 def check_magnet_bank(settings: TrackSettings, network: SensorNetwork,
@@ -35,14 +63,16 @@ def check_magnet_bank(settings: TrackSettings, network: SensorNetwork,
     if size > MOST_BYTES:
         raise SettingsError(f'track.magnet.grid_points: {magnet.grid_points} points x {n} sensors '
                             f'need {_gigabytes(size)}, more than {_gigabytes(MOST_BYTES)}')
-    _check_bank('track.magnet', {'starts': magnet.starts}, settings, network, model)
+    _check_bank('track.magnet', {'starts': magnet.starts}, settings, n, model)
 
 
-def _check_bank(group: str, factors: Mapping[str, int], settings: TrackSettings,
-                network: SensorNetwork, model: SourceModel) -> None:
-    """Compare the covariances of the product of `factors` {name: number} with `MOST_BYTES`."""
-    n, n_own = _n_sensors(settings, network), _states_per_sensor(settings)
-    n_hyp, n_x = math.prod(factors.values()), len(model.state_names) + n_own * n
+def _check_bank(group: str, factors: Mapping[str, int], settings: TrackSettings, n: int,
+                model: SourceModel) -> None:
+    """Compare the covariances of the product of `factors` {name: number}, with `n` sensors, with
+    `MOST_BYTES`.
+    """
+    n_hyp = math.prod(factors.values())
+    n_x = len(model.state_names) + _states_per_sensor(settings) * n
     size = n_hyp * n_x**2 * _FLOAT_BYTES
     if size > MOST_BYTES:
         product = ' x '.join(f'{name} ({number})' for name, number in factors.items())

@@ -8,6 +8,7 @@ from mag_tracking.calibration.doubtful_times import DoubtfulTimes, are_doubtful,
 from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.explanation import Explanation
 from mag_tracking.inference.innovation_consistency import InnovationConsistency
+from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.approach import Approach
@@ -99,6 +100,20 @@ class TrackEvidence:
     def doubt(self, reason: str) -> None:
         """From now on all of the track may be wrong."""
         self._doubts.add(reason)
+
+    def doubt_start(self, unseen_coming: bool, network: SensorNetwork, starts_anywhere: bool
+                    ) -> None:
+        """Doubt a track that was not seen `unseen_coming`, or whose range nothing tells.
+
+        `starts_anywhere` is that of the target.
+        """
+        # Who was not seen approaching may already have passed.
+        if unseen_coming and not starts_anywhere:
+            self.doubt(doubts.NOT_SEEN_APPROACHING)
+        # The range of a single sensor's target is what the settings say, and that of a vehicle near
+        # a few sensors at one place what the model leaves out of its field.
+        if len(network) == 1 or network.is_close and not starts_anywhere:
+            self.doubt(doubts.SENSORS_AT_ONE_PLACE)
 
     def watch(self, frame: FieldFrame) -> None:
         """Doubt the track where the field has grown unlike that of a target from afar."""

@@ -16,6 +16,7 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.bank_size import sensors_at_start
 from mag_tracking.stages.track.clock_evidence import ClockEvidence
 from mag_tracking.stages.track.disturbances import Disturbances
 from mag_tracking.stages.track.observation import MOST_TURNED
@@ -228,7 +229,9 @@ class TrackManager:
             self.counts[ALONE] += 1
             self._remember(frame)
             return []
-        sensors = self._sensors_at(frame)
+        later = self._sensors_at(frame, s.most_sensors)
+        n_at_start = sensors_at_start(s, self._network, self._target.model)
+        sensors = later if n_at_start >= len(later.rows) else self._sensors_at(frame, n_at_start)
         bank_filter = BankFilter(sensors.network, self._target.model, s)
         bank = self._target.start(s, sensors.network, sensors.part_of(frame),
                                   bank_filter.observation.own_covariance)
@@ -246,17 +249,17 @@ class TrackManager:
         self._next_id += 1
         self._tracks.append(track)
         track.doubt(self._doubtful_sensors(*recent, frame))
-        out = track.begin(frame, recent,
+        out = track.begin(frame, recent, later,
                           unseen_coming=in_tail or bool(recent) and _n_sensors(*recent) < 2)
         return out + self._delete_ended(frame.stamp_ns)
 
-    def _sensors_at(self, frame: FieldFrame) -> SensorSubset:
-        """The sensors for a track that starts: of a large network those near the strongest."""
-        if len(self._network) <= self._settings.most_sensors:
+    def _sensors_at(self, frame: FieldFrame, n: int) -> SensorSubset:
+        """At most `n` sensors for a track that starts: of a large network those near the strongest.
+        """
+        if len(self._network) <= n:
             return SensorSubset(self._network)
         strongest = int(np.argmax(whitened_energy(frame.field, frame.covariance)[0]))
-        return SensorSubset.near(self._network, self._network.positions[strongest, :2],
-                                 self._settings.most_sensors)
+        return SensorSubset.near(self._network, self._network.positions[strongest, :2], n)
 
 
 def _energy(frame: FieldFrame) -> float:

@@ -68,6 +68,10 @@ class Observation:
         """States of each sensor between the target's and the backgrounds."""
         return self.own_covariance.shape[1]
 
+    def n_states(self, n_sensors: int) -> int:
+        """States of a target that is seen by so many sensors."""
+        return self.n_target + (self.n_own + 3) * n_sensors
+
     def own(self, x: FloatArray) -> FloatArray:
         """(..., n_sensors, n_own): the sensors' own states among those on the last axis of `x`."""
         n = len(self.positions)

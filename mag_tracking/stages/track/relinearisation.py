@@ -26,6 +26,7 @@ import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.inference.starting_bank import StartingBank
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import Along, BankFilter
 from mag_tracking.units import NS
@@ -66,16 +67,15 @@ class Relinearisation:
 
     def clear(self) -> None:
         """Nothing is kept: no track is running."""
-        self._anchor: FilterBank | None = None
+        self._anchor: FilterBank | StartingBank | None = None
         # {origin: log-likelihood along the path minus that in the filter}, as of the last time.
         self._gain: dict[int, float] = {}
 
-    def begin(self, bank: FilterBank) -> None:
-        """A track begins with the `FilterBank`, which is not yet updated with its first frame.
-
-        As it is now it is the anchor: where the passes start from.
+    def begin(self, anchor: FilterBank | StartingBank) -> None:
+        """A track begins with a bank like the `anchor`, which is not yet updated with its first
+        frame. The passes start from the anchor, and nobody else may write into it.
         """
-        self._anchor, self._updated = bank.same(), False
+        self._anchor, self._updated = anchor, False
         self._frames: list[FieldFrame] = []
         self._intervals: list[float] = []
         # At each frame, and of each hypothesis of the anchor: where it is linearised, and the
@@ -114,7 +114,7 @@ class Relinearisation:
         if self._last_ns is None:
             self._last_ns = frame.stamp_ns
 
-    def _keep(self, anchor: FilterBank, mask: BoolArray) -> None:
+    def _keep(self, anchor: FilterBank | StartingBank, mask: BoolArray) -> None:
         """Keep the rows of `mask` of all that is kept for each hypothesis of the `anchor`."""
         anchor.keep(mask)
         self._paths = [path[mask] for path in self._paths]
@@ -131,7 +131,7 @@ class Relinearisation:
                 or self._frames[-1].stamp_ns - self._last_ns < self._interval_ns:
             return Counter()
         self._last_ns = self._frames[-1].stamp_ns
-        self._move_on(bank_filter, anchor, bank)
+        anchor = self._moved_on(bank_filter, anchor, bank)
         if self._updated and len(self._frames) == 1:
             return Counter()
         leading = self._leading(bank)
@@ -167,18 +167,22 @@ class Relinearisation:
         leading: IntArray = order[bank.log_w[order] >= bank.log_w.max() - LEADING]
         return leading[:max(1, min(self._most, affordable))]
 
-    def _move_on(self, bank_filter: BankFilter, anchor: FilterBank, bank: FilterBank) -> None:
-        """Once the frames are of twice the window, the anchor moves to where the window begins."""
+    def _moved_on(self, bank_filter: BankFilter, anchor: FilterBank | StartingBank,
+                  bank: FilterBank) -> FilterBank | StartingBank:
+        """The anchor: once the frames are of twice the window, it moves to where the window begins.
+        """
         now, n_frames = self._frames[-1].stamp_ns, len(self._frames)
         if now - self._frames[0].stamp_ns <= 2 * self._window_ns and n_frames <= MOST_FRAMES:
-            return
+            return anchor
         self._keep(anchor, np.isin(anchor.origin, bank.origin))
         n = next(k for k, f in enumerate(self._frames) if now - f.stamp_ns <= self._window_ns
                  and n_frames - k <= MOST_FRAMES // 2)
-        self._run_along(bank_filter, anchor, np.stack(self._paths[:n + 1], axis=1), 1)
+        moved = self._anchor = anchor.rows(np.arange(len(anchor)))
+        self._run_along(bank_filter, moved, np.stack(self._paths[:n + 1], axis=1), 1)
         self._frames, self._intervals = self._frames[n:], self._intervals[n:]
         self._paths, self._log_likelihoods = self._paths[n:], self._log_likelihoods[n:]
         self._updated = True
+        return moved
 
     def _run_along(self, bank_filter: BankFilter, bank: FilterBank, paths: FloatArray,
                    passes: int) -> Along:
@@ -214,6 +218,6 @@ def _widen(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,
     bank.P[rows[wider]] = apart[wider]
 
 
-def _rows(anchor: FilterBank, bank: FilterBank) -> IntArray:
+def _rows(anchor: FilterBank | StartingBank, bank: FilterBank) -> IntArray:
     """Rows of the `anchor` that the hypotheses of `bank` started from."""
     return np.searchsorted(anchor.origin, bank.origin)

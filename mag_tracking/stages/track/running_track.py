@@ -5,6 +5,7 @@ Source: ICASSP11 section 2, T10 Alg. 2 and 3; PHD15 Paper A for the magnet.
 
 from collections import Counter
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from itertools import pairwise
 
@@ -13,9 +14,11 @@ import numpy as np
 from mag_tracking.arrays import BoolArray, IntArray
 from mag_tracking.event_records import Disturbance
 from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.inference.starting_bank import StartingBank
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.bank_filter import BankFilter, NoTarget
+from mag_tracking.stages.track.bank_size import most_hypotheses
 from mag_tracking.stages.track.clock_evidence import ClockEvidence
 from mag_tracking.stages.track.disturbances import Unexplained
 from mag_tracking.stages.track.evidence import LEAST_WATCHED, TrackEvidence
@@ -24,7 +27,7 @@ from mag_tracking.stages.track.published_pose import ambiguities, published_trac
 from mag_tracking.stages.track.relinearisation import Relinearisation
 from mag_tracking.stages.track.second_opinion import SecondOpinion
 from mag_tracking.stages.track.sensor_rejection import SensorRejection
-from mag_tracking.stages.track.sensor_selection import AHEAD_S, SensorSubset, from_nearest, hand_on
+from mag_tracking.stages.track.sensor_selection import SensorSubset, hand_on
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import FixedLag, TrackState, WholeTrack
 from mag_tracking.stages.track.something_else import SomethingElse
@@ -91,13 +94,13 @@ class RunningTrack:
         """All of the track may be wrong if it uses one of the `sensors` (rows): their backgrounds
         are doubtful.
         """
-        is_new = doubts.DOUBTFUL_BACKGROUND not in self._evidence.doubts
-        if is_new and np.isin(self._sensors.rows, sensors).any():
+        if doubts.DOUBTFUL_BACKGROUND not in self._evidence.doubts \
+                and np.isin(self._sensors.rows, sensors).any():
             self.counts['tracks of a doubtful background'] += 1
             self._evidence.doubt(doubts.DOUBTFUL_BACKGROUND)
 
-    def begin(self, frame: FieldFrame, recent: list[FieldFrame], unseen_coming: bool = False
-              ) -> list[TrackRecord]:
+    def begin(self, frame: FieldFrame, recent: list[FieldFrame], later: SensorSubset,
+              unseen_coming: bool = False) -> list[TrackRecord]:
         """Run through the `recent` frames before the detection, and publish the first one after.
 
         Parameters
@@ -106,33 +109,30 @@ class RunningTrack:
             Of the whole network, with the detection.
         recent : list of FieldFrame
             Those before it, oldest first.
+        later : SensorSubset
+            The sensors from the `frame` on; of many, only some are used before.
         unseen_coming : bool
             What came before says nothing of how this target came.
         """
-        frame, recent = self._sensors.part_of(frame), [self._sensors.part_of(f) for f in recent]
-        lookback_ns = self._settings.lookback_s * NS
-        # A target that was not seen approaching may already have passed.
         watched_ns = frame.stamp_ns - recent[0].stamp_ns if recent else 0
-        is_late = watched_ns < LEAST_WATCHED * lookback_ns and not self._target.starts_anywhere
-        # The range of a single sensor's target is what the settings say, and that of a vehicle near
-        # a few sensors at one place what the model leaves out of its field.
-        whole = self._sensors.whole
-        at_one_place = len(whole) == 1 or whole.is_close and not self._target.starts_anywhere
-        if is_late or unseen_coming:
-            self._evidence.doubt(doubts.NOT_SEEN_APPROACHING)
-        if at_one_place:
-            self._evidence.doubt(doubts.SENSORS_AT_ONE_PLACE)
+        self._evidence.doubt_start(
+            unseen_coming or watched_ns < LEAST_WATCHED * self._settings.lookback_s * NS,
+            self._sensors.whole, self._target.starts_anywhere)
         self._begin_ns = frame.stamp_ns
         if recent:
             self._filter.move(self.bank, (recent[0].stamp_ns - frame.stamp_ns) / NS)
-        self._whole.begin(self.bank, self._filter)
+        start = StartingBank.of(self.bank, self._filter.observation.n_target)
+        self._whole.begin(copy(start), self._filter)
         if self._settings.relinearise_window_s:
-            self._relinearisation.begin(self.bank)
+            self._relinearisation.begin(start)
         dt = 0.0
         for before, after in pairwise([*recent, frame]):
-            self._step(before, dt, publish=False)
+            self._step(self._sensors.part_of(before), dt, publish=False)
             dt = (after.stamp_ns - before.stamp_ns) / NS
-        return self._step(frame, dt)
+        if later is not self._sensors and self.ended is None:
+            self._widen(later, dt)
+            dt = 0.0
+        return self.step(frame, dt)
 
     def step(self, frame: FieldFrame, dt: float) -> list[TrackRecord]:
         """Records of a frame of the whole network, `dt` [s] after the one before."""
@@ -189,18 +189,12 @@ class RunningTrack:
     def _end_if_over(self) -> list[TrackRecord]:
         """The closing records, if the latest pose says that the track is over."""
         assert self._last is not None
-        reason = self._evidence.reason_to_end(self._last, self._spread, self._is_coming(),
-                                              self._settings)
+        is_coming = not self._target.starts_anywhere and self._sensors.is_neared_by(self._last)
+        reason = self._evidence.reason_to_end(self._last, self._spread, is_coming, self._settings)
         if reason is None:
             return []
         self.is_lost = True
         return self.end(reason)
-
-    def _is_coming(self) -> bool:
-        """Whether a vehicle moves towards the sensor that it is nearest to."""
-        assert self._last is not None
-        away = from_nearest(self._last.position[:2], self._sensors.network.positions)
-        return not self._target.starts_anywhere and bool(away @ self._last.velocity[:2] < 0.0)
 
     def _look(self, best: int, measured: IntArray) -> None:
         """Note how far a vehicle has come, by the sensors (rows) that measured."""
@@ -213,21 +207,20 @@ class RunningTrack:
         """The `Track` of the hypothesis `best`, with what it says of the sensors."""
         bank, observation = self.bank, self._filter.observation
         measured: BoolArray = ~np.isnan(frame.field)
-        alone = len(self._sensors.network) > 1 and np.count_nonzero(measured.any(axis=1)) == 1
-        n_measured = int(np.count_nonzero(measured))
+        by = np.flatnonzero(measured.any(axis=1))
+        alone = len(self._sensors.network) > 1 and len(by) == 1
         self._evidence.support(alone, dt)
-        self._look(best, np.flatnonzero(measured.any(axis=1)))
-        found = self._doubts(frame, dt, best, alone)
-        found = self._evidence.note(found, frame.stamp_ns)
+        self._look(best, by)
+        found = self._evidence.note(self._doubts(frame, dt, best, alone), frame.stamp_ns)
         excess = 1.0 if self._target.starts_anywhere else self._evidence.innovations.excess
         return self._sensors.widened(published_track(
             bank, best, self._target.model, self._target.orientation, self._target.arrivals,
             self._target.kinds, stamp_ns=frame.stamp_ns, id=self.id, ended=False,
-            existence=self._evidence.existence, degrees_of_freedom=n_measured,
+            existence=self._evidence.existence, degrees_of_freedom=int(measured.sum()),
             found=found, excess=excess, unseen=self._unseen,
             difference=self._opinion.difference, ambiguous_poses=self._settings.ambiguous_poses,
             predicted=self._filter.predicted_field(bank, best, frame, dt),
-            mounting=observation.angles(bank.x[best]),
+            mounting=observation.angles(bank.x[best].copy()),
             mounting_covariance=observation.angle_covariances(bank.P[best])), self._settings)
 
     @property
@@ -298,19 +291,17 @@ class RunningTrack:
         Smoothing removes the doubts about its filter only in part.
         """
         ambiguous = doubtful or bool(ambiguities(self.bank, best, self.bank.apart(best)))
-        kind = int(self.bank.kind[best])
         return [smoothed_pose(
             self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,
-            kind=kind, kinds=self._target.kinds, unseen=self._unseen, complete=complete,
-            difference=difference,
+            kind=int(self.bank.kind[best]), kinds=self._target.kinds, unseen=self._unseen,
+            complete=complete, difference=difference,
             ambiguous=ambiguous or self._evidence.doubted_filter(stamp_ns))
             for (stamp_ns, x, P), difference in zip(states, self._opinion.differences(states),
                                                     strict=True)]
 
     def _smoothed_at_the_end(self) -> list[SmoothedPose]:
         """What is left of a fixed lag, and the whole track."""
-        best = self.bank.best()
-        doubtful = self._evidence.ends_in_misfit or self._is_doubted()
+        best, doubtful = self.bank.best(), self._evidence.ends_in_misfit or self._is_doubted()
         rest = [] if self._lag is None else self._smoothed(best, False, self._lag.rest(
             self._filter, self.bank, best), doubtful)
         states, left_out = self._whole.smoothed(self.bank, best)
@@ -331,18 +322,29 @@ class RunningTrack:
         best, self._handover_due = self._handover_due, None
         if best is None or self.ended is not None:
             return
-        x, n = self.bank.x[best], self._settings.most_sensors
-        place = x[:2] + AHEAD_S * x[3:5]
-        if self._sensors.serves(place, n):
-            return
-        before, sensors = self._sensors, SensorSubset.near(self._sensors.whole, place, n)
-        self._opinion.conclude(self._clocks, before.rows)
+        sensors = self._sensors.ahead_of(self.bank.x[best], self._settings.most_sensors)
+        if sensors is not self._sensors:
+            self._hand_on_to(sensors)
+            self._whole.give_up()
+            self._relinearisation.begin_anew()
+            self.counts['tracks handed on to other sensors'] += 1
+
+    def _widen(self, sensors: SensorSubset, dt: float) -> None:
+        """Use more sensors from the next frame on, which comes in `dt` [s]."""
+        most = most_hypotheses(self._filter.observation.n_states(len(sensors.rows)))
+        self.counts['hypotheses dropped'] += self.bank.prune(np.inf, most)
+        self._hand_on_to(sensors)
+        self._filter.move(self.bank, dt)
+        self._whole.begin(self.bank.copy(), self._filter)
+        if self._settings.relinearise_window_s:
+            self._relinearisation.begin(self.bank.copy())
+
+    def _hand_on_to(self, sensors: SensorSubset) -> None:
+        """Give the hypotheses the states of other sensors."""
+        before = self._sensors.rows
+        self._opinion.conclude(self._clocks, before)
         self._use(sensors, BankFilter(sensors.network, self._target.model, self._settings), True)
-        observation = self._filter.observation
-        hand_on(self.bank, observation.n_own, before.rows, sensors.rows,
-                observation.own_covariance, self._settings.background_std)
-        self._whole.give_up()
-        self._relinearisation.begin_anew()
+        own = self._filter.observation.own_covariance
+        hand_on(self.bank, before, sensors.rows, own, self._settings.background_std)
         if self._lag is not None:
             self._lag.clear()
-        self.counts['tracks handed on to other sensors'] += 1

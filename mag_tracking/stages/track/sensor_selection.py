@@ -56,33 +56,39 @@ class SensorSubset:
         """What of a frame of the whole network these sensors measured."""
         return part_of_frame(frame, self.rows) if self.is_part else frame
 
-    def serves(self, place: FloatArray, n: int) -> bool:
-        """Whether the nearer half of the `n` sensors nearest to a `place` (2,) [m] is among
-        these."""
-        return bool(np.isin(nearest(self.whole.positions, place, n // 2), self.rows).all())
+    def ahead_of(self, state: FloatArray, n: int) -> 'SensorSubset':
+        """The `n` sensors nearest to where a target of this state (n_x,) will be soon; these, if
+        the nearer half of them is among these."""
+        place = state[:2] + AHEAD_S * state[3:5]
+        serve = np.isin(nearest(self.whole.positions, place, n // 2), self.rows).all()
+        return self if serve else SensorSubset.near(self.whole, place, n)
+
+    def is_neared_by(self, track: Track) -> bool:
+        """Whether a `Track` moves towards the sensor that it is nearest to."""
+        away = from_nearest(track.position[:2], self.network.positions)
+        return bool(away @ track.velocity[:2] < 0.0)
 
     def widened(self, track: Track, settings: TrackSettings) -> Track:
         """A `Track` of these sensors as one of the whole network."""
         return widened(track, self.rows, self.whole, settings) if self.is_part else track
 
 
-def hand_on(bank: FilterBank, n_own: int, before: IntArray, after: IntArray,
-            own_covariance: FloatArray, background_std: float) -> None:
+def hand_on(bank: FilterBank, before: IntArray, after: IntArray, own_covariance: FloatArray,
+            background_std: float) -> None:
     """Give the hypotheses of a `FilterBank`, in place, the states of other sensors.
 
     Parameters
     ----------
     bank : FilterBank
-    n_own : int
-        States of each sensor between the target's and the backgrounds.
     before, after : (n_before,), (n_after,) int
         Rows in the network of the sensors whose states they have and shall have; those of both
         keep what is known of them, and how it hangs together.
     own_covariance : (n_after, n_own, n_own)
-        Of a new sensor's own states.
+        Of a new sensor's own states, which come between the target's and the backgrounds.
     background_std : float [T]
         Of a new sensor's background.
     """
+    n_own = own_covariance.shape[1]
     n_t = bank.x.shape[1] - (n_own + 3) * len(before)
     old, new = [_places(n_t, n_own, len(rows)) for rows in (before, after)]
     kept = [(list(before).index(row), k) for k, row in enumerate(after) if row in before]

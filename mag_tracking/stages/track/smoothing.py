@@ -16,6 +16,7 @@ import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.inference.starting_bank import StartingBank
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.units import NS
@@ -71,16 +72,7 @@ class _Start:
     """Where a track began, and the filter that it was moved with."""
 
     bank_filter: BankFilter
-    x: FloatArray
-    """(n_hyp, n_x)"""
-    P: FloatArray
-    """(n_hyp, n_x, n_x)"""
-    origin: IntArray
-    """(n_hyp,) as in `FilterBank`."""
-
-    def keep(self, rows: BoolArray) -> None:
-        """Keep the hypotheses of the mask `rows` (n_hyp,)."""
-        self.x, self.P, self.origin = self.x[rows], self.P[rows], self.origin[rows]
+    bank: FilterBank | StartingBank
 
 
 class WholeTrack:
@@ -98,12 +90,14 @@ class WholeTrack:
         self._published: list[bool] = []
         self._length_s, self.too_long = 0.0, False
 
-    def begin(self, bank: FilterBank, bank_filter: BankFilter) -> None:
-        """A track begins with `bank`, before its first frame; its settings stay those of now."""
+    def begin(self, bank: FilterBank | StartingBank, bank_filter: BankFilter) -> None:
+        """A track begins with a bank like `bank`, before its first frame, with the settings of now.
+
+        Nobody else may write into `bank`.
+        """
         self.clear()
         if self._longest_s:
-            same = bank.same()
-            self._start = _Start(copy(bank_filter), same.x, same.P, same.origin)
+            self._start = _Start(copy(bank_filter), bank)
 
     def give_up(self) -> None:
         """It cannot be smoothed as a whole."""
@@ -122,8 +116,8 @@ class WholeTrack:
         self._frames.append(frame)
         self._intervals.append(dt)
         self._published.append(published)
-        if len(bank) < len(self._start.origin) // 2:
-            self._start.keep(np.isin(self._start.origin, bank.origin))
+        if len(bank) < len(self._start.bank) // 2:
+            self._start.bank.keep(np.isin(self._start.bank.origin, bank.origin))
 
     def smoothed(self, bank: FilterBank, best: int) -> tuple[list[TrackState], int]:
         """[(stamp_ns, x, P)] of the published frames, and how many frames did not fit.
@@ -133,8 +127,7 @@ class WholeTrack:
         start = self._start
         if start is None or not self._frames:
             return [], 0
-        one, row = bank.alone(best), np.flatnonzero(start.origin == bank.origin[best])
-        one.x, one.P = start.x[row].copy(), start.P[row].copy()
+        one = start.bank.rows(np.flatnonzero(start.bank.origin == bank.origin[best]))
         states, left_out = smoothed_track(start.bank_filter, one, self._frames, self._intervals)
         return [(frame.stamp_ns, x, P) for frame, (x, P), published in zip(
             self._frames, states, self._published, strict=True) if published], left_out

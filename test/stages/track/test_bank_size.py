@@ -44,19 +44,51 @@ def test_so_are_those_of_a_magnet(changes, told):
     assert told in str(error.value)
 
 
+def bytes_at_start(n, settings):
+    """Of the covariances of all hypotheses of a vehicle that starts with `n` sensors."""
+    network = line_network(n)
+    target = target_of(settings, network)
+    frame = FieldFrame(0, np.full((n, 3), 1e-7), np.repeat(1e-16 * np.eye(3)[None], n, axis=0),
+                       np.full(n, 8), np.zeros(n))
+    own = BankFilter(network, target.model, settings).observation.own_covariance
+    return target.start(settings, network, frame, own).P.nbytes
+
+
 @pytest.mark.parametrize('n', [2, 5])
 @pytest.mark.parametrize('changes', [
     {}, POINT, {'track.mounting_std_deg': 0.0}, {'track.model_error_time_s': 0.0},
     {'track.vehicle.turn_acceleration': 0.0, 'track.vehicle.speeds': [3.0, 9.0]}])
 def test_the_bound_is_that_of_the_bank_that_is_made(monkeypatch, n, changes):
     network, settings = line_network(n), settings_for('vehicle', changes).track
-    target = target_of(settings, network)
-    frame = FieldFrame(0, np.full((n, 3), 1e-7), np.repeat(1e-16 * np.eye(3)[None], n, axis=0),
-                       np.full(n, 8), np.zeros(n))
-    own = BankFilter(network, target.model, settings).observation.own_covariance
-    size = target.start(settings, network, frame, own).P.nbytes
+    size = bytes_at_start(n, settings)
     monkeypatch.setattr(bank_size, 'MOST_BYTES', size)
     target_of(settings, network)
     monkeypatch.setattr(bank_size, 'MOST_BYTES', size - 1)
     with pytest.raises(SettingsError, match='starting hypotheses'):
         target_of(settings, network)
+
+
+@pytest.mark.parametrize('changes', [{}, POINT, {'track.mounting_std_deg': 0.0}])
+def test_a_vehicle_starts_with_as_many_sensors_as_its_hypotheses_allow(monkeypatch, changes):
+    settings = settings_for('vehicle', changes).track
+    model = target_of(settings, line_network(2)).model
+    monkeypatch.setattr(bank_size, 'START_BYTES', bytes_at_start(6, settings))
+    for n, expected in ((2, 2), (6, 6), (7, 6), (40, 6)):
+        assert bank_size.sensors_at_start(settings, line_network(n), model) == expected
+    monkeypatch.setattr(bank_size, 'START_BYTES', bank_size.START_BYTES - 1)
+    assert bank_size.sensors_at_start(settings, line_network(40), model) == 5
+    monkeypatch.setattr(bank_size, 'START_BYTES', 1)
+    assert bank_size.sensors_at_start(settings, line_network(40), model) == 4
+    assert bank_size.sensors_at_start(settings, line_network(3), model) == 3
+
+
+def test_a_magnet_starts_with_all():
+    settings, network = settings_for('magnet').track, line_network(40)
+    model = target_of(settings, network).model
+    assert bank_size.sensors_at_start(settings, network, model) == settings.most_sensors
+
+
+@pytest.mark.parametrize('n_states', [44, 170, 314, 10**6])
+def test_so_many_are_kept_as_take_no_more_than_they_may(n_states):
+    n, each = bank_size.most_hypotheses(n_states), 8 * n_states**2
+    assert n == 1 or n * each <= bank_size.WIDER_BYTES < (n + 1) * each

@@ -181,27 +181,19 @@ def test_arrays_of_other_sizes_are_refused(spoil, error):
 
 
 @pytest.mark.parametrize('name', CASES)
-def test_a_bank_is_moved_where_it_is_unless_somebody_else_has_it(name):
+def test_a_bank_is_moved_where_it_is_unless_its_prior_is_wanted(name):
     compiled, _, bank, frames, intervals = case(name, n_hyp=3)
-    before, kept, shared = bank.copy(), bank.copy(), bank.copy()
-    x, P = bank.x, bank.P
+    before, kept = bank.copy(), bank.copy()
+    x, P, kept_x, kept_P = bank.x, bank.P, kept.x, kept.P
     moved = compiled.advance(bank, frames[1], intervals[1])
     assert bank.x is x and bank.P is P and not np.array_equal(x, before.x)
-    kept_x, kept_P = kept.x, kept.P
-    other = shared.same()
-    for b, keeps in ((kept, True), (shared, False)):
-        for got, expected in zip(compiled.advance(b, frames[1], intervals[1], keeps), moved,
-                                 strict=True):
-            np.testing.assert_array_equal(got, expected)
-        np.testing.assert_array_equal(b.x, bank.x)
-        np.testing.assert_array_equal(b.P, bank.P)
-    for left_x, left_P in ((kept_x, kept_P), (other.x, other.P)):
-        np.testing.assert_array_equal(left_x, before.x)
-        np.testing.assert_array_equal(left_P, before.P)
-    # It now has arrays of its own.
-    x = shared.x
-    compiled.advance(shared, frames[2], intervals[2])
-    assert shared.x is x
+    for got, expected in zip(compiled.advance(kept, frames[1], intervals[1], keeps_prior=True),
+                             moved, strict=True):
+        np.testing.assert_array_equal(got, expected)
+    np.testing.assert_array_equal(kept.x, bank.x)
+    np.testing.assert_array_equal(kept.P, bank.P)
+    np.testing.assert_array_equal(kept_x, before.x)
+    np.testing.assert_array_equal(kept_P, before.P)
 
 
 def test_no_array_is_copied_that_would_be_written_to():

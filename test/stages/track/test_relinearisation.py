@@ -73,7 +73,7 @@ def followed_beside_plain(filter_, anew, n=40, anew_at=(), prune=True):
     bank = FilterBank.of_targets(rng.standard_normal((12, N_T)), np.tile(np.eye(N_T), (12, 1, 1)),
                                  np.zeros(12, dtype=int), 1, 1.0)
     plain = bank.copy()
-    anew.begin(bank)
+    anew.begin(bank.copy())
     for k in range(n):
         dt = (1.7 if k == 20 else rng.choice([0.05, 0.08, 0.2])) if k else 0.0
         stamp_ns += round(dt * NS)
@@ -149,7 +149,7 @@ def less_sure(more, linear):
     filter_.more, filter_.linear = more, linear
     bank = FilterBank.of_targets(np.zeros((1, N_T)), np.eye(N_T)[None], np.zeros(1, int), 1, 1.0)
     relinearisation = Relinearisation(0.0, 60.0, 1)
-    relinearisation.begin(bank)
+    relinearisation.begin(bank.copy())
     frame = FieldFrame(0, rng.standard_normal((1, 3)), np.eye(3)[None], np.full(1, 8), np.zeros(1),
                        True)
     predicted = bank.x.copy()
@@ -192,7 +192,7 @@ def test_the_gain_is_what_the_frames_are_more_probable_by_along_the_path(better)
     relinearisation.improve(filter_, bank)
     assert relinearisation.gain(0) == pytest.approx(better, abs=1e-9)
     assert relinearisation.gain(1) == 0.0
-    relinearisation.begin(bank)
+    relinearisation.begin(bank.copy())
     assert relinearisation.gain(0) == 0.0
     relinearisation.clear()
     assert relinearisation.gain(0) == 0.0
@@ -225,7 +225,7 @@ def test_it_is_done_for_the_heaviest(monkeypatch, most, affordable):
     filter_ = LinearFilter()
     bank, *_ = followed_beside_plain(filter_, Relinearisation(60.0, 60.0, most), prune=False)
     anew = Relinearisation(0.0, 60.0, most)
-    anew.begin(bank)
+    anew.begin(bank.copy())
     assert not filter_.origins
     frame = FieldFrame(10**12, np.zeros((1, 3)), np.eye(3)[None], np.full(1, 8), np.zeros(1), True)
     for _ in range(40):
@@ -260,7 +260,7 @@ def frames_of(y):
 
 def followed(filter_, bank, y, anew):
     """`bank` through the measurements `y` (n, n_sensors, 3); (tried, in vain) with the last one."""
-    anew.begin(bank)
+    anew.begin(bank.copy())
     for k, frame in enumerate(frames_of(y)):
         dt = PERIOD if k else 0.0
         anew.add(bank, *filter_.advance(bank, frame, dt), frame, dt)

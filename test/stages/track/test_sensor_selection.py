@@ -9,6 +9,7 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.simulation.scenario import Path, point_body
+from mag_tracking.stages.track import bank_size
 from mag_tracking.stages.track.sensor_selection import hand_on, nearest, part_of_frame
 from support.bundled import POINT
 from support.networks import line_network
@@ -33,7 +34,7 @@ def test_what_is_known_of_sensors_that_stay_is_kept(n_own):
     bank = bank_of(rng, 4, 8, n_own, 3)
     x, P = bank.x.copy(), bank.P.copy()
     prior = np.array([np.diag(np.arange(1.0, n_own + 1.0)) * (j + 1) for j in range(4)])
-    hand_on(bank, n_own, before, after, prior.reshape(4, n_own, n_own), 0.25)
+    hand_on(bank, before, after, prior.reshape(4, n_own, n_own), 0.25)
     n_x = 8 + (n_own + 3) * 4
     assert bank.x.shape == (4, n_x) and bank.P.shape == (4, n_x, n_x)
     assert np.isnan(bank.nis).all() and bank.nis.shape == (4, 4)
@@ -107,6 +108,35 @@ def test_a_target_is_followed_along_forty_sensors():
         assert used[nearest[:2]].any()
     assert not [r for r in records if isinstance(r, SmoothedPose) and r.complete]
     assert pipeline.counts()['track']['tracks too long to smooth'] == 1
+
+
+@pytest.mark.parametrize('most', [8, 16])
+def test_many_sensors_come_in_when_the_frames_before_the_detection_are_through(monkeypatch, most):
+    """With all of them from the beginning a start would take seconds and gigabytes."""
+    network, runs = line_network(12, tilt=0.02), []
+    for size in (10**12, 1):
+        monkeypatch.setattr(bank_size, 'START_BYTES', size)
+        records, pipeline, truth = driven(network, {'track.most_sensors': most})
+        live = [r for r in records if isinstance(r, Track) and not r.ended]
+        inside = [t for t in live if 0.0 < truth(t.stamp_ns / 1e9)[0] < 45.0]
+        e = np.array([t.position[:2] - truth(t.stamp_ns / 1e9) for t in inside])
+        nees = [v @ np.linalg.solve(t.covariance[:2, :2], v)
+                for v, t in zip(e, inside, strict=True)]
+        assert len(inside) > 20 and np.mean(nees) < 4.0
+        assert max(np.count_nonzero(~np.isnan(t.nis_by_sensor)) for t in live) == min(most, 12)
+        smoothed = [r for r in records if isinstance(r, SmoothedPose) and r.complete]
+        if most == 16:
+            assert pipeline.track.counts['tracks handed on to other sensors'] == 0
+            assert [p.stamp_ns for p in smoothed] == [t.stamp_ns for t in live]
+            errors = [np.linalg.norm(p.position[:2] - truth(p.stamp_ns / 1e9)) for p in smoothed
+                      if 0.0 < truth(p.stamp_ns / 1e9)[0] < 45.0]
+            assert np.sqrt(np.mean(np.square(errors))) < 0.3
+        runs.append(inside)
+    assert len(runs[0]) == len(runs[1])
+    apart = [(a.position[:2] - b.position[:2]) @ np.linalg.solve(
+        a.covariance[:2, :2], a.position[:2] - b.position[:2])
+        for a, b in zip(*runs, strict=True)]
+    assert np.mean(apart) < 1.0
 
 
 def test_a_network_that_is_not_larger_is_used_whole():

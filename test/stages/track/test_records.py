@@ -1,0 +1,42 @@
+"""What a track publishes is not changed by what comes later."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mag_tracking.network.file import read_network
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.records import SmoothedPose, Track
+from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
+
+
+def arrays_of(value, depth=0):
+    """The arrays in a record, however deep."""
+    if isinstance(value, np.ndarray):
+        yield value
+    elif dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            yield from arrays_of(getattr(value, field.name), depth + 1)
+    elif hasattr(value, '__dict__') and depth < 4:
+        for content in vars(value).values():
+            yield from arrays_of(content, depth + 1)
+
+
+@pytest.mark.parametrize('lag_s', [0.0, 0.5])
+def test_no_record_has_a_part_of_the_bank(lag_s):
+    """The filter writes into the states and covariances of its bank."""
+    network, n = read_network(NETWORK_FILE), 0
+    pipeline = Pipeline(network, settings_for('vehicle', {'track.smoothing_lag_s': lag_s}))
+    for readings in SampleReader(Recording(vehicle_path(VEHICLES[0])), network).readings():
+        for record in pipeline.feed(readings):
+            bank = pipeline.track.bank
+            if not isinstance(record, (Track, SmoothedPose)) or bank is None:
+                continue
+            n += 1
+            for array in arrays_of(record):
+                assert not np.shares_memory(array, bank.x)
+                assert not np.shares_memory(array, bank.P)
+    assert n > 30
