@@ -49,10 +49,12 @@ bool inverses(Array A, double least, Array out) {
     return true;
 }
 
-Size densest_of(Array mean, Array covariance, Array log_w) {
-    const Size n = length_of(log_w, "log_w", 1);
-    return densest(n, input_of(mean, "mean", {n, 3}), input_of(covariance, "covariance", {n, 3, 3}),
-                   input_of(log_w, "log_w", {n}));
+Size best(Array x, Array P, Array log_w, Integers label, Integers kind, double negligible) {
+    const Size n = length_of(log_w, "log_w", 1), n_x = length_of(x, "x", 2) ? x.shape(1) : 0;
+    if (n < 1 || n_x < 3) throw py::value_error("no hypothesis, or one without a position");
+    return best_of({std::size_t(n), std::size_t(n_x), input_of(x, "x", {n, n_x}),
+                    input_of(P, "P", {n, n_x, n_x}), input_of(log_w, "log_w", {n}),
+                    input_of(label, "label", {n}), input_of(kind, "kind", {n})}, negligible);
 }
 
 }  // namespace
@@ -66,5 +68,5 @@ PYBIND11_MODULE(core, m) {
     m.def("step_vectors", &step_vectors, IN(x), IN(P), IN(log_w), IN(densities), IN(vector), IN(H),
           IN(y), IN(variance), py::arg("dt"), py::arg("switch_s"));
     m.def("inverses", &inverses, IN(A), IN(least), IN(out));
-    m.def("densest", &densest_of, IN(mean), IN(covariance), IN(log_w));
+    m.def("best", &best, IN(x), IN(P), IN(log_w), IN(label), IN(kind), IN(negligible));
 }

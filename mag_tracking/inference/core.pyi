@@ -18,6 +18,6 @@ def inverses(A: FloatArray, least: float, out: FloatArray) -> bool:
     """Inverses of the symmetric `A` (n, k, k) into `out`; False where the least root of a pivot of
     one, scaled to unit diagonal, is not larger than `least`, or one is not finite."""
 
-def densest(mean: FloatArray, covariance: FloatArray, log_w: FloatArray) -> int:
-    """Which of the means (n, 3) of Gaussians with covariances (n, 3, 3) and weights (n,) their
-    mixture is densest at; -1 where a covariance is not positive definite."""
+def best(x: FloatArray, P: FloatArray, log_w: FloatArray, label: IntArray, kind: IntArray,
+         negligible: float) -> int:
+    """`FilterBank.best`, without hypotheses that are lighter than the heaviest by `negligible`."""

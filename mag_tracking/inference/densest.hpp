@@ -1,10 +1,13 @@
-// Where a mixture of Gaussians in space is densest, of their own means (filter_bank.py).
+// The hypothesis of a bank to publish (filter_bank.py), where their mixture in space is densest.
 
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstddef>
+#include <cstdint>
 #include <limits>
+#include <map>
 #include <vector>
 
 namespace mag_tracking {
@@ -59,6 +62,54 @@ inline std::ptrdiff_t densest(std::size_t n, const double* mean, const double* c
         if (density > most) most = density, best = std::ptrdiff_t(k);
     }
     return best;
+}
+
+// n hypotheses with states (n, n_x), of which the first three are a position.
+struct Mixture {
+    std::size_t n, n_x;
+    const double *x, *P, *log_w;
+    const std::int64_t *label, *kind;
+};
+
+// Those of the `rows` that are of the class which weighs most; `of` (n) are their classes.
+inline void keep_heaviest(std::vector<std::size_t>& rows, const std::int64_t* of,
+                          const double* log_w) {
+    double top = -std::numeric_limits<double>::infinity();
+    for (const std::size_t i : rows) top = std::max(top, log_w[i]);
+    std::map<std::int64_t, double> total;
+    for (const std::size_t i : rows)
+        total[of[i]] += std::isfinite(top) ? std::exp(log_w[i] - top) : 0.0;
+    const auto heaviest = std::max_element(
+        total.begin(), total.end(), [](const auto& a, const auto& b) { return a.second < b.second; });
+    rows.erase(std::remove_if(rows.begin(), rows.end(), [&](std::size_t i) {
+        return of[i] != heaviest->first;
+    }), rows.end());
+}
+
+// Of at least one hypothesis. Those that are lighter than the heaviest by more than `negligible`
+// have no say.
+inline std::size_t best_of(const Mixture& bank, double negligible) {
+    std::vector<std::size_t> rows(bank.n);
+    for (std::size_t i = 0; i < bank.n; ++i) rows[i] = i;
+    keep_heaviest(rows, bank.label, bank.log_w);
+    keep_heaviest(rows, bank.kind, bank.log_w);
+    const std::size_t heaviest = *std::max_element(
+        rows.begin(), rows.end(),
+        [&](std::size_t a, std::size_t b) { return bank.log_w[a] < bank.log_w[b]; });
+    rows.erase(std::remove_if(rows.begin(), rows.end(), [&](std::size_t i) {
+        return bank.log_w[i] < bank.log_w[heaviest] - negligible;
+    }), rows.end());
+    std::vector<double> mean, covariance, log_w;
+    for (const std::size_t i : rows) {
+        log_w.push_back(bank.log_w[i]);
+        for (std::size_t a = 0; a < 3; ++a) {
+            mean.push_back(bank.x[i * bank.n_x + a]);
+            for (std::size_t b = 0; b < 3; ++b)
+                covariance.push_back(bank.P[(i * bank.n_x + a) * bank.n_x + b]);
+        }
+    }
+    const auto found = densest(rows.size(), mean.data(), covariance.data(), log_w.data());
+    return found < 0 ? heaviest : rows[std::size_t(found)];
 }
 
 }  // namespace mag_tracking

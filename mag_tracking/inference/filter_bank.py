@@ -85,12 +85,7 @@ class FilterBank:
         their mixture is densest: near the mode of the posterior. The heaviest alone
         would be a lottery where many neighbours share the weight.
         """
-        rows = self._heaviest(self.label, np.arange(len(self)))
-        rows = self._heaviest(self.kind, rows)
-        rows = rows[self.log_w[rows] >= self.log_w[rows].max() - _NEGLIGIBLE]
-        densest = core.densest(np.ascontiguousarray(self.x[rows, :3]),
-                               np.ascontiguousarray(self.P[rows, :3, :3]), self.log_w[rows])
-        return int(rows[np.argmax(self.log_w[rows]) if densest < 0 else densest])
+        return core.best(self.x, self.P, self.log_w, self.label, self.kind, _NEGLIGIBLE)
 
     def copy(self) -> 'FilterBank':
         """The same bank with arrays of its own."""
@@ -104,16 +99,6 @@ class FilterBank:
     def alone(self, i: int) -> 'FilterBank':
         """A bank of the hypothesis `i` alone; its arrays are its own."""
         return self.rows(np.array([i]))
-
-    def _heaviest(self, kind: IntArray, rows: IntArray) -> IntArray:
-        """Those of `rows` that are of the kind (n_hyp,) which weighs most."""
-        of_rows = kind[rows]
-        if (of_rows == of_rows[0]).all():
-            return rows
-        kinds = np.unique(of_rows)
-        totals = [log_sum_exp(self.log_w[rows[of_rows == k]]) for k in kinds]
-        heaviest: IntArray = rows[of_rows == kinds[int(np.argmax(totals))]]
-        return heaviest
 
     def weight(self, rows: BoolArray) -> float:
         """Total weight of the hypotheses of the mask `rows` (n_hyp,)."""
