@@ -33,6 +33,9 @@ MORE = 4.0
 """The level of the beginning is replaced by one that lasts longer by this factor: what stood there
 at first has left."""
 
+AT_ONCE = 64
+"""Blocks that are compared with all others at once; with more of them it takes much memory."""
+
 
 @dataclass(frozen=True)
 class QuietLevel:
@@ -115,9 +118,12 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, most: int) -> QuietLe
 
 def _densest(means: FloatArray, width: FloatArray) -> IntArray:
     """Rows of (n, k) `means` that are within `width` (k,) of the one with the most such rows."""
-    near: BoolArray = np.ones((len(means), len(means)), dtype=bool)
-    for axis, widest in zip(means.T, width, strict=True):
-        near &= np.abs(axis[:, None] - axis) <= widest
-    best = near[np.argmax(np.count_nonzero(near, axis=1))]
+    best: BoolArray = np.zeros(len(means), dtype=bool)
+    for first in range(0, len(means), AT_ONCE):
+        near: BoolArray = np.ones((len(means[first:first + AT_ONCE]), len(means)), dtype=bool)
+        for axis, widest in zip(means.T, width, strict=True):
+            near &= np.abs(axis[first:first + AT_ONCE, None] - axis) <= widest
+        most = near[np.argmax(np.count_nonzero(near, axis=1))]
+        best = most if np.count_nonzero(most) > np.count_nonzero(best) else best
     centre = np.median(means[best], axis=0)
     return np.flatnonzero((np.abs(means - centre) <= width).all(axis=1))

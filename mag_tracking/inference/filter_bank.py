@@ -104,6 +104,10 @@ class FilterBank:
         """Total weight of the hypotheses of the mask `rows` (n_hyp,)."""
         return float(np.exp(log_sum_exp(self.log_w[rows]))) if rows.any() else 0.0
 
+    def outweigh(self, n: int, share: float) -> bool:
+        """Whether the `n` heaviest hypotheses have at least this share of the weight."""
+        return bool(np.exp(np.sort(self.log_w)[-n:]).sum() >= share)
+
     def apart(self, i: int, distance: float = 3.0) -> BoolArray:
         """(n_hyp,) whether the position of a hypothesis is another one than that of row `i`.
 
@@ -146,10 +150,7 @@ class FilterBank:
         rows = np.flatnonzero(mask)
         gone = len(mask) - len(rows)
         if gone:
-            if len(rows) < len(mask) // 2:
-                self.x, self.P = self.x[rows], self.P[rows]
-            else:
-                self.x, self.P = (_moved_up(a, rows) for a in (self.x, self.P))
+            self.x, self.P = (_moved_up(a, rows) for a in (self.x, self.P))
             self.log_w = self.log_w[mask] - log_sum_exp(self.log_w[mask])
             for name in ('label', 'kind', 'origin', 'nis'):
                 setattr(self, name, getattr(self, name)[mask])
@@ -166,7 +167,13 @@ class FilterBank:
 
 
 def _moved_up(a: FloatArray, rows: IntArray) -> FloatArray:
-    """The `rows` (n,), ascending, of an array, at its beginning: what is new takes longer."""
+    """The `rows` (n,), ascending, of an array, at its beginning: what is new takes longer.
+
+    A new array, though, where the rest would hold more memory than they do.
+    """
+    held = a if a.base is None else a.base
+    if len(rows) * a[:1].nbytes < held.nbytes // 2:
+        return a[rows]
     for new, old in enumerate(rows.tolist()):
         if new != old:
             a[new] = a[old]

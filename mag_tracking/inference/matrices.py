@@ -78,7 +78,8 @@ def pseudo_inverse(A: FloatArray, rank: float = 1e-15) -> FloatArray:
     """Pseudo-inverses (n, k, k), scaled to unit diagonal first: units differ by decades.
 
     Directions whose eigenvalue is then below the share `rank` of the largest are left out. A
-    matrix that is not finite, of a search that ran away, has an inverse of NaN.
+    matrix that is not finite, of a search that ran away, has an inverse of NaN. Of full rank the
+    lower triangles count.
     """
     A = np.ascontiguousarray(A, dtype=float)
     inverse: FloatArray = np.empty_like(A)

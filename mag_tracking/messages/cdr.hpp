@@ -4,15 +4,19 @@
 
 #pragma once
 
-#include <algorithm>
-#include <cstring>
+#include <cmath>
+#include <cstdint>
 #include <limits>
 #include <memory>
+#include <stdexcept>
 #include <string>
 #include <type_traits>
+#include <utility>
 #include <vector>
 
 #include "../python.hpp"
+
+static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "numbers are written as they are");
 
 namespace mag_tracking {
 
@@ -68,11 +72,16 @@ class Float : public Value {
 
   private:
     static T number(const py::handle& value) {
-        if (PyFloat_CheckExact(value.ptr())) return T(PyFloat_AS_DOUBLE(value.ptr()));
+        if (PyFloat_CheckExact(value.ptr())) return narrowed(PyFloat_AS_DOUBLE(value.ptr()));
         // As float() does, which takes text, too.
         const auto whole = py::reinterpret_steal<py::object>(PyNumber_Float(value.ptr()));
         check_python();
-        return T(PyFloat_AS_DOUBLE(whole.ptr()));
+        return narrowed(PyFloat_AS_DOUBLE(whole.ptr()));
+    }
+    static T narrowed(double value) {
+        if (std::isfinite(value) && std::abs(value) > double(std::numeric_limits<T>::max()))
+            throw std::overflow_error("beyond the range of its type: " + std::to_string(value));
+        return T(value);
     }
     T standard_;
 };
@@ -151,8 +160,7 @@ struct Field {
         if (length == SEQUENCE)
             out.add_length(n);
         else if (n && n != length)
-            throw py::value_error(std::string(name) + ": has " + std::to_string(n) +
-                                  " elements, not " + std::to_string(length));
+            throw py::value_error(std::to_string(n) + " elements, not " + std::to_string(length));
         for (Size i = 0; i < (length == SEQUENCE ? n : length); ++i)
             value->add(n ? py::handle(PySequence_Fast_GET_ITEM(items.ptr(), i)) : Py_None, out);
     }
@@ -172,7 +180,11 @@ class Message : public Value {
             PyObject* content = value.is_none()
                 ? nullptr : PyDict_GetItemWithError(value.ptr(), field.name.ptr());
             check_python();
-            field.add(content == nullptr ? py::handle(Py_None) : py::handle(content), out);
+            try {
+                field.add(content == nullptr ? py::handle(Py_None) : py::handle(content), out);
+            } catch (const py::value_error& error) {
+                throw py::value_error(std::string(field.name) + ": " + error.what());
+            }
         }
     }
 

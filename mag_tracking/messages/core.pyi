@@ -14,4 +14,5 @@ class Encoder:
     def __init__(self, fields: Sequence[tuple[str, int, str | Encoder, Any]]) -> None:
         """Of each field the name, the length of an array, the type and the default or None."""
     def __call__(self, message: dict[str, Any]) -> bytes:
-        """Raises ValueError, TypeError or OverflowError where it does not fit the type."""
+        """Raises ValueError, which names the field, TypeError or OverflowError where it does not
+        fit the type."""

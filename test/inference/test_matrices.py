@@ -19,13 +19,12 @@ def by_eigenvalues(A):
         scale, scale)
 
 
-@pytest.mark.parametrize('k', [1, 2, 7, 15])
-@pytest.mark.parametrize('missing', [0, 1])
+@pytest.mark.parametrize('k, missing', [(1, 0), (2, 0), (7, 0), (15, 0), (2, 1), (7, 1), (15, 2)])
 def test_it_is_that_of_the_eigenvalues(k, missing):
     rng = np.random.default_rng(k)
     A = information(k, k + 20, rng)
     if missing:
-        A[2] = information(k, max(1, k - missing), rng, 1)
+        A[2] = information(k, k - missing, rng, 1)
     got = pseudo_inverse(A, 1e-11)
     for one, inverse in zip(A, got, strict=True):
         scale = np.sqrt(np.diagonal(one))

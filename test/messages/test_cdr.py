@@ -86,6 +86,7 @@ def test_what_is_missing_has_its_default():
     (HEADER, {'stamp': {'sec': []}}, TypeError),
     (HEADER, {'frame_id': '\ud800'}, UnicodeEncodeError),
     ('geometry_msgs/msg/Point', {'x': 'far'}, ValueError),
+    ('std_msgs/msg/ColorRGBA', {'r': 1e39}, OverflowError),
     ('geometry_msgs/msg/Point', {'x': {}}, TypeError),
     ('geometry_msgs/msg/PoseWithCovariance', {'covariance': [0.0] * 35}, ValueError),
     ('geometry_msgs/msg/PoseWithCovariance', {'covariance': 'nothing'}, TypeError),
@@ -94,6 +95,13 @@ def test_what_is_missing_has_its_default():
 def test_what_does_not_fit_the_type_is_refused(name, message, error):
     with pytest.raises(error):
         encoder(name)(message)
+
+
+def test_an_error_names_the_field():
+    with pytest.raises(ValueError, match='^header: stamp: sec: beyond .*: 2147483648$'):
+        encoder('geometry_msgs/msg/PoseStamped')({'header': {'stamp': {'sec': 2**31}}})
+    with pytest.raises(ValueError, match='^covariance: 35 elements, not 36$'):
+        encoder('geometry_msgs/msg/PoseWithCovariance')({'covariance': [0.0] * 35})
 
 
 def test_values_are_taken_as_python_would_take_them():

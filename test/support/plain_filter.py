@@ -11,8 +11,8 @@ class StepByStep:
     """Runs a bank along paths, by its `predict` and `update`; see `BankFilter.run_along`."""
 
     def run_along(self, bank, frames, intervals, paths, *, passes, step, first_is_updated,
-                  enough=0.0, leaves_out=False, wants_covariances=False):
-        start, out, active = bank.copy(), None, np.ones(len(bank), dtype=bool)
+                  leaves_out=False, wants_covariances=False):
+        start = bank.copy()
         for _ in range(passes):
             bank.x, bank.P = start.x.copy(), start.P.copy()
             steps, log_likelihood, used = self.filtered(
@@ -21,20 +21,13 @@ class StepByStep:
             variance = np.array([np.einsum('pii->p', step.P[:, :3, :3]) for step in steps]).T
             log_likelihood[~(variance >= 0.0).all(axis=1)] = -np.inf
             std = np.sqrt(np.where(variance >= 0.0, variance, np.nan))
-            away = (np.linalg.norm((smoothed - paths)[:, :, :3], axis=2) / std).max(axis=1)
-            moved = np.where(np.isnan(paths), smoothed, paths + step * (smoothed - paths))
-            covariances = np.stack(smoothed_covariances(steps), axis=1) if wants_covariances \
-                else np.zeros((len(bank), 0))
-            of_pass = bank.x, bank.P, moved, log_likelihood, away, used, covariances
-            out = [a.copy() for a in of_pass] if out is None else out
-            for all_passes, a in zip(out, of_pass, strict=True):
-                all_passes[active] = a[active]
-            paths[:] = out[2]
-            active &= ~(away <= enough)
-            if not active.any():
-                break
-        bank.x, bank.P = out[:2]
-        return Along(*out[3:])
+            away = np.linalg.norm((smoothed - paths)[:, :, :3], axis=2) / std
+            new = np.isnan(paths)
+            paths += step * (smoothed - paths)
+            paths[new] = smoothed[new]
+        covariances = np.stack(smoothed_covariances(steps), axis=1) if wants_covariances \
+            else np.empty(0)
+        return Along(log_likelihood, away.max(axis=1), used, covariances)
 
     def filtered(self, bank, frames, intervals, paths, first_is_updated, leaves_out):
         """(`Step`s, log-likelihood, which frames were used) of one way through the frames."""

@@ -120,7 +120,7 @@ class BankFilter:
 
     def run_along(self, bank: FilterBank, frames: Sequence[FieldFrame],
                   intervals: Sequence[float], paths: FloatArray, *, passes: int, step: float,
-                  first_is_updated: bool, enough: float = 0.0, leaves_out: bool = False,
+                  first_is_updated: bool, leaves_out: bool = False,
                   wants_covariances: bool = False) -> Along:
         """Filter and smooth each hypothesis along its path, and end with the last frame.
 
@@ -135,13 +135,11 @@ class BankFilter:
             Where they are linearised; NaN: at the predictions, iterated as `advance` does. Moved,
             in place.
         passes : int
-            How often it is done at most; each time it is linearised where the time before led.
+            How often it is done; each time it is linearised where the time before led.
         step : float
             The share of the way that a path is moved to where the smoother has it.
         first_is_updated : bool
             The bank has been updated with the first frame.
-        enough : float
-            A path is done that a pass moved no more than this, in deviations of its position.
         leaves_out : bool
             Frames that contradict a hypothesis are left out.
         wants_covariances : bool
@@ -154,7 +152,7 @@ class BankFilter:
             **self._frames(frames, intervals), first_is_updated=first_is_updated,
             strange=self._settings.end_nis if leaves_out else np.inf,
             iterations=self._settings.iterations, passes=passes, step=step,
-            enough=enough, field_error=self._settings.field_error,
+            field_error=self._settings.field_error,
             near_field_length=self._near_field_lengths[bank.kind], x=bank.x, P=bank.P,
             new_x=new_x, new_P=new_P, paths=paths, log_likelihood=out.log_likelihood,
             unsettled=out.unsettled, covariances=out.covariances, used=out.used)

@@ -7,6 +7,7 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.sources import SourceModel
 from mag_tracking.stages.track.initiation_vehicle import moment_directions
+from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.settings import TrackSettings
 
 MOST_BYTES = 4 << 30
@@ -18,7 +19,11 @@ the others come in when the track has run through the frames before its detectio
 LEAST_AT_START = 4
 """Those nearest to the strongest, with which every track starts."""
 WIDER_BYTES = 100_000_000
-"""Then so many hypotheses are kept that their covariances take no more than this."""
+"""Then so many hypotheses are kept that their covariances take no more than this, but"""
+LEAST_HYPOTHESES = 100
+"""not fewer, and only if they have"""
+WEIGHT_KEPT = 0.999
+"""of the weight: fewer would look surer than the frames allow."""
 _FLOAT_BYTES = 8
 
 
@@ -27,6 +32,13 @@ def check_vehicle_bank(settings: TrackSettings, network: SensorNetwork,
     """Raise SettingsError where the starting hypotheses of a vehicle take too much memory."""
     _check_bank('track.vehicle', _vehicle_factors(settings), settings,
                 sensors_at_start(settings, network, model), model)
+    n = _n_sensors(settings, network)
+    size = LEAST_HYPOTHESES * _FLOAT_BYTES * (
+        len(model.state_names) + _states_per_sensor(settings) * n)**2
+    if size > MOST_BYTES:
+        raise SettingsError(f'track.most_sensors: {LEAST_HYPOTHESES} hypotheses of a target that '
+                            f'{n} sensors see need {_gigabytes(size)}, more than '
+                            f'{_gigabytes(MOST_BYTES)}')
 
 
 def _vehicle_factors(settings: TrackSettings) -> dict[str, int]:
@@ -43,15 +55,26 @@ def sensors_at_start(settings: TrackSettings, network: SensorNetwork, model: Sou
     most = _n_sensors(settings, network)
     if settings.target != 'vehicle':
         return most
-    n_hyp = math.prod(_vehicle_factors(settings).values())
+    return min(most, _affordable(math.prod(_vehicle_factors(settings).values()),
+                                 len(model.state_names), _states_per_sensor(settings)))
+
+
+def most_sensors(observation: Observation, n_hyp: int) -> int:
+    """How many sensors so many hypotheses may have states of."""
+    return _affordable(n_hyp, observation.n_target, observation.n_own + 3)
+
+
+def _affordable(n_hyp: int, n_target: int, n_of_sensor: int) -> int:
+    """How many sensors so many hypotheses may have states of, by how many states there are of the
+    target and of each sensor."""
     n_states = math.isqrt(START_BYTES // (_FLOAT_BYTES * n_hyp))
-    affordable = (n_states - len(model.state_names)) // _states_per_sensor(settings)
-    return min(most, max(affordable, LEAST_AT_START))
+    return max((n_states - n_target) // n_of_sensor, LEAST_AT_START)
 
 
-def most_hypotheses(n_states: int) -> int:
-    """How many are kept of a track that from now on has states of more sensors."""
-    return max(1, WIDER_BYTES // (_FLOAT_BYTES * n_states**2))
+def most_hypotheses(observation: Observation, n_sensors: int) -> int:
+    """How many are kept of a track that from now on has states of so many sensors."""
+    size = _FLOAT_BYTES * observation.n_states(n_sensors)**2
+    return max(LEAST_HYPOTHESES, WIDER_BYTES // size)
 
 
 def check_magnet_bank(settings: TrackSettings, network: SensorNetwork,
@@ -78,7 +101,7 @@ def _check_bank(group: str, factors: Mapping[str, int], settings: TrackSettings,
         product = ' x '.join(f'{name} ({number})' for name, number in factors.items())
         raise SettingsError(
             f'{group}: {n_hyp} starting hypotheses, {product}, with {n_x} states each for {n} '
-            f'sensors (track.most_sensors) need {_gigabytes(size)}, more than '
+            f'sensors (track.most_sensors) at the start need {_gigabytes(size)}, more than '
             f'{_gigabytes(MOST_BYTES)}')
 
 

@@ -25,7 +25,7 @@ struct Along {
     bool first_is_updated;
     double strange;
     int iterations, passes;
-    double step, enough;
+    double step;
     double *paths, *log_likelihood, *unsettled, *covariances;
     bool* used;
 };
@@ -104,7 +104,6 @@ INLINE void run_along_all(const Target& target, const Sensors& sensors, const Si
             for (int i = 0; i < frames.n * n_x; ++i)
                 at[i] = std::isnan(at[i]) ? smoothed[i]
                                           : at[i] + along.step * (smoothed[i] - at[i]);
-            if (along.unsettled[p] <= along.enough) break;
         }
         std::copy(x.data(), x.data() + n_x, out.x + p * n_x);
         from_wide(P.data(), n, out.P + p * square);
@@ -187,7 +186,8 @@ class CompiledFilter {
 
     void run_along(Array field, Array covariance, Array offset, Array dt, Array decay,
                    Array variance, bool first_is_updated, double strange, int iterations,
-                   int passes, double step, double enough, double field_error, Array near_field_length, Array x, Array P, Array new_x,
+                   int passes, double step,
+                   double field_error, Array near_field_length, Array x, Array P, Array new_x,
                    Array new_P, Array paths, Array log_likelihood, Array unsettled,
                    Array covariances, ArrayOf<bool> used) const {
         const Sizes n = sizes();
@@ -208,7 +208,7 @@ class CompiledFilter {
                            data_of(new_P, "new_P", {n_hyp, n_x, n_x}), nullptr, nullptr, nullptr};
         const bool wants_covariances = covariances.size() > 0;
         const Along along{
-            first_is_updated, strange, iterations, passes, step, enough,
+            first_is_updated, strange, iterations, passes, step,
             data_of(paths, "paths", {n_hyp, n_frames, n_x}),
             data_of(log_likelihood, "log_likelihood", {n_hyp}),
             data_of(unsettled, "unsettled", {n_hyp}),
@@ -256,7 +256,8 @@ void add_filter(py::module_& module, const char* name, Target (*target)(Numbers.
              IN(x), IN(P), IN(new_x), IN(new_P), IN(predicted), IN(log_likelihood), IN(nis))
         .def("run_along", &Class::run_along, IN(field), IN(covariance), IN(offset), IN(dt),
              IN(decay), IN(variance), IN(first_is_updated), IN(strange), IN(iterations),
-             IN(passes), IN(step), IN(enough), IN(field_error), IN(near_field_length), IN(x), IN(P), IN(new_x), IN(new_P),
+             IN(passes), IN(step),
+             IN(field_error), IN(near_field_length), IN(x), IN(P), IN(new_x), IN(new_P),
              IN(paths), IN(log_likelihood), IN(unsettled), IN(covariances), IN(used));
 }
 

@@ -12,11 +12,10 @@ class _Filter:
                 log_likelihood: FloatArray, nis: FloatArray) -> None: ...
     def run_along(self, *, field: FloatArray, covariance: FloatArray, offset: FloatArray,
                   dt: FloatArray, decay: FloatArray, variance: FloatArray, first_is_updated: bool,
-                  strange: float, iterations: int, passes: int, step: float, enough: float,
-                  field_error: float, near_field_length: FloatArray, x: FloatArray, P: FloatArray,
-                  new_x: FloatArray, new_P: FloatArray, paths: FloatArray,
-                  log_likelihood: FloatArray, unsettled: FloatArray, covariances: FloatArray,
-                  used: BoolArray) -> None: ...
+                  strange: float, iterations: int, passes: int, step: float, field_error: float,
+                  near_field_length: FloatArray, x: FloatArray, P: FloatArray, new_x: FloatArray,
+                  new_P: FloatArray, paths: FloatArray, log_likelihood: FloatArray,
+                  unsettled: FloatArray, covariances: FloatArray, used: BoolArray) -> None: ...
 
 class RowVehicleFilter(_Filter):
     def __init__(self, positions: FloatArray, R_sw: FloatArray, n_angles: int, n_errors: int,

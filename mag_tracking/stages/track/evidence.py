@@ -103,11 +103,11 @@ class TrackEvidence:
 
     def doubt_start(self, unseen_coming: bool, network: SensorNetwork, starts_anywhere: bool
                     ) -> None:
-        """Doubt a track that was not seen `unseen_coming`, or whose range nothing tells.
+        """Doubt a track whose target was not seen approaching, or whose range nothing tells.
 
         `starts_anywhere` is that of the target.
         """
-        # Who was not seen approaching may already have passed.
+        # One that was not seen approaching may already have passed.
         if unseen_coming and not starts_anywhere:
             self.doubt(doubts.NOT_SEEN_APPROACHING)
         # The range of a single sensor's target is what the settings say, and that of a vehicle near

@@ -245,11 +245,11 @@ class TrackManager:
             self.counts[LOUDER_THAN_LOST] += 1
         self._tail_until, self._loudest = None, _energy(frame)
         track = RunningTrack(self._next_id, self._target, s, sensors, bank_filter, bank,
-                             self.counts, self._clocks)
+                             self.counts, self._clocks, later)
         self._next_id += 1
         self._tracks.append(track)
         track.doubt(self._doubtful_sensors(*recent, frame))
-        out = track.begin(frame, recent, later,
+        out = track.begin(frame, recent,
                           unseen_coming=in_tail or bool(recent) and _n_sensors(*recent) < 2)
         return out + self._delete_ended(frame.stamp_ns)
 

@@ -35,7 +35,7 @@ LEADING = np.log(1e3)
 """A hypothesis leads that is not lighter than the heaviest by more than this."""
 
 PASSES = 3
-"""Gauss-Newton steps each time at most; the next time goes on from where they led."""
+"""Gauss-Newton steps each time; the next time goes on from where they led."""
 
 STEP = 0.5
 """Each goes so far. Whole ones overshoot where the field is far from linear, and run away."""
@@ -43,9 +43,6 @@ STEP = 0.5
 SETTLED = 0.3
 """In deviations of the position: a path has settled that the last step moved no more than this
 anywhere."""
-
-ENOUGH = 0.03
-"""In the same units: a step that would be shorter is the last one."""
 
 TRIED, IN_VAIN = 'paths linearised anew', 'paths linearised anew in vain'
 """What is counted."""
@@ -73,8 +70,11 @@ class Relinearisation:
 
     def begin(self, anchor: FilterBank | StartingBank) -> None:
         """A track begins with a bank like the `anchor`, which is not yet updated with its first
-        frame. The passes start from the anchor, and nobody else may write into it.
+        frame. The passes start from the anchor, and nobody else may write into it. Without a
+        window nothing is done.
         """
+        if not self._window_ns:
+            return
         self._anchor, self._updated = anchor, False
         self._frames: list[FieldFrame] = []
         self._intervals: list[float] = []
@@ -192,7 +192,7 @@ class Relinearisation:
         n = paths.shape[1]
         return bank_filter.run_along(
             bank, self._frames[:n], self._intervals[:n], paths, passes=passes, step=STEP,
-            enough=ENOUGH, first_is_updated=self._updated)
+            first_is_updated=self._updated)
 
 
 def _take(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray) -> None:

@@ -18,7 +18,7 @@ from mag_tracking.inference.starting_bank import StartingBank
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.bank_filter import BankFilter, NoTarget
-from mag_tracking.stages.track.bank_size import most_hypotheses
+from mag_tracking.stages.track.bank_size import WEIGHT_KEPT, most_hypotheses, most_sensors
 from mag_tracking.stages.track.clock_evidence import ClockEvidence
 from mag_tracking.stages.track.disturbances import Unexplained
 from mag_tracking.stages.track.evidence import LEAST_WATCHED, TrackEvidence
@@ -53,13 +53,15 @@ class RunningTrack:
 
     def __init__(self, id: int, target: Target, settings: TrackSettings, sensors: SensorSubset,
                  bank_filter: BankFilter, bank: FilterBank, counts: 'Counter[str]',
-                 clocks: ClockEvidence) -> None:
+                 clocks: ClockEvidence, later: SensorSubset) -> None:
+        """It starts with the `sensors`; `later` come in once its bank is small enough."""
         self.id, self.bank, self.counts, self._clocks = id, bank, counts, clocks
         self.ended: str | None = None
         self.is_lost = False
         self._target, self._settings = target, settings
         self._evidence, self._plausibility = TrackEvidence(len(sensors.whole)), Plausibility()
         self._use(sensors, bank_filter)
+        self._later: SensorSubset | None = later
         self._relinearisation = Relinearisation(
             settings.relinearise_interval_s, settings.relinearise_window_s,
             settings.relinearise_most)
@@ -91,16 +93,14 @@ class RunningTrack:
             self._opinion = SecondOpinion(self._sensors.network)
 
     def doubt(self, sensors: Sequence[int]) -> None:
-        """All of the track may be wrong if it uses one of the `sensors` (rows): their backgrounds
-        are doubtful.
-        """
+        """The backgrounds of the `sensors` (rows) are doubtful, and so is a track that uses one."""
         if doubts.DOUBTFUL_BACKGROUND not in self._evidence.doubts \
-                and np.isin(self._sensors.rows, sensors).any():
+                and np.isin((self._later or self._sensors).rows, sensors).any():
             self.counts['tracks of a doubtful background'] += 1
             self._evidence.doubt(doubts.DOUBTFUL_BACKGROUND)
 
-    def begin(self, frame: FieldFrame, recent: list[FieldFrame], later: SensorSubset,
-              unseen_coming: bool = False) -> list[TrackRecord]:
+    def begin(self, frame: FieldFrame, recent: list[FieldFrame], unseen_coming: bool = False
+              ) -> list[TrackRecord]:
         """Run through the `recent` frames before the detection, and publish the first one after.
 
         Parameters
@@ -109,8 +109,6 @@ class RunningTrack:
             Of the whole network, with the detection.
         recent : list of FieldFrame
             Those before it, oldest first.
-        later : SensorSubset
-            The sensors from the `frame` on; of many, only some are used before.
         unseen_coming : bool
             What came before says nothing of how this target came.
         """
@@ -123,26 +121,25 @@ class RunningTrack:
             self._filter.move(self.bank, (recent[0].stamp_ns - frame.stamp_ns) / NS)
         start = StartingBank.of(self.bank, self._filter.observation.n_target)
         self._whole.begin(copy(start), self._filter)
-        if self._settings.relinearise_window_s:
-            self._relinearisation.begin(start)
+        self._relinearisation.begin(start)
         dt = 0.0
         for before, after in pairwise([*recent, frame]):
-            self._step(self._sensors.part_of(before), dt, publish=False)
+            self.step(before, dt, publish=False)
             dt = (after.stamp_ns - before.stamp_ns) / NS
-        if later is not self._sensors and self.ended is None:
-            self._widen(later, dt)
-            dt = 0.0
+        if self.ended is None:
+            self._widen(dt)
         return self.step(frame, dt)
 
-    def step(self, frame: FieldFrame, dt: float) -> list[TrackRecord]:
-        """Records of a frame of the whole network, `dt` [s] after the one before."""
-        return self._step(self._sensors.part_of(frame), dt)
+    def step(self, frame: FieldFrame, dt: float, publish: bool = True) -> list[TrackRecord]:
+        """Predict, update, weigh; the records of a frame, if it is to be published.
 
-    def _step(self, frame: FieldFrame, dt: float, publish: bool = True) -> list[TrackRecord]:
-        """Predict, update, weigh, publish; the records of the frame if it is to be published."""
+        The `frame` is of the whole network, `dt` [s] after the one before.
+        """
         if self.ended is not None:
             return []
-        used = self._update(frame, dt, publish)
+        if not self._target.starts_anywhere:
+            self._evidence.watch((self._later or self._sensors).part_of(frame))
+        used = self._update(self._sensors.part_of(frame), dt, publish)
         if used is None:
             return self.end('no hypothesis explains the field')
         if not publish and self._lag is None:
@@ -155,8 +152,6 @@ class RunningTrack:
     def _update(self, frame: FieldFrame, dt: float, publish: bool) -> FieldFrame | None:
         """Move the bank through a frame; what was used of it, or None if nothing explains it."""
         s, bank = self._settings, self.bank
-        if not self._target.starts_anywhere:
-            self._evidence.watch(frame)
         predicted, log_likelihood, frame, rejected = self._rejection.advance(
             self._filter, bank, frame, dt)
         self.counts.update(rejected)
@@ -322,22 +317,27 @@ class RunningTrack:
         best, self._handover_due = self._handover_due, None
         if best is None or self.ended is not None:
             return
-        sensors = self._sensors.ahead_of(self.bank.x[best], self._settings.most_sensors)
+        sensors = self._sensors.ahead_of(self.bank.x[best], min(
+            self._settings.most_sensors, most_sensors(self._filter.observation, len(self.bank))))
         if sensors is not self._sensors:
             self._hand_on_to(sensors)
             self._whole.give_up()
             self._relinearisation.begin_anew()
             self.counts['tracks handed on to other sensors'] += 1
 
-    def _widen(self, sensors: SensorSubset, dt: float) -> None:
-        """Use more sensors from the next frame on, which comes in `dt` [s]."""
-        most = most_hypotheses(self._filter.observation.n_states(len(sensors.rows)))
+    def _widen(self, dt: float) -> None:
+        """Use all sensors from the next frame on, which comes in `dt` [s], if the frames until now
+        have made enough hypotheses improbable; else they come in with a handover."""
+        sensors, self._later = self._later or self._sensors, None
+        n, most = len(sensors.rows), most_hypotheses(self._filter.observation, len(sensors.rows))
+        if n == len(self._sensors.rows) or not self.bank.outweigh(most, WEIGHT_KEPT):
+            return
         self.counts['hypotheses dropped'] += self.bank.prune(np.inf, most)
         self._hand_on_to(sensors)
-        self._filter.move(self.bank, dt)
-        self._whole.begin(self.bank.copy(), self._filter)
-        if self._settings.relinearise_window_s:
-            self._relinearisation.begin(self.bank.copy())
+        anchor = self.bank.copy()
+        self._filter.move(anchor, dt)
+        self._whole.begin(anchor, self._filter)
+        self._relinearisation.begin(anchor.copy())
 
     def _hand_on_to(self, sensors: SensorSubset) -> None:
         """Give the hypotheses the states of other sensors."""

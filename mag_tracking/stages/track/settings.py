@@ -56,7 +56,9 @@ class TrackSettings:
         'prediction (magnets); for vehicles it locks into the wrong side.', '', (1, 20), live=True)
     most_sensors: int = param(
         16, 'Of a larger network a track uses the nearest so many, others as it moves on; it is '
-        'not smoothed then.', '', (2, 1000))
+        'not smoothed then. A vehicle starts with no more of them than its first hypotheses leave '
+        'memory for (250 MB), about ten; the others come in at its detection, where its smoothing '
+        'begins then, or as it moves on.', '', (2, 1000))
     prune_ratio: float = param(
         1e-12, 'A hypothesis lighter than the heaviest by this ratio is dropped (T10 Alg. 3).',
         '', (1e-300, 0.5), live=True)

@@ -17,7 +17,7 @@ from support.networks import line_network
     ('vehicle', {'track.vehicle.speeds': [1.0 + 1e-3 * k for k in range(100_000)]},
      '75600000 starting hypotheses, kinds (3) x arrival_names (3) x lateral_offsets (3) x speeds '
      '(100000) x moment directions (14) x turning or not (2), with 44 states each for 2 sensors '
-     '(track.most_sensors) need 1.17e+03 GB, more than 4.29 GB'),
+     '(track.most_sensors) at the start need 1.17e+03 GB, more than 4.29 GB'),
     ('vehicle', {**POINT, 'track.vehicle.lateral_offsets': [1e-3 * k for k in range(10_000)]},
      'lateral_offsets (10000)'),
     ('vehicle', {'track.vehicle.arrival_names': [str(k) for k in range(3000)],
@@ -88,7 +88,18 @@ def test_a_magnet_starts_with_all():
     assert bank_size.sensors_at_start(settings, network, model) == settings.most_sensors
 
 
-@pytest.mark.parametrize('n_states', [44, 170, 314, 10**6])
-def test_so_many_are_kept_as_take_no_more_than_they_may(n_states):
-    n, each = bank_size.most_hypotheses(n_states), 8 * n_states**2
-    assert n == 1 or n * each <= bank_size.WIDER_BYTES < (n + 1) * each
+@pytest.mark.parametrize('n', [2, 16, 32, 90])
+def test_so_many_are_kept_as_take_no_more_than_they_may(n):
+    settings, network = settings_for('vehicle').track, line_network(2)
+    observation = BankFilter(network, target_of(settings, network).model, settings).observation
+    kept, each = bank_size.most_hypotheses(observation, n), 8 * observation.n_states(n)**2
+    assert (kept == bank_size.LEAST_HYPOTHESES if n == 90
+            else kept * each <= bank_size.WIDER_BYTES < (kept + 1) * each)
+
+
+def test_more_sensors_than_the_memory_has_room_for_are_refused():
+    changes = {'track.most_sensors': 1000}
+    Pipeline(line_network(90), settings_for('vehicle', changes))
+    with pytest.raises(SettingsError, match=r'track.most_sensors: 100 hypotheses of a target that '
+                       r'400 sensors see need 10.5 GB, more than 4.29 GB'):
+        Pipeline(line_network(400), settings_for('vehicle', changes))

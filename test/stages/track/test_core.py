@@ -121,26 +121,6 @@ def test_paths_are_filtered_and_smoothed_as_step_by_step(
     np.testing.assert_allclose(got.unsettled, expected.unsettled, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize('name', CASES)
-def test_a_path_is_done_once_a_pass_hardly_moves_it(name):
-    compiled, _, bank, frames, intervals = case(name, n_hyp=4)
-    at_first = np.repeat(bank.x[:, None], len(frames), axis=1)
-
-    def run(passes, enough):
-        b, paths = bank.copy(), at_first.copy()
-        along = compiled.run_along(b, frames, intervals, paths, passes=passes, step=0.5,
-                                   first_is_updated=False, enough=enough, wants_covariances=True)
-        return b.x, b.P, paths, *along
-    runs = [run(passes, 0.0) for passes in (1, 2, 3)]
-    unsettled = np.array([along[4] for along in runs])
-    enough = np.median(unsettled[0])
-    done = [next((k for k, u in enumerate(of_one[:2]) if u <= enough), 2) for of_one in unsettled.T]
-    assert min(done) == 0 and max(done) > 0
-    for got, *of_passes in zip(run(3, enough), *runs, strict=True):
-        for i, k in enumerate(done):
-            np.testing.assert_array_equal(got[i], of_passes[k][i])
-
-
 def test_a_hypothesis_on_a_sensor_is_ruled_out_and_the_others_are_not():
     compiled, _, bank, frames, _ = case('point')
     alone = bank.alone(0)

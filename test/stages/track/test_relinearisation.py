@@ -211,7 +211,6 @@ def test_a_path_whose_covariance_is_none_is_of_no_use():
 def test_it_is_done_over_twice_the_window_at_most(monkeypatch, window_s, most_frames):
     """Frames are 0.05 s apart or more; beside the passes the anchor moves over half of them."""
     monkeypatch.setattr(relinearise, 'MOST_FRAMES', most_frames)
-    monkeypatch.setattr(relinearise, 'ENOUGH', 0.0)
     filter_ = LinearFilter()
     followed_beside_plain(filter_, Relinearisation(0.0, window_s, 5), n=90)
     frames = min(2 * round(window_s / 0.05), most_frames) + 1

@@ -9,7 +9,9 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.simulation.scenario import Path, point_body
-from mag_tracking.stages.track import bank_size
+from mag_tracking.stages.track import bank_size, manager
+from mag_tracking.stages.track.approach import Approach
+from mag_tracking.stages.track.doubts import DOUBTFUL_BACKGROUND
 from mag_tracking.stages.track.sensor_selection import hand_on, nearest, part_of_frame
 from support.bundled import POINT
 from support.networks import line_network
@@ -114,8 +116,8 @@ def test_a_target_is_followed_along_forty_sensors():
 def test_many_sensors_come_in_when_the_frames_before_the_detection_are_through(monkeypatch, most):
     """With all of them from the beginning a start would take seconds and gigabytes."""
     network, runs = line_network(12, tilt=0.02), []
-    for size in (10**12, 1):
-        monkeypatch.setattr(bank_size, 'START_BYTES', size)
+    for n in (1000, 4):
+        monkeypatch.setattr(manager, 'sensors_at_start', lambda *_, n=n: n)
         records, pipeline, truth = driven(network, {'track.most_sensors': most})
         live = [r for r in records if isinstance(r, Track) and not r.ended]
         inside = [t for t in live if 0.0 < truth(t.stamp_ns / 1e9)[0] < 45.0]
@@ -137,6 +139,78 @@ def test_many_sensors_come_in_when_the_frames_before_the_detection_are_through(m
         a.covariance[:2, :2], a.position[:2] - b.position[:2])
         for a, b in zip(*runs, strict=True)]
     assert np.mean(apart) < 1.0
+
+
+@pytest.fixture(scope='module')
+def frames():
+    """(network, frames) of a point target along twelve sensors."""
+    network = line_network(12, tilt=0.02)
+    found = [r for r in driven(network, {})[0] if isinstance(r, FieldFrame)]
+    return network, found
+
+
+def managed(frames, changes, doubtful=None, start=slice(None)):
+    """(manager, live tracks) of frames alone."""
+    network, every = frames
+    tracker, tracks = manager.TrackManager(network, settings_for('vehicle', changes).track), []
+    tracker.doubt(doubtful or {})
+    for frame in every[start]:
+        tracks += [r for r in tracker.feed(frame) if isinstance(r, Track) and not r.ended]
+    return tracker, tracks
+
+
+def test_sensors_that_come_in_and_say_nothing_change_nothing(monkeypatch, frames):
+    """The time of the first frame with all of them is gone through once."""
+    network, every = frames
+    first = next(f for f in every if f.target_present)
+    near = nearest(network.positions, network.positions[
+        np.argmax(np.linalg.norm(np.nan_to_num(first.field), axis=1)), :2], 4)
+    far = np.setdiff1d(np.arange(12), near)
+    silent = [dataclasses.replace(
+        f, field=np.where(np.isin(np.arange(12), far)[:, None], np.nan, f.field),
+        n_samples=np.where(np.isin(np.arange(12), far), 0, f.n_samples)) for f in every]
+    monkeypatch.setattr(manager, 'sensors_at_start', lambda *_: 4)
+    runs = [managed((network, silent), {**POINT, 'track.relinearise_window_s': 0.0,
+                                        'track.most_sensors': most})[1] for most in (4, 12)]
+    for a, b in zip(*(tracks[:3] for tracks in runs), strict=True):
+        np.testing.assert_allclose(b.position, a.position, atol=1e-6)
+        np.testing.assert_allclose(b.covariance, a.covariance, rtol=1e-6, atol=1e-9)
+
+
+def test_where_no_frame_came_before_the_detection_no_hypothesis_is_dropped_for_its_row(
+        monkeypatch, frames):
+    """Nothing tells yet which are better: the other sensors come in later."""
+    monkeypatch.setattr(manager, 'sensors_at_start', lambda *_: 4)
+    for name, value in (('WIDER_BYTES', 1), ('LEAST_HYPOTHESES', 20)):
+        monkeypatch.setattr(bank_size, name, value)
+    first = next(k for k, f in enumerate(frames[1]) if f.target_present)
+    tracker, _ = managed(frames, {}, start=slice(first, first + 1))
+    assert len(tracker.bank) == settings_for('vehicle').track.most_at_start
+    _, tracks = managed(frames, POINT, start=slice(first, None))
+    used = [np.count_nonzero(~np.isnan(t.nis_by_sensor)) for t in tracks]
+    assert used[0] <= 4 < max(used)
+
+
+def test_the_approach_is_judged_by_the_same_sensors_all_the_time(monkeypatch, frames):
+    monkeypatch.setattr(manager, 'sensors_at_start', lambda *_: 4)
+    looked, add = set(), Approach.add
+    monkeypatch.setattr(Approach, 'add', lambda self, frame: (
+        looked.add(len(frame.field)), add(self, frame))[1])
+    for most, expected in ((16, {12}), (8, {8})):
+        looked.clear()
+        managed(frames, {**POINT, 'track.most_sensors': most})
+        assert looked == expected
+
+
+def test_the_first_pose_is_doubted_for_a_sensor_that_comes_in_with_it(monkeypatch, frames):
+    network, every = frames
+    first = next(f for f in every if f.target_present)
+    far = network.names[int(np.nanargmin(np.linalg.norm(first.field, axis=1)))]
+    for n in (1000, 4):
+        monkeypatch.setattr(manager, 'sensors_at_start', lambda *_, n=n: n)
+        tracker, tracks = managed(frames, POINT, {far: ((0, 2**62),)})
+        assert DOUBTFUL_BACKGROUND in tracks[0].doubts
+        assert tracker.counts['tracks of a doubtful background'] == 1
 
 
 def test_a_network_that_is_not_larger_is_used_whole():
