@@ -21,6 +21,7 @@ from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.archive_folder import TableWriter, join_tables, stamped
 from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track.doubts import CLOCKS_APART
 from support.archives import command, rows, same_tables, wait_for
 from support.bundled import DATA, NETWORK_FILE, QUICK
 
@@ -99,7 +100,7 @@ def test_clocks_that_are_apart_are_remembered_from_stretch_to_stretch(
     assert_rows_of_replay(tmp_path / 'archive', result)
     # Those that the evidence of others could have changed were tracked once more.
     assert n > 1 and (len(tracked) > n) == bool(ahead_s)
-    assert any('clocks apart' in d for d in result.poses['doubts']) == bool(ahead_s)
+    assert any(CLOCKS_APART in d for d in result.poses['doubts']) == bool(ahead_s)
 
 
 def test_an_archive_of_recordings(tmp_path, recordings, capsys):
