@@ -10,7 +10,7 @@ from support.bundled import NETWORK_FILE, QUICK
 
 @pytest.fixture(scope='session')
 def recordings(tmp_path_factory):
-    """Three recordings and a file that is none."""
+    """A folder of three recordings and a file that is no recording."""
     return archive_recordings(tmp_path_factory.mktemp('recordings'))
 
 

@@ -1,4 +1,4 @@
-"""What the start of a track takes where 32 sensors see the target: time, and memory.
+"""Measure the time and memory of the start of a track that 32 sensors see.
 
     PYTHONPATH=test python -m bench.many_sensors
 

@@ -34,7 +34,7 @@ class Listener(Node):
         self.create_subscription(DiagnosticArray, '/diagnostics', self._note, RESULTS)
 
     def _track(self, message):
-        """Who draws a track needs its frame."""
+        """Count tracks that came before their frame: viewers draw both together."""
         stamps = {stamp_ns(f.header.stamp) for f in self.frames}
         self.early += any(stamp_ns(t.header.stamp) not in stamps for t in message.tracks)
 

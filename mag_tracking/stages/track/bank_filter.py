@@ -103,10 +103,9 @@ class BankFilter:
         """(predicted (n_hyp, n_x), log-likelihood (n_hyp,)); without iterations it only moves."""
         n_hyp = len(bank)
         decay, variance = self.observation.drift(np.asarray(dt), self._settings.background_drift)
-        # Of thousand hypotheses the covariances are read and written at the speed of memory: new
-        # ones would take twice as long.
-        new_x, new_P = (np.empty_like(a) if keeps_prior else a
-                        for a in (bank.x, bank.P))
+        # Memory limits the speed with a thousand hypotheses: writing to new arrays takes twice as
+        # long.
+        new_x, new_P = (np.empty_like(a) if keeps_prior else a for a in (bank.x, bank.P))
         predicted = np.empty_like(bank.x)
         log_likelihood, nis = np.zeros(n_hyp), np.full((n_hyp, self._n_sensors), np.nan)
         # By position: names of so many arguments would take as long as a few hypotheses.

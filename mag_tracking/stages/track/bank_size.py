@@ -17,13 +17,14 @@ START_BYTES = 250_000_000
 """The covariances of all starting hypotheses take no more than this, if need be with fewer sensors;
 the others come in when the track has run through the frames before its detection."""
 LEAST_AT_START = 4
-"""Those nearest to the strongest, with which every track starts."""
+"""Every track starts with at least this many sensors: those nearest to the strongest."""
 WIDER_BYTES = 100_000_000
-"""Then so many hypotheses are kept that their covariances take no more than this, but"""
+"""When they come in, the covariances of the hypotheses that are kept take no more than this."""
 LEAST_HYPOTHESES = 100
-"""not fewer, and only if they have"""
+"""No fewer hypotheses are kept, even if they take more."""
 WEIGHT_KEPT = 0.999
-"""of the weight: fewer would look surer than the frames allow."""
+"""The other sensors come in only if the hypotheses that are kept have this share of the weight:
+with less, the track would look surer than the frames allow."""
 _FLOAT_BYTES = 8
 
 
@@ -42,7 +43,7 @@ def check_vehicle_bank(settings: TrackSettings, network: SensorNetwork,
 
 
 def _vehicle_factors(settings: TrackSettings) -> dict[str, int]:
-    """What the starting hypotheses of a vehicle are the product of."""
+    """Factors {name: number} whose product is the number of starting hypotheses of a vehicle."""
     vehicle = settings.vehicle
     return {**{name: len(getattr(vehicle, name))
                for name in ('kinds', 'arrival_names', 'lateral_offsets', 'speeds')},

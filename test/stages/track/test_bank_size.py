@@ -45,7 +45,7 @@ def test_so_are_those_of_a_magnet(changes, told):
 
 
 def bytes_at_start(n, settings):
-    """Of the covariances of all hypotheses of a vehicle that starts with `n` sensors."""
+    """Size of the covariances of all hypotheses of a vehicle that starts with `n` sensors."""
     network = line_network(n)
     target = target_of(settings, network)
     frame = FieldFrame(0, np.full((n, 3), 1e-7), np.repeat(1e-16 * np.eye(3)[None], n, axis=0),

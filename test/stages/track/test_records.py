@@ -1,4 +1,4 @@
-"""What a track publishes is not changed by what comes later."""
+"""Records of a track stay as they were published."""
 
 import dataclasses
 
