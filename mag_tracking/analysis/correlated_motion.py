@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray, IntArray
@@ -196,6 +195,9 @@ class _Series:
 
     def smoothed(self, t: FloatArray, width: float) -> FloatArray:
         """(n, k) at even times `t` (n,), by a normal curve of a `width` [s]."""
+        # It takes a quarter of a second to import, and a replay hardly needs it.
+        from scipy.ndimage import gaussian_filter1d
+
         even = np.stack([np.interp(t, self.t, v) for v in self.field.T], axis=1)
         smooth: FloatArray = gaussian_filter1d(even, width / (t[1] - t[0]), axis=0)
         return smooth

@@ -31,9 +31,12 @@ double step_vectors(Array x, Array P, Array log_w, Array densities, Integers vec
     const Size n = length_of(log_w, "log_w", 2), n_strengths = log_w.shape(1);
     const Size n_y = length_of(y, "y", 1), m = length_of(densities, "densities", 2)
                                                    ? densities.shape(1) : 0;
-    const VectorBank bank{int(n), int(n_strengths), int(m),
-                          data_of(x, "x", {n, n_strengths, 2 * m}),
-                          data_of(P, "P", {n, n_strengths, 2 * m, 2 * m}), log_w.mutable_data(),
+    length_of(x, "x", 3);
+    const Size n_x = x.shape(2);
+    if (n_x < m || n_x > 2 * m) throw py::value_error("x: more rates than levels, or no levels");
+    const VectorBank bank{int(n), int(n_strengths), int(m), int(n_x - m),
+                          data_of(x, "x", {n, n_strengths, n_x}),
+                          data_of(P, "P", {n, n_strengths, n_x, n_x}), log_w.mutable_data(),
                           input_of(densities, "densities", {n_strengths, m})};
     return step(bank, {int(n_y), input_of(vector, "vector", {n_y}), input_of(H, "H", {n_y, m}),
                        y.data(), input_of(variance, "variance", {n_y})}, dt, switch_s);

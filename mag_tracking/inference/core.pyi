@@ -11,8 +11,8 @@ def smallest_pivots(y: FloatArray, C: FloatArray, out: FloatArray) -> None:
 def step_vectors(x: FloatArray, P: FloatArray, log_w: FloatArray, densities: FloatArray,
                  vector: IntArray, H: FloatArray, y: FloatArray, variance: FloatArray, dt: float,
                  switch_s: float) -> float:
-    """`GaussMarkovVectors.log_density`; the states (n, n_strengths, 2 m), their covariances and the
-    log weights (n, n_strengths) are changed."""
+    """`GaussMarkovVectors.log_density`; the states (n, n_strengths, m + n_moving), their covariances
+    and the log weights (n, n_strengths) are changed."""
 
 def inverses(A: FloatArray, least: float, out: FloatArray) -> bool:
     """Inverses of the symmetric `A` (n, k, k) into `out`; False where the least root of a pivot of

@@ -8,15 +8,21 @@
 #include <limits>
 #include <vector>
 
+#include "../arrays.hpp"
+#include "../processors.hpp"
+
 namespace mag_tracking {
 
-// n vectors of m components, each with a bank of strengths: states (n, n_strengths, 2 m) are levels
-// and rates, with their covariances (n, n_strengths, 2 m, 2 m); log weights (n, n_strengths);
-// squared densities (n_strengths, m).
+// n vectors of m components, of which the first n_moving change. Each has a bank of strengths: states
+// (n, n_strengths, n_x) are levels and the rates of those that change, n_x = m + n_moving, with their
+// covariances (n, n_strengths, n_x, n_x); log weights (n, n_strengths); squared densities
+// (n_strengths, m).
 struct VectorBank {
-    int n, n_strengths, m;
+    int n, n_strengths, m, n_moving;
     double *x, *P, *log_w;
     const double* densities;
+
+    INLINE int n_x() const { return m + n_moving; }
 };
 
 // Scalar measurements: `vector` says of which each is, ascending; (n_y, m) `H`, values, variances.
@@ -26,16 +32,16 @@ struct ScalarMeasurements {
     const double *H, *y, *variance;
 };
 
-// Move levels and rates (2 m) and their covariance on by `dt`, with densities q (m).
-inline void predict(double* x, double* P, const double* q, int m, double dt) {
-    const int n = 2 * m;
-    for (int i = 0; i < m; ++i) {
+// Move levels and rates (n_x) and their covariance on by `dt`, with densities q (m).
+INLINE void predict(double* x, double* P, const double* q, const VectorBank& bank, double dt) {
+    const int m = bank.m, n = bank.n_x();
+    for (int i = 0; i < bank.n_moving; ++i) {
         x[i] += dt * x[m + i];
         for (int j = 0; j < n; ++j) P[i * n + j] += dt * P[(m + i) * n + j];
     }
     for (int i = 0; i < n; ++i)
-        for (int j = 0; j < m; ++j) P[i * n + j] += dt * P[i * n + m + j];
-    for (int i = 0; i < m; ++i) {
+        for (int j = 0; j < bank.n_moving; ++j) P[i * n + j] += dt * P[i * n + m + j];
+    for (int i = 0; i < bank.n_moving; ++i) {
         P[i * n + i] += q[i] * (dt * dt * dt) / 3.0;
         P[i * n + m + i] += q[i] * (dt * dt) / 2.0;
         P[(m + i) * n + i] += q[i] * (dt * dt) / 2.0;
@@ -43,33 +49,43 @@ inline void predict(double* x, double* P, const double* q, int m, double dt) {
     }
 }
 
-// Update with a scalar measurement h (m) of the levels; its log-density. `PH` (2 m) is overwritten.
-inline double update(double* x, double* P, const double* h, int m, double y, double variance,
-                     double* PH) {
-    const int n = 2 * m;
-    double S = 0.0, nu = y;
-    for (int i = 0; i < n; ++i) {
-        PH[i] = 0.0;
-        for (int j = 0; j < m; ++j) PH[i] += P[i * n + j] * h[j];
+// Sum of the rows of P (n, n) by the components of h (m), most of which are zero; into `out` (n).
+INLINE void rows_by(const double* __restrict P, const double* h, int m, int n,
+                    double* __restrict out) {
+    for (int j = 0; j < n; ++j) out[j] = 0.0;
+    for (int i = 0; i < m; ++i) {
+        if (h[i] == 0.0) continue;
+        for (int j = 0; j < n; ++j) out[j] += h[i] * P[i * n + j];
     }
+}
+
+// Update with a scalar measurement h (m) of the levels; its log-density. `scratch` (3 n) is
+// overwritten.
+INLINE double update(double* x, double* __restrict P, const double* h, int m, int n, double y,
+                     double variance, double* __restrict scratch) {
+    double *PH = scratch, *K = PH + n, *c = K + n;
+    rows_by(P, h, m, n, PH);
+    double S = 0.0, nu = y;
     for (int j = 0; j < m; ++j) S += h[j] * PH[j], nu -= h[j] * x[j];
     // After a long gap the prediction is so wide that rounding errors exceed the noise.
     S = std::max(S, 0.0) + variance;
     for (int i = 0; i < n; ++i) {
-        const double gain = PH[i] / S;
-        x[i] += gain * nu;
-        for (int j = 0; j < n; ++j) P[i * n + j] -= gain * PH[j];
+        K[i] = PH[i] / S;
+        x[i] += K[i] * nu;
     }
-    // Joseph's form: (I - K h') P (I - K h')' + K R K', with K = PH / S; symmetric.
-    for (int i = 0; i < n; ++i) {
-        double left = 0.0;
-        for (int j = 0; j < m; ++j) left += P[i * n + j] * h[j];
-        for (int j = 0; j < n; ++j) P[i * n + j] += (variance * PH[i] / S - left) * PH[j] / S;
+    // Joseph's form, (I - K h') P (I - K h')' + K R K': what it adds to P - K (P h)' is c K', which
+    // would be zero without rounding errors. Half of it for each order of both keeps P symmetric.
+    for (int i = 0; i < m; ++i) {
+        if (h[i] == 0.0) continue;
+        for (int j = 0; j < n; ++j) P[i * n + j] -= K[i] * PH[j];
     }
+    rows_by(P, h, m, n, c);
+    for (int j = 0; j < n; ++j) c[j] = 0.5 * (variance * K[j] - c[j]);
     for (int i = 0; i < n; ++i) {
+        const double K_i = K[i], c_i = c[i], of_rest = i < m && h[i] != 0.0 ? 0.0 : K_i;
+        for (int j = 0; j < n; ++j)
+            P[i * n + j] = (P[i * n + j] - of_rest * PH[j]) + (c_i * K[j] + K_i * c[j]);
         P[i * n + i] = std::max(P[i * n + i], 0.0);
-        for (int j = 0; j < i; ++j)
-            P[i * n + j] = P[j * n + i] = 0.5 * (P[i * n + j] + P[j * n + i]);
     }
     constexpr double two_pi = 6.283185307179586;
     return -0.5 * (nu * nu / S + std::log(two_pi * S));
@@ -77,11 +93,11 @@ inline double update(double* x, double* P, const double* h, int m, double y, dou
 
 // Log-density of the measurements given those before, `dt` [s] ago; a strength holds for `switch_s`
 // in the mean.
-inline double step(const VectorBank& bank, const ScalarMeasurements& in, double dt,
-                   double switch_s) {
-    const int n = bank.n_strengths, m = bank.m;
+FOR_PROCESSORS static double step(const VectorBank& bank, const ScalarMeasurements& in, double dt,
+                          double switch_s) {
+    const int n = bank.n_strengths, m = bank.m, n_x = bank.n_x();
     const double stay = std::exp(-dt / switch_s);
-    std::vector<double> PH(2 * m);
+    std::vector<double> scratch(3 * n_x);
     double evidence = 0.0;
     int first = 0;
     for (int v = 0; v < bank.n; ++v) {
@@ -90,12 +106,13 @@ inline double step(const VectorBank& bank, const ScalarMeasurements& in, double 
         double* log_w = bank.log_w + v * n;
         double top = -std::numeric_limits<double>::infinity(), total = 0.0;
         for (int k = 0; k < n; ++k) {
-            double* x = bank.x + (v * n + k) * 2 * m;
-            double* P = bank.P + (v * n + k) * 4 * m * m;
+            double* x = bank.x + (v * n + k) * n_x;
+            double* P = bank.P + (v * n + k) * n_x * n_x;
             log_w[k] = std::log(stay * std::exp(log_w[k]) + (1.0 - stay) / n + 1e-300);
-            predict(x, P, bank.densities + k * m, m, dt);
+            predict(x, P, bank.densities + k * m, bank, dt);
             for (int i = first; i < after; ++i)
-                log_w[k] += update(x, P, in.H + i * m, m, in.y[i], in.variance[i], PH.data());
+                log_w[k] += update(x, P, in.H + i * m, m, n_x, in.y[i], in.variance[i],
+                                   scratch.data());
             top = std::max(top, log_w[k]);
         }
         for (int k = 0; k < n; ++k) total += std::exp(log_w[k] - top);

@@ -32,18 +32,22 @@ class GaussMarkovVectors:
         n : int
             Number of vectors.
         scale : (m,) array
-            Unit of the `STRENGTHS`, of each component.
+            Unit of the `STRENGTHS`, of each component; those that do not change, with zero, come
+            last.
         std : float
             Standard deviation of each component at the beginning.
         """
-        m, n_strengths = len(scale), len(STRENGTHS)
+        m, n_moving, n_strengths = len(scale), np.count_nonzero(scale), len(STRENGTHS)
+        if not scale[:n_moving].all():
+            raise ValueError('a component that does not change stands before one that does')
         # [k, i]: of strength k and component i.
         self._densities = np.square(STRENGTHS[:, None] * scale)
-        self._x = np.zeros((n, n_strengths, 2 * m))
-        self._P = np.zeros((n, n_strengths, 2 * m, 2 * m))
-        level = np.arange(m)
+        # Rates of those that do not change would be states that are known to be zero.
+        self._x = np.zeros((n, n_strengths, m + n_moving))
+        self._P = np.zeros((n, n_strengths, m + n_moving, m + n_moving))
+        level, rate = np.arange(m), m + np.arange(n_moving)
         self._P[:, :, level, level] = std**2
-        self._P[:, :, m + level, m + level] = self._densities
+        self._P[:, :, rate, rate] = self._densities[:, :n_moving]
         self._log_w = np.full((n, n_strengths), -np.log(n_strengths))
 
     def log_density(self, vector: IntArray, H: FloatArray, y: FloatArray, variance: FloatArray,

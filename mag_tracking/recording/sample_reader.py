@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.field_arrays import magnetic_fields
+from mag_tracking.messages.message_arrays import magnetic_fields
 from mag_tracking.messages.schema import acceleration_of, reading_of, readings_of
 from mag_tracking.messages.types import (
     FIELD_READINGS,
@@ -109,7 +109,7 @@ class SampleReader:
         together = Readings(
             sensors, place[block.channel[rows]], fields.stamp_ns[fields.is_read],
             fields.field[fields.is_read], None if C is None else C[fields.is_read])
-        others = np.setdiff1d(np.arange(len(block)), rows)
+        others = np.setdiff1d(np.arange(len(block)), np.append(rows, self._truth.take(block)))
         parts, done = [], 0
         for k in others:
             for record, _ in self._records_of([block.message(k)], {}):

@@ -7,16 +7,20 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import RecordingError
+from mag_tracking.messages.message_arrays import poses
 from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.messages.types import ODOMETRY, POSE, POSE_WITH_COVARIANCE
 from mag_tracking.recording.csv_file import number, read_csv
+from mag_tracking.recording.message_block import MessageBlock
 from mag_tracking.report.metrics import Truth
 from mag_tracking.units import LATEST_NS, NS
 
 TRUTH_TYPES = (POSE, POSE_WITH_COVARIANCE, ODOMETRY)
 """Types of messages that carry true poses."""
-_Row: TypeAlias = tuple[int, float, float, float, float, float, float, float]
+_Rows: TypeAlias = tuple[IntArray, FloatArray]
+"""Times (n,) [ns], and positions and quaternions (n, 7)."""
 _TIMES = {'stamp_ns': 1, 't': NS, 'time': NS}
 """{column: ns}."""
 
@@ -41,7 +45,7 @@ class TruthTopics:
     def __init__(self, prefix: str, frame: str, topic: str | None = None) -> None:
         self._prefix, self._frame, self._topic = prefix, frame, topic
         self.rejected: Counter[str] = Counter()
-        self._rows: dict[str, list[_Row]] = {}
+        self._rows: dict[str, list[_Rows]] = {}
 
     def wants(self, topic: str, kind: str) -> bool:
         """Whether a topic of a type carries truth."""
@@ -57,16 +61,30 @@ class TruthTopics:
         pose = content.pose if hasattr(content.pose, 'position') else content.pose.pose
         p, q = pose.position, pose.orientation
         self._rows.setdefault(topic, []).append(
-            (stamp_ns(content.header.stamp), p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+            (np.array([stamp_ns(content.header.stamp)]),
+             np.array([[p.x, p.y, p.z, q.x, q.y, q.z, q.w]])))
+
+    def take(self, block: MessageBlock) -> IntArray:
+        """Take the poses of a block that need no decoder; their rows."""
+        taken: list[IntArray] = [np.zeros(0, dtype=np.int64)]
+        for channel, kind in block.kinds.items():
+            rows: IntArray = np.flatnonzero(block.channel == channel)
+            if len(rows) and kind.type == POSE and kind.is_cdr and self.wants(kind.topic, POSE):
+                found = poses(block.data, block.begin[rows], block.end[rows], self._frame)
+                taken.append(rows[found.is_read])
+                self._rows.setdefault(kind.topic, []).append(
+                    (found.stamp_ns[found.is_read], found.pose[found.is_read]))
+        return np.concatenate(taken)
 
     def arrays(self) -> dict[str, Truth]:
         """{name: arrays} of the topics, in order of time."""
         out = {}
         for topic, rows in self._rows.items():
-            rows = sorted(rows)
-            out[topic.removeprefix(self._prefix).removesuffix('/pose')] = (
-                np.array([r[0] for r in rows], dtype=np.int64),
-                np.array([r[1:4] for r in rows]), np.array([r[4:] for r in rows]))
+            stamps, pose = (np.concatenate(arrays) for arrays in zip(*rows, strict=True))
+            order = np.argsort(stamps, kind='stable')
+            if len(order):
+                out[topic.removeprefix(self._prefix).removesuffix('/pose')] = (
+                    stamps[order], pose[order, :3], pose[order, 3:])
         return out
 
 

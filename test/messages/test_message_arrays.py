@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 
-from mag_tracking.messages.field_arrays import magnetic_fields
+from mag_tracking.messages.message_arrays import magnetic_fields
 from mag_tracking.messages.schema import magnetic_field_dicts, reading_of
 from mag_tracking.messages.types import MAGNETIC_FIELD, decode, encoder, schema_of
 from mag_tracking.recording.raw_message import RawMessage
