@@ -11,7 +11,7 @@ def smallest_pivots(y: FloatArray, C: FloatArray, out: FloatArray) -> None:
 def step_vectors(x: FloatArray, P: FloatArray, log_w: FloatArray, densities: FloatArray,
                  vector: IntArray, H: FloatArray, y: FloatArray, variance: FloatArray, dt: float,
                  switch_s: float) -> float:
-    """`GaussMarkovVectors.log_density`; the states (n, n_strengths, m + n_moving), their covariances
+    """`GaussMarkovVectors.log_density`; the states (n, n_strengths, n_x), their covariances
     and the log weights (n, n_strengths) are changed."""
 
 def inverses(A: FloatArray, least: float, out: FloatArray) -> bool:

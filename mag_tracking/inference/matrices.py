@@ -74,7 +74,11 @@ def running_away() -> AbstractContextManager[None]:
     return np.errstate(over='ignore', invalid='ignore')
 
 
-def pseudo_inverse(A: FloatArray, rank: float = 1e-15) -> FloatArray:
+RANK = 1e-15
+"""Directions whose eigenvalue is below this share of the largest are those of rounding errors."""
+
+
+def pseudo_inverse(A: FloatArray, rank: float = RANK) -> FloatArray:
     """Pseudo-inverses (n, k, k), scaled to unit diagonal first: units differ by decades.
 
     Directions whose eigenvalue is then below the share `rank` of the largest are left out. A

@@ -58,13 +58,16 @@ struct Middle {
     INLINE void derivative(const double* theta, long clock, int n, double* by) const {
         const double v = theta[SPEED], gain = theta[ACCELERATION];
         const double rate = theta[TURN_RATE], more = theta[TURN_ACCELERATION];
+        const bool bends = rate != 0.0 || more != 0.0;
+        const double cos_0 = std::cos(theta[HEADING]), sin_0 = std::sin(theta[HEADING]);
         double *x = by, *y = by + n, *z = by + 2 * n, *turned = by + 3 * n;
         for (int k = 0; k < 4 * n; ++k) by[k] = 0.0;
         x[X] = y[Y] = z[Z] = 1.0, z[CLIMB] = time;
         for (int g = 0; g < N_NODES; ++g) {
             const double at = 0.5 * time * (NODES[g] + 1.0), step = 0.5 * time * WEIGHTS[g];
             const double angle = theta[HEADING] + (rate + 0.5 * more * at) * at;
-            const double c = step * std::cos(angle), s = step * std::sin(angle);
+            const double c = step * (bends ? std::cos(angle) : cos_0);
+            const double s = step * (bends ? std::sin(angle) : sin_0);
             const double way = v + gain * at;
             x[SPEED] += c, y[SPEED] += s;
             x[ACCELERATION] += at * c, y[ACCELERATION] += at * s;
@@ -128,7 +131,7 @@ INLINE void steady_derivative(const double* theta, int n, const double* moments,
 }
 
 // Of `n` paths theta (n, n_theta), into A (n, 3 n_samples, 3 d).
-FOR_PROCESSORS static void set_steady_bases(const double* theta, long n, int n_theta,
+[[maybe_unused]] FOR_PROCESSORS static void set_steady_bases(const double* theta, long n, int n_theta,
                                             const Row& row, const Samples& samples,
                                             const std::int64_t* clocks, double* A) {
     for (long p = 0; p < n; ++p)
@@ -137,7 +140,7 @@ FOR_PROCESSORS static void set_steady_bases(const double* theta, long n, int n_t
 }
 
 // And of their moments (n, 3 d), into D (n, 3 n_samples, n_theta).
-FOR_PROCESSORS static void set_steady_derivatives(const double* theta, const double* moments,
+[[maybe_unused]] FOR_PROCESSORS static void set_steady_derivatives(const double* theta, const double* moments,
                                                   long n, int n_theta, const Row& row,
                                                   const Samples& samples,
                                                   const std::int64_t* clocks, double* D) {

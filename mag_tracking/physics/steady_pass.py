@@ -42,16 +42,19 @@ class SteadyPass:
     fixed: FloatArray
     """(N_PATH + n_clocks,) path and clocks [s]; only those that are not free count."""
     n_dipoles: int
-    _places: FloatArray = field(init=False)
-    _combinations: FloatArray = field(init=False)
+    places: FloatArray = field(init=False)
+    """(d,) of the dipoles from the row's middle, in lengths of the row."""
+    combinations: FloatArray = field(init=False)
+    """(d, d) by which each component of the moments follows from that of the linear parameters:
+    columns that are orthogonal along the row."""
 
     def __post_init__(self) -> None:
-        """Places in lengths of the row; combinations of moments that are orthogonal along it."""
+        """Places of the dipoles, and combinations of their moments."""
         d = self.n_dipoles
         places = np.linspace(-0.5, 0.5, d) if d > 1 else np.zeros(1)
-        object.__setattr__(self, '_places', places)
-        object.__setattr__(self, '_combinations', np.kron(
-            np.linalg.qr(np.vander(places, increasing=True))[0], np.eye(3)))
+        object.__setattr__(self, 'places', places)
+        object.__setattr__(self, 'combinations',
+                           np.linalg.qr(np.vander(places, increasing=True))[0])
 
     def whole(self, theta: FloatArray) -> FloatArray:
         """(n_paths, N_PATH + n_clocks) path and clocks for theta (n_paths, n_free)."""
@@ -61,14 +64,14 @@ class SteadyPass:
 
     def basis(self, theta: FloatArray) -> FloatArray:
         """Fields of unit combinations, (n_paths, 3 n, 3 d), for theta (n_paths, n_free)."""
-        A = core.steady_bases(self.whole(theta), self._places, self.t, self.positions, self.M,
+        A = core.steady_bases(self.whole(theta), self.places, self.t, self.positions, self.M,
                               self.clock)
-        return A @ self._combinations
+        return A @ np.kron(self.combinations, np.eye(3))
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
         """d(basis(theta) p)/d(theta), (n_paths, 3 n, n_free); `p` (n_paths, 3 d)."""
         D = core.steady_derivatives(
-            self.whole(theta), np.ascontiguousarray(p @ self._combinations.T), self._places, self.t,
+            self.whole(theta), p @ np.kron(self.combinations, np.eye(3)).T, self.places, self.t,
             self.positions, self.M, self.clock)
         free: FloatArray = D[:, :, self.free]
         return free

@@ -60,7 +60,7 @@ def n_events(found):
 
 def cost():
     """Share of a tracked frame that "something else" and the tests take."""
-    spent = {'_compare': 0.0, '_doubts': 0.0, '_step': 0.0}
+    spent = {'_compare': 0.0, '_doubts': 0.0, 'step': 0.0}
 
     def timed(method):
         original = getattr(RunningTrack, method)
@@ -85,7 +85,7 @@ def cost():
     finally:
         for method, (original, _) in originals.items():
             setattr(RunningTrack, method, original)
-    return (spent['_compare'] + spent['_doubts']) / spent['_step']
+    return (spent['_compare'] + spent['_doubts']) / spent['step']
 
 
 def main():

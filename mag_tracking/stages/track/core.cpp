@@ -1,4 +1,5 @@
-// What of the tracker is compiled, as a Python module. `bank_filter.py` is its only user.
+// What of the tracker is compiled, as a Python module. `bank_filter.py` and `pass_samples.py` are its
+// users.
 
 #include <array>
 #include <string>
@@ -7,6 +8,7 @@
 #include "../../processors.hpp"
 #include "../../python.hpp"
 #include "filter.hpp"
+#include "steady_fit.hpp"
 
 namespace mag_tracking {
 namespace {
@@ -261,6 +263,36 @@ void add_filter(py::module_& module, const char* name, Target (*target)(Numbers.
              IN(paths), IN(log_likelihood), IN(unsettled), IN(covariances), IN(used));
 }
 
+void fit_steady_pass(Array theta, Array cost, Array covariance, Integers free, Array fixed,
+                     Array places, Array combinations, Array t, Array positions, Array M,
+                     Integers clock, Array y, Array nuisance, int n_steps, double tolerance,
+                     double most_damping, double full_rank, double linear_rank, double rank) {
+    const Size n = length_of(theta, "theta", 2), k = length_of(free, "free", 1);
+    const Size n_t = length_of(t, "t", 1), d = length_of(places, "places", 1);
+    const Size n_whole = length_of(fixed, "fixed", 1), q = (length_of(nuisance, "nuisance", 2),
+                                                            nuisance.shape(1));
+    const std::int64_t *clocks = input_of(clock, "clock", {n_t}), *columns = free.data();
+    for (Size i = 0; i < n_t; ++i)
+        if (clocks[i] >= n_whole - N_PATH) throw py::value_error("clock: more than there are");
+    for (Size i = 0; i < k; ++i)
+        if (columns[i] < 0 || columns[i] >= n_whole) throw py::value_error("free: no such column");
+    const Samples samples{n_t, t.data(), input_of(positions, "positions", {n_t, 3}),
+                          input_of(M, "M", {n_t, 3, 3})};
+    SteadyModel model({int(d), places.data()}, input_of(combinations, "combinations", {d, d}),
+                      samples, clocks, fixed.data(), int(n_whole), columns, int(k));
+    const double* values = input_of(y, "y", {3 * n_t});
+    const double* projected = input_of(nuisance, "nuisance", {3 * n_t, q});
+    Rows rows(int(3 * n_t), int(q));
+    for (Size i = 0; i < 3 * n_t; ++i)
+        std::copy(projected + i * q, projected + (i + 1) * q, rows.row(int(i)));
+    double *found = data_of(theta, "theta", {n, k}), *costs = data_of(cost, "cost", {n});
+    double* C = data_of(covariance, "covariance", {n, k, k});
+    py::gil_scoped_release release;
+    fit_steady(model, values, rows,
+               {n_steps, tolerance, most_damping, full_rank, linear_rank, rank}, n, found, costs,
+               C);
+}
+
 using Vector = std::array<double, 3>;
 
 RowVehicle row_vehicle(int n_states, int n_dipoles, Vector density, Vector induction,
@@ -281,7 +313,12 @@ Magnet magnet(Vector density, double angular_density) {
 }  // namespace mag_tracking
 
 PYBIND11_MODULE(core, module) {
-    module.doc() = "The filters of the tracker, compiled; see bank_filter.py.";
-    mag_tracking::add_filter(module, "RowVehicleFilter", mag_tracking::row_vehicle);
-    mag_tracking::add_filter(module, "MagnetFilter", mag_tracking::magnet);
+    using namespace mag_tracking;
+    module.doc() = "The filters of the tracker, compiled; see bank_filter.py and pass_samples.py.";
+    add_filter(module, "RowVehicleFilter", row_vehicle);
+    add_filter(module, "MagnetFilter", magnet);
+    module.def("fit_steady_pass", &fit_steady_pass, IN(theta), IN(cost), IN(covariance), IN(free),
+               IN(fixed), IN(places), IN(combinations), IN(t), IN(positions), IN(M), IN(clock),
+               IN(y), IN(nuisance), IN(n_steps), IN(tolerance), IN(most_damping), IN(full_rank),
+               IN(linear_rank), IN(rank));
 }

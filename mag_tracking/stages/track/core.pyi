@@ -1,8 +1,9 @@
-"""The filters of the tracker, compiled; `bank_filter.py` says what the arguments are."""
+"""The filters and the pass fit of the tracker, compiled; `bank_filter.py` and `pass_samples.py` say
+what the arguments are."""
 
 from collections.abc import Sequence
 
-from mag_tracking.arrays import BoolArray, FloatArray
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 
 class _Filter:
     def advance(self, field: FloatArray, covariance: FloatArray, offset: FloatArray, dt: float,
@@ -26,3 +27,12 @@ class RowVehicleFilter(_Filter):
 class MagnetFilter(_Filter):
     def __init__(self, positions: FloatArray, R_sw: FloatArray, n_angles: int, n_errors: int,
                  density: Sequence[float], angular_density: float) -> None: ...
+
+def fit_steady_pass(*, theta: FloatArray, cost: FloatArray, covariance: FloatArray, free: IntArray,
+                    fixed: FloatArray, places: FloatArray, combinations: FloatArray, t: FloatArray,
+                    positions: FloatArray, M: FloatArray, clock: IntArray, y: FloatArray,
+                    nuisance: FloatArray, n_steps: int, tolerance: float, most_damping: float,
+                    full_rank: float, linear_rank: float, rank: float) -> None:
+    """`least_squares.refine` of a `SteadyPass` with `nuisance` (n_y, q), of orthonormal columns,
+    which `y` is without: from the starts `theta` (n, n_free), which become the points found, with
+    their `cost` (n,) and `covariance` (n, n_free, n_free)."""

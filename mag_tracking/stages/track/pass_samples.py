@@ -2,14 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.inference.least_squares import SeparableProblem, refine
+from mag_tracking.inference.least_squares import LINEAR_RANK, MOST_DAMPING
+from mag_tracking.inference.matrices import FULL_RANK, RANK
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.steady_pass import N_PATH, SteadyPass
-from mag_tracking.records import FieldFrame
+from mag_tracking.records import FieldFrame, plain
+from mag_tracking.stages.track import core
 from mag_tracking.stages.track.bank_filter import known_covariance
 from mag_tracking.units import NS
 
@@ -103,7 +106,21 @@ class PassSamples:
         """
         model = SteadyPass(self.t, self.positions, self.M, self.clock, free,
                            np.zeros(N_PATH + self.n_clocks), n_dipoles)
-        problem = SeparableProblem(model, self.y, self.backgrounds)
-        theta, cost, P, _ = refine(problem.residual_and_jacobian, starts, N_STEPS, TOLERANCE)
+        nuisance, y = self._projected
+        theta = np.array(starts, dtype=float, order='C')
+        n, n_free = theta.shape
+        cost, P = np.empty(n), np.empty((n, n_free, n_free))
+        core.fit_steady_pass(
+            theta=theta, cost=cost, covariance=P, free=plain(free, np.int64), fixed=model.fixed,
+            places=model.places, combinations=model.combinations, t=self.t,
+            positions=self.positions, M=self.M, clock=self.clock, y=y, nuisance=nuisance,
+            n_steps=N_STEPS, tolerance=TOLERANCE, most_damping=MOST_DAMPING, full_rank=FULL_RANK,
+            linear_rank=LINEAR_RANK, rank=RANK)
         k = int(np.argmin(cost))
         return model.whole(theta[k:k + 1])[0], float(cost[k]), P[k]
+
+    @cached_property
+    def _projected(self) -> tuple[FloatArray, FloatArray]:
+        """Orthonormal columns of the backgrounds, and the whitened fields without them."""
+        Q = np.linalg.qr(self.backgrounds)[0]
+        return plain(Q), self.y - Q @ (Q.T @ self.y)
