@@ -29,6 +29,10 @@ from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.events.stage import Events
 from mag_tracking.stages.stage import Stage
 
+MOST_UNDESCRIBED = 100
+"""Events are sought once a frame, as each search costs as much as many readings; or, while no frame
+is complete, once so many batches of readings have come."""
+
 
 class DetectionNode(StageNode):
     """Aligns the sensors to frames and tests each for a target."""
@@ -48,6 +52,7 @@ class DetectionNode(StageNode):
             self.get_logger().warning(warning)
         self._events = Events(self.network, self.settings.align, self.settings.detect) \
             if len(self.network) <= self.settings.events.most_sensors else None
+        self._undescribed: list[Readings] = []
         self._described = self.publisher(PassEventMessage, '~/events', RESULTS)
         self._detect = Detect(self.network, self.settings.detect)
         self._frames = self.publisher(NetworkFrame, NETWORK_FRAME, SENT)
@@ -91,9 +96,15 @@ class DetectionNode(StageNode):
 
     def _feed(self, readings: Readings) -> None:
         """Calibrated readings: the frames and events that they complete."""
-        self._publish(self._align.feed(readings))
-        for event in [] if self._events is None else self._events.feed(readings):
-            self._described.publish(to_message(PassEventMessage, pass_event_dict(event)))
+        frames = self._align.feed(readings)
+        self._publish(frames)
+        if self._events is None:
+            return
+        self._undescribed.append(readings)
+        if frames or len(self._undescribed) >= MOST_UNDESCRIBED:
+            for event in self._events.feed(Readings.joined(self._undescribed)):
+                self._described.publish(to_message(PassEventMessage, pass_event_dict(event)))
+            self._undescribed.clear()
 
     def _publish(self, frames: list[FieldFrame]) -> None:
         """Frames that are complete, and what is detected in them."""

@@ -30,6 +30,8 @@ NODES = ('calibration_node', 'detection_node', 'tracker_node', 'driver_node')
 RATE, PERIOD_S = 100.0, 0.08
 """[Hz] of each sensor, and the length of a frame (`align.period_s`)."""
 WARM_UP_S = 20.0
+BEGINS_AFTER_S = 0.5
+"""[s] A pose that comes so long after the one before is the first of a track."""
 MANY, GATHER_S = 16, 0.002
 """More sensors than this send their readings together; those of [s], where they measure in turn."""
 LEAN = {'arrival_names': "['left']", 'arrival_headings_deg': '[0.0]'}
@@ -69,6 +71,8 @@ class Ear:
 
         from mag_tracking.nodes.stage_node import STREAM
         self.latencies, self.values, self.troubles, self._before = [], {}, {}, {}
+        # Whether each pose is the first of a track.
+        self.begins, self._stamp = [], 0.0
         self._unread = []
         # The stamp is the mean of the samples; the one that shows that they were all comes behind:
         # half a frame, and what the sensors are apart.
@@ -84,6 +88,8 @@ class Ear:
         """How long after the sample that completed the frame it came."""
         stamp = message.header.stamp.sec + message.header.stamp.nanosec / 1e9
         self.latencies.append(time.time() - stamp - self._completed_s)
+        self.begins.append(stamp - self._stamp > BEGINS_AFTER_S)
+        self._stamp = stamp
 
     def _read(self):
         """Keep the latest of what has been heard."""
@@ -97,7 +103,7 @@ class Ear:
 
     def begin(self):
         """What was before was the warm-up: sensors that a car stood at learn later than others."""
-        self._before, self.latencies, self.troubles = self._losses(), [], {}
+        self._before, self.latencies, self.begins, self.troubles = self._losses(), [], [], {}
 
     def losses(self):
         """{what: how many} of all that says that something was lost since `begin`."""
@@ -182,6 +188,12 @@ def report(ear, rows):
         print(f'{len(late)} poses, after the sample that completed the frame: median '
           f'{np.median(late):.1f} ms, p99 {np.quantile(late, 0.99):.1f} ms, '
           f'worst {late.max():.1f} ms')
+        begins = np.array(ear.begins)
+        first, rest = late[begins], late[~begins]
+        if len(first) and len(rest):
+            print(f'{len(first)} of them are the first of a track: median {np.median(first):.1f} '
+                  f'ms, worst {first.max():.1f} ms; the others: p99 {np.quantile(rest, 0.99):.1f} '
+                  f'ms, worst {rest.max():.1f} ms')
     first, last = rows[0], rows[-1]
     minute = rows[min(len(rows) - 1, 5)]
     total = 0.0

@@ -29,13 +29,16 @@ class SteadyModel {
         const int d = row_.n;
         for (long s = 0; s < samples_.n; ++s) {
             steady_basis(whole_.data(), row_, samples_, s, long(clocks_[s]), unit_.data());
-            for (int a = 0; a < 3; ++a)
-                for (int c = 0; c < 3 * d; ++c) {
-                    double sum = 0.0;
-                    for (int i = 0; i < d; ++i)
-                        sum += unit_[a * 3 * d + 3 * i + c % 3] * combinations_[i * d + c / 3];
-                    out.row(int(3 * s + a))[c] = sum;
-                }
+            for (int a = 0; a < 3; ++a) {
+                const double* unit = unit_.data() + a * 3 * d;
+                double* row = out.row(int(3 * s + a));
+                for (int j = 0; j < d; ++j)
+                    for (int b = 0; b < 3; ++b) {
+                        row[3 * j + b] = 0.0;
+                        for (int i = 0; i < d; ++i)
+                            row[3 * j + b] += unit[3 * i + b] * combinations_[i * d + j];
+                    }
+            }
         }
     }
 
