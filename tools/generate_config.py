@@ -39,7 +39,8 @@ sensor drifts.
   settings or another version of the tables are refused: rows would not be comparable.
 - **A recording that fails does not stop the others**; its reason is in `recordings.parquet`, and
   the next run tries it again. A lost worker costs time only: its tasks are run again, up to three
-  times.
+  times, and at the end once more with nothing else beside them: only then is it the recording that
+  ended its workers.
 - **A full disk stops the run**: what is complete stays.
 - Memory of a worker grows with a stretch and with a track, not with the recording.
 

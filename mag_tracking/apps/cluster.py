@@ -4,11 +4,12 @@ import asyncio
 import logging
 import signal
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import resource_tracker
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 from mag_tracking.errors import ClusterError, MagTrackingError, MissingDependencyError
 
@@ -29,6 +30,16 @@ _TIME_OUT = (TimeoutError, asyncio.TimeoutError)
 
 class LostWorkersError(MagTrackingError):
     """A task took several workers with it."""
+
+
+class _Task(NamedTuple):
+    """A task, and whether nothing else runs beside it."""
+
+    key: Any
+    priority: int
+    call: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    is_alone: bool
 
 
 class Cluster(Generic[_Key]):
@@ -56,7 +67,10 @@ class Cluster(Generic[_Key]):
         # It would fill pages for each worker that is lost.
         logging.getLogger('distributed').setLevel(logging.CRITICAL)
         self._stack = ExitStack()
-        self._running: dict[Future[Any], _Key] = {}
+        self._running: dict[Future[Any], _Task] = {}
+        # Dask blames all tasks that a lost worker had, also those that waited there. So each is
+        # tried once more, when it is the only one that runs.
+        self._suspects: deque[_Task] = deque()
         self._seen: set[str] = set()
         self.n_lost = 0
         self._worked = time.monotonic()
@@ -79,7 +93,7 @@ class Cluster(Generic[_Key]):
     @property
     def n_running(self) -> int:
         """Number of tasks that are not finished."""
-        return len(self._running)
+        return len(self._running) + len(self._suspects)
 
     @property
     def n_workers(self) -> int:
@@ -87,13 +101,18 @@ class Cluster(Generic[_Key]):
         return max(1, len(self._seen))
 
     def keys(self) -> list[_Key]:
-        """The keys of the tasks that are not finished."""
-        return list(self._running.values())
+        """The keys of the tasks that are running."""
+        return [task.key for task in self._running.values()]
 
     def submit(self, key: _Key, priority: int, task: Callable[..., Any], *arguments: Any) -> None:
         """Run `task(*arguments)`; those of a higher priority come first."""
-        future = self._client.submit(task, *arguments, pure=False, priority=priority)
-        self._running[future] = key
+        self._run(_Task(key, priority, task, arguments, False))
+
+    def _run(self, task: _Task) -> None:
+        """Have the scheduler run a task."""
+        future = self._client.submit(task.call, *task.arguments, pure=False,
+                                     priority=task.priority)
+        self._running[future] = task
 
     def finished(self) -> Iterator[tuple[_Key, Any]]:
         """The tasks that have finished since, with what they returned or raised; waits a moment.
@@ -102,11 +121,17 @@ class Cluster(Generic[_Key]):
         """
         from distributed import wait
 
+        if not self._running and self._suspects:
+            self._run(self._suspects.popleft()._replace(is_alone=True))
         with suppress(*_TIME_OUT), self._scheduler_named():
             wait(list(self._running), timeout=LOOK_S, return_when='FIRST_COMPLETED')
         self._count_lost()
         for future in [f for f in self._running if f.done()]:
-            yield self._running.pop(future), self._result_of(future)
+            task, result = self._running.pop(future), self._result_of(future)
+            if isinstance(result, LostWorkersError) and not task.is_alone:
+                self._suspects.append(task)
+            else:
+                yield task.key, result
 
     def _result_of(self, future: 'Future[Any]') -> Any:
         """What a task returned, or its error."""

@@ -182,7 +182,8 @@ def test_nothing_of_another_state_of_a_recording_is_used(tmp_path):
 
 
 def test_a_recording_that_kills_its_workers_stops_nobody(tmp_path, recordings, monkeypatch):
-    """A file name that makes a worker end stands for one that needs too much memory."""
+    """A file name that makes a worker end stands for one that needs too much memory. What
+    waits at the same worker is lost with it, and is no worse for that."""
     folder = tmp_path / 'recordings'
     folder.mkdir()
     shutil.copy(recordings / 'straight_car_right.mcap', folder / 'good.mcap')
