@@ -13,10 +13,10 @@
 
 namespace mag_tracking {
 
-// n vectors of m components, of which the first n_moving change. Each has a bank of strengths: states
-// (n, n_strengths, n_x) are levels and the rates of those that change, n_x = m + n_moving, with their
-// covariances (n, n_strengths, n_x, n_x); log weights (n, n_strengths); squared densities
-// (n_strengths, m).
+// n vectors of m components, of which the first n_moving change. Each has a bank of strengths:
+// states (n, n_strengths, n_x) are levels and the rates of those that change, n_x = m + n_moving,
+// with their covariances (n, n_strengths, n_x, n_x); log weights (n, n_strengths); squared
+// densities (n_strengths, m).
 struct VectorBank {
     int n, n_strengths, m, n_moving;
     double *x, *P, *log_w;
@@ -74,7 +74,7 @@ INLINE double update(double* x, double* __restrict P, const double* h, int m, in
         x[i] += K[i] * nu;
     }
     // Joseph's form, (I - K h') P (I - K h')' + K R K': what it adds to P - K (P h)' is c K', which
-    // would be zero without rounding errors. Half of it for each order of both keeps P symmetric.
+    // would be zero without rounding errors. It is added in both orders, half of it each.
     for (int i = 0; i < m; ++i) {
         if (h[i] == 0.0) continue;
         for (int j = 0; j < n; ++j) P[i * n + j] -= K[i] * PH[j];
@@ -87,6 +87,11 @@ INLINE double update(double* x, double* __restrict P, const double* h, int m, in
             P[i * n + j] = (P[i * n + j] - of_rest * PH[j]) + (c_i * K[j] + K_i * c[j]);
         P[i * n + i] = std::max(P[i * n + i], 0.0);
     }
+    // Rounding, and sums of products in one step, are not alike in both halves: what is left of that
+    // after a long gap would make P indefinite.
+    for (int i = 1; i < n; ++i)
+        for (int j = 0; j < i; ++j)
+            P[i * n + j] = P[j * n + i] = 0.5 * (P[i * n + j] + P[j * n + i]);
     constexpr double two_pi = 6.283185307179586;
     return -0.5 * (nu * nu / S + std::log(two_pi * S));
 }

@@ -90,14 +90,16 @@ class Eigen {
     bool is_diagonal(const double* A) const {
         double on = 0.0, off = 0.0;
         for (std::size_t i = 0; i < n_; ++i)
-            for (std::size_t k = 0; k < n_; ++k) (i == k ? on : off) += A[i * n_ + k] * A[i * n_ + k];
+            for (std::size_t k = 0; k < n_; ++k)
+                (i == k ? on : off) += A[i * n_ + k] * A[i * n_ + k];
         return off <= 1e-32 * on;
     }
 
     // Make the elements (p, q) and (q, p) zero.
     void rotate(double* A, std::size_t p, std::size_t q) {
         const double slope = (A[q * n_ + q] - A[p * n_ + p]) / (2.0 * A[p * n_ + q]);
-        const double t = (slope >= 0.0 ? 1.0 : -1.0) / (std::abs(slope) + std::sqrt(1.0 + slope * slope));
+        const double t = (slope >= 0.0 ? 1.0 : -1.0)
+            / (std::abs(slope) + std::sqrt(1.0 + slope * slope));
         const double c = 1.0 / std::sqrt(1.0 + t * t), s = t * c;
         for (std::size_t i = 0; i < n_; ++i) turn(A[i * n_ + p], A[i * n_ + q], c, s);
         for (std::size_t i = 0; i < n_; ++i) turn(A[p * n_ + i], A[q * n_ + i], c, s);

@@ -21,6 +21,7 @@ from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.nodes.stage_node import RESULTS, SENT, STREAM, StageNode, is_heard
+from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.records import Detection, FieldFrame, Readings
 from mag_tracking.stages.align.frame_period import too_long
@@ -32,6 +33,8 @@ from mag_tracking.stages.stage import Stage
 MOST_UNDESCRIBED = 100
 """Events are sought once a frame, as each search costs as much as many readings; or, while no frame
 is complete, once so many batches of readings have come."""
+DESCRIBED_S = 0.5
+"""[s] After the last readings they are sought so late at most."""
 
 
 class DetectionNode(StageNode):
@@ -53,6 +56,7 @@ class DetectionNode(StageNode):
         self._events = Events(self.network, self.settings.align, self.settings.detect) \
             if len(self.network) <= self.settings.events.most_sensors else None
         self._undescribed: list[Readings] = []
+        steady_timer(self, DESCRIBED_S, self._describe)
         self._described = self.publisher(PassEventMessage, '~/events', RESULTS)
         self._detect = Detect(self.network, self.settings.detect)
         self._frames = self.publisher(NetworkFrame, NETWORK_FRAME, SENT)
@@ -82,7 +86,8 @@ class DetectionNode(StageNode):
 
     def queues(self) -> dict[str, int]:
         """{name of a stage: how many records it holds}."""
-        return {'align': self._align.n_held}
+        held = {} if self._events is None else {'events': sum(map(len, self._undescribed))}
+        return {'align': self._align.n_held, **held}
 
     def _take(self, sensor: str, message: MagneticField) -> None:
         """One calibrated reading."""
@@ -102,9 +107,13 @@ class DetectionNode(StageNode):
             return
         self._undescribed.append(readings)
         if frames or len(self._undescribed) >= MOST_UNDESCRIBED:
-            for event in self._events.feed(Readings.joined(self._undescribed)):
-                self._described.publish(to_message(PassEventMessage, pass_event_dict(event)))
-            self._undescribed.clear()
+            self._describe()
+
+    def _describe(self) -> None:
+        """Publish the events that the readings since the last time complete."""
+        readings, self._undescribed = Readings.joined(self._undescribed), []
+        for event in [] if self._events is None else self._events.feed(readings):
+            self._described.publish(to_message(PassEventMessage, pass_event_dict(event)))
 
     def _publish(self, frames: list[FieldFrame]) -> None:
         """Frames that are complete, and what is detected in them."""

@@ -83,7 +83,8 @@ class StraightPath {
 };
 
 // Of `n` paths theta (n, n_theta), into A (n, 3 n_samples, 3 d).
-[[maybe_unused]] FOR_PROCESSORS static void set_row_bases(const double* theta, long n, int n_theta, const Row& row,
+[[maybe_unused]]
+FOR_PROCESSORS static void set_row_bases(const double* theta, long n, int n_theta, const Row& row,
                                          const Samples& samples, double* A) {
     for (long p = 0; p < n; ++p) {
         const StraightPath path(theta + p * n_theta, row);
@@ -92,7 +93,8 @@ class StraightPath {
 }
 
 // And of their moments (n, 3 d), into D (n, 3 n_samples, n_theta).
-[[maybe_unused]] FOR_PROCESSORS static void set_row_derivatives(const double* theta, const double* moments, long n,
+[[maybe_unused]]
+FOR_PROCESSORS static void set_row_derivatives(const double* theta, const double* moments, long n,
                                                int n_theta, const Row& row,
                                                const Samples& samples, double* D) {
     for (long p = 0; p < n; ++p) {

@@ -131,7 +131,8 @@ INLINE void steady_derivative(const double* theta, int n, const double* moments,
 }
 
 // Of `n` paths theta (n, n_theta), into A (n, 3 n_samples, 3 d).
-[[maybe_unused]] FOR_PROCESSORS static void set_steady_bases(const double* theta, long n, int n_theta,
+[[maybe_unused]]
+FOR_PROCESSORS static void set_steady_bases(const double* theta, long n, int n_theta,
                                             const Row& row, const Samples& samples,
                                             const std::int64_t* clocks, double* A) {
     for (long p = 0; p < n; ++p)
@@ -140,7 +141,8 @@ INLINE void steady_derivative(const double* theta, int n, const double* moments,
 }
 
 // And of their moments (n, 3 d), into D (n, 3 n_samples, n_theta).
-[[maybe_unused]] FOR_PROCESSORS static void set_steady_derivatives(const double* theta, const double* moments,
+[[maybe_unused]]
+FOR_PROCESSORS static void set_steady_derivatives(const double* theta, const double* moments,
                                                   long n, int n_theta, const Row& row,
                                                   const Samples& samples,
                                                   const std::int64_t* clocks, double* D) {

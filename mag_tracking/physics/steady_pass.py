@@ -26,7 +26,9 @@ class SteadyPass:
     """A row of `n_dipoles` dipoles along a path of steady acceleration and turning.
 
     theta: those of `PATH` and of the clocks that are in `free`, in that order; the others stay as
-    in `fixed`. Linear (3 d): combinations of the moments.
+    in `fixed`. Linear (3 d): combinations of the moments. The tracker fits it in compiled code
+    (`stages/track/steady_fit.hpp`); `basis` and `derivative` are for simulations, and for the tests
+    that compare.
     """
 
     t: FloatArray

@@ -103,3 +103,36 @@ def test_densities_stay_finite_over_long_gaps_and_with_little_noise(gap, noise):
                               0.08) for value in (y, y, y + 1e3 * noise)]
     # A strength a thousand times larger costs log(1000) on each axis.
     assert known[2] < known[1] - 15.0
+
+
+def test_components_that_do_not_change_are_constants():
+    """One that changes and a constant, seen together and apart, against filterpy."""
+    rng = np.random.default_rng(5)
+    bank = GaussMarkovVectors(1, np.array([0.5, 0.0]), 2.0)
+    H = np.array([[1.0, 0.3], [0.2, -1.0]])
+    filters, log_w = [], np.full(len(STRENGTHS), -np.log(len(STRENGTHS)))
+    for strength in STRENGTHS:
+        kf = KalmanFilter(dim_x=3, dim_z=2)
+        kf.H, kf.R = np.insert(H, 1, 0.0, axis=1), 0.04 * np.eye(2)
+        kf.P = np.diag([4.0, (0.5 * strength)**2, 4.0])
+        filters.append(kf)
+    for y in np.cumsum(rng.standard_normal((25, 2)), axis=0):
+        stay = np.exp(-0.1 / SWITCH_S)
+        log_w = np.log(stay * np.exp(log_w) + (1.0 - stay) / len(STRENGTHS))
+        for k, kf in enumerate(filters):
+            Q = np.zeros((3, 3))
+            Q[:2, :2] = Q_continuous_white_noise(2, 0.1, (0.5 * STRENGTHS[k])**2)
+            F = np.eye(3)
+            F[0, 1] = 0.1
+            kf.predict(F=F, Q=Q)
+            kf.update(y)
+            log_w[k] += kf.log_likelihood
+        expected = logsumexp(log_w)
+        log_w -= expected
+        assert bank.log_density(np.zeros(2, dtype=np.int64), H, y, np.full(2, 0.04), 0.1) \
+            == pytest.approx(expected, rel=1e-8)
+
+
+def test_a_component_that_does_not_change_stands_behind_those_that_do():
+    with pytest.raises(ValueError, match='stands before'):
+        GaussMarkovVectors(1, np.array([0.0, 1.0]), 1.0)

@@ -1,13 +1,13 @@
-"""Magnetic fields as arrays against the decoder of one message after the other."""
+"""Messages as arrays against the decoder of one message after the other."""
 
 import struct
 
 import numpy as np
 import pytest
 
-from mag_tracking.messages.message_arrays import magnetic_fields
-from mag_tracking.messages.schema import magnetic_field_dicts, reading_of
-from mag_tracking.messages.types import MAGNETIC_FIELD, decode, encoder, schema_of
+from mag_tracking.messages.message_arrays import magnetic_fields, poses
+from mag_tracking.messages.schema import header_dict, magnetic_field_dicts, reading_of
+from mag_tracking.messages.types import MAGNETIC_FIELD, POSE, decode, encoder, schema_of
 from mag_tracking.recording.raw_message import RawMessage
 from mag_tracking.records import Readings
 
@@ -92,3 +92,42 @@ def test_any_bytes_are_read_or_left_out():
     for m, is_read, field in zip(data, found.is_read, found.field, strict=True):
         if is_read:
             np.testing.assert_array_equal(field, decoded(m).field[0])
+
+
+def pose_message(k, frame):
+    """CDR bytes of geometry_msgs/PoseStamped, which differ from the others'."""
+    numbers = np.random.default_rng(k).standard_normal(7).tolist()
+    return encoder(POSE)({'header': header_dict(10**18 + 7 * k, frame), 'pose': {
+        'position': dict(zip('xyz', numbers, strict=False)),
+        'orientation': dict(zip('xyzw', numbers[3:], strict=True))}})
+
+
+def poses_of(messages, frame='map'):
+    """What is read of the bytes of `messages`."""
+    ends = np.cumsum([len(m) for m in messages], dtype=np.int64)
+    return poses(b''.join(messages), ends - [len(m) for m in messages], ends, frame)
+
+
+@pytest.mark.parametrize('frame', ['map', '', 'a much longer name', 'möp'])
+def test_poses_of_a_frame_are_read_as_by_the_decoder(frame):
+    """Also where another frame has a name of the same length."""
+    frames = ['map', 'utm', '', 'a', 'a much longer name', 'möp', 'odom']
+    data = [pose_message(k, frames[k % len(frames)]) for k in range(28)]
+    found = poses_of(data, frame)
+    assert found.is_read.tolist() == [frames[k % len(frames)] == frame for k in range(28)]
+    for k in np.flatnonzero(found.is_read):
+        said = decode(RawMessage('/p', POSE, 0, data[k], schema_of(POSE)))
+        p, q = said.pose.position, said.pose.orientation
+        assert found.pose[k].tolist() == [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
+        assert found.stamp_ns[k] == said.header.stamp.sec * 10**9 + said.header.stamp.nanosec
+
+
+@pytest.mark.parametrize('spoil', [
+    lambda m: b'', lambda m: m[:3], lambda m: m[:15], lambda m: m[:40], lambda m: m[:-1],
+    lambda m: b'\x00\x00' + m[2:], lambda m: b'\x07' + m[1:],
+    lambda m: m[:12] + struct.pack('<I', 2**31 + 5) + m[16:],
+    lambda m: m[:12] + struct.pack('<I', 0) + m[16:], lambda m: m[:19] + b'x' + m[20:]])
+def test_poses_that_are_damaged_or_unusual_are_left_to_the_decoder(spoil):
+    data = [pose_message(k, 'map') for k in range(5)]
+    data[2] = spoil(data[2])
+    assert poses_of(data).is_read.tolist() == [True, True, False, True, True]

@@ -9,11 +9,19 @@ import pytest
 from mag_tracking.apps.replay import replay, write_trajectories
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import header_dict
-from mag_tracking.messages.types import MAGNETIC_FIELD, POSE, POSE_WITH_COVARIANCE
+from mag_tracking.messages.types import (
+    MAGNETIC_FIELD,
+    POSE,
+    POSE_WITH_COVARIANCE,
+    encoder,
+    schema_of,
+)
 from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.message_block import MessageBlock
+from mag_tracking.recording.raw_message import RawMessage
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.recording.truth import read_truth_table
+from mag_tracking.recording.truth import TruthTopics, read_truth_table
 from mag_tracking.recording.tum_file import write_tum
 from mag_tracking.recording.writer import RecordingWriter
 from support.bundled import QUICK, vehicle_path
@@ -59,6 +67,31 @@ def test_a_topic_of_either_type_is_truth_in_order_of_time(tmp_path):
         assert stamps.tolist() == [10**9 + 7, 2 * 10**9 + 7]
         assert position.tolist() == [[first, 2.0, 3.0], [2.0 * first, 2.0, 3.0]]
         assert quaternion.tolist() == [[0.0, 0.0, 0.0, 1.0]] * 2
+
+
+def test_poses_are_taken_in_blocks_and_put_in_order_of_their_stamps():
+    """Those of two channels of one topic, in the order of the log; other frames and types are left
+    to the decoder."""
+    def message(topic, stamp_ns, frame='map', kind=POSE):
+        return RawMessage(topic, kind, 0, encoder(POSE)({
+            'header': header_dict(stamp_ns, frame), 'pose': pose(float(stamp_ns))}),
+            schema_of(POSE))
+
+    topics = TruthTopics('/ground_truth/', 'map')
+    block = MessageBlock.of_messages([
+        message('/ground_truth/car/pose', 30), message('/ground_truth/car/pose', 20),
+        message('/ground_truth/car/pose', 10, 'utm'), message('/elsewhere', 40),
+        message('/ground_truth/truck/pose', 50)])
+    assert sorted(topics.take(block).tolist()) == [0, 1, 4]
+    coded = MessageBlock(block.data, {n: kind._replace(is_cdr=False)
+                                      for n, kind in block.kinds.items()}, block.channel,
+                         block.log_time_ns, block.begin, block.end)
+    assert not len(topics.take(coded))
+    assert not len(topics.take(block.part(slice(0, 0))))
+    arrays = topics.arrays()
+    assert list(arrays) == ['car', 'truck']
+    stamps, position, _ = arrays['car']
+    assert stamps.tolist() == [20, 30] and position[:, 0].tolist() == [20.0, 30.0]
 
 
 def test_truth_in_another_frame_is_not_compared_and_said(tmp_path):

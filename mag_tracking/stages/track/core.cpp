@@ -1,5 +1,4 @@
-// What of the tracker is compiled, as a Python module. `bank_filter.py` and `pass_samples.py` are its
-// users.
+// What of the tracker is compiled, as a Python module, for `bank_filter.py` and `pass_samples.py`.
 
 #include <array>
 #include <string>
@@ -272,8 +271,10 @@ void fit_steady_pass(Array theta, Array cost, Array covariance, Integers free, A
     const Size n_whole = length_of(fixed, "fixed", 1), q = (length_of(nuisance, "nuisance", 2),
                                                             nuisance.shape(1));
     const std::int64_t *clocks = input_of(clock, "clock", {n_t}), *columns = free.data();
+    if (n_whole < N_PATH) throw py::value_error("fixed: not path and clocks");
     for (Size i = 0; i < n_t; ++i)
-        if (clocks[i] >= n_whole - N_PATH) throw py::value_error("clock: more than there are");
+        if (clocks[i] < -1 || clocks[i] >= n_whole - N_PATH)
+            throw py::value_error("clock: no such clock");
     for (Size i = 0; i < k; ++i)
         if (columns[i] < 0 || columns[i] >= n_whole) throw py::value_error("free: no such column");
     const Samples samples{n_t, t.data(), input_of(positions, "positions", {n_t, 3}),

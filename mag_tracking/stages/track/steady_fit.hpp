@@ -74,7 +74,8 @@ class SteadyModel {
     std::vector<double> whole_, unit_, moments_, by_, derivative_;
 };
 
-// From each of `n` starts theta (n, n_free), in place; into cost (n), covariance (n, n_free, n_free).
+// From each of `n` starts theta (n, n_free), in place; into cost (n) and covariance
+// (n, n_free, n_free).
 FOR_PROCESSORS static void fit_steady(SteadyModel& model, const double* y, Rows& nuisance,
                                       const SearchLimits& limits, long n, double* theta,
                                       double* cost, double* covariance) {

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mag_tracking.inference.least_squares import SeparableProblem, refine
-from mag_tracking.inference.matrices import pseudo_inverse
+from mag_tracking.inference.least_squares import LINEAR_RANK, SeparableProblem, refine
+from mag_tracking.inference.matrices import RANK, pseudo_inverse
 from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, PATH, SteadyPass
 from mag_tracking.stages.track import core
 from mag_tracking.stages.track.pass_samples import N_STEPS, TOLERANCE, PassSamples
@@ -68,7 +68,7 @@ def test_directions_that_nothing_determines_have_no_variance():
 
 
 def test_pseudo_inverses_in_the_fit_are_those_of_numpy():
-    """Two clocks of one sensor: of the two columns only the sum is determined."""
+    """One parameter twice: only the sum of the two is determined."""
     data = samples_of(ROAD, (0.0,))
     free = np.arange(N_STRAIGHT)
     model = SteadyPass(data.t, data.positions, data.M, data.clock, free,
@@ -83,8 +83,33 @@ def test_pseudo_inverses_in_the_fit_are_those_of_numpy():
     np.testing.assert_allclose(P, expected, rtol=1e-5, atol=1e-8 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize('length', [1e-1, 1e-2, 1e-3])
+def test_dipoles_that_are_almost_at_one_place_are_fitted_as_by_numpy(length):
+    """A start without steps."""
+    data = samples_of(ROAD, (0.0,))
+    free = np.array([PATH.index('x'), PATH.index('length')])
+    fixed = np.append(STRAIGHT, 0.0)
+    model = SteadyPass(data.t, data.positions, data.M, data.clock, free, fixed, 5)
+    problem = SeparableProblem(model, data.y, data.backgrounds)
+    theta = np.array([[0.0, length]])
+    nuisance = np.linalg.qr(data.backgrounds)[0]
+    cost, P = np.empty(1), np.empty((1, 2, 2))
+    core.fit_steady_pass(
+        theta=theta.copy(), cost=cost, covariance=P, free=free, fixed=fixed, places=model.places,
+        combinations=model.combinations, t=data.t, positions=data.positions, M=data.M,
+        clock=data.clock, y=data.y - nuisance @ (nuisance.T @ data.y), nuisance=nuisance,
+        n_steps=0, tolerance=0.0, most_damping=1e12, full_rank=1e-3, linear_rank=LINEAR_RANK,
+        rank=RANK)
+    residual, J = problem.residual_and_jacobian(theta)
+    assert cost[0] == pytest.approx(float(residual[0] @ residual[0]), rel=1e-6)
+    # Eigenvalues near the limit are known to a few digits only.
+    np.testing.assert_allclose(P[0], pseudo_inverse((J[0].T @ J[0])[None])[0], rtol=0.3)
+
+
 @pytest.mark.parametrize('name, value, error', [
-    ('clock', np.full(4, 1), 'clock: more than there are'),
+    ('clock', np.full(4, 1), 'clock: no such clock'),
+    ('clock', np.full(4, -2), 'clock: no such clock'),
+    ('fixed', np.zeros(N_PATH - 1), 'fixed: not path and clocks'),
     ('free', np.array([0, 11]), 'free: no such column'),
     ('free', np.array([-1, 3]), 'free: no such column'),
     ('y', np.zeros(11), 'y: not of the shape'),

@@ -98,3 +98,20 @@ def test_the_first_frame_after_a_handover_is_not_compared():
     before.log_density(smooth[0], 0.0, none)
     assert rest == pytest.approx(sum(before.log_density(f, 0.08, none) for f in smooth[1:]),
                                  abs=60.0)
+
+
+@pytest.mark.parametrize('gap_s', [2.0, 20.0, 60.0])
+def test_it_stays_finite_over_gaps_where_sensors_are_turned(gap_s):
+    """Each update mixes all components: what rounding does to one half of a covariance only would
+    grow until it is none."""
+    network, rng = line_network(4), np.random.default_rng(2)
+    turned = np.linalg.qr(rng.standard_normal((4, 3, 3)))[0]
+    network = dataclasses.replace(network, R_ws=turned * np.sign(np.linalg.det(turned))[:, None,
+                                                                                        None])
+    other = SomethingElse(network, 5e-9)
+    C = np.tile(1.6e-17 * np.eye(3), (4, 1, 1))
+    for k in range(2500):
+        field = network.R_sw @ (1e-6 * np.sin(0.05 * k) * np.array([1.0, 0.5, -0.3])) \
+            + 4e-9 * rng.standard_normal((4, 3))
+        frame = FieldFrame(k, field, C, np.ones(4, dtype=np.int64), np.zeros(4))
+        assert np.isfinite(other.log_density(frame, gap_s if k % 50 == 49 else 0.08, np.zeros(4)))
