@@ -74,21 +74,16 @@ INLINE double update(double* x, double* __restrict P, const double* h, int m, in
         x[i] += K[i] * nu;
     }
     // Joseph's form, (I - K h') P (I - K h')' + K R K': what it adds to P - K (P h)' is c K', which
-    // would be zero without rounding errors. It is added in both orders, half of it each.
-    for (int i = 0; i < m; ++i) {
-        if (h[i] == 0.0) continue;
+    // would be zero without rounding errors.
+    for (int i = 0; i < n; ++i)
         for (int j = 0; j < n; ++j) P[i * n + j] -= K[i] * PH[j];
-    }
     rows_by(P, h, m, n, c);
-    for (int j = 0; j < n; ++j) c[j] = 0.5 * (variance * K[j] - c[j]);
     for (int i = 0; i < n; ++i) {
-        const double K_i = K[i], c_i = c[i], of_rest = i < m && h[i] != 0.0 ? 0.0 : K_i;
-        for (int j = 0; j < n; ++j)
-            P[i * n + j] = (P[i * n + j] - of_rest * PH[j]) + (c_i * K[j] + K_i * c[j]);
+        const double c_i = variance * K[i] - c[i];
+        for (int j = 0; j < n; ++j) P[i * n + j] += c_i * K[j];
         P[i * n + i] = std::max(P[i * n + i], 0.0);
     }
-    // Rounding, and sums of products in one step, are not alike in both halves: what is left of that
-    // after a long gap would make P indefinite.
+    // Rounding errors differ between the halves, and after long gaps would make P indefinite.
     for (int i = 1; i < n; ++i)
         for (int j = 0; j < i; ++j)
             P[i * n + j] = P[j * n + i] = 0.5 * (P[i * n + j] + P[j * n + i]);

@@ -22,11 +22,11 @@ _POSE_DOUBLES = 7
 
 
 class FieldArrays(NamedTuple):
-    """What magnetic fields say, in arrays."""
+    """The contents of magnetic fields as arrays."""
 
     is_read: BoolArray
-    """(n,) False: the message is unusual or damaged, and left to a decoder. What is said of it in
-    the other arrays means nothing."""
+    """(n,) False: the message is unusual or damaged, and left to a decoder. Its elements of the
+    other arrays are meaningless."""
     stamp_ns: IntArray
     """(n,)"""
     field: FloatArray
@@ -36,11 +36,11 @@ class FieldArrays(NamedTuple):
 
 
 class PoseArrays(NamedTuple):
-    """What poses say, in arrays."""
+    """The contents of poses as arrays."""
 
     is_read: BoolArray
-    """(n,) False: the message is of another frame, unusual or damaged, and left to a decoder. What
-    is said of it in the other arrays means nothing."""
+    """(n,) False: the message is of another frame, unusual or damaged, and left to a decoder. Its
+    elements of the other arrays are meaningless."""
     stamp_ns: IntArray
     """(n,)"""
     pose: FloatArray

@@ -30,11 +30,9 @@ from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.events.stage import Events
 from mag_tracking.stages.stage import Stage
 
-MOST_UNDESCRIBED = 100
-"""Events are sought once a frame, as each search costs as much as many readings; or, while no frame
-is complete, once so many batches of readings have come."""
 DESCRIBED_S = 0.5
-"""[s] After the last readings they are sought so late at most."""
+"""[s] Events are sought once a frame, since a search costs as much as many readings. Without frames
+they are sought at this interval."""
 
 
 class DetectionNode(StageNode):
@@ -56,7 +54,8 @@ class DetectionNode(StageNode):
         self._events = Events(self.network, self.settings.align, self.settings.detect) \
             if len(self.network) <= self.settings.events.most_sensors else None
         self._undescribed: list[Readings] = []
-        steady_timer(self, DESCRIBED_S, self._describe)
+        if self._events is not None:
+            steady_timer(self, DESCRIBED_S, self._describe)
         self._described = self.publisher(PassEventMessage, '~/events', RESULTS)
         self._detect = Detect(self.network, self.settings.detect)
         self._frames = self.publisher(NetworkFrame, NETWORK_FRAME, SENT)
@@ -103,16 +102,16 @@ class DetectionNode(StageNode):
         """Calibrated readings: the frames and events that they complete."""
         frames = self._align.feed(readings)
         self._publish(frames)
-        if self._events is None:
-            return
-        self._undescribed.append(readings)
-        if frames or len(self._undescribed) >= MOST_UNDESCRIBED:
-            self._describe()
+        if self._events is not None:
+            self._undescribed.append(readings)
+            if frames:
+                self._describe()
 
     def _describe(self) -> None:
         """Publish the events that the readings since the last time complete."""
+        assert self._events is not None
         readings, self._undescribed = Readings.joined(self._undescribed), []
-        for event in [] if self._events is None else self._events.feed(readings):
+        for event in self._events.feed(readings):
             self._described.publish(to_message(PassEventMessage, pass_event_dict(event)))
 
     def _publish(self, frames: list[FieldFrame]) -> None:

@@ -22,7 +22,7 @@ def message(k, frame='mag_1', covariance=None):
 
 
 def read(messages):
-    """What is read of the bytes of `messages`, which stand one after the other."""
+    """`FieldArrays` of the bytes of `messages`, one after the other."""
     ends = np.cumsum([len(m) for m in messages], dtype=np.int64)
     return magnetic_fields(b''.join(messages), ends - [len(m) for m in messages], ends)
 
@@ -103,7 +103,7 @@ def pose_message(k, frame):
 
 
 def poses_of(messages, frame='map'):
-    """What is read of the bytes of `messages`."""
+    """`PoseArrays` of the bytes of `messages`."""
     ends = np.cumsum([len(m) for m in messages], dtype=np.int64)
     return poses(b''.join(messages), ends - [len(m) for m in messages], ends, frame)
 

@@ -102,8 +102,8 @@ def test_the_first_frame_after_a_handover_is_not_compared():
 
 @pytest.mark.parametrize('gap_s', [2.0, 20.0, 60.0])
 def test_it_stays_finite_over_gaps_where_sensors_are_turned(gap_s):
-    """Each update mixes all components: what rounding does to one half of a covariance only would
-    grow until it is none."""
+    """Each update mixes all components: without mirroring, rounding errors of one half of a
+    covariance grow until it is indefinite."""
     network, rng = line_network(4), np.random.default_rng(2)
     turned = np.linalg.qr(rng.standard_normal((4, 3, 3)))[0]
     network = dataclasses.replace(network, R_ws=turned * np.sign(np.linalg.det(turned))[:, None,
