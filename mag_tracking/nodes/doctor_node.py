@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
-import rclpy
 from mag_tracking_msgs.msg import FieldReadings
 from rclpy.node import Node
 from sensor_msgs.msg import MagneticField
@@ -16,6 +15,7 @@ from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import reading_of, readings_of
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.network import SensorNetwork
+from mag_tracking.nodes.leaving import leave
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.sensor_graph import missing_publisher, topic_findings
 from mag_tracking.nodes.stage_node import SENSORS, STREAM, make_executor, spin
@@ -78,7 +78,5 @@ def listen(network: SensorNetwork, settings: Settings, seconds: float,
         spin(executor, lambda: stopped() or time.monotonic() > end)
         return node.doctor, node.findings()
     finally:
-        executor.remove_node(node)
-        node.destroy_node()
-        executor.shutdown()
-        rclpy.try_shutdown()
+        # A process that is ended here has reported nothing.
+        leave([node], executor, status=1)

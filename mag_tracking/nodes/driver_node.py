@@ -100,9 +100,13 @@ class DriverNode(ManagedNode):
         self._forget()
         return TransitionCallbackReturn.SUCCESS
 
-    def destroy_node(self) -> None:
-        """Stop the threads first: they publish."""
+    def close(self) -> None:
+        """End the threads, which publish; they close their devices."""
         self._stop()
+
+    def destroy_node(self) -> None:
+        """Destroy the node, closed first."""
+        self.close()
         ManagedNode.destroy_node(self)
 
     def _advertise(self, sensor: str,

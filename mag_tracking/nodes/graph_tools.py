@@ -23,6 +23,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from mag_tracking.errors import GraphError
 from mag_tracking.nodes.convert import message_class
+from mag_tracking.nodes.leaving import leave
 from mag_tracking.nodes.middleware import RCLError, begin
 from mag_tracking.nodes.stage_node import make_executor, spin
 
@@ -91,13 +92,12 @@ def observer(ros_arguments: Sequence[str] = ()) -> Iterator[Observer]:
     begin(list(ros_arguments))
     executor, node = make_executor(), Node('mag_tracking_observer', start_parameter_services=False)
     executor.add_node(node)
+    status = 1
     try:
         yield Observer(node, executor)
+        status = 0
     finally:
-        executor.remove_node(node)
-        node.destroy_node()
-        executor.shutdown()
-        rclpy.try_shutdown()
+        leave([node], executor, status)
 
 
 def topics(graph: Observer) -> list[tuple[str, str, int, int]]:

@@ -32,6 +32,9 @@ class ManagedNode(LifecycleNode):
         """Read files and advertise topics; called on configuration. Raises MagTrackingError."""
         raise NotImplementedError
 
+    def close(self) -> None:
+        """Stop what runs beside the node, before it is destroyed."""
+
     def on_configure(self, state: State) -> TransitionCallbackReturn:
         """Call `prepare`; an error is logged and leaves the node unconfigured."""
         try:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from mag_tracking_msgs.msg import NetworkFrame, SmoothedTrack, TrackArray
 from rclpy.node import Node
@@ -24,6 +23,7 @@ from mag_tracking.messages.frame import frame_of
 from mag_tracking.messages.markers import SENSOR_KINDS
 from mag_tracking.messages.types import NETWORK_FRAME
 from mag_tracking.nodes.convert import track_of
+from mag_tracking.nodes.leaving import leave
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.stage_node import LATCHED, RESULTS, STREAM, make_executor, spin
 from mag_tracking.nodes.steady_timer import steady_timer
@@ -220,13 +220,11 @@ def watch(host: str, port: int, report: Callable[[str], object],
             PageServer(scene, host, port) as server:
         report(f'live page: {server.url}')
         begin(list(ros_arguments))
-        executor, node = make_executor(), PageNode(scene)
+        executor, node, status = make_executor(), PageNode(scene), 1
         executor.add_node(node)
         try:
             spin(executor, lambda: bool(seen) or not server.is_serving or ended())
+            status = 0 if server.is_serving else 1
         finally:
-            executor.remove_node(node)
-            node.destroy_node()
-            executor.shutdown()
-            rclpy.try_shutdown()
-        return 0 if server.is_serving else 1
+            leave([node], executor, status)
+        return status

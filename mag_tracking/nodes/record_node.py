@@ -23,6 +23,7 @@ from mag_tracking.messages.types import (
 )
 from mag_tracking.nodes.convert import message_class
 from mag_tracking.nodes.definitions import definition_of
+from mag_tracking.nodes.leaving import leave
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.recording.recorder import Recorder
 from mag_tracking.recording.writer import offered_qos
@@ -222,22 +223,20 @@ def run(selection: Selection, out: Path, split_bytes: int = 10**9,
 
     Raises OutputError where `out` cannot take a recording.
     """
+    node, status = None, 1
     with noted_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as seen:
-        with Recorder(out, split_bytes, split_ns, report=say) as recorder:
-            begin(list(ros_arguments))
-            node = None
-            try:
+        try:
+            with Recorder(out, split_bytes, split_ns, report=say) as recorder:
+                begin(list(ros_arguments))
                 node = RecordNode(recorder, selection, say)
                 say(f'recording into {out}; Ctrl-C ends it')
                 _record(node, lambda: bool(seen))
-                lost, refused, selection = node.lost, node.refused, node.selection
-            finally:
-                if node is not None:
-                    node.destroy_node()
-                rclpy.try_shutdown()
-        for line in summary(recorder, selection, lost, refused):
-            print(line)
-    return 1 if recorder.unfinished else 0
+            for line in summary(recorder, node.selection, node.lost, node.refused):
+                print(line)
+            status = 1 if recorder.unfinished else 0
+        finally:
+            leave([] if node is None else [node], status=status)
+    return status
 
 
 def _record(node: RecordNode, stopped: Callable[[], bool]) -> None:

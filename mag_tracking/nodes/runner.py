@@ -8,7 +8,6 @@ from functools import partial
 from os import PathLike as OsPathLike
 from typing import TextIO
 
-import rclpy
 from mag_tracking_msgs.msg import TrackArray
 from rclpy.executors import Executor
 from rclpy.node import Node
@@ -22,6 +21,7 @@ from mag_tracking.nodes.calibration_node import CalibrationNode
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.detection_node import DetectionNode
 from mag_tracking.nodes.driver_node import DriverNode
+from mag_tracking.nodes.leaving import leave
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.replay_node import ReplayNode
 from mag_tracking.nodes.stage_node import STREAM, StageNode, freeze, make_executor, spin
@@ -149,11 +149,8 @@ def run(network_path: PathLike, settings: Settings, recording: PathLike | None =
         # The driver node comes last, when there is somebody to hear it.
         last = [partial(driver_node, drivers, network_path, batches)] if drivers else []
         begin(list(ros_arguments))
-        try:
-            return _run_until(lambda: bool(seen), network_path, settings, recording, rate, loop,
-                              observers, last)
-        finally:
-            rclpy.try_shutdown()
+        return _run_until(lambda: bool(seen), network_path, settings, recording, rate, loop,
+                          observers, last)
 
 
 def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Settings,
@@ -162,6 +159,7 @@ def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Se
     """As `run`, until `stopped()`; the nodes `last` are created after all others."""
     executor = make_executor()
     nodes: list[Node] = []
+    status = 1
     try:
         stages, replay = make_nodes(network_path, settings, recording, rate, loop)
         tracks = stages[-1].resolve_topic_name('~/tracks')
@@ -173,23 +171,27 @@ def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Se
         freeze()
         if replay is None:
             spin(executor, stopped)
-            return 0
-        _check_topics(stages[0], replay)
-        deadline = time.monotonic() + LONGEST_DISCOVERY_S
-        spin(executor, lambda: all_connected(stages, replay) or stopped()
-             or time.monotonic() > deadline)
-        if not all_connected(stages, replay) and not stopped():
-            raise MagTrackingError('the nodes did not find each other within '
-                                   f'{LONGEST_DISCOVERY_S:g} s')
-        replay.resume()
-        spin(executor, lambda: replay.finished or stopped())
-        _work_off(executor, stages, stopped)
-        return 0
+        else:
+            _play(executor, stages, replay, stopped)
+        status = 0
     finally:
-        for node in nodes:
-            executor.remove_node(node)
-            node.destroy_node()
-        executor.shutdown()
+        leave(nodes, executor, status)
+    return status
+
+
+def _play(executor: Executor, stages: list[StageNode], replay: ReplayNode,
+          stopped: Callable[[], bool]) -> None:
+    """Play the recording once all have found each other, and wait until it is worked off."""
+    _check_topics(stages[0], replay)
+    deadline = time.monotonic() + LONGEST_DISCOVERY_S
+    spin(executor, lambda: all_connected(stages, replay) or stopped()
+         or time.monotonic() > deadline)
+    if not all_connected(stages, replay) and not stopped():
+        raise MagTrackingError('the nodes did not find each other within '
+                               f'{LONGEST_DISCOVERY_S:g} s')
+    replay.resume()
+    spin(executor, lambda: replay.finished or stopped())
+    _work_off(executor, stages, stopped)
 
 
 def _check_topics(node: StageNode, replay: ReplayNode) -> None:

@@ -25,6 +25,7 @@ from mag_tracking.interrupts import noted_signals
 from mag_tracking.messages.schema import readings_of, stamp_ns
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.flow import Flow, Listener
+from mag_tracking.nodes.leaving import leave
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
 from mag_tracking.nodes.sensor_graph import node_of, shortened
@@ -301,21 +302,17 @@ def _run_until(seen: list[int], node_class: Callable[[], Node],
     except SettingsError as error:
         rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
         return 1
-    executor, node = make_executor(), None
+    executor, node, status = make_executor(), None, 1
     try:
         node = node_class()
         executor.add_node(node)
         freeze()
         spin(executor, lambda: bool(seen))
+        status = 0
     except (MagTrackingError, ParameterException) as error:
         rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
-        return 1
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        status = 0
     finally:
-        if node is not None:
-            executor.remove_node(node)
-            node.destroy_node()
-        executor.shutdown()
-        rclpy.try_shutdown()
-    return 0
+        leave([] if node is None else [node], executor, status)
+    return status
