@@ -11,51 +11,9 @@
 #include <cstring>
 #include <limits>
 
-#include "../arrays.hpp"
+#include "wide_rows.hpp"
 
 namespace mag_tracking {
-
-// How many states there are. Rows of a state's length are stored with `wide` numbers, the last of
-// which are zero, so that they are whole vectors of eight.
-struct Sizes {
-    int n_x, n_t, n_own, n_sensors, wide, n_eights;
-
-    Sizes(int n_t_, int n_own_, int n_sensors_)
-        : n_x(n_t_ + (n_own_ + 3) * n_sensors_), n_t(n_t_), n_own(n_own_), n_sensors(n_sensors_),
-          wide((n_x + EIGHT - 1) / EIGHT * EIGHT), n_eights(wide / EIGHT) {}
-
-    INLINE int n_seen() const { return n_t + n_own; }
-    // First of the states of sensor j that only it sees.
-    INLINE int own(int j) const { return n_t + n_own * j; }
-    // State that belongs to column c of the derivative of sensor j.
-    INLINE int seen(int j, int c) const { return c < n_t ? c : c + n_own * j; }
-    INLINE int background(int j) const { return n_x - 3 * (n_sensors - j); }
-    INLINE std::size_t square() const { return std::size_t(n_x) * wide; }
-};
-
-// A covariance (n_x, n_x) of others into one of rows that are `wide`, and back. Rows are too short
-// for a call of memcpy.
-INLINE void copy_rows(const double* from, int from_row, double* to, int to_row, int n) {
-    for (int i = 0; i < n; ++i, from += from_row, to += to_row) {
-        int k = 0;
-        for (; k + EIGHT <= n; k += EIGHT) std::memcpy(to + k, from + k, sizeof(Eight));
-        // The rest, once more with what is before it.
-        if (k < n && n >= EIGHT)
-            std::memcpy(to + n - EIGHT, from + n - EIGHT, sizeof(Eight));
-        else
-            for (; k < n; ++k) to[k] = from[k];
-    }
-}
-
-INLINE void to_wide(const double* from, const Sizes& n, double* to) {
-    // What is beyond the states takes part in sums: NaN that a hypothesis before left is not zero.
-    std::memset(to, 0, n.square() * sizeof(double));
-    copy_rows(from, n.n_x, to, n.wide, n.n_x);
-}
-
-INLINE void from_wide(const double* from, const Sizes& n, double* to) {
-    copy_rows(from, n.wide, to, n.n_x, n.n_x);
-}
 
 // What an update did, sensor after sensor. Of each given those before it: z = W u whitens its
 // innovation u, and x += G' z, P -= G' G, with G = W [H | I] P.
@@ -137,8 +95,8 @@ INLINE void gain_rows(const double* __restrict P, const double* H, const Sizes& 
     }
 }
 
-// P -= G' G. Both halves get the same products, so that P stays symmetric; four rows of P at a
-// time, so that G is read less often.
+// P -= G' G, from the first number of each row that is kept up to date. Both halves get the same
+// products, so that P stays symmetric; four rows of P at a time, so that G is read less often.
 INLINE void subtract_products(double* __restrict P, const double* __restrict G, const Sizes& n) {
     const int m = n.n_eights;
     const Eight *g0 = eights(G), *g1 = g0 + m, *g2 = g1 + m;
@@ -146,7 +104,7 @@ INLINE void subtract_products(double* __restrict P, const double* __restrict G, 
     int i = 0;
     for (; i + 4 <= n.n_x; i += 4) {
         Eight* row = eights(P + i * n.wide);
-        for (int v = 0; v < m; ++v) {
+        for (int v = n.first_eight(i); v < m; ++v) {
             const Eight b0 = g0[v], b1 = g1[v], b2 = g2[v];
             for (int k = 0; k < 4; ++k)
                 row[v + k * m] -= a0[i + k] * b0 + a1[i + k] * b1 + a2[i + k] * b2;
@@ -154,11 +112,13 @@ INLINE void subtract_products(double* __restrict P, const double* __restrict G, 
     }
     for (; i < n.n_x; ++i) {
         Eight* row = eights(P + i * n.wide);
-        for (int v = 0; v < m; ++v) row[v] -= a0[i] * g0[v] + a1[i] * g1[v] + a2[i] * g2[v];
+        for (int v = n.first_eight(i); v < m; ++v)
+            row[v] -= a0[i] * g0[v] + a1[i] * g1[v] + a2[i] * g2[v];
     }
 }
 
-// Update of a hypothesis by sensor j, in place, linearised at `x_lin` (n_x).
+// Update of a hypothesis by sensor j, in place, linearised at `x_lin` (n_x). Where the sizes say so
+// it leaves half of the covariance behind, for `complete` after the last sensor.
 //
 // y (3), C (3, 3): what the sensor measured, NaN where an axis is missing, and its noise, without
 // NaN. h (3), H (3, n_seen): its field without the background, and the derivative. `inflation` is
@@ -169,6 +129,10 @@ INLINE double update_by_sensor(double* x, double* __restrict P, const double* x_
                                double inflation, const Sizes& n, int j, double* __restrict G,
                                double* z, double* W, double& log_likelihood) {
     const int wide = n.wide, first = n.background(j);
+    if (n.is_halved) {
+        complete_rows(P, n, n.own(j), n.own(j) + n.n_own);
+        complete_rows(P, n, first, first + 3);
+    }
     gain_rows(P, H, n, j, G);
     bool missing[3];
     int present = 0;

@@ -110,6 +110,7 @@ class Filter {
                 x, P, x_lin, frame.field + 3 * j, frame.covariance + 9 * j, h_.data() + 3 * j,
                 gains.H + j * 3 * n_.n_seen(), inflation_[j], n_, j, gains.G + j * 3 * n_.wide,
                 gains.z + 3 * j, gains.W + 6 * j, log_likelihood);
+        complete(P, n_);
         return is_lost ? -std::numeric_limits<double>::infinity() : log_likelihood;
     }
 

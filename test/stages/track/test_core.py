@@ -14,6 +14,9 @@ from support.networks import line_network
 from support.plain_filter import PlainFilter
 
 SIGMA = 4e-9
+MANY = 23
+"""Sensors with which the states of every target fill the ten vectors of eight from which an update
+keeps up half of a covariance."""
 CASES = {
     'row that turns': ('vehicle', {}),
     'row, straight on': ('vehicle', {'track.vehicle.turn_acceleration': 0.0}),
@@ -75,10 +78,11 @@ def assert_same(a, b, tolerance=1e-9):
     assert np.abs((a.P - b.P) / std[:, :, None] / std[:, None]).max() <= tolerance
 
 
+@pytest.mark.parametrize('n_sensors', [3, MANY])
 @pytest.mark.parametrize('name', CASES)
-def test_a_bank_moves_through_frames_as_step_by_step(name):
+def test_a_bank_moves_through_frames_as_step_by_step(name, n_sensors):
     """With axes and a sensor missing, and sensors that are read at other times."""
-    compiled, plain, bank, frames, intervals = case(name)
+    compiled, plain, bank, frames, intervals = case(name, n_sensors)
     other = bank.copy()
     for filter_, b in ((compiled, bank), (plain, other)):
         filter_.move(b, -0.3)
@@ -97,10 +101,10 @@ def test_a_bank_moves_through_frames_as_step_by_step(name):
 @pytest.mark.parametrize('first_is_updated', [False, True])
 @pytest.mark.parametrize('passes, step, leaves_out, at_predictions', [
     (1, 0.5, False, False), (3, 0.5, False, False), (2, 1.0, True, True)])
-@pytest.mark.parametrize('name', CASES)
+@pytest.mark.parametrize('name, n_sensors', [*((name, 3) for name in CASES), ('mounting', MANY)])
 def test_paths_are_filtered_and_smoothed_as_step_by_step(
-        name, passes, step, leaves_out, at_predictions, first_is_updated):
-    compiled, plain, bank, frames, intervals = case(name, n_hyp=1 if leaves_out else 4)
+        name, n_sensors, passes, step, leaves_out, at_predictions, first_is_updated):
+    compiled, plain, bank, frames, intervals = case(name, n_sensors, 1 if leaves_out else 4)
     paths = np.repeat(bank.x[:, None], len(frames), axis=1)
     if at_predictions:
         paths[:] = np.nan
