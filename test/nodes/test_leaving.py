@@ -43,19 +43,22 @@ sys.exit(stage_node.main(Stuck, ['stuck']))
 
 
 def started(*words):
-    """The process of a node that cannot be destroyed."""
+    """The process of a node that cannot be destroyed, and that keeps its output until it has to
+    be written."""
+    buffered = environment(ROS_HOME=os.environ['ROS_HOME'])
+    buffered.pop('PYTHONUNBUFFERED', None)
     return subprocess.Popen([sys.executable, '-c', STUCK, *words], text=True,
-                            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                            env=environment(ROS_HOME=os.environ['ROS_HOME']))
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=buffered)
 
 
 def test_a_node_that_cannot_leave_is_ended_with_its_status():
-    process = started()
-    assert process.stdout.readline() == 'it runs\n'
-    begin = time.monotonic()
-    process.send_signal(signal.SIGINT)
-    output, errors = process.communicate(timeout=LONGEST_S)
-    assert process.returncode == 0 and output == 'not flushed', (output, errors)
+    with started() as process:
+        assert process.stdout.readline() == 'it runs\n'
+        begin = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        # By the stream that has read a line, and may have read more.
+        output, errors = process.stdout.read(), process.stderr.read()
+        assert process.wait(LONGEST_S) == 0 and output == 'not flushed', (output, errors)
     assert time.monotonic() - begin > LEAVING_S
     assert errors.endswith(f'the middleware has not let go within {LEAVING_S:g} s; the process '
                            'was ended\n')
