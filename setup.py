@@ -104,7 +104,7 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            'mag-tracking = mag_tracking.cli:main',
+            'mag-tracking = mag_tracking.cli:command',
             *(f'{node} = mag_tracking.nodes.start:{node}' for node in NODES),
         ],
     },

@@ -5,12 +5,24 @@ import io
 import signal
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 from mag_tracking.errors import MagTrackingError
 from mag_tracking.interrupts import exit_on_signals
+from mag_tracking.nodes.start import end_soon
 
 INTERRUPTED = 'mag-tracking: interrupted'
 """What Ctrl-C has the command say."""
+
+
+def command() -> NoReturn:
+    """Run the command as a process; does not return."""
+    status = 1
+    try:
+        status = main()
+    finally:
+        end_soon(status)
+    sys.exit(status)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

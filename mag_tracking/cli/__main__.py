@@ -1,7 +1,5 @@
 """`python -m mag_tracking.cli`."""
 
-import sys
+from mag_tracking.cli import command
 
-from mag_tracking.cli import main
-
-sys.exit(main())
+command()

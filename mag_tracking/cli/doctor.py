@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.apps.doctor import examine
+from mag_tracking.apps.doctor import Doctor, examine
 from mag_tracking.apps.doctor_report import write_report
 from mag_tracking.cli.options import (
     Commands,
@@ -21,7 +21,7 @@ from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.recording.reader import Recording
-from mag_tracking.stages.health.sensor_health import SensorHealth
+from mag_tracking.stages.health.sensor_health import Finding, SensorHealth
 
 _DOCTOR = '''
 Reads a recording, or listens to what is published now, and says what is wrong with each
@@ -59,16 +59,22 @@ def _doctor(args: argparse.Namespace) -> int:
             if not 1.0 <= args.live <= 86400.0:
                 raise SettingsError(f'--live: {args.live:g} is not between 1 and 86400 s')
             # Only this needs ROS.
-            from mag_tracking.nodes.doctor_node import listen
+            from mag_tracking.nodes.doctor_node import listening
 
-            doctor, more = listen(network, settings, args.live, lambda: bool(seen),
-                                  args.ros_arguments)
-        else:
-            recording = Recording(args.recording)
-            with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
-                      disable=None) as bar:
-                doctor, more = examine(recording, network, settings, bar.update,
-                                       lambda: bool(seen))
+            with listening(network, settings, args.live, lambda: bool(seen),
+                           args.ros_arguments) as heard:
+                heard.status = _report(args, heard.doctor, heard.findings, bool(seen))
+            return heard.status
+        recording = Recording(args.recording)
+        with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
+                  disable=None) as bar:
+            doctor, more = examine(recording, network, settings, bar.update, lambda: bool(seen))
+    return _report(args, doctor, more, bool(seen))
+
+
+def _report(args: argparse.Namespace, doctor: Doctor, more: list[Finding],
+            is_interrupted: bool) -> int:
+    """Print the findings, `more` included, and write the page; returns the exit status."""
     for name, health in doctor.sensors.items():
         print(f'{name:11s} {_row(health)}')
     findings = sorted(more + doctor.findings(), key=lambda f: not f.serious)
@@ -80,7 +86,7 @@ def _doctor(args: argparse.Namespace) -> int:
     if args.report is not None:
         write_report(doctor, findings, 'the running sensors' if args.recording is None
                      else args.recording.name, args.report)
-    if seen:
+    if is_interrupted:
         print('interrupted: this is of what was read until then')
         return 130
     return 2 if any(f.serious for f in findings) else 0

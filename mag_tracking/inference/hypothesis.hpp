@@ -95,8 +95,8 @@ INLINE void gain_rows(const double* __restrict P, const double* H, const Sizes& 
     }
 }
 
-// P -= G' G, from the first number of each row that is kept up to date. Both halves get the same
-// products, so that P stays symmetric; four rows of P at a time, so that G is read less often.
+// P -= G' G, from `first_eight` of each row on. Both halves get the same products, so that P stays
+// symmetric; four rows of P at a time, so that G is read less often.
 INLINE void subtract_products(double* __restrict P, const double* __restrict G, const Sizes& n) {
     const int m = n.n_eights;
     const Eight *g0 = eights(G), *g1 = g0 + m, *g2 = g1 + m;
@@ -117,8 +117,8 @@ INLINE void subtract_products(double* __restrict P, const double* __restrict G, 
     }
 }
 
-// Update of a hypothesis by sensor j, in place, linearised at `x_lin` (n_x). Where the sizes say so
-// it leaves half of the covariance behind, for `complete` after the last sensor.
+// Update of a hypothesis by sensor j, in place, linearised at `x_lin` (n_x). If the sizes are
+// `is_halved`, P needs `complete` after the last sensor.
 //
 // y (3), C (3, 3): what the sensor measured, NaN where an axis is missing, and its noise, without
 // NaN. h (3), H (3, n_seen): its field without the background, and the derivative. `inflation` is

@@ -1,4 +1,4 @@
-// Covariances in rows of whole vectors of eight, and which part of them an update has to touch.
+// Covariances in rows of whole vectors of eight, and the part of them that an update changes.
 
 #pragma once
 
@@ -9,15 +9,15 @@
 
 namespace mag_tracking {
 
-// Below this many vectors of eight a row, to complete rows takes longer than to update all of them.
+// With shorter rows, copying takes longer than updating the whole covariance.
 constexpr int HALVED_FROM = 10;
 
 // How many states there are. Rows of a state's length are stored with `wide` numbers, the last of
 // which are zero, so that they are whole vectors of eight.
 struct Sizes {
     int n_x, n_t, n_own, n_sensors, wide, n_eights;
-    // An update keeps up half of the covariance: all of the target's rows, the others from their
-    // own block on.
+    // Updates skip half of the covariance: of rows that are not the target's, all before the
+    // diagonal block.
     bool is_halved;
 
     Sizes(int n_t_, int n_own_, int n_sensors_)
@@ -32,7 +32,7 @@ struct Sizes {
     INLINE int seen(int j, int c) const { return c < n_t ? c : c + n_own * j; }
     INLINE int background(int j) const { return n_x - 3 * (n_sensors - j); }
     INLINE std::size_t square() const { return std::size_t(n_x) * wide; }
-    // Of row i the vector of eight from which an update keeps it up.
+    // First vector of row i that an update changes.
     INLINE int first_eight(int i) const { return is_halved && i >= n_t ? i / EIGHT : 0; }
 };
 
@@ -61,34 +61,46 @@ INLINE void from_wide(const double* from, const Sizes& n, double* to) {
     copy_rows(from, n.wide, to, n.n_x, n.n_x);
 }
 
-// The numbers of rows [first, last) of a covariance that an update has left behind, from its columns.
+// Copies the numbers of rows [first, last) that an update has skipped from the columns.
 INLINE void complete_rows(double* P, const Sizes& n, int first, int last) {
     for (int k = 0; k < (last - 1) / EIGHT * EIGHT; ++k)
         for (int i = std::max(first, (k / EIGHT + 1) * EIGHT); i < last; ++i)
             P[i * n.wide + k] = P[k * n.wide + i];
 }
 
-// Rows `from` (8, 8) as columns `to` (8, 8): pairs are exchanged between rows 1, 2 and 4 apart.
+#ifdef __clang__
+#define SHUFFLED(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#else
+#define SHUFFLED(a, b, ...) __builtin_shuffle(a, b, Indices{__VA_ARGS__})
+#endif
+
+// Transposes a block (8, 8) of rows that are `row` numbers apart: swaps elements between rows 1, 2
+// and 4 apart.
 INLINE void transpose_block(const double* from, double* to, int row) {
-    using Indices = long long __attribute__((vector_size(64)));
-    constexpr Indices LOW[3] = {{0, 8, 2, 10, 4, 12, 6, 14}, {0, 1, 8, 9, 4, 5, 12, 13},
-                                {0, 1, 2, 3, 8, 9, 10, 11}};
-    constexpr Indices HIGH[3] = {{1, 9, 3, 11, 5, 13, 7, 15}, {2, 3, 10, 11, 6, 7, 14, 15},
-                                 {4, 5, 6, 7, 12, 13, 14, 15}};
+    using Indices [[maybe_unused]] = long long __attribute__((vector_size(64)));
     Eight block[EIGHT];
     for (int k = 0; k < EIGHT; ++k) block[k] = *eights(from + k * row);
-    for (int step = 0; step < 3; ++step)
-        for (int k = 0; k < EIGHT; ++k) {
-            const int other = k | 1 << step;
-            if (other == k) continue;
-            const Eight one = block[k], two = block[other];
-            block[k] = __builtin_shuffle(one, two, LOW[step]);
-            block[other] = __builtin_shuffle(one, two, HIGH[step]);
-        }
+    for (int k = 0; k < EIGHT; k += 2) {
+        const Eight a = block[k], b = block[k + 1];
+        block[k] = SHUFFLED(a, b, 0, 8, 2, 10, 4, 12, 6, 14);
+        block[k + 1] = SHUFFLED(a, b, 1, 9, 3, 11, 5, 13, 7, 15);
+    }
+    for (int k : {0, 1, 4, 5}) {
+        const Eight a = block[k], b = block[k + 2];
+        block[k] = SHUFFLED(a, b, 0, 1, 8, 9, 4, 5, 12, 13);
+        block[k + 2] = SHUFFLED(a, b, 2, 3, 10, 11, 6, 7, 14, 15);
+    }
+    for (int k = 0; k < 4; ++k) {
+        const Eight a = block[k], b = block[k + 4];
+        block[k] = SHUFFLED(a, b, 0, 1, 2, 3, 8, 9, 10, 11);
+        block[k + 4] = SHUFFLED(a, b, 4, 5, 6, 7, 12, 13, 14, 15);
+    }
     for (int k = 0; k < EIGHT; ++k) *eights(to + k * row) = block[k];
 }
 
-// All that an update has left behind.
+#undef SHUFFLED
+
+// Copies all that an update has skipped.
 INLINE void complete(double* P, const Sizes& n) {
     if (!n.is_halved) return;
     for (int i = n.n_t / EIGHT * EIGHT; i < n.n_x; i += EIGHT) {

@@ -1,8 +1,10 @@
-// What has to happen even while Python is held up, as a Python module; core.pyi says what the
-// arguments are.
+// A watch over the end of a process, which works while Python is blocked, as a Python module;
+// core.pyi says what the arguments are.
 
+#include <poll.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <chrono>
 #include <condition_variable>
 #include <mutex>
@@ -13,15 +15,36 @@
 namespace mag_tracking {
 namespace {
 
+constexpr double LONGEST_S = 1e6;
+// A pipe that can be written to takes as much without blocking (PIPE_BUF).
+constexpr std::size_t LONGEST_MESSAGE = 4096;
+
+[[noreturn]] void end_process(int status, const std::string& message) {
+    pollfd error_output{STDERR_FILENO, POLLOUT, 0};
+    if (poll(&error_output, 1, 0) > 0) {
+        // If it cannot be written, there is no other place for it.
+        [[maybe_unused]] const auto written =
+            write(STDERR_FILENO, message.data(), std::min(message.size(), LONGEST_MESSAGE));
+    }
+    _exit(status);
+}
+
+double checked(double seconds) {
+    if (!(seconds >= 0.0 && seconds <= LONGEST_S))
+        throw py::value_error("a deadline is between 0 and 1e6 s");
+    return seconds;
+}
+
 class Deadline {
   public:
     Deadline(double seconds, int status, const std::string& message)
-        : thread_([this, seconds, status, message] { watch(seconds, status, message); }) {}
+        : seconds_(checked(seconds)), status_(status), message_(message),
+          thread_([this] { watch(); }) {}
     Deadline(const Deadline&) = delete;
     Deadline& operator=(const Deadline&) = delete;
     ~Deadline() { cancel(); }
 
-    // The thread takes nothing that the caller may hold, so that waiting for it is safe.
+    // The thread holds no lock that the caller may need, so joining it cannot block.
     void cancel() {
         {
             const std::lock_guard<std::mutex> lock(mutex_);
@@ -32,20 +55,20 @@ class Deadline {
     }
 
   private:
-    void watch(double seconds, int status, const std::string& message) {
+    void watch() {
         std::unique_lock<std::mutex> lock(mutex_);
-        if (changed_.wait_for(lock, std::chrono::duration<double>(seconds),
-                              [this] { return cancelled_; }))
-            return;
-        // Nobody is left to be told of a message that cannot be written.
-        [[maybe_unused]] const auto written = write(STDERR_FILENO, message.data(), message.size());
-        _exit(status);
+        if (!changed_.wait_for(lock, std::chrono::duration<double>(seconds_),
+                               [this] { return cancelled_; }))
+            end_process(status_, message_);
     }
 
+    const double seconds_;
+    const int status_;
+    const std::string message_;
     std::mutex mutex_;
     std::condition_variable changed_;
     bool cancelled_ = false;
-    // The last, as it begins with the others in place.
+    // Last, because it starts with all of the others in place.
     std::thread thread_;
 };
 
@@ -56,6 +79,13 @@ PYBIND11_MODULE(core, m) {
         .def(py::init<double, int, const std::string&>(), py::arg("seconds"), py::arg("status"),
              py::arg("message"))
         .def("cancel", &Deadline::cancel);
+    m.def(
+        "end_within",
+        [](double seconds, int status, const std::string& message) {
+            // Never deleted: it outlives the interpreter.
+            new Deadline(seconds, status, message);
+        },
+        py::arg("seconds"), py::arg("status"), py::arg("message"));
 }
 
 }  // namespace mag_tracking

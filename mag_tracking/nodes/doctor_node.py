@@ -2,7 +2,9 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -65,18 +67,33 @@ class DoctorNode(Node):
         return found
 
 
-def listen(network: SensorNetwork, settings: Settings, seconds: float,
-           stopped: Callable[[], bool], ros_arguments: Sequence[str] = ()
-           ) -> tuple[Doctor, list[Finding]]:
-    """Listen for `seconds` or until `stopped()`: (Doctor, list of Finding of the graph)."""
+@dataclass
+class Heard:
+    """Result of listening."""
+
+    doctor: Doctor
+    findings: list[Finding]
+    """Findings that only the graph shows."""
+    status: int = 1
+    """Exit status if the middleware does not shut down; set it when the report is written."""
+
+
+@contextmanager
+def listening(network: SensorNetwork, settings: Settings, seconds: float,
+              stopped: Callable[[], bool], ros_arguments: Sequence[str] = ()) -> Iterator[Heard]:
+    """Listen for `seconds` or until `stopped()`; leave the graph after the context.
+
+    If the middleware hangs, the process ends there: see `leave`.
+    """
     begin(list(ros_arguments))
     executor = make_executor()
     node = DoctorNode(network, settings)
+    heard = Heard(node.doctor, [])
     try:
         executor.add_node(node)
         end = time.monotonic() + seconds
         spin(executor, lambda: stopped() or time.monotonic() > end)
-        return node.doctor, node.findings()
+        heard.findings = node.findings()
+        yield heard
     finally:
-        # A process that is ended here has reported nothing.
-        leave([node], executor, status=1)
+        leave([node], executor, heard.status)

@@ -101,11 +101,13 @@ class DriverNode(ManagedNode):
         return TransitionCallbackReturn.SUCCESS
 
     def close(self) -> None:
-        """End the threads, which publish; they close their devices."""
+        """Stop the threads, which publish; each closes its device."""
         self._stop()
+        # A thread that has not stopped is not waited for again.
+        self._threads = []
 
     def destroy_node(self) -> None:
-        """Destroy the node, closed first."""
+        """Close and destroy the node."""
         self.close()
         ManagedNode.destroy_node(self)
 

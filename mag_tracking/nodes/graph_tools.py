@@ -88,7 +88,7 @@ def valid_names() -> Iterator[None]:
 
 @contextmanager
 def observer(ros_arguments: Sequence[str] = ()) -> Iterator[Observer]:
-    """An `Observer` while the context lasts."""
+    """An `Observer` while the context lasts; if the middleware hangs then, see `leave`."""
     begin(list(ros_arguments))
     executor, node = make_executor(), Node('mag_tracking_observer', start_parameter_services=False)
     executor.add_node(node)

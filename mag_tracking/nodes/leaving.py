@@ -1,55 +1,81 @@
-"""How every process ends with ROS."""
+"""How every process with ROS ends."""
 
 import sys
+import traceback
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 import rclpy
 from rclpy.executors import Executor
 from rclpy.node import Node
 
-from mag_tracking.nodes.core import Deadline
+from mag_tracking.errors import MagTrackingError
+from mag_tracking.nodes.core import Deadline, end_within
 from mag_tracking.nodes.managed_node import ManagedNode
 
 LEAVING_S = 4.0
-"""[s] Longest time for leaving the middleware. It takes .3 s; `ros2 launch` sends the next signal
-5 s after the first."""
+"""[s] Longest time for leaving the middleware. Usually it takes 0.3 s; `ros2 launch` sends the next
+signal 5 s after the first."""
+HUNG = f'the middleware did not shut down within {LEAVING_S:g} s; the process was ended\n'
 
 
 def leave(nodes: Sequence[Node], executor: Executor | None = None, status: int = 0) -> None:
     """Close and destroy nodes and shut ROS down; end the process if the middleware hangs.
 
-    Workaround: Fast DDS 2.14 spins for ever, with the lock of Python in hand, where a participant
-    is destroyed while another one is just leaving (eProsima/Fast-DDS 6513). Of nodes that are all
-    signalled at once one in some hundred does. The `Deadline` can go with that.
+    Workaround: Fast DDS 2.14 blocks for ever, and holds the interpreter's lock, when a participant
+    is destroyed while another one leaves (eProsima/Fast-DDS 6513). This happens to about one node
+    in 250 when several are signalled together. The deadline can be removed once that is fixed.
 
     Parameters
     ----------
     nodes : sequence of Node
     executor : Executor, optional
-        The one that they are in.
+        The executor of the nodes.
     status : int
         Exit status of the process if it is ended here.
     """
-    for node in nodes:
-        if executor is not None:
-            executor.remove_node(node)
-        if isinstance(node, ManagedNode):
-            node.close()
-    for stream in (sys.stdout, sys.stderr):
-        # Whoever read it has left; Python says so once more at its end.
-        with suppress(BrokenPipeError):
-            stream.flush()
-    # An error that is on its way would not be printed any more.
-    error = sys.exc_info()[1]
-    deadline = Deadline(LEAVING_S, status, (f'{error}\n' if error is not None else '') +
-                        f'the middleware has not let go within {LEAVING_S:g} s; the process was '
-                        'ended\n')
     try:
         for node in nodes:
-            node.destroy_node()
-        if executor is not None:
-            executor.shutdown()
-        rclpy.try_shutdown()
+            if executor is not None:
+                executor.remove_node(node)
+            if isinstance(node, ManagedNode):
+                # Devices have their own, longer time limit.
+                node.close()
     finally:
-        deadline.cancel()
+        flush()
+        with ExitStack() as stack:
+            stack.callback(Deadline(LEAVING_S, status, _last_words()).cancel)
+            stack.callback(rclpy.try_shutdown)
+            if executor is not None:
+                stack.callback(executor.shutdown)
+            for node in reversed(nodes):
+                stack.callback(node.destroy_node)
+
+
+def end_soon(status: int) -> None:
+    """Limit the time until the process has ended, as `leave` does.
+
+    A node whose constructor raised is destroyed only with the interpreter.
+    """
+    flush()
+    end_within(LEAVING_S, status, HUNG.encode())
+
+
+def flush() -> None:
+    """Flush the standard streams; an error remains for the end of Python, which reports it."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            if stream is not None:
+                stream.flush()
+
+
+def _last_words() -> bytes:
+    """What the process writes if it is ended: also the pending error, which nobody would print."""
+    error = sys.exc_info()[1]
+    if error is None or isinstance(error, KeyboardInterrupt):
+        pending = ''
+    elif isinstance(error, MagTrackingError):
+        pending = f'{error}\n'
+    else:
+        pending = ''.join(traceback.format_exception(error))
+    return (pending + HUNG).encode(errors='backslashreplace')

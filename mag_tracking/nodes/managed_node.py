@@ -33,7 +33,7 @@ class ManagedNode(LifecycleNode):
         raise NotImplementedError
 
     def close(self) -> None:
-        """Stop what runs beside the node, before it is destroyed."""
+        """Stop threads of the node; called before it is destroyed."""
 
     def on_configure(self, state: State) -> TransitionCallbackReturn:
         """Call `prepare`; an error is logged and leaves the node unconfigured."""

@@ -201,6 +201,8 @@ def watch(host: str, port: int, report: Callable[[str], object],
           ros_arguments: Sequence[str] = (), ended: Callable[[], bool] = lambda: False) -> int:
     """Serve the page of running nodes until SIGINT or SIGTERM; returns the exit status.
 
+    If the middleware hangs at the end, the process ends: see `leave`.
+
     Parameters
     ----------
     host, port : str, int

@@ -211,6 +211,8 @@ def run(selection: Selection, out: Path, split_bytes: int = 10**9,
         split_ns: int = 3600 * 10**9, ros_arguments: Sequence[str] = ()) -> int:
     """Record until SIGINT, SIGTERM or SIGHUP; returns the exit status.
 
+    If the middleware hangs at the end, the process ends: see `leave`. The recording is closed then.
+
     Parameters
     ----------
     selection : Selection

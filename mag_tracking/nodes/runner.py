@@ -143,7 +143,7 @@ def run(network_path: PathLike, settings: Settings, recording: PathLike | None =
     ros_arguments : sequence of str
         Of all nodes, beginning with `--ros-args`.
 
-    Returns the exit status.
+    Returns the exit status. If the middleware hangs at the end, the process ends: see `leave`.
     """
     with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
         # The driver node comes last, when there is somebody to hear it.

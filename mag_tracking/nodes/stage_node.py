@@ -25,7 +25,7 @@ from mag_tracking.interrupts import noted_signals
 from mag_tracking.messages.schema import readings_of, stamp_ns
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.flow import Flow, Listener
-from mag_tracking.nodes.leaving import leave
+from mag_tracking.nodes.leaving import end_soon, leave
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
 from mag_tracking.nodes.sensor_graph import node_of, shortened
@@ -311,6 +311,8 @@ def _run_until(seen: list[int], node_class: Callable[[], Node],
         status = 0
     except (MagTrackingError, ParameterException) as error:
         rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
+        # A node that is only half built leaves the middleware when the error is deleted.
+        end_soon(status)
     except (KeyboardInterrupt, ExternalShutdownException):
         status = 0
     finally:

@@ -19,15 +19,24 @@ ENDING = (signal.SIGINT, signal.SIGTERM)
 
 def run_node(name: str) -> NoReturn:
     """Run the node of the module `name` as a process; does not return."""
+    status = 1
     try:
         with exit_on_signals(0, *ENDING):
             status = import_module(f'mag_tracking.nodes.{name}').main()
     except KeyboardInterrupt:
         status = 130
-    # The end of Python takes a while, too: a second signal is ignored.
-    for s in ENDING:
-        signal.signal(s, signal.SIG_IGN)
+    finally:
+        # The end of Python takes a while, too: a second signal is ignored.
+        for s in ENDING:
+            signal.signal(s, signal.SIG_IGN)
+        end_soon(status)
     sys.exit(status)
+
+
+def end_soon(status: int) -> None:
+    """Limit the time until the process has ended, if it has used ROS."""
+    if 'rclpy' in sys.modules:
+        import_module('mag_tracking.nodes.leaving').end_soon(status)
 
 
 def driver_node() -> NoReturn:

@@ -15,8 +15,8 @@ from support.plain_filter import PlainFilter
 
 SIGMA = 4e-9
 MANY = 23
-"""Sensors with which the states of every target fill the ten vectors of eight from which an update
-keeps up half of a covariance."""
+"""With so many sensors the states of every target are enough for updates to change only half of the
+covariance (`HALVED_FROM`)."""
 CASES = {
     'row that turns': ('vehicle', {}),
     'row, straight on': ('vehicle', {'track.vehicle.turn_acceleration': 0.0}),
