@@ -70,7 +70,7 @@ def flush() -> None:
 
 
 def _last_words() -> bytes:
-    """What the process writes if it is ended: also the pending error, which nobody would print."""
+    """Message of the deadline; begins with the pending error, which would not be printed."""
     error = sys.exc_info()[1]
     if error is None or isinstance(error, KeyboardInterrupt):
         pending = ''

@@ -19,7 +19,6 @@ FAST_DDS = 'rmw_fastrtps_cpp'
 STUCK = '''
 import re, sys
 from rclpy.node import Node
-from mag_tracking.errors import MagTrackingError
 from mag_tracking.nodes import stage_node
 
 class Stuck(Node):
@@ -38,13 +37,11 @@ class Stuck(Node):
             raise RuntimeError('on its way')
 
     def destroy_node(self):
-        # Years, without the lock of Python being given back, as in Fast DDS.
+        # This takes years and, as in Fast DDS, never releases the interpreter's lock.
         re.match(r'(a+)+$', 'a' * 64 + 'b')
 
 sys.exit(stage_node.main(Stuck, ['stuck']))
 '''
-
-
 HALF_BUILT = '''
 import atexit, re, sys, types
 import rclpy
