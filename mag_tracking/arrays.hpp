@@ -33,16 +33,17 @@ class Numbers {
 INLINE Eight* eights(double* p) { return reinterpret_cast<Eight*>(p); }
 INLINE const Eight* eights(const double* p) { return reinterpret_cast<const Eight*>(p); }
 
-constexpr int MOST_MOVING = 6;
+// Of one target as many states move at most, and so many targets share a state at most.
+constexpr int MOST_MOVING = 6, MOST_TARGETS = 4, MOST_ROWS = MOST_MOVING * MOST_TARGETS;
 
-// A move of the target, and its Jacobian where that is not the one of identity: in `n` rows, each
+// A move of the targets, and its Jacobian where that is not the one of identity: in `n` rows, each
 // of which has `width` columns that may differ from zero.
 struct Motion {
     int n, width;
-    int rows[MOST_MOVING];
-    int columns[MOST_MOVING][MOST_MOVING];
-    double f[MOST_MOVING][MOST_MOVING];
-    double moved[MOST_MOVING];  // The states of the rows.
+    int rows[MOST_ROWS];
+    int columns[MOST_ROWS][MOST_MOVING];
+    double f[MOST_ROWS][MOST_MOVING];
+    double moved[MOST_ROWS];  // The states of the rows.
 };
 
 }  // namespace mag_tracking

@@ -31,7 +31,8 @@ def log_sum_exp(a: ArrayLike, axis: int | None = None) -> FloatArray:
 
 @dataclass
 class FilterBank:
-    """Hypotheses of one target; every array has the hypothesis as first axis."""
+    """Hypotheses of one target, or of several that share a state; every array has the hypothesis as
+    first axis."""
 
     x: FloatArray
     """(n_hyp, n_x) states."""
@@ -40,9 +41,9 @@ class FilterBank:
     log_w: FloatArray
     """(n_hyp,) normalised log-weights."""
     label: IntArray
-    """(n_hyp,) int: the arrival that each hypothesis assumes."""
+    """(n_hyp,) int: the arrival that each hypothesis assumes; of several (n_hyp, n_targets)."""
     kind: IntArray
-    """(n_hyp,) int: the kind of target that each hypothesis assumes."""
+    """(n_hyp,) int: the kind of target that each assumes; of several (n_hyp, n_targets)."""
     origin: IntArray
     """(n_hyp,) int: the row that each hypothesis had when the bank was made."""
     nis: FloatArray
@@ -85,7 +86,30 @@ class FilterBank:
         their mixture is densest: near the mode of the posterior. The heaviest alone
         would be a lottery where many neighbours share the weight.
         """
-        return core.best(self.x, self.P, self.log_w, self.label, self.kind, _NEGLIGIBLE)
+        return core.best(self.x, self.P, self.log_w, _classes(self.label), _classes(self.kind),
+                         _NEGLIGIBLE)
+
+    def of_target(self, i: int, n_one: int) -> 'FilterBank':
+        """The same hypotheses with the states of target `i` of several alone, each of which has
+        `n_one` states; of a single target it is the bank itself.
+        """
+        if self.label.ndim == 1:
+            return self
+        others = n_one * self.label.shape[1]
+        columns = np.append(np.arange(i * n_one, (i + 1) * n_one),
+                            np.arange(others, self.x.shape[1]))
+        return FilterBank(self.x[:, columns], self.P[:, columns[:, None], columns], self.log_w,
+                          self.label[:, i].copy(), self.kind[:, i].copy(), self.origin, self.nis)
+
+    def without_target(self, i: int, n_one: int) -> 'FilterBank':
+        """The same hypotheses of the other targets: what is known of them is marginal."""
+        n_targets = self.label.shape[1]
+        columns = np.delete(np.arange(self.x.shape[1]), np.arange(i * n_one, (i + 1) * n_one))
+        label, kind = np.delete(self.label, i, axis=1), np.delete(self.kind, i, axis=1)
+        if n_targets == 2:
+            label, kind = label[:, 0].copy(), kind[:, 0].copy()
+        return FilterBank(self.x[:, columns], self.P[:, columns[:, None], columns],
+                          self.log_w.copy(), label, kind, self.origin.copy(), self.nis.copy())
 
     def copy(self) -> 'FilterBank':
         """The same bank with arrays of its own."""
@@ -164,6 +188,14 @@ class FilterBank:
             mask = np.zeros(len(self), dtype=bool)
             mask[order[:most]] = True
         return self.keep(mask)
+
+
+def _classes(labels: IntArray) -> IntArray:
+    """(n,) int: one number for each set of labels (n,) or (n, n_targets)."""
+    if labels.ndim == 1:
+        return labels
+    classes: IntArray = np.unique(labels, axis=0, return_inverse=True)[1].reshape(-1)
+    return classes
 
 
 def _moved_up(a: FloatArray, rows: IntArray) -> FloatArray:

@@ -139,4 +139,64 @@ struct Magnet {
     }
 };
 
+// Several vehicles whose fields add up: the states of one after those of the other.
+struct Vehicles {
+    RowVehicle one;
+    int count;
+
+    INLINE int n() const { return count * one.n(); }
+
+    INLINE void move(const double* x, double dt, Motion& out) const {
+        Motion of_one;
+        out.n = 0;
+        for (int v = 0; v < count; ++v) {
+            const int first = v * one.n();
+            one.move(x + first, dt, of_one);
+            out.width = of_one.width;
+            for (int r = 0; r < of_one.n; ++r, ++out.n) {
+                out.rows[out.n] = first + of_one.rows[r];
+                out.moved[out.n] = of_one.moved[r];
+                for (int m = 0; m < of_one.width; ++m) {
+                    out.columns[out.n][m] = first + of_one.columns[r][m];
+                    out.f[out.n][m] = of_one.f[r][m];
+                }
+            }
+        }
+    }
+
+    INLINE void noise(const double* x, const double* P, int wide, double dt, const Motion& motion,
+                      double* Q) const {
+        for (int v = 0; v < count; ++v) {
+            const int first = v * one.n(), block = first * wide + first;
+            one.noise(x + first, P + block, wide, dt, motion, Q + block);
+        }
+    }
+};
+
+// Field and derivative as of a target's `field`; returns the size [T] of what its model leaves out,
+// by the `lengths` [m], one a target.
+template <class Target>
+INLINE double field_and_error(const Target& target, const double* x, const double* position,
+                              const double* R, const double* lengths, double* field, double* H,
+                              int stride) {
+    return lengths[0] * target.field(x, position, R, field, H, stride);
+}
+
+// What is left out of several fields is independent.
+INLINE double field_and_error(const Vehicles& vehicles, const double* x, const double* position,
+                              const double* R, const double* lengths, double* field, double* H,
+                              int stride) {
+    double square = 0.0;
+    for (int a = 0; a < 3; ++a) field[a] = 0.0;
+    for (int v = 0; v < vehicles.count; ++v) {
+        const int first = v * vehicles.one.n();
+        double of_one[3];
+        const double error = lengths[v] * vehicles.one.field(x + first, position, R, of_one,
+                                                             H + first, stride);
+        for (int a = 0; a < 3; ++a) field[a] += of_one[a];
+        square += error * error;
+    }
+    return std::sqrt(square);
+}
+
 }  // namespace mag_tracking

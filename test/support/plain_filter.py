@@ -83,7 +83,7 @@ class PlainFilter(StepByStep, BankFilter):
         for _ in range(iterations):
             bank.x, bank.P = x_prior.copy(), P_prior.copy()
             h, H, inflation = self.observation.fields(
-                x_lin, self.time_offset(frame, dt), self._near_field_lengths[bank.kind],
+                x_lin, self.time_offset(frame, dt), self._lengths(bank.kind),
                 self._settings.field_error)
             lost = ~(np.isfinite(h).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3)))
             h[lost], H[lost], inflation[lost] = 0.0, 0.0, 0.0

@@ -39,29 +39,31 @@ class Along(NamedTuple):
 
 
 def compiled_filter(model: SourceModel, observation: Observation
-                    ) -> core.RowVehicleFilter | core.MagnetFilter:
-    """The compiled filter of a target that is seen as `observation` says."""
+                    ) -> core.RowVehicleFilter | core.VehiclesFilter | core.MagnetFilter:
+    """The compiled filter of targets that are seen as `observation` says."""
     sensors = (observation.positions, observation.R_sw, observation.n_angles,
                observation.n_own - observation.n_angles)
     if isinstance(model, RowVehicle):
-        return core.RowVehicleFilter(
-            *sensors, len(model.state_names), model.n_dipoles, list(model.acceleration_density),
-            list(model.induction), model.moment_drift, model.difference_drift,
-            model.turn_acceleration, model.turn_time, FASTEST_TURN)
-    assert isinstance(model, Magnet)
+        row = (len(model.state_names), model.n_dipoles, list(model.acceleration_density),
+               list(model.induction), model.moment_drift, model.difference_drift,
+               model.turn_acceleration, model.turn_time, FASTEST_TURN)
+        return (core.RowVehicleFilter(*sensors, *row) if observation.n_targets == 1
+                else core.VehiclesFilter(*sensors, *row, observation.n_targets))
+    assert isinstance(model, Magnet) and observation.n_targets == 1
     return core.MagnetFilter(*sensors, list(model.acceleration_density), model.angular_density)
 
 
 class BankFilter:
     """Moves a `FilterBank` through frames; has no memory of its own."""
 
-    def __init__(self, network: SensorNetwork, model: SourceModel,
-                 settings: TrackSettings) -> None:
-        """`settings` is a `TrackSettings`; the live ones may be changed by `configure`."""
+    def __init__(self, network: SensorNetwork, model: SourceModel, settings: TrackSettings,
+                 n_targets: int = 1) -> None:
+        """`settings` is a `TrackSettings`; the live ones may be changed by `configure`. The states
+        are those of `n_targets` targets whose fields add up."""
         self._n_sensors = len(network)
         self._no_offset = np.zeros(len(network))
         self.observation = Observation(network, model, np.deg2rad(settings.mounting_std_deg),
-                                       settings.model_error_time_s)
+                                       settings.model_error_time_s, n_targets)
         self._compiled = compiled_filter(model, self.observation)
         self.configure(settings)
 
@@ -112,8 +114,8 @@ class BankFilter:
         self._compiled.advance(
             plain(frame.field), plain(known_covariance(frame.covariance)),
             self.time_offset(frame, dt), dt, decay, variance, moves, iterations,
-            self._settings.field_error, self._near_field_lengths[bank.kind], bank.x, bank.P, new_x,
-            new_P, predicted, log_likelihood, nis)
+            self._settings.field_error, self._lengths(bank.kind), bank.x, bank.P, new_x, new_P,
+            predicted, log_likelihood, nis)
         bank.x, bank.P, bank.nis = new_x, new_P, nis
         return predicted, log_likelihood
 
@@ -152,7 +154,7 @@ class BankFilter:
             strange=self._settings.end_nis if leaves_out else np.inf,
             iterations=self._settings.iterations, passes=passes, step=step,
             field_error=self._settings.field_error,
-            near_field_length=self._near_field_lengths[bank.kind], x=bank.x, P=bank.P,
+            near_field_length=self._lengths(bank.kind), x=bank.x, P=bank.P,
             new_x=new_x, new_P=new_P, paths=paths, log_likelihood=out.log_likelihood,
             unsettled=out.unsettled, covariances=out.covariances, used=out.used)
         bank.x, bank.P = new_x, new_P
@@ -182,7 +184,7 @@ class BankFilter:
         Only of what is new after `dt` [s].
         """
         error = self.observation.model_error(
-            bank.x[i], float(self._near_field_lengths[bank.kind[i]]), self._settings.field_error)
+            bank.x[i], self._lengths(bank.kind[i:i + 1])[0], self._settings.field_error)
         time = self._settings.model_error_time_s
         share = -np.expm1(-2.0 * dt / time) if time else 1.0
         return share * np.nan_to_num(error, posinf=0.0)
@@ -195,14 +197,25 @@ class BankFilter:
         """
         x = self.observation.without_errors(bank.x[i:i + 1])
         h, _, _ = self.observation.fields(
-            x, self.time_offset(frame, dt), self._near_field_lengths[bank.kind[i:i + 1]],
+            x, self.time_offset(frame, dt), self._lengths(bank.kind[i:i + 1]),
             self._settings.field_error)
         field: FloatArray = h[0] + x[0, -3 * self._n_sensors:].reshape(-1, 3)
         return field
 
+    def field_of_others(self, bank: FilterBank, i: int, target: int, frame: FieldFrame,
+                        dt: float) -> FloatArray:
+        """(n_sensors, 3) [T] the field of a frame that hypothesis `i` has of all but one target."""
+        return self.observation.field_of_others(bank.x[i], target, self.time_offset(frame, dt))
+
+    def _lengths(self, kind: IntArray) -> FloatArray:
+        """(n, n_targets) [m] near-field lengths of the kinds `kind` (n,) or (n, n_targets)."""
+        return self._near_field_lengths[kind].reshape(len(kind), -1)
+
     def are_long(self, kind: IntArray) -> BoolArray:
-        """(n,) whether targets of the kinds `kind` (n,) are longer than a car."""
-        return self._are_long[kind]
+        """(n,) whether any target of the kinds `kind` (n,) or (n, n_targets) is longer than a car.
+        """
+        are_long: BoolArray = self._are_long[kind].reshape(len(kind), -1).any(axis=1)
+        return are_long
 
     def nearly_linear(self, x: FloatArray) -> FloatArray:
         """(n_hyp,) [m] how far the position of the states `x` (n_hyp, n_x) may be off for the field

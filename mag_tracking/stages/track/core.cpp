@@ -13,8 +13,11 @@ namespace mag_tracking {
 namespace {
 
 struct Bank {
-    int n_hyp;
+    int n_hyp, n_targets;
     const double *near_field_length, *x, *P;
+
+    // (n_targets) of hypothesis p.
+    INLINE const double* lengths(int p) const { return near_field_length + p * n_targets; }
 };
 
 // May be where the bank is: one hypothesis is done before the next is looked at.
@@ -56,7 +59,7 @@ INLINE void advance_all(const Target& target, const Sensors& sensors, const Size
                 std::memcpy(prior.data(), P.data(), n.square() * sizeof(double));
             }
             out.log_likelihood[p] = filter.update(
-                frame, x_lin.data(), bank.near_field_length[p], x.data(), P.data(),
+                frame, x_lin.data(), bank.lengths(p), x.data(), P.data(),
                 scratch.gains(0, n), out.nis + p * n.n_sensors);
         }
         std::copy(x.data(), x.data() + n_x, out.x + p * n_x);
@@ -98,7 +101,7 @@ INLINE void run_along_all(const Target& target, const Sensors& sensors, const Si
             to_wide(bank.P + p * square, n, P.data());
             along.log_likelihood[p] = filter.run(
                 frames, along.first_is_updated, along.strange, along.iterations,
-                bank.near_field_length[p], at, x.data(), P.data(), path);
+                bank.lengths(p), at, x.data(), P.data(), path);
             if (!filter.smooth(frames, path, smoothed.data(), std.data()))
                 along.log_likelihood[p] = -std::numeric_limits<double>::infinity();
             along.unsettled[p] = farthest(smoothed.data(), at, std.data(), frames.n, n_x);
@@ -122,6 +125,12 @@ FOR_PROCESSORS void advance(const RowVehicle& target, const Sensors& sensors, co
     advance_all(target, sensors, n, frame, moves, iterations, bank, out);
 }
 
+FOR_PROCESSORS void advance(const Vehicles& target, const Sensors& sensors, const Sizes& n,
+                            const Frame& frame, bool moves, int iterations, const Bank& bank,
+                            const Advanced& out) {
+    advance_all(target, sensors, n, frame, moves, iterations, bank, out);
+}
+
 FOR_PROCESSORS void advance(const Magnet& target, const Sensors& sensors, const Sizes& n,
                             const Frame& frame, bool moves, int iterations, const Bank& bank,
                             const Advanced& out) {
@@ -134,11 +143,22 @@ FOR_PROCESSORS void run_along(const RowVehicle& target, const Sensors& sensors, 
     run_along_all(target, sensors, n, frames, bank, along, out);
 }
 
+FOR_PROCESSORS void run_along(const Vehicles& target, const Sensors& sensors, const Sizes& n,
+                              const Frames& frames, const Bank& bank, const Along& along,
+                              const Advanced& out) {
+    run_along_all(target, sensors, n, frames, bank, along, out);
+}
+
 FOR_PROCESSORS void run_along(const Magnet& target, const Sensors& sensors, const Sizes& n,
                               const Frames& frames, const Bank& bank, const Along& along,
                               const Advanced& out) {
     run_along_all(target, sensors, n, frames, bank, along, out);
 }
+
+// Targets that share a state.
+template <class Target>
+Size number_of(const Target&) { return 1; }
+Size number_of(const Vehicles& vehicles) { return vehicles.count; }
 
 template <class Target>
 class CompiledFilter {
@@ -163,7 +183,8 @@ class CompiledFilter {
                  Array near_field_length, Array x, Array P, Array new_x, Array new_P,
                  Array predicted, Array log_likelihood, Array nis) const {
         const Sizes n = sizes();
-        const Size n_hyp = length_of(near_field_length, "near_field_length", 1);
+        const Size n_hyp = length_of(near_field_length, "near_field_length", 2);
+        const Size n_targets = near_field_length.shape(1);
         const Size n_s = n_sensors_, n_x = n.n_x;
         const Frame frame{data_of(field, "field", {n_s, 3}),
                           data_of(covariance, "covariance", {n_s, 3, 3}),
@@ -171,7 +192,9 @@ class CompiledFilter {
                           dt,
                           data_of(decay, "decay", {n_x - n.n_t}),
                           data_of(variance, "variance", {n_x - n.n_t})};
-        const Bank bank{int(n_hyp), input_of(near_field_length, "near_field_length", {n_hyp}),
+        const Bank bank{int(n_hyp), int(n_targets),
+                        input_of(near_field_length, "near_field_length",
+                                 {n_hyp, number_of(target_)}),
                         data_of(x, "x", {n_hyp, n_x}),
                         data_of(P, "P", {n_hyp, n_x, n_x})};
         const Advanced out{data_of(new_x, "new_x", {n_hyp, n_x}),
@@ -192,7 +215,8 @@ class CompiledFilter {
                    Array new_P, Array paths, Array log_likelihood, Array unsettled,
                    Array covariances, ArrayOf<bool> used) const {
         const Sizes n = sizes();
-        const Size n_hyp = length_of(near_field_length, "near_field_length", 1);
+        const Size n_hyp = length_of(near_field_length, "near_field_length", 2);
+        const Size n_targets = near_field_length.shape(1);
         const Size n_s = n_sensors_, n_x = n.n_x;
         const Size n_frames = length_of(dt, "dt", 1);
         const Frames frames{int(n_frames),
@@ -202,7 +226,9 @@ class CompiledFilter {
                             dt.data(),
                             data_of(decay, "decay", {n_frames, n_x - n.n_t}),
                             data_of(variance, "variance", {n_frames, n_x - n.n_t})};
-        const Bank bank{int(n_hyp), input_of(near_field_length, "near_field_length", {n_hyp}),
+        const Bank bank{int(n_hyp), int(n_targets),
+                        input_of(near_field_length, "near_field_length",
+                                 {n_hyp, number_of(target_)}),
                         data_of(x, "x", {n_hyp, n_x}),
                         data_of(P, "P", {n_hyp, n_x, n_x})};
         const Advanced out{data_of(new_x, "new_x", {n_hyp, n_x}),
@@ -306,6 +332,15 @@ RowVehicle row_vehicle(int n_states, int n_dipoles, Vector density, Vector induc
             turn_acceleration, turn_time, fastest_turn};
 }
 
+Vehicles vehicles(int n_states, int n_dipoles, Vector density, Vector induction,
+                  double moment_drift, double difference_drift, double turn_acceleration,
+                  double turn_time, double fastest_turn, int count) {
+    if (count < 1 || count > MOST_TARGETS)
+        throw py::value_error("count: from 1 to " + std::to_string(MOST_TARGETS));
+    return {row_vehicle(n_states, n_dipoles, density, induction, moment_drift, difference_drift,
+                        turn_acceleration, turn_time, fastest_turn), count};
+}
+
 Magnet magnet(Vector density, double angular_density) {
     return {{density[0], density[1], density[2]}, angular_density};
 }
@@ -317,7 +352,9 @@ PYBIND11_MODULE(core, module) {
     using namespace mag_tracking;
     module.doc() = "The filters of the tracker, compiled; see bank_filter.py and pass_samples.py.";
     add_filter(module, "RowVehicleFilter", row_vehicle);
+    add_filter(module, "VehiclesFilter", vehicles);
     add_filter(module, "MagnetFilter", magnet);
+    module.attr("MOST_TARGETS") = MOST_TARGETS;
     module.def("fit_steady_pass", &fit_steady_pass, IN(theta), IN(cost), IN(covariance), IN(free),
                IN(fixed), IN(places), IN(combinations), IN(t), IN(positions), IN(M), IN(clock),
                IN(y), IN(nuisance), IN(n_steps), IN(tolerance), IN(most_damping), IN(full_rank),

@@ -5,6 +5,9 @@ from collections.abc import Sequence
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 
+MOST_TARGETS: int
+"""Vehicles that share a state at most."""
+
 class _Filter:
     def advance(self, field: FloatArray, covariance: FloatArray, offset: FloatArray, dt: float,
                 decay: FloatArray, variance: FloatArray, moves: bool, iterations: int,
@@ -23,6 +26,15 @@ class RowVehicleFilter(_Filter):
                  n_states: int, n_dipoles: int, density: Sequence[float],
                  induction: Sequence[float], moment_drift: float, difference_drift: float,
                  turn_acceleration: float, turn_time: float, fastest_turn: float) -> None: ...
+
+class VehiclesFilter(_Filter):
+    """Of `count` vehicles whose fields add up."""
+
+    def __init__(self, positions: FloatArray, R_sw: FloatArray, n_angles: int, n_errors: int,
+                 n_states: int, n_dipoles: int, density: Sequence[float],
+                 induction: Sequence[float], moment_drift: float, difference_drift: float,
+                 turn_acceleration: float, turn_time: float, fastest_turn: float,
+                 count: int) -> None: ...
 
 class MagnetFilter(_Filter):
     def __init__(self, positions: FloatArray, R_sw: FloatArray, n_angles: int, n_errors: int,

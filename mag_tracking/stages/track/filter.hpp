@@ -67,7 +67,7 @@ class Filter {
   public:
     Filter(const Target& target, const Sensors& sensors, const Sizes& sizes)
         : target_(target), sensors_(sensors), n_(sizes), Q_(sizes.n_t * sizes.wide),
-          T_(MOST_MOVING * sizes.wide), h_(3 * sizes.n_sensors), inflation_(sizes.n_sensors),
+          T_(MOST_ROWS * sizes.wide), h_(3 * sizes.n_sensors), inflation_(sizes.n_sensors),
           x_lin_(sizes.wide) {}
 
     // Time update of `x` (wide) and `P` (n_x, wide) linearised at `at` (n_x); backwards in time
@@ -76,7 +76,7 @@ class Filter {
                         Motion& motion) {
         target_.move(at, frame.dt, motion);
         if (frame.dt > 0.0) target_.noise(at, P, n_.wide, frame.dt, motion, Q_.data());
-        double moved[MOST_MOVING];
+        double moved[MOST_ROWS];
         for (int r = 0; r < motion.n; ++r) {
             moved[r] = motion.moved[r];
             for (int m = 0; m < motion.width; ++m) {
@@ -93,9 +93,10 @@ class Filter {
                     eights(P + a * n_.wide)[v] += eights(Q_.data() + a * n_.wide)[v];
     }
 
-    // Measurement update linearised at `x_lin` (n_x); its log-likelihood. What it did goes into
+    // Measurement update linearised at `x_lin` (n_x); its log-likelihood. `near_field_length` has
+    // one value a target. What it did goes into
     // `gains`, the normalised innovation squared of each sensor into `nis`.
-    INLINE double update(const Frame& frame, const double* x_lin, double near_field_length,
+    INLINE double update(const Frame& frame, const double* x_lin, const double* near_field_length,
                          double* x, double* P, const Gains& gains, double* nis) {
         const bool is_lost = !see(frame, x_lin, near_field_length, gains.H);
         if (is_lost) {
@@ -119,7 +120,7 @@ class Filter {
     // `iterations` times, at what came of that. A frame whose normalised innovation is larger than
     // `strange` per axis is left out.
     INLINE double run(const Frames& frames, bool first_is_updated, double strange, int iterations,
-                      double near_field_length, const double* path, double* x, double* P,
+                      const double* near_field_length, const double* path, double* x, double* P,
                       Path& out) {
         double total = 0.0;
         std::vector<double> nis(n_.n_sensors);
@@ -232,26 +233,29 @@ class Filter {
     }
 
     // Fields h_, derivative `H` and inflation_ of the state `x`; false where they are not finite.
-    INLINE bool see(const Frame& frame, const double* x, double near_field_length, double* H) {
+    INLINE bool see(const Frame& frame, const double* x, const double* near_field_length,
+                    double* H) {
         double at[MOST_TARGET_STATES], total = 0.0;
         std::copy(x, x + n_.n_t, at);
         for (int j = 0; j < n_.n_sensors; ++j, H += 3 * n_.n_seen()) {
             const double* position = sensors_.positions + 3 * j;
-            double R[9], world[3], gradient;
+            double R[9], world[3], error;
             turn(j, x + n_.own(j), R);
             if (frame.offset[j] == 0.0) {
-                gradient = target_.field(at, position, R, world, H, n_.n_seen());
+                error = field_and_error(target_, at, position, R, near_field_length, world, H,
+                                        n_.n_seen());
             } else {
                 Motion motion;
                 target_.move(x, frame.offset[j], motion);
                 for (int r = 0; r < motion.n; ++r) at[motion.rows[r]] = motion.moved[r];
-                gradient = target_.field(at, position, R, world, H, n_.n_seen());
+                error = field_and_error(target_, at, position, R, near_field_length, world, H,
+                                        n_.n_seen());
                 to_before(motion, H);
                 for (int r = 0; r < motion.n; ++r) at[motion.rows[r]] = x[motion.rows[r]];
             }
-            see_own(j, x + n_.own(j), R, world, near_field_length * gradient, H);
-            // The derivative grows with nearness as the gradient does.
-            total += gradient + h_[3 * j] + h_[3 * j + 1] + h_[3 * j + 2];
+            see_own(j, x + n_.own(j), R, world, error, H);
+            // The derivative grows with nearness as the error does.
+            total += error + h_[3 * j] + h_[3 * j + 1] + h_[3 * j + 2];
         }
         return std::isfinite(total);
     }
@@ -271,7 +275,7 @@ class Filter {
     // `H` (3, n_seen) by the moved state to that by the state before: H F.
     INLINE void to_before(const Motion& motion, double* H) const {
         for (int a = 0; a < 3; ++a, H += n_.n_seen()) {
-            double by_moved[MOST_MOVING];
+            double by_moved[MOST_ROWS];
             for (int r = 0; r < motion.n; ++r) {
                 by_moved[r] = H[motion.rows[r]];
                 H[motion.rows[r]] = 0.0;

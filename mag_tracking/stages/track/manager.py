@@ -184,10 +184,9 @@ class TrackManager:
     def _unexplained(self, tracks: list[RunningTrack], stamp_ns: int) -> list[TrackRecord]:
         """The disturbances that tracks which have ended leave behind."""
         out: list[TrackRecord] = []
-        for found in (track.unexplained for track in tracks):
-            if found is not None:
-                self.counts[DISTURBED] += 1
-                out += self._disturbances.begin(found, stamp_ns)
+        for found in (found for track in tracks for found in track.unexplained):
+            self.counts[DISTURBED] += 1
+            out += self._disturbances.begin(found, stamp_ns)
         return out
 
     def _maintain(self, frame: FieldFrame, dt: float) -> list[TrackRecord]:

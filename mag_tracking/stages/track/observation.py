@@ -32,7 +32,8 @@ def angle_priors(network: SensorNetwork, mounting_std: float) -> FloatArray:
 class Observation:
     """The field that a network has of hypotheses, and the states that belong to its sensors.
 
-    A state is as on top of `inference/hypothesis.hpp`. Behind the target's states come each
+    A state is as on top of `inference/hypothesis.hpp`: the states of `n_targets` targets of the same
+    model, whose fields add up, one after the other. Behind the targets' states come each
     sensor's own: three mounting angles [rad] where they are estimated, and three model errors, in
     units of their size, where those last. They are what the target model leaves out near a
     vehicle, and stay alike for `error_time` (first-order Gauss-Markov), so that what is counted
@@ -40,7 +41,7 @@ class Observation:
     """
 
     def __init__(self, network: SensorNetwork, model: SourceModel, mounting_std: float,
-                 error_time: float) -> None:
+                 error_time: float, n_targets: int = 1) -> None:
         """`mounting_std` [rad] is that of a sensor whose `orientation_std` is not known."""
         self.positions: FloatArray = np.ascontiguousarray(network.positions, dtype=float)
         """(n_sensors, 3) [m]"""
@@ -50,7 +51,10 @@ class Observation:
         self._error_time = error_time
         self.n_angles = 3 if mounting_std else 0
         """States of each sensor for how it is mounted."""
-        self.n_target = len(model.state_names)
+        self.n_targets = n_targets
+        self.n_one = len(model.state_names)
+        """States of each target."""
+        self.n_target = n_targets * self.n_one
         n_own = self.n_angles + (3 if error_time else 0)
         self.own_covariance = np.zeros((len(network), n_own, n_own))
         """(n_sensors, n_own, n_own) of the sensors' own states when a track begins."""
@@ -58,6 +62,9 @@ class Observation:
         self.own_covariance[:, errors, errors] = 1.0
         if mounting_std:
             self.own_covariance[:, :3, :3] = angle_priors(network, mounting_std)
+        self.of_one: Observation = self if n_targets == 1 else Observation(
+            network, model, mounting_std, error_time)
+        """The same of a single target."""
         # Of the states behind the target's: 1 where it is one of these, else 0.
         is_error = np.tile(np.arange(n_own) >= self.n_angles, len(network))
         self._is_error: FloatArray = np.append(is_error, np.zeros(3 * len(network)))
@@ -96,9 +103,15 @@ class Observation:
 
     def nearest(self, x: FloatArray) -> FloatArray:
         """(n_hyp,) [m] from the positions of the states `x` (n_hyp, n_x) to the nearest sensor."""
-        away = np.linalg.norm(x[:, None, :3] - self.positions, axis=2)
-        nearest: FloatArray = away.min(axis=1)
+        away = np.linalg.norm(self.places(x)[:, :, None] - self.positions, axis=3)
+        nearest: FloatArray = away.min(axis=(1, 2))
         return nearest
+
+    def places(self, x: FloatArray) -> FloatArray:
+        """(n_hyp, n_targets, 3) [m] positions of the targets of the states `x` (n_hyp, n_x)."""
+        places: FloatArray = x[:, :self.n_target].reshape(
+            len(x), self.n_targets, self.n_one)[:, :, :3]
+        return places
 
     def drift(self, dt: FloatArray, background_density: float) -> tuple[FloatArray, FloatArray]:
         """What becomes of the sensors' states over the times `dt` (...) [s].
@@ -113,22 +126,60 @@ class Observation:
             + np.multiply.outer(background_density**2 * np.maximum(dt, 0.0), self._is_background)
         return 1.0 - np.multiply.outer(1.0 - fading, self._is_error), variance
 
-    def target_fields(self, x: FloatArray, time_offset: FloatArray
+    def target_fields(self, x: FloatArray, time_offset: FloatArray, near_field_length: FloatArray
                       ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Field of the target alone, at each sensor's own time; see `sensor_fields`."""
-        n_hyp, n, n_t = len(x), len(self.positions), self.n_target
+        """Field of the targets alone, at each sensor's own time.
+
+        Parameters
+        ----------
+        x : (n_hyp, n_x)
+        time_offset : (n_sensors,) [s]
+        near_field_length : (n_hyp, n_targets) [m]
+
+        Returns
+        -------
+        h : (n_hyp, n_sensors, 3) [T], sensor frame
+        H : (n_hyp, n_sensors, 3, n_target)
+        variance : (n_hyp, n_sensors) [T^2]
+            Of what the models leave out near the targets; they do so independently.
+        """
+        h, H, gradients = zip(*(
+            self._field_of_one(x[:, first:first + self.n_one], time_offset)
+            for first in range(0, self.n_target, self.n_one)), strict=True)
+        # NaN where a dipole is on a sensor, as the field there: also where the length is zero.
+        with np.errstate(invalid='ignore'):
+            variance = sum(np.square(length)[:, None] * gradient**2 for length, gradient in zip(
+                near_field_length.T, gradients, strict=True))
+        return sum(h[1:], h[0]), np.concatenate(H, axis=3), np.asarray(variance)
+
+    def _field_of_one(self, x: FloatArray, time_offset: FloatArray
+                      ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Field of one target with the states `x` (n_hyp, n_one); see `sensor_fields`."""
+        n_hyp, n, n_t = len(x), len(self.positions), self.n_one
         if not time_offset.any():
-            return sensor_fields(self.positions, self.R_sw, *self._model.dipoles(x[:, :n_t]))
+            return sensor_fields(self.positions, self.R_sw, *self._model.dipoles(x))
         h, H = np.empty((n_hyp, n, 3)), np.empty((n_hyp, n, 3, n_t))
         gradient = np.empty((n_hyp, n))
         steps = np.round(time_offset / SAME_TIME_S)
         for step in np.unique(steps):
             j = np.flatnonzero(steps == step)
-            moved, F, _ = self._model.propagate(x[:, :n_t], step * SAME_TIME_S)
+            moved, F, _ = self._model.propagate(x, step * SAME_TIME_S)
             h[:, j], H_moved, gradient[:, j] = sensor_fields(
                 self.positions[j], self.R_sw[j], *self._model.dipoles(moved))
             H[:, j] = H_moved @ (F if F.ndim == 2 else F[:, None])
         return h, H, gradient
+
+    def field_of_others(self, x: FloatArray, target: int, time_offset: FloatArray) -> FloatArray:
+        """(n_sensors, 3) [T] the field of all targets but one, of a state (n_x,)."""
+        n = self.n_one
+        h, H = np.zeros((1, *self.positions.shape)), np.zeros((1, *self.positions.shape, 0))
+        for first in range(0, self.n_target, n):
+            if first != target * n:
+                h = h + self._field_of_one(x[None, first:first + n], time_offset)[0]
+        if self.n_angles:
+            h, _ = turned_fields(h, H, np.ascontiguousarray(self.own(x[None])[..., :3]))
+        of_others: FloatArray = h[0]
+        return of_others
 
     def fields(self, x: FloatArray, time_offset: FloatArray, near_field_length: FloatArray,
                field_error: float) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -138,7 +189,7 @@ class Observation:
         ----------
         x : (n_hyp, n_x)
         time_offset : (n_sensors,) [s]
-        near_field_length : (n_hyp,) [m]
+        near_field_length : (n_hyp, n_targets) [m]
         field_error : float
             Model error relative to the field.
 
@@ -153,8 +204,8 @@ class Observation:
         a hundred of the derivative where the error is large. ICASSP11 eq. (9) for that size,
         there as noise.
         """
-        h, H, gradient = self.target_fields(x, time_offset)
-        variance = _model_error(h, gradient, near_field_length, field_error)
+        h, H, variance = self.target_fields(x, time_offset, near_field_length)
+        variance = variance + _share_of_field(h, field_error)
         own = self.own(x)
         if self.n_angles:
             h, H = turned_fields(h, H, np.ascontiguousarray(own[..., :3]))
@@ -165,23 +216,18 @@ class Observation:
         H = np.concatenate([H, size[..., None] * np.eye(3)], axis=3)
         return h, H, np.zeros_like(variance)
 
-    def model_error(self, x: FloatArray, near_field_length: float, field_error: float
+    def model_error(self, x: FloatArray, near_field_length: FloatArray, field_error: float
                     ) -> FloatArray:
-        """(n_sensors,) [T^2] Variance of what the model leaves out of the field of a state (n_x,).
+        """(n_sensors,) [T^2] Variance of what the models leave out of the field of a state (n_x,).
 
-        NaN where a dipole is on a sensor.
+        `near_field_length` (n_targets,) [m]. NaN where a dipole is on a sensor.
         """
-        h, _, gradient = self.target_fields(x[None], np.zeros(len(self.positions)))
-        variance: FloatArray = _model_error(h, gradient, np.array([near_field_length]),
-                                            field_error)[0]
-        return variance
+        h, _, variance = self.target_fields(x[None], np.zeros(len(self.positions)),
+                                            near_field_length[None])
+        return np.asarray(variance[0] + _share_of_field(h, field_error)[0])
 
 
-def _model_error(h: FloatArray, gradient: FloatArray, near_field_length: FloatArray,
-                 field_error: float) -> FloatArray:
-    """(n_hyp, n_sensors) [T^2] Variance of what the model leaves out of fields."""
-    # NaN where a dipole is on a sensor, as the field there: also where the length is zero.
-    with np.errstate(invalid='ignore'):
-        variance: FloatArray = (np.square(near_field_length)[:, None] * gradient**2
-                                + field_error**2 * np.einsum('pji,pji->pj', h, h))
+def _share_of_field(h: FloatArray, field_error: float) -> FloatArray:
+    """(n_hyp, n_sensors) [T^2] Variance of a model error that is a share of fields `h`."""
+    variance: FloatArray = field_error**2 * np.einsum('pji,pji->pj', h, h)
     return variance

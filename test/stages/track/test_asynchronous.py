@@ -33,7 +33,7 @@ def test_derivatives_hold_at_every_sensors_own_time(target):
     observation = BankFilter(network, model, settings).observation
 
     def fields(x):
-        return observation.fields(x, offset, np.zeros(1), 0.0)
+        return observation.fields(x, offset, np.zeros((1, 1)), 0.0)
     H = fields(x)[1][0]
     for k in range(n_t):
         e = np.zeros_like(x)

@@ -245,7 +245,7 @@ def fields_along(model, network, x0, n):
     filter_ = BankFilter(network, model, settings_for('vehicle', STILL).track)
     for k in range(n):
         x = model.propagate(x0[None, :n_t], k * PERIOD)[0]
-        h, _, _ = filter_.observation.target_fields(x, np.zeros(len(network)))
+        h, _, _ = filter_.observation.target_fields(x, np.zeros(len(network)), np.zeros((1, 1)))
         out.append(h[0] + x0[n_t:].reshape(-1, 3))
     return np.array(out)
 

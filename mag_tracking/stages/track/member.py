@@ -1,0 +1,192 @@
+"""One target of a running track: its evidence, its doubts, and what is published of it."""
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from mag_tracking.arrays import BoolArray
+from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.records import FieldFrame, SmoothedPose, Track
+from mag_tracking.stages.track import doubts
+from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.clock_evidence import ClockEvidence
+from mag_tracking.stages.track.disturbances import Unexplained
+from mag_tracking.stages.track.evidence import TrackEvidence
+from mag_tracking.stages.track.observation import Observation
+from mag_tracking.stages.track.plausibility import Plausibility
+from mag_tracking.stages.track.published_pose import ambiguities, published_track, smoothed_pose
+from mag_tracking.stages.track.second_opinion import SecondOpinion
+from mag_tracking.stages.track.sensor_selection import SensorSubset
+from mag_tracking.stages.track.settings import TrackSettings
+from mag_tracking.stages.track.smoothing import TrackState
+from mag_tracking.stages.track.target import Target
+
+
+@dataclass(frozen=True)
+class Update:
+    """What a frame did to the bank of a running track."""
+
+    frame: FieldFrame
+    """What was used of it, of the sensors that the track uses."""
+    dt: float
+    """[s] Since the frame before."""
+    bank: FilterBank
+    """Of all members."""
+    bank_filter: BankFilter
+    sensors: SensorSubset
+    settings: TrackSettings
+
+
+@dataclass(frozen=True)
+class View:
+    """The bank of a running track, of one member alone."""
+
+    bank: FilterBank
+    best: int
+    """Row of the hypothesis that is published of it."""
+    observation: Observation
+    gain: float
+    """[nats] Of the latest frames along the path of that hypothesis, less than in its filter."""
+
+
+class Member:
+    """A target of a running track.
+
+    Attributes
+    ----------
+    id : int
+    evidence : TrackEvidence
+    opinion : SecondOpinion
+    last : Track or None
+        The latest record.
+    ended : str or None
+        Why it is over; None while it is followed.
+    is_lost : bool
+        It ended while the target was still detected.
+    early : list of TrackState
+        Smoothed states before the target shared its state with others.
+    slot : int
+        Where its states are among those of the frames that are kept for smoothing.
+    """
+
+    def __init__(self, id: int, target: Target, sensors: SensorSubset, counts: 'Counter[str]',
+                 clocks: ClockEvidence, begin_ns: int) -> None:
+        self.id, self._target, self._counts, self._clocks = id, target, counts, clocks
+        self.begin_ns = begin_ns
+        self.evidence, self._plausibility = TrackEvidence(len(sensors.whole)), Plausibility()
+        self.opinion = SecondOpinion(sensors.network)
+        self.last: Track | None = None
+        self.ended: str | None = None
+        self.is_lost = False
+        self.early: list[TrackState] = []
+        self.slot = 0
+        self._spread = np.inf
+        self._unseen = target.unseen()
+        self._was_sure = False
+
+    def use(self, sensors: SensorSubset) -> None:
+        """From now on the target is measured by these sensors."""
+        self.opinion = SecondOpinion(sensors.network)
+
+    def publish(self, update: Update, view: View) -> Track:
+        """The `Track` of a frame."""
+        self.last = self._published(update, view)
+        self._spread = float(np.sqrt(np.trace(view.bank.P[view.best, :2, :2])))
+        self._was_sure |= not self.last.ambiguous
+        self._counts['poses'] += 1
+        return self.last
+
+    def _published(self, update: Update, view: View) -> Track:
+        """The `Track` of a frame, with what it says of the sensors."""
+        frame, dt, sensors, best = update.frame, update.dt, update.sensors, view.best
+        measured: BoolArray = ~np.isnan(frame.field)
+        by = np.flatnonzero(measured.any(axis=1))
+        alone = len(sensors.network) > 1 and len(by) == 1
+        self.evidence.support(alone, dt)
+        if self._unseen is not None:
+            self._unseen.look(
+                view.bank.x[best], view.bank.P[best], sensors.network.positions[by],
+                self.last is not None and (self.evidence.doubted or not self.last.ambiguous))
+        found = self.evidence.note(self._doubts(update, view, alone), frame.stamp_ns)
+        excess = 1.0 if self._target.starts_anywhere else self.evidence.innovations.excess
+        return sensors.widened(published_track(
+            view.bank, best, self._target.model, self._target.orientation, self._target.arrivals,
+            self._target.kinds, stamp_ns=frame.stamp_ns, id=self.id, ended=False,
+            existence=self.evidence.existence, degrees_of_freedom=int(measured.sum()),
+            found=found, excess=excess, unseen=self._unseen, difference=self.opinion.difference,
+            ambiguous_poses=update.settings.ambiguous_poses,
+            predicted=update.bank_filter.predicted_field(update.bank, best, frame, dt),
+            mounting=view.observation.angles(view.bank.x[best].copy()),
+            mounting_covariance=view.observation.angle_covariances(view.bank.P[best])),
+            update.settings)
+
+    def is_doubted(self, settings: TrackSettings) -> bool:
+        """Whether all of the track, as it stands, may be wrong."""
+        return self.evidence.doubted or self.opinion.is_doubtful \
+            or not self.evidence.explanation.leads(settings.explained_ratio) \
+            or not self._target.starts_anywhere and self.evidence.is_felt_by_one
+
+    def _doubts(self, update: Update, view: View, alone: bool) -> set[str]:
+        """Doubts about the pose of the best hypothesis; `alone`: one sensor measured."""
+        bank, best, evidence, settings = view.bank, view.best, self.evidence, update.settings
+        found = evidence.doubts | ({doubts.ONE_SENSOR} if alone else set())
+        if update.bank_filter.is_strange(bank, best, update.frame):
+            found.add(doubts.MISFIT)
+        if not evidence.explanation.leads(settings.explained_ratio):
+            found.add(doubts.SOMETHING_ELSE)
+        # A magnet may rest: it is then as smooth as anything, and is where it was.
+        if self._target.starts_anywhere:
+            return found
+        found |= evidence.vehicle_doubts(
+            bank.nis[best], int(np.count_nonzero(~np.isnan(update.frame.field))),
+            settings.explained_ratio)
+        if self._overfits(update, view):
+            found.add(doubts.OVERFIT)
+        found |= self.opinion.doubts(self._clocks.apart_s(update.sensors.rows))
+        found |= self._plausibility.judge(
+            view.observation, bank, best, settings.vehicle,
+            np.deg2rad(settings.mounting_std_deg), update.dt)
+        for reason in found & doubts.FOR_GOOD:
+            evidence.doubt(reason)
+        return found | evidence.doubts
+
+    def _overfits(self, update: Update, view: View) -> bool:
+        """Whether the filter fits the frames much better than the path of its hypothesis."""
+        overfits = self.evidence.doubts_filter(view.gain, update.frame.stamp_ns,
+                                               update.settings.relinearise_window_s)
+        if overfits:
+            self._counts['poses in doubt: the filter fits better than its path'] += 1
+        return overfits
+
+    def reason_to_end(self, sensors: SensorSubset, settings: TrackSettings) -> str | None:
+        """Why the target is over by its latest record; None while it goes on."""
+        assert self.last is not None
+        is_coming = not self._target.starts_anywhere and sensors.is_neared_by(self.last)
+        return self.evidence.reason_to_end(self.last, self._spread, is_coming, settings)
+
+    def unexplained(self, uniform: float) -> Unexplained | None:
+        """The field during the track, if a target never explained it; else None.
+
+        `uniform` is the probability that it was one field over the network.
+        """
+        if self._was_sure or self.last is None \
+                or self.evidence.explanation.unexplained_s(self.last.stamp_ns) <= 0.0:
+            return None
+        return Unexplained(self.id, self.begin_ns, self.evidence.largest, self.evidence.felt,
+                           uniform)
+
+    def smoothed(self, bank: FilterBank, best: int, complete: bool, states: list[TrackState],
+                 doubtful: bool) -> list[SmoothedPose]:
+        """The `SmoothedPose`s of states of the hypothesis `best` of this member's `bank`.
+
+        Smoothing removes the doubts about its filter only in part.
+        """
+        ambiguous = doubtful or bool(ambiguities(bank, best, bank.apart(best)))
+        return [smoothed_pose(
+            self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,
+            kind=int(bank.kind[best]), kinds=self._target.kinds, unseen=self._unseen,
+            complete=complete, difference=difference,
+            ambiguous=ambiguous or self.evidence.doubted_filter(stamp_ns))
+            for (stamp_ns, x, P), difference in zip(states, self.opinion.differences(states),
+                                                    strict=True)]
