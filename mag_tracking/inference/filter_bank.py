@@ -98,7 +98,7 @@ class FilterBank:
         others = n_one * self.label.shape[1]
         columns = np.append(np.arange(i * n_one, (i + 1) * n_one),
                             np.arange(others, self.x.shape[1]))
-        return FilterBank(self.x[:, columns], self.P[:, columns[:, None], columns], self.log_w,
+        return FilterBank(*_of_columns(self.x, self.P, columns), self.log_w,
                           self.label[:, i].copy(), self.kind[:, i].copy(), self.origin, self.nis)
 
     def without_target(self, i: int, n_one: int) -> 'FilterBank':
@@ -108,8 +108,7 @@ class FilterBank:
         label, kind = np.delete(self.label, i, axis=1), np.delete(self.kind, i, axis=1)
         if n_targets == 2:
             label, kind = label[:, 0].copy(), kind[:, 0].copy()
-        return FilterBank(self.x[:, columns], self.P[:, columns[:, None], columns],
-                          self.log_w.copy(), label, kind, self.origin.copy(), self.nis.copy())
+        return FilterBank(*_of_columns(self.x, self.P, columns), self.log_w.copy(), label, kind, self.origin.copy(), self.nis.copy())
 
     def copy(self) -> 'FilterBank':
         """The same bank with arrays of its own."""
@@ -188,6 +187,12 @@ class FilterBank:
             mask = np.zeros(len(self), dtype=bool)
             mask[order[:most]] = True
         return self.keep(mask)
+
+
+def _of_columns(x: FloatArray, P: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Some of the states (n_hyp, n_x), and their covariances, as arrays of their own."""
+    return (np.ascontiguousarray(x[:, columns]),
+            np.ascontiguousarray(P[:, columns[:, None], columns]))
 
 
 def _classes(labels: IntArray) -> IntArray:

@@ -202,6 +202,18 @@ class BankFilter:
         field: FloatArray = h[0] + x[0, -3 * self._n_sensors:].reshape(-1, 3)
         return field
 
+    def fields_at(self, x: FloatArray, kind: IntArray, frame: FieldFrame, dt: float
+                  ) -> tuple[FloatArray, FloatArray]:
+        """The fields (n_sensors, 3) [T] of the targets of a state (n_x,), without backgrounds and
+        errors, at the times of a frame; and their derivative (n_sensors, 3, n_target).
+
+        `kind` (1,) or (1, n_targets).
+        """
+        h, H, _ = self.observation.fields(
+            self.observation.without_errors(x[None]), self.time_offset(frame, dt),
+            self._lengths(kind), self._settings.field_error)
+        return h[0], H[0, :, :, :self.observation.n_target]
+
     def field_of_others(self, bank: FilterBank, i: int, target: int, frame: FieldFrame,
                         dt: float) -> FloatArray:
         """(n_sensors, 3) [T] the field of a frame that hypothesis `i` has of all but one target."""

@@ -101,6 +101,14 @@ class TrackEvidence:
         """From now on all of the track may be wrong."""
         self._doubts.add(reason)
 
+    def forgive(self) -> None:
+        """Drop the doubts that another vehicle explains."""
+        self._doubts -= {doubts.CONTRADICTION, doubts.INNOVATIONS, doubts.SENSORS_CONTRADICT,
+                         *doubts.FOR_GOOD}
+        self.innovations = InnovationConsistency(len(self.largest))
+        self._n_misfits, self._doubts_filter_until_ns = 0, -1
+        self._found_ns.clear()
+
     def doubt_start(self, unseen_coming: bool, network: SensorNetwork, starts_anywhere: bool
                     ) -> None:
         """Doubt a track whose target was not seen approaching, or whose range nothing tells.

@@ -143,7 +143,7 @@ def _soft_iron_per_share(settings: VehicleSettings, kind: int) -> float:
     return settings.moments[kind] * MU0 / SHARE_FIELD
 
 
-def _soft_iron(settings: VehicleSettings, kind: int) -> float:
+def soft_iron(settings: VehicleSettings, kind: int) -> float:
     """[m^3] D that a kind starts with, along each axis."""
     return settings.induced_share * _soft_iron_per_share(settings, kind)
 
@@ -179,12 +179,14 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
         moments = settings.moments[kind] * moment_directions()
         for label, heading in enumerate(np.deg2rad(settings.arrival_headings_deg)):
             R = rotation_about_z(heading)
-            hard = (moments - _soft_iron(settings, kind) * _earth_field(network) / MU0) @ R
+            hard = (moments - soft_iron(settings, kind) * _earth_field(network) / MU0) @ R
             velocities = np.array(settings.speeds)[:, None] * R[:, 0]
             starts = _matching_positions(settings, network, measured, R, moments,
                                          settings.heights[kind])
             states.append(_states(settings, kind, starts, velocities, hard))
-            by_speed = np.array([_covariance(settings, kind, R, v) for v in settings.speeds])
+            by_speed = np.array([
+                starting_covariance(settings, kind, R, v, settings.moment_stds[kind])
+                for v in settings.speeds])
             covariances.append(np.tile(by_speed.repeat(len(moments), 0), (len(starts), 1, 1)))
             labels += [label] * len(states[-1])
             kinds += [kind] * len(states[-1])
@@ -248,13 +250,17 @@ def _states(settings: VehicleSettings, kind: int, positions: FloatArray, velocit
     x = np.empty((len(positions), len(velocities), len(hard), 8 + 3 * d + min(d, 2) + turns))
     x[..., :3], x[..., 3:6] = positions[:, None], velocities[:, None]
     x[..., 6:6 + 3 * d] = np.tile(hard / d, d)
-    x[..., 6 + 3 * d:] = [*[_soft_iron(settings, kind)] * 3, *[settings.lengths[kind]] * (d > 1),
+    x[..., 6 + 3 * d:] = [*[soft_iron(settings, kind)] * 3, *[settings.lengths[kind]] * (d > 1),
                           *[0.0] * turns]
     return x.reshape(-1, x.shape[-1])
 
 
-def _covariance(settings: VehicleSettings, kind: int, R: FloatArray, speed: float) -> FloatArray:
-    """Starting covariance (n_t, n_t) of one hypothesis."""
+def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, speed: float,
+                        moment_std: float) -> FloatArray:
+    """Covariance (n_t, n_t) of one hypothesis that arrives along the x axis of `R` (3, 3).
+
+    `speed` [m/s]; `moment_std` [A m^2] of its whole hard iron moment.
+    """
     d = _n_dipoles(settings)
     hard = 6 + 3 * d
     soft_iron_std = settings.induced_share_std * _soft_iron_per_share(settings, kind)
@@ -266,7 +272,7 @@ def _covariance(settings: VehicleSettings, kind: int, R: FloatArray, speed: floa
                                (settings.cross_speed_std * speed) ** 2,
                                settings.climb_std**2]) @ R.T
     mean = np.full((d, d), 1.0 / d)
-    P[6:hard, 6:hard] = np.kron(settings.moment_stds[kind]**2 / d * mean
+    P[6:hard, 6:hard] = np.kron(moment_std**2 / d * mean
                                 + settings.difference_stds[kind]**2 * (np.eye(d) - mean), np.eye(3))
     P[hard:hard + 3, hard:hard + 3] = soft_iron_std**2 * (1.0 + np.eye(3))
     if d > 1:

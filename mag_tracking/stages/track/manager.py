@@ -152,6 +152,12 @@ class TrackManager:
         """Do the work that may wait until the latest records are published."""
         for track in self._tracks:
             track.hand_over()
+            joint = track.newcomer()
+            if joint is not None:
+                self.counts['tracks'] += 1
+                self.counts['tracks of newcomers'] += 1
+                track.admit(joint, self._next_id)
+                self._next_id += 1
 
     def give_up(self, reason: str) -> list[TrackRecord]:
         """End all tracks and forget the recent frames; nothing is known of what came since."""

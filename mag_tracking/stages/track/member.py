@@ -89,6 +89,11 @@ class Member:
         """From now on the target is measured by these sensors."""
         self.opinion = SecondOpinion(sensors.network)
 
+    def begin_again(self) -> None:
+        """What spoke against the track was the field of another vehicle."""
+        self.evidence.forgive()
+        self._plausibility = Plausibility()
+
     def publish(self, update: Update, view: View) -> Track:
         """The `Track` of a frame."""
         self.last = self._published(update, view)

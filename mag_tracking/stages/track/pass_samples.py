@@ -73,14 +73,14 @@ class PassSamples:
                        backgrounds=self.backgrounds * rows[:, None])
 
     @classmethod
-    def of(cls, network: SensorNetwork, frames: Sequence[FieldFrame], stamp_ns: int
-           ) -> 'PassSamples':
+    def of(cls, network: SensorNetwork, frames: Sequence[FieldFrame], stamp_ns: int,
+           most_sensors: int = MOST_SENSORS) -> 'PassSamples':
         """The samples of the sensors with the strongest fields."""
         field = np.array([f.field for f in frames])
         energy = np.nansum(np.square(field), axis=2)
         measured = np.count_nonzero(~np.isnan(field).all(axis=2), axis=0)
         order = np.argsort(-energy.max(axis=0), kind='stable')
-        compared = order[measured[order] > len(frames) // 2][:MOST_SENSORS]
+        compared = order[measured[order] > len(frames) // 2][:most_sensors]
         n = len(compared)
         C = np.array([known_covariance(f.covariance)[compared] for f in frames]).reshape(-1, 3, 3)
         t = np.array([(f.stamp_ns - stamp_ns) / NS + f.time_offset[compared] for f in frames])

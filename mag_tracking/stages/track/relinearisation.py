@@ -21,6 +21,7 @@ Source: Bell 1994, The iterated Kalman smoother as a Gauss-Newton method.
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -55,6 +56,29 @@ MOST_NUMBERS = 5_000_000
 """Frames times hypotheses times states squared: with many sensors it is done for fewer of them."""
 
 
+@dataclass(frozen=True)
+class Window:
+    """The latest frames of a running track, and the path of each hypothesis through them."""
+
+    anchor: FilterBank | StartingBank
+    """At the first of the frames."""
+    is_updated: bool
+    """The anchor has been updated with the first frame."""
+    frames: list[FieldFrame]
+    intervals: list[float]
+    """[s] From the frame before to each."""
+    paths: list[FloatArray]
+    """(n_hyp, n_x) at each frame: where the hypotheses of the anchor are linearised."""
+    log_likelihoods: list[FloatArray]
+    """(n_hyp,) of each frame, in the filter; -inf of what was dropped."""
+    evidence: float
+    """Log-evidence of the frames that the anchor was not updated with, in the filter."""
+    is_start: bool
+    """It begins with the track."""
+    most: int
+    """So many hypotheses are linearised at most."""
+
+
 class Relinearisation:
     """The latest frames of a running track, and the path of each hypothesis through them."""
 
@@ -82,6 +106,7 @@ class Relinearisation:
         # log-likelihood that the filter gave it.
         self._paths: list[FloatArray] = []
         self._log_likelihoods: list[FloatArray] = []
+        self._evidence: list[float] = []
         self._last_ns: int | None = None
         self._stale = False
         self._gain = {}
@@ -91,11 +116,12 @@ class Relinearisation:
         self._stale = self._anchor is not None
 
     def add(self, bank: FilterBank, predicted: FloatArray, log_likelihood: FloatArray,
-            frame: FieldFrame, dt: float) -> None:
+            evidence: float, frame: FieldFrame, dt: float) -> None:
         """The `FilterBank` was updated with a `FieldFrame`, `dt` [s] after the one before.
 
         `log_likelihood` (n_hyp,) of it, linearised at the states `predicted` (n_hyp, n_x); where
-        the filter iterates its updates that is not quite where it ended.
+        the filter iterates its updates that is not quite where it ended. `evidence` is the
+        log-density of the frame by all hypotheses.
         """
         if self._anchor is None:
             return
@@ -111,6 +137,7 @@ class Relinearisation:
         self._intervals.append(dt)
         self._paths.append(path)
         self._log_likelihoods.append(of_frame)
+        self._evidence.append(evidence)
         if self._last_ns is None:
             self._last_ns = frame.stamp_ns
 
@@ -154,6 +181,26 @@ class Relinearisation:
         _widen(bank, leading[rest], last.x[rest], last.P[rest], bank_filter.nearly_linear)
         return Counter({TRIED: len(taken), IN_VAIN: int(np.count_nonzero(~taken))})
 
+    @property
+    def window(self) -> Window | None:
+        """What is kept; None where nothing is."""
+        if self._anchor is None or self._stale or not self._frames:
+            return None
+        begin = int(self._updated)
+        return Window(self._anchor, self._updated, self._frames, self._intervals, self._paths,
+                      self._log_likelihoods, float(sum(self._evidence[begin:])),
+                      not self._updated, self._most)
+
+    def resume(self, window: Window) -> None:
+        """Go on from another window, whose hypotheses are now those of the track."""
+        self.begin(window.anchor)
+        self._updated = window.is_updated
+        self._frames, self._intervals = list(window.frames), list(window.intervals)
+        self._paths, self._log_likelihoods = list(window.paths), list(window.log_likelihoods)
+        n = len(window.frames)
+        self._evidence = [window.evidence / n] * n
+        self._last_ns = window.frames[-1].stamp_ns
+
     def gain(self, origin: int) -> float:
         """Log-likelihood [nats] of the latest frames along the path of a hypothesis, minus that in
         its filter; 0 where there is no path, or it was not done last time.
@@ -181,6 +228,7 @@ class Relinearisation:
         self._run_along(bank_filter, moved, np.stack(self._paths[:n + 1], axis=1), 1)
         self._frames, self._intervals = self._frames[n:], self._intervals[n:]
         self._paths, self._log_likelihoods = self._paths[n:], self._log_likelihoods[n:]
+        self._evidence = self._evidence[n:]
         self._updated = True
         return moved
 

@@ -26,6 +26,7 @@ from mag_tracking.stages.track.clock_evidence import ClockEvidence
 from mag_tracking.stages.track.disturbances import Unexplained
 from mag_tracking.stages.track.evidence import LEAST_WATCHED
 from mag_tracking.stages.track.member import Member, Update, View
+from mag_tracking.stages.track.newcomer import LEAST_NATS, Joint, NewcomerSearch, NewcomerTest
 from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.relinearisation import Relinearisation
 from mag_tracking.stages.track.sensor_rejection import SensorRejection
@@ -34,6 +35,7 @@ from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import FixedLag, TrackState, WholeTrack
 from mag_tracking.stages.track.something_else import SomethingElse
 from mag_tracking.stages.track.target import Target
+from mag_tracking.stages.track.vehicle_state import VehicleState
 from mag_tracking.units import NS
 
 TrackRecord = Track | SmoothedPose | Disturbance
@@ -71,6 +73,7 @@ class RunningTrack:
         self._whole = WholeTrack(settings.smooth_longest_s)
         self._lag = FixedLag(settings.smoothing_lag_s) if settings.smoothing_lag_s else None
         self._handover_due: int | None = None
+        self._test = NewcomerTest()
 
     def _use(self, sensors: SensorSubset, bank_filter: BankFilter,
              is_handover: bool = False) -> None:
@@ -195,12 +198,15 @@ class RunningTrack:
             self.counts['banks lost'] += 1
             return None
         self._compare(frame, dt, evidence)
-        self._relinearisation.add(bank, predicted, log_likelihood, frame, dt)
+        self._relinearisation.add(bank, predicted, log_likelihood, evidence, frame, dt)
         self.counts['hypotheses dropped'] += bank.prune(
             -np.log(s.prune_ratio),
             s.most_hypotheses if publish else max(s.most_hypotheses, s.most_at_start))
         self.counts.update(self._relinearisation.improve(self._filter, bank))
         self._whole.add(bank, frame, dt, publish)
+        best = bank.best()
+        self._test.add(float(np.nansum(bank.nis[best])), np.count_nonzero(~np.isnan(frame.field)),
+                       frame.stamp_ns, bool(rejected))
         return frame
 
     def _compare(self, frame: FieldFrame, dt: float, evidence: float) -> None:
@@ -288,19 +294,78 @@ class RunningTrack:
                   doubtful: bool) -> list[SmoothedPose]:
         """The `SmoothedPose`s of member `i` of the states of all; of a complete track, with those
         before it shared its state."""
-        member, n = self.members[i], self._one.n_target
-        first = n * (member.slot if complete else i)
-        rows = slice(first, first + n)
-        mine = [(stamp_ns, x[rows], P[rows, rows]) for stamp_ns, x, P in states
-                if stamp_ns >= member.begin_ns]
+        member = self.members[i]
+        mine = self._states_of(member.slot if complete else i, member, states)
         return member.smoothed(view.bank, view.best, complete,
                                [*member.early, *mine] if complete else mine, doubtful)
+
+    def _states_of(self, slot: int, member: Member, states: list[TrackState]) -> list[TrackState]:
+        """The states of a member, which has this place among the `states` of all."""
+        n = self._one.n_target
+        rows = slice(n * slot, n * (slot + 1))
+        return [(stamp_ns, x[rows], P[rows, rows]) for stamp_ns, x, P in states
+                if stamp_ns >= member.begin_ns]
 
     @property
     def unexplained(self) -> list[Unexplained]:
         """The fields during tracks that have ended, where a target never explained them."""
         found = [m.unexplained(self._something_else.uniform) for m in self.members if m.ended]
         return [u for u in found if u is not None]
+
+    def newcomer(self) -> Joint | None:
+        """An explanation of the latest frames with a vehicle more, where they ask for one and it
+        is believed."""
+        window, n = self._relinearisation.window, len(self.members)
+        if self.ended is not None or self._target.starts_anywhere or window is None \
+                or self.members[0].last is None \
+                or not self._test.is_due(window.frames[-1].stamp_ns):
+            return None
+        if n >= self._settings.most_together:
+            self.counts['newcomers not sought: too many vehicles at once'] += 1
+            return None
+        self.counts['newcomers sought'] += 1
+        found = NewcomerSearch(
+            self.bank, window, self._filter, self._filter_of(n + 1), VehicleState(
+                self._settings.vehicle, self._sensors.network,
+                self._settings.background_std)).find()
+        return found if found is not None and found.log_odds > LEAST_NATS else None
+
+    def admit(self, joint: Joint, id: int) -> None:
+        """Follow a newcomer, too, as the member `id`."""
+        window, best = joint.window, self.bank.best()
+        begin_ns, now_ns = (window.frames[k].stamp_ns for k in (0, -1))
+        if not joint.is_anew:
+            states, _ = self._whole.smoothed(self.bank, best)
+            before = [state for state in states if state[0] < begin_ns]
+            for member in self.members:
+                member.early += self._states_of(member.slot, member, before)
+        new = Member(id, self._target, self._sensors, self.counts, self._clocks,
+                     now_ns - round(self._settings.lookback_s * NS))
+        for member in self.members:
+            member.begin_again()
+        new.evidence.doubt_start(False, self._sensors.whole, False)
+        new.evidence.explanation.add(joint.log_odds, now_ns, self._settings.explained_ratio)
+        self.bank, self._filter = joint.bank, joint.bank_filter
+        self.members.append(new)
+        if joint.is_anew and self._is_nearer_to_second():
+            self.members.reverse()
+        for slot, member in enumerate(self.members):
+            member.slot = slot
+            member.evidence.add(joint.log_odds)
+        self._relinearisation.resume(window)
+        self._whole.resume(window, self._filter)
+        self._rejection.clear()
+        if self._lag is not None:
+            self._lag.clear()
+
+    def _is_nearer_to_second(self) -> bool:
+        """Whether the track as it was is nearer to the second of two vehicles."""
+        last = self.members[0].last
+        assert last is not None
+        best = self.bank.best()
+        places = self._filter.observation.places(self.bank.x[best:best + 1])[0]
+        away = np.linalg.norm(places[:, :2] - last.position[:2], axis=1)
+        return bool(away[1] < away[0])
 
     def hand_over(self) -> None:
         """Switch to the sensors near where the target is going, if those used are others."""

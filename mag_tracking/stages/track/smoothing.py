@@ -19,6 +19,7 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.inference.starting_bank import StartingBank
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.relinearisation import Window
 from mag_tracking.units import NS
 
 State: TypeAlias = tuple[FloatArray, FloatArray]
@@ -89,6 +90,7 @@ class WholeTrack:
         self._intervals: list[float] = []
         self._published: list[bool] = []
         self._length_s, self.too_long = 0.0, False
+        self._updated = False
 
     def begin(self, bank: FilterBank | StartingBank, bank_filter: BankFilter) -> None:
         """A track begins with a bank like `bank`, before its first frame, with the settings of now.
@@ -98,6 +100,14 @@ class WholeTrack:
         self.clear()
         if self._longest_s:
             self._start = _Start(copy(bank_filter), bank)
+
+    def resume(self, window: Window, bank_filter: BankFilter) -> None:
+        """Go on from a window of another filter, of which all frames count as published."""
+        anchor = window.anchor.rows(np.arange(len(window.anchor)))
+        self.begin(anchor, bank_filter)
+        self._updated = window.is_updated
+        for frame, dt in zip(window.frames, window.intervals, strict=True):
+            self.add(anchor, frame, dt, True)
 
     def give_up(self) -> None:
         """It cannot be smoothed as a whole."""
@@ -128,7 +138,8 @@ class WholeTrack:
         if start is None or not self._frames:
             return [], 0
         one = start.bank.rows(np.flatnonzero(start.bank.origin == bank.origin[best]))
-        states, left_out = smoothed_track(start.bank_filter, one, self._frames, self._intervals)
+        states, left_out = smoothed_track(start.bank_filter, one, self._frames, self._intervals,
+                                          self._updated)
         return [(frame.stamp_ns, x, P) for frame, (x, P), published in zip(
             self._frames, states, self._published, strict=True) if published], left_out
 

@@ -89,7 +89,7 @@ def followed_beside_plain(filter_, anew, n=40, anew_at=(), prune=True):
             b.reweight(log_likelihood)
         if k in anew_at:
             anew.begin_anew()
-        anew.add(bank, predicted, log_likelihood, frame, dt)
+        anew.add(bank, predicted, log_likelihood, 0.0, frame, dt)
         if prune and k % 6 == 3:
             mask = np.append(True, rng.uniform(size=len(bank) - 1) < 0.8)
             plain.keep(mask)
@@ -155,7 +155,7 @@ def less_sure(more, linear):
     predicted = bank.x.copy()
     bank.x, bank.P = bank.x.copy(), bank.P.copy()
     log_likelihood, _ = filter_.update(bank, frame, 0.0)
-    relinearisation.add(bank, predicted, log_likelihood, frame, 0.0)
+    relinearisation.add(bank, predicted, log_likelihood, 0.0, frame, 0.0)
     return filter_, bank, relinearisation
 
 
@@ -228,7 +228,7 @@ def test_it_is_done_for_the_heaviest(monkeypatch, most, affordable):
     assert not filter_.origins
     frame = FieldFrame(10**12, np.zeros((1, 3)), np.eye(3)[None], np.full(1, 8), np.zeros(1), True)
     for _ in range(40):
-        anew.add(bank, bank.x.copy(), np.zeros(len(bank)), frame, 0.1)
+        anew.add(bank, bank.x.copy(), np.zeros(len(bank)), 0.0, frame, 0.1)
     assert anew.improve(filter_, bank)[relinearise.TRIED] == 1
     assert filter_.origins == {bank.origin[np.argmax(bank.log_w)]}
 
@@ -262,7 +262,7 @@ def followed(filter_, bank, y, anew):
     anew.begin(bank.copy())
     for k, frame in enumerate(frames_of(y)):
         dt = PERIOD if k else 0.0
-        anew.add(bank, *filter_.advance(bank, frame, dt), frame, dt)
+        anew.add(bank, *filter_.advance(bank, frame, dt), 0.0, frame, dt)
         counts = anew.improve(filter_, bank)
     return counts[relinearise.TRIED], counts[relinearise.IN_VAIN]
 
