@@ -217,7 +217,8 @@ class BankFilter:
     def field_of_others(self, bank: FilterBank, i: int, target: int, frame: FieldFrame,
                         dt: float) -> FloatArray:
         """(n_sensors, 3) [T] the field of a frame that hypothesis `i` has of all but one target."""
-        return self.observation.field_of_others(bank.x[i], target, self.time_offset(frame, dt))
+        others = [k for k in range(self.observation.n_targets) if k != target]
+        return self.observation.field_of(bank.x[i], others, self.time_offset(frame, dt))
 
     def _lengths(self, kind: IntArray) -> FloatArray:
         """(n, n_targets) [m] near-field lengths of the kinds `kind` (n,) or (n, n_targets)."""

@@ -20,6 +20,7 @@ LONGEST_SINGLE_SENSOR_S = 0.5
 """[s] A track that one sensor of several has supported alone for longer stays ambiguous."""
 
 LOST = 'lost its target'
+OUT_OF_REACH = 'out of reach'
 UNEXPLAINED = 'unexplained'
 """Reasons for the end of a track."""
 
@@ -253,6 +254,6 @@ class TrackEvidence:
         if self._n_misfits > 1:
             return LOST
         if spread > settings.end_std > self._best_spread and not is_coming:
-            return LOST if misfit else 'out of reach'
+            return LOST if misfit else OUT_OF_REACH
         self._best_spread = min(self._best_spread, spread)
         return None

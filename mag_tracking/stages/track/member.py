@@ -1,11 +1,12 @@
 """One target of a running track: its evidence, its doubts, and what is published of it."""
 
-from collections import Counter
+from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from mag_tracking.arrays import BoolArray
+from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
@@ -21,6 +22,9 @@ from mag_tracking.stages.track.sensor_selection import SensorSubset
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.stages.track.target import Target
+
+MOST_PLACES = 64
+"""So many places of a target are remembered, to tell it from another one."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,8 @@ class Member:
         self._spread = np.inf
         self._unseen = target.unseen()
         self._was_sure = False
+        # Where the latest poses were published.
+        self._places: deque[tuple[int, FloatArray]] = deque(maxlen=MOST_PLACES)
 
     def use(self, sensors: SensorSubset) -> None:
         """From now on the target is measured by these sensors."""
@@ -94,11 +100,22 @@ class Member:
         self.evidence.forgive()
         self._plausibility = Plausibility()
 
+    def distance_from(self, stamps_ns: Sequence[int], path: FloatArray) -> float:
+        """[m] mean distance of the latest poses from a path (n, 2) with these timestamps.
+
+        0 where no pose was published at them.
+        """
+        at = dict(zip(stamps_ns, path, strict=True))
+        away = [float(np.hypot(*(place - at[stamp_ns]))) for stamp_ns, place in self._places
+                if stamp_ns in at]
+        return float(np.mean(away)) if away else 0.0
+
     def publish(self, update: Update, view: View) -> Track:
         """The `Track` of a frame."""
         self.last = self._published(update, view)
         self._spread = float(np.sqrt(np.trace(view.bank.P[view.best, :2, :2])))
         self._was_sure |= not self.last.ambiguous
+        self._places.append((self.last.stamp_ns, self.last.position[:2]))
         self._counts['poses'] += 1
         return self.last
 

@@ -7,10 +7,12 @@ knew of one vehicle has been misled by two. What is found is filtered and smooth
 like any hypothesis, and its evidence is compared with that of the track as it is.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import chdtrc
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
@@ -30,6 +32,10 @@ sought."""
 WINDOW_S, AGAIN_S = 0.25, 0.15
 """[s] The latest frames; and at least so much time is between two searches."""
 
+LONG_AGAIN_S, LONGER = 0.3, 1.5
+"""[s] A long vehicle is compared with two so long after the last comparison; then after so many
+times as long."""
+
 PASSES, STEP = 3, 0.5
 """Gauss-Newton steps along each path, and the share that each goes."""
 
@@ -39,6 +45,10 @@ MOST_ROWS = 320
 KNOWN_ROWS, FIRST, SECOND = 3, 3, 2
 """So many hypotheses of the tracked vehicles, and paths of a first and of a second vehicle beside
 each, are tried."""
+
+KNOWN_STD, KNOWN_SHARE = 0.7, 0.3
+"""[m], [m/s] By so much may vehicles that are tracked be off while another is sought; and by this
+share their moments."""
 
 NATS_KEPT, MOST_KEPT = 10.0, 12
 """Of the kinds that a newcomer may be those are kept that are no less probable than the best."""
@@ -54,32 +64,53 @@ LEAST_NATS = 10.0
 
 
 class NewcomerTest:
-    """Whether the latest innovations of a track ask for a newcomer."""
+    """Whether a track is to be compared with one of a vehicle more.
+
+    That is so where the latest innovations are improbable. A long vehicle explains two short ones
+    without any; it is compared from time to time.
+    """
 
     def __init__(self) -> None:
         self._latest = LatestFrames(WINDOW_S)
         self._last_ns: int | None = None
-        self._was_rejected = False
+        self._was_rejected = self._is_long = False
+        self._long_wait_s = LONG_AGAIN_S
 
-    def add(self, nis: float, degrees_of_freedom: int, stamp_ns: int, rejected: bool) -> None:
-        """Count a frame; a sensor that was `rejected` is as good as a large innovation."""
+    def add(self, nis: float, degrees_of_freedom: int, stamp_ns: int, rejected: bool,
+            is_long: bool) -> None:
+        """Count a frame.
+
+        Parameters
+        ----------
+        nis : float
+            Normalised innovation squared.
+        degrees_of_freedom : int
+        stamp_ns : int
+        rejected : bool
+            A sensor was left out, which is as good as a large innovation.
+        is_long : bool
+            The best hypothesis is a long vehicle.
+        """
         self._latest.add(stamp_ns, [nis, degrees_of_freedom])
-        self._was_rejected = rejected
+        self._was_rejected, self._is_long = rejected, is_long
 
     def is_due(self, stamp_ns: int) -> bool:
         """Whether a newcomer is to be sought now."""
         total, freedom = self._latest.total
-        if not self._was_rejected and chdtrc(max(freedom, 1.0), total) > FALSE_ALARM:
-            return False
-        if self._last_ns is not None and stamp_ns - self._last_ns < AGAIN_S * NS:
-            return False
-        self._last_ns = stamp_ns
-        return True
+        since = np.inf if self._last_ns is None else (stamp_ns - self._last_ns) / NS
+        odd = self._was_rejected or chdtrc(max(freedom, 1.0), total) <= FALSE_ALARM
+        is_due = odd and since >= AGAIN_S
+        if not odd and self._is_long and since >= self._long_wait_s:
+            is_due = True
+            self._long_wait_s *= LONGER
+        if is_due:
+            self._last_ns = stamp_ns
+        return is_due
 
 
 @dataclass(frozen=True)
 class Joint:
-    """Hypotheses of the tracked vehicles and a newcomer, which comes last in their states."""
+    """Hypotheses of the tracked vehicles and a newcomer; what is new comes last in their states."""
 
     bank: FilterBank
     """At the latest frame of the window."""
@@ -88,8 +119,8 @@ class Joint:
     bank_filter: BankFilter
     log_odds: float
     """[nats] Against the track as it is."""
-    is_anew: bool
-    """The tracked vehicle was sought anew, too."""
+    replaced: int | None
+    """This vehicle of the track was sought anew, too: the last two may be it."""
 
 
 @dataclass(frozen=True)
@@ -105,21 +136,43 @@ class _Start:
     label: tuple[int, ...]
     kind: tuple[int, ...]
     log_w: float
-    is_anew: bool
+    replaced: int | None
+    """As of `Joint`."""
+
+    @property
+    def is_new(self) -> range:
+        """Places of the vehicles that were sought."""
+        n = len(self.kind)
+        return range(n - 1 if self.replaced is None else n - 2, n)
+
+
+@dataclass(frozen=True)
+class _Known:
+    """Vehicles that are known, beside which others are sought."""
+
+    x: FloatArray
+    """(n_x,) at the beginning of the window."""
+    P: FloatArray
+    path: FloatArray
+    """(n, n_x)"""
+    label: tuple[int, ...]
+    kind: tuple[int, ...]
+    log_w: float
+    filter: BankFilter | None
+    """Of them; None where there are none."""
 
 
 class NewcomerSearch:
     """Explains a window with one vehicle more."""
 
-    def __init__(self, bank: FilterBank, window: Window, bank_filter: BankFilter,
-                 joint_filter: BankFilter, vehicles: VehicleState) -> None:
-        """`bank` of the track, moved by `bank_filter`; `joint_filter` is that of one vehicle more.
-        """
-        self._bank, self._window, self._filter = bank, window, bank_filter
-        self._joint_filter, self._vehicles = joint_filter, vehicles
+    def __init__(self, bank: FilterBank, window: Window, filter_of: Callable[[int], BankFilter],
+                 n_targets: int, vehicles: VehicleState) -> None:
+        """`bank` of a track of `n_targets` vehicles; `filter_of` makes the filter of so many."""
+        self._bank, self._window = bank, window
+        self._filter_of, self._n_targets, self._vehicles = filter_of, n_targets, vehicles
+        self._filter, self._joint_filter = filter_of(n_targets), filter_of(n_targets + 1)
         network, settings = vehicles.network, vehicles.settings
-        self._n_one = bank_filter.observation.n_one
-        self._n_t = bank_filter.observation.n_target
+        self._n_one = self._filter.observation.n_one
         self._times = np.array([(f.stamp_ns - window.frames[-1].stamp_ns) / NS
                                 for f in window.frames])
         step = -(-len(window.frames) * len(network) // MOST_ROWS)
@@ -128,6 +181,8 @@ class NewcomerSearch:
         self._samples = PassSamples.of(network, [window.frames[k] for k in self._thinned],
                                        window.frames[-1].stamp_ns, len(network))
         self._starts = self._prior.starts(settings, network)
+        # The first pair that was found in place of a vehicle: all have its order.
+        self._pairs: dict[int, FloatArray] = {}
         self._of_cell = -float(np.log(
             len(settings.arrival_names) * len(settings.lateral_offsets) * len(settings.speeds)
             * len(settings.kinds) * N_DISTANCES))
@@ -135,10 +190,12 @@ class NewcomerSearch:
     def find(self) -> Joint | None:
         """The best explanation with a newcomer; None where there is none at all."""
         rows, of_track, log_w, paths = self._as_it_is()
-        starts = [start for k in self._leaders(rows, log_w)
-                  for start in self._beside(rows[k], log_w[k] - of_track[k], paths[k])]
-        if self._window.is_start and self._bank.label.ndim == 1:
-            starts += self._anew()
+        starts = []
+        for k in self._leaders(rows, log_w):
+            known = self._known(rows[k], log_w[k] - of_track[k], paths[k])
+            starts += self._beside(known)
+            starts += [start for i in self._doubtful(known)
+                       for start in self._anew(self._without(known, i), i)]
         if not starts:
             return None
         kept = self._with_turns(self._kept(starts))
@@ -176,45 +233,82 @@ class NewcomerSearch:
                 chosen.append(k)
         return chosen
 
-    def _beside(self, row: int, log_w: float, path: FloatArray) -> list[_Start]:
-        """A newcomer beside the vehicles of a hypothesis of the track, on its `path` (n, n_x)."""
-        search = self._search_beside(row, path)
-        window, n_t = self._window, self._n_t
-        at = np.searchsorted(window.anchor.origin, self._bank.origin[[row]])
-        before = window.anchor.rows(at)
-        labels = tuple(np.ravel(self._bank.label[row]).tolist())
-        kinds = tuple(np.ravel(self._bank.kind[row]).tolist())
+    def _known(self, row: int, log_w: float, path: FloatArray) -> '_Known':
+        """The vehicles of a hypothesis of the track, with its log-weight at the anchor."""
+        at = np.searchsorted(self._window.anchor.origin, self._bank.origin[[row]])
+        before = self._window.anchor.rows(at)
+        return _Known(before.x[0], before.P[0], path, tuple(np.ravel(self._bank.label[row]).tolist()),
+                      tuple(np.ravel(self._bank.kind[row]).tolist()), log_w, self._filter)
+
+    def _doubtful(self, known: '_Known') -> list[int]:
+        """Vehicles that may be two: long ones, and one that is alone."""
+        if self._n_targets == 1:
+            return [0]
+        return [i for i, kind in enumerate(known.kind)
+                if self._filter.are_long(np.array([kind]))[0]]
+
+    def _without(self, known: '_Known', i: int) -> '_Known':
+        """The same without vehicle `i`; of one alone nothing is left that is known."""
+        n, n_t = self._n_one, len(known.kind) * self._n_one
+        if self._n_targets == 1:
+            own = self._sensors_at_start()
+            return _Known(np.zeros(len(own)), own, np.zeros((len(self._times), len(own))), (), (),
+                          0.0, None)
+        rows = np.delete(np.arange(known.path.shape[1]), np.arange(i * n, (i + 1) * n))
+        assert n_t > n
+        return _Known(known.x[rows], known.P[np.ix_(rows, rows)], known.path[:, rows],
+                      known.label[:i] + known.label[i + 1:], known.kind[:i] + known.kind[i + 1:],
+                      known.log_w, self._filter_of(self._n_targets - 1))
+
+    def _beside(self, known: '_Known') -> list[_Start]:
+        """A newcomer beside known vehicles."""
+        search = self._search_beside(known)
+        return [start for theta in search.best(self._starts, FIRST)
+                for start in self._started(known, theta[None], [search.moments(theta)], None)]
+
+    def _anew(self, others: '_Known', i: int) -> list[_Start]:
+        """Two vehicles in place of vehicle `i`, whose filter may have been misled by them."""
+        search = self._search_beside(others)
         starts = []
-        for theta in search.best(self._starts, FIRST):
-            moments = search.moments(theta)
-            label = int(self._prior.nearest(theta[None])[0][0])
-            for kind in range(len(self._vehicles.settings.kinds)):
-                x, P = self._vehicles.prior(theta, self._times[0], kind, label)
-                states = self._vehicles.along(theta, moments, self._times, kind)
-                starts.append(_Start(
-                    np.insert(before.x[0], n_t, x), _inserted(before.P[0], P, n_t),
-                    np.hstack([path[:, :n_t], states, path[:, n_t:]]), (*labels, label),
-                    (*kinds, kind), log_w + self._of_cell, False))
+        for found in search.pairs(self._starts, FIRST, SECOND)[:FIRST]:
+            pair = _in_order_of(self._pairs.setdefault(i, found), found)
+            moments = [search.beside(pair[1 - k]).moments(pair[k]) for k in (0, 1)]
+            starts += self._started(others, pair, moments, i)
         return starts
 
-    def _search_beside(self, row: int, path: FloatArray) -> SteadySearch:
-        """The search for a vehicle beside those of a hypothesis on its `path` (n, n_x)."""
-        samples, observation = self._samples, self._filter.observation
-        path, t = path[self._thinned], self._times[self._thinned]
-        n = len(path)
-        known, H = np.zeros((n, len(observation.positions), 3)), []
-        for k in range(n):
-            frame = self._window.frames[self._thinned[k]]
-            dt = self._window.intervals[self._thinned[k]]
-            h, H_k = self._filter.fields_at(path[k], self._bank.kind[row:row + 1], frame, dt)
-            known[k] = h
-            H.append(H_k)
-        columns = self._columns(np.array(H), path[-1], t)
+    def _started(self, known: '_Known', paths: FloatArray, moments: Sequence[FloatArray],
+                 replaced: int | None) -> list[_Start]:
+        """Known vehicles and new ones on `paths` (k, 7), of any kinds."""
+        n_known, labels = len(known.kind) * self._n_one, self._prior.nearest(paths)[0].tolist()
+        starts = []
+        for kinds in product(range(len(self._vehicles.settings.kinds)), repeat=len(paths)):
+            x, P, path = known.x, known.P, [known.path[:, :n_known]]
+            for theta, m, kind, label in zip(paths, moments, kinds, labels, strict=True):
+                at = n_known + (len(path) - 1) * self._n_one
+                mean, covariance = self._vehicles.prior(theta, self._times[0], kind, label)
+                x, P = np.insert(x, at, mean), _inserted(P, covariance, at)
+                path.append(self._vehicles.along(theta, m, self._times, kind))
+            starts.append(_Start(x, P, np.hstack([*path, known.path[:, n_known:]]),
+                                 (*known.label, *labels), (*known.kind, *kinds),
+                                 known.log_w + len(paths) * self._of_cell, replaced))
+        return starts
+
+    def _search_beside(self, known: '_Known') -> SteadySearch:
+        """The search for a vehicle beside those that are known."""
+        samples = self._samples
+        if known.filter is None:
+            return SteadySearch(samples, self._prior, np.zeros(len(samples.y)), self._backgrounds())
+        path, t = known.path[self._thinned], self._times[self._thinned]
+        n, kind = len(path), np.array([known.kind])
+        fields = [known.filter.fields_at(path[k], kind, self._window.frames[i],
+                                         self._window.intervals[i])
+                  for k, i in enumerate(self._thinned.tolist())]
+        h, H = (np.array(part) for part in zip(*fields, strict=True))
         W = samples.M @ np.swapaxes(
             np.tile(self._vehicles.network.R_sw[samples.compared], (n, 1, 1)), 1, 2)
-        known = known[:, samples.compared].reshape(-1, 3)
-        columns = columns[:, samples.compared].reshape(len(W), 3, -1)
-        return SteadySearch(samples, self._prior, np.einsum('nij,nj->ni', W, known).ravel(),
+        h = h[:, samples.compared].reshape(-1, 3)
+        columns = self._columns(H, path[-1], t)[:, samples.compared].reshape(len(W), 3, -1)
+        return SteadySearch(samples, self._prior, np.einsum('nij,nj->ni', W, h).ravel(),
                             np.hstack([self._backgrounds(), (W @ columns).reshape(3 * len(W), -1)]))
 
     def _backgrounds(self) -> FloatArray:
@@ -228,55 +322,40 @@ class NewcomerSearch:
         times `t` (n,) [s] before that.
         """
         out = []
-        for first in range(0, self._n_t, self._n_one):
+        for first in range(0, H.shape[-1], self._n_one):
             part = H[..., first:first + self._n_one]
-            out += [part[..., :3] * 0.7,
-                    0.7 * (part[..., 3:6] + t[:, None, None, None] * part[..., :3])]
+            by_velocity = part[..., 3:6] + t[:, None, None, None] * part[..., :3]
             hard = self._vehicles.hard_moments(x[first:first + self._n_one])
-            size = float(np.linalg.norm(hard.sum(axis=0)))
             of_moment = part[..., 6:6 + hard.size].reshape(*part.shape[:3], -1, 3).mean(axis=3)
-            out.append(0.3 * size * of_moment)
+            size = float(np.linalg.norm(hard.sum(axis=0)))
+            out += [KNOWN_STD * part[..., :3], KNOWN_STD * by_velocity,
+                    KNOWN_SHARE * size * of_moment]
         return np.concatenate(out, axis=3)
 
-    def _anew(self) -> list[_Start]:
-        """Both vehicles sought anew, in a window that begins with the track."""
-        n = len(self._window.frames)
-        search = SteadySearch(self._samples, self._prior, np.zeros(len(self._samples.y)),
-                              self._backgrounds())
-        sensors = self._window.anchor.rows(np.zeros(1, dtype=int))
-        own = (sensors.x[0, self._n_t:], sensors.P[0, self._n_t:, self._n_t:])
-        starts = []
-        n_kinds = len(self._vehicles.settings.kinds)
-        for pair in search.pairs(self._starts, FIRST, SECOND)[:FIRST]:
-            moments = [search.beside(pair[1 - i]).moments(pair[i]) for i in (0, 1)]
-            label = tuple(self._prior.nearest(pair)[0].tolist())
-            for kinds in np.ndindex(n_kinds, n_kinds):
-                priors = [self._vehicles.prior(pair[i], self._times[0], kinds[i], label[i])
-                          for i in (0, 1)]
-                states = [self._vehicles.along(pair[i], moments[i], self._times, kinds[i])
-                          for i in (0, 1)]
-                x = np.concatenate([priors[0][0], priors[1][0], own[0]])
-                P = _inserted(_inserted(own[1], priors[1][1], 0), priors[0][1], 0)
-                starts.append(_Start(x, P, np.hstack([*states, np.zeros((n, len(own[0])))]), label,
-                                     kinds, 2.0 * self._of_cell, True))
-        return starts
+    def _sensors_at_start(self) -> FloatArray:
+        """Covariance of the states of the sensors when a track begins."""
+        observation, std = self._filter.observation, self._vehicles.background_std
+        return block_diag(*observation.own_covariance,
+                          std**2 * np.eye(3 * len(observation.positions)))
 
     def _kept(self, starts: Sequence[_Start]) -> list[_Start]:
         """Those that explain the frames about as well as the best one; moved along."""
         _, _, log_w, paths = self._run(starts)
         order = np.argsort(-log_w, kind='stable')[:MOST_KEPT]
-        return [_moved(starts[k], paths[k]) for k in order.tolist()
+        return [replace(starts[k], path=paths[k]) for k in order.tolist()
                 if log_w[k] >= log_w.max() - NATS_KEPT]
 
     def _with_turns(self, starts: Sequence[_Start]) -> list[_Start]:
-        """Each as it is, and with every newcomer turning."""
-        out = list(starts)
+        """Each as it is, and with one of the new vehicles turning."""
+        share = self._vehicles.settings.turn_share
+        out = []
         for start in starts:
-            for i in range(len(start.kind)):
-                if start.is_anew or i == len(start.kind) - 1:
-                    turning = self._vehicles.turning(start.x, start.P, i)
-                    if turning is not None:
-                        out.append(_with_P(start, turning))
+            turning = [P for P in (self._vehicles.turning(start.x, start.P, i)
+                                   for i in start.is_new) if P is not None]
+            out.append(replace(start, log_w=start.log_w + float(np.log(1.0 - share))
+                               if turning else start.log_w))
+            out += [replace(start, P=P, log_w=start.log_w + float(np.log(share / len(turning))))
+                    for P in turning]
         return out
 
     def _run(self, starts: Sequence[_Start]) -> tuple[FilterBank, FloatArray, FloatArray,
@@ -298,10 +377,12 @@ class NewcomerSearch:
 
     def _made(self, starts: Sequence[_Start], bank: FilterBank, log_likelihood: FloatArray,
               log_w: FloatArray, paths: FloatArray, log_odds: float) -> Joint | None:
-        """The `Joint` of those that can be used."""
-        rows = np.flatnonzero(np.isfinite(log_w))
-        if not len(rows):
+        """The `Joint` of those that can be used, and have the states of the best in their order."""
+        best = int(np.argmax(log_w))
+        if not np.isfinite(log_w[best]):
             return None
+        replaced = starts[best].replaced
+        rows = np.flatnonzero(np.isfinite(log_w) & [s.replaced == replaced for s in starts])
         n = len(rows)
         anchor = FilterBank(
             np.array([starts[k].x for k in rows]), np.array([starts[k].P for k in rows]),
@@ -315,8 +396,7 @@ class NewcomerSearch:
                         [np.ascontiguousarray(paths[rows, k]) for k in range(n_frames)],
                         [each.copy() for _ in range(n_frames)], 0.0, self._window.is_start,
                         self._window.most)
-        is_anew = starts[int(rows[np.argmax(log_w[rows])])].is_anew
-        return Joint(now, window, self._joint_filter, log_odds, is_anew)
+        return Joint(now, window, self._joint_filter, log_odds, replaced)
 
 
 def _inserted(P: FloatArray, block: FloatArray, at: int) -> FloatArray:
@@ -329,11 +409,7 @@ def _inserted(P: FloatArray, block: FloatArray, at: int) -> FloatArray:
     return out
 
 
-def _moved(start: _Start, path: FloatArray) -> _Start:
-    """The same along another path (n, n_x)."""
-    return _Start(start.x, start.P, path, start.label, start.kind, start.log_w, start.is_anew)
-
-
-def _with_P(start: _Start, P: FloatArray) -> _Start:
-    """The same with another covariance (n_x, n_x)."""
-    return _Start(start.x, P, start.path, start.label, start.kind, start.log_w, start.is_anew)
+def _in_order_of(first: FloatArray, pair: FloatArray) -> FloatArray:
+    """A pair of paths (2, 7), the nearer one of the `first` pair's first coming first."""
+    away = np.linalg.norm(pair[:, None, :2] - first[:, :2], axis=2)
+    return pair if away[0, 0] + away[1, 1] <= away[0, 1] + away[1, 0] else pair[::-1].copy()

@@ -1,5 +1,7 @@
 """What the sensors see of a bank's states: where the target's physics meets the filter's states."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
@@ -169,17 +171,17 @@ class Observation:
             H[:, j] = H_moved @ (F if F.ndim == 2 else F[:, None])
         return h, H, gradient
 
-    def field_of_others(self, x: FloatArray, target: int, time_offset: FloatArray) -> FloatArray:
-        """(n_sensors, 3) [T] the field of all targets but one, of a state (n_x,)."""
+    def field_of(self, x: FloatArray, targets: Iterable[int], time_offset: FloatArray
+                 ) -> FloatArray:
+        """(n_sensors, 3) [T] the field of some targets of a state (n_x,)."""
         n = self.n_one
         h, H = np.zeros((1, *self.positions.shape)), np.zeros((1, *self.positions.shape, 0))
-        for first in range(0, self.n_target, n):
-            if first != target * n:
-                h = h + self._field_of_one(x[None, first:first + n], time_offset)[0]
+        for target in targets:
+            h = h + self._field_of_one(x[None, target * n:(target + 1) * n], time_offset)[0]
         if self.n_angles:
             h, _ = turned_fields(h, H, np.ascontiguousarray(self.own(x[None])[..., :3]))
-        of_others: FloatArray = h[0]
-        return of_others
+        field: FloatArray = h[0]
+        return field
 
     def fields(self, x: FloatArray, time_offset: FloatArray, near_field_length: FloatArray,
                field_error: float) -> tuple[FloatArray, FloatArray, FloatArray]:

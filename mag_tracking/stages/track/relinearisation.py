@@ -191,6 +191,21 @@ class Relinearisation:
                       self._log_likelihoods, float(sum(self._evidence[begin:])),
                       not self._updated, self._most)
 
+    def without_target(self, bank_filter: BankFilter, bank: FilterBank, i: int, n: int) -> None:
+        """Target `i` of several is no longer followed, and is not felt from the frame `n` on.
+
+        By the `BankFilter` and the `FilterBank` with that target.
+        """
+        if self._anchor is None or self._stale or n >= len(self._frames):
+            self.begin_anew()
+            return
+        anchor = self._move_to(bank_filter, self._anchor, bank, n)
+        n_one = bank_filter.observation.n_one
+        self._anchor = anchor.without_target(i, n_one)
+        columns = np.arange(i * n_one, (i + 1) * n_one)
+        self._paths = [np.delete(path, columns, axis=1) for path in self._paths]
+        self._gain = {}
+
     def resume(self, window: Window) -> None:
         """Go on from another window, whose hypotheses are now those of the track."""
         self.begin(window.anchor)
@@ -221,9 +236,14 @@ class Relinearisation:
         now, n_frames = self._frames[-1].stamp_ns, len(self._frames)
         if now - self._frames[0].stamp_ns <= 2 * self._window_ns and n_frames <= MOST_FRAMES:
             return anchor
-        self._keep(anchor, np.isin(anchor.origin, bank.origin))
         n = next(k for k, f in enumerate(self._frames) if now - f.stamp_ns <= self._window_ns
                  and n_frames - k <= MOST_FRAMES // 2)
+        return self._move_to(bank_filter, anchor, bank, n)
+
+    def _move_to(self, bank_filter: BankFilter, anchor: FilterBank | StartingBank,
+                 bank: FilterBank, n: int) -> FilterBank:
+        """The anchor, moved to the frame `n`, where the window begins from now on."""
+        self._keep(anchor, np.isin(anchor.origin, bank.origin))
         moved = self._anchor = anchor.rows(np.arange(len(anchor)))
         self._run_along(bank_filter, moved, np.stack(self._paths[:n + 1], axis=1), 1)
         self._frames, self._intervals = self._frames[n:], self._intervals[n:]

@@ -15,7 +15,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.event_records import Disturbance
+from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.inference.starting_bank import StartingBank
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
@@ -24,7 +26,7 @@ from mag_tracking.stages.track.bank_filter import BankFilter, NoTarget
 from mag_tracking.stages.track.bank_size import WEIGHT_KEPT, most_hypotheses, most_sensors
 from mag_tracking.stages.track.clock_evidence import ClockEvidence
 from mag_tracking.stages.track.disturbances import Unexplained
-from mag_tracking.stages.track.evidence import LEAST_WATCHED
+from mag_tracking.stages.track.evidence import LEAST_WATCHED, OUT_OF_REACH
 from mag_tracking.stages.track.member import Member, Update, View
 from mag_tracking.stages.track.newcomer import LEAST_NATS, Joint, NewcomerSearch, NewcomerTest
 from mag_tracking.stages.track.observation import Observation
@@ -37,6 +39,10 @@ from mag_tracking.stages.track.something_else import SomethingElse
 from mag_tracking.stages.track.target import Target
 from mag_tracking.stages.track.vehicle_state import VehicleState
 from mag_tracking.units import NS
+
+UNFELT, FAINT = 0.1, 1.0
+"""A member whose field has less energy than this in a frame, in units of its noise, is not felt;
+and with less than that it does not disturb the others."""
 
 TrackRecord = Track | SmoothedPose | Disturbance
 
@@ -175,7 +181,7 @@ class RunningTrack:
         out: list[TrackRecord] = [member.publish(update, view)
                                   for member, view in zip(self.members, views, strict=True)]
         self._handover_due = best if self._sensors.is_part else None
-        return [*out, *late, *self._end_if_over()]
+        return [*out, *late, *self._end_if_over(used)]
 
     def _view(self, i: int, best: int) -> View:
         """The bank of member `i` alone; `best` is the row of all members."""
@@ -206,7 +212,8 @@ class RunningTrack:
         self._whole.add(bank, frame, dt, publish)
         best = bank.best()
         self._test.add(float(np.nansum(bank.nis[best])), np.count_nonzero(~np.isnan(frame.field)),
-                       frame.stamp_ns, bool(rejected))
+                       frame.stamp_ns, bool(rejected),
+                       bool(self._filter.are_long(bank.kind[best:best + 1])[0]))
         return frame
 
     def _compare(self, frame: FieldFrame, dt: float, evidence: float) -> None:
@@ -234,11 +241,37 @@ class RunningTrack:
         others = self._filter.field_of_others(self.bank, best, i, frame, dt)
         return replace(frame, field=frame.field - others)
 
-    def _end_if_over(self) -> list[TrackRecord]:
+    def _is_out_of_reach(self, member: Member, frame: FieldFrame) -> bool:
+        """Whether one of several members goes away, and is no longer felt."""
+        assert member.last is not None
+        state = self.bank.x[self.bank.best()]
+        return self._energy(self.members.index(member), state, frame) < UNFELT \
+            and not self._sensors.is_neared_by(member.last)
+
+    def _energy(self, i: int, state: FloatArray, frame: FieldFrame) -> float:
+        """Of the field of member `i` in a frame, in units of its noise, by a state (n_x,)."""
+        field = self._filter.observation.field_of(state, [i], np.zeros(len(frame.field)))
+        energy, _ = whitened_energy(np.where(np.isnan(frame.field), np.nan, field),
+                                    frame.covariance)
+        return float(energy.sum())
+
+    def _faint_from(self, i: int) -> int:
+        """The frame of the window from which on member `i` is hardly felt."""
+        window, best = self._relinearisation.window, self.bank.best()
+        if window is None:
+            return 0
+        row = int(np.searchsorted(window.anchor.origin, self.bank.origin[best]))
+        felt = [self._energy(i, path[row], frame) > FAINT
+                for path, frame in zip(window.paths, window.frames, strict=True)]
+        return max((k for k, is_felt in enumerate(felt) if is_felt), default=-1) + 1
+
+    def _end_if_over(self, frame: FieldFrame) -> list[TrackRecord]:
         """The closing records of those members that are over by their latest poses."""
         out: list[TrackRecord] = []
         for member in list(self.members):
             reason = member.reason_to_end(self._sensors, self._settings)
+            if reason is None and len(self.members) > 1 and self._is_out_of_reach(member, frame):
+                reason = OUT_OF_REACH
             if reason is None:
                 continue
             member.is_lost = True
@@ -252,10 +285,11 @@ class RunningTrack:
             return self.end(reason)
         i = self.members.index(member)
         out = self._closing(i, reason)
-        self.bank = self.bank.without_target(i, self._one.n_target)
+        n_one = self._one.n_target
+        self._relinearisation.without_target(self._filter, self.bank, i, self._faint_from(i))
+        self.bank = self.bank.without_target(i, n_one)
         del self.members[i]
         self._filter = self._filter_of(len(self.members))
-        self._relinearisation.begin_anew()
         self._rejection.clear()
         if self._lag is not None:
             self._lag.clear()
@@ -325,7 +359,7 @@ class RunningTrack:
             return None
         self.counts['newcomers sought'] += 1
         found = NewcomerSearch(
-            self.bank, window, self._filter, self._filter_of(n + 1), VehicleState(
+            self.bank, window, self._filter_of, n, VehicleState(
                 self._settings.vehicle, self._sensors.network,
                 self._settings.background_std)).find()
         return found if found is not None and found.log_odds > LEAST_NATS else None
@@ -334,21 +368,17 @@ class RunningTrack:
         """Follow a newcomer, too, as the member `id`."""
         window, best = joint.window, self.bank.best()
         begin_ns, now_ns = (window.frames[k].stamp_ns for k in (0, -1))
-        if not joint.is_anew:
-            states, _ = self._whole.smoothed(self.bank, best)
-            before = [state for state in states if state[0] < begin_ns]
-            for member in self.members:
-                member.early += self._states_of(member.slot, member, before)
+        states, _ = self._whole.smoothed(self.bank, best)
+        before = [state for state in states if state[0] < begin_ns]
+        for member in self.members:
+            member.early += self._states_of(member.slot, member, before)
+            member.begin_again()
         new = Member(id, self._target, self._sensors, self.counts, self._clocks,
                      now_ns - round(self._settings.lookback_s * NS))
-        for member in self.members:
-            member.begin_again()
         new.evidence.doubt_start(False, self._sensors.whole, False)
         new.evidence.explanation.add(joint.log_odds, now_ns, self._settings.explained_ratio)
         self.bank, self._filter = joint.bank, joint.bank_filter
-        self.members.append(new)
-        if joint.is_anew and self._is_nearer_to_second():
-            self.members.reverse()
+        self.members = self._in_order(new, joint)
         for slot, member in enumerate(self.members):
             member.slot = slot
             member.evidence.add(joint.log_odds)
@@ -358,14 +388,18 @@ class RunningTrack:
         if self._lag is not None:
             self._lag.clear()
 
-    def _is_nearer_to_second(self) -> bool:
-        """Whether the track as it was is nearer to the second of two vehicles."""
-        last = self.members[0].last
-        assert last is not None
-        best = self.bank.best()
-        places = self._filter.observation.places(self.bank.x[best:best + 1])[0]
-        away = np.linalg.norm(places[:, :2] - last.position[:2], axis=1)
-        return bool(away[1] < away[0])
+    def _in_order(self, new: Member, joint: Joint) -> list[Member]:
+        """The members in the order of their states."""
+        if joint.replaced is None:
+            return [*self.members, new]
+        others = list(self.members)
+        old = others.pop(joint.replaced)
+        best, n = joint.bank.best(), self._one.n_target
+        first = n * len(others)
+        paths = np.array([path[best, first:] for path in joint.window.paths])
+        stamps = [frame.stamp_ns for frame in joint.window.frames]
+        away = [old.distance_from(stamps, paths[:, k * n:k * n + 2]) for k in (0, 1)]
+        return [*others, old, new] if away[0] <= away[1] else [*others, new, old]
 
     def hand_over(self) -> None:
         """Switch to the sensors near where the target is going, if those used are others."""
