@@ -20,6 +20,7 @@ from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
 from mag_tracking.inference.latest_frames import LatestFrames
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.vehicle_state import VehicleState
+from mag_tracking.stages.track.initiation_vehicle import moment_directions
 from mag_tracking.stages.track.pass_samples import PassSamples
 from mag_tracking.stages.track.relinearisation import Window
 from mag_tracking.stages.track.steady_search import PathPrior, SteadySearch
@@ -185,7 +186,7 @@ class NewcomerSearch:
         self._pairs: dict[int, FloatArray] = {}
         self._of_cell = -float(np.log(
             len(settings.arrival_names) * len(settings.lateral_offsets) * len(settings.speeds)
-            * len(settings.kinds) * N_DISTANCES))
+            * len(settings.kinds) * len(moment_directions()) * N_DISTANCES))
 
     def find(self) -> Joint | None:
         """The best explanation with a newcomer; None where there is none at all."""
@@ -285,7 +286,7 @@ class NewcomerSearch:
             x, P, path = known.x, known.P, [known.path[:, :n_known]]
             for theta, m, kind, label in zip(paths, moments, kinds, labels, strict=True):
                 at = n_known + (len(path) - 1) * self._n_one
-                mean, covariance = self._vehicles.prior(theta, self._times[0], kind, label)
+                mean, covariance = self._vehicles.prior(theta, m, self._times[0], kind, label)
                 x, P = np.insert(x, at, mean), _inserted(P, covariance, at)
                 path.append(self._vehicles.along(theta, m, self._times, kind))
             starts.append(_Start(x, P, np.hstack([*path, known.path[:, n_known:]]),

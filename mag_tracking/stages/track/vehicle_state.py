@@ -17,6 +17,9 @@ from mag_tracking.stages.track.initiation_vehicle import (
     vehicle_model,
 )
 
+LEAST_MOMENT = 1e-6
+"""[A m^2] A smaller moment has no direction."""
+
 
 @dataclass(frozen=True)
 class VehicleState:
@@ -37,14 +40,18 @@ class VehicleState:
         """Dipoles of a vehicle."""
         return self._model.n_dipoles
 
-    def prior(self, theta: FloatArray, t: float, kind: int, label: int
+    def prior(self, theta: FloatArray, moments: FloatArray, t: float, kind: int, label: int
               ) -> tuple[FloatArray, FloatArray]:
         """What is known of a vehicle that comes about here, before anything is measured.
+
+        As where a track starts, but that the direction of its moment is about the one found.
 
         Parameters
         ----------
         theta : (7,)
             A straight path.
+        moments : (k, 3) [A m^2], world
+            Those that were found.
         t : float [s]
             The time on that path.
         kind, label : int
@@ -53,17 +60,17 @@ class VehicleState:
         Returns
         -------
         x : (n_t,)
-            Its moment may point anywhere: it is zero.
         P : (n_t, n_t)
         """
         s = self.settings
         R = rotation_about_z(float(np.deg2rad(s.arrival_headings_deg[label])))
-        total_std = float(np.hypot(s.moments[kind] / np.sqrt(3.0), s.moment_stds[kind]))
-        x = self.along(theta, np.zeros((1, 3)), np.array([t]), kind)[0]
+        found = moments.sum(axis=0)
+        mean = s.moments[kind] * found / max(float(np.linalg.norm(found)), LEAST_MOMENT)
+        x = self.along(theta, mean[None], np.array([t]), kind)[0]
         x[2], x[5] = s.heights[kind], 0.0
         if self._d > 1:
             x[9 + 3 * self._d] = s.lengths[kind]
-        return x, starting_covariance(s, kind, R, float(theta[3]), total_std)
+        return x, starting_covariance(s, kind, R, float(theta[3]), s.moment_stds[kind])
 
     def along(self, theta: FloatArray, moments: FloatArray, times: FloatArray, kind: int
               ) -> FloatArray:
