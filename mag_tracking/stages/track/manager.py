@@ -154,10 +154,10 @@ class TrackManager:
             track.hand_over()
             joint = track.newcomer()
             if joint is not None:
-                self.counts['tracks'] += 1
-                self.counts['tracks of newcomers'] += 1
                 track.admit(joint, self._next_id)
-                self._next_id += 1
+                self.counts['tracks'] += joint.adds
+                self.counts['tracks of newcomers' if joint.adds else 'tracks found again'] += 1
+                self._next_id += joint.adds
 
     def give_up(self, reason: str) -> list[TrackRecord]:
         """End all tracks and forget the recent frames; nothing is known of what came since."""

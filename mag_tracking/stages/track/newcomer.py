@@ -121,7 +121,9 @@ class Joint:
     log_odds: float
     """[nats] Against the track as it is."""
     replaced: int | None
-    """This vehicle of the track was sought anew, too: the last two may be it."""
+    """This vehicle of the track was sought anew: one of the last two is it, or the last."""
+    adds: bool
+    """There is a vehicle more."""
 
 
 @dataclass(frozen=True)
@@ -137,14 +139,15 @@ class _Start:
     label: tuple[int, ...]
     kind: tuple[int, ...]
     log_w: float
+    n_new: int
+    """So many vehicles were sought: the last ones."""
     replaced: int | None
     """As of `Joint`."""
 
     @property
-    def is_new(self) -> range:
+    def are_new(self) -> range:
         """Places of the vehicles that were sought."""
-        n = len(self.kind)
-        return range(n - 1 if self.replaced is None else n - 2, n)
+        return range(len(self.kind) - self.n_new, len(self.kind))
 
 
 @dataclass(frozen=True)
@@ -167,11 +170,13 @@ class NewcomerSearch:
     """Explains a window with one vehicle more."""
 
     def __init__(self, bank: FilterBank, window: Window, filter_of: Callable[[int], BankFilter],
-                 n_targets: int, vehicles: VehicleState) -> None:
-        """`bank` of a track of `n_targets` vehicles; `filter_of` makes the filter of so many."""
+                 n_targets: int, vehicles: VehicleState, may_be_more: bool) -> None:
+        """`bank` of a track of `n_targets` vehicles; `filter_of` makes the filter of so many.
+        Unless there `may_be_more`, only the track's own are sought anew.
+        """
         self._bank, self._window = bank, window
         self._filter_of, self._n_targets, self._vehicles = filter_of, n_targets, vehicles
-        self._filter, self._joint_filter = filter_of(n_targets), filter_of(n_targets + 1)
+        self._filter, self._may_be_more = filter_of(n_targets), may_be_more
         network, settings = vehicles.network, vehicles.settings
         self._n_one = self._filter.observation.n_one
         self._times = np.array([(f.stamp_ns - window.frames[-1].stamp_ns) / NS
@@ -189,21 +194,33 @@ class NewcomerSearch:
             * len(settings.kinds) * len(moment_directions()) * N_DISTANCES))
 
     def find(self) -> Joint | None:
-        """The best explanation with a newcomer; None where there is none at all."""
+        """The best explanation with a newcomer, or with a vehicle elsewhere; None where there is
+        none at all."""
         rows, of_track, log_w, paths = self._as_it_is()
-        starts = []
+        more: list[_Start] = []
+        elsewhere: list[_Start] = []
         for k in self._leaders(rows, log_w):
             known = self._known(rows[k], log_w[k] - of_track[k], paths[k])
-            starts += self._beside(known)
-            starts += [start for i in self._doubtful(known)
-                       for start in self._anew(self._without(known, i), i)]
-        if not starts:
-            return None
-        kept = self._with_turns(self._kept(starts))
-        joint, evidence, log_w_joint, joint_paths = self._run(kept)
+            if self._may_be_more:
+                more += self._beside(known)
+            for i in range(self._n_targets):
+                others = self._without(known, i)
+                elsewhere += self._beside(others, i)
+                if self._may_be_more and self._may_be_two(known, i):
+                    more += self._anew(others, i)
         alone = float(log_sum_exp(log_w))
-        return self._made(kept, joint, evidence, log_w_joint, joint_paths,
-                          float(log_sum_exp(log_w_joint)) + ARRIVES - alone)
+        found = [self._best_of(starts, alone) for starts in (more, elsewhere) if starts]
+        return max((joint for joint in found if joint is not None),
+                   key=lambda joint: joint.log_odds, default=None)
+
+    def _best_of(self, starts: Sequence[_Start], alone: float) -> Joint | None:
+        """What comes of hypotheses of as many vehicles; `alone` is the log-evidence of the track
+        as it is."""
+        kept = self._with_turns(self._kept(starts))
+        prior = ARRIVES if len(kept[0].kind) > self._n_targets else 0.0
+        bank, log_likelihood, log_w, paths = self._run(kept)
+        return self._made(kept, bank, log_likelihood, log_w, paths,
+                          float(log_sum_exp(log_w)) + prior - alone)
 
     def _as_it_is(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
         """The leading hypotheses of the track along their paths: rows of the bank (n,), the
@@ -241,12 +258,10 @@ class NewcomerSearch:
         return _Known(before.x[0], before.P[0], path, tuple(np.ravel(self._bank.label[row]).tolist()),
                       tuple(np.ravel(self._bank.kind[row]).tolist()), log_w, self._filter)
 
-    def _doubtful(self, known: '_Known') -> list[int]:
-        """Vehicles that may be two: long ones, and one that is alone."""
-        if self._n_targets == 1:
-            return [0]
-        return [i for i, kind in enumerate(known.kind)
-                if self._filter.are_long(np.array([kind]))[0]]
+    def _may_be_two(self, known: '_Known', i: int) -> bool:
+        """Whether vehicle `i` is long, or alone."""
+        return self._n_targets == 1 or bool(
+            self._filter.are_long(np.array([known.kind[i]]))[0])
 
     def _without(self, known: '_Known', i: int) -> '_Known':
         """The same without vehicle `i`; of one alone nothing is left that is known."""
@@ -261,11 +276,11 @@ class NewcomerSearch:
                       known.label[:i] + known.label[i + 1:], known.kind[:i] + known.kind[i + 1:],
                       known.log_w, self._filter_of(self._n_targets - 1))
 
-    def _beside(self, known: '_Known') -> list[_Start]:
-        """A newcomer beside known vehicles."""
+    def _beside(self, known: '_Known', replaced: int | None = None) -> list[_Start]:
+        """One vehicle beside known ones: a newcomer, or in place of vehicle `replaced`."""
         search = self._search_beside(known)
         return [start for theta in search.best(self._starts, FIRST)
-                for start in self._started(known, theta[None], [search.moments(theta)], None)]
+                for start in self._started(known, theta[None], [search.moments(theta)], replaced)]
 
     def _anew(self, others: '_Known', i: int) -> list[_Start]:
         """Two vehicles in place of vehicle `i`, whose filter may have been misled by them."""
@@ -291,7 +306,8 @@ class NewcomerSearch:
                 path.append(self._vehicles.along(theta, m, self._times, kind))
             starts.append(_Start(x, P, np.hstack([*path, known.path[:, n_known:]]),
                                  (*known.label, *labels), (*known.kind, *kinds),
-                                 known.log_w + len(paths) * self._of_cell, replaced))
+                                 known.log_w + len(paths) * self._of_cell, len(paths),
+                                 replaced))
         return starts
 
     def _search_beside(self, known: '_Known') -> SteadySearch:
@@ -352,7 +368,7 @@ class NewcomerSearch:
         out = []
         for start in starts:
             turning = [P for P in (self._vehicles.turning(start.x, start.P, i)
-                                   for i in start.is_new) if P is not None]
+                                   for i in start.are_new) if P is not None]
             out.append(replace(start, log_w=start.log_w + float(np.log(1.0 - share))
                                if turning else start.log_w))
             out += [replace(start, P=P, log_w=start.log_w + float(np.log(share / len(turning))))
@@ -365,10 +381,10 @@ class NewcomerSearch:
         window, n = self._window, len(starts)
         bank = FilterBank(
             np.array([s.x for s in starts]), np.array([s.P for s in starts]), np.zeros(n),
-            np.array([s.label for s in starts]), np.array([s.kind for s in starts]), np.arange(n),
+            _labels([s.label for s in starts]), _labels([s.kind for s in starts]), np.arange(n),
             np.full((n, len(self._vehicles.network)), np.nan))
         paths = np.array([s.path for s in starts])
-        along = self._joint_filter.run_along(
+        along = self._filter_of(len(starts[0].kind)).run_along(
             bank, window.frames, window.intervals, paths, passes=PASSES, step=STEP,
             first_is_updated=window.is_updated)
         usable: BoolArray = np.isfinite(along.log_likelihood) \
@@ -395,9 +411,11 @@ class NewcomerSearch:
         window = Window(anchor, self._window.is_updated, self._window.frames,
                         self._window.intervals,
                         [np.ascontiguousarray(paths[rows, k]) for k in range(n_frames)],
-                        [each.copy() for _ in range(n_frames)], 0.0, self._window.is_start,
-                        self._window.most)
-        return Joint(now, window, self._joint_filter, log_odds, replaced)
+                        [each.copy() for _ in range(n_frames)], float(log_sum_exp(log_w[rows])),
+                        self._window.is_start, self._window.most)
+        n_targets = len(starts[best].kind)
+        return Joint(now, window, self._filter_of(n_targets), log_odds, replaced,
+                     n_targets > self._n_targets)
 
 
 def _inserted(P: FloatArray, block: FloatArray, at: int) -> FloatArray:
@@ -414,3 +432,9 @@ def _in_order_of(first: FloatArray, pair: FloatArray) -> FloatArray:
     """A pair of paths (2, 7), the nearer one of the `first` pair's first coming first."""
     away = np.linalg.norm(pair[:, None, :2] - first[:, :2], axis=2)
     return pair if away[0, 0] + away[1, 1] <= away[0, 1] + away[1, 0] else pair[::-1].copy()
+
+
+def _labels(labels: Sequence[tuple[int, ...]]) -> IntArray:
+    """(n,) or (n, n_targets) as of a `FilterBank`."""
+    out = np.array(labels)
+    return out[:, 0].copy() if out.shape[1] == 1 else out

@@ -354,18 +354,18 @@ class RunningTrack:
                 or self.members[0].last is None \
                 or not self._test.is_due(window.frames[-1].stamp_ns):
             return None
-        if n >= self._settings.most_together:
+        may_be_more = n < self._settings.most_together
+        if not may_be_more:
             self.counts['newcomers not sought: too many vehicles at once'] += 1
-            return None
         self.counts['newcomers sought'] += 1
         found = NewcomerSearch(
             self.bank, window, self._filter_of, n, VehicleState(
                 self._settings.vehicle, self._sensors.network,
-                self._settings.background_std)).find()
+                self._settings.background_std), may_be_more).find()
         return found if found is not None and found.log_odds > LEAST_NATS else None
 
     def admit(self, joint: Joint, id: int) -> None:
-        """Follow a newcomer, too, as the member `id`."""
+        """Go on with another explanation; a newcomer becomes the member `id`."""
         window, best = joint.window, self.bank.best()
         begin_ns, now_ns = (window.frames[k].stamp_ns for k in (0, -1))
         states, _ = self._whole.smoothed(self.bank, best)
@@ -373,10 +373,7 @@ class RunningTrack:
         for member in self.members:
             member.early += self._states_of(member.slot, member, before)
             member.begin_again()
-        new = Member(id, self._target, self._sensors, self.counts, self._clocks,
-                     now_ns - round(self._settings.lookback_s * NS))
-        new.evidence.doubt_start(False, self._sensors.whole, False)
-        new.evidence.explanation.add(joint.log_odds, now_ns, self._settings.explained_ratio)
+        new = self._newcomer(id, joint, now_ns) if joint.adds else None
         self.bank, self._filter = joint.bank, joint.bank_filter
         self.members = self._in_order(new, joint)
         for slot, member in enumerate(self.members):
@@ -388,12 +385,20 @@ class RunningTrack:
         if self._lag is not None:
             self._lag.clear()
 
-    def _in_order(self, new: Member, joint: Joint) -> list[Member]:
+    def _newcomer(self, id: int, joint: Joint, now_ns: int) -> Member:
+        """The member that a newcomer becomes."""
+        new = Member(id, self._target, self._sensors, self.counts, self._clocks,
+                     now_ns - round(self._settings.lookback_s * NS))
+        new.evidence.doubt_start(False, self._sensors.whole, False)
+        new.evidence.explanation.add(joint.log_odds, now_ns, self._settings.explained_ratio)
+        return new
+
+    def _in_order(self, new: Member | None, joint: Joint) -> list[Member]:
         """The members in the order of their states."""
-        if joint.replaced is None:
-            return [*self.members, new]
         others = list(self.members)
-        old = others.pop(joint.replaced)
+        old = others.pop(joint.replaced) if joint.replaced is not None else None
+        if new is None or old is None:
+            return [*others, *([old] if old else []), *([new] if new else [])]
         best, n = joint.bank.best(), self._one.n_target
         first = n * len(others)
         paths = np.array([path[best, first:] for path in joint.window.paths])
