@@ -21,6 +21,7 @@ OFF_THE_ROAD = 'off_the_road'
 FRAMES_TOO_LONG = 'frames_too_long'
 CLOCKS_APART = 'clocks_apart'
 NO_STEADY_PATH = 'no_steady_path'
+ANOTHER_VEHICLE = 'another_vehicle'
 
 FOR_GOOD = frozenset({SENSORS_ROTATED, FRAMES_TOO_LONG, CLOCKS_APART})
 """These doubts stay: the track was bent. A state that no vehicle has may soon be right again."""
@@ -47,6 +48,7 @@ MEANINGS = {
     OFF_THE_ROAD: 'the target passes all sensors on one side, beyond the lanes of the settings',
     FRAMES_TOO_LONG: 'the target moves too far within a frame',
     CLOCKS_APART: 'the clocks of the sensors seem to be apart, by this pass or those before',
+    ANOTHER_VEHICLE: 'two vehicles, or a vehicle elsewhere, explain the latest frames about as well',
     NO_STEADY_PATH: 'no vehicle that accelerates and turns steadily explains the pass as a whole',
 }
 """{doubt: what it means}, in the order in which they are listed."""

@@ -79,6 +79,8 @@ class TrackEvidence:
         self._doubtful_times: DoubtfulTimes = ()
         # The latest timestamp of each passing doubt.
         self._found_ns: dict[str, int] = {}
+        # Until when other doubts last.
+        self._until_ns: dict[str, int] = {}
         self._best_spread = np.inf
         # Per sensor: whitened energy of its fields above that of noise, and number of axes.
         self._energy, self._n_axes = np.zeros(n_sensors), np.zeros(n_sensors)
@@ -124,6 +126,10 @@ class TrackEvidence:
         if len(network) == 1 or network.is_close and not starts_anywhere:
             self.doubt(doubts.SENSORS_AT_ONE_PLACE)
 
+    def doubt_for(self, reason: str, stamp_ns: int, seconds: float) -> None:
+        """The poses of so many seconds may be wrong."""
+        self._until_ns[reason] = stamp_ns + round(seconds * NS)
+
     def watch(self, frame: FieldFrame) -> None:
         """Doubt the track where the field has grown unlike that of a target from afar."""
         if self._approach.add(frame):
@@ -166,7 +172,8 @@ class TrackEvidence:
         self._doubtful_times = noted(self._doubtful_times, stamp_ns, bool(passing), MOST_STRETCHES)
         self._found_ns |= dict.fromkeys(passing, stamp_ns)
         return found | {reason for reason, when in self._found_ns.items()
-                        if (stamp_ns - when) / NS <= LASTS_S}
+                        if (stamp_ns - when) / NS <= LASTS_S} \
+            | {reason for reason, until in self._until_ns.items() if stamp_ns <= until}
 
     def contradicts(self, nis: FloatArray, degrees_of_freedom: int) -> bool:
         """Whether a normalised innovation is one that no target of ours makes.

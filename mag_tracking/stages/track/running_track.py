@@ -40,6 +40,9 @@ from mag_tracking.stages.track.target import Target
 from mag_tracking.stages.track.vehicle_state import VehicleState
 from mag_tracking.units import NS
 
+UNDECIDED_S = 0.5
+"""[s] Poses are in doubt for so long after another explanation was about as probable."""
+
 UNFELT, FAINT = 0.1, 1.0
 """A member whose field has less energy than this in a frame, in units of its noise, is not felt;
 and with less than that it does not disturb the others."""
@@ -80,6 +83,8 @@ class RunningTrack:
         self._lag = FixedLag(settings.smoothing_lag_s) if settings.smoothing_lag_s else None
         self._handover_due: int | None = None
         self._test = NewcomerTest()
+        # A newcomer could not be sought: there are too many members.
+        self._is_full = False
 
     def _use(self, sensors: SensorSubset, bank_filter: BankFilter,
              is_handover: bool = False) -> None:
@@ -245,7 +250,8 @@ class RunningTrack:
         """Whether one of several members goes away, and is no longer felt."""
         assert member.last is not None
         state = self.bank.x[self.bank.best()]
-        return self._energy(self.members.index(member), state, frame) < UNFELT \
+        limit = FAINT if self._is_full else UNFELT
+        return self._energy(self.members.index(member), state, frame) < limit \
             and not self._sensors.is_neared_by(member.last)
 
     def _energy(self, i: int, state: FloatArray, frame: FieldFrame) -> float:
@@ -355,14 +361,22 @@ class RunningTrack:
                 or not self._test.is_due(window.frames[-1].stamp_ns):
             return None
         may_be_more = n < self._settings.most_together
-        if not may_be_more:
+        self._is_full = not may_be_more
+        if self._is_full:
             self.counts['newcomers not sought: too many vehicles at once'] += 1
         self.counts['newcomers sought'] += 1
         found = NewcomerSearch(
             self.bank, window, self._filter_of, n, VehicleState(
                 self._settings.vehicle, self._sensors.network,
                 self._settings.background_std), may_be_more).find()
-        return found if found is not None and found.log_odds > LEAST_NATS else None
+        if found is None or found.log_odds > LEAST_NATS:
+            return found
+        if found.log_odds > -LEAST_NATS / 2.0:
+            now_ns = window.frames[-1].stamp_ns
+            for i, member in enumerate(self.members):
+                if found.replaced in (None, i):
+                    member.evidence.doubt_for(doubts.ANOTHER_VEHICLE, now_ns, UNDECIDED_S)
+        return None
 
     def admit(self, joint: Joint, id: int) -> None:
         """Go on with another explanation; a newcomer becomes the member `id`."""
@@ -375,7 +389,7 @@ class RunningTrack:
             member.begin_again()
         new = self._newcomer(id, joint, now_ns) if joint.adds else None
         self.bank, self._filter = joint.bank, joint.bank_filter
-        self.members = self._in_order(new, joint)
+        self.members, self._is_full = self._in_order(new, joint), False
         for slot, member in enumerate(self.members):
             member.slot = slot
             member.evidence.add(joint.log_odds)

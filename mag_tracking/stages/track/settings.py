@@ -60,7 +60,7 @@ class TrackSettings:
         'memory for (250 MB), about ten; the others come in at its detection, where its smoothing '
         'begins then, or as it moves on.', '', (2, 1000))
     most_together: int = param(
-        3, 'Vehicles whose fields overlap are tracked together, so many at most. What two of them '
+        4, 'Vehicles whose fields overlap are tracked together, so many at most. What two of them '
         'take is about three times what one does. 1 = a track is of one vehicle, whatever the '
         'frames say.', '', (1, 4))
     prune_ratio: float = param(
