@@ -16,6 +16,7 @@ from scipy.linalg import block_diag
 from scipy.special import chdtrc
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
 from mag_tracking.inference.latest_frames import LatestFrames
 from mag_tracking.stages.track.bank_filter import BankFilter
@@ -57,11 +58,29 @@ NATS_KEPT, MOST_KEPT = 10.0, 12
 ARRIVES = np.log(0.05)
 """Log-probability that another vehicle comes while one passes."""
 
+ELSEWHERE_M = 2.0
+"""[m] A vehicle that was sought anew, and is found nearer than this, was followed rightly."""
+
+WAS_LOST = np.log(0.01)
+"""Log-probability that a vehicle has been elsewhere than its track for the whole window."""
+
+FELT = 4.0
+"""A vehicle of which the last frame has less energy, in units of its noise, is not sought again."""
+
+WIDTH, OVERHANG, DEPTH_STD = 1.5, 1.0, 0.5
+"""[m] Two bodies are in each other's way that are less than so much apart across their heading; by
+so much they are longer than their rows together; and by so much their paths may be off."""
+
 N_DISTANCES = 10
 """Places on its line where a newcomer may be when the window begins."""
 
-LEAST_NATS = 10.0
-"""A newcomer is believed if the frames are so much more probable with it."""
+LEAST_NATS, UNDECIDED_NATS = 7.0, -5.0
+"""A newcomer is believed if the frames are so much more probable with it; if they are not much less
+probable, the track is in doubt."""
+
+
+ODD, LONG = 'improbable innovations', 'a long vehicle'
+"""Why a track is compared with other explanations."""
 
 
 class NewcomerTest:
@@ -95,18 +114,19 @@ class NewcomerTest:
         self._latest.add(stamp_ns, [nis, degrees_of_freedom])
         self._was_rejected, self._is_long = rejected, is_long
 
-    def is_due(self, stamp_ns: int) -> bool:
-        """Whether a newcomer is to be sought now."""
+    def due(self, stamp_ns: int) -> str | None:
+        """`ODD` or `LONG` if the track is to be compared now, else None."""
         total, freedom = self._latest.total
         since = np.inf if self._last_ns is None else (stamp_ns - self._last_ns) / NS
-        odd = self._was_rejected or chdtrc(max(freedom, 1.0), total) <= FALSE_ALARM
-        is_due = odd and since >= AGAIN_S
-        if not odd and self._is_long and since >= self._long_wait_s:
-            is_due = True
+        reason = None
+        if self._was_rejected or chdtrc(max(freedom, 1.0), total) <= FALSE_ALARM:
+            reason = ODD if since >= AGAIN_S else None
+        elif self._is_long and since >= self._long_wait_s:
+            reason = LONG
             self._long_wait_s *= LONGER
-        if is_due:
+        if reason is not None:
             self._last_ns = stamp_ns
-        return is_due
+        return reason
 
 
 @dataclass(frozen=True)
@@ -170,10 +190,15 @@ class NewcomerSearch:
     """Explains a window with one vehicle more."""
 
     def __init__(self, bank: FilterBank, window: Window, filter_of: Callable[[int], BankFilter],
-                 n_targets: int, vehicles: VehicleState, may_be_more: bool) -> None:
+                 n_targets: int, vehicles: VehicleState, reason: str, may_be_more: bool
+                 ) -> None:
         """`bank` of a track of `n_targets` vehicles; `filter_of` makes the filter of so many.
-        Unless there `may_be_more`, only the track's own are sought anew.
+
+        The `reason` is that of `NewcomerTest.due`: nobody is sought beside a long vehicle, or
+        elsewhere, if the innovations are as they should be. Unless there `may_be_more`, only the
+        track's own vehicles are sought anew.
         """
+        self._is_odd = reason == ODD
         self._bank, self._window = bank, window
         self._filter_of, self._n_targets, self._vehicles = filter_of, n_targets, vehicles
         self._filter, self._may_be_more = filter_of(n_targets), may_be_more
@@ -201,23 +226,25 @@ class NewcomerSearch:
         elsewhere: list[_Start] = []
         for k in self._leaders(rows, log_w):
             known = self._known(rows[k], log_w[k] - of_track[k], paths[k])
-            if self._may_be_more:
+            if self._may_be_more and self._is_odd:
                 more += self._beside(known)
             for i in range(self._n_targets):
                 others = self._without(known, i)
-                elsewhere += self._beside(others, i)
+                if self._is_odd and self._is_felt(known, i):
+                    elsewhere += self._beside(others, i)
                 if self._may_be_more and self._may_be_two(known, i):
                     more += self._anew(others, i)
         alone = float(log_sum_exp(log_w))
         found = [self._best_of(starts, alone) for starts in (more, elsewhere) if starts]
-        return max((joint for joint in found if joint is not None),
+        return max((joint for joint in found if joint is not None
+                    and (joint.adds or self._is_elsewhere(joint))),
                    key=lambda joint: joint.log_odds, default=None)
 
     def _best_of(self, starts: Sequence[_Start], alone: float) -> Joint | None:
         """What comes of hypotheses of as many vehicles; `alone` is the log-evidence of the track
         as it is."""
         kept = self._with_turns(self._kept(starts))
-        prior = ARRIVES if len(kept[0].kind) > self._n_targets else 0.0
+        prior = ARRIVES if len(kept[0].kind) > self._n_targets else WAS_LOST
         bank, log_likelihood, log_w, paths = self._run(kept)
         return self._made(kept, bank, log_likelihood, log_w, paths,
                           float(log_sum_exp(log_w)) + prior - alone)
@@ -262,6 +289,23 @@ class NewcomerSearch:
         """Whether vehicle `i` is long, or alone."""
         return self._n_targets == 1 or bool(
             self._filter.are_long(np.array([known.kind[i]]))[0])
+
+    def _is_felt(self, known: '_Known', i: int) -> bool:
+        """Whether the sensors feel vehicle `i` in the last frame."""
+        frame = self._window.frames[-1]
+        field = self._filter.observation.field_of(known.path[-1], [i], np.zeros(len(frame.field)))
+        energy, _ = whitened_energy(np.where(np.isnan(frame.field), np.nan, field),
+                                    frame.covariance)
+        return bool(energy.sum() > FELT)
+
+    def _is_elsewhere(self, joint: Joint) -> bool:
+        """Whether a vehicle that was sought anew is far from where the track has it."""
+        n, now = self._n_one, self._bank.x[self._bank.best()]
+        assert joint.replaced is not None
+        found = joint.bank.x[joint.bank.best()]
+        last = n * (self._n_targets - 1)
+        before = now[joint.replaced * n:joint.replaced * n + 2]
+        return bool(np.hypot(*(found[last:last + 2] - before)) > ELSEWHERE_M)
 
     def _without(self, known: '_Known', i: int) -> '_Known':
         """The same without vehicle `i`; of one alone nothing is left that is known."""
@@ -390,7 +434,10 @@ class NewcomerSearch:
         usable: BoolArray = np.isfinite(along.log_likelihood) \
             & np.isfinite(paths).all(axis=(1, 2)) & np.isfinite(bank.x).all(axis=1)
         log_likelihood = np.where(usable, along.log_likelihood, -np.inf)
-        return bank, log_likelihood, log_likelihood + [s.log_w for s in starts], paths
+        log_w = log_likelihood + [s.log_w for s in starts] - 0.5 * np.square(
+            [_depth(path, self._n_one, len(s.kind), self._vehicles.length_column) / DEPTH_STD
+             for s, path in zip(starts, paths, strict=True)])
+        return bank, log_likelihood, log_w, paths
 
     def _made(self, starts: Sequence[_Start], bank: FilterBank, log_likelihood: FloatArray,
               log_w: FloatArray, paths: FloatArray, log_odds: float) -> Joint | None:
@@ -438,3 +485,22 @@ def _labels(labels: Sequence[tuple[int, ...]]) -> IntArray:
     """(n,) or (n, n_targets) as of a `FilterBank`."""
     out = np.array(labels)
     return out[:, 0].copy() if out.shape[1] == 1 else out
+
+
+def _depth(path: FloatArray, n_one: int, n_targets: int, length: int | None) -> float:
+    """[m] by how much two vehicles of a `path` (n, n_x) are in each other at most.
+
+    Each has `n_one` states, of which `length` is the column of its length; None: all are points.
+    """
+    x = path[:, :n_one * n_targets].reshape(len(path), n_targets, n_one)
+    forward = x[:, :, 3:5] / np.maximum(np.linalg.norm(x[:, :, 3:5], axis=2), 1e-6)[:, :, None]
+    depth = 0.0
+    for i in range(n_targets):
+        for k in range(i):
+            away = x[:, i, :2] - x[:, k, :2]
+            along = np.abs(np.einsum('ni,ni->n', away, forward[:, k]))
+            across = np.abs(away[:, 0] * forward[:, k, 1] - away[:, 1] * forward[:, k, 0])
+            need = OVERHANG + (0.0 if length is None else
+                               0.5 * (np.abs(x[:, i, length]) + np.abs(x[:, k, length])))
+            depth = max(depth, float(np.where(across < WIDTH, need - along, 0.0).max()))
+    return depth

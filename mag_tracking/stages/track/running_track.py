@@ -28,7 +28,13 @@ from mag_tracking.stages.track.clock_evidence import ClockEvidence
 from mag_tracking.stages.track.disturbances import Unexplained
 from mag_tracking.stages.track.evidence import LEAST_WATCHED, OUT_OF_REACH
 from mag_tracking.stages.track.member import Member, Update, View
-from mag_tracking.stages.track.newcomer import LEAST_NATS, Joint, NewcomerSearch, NewcomerTest
+from mag_tracking.stages.track.newcomer import (
+    LEAST_NATS,
+    UNDECIDED_NATS,
+    Joint,
+    NewcomerSearch,
+    NewcomerTest,
+)
 from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.relinearisation import Relinearisation
 from mag_tracking.stages.track.sensor_rejection import SensorRejection
@@ -40,7 +46,7 @@ from mag_tracking.stages.track.target import Target
 from mag_tracking.stages.track.vehicle_state import VehicleState
 from mag_tracking.units import NS
 
-UNDECIDED_S = 0.5
+UNDECIDED_S = 1.0
 """[s] Poses are in doubt for so long after another explanation was about as probable."""
 
 UNFELT, FAINT = 0.1, 1.0
@@ -357,8 +363,10 @@ class RunningTrack:
         is believed."""
         window, n = self._relinearisation.window, len(self.members)
         if self.ended is not None or self._target.starts_anywhere or window is None \
-                or self.members[0].last is None \
-                or not self._test.is_due(window.frames[-1].stamp_ns):
+                or self.members[0].last is None:
+            return None
+        reason = self._test.due(window.frames[-1].stamp_ns)
+        if reason is None:
             return None
         may_be_more = n < self._settings.most_together
         self._is_full = not may_be_more
@@ -368,10 +376,10 @@ class RunningTrack:
         found = NewcomerSearch(
             self.bank, window, self._filter_of, n, VehicleState(
                 self._settings.vehicle, self._sensors.network,
-                self._settings.background_std), may_be_more).find()
+                self._settings.background_std), reason, may_be_more).find()
         if found is None or found.log_odds > LEAST_NATS:
             return found
-        if found.log_odds > -LEAST_NATS / 2.0:
+        if found.log_odds > UNDECIDED_NATS:
             now_ns = window.frames[-1].stamp_ns
             for i, member in enumerate(self.members):
                 if found.replaced in (None, i):

@@ -40,6 +40,11 @@ class VehicleState:
         """Dipoles of a vehicle."""
         return self._model.n_dipoles
 
+    @property
+    def length_column(self) -> int | None:
+        """Of the length among the states of a vehicle; None where all are points."""
+        return 9 + 3 * self._d if self._d > 1 else None
+
     def prior(self, theta: FloatArray, moments: FloatArray, t: float, kind: int, label: int
               ) -> tuple[FloatArray, FloatArray]:
         """What is known of a vehicle that comes about here, before anything is measured.

@@ -1,0 +1,172 @@
+"""Worlds of several vehicles at once, and how well tracks follow each of them.
+
+The traffic is like that of the bundled recordings (meeting, following, free), the vehicles and
+sensors are not: boxes with spinning wheels, drivers who brake and swerve, gain errors.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mag_tracking.physics.dipole import dipole_field
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.records import Track
+from mag_tracking.simulation.scenario import Path, body_axes
+from support.box_vehicles import random_drive
+from support.passes import network_of
+from support.random_passes import are_wrong, errors_of
+from support.situation_worlds import car, truck
+from support.worlds import FLAWS, world
+
+NETWORKS = {
+    2: network_of([[0.0, -5.5, 0.0], [0.0, 5.5, 0.0]]),
+    4: network_of([[-3.0, -5.5, 0.0], [3.0, 5.5, 0.0], [-3.0, 5.5, 0.0], [3.0, -5.5, 0.0]]),
+    8: network_of([[6.0 * k - 21.0, 5.5 * (-1.0)**k, 0.0] for k in range(8)])}
+LEAD_S, RATE = 12.0, 50.0
+NEAR_M = 8.0
+"""[m] The error of a track is that within this distance of the origin."""
+LANE_M = 1.75
+TRUCKS = 0.1
+"""Share of the vehicles that are long."""
+
+
+@dataclass(frozen=True)
+class OnWheels:
+    """A body with a steel belt in each of four tyres, which turns as it rolls."""
+
+    body: object
+    moments: np.ndarray
+    """(4, 2) [A m^2] across the axle, in the plane of the wheel."""
+    radius: float = 0.3
+
+    def field(self, earth_field, position, heading, points):
+        """See `mag_tracking.simulation.scenario.Body`."""
+        B = self.body.field(earth_field, position, heading, points)
+        R, origin = body_axes(position, heading)
+        way = np.concatenate([[0.0], np.hypot(*np.diff(position[:, :2], axis=0).T).cumsum()])
+        for k, (x, y) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):
+            a = way / self.radius + 1.7 * k
+            ahead, up = self.moments[k]
+            m = np.stack([ahead * np.cos(a) - up * np.sin(a), np.zeros_like(a),
+                          ahead * np.sin(a) + up * np.cos(a)], axis=1)
+            wheel = origin + np.einsum('nij,j->ni', R, [0.3 * self.body.length * x, 0.75 * y,
+                                                        self.radius])
+            moment = np.einsum('nij,nj->ni', R, m)
+            B = B + dipole_field(points[None] - wheel[:, None],
+                                 np.broadcast_to(moment[:, None], (*moment.shape[:1],
+                                                                   len(points), 3)))
+        return B
+
+
+def vehicle(rng, simulator):
+    """A car, now and then a truck; of boxes it rolls on wheels."""
+    body = (truck if rng.random() < TRUCKS else car)(rng, simulator)
+    return OnWheels(body, rng.normal(0.0, 2.0, (4, 2))) if simulator == 'boxes' else body
+
+
+def passing(rng, simulator, at_s, direction, speed):
+    """(body, course) of a vehicle that is at the origin at a time [s]."""
+    lane = -direction * (LANE_M + rng.uniform(-0.3, 0.3))
+    path = Path(np.array([-direction * speed * at_s, lane]), 0.0 if direction > 0 else np.pi, speed)
+    return vehicle(rng, simulator), random_drive(rng, path, at_s) if simulator == 'boxes' else path
+
+
+def pair(rng, how, at_s):
+    """[(time [s], direction, speed [m/s])] of two vehicles that meet or follow."""
+    speed, direction = rng.uniform(8.0, 20.0), int(rng.choice([-1, 1]))
+    if how == 'meeting':
+        return [(at_s, direction, speed),
+                (at_s + rng.uniform(0.1, 1.1), -direction, rng.uniform(8.0, 20.0))]
+    return [(at_s, direction, speed),
+            (at_s + rng.uniform(1.2, 2.5), direction, speed * rng.uniform(0.96, 1.04))]
+
+
+def busy(how, n_sensors, simulator, seed, n=4):
+    """`World` of `n` pairs that are 'meeting' or 'following', or of 3 `n` vehicles in 'traffic'."""
+    rng = np.random.default_rng([seed, n_sensors, len(how), len(simulator)])
+    if how == 'traffic':
+        times = LEAD_S + np.cumsum(rng.exponential(3.0, 3 * n))
+        plan = [(t, int(rng.choice([-1, 1])), rng.uniform(8.0, 20.0)) for t in times]
+        plan = [p for k, p in enumerate(plan) if not any(
+            # One does not drive through another in its lane.
+            q[1] == p[1] and (p[0] - q[0]) * min(p[2], q[2]) < 14.0 for q in plan[:k])]
+    else:
+        plan = [p for k in range(n) for p in pair(rng, how, LEAD_S + 14.0 * k)]
+    movers = [passing(rng, simulator, *p) for p in plan]
+    return world(NETWORKS[n_sensors], movers, max(p[0] for p in plan) + 7.0, rng,
+                 FLAWS[simulator], RATE)
+
+
+@dataclass(frozen=True)
+class Score:
+    """How a set of tracks follows a set of vehicles."""
+
+    rms: np.ndarray
+    """(n_vehicles,) [m] within `NEAR_M` of the origin; NaN of one without a track."""
+    nees: np.ndarray
+    """(n_vehicles,) median, of two degrees of freedom; NaN where there is no track."""
+    is_found: np.ndarray
+    """(n_vehicles,) its track goes the right way."""
+    n_extra: int
+    """Tracks that belong to nobody."""
+    n_sure: int
+    """Poses without a flag."""
+    n_wrong: int
+    """Of them wrong about every vehicle."""
+
+    def __str__(self):
+        return (f'found {self.is_found.sum()} of {len(self.rms)}, RMS {np.nanmedian(self.rms):.2f} '
+                f'm, NEES {np.nanmedian(self.nees):.2f}, of nobody {self.n_extra}, sure '
+                f'{self.n_sure}, of them wrong {self.n_wrong}')
+
+
+FOUND_M = 5.0
+"""[m] A track with a larger RMS error is not that of the vehicle."""
+
+
+def score(poses, vehicles):
+    """`Score` of `Track`s.
+
+    Parameters
+    ----------
+    poses : list of Track
+        Without the closing ones.
+    vehicles : list of (t (n,) [s], positions (n, 2) [m])
+    """
+    of_track = {i: [p for p in poses if p.id == i] for i in sorted({p.id for p in poses})}
+    candidates, sure = [], [p for p in poses if not p.ambiguous]
+    wrong = np.ones(len(sure), dtype=bool)
+    for k, (t, position) in enumerate(vehicles):
+        wrong &= are_wrong(*errors_of(sure, t, position)[:2]) | _outside(sure, t)
+        for i, mine in of_track.items():
+            error, _, nees, true = errors_of(mine, t, position)
+            near = (np.hypot(*true.T) < NEAR_M) & ~_outside(mine, t)
+            if near.any():
+                way = np.interp([mine[0].stamp_ns / 1e9, mine[-1].stamp_ns / 1e9], t,
+                                position[:, 0])
+                velocity = np.median([p.velocity[0] for p, n in zip(mine, near, strict=True) if n])
+                candidates.append((float(np.sqrt(np.mean(error[near]**2))), i, k,
+                                   2.0 * float(np.median(nees[near])),
+                                   bool(velocity * (way[1] - way[0]) > 0.0)))
+    n = len(vehicles)
+    rms, nees, found = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, dtype=bool)
+    used = set()
+    for error, i, k, of_k, goes_right in sorted(candidates):
+        if i not in used and np.isnan(rms[k]):
+            used.add(i)
+            rms[k], nees[k], found[k] = error, of_k, goes_right and error < FOUND_M
+    return Score(rms, nees, found, len(set(of_track) - used), len(sure), int(wrong.sum()))
+
+
+def _outside(poses, t):
+    """(n,) poses before or after the truth."""
+    stamps = np.array([p.stamp_ns for p in poses]) / 1e9
+    return (stamps < t[0]) | (stamps > t[-1])
+
+
+def tracked(a_world, changes=None):
+    """(`Score`, `Pipeline`) of a `World`."""
+    pipeline = Pipeline(a_world.network, settings_for('vehicle', changes))
+    records = pipeline.feed(a_world.readings) + pipeline.flush()
+    poses = [r for r in records if isinstance(r, Track) and not r.ended]
+    return score(poses, [(a_world.t, position) for position in a_world.positions]), pipeline
