@@ -67,16 +67,16 @@ WAS_LOST = np.log(0.01)
 FELT = 4.0
 """A vehicle of which the last frame has less energy, in units of its noise, is not sought again."""
 
-WIDTH, OVERHANG, DEPTH_STD = 1.5, 1.0, 0.5
+WIDTH, OVERHANG, DEPTH_STD = 1.5, 1.0, 1.0
 """[m] Two bodies are in each other's way that are less than so much apart across their heading; by
 so much they are longer than their rows together; and by so much their paths may be off."""
 
 N_DISTANCES = 10
 """Places on its line where a newcomer may be when the window begins."""
 
-LEAST_NATS, UNDECIDED_NATS = 7.0, -5.0
-"""A newcomer is believed if the frames are so much more probable with it; if they are not much less
-probable, the track is in doubt."""
+LEAST_NATS, AGAIN_NATS, UNDECIDED_NATS = 10.0, 5.0, -5.0
+"""Another explanation is believed if the frames are so much more probable with it; or, if less, by
+two comparisons in turn. If they are not much less probable with it, the track is in doubt."""
 
 
 ODD, LONG = 'improbable innovations', 'a long vehicle'
@@ -93,6 +93,7 @@ class NewcomerTest:
     def __init__(self) -> None:
         self._latest = LatestFrames(WINDOW_S)
         self._last_ns: int | None = None
+        self._was_probable = False
         self._was_rejected = self._is_long = False
         self._long_wait_s = LONG_AGAIN_S
 
@@ -127,6 +128,13 @@ class NewcomerTest:
         if reason is not None:
             self._last_ns = stamp_ns
         return reason
+
+
+    def believes(self, log_odds: float) -> bool:
+        """Whether another explanation is believed, given those compared before."""
+        believes = log_odds > LEAST_NATS or self._was_probable and log_odds > AGAIN_NATS
+        self._was_probable = log_odds > AGAIN_NATS and not believes
+        return believes
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,6 @@ from mag_tracking.stages.track.disturbances import Unexplained
 from mag_tracking.stages.track.evidence import LEAST_WATCHED, OUT_OF_REACH
 from mag_tracking.stages.track.member import Member, Update, View
 from mag_tracking.stages.track.newcomer import (
-    LEAST_NATS,
     UNDECIDED_NATS,
     Joint,
     NewcomerSearch,
@@ -377,9 +376,9 @@ class RunningTrack:
             self.bank, window, self._filter_of, n, VehicleState(
                 self._settings.vehicle, self._sensors.network,
                 self._settings.background_std), reason, may_be_more).find()
-        if found is None or found.log_odds > LEAST_NATS:
+        if self._test.believes(-np.inf if found is None else found.log_odds):
             return found
-        if found.log_odds > UNDECIDED_NATS:
+        if found is not None and found.log_odds > UNDECIDED_NATS:
             now_ns = window.frames[-1].stamp_ns
             for i, member in enumerate(self.members):
                 if found.replaced in (None, i):

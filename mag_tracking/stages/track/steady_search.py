@@ -27,6 +27,9 @@ N_DIPOLES = 3
 STEP_ALONG, BEYOND = 3.0, 12.0
 """[m] The grid has positions this far apart, up to so far beyond the outermost sensor."""
 
+SLOWEST = 0.2
+"""No vehicle comes that is slower than this share of the lowest starting speed."""
+
 N_STARTS, N_STEPS, TOLERANCE = 10, 12, 1e-3
 """So many starts that differ are refined, in so many steps, or until one improves the cost by less
 than this share."""
@@ -56,6 +59,8 @@ class PathPrior:
     """(7,)"""
     moment_std: FloatArray
     """(3 d,) [A m^2] of the combinations of moments."""
+    slowest: float
+    """[m/s] What is slower does not come: it was there before."""
 
     @classmethod
     def of(cls, vehicle: VehicleSettings, network: SensorNetwork) -> 'PathPrior':
@@ -76,7 +81,8 @@ class PathPrior:
                    np.array([0.0, 0.0, height, speed, 0.0, 0.0, length]),
                    np.array([np.inf, lateral_std, height_std, speed_std, vehicle.cross_speed_std,
                              vehicle.climb_std, length_std]),
-                   np.repeat([total / np.sqrt(N_DIPOLES)] + [difference] * (N_DIPOLES - 1), 3))
+                   np.repeat([total / np.sqrt(N_DIPOLES)] + [difference] * (N_DIPOLES - 1), 3),
+                   SLOWEST * min(vehicle.speeds))
 
     def nearest(self, theta: FloatArray) -> tuple[IntArray, FloatArray]:
         """The arrival line (n,) nearest in heading to paths theta (n, 7), and by how much [rad]."""
@@ -175,9 +181,10 @@ class SteadySearch:
                 np.concatenate([D - A @ moved, -moved / std[:, None], off_J], axis=1))
 
     def refined(self, theta: FloatArray, n_steps: int = N_STEPS) -> tuple[FloatArray, FloatArray]:
-        """Paths (n, 7) and costs (n,) after steps of Levenberg and Marquardt."""
+        """Paths (n, 7) after steps of Levenberg and Marquardt, and costs (n,); infinite where a
+        vehicle stands, or goes backwards."""
         path, cost, _, _ = refine(self._residual_and_jacobian, theta, n_steps, TOLERANCE)
-        return path, cost
+        return path, np.where(path[:, 3] >= self.prior.slowest, cost, np.inf)
 
     def best(self, starts: FloatArray, most: int) -> FloatArray:
         """At most so many paths (n, 7) that explain the frames best, the best one first."""
@@ -205,7 +212,7 @@ class SteadySearch:
             for second in self.beside(first).best(starts, most_second):
                 pair = self._refined_in_turn(first, second)
                 found.append((self._cost_of_pair(pair), pair))
-        return [pair for _, pair in sorted(found, key=lambda f: f[0])]
+        return [pair for cost, pair in sorted(found, key=lambda f: f[0]) if np.isfinite(cost)]
 
     def _refined_in_turn(self, first: FloatArray, second: FloatArray) -> FloatArray:
         """Both paths (2, 7), each refined a little while the other is not known."""
@@ -220,7 +227,8 @@ class SteadySearch:
         without = Marginalised(np.hstack([self.columns, *bases]))
         left = without(self.samples.y - self.known)
         off, _ = self.prior.residual_and_jacobian(pair)
-        return float(left @ left + without.log_determinant + (off**2).sum())
+        cost = float(left @ left + without.log_determinant + (off**2).sum())
+        return cost if (pair[:, 3] >= self.prior.slowest).all() else np.inf
 
 
 def _distinct(theta: FloatArray, cost: FloatArray, apart: FloatArray, most: int) -> IntArray:
