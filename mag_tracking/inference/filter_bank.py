@@ -108,7 +108,8 @@ class FilterBank:
         label, kind = np.delete(self.label, i, axis=1), np.delete(self.kind, i, axis=1)
         if n_targets == 2:
             label, kind = label[:, 0].copy(), kind[:, 0].copy()
-        return FilterBank(*_of_columns(self.x, self.P, columns), self.log_w.copy(), label, kind, self.origin.copy(), self.nis.copy())
+        return FilterBank(*_of_columns(self.x, self.P, columns), self.log_w.copy(), label, kind,
+                          self.origin.copy(), self.nis.copy())
 
     def copy(self) -> 'FilterBank':
         """The same bank with arrays of its own."""

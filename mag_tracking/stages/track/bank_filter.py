@@ -1,6 +1,7 @@
 """Prediction and update of a bank: where the target's physics meets the filter."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -44,11 +45,11 @@ def compiled_filter(model: SourceModel, observation: Observation
     sensors = (observation.positions, observation.R_sw, observation.n_angles,
                observation.n_own - observation.n_angles)
     if isinstance(model, RowVehicle):
-        row = (len(model.state_names), model.n_dipoles, list(model.acceleration_density),
-               list(model.induction), model.moment_drift, model.difference_drift,
-               model.turn_acceleration, model.turn_time, FASTEST_TURN)
-        return (core.RowVehicleFilter(*sensors, *row) if observation.n_targets == 1
-                else core.VehiclesFilter(*sensors, *row, observation.n_targets))
+        one = partial(core.RowVehicleFilter, *sensors) if observation.n_targets == 1 \
+            else partial(core.VehiclesFilter, *sensors, observation.n_targets)
+        return one(len(model.state_names), model.n_dipoles, list(model.acceleration_density),
+                   list(model.induction), model.moment_drift, model.difference_drift,
+                   model.turn_acceleration, model.turn_time, FASTEST_TURN)
     assert isinstance(model, Magnet) and observation.n_targets == 1
     return core.MagnetFilter(*sensors, list(model.acceleration_density), model.angular_density)
 
@@ -227,7 +228,7 @@ class BankFilter:
     def are_long(self, kind: IntArray) -> BoolArray:
         """(n,) whether any target of the kinds `kind` (n,) or (n, n_targets) is longer than a car.
         """
-        are_long: BoolArray = self._are_long[kind].reshape(len(kind), -1).any(axis=1)
+        are_long: BoolArray = np.any(self._are_long[kind].reshape(len(kind), -1), axis=1)
         return are_long
 
     def nearly_linear(self, x: FloatArray) -> FloatArray:

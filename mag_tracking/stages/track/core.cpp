@@ -332,9 +332,9 @@ RowVehicle row_vehicle(int n_states, int n_dipoles, Vector density, Vector induc
             turn_acceleration, turn_time, fastest_turn};
 }
 
-Vehicles vehicles(int n_states, int n_dipoles, Vector density, Vector induction,
+Vehicles vehicles(int count, int n_states, int n_dipoles, Vector density, Vector induction,
                   double moment_drift, double difference_drift, double turn_acceleration,
-                  double turn_time, double fastest_turn, int count) {
+                  double turn_time, double fastest_turn) {
     if (count < 1 || count > MOST_TARGETS)
         throw py::value_error("count: from 1 to " + std::to_string(MOST_TARGETS));
     return {row_vehicle(n_states, n_dipoles, density, induction, moment_drift, difference_drift,

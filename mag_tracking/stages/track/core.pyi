@@ -31,10 +31,9 @@ class VehiclesFilter(_Filter):
     """Of `count` vehicles whose fields add up."""
 
     def __init__(self, positions: FloatArray, R_sw: FloatArray, n_angles: int, n_errors: int,
-                 n_states: int, n_dipoles: int, density: Sequence[float],
+                 count: int, n_states: int, n_dipoles: int, density: Sequence[float],
                  induction: Sequence[float], moment_drift: float, difference_drift: float,
-                 turn_acceleration: float, turn_time: float, fastest_turn: float,
-                 count: int) -> None: ...
+                 turn_acceleration: float, turn_time: float, fastest_turn: float) -> None: ...
 
 class MagnetFilter(_Filter):
     def __init__(self, positions: FloatArray, R_sw: FloatArray, n_angles: int, n_errors: int,

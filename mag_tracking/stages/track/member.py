@@ -1,7 +1,7 @@
 """One target of a running track: its evidence, its doubts, and what is published of it."""
 
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.clock_evidence import ClockEvidence
 from mag_tracking.stages.track.disturbances import Unexplained
 from mag_tracking.stages.track.evidence import TrackEvidence
+from mag_tracking.stages.track.newcomer import Joint
 from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.plausibility import Plausibility
 from mag_tracking.stages.track.published_pose import ambiguities, published_track, smoothed_pose
@@ -95,9 +96,10 @@ class Member:
         """From now on the target is measured by these sensors."""
         self.opinion = SecondOpinion(sensors.network)
 
-    def begin_again(self) -> None:
+    def begin_again(self, sensors: SensorSubset) -> None:
         """What spoke against the track was the field of another vehicle."""
         self.evidence.forgive()
+        self.use(sensors)
         self._plausibility = Plausibility()
 
     def distance_from(self, stamps_ns: Sequence[int], path: FloatArray) -> float:
@@ -198,6 +200,13 @@ class Member:
         return Unexplained(self.id, self.begin_ns, self.evidence.largest, self.evidence.felt,
                            uniform)
 
+    def states_of(self, slot: int, n_one: int, states: Iterable[TrackState]) -> list[TrackState]:
+        """Its states since it began, which have this place among the `states` of all members, each
+        of which has `n_one`."""
+        rows = slice(n_one * slot, n_one * (slot + 1))
+        return [(stamp_ns, x[rows], P[rows, rows]) for stamp_ns, x, P in states
+                if stamp_ns >= self.begin_ns]
+
     def smoothed(self, bank: FilterBank, best: int, complete: bool, states: list[TrackState],
                  doubtful: bool) -> list[SmoothedPose]:
         """The `SmoothedPose`s of states of the hypothesis `best` of this member's `bank`.
@@ -212,3 +221,21 @@ class Member:
             ambiguous=ambiguous or self.evidence.doubted_filter(stamp_ns))
             for (stamp_ns, x, P), difference in zip(states, self.opinion.differences(states),
                                                     strict=True)]
+
+
+def in_order(members: Sequence[Member], new: Member | None, joint: Joint, n_one: int
+             ) -> list[Member]:
+    """Members, and a newcomer, in the order of the states of a `Joint`.
+
+    Where two vehicles take the place of one, that is the one of them which was where its poses
+    were. Each vehicle has `n_one` states.
+    """
+    others = list(members)
+    old = others.pop(joint.replaced) if joint.replaced is not None else None
+    if new is None or old is None:
+        return [*others, *([old] if old else []), *([new] if new else [])]
+    first = n_one * len(others)
+    paths = np.array([path[joint.bank.best(), first:] for path in joint.window.paths])
+    stamps = [frame.stamp_ns for frame in joint.window.frames]
+    away = [old.distance_from(stamps, paths[:, k * n_one:k * n_one + 2]) for k in (0, 1)]
+    return [*others, old, new] if away[0] <= away[1] else [*others, new, old]

@@ -34,9 +34,9 @@ def angle_priors(network: SensorNetwork, mounting_std: float) -> FloatArray:
 class Observation:
     """The field that a network has of hypotheses, and the states that belong to its sensors.
 
-    A state is as on top of `inference/hypothesis.hpp`: the states of `n_targets` targets of the same
-    model, whose fields add up, one after the other. Behind the targets' states come each
-    sensor's own: three mounting angles [rad] where they are estimated, and three model errors, in
+    A state is as on top of `inference/hypothesis.hpp`: the states of `n_targets` targets of one
+    model, whose fields add up, one after the other. Behind the targets' states come each sensor's
+    own: three mounting angles [rad] where they are estimated, and three model errors, in
     units of their size, where those last. They are what the target model leaves out near a
     vehicle, and stay alike for `error_time` (first-order Gauss-Markov), so that what is counted
     of them does not depend on the frame period. Without an `error_time` they are new every frame.

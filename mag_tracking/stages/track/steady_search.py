@@ -157,8 +157,9 @@ class SteadySearch:
         A = self._without(model.basis(theta))
         At = np.swapaxes(A, 1, 2)
         information = At @ A + np.diag(moment_std**-2.0)
-        return model, A, information, np.linalg.solve(information, (At @ self._y)[:, :, None])[
-            :, :, 0]
+        p = np.asarray(np.linalg.solve(information, (At @ self._y)[:, :, None])[:, :, 0],
+                       dtype=np.float64)
+        return model, A, information, p
 
     def cost(self, theta: FloatArray) -> FloatArray:
         """(n,) minus twice the log-density of the frames with a point on paths theta (n, 7)."""

@@ -1,0 +1,81 @@
+"""The frames of a window as the search for a vehicle takes them, without those that are known."""
+
+import numpy as np
+
+from mag_tracking.arrays import FloatArray
+from mag_tracking.stages.track.pass_samples import PassSamples
+from mag_tracking.stages.track.relinearisation import Window
+from mag_tracking.stages.track.steady_search import PathPrior, SteadySearch
+from mag_tracking.stages.track.vehicle_state import VehicleState
+from mag_tracking.stages.track.window_start import KnownVehicles
+from mag_tracking.units import NS
+
+MOST_ROWS = 320
+"""Samples that a search is of: of more frames than that only every other one, or fewer."""
+
+KNOWN_STD, KNOWN_SHARE = 0.7, 0.3
+"""[m], [m/s] By so much may vehicles that are tracked be off while another is sought; and by this
+share their moments."""
+
+
+class WindowSearch:
+    """Samples of a window, in which vehicles are sought.
+
+    Attributes
+    ----------
+    times : (n,) array, s
+        Of the frames, before the last one.
+    prior : PathPrior
+    """
+
+    def __init__(self, window: Window, vehicles: VehicleState) -> None:
+        """`vehicles` makes states of what is found."""
+        network, frames = vehicles.network, window.frames
+        self._window, self._vehicles = window, vehicles
+        self.times: FloatArray = np.array([(f.stamp_ns - frames[-1].stamp_ns) / NS
+                                           for f in frames])
+        step = -(-len(frames) * len(network) // MOST_ROWS)
+        self._thinned = np.arange(len(frames))[::-1][::step][::-1]
+        self.prior = PathPrior.of(vehicles.settings, network)
+        self.samples = PassSamples.of(network, [frames[k] for k in self._thinned],
+                                      frames[-1].stamp_ns, len(network))
+
+    def beside(self, known: 'KnownVehicles') -> SteadySearch:
+        """The search for a vehicle beside those that are known."""
+        samples = self.samples
+        if known.filter is None:
+            return SteadySearch(samples, self.prior, np.zeros(len(samples.y)), self._backgrounds())
+        path, t = known.path[self._thinned], self.times[self._thinned]
+        n, kind = len(path), np.array([known.kind])
+        fields = [known.filter.fields_at(path[k], kind, self._window.frames[i],
+                                         self._window.intervals[i])
+                  for k, i in enumerate(self._thinned.tolist())]
+        h, H = (np.array(part) for part in zip(*fields, strict=True))
+        W = samples.M @ np.swapaxes(
+            np.tile(self._vehicles.network.R_sw[samples.compared], (n, 1, 1)), 1, 2)
+        h = h[:, samples.compared].reshape(-1, 3)
+        columns = self._columns(H, path[-1], t, known.filter.observation.n_one)
+        columns = columns[:, samples.compared].reshape(len(W), 3, -1)
+        return SteadySearch(samples, self.prior, np.einsum('nij,nj->ni', W, h).ravel(),
+                            np.hstack([self._backgrounds(), (W @ columns).reshape(3 * len(W), -1)]))
+
+    def _backgrounds(self) -> FloatArray:
+        """(3 n, q) whitened columns of the backgrounds, each times its standard deviation."""
+        return self._vehicles.background_std * self.samples.backgrounds
+
+    def _columns(self, H: FloatArray, x: FloatArray, t: FloatArray, n_one: int) -> FloatArray:
+        """(n, n_sensors, 3, q) fields of one deviation of what is not known of the vehicles.
+
+        By the derivatives `H` (n, n_sensors, 3, n_t) along a path that ends with `x` (n_x,), at the
+        times `t` (n,) [s] before that. Each vehicle has `n_one` states.
+        """
+        out = []
+        for first in range(0, H.shape[-1], n_one):
+            part = H[..., first:first + n_one]
+            by_velocity = part[..., 3:6] + t[:, None, None, None] * part[..., :3]
+            hard = self._vehicles.hard_moments(x[first:first + n_one])
+            of_moment = part[..., 6:6 + hard.size].reshape(*part.shape[:3], -1, 3).mean(axis=3)
+            size = float(np.linalg.norm(hard.sum(axis=0)))
+            out += [KNOWN_STD * part[..., :3], KNOWN_STD * by_velocity,
+                    KNOWN_SHARE * size * of_moment]
+        return np.concatenate(out, axis=3)
