@@ -55,15 +55,25 @@ class StepByStep:
 class PlainFilter(StepByStep, BankFilter):
     """A `BankFilter` whose steps are taken one after the other, each for the whole bank."""
 
-    def __init__(self, network, model, settings):
-        super().__init__(network, model, settings)
+    def __init__(self, network, model, settings, n_targets=1):
+        super().__init__(network, model, settings, n_targets)
         self.model = model
+
+    def _propagate(self, x, dt, P):
+        """`SourceModel.propagate` of all targets, one after the other."""
+        n, n_one = self.observation.n_target, self.observation.n_one
+        moved, F, Q = np.empty_like(x), np.zeros((len(x), n, n)), np.zeros((len(x), n, n))
+        for first in range(0, n, n_one):
+            mine = slice(first, first + n_one)
+            moved[:, mine], F[:, mine, mine], Q[:, mine, mine] = self.model.propagate(
+                x[:, mine], dt, P[:, mine, mine])
+        return moved, F, Q
 
     def predict(self, bank, dt, x_lin=None):
         """Time update in place, linearised at `x_lin` or the bank; (Jacobian, decay)."""
         n_t = self.observation.n_target
         at = (bank.x if x_lin is None else x_lin)[:, :n_t]
-        x_target, F, Q = self.model.propagate(at, dt, bank.P[:, :n_t, :n_t])
+        x_target, F, Q = self._propagate(at, dt, bank.P[:, :n_t, :n_t])
         if x_lin is not None:
             x_target = x_target + (F @ (bank.x[:, :n_t] - at)[:, :, None])[:, :, 0]
         decay, variance = (v[0] for v in self.observation.drift(

@@ -1,5 +1,7 @@
 """The compiled filters against the same in NumPy, step by step, and what they refuse."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track import core
 from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.initiation_vehicle import start_vehicle
 from mag_tracking.stages.track.target import target_of
 from support.bundled import POINT
 from support.networks import line_network
@@ -17,7 +20,11 @@ SIGMA = 4e-9
 MANY = 23
 """With so many sensors the states of every target are enough for updates to change only half of the
 covariance (`HALVED_FROM`)."""
+TOGETHER = {'two rows that turn': 2, 'three points': 3}
+"""{case: vehicles that share a state}."""
 CASES = {
+    'two rows that turn': ('vehicle', {}),
+    'three points': ('vehicle', POINT),
     'row that turns': ('vehicle', {}),
     'row, straight on': ('vehicle', {'track.vehicle.turn_acceleration': 0.0}),
     'point': ('vehicle', POINT),
@@ -37,8 +44,9 @@ def case(name, n_sensors=3, n_hyp=6, seed=0):
     settings = settings_for(target, changes).track
     network, rng = line_network(n_sensors), np.random.default_rng(seed)
     model = target_of(settings, network).model
-    filters = BankFilter(network, model, settings), PlainFilter(network, model, settings)
-    names = model.state_names
+    n_targets = TOGETHER.get(name, 1)
+    filters = [of(network, model, settings, n_targets) for of in (BankFilter, PlainFilter)]
+    names = model.state_names * n_targets
     size = np.array([{'x': 3.0, 'y': 1.0, 'z': 0.3, 'v': 2.0, 'm': 50.0, 'D': 2.0, 'L': 1.0,
                       'w': 0.3}[n[0]] for n in names])
     if target == 'magnet':
@@ -47,15 +55,17 @@ def case(name, n_sensors=3, n_hyp=6, seed=0):
                   for _ in range(n_hyp)]) * 0.02 + 0.2 * np.eye(len(names))
     P = 0.5 * (P + np.swapaxes(P, 1, 2))
     bank = FilterBank.of_targets(
-        size * rng.standard_normal((n_hyp, len(names))) + np.eye(len(names))[2] * 2.0,
+        size * rng.standard_normal((n_hyp, len(names))) + np.isin(names, 'z') * 2.0,
         P * np.outer(size, size), np.zeros(n_hyp, dtype=int), n_sensors, 1e-8,
         filters[0].observation.own_covariance,
-        rng.integers(0, len(np.atleast_1d(settings.vehicle.lengths)), n_hyp)
+        rng.integers(0, len(np.atleast_1d(settings.vehicle.lengths)),
+                     (n_hyp, n_targets) if n_targets > 1 else n_hyp)
         if target == 'vehicle' else None)
     if settings.vehicle.turn_acceleration and target == 'vehicle':
         # Half of them go straight on.
-        bank.x[::2, len(names) - 1] = 0.0
-        bank.P[::2, len(names) - 1] = bank.P[::2, :, len(names) - 1] = 0.0
+        for w in np.flatnonzero(np.isin(names, 'w')):
+            bank.x[::2, w] = 0.0
+            bank.P[::2, w] = bank.P[::2, :, w] = 0.0
     frames = []
     for k in range(7):
         field = 3e-8 * rng.standard_normal((n_sensors, 3))
@@ -219,6 +229,67 @@ def test_of_a_path_that_is_nowhere_nothing_is_settled():
     along = compiled.run_along(bank, frames, intervals, paths, passes=1, step=0.5,
                                first_is_updated=False)
     assert np.isnan(along.unsettled[0]) and np.isfinite(along.unsettled[1])
+
+
+def test_vehicles_that_share_a_state_are_a_few():
+    for count in (0, core.MOST_TARGETS + 1):
+        with pytest.raises(ValueError, match='count: from 1 to 4'):
+            core.VehiclesFilter(np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), 0, 0, count, 12,
+                                *ROW)
+
+
+def test_two_vehicles_that_no_sensor_feels_at_once_are_filtered_like_two_alone():
+    """Each passes sensors of its own, far from those of the other."""
+    settings = settings_for('vehicle', {**POINT, 'track.background_std': 1e-8}).track
+    near, rng = line_network(2), np.random.default_rng(1)
+    far = dataclasses.replace(line_network(2), positions=near.positions + [5e4, 0.0, 0.0],
+                              names=('a', 'b'), topics=('/a', '/b'))
+    both = dataclasses.replace(
+        line_network(4), positions=np.vstack([near.positions, far.positions]),
+        R_ws=np.concatenate([near.R_ws, far.R_ws]))
+    model = target_of(settings, near).model
+    banks = [start_vehicle(settings.vehicle, network, FieldFrame(
+        0, np.full((2, 3), 1e-8), np.tile(SIGMA**2 * np.eye(3), (2, 1, 1)), np.ones(2),
+        np.zeros(2), True), settings.background_std, BankFilter(
+            network, model, settings).observation.own_covariance).alone(3)
+        for network in (near, far)]
+    filters = [BankFilter(network, model, settings) for network in (near, far)]
+    together = joined(*banks, len(model.state_names))
+    joint = BankFilter(both, model, settings, 2)
+    for k in range(6):
+        field = 3e-8 * rng.standard_normal((4, 3))
+        C = np.tile(SIGMA**2 * np.eye(3), (4, 1, 1))
+        log_likelihood = joint.advance(together, FieldFrame(
+            k, field, C, np.ones(4), np.zeros(4), True), 0.1)[1]
+        of_each = [f.advance(b, FieldFrame(k, field[rows], C[rows], np.ones(2), np.zeros(2), True),
+                             0.1)[1] for f, b, rows in zip(
+                                 filters, banks, (slice(0, 2), slice(2, 4)), strict=True)]
+        assert log_likelihood[0] == pytest.approx(of_each[0][0] + of_each[1][0], rel=1e-9)
+        for i, bank in enumerate(banks):
+            view, n_t = together.of_target(i, len(model.state_names)), len(model.state_names)
+            np.testing.assert_allclose(view.x[0, :n_t], bank.x[0, :n_t], rtol=1e-9, atol=1e-9)
+            std = np.sqrt(np.diagonal(bank.P[0])[:n_t])
+            assert np.abs((view.P[0, :n_t, :n_t] - bank.P[0, :n_t, :n_t])
+                          / np.outer(std, std)).max() <= 1e-9
+
+
+def joined(a, b, n_t):
+    """A bank of the targets of two, one hypothesis each, with their sensors side by side."""
+    n_own = (a.x.shape[1] - n_t) // 2 - 3
+    places = [(bank, np.arange(n_t), i * n_t + np.arange(n_t)) for i, bank in enumerate((a, b))]
+    for i, bank in enumerate((a, b)):
+        own = np.arange(2 * n_own)
+        places.append((bank, n_t + own, 2 * n_t + i * 2 * n_own + own))
+        background = np.arange(6)
+        places.append((bank, n_t + 2 * n_own + background,
+                       2 * n_t + 4 * n_own + 6 * i + background))
+    n_x = 2 * a.x.shape[1]
+    x, P = np.zeros((1, n_x)), np.zeros((1, n_x, n_x))
+    for bank, of, to in places:
+        x[0, to] = bank.x[0, of]
+        P[0, to[:, None], to] = bank.P[0][np.ix_(of, of)]
+    both = [np.stack([getattr(a, name), getattr(b, name)], axis=1) for name in ('label', 'kind')]
+    return FilterBank(x, P, np.zeros(1), *both, np.zeros(1, dtype=int), np.full((1, 4), np.nan))
 
 
 ROW = (1, [1.0] * 3, [1.0] * 3, 0.1, 0.1, 0.0, 1.0, 1.0)

@@ -1,0 +1,40 @@
+"""The recordings of several vehicles at once, tracked, and how well each vehicle is followed.
+
+Those in `test/data/busy` are some of nine; `folder` takes the others.
+"""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+
+from mag_tracking.apps.first_pass import first_pass_of
+from mag_tracking.apps.readings import recorded
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.records import Readings, Track
+from support.bundled import DATA
+from support.busy_worlds import score
+from support.passes import network_of
+
+BUSY = DATA / 'busy'
+NAMES = tuple(sorted(p.name.removesuffix('.truth.json') for p in BUSY.glob('*.truth.json')))
+
+
+def tracked_recording(name, folder=BUSY, changes=None):
+    """(`Score`, [`Track`], `Pipeline`) of a recording."""
+    truth = json.loads((folder / f'{name}.truth.json').read_text())
+    # What an installer would know.
+    network = replace(network_of(truth['sensors_m']),
+                      earth_field=np.array(truth['earth_field_T']))
+    pipeline = Pipeline(network, settings_for('vehicle', changes))
+    recording = Recording(folder / f'{name}.mcap')
+    reader = SampleReader(recording, network)
+    first_pass_of(recording, network, pipeline.settings.calibrate).apply(pipeline.calibrate)
+    records = [r for readings in reader.readings() for r in pipeline.feed(readings)]
+    records += pipeline.flush()
+    poses = [r for r in records if isinstance(r, Track) and not r.ended]
+    vehicles = [(stamps / 1e9, position[:, :2]) for stamps, position, _ in
+                recorded(recording, reader, Readings.joined([])).truth.values()]
+    return score(poses, vehicles), poses, pipeline
