@@ -200,12 +200,13 @@ class Member:
         return Unexplained(self.id, self.begin_ns, self.evidence.largest, self.evidence.felt,
                            uniform)
 
-    def states_of(self, slot: int, n_one: int, states: Iterable[TrackState]) -> list[TrackState]:
-        """Its states since it began, which have this place among the `states` of all members, each
-        of which has `n_one`."""
+    def states_of(self, slot: int, n_one: int, states: Iterable[TrackState],
+                  end_ns: float = np.inf) -> list[TrackState]:
+        """Its states from when it began until before `end_ns`, which have this place among the
+        `states` of all members, each of which has `n_one`."""
         rows = slice(n_one * slot, n_one * (slot + 1))
         return [(stamp_ns, x[rows], P[rows, rows]) for stamp_ns, x, P in states
-                if stamp_ns >= self.begin_ns]
+                if self.begin_ns <= stamp_ns < end_ns]
 
     def smoothed(self, bank: FilterBank, best: int, complete: bool, states: list[TrackState],
                  doubtful: bool) -> list[SmoothedPose]:

@@ -76,6 +76,22 @@ class Joint:
     adds: bool
     """There is a vehicle more."""
 
+    def doubtful(self, n_one: int) -> tuple[int, ...]:
+        """Places of vehicles that may be others, each of `n_one` states.
+
+        One that was found elsewhere; and two that took the place of one and go the same way: a
+        long vehicle of which the model leaves much out looks like two.
+        """
+        if self.replaced is None:
+            return ()
+        n = self.bank.label.shape[1] if self.bank.label.ndim > 1 else 1
+        if not self.adds:
+            return (n - 1,)
+        places = (n - 2, n - 1)
+        x = self.bank.x[self.bank.best()]
+        first, second = (x[k * n_one + 3:k * n_one + 5] for k in places)
+        return places if first @ second > 0.0 else ()
+
 
 class NewcomerSearch:
     """Explains a window with one vehicle more."""
@@ -276,12 +292,19 @@ class NewcomerSearch:
             bank, window.frames, window.intervals, paths, passes=PASSES, step=STEP,
             first_is_updated=window.is_updated)
         usable: BoolArray = np.isfinite(along.log_likelihood) \
-            & np.isfinite(paths).all(axis=(1, 2)) & np.isfinite(bank.x).all(axis=1)
+            & np.isfinite(paths).all(axis=(1, 2)) & np.isfinite(bank.x).all(axis=1) \
+            & [self._all_come(s, x) for s, x in zip(starts, bank.x, strict=True)]
         log_likelihood = np.where(usable, along.log_likelihood, -np.inf)
         log_w = log_likelihood + [s.log_w for s in starts] - 0.5 * np.square(
             [overlap_depth(path, self._n_one, len(s.kind), self._vehicles.length_column) / DEPTH_STD
              for s, path in zip(starts, paths, strict=True)])
         return bank, log_likelihood, log_w, paths
+
+    def _all_come(self, start: WindowStart, x: FloatArray) -> bool:
+        """Whether the vehicles that were sought are as fast, in the state `x` (n_x,), as what
+        comes: what stands was there before."""
+        return all(np.hypot(*x[i * self._n_one + 3:i * self._n_one + 5])
+                   >= self._search.prior.slowest for i in start.are_new)
 
     def _made(self, starts: Sequence[WindowStart], bank: FilterBank, log_likelihood: FloatArray,
               log_w: FloatArray, paths: FloatArray, log_odds: float) -> Joint | None:

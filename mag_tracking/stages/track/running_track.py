@@ -38,6 +38,9 @@ from mag_tracking.units import NS
 UNDECIDED_S = 1.0
 """[s] Poses are in doubt for so long after another explanation was about as probable."""
 
+DOUBTED_S = 3.0
+"""[s] Vehicles of an explanation that may be others are in doubt for so long."""
+
 TrackRecord = Track | SmoothedPose | Disturbance
 
 
@@ -149,9 +152,8 @@ class RunningTrack:
         """
         if self.ended is not None:
             return []
-        if not self._target.starts_anywhere:
-            for member in self.members:
-                member.evidence.watch(self._seeing.part_of(frame))
+        for member in () if self._target.starts_anywhere else self.members:
+            member.evidence.watch(self._seeing.part_of(frame))
         advance = self._bank.advance(self._bank.sensors.part_of(frame), dt)
         if not self._weigh(advance):
             return self.end('no hypothesis explains the field')
@@ -318,10 +320,9 @@ class RunningTrack:
         """Go on with another explanation; a newcomer becomes the member `id`."""
         begin_ns, now_ns = (joint.window.frames[k].stamp_ns for k in (0, -1))
         n, sensors = self._bank.one.n_target, self._bank.sensors
-        before = [state for state in self._bank.smoothed(self.bank.best(), False)
-                  if state[0] < begin_ns]
+        states = self._bank.smoothed(self.bank.best(), False)
         for member in self.members:
-            member.early += member.states_of(member.slot, n, before)
+            member.early += member.states_of(member.slot, n, states, begin_ns)
             member.begin_again(sensors)
         new = None
         if joint.adds:
@@ -329,18 +330,21 @@ class RunningTrack:
                          now_ns - round(self._settings.lookback_s * NS))
             new.evidence.doubt_start(False, sensors.whole, False)
             new.evidence.explanation.add(joint.log_odds, now_ns, self._settings.explained_ratio)
+        doubtful = joint.doubtful(n)
         self._bank.resume(joint)
         self.members, self._is_full = in_order(self.members, new, joint, n), False
         for slot, member in enumerate(self.members):
             member.slot = slot
             member.evidence.add(joint.log_odds)
+            if slot in doubtful:
+                member.evidence.doubt_for(doubts.ANOTHER_VEHICLE, now_ns, DOUBTED_S)
 
     def hand_over(self) -> None:
         """Switch to the sensors near where the target is going, if those used are others."""
         best, self._handover_due = self._handover_due, None
         if best is None or self.ended is not None or len(self.members) > 1:
             return
-        before = self._bank.sensors.rows
+        rows = self._bank.sensors.rows
         if self._bank.hand_over(best):
-            self.members[0].opinion.conclude(self._clocks, before)
+            self.members[0].opinion.conclude(self._clocks, rows)
             self._use(True)

@@ -171,7 +171,7 @@ class SteadySearch:
             + (off**2).sum(axis=1) + np.linalg.slogdet(information * np.outer(std, std))[1]
         return np.where(np.isfinite(cost), cost, np.inf)
 
-    def _residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Of measurements, moments and path; with the Jacobian of Kaufman (1975)."""
         std = self.prior.moment_std
         model, A, information, p = self._solved(theta, std)
@@ -184,7 +184,7 @@ class SteadySearch:
     def refined(self, theta: FloatArray, n_steps: int = N_STEPS) -> tuple[FloatArray, FloatArray]:
         """Paths (n, 7) after steps of Levenberg and Marquardt, and costs (n,); infinite where a
         vehicle stands, or goes backwards."""
-        path, cost, _, _ = refine(self._residual_and_jacobian, theta, n_steps, TOLERANCE)
+        path, cost, _, _ = refine(self.residual_and_jacobian, theta, n_steps, TOLERANCE)
         return path, np.where(path[:, 3] >= self.prior.slowest, cost, np.inf)
 
     def best(self, starts: FloatArray, most: int) -> FloatArray:

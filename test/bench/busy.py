@@ -1,0 +1,147 @@
+"""`make bench`: several vehicles at once: who is found, how well, and what it costs.
+
+`--data FOLDER` takes the recordings of another folder (`*.mcap` with `*.truth.json`).
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from bench.figures import Figures
+from mag_tracking.apps.track import track
+from mag_tracking.pipeline import settings_for
+from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.initiation_vehicle import start_vehicle, vehicle_model
+from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
+from support.busy_recordings import BUSY, tracked_recording
+from support.busy_worlds import NETWORKS, busy, tracked
+from support.random_passes import KINDS, are_wrong, one_random_pass
+
+AIMS = {'meeting': (1.0, 4.0, 1.0), 'meeting more': (0.7, 3.0, 1.0), 'following': (0.9, 4.0, 1.0),
+        'traffic': (np.inf, np.inf, 11 / 12)}
+"""{recordings: median RMS [m], median NEES of two, share of vehicles found}."""
+LEAST_MEETING = 15 / 16
+"""With two sensors one of sixteen may be missed."""
+MOST_WRONG, MOST_COST = 0.01, 4.0
+N_HYP, RUNS = 20, 25
+
+
+def aims_of(name):
+    """(RMS [m], NEES, share found) of a recording, by its name."""
+    kind = next((k for k in ('meeting', 'following', 'traffic') if name.startswith(k)), 'traffic')
+    rms, nees, found = AIMS['meeting more' if kind == 'meeting' and '2_sensors' not in name
+                            else kind]
+    return rms, nees, LEAST_MEETING if name.startswith('meeting_2') else found
+
+
+def shown(items, what):
+    """The items, with a bar on a terminal."""
+    return tqdm(items, desc=what, disable=None, leave=False)
+
+
+def recordings(figures, folder):
+    """[(poses without a flag, of them wrong)] of the recordings."""
+    counted = []
+    for path in shown(sorted(folder.glob('*.truth.json')), 'recordings'):
+        name = path.name.removesuffix('.truth.json')
+        got, _, _ = tracked_recording(name, folder)
+        rms, nees, found = aims_of(name)
+        n = len(got.rms)
+        figures.add(f'{name}: found', float(got.is_found.mean()), '', found, True,
+                    f' ({got.is_found.sum()} of {n})')
+        figures.add(f'{name}: RMS', float(np.nanmedian(got.rms)), 'm', rms)
+        figures.add(f'{name}: NEES', float(np.nanmedian(got.nees)), '', nees)
+        figures.add(f'{name}: tracks of nobody', got.n_extra, '', 0)
+        counted.append((got.n_sure, got.n_wrong))
+    return counted
+
+
+def simulated(figures, seeds):
+    """[(poses without a flag, of them wrong)] of worlds of the second simulator."""
+    counted = []
+    for how in ('meeting', 'following', 'traffic'):
+        scores = [tracked(busy(how, n, 'boxes', seed))[0]
+                  for n in (2, 4) for seed in shown(range(seeds), how)]
+        found = np.concatenate([s.is_found for s in scores])
+        figures.add(f'boxes, {how}: found', float(found.mean()), '', note=f' (of {len(found)})')
+        figures.add(f'boxes, {how}: RMS',
+                    float(np.nanmedian(np.concatenate([s.rms for s in scores]))), 'm')
+        figures.add(f'boxes, {how}: tracks of nobody', sum(s.n_extra for s in scores), '')
+        counted += [(s.n_sure, s.n_wrong) for s in scores]
+    return counted
+
+
+def of_one(passes):
+    """[(poses without a flag, of them wrong)] of single vehicles: the recordings, and passes of
+    each kind of the second simulator."""
+    counted = []
+    for name in shown(VEHICLES, 'vehicles'):
+        result = track(vehicle_path(name), NETWORK_FILE)
+        poses = result.poses[~result.poses['ambiguous']]
+        t, true, _ = next(iter(result.truth.values()))
+        error = poses['position'][:, :2] - np.stack([np.interp(
+            poses['stamp_ns'], t, true[:, k]) for k in (0, 1)], axis=1)
+        size = np.hypot(*error.T)
+        along = np.sqrt(np.einsum('ni,nij,nj->n', error, poses['covariance'][:, :2, :2], error))
+        counted.append((len(poses), int(are_wrong(size, along / np.maximum(size, 1e-9)).sum())))
+    for kind in KINDS:
+        for seed in shown(range(passes), kind):
+            got = one_random_pass('boxes', kind, seed)
+            counted.append((int((~got.ambiguous).sum()), int(got.sure_and_wrong.sum())))
+    return counted
+
+
+def cost():
+    """Time of a frame of two vehicles with two sensors over that of one, as many hypotheses."""
+    settings, network = settings_for('vehicle').track, NETWORKS[2]
+    model, C = vehicle_model(settings.vehicle, network), np.tile(3.6e-17 * np.eye(3), (2, 1, 1))
+    frame = FieldFrame(0, np.full((2, 3), 2e-8), C, np.full(2, 4), np.zeros(2), True)
+    filters = [BankFilter(network, model, settings, n) for n in (1, 2)]
+    one = start_vehicle(settings.vehicle, network, frame, settings.background_std,
+                        filters[0].observation.own_covariance).rows(np.arange(N_HYP))
+    n = len(model.state_names)
+    two = one.copy()
+    two.x = np.insert(one.x, [n] * n, one.x[::-1, :n], axis=1)
+    two.P = np.zeros((N_HYP, two.x.shape[1], two.x.shape[1]))
+    rest = np.append(np.arange(n), np.arange(2 * n, two.x.shape[1]))
+    two.P[:, rest[:, None], rest] = one.P
+    two.P[:, n:2 * n, n:2 * n] = one.P[::-1, :n, :n]
+    two.label, two.kind = (np.stack([a, a[::-1]], axis=1) for a in (one.label, one.kind))
+    best = [np.inf, np.inf]
+    for _ in range(RUNS):
+        for k, bank in enumerate((one, two)):
+            b = bank.copy()
+            begin = time.perf_counter()
+            filters[k].advance(b, frame, 0.08)
+            filters[k].run_along(b, [frame] * 25, [0.08] * 25,
+                                 np.repeat(b.x[:, None], 25, axis=1), passes=3, step=0.5,
+                                 first_is_updated=True)
+            best[k] = min(best[k], time.perf_counter() - begin)
+    return best[1] / best[0]
+
+
+def main():
+    """Print the figures; returns 1 where an aim is missed."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument('--data', type=Path, metavar='FOLDER', default=BUSY)
+    parser.add_argument('--seeds', type=int, default=3, help='worlds of each kind')
+    parser.add_argument('--passes', type=int, default=33, help='of each kind of single vehicle')
+    given = parser.parse_args()
+    figures = Figures('busy')
+    print('Several vehicles at once')
+    counted = np.array([*recordings(figures, given.data), *simulated(figures, given.seeds),
+                        *of_one(given.passes)])
+    sure, wrong = counted.sum(axis=0)
+    figures.add('poses without a flag that are wrong', wrong / sure, '', MOST_WRONG,
+                note=f' ({wrong} of {sure})')
+    figures.add('two vehicles together over one', cost(), 'times', MOST_COST)
+    return figures.save()
+
+
+if __name__ == '__main__':
+    sys.exit(main())

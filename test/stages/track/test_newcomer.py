@@ -1,0 +1,144 @@
+"""When another vehicle is sought in the frames of a track, and what becomes of its members."""
+
+import numpy as np
+import pytest
+
+from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.records import SmoothedPose, Track
+from mag_tracking.stages.track.newcomer_test import (
+    AGAIN_NATS,
+    AGAIN_S,
+    LEAST_NATS,
+    LONG,
+    LONG_AGAIN_S,
+    ODD,
+    NewcomerTest,
+)
+from mag_tracking.stages.track.window_start import in_order_of, inserted, overlap_depth
+from mag_tracking.units import NS
+from support import busy_worlds
+from support.busy_worlds import NETWORKS, passing, world
+
+PERIOD = round(0.08 * NS)
+
+
+def asked(nis, n=20, rejected=False, is_long=False):
+    """[(frame, reason)] for which a track with innovations of this size is compared."""
+    test, found = NewcomerTest(), []
+    for k in range(n):
+        test.add(nis, 6, k * PERIOD, rejected, is_long)
+        reason = test.due(k * PERIOD)
+        found += [] if reason is None else [(k, reason)]
+    return found
+
+
+def test_innovations_as_they_should_be_ask_for_nobody():
+    assert asked(6.0) == []
+
+
+@pytest.mark.parametrize('given', [{'nis': 30.0}, {'nis': 1.0, 'rejected': True}])
+def test_improbable_innovations_and_rejected_sensors_ask_for_a_newcomer(given):
+    found = asked(**given)
+    assert {reason for _, reason in found} == {ODD}
+    # Not in every frame: a search takes longer than a frame.
+    assert np.diff([k for k, _ in found]).min() * PERIOD >= AGAIN_S * NS
+
+
+def test_a_long_vehicle_is_compared_less_and_less_often():
+    found = asked(6.0, n=60, is_long=True)
+    assert {reason for _, reason in found} == {LONG}
+    waits = np.diff([k for k, _ in found]) * PERIOD / NS
+    assert waits[0] >= LONG_AGAIN_S and (np.diff(waits) > 0.0).all()
+
+
+def test_what_is_less_probable_is_believed_the_second_time():
+    test, between = NewcomerTest(), 0.5 * (AGAIN_NATS + LEAST_NATS)
+    assert test.believes(LEAST_NATS + 0.1)
+    assert [test.believes(odds) for odds in (between, between)] == [False, True]
+    assert [test.believes(odds) for odds in (between, 0.0, between)] == [False] * 3
+
+
+def test_vehicles_in_one_lane_may_not_be_in_each_other():
+    path = np.zeros((2, 2 * 7))
+    path[:, 3], path[:, 10] = 10.0, 10.0
+    path[:, 6], path[:, 13] = 3.0, 5.0
+    for ahead, aside, depth in ((20.0, 0.0, 0.0), (3.0, 0.0, 2.0), (3.0, 3.5, 0.0)):
+        path[:, 7], path[:, 8] = [20.0, ahead], aside
+        # The rows reach 4 m, and the bodies one more.
+        assert overlap_depth(path, 7, 2, 6) == pytest.approx(depth)
+
+
+def test_a_block_goes_into_a_covariance_without_correlation():
+    P = inserted(np.full((3, 3), 2.0), np.full((2, 2), 5.0), 1)
+    rows = [0, 3, 4]
+    assert (P[np.ix_(rows, rows)] == 2.0).all() and (P[1:3, 1:3] == 5.0).all()
+    assert not P[np.ix_(rows, [1, 2])].any()
+
+
+def test_pairs_are_put_into_the_order_of_the_first():
+    first = np.array([[0.0, 0.0], [10.0, 0.0]])
+    for pair in (first + 1.0, (first + 1.0)[::-1]):
+        np.testing.assert_array_equal(in_order_of(first, pair), first + 1.0)
+
+
+def test_a_member_alone_is_the_marginal_of_all():
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((2, 9, 9))
+    bank = FilterBank(rng.standard_normal((2, 9)), root @ np.swapaxes(root, 1, 2),
+                      np.log([0.4, 0.6]), np.array([[0, 1], [2, 1]]), np.array([[1, 0], [1, 2]]),
+                      np.arange(2), np.zeros((2, 1)))
+    for i, others in ((0, 1), (1, 0)):
+        columns = [*range(3 * i, 3 * i + 3), 6, 7, 8]
+        view, rest = bank.of_target(i, 3), bank.without_target(others, 3)
+        for one in (view, rest):
+            np.testing.assert_array_equal(one.x, bank.x[:, columns])
+            np.testing.assert_array_equal(one.P, bank.P[:, columns][:, :, columns])
+            np.testing.assert_array_equal(one.label, bank.label[:, i])
+            np.testing.assert_array_equal(one.kind, bank.kind[:, i])
+            np.testing.assert_array_equal(one.log_w, bank.log_w)
+
+
+@pytest.fixture(scope='module')
+def meeting():
+    """(`World`, records, pipeline) of two cars that meet at four sensors."""
+    rng = np.random.default_rng(3)
+    a_world = world(NETWORKS[4], [passing(rng, 'clouds', 12.0, 1, 12.0),
+                                  passing(rng, 'clouds', 12.4, -1, 15.0)], 20.0, rng, rate=50.0)
+    pipeline = Pipeline(a_world.network, settings_for('vehicle'))
+    return a_world, pipeline.feed(a_world.readings) + pipeline.flush(), pipeline
+
+
+def test_two_that_meet_keep_their_tracks(meeting):
+    a_world, records, pipeline = meeting
+    tracks = [r for r in records if isinstance(r, Track)]
+    assert {t.id for t in tracks} == {1, 2} and pipeline.track.counts['tracks of newcomers'] == 1
+    score = busy_worlds.score([t for t in tracks if not t.ended],
+                              [(a_world.t, p) for p in a_world.positions])
+    assert score.is_found.all() and score.rms.max() <= 1.0, str(score)
+    assert sum(t.ended for t in tracks) == 2
+
+
+def test_they_are_smoothed_together(meeting):
+    """Each once, in order, and nearer to the truth than the poses were."""
+    a_world, records, _ = meeting
+    for id in (1, 2):
+        poses = [r for r in records if isinstance(r, SmoothedPose) and r.id == id]
+        stamps = [p.stamp_ns for p in poses]
+        assert stamps == sorted(set(stamps)) and len(stamps) > 10
+        error = min(busy_worlds.errors_of(poses, a_world.t, position)[0].mean()
+                    for position in a_world.positions)
+        assert error <= 0.6
+
+
+def test_it_does_not_depend_on_how_the_readings_are_split(meeting):
+    a_world, records, _ = meeting
+    pipeline = Pipeline(a_world.network, settings_for('vehicle'))
+    again = []
+    for start in range(0, len(a_world.readings), 37):
+        again += pipeline.feed(a_world.readings.part(slice(start, start + 37)))
+    again += pipeline.flush()
+    for kind in (Track, SmoothedPose):
+        a, b = ([(r.id, r.stamp_ns, *r.position) for r in found if isinstance(r, kind)]
+                for found in (records, again))
+        assert a == b

@@ -1,0 +1,101 @@
+"""Vehicles on straight paths that are sought in the frames of a window."""
+
+import numpy as np
+import pytest
+
+from mag_tracking.physics.passes import RowPass
+from mag_tracking.pipeline import settings_for
+from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track.pass_samples import PassSamples
+from mag_tracking.stages.track.steady_search import PathPrior, SteadySearch
+from mag_tracking.units import NS
+from support.busy_worlds import NETWORKS
+
+NOISE = 6e-9
+VEHICLE = settings_for('vehicle').track.vehicle
+FIRST = np.array([4.0, -1.8, 0.5, 12.0, 0.0, 0.0, 3.0])
+SECOND = np.array([-2.0, 1.7, 0.6, 15.0, np.pi, 0.0, 2.5])
+MOMENTS = {id(FIRST): [120.0, -90.0, -100.0], id(SECOND): [-60.0, 130.0, -110.0]}
+
+
+def field_of(path, network, t):
+    """(n, n_sensors, 3) [T] of a row of three dipoles on a path, time zero at the last frame."""
+    n = len(network)
+    velocity = path[3] * np.array([np.cos(path[4]), np.sin(path[4]), 0.0])
+    model = RowPass(np.repeat(t, n), np.tile(network.positions, (len(t), 1)),
+                    np.tile(np.eye(3), (n * len(t), 1, 1)), 3)
+    moments = np.tile(MOMENTS[id(path)], 3)
+    p = np.linalg.solve(model.combinations, moments)
+    basis = model.basis(np.concatenate([path[:3], velocity, path[6:]])[None])[0]
+    return (basis @ p).reshape(len(t), n, 3)
+
+
+def search_of(*paths, n_sensors=4, seed=0):
+    """`SteadySearch` in two seconds of frames with these vehicles, and its starts."""
+    network, rng = NETWORKS[n_sensors], np.random.default_rng(seed)
+    t = np.arange(-24, 1) * 0.08
+    field = sum(field_of(path, network, t) for path in paths)
+    field = field + NOISE * rng.standard_normal(field.shape)
+    C = np.tile(NOISE**2 * np.eye(3), (len(network), 1, 1))
+    frames = [FieldFrame(round(s * NS), f, C, np.full(len(network), 4), np.zeros(len(network)),
+                         True) for s, f in zip(t, field, strict=True)]
+    samples = PassSamples.of(network, frames, 0, len(network))
+    prior = PathPrior.of(VEHICLE, network)
+    return (SteadySearch(samples, prior, np.zeros(len(samples.y)), 2e-8 * samples.backgrounds),
+            prior.starts(VEHICLE, network))
+
+
+def assert_near(path, truth, where=0.5, speed=1.0):
+    assert np.hypot(*(path[:2] - truth[:2])) <= where, (path, truth)
+    assert abs(path[3] - truth[3]) <= speed and abs(np.cos(path[4] - truth[4]) - 1.0) <= 0.02
+
+
+@pytest.mark.parametrize('truth', [FIRST, SECOND])
+def test_a_vehicle_alone_is_found(truth):
+    search, starts = search_of(truth)
+    best = search.best(starts, 3)
+    assert_near(best[0], truth)
+    total = search.moments(best[0]).sum(axis=0)
+    np.testing.assert_allclose(total, 3.0 * np.array(MOMENTS[id(truth)]), atol=60.0)
+
+
+@pytest.mark.parametrize('n_sensors', [2, 4])
+def test_two_that_meet_are_found_whichever_comes_first(n_sensors):
+    search, starts = search_of(FIRST, SECOND, n_sensors=n_sensors)
+    pair = search.pairs(starts, 3, 2)[0]
+    pair = pair if pair[0, 0] > pair[1, 0] else pair[::-1]
+    assert_near(pair[0], FIRST, 1.5, 1.5)
+    assert_near(pair[1], SECOND, 1.5, 1.5)
+
+
+def test_beside_a_known_one_the_other_is_found():
+    search, starts = search_of(FIRST, SECOND)
+    assert_near(search.beside(FIRST).best(starts, 1)[0], SECOND, 1.0, 1.5)
+
+
+def test_what_is_not_known_of_a_known_field_is_not_taken_for_a_vehicle():
+    """Of a vehicle alone that is known, noise is left: no path explains more than another."""
+    search, starts = search_of(FIRST)
+    alone, beside = search.cost(starts), search.beside(FIRST).cost(starts)
+    assert np.ptp(alone) > 1000.0
+    # The prior of a path and its moments costs up to some dozens.
+    assert np.ptp(beside) < 100.0
+
+
+def test_residuals_have_the_stated_derivative():
+    """With Kaufman's Jacobian the gradient of the cost is exact."""
+    search, _ = search_of(FIRST)
+    theta = (FIRST + [0.3, 0.2, 0.1, -0.5, 0.02, 0.01, 0.3])[None]
+    r, J = search.residual_and_jacobian(theta)
+    gradient = -2.0 * np.einsum('nyi,ny->ni', J, r)[0]
+    step = 1e-5
+    for k in range(7):
+        moved = np.repeat(theta, 2, axis=0)
+        moved[:, k] += [step, -step]
+        cost = (search.residual_and_jacobian(moved)[0]**2).sum(axis=1)
+        assert gradient[k] == pytest.approx((cost[0] - cost[1]) / (2.0 * step), rel=2e-2, abs=0.5)
+
+
+def test_what_stands_or_goes_backwards_is_not_found():
+    search, starts = search_of(FIRST)
+    assert (search.best(starts, 5)[:, 3] >= 0.2 * min(VEHICLE.speeds)).all()
