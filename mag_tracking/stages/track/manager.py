@@ -41,8 +41,8 @@ of any frame of the lost track: twice the field. In the tail of a pass the field
 class TrackManager:
     """Frames with a verdict to `Track`s, one a frame while a target is present.
 
-    With them come `SmoothedPose`s: each track's when it ends, and those of a fixed lag. At most
-    one track is started at a time; all that run are maintained alike.
+    With them come `SmoothedPose`s: each track's when it ends, and those of a fixed lag. While a
+    track runs, further vehicles become members of it.
     """
 
     def __init__(self, network: SensorNetwork, settings: TrackSettings,
