@@ -103,7 +103,8 @@ class TrackerNode(StageNode):
         self._detections_3d = self.publisher(Detection3DArray, '~/detections_3d', RESULTS)
         self._sensor_markers = self.publisher(MarkerArray, '~/sensor_markers', LATCHED)
         self._sensor_markers.publish(to_message(MarkerArray, sensor_markers(self.network)))
-        self._path: deque[PoseStamped] = deque(maxlen=LONGEST_PATH)
+        # The poses of each running track.
+        self._paths: dict[int, deque[PoseStamped]] = {}
         self._is_silent, self._latest_id = False, -1
         self._doubtful: dict[str, DoubtfulTimes] = {}
         if is_fed:
@@ -199,10 +200,11 @@ class TrackerNode(StageNode):
             elif not record.ambiguous or self.settings.track.ambiguous_poses == BEST:
                 self._smoothed_pose.publish(to_message(
                     PoseWithCovarianceStamped, smoothed_pose_dict(record, self.network.frame)))
-        if whole:
+        for id in dict.fromkeys(pose.id for pose in whole):
+            mine = [pose for pose in whole if pose.id == id]
             self._smoothed.publish(to_message(
-                SmoothedTrack, smoothed_track_dict(whole, self.network.frame)))
-            self._smoothed_path.publish(self._path_of(whole))
+                SmoothedTrack, smoothed_track_dict(mine, self.network.frame)))
+            self._smoothed_path.publish(self._path_of(mine))
 
     def _path_of(self, poses: list[SmoothedPose]) -> Path:
         """nav_msgs/Path of `SmoothedPose`s, with the header of the latest."""
@@ -230,7 +232,7 @@ class TrackerNode(StageNode):
             self._detections_3d.publish(to_message(
                 Detection3DArray, detections_3d_dict(track, frame)))
         if track.ended:
-            self._path.clear()
+            self._paths.pop(track.id, None)
             self._markers.publish(to_message(MarkerArray, delete_markers(track, frame)))
         else:
             self._publish_views(track, frame)
@@ -238,7 +240,7 @@ class TrackerNode(StageNode):
 
     def _log_life(self, track: Track) -> None:
         """Log that a track begins, and that it has ended."""
-        if track.id != self._latest_id:
+        if track.id > self._latest_id:
             self._latest_id = track.id
             self.get_logger().info(f'track {track.id} begins' + (
                 f', arrival {track.arrival}' if track.arrival else ''))
@@ -251,12 +253,13 @@ class TrackerNode(StageNode):
         publish_if_any(self._odometry, Odometry, odometry_dict(track, frame, child_frame))
         if self._tf is not None:
             publish_if_any(self._tf, TFMessage, track_transform_dict(track, frame, child_frame))
+        path = self._paths.setdefault(track.id, deque(maxlen=LONGEST_PATH))
         if track.topic_uncertainty is not None:
-            self._path.append(to_message(PoseStamped, pose_dict(
+            path.append(to_message(PoseStamped, pose_dict(
                 track.stamp_ns, frame, track.position, track.orientation)))
-        if self._path and is_heard(self._path_publisher):
-            self._path_publisher.publish(
-                Path(header=self._path[-1].header, poses=list(self._path)))
+        # One path fits the topic: that of the track that began first.
+        if path and track.id == min(self._paths) and is_heard(self._path_publisher):
+            self._path_publisher.publish(Path(header=path[-1].header, poses=list(path)))
         if is_heard(self._markers):
             self._markers.publish(to_message(MarkerArray, track_markers(track, frame)))
 

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import os
 import signal
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -29,13 +30,14 @@ from visualization_msgs.msg import MarkerArray
 import mag_tracking as mt
 from mag_tracking.apps.replay import replay
 from mag_tracking.messages.schema import pass_event_dict, stamp_ns
-from mag_tracking.network.file import read_network
+from mag_tracking.network.file import read_network, write_network
 from mag_tracking.nodes.convert import to_message, track_of
 from mag_tracking.nodes.runner import run
 from mag_tracking.nodes.stage_node import LATCHED, RESULTS, STREAM
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
 from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
+from support.busy_recordings import BUSY, network_of_recording
 from support.marks import studied
 from support.node_processes import LONGEST_S, call, start, stop, without_states
 from support.shared_memory import left_behind, segments_of
@@ -69,7 +71,7 @@ class Collector(Node):
 def compare_with_offline(collector, folder):
     """Every pose of the topics equals its row of poses.csv; returns the largest difference."""
     with open(folder / 'poses.csv', newline='') as stream:
-        offline = {(int(r['stamp_ns'])): r for r in csv.DictReader(stream)}
+        offline = {(int(r['stamp_ns']), int(r['track_id'])): r for r in csv.DictReader(stream)}
     tracks = [track_of(t) for m in collector.tracks for t in m.tracks]
     live = [t for t in tracks if not t.ended]
     assert len(live) == len(collector.poses)
@@ -77,14 +79,14 @@ def compare_with_offline(collector, folder):
     assert len(offline) - 2 <= len(live) <= len(offline)
     worst = 0.0
     for t, pose in zip(live, collector.poses, strict=True):
-        row = offline[t.stamp_ns]
+        row = offline[t.stamp_ns, t.id]
         theirs = np.array([float(row[c]) for c in (
             'x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz',
             'mx', 'my', 'mz', 'weight')])
         ours = np.r_[t.position, t.velocity, np.sqrt(np.diagonal(t.covariance)), t.moment, t.weight]
         worst = max(worst, np.abs(ours - theirs).max() / np.abs(theirs).max(),
                     (np.abs(ours - theirs) / np.maximum(np.abs(theirs), 1e-9)).max())
-        assert t.id == int(row['track_id']) and t.ambiguous == bool(int(row['ambiguous']))
+        assert t.ambiguous == bool(int(row['ambiguous']))
         p = pose.pose.pose.position
         assert (p.x, p.y, p.z) == tuple(t.position) and stamp_ns(pose.header.stamp) == t.stamp_ns
     return worst
@@ -136,6 +138,25 @@ def test_nodes_equal_offline_on_vehicles(name, tmp_path, road_network):
     worst = compare_with_offline(collector, tmp_path)
     compare_smoothed(collector, tmp_path)
     print(f'{name}: nodes against offline, largest relative difference {worst:.1e}')
+    assert worst <= 1e-9
+
+
+def test_nodes_equal_offline_on_several_vehicles(tmp_path):
+    """Twelve in 45 seconds. Every track is smoothed by itself, and begins once in the log."""
+    name = 'traffic_2_sensors'
+    network = network_of_recording(name)
+    write_network(network_file := tmp_path / 'network.yaml', network)
+    settings, recording = settings_for('vehicle', PATIENT), BUSY / f'{name}.mcap'
+    replay(Recording(recording), network, settings, tmp_path)
+    collector = over_topics(network_file, settings, recording, 2.0)
+    worst = compare_with_offline(collector, tmp_path)
+    ids = {t.id for m in collector.tracks for t in m.tracks}
+    together = [s for s, n in Counter(t.header.stamp.sec for m in collector.tracks
+                                      for t in m.tracks).items() if n > 13]
+    assert len(ids) > 5 and together
+    smoothed = [m.track_id for m in collector.smoothed]
+    assert len(smoothed) == len(set(smoothed)) and set(smoothed) <= ids
+    print(f'several vehicles: nodes against offline, largest relative difference {worst:.1e}')
     assert worst <= 1e-9
 
 

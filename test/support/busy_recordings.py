@@ -22,12 +22,16 @@ BUSY = DATA / 'busy'
 NAMES = tuple(sorted(p.name.removesuffix('.truth.json') for p in BUSY.glob('*.truth.json')))
 
 
+def network_of_recording(name, folder=BUSY):
+    """What an installer would know."""
+    truth = json.loads((folder / f'{name}.truth.json').read_text())
+    return replace(network_of(truth['sensors_m']),
+                   earth_field=np.array(truth['earth_field_T']))
+
+
 def tracked_recording(name, folder=BUSY, changes=None):
     """(`Score`, [`Track`], `Pipeline`) of a recording."""
-    truth = json.loads((folder / f'{name}.truth.json').read_text())
-    # What an installer would know.
-    network = replace(network_of(truth['sensors_m']),
-                      earth_field=np.array(truth['earth_field_T']))
+    network = network_of_recording(name, folder)
     pipeline = Pipeline(network, settings_for('vehicle', changes))
     recording = Recording(folder / f'{name}.mcap')
     reader = SampleReader(recording, network)
