@@ -36,9 +36,9 @@ from mag_tracking.stages.track.window_start import (
 PASSES, STEP = 3, 0.5
 """Gauss-Newton steps along each path, and the share that each goes."""
 
-KNOWN_ROWS, FIRST, SECOND = 3, 3, 2
-"""So many hypotheses of the tracked vehicles, and paths of a first and of a second vehicle beside
-each, are tried."""
+KNOWN_ROWS, FIRST, SECOND = 2, 3, 2
+"""So many hypotheses of a tracked vehicle, of several vehicles one, and paths of a first and of a
+second vehicle beside each, are tried."""
 
 NATS_KEPT, MOST_KEPT = 10.0, 12
 """Of the kinds that a newcomer may be those are kept that are no less probable than the best."""
@@ -170,11 +170,12 @@ class NewcomerSearch:
     def _leaders(self, rows: IntArray, log_w: FloatArray) -> list[int]:
         """Which of the `rows` are tried with a newcomer: the best of each arrival and kind."""
         seen: set[tuple[int, ...]] = set()
+        most = KNOWN_ROWS if self._n_targets == 1 else 1
         chosen: list[int] = []
         for k in np.argsort(-log_w, kind='stable').tolist():
             what = (*np.ravel(self._bank.label[rows[k]]).tolist(),
                     *np.ravel(self._bank.kind[rows[k]]).tolist())
-            if np.isfinite(log_w[k]) and what not in seen and len(chosen) < KNOWN_ROWS:
+            if np.isfinite(log_w[k]) and what not in seen and len(chosen) < most:
                 seen.add(what)
                 chosen.append(k)
         return chosen
