@@ -8,6 +8,9 @@ from mag_tracking.units import NS
 WINDOW_S = 1.0
 """[s] Length of the latest frames, over which a target must not fall behind."""
 
+FAR_BEHIND = -30.0
+"""[nats] Where something else explains a track so much better, it is no target at all."""
+
 
 class Explanation:
     """Log of the Bayes factor of a target against something else.
@@ -45,6 +48,12 @@ class Explanation:
         elif self._behind_since_ns is None:
             self._behind_since_ns = stamp_ns
         self._latest.add(stamp_ns, log_ratio)
+
+    def would_lead(self, log_ratio: float, ratio: float) -> bool:
+        """Whether a target would lead if it explained the track better by `log_ratio` [nats]; not
+        where something else is far ahead."""
+        return self._is_known and self.log_ratio > FAR_BEHIND \
+            and self.log_ratio + log_ratio >= float(np.log(ratio))
 
     def leads(self, ratio: float) -> bool:
         """Whether a target explains the whole track `ratio` times better than something else."""

@@ -14,7 +14,7 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.clock_evidence import ClockEvidence
 from mag_tracking.stages.track.disturbances import Unexplained
 from mag_tracking.stages.track.evidence import TrackEvidence
-from mag_tracking.stages.track.newcomer import Joint
+from mag_tracking.stages.track.joint import Joint
 from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.plausibility import Plausibility
 from mag_tracking.stages.track.published_pose import ambiguities, published_track, smoothed_pose
@@ -78,7 +78,7 @@ class Member:
     def __init__(self, id: int, target: Target, sensors: SensorSubset, counts: 'Counter[str]',
                  clocks: ClockEvidence, begin_ns: int) -> None:
         self.id, self._target, self._counts, self._clocks = id, target, counts, clocks
-        self.begin_ns = begin_ns
+        self.begin_ns, self._sensors = begin_ns, sensors
         self.evidence, self._plausibility = TrackEvidence(len(sensors.whole)), Plausibility()
         self.opinion = SecondOpinion(sensors.network)
         self.last: Track | None = None
@@ -94,6 +94,7 @@ class Member:
 
     def use(self, sensors: SensorSubset) -> None:
         """From now on the target is measured by these sensors."""
+        self._sensors = sensors
         self.opinion = SecondOpinion(sensors.network)
 
     def begin_again(self, sensors: SensorSubset) -> None:
@@ -101,6 +102,16 @@ class Member:
         self.evidence.forgive()
         self.use(sensors)
         self._plausibility = Plausibility()
+
+    def begin_beside(self, first: 'Member', stamp_ns: int, ratio: float) -> None:
+        """It begins as a newcomer beside the `first` member of a track, whose doubts about how it
+        came, and whose evidence against something else, are its own.
+
+        `ratio` is that by which a target has to explain the frames better.
+        """
+        self.evidence.doubt_start(doubts.NOT_SEEN_APPROACHING in first.evidence.doubts,
+                                  self._sensors.whole, False)
+        self.evidence.explanation.add(first.evidence.explanation.log_ratio, stamp_ns, ratio)
 
     def distance_from(self, stamps_ns: Sequence[int], path: FloatArray) -> float:
         """[m] mean distance of the latest poses from a path (n, 2) with these timestamps.

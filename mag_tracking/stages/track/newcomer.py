@@ -8,7 +8,7 @@ like any hypothesis, and its evidence is compared with that of the track as it i
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -18,6 +18,7 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_vehicle import moment_directions
+from mag_tracking.stages.track.joint import FELT, Joint, are_felt_by_two
 from mag_tracking.stages.track.newcomer_test import ODD
 from mag_tracking.stages.track.reach import energy_of
 from mag_tracking.stages.track.relinearisation import Window
@@ -49,48 +50,15 @@ ARRIVES = np.log(0.05)
 ELSEWHERE_M = 2.0
 """[m] A vehicle that was sought anew, and is found nearer than this, was followed rightly."""
 
+MOST_TIMES = 5.0
+"""No vehicle is so many times faster, or stronger, than the largest of the settings."""
+
 WAS_LOST = np.log(0.01)
 """Log-probability that a vehicle has been elsewhere than its track for the whole window."""
-
-FELT = 4.0
-"""A vehicle of which the last frame has less energy, in units of its noise, is not sought again."""
 
 N_DISTANCES = 10
 """Places on its line where a newcomer may be when the window begins."""
 
-
-
-@dataclass(frozen=True)
-class Joint:
-    """Hypotheses of the tracked vehicles and a newcomer; what is new comes last in their states."""
-
-    bank: FilterBank
-    """At the latest frame of the window."""
-    window: Window
-    """With the hypotheses of all as its anchor."""
-    bank_filter: BankFilter
-    log_odds: float
-    """[nats] Against the track as it is."""
-    replaced: int | None
-    """This vehicle of the track was sought anew: one of the last two is it, or the last."""
-    adds: bool
-    """There is a vehicle more."""
-
-    def doubtful(self, n_one: int) -> tuple[int, ...]:
-        """Places of vehicles that may be others, each of `n_one` states.
-
-        One that was found elsewhere; and two that took the place of one and go the same way: a
-        long vehicle of which the model leaves much out looks like two.
-        """
-        if self.replaced is None:
-            return ()
-        n = self.bank.label.shape[1] if self.bank.label.ndim > 1 else 1
-        if not self.adds:
-            return (n - 1,)
-        places = (n - 2, n - 1)
-        x = self.bank.x[self.bank.best()]
-        first, second = (x[k * n_one + 3:k * n_one + 5] for k in places)
-        return places if first @ second > 0.0 else ()
 
 
 class NewcomerSearch:
@@ -138,7 +106,8 @@ class NewcomerSearch:
         alone = float(log_sum_exp(log_w))
         found = [self._best_of(starts, alone) for starts in (more, elsewhere) if starts]
         return max((joint for joint in found if joint is not None
-                    and (joint.adds or self._is_elsewhere(joint))),
+                    and (are_felt_by_two(joint) if joint.adds
+                         else self._is_elsewhere(joint))),
                    key=lambda joint: joint.log_odds, default=None)
 
     def _best_of(self, starts: Sequence[WindowStart], alone: float) -> Joint | None:
@@ -302,10 +271,16 @@ class NewcomerSearch:
         return bank, log_likelihood, log_w, paths
 
     def _all_come(self, start: WindowStart, x: FloatArray) -> bool:
-        """Whether the vehicles that were sought are as fast, in the state `x` (n_x,), as what
-        comes: what stands was there before."""
-        return all(np.hypot(*x[i * self._n_one + 3:i * self._n_one + 5])
-                   >= self._search.prior.slowest for i in start.are_new)
+        """Whether the vehicles that were sought are as fast and as strong, in the state `x` (n_x,),
+        as what comes: what stands was there before."""
+        settings, n = self._vehicles.settings, self._n_one
+        for i in start.are_new:
+            speed = np.hypot(*x[i * n + 3:i * n + 5])
+            moment = np.linalg.norm(self._vehicles.hard_moments(x[i * n:]).sum(axis=0))
+            if not self._search.prior.slowest <= speed <= MOST_TIMES * max(settings.speeds) \
+                    or moment > MOST_TIMES * max(settings.moments):
+                return False
+        return True
 
     def _made(self, starts: Sequence[WindowStart], bank: FilterBank, log_likelihood: FloatArray,
               log_w: FloatArray, paths: FloatArray, log_odds: float) -> Joint | None:

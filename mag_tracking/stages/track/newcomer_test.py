@@ -50,7 +50,8 @@ class NewcomerTest:
         degrees_of_freedom : int
         stamp_ns : int
         rejected : bool
-            A sensor was left out, which is as good as a large innovation.
+            One of two sensors was left out, which is as good as a large innovation. Where more
+            agree, it is the sensor that is wrong.
         is_long : bool
             The best hypothesis is a long vehicle.
         """

@@ -13,11 +13,17 @@ UNFELT, FAINT = 0.1, 1.0
 and with less than that it does not disturb others."""
 
 
-def energy_of(bank_filter: BankFilter, target: int, state: FloatArray, frame: FieldFrame) -> float:
-    """Energy of the field of a target of a state (n_x,) in a frame, in units of its noise."""
+def energies_of(bank_filter: BankFilter, target: int, state: FloatArray, frame: FieldFrame
+                ) -> FloatArray:
+    """(n_sensors,) energy of the field of a target of a state (n_x,) in a frame, in units of its
+    noise."""
     field = bank_filter.observation.field_of(state, [target], np.zeros(len(frame.field)))
-    energy, _ = whitened_energy(np.where(np.isnan(frame.field), np.nan, field), frame.covariance)
-    return float(energy.sum())
+    return whitened_energy(np.where(np.isnan(frame.field), np.nan, field), frame.covariance)[0]
+
+
+def energy_of(bank_filter: BankFilter, target: int, state: FloatArray, frame: FieldFrame) -> float:
+    """As `energies_of`, of all sensors together."""
+    return float(energies_of(bank_filter, target, state, frame).sum())
 
 
 def faint_from(bank_filter: BankFilter, target: int, window: Window | None, origin: int) -> int:

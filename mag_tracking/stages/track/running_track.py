@@ -22,8 +22,9 @@ from mag_tracking.stages.track.bank_filter import BankFilter, NoTarget
 from mag_tracking.stages.track.clock_evidence import ClockEvidence
 from mag_tracking.stages.track.disturbances import Unexplained
 from mag_tracking.stages.track.evidence import LEAST_WATCHED, OUT_OF_REACH
+from mag_tracking.stages.track.joint import Joint
 from mag_tracking.stages.track.member import Member, Update, View, in_order
-from mag_tracking.stages.track.newcomer import Joint, NewcomerSearch
+from mag_tracking.stages.track.newcomer import NewcomerSearch
 from mag_tracking.stages.track.newcomer_test import UNDECIDED_NATS, NewcomerTest
 from mag_tracking.stages.track.reach import FAINT, UNFELT, energy_of
 from mag_tracking.stages.track.sensor_selection import SensorSubset
@@ -81,11 +82,6 @@ class RunningTrack:
                                              is_handover)
         for member in self.members:
             member.use(sensors)
-
-    @property
-    def id(self) -> int:
-        """That of its first member."""
-        return self.members[0].id
 
     @property
     def bank(self) -> FilterBank:
@@ -212,7 +208,7 @@ class RunningTrack:
         """Count how a frame fits hypothesis `best`, for the question of newcomers."""
         bank, frame = self.bank, advance.frame
         self._test.add(float(np.nansum(bank.nis[best])), np.count_nonzero(~np.isnan(frame.field)),
-                       frame.stamp_ns, advance.n_rejected > 0,
+                       frame.stamp_ns, advance.n_rejected > 0 and len(frame.field) == 2,
                        bool(self._bank.filter.are_long(bank.kind[best:best + 1])[0]))
 
     def _frame_of(self, i: int, best: int, frame: FieldFrame, dt: float) -> FieldFrame:
@@ -291,8 +287,7 @@ class RunningTrack:
         return [u for u in found if u is not None]
 
     def newcomer(self) -> Joint | None:
-        """Another explanation of the latest frames, with a vehicle more or a vehicle elsewhere,
-        where they ask for one and it is believed."""
+        """Another explanation of the latest frames, where they ask for one and it is believed."""
         window, n = self._bank.window, len(self.members)
         if self.ended is not None or self._target.starts_anywhere or window is None \
                 or self.members[0].last is None:
@@ -307,7 +302,10 @@ class RunningTrack:
             self.bank, window, self._bank.filter_of, n, VehicleState(
                 self._settings.vehicle, self._bank.sensors.network,
                 self._settings.background_std), reason, not self._is_full).find()
-        if self._test.believes(-np.inf if found is None else found.log_odds):
+        # A field of something else is no vehicle more.
+        if self._test.believes(found.log_odds if found and all(
+                m.evidence.explanation.would_lead(found.log_odds, self._settings.explained_ratio)
+                for m in self.members) else -np.inf):
             return found
         if found is not None and found.log_odds > UNDECIDED_NATS:
             for i, member in enumerate(self.members):
@@ -320,6 +318,7 @@ class RunningTrack:
         """Go on with another explanation; a newcomer becomes the member `id`."""
         begin_ns, now_ns = (joint.window.frames[k].stamp_ns for k in (0, -1))
         n, sensors = self._bank.one.n_target, self._bank.sensors
+        ratio = self._settings.explained_ratio
         states = self._bank.smoothed(self.bank.best(), False)
         for member in self.members:
             member.early += member.states_of(member.slot, n, states, begin_ns)
@@ -328,14 +327,14 @@ class RunningTrack:
         if joint.adds:
             new = Member(id, self._target, sensors, self.counts, self._clocks,
                          now_ns - round(self._settings.lookback_s * NS))
-            new.evidence.doubt_start(False, sensors.whole, False)
-            new.evidence.explanation.add(joint.log_odds, now_ns, self._settings.explained_ratio)
+            new.begin_beside(self.members[0], now_ns, ratio)
         doubtful = joint.doubtful(n)
         self._bank.resume(joint)
         self.members, self._is_full = in_order(self.members, new, joint, n), False
         for slot, member in enumerate(self.members):
             member.slot = slot
             member.evidence.add(joint.log_odds)
+            member.evidence.explanation.add(joint.log_odds, now_ns, ratio)
             if slot in doubtful:
                 member.evidence.doubt_for(doubts.ANOTHER_VEHICLE, now_ns, DOUBTED_S)
 

@@ -27,6 +27,9 @@ N_DIPOLES = 3
 STEP_ALONG, BEYOND = 3.0, 12.0
 """[m] The grid has positions this far apart, up to so far beyond the outermost sensor."""
 
+LEAST_STD = 1e-3
+"""[m], [m/s], [A m^2] Of what the settings have without a spread, such as the length of a point."""
+
 SLOWEST = 0.2
 """No vehicle comes that is slower than this share of the lowest starting speed."""
 
@@ -67,7 +70,7 @@ class PathPrior:
         """That of all kinds of the settings together."""
         def spread(means: Iterable[float], stds: Iterable[float]) -> tuple[float, float]:
             m, s = np.array(means, dtype=float), np.array(stds, dtype=float)
-            return float(m.mean()), float(np.sqrt(m.var() + np.square(s).mean()))
+            return float(m.mean()), max(float(np.sqrt(m.var() + np.square(s).mean())), LEAST_STD)
 
         height, height_std = spread(vehicle.heights, vehicle.height_stds)
         speeds = np.array(vehicle.speeds)
@@ -75,7 +78,7 @@ class PathPrior:
         length, length_std = spread(vehicle.lengths, vehicle.length_stds)
         lateral_std = spread(vehicle.lateral_offsets, [vehicle.lateral_std])[1]
         total = np.sqrt(np.square(vehicle.moments).mean() / 3.0)
-        difference = np.sqrt(np.square(vehicle.difference_stds).mean())
+        difference = max(float(np.sqrt(np.square(vehicle.difference_stds).mean())), LEAST_STD)
         # The first combination is the mean of the row, times the root of the number of dipoles.
         return cls(np.deg2rad(vehicle.arrival_headings_deg), network.centre[:2],
                    np.array([0.0, 0.0, height, speed, 0.0, 0.0, length]),

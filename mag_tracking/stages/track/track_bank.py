@@ -12,7 +12,7 @@ from mag_tracking.inference.starting_bank import StartingBank
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.bank_size import WEIGHT_KEPT, most_hypotheses, most_sensors
-from mag_tracking.stages.track.newcomer import Joint
+from mag_tracking.stages.track.joint import Joint
 from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.reach import faint_from
 from mag_tracking.stages.track.relinearisation import Relinearisation, Window

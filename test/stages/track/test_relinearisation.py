@@ -381,7 +381,7 @@ def test_it_is_told_the_time_between_the_frames(monkeypatch):
     """Also where one is missing, and of those before the detection."""
     told, add = [], Relinearisation.add
     monkeypatch.setattr(Relinearisation, 'add', lambda self, *a: (
-        told.append((a[3].stamp_ns, a[4])), add(self, *a)))
+        told.append((a[4].stamp_ns, a[5])), add(self, *a)))
     network, settings = line_network(2, tilt=0.0), settings_for('vehicle')
     samples, *_ = simulate(network, random_vehicle(np.random.default_rng(1), length=4.0),
                            Path(np.array([-70.0, -1.2]), 0.0, 10.0), 100.0, 9.0,

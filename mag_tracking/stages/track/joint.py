@@ -1,0 +1,59 @@
+"""Another explanation of the latest frames of a track: with other vehicles, or one more."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.reach import energies_of
+from mag_tracking.stages.track.relinearisation import Window
+
+FELT = 4.0
+"""A vehicle of which the last frame has less energy, in units of its noise, is not sought again. A
+sensor does not feel one of which all frames together have less."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Hypotheses of the tracked vehicles and a newcomer; what is new comes last in their states."""
+
+    bank: FilterBank
+    """At the latest frame of the window."""
+    window: Window
+    """With the hypotheses of all as its anchor."""
+    bank_filter: BankFilter
+    log_odds: float
+    """[nats] Against the track as it is."""
+    replaced: int | None
+    """This vehicle of the track was sought anew: one of the last two is it, or the last."""
+    adds: bool
+    """There is a vehicle more."""
+
+    def doubtful(self, n_one: int) -> tuple[int, ...]:
+        """Places of vehicles that may be others, each of `n_one` states.
+
+        One that was found elsewhere; and two that took the place of one and go the same way: a
+        long vehicle of which the model leaves much out looks like two.
+        """
+        if self.replaced is None:
+            return ()
+        n = self.bank.label.shape[1] if self.bank.label.ndim > 1 else 1
+        if not self.adds:
+            return (n - 1,)
+        places = (n - 2, n - 1)
+        x = self.bank.x[self.bank.best()]
+        first, second = (x[k * n_one + 3:k * n_one + 5] for k in places)
+        return places if first @ second > 0.0 else ()
+
+
+def are_felt_by_two(joint: Joint) -> bool:
+    """Whether two sensors feel each of the vehicles that were sought: what one alone feels may be a
+    fault of that sensor."""
+    n, best = joint.bank.label.shape[1], joint.bank.best()
+    for i in range(n - (1 if joint.replaced is None else 2), n):
+        energy = sum(energies_of(joint.bank_filter, i, path[best], frame) for path, frame in
+                     zip(joint.window.paths, joint.window.frames, strict=True))
+        if np.count_nonzero(energy > FELT) < 2:
+            return False
+    return True
