@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
@@ -51,11 +52,11 @@ def test_a_tracker_of_one_vehicle_at_a_time_is_worse():
 @pytest.mark.parametrize('simulator', SIMULATORS)
 @pytest.mark.parametrize('how', ['meeting', 'following', 'traffic'])
 def test_vehicles_of_both_simulators_are_followed(how, simulator):
-    """Nine in ten with two sensors; the aim for recordings is 15 of 16 and all."""
+    """The aim is nine in ten with two sensors, whichever vehicles come."""
     scores = [busy_worlds.tracked(busy_worlds.busy(how, 2, simulator, seed))[0]
               for seed in range(3)]
     found = np.concatenate([s.is_found for s in scores])
-    assert found.mean() >= 0.85, [str(s) for s in scores]
+    assert found.sum() >= binom.ppf(0.01, len(found), 0.9), [str(s) for s in scores]
     assert sum(s.n_extra for s in scores) <= 0.05 * len(found)
 
 
