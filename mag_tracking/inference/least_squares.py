@@ -10,7 +10,7 @@ from typing import Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mag_tracking.arrays import BoolArray, FloatArray
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.matrices import pseudo_inverse, running_away
 
 ResidualAndJacobian: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
@@ -286,13 +286,13 @@ def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparablePr
     theta, cost = starts, smooth.cost(starts)
     theta = theta[np.argsort(cost, kind='stable')[:n_refined]]
     theta, cost, _, _ = refine(smooth.residual_and_jacobian, theta, n_steps)
-    theta = _distinct(theta, cost, apart, n_distinct)
+    theta = theta[distinct(theta, cost, apart, n_distinct)]
     theta, cost, _, _ = refine(coarse.residual_and_jacobian, theta, 40, 1e-6)
     if companions is not None:
         more, more_cost, _, _ = refine(coarse.residual_and_jacobian,
                                        companions(theta[np.argmin(cost)]), 40, 1e-6)
         theta, cost = np.vstack([theta, more]), np.append(cost, more_cost)
-    theta = _distinct(theta, cost, apart, n_best)
+    theta = theta[distinct(theta, cost, apart, n_best)]
     theta, cost, _, converged = refine(fine.residual_and_jacobian, theta, 100, 1e-8)
     order = np.argsort(cost, kind='stable')
     best = order[0]
@@ -304,12 +304,15 @@ def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparablePr
     return Minimum(theta[best], float(cost[best]), bool(converged[best]), tuple(rivals))
 
 
-def _distinct(theta: FloatArray, cost: FloatArray, apart: FloatArray, most: int) -> FloatArray:
-    """The best `most` of theta (n, n_theta) of which no two are the same point."""
-    kept: list[FloatArray] = []
-    for x in theta[np.argsort(cost, kind='stable')]:
-        if all((np.abs(x - other) > apart).any() for other in kept):
-            kept.append(x)
+def distinct(theta: FloatArray, cost: FloatArray, apart: FloatArray, most: int) -> IntArray:
+    """Rows of the best `most` of theta (n, n_theta) of which no two are the same point.
+
+    Points differ that are farther from each other than `apart` (n_theta,) in any of the numbers.
+    """
+    kept: list[int] = []
+    for row in np.argsort(cost, kind='stable').tolist():
+        if all((np.abs(theta[row] - theta[other]) > apart).any() for other in kept):
+            kept.append(row)
             if len(kept) == most:
                 break
-    return np.array(kept)
+    return np.array(kept, dtype=np.int64)

@@ -17,7 +17,7 @@ class Marginalised:
         self._U, size, _ = np.linalg.svd(columns, full_matrices=False)
         self._taken: FloatArray = 1.0 - 1.0 / np.sqrt(1.0 + size**2)
         self.log_determinant = float(np.log1p(size**2).sum())
-        """Of I + C C'."""
+        """Log-determinant of I + C C'."""
 
     def __call__(self, A: FloatArray) -> FloatArray:
         """The inverse root times A (..., n_y, k), or (n_y,)."""

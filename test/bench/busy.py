@@ -6,6 +6,7 @@
 import argparse
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_vehicle import start_vehicle, vehicle_model
+from mag_tracking.stages.track.newcomer import NewcomerSearch
 from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
 from support.busy_recordings import BUSY, tracked_recording
 from support.busy_worlds import NETWORKS, busy, tracked
@@ -44,12 +46,32 @@ def shown(items, what):
     return tqdm(items, desc=what, disable=None, leave=False)
 
 
+@contextmanager
+def searches():
+    """[s] that each search for another vehicle takes."""
+    seconds, find = [], NewcomerSearch.find
+
+    def timed(search):
+        begin = time.perf_counter()
+        try:
+            return find(search)
+        finally:
+            seconds.append(time.perf_counter() - begin)
+
+    NewcomerSearch.find = timed
+    try:
+        yield seconds
+    finally:
+        NewcomerSearch.find = find
+
+
 def recordings(figures, folder):
     """[(poses without a flag, of them wrong)] of the recordings."""
     counted = []
     for path in shown(sorted(folder.glob('*.truth.json')), 'recordings'):
         name = path.name.removesuffix('.truth.json')
-        got, _, _ = tracked_recording(name, folder)
+        with searches() as seconds:
+            got, _, _ = tracked_recording(name, folder)
         rms, nees, found = aims_of(name)
         n = len(got.rms)
         figures.add(f'{name}: found', float(got.is_found.mean()), '', found, True,
@@ -57,6 +79,8 @@ def recordings(figures, folder):
         figures.add(f'{name}: RMS', float(np.nanmedian(got.rms)), 'm', rms)
         figures.add(f'{name}: NEES', float(np.nanmedian(got.nees)), '', nees)
         figures.add(f'{name}: tracks of nobody', got.n_extra, '', 0)
+        figures.add(f'{name}: a search', float(np.median(seconds)), 's',
+                    note=f' (longest {max(seconds):.2g}, {len(seconds)} of them)')
         counted.append((got.n_sure, got.n_wrong))
     return counted
 

@@ -26,7 +26,7 @@ class Joint:
     log_odds: float
     """[nats] Against the track as it is."""
     replaced: int | None
-    """This vehicle of the track was sought anew: one of the last two is it, or the last."""
+    """The vehicle of the track that was sought anew, and is now the last or one of the last two."""
     adds: bool
     """There is a vehicle more."""
 

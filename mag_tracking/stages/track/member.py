@@ -25,19 +25,19 @@ from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.stages.track.target import Target
 
 MOST_PLACES = 64
-"""So many places of a target are remembered, to tell it from another one."""
+"""Number of places of a target that are remembered, to tell it from another one."""
 
 
 @dataclass(frozen=True)
 class Update:
-    """What a frame did to the bank of a running track."""
+    """The bank of a running track after a frame."""
 
     frame: FieldFrame
-    """What was used of it, of the sensors that the track uses."""
+    """The used fields, of the sensors that the track uses."""
     dt: float
     """[s] Since the frame before."""
     bank: FilterBank
-    """Of all members."""
+    """The hypotheses of all members."""
     bank_filter: BankFilter
     sensors: SensorSubset
     settings: TrackSettings
@@ -98,7 +98,7 @@ class Member:
         self.opinion = SecondOpinion(sensors.network)
 
     def begin_again(self, sensors: SensorSubset) -> None:
-        """What spoke against the track was the field of another vehicle."""
+        """Drop the doubts that were due to the field of another vehicle."""
         self.evidence.forgive()
         self.use(sensors)
         self._plausibility = Plausibility()

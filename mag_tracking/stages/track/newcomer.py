@@ -1,14 +1,14 @@
 """Newcomers: a vehicle more in the frames of a running track, believed only if evidence demands it.
 
-Where the latest innovations are improbable, the frames of the window that is kept for
-relinearising are explained once more with a vehicle more. It is sought beside the paths of those
-that are tracked; where the track is as young as the window, both are sought anew, as a filter that
-knew of one vehicle has been misled by two. What is found is filtered and smoothed along its path
-like any hypothesis, and its evidence is compared with that of the track as it is.
+The frames of the window that is kept for relinearising are explained once more: by a vehicle beside
+those that are tracked, by two in place of one, whose filter two may have misled, or by one of them
+elsewhere. Each explanation is filtered and smoothed along its path like any hypothesis, and its
+evidence is compared with that of the track as it is.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -38,17 +38,18 @@ PASSES, STEP = 3, 0.5
 """Gauss-Newton steps along each path, and the share that each goes."""
 
 KNOWN_ROWS, FIRST, SECOND = 2, 3, 2
-"""So many hypotheses of a tracked vehicle, of several vehicles one, and paths of a first and of a
-second vehicle beside each, are tried."""
+"""Number of hypotheses of a tracked vehicle that are tried (one of several), and of paths of a first
+and of a second vehicle beside each."""
 
 NATS_KEPT, MOST_KEPT = 10.0, 12
-"""Of the kinds that a newcomer may be those are kept that are no less probable than the best."""
+"""[nats] A kind is dropped if it is less probable than the best by more than this; and the number
+of kinds that are kept."""
 
 ARRIVES = np.log(0.05)
 """Log-probability that another vehicle comes while one passes."""
 
 ELSEWHERE_M = 2.0
-"""[m] A vehicle that was sought anew, and is found nearer than this, was followed rightly."""
+"""[m] A vehicle that is found nearer to its track than this was followed rightly."""
 
 MOST_TIMES = 5.0
 """No vehicle is so many times faster, or stronger, than the largest of the settings."""
@@ -60,7 +61,6 @@ N_DISTANCES = 10
 """Places on its line where a newcomer may be when the window begins."""
 
 
-
 class NewcomerSearch:
     """Explains a window with one vehicle more."""
 
@@ -70,13 +70,13 @@ class NewcomerSearch:
         """`bank` of a track of `n_targets` vehicles; `filter_of` makes the filter of so many.
 
         The `reason` is that of `NewcomerTest.due`: nobody is sought beside a long vehicle, or
-        elsewhere, if the innovations are as they should be. Unless there `may_be_more`, only the
-        track's own vehicles are sought anew.
+        elsewhere, if the innovations are as they should be. Without `may_be_more` no vehicle is
+        added.
         """
         self._is_odd = reason == ODD
         self._bank, self._window = bank, window
-        self._filter_of, self._n_targets, self._vehicles = filter_of, n_targets, vehicles
-        self._filter, self._may_be_more = filter_of(n_targets), may_be_more
+        self._filter_of, self._n_targets, self._vehicles = cache(filter_of), n_targets, vehicles
+        self._filter, self._may_be_more = self._filter_of(n_targets), may_be_more
         network, settings = vehicles.network, vehicles.settings
         self._n_one = self._filter.observation.n_one
         self._search = WindowSearch(window, vehicles)
@@ -149,7 +149,7 @@ class NewcomerSearch:
                 chosen.append(k)
         return chosen
 
-    def _known(self, row: int, log_w: float, path: FloatArray) -> 'KnownVehicles':
+    def _known(self, row: int, log_w: float, path: FloatArray) -> KnownVehicles:
         """The vehicles of a hypothesis of the track, with its log-weight at the anchor."""
         at = np.searchsorted(self._window.anchor.origin, self._bank.origin[[row]])
         before = self._window.anchor.rows(at)
@@ -157,7 +157,7 @@ class NewcomerSearch:
                        for of in (self._bank.label, self._bank.kind))
         return KnownVehicles(before.x[0], before.P[0], path, label, kind, log_w, self._filter)
 
-    def _may_be_two(self, known: 'KnownVehicles', i: int) -> bool:
+    def _may_be_two(self, known: KnownVehicles, i: int) -> bool:
         """Whether vehicle `i` is long, or alone."""
         return self._n_targets == 1 or bool(
             self._filter.are_long(np.array([known.kind[i]]))[0])
@@ -175,26 +175,26 @@ class NewcomerSearch:
         before = now[joint.replaced * n:joint.replaced * n + 2]
         return bool(np.hypot(*(found[last:last + 2] - before)) > ELSEWHERE_M)
 
-    def _without(self, known: 'KnownVehicles', i: int) -> 'KnownVehicles':
+    def _without(self, known: KnownVehicles, i: int) -> KnownVehicles:
         """The same without vehicle `i`; of one alone nothing is left that is known."""
-        n, n_t = self._n_one, len(known.kind) * self._n_one
+        n = self._n_one
         if self._n_targets == 1:
             own = self._sensors_at_start()
             nowhere = np.zeros((len(self._search.times), len(own)))
             return KnownVehicles(nowhere[0], own, nowhere, (), (), 0.0, None)
         rows = np.delete(np.arange(known.path.shape[1]), np.arange(i * n, (i + 1) * n))
-        assert n_t > n
-        return KnownVehicles(known.x[rows], known.P[np.ix_(rows, rows)], known.path[:, rows],
-                      known.label[:i] + known.label[i + 1:], known.kind[:i] + known.kind[i + 1:],
-                      known.log_w, self._filter_of(self._n_targets - 1))
+        return KnownVehicles(
+            known.x[rows], known.P[np.ix_(rows, rows)], known.path[:, rows],
+            known.label[:i] + known.label[i + 1:], known.kind[:i] + known.kind[i + 1:],
+            known.log_w, self._filter_of(self._n_targets - 1))
 
-    def _beside(self, known: 'KnownVehicles', replaced: int | None = None) -> list[WindowStart]:
+    def _beside(self, known: KnownVehicles, replaced: int | None = None) -> list[WindowStart]:
         """One vehicle beside known ones: a newcomer, or in place of vehicle `replaced`."""
         search = self._search.beside(known)
         return [start for theta in search.best(self._starts, FIRST)
                 for start in self._started(known, theta[None], [search.moments(theta)], replaced)]
 
-    def _anew(self, others: 'KnownVehicles', i: int) -> list[WindowStart]:
+    def _anew(self, others: KnownVehicles, i: int) -> list[WindowStart]:
         """Two vehicles in place of vehicle `i`, whose filter may have been misled by them."""
         search = self._search.beside(others)
         starts: list[WindowStart] = []
@@ -204,7 +204,7 @@ class NewcomerSearch:
             starts += self._started(others, pair, moments, i)
         return starts
 
-    def _started(self, known: 'KnownVehicles', paths: FloatArray, moments: Sequence[FloatArray],
+    def _started(self, known: KnownVehicles, paths: FloatArray, moments: Sequence[FloatArray],
                  replaced: int | None) -> list[WindowStart]:
         """Known vehicles and new ones on `paths` (k, 7), of any kinds."""
         n_known, times = len(known.kind) * self._n_one, self._search.times
@@ -217,10 +217,10 @@ class NewcomerSearch:
                 mean, covariance = self._vehicles.prior(theta, m, times[0], kind, label)
                 x, P = np.insert(x, at, mean), inserted(P, covariance, at)
                 path.append(self._vehicles.along(theta, m, times, kind))
-            starts.append(WindowStart(x, P, np.hstack([*path, known.path[:, n_known:]]),
-                                 (*known.label, *labels), (*known.kind, *kinds),
-                                 known.log_w + len(paths) * self._of_cell, len(paths),
-                                 replaced))
+            starts.append(WindowStart(
+                x, P, np.hstack([*path, known.path[:, n_known:]]), (*known.label, *labels),
+                (*known.kind, *kinds), known.log_w + len(paths) * self._of_cell, len(paths),
+                replaced))
         return starts
 
     def _sensors_at_start(self) -> FloatArray:
@@ -249,8 +249,8 @@ class NewcomerSearch:
                     for P in turning]
         return out
 
-    def _run(self, starts: Sequence[WindowStart]) -> tuple[FilterBank, FloatArray, FloatArray,
-                                                      FloatArray]:
+    def _run(self, starts: Sequence[WindowStart]
+             ) -> tuple[FilterBank, FloatArray, FloatArray, FloatArray]:
         """Bank at the end, log-likelihoods (n,), log-weights (n,) and paths (n, n_frames, n_x)."""
         window, n = self._window, len(starts)
         bank = FilterBank(
@@ -302,7 +302,7 @@ class NewcomerSearch:
                         self._window.intervals,
                         [np.ascontiguousarray(paths[rows, k]) for k in range(n_frames)],
                         [each.copy() for _ in range(n_frames)], float(log_sum_exp(log_w[rows])),
-                        self._window.is_start, self._window.most)
+                        self._window.most)
         n_targets = len(starts[best].kind)
         return Joint(now, window, self._filter_of(n_targets), log_odds, replaced,
                      n_targets > self._n_targets)

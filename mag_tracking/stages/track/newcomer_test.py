@@ -72,7 +72,6 @@ class NewcomerTest:
             self._last_ns = stamp_ns
         return reason
 
-
     def believes(self, log_odds: float) -> bool:
         """Whether another explanation is believed, given those compared before."""
         believes = log_odds > LEAST_NATS or self._was_probable and log_odds > AGAIN_NATS

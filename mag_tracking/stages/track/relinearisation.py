@@ -73,8 +73,6 @@ class Window:
     """(n_hyp,) of each frame, in the filter; -inf of what was dropped."""
     evidence: float
     """Log-evidence of the frames that the anchor was not updated with, in the filter."""
-    is_start: bool
-    """It begins with the track."""
     most: int
     """So many hypotheses are linearised at most."""
 
@@ -188,8 +186,7 @@ class Relinearisation:
             return None
         begin = int(self._updated)
         return Window(self._anchor, self._updated, self._frames, self._intervals, self._paths,
-                      self._log_likelihoods, float(sum(self._evidence[begin:])),
-                      not self._updated, self._most)
+                      self._log_likelihoods, float(sum(self._evidence[begin:])), self._most)
 
     def without_target(self, bank_filter: BankFilter, bank: FilterBank, i: int, n: int) -> None:
         """Target `i` of several is no longer followed, and is not felt from the frame `n` on.

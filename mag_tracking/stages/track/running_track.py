@@ -297,7 +297,8 @@ class RunningTrack:
             return None
         self._is_full = n >= self._settings.most_together
         self.counts['newcomers sought'] += 1
-        self.counts['newcomers not sought: too many vehicles at once'] += self._is_full
+        if self._is_full:
+            self.counts['newcomers not sought: too many vehicles at once'] += 1
         found = NewcomerSearch(
             self.bank, window, self._bank.filter_of, n, VehicleState(
                 self._settings.vehicle, self._bank.sensors.network,

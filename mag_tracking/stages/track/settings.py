@@ -60,9 +60,9 @@ class TrackSettings:
         'memory for (250 MB), about ten; the others come in at its detection, where its smoothing '
         'begins then, or as it moves on.', '', (2, 1000))
     most_together: int = param(
-        4, 'Vehicles whose fields overlap are tracked together, so many at most. What two of them '
-        'take is about three times what one does. 1 = a track is of one vehicle, whatever the '
-        'frames say.', '', (1, 4))
+        4, 'Vehicles whose fields overlap are tracked together, so many at most. Two take 2.3 '
+        'times as long as one (`bench.busy`). 1 = a track is of one vehicle, whatever the frames '
+        'say.', '', (1, 4))
     prune_ratio: float = param(
         1e-12, 'A hypothesis lighter than the heaviest by this ratio is dropped (T10 Alg. 3).',
         '', (1e-300, 0.5), live=True)

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.inference.least_squares import refine
+from mag_tracking.inference.least_squares import distinct, refine
 from mag_tracking.inference.marginalised import Marginalised
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, SteadyPass
@@ -192,9 +192,8 @@ class SteadySearch:
 
     def best(self, starts: FloatArray, most: int) -> FloatArray:
         """At most so many paths (n, 7) that explain the frames best, the best one first."""
-        chosen = starts[_distinct(starts, self.cost(starts), APART_START, N_STARTS)]
-        path, cost = self.refined(chosen)
-        return path[_distinct(path, cost, APART, most)]
+        path, cost = self.refined(_usable(starts, self.cost(starts), APART_START, N_STARTS))
+        return _usable(path, cost, APART, most)
 
     def moments(self, path: FloatArray) -> FloatArray:
         """(3, 3) [A m^2, world] moments of the row on a path (7,), from the tail to the head."""
@@ -235,13 +234,8 @@ class SteadySearch:
         return cost if (pair[:, 3] >= self.prior.slowest).all() else np.inf
 
 
-def _distinct(theta: FloatArray, cost: FloatArray, apart: FloatArray, most: int) -> IntArray:
-    """Rows of the best `most` paths (n, 7) that can be used, of which no two are the same."""
-    kept: list[int] = []
-    for i in np.argsort(cost, kind='stable').tolist():
-        if np.isfinite(cost[i]) and all(
-                (np.abs(theta[i] - theta[k]) > apart).any() for k in kept):
-            kept.append(i)
-            if len(kept) == most:
-                break
-    return np.array(kept, dtype=int)
+def _usable(theta: FloatArray, cost: FloatArray, apart: FloatArray, most: int) -> FloatArray:
+    """The best `most` paths (n, 7) that can be used, of which no two are the same."""
+    usable = np.isfinite(cost)
+    paths: FloatArray = theta[usable]
+    return paths[distinct(paths, cost[usable], apart, most)]

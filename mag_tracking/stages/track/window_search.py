@@ -40,7 +40,7 @@ class WindowSearch:
         self.samples = PassSamples.of(network, [frames[k] for k in self._thinned],
                                       frames[-1].stamp_ns, len(network))
 
-    def beside(self, known: 'KnownVehicles') -> SteadySearch:
+    def beside(self, known: KnownVehicles) -> SteadySearch:
         """The search for a vehicle beside those that are known."""
         samples = self.samples
         if known.filter is None:

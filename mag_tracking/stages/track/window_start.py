@@ -14,18 +14,25 @@ so much they are longer than their rows together; and by so much their paths may
 
 
 @dataclass(frozen=True)
-class WindowStart:
-    """A hypothesis at the beginning of a window, with the path to linearise it along."""
+class PathHypothesis:
+    """A hypothesis of some vehicles, with the path to linearise it along."""
 
     x: FloatArray
-    """(n_x,)"""
+    """(n_x,) at the beginning of the window."""
     P: FloatArray
     """(n_x, n_x)"""
     path: FloatArray
     """(n, n_x)"""
     label: tuple[int, ...]
+    """The arrival of each vehicle."""
     kind: tuple[int, ...]
     log_w: float
+
+
+@dataclass(frozen=True)
+class WindowStart(PathHypothesis):
+    """Known vehicles, and others that were sought."""
+
     n_new: int
     """So many vehicles were sought: the last ones."""
     replaced: int | None
@@ -38,19 +45,12 @@ class WindowStart:
 
 
 @dataclass(frozen=True)
-class KnownVehicles:
-    """Vehicles that are known, beside which others are sought."""
+class KnownVehicles(PathHypothesis):
+    """Vehicles beside which others are sought."""
 
-    x: FloatArray
-    """(n_x,) at the beginning of the window."""
-    P: FloatArray
-    path: FloatArray
-    """(n, n_x)"""
-    label: tuple[int, ...]
-    kind: tuple[int, ...]
-    log_w: float
     filter: BankFilter | None
-    """Of them; None where there are none."""
+    """The filter of so many vehicles; None where there are none."""
+
 
 def inserted(P: FloatArray, block: FloatArray, at: int) -> FloatArray:
     """The covariance `P` (n, n) with an independent `block` (k, k) from row `at` on."""
