@@ -38,8 +38,8 @@ PASSES, STEP = 3, 0.5
 """Gauss-Newton steps along each path, and the share that each goes."""
 
 KNOWN_ROWS, FIRST, SECOND = 2, 3, 2
-"""Number of hypotheses of a tracked vehicle that are tried (one of several), and of paths of a first
-and of a second vehicle beside each."""
+"""Number of hypotheses of a tracked vehicle that are tried (one of several), and of paths of a
+first and of a second vehicle beside each."""
 
 NATS_KEPT, MOST_KEPT = 10.0, 12
 """[nats] A kind is dropped if it is less probable than the best by more than this; and the number
