@@ -1,11 +1,14 @@
 """When another vehicle is sought in the frames of a track, and what becomes of its members."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import SmoothedPose, Track
+from mag_tracking.stages.track.member import in_order
 from mag_tracking.stages.track.newcomer_test import (
     AGAIN_NATS,
     AGAIN_S,
@@ -142,3 +145,51 @@ def test_it_does_not_depend_on_how_the_readings_are_split(meeting):
         a, b = ([(r.id, r.stamp_ns, *r.position) for r in found if isinstance(r, kind)]
                 for found in (records, again))
         assert a == b
+
+
+@pytest.fixture(scope='module')
+def following():
+    """(`World`, records) of two cars, of which the first is out of reach before the second."""
+    rng = np.random.default_rng(5)
+    a_world = world(NETWORKS[4], [passing(rng, 'clouds', 12.0, 1, 6.0),
+                                  passing(rng, 'clouds', 15.5, 1, 6.5)], 26.0, rng, rate=50.0)
+    pipeline = Pipeline(a_world.network, settings_for('vehicle'))
+    return a_world, pipeline.feed(a_world.readings) + pipeline.flush()
+
+
+def test_one_that_leaves_takes_nothing_from_the_other(following):
+    """Neither the states that are smoothed, nor what it was before they shared them."""
+    a_world, records = following
+    tracks = [r for r in records if isinstance(r, Track)]
+    ends = {t.id: t.stamp_ns for t in tracks if t.ended}
+    assert len(ends) == 2 and ends[1] < ends[2] - NS // 2
+    for id, position in zip((1, 2), a_world.positions, strict=True):
+        smoothed = [r for r in records if isinstance(r, SmoothedPose) and r.id == id]
+        stamps = {s.stamp_ns for s in smoothed}
+        assert {t.stamp_ns for t in tracks if t.id == id} <= stamps
+        error, *_, true = busy_worlds.errors_of(smoothed, a_world.t, position)
+        assert error[np.hypot(*true.T) < 8.0].max() <= 1.0
+
+
+@pytest.mark.parametrize('is_first', [True, False])
+def test_of_two_in_place_of_one_that_is_it_which_was_where_it_was(is_first):
+    places = np.array([[0.0, 0.0], [30.0, 0.0]])
+
+    class Known:
+        """A member whose poses were at one of the places."""
+
+        def distance_from(self, stamps, path):
+            return float(np.hypot(*(path - places[0 if is_first else 1]).T).mean())
+
+    class Found:
+        """Two vehicles of two states in place of the second of two, at these places."""
+
+        replaced = 1
+        bank = SimpleNamespace(best=lambda: 0)
+        window = SimpleNamespace(
+            paths=[np.array([[9.0, 9.0, *places.ravel()]])] * 3,
+            frames=[SimpleNamespace(stamp_ns=k) for k in range(3)])
+
+    other, old, new = object(), Known(), object()
+    order = in_order([other, old], new, Found, 2)
+    assert order == ([other, old, new] if is_first else [other, new, old])
