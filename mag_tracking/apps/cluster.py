@@ -2,12 +2,15 @@
 
 import asyncio
 import logging
+import queue
 import signal
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
+from functools import cache
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
@@ -15,6 +18,7 @@ from mag_tracking.errors import ClusterError, MagTrackingError, MissingDependenc
 
 if TYPE_CHECKING:
     from distributed import Client, Future
+    from tornado.ioloop import IOLoop
 
 PATIENCE_S = 15.0
 """[s] A scheduler that has not answered by then, or has no worker, does not."""
@@ -168,30 +172,60 @@ class Cluster(Generic[_Key]):
             raise ClusterError(f'the scheduler is gone ({error}); run it again') from error
 
 
+@cache
+def _event_loop() -> 'IOLoop':
+    """The loop of events of all clusters, in a thread that ends with the process.
+
+    Dask's own would begin under a lock which a client that could not connect takes as well, when
+    it is collected, maybe in the thread that is to begin: nobody goes on, for ten seconds.
+    """
+    from tornado.ioloop import IOLoop
+
+    begun: queue.SimpleQueue[IOLoop] = queue.SimpleQueue()
+
+    async def run() -> None:
+        begun.put(IOLoop.current())
+        await asyncio.Event().wait()
+
+    def begin() -> None:
+        # A terminal sends Ctrl-C to all processes. Only this one is to hear it, and ends the
+        # others, which inherit what is blocked here.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        asyncio.run(run())
+
+    threading.Thread(target=begin, name='cluster', daemon=True).start()
+    return begun.get()
+
+
 def _local(distributed: Any, stack: ExitStack, workers: int) -> 'Client':
     """The client of processes on this machine."""
-    # A terminal sends Ctrl-C to all processes. Only this one is to hear it, and ends the others,
-    # which inherit what is blocked, by way of the threads that are made here.
     # Where Python's tracker of resources is started, SIGINT is not blocked any more after it.
     resource_tracker.ensure_running()
-    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        cluster = stack.enter_context(distributed.LocalCluster(
-            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=':0',
-            # What a task raises comes back as its result.
-            silence_logs=logging.CRITICAL,
-            # Each has a core for itself.
-            env={'OPENBLAS_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1'}))
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+    cluster = stack.enter_context(distributed.LocalCluster(
+        loop=_event_loop(), n_workers=workers, threads_per_worker=1, processes=True,
+        dashboard_address=':0',
+        # What a task raises comes back as its result.
+        silence_logs=logging.CRITICAL,
+        # Each has a core for itself.
+        env={'OPENBLAS_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1'}))
     client: Client = distributed.Client(cluster)
     return client
 
 
+async def _reach(address: str) -> None:
+    """Connect to a scheduler once; OSError or ValueError where it does not answer."""
+    from distributed.comm.core import connect
+
+    await (await connect(address, timeout=PATIENCE_S)).close()
+
+
 def _remote(distributed: Any, address: str) -> 'Client':
     """The client of a scheduler that runs somewhere; raises ClusterError."""
+    loop = _event_loop()
     try:
-        client: Client = distributed.Client(address, timeout=PATIENCE_S)
+        # A client that can't connect is left half made, and complains when it is collected.
+        distributed.utils.sync(loop, _reach, address)
+        client: Client = distributed.Client(address, timeout=PATIENCE_S, loop=loop)
     except (OSError, ValueError) as error:
         raise ClusterError(f'{address}: no Dask scheduler answers ({error})') from error
     try:

@@ -1,6 +1,7 @@
 """Archives: what is bad or missing is named, and what is lost is done again."""
 
 import contextlib
+import gc
 import json
 import os
 import shutil
@@ -101,6 +102,35 @@ def test_a_scheduler_without_workers_and_with(tmp_path, recordings, monkeypatch)
         there.scale(1)
         run = archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
                       scheduler=there.scheduler_address)
+        assert len(run.done) == 3
+
+
+def test_a_client_that_failed_does_not_hold_up_the_next(tmp_path, recordings, monkeypatch):
+    """Wherever it is collected; Dask's own loop of events waited for itself."""
+    from distributed import LocalCluster
+    from tornado.ioloop import IOLoop
+
+    settings, current = settings_for('vehicle', QUICK), IOLoop.current
+    seen: set[int] = set()
+
+    def collecting(*args, **kwargs):
+        if threading.get_ident() not in seen:
+            seen.add(threading.get_ident())
+            gc.collect()
+        return current(*args, **kwargs)
+
+    with LocalCluster(n_workers=1, processes=False, dashboard_address=None,
+                      threads_per_worker=1) as there:
+        gc.disable()
+        try:
+            with pytest.raises(ClusterError, match='no Dask scheduler answers'):
+                archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
+                        scheduler='nonsense://x')
+            monkeypatch.setattr(IOLoop, 'current', collecting)
+            run = archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
+                          scheduler=there.scheduler_address)
+        finally:
+            gc.enable()
         assert len(run.done) == 3
 
 
