@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import ndtr
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.inference.driving_direction import LEAST_SAMPLES, field_rotation, lag_of
 from mag_tracking.physics.anderson import anderson_residual
 from mag_tracking.records import plain
 
@@ -21,10 +21,6 @@ CORRELATED = 2.0
 
 OFF_CENTRE = 0.15
 """[time scales] The magnetic centre of a vehicle is so far from the middle of its body."""
-
-LAG = 0.35
-"""Lag of the correlation, in widths of the energy at half its height: near the best one for
-passes at constant speed (PHD15 Paper B eq. (19))."""
 
 MOST_SURE = 0.98
 """The sign of the correlation is exact for a target at the height of the sensor only. Half its
@@ -133,21 +129,10 @@ def turning(field: FloatArray, noise_std: float, n_quiet: int) -> tuple[float, f
 
     References
     ----------
-    [PHD15]_ Paper B eq. (5), (11), (16), (18); the floor of the variance is (2N/p^2) sigma^4.
+    [PHD15]_ Paper B eq. (5), (11), (16), (18).
     """
-    if len(field) < 8:
+    lag = lag_of(field, noise_std, n_quiet) if len(field) >= LEAST_SAMPLES else 0
+    if not lag:
         return 0.0, 0.5
-    around = 1 + len(field) // 20
-    energy = np.convolve(np.sum(field**2, axis=1) - 2.0 * noise_std**2, np.ones(around), 'same')
-    above = np.flatnonzero(energy > 0.5 * energy.max())
-    if not len(above):
-        return 0.0, 0.5
-    p = int(np.clip(round(LAG * (above[-1] - above[0] + 1)), 1, max(1, min(n_quiet,
-                                                                          len(field) // 4))))
-    now, later = field[:-p], field[p:]
-    f = float(np.sum(now[:, 0] * later[:, 1] - now[:, 1] * later[:, 0])) / p
-    across = field[2 * p:] - field[:-2 * p]
-    floor = 2.0 * len(now) / p**2 * noise_std**4
-    variance = max(noise_std**2 / p**2 * float(np.sum(across**2)) - floor, floor)
-    probability = float(ndtr(-f / np.sqrt(variance)))
-    return f, float(np.clip(probability, 1.0 - MOST_SURE, MOST_SURE))
+    found = field_rotation(field, noise_std, lag)
+    return found.correlation, float(np.clip(found.left_to_right, 1.0 - MOST_SURE, MOST_SURE))

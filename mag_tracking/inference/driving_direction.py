@@ -1,0 +1,187 @@
+"""Driving direction by the sense in which a target's horizontal field rotates.
+
+Seen from the sensor towards the target, a target that moves from left to right rotates the field
+clockwise, whatever its moment, and a target that moves from right to left the other way. That is
+exact for a target at the height of the sensor. A sensor in the lane observes no direction.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import log_ndtr, ndtr
+
+from mag_tracking.arrays import FloatArray
+
+LAG = 0.35
+"""Default lag, in widths of the energy at half its height: near the best one for passes at constant
+speed (PHD15 Paper B eq. (19))."""
+
+LEAST_SAMPLES = 8
+
+
+class FieldRotation(NamedTuple):
+    """Statistic of the rotation sense, taken as normally distributed."""
+
+    correlation: float
+    """[T^2] negative for a target that moves from left to right."""
+    variance: float
+    """[T^4]"""
+
+    @property
+    def error_probability(self) -> float:
+        """Probability that the sign is wrong; PHD15 Paper B eq. (17), (18)."""
+        return float(ndtr(-abs(self.correlation) / np.sqrt(self.variance)))
+
+    @property
+    def left_to_right(self) -> float:
+        """Probability of a target that moves from left to right, for equal priors."""
+        return float(ndtr(-self.correlation / np.sqrt(self.variance)))
+
+    @property
+    def log_odds(self) -> float:
+        """Log odds of left to right against right to left, for equal priors."""
+        z = self.correlation / np.sqrt(self.variance)
+        return float(log_ndtr(-z) - log_ndtr(z))
+
+
+def field_rotation(field: FloatArray, noise_std: float, lag: int) -> FieldRotation:
+    """Correlation of the two horizontal axes at a lag, with its estimated variance.
+
+    Parameters
+    ----------
+    field : (n, 2) array, T
+        x and y of a frame whose z points up, without the background. The first and the last `lag`
+        samples are free of the target.
+    noise_std : float, T
+        Standard deviation of one sample on each axis.
+    lag : int
+        In samples; 2 lag < n.
+
+    Returns
+    -------
+    FieldRotation
+        The variance is at least that of noise alone.
+
+    Raises
+    ------
+    ValueError
+        If the lag does not fit into the window.
+
+    References
+    ----------
+    [PHD15]_ Paper B eq. (5), (11), (16).
+    """
+    n = len(field) - 2 * lag
+    if lag < 1 or n < 1:
+        raise ValueError(f'lag: expected 1 to {(len(field) - 1) // 2} samples, got {lag}')
+    floor = 2.0 * n / lag**2 * noise_std**4
+    estimate = noise_std**2 / lag**2 * _spread(field, lag) - floor
+    return FieldRotation(_correlation(field, lag), max(estimate, floor))
+
+
+def expected_rotation(signal: FloatArray, noise_std: float, lag: int) -> FieldRotation:
+    """Mean and variance of `field_rotation` for a known signal.
+
+    Parameters
+    ----------
+    signal : (n, 2) array, T
+        Field without noise in the window; zero outside.
+    noise_std : float, T
+    lag : int
+        In samples, at least 1.
+
+    Returns
+    -------
+    FieldRotation
+
+    References
+    ----------
+    [PHD15]_ Paper B eq. (12), (14).
+    """
+    padded = np.pad(signal, ((lag, lag), (0, 0)))
+    return FieldRotation(_correlation(padded, lag), noise_std**2 / lag**2 * _spread(padded, lag)
+                         + 2.0 * len(signal) / lag**2 * noise_std**4)
+
+
+def _correlation(field: FloatArray, lag: int) -> float:
+    """PHD15 Paper B eq. (5a) over all but the first and last `lag` samples."""
+    now, later = field[lag:-lag], field[2 * lag:]
+    return float(np.sum(now[:, 0] * later[:, 1] - now[:, 1] * later[:, 0])) / lag
+
+
+def _spread(field: FloatArray, lag: int) -> float:
+    """Sum of the squared differences over two lags."""
+    return float(np.sum(np.square(field[2 * lag:] - field[:-2 * lag])))
+
+
+def lag_of(field: FloatArray, noise_std: float, most: int) -> int:
+    """Lag that suits the width of a pass.
+
+    Parameters
+    ----------
+    field : (n, 2) array, T
+        As for `field_rotation`.
+    noise_std : float, T
+    most : int
+        Samples at each end that are free of the target.
+
+    Returns
+    -------
+    int
+        From 1 to a quarter of the window; 0 if the field does not exceed the noise.
+    """
+    around = 1 + len(field) // 20
+    energy = np.convolve(np.sum(field**2, axis=1) - 2.0 * noise_std**2, np.ones(around), 'same')
+    # Counted, since another target may be at an end of the window.
+    width = np.count_nonzero(energy > 0.5 * energy.max())
+    if not width:
+        return 0
+    return int(np.clip(round(LAG * width), 1, max(1, min(most, len(field) // 4))))
+
+
+def best_lag(windows: Iterable[FloatArray], noise_std: float, lags: Sequence[int]) -> int:
+    """Lag with the smallest mean error probability over a training set.
+
+    Parameters
+    ----------
+    windows : iterable of (n, 2) arrays, T
+        As for `field_rotation`.
+    noise_std : float, T
+    lags : sequence of int
+        Candidates.
+
+    Returns
+    -------
+    int
+
+    References
+    ----------
+    [PHD15]_ Paper B eq. (19).
+    """
+    windows = list(windows)
+    errors = [np.mean([field_rotation(w, noise_std, lag).error_probability for w in windows])
+              for lag in lags]
+    return lags[int(np.argmin(errors))]
+
+
+def fused_log_odds(log_odds: Iterable[float], same_side: Iterable[bool]) -> float:
+    """Log odds of left to right, seen from the side of the first kind of sensors.
+
+    Parameters
+    ----------
+    log_odds : iterable of float
+        Log odds of each sensor, as it sees the target.
+    same_side : iterable of bool
+        False for a sensor on the opposite side of the road, to which left is right.
+
+    Returns
+    -------
+    float
+
+    References
+    ----------
+    [PHD15]_ Paper B eq. (20)-(23); the sensors' errors are taken as independent.
+    """
+    return float(sum(value if same else -value
+                     for value, same in zip(log_odds, same_side, strict=True)))

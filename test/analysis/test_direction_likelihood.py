@@ -1,0 +1,54 @@
+"""The likelihood ratio of two lanes: right without noise, scaled as theory has it, and refused."""
+
+import numpy as np
+import pytest
+
+from mag_tracking.analysis.direction_likelihood import (
+    LaneHypothesis,
+    direction_likelihood_ratio,
+)
+from mag_tracking.physics.dipole import dipole_field
+from support.two_way_traffic import calibration, passings, shares
+
+RIGHT, LEFT = LaneHypothesis(25.0, 3.5), LaneHypothesis(-25.0, 6.5)
+T = np.arange(-0.75, 0.75, 0.01)
+
+
+def passing(rng, lane):
+    """(n, 2) [T] horizontal field of a random dipole in a lane, at the sensor."""
+    r = np.stack([lane.speed * (T - rng.uniform(-0.1, 0.1)), np.full(len(T), lane.distance),
+                  np.full(len(T), lane.height)], axis=1)
+    return dipole_field(-r, 400.0 * rng.standard_normal(3))[:, :2]
+
+
+@pytest.mark.parametrize('height', [0.0, 0.6])
+def test_a_dipole_in_either_lane_is_told(height):
+    rng = np.random.default_rng(0)
+    right, left = RIGHT._replace(height=height), LEFT._replace(height=height)
+    for _ in range(30):
+        for lane, sign in ((right, 1.0), (left, -1.0)):
+            h = passing(rng, lane)
+            noisy = h + 1e-8 * rng.standard_normal(h.shape)
+            assert sign * direction_likelihood_ratio(T, noisy, 1e-8, right, left) > 0.0
+
+
+def test_a_matched_lane_leaves_the_noise():
+    """The larger of the two likelihoods is that of noise; the ratio grows with the signal."""
+    rng = np.random.default_rng(1)
+    h = passing(rng, RIGHT)
+    ratios = [direction_likelihood_ratio(T, h, std, RIGHT, LEFT) for std in (2e-8, 1e-8)]
+    assert ratios[1] == pytest.approx(4.0 * ratios[0], rel=1e-6)
+
+
+@pytest.mark.study
+@pytest.mark.parametrize('simulator', ['clouds', 'boxes'])
+def test_directions_in_the_published_traffic(simulator):
+    """PHD15 Paper B, Table 1: 510 of 511 near, 494 of 511 fused."""
+    vehicles = passings(simulator, 1)
+    share = shares(vehicles, [v.log_odds_of_north() for v in vehicles])
+    # Three standard deviations of 511 below the aims of 99.8 % and 97 %. With boxes 99.5 % are
+    # reached (`bench.directions`): trucks in the other lane within half a second.
+    assert share.near > 0.998 - 3.0 * np.sqrt(0.998 * 0.002 / 511)
+    assert share.fused > 0.97 - 3.0 * np.sqrt(0.97 * 0.03 / 511)
+    stated, measured = calibration(vehicles)
+    assert abs(stated - measured) < 0.05

@@ -1,0 +1,155 @@
+"""The traffic of PHD15 Paper B, simulated: 511 vehicles between two sensors with two axes.
+
+Both lanes, the counts of both directions, the distances and the speed are the paper's; vehicles
+are those of either simulator, sensors have errors, and some vehicles meet or follow closely.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mag_tracking.analysis.direction_likelihood import (
+    LaneHypothesis,
+    direction_likelihood_ratio,
+)
+from mag_tracking.inference.driving_direction import (
+    FieldRotation,
+    field_rotation,
+    fused_log_odds,
+    lag_of,
+)
+from support.passes import EARTH
+from support.situation_worlds import car, truck
+
+SENSORS = np.array([[0.0, -5.0, 0.0], [0.0, 5.0, 0.0]])
+LANE_M = 1.5
+"""[m] Lanes at y = -1.5 (northbound, along x) and y = 1.5: 3.5 m and 6.5 m from the sensors."""
+N_NORTH, N_SOUTH = 291, 220
+SPEED, SPEED_STD = 25.0, 2.5
+MINUTES = 120.0
+RATE = 100.0
+WINDOW_S, PAD_S = 0.7, 0.4
+"""[s] The paper has 1.5 s, in which more of the others are seen, too."""
+SATURATION = 200e-6
+NOISE = 3e-8
+"""[T] On each axis."""
+OFFSET_STD = 5e-9
+"""[T] Error of the background."""
+TRUCKS = 0.1
+LEAST_HEADWAY_S = 1.0
+"""[s] In one lane."""
+
+
+@dataclass(frozen=True)
+class Passing:
+    """A vehicle, what both sensors measured around it, and the truth."""
+
+    t: np.ndarray
+    """(n,) [s] from the closest approach."""
+    field: np.ndarray
+    """(2, n, 2) [T] of each sensor, world axes."""
+    is_north: bool
+    headway: float
+    """[s] to the nearest other vehicle at the sensors."""
+
+    @property
+    def near(self):
+        """Row of the sensor beside the vehicle's own lane."""
+        return 0 if self.is_north else 1
+
+    def rotations(self):
+        """`FieldRotation` of each sensor; none where the field tells nothing."""
+        pad = int(PAD_S * RATE)
+        out = []
+        for field in self.field:
+            lag = lag_of(field, NOISE, pad)
+            out.append(field_rotation(field, NOISE, lag) if lag else FieldRotation(0.0, 1.0))
+        return out
+
+    def likelihood_ratio_of_north(self):
+        """(log likelihood ratio of each sensor, their sum) of a vehicle along x."""
+        near, far = 5.0 - LANE_M, 5.0 + LANE_M
+        one = direction_likelihood_ratio(self.t, self.field[0], NOISE,
+                                         LaneHypothesis(SPEED, near), LaneHypothesis(-SPEED, far))
+        # From the second sensor, which looks along -y, the axes are turned.
+        other = direction_likelihood_ratio(self.t, -self.field[1], NOISE,
+                                           LaneHypothesis(SPEED, near),
+                                           LaneHypothesis(-SPEED, far))
+        return [one, -other], one - other
+
+    def log_odds_of_north(self):
+        """([log odds of each sensor], fused ones) of a vehicle along x."""
+        # From the first sensor a northbound vehicle moves from left to right.
+        one, other = (r.log_odds for r in self.rotations())
+        return [one, -other], fused_log_odds([one, other], [True, False])
+
+
+def arrivals(rng):
+    """[(time [s], is it northbound, speed [m/s])] in order of time."""
+    out = []
+    for n, is_north in ((N_NORTH, True), (N_SOUTH, False)):
+        while True:
+            t = np.sort(rng.uniform(0.0, 60.0 * MINUTES, n))
+            close = np.flatnonzero(np.diff(t) < LEAST_HEADWAY_S)
+            t[close + 1] = t[close] + LEAST_HEADWAY_S
+            if np.diff(t).min() >= LEAST_HEADWAY_S:
+                break
+        out += [(float(at), is_north, float(rng.normal(SPEED, SPEED_STD))) for at in t]
+    return sorted(out)
+
+
+def passings(simulator, seed):
+    """[`Passing`] of all vehicles of one replica."""
+    rng = np.random.default_rng([seed, len(simulator)])
+    plan = arrivals(rng)
+    bodies = [(truck if rng.random() < TRUCKS else car)(rng, simulator) for _ in plan]
+    gain = 1.0 + 0.01 * rng.standard_normal((2, 2))
+    lateral = LANE_M + 0.3 * rng.standard_normal(len(plan))
+    half = WINDOW_S / 2.0 + PAD_S
+    t, out = np.arange(-half, half, 1.0 / RATE), []
+    times = np.array([p[0] for p in plan])
+    for k, (at, is_north, _) in enumerate(plan):
+        near = np.flatnonzero(np.abs(times - at) < half + 2.0)
+        B = sum(field_of(bodies[i], plan[i], lateral[i], at + t) for i in near)
+        B = np.clip(gain[:, None] * B + OFFSET_STD * rng.standard_normal((2, 1, 2))
+                    + NOISE * rng.standard_normal(B.shape), -SATURATION, SATURATION)
+        others = np.abs(np.delete(times, k) - at)
+        out.append(Passing(t, B, is_north, float(others.min())))
+    return out
+
+
+def field_of(body, arrival, lateral, t):
+    """(2, n, 2) [T] field of a vehicle at both sensors at times (n,) [s]."""
+    at, is_north, speed = arrival
+    way = 1.0 if is_north else -1.0
+    position = np.stack([way * speed * (t - at), np.full(len(t), -way * lateral)], axis=1)
+    heading = np.full(len(t), 0.0 if is_north else np.pi)
+    return body.field(EARTH, position, heading, SENSORS)[..., :2].swapaxes(0, 1)
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Shares of right directions."""
+
+    near: float
+    far: float
+    fused: float
+
+
+def shares(vehicles, log_odds):
+    """`Shares` of `Passing`s, of ([log odds of each sensor], fused ones) of each."""
+    north = np.array([v.is_north for v in vehicles])
+    near = np.array([v.near for v in vehicles])
+    single = (np.array([each for each, _ in log_odds]) > 0.0) == north[:, None]
+    rows = np.arange(len(near))
+    return Shares(*(float(np.mean(right)) for right in (
+        single[rows, near], single[rows, 1 - near],
+        (np.array([fused for _, fused in log_odds]) > 0.0) == north)))
+
+
+def calibration(vehicles):
+    """(stated, measured) error probability in the far lane, of vehicles that are alone."""
+    alone = [v for v in vehicles if v.headway > 2.0]
+    far = [(v.log_odds_of_north()[0][1 - v.near], v.is_north) for v in alone]
+    stated = [1.0 / (1.0 + np.exp(min(abs(odds), 500.0))) for odds, _ in far]
+    return float(np.mean(stated)), float(np.mean([(odds > 0.0) != north for odds, north in far]))
