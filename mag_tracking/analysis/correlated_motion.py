@@ -308,6 +308,9 @@ def _refined(pair: _Pair, tau: float) -> tuple[float, float, float]:
         information = J.T @ J / std**2 + prior
         step = np.linalg.solve(information, J.T @ left / std**2 - prior @ theta)
         theta = theta + step
+        if abs(theta[0] - tau) > pair.t[-1] - pair.t[0]:
+            # Diverged, and soon beyond all numbers.
+            return tau, np.inf, 0.0
         if abs(step[0]) < 1e-6 * pair.width:
             break
     if abs(theta[0] - tau) > STRAYED * pair.width or theta @ prior @ theta > MOST_CHANGED:

@@ -9,7 +9,7 @@ last need not be where the smoothed track ends: each was linearised elsewhere.
 from collections import deque
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -39,7 +39,8 @@ MOST_NUMBERS = 10_000_000
 
 def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[FieldFrame],
                    intervals: Sequence[float], updated: bool = False,
-                   relinearisations: int = RELINEARISATIONS) -> tuple[list[State], int]:
+                   relinearisations: int = RELINEARISATIONS, path: Sequence[FloatArray] = ()
+                   ) -> tuple[list[State], int]:
     """States of a hypothesis at each frame, given all of them.
 
     Parameters
@@ -53,6 +54,8 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
     updated : bool
         The bank has been updated with the first frame.
     relinearisations : int
+    path : list of FloatArray (n_x,)
+        States at the first frames, as far as they are known; the first pass is linearised there.
 
     Returns
     -------
@@ -61,6 +64,8 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
         Frames that the hypothesis contradicted; it coasted through them.
     """
     paths = np.full((1, len(frames), bank.x.shape[1]), np.nan)
+    for at, known in zip(paths[0], path, strict=False):
+        at[:] = known
     along = bank_filter.run_along(
         bank.alone(0), frames, intervals, paths, passes=relinearisations + 1, step=1.0,
         first_is_updated=updated, leaves_out=True, wants_covariances=True)
@@ -74,6 +79,15 @@ class _Start:
 
     bank_filter: BankFilter
     bank: FilterBank | StartingBank
+    window: Window | None = None
+    """The frames with which it began again, with the paths of the hypotheses."""
+
+    def path_of(self, origin: int) -> list[FloatArray]:
+        """The path of a hypothesis through the frames of the window."""
+        if self.window is None:
+            return []
+        row = int(np.flatnonzero(self.window.anchor.origin == origin)[0])
+        return [path[row] for path in self.window.paths]
 
 
 class WholeTrack:
@@ -105,6 +119,11 @@ class WholeTrack:
         """Go on from a window of another filter, of which all frames count as published."""
         anchor = window.anchor.rows(np.arange(len(window.anchor)))
         self.begin(anchor, bank_filter)
+        if self._start is not None:
+            # The window goes on, and drops what this still needs.
+            kept = replace(window, anchor=window.anchor.rows(np.arange(len(window.anchor))),
+                           paths=[path.copy() for path in window.paths])
+            self._start = replace(self._start, window=kept)
         self._updated = window.is_updated
         for frame, dt in zip(window.frames, window.intervals, strict=True):
             self.add(anchor, frame, dt, True)
@@ -137,9 +156,10 @@ class WholeTrack:
         start = self._start
         if start is None or not self._frames:
             return [], 0
-        one = start.bank.rows(np.flatnonzero(start.bank.origin == bank.origin[best]))
+        origin = int(bank.origin[best])
+        one = start.bank.rows(np.flatnonzero(start.bank.origin == origin))
         states, left_out = smoothed_track(start.bank_filter, one, self._frames, self._intervals,
-                                          self._updated)
+                                          self._updated, path=start.path_of(origin))
         return [(frame.stamp_ns, x, P) for frame, (x, P), published in zip(
             self._frames, states, self._published, strict=True) if published], left_out
 
