@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from mag_tracking.apps.plan_inputs import plan
     from mag_tracking.apps.readings import RecordedReadings, read_recording, readings_from_arrays
     from mag_tracking.apps.track import TrackingResult, track
+    from mag_tracking.apps.traffic import TrafficResult, traffic
     from mag_tracking.errors import (
         MagTrackingError,
         MissingDependencyError,
@@ -41,8 +42,8 @@ __all__ = [
     'EventsResult', 'FitResult', 'FittedPass', 'MagTrackingError', 'MissingDependencyError',
     'NetworkError', 'Plan', 'PlannedTarget', 'Readings', 'ReadingsError', 'RecordedReadings',
     'RecordingError', 'Sampling', 'SensorNetwork', 'SettingsError', 'TrackingResult',
-    'UnknownTrackError', 'events', 'fit', 'plan', 'read_network', 'read_parameter_file',
-    'read_recording', 'readings_from_arrays', 'track']
+    'TrafficResult', 'UnknownTrackError', 'events', 'fit', 'plan', 'read_network',
+    'read_parameter_file', 'read_recording', 'readings_from_arrays', 'track', 'traffic']
 
 # The modules of the names above, imported on first use: `import mag_tracking` is done by every
 # command and node at once, and compiled code and the figures take seconds.
@@ -54,6 +55,7 @@ _MODULES = {
     'apps.plan_inputs': ('plan',),
     'apps.readings': ('RecordedReadings', 'read_recording', 'readings_from_arrays'),
     'apps.track': ('TrackingResult', 'track'),
+    'apps.traffic': ('TrafficResult', 'traffic'),
     'errors': ('MagTrackingError', 'MissingDependencyError', 'NetworkError', 'ReadingsError',
                'RecordingError', 'SettingsError', 'UnknownTrackError'),
     'network': ('SensorNetwork',),

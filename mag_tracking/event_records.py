@@ -1,4 +1,4 @@
-"""The records of what happened: passes described by one sensor, and disturbances."""
+"""Event records: passes described by one sensor, disturbances, vehicles that crossed a line."""
 
 from dataclasses import dataclass
 
@@ -61,3 +61,75 @@ class Disturbance:
     """Probability that one field over the network made it, and not one at each sensor."""
     track_id: int
     """The latest track that it made ambiguous."""
+
+
+@dataclass(frozen=True, slots=True)
+class VehiclePassage:
+    """A vehicle that crossed a counting line, from its whole track."""
+
+    stamp_ns: int
+    """When its middle was on the line."""
+    number: int
+    """Counts the passages of all lines, from 1, in order of time."""
+    line: str
+    track_id: int
+    forward: bool
+    """Whether it moved in the forward direction of the line."""
+    direction_error: float
+    """Probability that the direction is wrong, by the rotation of the field at each sensor beside
+    its path and not by the track; NaN where that tells nothing or another vehicle was near."""
+    position: FloatArray
+    """(3,) [m] on the line, world."""
+    lateral: float
+    """[m] to the left of the line's middle, seen in its forward direction."""
+    velocity: FloatArray
+    """(3,) [m/s], world."""
+    speed: float
+    """[m/s], horizontal."""
+    speed_std: float
+    length: float
+    """[m] of the row of dipoles that it is taken for; 0 for a point."""
+    length_std: float
+    """[m]; 0 for a point."""
+    moment: FloatArray
+    """(3,) [A m^2], world."""
+    moment_covariance: FloatArray
+    """(3, 3)."""
+    vehicle_class: str
+    """The most probable class, or `unknown`."""
+    class_probabilities: FloatArray
+    """(n_classes,) in the order of `traffic.class_names`."""
+    headway: float
+    """[s] since the passage before in the same direction; NaN of the first one."""
+    ambiguous: bool
+    """Whether the track is doubtful at the line."""
+    doubts: tuple[str, ...]
+    """Why: names of `stages.traffic.stage`."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrafficCount:
+    """Vehicles of one direction and class in an interval."""
+
+    forward: bool
+    vehicle_class: str
+    count: int
+    ambiguous: int
+    """Of them."""
+    mean_speed: float
+    """[m/s]"""
+    mean_headway: float
+    """[s]; NaN where none is known."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrafficSummary:
+    """Traffic across one line in one interval."""
+
+    begin_ns: int
+    end_ns: int
+    line: str
+    observed_s: float
+    """[s] of the interval that are covered by frames."""
+    counts: tuple[TrafficCount, ...]
+    """Of the directions and classes that were there."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 from mag_tracking.errors import SettingsError
-from mag_tracking.event_records import Disturbance
+from mag_tracking.event_records import Disturbance, TrafficSummary, VehiclePassage
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Detection, FieldFrame, Readings, SmoothedPose, Track
 from mag_tracking.settings import replace
@@ -21,6 +21,8 @@ from mag_tracking.stages.stage import Stage, rejected
 from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.settings import TrackSettings
+from mag_tracking.stages.traffic.settings import TrafficSettings
+from mag_tracking.stages.traffic.stage import TrackedFrame, Traffic
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,7 @@ class Settings:
     detect: DetectSettings = field(default_factory=DetectSettings)
     events: EventsSettings = field(default_factory=EventsSettings)
     track: TrackSettings = field(default_factory=TrackSettings)
+    traffic: TrafficSettings = field(default_factory=TrafficSettings)
     survey: SurveySettings = field(default_factory=SurveySettings)
 
 
@@ -75,7 +78,8 @@ def settings_for(target: str, changes: Mapping[str, Any] | None = None) -> Setti
     return replace(replace(Settings(), TARGET_DEFAULTS[target]), changes)
 
 
-Output: TypeAlias = FieldFrame | Detection | Track | SmoothedPose | Disturbance
+Output: TypeAlias = (FieldFrame | Detection | Track | SmoothedPose | Disturbance | VehiclePassage
+                     | TrafficSummary)
 """What leaves the chain."""
 
 
@@ -89,11 +93,13 @@ class Pipeline:
         self.align = Align(network, settings.align)
         self.detect = Detect(network, settings.detect)
         self.track = TrackManager(network, settings.track)
+        self.traffic = Traffic(network, settings.traffic, settings.track.target == 'vehicle')
         # The same as links of the chain: a type checker compares them with the protocol.
         self._calibrate: Stage[Readings, Readings] = self.calibrate
         self._align: Stage[Readings, FieldFrame] = self.align
         self._detect: Stage[FieldFrame, FieldFrame | Detection] = self.detect
         self._track: Stage[FieldFrame, Track | SmoothedPose | Disturbance] = self.track
+        self._traffic: Stage[TrackedFrame, VehiclePassage | TrafficSummary] = self.traffic
 
     def feed(self, readings: Readings) -> list[Output]:
         """Raw `Readings` give the `FieldFrame | Detection | Track` records that follow.
@@ -106,14 +112,17 @@ class Pipeline:
 
     def flush(self) -> list[Output]:
         """The input has ended: what was still held back."""
-        return [*self._after_calibrate(self._calibrate.flush()),
-                *self._after_align(self._align.flush()),
-                *self._after_detect(self._detect.flush()), *self._track.flush()]
+        out = [*self._after_calibrate(self._calibrate.flush()),
+               *self._after_align(self._align.flush()),
+               *self._after_detect(self._detect.flush())]
+        tracked = self._track.flush()
+        return [*out, *tracked, *self._traffic.feed(TrackedFrame(None, tracked)),
+                *self._traffic.flush()]
 
     def _stages(self) -> dict[str, Stage[Any, Any]]:
         """{name: stage}, in the order of the way."""
         return {'calibrate': self._calibrate, 'align': self._align, 'detect': self._detect,
-                'track': self._track}
+                'track': self._track, 'traffic': self._traffic}
 
     def _after_calibrate(self, batches: Iterable[Readings]) -> list[Output]:
         """The outputs that follow from calibrated readings."""
@@ -129,7 +138,8 @@ class Pipeline:
         for record in records:
             out.append(record)
             if isinstance(record, FieldFrame):
-                out += self._track.feed(record)
+                tracked = self._track.feed(record)
+                out += [*tracked, *self._traffic.feed(TrackedFrame(record, tracked))]
         return out
 
     def counts(self) -> dict[str, dict[str, int]]:

@@ -172,7 +172,7 @@ class RunCollector:
                 self._results.add_smoothed(record)
                 if record.complete:
                     self.smoothed.setdefault(record.id, SmoothedLog(record.id)).add(record)
-            else:
+            elif isinstance(record, Track):
                 self._results.add_track(record)
                 self.logs.setdefault(record.id, TrackLog(record.id)).add(record, self._frame)
 

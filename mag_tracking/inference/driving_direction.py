@@ -18,6 +18,14 @@ LAG = 0.35
 speed (PHD15 Paper B eq. (19))."""
 
 LEAST_SAMPLES = 8
+"""A shorter window tells nothing."""
+
+MOST_SURE = 0.98
+"""The sign of the correlation is exact for a target at the height of the sensor only. Half its
+lateral distance above it 0.6 % of random moments turn the other way, the whole distance 2.2 %."""
+
+UPRIGHT = 0.2
+"""Share of the vertical field that a tilted horizontal axis may miss."""
 
 
 class FieldRotation(NamedTuple):
@@ -185,3 +193,61 @@ def fused_log_odds(log_odds: Iterable[float], same_side: Iterable[bool]) -> floa
     """
     return float(sum(value if same else -value
                      for value, same in zip(log_odds, same_side, strict=True)))
+
+
+def horizontal_field(field: FloatArray, R_ws: FloatArray) -> FloatArray:
+    """Horizontal components in the world.
+
+    Parameters
+    ----------
+    field : (n, 3) array, T, sensor frame
+        NaN = missing axis; one that is nearly vertical matters little.
+    R_ws : (3, 3) array
+        Rotation from the sensor to the world.
+
+    Returns
+    -------
+    (n, 2) array, T
+        NaN where they are not known.
+    """
+    out: FloatArray = np.zeros((len(field), 2))
+    for a in range(3):
+        missing = np.isnan(field[:, a])
+        for b in range(2):
+            part = R_ws[b, a] * field[:, a]
+            out[:, b] += np.where(missing, 0.0 if abs(R_ws[b, a]) < UPRIGHT else np.nan, part)
+    return out
+
+
+def turning(field: FloatArray, noise_std: float, n_quiet: int) -> tuple[float, float]:
+    """Which way the horizontal field of a pass turns.
+
+    Seen from the sensor towards the target, a target that moves from left to right turns the
+    horizontal field one way, from right to left the other way, whatever its moment.
+
+    Parameters
+    ----------
+    field : (n, 2) array, T
+        Horizontal field, x and y of a frame whose z points up.
+    noise_std : float, T
+        Of one sample on each axis.
+    n_quiet : int
+        Samples at both ends that are without the target.
+
+    Returns
+    -------
+    correlation : float, T^2
+        Negative from left to right.
+    probability : float
+        Of left to right; 0.5 where the field does not tell. Every size of the correlation is taken
+        for equally likely beforehand, so that it is too sure where the target is below the noise.
+
+    References
+    ----------
+    [PHD15]_ Paper B eq. (5), (11), (16), (18).
+    """
+    lag = lag_of(field, noise_std, n_quiet) if len(field) >= LEAST_SAMPLES else 0
+    if not lag:
+        return 0.0, 0.5
+    found = field_rotation(field, noise_std, lag)
+    return found.correlation, float(np.clip(found.left_to_right, 1.0 - MOST_SURE, MOST_SURE))

@@ -8,7 +8,12 @@ from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
-from mag_tracking.event_records import Disturbance, PassEvent
+from mag_tracking.event_records import (
+    Disturbance,
+    PassEvent,
+    TrafficSummary,
+    VehiclePassage,
+)
 from mag_tracking.geometry import rotation_from_quaternion
 from mag_tracking.messages.shapes import FieldReadings, Imu, MagneticField, MessageDict, Time
 from mag_tracking.records import (
@@ -262,6 +267,29 @@ def pass_event_dict(e: PassEvent) -> MessageDict:
             'closest_time': stamp_dict(e.closest_ns), 'closest_std': e.closest_std,
             'time_scale': e.time_scale, 'left_to_right': e.left_to_right,
             'signature': doubles(e.signature.ravel())}
+
+
+def vehicle_passage_dict(p: VehiclePassage, class_names: Sequence[str],
+                         frame: str) -> MessageDict:
+    """mag_tracking_msgs/VehiclePassage of a `VehiclePassage`."""
+    return {'header': header_dict(p.stamp_ns, frame), 'number': p.number, 'line': p.line,
+            'track_id': p.track_id, 'forward': p.forward, 'direction_error': p.direction_error,
+            'position': xyz(p.position), 'lateral': p.lateral, 'velocity': xyz(p.velocity),
+            'speed': p.speed, 'speed_std': p.speed_std, 'length': p.length,
+            'length_std': p.length_std, 'moment': xyz(p.moment),
+            'moment_covariance': p.moment_covariance.ravel().tolist(),
+            'vehicle_class': p.vehicle_class, 'class_names': list(class_names),
+            'class_probabilities': doubles(p.class_probabilities), 'headway': p.headway,
+            'ambiguous': p.ambiguous, 'doubts': list(p.doubts)}
+
+
+def traffic_summary_dict(s: TrafficSummary, frame: str) -> MessageDict:
+    """mag_tracking_msgs/TrafficSummary of a `TrafficSummary`."""
+    return {'header': header_dict(s.end_ns, frame), 'begin': stamp_dict(s.begin_ns),
+            'line': s.line, 'observed_s': s.observed_s, 'counts': [
+                {'forward': c.forward, 'vehicle_class': c.vehicle_class, 'count': c.count,
+                 'ambiguous': c.ambiguous, 'mean_speed': c.mean_speed,
+                 'mean_headway': c.mean_headway} for c in s.counts]}
 
 
 def odometry_dict(track: Track, frame: str, child_frame: str) -> MessageDict | None:

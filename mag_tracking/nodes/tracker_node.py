@@ -60,11 +60,13 @@ from mag_tracking.nodes.stage_node import (
     is_heard,
 )
 from mag_tracking.nodes.steady_timer import steady_timer
+from mag_tracking.nodes.traffic_topics import TrafficTopics
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.stage import Stage
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.running_track import TrackRecord
 from mag_tracking.stages.track.settings import BEST
+from mag_tracking.stages.traffic.stage import TrackedFrame
 
 SLACK_S = 1.0
 """[s] What the way of a frame may take on top of the longest gap."""
@@ -82,6 +84,7 @@ class TrackerNode(StageNode):
         self.behind_pose: Callable[[], None] | None = None
         """Called when a pose is out, before all else: a track follows the frame it is of."""
         self._stage = TrackManager(self.network, self.settings.track)
+        self._traffic = TrafficTopics(self)
         follow_changes(self, self.settings, lambda s: self._stage.configure(s.track))
         self._child_frame = fixed_parameter(
             self, 'child_frame', '', 'Frame of the target in odometry and transforms, as '
@@ -118,7 +121,7 @@ class TrackerNode(StageNode):
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
         """{name: stage} whose counts are published."""
-        return {'track': self._stage}
+        return {'track': self._stage, 'traffic': self._traffic.stage}
 
     def end_without_frames(self) -> None:
         """Tell of a track that is lost because no frame comes any more.
@@ -135,7 +138,7 @@ class TrackerNode(StageNode):
         was_silent, self._is_silent = self._is_silent, \
             silent_s > self.settings.track.end_gap_s + SLACK_S
         if was_silent and self._is_silent:
-            self._publish_all(self._stage.give_up('no frames came'))
+            self._publish_all(self._stage.give_up('no frames came'), None)
 
     def _calibrated(self, message: CalibrationState) -> None:
         """The sensors' orientations, which a survey may have changed, and doubtful backgrounds."""
@@ -181,12 +184,12 @@ class TrackerNode(StageNode):
 
     def _feed(self, frame: FieldFrame) -> None:
         """What follows from a frame, published."""
-        self._publish_all(self._stage.feed(frame))
+        self._publish_all(self._stage.feed(frame), frame)
         if self._stage.clocks_apart:
             self.get_logger().warning(self._stage.clocks_apart, throttle_duration_sec=60.0)
 
-    def _publish_all(self, records: list[TrackRecord]) -> None:
-        """`Track`s, `SmoothedPose`s and `Disturbance`s, each where it belongs."""
+    def _publish_all(self, records: list[TrackRecord], frame: FieldFrame | None) -> None:
+        """`Track`s, `SmoothedPose`s and `Disturbance`s of a frame, each where it belongs."""
         whole = []
         for record in records:
             if isinstance(record, Disturbance):
@@ -205,6 +208,7 @@ class TrackerNode(StageNode):
             self._smoothed.publish(to_message(
                 SmoothedTrack, smoothed_track_dict(mine, self.network.frame)))
             self._smoothed_path.publish(self._path_of(mine))
+        self._traffic.take(TrackedFrame(frame, records), frame is None)
 
     def _path_of(self, poses: list[SmoothedPose]) -> Path:
         """nav_msgs/Path of `SmoothedPose`s, with the header of the latest."""

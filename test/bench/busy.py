@@ -20,7 +20,7 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_vehicle import start_vehicle, vehicle_model
 from mag_tracking.stages.track.newcomer import NewcomerSearch
 from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
-from support.busy_recordings import BUSY, tracked_recording
+from support.busy_recordings import BUSY, rightly_counted, tracked_recording
 from support.busy_worlds import NETWORKS, busy, tracked
 from support.random_passes import KINDS, are_wrong, one_random_pass
 
@@ -71,11 +71,15 @@ def recordings(figures, folder):
     for path in shown(sorted(folder.glob('*.truth.json')), 'recordings'):
         name = path.name.removesuffix('.truth.json')
         with searches() as seconds:
-            got, _, _ = tracked_recording(name, folder)
+            tracked = tracked_recording(name, folder)
+            got = tracked.score
         rms, nees, found = aims_of(name)
         n = len(got.rms)
         figures.add(f'{name}: found', float(got.is_found.mean()), '', found, True,
                     f' ({got.is_found.sum()} of {n})')
+        figures.add(f'{name}: counted in the right direction', float(len(
+            rightly_counted(name, tracked.passages, folder))), '', None, True,
+            f' (of {len(tracked.passages)} counted)')
         figures.add(f'{name}: RMS', float(np.nanmedian(got.rms)), 'm', rms)
         figures.add(f'{name}: NEES', float(np.nanmedian(got.nees)), '', nees)
         figures.add(f'{name}: tracks of nobody', got.n_extra, '', 0)

@@ -5,21 +5,34 @@ Those in `test/data/busy` are some of nine; `folder` takes the others.
 
 import json
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from mag_tracking.apps.first_pass import first_pass_of
 from mag_tracking.apps.readings import recorded
+from mag_tracking.event_records import VehiclePassage
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.records import Readings, Track
+from mag_tracking.records import Readings, SmoothedPose, Track
 from support.bundled import DATA
-from support.busy_worlds import score
+from support.busy_worlds import Score, score
 from support.passes import network_of
 
 BUSY = DATA / 'busy'
 NAMES = tuple(sorted(p.name.removesuffix('.truth.json') for p in BUSY.glob('*.truth.json')))
+
+
+class TrackedRecording(NamedTuple):
+    """What came of a recording."""
+
+    score: Score
+    poses: list[Track]
+    pipeline: Pipeline
+    smoothed: list[SmoothedPose]
+    """Of complete tracks."""
+    passages: list[VehiclePassage]
 
 
 def network_of_recording(name, folder=BUSY):
@@ -30,7 +43,7 @@ def network_of_recording(name, folder=BUSY):
 
 
 def tracked_recording(name, folder=BUSY, changes=None):
-    """(`Score`, [`Track`], `Pipeline`) of a recording."""
+    """`TrackedRecording` of a recording."""
     network = network_of_recording(name, folder)
     pipeline = Pipeline(network, settings_for('vehicle', changes))
     recording = Recording(folder / f'{name}.mcap')
@@ -41,4 +54,22 @@ def tracked_recording(name, folder=BUSY, changes=None):
     poses = [r for r in records if isinstance(r, Track) and not r.ended]
     vehicles = [(stamps / 1e9, position[:, :2]) for stamps, position, _ in
                 recorded(recording, reader, Readings.joined([])).truth.values()]
-    return score(poses, vehicles), poses, pipeline
+    return TrackedRecording(score(poses, vehicles), poses, pipeline,
+                            [r for r in records if isinstance(r, SmoothedPose) and r.complete],
+                            [r for r in records if isinstance(r, VehiclePassage)])
+
+
+def rightly_counted(name, passages, folder=BUSY):
+    """[(passage, vehicle)] of the passages that are within a second of a vehicle of the truth, in
+    its direction; each vehicle once."""
+    truth, out = json.loads((folder / f'{name}.truth.json').read_text()), []
+    left = list(truth['vehicles'])
+    for p in passages:
+        def apart(vehicle, at=p.stamp_ns / 1e9 - truth['epoch_s']):
+            return abs(vehicle['cpa_time_s'] - at)
+
+        near = [v for v in left if (v['direction'] > 0) == p.forward and apart(v) < 1.0]
+        if near:
+            left.remove(best := min(near, key=apart))
+            out.append((p, best))
+    return out

@@ -25,7 +25,7 @@ tracked_recording = cache(busy_recordings.tracked_recording)
 @pytest.mark.parametrize('name', AIMS)
 def test_every_vehicle_of_a_recording_is_followed(name):
     found, rms, nees = AIMS[name]
-    got, poses, pipeline = tracked_recording(name)
+    got, poses, pipeline, *_ = tracked_recording(name)
     assert got.is_found.sum() >= found, str(got)
     assert np.nanmedian(got.rms) <= rms and np.nanmedian(got.nees) <= nees, str(got)
     assert got.n_extra == 0, str(got)
@@ -34,15 +34,42 @@ def test_every_vehicle_of_a_recording_is_followed(name):
     assert pipeline.track.counts['tracks'] == len({p.id for p in poses})
 
 
+@pytest.mark.parametrize('name', AIMS)
+def test_every_vehicle_of_a_recording_is_counted(name):
+    """In its direction, and no other."""
+    passages = tracked_recording(name).passages
+    right = busy_recordings.rightly_counted(name, passages)
+    assert len(right) >= AIMS[name][0] and len(right) == len(passages)
+    assert [p.number for p in passages] == list(range(1, len(passages) + 1))
+    assert (np.diff([p.stamp_ns for p in passages]) > 0).all()
+    trucks = [(p.vehicle_class == 'truck') == (v['length_m'] > 6.0) for p, v in right]
+    assert np.count_nonzero(trucks) >= binom.ppf(0.01, len(trucks), 0.95)
+
+
+def test_smoothed_paths_of_newcomers_are_where_their_poses_were():
+    """They are linearised where the vehicle was found: by themselves they led 50 m astray."""
+    n = 0
+    for name in AIMS:
+        got = tracked_recording(name)
+        published = {(p.id, p.stamp_ns): p for p in got.poses if not p.ambiguous}
+        for s in got.smoothed:
+            p = published.get((s.id, s.stamp_ns))
+            if p is not None:
+                n += 1
+                away = np.hypot(*(s.position - p.position)[:2])
+                assert away < 5.0 * np.sqrt(np.trace(p.covariance[:2, :2])) + 3.0
+    assert n > 300
+
+
 def test_poses_without_a_flag_are_hardly_ever_wrong():
-    scores = [tracked_recording(name)[0] for name in AIMS]
+    scores = [tracked_recording(name).score for name in AIMS]
     n_sure, n_wrong = (sum(getattr(s, of) for s in scores) for of in ('n_sure', 'n_wrong'))
     assert n_sure > 500 and n_wrong <= MOST_WRONG * n_sure
 
 
 def test_a_tracker_of_one_vehicle_at_a_time_is_worse():
     """What all of this is for; and the setting works."""
-    alone, poses, pipeline = busy_recordings.tracked_recording(
+    alone, poses, pipeline, *_ = busy_recordings.tracked_recording(
         'meeting_2_sensors', changes={'track.most_together': 1})
     assert alone.is_found.sum() <= 10
     assert pipeline.track.counts['tracks of newcomers'] == 0

@@ -6,7 +6,6 @@ import numpy as np
 from scipy.optimize import minimize
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.inference.driving_direction import LEAST_SAMPLES, field_rotation, lag_of
 from mag_tracking.physics.anderson import anderson_residual
 from mag_tracking.records import plain
 
@@ -21,10 +20,6 @@ CORRELATED = 2.0
 
 OFF_CENTRE = 0.15
 """[time scales] The magnetic centre of a vehicle is so far from the middle of its body."""
-
-MOST_SURE = 0.98
-"""The sign of the correlation is exact for a target at the height of the sensor only. Half its
-lateral distance above it 0.6 % of random moments turn the other way, the whole distance 2.2 %."""
 
 
 class ClosestPoint(NamedTuple):
@@ -102,37 +97,3 @@ def _averaged(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     n = -(-len(t) // MOST_SAMPLES) or 1
     k = len(t) // n
     return t[:k * n].reshape(k, n).mean(axis=1), y[:k * n].reshape(k, n, -1).mean(axis=1)
-
-
-def turning(field: FloatArray, noise_std: float, n_quiet: int) -> tuple[float, float]:
-    """Which way the horizontal field of a pass turns.
-
-    Seen from the sensor towards the target, a target that moves from left to right turns the
-    horizontal field one way, from right to left the other way, whatever its moment.
-
-    Parameters
-    ----------
-    field : (n, 2) array, T
-        Horizontal field, x and y of a frame whose z points up.
-    noise_std : float, T
-        Of one sample on each axis.
-    n_quiet : int
-        Samples at both ends that are without the target.
-
-    Returns
-    -------
-    correlation : float, T^2
-        Negative from left to right.
-    probability : float
-        Of left to right; 0.5 where the field does not tell. Every size of the correlation is taken
-        for equally likely beforehand, so that it is too sure where the target is below the noise.
-
-    References
-    ----------
-    [PHD15]_ Paper B eq. (5), (11), (16), (18).
-    """
-    lag = lag_of(field, noise_std, n_quiet) if len(field) >= LEAST_SAMPLES else 0
-    if not lag:
-        return 0.0, 0.5
-    found = field_rotation(field, noise_std, lag)
-    return found.correlation, float(np.clip(found.left_to_right, 1.0 - MOST_SURE, MOST_SURE))

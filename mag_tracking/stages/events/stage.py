@@ -6,20 +6,18 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.event_records import SIGNATURE_SPAN, PassEvent
+from mag_tracking.inference.driving_direction import horizontal_field, turning
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Detection, Readings
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
-from mag_tracking.stages.events.single_sensor_pass import closest_point, turning
+from mag_tracking.stages.events.single_sensor_pass import closest_point
 from mag_tracking.units import NS
 
 PAD_S = 1.0
 """[s] Before an onset and after the last loud frame, where the sensor is without the target."""
-
-UPRIGHT = 0.2
-"""Share of the vertical field that a tilted horizontal axis may miss."""
 
 LONGEST_S = 120.0
 """[s] Of a longer detection, the latest readings are described."""
@@ -149,7 +147,7 @@ class _SensorEvents:
         inside = (onset_ns <= stamp) & (stamp <= release_ns)
         there = ~np.all(np.isnan(field), axis=0)
         closest = closest_point(t, field, noise)
-        horizontal = _horizontal(field, self._R_ws)
+        horizontal = horizontal_field(field, self._R_ws)
         known = ~np.isnan(horizontal).any(axis=1)
         _, left = turning(horizontal[known], float(np.nanmean(noise)) if known.any() else 0.0,
                           int(np.count_nonzero(stamp < onset_ns)))
@@ -159,20 +157,6 @@ class _SensorEvents:
             ''.join(np.array(list('xyz'))[there]), noise,
             onset_ns + int(round(closest.time * NS)), closest.time_std, closest.time_scale, left,
             _signature(t, field, closest.time, closest.time_scale))
-
-
-def _horizontal(field: FloatArray, R_ws: FloatArray) -> FloatArray:
-    """(n, 2) [T] horizontal parts in the world of `field` (n, 3) [T]; NaN where they are not known.
-
-    A missing axis that is nearly vertical matters little.
-    """
-    out: FloatArray = np.zeros((len(field), 2))
-    for a in range(3):
-        missing = np.isnan(field[:, a])
-        for b in range(2):
-            part = R_ws[b, a] * field[:, a]
-            out[:, b] += np.where(missing, 0.0 if abs(R_ws[b, a]) < UPRIGHT else np.nan, part)
-    return out
 
 
 def _noise_of(readings: Readings) -> FloatArray:

@@ -9,13 +9,14 @@ import pytest
 import mag_tracking as mt
 from mag_tracking.cli import main
 from mag_tracking.event_records import PassEvent
+from mag_tracking.inference.driving_direction import MOST_SURE, turning
 from mag_tracking.messages.schema import pass_event_dict
 from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.event_tables import EVENT_COLUMNS
 from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.stage import Calibrate
-from mag_tracking.stages.events.single_sensor_pass import MOST_SURE, closest_point, turning
+from mag_tracking.stages.events.single_sensor_pass import closest_point
 from mag_tracking.stages.events.stage import Events
 from mag_tracking.stages.track.manager import ALONE
 from mag_tracking.units import NS

@@ -1,0 +1,132 @@
+"""mag-tracking traffic."""
+
+import argparse
+import signal
+from collections import Counter
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from mag_tracking.apps.traffic import CountedVehicle, TrafficResult, count_traffic
+from mag_tracking.cli.options import (
+    Commands,
+    add_command,
+    add_recorded_network,
+    distinct_names,
+    recorded_network,
+)
+from mag_tracking.cli.tracking_options import add_settings, settings_of
+from mag_tracking.errors import OutputError
+from mag_tracking.interrupts import noted_signals
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.traffic_tables import (
+    DIRECTIONS,
+    passage_row,
+    summary_rows,
+    write_traffic,
+)
+from mag_tracking.units import NS
+
+_TRAFFIC = '''
+Tracks the vehicles of each recording and counts those that cross a line: time, direction, speed,
+length, class, headway. By default the line is perpendicular to the x axis, through the centre of
+the network; the settings traffic.line_* place others. A vehicle is counted when its track has
+ended. An ambiguous passage is counted, too, and marked with its doubts.
+
+With --out DIR: passages.csv with a row for each vehicle, intervals.csv with counts and mean speeds
+for each interval, direction and class, and the same as Parquet where pyarrow is installed.
+
+examples:
+  mag-tracking traffic road.mcap --network network.yaml
+  mag-tracking traffic monday.mcap tuesday.mcap --network network.yaml --out week
+'''
+
+
+def add(commands: Commands) -> None:
+    """Register the command."""
+    p = add_command(commands, 'traffic', _traffic, _TRAFFIC)
+    p.add_argument('recordings', type=Path, nargs='+', metavar='RECORDING',
+                   help='.mcap, .db3 or .bag files, or rosbag2 folders')
+    add_recorded_network(p)
+    p.add_argument('--out', type=Path, metavar='DIR', help='folder for tables')
+    add_settings(p)
+
+
+def _traffic(args: argparse.Namespace) -> int:
+    """mag-tracking traffic."""
+    network, settings = recorded_network(args), settings_of(args)
+    names = distinct_names(args.recordings)
+    recordings = [Recording(path) for path in args.recordings]
+    for recording in recordings:
+        if args.out is not None and recording.lies_in(args.out):
+            raise OutputError(f'{args.out} is the folder of the recording; the tables would be in '
+                              'it')
+    tables: dict[str, list[dict[str, Any]]] = {'passages': [], 'intervals': []}
+    with noted_signals(signal.SIGINT) as seen:
+        for name, recording in zip(names, recordings, strict=True):
+            if seen:
+                break
+            with tqdm(total=recording.size, unit='B', unit_scale=True, desc=recording.path.name,
+                      disable=None) as bar:
+                result = count_traffic(recording, network, settings, bar.update,
+                                       lambda: bool(seen))
+            _print(name, result, recording)
+            tables['passages'] += [passage_row(name, v.passage, result.class_names, _delay(v))
+                                   for v in result.vehicles]
+            tables['intervals'] += [row for s in result.summaries for row in summary_rows(name, s)]
+    if args.out is not None:
+        paths = write_traffic(args.out, tables)
+        print(f'tables in {args.out}: {", ".join(path.name for path in paths)}')
+    if seen:
+        print('interrupted: this is of what was read until then')
+        return 130
+    return 0
+
+
+def _delay(vehicle: CountedVehicle) -> dict[str, Any]:
+    """Columns of the speed by the delay between sensors."""
+    return {'delay_speed': vehicle.delay.speed, 'sd_delay_speed': vehicle.delay.speed_std,
+            'speeds_contradict': vehicle.speeds_contradict}
+
+
+def _print(name: str, result: TrafficResult, recording: Recording) -> None:
+    """The vehicles of a recording, a line each, their counts and the warnings."""
+    for vehicle in result.vehicles:
+        print(line_of(vehicle))
+    total = Counter((v.passage.line, DIRECTIONS[v.passage.forward], v.passage.vehicle_class)
+                    for v in result.vehicles)
+    print(f'{name}: {len(result.vehicles)} vehicles')
+    for (line, direction, vehicle_class), n in sorted(total.items()):
+        print(f'  {line}, {direction}, {vehicle_class}: {n}')
+    doubtful = sum(v.passage.ambiguous for v in result.vehicles)
+    warnings = {**({'ambiguous passages': doubtful} if doubtful else {}),
+                **{what: n for what, n in result.counts.items() if n and what != 'passages'},
+                **result.rejections, **recording.losses}
+    for what, n in warnings.items():
+        print(f'  warning: {what}: {n}')
+    for topic in result.missing_topics:
+        print(f'  warning: nothing on {topic}')
+    for sensor in result.sensors_without_background:
+        print(f'  warning: no background was learnt for {sensor}: it was quiet for too short a '
+              'time')
+    if result.why_no_detection:
+        print(f'  nothing was detected: {result.why_no_detection}')
+
+
+def line_of(vehicle: CountedVehicle) -> str:
+    """A passage in one line."""
+    p = vehicle.passage
+    at = datetime.fromtimestamp(p.stamp_ns / NS, tz=timezone.utc)
+    error = '' if np.isnan(p.direction_error) else f' (P_E {p.direction_error:.3f})'
+    known = f'{p.vehicle_class} ({p.class_probabilities.max():.0%})'
+    length = f', {p.length:.1f} m' if p.length else ''
+    headway = '' if np.isnan(p.headway) else f', headway {p.headway:.1f} s'
+    delay = '' if vehicle.delay.reason else f', {vehicle.delay.speed:.1f} m/s by delay'
+    contradiction = ', speeds contradict each other' if vehicle.speeds_contradict else ''
+    doubts = f', ambiguous: {", ".join(p.doubts)}' if p.doubts else ''
+    return (f'{p.number} {at:%H:%M:%S}.{at.microsecond // 10000:02d} {p.line}: '
+            f'{DIRECTIONS[p.forward]}{error}, {p.speed:.1f} ± {p.speed_std:.1f} m/s{delay}, '
+            f'{known}{length}{headway}{contradiction}{doubts}')

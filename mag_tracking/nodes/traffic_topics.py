@@ -1,0 +1,33 @@
+"""The topics of the traffic statistics, of the tracker node."""
+
+from mag_tracking_msgs.msg import TrafficSummary as TrafficSummaryMessage
+from mag_tracking_msgs.msg import VehiclePassage as VehiclePassageMessage
+
+from mag_tracking.event_records import VehiclePassage
+from mag_tracking.messages.schema import traffic_summary_dict, vehicle_passage_dict
+from mag_tracking.nodes.convert import to_message
+from mag_tracking.nodes.ros_params import declare_settings
+from mag_tracking.nodes.stage_node import RESULTS, SENT, StageNode
+from mag_tracking.stages.traffic.stage import TrackedFrame, Traffic
+
+
+class TrafficTopics:
+    """Counts the vehicles of a tracker node, and publishes passages and summaries."""
+
+    def __init__(self, node: StageNode) -> None:
+        node.settings = declare_settings(node, node.settings, 'traffic')
+        self.stage = Traffic(node.network, node.settings.traffic,
+                             node.settings.track.target == 'vehicle')
+        self._classes, self._frame = node.settings.traffic.class_names, node.network.frame
+        self._passages = node.publisher(VehiclePassageMessage, '~/passages', SENT)
+        self._summaries = node.publisher(TrafficSummaryMessage, '~/traffic', RESULTS)
+
+    def take(self, item: TrackedFrame, is_last: bool = False) -> None:
+        """What the tracker made of a frame; `is_last`: no other one follows soon."""
+        for record in [*self.stage.feed(item), *(self.stage.flush() if is_last else [])]:
+            if isinstance(record, VehiclePassage):
+                self._passages.publish(to_message(VehiclePassageMessage, vehicle_passage_dict(
+                    record, self._classes, self._frame)))
+            else:
+                self._summaries.publish(to_message(
+                    TrafficSummaryMessage, traffic_summary_dict(record, self._frame)))

@@ -1,0 +1,87 @@
+"""Counts of passages in intervals of time."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mag_tracking.event_records import TrafficCount, TrafficSummary, VehiclePassage
+from mag_tracking.units import NS
+
+LONGEST_GAP_S = 2.0
+"""[s] Frames further apart than this observe nothing between them."""
+
+
+class Intervals:
+    """Summaries of equal intervals, each as soon as no passage of it can come any more."""
+
+    def __init__(self, line_names: Sequence[str], interval_s: float) -> None:
+        self._names, self._length = tuple(line_names), round(interval_s * NS)
+        self._passages: list[VehiclePassage] = []
+        # {begin of an interval: [ns] observed}
+        self._observed: dict[int, int] = {}
+        self._last_ns: int | None = None
+
+    def add(self, passage: VehiclePassage) -> None:
+        """Take the next passage, in order of time."""
+        self._passages.append(passage)
+        self._observed.setdefault(self._begin_of(passage.stamp_ns), 0)
+
+    def due(self, before_ns: int, now_ns: int) -> list[TrafficSummary]:
+        """Summaries of the intervals that are complete.
+
+        Parameters
+        ----------
+        before_ns : int
+            All passages before this time have been added.
+        now_ns : int
+            Time of the latest frame.
+        """
+        self._observe(now_ns)
+        return self._close([begin for begin in self._observed
+                            if begin + self._length <= before_ns])
+
+    def flush(self) -> list[TrafficSummary]:
+        """The intervals that have begun."""
+        self._last_ns = None
+        return self._close(list(self._observed))
+
+    def _begin_of(self, stamp_ns: int) -> int:
+        """Begin of the interval that holds a time."""
+        return stamp_ns // self._length * self._length
+
+    def _observe(self, now_ns: int) -> None:
+        """Add the time since the frame before to its intervals."""
+        self._observed.setdefault(self._begin_of(now_ns), 0)
+        last_ns, self._last_ns = self._last_ns, now_ns
+        if last_ns is None or now_ns - last_ns > LONGEST_GAP_S * NS:
+            return
+        while last_ns < now_ns:
+            begin = self._begin_of(last_ns)
+            until = min(now_ns, begin + self._length)
+            self._observed[begin] = self._observed.get(begin, 0) + until - last_ns
+            last_ns = until
+
+    def _close(self, begins: list[int]) -> list[TrafficSummary]:
+        """The summaries of intervals, for each line."""
+        out: list[TrafficSummary] = []
+        for begin in sorted(begins):
+            end, observed_s = begin + self._length, self._observed.pop(begin) / NS
+            mine = [p for p in self._passages if begin <= p.stamp_ns < end]
+            self._passages = [p for p in self._passages if not begin <= p.stamp_ns < end]
+            out += [TrafficSummary(begin, end, name, observed_s,
+                                   counts_of([p for p in mine if p.line == name]))
+                    for name in self._names]
+        return out
+
+
+def counts_of(passages: Sequence[VehiclePassage]) -> tuple[TrafficCount, ...]:
+    """Counts of the directions and classes that there are, forward first."""
+    groups = sorted({(not p.forward, p.vehicle_class) for p in passages})
+    out = []
+    for backward, name in groups:
+        mine = [p for p in passages if p.forward is not backward and p.vehicle_class == name]
+        headways = [p.headway for p in mine if np.isfinite(p.headway)]
+        out.append(TrafficCount(not backward, name, len(mine), sum(p.ambiguous for p in mine),
+                                float(np.mean([p.speed for p in mine])),
+                                float(np.mean(headways)) if headways else float('nan')))
+    return tuple(out)

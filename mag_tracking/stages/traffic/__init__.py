@@ -1,0 +1,1 @@
+"""Traffic: vehicles that cross lines, their classes, and statistics of intervals."""

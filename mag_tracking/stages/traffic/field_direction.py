@@ -1,0 +1,87 @@
+"""Check of a track's direction by the rotation of the field at each sensor."""
+
+from collections import deque
+
+import numpy as np
+
+from mag_tracking.inference.driving_direction import (
+    LEAST_SAMPLES,
+    MOST_SURE,
+    field_rotation,
+    fused_log_odds,
+    horizontal_field,
+    lag_of,
+)
+from mag_tracking.network import SensorNetwork
+from mag_tracking.network.counting_line import Crossing
+from mag_tracking.records import FieldFrame
+from mag_tracking.units import NS
+
+KEPT_S = 70.0
+"""[s] Frames kept: the longest track that is smoothed, and more."""
+
+IN_LANE = 1.5
+"""[m] A sensor closer to the path than this observes no direction."""
+
+REACH = 12.0
+"""[m] Sensors whose closest approach is further than this from the crossing are not asked."""
+
+WIDTHS = 3.0
+"""The window reaches this many distances from the path to both sides."""
+
+SHORTEST_S, LONGEST_S = 0.5, 4.0
+"""[s] Bounds of half the window."""
+
+MOST_LOG_ODDS = float(np.log(MOST_SURE / (1.0 - MOST_SURE)))
+
+
+class FieldDirection:
+    """Keeps the latest frames and tells how probable a direction is by them."""
+
+    def __init__(self, network: SensorNetwork) -> None:
+        self._network = network
+        self._frames: deque[FieldFrame] = deque()
+
+    def remember(self, frame: FieldFrame) -> None:
+        """Keep a frame, and forget those that are too old or of another time."""
+        if self._frames and frame.stamp_ns <= self._frames[-1].stamp_ns:
+            self._frames.clear()
+        self._frames.append(frame)
+        while frame.stamp_ns - self._frames[0].stamp_ns > KEPT_S * NS:
+            self._frames.popleft()
+
+    def error_probability(self, crossing: Crossing) -> float:
+        """Probability that the direction of a crossing is wrong; NaN where the fields do not tell.
+        """
+        velocity = crossing.pose.velocity[:2]
+        speed = float(np.hypot(*velocity))
+        if not self._frames or speed < 0.1:
+            return float('nan')
+        u = velocity / speed
+        r = self._network.positions[:, :2] - crossing.position[:2]
+        along, left = r @ u, u[0] * r[:, 1] - u[1] * r[:, 0]
+        odds, same_side = [], []
+        for j in np.flatnonzero((np.abs(left) >= IN_LANE) & (np.abs(along) <= REACH)).tolist():
+            half = np.clip(WIDTHS * abs(left[j]) / speed, SHORTEST_S, LONGEST_S)
+            found = self._log_odds(j, crossing.stamp_ns + round(along[j] / speed * NS),
+                                   round(half * NS))
+            if found is not None:
+                odds.append(float(np.clip(found, -MOST_LOG_ODDS, MOST_LOG_ODDS)))
+                # To a sensor on its left, which looks to the right, it moves from right to left.
+                same_side.append(bool(left[j] < 0.0))
+        return float(1.0 / (1.0 + np.exp(fused_log_odds(odds, same_side)))) if odds \
+            else float('nan')
+
+    def _log_odds(self, j: int, middle_ns: int, half_ns: int) -> float | None:
+        """Log odds of left to right at sensor `j`; None without two horizontal axes."""
+        frames = [f for f in self._frames if abs(f.stamp_ns - middle_ns) <= half_ns]
+        field = horizontal_field(np.array([f.field[j] for f in frames]).reshape(-1, 3),
+                                 self._network.R_ws[j])
+        known = ~np.isnan(field).any(axis=1)
+        if np.count_nonzero(known) < LEAST_SAMPLES:
+            return None
+        variance = [np.nanmean(np.diagonal(frames[k].covariance[j]))
+                    for k in np.flatnonzero(known).tolist()]
+        noise = float(np.sqrt(np.median(variance)))
+        lag = lag_of(field[known], noise, len(frames) // 4)
+        return field_rotation(field[known], noise, lag).log_odds if lag else None

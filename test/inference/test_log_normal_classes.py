@@ -1,0 +1,52 @@
+"""Classes by moment and length: the posterior of the laws, unknown vehicles, and calibration."""
+
+import numpy as np
+import pytest
+
+from mag_tracking.inference.log_normal_classes import UNKNOWN, Feature, class_posterior
+from mag_tracking.stages.traffic.settings import TrafficSettings
+
+SETTINGS = TrafficSettings()
+
+
+def posterior(size, length, moment_std=0.0, length_std=0.0):
+    features = [Feature(size, moment_std, SETTINGS.class_moments, SETTINGS.class_moment_spreads)]
+    if length:
+        features.append(Feature(length, length_std, SETTINGS.class_lengths,
+                                SETTINGS.class_length_spreads))
+    return class_posterior(SETTINGS.class_names, SETTINGS.class_shares, features)
+
+
+@pytest.mark.parametrize(('name', 'size', 'length'), [
+    ('motorcycle', 50.0, 0.0), ('car', 335.0, 2.1), ('car', 581.0, 5.0), ('car', 400.0, 0.0),
+    ('truck', 1734.0, 9.1), ('truck', 1897.0, 11.3), ('truck', 2500.0, 0.0)])
+def test_published_vehicles(name, size, length):
+    """TSP14 Tables II and V: the smallest and the largest of each kind."""
+    found = posterior(size, length, 20.0, 0.3)
+    assert found.name == name and found.probabilities.sum() == pytest.approx(1.0)
+    assert found.probabilities.max() > 0.8
+
+
+def test_a_vehicle_that_fits_no_class_is_unknown():
+    assert posterior(1e5, 0.0).name == UNKNOWN and posterior(0.5, 0.0).name == UNKNOWN
+    assert posterior(400.0, 60.0).name == UNKNOWN
+    # With so large a deviation it may be any.
+    assert posterior(400.0, 60.0, length_std=120.0).name == 'car'
+
+
+def test_posteriors_are_calibrated():
+    """Vehicles of the laws themselves: a stated probability is the share that is right."""
+    rng, s = np.random.default_rng(0), SETTINGS
+    stated, right = [], []
+    for _ in range(4000):
+        k = rng.choice(3, p=np.array(s.class_shares) / sum(s.class_shares))
+        size = s.class_moments[k] * np.exp(s.class_moment_spreads[k] * rng.standard_normal())
+        length = s.class_lengths[k] * np.exp(s.class_length_spreads[k] * rng.standard_normal())
+        found = posterior(size, length if rng.random() < 0.5 else 0.0)
+        stated.append(found.probabilities.max())
+        right.append(int(np.argmax(found.probabilities)) == k)
+    stated, right = np.array(stated), np.array(right)
+    for low, high in ((0.33, 0.7), (0.7, 0.9), (0.9, 0.99), (0.99, 1.01)):
+        mine = (low <= stated) & (stated < high)
+        allowed = 3.0 * np.sqrt(0.25 / max(mine.sum(), 1))
+        assert abs(stated[mine].mean() - right[mine].mean()) < allowed

@@ -1,0 +1,223 @@
+"""Counting lines: what is counted, when, once, and in order; and what the fields say of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mag_tracking.errors import SettingsError
+from mag_tracking.event_records import TrafficSummary, VehiclePassage
+from mag_tracking.physics.dipole import dipole_field
+from mag_tracking.stages.traffic.settings import TrafficSettings
+from mag_tracking.stages.traffic.stage import (
+    AMBIGUOUS,
+    CONTRADICTED,
+    EXTRAPOLATED,
+    TrackedFrame,
+    Traffic,
+)
+from mag_tracking.units import NS
+from support.passes import network_of
+from support.track_records import frame, smoothed_pose, track_pose
+
+NETWORK = network_of([[0.0, -5.0, 0.0], [0.0, 5.0, 0.0]])
+STEP = 0.1
+
+
+def drive(begin_s, end_s, at_s, v=10.0, y=-1.5, **changes):
+    """{time in steps: [pose]} of a vehicle that is on the line at a time [s]; it ends there."""
+    steps = range(round(begin_s / STEP), round(end_s / STEP) + 1)
+    out = {k: [track_pose(k * STEP, v * (k * STEP - at_s), y, v, **changes)] for k in steps}
+    out[steps[-1]].append(replace(out[steps[-1]][0], ended=True))
+    return out
+
+
+def counted(*drives, settings=None, last_s=30.0, field_at=None, network=NETWORK, first_s=0.0):
+    """(records, `Traffic`) of vehicles in a stretch of frames."""
+    stage, out = Traffic(network, settings or TrafficSettings()), []
+    for k in range(round(first_s / STEP), round(last_s / STEP) + 1):
+        field = None if field_at is None else field_at(k * STEP)
+        records = [r for d in drives for r in d.get(k, [])]
+        out += stage.feed(TrackedFrame(frame(k * STEP, len(network), field), records))
+    return out + stage.flush(), stage
+
+
+def passages(records):
+    return [r for r in records if isinstance(r, VehiclePassage)]
+
+
+def summaries(records):
+    return [r for r in records if isinstance(r, TrafficSummary)]
+
+
+@pytest.mark.parametrize('v', [10.0, -10.0])
+def test_a_vehicle_is_counted_where_and_when_it_crosses(v):
+    (p,) = passages(counted(drive(2.0, 6.0, 4.037, v))[0])
+    assert p.stamp_ns == pytest.approx(4.037 * NS, abs=1000) and p.forward == (v > 0)
+    assert p.position == pytest.approx([0.0, -1.5, 0.5]) and p.lateral == pytest.approx(-1.5)
+    assert p.speed == pytest.approx(10.0) and p.speed_std == pytest.approx(0.1, rel=0.1)
+    assert (p.number, p.track_id, p.line, p.vehicle_class) == (1, 1, 'road', 'car')
+    assert np.isnan(p.headway) and not p.ambiguous and p.doubts == ()
+
+
+def test_a_vehicle_that_does_not_cross_is_not_counted():
+    beside = drive(2.0, 6.0, 4.0, y=20.0)
+    turns = drive(2.0, 6.0, 4.0)
+    turns = {k: [replace(r, position=-np.abs(r.position)) for r in rs] for k, rs in turns.items()}
+    for one in (beside, turns, drive(2.0, 2.5, 4.0)):
+        records, stage = counted(one)
+        assert passages(records) == []
+        assert stage.counts['tracks that crossed no line'] == 1
+
+
+def test_a_crossing_is_extrapolated_only_a_little():
+    for begin, end in ((2.0, 3.5), (4.4, 6.0)):
+        (p,) = passages(counted(drive(begin, end, 4.0))[0])
+        assert p.stamp_ns == pytest.approx(4.0 * NS, abs=1000) and p.doubts == (EXTRAPOLATED,)
+        assert p.ambiguous
+    assert passages(counted(drive(5.1, 7.0, 4.0))[0]) == []
+
+
+def test_a_track_that_is_lost_and_begun_again_is_counted_once():
+    records, stage = counted(drive(2.0, 4.3, 4.0), drive(4.6, 6.0, 4.1, id=2))
+    assert len(passages(records)) == 1
+    assert stage.counts['crossings of lost tracks, counted once'] == 1
+
+
+def test_two_that_meet_are_both_counted():
+    records, _ = counted(drive(2.0, 6.0, 4.0), drive(2.0, 6.0, 4.2, -12.0, 1.5, id=2))
+    assert [(p.track_id, p.forward) for p in passages(records)] == [(1, True), (2, False)]
+    # Each has a part in the fields of the other.
+    assert all(np.isnan(p.direction_error) for p in passages(records))
+
+
+def test_the_smoothed_path_is_the_one_that_counts():
+    one = drive(2.0, 6.0, 4.0)
+    one[60] += [smoothed_pose(t, 12.0 * (t - 3.9), v=12.0) for t in np.arange(2.0, 6.0, STEP)]
+    (p,) = passages(counted(one)[0])
+    assert p.stamp_ns == pytest.approx(3.9 * NS, abs=1000) and p.speed == pytest.approx(12.0)
+
+
+def test_passages_come_in_order_and_have_headways():
+    slow = drive(1.0, 12.0, 8.0, 2.0)
+    fast = [drive(3.0, 6.0, 4.0, 20.0, id=2), drive(6.0, 11.0, 7.5, -15.0, id=3)]
+    records, _ = counted(slow, *fast)
+    found = passages(records)
+    assert [p.track_id for p in found] == [2, 3, 1] and [p.number for p in found] == [1, 2, 3]
+    assert found[2].headway == pytest.approx(4.0) and np.isnan(found[1].headway)
+
+
+def test_an_ambiguous_pose_marks_the_passage():
+    (p,) = passages(counted(drive(2.0, 6.0, 4.0, ambiguous=True))[0])
+    assert p.ambiguous and p.doubts == (AMBIGUOUS,)
+
+
+def test_several_lines_count_each():
+    settings = TrafficSettings(
+        line_names=('west', 'east', 'across'), line_headings_deg=(0.0, 180.0, 90.0),
+        line_offsets=(-5.0, -5.0, 0.0), line_half_widths=(15.0,) * 3)
+    found = passages(counted(drive(2.0, 6.0, 4.0), settings=settings)[0])
+    assert [(p.line, p.forward) for p in found] == [('west', True), ('east', False)]
+    assert [p.stamp_ns / NS for p in found] == pytest.approx([3.5, 4.5])
+
+
+def test_a_jump_back_in_time_begins_again():
+    stage, out = Traffic(NETWORK, TrafficSettings()), []
+    for shift in (1000.0, 0.0):
+        one = drive(2.0, 6.0, 4.0, id=1 + int(shift == 0.0))
+        for k in range(70):
+            records = [replace(r, stamp_ns=r.stamp_ns + round(shift * NS)) for r in one.get(k, [])]
+            out += stage.feed(TrackedFrame(frame(shift + k * STEP), records))
+    out += stage.flush()
+    assert [p.stamp_ns / NS for p in passages(out)] == pytest.approx([1004.0, 4.0])
+    assert np.isnan(passages(out)[1].headway) and stage.counts['time jumped back'] == 1
+
+
+def test_tracks_that_end_without_a_frame_are_counted():
+    stage = Traffic(NETWORK, TrafficSettings())
+    one = drive(2.0, 6.0, 4.0)
+    for k in range(20, 60):
+        assert stage.feed(TrackedFrame(frame(k * STEP), one[k])) == []
+    ended = [replace(one[59][0], ended=True)]
+    assert len(passages(stage.feed(TrackedFrame(None, ended)))) == 1
+
+
+def field_of(direction):
+    """The field of a dipole that goes along x at 10 m/s and is on the line at 4 s."""
+    def at(t):
+        r = NETWORK.positions - [direction * 10.0 * (t - 4.0), -1.5, 0.2]
+        return dipole_field(r, np.array([300.0, 200.0, -300.0])) + 1e-9 * np.sin(50.0 * t)
+
+    return at
+
+
+def test_the_fields_confirm_a_direction_or_contradict_it():
+    (p,) = passages(counted(drive(2.0, 6.0, 4.0), field_at=field_of(1.0))[0])
+    assert p.direction_error < 0.01 and not p.ambiguous
+    (p,) = passages(counted(drive(2.0, 6.0, 4.0), field_at=field_of(-1.0))[0])
+    assert p.direction_error > 0.99 and p.doubts == (CONTRADICTED,)
+
+
+def test_a_sensor_in_the_lane_is_not_asked_for_a_direction():
+    network = network_of([[0.0, -1.0, 0.0], [30.0, 5.0, 0.0]])
+    settings = TrafficSettings(line_offsets=(-15.0,))
+    (p,) = passages(counted(drive(2.0, 6.0, 4.0), field_at=field_of(1.0), network=network,
+                            settings=settings)[0])
+    assert np.isnan(p.direction_error)
+
+
+def test_a_vertical_axis_alone_tells_no_direction():
+    def at(t):
+        field = field_of(1.0)(t)
+        field[:, :2] = np.nan
+        return field
+
+    (p,) = passages(counted(drive(2.0, 6.0, 4.0), field_at=at)[0])
+    assert np.isnan(p.direction_error)
+
+
+def test_intervals_hold_all_passages_and_no_other():
+    drives = [drive(begin, begin + 4.0, begin + 2.0, v, id=k)
+              for k, (begin, v) in enumerate(((3.0, 10.0), (8.0, -8.0), (16.0, 12.0)), 1)]
+    records, _ = counted(*drives, settings=TrafficSettings(interval_s=10.0), last_s=34.0)
+    found = summaries(records)
+    assert [(s.begin_ns / NS, s.end_ns / NS) for s in found] == [
+        (0.0, 10.0), (10.0, 20.0), (20.0, 30.0), (30.0, 40.0)]
+    assert [sum(c.count for c in s.counts) for s in found] == [1, 2, 0, 0]
+    assert [s.observed_s for s in found] == pytest.approx([10.0, 10.0, 10.0, 4.0])
+    forward, backward = found[1].counts
+    assert (forward.forward, forward.count, forward.mean_speed) == (True, 1, pytest.approx(12.0))
+    assert (backward.forward, backward.mean_speed) == (False, pytest.approx(8.0))
+    assert forward.mean_headway == pytest.approx(13.0) and np.isnan(backward.mean_headway)
+
+
+def test_an_interval_waits_for_the_tracks_that_began_in_it():
+    stage, found = Traffic(NETWORK, TrafficSettings(interval_s=10.0)), {}
+    one = drive(5.0, 14.0, 9.0, 2.0)
+    for k in range(200):
+        for s in summaries(stage.feed(TrackedFrame(frame(k * STEP), one.get(k, [])))):
+            found[s.begin_ns] = k, sum(c.count for c in s.counts)
+    assert found[0] == (140, 1)
+
+
+def test_a_gap_in_the_frames_has_no_intervals():
+    stage, out = Traffic(NETWORK, TrafficSettings(interval_s=10.0)), []
+    for t in [*np.arange(0.0, 15.0, STEP), *np.arange(1003.0, 1012.0, STEP)]:
+        out += stage.feed(TrackedFrame(frame(t), []))
+    out += stage.flush()
+    assert [s.begin_ns / NS for s in summaries(out)] == [0.0, 10.0, 1000.0, 1010.0]
+    assert summaries(out)[1].observed_s == pytest.approx(5.0, abs=0.2)
+
+
+def test_magnets_are_not_counted():
+    stage = Traffic(NETWORK, TrafficSettings(), is_of_vehicles=False)
+    assert stage.feed(TrackedFrame(frame(0.0), [])) == stage.flush() == []
+
+
+@pytest.mark.parametrize(('changes', 'why'), [
+    ({'line_offsets': (0.0, 1.0)}, r'traffic.line_offsets: expected 1 values'),
+    ({'class_lengths': (3.0,)}, r'traffic.class_lengths: expected 3 values'),
+    ({'class_names': ('car', 'car', 'truck')}, 'a name is there twice')])
+def test_lists_that_do_not_belong_together_are_refused(changes, why):
+    with pytest.raises(SettingsError, match=why):
+        Traffic(NETWORK, TrafficSettings(**changes))
