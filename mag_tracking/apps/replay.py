@@ -33,6 +33,7 @@ from mag_tracking.report.metrics import (
     magnet_errors,
     near_poses,
     pass_errors,
+    unflagged_poses,
 )
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.stages.align.frame_period import too_long
@@ -208,7 +209,9 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
             'frames_too_long': too_long(pipeline.settings.align, pipeline.network),
             'clocks_apart': pipeline.track.clocks_apart,
             'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks,
-            'disturbances': disturbances}
+            'disturbances': disturbances,
+            'unflagged_poses': unflagged_poses(taker.logs.values(), truth.values())
+            if truth and pipeline.settings.track.target == 'vehicle' else None}
 
 
 def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline,

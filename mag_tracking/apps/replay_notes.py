@@ -17,7 +17,7 @@ def notes_of(summary: Mapping[str, Any]) -> list[Note]:
     summary : dict
         Content of `summary.json`.
     """
-    return [*_input_notes(summary), *_limit_notes(summary),
+    return [*_input_notes(summary), *_limit_notes(summary), *_truth_notes(summary),
             *(Note(NOTE, _disturbance_text(d)) for d in summary['disturbances'])]
 
 
@@ -75,6 +75,15 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
     if too_long:
         yield Note(WARNING, f'{too_long} tracks were too long to smooth (track.smooth_longest_s, '
                    'or too many frames for so many sensors)')
+
+
+def _truth_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
+    """How far poses without a flag can be relied on."""
+    found = summary['unflagged_poses']
+    if found and found['n']:
+        yield Note(NOTE, f'poses without a flag: {found["n"]}, of which {found["wrong"]} '
+                   f'({found["wrong"] / found["n"]:.1%}) are wrong: off by more than 2 m and by '
+                   'more than three standard deviations')
 
 
 def _disturbance_text(d: Mapping[str, Any]) -> str:

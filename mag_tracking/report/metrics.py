@@ -1,5 +1,6 @@
 """Tracks against truth: errors, and whether the covariance told the truth about them."""
 
+from collections.abc import Iterable
 from typing import TypeAlias, TypedDict
 
 import numpy as np
@@ -75,6 +76,53 @@ def pass_errors(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
     return {'rms': float(np.sqrt(np.mean(size[rows] ** 2))) if near.all() else None,
             'closest': float(size[closest]), 'closest_distance': float(distance[closest]),
             'anees': float(np.mean(nees)), 'n': int(near.sum())}
+
+
+class UnflaggedPoses(TypedDict):
+    """What `unflagged_poses` returns."""
+
+    n: int
+    wrong: int
+
+
+WRONG_M, WRONG_STD = 2.0, 3.0
+"""A pose is wrong whose horizontal error is larger than this, and than so many standard deviations
+in its direction."""
+
+
+def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> UnflaggedPoses:
+    """Poses of vehicles that are not flagged as ambiguous, and how many of them are wrong.
+
+    Parameters
+    ----------
+    logs : iterable of TrackLog
+    truths : iterable of (stamps (n,), positions (n, 3), quaternions (n, 4))
+        A pose is wrong if it is wrong about every one that was there at its time.
+
+    Returns
+    -------
+    dict
+        n : poses without a flag at whose time there is a true one; wrong : of them.
+    """
+    truths, n, n_wrong = list(truths), 0, 0
+    for log in logs:
+        sure = ~np.array(log.ambiguous, dtype=bool)
+        if not sure.any():
+            continue
+        stamps = np.array(log.stamp_ns, dtype=np.int64)[sure]
+        position = np.array(log.position)[sure][:, :2]
+        P = np.array(log.covariance)[sure][:, :2, :2]
+        known, wrong = np.zeros(len(stamps), dtype=bool), np.ones(len(stamps), dtype=bool)
+        for truth in truths:
+            error = position - interpolate_truth(truth, stamps)[:, :2]
+            there = np.isfinite(error).all(axis=1)
+            error = np.where(there[:, None], error, 0.0)
+            size = np.hypot(*error.T)
+            std = np.sqrt(np.einsum('ni,nij,nj->n', error, P, error)) / np.maximum(size, 1e-9)
+            known |= there
+            wrong &= ~there | (size > WRONG_M) & (size > WRONG_STD * std)
+        n, n_wrong = n + int(known.sum()), n_wrong + int((known & wrong).sum())
+    return {'n': n, 'wrong': n_wrong}
 
 
 def near_poses(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,

@@ -1,0 +1,51 @@
+"""Poses without a flag against truth: what counts as wrong."""
+
+import numpy as np
+
+from mag_tracking.apps.replay_notes import notes_of
+from mag_tracking.report.metrics import unflagged_poses
+from mag_tracking.report.track_log import TrackLog
+from support.track_records import frame, track_pose
+
+T = np.arange(0.0, 5.0, 0.1)
+QUATERNIONS = np.tile([0.0, 0.0, 0.0, 1.0], (len(T), 1))
+
+
+def truth(y=0.0, shift_s=0.0):
+    return (np.round((T + shift_s) * 1e9).astype(np.int64),
+            np.stack([10.0 * T, y + 0.0 * T, 0.0 * T], axis=1), QUATERNIONS)
+
+
+def log(off_m=0.0, std_m=0.1, ambiguous=False):
+    """A track beside the first vehicle."""
+    out = TrackLog(1)
+    for t in T:
+        out.add(track_pose(t, 10.0 * t, off_m, ambiguous=ambiguous,
+                           covariance=std_m**2 * np.eye(6)), frame(t))
+    return out
+
+
+def test_a_pose_is_wrong_by_metres_and_by_standard_deviations():
+    n = len(T)
+    assert unflagged_poses([log(0.5)], [truth()]) == {'n': n, 'wrong': 0}
+    assert unflagged_poses([log(2.1)], [truth()]) == {'n': n, 'wrong': n}
+    assert unflagged_poses([log(2.1, std_m=1.0)], [truth()]) == {'n': n, 'wrong': 0}
+    assert unflagged_poses([log(9.0, ambiguous=True)], [truth()]) == {'n': 0, 'wrong': 0}
+
+
+def test_a_pose_is_right_that_is_right_about_any_vehicle_there():
+    assert unflagged_poses([log(5.0)], [truth(), truth(5.0)])['wrong'] == 0
+    assert unflagged_poses([log(5.0)], [truth(), truth(-5.0)])['wrong'] == len(T)
+    # A vehicle that comes later excuses nothing, and without any truth nothing is known.
+    assert unflagged_poses([log(5.0)], [truth(), truth(5.0, 100.0)])['wrong'] == len(T)
+    assert unflagged_poses([log(5.0)], [truth(shift_s=100.0)]) == {'n': 0, 'wrong': 0}
+
+
+def test_the_share_is_reported():
+    summary = {'missing_topics': [], 'why_no_detection': None, 'rejected': {}, 'lost': {},
+               'sensors': {}, 'counts': {'track': {}}, 'close_network': False, 'tracks': [],
+               'frames_too_long': None, 'clocks_apart': '', 'disturbances': [],
+               'target': 'vehicle', 'unflagged_poses': {'n': 200, 'wrong': 3}}
+    assert [n.text.partition(':')[2][:27] for n in notes_of(summary)] == [
+        ' 200, of which 3 (1.5%) are']
+    assert notes_of({**summary, 'unflagged_poses': None}) == []
