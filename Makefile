@@ -44,7 +44,7 @@ $(STAMP): $(SOURCES)
 	@echo 'Setting up: ROS messages (compiled here, about a minute)'
 	@$(PIP) install $(PINS) ./msg_defs
 	@echo 'Setting up: mag_tracking and what it needs (compiled in part, about a minute)'
-	@$(QUIET_EDITABLE) $(PIP) install $(PINS) -e '.[ros,archive,test]'
+	@$(QUIET_EDITABLE) $(PIP) install $(PINS) -e '.[ros,archive,classes,test]'
 	@touch $@
 	@echo 'Setting up: done'
 
@@ -98,7 +98,7 @@ lock:  ## write constraints.txt anew, with the newest that there is (needs LOCK_
 	@echo 'Locking: installing the newest of everything'
 	@$(LOCK) install --upgrade pip
 	@$(LOCK) install --upgrade setuptools wheel colcon-common-extensions \
-		$$(build/lock/bin/python tools/pins.py build-requires) '.[ros,archive,test]'
+		$$(build/lock/bin/python tools/pins.py build-requires) '.[ros,archive,classes,test]'
 	@{ printf '# %s\n' \
 		'Exact versions of all that pip installs here: to run, to test, to build the messages, and colcon.' \
 		'Written by `make lock`, with the oldest Python that is supported so that newer ones find wheels' \

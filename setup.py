@@ -74,6 +74,7 @@ setup(
             'ros-jazzy-rmw-fastrtps-cpp',
         ],
         'archive': ['dask', 'distributed', 'pyarrow'],
+        'classes': ['scikit-learn'],
         'pandas': ['pandas'],
         'rerun': ['rerun-sdk'],
         # `colcon test` runs pytest only where the extra "test" names it.

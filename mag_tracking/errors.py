@@ -43,3 +43,7 @@ class GraphError(MagTrackingError):
 
 class ClusterError(MagTrackingError):
     """A Dask scheduler does not answer, has no worker, or is gone."""
+
+
+class LabelsError(MagTrackingError):
+    """Labelled examples are missing, overlap, or are too few to learn from."""

@@ -25,6 +25,7 @@ COMMANDS = {
     'replay': Command('replay', 'Track what is in recordings, offline.'),
     'events': Command('events', 'Count and describe passes, sensor by sensor.'),
     'traffic': Command('traffic', 'Count vehicles by direction, class and speed.'),
+    'classes': Command('classes', 'Learn and tell classes of passes by one sensor.'),
     'calibrate': Command('calibrate', 'Find how sensors are turned and their clocks are off.'),
     'tumble': Command('tumble', 'Find the hard and soft iron of sensors that were turned about.'),
     'board-geometry': Command(

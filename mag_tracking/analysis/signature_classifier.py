@@ -1,0 +1,337 @@
+"""Classes of passes by their signature at one sensor: training, posteriors, evaluation."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mag_tracking.analysis.signature import Signature, features
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.errors import LabelsError, MissingDependencyError
+from mag_tracking.inference.log_normal_classes import UNKNOWN
+
+VERSION = 1
+FEWEST = 4
+"""A class with fewer examples is refused: it can't be tested on others than it was trained on."""
+
+FOLDS = 5
+PENALTIES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
+"""Inverse penalties of the logistic regression that are tried."""
+
+KNOWN = 0.99
+"""A signature further from all classes than this share of the training set was from its own, each
+when it was left out, is of an unknown class."""
+
+TEMPERATURES = np.geomspace(0.3, 10.0, 40)
+
+
+@dataclass(frozen=True)
+class SignatureModel:
+    """A linear classifier, and how far a class reaches."""
+
+    classes: tuple[str, ...]
+    n_axes: int
+    method: str
+    mean: FloatArray
+    """(n_features,) of the training set."""
+    scale: FloatArray
+    """(n_features,) standard deviations."""
+    weights: FloatArray
+    """(n_classes, n_features) of the scaled features."""
+    offsets: FloatArray
+    """(n_classes,)"""
+    temperature: float
+    """The logits are divided by it: what was learnt from few examples is too sure."""
+    centres: FloatArray
+    """(n_classes, n_features) of the scaled features."""
+    precision: FloatArray
+    """(n_features, n_features) inverse of the shrunk covariance within the classes."""
+    limit: float
+    """Squared distance beyond which a signature is of an unknown class."""
+    examples: dict[str, int]
+    """{class: number of examples}."""
+
+    def posterior(self, x: FloatArray) -> FloatArray:
+        """(n, n_classes) probabilities of features (n, n_features)."""
+        return _softmax((self._scaled(x) @ self.weights.T + self.offsets) / self.temperature)
+
+    def is_known(self, x: FloatArray) -> FloatArray:
+        """(n,) whether features (n, n_features) are as near to a class as its examples."""
+        known: FloatArray = _distances(self._scaled(x), self.centres,
+                                       self.precision).min(axis=1) <= self.limit
+        return known
+
+    def names(self, x: FloatArray) -> list[str]:
+        """The most probable class of each, or `unknown`."""
+        best = self.posterior(x).argmax(axis=1)
+        return [self.classes[k] if known else UNKNOWN
+                for k, known in zip(best.tolist(), self.is_known(x).tolist(), strict=True)]
+
+    def _scaled(self, x: FloatArray) -> FloatArray:
+        """Features in units of the training set."""
+        scaled: FloatArray = (x - self.mean) / self.scale
+        return scaled
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How well classes are told, over one or several sets that were not trained on."""
+
+    classes: tuple[str, ...]
+    n: int
+    """Signatures in a set."""
+    majority: float
+    """Share of the largest class: the accuracy of a constant answer."""
+    accuracy: FloatArray
+    """(n_sets,) share of right answers; `unknown` is none."""
+    balanced_accuracy: FloatArray
+    """(n_sets,) mean of the recalls."""
+    recall: FloatArray
+    """(n_sets, n_classes)"""
+    unknown: FloatArray
+    """(n_sets,) share of answers `unknown`."""
+    reliability: float
+    """Mean difference between stated and measured share of right classes, weighted by numbers, over
+    bins of the stated probability."""
+
+
+def feature_table(signatures: Sequence[Signature]) -> tuple[FloatArray, IntArray, list[str]]:
+    """Features (n, n_features) of signatures, the rows (n,) that have them, and reasons.
+
+    Raises LabelsError where the number of axes differs.
+    """
+    axes = Counter(s.field.shape[1] for s in signatures)
+    if len(axes) > 1:
+        raise LabelsError('signatures have different numbers of axes: '
+                          + ', '.join(f'{n} with {k}' for k, n in sorted(axes.items())))
+    rows, found, reasons = [], [], []
+    for i, signature in enumerate(signatures):
+        try:
+            found.append(features(signature))
+            rows.append(i)
+        except ValueError as error:
+            reasons.append(f'{signature.source}: {error}')
+    return np.array(found, ndmin=2), np.array(rows, dtype=np.int64), reasons
+
+
+def train(x: FloatArray, labels: Sequence[str], n_axes: int, seed: int = 0) -> SignatureModel:
+    """Train a classifier; method and penalty are chosen by cross-validation.
+
+    Parameters
+    ----------
+    x : (n, n_features) array
+    labels : sequence of n str
+    n_axes : int
+    seed : int
+        Of the folds.
+
+    Returns
+    -------
+    SignatureModel
+
+    Raises
+    ------
+    LabelsError
+        If there are fewer than two classes, or too few examples of one.
+    MissingDependencyError
+    """
+    counts = check_labels(labels)
+    classes = tuple(sorted(counts))
+    y = np.array([classes.index(label) for label in labels])
+    mean, scale = x.mean(axis=0), x.std(axis=0)
+    scale = np.where(scale > 1e-9 * (1.0 + np.abs(mean)), scale, 1.0)
+    z = (x - mean) / scale
+    folds = list(_folds(y, min(FOLDS, min(counts.values())), seed))
+    scored = []
+    for name, make in _candidates():
+        logits = np.zeros((len(y), len(classes)))
+        for inside, outside in folds:
+            logits[outside] = _logits(make().fit(z[inside], y[inside]), z[outside])
+        losses = [_log_loss(logits / t, y) for t in TEMPERATURES]
+        k = int(np.argmin(losses))
+        scored.append((losses[k], name, make, float(TEMPERATURES[k])))
+    _, name, make, temperature = min(scored, key=lambda s: s[0])
+    fitted = make().fit(z, y)
+    centres, precision = _spread(z, y)
+    left_out = np.concatenate([_own_distances(z, y, inside, outside) for inside, outside in folds])
+    return SignatureModel(classes, n_axes, name, mean, scale, *_linear(fitted, len(classes)),
+                          temperature, centres, precision, float(np.quantile(left_out, KNOWN)),
+                          dict(counts))
+
+
+def check_labels(labels: Sequence[str]) -> 'Counter[str]':
+    """{class: examples}; raises LabelsError where nothing can be learnt from them."""
+    counts = Counter(labels)
+    if '' in counts:
+        raise LabelsError(f'{counts[""]} signatures have no label')
+    if UNKNOWN in counts:
+        raise LabelsError(f'{UNKNOWN!r} is the answer for what fits no class; name the class '
+                          'otherwise')
+    if len(counts) < 2:
+        raise LabelsError(f'one class ({", ".join(counts) or "none"}): nothing can be told apart')
+    few = {name: n for name, n in counts.items() if n < FEWEST}
+    if few:
+        raise LabelsError('expected at least ' + str(FEWEST) + ' examples of each class, got '
+                          + ', '.join(f'{n} of {name!r}' for name, n in sorted(few.items())))
+    return counts
+
+
+def evaluate_splits(x: FloatArray, labels: Sequence[str], n_axes: int, n_splits: int = 20,
+                    test_share: float = 0.3, progress: Any = iter) -> Evaluation:
+    """Train and test on stratified splits; everything is chosen inside the training part.
+
+    Parameters
+    ----------
+    x, labels, n_axes
+        As for `train`.
+    n_splits : int
+    test_share : float
+    progress : function
+        Wraps the iterator of the splits.
+
+    Returns
+    -------
+    Evaluation
+
+    Raises
+    ------
+    LabelsError, MissingDependencyError
+    """
+    check_labels(labels)
+    y = np.array(labels)
+    parts = []
+    for seed in progress(range(n_splits)):
+        inside, outside = _split(y, test_share, seed)
+        model = train(x[inside], y[inside].tolist(), n_axes, seed)
+        parts.append((model, x[outside], y[outside]))
+    return _evaluation(parts)
+
+
+def evaluate(model: SignatureModel, x: FloatArray, labels: Sequence[str]) -> Evaluation:
+    """A trained model on other signatures; raises LabelsError for a class that it has not."""
+    others = sorted(set(labels) - set(model.classes))
+    if others:
+        raise LabelsError(f'the model does not have {", ".join(map(repr, others))}; it has '
+                          f'{", ".join(model.classes)}')
+    return _evaluation([(model, x, np.array(labels))])
+
+
+def _evaluation(parts: Sequence[tuple[SignatureModel, FloatArray, Any]]) -> Evaluation:
+    """The `Evaluation` of models on their test sets."""
+    classes = parts[0][0].classes
+    accuracy, recall, unknown, stated, right = [], [], [], [], []
+    for model, x, y in parts:
+        p, names = model.posterior(x), np.array(model.names(x))
+        accuracy.append(float(np.mean(names == y)))
+        recall.append([float(np.mean(names[y == c] == c)) if (y == c).any() else np.nan
+                       for c in classes])
+        unknown.append(float(np.mean(names == UNKNOWN)))
+        stated += p.max(axis=1).tolist()
+        right += (np.array(classes)[p.argmax(axis=1)] == y).tolist()
+    y = np.concatenate([part[2] for part in parts])
+    recalls = np.array(recall)
+    return Evaluation(classes, len(parts[0][2]), max(Counter(y.tolist()).values()) / len(y),
+                      np.array(accuracy), np.nanmean(recalls, axis=1), recalls, np.array(unknown),
+                      reliability_error(np.array(stated), np.array(right)))
+
+
+def reliability_error(stated: FloatArray, right: FloatArray, n_bins: int = 10) -> float:
+    """Expected calibration error of probabilities (n,) of answers that are `right` (n,)."""
+    bins = np.minimum((stated * n_bins).astype(int), n_bins - 1)
+    return float(sum(abs(stated[bins == b].mean() - right[bins == b].mean()) * np.mean(bins == b)
+                     for b in np.unique(bins)))
+
+
+def _candidates() -> list[tuple[str, Any]]:
+    """[(name, function that makes an estimator)]; raises MissingDependencyError."""
+    try:
+        from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+        from sklearn.linear_model import LogisticRegression
+    except ImportError as error:
+        raise MissingDependencyError('classes of signatures need scikit-learn: pip install '
+                                     '"mag_tracking[classes]"') from error
+    out: list[tuple[str, Any]] = [('linear discriminant analysis', lambda: (
+        LinearDiscriminantAnalysis(solver='lsqr', shrinkage='auto')))]
+    for penalty in PENALTIES:
+        out.append((f'logistic regression, C = {penalty:g}', lambda c=penalty: (
+            LogisticRegression(C=c, max_iter=5000))))
+    return out
+
+
+def _linear(fitted: Any, n_classes: int) -> tuple[FloatArray, FloatArray]:
+    """Weights (n_classes, n_features) and offsets (n_classes,) of an estimator."""
+    weights, offsets = np.asarray(fitted.coef_), np.asarray(fitted.intercept_)
+    if n_classes == 2:
+        weights, offsets = np.vstack([-0.5 * weights, 0.5 * weights]), \
+            np.concatenate([-0.5 * offsets, 0.5 * offsets])
+    return weights, offsets
+
+
+def _logits(fitted: Any, z: FloatArray) -> FloatArray:
+    """(n, n_classes) logits of an estimator."""
+    weights, offsets = _linear(fitted, len(fitted.classes_))
+    logits: FloatArray = z @ weights.T + offsets
+    return logits
+
+
+def _folds(y: IntArray, n: int, seed: int) -> Any:
+    """Stratified folds: (rows inside, rows outside)."""
+    try:
+        from sklearn.model_selection import StratifiedKFold
+    except ImportError as error:
+        raise MissingDependencyError('classes of signatures need scikit-learn: pip install '
+                                     '"mag_tracking[classes]"') from error
+    return StratifiedKFold(n, shuffle=True, random_state=seed).split(np.zeros(len(y)), y)
+
+
+def _split(y: Any, test_share: float, seed: int) -> tuple[IntArray, IntArray]:
+    """Rows to train on, and rows to test on, of every class its share."""
+    rng, inside, outside = np.random.default_rng(seed), [], []
+    for name in np.unique(y):
+        rows = rng.permutation(np.flatnonzero(y == name))
+        # Enough of each is left to train on.
+        n = min(max(1, round(test_share * len(rows))), max(len(rows) - FEWEST, 0))
+        outside += rows[:n].tolist()
+        inside += rows[n:].tolist()
+    if not outside:
+        raise LabelsError(f'too few examples to leave some out: expected more than {FEWEST} of a '
+                          'class')
+    return np.array(sorted(inside)), np.array(sorted(outside))
+
+
+def _spread(z: FloatArray, y: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Centres (n_classes, n_features), and the inverse of the covariance within the classes."""
+    from sklearn.covariance import ledoit_wolf
+
+    centres = np.array([z[y == k].mean(axis=0) for k in range(int(y.max()) + 1)])
+    covariance, _ = ledoit_wolf(z - centres[y])
+    return centres, np.linalg.inv(covariance + 1e-6 * np.eye(z.shape[1]))
+
+
+def _own_distances(z: FloatArray, y: IntArray, inside: IntArray, outside: IntArray) -> FloatArray:
+    """Squared distances of those that were left out, to their own class."""
+    centres, precision = _spread(z[inside], y[inside])
+    own: FloatArray = _distances(z[outside], centres, precision)[np.arange(len(outside)),
+                                                                 y[outside]]
+    return own
+
+
+def _distances(z: FloatArray, centres: FloatArray, precision: FloatArray) -> FloatArray:
+    """(n, n_classes) squared distances."""
+    e = z[:, None] - centres
+    distances: FloatArray = np.einsum('nci,ij,ncj->nc', e, precision, e)
+    return distances
+
+
+def _softmax(logits: FloatArray) -> FloatArray:
+    """(n, n_classes) probabilities."""
+    p = np.exp(logits - logits.max(axis=1, keepdims=True))
+    out: FloatArray = p / p.sum(axis=1, keepdims=True)
+    return out
+
+
+def _log_loss(logits: FloatArray, y: IntArray) -> float:
+    """Mean negative logarithm of the probability of the right class."""
+    return float(-np.mean(np.log(np.maximum(_softmax(logits)[np.arange(len(y)), y], 1e-300))))

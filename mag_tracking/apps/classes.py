@@ -1,0 +1,173 @@
+"""Classes of passes by the signature at one sensor: train, evaluate, predict."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mag_tracking.analysis.signature import Signature
+from mag_tracking.analysis.signature_classifier import (
+    Evaluation,
+    SignatureModel,
+    check_labels,
+    evaluate,
+    evaluate_splits,
+    feature_table,
+    train,
+)
+from mag_tracking.apps.first_pass import first_pass_of
+from mag_tracking.arrays import FloatArray
+from mag_tracking.errors import LabelsError
+from mag_tracking.network import SensorNetwork
+from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.recording.signature_tables import (
+    LabelledInterval,
+    read_intervals,
+    read_signatures,
+)
+from mag_tracking.records import Readings
+from mag_tracking.stages.calibrate.stage import Calibrate
+
+
+@dataclass(frozen=True)
+class Examples:
+    """Signatures as features."""
+
+    x: FloatArray
+    """(n, n_features)"""
+    labels: tuple[str, ...]
+    """(n,)"""
+    sources: tuple[str, ...]
+    """(n,)"""
+    n_axes: int
+    left_out: tuple[str, ...]
+    """A sentence for each signature that has no features."""
+
+
+def examples_of(signatures: list[Signature]) -> Examples:
+    """The `Examples` of signatures.
+
+    Raises
+    ------
+    LabelsError
+        If there is none, or the number of axes differs.
+    """
+    if not signatures:
+        raise LabelsError('there is no signature')
+    x, rows, reasons = feature_table(signatures)
+    if not len(rows):
+        raise LabelsError(f'no signature can be used; {reasons[0]}')
+    kept = [signatures[i] for i in rows.tolist()]
+    return Examples(x, tuple(s.label for s in kept), tuple(s.source for s in kept),
+                    signatures[0].field.shape[1], tuple(reasons))
+
+
+def labelled_signatures(path: str | PathLike[str], labels: str | PathLike[str] | None = None,
+                        network: SensorNetwork | None = None, is_labelled: bool = True
+                        ) -> list[Signature]:
+    """Signatures of a table, or of the labelled intervals of a recording.
+
+    Parameters
+    ----------
+    path : path
+        A CSV table of signatures, or a recording.
+    labels : path, optional
+        A CSV table of the intervals; needed for a recording.
+    network : SensorNetwork, optional
+        Needed for a recording.
+    is_labelled : bool
+        Whether a table of signatures needs labels.
+
+    Raises
+    ------
+    LabelsError
+        If labels are missing, overlap or are empty, or an interval holds no readings.
+    RecordingError
+        If a file cannot be read.
+    """
+    if Path(path).suffix.lower() == '.csv' and labels is None:
+        return read_signatures(path, is_labelled)
+    if labels is None or network is None:
+        raise LabelsError(f'{path}: a recording needs a table of labelled intervals and a network')
+    return list(_cut_out(Path(path), labels, network))
+
+
+def _cut_out(path: Path, labels: str | PathLike[str], network: SensorNetwork
+             ) -> Iterator[Signature]:
+    """The signatures of the intervals, for each sensor that measured in them."""
+    readings = _calibrated(path, network)
+    if not len(readings):
+        raise LabelsError(f'{path}: no sensor has a calibrated reading')
+    names = np.array(readings.names)[readings.sensor]
+    for interval in read_intervals(labels, int(readings.stamp_ns.min())):
+        if interval.sensor and interval.sensor not in network.names:
+            raise LabelsError(f'{labels}: row {interval.row}: the network has no sensor '
+                              f'{interval.sensor!r}; it has {", ".join(network.names)}')
+        found = list(_signatures(path, readings, names, interval))
+        if not found:
+            raise LabelsError(f'{labels}: row {interval.row}: there are no readings in the '
+                              'interval')
+        yield from found
+
+
+def _signatures(path: Path, readings: Readings, names: Any,
+                interval: LabelledInterval) -> Iterator[Signature]:
+    """The signatures of one interval."""
+    inside = (interval.begin_ns <= readings.stamp_ns) & (readings.stamp_ns <= interval.end_ns)
+    for name in readings.names:
+        mine = inside & (names == name)
+        if interval.sensor not in ('', name) or not mine.any():
+            continue
+        field = readings.field[mine]
+        field = field[:, ~np.isnan(field).all(axis=0)]
+        whole = ~np.isnan(field).any(axis=1)
+        if field.shape[1] and whole.any():
+            yield Signature((readings.stamp_ns[mine][whole] - interval.begin_ns) / 1e9,
+                            field[whole], interval.label,
+                            f'{path.name}: {name}, row {interval.row}')
+
+
+def _calibrated(path: Path, network: SensorNetwork) -> Readings:
+    """The calibrated readings of a recording."""
+    settings = settings_for('vehicle')
+    recording = Recording(path)
+    calibrate = Calibrate(network, settings.calibrate)
+    first_pass_of(recording, network, settings.calibrate).apply(calibrate)
+    parts = [part for batch in SampleReader(recording, network).readings()
+             for part in calibrate.feed(batch)]
+    return Readings.joined([*parts, *calibrate.flush()])
+
+
+def train_classes(examples: Examples) -> SignatureModel:
+    """Train on examples; raises LabelsError and MissingDependencyError."""
+    check_labels(examples.labels)
+    return train(examples.x, examples.labels, examples.n_axes)
+
+
+def evaluate_classes(examples: Examples, model: SignatureModel | None = None, n_splits: int = 20,
+                     progress: Callable[[Iterable[int]], Iterable[int]] = iter) -> Evaluation:
+    """Evaluate a trained model, or training itself on stratified splits.
+
+    Raises
+    ------
+    LabelsError
+        If there are too few examples, or the model has other axes or classes.
+    MissingDependencyError
+    """
+    if model is None:
+        return evaluate_splits(examples.x, examples.labels, examples.n_axes, n_splits,
+                               progress=progress)
+    check_axes(examples, model)
+    return evaluate(model, examples.x, examples.labels)
+
+
+def check_axes(examples: Examples, model: SignatureModel) -> None:
+    """Raise LabelsError where signatures do not have the axes of a model."""
+    if examples.n_axes != model.n_axes:
+        raise LabelsError(f'the signatures have {examples.n_axes} axes, the model was trained on '
+                          f'{model.n_axes}')

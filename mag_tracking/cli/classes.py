@@ -1,0 +1,145 @@
+"""mag-tracking classes."""
+
+import argparse
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from mag_tracking.analysis.signature_classifier import Evaluation
+from mag_tracking.apps.classes import (
+    Examples,
+    check_axes,
+    evaluate_classes,
+    examples_of,
+    labelled_signatures,
+    train_classes,
+)
+from mag_tracking.cli.options import Commands, add_command, check_writable
+from mag_tracking.errors import SettingsError
+from mag_tracking.network.file import read_network
+from mag_tracking.recording.signature_tables import read_model, write_model
+
+_CLASSES = '''
+One sensor does not tell size or distance, but the shape of the field as something passes tells
+its class, after training on labelled passes of your own.
+
+LABELLED is a CSV table: a row for each sample (label, signature, time_s, x_nt, y_nt, z_nt), or a
+row for each signature (label, x0, x1, ..., y0, y1, ...). Or it is a recording with --network FILE
+and --labels FILE, a CSV table of intervals (label, begin_s, end_s, and maybe sensor; seconds since
+the first reading or since 1970, or begin_ns and end_ns). The table of `mag-tracking events`
+(signatures.csv) is one without labels.
+
+train chooses the method by cross-validation and writes JSON. evaluate trains and tests on
+stratified splits, or tests a model on other examples. predict prints the probability of each class.
+Where a signature is far from all examples the answer is "unknown".
+
+examples:
+  mag-tracking classes evaluate passes.csv
+  mag-tracking classes train passes.csv --out classes.json
+  mag-tracking classes train monday.mcap --network site.yaml --labels monday.csv --out classes.json
+  mag-tracking classes predict events/signatures.csv --model classes.json
+'''
+
+
+def add(commands: Commands) -> None:
+    """Register the command."""
+    p = add_command(commands, 'classes', _no_action, _CLASSES)
+    actions = p.add_subparsers(dest='action', metavar='ACTION', required=True)
+    for name, run, text in (('train', _train, 'learn classes from labelled passes'),
+                            ('evaluate', _evaluate, 'measure how well classes are told'),
+                            ('predict', _predict, 'classes of signatures')):
+        _add_action(actions, name, run, text)
+
+
+def _add_action(actions: Commands, name: str, run: Callable[[argparse.Namespace], int],
+                text: str) -> None:
+    """Register `train`, `evaluate` or `predict`."""
+    p = actions.add_parser(name, help=text, description=text)
+    p.set_defaults(run_command=run)
+    p.add_argument('labelled', type=Path, metavar='LABELLED', help='table or recording')
+    p.add_argument('--labels', type=Path, metavar='FILE', help='intervals of a recording')
+    p.add_argument('--network', type=Path, metavar='FILE', help='of a recording')
+    if name == 'train':
+        p.add_argument('--out', type=Path, required=True, metavar='FILE', help='written as JSON')
+    else:
+        p.add_argument('--model', type=Path, required=name == 'predict', metavar='FILE',
+                       help='of `classes train`')
+    if name == 'evaluate':
+        p.add_argument('--splits', type=int, default=20, metavar='N',
+                       help='70/30 splits without a model (default: 20)')
+
+
+def _no_action(args: argparse.Namespace) -> int:
+    """Argparse asks for an action before this."""
+    raise SettingsError('classes: expected train, evaluate or predict')
+
+
+def _examples(args: argparse.Namespace) -> Examples:
+    """The signatures of a command line, with a warning for each that cannot be used."""
+    network = None if args.network is None else read_network(args.network)
+    examples = examples_of(labelled_signatures(args.labelled, args.labels, network,
+                                               args.action != 'predict'))
+    for reason in examples.left_out:
+        print(f'  warning: left out: {reason}')
+    return examples
+
+
+def _train(args: argparse.Namespace) -> int:
+    """mag-tracking classes train."""
+    check_writable(args.out)
+    model = train_classes(_examples(args))
+    write_model(args.out, model)
+    print(f'{args.out}: {model.method}; '
+          + ', '.join(f'{n} of {name}' for name, n in sorted(model.examples.items())))
+    return 0
+
+
+def _evaluate(args: argparse.Namespace) -> int:
+    """mag-tracking classes evaluate."""
+    if args.splits < 1:
+        raise SettingsError(f'--splits: {args.splits} is not a number of at least 1')
+    examples = _examples(args)
+    model = None if args.model is None else read_model(args.model)
+    found = evaluate_classes(examples, model, args.splits,
+                             partial(tqdm, desc='splits', disable=None, leave=False))
+    how = f'{args.splits} splits of 70/30' if model is None else f'{args.model}'
+    print(f'{len(examples.labels)} signatures, {how}; tested on {found.n}')
+    _print_evaluation(found)
+    return 0
+
+
+def _print_evaluation(found: Evaluation) -> None:
+    """The figures of an evaluation."""
+    print(f'  largest class: {found.majority:.1%} (accuracy of a constant answer)')
+    for name, values in (('accuracy', found.accuracy),
+                         ('balanced accuracy', found.balanced_accuracy),
+                         ('answers unknown', found.unknown)):
+        print(f'  {name}: {_share(values)}')
+    for k, name in enumerate(found.classes):
+        print(f'  recall of {name}: {_share(found.recall[:, k])}')
+    print(f'  reliability error of the probabilities: {found.reliability:.3f}')
+
+
+def _share(values: 'np.ndarray[tuple[int, ...], np.dtype[np.float64]]') -> str:
+    """A share over all sets, with its standard deviation where there are several."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return 'no examples'
+    spread = f' ± {known.std():.1%}' if len(known) > 1 else ''
+    return f'{known.mean():.1%}{spread}'
+
+
+def _predict(args: argparse.Namespace) -> int:
+    """mag-tracking classes predict."""
+    model, examples = read_model(args.model), _examples(args)
+    check_axes(examples, model)
+    names, posterior = model.names(examples.x), model.posterior(examples.x)
+    for source, name, p in zip(examples.sources, names, posterior, strict=True):
+        print(f'{source}: {name} ('
+              + ', '.join(f'{c} {v:.1%}' for c, v in zip(model.classes, p, strict=True)) + ')')
+    print(', '.join(f'{n} {name}' for name, n in sorted(Counter(names).items())))
+    return 0

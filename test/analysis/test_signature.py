@@ -1,0 +1,56 @@
+"""Features of signatures: what they depend on, and what they do not."""
+
+import numpy as np
+import pytest
+
+from mag_tracking.analysis.signature import Signature, features
+from support.labelled_passes import signature
+
+
+def made(seed=0, name='car'):
+    return signature(np.random.default_rng(seed), name, 'boxes')
+
+
+def changed(s, t=None, field=None):
+    return Signature(s.t if t is None else t, s.field if field is None else field, s.label,
+                     s.source)
+
+
+def test_the_duration_does_not_matter():
+    s = made()
+    np.testing.assert_allclose(features(changed(s, t=3.7 * s.t + 100.0)), features(s), atol=1e-9)
+
+
+def test_the_unit_changes_the_size_only():
+    s = made()
+    first, other = features(s), features(changed(s, field=1e9 * s.field))
+    assert other[0] - first[0] == pytest.approx(np.log(1e9))
+    np.testing.assert_allclose(other[1:], first[1:], atol=1e-6)
+
+
+def test_baseline_and_drift_do_not_matter():
+    s = made()
+    drifting = s.field + [3e-5, -1e-5, 4e-5] + 1e-7 * s.t[:, None]
+    np.testing.assert_allclose(features(changed(s, field=drifting)), features(s), atol=1e-6)
+
+
+def test_quiet_ends_hardly_matter():
+    s = made()
+    t = np.arange(0.0, s.t[-1] + 4.0, 0.02)
+    rng = np.random.default_rng(1)
+    field = 2e-8 * rng.standard_normal((len(t), 3))
+    inside = (t >= 2.0) & (t <= s.t[-1] + 2.0)
+    field[inside] += np.stack([np.interp(t[inside] - 2.0, s.t, axis - axis[0])
+                               for axis in s.field.T], axis=1)
+    apart = np.abs(features(changed(s, t=t, field=field)) - features(s))
+    assert np.median(apart) < 0.1
+
+
+@pytest.mark.parametrize(('t', 'field', 'why'), [
+    (np.arange(5.0), np.ones((5, 3)), 'too few'),
+    (np.arange(20.0), np.ones((20, 3)), 'does not vary'),
+    (np.arange(20.0), np.full((20, 3), np.nan), 'not finite'),
+    (np.zeros(20), np.random.default_rng(0).standard_normal((20, 3)), 'do not increase')])
+def test_what_has_no_shape_is_refused(t, field, why):
+    with pytest.raises(ValueError, match=why):
+        features(Signature(t, field, '', ''))

@@ -1,0 +1,86 @@
+"""Trained classes: accuracy, calibrated probabilities, unknown signatures, refused labels."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from mag_tracking.analysis.signature_classifier import (
+    evaluate,
+    evaluate_splits,
+    reliability_error,
+    train,
+)
+from mag_tracking.apps.classes import examples_of
+from mag_tracking.errors import LabelsError
+from mag_tracking.inference.log_normal_classes import UNKNOWN
+from mag_tracking.recording.signature_tables import read_model, write_model
+from support.labelled_passes import signatures
+
+COUNTS = {'motorcycle': 20, 'car': 100, 'truck': 20}
+
+
+@cache
+def examples(simulator='boxes', seed=0):
+    return examples_of(signatures(COUNTS, simulator, seed))
+
+
+@pytest.mark.parametrize('simulator', ['clouds', 'boxes'])
+def test_classes_are_told_better_than_by_the_largest_one(simulator):
+    e = examples(simulator)
+    found = evaluate_splits(e.x, e.labels, e.n_axes, 5)
+    assert found.majority == pytest.approx(100 / 140, abs=0.03)
+    assert found.accuracy.mean() > found.majority + 0.05
+    # Of three classes a constant answer has a third.
+    assert found.balanced_accuracy.mean() > 0.65
+    # 0.05 is the aim; three standard errors of 5 x 42 answers come on top.
+    assert found.reliability < 0.05 + 3.0 * np.sqrt(0.1 / 210)
+    assert found.unknown.mean() < 0.1
+
+
+def test_what_is_far_from_all_examples_is_unknown():
+    e = examples()
+    model = train(e.x, e.labels, e.n_axes)
+    assert np.mean(np.array(model.names(e.x)) == UNKNOWN) < 0.05
+    far = e.x + 8.0 * model.scale * np.random.default_rng(0).choice([-1.0, 1.0], e.x.shape)
+    assert set(model.names(far)) == {UNKNOWN}
+    assert model.posterior(far).sum(axis=1) == pytest.approx(1.0)
+
+
+def test_training_is_repeated_exactly_and_survives_its_file(tmp_path):
+    e, other = examples(), examples(seed=1)
+    model = train(e.x, e.labels, e.n_axes)
+    write_model(tmp_path / 'classes.json', model)
+    again, stored = train(e.x, e.labels, e.n_axes), read_model(tmp_path / 'classes.json')
+    for found in (again, stored):
+        np.testing.assert_array_equal(found.posterior(other.x), model.posterior(other.x))
+        assert found.names(other.x) == model.names(other.x)
+    assert evaluate(stored, other.x, other.labels).accuracy[0] > 0.8
+    with pytest.raises(LabelsError, match="does not have 'tank'"):
+        evaluate(stored, other.x, ['tank'] * len(other.labels))
+
+
+def test_two_classes_have_probabilities_too():
+    e = examples()
+    rows = [k for k, label in enumerate(e.labels) if label != 'motorcycle']
+    model = train(e.x[rows], [e.labels[k] for k in rows], e.n_axes)
+    p = model.posterior(e.x[rows])
+    assert p.shape == (len(rows), 2) and p.sum(axis=1) == pytest.approx(1.0)
+    assert np.mean([model.classes[k] == e.labels[r]
+                    for k, r in zip(p.argmax(axis=1), rows, strict=True)]) > 0.9
+
+
+@pytest.mark.parametrize(('labels', 'why'), [
+    (['car'] * 10, 'one class'), (['car'] * 9 + ['truck'], "got 1 of 'truck'"),
+    (['car'] * 5 + [''] * 5, 'no label'), (['car'] * 5 + ['unknown'] * 5, 'name the class')])
+def test_labels_from_which_nothing_is_learnt_are_refused(labels, why):
+    x = np.random.default_rng(0).standard_normal((10, 4))
+    with pytest.raises(LabelsError, match=why):
+        train(x, labels, 1)
+
+
+def test_the_reliability_error_is_that_of_its_definition():
+    assert reliability_error(np.array([0.9] * 10), np.array([True] * 9 + [False])) == \
+        pytest.approx(0.0)
+    assert reliability_error(np.array([0.95] * 10), np.array([True] * 5 + [False] * 5)) == \
+        pytest.approx(0.45)

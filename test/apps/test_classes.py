@@ -1,0 +1,114 @@
+"""`mag-tracking classes`: tables, recordings with intervals, and bad labels."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from mag_tracking.apps.classes import labelled_signatures
+from mag_tracking.cli import main
+from mag_tracking.errors import LabelsError
+from mag_tracking.network.file import read_network
+from support.bundled import DATA, NETWORK_FILE, vehicle_path
+from support.labelled_passes import signatures, write_by_row, write_by_sample
+
+COUNTS = {'car': 25, 'truck': 10}
+ROAD = DATA / 'two_way_road'
+
+
+@pytest.fixture(scope='module')
+def tables(tmp_path_factory):
+    """The same signatures as a table by sample and by row."""
+    folder, found = tmp_path_factory.mktemp('classes'), signatures(COUNTS, 'boxes')
+    write_by_sample(folder / 'by_sample.csv', found)
+    write_by_row(folder / 'by_row.csv', found)
+    return folder
+
+
+@pytest.mark.parametrize('name', ['by_sample', 'by_row'])
+def test_train_evaluate_and_predict(tables, tmp_path, capsys, name):
+    table, model = str(tables / f'{name}.csv'), str(tmp_path / 'classes.json')
+    assert main(['classes', 'evaluate', table, '--splits', '3']) == 0
+    printed = capsys.readouterr().out
+    for what in ('largest class: 7', 'balanced accuracy: ', 'recall of truck: ', 'reliability'):
+        assert what in printed
+    assert main(['classes', 'train', table, '--out', model]) == 0
+    assert '25 of car, 10 of truck' in capsys.readouterr().out
+    assert main(['classes', 'evaluate', table, '--model', model]) == 0
+    assert main(['classes', 'predict', table, '--model', model]) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert 'car' in last and 'truck' in last
+
+
+def test_both_kinds_of_table_hold_the_same(tables):
+    one, other = (labelled_signatures(tables / f'{name}.csv') for name in ('by_sample', 'by_row'))
+    assert [s.label for s in one] == [s.label for s in other]
+    np.testing.assert_allclose(one[0].field[0], other[0].field[0])
+
+
+def intervals(path, rows, header=('label', 'begin_s', 'end_s')):
+    with open(path, 'w', newline='') as stream:
+        csv.writer(stream).writerows([header, *rows])
+    return path
+
+
+def test_intervals_of_a_recording(tmp_path):
+    truth = json.loads((ROAD / 'two_way_road.truth.json').read_text())
+    vehicles = [v for k, v in enumerate(truth['vehicles'])
+                if all(abs(v['cpa_time_s'] - w['cpa_time_s']) > 5.0
+                       for j, w in enumerate(truth['vehicles']) if j != k)]
+    rows = [('truck' if v['length_m'] > 6 else 'car', v['cpa_time_s'] - 2.0, v['cpa_time_s'] + 2.0)
+            for v in vehicles]
+    network = read_network(NETWORK_FILE)
+    found = labelled_signatures(ROAD / 'two_way_road.mcap', intervals(tmp_path / 'a.csv', rows),
+                                network)
+    # Two sensors with two axes.
+    assert len(found) == 2 * len(rows) and all(s.field.shape[1] == 2 for s in found)
+    epoch = truth['epoch_s']
+    absolute = [(label, round((epoch + a) * 1e9), round((epoch + b) * 1e9), 'mag_2')
+                for label, a, b in rows]
+    of_one = labelled_signatures(ROAD / 'two_way_road.mcap', intervals(
+        tmp_path / 'b.csv', absolute, ('label', 'begin_ns', 'end_ns', 'sensor')), network)
+    assert len(of_one) == len(rows) and all('mag_2' in s.source for s in of_one)
+    assert {s.label for s in of_one} == {'car', 'truck'}
+
+
+@pytest.mark.parametrize(('rows', 'why'), [
+    ([('car', 5, 9), ('truck', 8, 11)], 'rows 2 and 3 overlap'),
+    ([('', 5, 9)], 'row 2: the label is empty'), ([('car', 9, 5)], 'ends before it begins'),
+    ([('car', 5000, 5009)], 'no readings in the interval')])
+def test_bad_intervals_are_named(tmp_path, rows, why):
+    with pytest.raises(LabelsError, match=why):
+        labelled_signatures(vehicle_path('straight_car_right'),
+                            intervals(tmp_path / 'a.csv', rows), read_network(NETWORK_FILE))
+
+
+def test_bad_tables_are_named(tmp_path, tables, capsys):
+    bad = {'no label': 'a,x0,x1\n1,2,3\n', 'numbered': 'label,x,y\ncar,1,2\n',
+           'several labels': 'label,signature,time_s,x\ncar,1,0,1\ntruck,1,1,2\n',
+           'tells one': 'label,time_s,x\ncar,0,1\n', 'too few': 'label,x0,x1\ncar,1,2\n',
+           'no number': 'label,x0,x1\ncar,1,two\n', 'has no rows': 'label,x0\n'}
+    for k, text in enumerate(bad.values()):
+        path = tmp_path / f'{k}.csv'
+        path.write_text(text)
+        assert main(['classes', 'train', str(path), '--out', str(tmp_path / 'm.json')]) == 1
+        assert 'mag-tracking: ' in capsys.readouterr().err and not (tmp_path / 'm.json').exists()
+    by_row = str(tables / 'by_row.csv')
+    (tmp_path / 'other.json').write_text('{"a": 1}')
+    assert main(['classes', 'predict', by_row, '--model', str(tmp_path / 'other.json')]) == 1
+    assert 'holds no trained classes' in capsys.readouterr().err
+    assert main(['classes', 'train', str(vehicle_path('straight_car_right')), '--out',
+                 str(tmp_path / 'm.json')]) == 1
+    assert 'needs a table of labelled intervals' in capsys.readouterr().err
+    assert main(['classes', 'evaluate', by_row, '--splits', '0']) == 1
+
+
+def test_a_model_of_other_axes_is_refused(tables, tmp_path, capsys):
+    model = str(tmp_path / 'classes.json')
+    assert main(['classes', 'train', str(tables / 'by_row.csv'), '--out', model]) == 0
+    write_by_row(tmp_path / 'two.csv', [])
+    (tmp_path / 'two.csv').write_text('label,' + ','.join(f'x{k}' for k in range(20)) + '\ncar,'
+                                      + ','.join(str(k * (19 - k)) for k in range(20)) + '\n')
+    assert main(['classes', 'predict', str(tmp_path / 'two.csv'), '--model', model]) == 1
+    assert 'have 1 axes, the model was trained on 3' in capsys.readouterr().err
