@@ -1,0 +1,112 @@
+"""Enrolled vehicles: the published passes of one, and two cars of equal size."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from mag_tracking.inference.identification import BETWEEN_STD, enrol, identify
+from mag_tracking.inference.log_normal_classes import UNKNOWN
+from mag_tracking.physics.dipole import MU0
+from support.vehicle_5 import TABLE
+
+SCALE = 450.0
+"""[A m^2] of T10's unit of moment (the ratio of TSP14 to T10 for the same vehicles)."""
+MOMENTS = SCALE * TABLE[:, 1:4]
+COVARIANCES = np.array([np.diag((SCALE * std)**2) for std in TABLE[:, 4:7]])
+HEADINGS = np.deg2rad(TABLE[:, 0])
+INDUCTION = 1.7e-7 * np.array([0.0, 0.31, -0.95]) / MU0 * 3.0 * SCALE
+HARD, SOFT = SCALE * np.array([-0.47, 0.29, -0.56]), 1.22
+
+
+def distances(between_std, monkeypatch):
+    """Squared distances of each published pass to what the twelve others predict."""
+    monkeypatch.setattr('mag_tracking.inference.identification.BETWEEN_STD', between_std)
+    out = []
+    for k in range(len(TABLE)):
+        rest = np.arange(len(TABLE)) != k
+        vehicle = enrol('5', MOMENTS[rest], COVARIANCES[rest], HEADINGS[rest], INDUCTION)
+        found = identify([vehicle], MOMENTS[k], COVARIANCES[k], HEADINGS[k], 0.0, INDUCTION)
+        out.append(found.distances['5'])
+    return np.array(out)
+
+
+def test_published_passes_are_consistent_with_the_spread_between_passes(monkeypatch):
+    """T10 Table 6.9, each pass left out; the stated deviations alone are too small."""
+    low, high = chi2.ppf([0.005, 0.995], 3 * len(TABLE)) / len(TABLE)
+    assert low < distances(BETWEEN_STD, monkeypatch).mean() < high
+    assert distances(1e-6, monkeypatch).mean() > high
+
+
+def test_a_heading_that_was_not_enrolled_is_identified():
+    """T10 Table 6.9, all passes of one heading left out."""
+    for heading in np.unique(HEADINGS):
+        rest = heading != HEADINGS
+        vehicle = enrol('5', MOMENTS[rest], COVARIANCES[rest], HEADINGS[rest], INDUCTION)
+        for k in np.flatnonzero(~rest):
+            found = identify([vehicle], MOMENTS[k], COVARIANCES[k], heading, 0.02, INDUCTION)
+            assert found.name == '5', (np.rad2deg(heading), found.distances)
+
+
+def moment_at(hard, heading):
+    c, s = np.cos(heading), np.sin(heading)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ hard + SOFT * INDUCTION
+
+
+def turned(degrees):
+    """The hard iron of a car of equal size."""
+    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ HARD
+
+
+@pytest.mark.parametrize('degrees', [60, 90, 120, 180])
+def test_two_cars_of_equal_size_are_told_apart(degrees):
+    """T10 Fig. 7.1 in kind: enrolled heading north and south, identified at any heading."""
+    rng, C = np.random.default_rng(degrees), np.diag([8.0, 8.0, 15.0])**2
+    spread = np.linalg.cholesky(C + BETWEEN_STD**2 * np.eye(3))
+    cars = {'vehicle 5': HARD, 'other': turned(degrees)}
+    enrolled_at = np.deg2rad([90.0, 90.0, 270.0, 270.0])
+
+    def passes(hard, headings):
+        return np.array([moment_at(hard, h) + spread @ rng.standard_normal(3) for h in headings])
+
+    fleet = [enrol(name, passes(hard, enrolled_at), np.tile(C, (4, 1, 1)), enrolled_at, INDUCTION)
+             for name, hard in cars.items()]
+    # The 90 % ellipses of the horizontal moment do not touch at the headings of the figure.
+    for heading in enrolled_at:
+        (one, P), (other, Q) = (v.moment_at(heading, 0.0, INDUCTION) for v in fleet)
+        e = (one - other)[:2]
+        reach = [np.sqrt(chi2.ppf(0.9, 2) * e @ S[:2, :2] @ e) / np.linalg.norm(e) for S in (P, Q)]
+        assert sum(reach) < np.linalg.norm(e)
+    right = [identify(fleet, m, C, heading, 0.02, INDUCTION).name == name
+             for name, hard in cars.items() for heading in np.deg2rad([90.0, 270.0, 20.0, 200.0])
+             for m in passes(hard, [heading] * 10)]
+    # One in a hundred is further away than the threshold of `unknown`.
+    assert np.mean(right) > 0.99 - 3.0 * np.sqrt(0.01 * 0.99 / len(right))
+
+
+def test_one_heading_is_compared_at_that_heading_only():
+    C = np.tile(np.diag([10.0] * 3)**2, (2, 1, 1))
+    headings = np.deg2rad([88.0, 92.0])
+    one = enrol('van', np.array([moment_at(HARD, h) for h in headings]), C, headings, INDUCTION)
+    assert one.iron is None
+    found = identify([one], moment_at(HARD, np.pi / 2), C[0], np.pi / 2, 0.02, INDUCTION)
+    assert found.name == 'van' and found.probabilities == {'van': 1.0}
+    found = identify([one], moment_at(HARD, 0.0), C[0], 0.0, 0.02, INDUCTION)
+    assert found.name == UNKNOWN and found.not_compared == ('van',)
+
+
+def test_a_stranger_is_unknown():
+    C = np.tile(np.diag([10.0] * 3)**2, (4, 1, 1))
+    headings = np.deg2rad([0.0, 90.0, 180.0, 270.0])
+    one = enrol('van', np.array([moment_at(HARD, h) for h in headings]), C, headings, INDUCTION)
+    found = identify([one], moment_at(2.0 * turned(90), 0.3), C[0], 0.3, 0.02, INDUCTION)
+    assert found.name == UNKNOWN and found.distances['van'] > 11.3
+
+
+@pytest.mark.parametrize(('headings', 'why'), [
+    ([], 'at least one pass'), ([0.0, 25.0], '25 degrees apart')])
+def test_what_cannot_be_enrolled_is_named(headings, why):
+    headings = np.deg2rad(headings)
+    moments = np.array([moment_at(HARD, h) for h in headings]).reshape(-1, 3)
+    with pytest.raises(ValueError, match=why):
+        enrol('van', moments, np.tile(np.eye(3), (len(headings), 1, 1)), headings, INDUCTION)
