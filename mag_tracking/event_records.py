@@ -87,6 +87,8 @@ class VehiclePassage:
     speed: float
     """[m/s], horizontal."""
     speed_std: float
+    heading_std: float
+    """[rad] of the direction of `velocity`."""
     length: float
     """[m] of the row of dipoles that it is taken for; 0 for a point."""
     length_std: float

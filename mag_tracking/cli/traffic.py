@@ -3,6 +3,7 @@
 import argparse
 import signal
 from collections import Counter
+from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -10,17 +11,22 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from mag_tracking.apps.fleet import Fleet, induction_of, pass_of
 from mag_tracking.apps.traffic import CountedVehicle, TrafficResult, count_traffic
 from mag_tracking.cli.options import (
     Commands,
     add_command,
     add_recorded_network,
+    check_writable,
     distinct_names,
     recorded_network,
 )
 from mag_tracking.cli.tracking_options import add_settings, settings_of
-from mag_tracking.errors import OutputError
+from mag_tracking.errors import OutputError, SettingsError
+from mag_tracking.inference.identification import Identification
 from mag_tracking.interrupts import noted_signals
+from mag_tracking.network import SensorNetwork
+from mag_tracking.recording.fleet_file import FleetPass, read_fleet, write_fleet
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.traffic_tables import (
     DIRECTIONS,
@@ -39,8 +45,13 @@ ended. An ambiguous passage is counted, too, and marked with its doubts.
 With --out DIR: passages.csv with a row for each vehicle, intervals.csv with counts and mean speeds
 for each interval, direction and class, and the same as Parquet where pyarrow is installed.
 
+With --fleet FILE enrolled vehicles are recognised by the hard and soft iron of their moments.
+--enrol NAME adds to that file the one vehicle of each recording; enrolled at headings 45 degrees
+apart it is recognised at any heading, else at that heading only.
+
 examples:
   mag-tracking traffic road.mcap --network network.yaml
+  mag-tracking traffic out.mcap back.mcap --network site.yaml --fleet fleet.json --enrol 'van 3'
   mag-tracking traffic monday.mcap tuesday.mcap --network network.yaml --out week
 '''
 
@@ -52,6 +63,9 @@ def add(commands: Commands) -> None:
                    help='.mcap, .db3 or .bag files, or rosbag2 folders')
     add_recorded_network(p)
     p.add_argument('--out', type=Path, metavar='DIR', help='folder for tables')
+    p.add_argument('--fleet', type=Path, metavar='FILE', help='enrolled vehicles to recognise')
+    p.add_argument('--enrol', metavar='NAME',
+                   help='add the vehicle of each recording to the fleet, as passes of NAME')
     add_settings(p)
 
 
@@ -65,6 +79,8 @@ def _traffic(args: argparse.Namespace) -> int:
             raise OutputError(f'{args.out} is the folder of the recording; the tables would be in '
                               'it')
     tables: dict[str, list[dict[str, Any]]] = {'passages': [], 'intervals': []}
+    fleet = _fleet(args, network)
+    enrolled: list[FleetPass] = []
     with noted_signals(signal.SIGINT) as seen:
         for name, recording in zip(names, recordings, strict=True):
             if seen:
@@ -73,10 +89,17 @@ def _traffic(args: argparse.Namespace) -> int:
                       disable=None) as bar:
                 result = count_traffic(recording, network, settings, bar.update,
                                        lambda: bool(seen))
-            _print(name, result, recording)
-            tables['passages'] += [passage_row(name, v.passage, result.class_names, _delay(v))
-                                   for v in result.vehicles]
+            if args.enrol is not None and not seen:
+                enrolled.append(pass_of(name, [v.passage for v in result.vehicles]))
+            found = [None if fleet is None else fleet.identify(v.passage)
+                     for v in result.vehicles]
+            _print(name, result, recording, found)
+            tables['passages'] += [
+                passage_row(name, v.passage, result.class_names, _delay(v), _vehicle(who))
+                for v, who in zip(result.vehicles, found, strict=True)]
             tables['intervals'] += [row for s in result.summaries for row in summary_rows(name, s)]
+    if args.enrol is not None and not seen:
+        _enrol(args, network, enrolled)
     if args.out is not None:
         paths = write_traffic(args.out, tables)
         print(f'tables in {args.out}: {", ".join(path.name for path in paths)}')
@@ -86,16 +109,48 @@ def _traffic(args: argparse.Namespace) -> int:
     return 0
 
 
+def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
+    """The enrolled vehicles that are to be recognised."""
+    if args.enrol is not None:
+        if args.fleet is None:
+            raise SettingsError('--enrol: --fleet names the file to add it to')
+        induction_of(network)
+        check_writable(args.fleet)
+        return None
+    return None if args.fleet is None else Fleet(read_fleet(args.fleet), network)
+
+
+def _enrol(args: argparse.Namespace, network: SensorNetwork, passes: list[FleetPass]) -> None:
+    """Add passes to the file of the fleet."""
+    fleet = read_fleet(args.fleet) if args.fleet.exists() else {}
+    fleet[args.enrol] = [*fleet.get(args.enrol, []), *passes]
+    # What cannot be enrolled is not written.
+    vehicle = next(v for v in Fleet(fleet, network).vehicles if v.name == args.enrol)
+    write_fleet(args.fleet, fleet)
+    at = 'any heading' if vehicle.iron is not None else \
+        f'a heading of {np.degrees(vehicle.heading):.0f} degrees only'
+    print(f'{args.fleet}: {args.enrol} has {len(fleet[args.enrol])} passes, and is recognised at '
+          f'{at}')
+
+
+def _vehicle(found: Identification | None) -> dict[str, Any]:
+    """Columns of the enrolled vehicle; none without a fleet."""
+    return {} if found is None else {
+        'vehicle': found.name, 'p_vehicle': found.probabilities.get(found.name, np.nan)}
+
+
 def _delay(vehicle: CountedVehicle) -> dict[str, Any]:
     """Columns of the speed by the delay between sensors."""
     return {'delay_speed': vehicle.delay.speed, 'sd_delay_speed': vehicle.delay.speed_std,
             'speeds_contradict': vehicle.speeds_contradict}
 
 
-def _print(name: str, result: TrafficResult, recording: Recording) -> None:
+def _print(name: str, result: TrafficResult, recording: Recording,
+           found: Sequence[Identification | None]) -> None:
     """The vehicles of a recording, a line each, their counts and the warnings."""
-    for vehicle in result.vehicles:
-        print(line_of(vehicle))
+    for vehicle, who in zip(result.vehicles, found, strict=True):
+        known = '' if who is None else f', vehicle {who.name}'
+        print(f'{line_of(vehicle)}{known}')
     total = Counter((v.passage.line, DIRECTIONS[v.passage.forward], v.passage.vehicle_class)
                     for v in result.vehicles)
     print(f'{name}: {len(result.vehicles)} vehicles')

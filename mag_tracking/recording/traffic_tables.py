@@ -17,10 +17,11 @@ DIRECTIONS = {True: 'forward', False: 'backward'}
 
 
 def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[str],
-                delay: dict[str, Any]) -> dict[str, Any]:
+                delay: dict[str, Any], vehicle: dict[str, Any]) -> dict[str, Any]:
     """The columns of `passages`; SI units, NaN = unknown.
 
-    `delay` has those of the speed by the delay between sensors.
+    `delay` has those of the speed by the delay between sensors, `vehicle` those of the enrolled
+    vehicle that it is.
     """
     x, y, z = passage.position.tolist()
     vx, vy, vz = passage.velocity.tolist()
@@ -30,12 +31,14 @@ def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[s
         'line': passage.line, 'track_id': passage.track_id,
         'direction': DIRECTIONS[passage.forward], 'direction_error': passage.direction_error,
         'x': x, 'y': y, 'z': z, 'lateral': passage.lateral, 'vx': vx, 'vy': vy, 'vz': vz,
+        'heading_deg': float(np.degrees(np.arctan2(vy, vx))),
+        'sd_heading_deg': float(np.degrees(passage.heading_std)),
         'speed': passage.speed, 'sd_speed': passage.speed_std, **delay,
         'length': passage.length, 'sd_length': passage.length_std, 'mx': mx, 'my': my, 'mz': mz,
         'moment_size': float(np.linalg.norm(passage.moment)), 'class': passage.vehicle_class,
         **{f'p_{name}': float(p) for name, p in zip(class_names, passage.class_probabilities,
                                                     strict=True)},
-        'headway': passage.headway, 'ambiguous': passage.ambiguous,
+        **vehicle, 'headway': passage.headway, 'ambiguous': passage.ambiguous,
         'doubts': ' '.join(passage.doubts)}
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import Disturbance, TrafficSummary, VehiclePassage
-from mag_tracking.geometry import speed_of
+from mag_tracking.geometry import heading_of, speed_of
 from mag_tracking.inference.log_normal_classes import ClassPosterior, Feature, class_posterior
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.counting_line import Crossing, Line, LinePath, Pose, lines_of
@@ -198,14 +198,16 @@ class Traffic:
         doubts = tuple(name for name, is_so in (
             (AMBIGUOUS, pose.ambiguous), (CONTRADICTED, found.direction_error > MOST_ERROR),
             (EXTRAPOLATED, crossing.is_extrapolated)) if is_so)
-        speed, speed_std = speed_of(pose.velocity[:2], pose.covariance[3:5, 3:5])
+        moving = pose.velocity[:2], pose.covariance[3:5, 3:5]
+        speed, speed_std = speed_of(*moving)
         posterior = _class_of(pose, self._settings)
         passage = VehiclePassage(
             crossing.stamp_ns, self.counts['passages'], line.name, found.track_id,
             crossing.forward, found.direction_error, crossing.position,
-            line.lateral(crossing.position), pose.velocity, speed, speed_std, pose.length,
-            pose.length_std, pose.moment, pose.moment_covariance, posterior.name,
-            np.asarray(posterior.probabilities), headway, bool(doubts), doubts)
+            line.lateral(crossing.position), pose.velocity, speed, speed_std,
+            heading_of(*moving)[1], pose.length, pose.length_std, pose.moment,
+            pose.moment_covariance, posterior.name, posterior.probabilities, headway, bool(doubts),
+            doubts)
         self._intervals.add(passage)
         return passage
 

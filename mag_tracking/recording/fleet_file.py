@@ -1,0 +1,56 @@
+"""Enrolled vehicles in JSON: the passes of each, so that more can be added."""
+
+import json
+from dataclasses import asdict, dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from mag_tracking.arrays import FloatArray
+from mag_tracking.errors import RecordingError
+from mag_tracking.files import checked_path, replace_text
+
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class FleetPass:
+    """One pass of an enrolled vehicle."""
+
+    moment: FloatArray
+    """(3,) [A m^2], world."""
+    covariance: FloatArray
+    """(3, 3)"""
+    heading: float
+    """[rad] anticlockwise from x."""
+    source: str
+    """Recording and number of the passage."""
+
+
+def read_fleet(path: str | PathLike[str]) -> dict[str, list[FleetPass]]:
+    """{name: passes} of a file; raises RecordingError."""
+    path = checked_path(path, RecordingError)
+    try:
+        with open(path, encoding='utf-8') as stream:
+            content = json.load(stream)
+        if content['mag_tracking.fleet'] != VERSION:
+            raise RecordingError(f'{path}: a fleet of version {content["mag_tracking.fleet"]}; '
+                                 f'this reads {VERSION}')
+        return {str(name): [FleetPass(
+            np.array(p['moment'], dtype=float).reshape(3),
+            np.array(p['covariance'], dtype=float).reshape(3, 3), float(p['heading']),
+            str(p['source'])) for p in passes] for name, passes in content['vehicles'].items()}
+    except OSError as error:
+        raise RecordingError(f'cannot read {path}: {error.strerror}') from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise RecordingError(f'{path} holds no enrolled vehicles ({error})') from error
+
+
+def write_fleet(path: Path, fleet: dict[str, list[FleetPass]]) -> None:
+    """Write a file as a whole; raises OutputError."""
+    vehicles = {name: [{k: v.tolist() if isinstance(v, np.ndarray) else v
+                        for k, v in asdict(p).items()} for p in passes]
+                for name, passes in fleet.items()}
+    replace_text(path, json.dumps({'mag_tracking.fleet': VERSION, 'vehicles': vehicles},
+                                  indent=1) + '\n')
