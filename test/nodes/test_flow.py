@@ -154,7 +154,7 @@ class StandIn:
         self._stage = SimpleNamespace(bank=object(), give_up=lambda why: [why])
         self.published = []
 
-    def _publish_all(self, records):
+    def _publish_all(self, records, frame):
         self.published += records
 
     def ticks(self, seconds, frames):
