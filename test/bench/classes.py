@@ -1,0 +1,75 @@
+"""`make bench`: vehicle classes by moment and length, of simulated passes of both simulators."""
+
+import sys
+
+import numpy as np
+from tqdm import tqdm
+
+from bench.figures import Figures
+from mag_tracking.analysis.signature_classifier import reliability_error
+from mag_tracking.event_records import VehiclePassage
+from mag_tracking.network.file import read_network
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.simulation.scenario import Imperfections
+from support.box_vehicles import BOUGHT, random_drive
+from support.bundled import NETWORK_FILE
+from support.random_passes import SIMULATORS, random_course
+from support.samples import scenario
+from support.situation_worlds import car, small, truck
+
+SHARES = {'motorcycle': 0.05, 'car': 0.8, 'truck': 0.15}
+"""Those of `traffic.class_shares`."""
+N = 120
+"""Passes of each simulator."""
+LEAST_RIGHT, MOST_APART = 0.95, 0.05
+
+
+def body_of(rng, name, simulator):
+    """A vehicle of a class; two-wheelers as heavy as a touring motorcycle."""
+    if name == 'motorcycle':
+        return small(rng, simulator, rng.uniform(1.9, 2.3), rng.uniform(40.0, 120.0))
+    return (car if name == 'car' else truck)(rng, simulator)
+
+
+def classified(simulator, seed):
+    """(class, `VehiclePassage` or None) of one pass, 2.9 to 6.1 m from the sensors."""
+    rng = np.random.default_rng([seed, SIMULATORS.index(simulator)])
+    name = str(rng.choice(list(SHARES), p=list(SHARES.values())))
+    path, duration, closest_s = random_course(rng, False)
+    course, flaws = (path, Imperfections()) if simulator == 'clouds' else \
+        (random_drive(rng, path, closest_s), BOUGHT)
+    network = read_network(NETWORK_FILE)
+    readings, *_ = scenario.simulate(network, body_of(rng, name, simulator), course, 100.0,
+                                     duration + 3.0, rng, flaws)
+    pipeline = Pipeline(network, settings_for('vehicle'))
+    passages = [r for r in pipeline.feed(readings) + pipeline.flush()
+                if isinstance(r, VehiclePassage)]
+    return name, passages[0] if passages else None
+
+
+def main():
+    """Print the figures; 1 where an aim is missed."""
+    figures = Figures('classes')
+    print('Vehicle classes by moment and length, two sensors')
+    classes = settings_for('vehicle').traffic.class_names
+    for simulator in SIMULATORS:
+        found = [classified(simulator, seed) for seed in tqdm(
+            range(N), desc=simulator, disable=None, leave=False)]
+        counted = [(name, p) for name, p in found if p is not None]
+        right = np.array([p.vehicle_class == name for name, p in counted])
+        figures.add(f'{simulator}: counted', len(counted) / N, '', None, True)
+        figures.add(f'{simulator}: class right', float(right.mean()), '', LEAST_RIGHT, True)
+        for kind in classes:
+            mine = np.array([name == kind for name, _ in counted])
+            figures.add(f'{simulator}: recall of {kind}', float(right[mine].mean()), '', None, True,
+                        f' (of {mine.sum()})')
+        stated = np.array([p.class_probabilities.max() for _, p in counted])
+        best = np.array([classes[int(np.argmax(p.class_probabilities))] == name
+                         for name, p in counted])
+        figures.add(f'{simulator}: reliability error', reliability_error(stated, best), '',
+                    MOST_APART)
+    return figures.save()
+
+
+if __name__ == '__main__':
+    sys.exit(main())
