@@ -45,13 +45,21 @@ def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
                        f'its most frequent level, at {begin:.1f} to {end:.1f} s')
 
 
+def why_no_track(counts: Mapping[str, int]) -> str | None:
+    """One sentence where one sensor alone measured; `counts` of the tracker."""
+    if counts.get(NO_SCALE, 0) or counts.get(ALONE, 0) and not counts.get('tracks', 0):
+        return ('no track: one sensor does not tell the scale. `mag-tracking events` describes '
+                'what passes without it; where the settings are true of the vehicles here, '
+                'track.single_sensor_prior: true takes the scale from them')
+    return None
+
+
 def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
     """Notes on the limits of the tracks and their causes."""
     counts = summary['counts']['track']
-    if counts.get(NO_SCALE, 0) or counts.get(ALONE, 0) and not summary['tracks']:
-        yield Note(NOTE, 'no track: one sensor does not tell the scale. `mag-tracking events` '
-                   'describes what passes without it; where the settings are true of the vehicles '
-                   'here, track.single_sensor_prior: true takes the scale from them')
+    why = why_no_track(counts)
+    if why:
+        yield Note(NOTE, why)
     elif len(summary['sensors']) == 1 and summary['tracks']:
         yield Note(NOTE, 'range and size are those of the settings (track.single_sensor_prior): '
                    'one sensor does not tell the scale')

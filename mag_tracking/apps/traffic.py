@@ -13,6 +13,7 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.first_pass import first_pass_of
 from mag_tracking.apps.no_detection import why_no_detection
 from mag_tracking.apps.readings import network_of
+from mag_tracking.apps.replay_notes import why_no_track
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import TrafficSummary, VehiclePassage
 from mag_tracking.network import SensorNetwork
@@ -67,6 +68,8 @@ class TrafficResult:
     sensors_without_background: tuple[str, ...]
     why_no_detection: str | None
     """One sentence where nothing was detected; else None."""
+    why_no_track: str | None
+    """One sentence where one sensor alone measured, so that nothing was tracked; else None."""
 
     def __repr__(self) -> str:
         lines = dict(Counter(v.passage.line for v in self.vehicles))
@@ -129,7 +132,8 @@ def count_traffic(recording: Recording, network: SensorNetwork, settings: Settin
                            reader.missing_topics(), rejections)
     return TrafficResult(settings.traffic.class_names, tuple(counter.vehicles),
                          tuple(counter.summaries), dict(pipeline.traffic.counts), rejections,
-                         tuple(reader.missing_topics()), tuple(pipeline.calibrate.unready()), why)
+                         tuple(reader.missing_topics()), tuple(pipeline.calibrate.unready()), why,
+                         why_no_track(pipeline.counts()['track']))
 
 
 class _Counter:
@@ -137,7 +141,8 @@ class _Counter:
 
     def __init__(self, network: SensorNetwork) -> None:
         self._network = network
-        self._frame: FieldFrame
+        self._frame: FieldFrame | None = None
+        self._before_jump: set[int] = set()
         self._frames: dict[int, list[FieldFrame]] = {}
         self.vehicles: list[CountedVehicle] = []
         self.summaries: list[TrafficSummary] = []
@@ -146,9 +151,10 @@ class _Counter:
         """Take the outputs of a batch of readings."""
         for record in records:
             if isinstance(record, FieldFrame):
-                self._frame = record
                 self._forget(record.stamp_ns)
+                self._frame = record
             elif isinstance(record, Track) and not record.ended:
+                assert self._frame is not None, 'a pose without a frame'
                 self._frames.setdefault(record.id, []).append(self._frame)
             elif isinstance(record, VehiclePassage):
                 self.vehicles.append(CountedVehicle(record, self._delay(record.track_id)))
@@ -156,10 +162,14 @@ class _Counter:
                 self.summaries.append(record)
 
     def _forget(self, now_ns: int) -> None:
-        """Drop the fields of tracks that ended long ago."""
-        for id in [id for id, frames in self._frames.items()
-                   if abs(now_ns - frames[-1].stamp_ns) > FORGOTTEN_S * NS]:
+        """Drop the fields of tracks that ended long ago, or before time jumped back."""
+        old = self._before_jump or {id for id, frames in self._frames.items()
+                                    if now_ns - frames[-1].stamp_ns > FORGOTTEN_S * NS}
+        for id in old:
             del self._frames[id]
+        # Their passages come with the frame that jumped back.
+        jumped = self._frame is not None and now_ns < self._frame.stamp_ns
+        self._before_jump = set(self._frames) if jumped else set()
 
     def _delay(self, id: int) -> CorrelatedMotion:
         """The motion of a track by the delays between the sensors."""

@@ -23,11 +23,13 @@ from mag_tracking.cli.options import (
 )
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import OutputError, SettingsError
+from mag_tracking.files import output_folder
 from mag_tracking.inference.identification import Identification
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.fleet_file import FleetPass, read_fleet, write_fleet
 from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.traffic_tables import (
     DIRECTIONS,
     passage_row,
@@ -78,10 +80,14 @@ def _traffic(args: argparse.Namespace) -> int:
         if args.out is not None and recording.lies_in(args.out):
             raise OutputError(f'{args.out} is the folder of the recording; the tables would be in '
                               'it')
+    if args.out is not None:
+        output_folder(args.out)
+    for recording in recordings:
+        SampleReader(recording, network)
     tables: dict[str, list[dict[str, Any]]] = {'passages': [], 'intervals': []}
     fleet = _fleet(args, network)
     enrolled: list[FleetPass] = []
-    with noted_signals(signal.SIGINT) as seen:
+    with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
         for name, recording in zip(names, recordings, strict=True):
             if seen:
                 break
@@ -98,15 +104,23 @@ def _traffic(args: argparse.Namespace) -> int:
                 passage_row(name, v.passage, result.class_names, _delay(v), _vehicle(who))
                 for v, who in zip(result.vehicles, found, strict=True)]
             tables['intervals'] += [row for s in result.summaries for row in summary_rows(name, s)]
+            # After each recording: what is done stays, whatever comes.
+            _write(args, tables, result.class_names, fleet is not None)
     if args.enrol is not None and not seen:
         _enrol(args, network, enrolled)
     if args.out is not None:
-        paths = write_traffic(args.out, tables)
-        print(f'tables in {args.out}: {", ".join(path.name for path in paths)}')
+        print(f'tables in {args.out}')
     if seen:
         print('interrupted: this is of what was read until then')
         return 130
     return 0
+
+
+def _write(args: argparse.Namespace, tables: dict[str, list[dict[str, Any]]],
+           class_names: tuple[str, ...], with_fleet: bool) -> None:
+    """Write the tables, where they are asked for."""
+    if args.out is not None:
+        write_traffic(args.out, tables, class_names, with_fleet)
 
 
 def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
@@ -169,6 +183,8 @@ def _print(name: str, result: TrafficResult, recording: Recording,
               'time')
     if result.why_no_detection:
         print(f'  nothing was detected: {result.why_no_detection}')
+    if result.why_no_track:
+        print(f'  {result.why_no_track}')
 
 
 def line_of(vehicle: CountedVehicle) -> str:

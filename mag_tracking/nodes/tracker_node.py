@@ -208,7 +208,7 @@ class TrackerNode(StageNode):
             self._smoothed.publish(to_message(
                 SmoothedTrack, smoothed_track_dict(mine, self.network.frame)))
             self._smoothed_path.publish(self._path_of(mine))
-        self._traffic.take(TrackedFrame(frame, records), frame is None)
+        self._traffic.take(TrackedFrame(frame, records))
 
     def _path_of(self, poses: list[SmoothedPose]) -> Path:
         """nav_msgs/Path of `SmoothedPose`s, with the header of the latest."""

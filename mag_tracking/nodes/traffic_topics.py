@@ -22,9 +22,9 @@ class TrafficTopics:
         self._passages = node.publisher(VehiclePassageMessage, '~/passages', SENT)
         self._summaries = node.publisher(TrafficSummaryMessage, '~/traffic', RESULTS)
 
-    def take(self, item: TrackedFrame, is_last: bool = False) -> None:
-        """What the tracker made of a frame; `is_last`: no other one follows soon."""
-        for record in [*self.stage.feed(item), *(self.stage.flush() if is_last else [])]:
+    def take(self, item: TrackedFrame) -> None:
+        """Publish what follows from what the tracker made of a frame."""
+        for record in self.stage.feed(item):
             if isinstance(record, VehiclePassage):
                 self._passages.publish(to_message(VehiclePassageMessage, vehicle_passage_dict(
                     record, self._classes, self._frame)))

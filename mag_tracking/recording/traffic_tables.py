@@ -15,6 +15,18 @@ from mag_tracking.files import new_text_file, output_folder
 
 DIRECTIONS = {True: 'forward', False: 'backward'}
 
+_PASSAGES_BEGIN = '''
+    recording number stamp_ns line track_id direction direction_error x y z lateral vx vy vz
+    heading_deg sd_heading_deg speed sd_speed delay_speed sd_delay_speed speeds_contradict length
+    sd_length mx my mz moment_size class'''
+_PASSAGES_END = 'headway ambiguous doubts'
+_INTERVALS = '''
+    recording begin_ns end_ns line observed_s direction class count n_ambiguous mean_speed
+    mean_headway'''
+_TEXTS = ('recording', 'line', 'direction', 'class', 'vehicle', 'doubts')
+_INTEGERS = ('number', 'stamp_ns', 'track_id', 'begin_ns', 'end_ns', 'count', 'n_ambiguous')
+_FLAGS = ('ambiguous', 'speeds_contradict')
+
 
 def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[str],
                 delay: dict[str, Any], vehicle: dict[str, Any]) -> dict[str, Any]:
@@ -47,32 +59,44 @@ def summary_rows(recording: str, summary: TrafficSummary) -> list[dict[str, Any]
     head = {'recording': recording, 'begin_ns': summary.begin_ns, 'end_ns': summary.end_ns,
             'line': summary.line, 'observed_s': summary.observed_s}
     if not summary.counts:
-        return [{**head, 'direction': '', 'class': '', 'count': 0, 'ambiguous': 0,
+        return [{**head, 'direction': '', 'class': '', 'count': 0, 'n_ambiguous': 0,
                  'mean_speed': np.nan, 'mean_headway': np.nan}]
     return [{**head, 'direction': DIRECTIONS[c.forward], 'class': c.vehicle_class,
-             'count': c.count, 'ambiguous': c.ambiguous, 'mean_speed': c.mean_speed,
+             'count': c.count, 'n_ambiguous': c.ambiguous, 'mean_speed': c.mean_speed,
              'mean_headway': c.mean_headway} for c in summary.counts]
 
 
-def write_traffic(folder: Path, tables: dict[str, list[dict[str, Any]]]) -> list[Path]:
+def write_traffic(folder: Path, tables: dict[str, list[dict[str, Any]]],
+                  class_names: Sequence[str], with_fleet: bool) -> list[Path]:
     """Write tables, {name: rows}, into a folder; returns the paths.
 
-    Parquet is left out where pyarrow is not installed. Raises OutputError.
+    Tables without rows have their columns. Parquet is left out where pyarrow is not installed, and
+    that of an earlier run is removed. Raises OutputError.
     """
     folder, paths = output_folder(folder), []
     try:
         for name, rows in tables.items():
+            columns = columns_of(name, class_names, with_fleet)
             paths.append(folder / f'{name}.csv')
             with new_text_file(paths[-1], newline='') as stream:
-                writer = csv.DictWriter(stream, list(rows[0]) if rows else [])
+                writer = csv.DictWriter(stream, columns)
                 writer.writeheader()
                 writer.writerows({k: _text(v) for k, v in row.items()} for row in rows)
-            if rows and find_spec('pyarrow') is not None:
-                paths.append(folder / f'{name}.parquet')
-                _write_parquet(paths[-1], rows)
+            parquet = folder / f'{name}.parquet'
+            parquet.unlink(missing_ok=True)
+            if find_spec('pyarrow') is not None:
+                paths.append(parquet)
+                _write_parquet(parquet, columns, rows)
     except OSError as error:
         raise OutputError(f'cannot write to {folder}: {error.strerror or error}') from error
     return paths
+
+
+def columns_of(table: str, class_names: Sequence[str], with_fleet: bool) -> list[str]:
+    """The columns of `passages` or `intervals`."""
+    return _INTERVALS.split() if table == 'intervals' else [
+        *_PASSAGES_BEGIN.split(), *(f'p_{name}' for name in class_names),
+        *(('vehicle', 'p_vehicle') if with_fleet else ()), *_PASSAGES_END.split()]
 
 
 def _text(value: object) -> object:
@@ -82,17 +106,20 @@ def _text(value: object) -> object:
     return value
 
 
-def _write_parquet(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Write a table; until it is complete, what was there stays."""
+def _write_parquet(path: Path, columns: Sequence[str], rows: list[dict[str, Any]]) -> None:
+    """Write a table; the types of its columns do not depend on the rows."""
     # It takes half a second to import.
     import pyarrow as pa
     import pyarrow.parquet
 
+    kinds = {**dict.fromkeys(_TEXTS, pa.string()), **dict.fromkeys(_INTEGERS, pa.int64()),
+             **dict.fromkeys(_FLAGS, pa.bool_())}
+    schema = pa.schema([(name, kinds.get(name, pa.float64())) for name in columns])
     draft = path.with_name(f'.{secrets.token_hex(8)}.part')
     try:
-        pyarrow.parquet.write_table(pa.table(
-            {name: [None if isinstance(row[name], float) and np.isnan(row[name]) else row[name]
-                    for row in rows] for name in rows[0]}), draft)
+        pyarrow.parquet.write_table(pa.Table.from_pylist([
+            {k: None if isinstance(v, float) and np.isnan(v) else v for k, v in row.items()}
+            for row in rows], schema), draft)
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)

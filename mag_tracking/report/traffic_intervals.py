@@ -1,5 +1,6 @@
 """Counts of passages in intervals of time."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -7,24 +8,32 @@ import numpy as np
 from mag_tracking.event_records import TrafficCount, TrafficSummary, VehiclePassage
 from mag_tracking.units import NS
 
-LONGEST_GAP_S = 2.0
+LONGEST_GAP_S = 5.0
 """[s] Frames further apart than this observe nothing between them."""
 
 
 class Intervals:
     """Summaries of equal intervals, each as soon as no passage of it can come any more."""
 
-    def __init__(self, line_names: Sequence[str], interval_s: float) -> None:
-        self._names, self._length = tuple(line_names), round(interval_s * NS)
-        self._passages: list[VehiclePassage] = []
+    def __init__(self, line_names: Sequence[str], interval_s: float,
+                 counts: 'Counter[str]') -> None:
+        self._names, self._length, self._counts = tuple(line_names), round(interval_s * NS), counts
+        # No interval before this time is summarised again.
+        self._closed_ns: int | None = None
+        # Each with the begin of its interval.
+        self._passages: list[tuple[int, VehiclePassage]] = []
         # {begin of an interval: [ns] observed}
         self._observed: dict[int, int] = {}
         self._last_ns: int | None = None
 
     def add(self, passage: VehiclePassage) -> None:
-        """Take the next passage, in order of time."""
-        self._passages.append(passage)
-        self._observed.setdefault(self._begin_of(passage.stamp_ns), 0)
+        """Take a passage; one that comes too late counts in the earliest interval that is open."""
+        begin = self._begin_of(passage.stamp_ns)
+        if self._closed_ns is not None and begin < self._closed_ns:
+            self._counts['passages counted in a later interval'] += 1
+            begin = self._closed_ns
+        self._passages.append((begin, passage))
+        self._observed.setdefault(begin, 0)
 
     def due(self, before_ns: int, now_ns: int) -> list[TrafficSummary]:
         """Summaries of the intervals that are complete.
@@ -43,7 +52,9 @@ class Intervals:
     def flush(self) -> list[TrafficSummary]:
         """The intervals that have begun."""
         self._last_ns = None
-        return self._close(list(self._observed))
+        out = self._close(list(self._observed))
+        self._closed_ns = None
+        return out
 
     def _begin_of(self, stamp_ns: int) -> int:
         """Begin of the interval that holds a time."""
@@ -66,8 +77,9 @@ class Intervals:
         out: list[TrafficSummary] = []
         for begin in sorted(begins):
             end, observed_s = begin + self._length, self._observed.pop(begin) / NS
-            mine = [p for p in self._passages if begin <= p.stamp_ns < end]
-            self._passages = [p for p in self._passages if not begin <= p.stamp_ns < end]
+            mine = [p for first, p in self._passages if first == begin]
+            self._passages = [(first, p) for first, p in self._passages if first != begin]
+            self._closed_ns = end
             out += [TrafficSummary(begin, end, name, observed_s,
                                    counts_of([p for p in mine if p.line == name]))
                     for name in self._names]

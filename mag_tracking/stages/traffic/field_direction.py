@@ -18,13 +18,13 @@ from mag_tracking.records import FieldFrame
 from mag_tracking.units import NS
 
 KEPT_S = 70.0
-"""[s] Frames kept: the longest track that is smoothed, and more."""
+"""[s] Frames are kept for this time at most: the longest track that is smoothed, and more."""
 
 IN_LANE = 1.5
 """[m] A sensor closer to the path than this observes no direction."""
 
 REACH = 12.0
-"""[m] Sensors whose closest approach is further than this from the crossing are not asked."""
+"""[m] A sensor whose closest approach is further than this from the crossing is not used."""
 
 WIDTHS = 3.0
 """The window reaches this many distances from the path to both sides."""
@@ -36,22 +36,27 @@ MOST_LOG_ODDS = float(np.log(MOST_SURE / (1.0 - MOST_SURE)))
 
 
 class FieldDirection:
-    """Keeps the latest frames and tells how probable a direction is by them."""
+    """Probability of a direction by the latest frames."""
 
     def __init__(self, network: SensorNetwork) -> None:
         self._network = network
         self._frames: deque[FieldFrame] = deque()
 
-    def remember(self, frame: FieldFrame) -> None:
-        """Keep a frame, and forget those that are too old or of another time."""
+    def remember(self, frame: FieldFrame, since_ns: int) -> None:
+        """Keep a frame, and forget those of another time and those that no crossing needs.
+
+        Crossings since `since_ns` may still be found.
+        """
         if self._frames and frame.stamp_ns <= self._frames[-1].stamp_ns:
             self._frames.clear()
         self._frames.append(frame)
-        while frame.stamp_ns - self._frames[0].stamp_ns > KEPT_S * NS:
+        oldest = max(since_ns - round(LONGEST_S * NS), frame.stamp_ns - round(KEPT_S * NS))
+        while self._frames[0].stamp_ns < oldest:
             self._frames.popleft()
 
     def error_probability(self, crossing: Crossing) -> float:
-        """Probability that the direction of a crossing is wrong; NaN where the fields do not tell.
+        """Probability that the direction of a crossing is wrong; NaN where it is not observable, or
+        sensors contradict each other.
         """
         velocity = crossing.pose.velocity[:2]
         speed = float(np.hypot(*velocity))
@@ -69,8 +74,10 @@ class FieldDirection:
                 odds.append(float(np.clip(found, -MOST_LOG_ODDS, MOST_LOG_ODDS)))
                 # To a sensor on its left, which looks to the right, it moves from right to left.
                 same_side.append(bool(left[j] < 0.0))
-        return float(1.0 / (1.0 + np.exp(fused_log_odds(odds, same_side)))) if odds \
-            else float('nan')
+        fused = fused_log_odds(odds, same_side)
+        if not odds or len(odds) > 1 and abs(fused) < 0.5 * max(map(abs, odds)):
+            return float('nan')
+        return float(1.0 / (1.0 + np.exp(fused)))
 
     def _log_odds(self, j: int, middle_ns: int, half_ns: int) -> float | None:
         """Log odds of left to right at sensor `j`; None without two horizontal axes."""

@@ -84,8 +84,25 @@ def test_a_track_that_is_lost_and_begun_again_is_counted_once():
     assert stage.counts['crossings of lost tracks, counted once'] == 1
 
 
-def test_two_that_meet_are_both_counted():
-    records, _ = counted(drive(2.0, 6.0, 4.0), drive(2.0, 6.0, 4.2, -12.0, 1.5, id=2))
+def test_that_holds_where_the_extrapolated_crossing_comes_first():
+    records, stage = counted(drive(2.0, 3.9, 4.1), drive(4.0, 6.0, 4.15, id=2))
+    assert len(passages(records)) == 1
+    assert stage.counts['crossings of lost tracks, counted once'] == 1
+
+
+def test_vehicles_in_two_lanes_are_not_one():
+    records, _ = counted(drive(2.0, 4.3, 4.0), drive(4.6, 6.0, 4.3, y=4.5, id=2))
+    assert [p.track_id for p in passages(records)] == [1, 2]
+
+
+def test_a_vehicle_that_stops_before_the_line_is_not_extrapolated():
+    assert passages(counted(drive(2.0, 3.9, 4.4, 0.5))[0]) == []
+
+
+@pytest.mark.parametrize('ends', [(6.0, 6.0), (6.0, 5.5), (5.5, 6.0), (7.0, 5.0)])
+def test_two_that_meet_are_both_counted(ends):
+    records, _ = counted(drive(2.0, ends[0], 4.0), drive(2.0, ends[1], 4.2, -12.0, 1.5, id=2),
+                         field_at=field_of(1.0))
     assert [(p.track_id, p.forward) for p in passages(records)] == [(1, True), (2, False)]
     # Each has a part in the fields of the other.
     assert all(np.isnan(p.direction_error) for p in passages(records))
@@ -119,6 +136,19 @@ def test_several_lines_count_each():
     found = passages(counted(drive(2.0, 6.0, 4.0), settings=settings)[0])
     assert [(p.line, p.forward) for p in found] == [('west', True), ('east', False)]
     assert [p.stamp_ns / NS for p in found] == pytest.approx([3.5, 4.5])
+
+
+def test_a_passage_without_a_frame_to_wait_for_has_no_negative_headway():
+    """Frames stop, and a recording begins again at an earlier time."""
+    stage, out = Traffic(NETWORK, TrafficSettings()), []
+    for shift in (20.0, 0.0):
+        one = drive(2.0, 6.0, 4.0, id=1 + int(shift == 0.0))
+        for k in range(61):
+            records = [replace(r, stamp_ns=r.stamp_ns + round(shift * NS)) for r in one.get(k, [])]
+            out += stage.feed(TrackedFrame(frame(shift + k * STEP), records))
+        out += stage.feed(TrackedFrame(None, []))
+    assert [p.stamp_ns / NS for p in passages(out)] == pytest.approx([24.0, 4.0])
+    assert all(np.isnan(p.headway) for p in passages(out))
 
 
 def test_a_jump_back_in_time_begins_again():
@@ -200,6 +230,27 @@ def test_an_interval_waits_for_the_tracks_that_began_in_it():
     assert found[0] == (140, 1)
 
 
+def test_no_interval_comes_twice():
+    """A crossing may be extrapolated to the interval before."""
+    late = drive(10.5, 14.0, 9.9)
+    records, _ = counted(late, settings=TrafficSettings(interval_s=10.0), last_s=40.0)
+    found = summaries(records)
+    assert [s.begin_ns / NS for s in found] == [0.0, 10.0, 20.0, 30.0, 40.0]
+    assert [sum(c.count for c in s.counts) for s in found] == [1, 0, 0, 0, 0]
+
+
+def test_others_do_not_wait_for_ever_for_a_track():
+    """One that stands for an hour."""
+    stage, n = Traffic(NETWORK, TrafficSettings()), 0
+    for k in range(4000):
+        records = [track_pose(k * STEP, -8.0, id=99)]
+        if k % 100 < 41:
+            records += [replace(r, id=k // 100) for r in drive(0.0, 4.0, 2.0)[k % 100]]
+            records = [replace(r, stamp_ns=round(k * STEP * NS)) for r in records]
+        n += len(passages(stage.feed(TrackedFrame(frame(k * STEP), records))))
+    assert 25 <= n < 40
+
+
 def test_a_gap_in_the_frames_has_no_intervals():
     stage, out = Traffic(NETWORK, TrafficSettings(interval_s=10.0)), []
     for t in [*np.arange(0.0, 15.0, STEP), *np.arange(1003.0, 1012.0, STEP)]:
@@ -217,7 +268,9 @@ def test_magnets_are_not_counted():
 @pytest.mark.parametrize(('changes', 'why'), [
     ({'line_offsets': (0.0, 1.0)}, r'traffic.line_offsets: expected 1 values'),
     ({'class_lengths': (3.0,)}, r'traffic.class_lengths: expected 3 values'),
-    ({'class_names': ('car', 'car', 'truck')}, 'a name is there twice')])
+    ({'class_names': ('car', 'car', 'truck')}, 'duplicate names'),
+    ({'class_names': ('car', 'unknown', 'truck')}, "'unknown' is not a usable name"),
+    ({'line_names': ('',)}, 'is not a usable name')])
 def test_lists_that_do_not_belong_together_are_refused(changes, why):
     with pytest.raises(SettingsError, match=why):
         Traffic(NETWORK, TrafficSettings(**changes))
