@@ -35,11 +35,18 @@ class Signature:
     t: FloatArray
     """(n,) [s], in order."""
     field: FloatArray
-    """(n, n_axes) [T], or in any other unit: the same for all."""
+    """(n, n_axes) [T], or in an unknown unit."""
     label: str
     """Class; empty if it is unknown."""
     source: str
     """Where it came from, for messages."""
+    axes: tuple[str, ...]
+    """Names of the axes."""
+    unit: str
+    """T, or empty if it is unknown."""
+    group: str
+    """Signatures of one target have the same: to train on one and to test on the other would be
+    to test on what is known."""
 
 
 def features(signature: Signature) -> FloatArray:
@@ -69,14 +76,16 @@ def features(signature: Signature) -> FloatArray:
         raise ValueError('a time or a field is not finite')
     if not (np.diff(t) > 0.0).all():
         raise ValueError('its times do not increase')
-    if not np.ptp(field, axis=0).max() > 1e-12 * np.abs(field).max():
+    largest = np.abs(field).max()
+    if not largest > 0.0 or not np.ptp(field / largest, axis=0).max() > 1e-12:
         raise ValueError('the field does not vary')
-    shape = _resampled(t, _without_baseline(t, field))
+    shape = _resampled(t, _without_baseline(t, field / largest))
     size = np.linalg.norm(shape, axis=1)
     energy = np.square(shape).sum(axis=0)
     of_axes = [v for axis, share in zip(shape.T, energy / energy.sum(), strict=True)
                for v in _axis_features(axis, float(share), float(size.max()))]
-    return np.array([np.log(size.max()), *of_axes, *_size_features(size / size.max())])
+    return np.array([np.log(size.max()) + np.log(largest), *of_axes,
+                     *_size_features(size / size.max())])
 
 
 def _without_baseline(t: FloatArray, field: FloatArray) -> FloatArray:

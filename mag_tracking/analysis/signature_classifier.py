@@ -32,7 +32,9 @@ class SignatureModel:
     """A linear classifier, and how far a class reaches."""
 
     classes: tuple[str, ...]
-    n_axes: int
+    axes: tuple[str, ...]
+    unit: str
+    """Of the fields: T, or empty if it was unknown."""
     method: str
     mean: FloatArray
     """(n_features,) of the training set."""
@@ -77,7 +79,7 @@ class SignatureModel:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How well classes are told, over one or several sets that were not trained on."""
+    """Accuracy over one or several sets of signatures that were not trained on."""
 
     classes: tuple[str, ...]
     n: int
@@ -100,12 +102,13 @@ class Evaluation:
 def feature_table(signatures: Sequence[Signature]) -> tuple[FloatArray, IntArray, list[str]]:
     """Features (n, n_features) of signatures, the rows (n,) that have them, and reasons.
 
-    Raises LabelsError where the number of axes differs.
+    Raises LabelsError where axes or units differ.
     """
-    axes = Counter(s.field.shape[1] for s in signatures)
+    axes = Counter((' '.join(s.axes), s.unit) for s in signatures)
     if len(axes) > 1:
-        raise LabelsError('signatures have different numbers of axes: '
-                          + ', '.join(f'{n} with {k}' for k, n in sorted(axes.items())))
+        raise LabelsError('signatures have different axes or units: ' + ', '.join(
+            f'{n} with {name or "none"} [{unit or "unit unknown"}]'
+            for (name, unit), n in sorted(axes.items())))
     rows, found, reasons = [], [], []
     for i, signature in enumerate(signatures):
         try:
@@ -116,14 +119,18 @@ def feature_table(signatures: Sequence[Signature]) -> tuple[FloatArray, IntArray
     return np.array(found, ndmin=2), np.array(rows, dtype=np.int64), reasons
 
 
-def train(x: FloatArray, labels: Sequence[str], n_axes: int, seed: int = 0) -> SignatureModel:
+def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tuple[str, ...],
+          unit: str, seed: int = 0) -> SignatureModel:
     """Train a classifier; method and penalty are chosen by cross-validation.
 
     Parameters
     ----------
     x : (n, n_features) array
     labels : sequence of n str
-    n_axes : int
+    groups : sequence of n str
+        Signatures of one target, which are left out together.
+    axes : tuple of str
+    unit : str
     seed : int
         Of the folds.
 
@@ -137,13 +144,13 @@ def train(x: FloatArray, labels: Sequence[str], n_axes: int, seed: int = 0) -> S
         If there are fewer than two classes, or too few examples of one.
     MissingDependencyError
     """
-    counts = check_labels(labels)
+    counts = check_labels(labels, groups)
     classes = tuple(sorted(counts))
     y = np.array([classes.index(label) for label in labels])
     mean, scale = x.mean(axis=0), x.std(axis=0)
     scale = np.where(scale > 1e-9 * (1.0 + np.abs(mean)), scale, 1.0)
     z = (x - mean) / scale
-    folds = list(_folds(y, min(FOLDS, min(counts.values())), seed))
+    folds = list(_folds(y, groups, min(FOLDS, min(counts.values())), seed))
     scored = []
     for name, make in _candidates():
         logits = np.zeros((len(y), len(classes)))
@@ -156,21 +163,21 @@ def train(x: FloatArray, labels: Sequence[str], n_axes: int, seed: int = 0) -> S
     fitted = make().fit(z, y)
     centres, precision = _spread(z, y)
     left_out = np.concatenate([_own_distances(z, y, inside, outside) for inside, outside in folds])
-    return SignatureModel(classes, n_axes, name, mean, scale, *_linear(fitted, len(classes)),
+    return SignatureModel(classes, axes, unit, name, mean, scale, *_linear(fitted, len(classes)),
                           temperature, centres, precision, float(np.quantile(left_out, KNOWN)),
                           dict(counts))
 
 
-def check_labels(labels: Sequence[str]) -> 'Counter[str]':
-    """{class: examples}; raises LabelsError where nothing can be learnt from them."""
-    counts = Counter(labels)
+def check_labels(labels: Sequence[str], groups: Sequence[str]) -> 'Counter[str]':
+    """{class: targets}; raises LabelsError where nothing can be learnt from them."""
+    counts = Counter(label for label, _ in set(zip(labels, groups, strict=True)))
     if '' in counts:
         raise LabelsError(f'{counts[""]} signatures have no label')
     if UNKNOWN in counts:
         raise LabelsError(f'{UNKNOWN!r} is the answer for what fits no class; name the class '
                           'otherwise')
     if len(counts) < 2:
-        raise LabelsError(f'one class ({", ".join(counts) or "none"}): nothing can be told apart')
+        raise LabelsError(f'expected at least two classes, got {", ".join(counts) or "none"}')
     few = {name: n for name, n in counts.items() if n < FEWEST}
     if few:
         raise LabelsError('expected at least ' + str(FEWEST) + ' examples of each class, got '
@@ -178,13 +185,14 @@ def check_labels(labels: Sequence[str]) -> 'Counter[str]':
     return counts
 
 
-def evaluate_splits(x: FloatArray, labels: Sequence[str], n_axes: int, n_splits: int = 20,
+def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
+                    axes: tuple[str, ...], unit: str, n_splits: int = 20,
                     test_share: float = 0.3, progress: Any = iter) -> Evaluation:
     """Train and test on stratified splits; everything is chosen inside the training part.
 
     Parameters
     ----------
-    x, labels, n_axes
+    x, labels, groups, axes, unit
         As for `train`.
     n_splits : int
     test_share : float
@@ -199,12 +207,12 @@ def evaluate_splits(x: FloatArray, labels: Sequence[str], n_axes: int, n_splits:
     ------
     LabelsError, MissingDependencyError
     """
-    check_labels(labels)
-    y = np.array(labels)
+    check_labels(labels, groups)
+    y, g = np.array(labels), np.array(groups)
     parts = []
     for seed in progress(range(n_splits)):
-        inside, outside = _split(y, test_share, seed)
-        model = train(x[inside], y[inside].tolist(), n_axes, seed)
+        inside, outside = _split(y, g, test_share, seed)
+        model = train(x[inside], y[inside].tolist(), g[inside].tolist(), axes, unit, seed)
         parts.append((model, x[outside], y[outside]))
     return _evaluation(parts)
 
@@ -276,29 +284,30 @@ def _logits(fitted: Any, z: FloatArray) -> FloatArray:
     return logits
 
 
-def _folds(y: IntArray, n: int, seed: int) -> Any:
-    """Stratified folds: (rows inside, rows outside)."""
+def _folds(y: IntArray, groups: Sequence[str], n: int, seed: int) -> Any:
+    """Stratified folds of whole groups: (rows inside, rows outside)."""
     try:
-        from sklearn.model_selection import StratifiedKFold
+        from sklearn.model_selection import StratifiedGroupKFold
     except ImportError as error:
         raise MissingDependencyError('classes of signatures need scikit-learn: pip install '
                                      '"mag_tracking[classes]"') from error
-    return StratifiedKFold(n, shuffle=True, random_state=seed).split(np.zeros(len(y)), y)
+    folds = StratifiedGroupKFold(n, shuffle=True, random_state=seed)
+    return folds.split(np.zeros(len(y)), y, np.array(groups))
 
 
-def _split(y: Any, test_share: float, seed: int) -> tuple[IntArray, IntArray]:
-    """Rows to train on, and rows to test on, of every class its share."""
-    rng, inside, outside = np.random.default_rng(seed), [], []
+def _split(y: Any, groups: Any, test_share: float, seed: int) -> tuple[IntArray, IntArray]:
+    """Rows to train on, and rows to test on: of every class its share of the groups."""
+    rng, tested = np.random.default_rng(seed), set[str]()
     for name in np.unique(y):
-        rows = rng.permutation(np.flatnonzero(y == name))
+        mine = rng.permutation(np.unique(groups[y == name]))
         # Enough of each is left to train on.
-        n = min(max(1, round(test_share * len(rows))), max(len(rows) - FEWEST, 0))
-        outside += rows[:n].tolist()
-        inside += rows[n:].tolist()
-    if not outside:
+        n = min(max(1, round(test_share * len(mine))), max(len(mine) - FEWEST, 0))
+        tested |= set(mine[:n].tolist())
+    outside = np.isin(groups, list(tested))
+    if not outside.any():
         raise LabelsError(f'too few examples to leave some out: expected more than {FEWEST} of a '
                           'class')
-    return np.array(sorted(inside)), np.array(sorted(outside))
+    return np.flatnonzero(~outside), np.flatnonzero(outside)
 
 
 def _spread(z: FloatArray, y: IntArray) -> tuple[FloatArray, FloatArray]:

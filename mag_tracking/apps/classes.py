@@ -12,7 +12,6 @@ from mag_tracking.analysis.signature import Signature
 from mag_tracking.analysis.signature_classifier import (
     Evaluation,
     SignatureModel,
-    check_labels,
     evaluate,
     evaluate_splits,
     feature_table,
@@ -44,7 +43,10 @@ class Examples:
     """(n,)"""
     sources: tuple[str, ...]
     """(n,)"""
-    n_axes: int
+    groups: tuple[str, ...]
+    """(n,) signatures of one target have the same."""
+    axes: tuple[str, ...]
+    unit: str
     left_out: tuple[str, ...]
     """A sentence for each signature that has no features."""
 
@@ -55,7 +57,7 @@ def examples_of(signatures: list[Signature]) -> Examples:
     Raises
     ------
     LabelsError
-        If there is none, or the number of axes differs.
+        If there is none, or axes or units differ.
     """
     if not signatures:
         raise LabelsError('there is no signature')
@@ -64,7 +66,7 @@ def examples_of(signatures: list[Signature]) -> Examples:
         raise LabelsError(f'no signature can be used; {reasons[0]}')
     kept = [signatures[i] for i in rows.tolist()]
     return Examples(x, tuple(s.label for s in kept), tuple(s.source for s in kept),
-                    signatures[0].field.shape[1], tuple(reasons))
+                    tuple(s.group for s in kept), kept[0].axes, kept[0].unit, tuple(reasons))
 
 
 def labelled_signatures(path: str | PathLike[str], labels: str | PathLike[str] | None = None,
@@ -124,12 +126,15 @@ def _signatures(path: Path, readings: Readings, names: Any,
         if interval.sensor not in ('', name) or not mine.any():
             continue
         field = readings.field[mine]
-        field = field[:, ~np.isnan(field).all(axis=0)]
+        there = ~np.isnan(field).all(axis=0)
+        field = field[:, there]
         whole = ~np.isnan(field).any(axis=1)
-        if field.shape[1] and whole.any():
+        if there.any() and whole.any():
             yield Signature((readings.stamp_ns[mine][whole] - interval.begin_ns) / 1e9,
                             field[whole], interval.label,
-                            f'{path.name}: {name}, row {interval.row}')
+                            f'{path.name}: {name}, row {interval.row}',
+                            tuple(np.array(list('xyz'))[there].tolist()), 'T',
+                            f'row {interval.row}')
 
 
 def _calibrated(path: Path, network: SensorNetwork) -> Readings:
@@ -145,8 +150,7 @@ def _calibrated(path: Path, network: SensorNetwork) -> Readings:
 
 def train_classes(examples: Examples) -> SignatureModel:
     """Train on examples; raises LabelsError and MissingDependencyError."""
-    check_labels(examples.labels)
-    return train(examples.x, examples.labels, examples.n_axes)
+    return train(examples.x, examples.labels, examples.groups, examples.axes, examples.unit)
 
 
 def evaluate_classes(examples: Examples, model: SignatureModel | None = None, n_splits: int = 20,
@@ -160,14 +164,18 @@ def evaluate_classes(examples: Examples, model: SignatureModel | None = None, n_
     MissingDependencyError
     """
     if model is None:
-        return evaluate_splits(examples.x, examples.labels, examples.n_axes, n_splits,
-                               progress=progress)
+        return evaluate_splits(examples.x, examples.labels, examples.groups, examples.axes,
+                               examples.unit, n_splits, progress=progress)
     check_axes(examples, model)
     return evaluate(model, examples.x, examples.labels)
 
 
 def check_axes(examples: Examples, model: SignatureModel) -> None:
-    """Raise LabelsError where signatures do not have the axes of a model."""
-    if examples.n_axes != model.n_axes:
-        raise LabelsError(f'the signatures have {examples.n_axes} axes, the model was trained on '
-                          f'{model.n_axes}')
+    """Raise LabelsError where signatures do not have the axes and the unit of a model."""
+    if examples.axes != model.axes:
+        raise LabelsError(f'the signatures have the axes {" ".join(examples.axes)}, the model was '
+                          f'trained on {" ".join(model.axes)}')
+    if examples.unit != model.unit:
+        raise LabelsError(f'the signatures are in {examples.unit or "an unknown unit"}, the model '
+                          f'was trained on {model.unit or "an unknown unit"}; columns such as '
+                          'x_nt, x_ut and x_t have one')

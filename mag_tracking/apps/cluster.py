@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 PATIENCE_S = 15.0
 """[s] A scheduler that has not answered by then, or has no worker, does not."""
+BEGIN_S = 60.0
+"""[s] Longest time for a thread to start."""
 ALONE_S = 60.0
 """[s] A scheduler whose workers are all gone gets others by then, or never."""
 LOOK_S = 0.3
@@ -174,10 +176,10 @@ class Cluster(Generic[_Key]):
 
 @cache
 def _event_loop() -> 'IOLoop':
-    """The loop of events of all clusters, in a thread that ends with the process.
+    """The event loop of all clusters, in a thread that ends with the process.
 
-    Dask's own would begin under a lock which a client that could not connect takes as well, when
-    it is collected, maybe in the thread that is to begin: nobody goes on, for ten seconds.
+    Dask starts its own loop under a lock that a failed client takes as well when it is collected.
+    Collected in the starting thread, it blocks the start for ten seconds. Raises ClusterError.
     """
     from tornado.ioloop import IOLoop
 
@@ -194,7 +196,10 @@ def _event_loop() -> 'IOLoop':
         asyncio.run(run())
 
     threading.Thread(target=begin, name='cluster', daemon=True).start()
-    return begun.get()
+    try:
+        return begun.get(timeout=BEGIN_S)
+    except queue.Empty as error:
+        raise ClusterError(f'no thread could begin in {BEGIN_S:.0f} s') from error
 
 
 def _local(distributed: Any, stack: ExitStack, workers: int) -> 'Client':

@@ -91,7 +91,9 @@ def _truth_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
     if found and found['n']:
         yield Note(NOTE, f'poses without a flag: {found["n"]}, of which {found["wrong"]} '
                    f'({found["wrong"] / found["n"]:.1%}) are wrong: off by more than 2 m and by '
-                   'more than three standard deviations')
+                   'more than three standard deviations'
+                   + (f'; {found["without_truth"]} more at times without a true pose'
+                      if found['without_truth'] else ''))
 
 
 def _disturbance_text(d: Mapping[str, Any]) -> str:

@@ -19,7 +19,7 @@ from mag_tracking.apps.classes import (
     train_classes,
 )
 from mag_tracking.cli.options import Commands, add_command, check_writable
-from mag_tracking.errors import SettingsError
+from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.network.file import read_network
 from mag_tracking.recording.signature_tables import read_model, write_model
 
@@ -28,7 +28,8 @@ One sensor does not tell size or distance, but the shape of the field as somethi
 its class, after training on labelled passes of your own.
 
 LABELLED is a CSV table: a row for each sample (label, signature, time_s, x_nt, y_nt, z_nt), or a
-row for each signature (label, x0, x1, ..., y0, y1, ...). Or it is a recording with --network FILE
+row for each signature (label, x0, x1, ..., y0, y1, ...). A column pass names signatures of one
+target at several sensors. Or it is a recording with --network FILE
 and --labels FILE, a CSV table of intervals (label, begin_s, end_s, and maybe sensor; seconds since
 the first reading or since 1970, or begin_ns and end_ns). The table of `mag-tracking events`
 (signatures.csv) is one without labels.
@@ -50,7 +51,7 @@ def add(commands: Commands) -> None:
     p = add_command(commands, 'classes', _no_action, _CLASSES)
     actions = p.add_subparsers(dest='action', metavar='ACTION', required=True)
     for name, run, text in (('train', _train, 'learn classes from labelled passes'),
-                            ('evaluate', _evaluate, 'measure how well classes are told'),
+                            ('evaluate', _evaluate, 'measure accuracy and reliability'),
                             ('predict', _predict, 'classes of signatures')):
         _add_action(actions, name, run, text)
 
@@ -91,6 +92,9 @@ def _examples(args: argparse.Namespace) -> Examples:
 def _train(args: argparse.Namespace) -> int:
     """mag-tracking classes train."""
     check_writable(args.out)
+    if any(path is not None and path.resolve() == args.out.resolve()
+           for path in (args.labelled, args.labels, args.network)):
+        raise OutputError(f'--out: {args.out} is an input of this command')
     model = train_classes(_examples(args))
     write_model(args.out, model)
     print(f'{args.out}: {model.method}; '

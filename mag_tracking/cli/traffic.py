@@ -75,15 +75,7 @@ def _traffic(args: argparse.Namespace) -> int:
     """mag-tracking traffic."""
     network, settings = recorded_network(args), settings_of(args)
     names = distinct_names(args.recordings)
-    recordings = [Recording(path) for path in args.recordings]
-    for recording in recordings:
-        if args.out is not None and recording.lies_in(args.out):
-            raise OutputError(f'{args.out} is the folder of the recording; the tables would be in '
-                              'it')
-    if args.out is not None:
-        output_folder(args.out)
-    for recording in recordings:
-        SampleReader(recording, network)
+    recordings = _recordings(args, network)
     tables: dict[str, list[dict[str, Any]]] = {'passages': [], 'intervals': []}
     fleet = _fleet(args, network)
     enrolled: list[FleetPass] = []
@@ -114,6 +106,19 @@ def _traffic(args: argparse.Namespace) -> int:
         print('interrupted: this is of what was read until then')
         return 130
     return 0
+
+
+def _recordings(args: argparse.Namespace, network: SensorNetwork) -> list[Recording]:
+    """The recordings, all of which can be read; raises what stops the run before it begins."""
+    recordings = [Recording(path) for path in args.recordings]
+    for recording in recordings:
+        SampleReader(recording, network)
+        if args.out is not None and recording.lies_in(args.out):
+            raise OutputError(f'{args.out} is the folder of the recording; the tables would be in '
+                              'it')
+    if args.out is not None:
+        output_folder(args.out)
+    return recordings
 
 
 def _write(args: argparse.Namespace, tables: dict[str, list[dict[str, Any]]],

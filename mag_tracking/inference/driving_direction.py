@@ -18,7 +18,7 @@ LAG = 0.35
 speed (PHD15 Paper B eq. (19))."""
 
 LEAST_SAMPLES = 8
-"""A shorter window tells nothing."""
+"""Fewest samples of a window."""
 
 MOST_SURE = 0.98
 """The sign of the correlation is exact for a target at the height of the sensor only. Half its

@@ -9,22 +9,29 @@ import json
 import re
 from dataclasses import asdict, dataclass
 from os import PathLike
-from typing import Any
 
 import numpy as np
 
 from mag_tracking.analysis.signature import Signature
 from mag_tracking.analysis.signature_classifier import VERSION, SignatureModel
+from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import LabelsError, RecordingError
 from mag_tracking.files import checked_path, replace_text
 from mag_tracking.recording.csv_file import Lines, number, read_csv
 from mag_tracking.units import NS
 
-LABEL, TIME = 'label', 'time_s'
+LABEL, TIME, PASS = 'label', 'time_s', 'pass'
 EPOCH_S = 1e8
 """Seconds that are larger are since 1970, others since the first reading."""
 
-_SAMPLE = re.compile(r'(?P<axis>.*?)_?(?P<number>\d+)')
+LATEST_S = 1e11
+"""Seconds that are larger are no time."""
+
+UNITS = {'t': 1.0, 'ut': 1e-6, 'nt': 1e-9}
+"""{suffix of a column: [T]}"""
+
+_AXIS = re.compile(r'b?(?P<axis>[xyz])(_(?P<unit>t|ut|nt))?')
+_SAMPLE = re.compile(r'b?(?P<axis>[xyz])(_(?P<unit>t|ut|nt))?_?(?P<number>\d+)')
 
 
 @dataclass(frozen=True)
@@ -52,62 +59,107 @@ def read_signatures(path: str | PathLike[str], is_labelled: bool = True) -> list
     """
     header, lines = read_csv(path)
     if LABEL not in header and is_labelled:
-        raise LabelsError(f'{path}: there is no column {LABEL!r}; there are {", ".join(header)}')
+        other = next((c for c in ';\t' if c in header[0]), None)
+        hint = f'; the delimiter is {other!r}, expected a comma' if other else ''
+        raise LabelsError(f'{path}: there is no column {LABEL!r}; there are {", ".join(header)}'
+                          f'{hint}')
     return _by_sample(path, header, lines) if TIME in header else _by_row(path, header, lines)
 
 
 def _by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:
     """Signatures with a row for each sample; the other columns name the signature."""
-    axes = [name for name in header if re.fullmatch(r'[xyz](_.*)?|b[xyz](_.*)?', name.lower())]
-    names = [name for name in header if name not in (*axes, LABEL, TIME)]
+    axes = {name: match for name in header if (match := _AXIS.fullmatch(name.lower()))}
+    names = [name for name in header if name not in (*axes, LABEL, TIME, PASS)]
     if not axes:
         raise LabelsError(f'{path}: no column is a field; expected x, y, z (or x_nt and so on)')
     if not names:
-        raise LabelsError(f'{path}: no column tells one signature from the next; expected one '
-                          'such as signature')
-    found: dict[tuple[str, ...], list[tuple[int, list[str]]]] = {}
+        raise LabelsError(f'{path}: no column names the signature; expected one such as signature')
+    fields = _Fields(path, [(m['axis'], m['unit'] or '', [name]) for name, m in axes.items()])
+    found: dict[tuple[str, ...], list[tuple[int, dict[str, str]]]] = {}
     for line, row in lines:
         cells = dict(zip(header, row, strict=True))
-        found.setdefault(tuple(cells[n] for n in names), []).append((line, row))
+        found.setdefault(tuple(cells[n] for n in names), []).append((line, cells))
     out = []
     for key, rows in found.items():
-        cells_of = [dict(zip(header, row, strict=True)) for _, row in rows]
-        labels = sorted({cells.get(LABEL, '').strip() for cells in cells_of})
         source = f'{path}: signature {" ".join(key)}'
-        if len(labels) > 1:
-            raise LabelsError(f'{source} has several labels: {", ".join(labels)}')
-        t = [number(path, line, TIME, c[TIME], True) for (line, _), c in
-             zip(rows, cells_of, strict=True)]
-        field = [[number(path, line, a, c[a], False) for a in axes] for (line, _), c in
-                 zip(rows, cells_of, strict=True)]
-        out.append(Signature(np.array(t), _measured(np.array(field)), labels[0], source))
+        (label,), (group,) = (_only(source, column, rows) for column in (LABEL, PASS))
+        t = np.array([number(path, line, TIME, cells[TIME], True) for line, cells in rows])
+        field = np.array([fields.of(line, cells)[0] for line, cells in rows])
+        out.append(fields.signature(t, field, label, source, group))
+    if len(out) > 1 and all(len(s.t) == 1 for s in out):
+        raise LabelsError(f'{path}: each signature has one sample; the columns {", ".join(names)} '
+                          'are taken for names of signatures')
     return out
+
+
+def _only(source: str, column: str, rows: list[tuple[int, dict[str, str]]]) -> tuple[str]:
+    """The only value of a column, empty without it; LabelsError where there are several."""
+    values = sorted({cells.get(column, '').strip() for _, cells in rows})
+    if len(values) > 1:
+        raise LabelsError(f'{source} has several values of {column}: {", ".join(values)}')
+    return (values[0],)
 
 
 def _by_row(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:
-    """Signatures with a row each: columns x0, x1, ... (y0, ...), or any that are numbered."""
-    axes: dict[str, list[tuple[int, str]]] = {}
+    """Signatures with a row each: columns x0, x1, ... (and y0, ...)."""
+    axes: dict[tuple[str, str], list[tuple[int, str]]] = {}
     for name in header:
-        match = _SAMPLE.fullmatch(name)
-        if name != LABEL and match:
-            axes.setdefault(match['axis'], []).append((int(match['number']), name))
-    columns = [[name for _, name in sorted(found)] for _, found in sorted(axes.items())]
-    if not columns or len({len(c) for c in columns}) > 1:
+        match = _SAMPLE.fullmatch(name.lower())
+        if match:
+            axes.setdefault((match['axis'], match['unit'] or ''), []).append(
+                (int(match['number']), name))
+    for found in axes.values():
+        numbers = sorted(n for n, _ in found)
+        if numbers != list(range(numbers[0], numbers[0] + len(numbers))):
+            raise LabelsError(f'{path}: the columns {found[0][1]}, ... are not numbered one after '
+                              'the other')
+    if not axes or len({len(found) for found in axes.values()}) > 1:
         raise LabelsError(f'{path}: expected numbered columns of samples, as many for each axis '
-                          f'(x0, x1, ..., y0, y1, ...) or a column {TIME}')
+                          f'(x0, x1, ..., y0, y1, ...), or a column {TIME}')
+    fields = _Fields(path, [(axis, unit, [name for _, name in sorted(found)])
+                            for (axis, unit), found in axes.items()])
     out = []
     for line, row in lines:
         cells = dict(zip(header, row, strict=True))
-        field = np.array([[number(path, line, name, cells[name], False) for name in names]
-                          for names in columns]).T
-        out.append(Signature(np.arange(len(field), dtype=float), _measured(field),
-                             cells.get(LABEL, '').strip(), f'{path}: row {line}'))
+        field = fields.of(line, cells)
+        out.append(fields.signature(np.arange(len(field), dtype=float), field,
+                                    cells.get(LABEL, '').strip(), f'{path}: row {line}',
+                                    cells.get(PASS, '').strip()))
     return out
 
 
-def _measured(field: Any) -> Any:
-    """The axes (n, n_axes) that were measured."""
-    return field[:, ~np.isnan(field).all(axis=0)]
+class _Fields:
+    """The columns of a table that hold fields, by axis."""
+
+    def __init__(self, path: str | PathLike[str], columns: list[tuple[str, str, list[str]]]
+                 ) -> None:
+        """`columns` [(axis, unit, names)]; raises LabelsError for an axis that is there twice, and
+        for units that are known in part."""
+        columns = sorted(columns)
+        axes = [axis for axis, _, _ in columns]
+        twice = sorted({axis for axis in axes if axes.count(axis) > 1})
+        if twice:
+            raise LabelsError(f'{path}: several columns are the axis {twice[0]}')
+        known = [unit for _, unit, _ in columns if unit]
+        if known and len(known) < len(columns):
+            raise LabelsError(f'{path}: some fields have a unit (_t, _ut or _nt), others none')
+        self._path, self._columns, self._unit = path, columns, 'T' if known else ''
+
+    def of(self, line: int, cells: dict[str, str]) -> FloatArray:
+        """(n, n_axes) of a row of the table."""
+        return np.array([[number(self._path, line, name, cells[name], False)
+                          * UNITS.get(unit, 1.0) for name in names]
+                         for _, unit, names in self._columns]).T
+
+    def signature(self, t: FloatArray, field: FloatArray, label: str, source: str,
+                  group: str) -> Signature:
+        """The signature, without axes and ends that were not measured."""
+        there = np.flatnonzero(~np.isnan(field).all(axis=0))
+        field = field[:, there]
+        whole = np.flatnonzero(~np.isnan(field).any(axis=1)) if len(there) else there
+        inner = slice(whole[0], whole[-1] + 1) if len(whole) else slice(0, 0)
+        axes = tuple(self._columns[k][0] for k in there.tolist())
+        return Signature(t[inner], field[inner], label, source, axes, self._unit, group or source)
 
 
 def read_intervals(path: str | PathLike[str], first_ns: int) -> list[LabelledInterval]:
@@ -145,6 +197,8 @@ def _stamp(path: str | PathLike[str], line: int, column: str, cells: dict[str, s
            first_ns: int) -> int:
     """[ns] of a cell."""
     value = number(path, line, column, cells[column], True)
+    if abs(value) > (LATEST_S * NS if column.endswith('_ns') else LATEST_S):
+        raise LabelsError(f'{path}: row {line}: {column} is no time')
     if column.endswith('_ns'):
         # A float does not hold all nanoseconds since 1970.
         return int(cells[column]) if cells[column].strip().isdigit() else int(value)
@@ -179,10 +233,32 @@ def read_model(path: str | PathLike[str]) -> SignatureModel:
         version = content.pop('mag_tracking.classes')
         if version != VERSION:
             raise RecordingError(f'{path}: classes of version {version}; this reads {VERSION}')
-        arrays = ('mean', 'scale', 'weights', 'offsets', 'centres', 'precision')
-        content.update({name: np.array(content[name], dtype=float) for name in arrays})
-        return SignatureModel(**{**content, 'classes': tuple(content['classes'])})
+        names = ('mean', 'scale', 'weights', 'offsets', 'centres', 'precision')
+        content.update({name: np.array(content[name], dtype=float) for name in names})
+        content.update({name: float(content[name]) for name in ('temperature', 'limit')})
+        content.update({name: tuple(map(str, content[name])) for name in ('classes', 'axes')})
+        model = SignatureModel(**content)
+        _check_model(model)
+        return model
     except OSError as error:
         raise RecordingError(f'cannot read {path}: {error.strerror}') from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise RecordingError(f'{path} holds no trained classes ({error})') from error
+
+
+def _check_model(model: SignatureModel) -> None:
+    """Raise ValueError where the numbers of a model do not fit together."""
+    n, k = len(model.mean), len(set(model.classes))
+    shapes = {'mean': (n,), 'scale': (n,), 'weights': (k, n), 'offsets': (k,), 'centres': (k, n),
+              'precision': (n, n)}
+    for name, shape in shapes.items():
+        values = getattr(model, name)
+        if values.shape != shape or not np.isfinite(values).all():
+            raise ValueError(f'{name}: expected {shape} finite numbers')
+    if k < 2 or k < len(model.classes) or not n:
+        raise ValueError('classes: expected at least two different names')
+    for name in ('temperature', 'limit'):
+        if not 0.0 < getattr(model, name) < np.inf:
+            raise ValueError(f'{name}: expected a positive number')
+    if not (model.scale > 0.0).all():
+        raise ValueError('scale: expected positive numbers')

@@ -83,6 +83,7 @@ class UnflaggedPoses(TypedDict):
 
     n: int
     wrong: int
+    without_truth: int
 
 
 WRONG_M, WRONG_STD = 2.0, 3.0
@@ -102,9 +103,10 @@ def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> Unflag
     Returns
     -------
     dict
-        n : poses without a flag at whose time there is a true one; wrong : of them.
+        n : poses without a flag at whose time there is a true one; wrong : of them;
+        without_truth : poses without a flag at whose time there is none.
     """
-    truths, n, n_wrong = list(truths), 0, 0
+    truths, n, n_wrong, n_without = list(truths), 0, 0, 0
     for log in logs:
         sure = ~np.array(log.ambiguous, dtype=bool)
         if not sure.any():
@@ -122,7 +124,8 @@ def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> Unflag
             known |= there
             wrong &= ~there | (size > WRONG_M) & (size > WRONG_STD * std)
         n, n_wrong = n + int(known.sum()), n_wrong + int((known & wrong).sum())
-    return {'n': n, 'wrong': n_wrong}
+        n_without += int((~known).sum())
+    return {'n': n, 'wrong': n_wrong, 'without_truth': n_without}
 
 
 def near_poses(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,

@@ -1,9 +1,11 @@
 """Features of signatures: what they depend on, and what they do not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from mag_tracking.analysis.signature import Signature, features
+from mag_tracking.analysis.signature import features
 from support.labelled_passes import signature
 
 
@@ -12,8 +14,7 @@ def made(seed=0, name='car'):
 
 
 def changed(s, t=None, field=None):
-    return Signature(s.t if t is None else t, s.field if field is None else field, s.label,
-                     s.source)
+    return replace(s, t=s.t if t is None else t, field=s.field if field is None else field)
 
 
 def test_the_duration_does_not_matter():
@@ -26,6 +27,13 @@ def test_the_unit_changes_the_size_only():
     first, other = features(s), features(changed(s, field=1e9 * s.field))
     assert other[0] - first[0] == pytest.approx(np.log(1e9))
     np.testing.assert_allclose(other[1:], first[1:], atol=1e-6)
+
+
+@pytest.mark.parametrize('unit', [1e200, 1e-200])
+def test_numbers_of_any_size_have_features(unit):
+    s = made()
+    found = features(changed(s, field=unit * 1e6 * s.field))
+    np.testing.assert_allclose(found[1:], features(s)[1:], atol=1e-6)
 
 
 def test_baseline_and_drift_do_not_matter():
@@ -53,4 +61,4 @@ def test_quiet_ends_hardly_matter():
     (np.zeros(20), np.random.default_rng(0).standard_normal((20, 3)), 'do not increase')])
 def test_what_has_no_shape_is_refused(t, field, why):
     with pytest.raises(ValueError, match=why):
-        features(Signature(t, field, '', ''))
+        features(changed(made(), t, field))

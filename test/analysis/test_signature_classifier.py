@@ -25,10 +25,14 @@ def examples(simulator='boxes', seed=0):
     return examples_of(signatures(COUNTS, simulator, seed))
 
 
+def trained(e):
+    return train(e.x, e.labels, e.groups, e.axes, e.unit)
+
+
 @pytest.mark.parametrize('simulator', ['clouds', 'boxes'])
 def test_classes_are_told_better_than_by_the_largest_one(simulator):
     e = examples(simulator)
-    found = evaluate_splits(e.x, e.labels, e.n_axes, 5)
+    found = evaluate_splits(e.x, e.labels, e.groups, e.axes, e.unit, 5)
     assert found.majority == pytest.approx(100 / 140, abs=0.03)
     assert found.accuracy.mean() > found.majority + 0.05
     # Of three classes a constant answer has a third.
@@ -40,7 +44,7 @@ def test_classes_are_told_better_than_by_the_largest_one(simulator):
 
 def test_what_is_far_from_all_examples_is_unknown():
     e = examples()
-    model = train(e.x, e.labels, e.n_axes)
+    model = trained(e)
     assert np.mean(np.array(model.names(e.x)) == UNKNOWN) < 0.05
     far = e.x + 8.0 * model.scale * np.random.default_rng(0).choice([-1.0, 1.0], e.x.shape)
     assert set(model.names(far)) == {UNKNOWN}
@@ -49,9 +53,9 @@ def test_what_is_far_from_all_examples_is_unknown():
 
 def test_training_is_repeated_exactly_and_survives_its_file(tmp_path):
     e, other = examples(), examples(seed=1)
-    model = train(e.x, e.labels, e.n_axes)
+    model = trained(e)
     write_model(tmp_path / 'classes.json', model)
-    again, stored = train(e.x, e.labels, e.n_axes), read_model(tmp_path / 'classes.json')
+    again, stored = trained(e), read_model(tmp_path / 'classes.json')
     for found in (again, stored):
         np.testing.assert_array_equal(found.posterior(other.x), model.posterior(other.x))
         assert found.names(other.x) == model.names(other.x)
@@ -63,7 +67,7 @@ def test_training_is_repeated_exactly_and_survives_its_file(tmp_path):
 def test_two_classes_have_probabilities_too():
     e = examples()
     rows = [k for k, label in enumerate(e.labels) if label != 'motorcycle']
-    model = train(e.x[rows], [e.labels[k] for k in rows], e.n_axes)
+    model = train(e.x[rows], [e.labels[k] for k in rows], [e.groups[k] for k in rows], e.axes, 'T')
     p = model.posterior(e.x[rows])
     assert p.shape == (len(rows), 2) and p.sum(axis=1) == pytest.approx(1.0)
     assert np.mean([model.classes[k] == e.labels[r]
@@ -71,12 +75,12 @@ def test_two_classes_have_probabilities_too():
 
 
 @pytest.mark.parametrize(('labels', 'why'), [
-    (['car'] * 10, 'one class'), (['car'] * 9 + ['truck'], "got 1 of 'truck'"),
+    (['car'] * 10, 'at least two classes, got car'), (['car'] * 9 + ['truck'], "got 1 of 'truck'"),
     (['car'] * 5 + [''] * 5, 'no label'), (['car'] * 5 + ['unknown'] * 5, 'name the class')])
 def test_labels_from_which_nothing_is_learnt_are_refused(labels, why):
     x = np.random.default_rng(0).standard_normal((10, 4))
     with pytest.raises(LabelsError, match=why):
-        train(x, labels, 1)
+        train(x, labels, list(map(str, range(10))), ('x',), 'T')
 
 
 def test_the_reliability_error_is_that_of_its_definition():
@@ -84,3 +88,16 @@ def test_the_reliability_error_is_that_of_its_definition():
         pytest.approx(0.0)
     assert reliability_error(np.array([0.95] * 10), np.array([True] * 5 + [False] * 5)) == \
         pytest.approx(0.45)
+
+
+def test_labels_of_chance_are_not_learnt_from_several_sensors_of_one_pass():
+    """Four sensors feel nearly the same: one of them in the test set would give all away."""
+    rng = np.random.default_rng(2)
+    of_pass = rng.standard_normal((40, 20)).repeat(4, axis=0)
+    x = of_pass + 0.01 * rng.standard_normal(of_pass.shape)
+    labels = rng.choice(['a', 'b'], 40).repeat(4).tolist()
+    groups = list(map(str, np.arange(40).repeat(4)))
+    found = evaluate_splits(x, labels, groups, ('x',), 'T', 10)
+    # Ten splits of twelve passes: a coin, within three standard errors, which share passes.
+    assert abs(found.balanced_accuracy.mean() - 0.5) < 0.25
+    assert found.accuracy.mean() < 0.8

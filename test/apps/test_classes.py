@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from mag_tracking.apps.classes import labelled_signatures
+from mag_tracking.apps.classes import examples_of, labelled_signatures
 from mag_tracking.cli import main
 from mag_tracking.errors import LabelsError
 from mag_tracking.network.file import read_network
@@ -86,6 +86,8 @@ def test_bad_intervals_are_named(tmp_path, rows, why):
 
 def test_bad_tables_are_named(tmp_path, tables, capsys):
     bad = {'no label': 'a,x0,x1\n1,2,3\n', 'numbered': 'label,x,y\ncar,1,2\n',
+           'two x': 'label,x0,x1,bx0,bx1\ncar,1,2,3,4\n', 'a gap': 'label,x0,x2\ncar,1,2\n',
+           'half a unit': 'label,x_nt_0,y_0\ncar,1,2\n', 'semicolons': 'label;x0\ncar;1\n',
            'several labels': 'label,signature,time_s,x\ncar,1,0,1\ntruck,1,1,2\n',
            'tells one': 'label,time_s,x\ncar,0,1\n', 'too few': 'label,x0,x1\ncar,1,2\n',
            'no number': 'label,x0,x1\ncar,1,two\n', 'has no rows': 'label,x0\n'}
@@ -111,4 +113,48 @@ def test_a_model_of_other_axes_is_refused(tables, tmp_path, capsys):
     (tmp_path / 'two.csv').write_text('label,' + ','.join(f'x{k}' for k in range(20)) + '\ncar,'
                                       + ','.join(str(k * (19 - k)) for k in range(20)) + '\n')
     assert main(['classes', 'predict', str(tmp_path / 'two.csv'), '--model', model]) == 1
-    assert 'have 1 axes, the model was trained on 3' in capsys.readouterr().err
+    assert 'have the axes x, the model was trained on x y z' in capsys.readouterr().err
+
+
+def test_units_are_converted_or_refused(tables, tmp_path, capsys):
+    """The same signatures in nanotesla, in tesla, and in an unknown unit."""
+    found = signatures(COUNTS, 'boxes')
+    for name, suffix, unit in (('t', '_t', 1.0), ('ut', '_ut', 1e6), ('none', '', 1e9)):
+        write_by_sample(tmp_path / f'{name}.csv', found, unit)
+        text = (tmp_path / f'{name}.csv').read_text().replace('_nt', suffix)
+        (tmp_path / f'{name}.csv').write_text(text)
+    model = str(tmp_path / 'classes.json')
+    assert main(['classes', 'train', str(tables / 'by_sample.csv'), '--out', model]) == 0
+    answers = []
+    for path in (tables / 'by_sample.csv', tmp_path / 't.csv', tmp_path / 'ut.csv'):
+        capsys.readouterr()
+        assert main(['classes', 'predict', str(path), '--model', model]) == 0
+        answers.append(capsys.readouterr().out.splitlines()[-1])
+    assert len(set(answers)) == 1 and 'car' in answers[0]
+    assert main(['classes', 'predict', str(tmp_path / 'none.csv'), '--model', model]) == 1
+    assert 'in an unknown unit, the model was trained on T' in capsys.readouterr().err
+
+
+def test_signatures_of_events_can_be_predicted(tmp_path, capsys):
+    """They are empty before the first reading, and after the last one."""
+    recording, network = str(ROAD / 'two_way_road.mcap'), str(NETWORK_FILE)
+    assert main(['events', recording, '--network', network, '--out', str(tmp_path)]) == 0
+    found = labelled_signatures(tmp_path / 'signatures.csv', is_labelled=False)
+    usable = examples_of(found)
+    assert len(usable.labels) > 0.9 * len(found) and usable.unit == 'T'
+
+
+def test_a_model_that_does_not_fit_together_is_refused(tables, tmp_path, capsys):
+    model = tmp_path / 'classes.json'
+    assert main(['classes', 'train', str(tables / 'by_row.csv'), '--out', str(model)]) == 0
+    good = json.loads(model.read_text())
+    for name, value in (('weights', [[1.0]]), ('temperature', 0), ('limit', None), ('scale', 0),
+                        ('classes', ['car']), ('classes', ['car', 'car']), ('mean', [1.0])):
+        model.write_text(json.dumps({**good, name: value}))
+        assert main(['classes', 'predict', str(tables / 'by_row.csv'), '--model', str(model)]) == 1
+        assert 'holds no trained classes' in capsys.readouterr().err
+    model.write_text(json.dumps(good))
+    table = tmp_path / 'table.csv'
+    table.write_text((tables / 'by_row.csv').read_text())
+    assert main(['classes', 'train', str(table), '--out', str(table)]) == 1
+    assert 'is an input of this command' in capsys.readouterr().err

@@ -12,8 +12,11 @@ import pytest
 import mag_tracking as mt
 from mag_tracking.cli import main
 from mag_tracking.errors import SettingsError
+from mag_tracking.messages.types import MAGNETIC_FIELD
+from mag_tracking.recording.writer import RecordingWriter
 from support.bundled import DATA, NETWORK_FILE, QUICK, vehicle_path
 from support.busy_recordings import network_of_recording, rightly_counted
+from support.samples import field_dict
 
 ROAD = DATA / 'two_way_road'
 
@@ -100,6 +103,37 @@ def test_what_cannot_be_counted_is_named(tmp_path, capsys):
     assert main(['traffic', str(tmp_path / 'none.mcap'), '--network', str(NETWORK_FILE)]) == 1
     assert main(['traffic', str(recording), *words[1:]]) == 1
     assert 'two recordings are named' in capsys.readouterr().err
+
+
+def test_tables_without_rows_have_their_columns(tmp_path, capsys):
+    """And nothing of an earlier run stays."""
+    recording = str(vehicle_path('straight_car_right'))
+    one = tmp_path / 'one.yaml'
+    one.write_text('sensors:\n  mag_1: {position: [0, -4.5, 0]}\n')
+    for network, n in ((str(NETWORK_FILE), 1), (str(one), 0)):
+        assert main(['traffic', recording, '--network', network, '--out', str(tmp_path)]) == 0
+        printed = capsys.readouterr().out
+        assert f'{n} vehicles' in printed
+        assert ('one sensor does not tell the scale' in printed) == (n == 0)
+        csv_rows, rows = (read(tmp_path / f'passages.{kind}') for read, kind in (
+            (pd.read_csv, 'csv'), (pd.read_parquet, 'parquet')))
+        assert list(csv_rows.columns) == list(rows.columns) and len(rows) == n
+        assert str(rows['delay_speed'].dtype) == 'float64'
+
+
+def test_what_stops_a_run_is_found_before_it(tmp_path, capsys):
+    good = str(vehicle_path('straight_car_right'))
+    magnets = tmp_path / 'other.mcap'
+    with RecordingWriter(magnets) as writer:
+        writer.write('/elsewhere', MAGNETIC_FIELD, field_dict(0, 'mag_9', np.ones(3)), 0)
+    assert main(['traffic', good, str(magnets), '--network', str(NETWORK_FILE)]) == 1
+    out, err = capsys.readouterr()
+    assert '1 vehicles' not in out and 'mag-tracking: ' in err
+    (tmp_path / 'file').write_text('')
+    assert main(['traffic', good, '--network', str(NETWORK_FILE), '--out',
+                 str(tmp_path / 'file')]) == 1
+    out, err = capsys.readouterr()
+    assert '1 vehicles' not in out and 'mag-tracking: ' in err
 
 
 def test_lines_that_nobody_crosses_count_nobody():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from mag_tracking.inference.log_normal_classes import UNKNOWN, Feature, class_posterior
 from mag_tracking.stages.traffic.settings import TrafficSettings
@@ -25,6 +26,18 @@ def test_published_vehicles(name, size, length):
     found = posterior(size, length, 20.0, 0.3)
     assert found.name == name and found.probabilities.sum() == pytest.approx(1.0)
     assert found.probabilities.max() > 0.8
+
+
+def test_the_posterior_is_that_of_the_densities():
+    size, length, std = 900.0, 6.0, 0.8
+    expected = np.array([
+        share * norm.pdf(np.log(size), np.log(m), a) * norm.pdf(
+            np.log(length), np.log(row), np.hypot(b, std / length))
+        for share, m, a, row, b in zip(
+            SETTINGS.class_shares, SETTINGS.class_moments, SETTINGS.class_moment_spreads,
+            SETTINGS.class_lengths, SETTINGS.class_length_spreads, strict=True)])
+    np.testing.assert_allclose(posterior(size, length, 0.0, std).probabilities,
+                               expected / expected.sum(), rtol=1e-9)
 
 
 def test_a_vehicle_that_fits_no_class_is_unknown():

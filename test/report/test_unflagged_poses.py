@@ -16,6 +16,10 @@ def truth(y=0.0, shift_s=0.0):
             np.stack([10.0 * T, y + 0.0 * T, 0.0 * T], axis=1), QUATERNIONS)
 
 
+def counted(n, wrong=0, without_truth=0):
+    return {'n': n, 'wrong': wrong, 'without_truth': without_truth}
+
+
 def log(off_m=0.0, std_m=0.1, ambiguous=False):
     """A track beside the first vehicle."""
     out = TrackLog(1)
@@ -27,10 +31,10 @@ def log(off_m=0.0, std_m=0.1, ambiguous=False):
 
 def test_a_pose_is_wrong_by_metres_and_by_standard_deviations():
     n = len(T)
-    assert unflagged_poses([log(0.5)], [truth()]) == {'n': n, 'wrong': 0}
-    assert unflagged_poses([log(2.1)], [truth()]) == {'n': n, 'wrong': n}
-    assert unflagged_poses([log(2.1, std_m=1.0)], [truth()]) == {'n': n, 'wrong': 0}
-    assert unflagged_poses([log(9.0, ambiguous=True)], [truth()]) == {'n': 0, 'wrong': 0}
+    assert unflagged_poses([log(0.5)], [truth()]) == counted(n)
+    assert unflagged_poses([log(2.1)], [truth()]) == counted(n, n)
+    assert unflagged_poses([log(2.1, std_m=1.0)], [truth()]) == counted(n)
+    assert unflagged_poses([log(9.0, ambiguous=True)], [truth()]) == counted(0)
 
 
 def test_a_pose_is_right_that_is_right_about_any_vehicle_there():
@@ -38,14 +42,14 @@ def test_a_pose_is_right_that_is_right_about_any_vehicle_there():
     assert unflagged_poses([log(5.0)], [truth(), truth(-5.0)])['wrong'] == len(T)
     # A vehicle that comes later excuses nothing, and without any truth nothing is known.
     assert unflagged_poses([log(5.0)], [truth(), truth(5.0, 100.0)])['wrong'] == len(T)
-    assert unflagged_poses([log(5.0)], [truth(shift_s=100.0)]) == {'n': 0, 'wrong': 0}
+    assert unflagged_poses([log(5.0)], [truth(shift_s=100.0)]) == counted(0, 0, len(T))
 
 
 def test_the_share_is_reported():
     summary = {'missing_topics': [], 'why_no_detection': None, 'rejected': {}, 'lost': {},
                'sensors': {}, 'counts': {'track': {}}, 'close_network': False, 'tracks': [],
                'frames_too_long': None, 'clocks_apart': '', 'disturbances': [],
-               'target': 'vehicle', 'unflagged_poses': {'n': 200, 'wrong': 3}}
+               'target': 'vehicle', 'unflagged_poses': counted(200, 3)}
     assert [n.text.partition(':')[2][:27] for n in notes_of(summary)] == [
         ' 200, of which 3 (1.5%) are']
     assert notes_of({**summary, 'unflagged_poses': None}) == []

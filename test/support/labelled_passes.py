@@ -30,7 +30,8 @@ def signature(rng, name, simulator, n_axes=3):
     heading = np.full(len(t), 0.0 if way > 0 else np.pi)
     B = body.field(EARTH, position, heading, SENSOR)[:, 0]
     B = B + NOISE * rng.standard_normal(B.shape) + 1e-8 * rng.standard_normal(3) * t[:, None]
-    return Signature(t, B[:, :n_axes], name, f'{name} of {simulator}')
+    return Signature(t, B[:, :n_axes], name, f'{name} of {simulator}', tuple('xyz'[:n_axes]), 'T',
+                     str(rng.random()))
 
 
 def signatures(counts, simulator, seed=0, n_axes=3):
@@ -53,7 +54,7 @@ def write_by_row(path, found, n=80):
     """Resampled to `n` samples."""
     with open(path, 'w', newline='') as stream:
         writer = csv.writer(stream)
-        writer.writerow(['label', *(f'{a}{k}' for a in 'xyz' for k in range(n))])
+        writer.writerow(['label', *(f'{a}_nt_{k}' for a in 'xyz' for k in range(n))])
         for s in found:
             at = np.linspace(s.t[0], s.t[-1], n)
             writer.writerow([s.label, *(1e9 * v for axis in s.field.T
