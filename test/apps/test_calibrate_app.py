@@ -133,7 +133,10 @@ def test_right_recordings_give_no_warning(name):
     assert found.survey.reference == 'mag_1'
 
 
-@pytest.mark.parametrize('name', EVERY)
+@pytest.mark.parametrize('name', studied(FILES, OFTEN, also=lambda name: [
+    pytest.mark.xfail(strict=True, reason='most poses of the truck are flagged as of two vehicles, '
+                      'or as fitted better than their path: one of 89 is left')]
+    if name == 'straight_truck_right' else []))
 def test_what_a_calibration_is_marked_with(name):
     found = calibration_of(name)
     # The start of the two-way road ends before anything passes.
