@@ -117,7 +117,7 @@ class TrafficCount:
     vehicle_class: str
     count: int
     ambiguous: int
-    """Of them."""
+    """Number of ambiguous passages among them."""
     mean_speed: float
     """[m/s]"""
     mean_headway: float
@@ -134,4 +134,4 @@ class TrafficSummary:
     observed_s: float
     """[s] of the interval that are covered by frames."""
     counts: tuple[TrafficCount, ...]
-    """Of the directions and classes that were there."""
+    """One for each direction and class that was observed."""

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from mag_tracking.drivers.configuration import settings_by_kind
 from mag_tracking.pipeline import TARGET_DEFAULTS, Settings, settings_for
-from mag_tracking.recording.archive_tables import TABLES, VERSION
+from mag_tracking.recording.archive_tables import TABLES
+from mag_tracking.recording.parquet_table import VERSION
 from mag_tracking.settings import flatten, to_reference, to_yaml
 from mag_tracking.stages.track.doubts import MEANINGS
 

@@ -1,6 +1,6 @@
 """What a network measured while something passed, as arrays that can be fitted."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
@@ -10,6 +10,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.least_squares import SeparableModel, SeparableProblem
 from mag_tracking.network import SensorNetwork
+from mag_tracking.units import NS
 
 ModelOf: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], SeparableModel]
 """Of times (n,) [s], positions (n, 3) [m] and matrices (n, 3, 3) that a field is multiplied by."""
@@ -33,6 +34,29 @@ class PassData:
     axis is missing."""
     count: IntArray | None = None
     """(n,) of how many samples each is the mean; None = of one."""
+
+    @classmethod
+    def of_frames(cls, network: SensorNetwork, stamps_ns: Sequence[int],
+                  fields: Sequence[FloatArray], covariances: Sequence[FloatArray],
+                  offsets: Sequence[FloatArray] | None = None) -> 'PassData':
+        """The frames of a network.
+
+        Parameters
+        ----------
+        network : SensorNetwork
+        stamps_ns : n int
+        fields : n arrays (n_sensors, 3) [T]
+        covariances : n arrays (n_sensors, 3, 3) [T^2]
+        offsets : n arrays (n_sensors,) [s], optional
+            Of the sensors' times from the timestamps.
+        """
+        n, n_sensors = len(stamps_ns), len(network)
+        t = np.tile((np.array(stamps_ns, dtype=np.int64) - stamps_ns[0]) / NS, (n_sensors, 1))
+        if offsets is not None:
+            t = t + np.array(offsets).T
+        return cls(network, stamps_ns[0], t.ravel(), np.repeat(np.arange(n_sensors), n),
+                   np.array(fields).transpose(1, 0, 2).reshape(-1, 3),
+                   np.array(covariances).transpose(1, 0, 2, 3).reshape(-1, 3, 3))
 
     @property
     def n_values(self) -> int:

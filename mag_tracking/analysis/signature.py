@@ -19,7 +19,7 @@ PROMINENT = 0.1
 """An extremum counts that stands out by this share of the range of its axis."""
 
 LAGS = (2, 4, 8, 16)
-"""Of the autocorrelation of the size, in samples."""
+"""Lags of the autocorrelation of the size, in samples."""
 
 N_COSINES = 8
 """Coefficients of the discrete cosine transform of the size."""
@@ -45,8 +45,7 @@ class Signature:
     unit: str
     """T, or empty if it is unknown."""
     group: str
-    """Signatures of one target have the same: to train on one and to test on the other would be
-    to test on what is known."""
+    """Name shared by the signatures of one target, which are trained on or tested on together."""
 
 
 def features(signature: Signature) -> FloatArray:
@@ -59,10 +58,10 @@ def features(signature: Signature) -> FloatArray:
     Returns
     -------
     (n_features,) array
-        Of each axis: logarithm of the range, share of the energy, number of extrema, places of
-        the largest and the smallest value, share of the upper third of the spectrum. Of the size:
-        its logarithm, number of maxima, autocorrelation, cosine transform. The duration is none of
-        them: the speed is not known.
+        For each axis the logarithm of the range, the share of the energy, the number of extrema,
+        the places of the largest and the smallest value and the share of the upper third of the
+        spectrum; for the size of the field its logarithm, the number of maxima, autocorrelation
+        and cosine transform. The duration is left out, as the speed is not known.
 
     Raises
     ------

@@ -34,7 +34,7 @@ class SignatureModel:
     classes: tuple[str, ...]
     axes: tuple[str, ...]
     unit: str
-    """Of the fields: T, or empty if it was unknown."""
+    """Unit of the fields: T, or empty if it is unknown."""
     method: str
     mean: FloatArray
     """(n_features,) of the training set."""
@@ -87,7 +87,7 @@ class Evaluation:
     majority: float
     """Share of the largest class: the accuracy of a constant answer."""
     accuracy: FloatArray
-    """(n_sets,) share of right answers; `unknown` is none."""
+    """(n_sets,) share of right answers; `unknown` counts as wrong."""
     balanced_accuracy: FloatArray
     """(n_sets,) mean of the recalls."""
     recall: FloatArray

@@ -18,7 +18,8 @@ from mag_tracking.errors import ClusterError, MagTrackingError, OutputError, Rec
 from mag_tracking.files import checked_path
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
-from mag_tracking.recording.archive_folder import ArchiveFolder, import_pyarrow, stamped, state_of
+from mag_tracking.recording.archive_folder import ArchiveFolder, stamped, state_of
+from mag_tracking.recording.parquet_table import import_pyarrow
 from mag_tracking.recording.reader import SUFFIXES
 
 _Cluster = Cluster[tuple[str, Job]]

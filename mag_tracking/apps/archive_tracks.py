@@ -14,8 +14,10 @@ from mag_tracking.apps.archive_stretches import Piece
 from mag_tracking.apps.fit import FittedPass
 from mag_tracking.apps.replay import RunCollector
 from mag_tracking.event_records import Disturbance
-from mag_tracking.recording.archive_folder import TableWriter, stamped
+from mag_tracking.recording.archive_folder import stamped
+from mag_tracking.recording.archive_tables import TABLES
 from mag_tracking.recording.fit_folder import pass_rows
+from mag_tracking.recording.parquet_table import TableWriter
 from mag_tracking.records import Detection, FieldFrame, SmoothedPose, Track
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.stages.track.manager import TrackManager
@@ -36,7 +38,7 @@ class StretchTables:
         """`paths` of the tables `TRACKED`; passes are fitted with rows of `n_dipoles`."""
         self._recording, self._n_dipoles = recording, n_dipoles
         self._files = ExitStack()
-        self._tables = {name: self._files.enter_context(TableWriter(paths[name], name))
+        self._tables = {name: self._files.enter_context(TableWriter(paths[name], TABLES[name]))
                         for name in TRACKED}
         self._collector = RunCollector(self)
         self.n_tracks = self.n_passes = 0

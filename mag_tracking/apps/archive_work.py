@@ -28,7 +28,9 @@ from mag_tracking.errors import OutputError
 from mag_tracking.files import replace_text
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
-from mag_tracking.recording.archive_folder import TableWriter, join_tables, name_of, stamped
+from mag_tracking.recording.archive_folder import join_tables, name_of, stamped
+from mag_tracking.recording.archive_tables import TABLES
+from mag_tracking.recording.parquet_table import TableWriter
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import FieldFrame
@@ -108,7 +110,7 @@ def cut(job: Job) -> dict[str, Any]:
     """
     if not job.cut.exists():
         with _attempt(job.cut) as folder:
-            with TableWriter(folder / 'health.parquet', 'health') as table:
+            with TableWriter(folder / 'health.parquet', TABLES['health']) as table:
                 known = _Cut(job, folder, table).read()
             replace_text(folder / KNOWN, json.dumps(known))
     read: dict[str, Any] = json.loads((job.cut / KNOWN).read_text())

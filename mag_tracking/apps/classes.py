@@ -57,7 +57,7 @@ def examples_of(signatures: list[Signature]) -> Examples:
     Raises
     ------
     LabelsError
-        If there is none, or axes or units differ.
+        If there is no usable signature, or axes or units differ.
     """
     if not signatures:
         raise LabelsError('there is no signature')

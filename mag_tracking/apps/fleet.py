@@ -22,7 +22,7 @@ def induction_of(network: SensorNetwork) -> FloatArray:
     """(3,) [A/m] of the earth's field; raises NetworkError where it is not known."""
     if network.earth_field is None or not network.earth_field.any():
         raise NetworkError('the network file has no earth_field, without which hard and soft iron '
-                           'cannot be told apart')
+                           'cannot be separated')
     return network.earth_field / MU0
 
 
@@ -32,7 +32,7 @@ def pass_of(recording: str, passages: Sequence[VehiclePassage]) -> FleetPass:
     Raises
     ------
     LabelsError
-        If there is none, more than one, or a doubtful one.
+        If there is no passage, more than one, or a doubtful one.
     """
     if len(passages) != 1:
         raise LabelsError(f'{recording}: expected one vehicle to enrol, {len(passages)} crossed a '

@@ -236,7 +236,7 @@ def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline
 
 def _delay_entry(log: TrackLog, network: SensorNetwork) -> dict[str, Any]:
     """Speed and heading by the delays between the sensors, JSON-ready; or why there are none."""
-    found = correlated_motion(_pass_of(log, network))
+    found = correlated_motion(PassData.of_frames(network, log.stamp_ns, log.measured, log.noise))
     if found.reason:
         return {'reason': found.reason}
     k = log.surest()
@@ -246,15 +246,6 @@ def _delay_entry(log: TrackLog, network: SensorNetwork) -> dict[str, Any]:
             'heading_sd_deg': None if np.isnan(found.heading_std)
             else float(np.degrees(found.heading_std)),
             'contradicts': disagree(speed_of(*moving), heading_of(*moving), found)}
-
-
-def _pass_of(log: TrackLog, network: SensorNetwork) -> PassData:
-    """The readings of all sensors while a track ran."""
-    n, n_sensors = len(log.stamp_ns), len(network)
-    return PassData(network, log.stamp_ns[0], np.tile(log.seconds(), n_sensors),
-                    np.repeat(np.arange(n_sensors), n),
-                    np.array(log.measured).transpose(1, 0, 2).reshape(-1, 3),
-                    np.array(log.noise).transpose(1, 0, 2, 3).reshape(-1, 3, 3))
 
 
 def _mounting(log: TrackLog, pipeline: Pipeline) -> dict[str, dict[str, Any]]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mag_tracking.analysis.correlated_motion import CorrelatedMotion, correlated_motion
+from mag_tracking.analysis.correlated_motion import CorrelatedMotion, correlated_motion, disagree
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.first_pass import first_pass_of
 from mag_tracking.apps.no_detection import why_no_detection
@@ -27,10 +27,6 @@ from mag_tracking.units import NS
 FORGOTTEN_S = 300.0
 """[s] The fields of a track that has ended are kept for its passage for this time."""
 
-DISAGREE_STD, DISAGREE_SHARE = 3.0, 0.1
-"""Two speeds contradict each other that are apart by more standard deviations and by more than
-this share."""
-
 
 @dataclass(frozen=True)
 class CountedVehicle:
@@ -42,12 +38,10 @@ class CountedVehicle:
 
     @property
     def speeds_contradict(self) -> bool:
-        """Whether the two speeds contradict each other."""
-        if self.delay.reason:
-            return False
-        apart = abs(self.passage.speed - self.delay.speed)
-        std = np.hypot(self.passage.speed_std, self.delay.speed_std)
-        return bool(apart > DISAGREE_STD * std and apart > DISAGREE_SHARE * self.delay.speed)
+        """Whether speed or direction contradict the delays."""
+        p = self.passage
+        heading = float(np.arctan2(p.velocity[1], p.velocity[0]))
+        return disagree((p.speed, p.speed_std), (heading, p.heading_std), self.delay)
 
 
 @dataclass(frozen=True)
@@ -59,7 +53,7 @@ class TrafficResult:
     vehicles: tuple[CountedVehicle, ...]
     """In order of time."""
     summaries: tuple[TrafficSummary, ...]
-    """Of each line and interval."""
+    """One for each line and interval."""
     counts: dict[str, int]
     """{what: number}: tracks that crossed no line, and others that were not counted."""
     rejections: dict[str, int]
@@ -180,11 +174,6 @@ class _Counter:
         if any(other[0].stamp_ns <= end and begin <= other[-1].stamp_ns
                for name, other in self._frames.items() if name != id):
             return CorrelatedMotion('another vehicle was near')
-        n, n_sensors = len(frames), len(self._network)
-        t = np.array([f.stamp_ns - frames[0].stamp_ns for f in frames]) / NS
-        offsets = np.array([f.time_offset for f in frames])
-        return correlated_motion(PassData(
-            self._network, frames[0].stamp_ns, (t[:, None] + offsets).T.ravel(),
-            np.repeat(np.arange(n_sensors), n),
-            np.array([f.field for f in frames]).transpose(1, 0, 2).reshape(-1, 3),
-            np.array([f.covariance for f in frames]).transpose(1, 0, 2, 3).reshape(-1, 3, 3)))
+        return correlated_motion(PassData.of_frames(
+            self._network, [f.stamp_ns for f in frames], [f.field for f in frames],
+            [f.covariance for f in frames], [f.time_offset for f in frames]))

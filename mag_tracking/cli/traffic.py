@@ -34,6 +34,7 @@ from mag_tracking.recording.traffic_tables import (
     DIRECTIONS,
     passage_row,
     summary_rows,
+    tables_of,
     write_traffic,
 )
 from mag_tracking.units import NS
@@ -96,8 +97,9 @@ def _traffic(args: argparse.Namespace) -> int:
                 passage_row(name, v.passage, result.class_names, _delay(v), _vehicle(who))
                 for v, who in zip(result.vehicles, found, strict=True)]
             tables['intervals'] += [row for s in result.summaries for row in summary_rows(name, s)]
-            # After each recording: what is done stays, whatever comes.
-            _write(args, tables, result.class_names, fleet is not None)
+            if args.out is not None:
+                # After each recording: what is done stays, whatever comes.
+                write_traffic(args.out, tables, tables_of(result.class_names, fleet is not None))
     if args.enrol is not None and not seen:
         _enrol(args, network, enrolled)
     if args.out is not None:
@@ -119,13 +121,6 @@ def _recordings(args: argparse.Namespace, network: SensorNetwork) -> list[Record
     if args.out is not None:
         output_folder(args.out)
     return recordings
-
-
-def _write(args: argparse.Namespace, tables: dict[str, list[dict[str, Any]]],
-           class_names: tuple[str, ...], with_fleet: bool) -> None:
-    """Write the tables, where they are asked for."""
-    if args.out is not None:
-        write_traffic(args.out, tables, class_names, with_fleet)
 
 
 def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:

@@ -219,35 +219,24 @@ def horizontal_field(field: FloatArray, R_ws: FloatArray) -> FloatArray:
     return out
 
 
-def turning(field: FloatArray, noise_std: float, n_quiet: int) -> tuple[float, float]:
-    """Which way the horizontal field of a pass turns.
+def rotation_of_pass(field: FloatArray, noise_std: float, n_quiet: int) -> FieldRotation | None:
+    """`field_rotation` at the lag that suits the width of a pass.
 
-    Seen from the sensor towards the target, a target that moves from left to right turns the
-    horizontal field one way, from right to left the other way, whatever its moment.
+    Every size of the correlation is taken for equally likely beforehand, so that the probability is
+    too sure where the target is below the noise.
 
     Parameters
     ----------
     field : (n, 2) array, T
-        Horizontal field, x and y of a frame whose z points up.
+        As for `field_rotation`.
     noise_std : float, T
-        Of one sample on each axis.
     n_quiet : int
-        Samples at both ends that are without the target.
+        Samples at each end that are free of the target.
 
     Returns
     -------
-    correlation : float, T^2
-        Negative from left to right.
-    probability : float
-        Of left to right; 0.5 where the field does not tell. Every size of the correlation is taken
-        for equally likely beforehand, so that it is too sure where the target is below the noise.
-
-    References
-    ----------
-    [PHD15]_ Paper B eq. (5), (11), (16), (18).
+    FieldRotation or None
+        None for a window that is too short, or does not exceed the noise.
     """
     lag = lag_of(field, noise_std, n_quiet) if len(field) >= LEAST_SAMPLES else 0
-    if not lag:
-        return 0.0, 0.5
-    found = field_rotation(field, noise_std, lag)
-    return found.correlation, float(np.clip(found.left_to_right, 1.0 - MOST_SURE, MOST_SURE))
+    return field_rotation(field, noise_std, lag) if lag else None

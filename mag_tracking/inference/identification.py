@@ -26,7 +26,7 @@ LEVEL = 0.01
 
 @dataclass(frozen=True)
 class EnrolledVehicle:
-    """What is known of one vehicle."""
+    """A vehicle with its hard and soft iron, or with its moment at one heading."""
 
     name: str
     iron: Iron | None

@@ -16,48 +16,26 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mag_tracking.errors import MissingDependencyError, OutputError
+from mag_tracking.errors import OutputError
 from mag_tracking.files import output_folder, replace_text
-from mag_tracking.recording.archive_tables import TABLES, VERSION
+from mag_tracking.recording.archive_tables import TABLES
+from mag_tracking.recording.parquet_table import VERSION, TableWriter, import_pyarrow
 from mag_tracking.units import NS
 
 if TYPE_CHECKING:
-    import pyarrow as pa
-
-ROWS = 5000
-"""Rows that are kept in memory at once."""
+    pass
 
 MOST_BYTES = 100
 """Of the stem of a recording, in the names of its files."""
 
 _PACKAGE = 'mag_tracking'
 _HEAD, _DONE, _WORK, _LOCK = 'archive.json', 'done', 'unfinished', '.lock'
-
-
-def import_pyarrow() -> Any:
-    """pyarrow, with its Parquet part; raises MissingDependencyError."""
-    try:
-        import pyarrow.compute
-        import pyarrow.parquet
-    except ImportError as error:
-        raise MissingDependencyError(
-            'archives need pyarrow and Dask: pip install "mag_tracking[archive]"') from error
-    return pyarrow
-
-
-def schema_of(table: str) -> 'pa.Schema':
-    """The columns of a table, with their meaning and unit; raises MissingDependencyError."""
-    pa = import_pyarrow()
-    kinds = {'i': pa.int64(), 'f': pa.float64(), 's': pa.string(), 'b': pa.bool_(),
-             't': pa.timestamp('ns', 'UTC'), 'C': pa.list_(pa.float64(), 36)}
-    return pa.schema([pa.field(c.name, kinds[c.kind], metadata={'unit': c.unit, 'is': c.meaning})
-                      for c in TABLES[table]], metadata={'mag_tracking.schema': str(VERSION)})
 
 
 def name_of(recording: Path) -> str:
@@ -185,76 +163,13 @@ class ArchiveFolder:
 
     def write_recordings(self, rows: Iterable[Mapping[str, Any]]) -> None:
         """The table `recordings`, as a whole."""
-        with TableWriter(self.path / 'recordings.parquet', 'recordings') as table:
+        with TableWriter(self.path / 'recordings.parquet', TABLES['recordings']) as table:
             for row in rows:
                 table.add(row)
 
     def known(self) -> list[dict[str, Any]]:
         """What is known of each recording that is complete, also of earlier runs."""
         return [_read_json(path) for path in sorted((self.path / _DONE).glob('*.json'))]
-
-
-class TableWriter:
-    """Writes a table piece by piece; until it is complete, what was there stays.
-
-    A context manager, left with an error it leaves nothing. Raises OutputError.
-    """
-
-    def __init__(self, path: Path, table: str) -> None:
-        self._path, self._schema = path, schema_of(table)
-        # Another attempt at the same table may be going on, on a worker that was taken for lost.
-        self._draft = path.with_name(f'.{secrets.token_hex(8)}.part')
-        self._rows: list[Mapping[str, Any]] = []
-        with self._errors_named():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._writer = import_pyarrow().parquet.ParquetWriter(
-                self._draft, self._schema, compression='zstd')
-
-    @contextmanager
-    def _errors_named(self) -> Iterator[None]:
-        """Errors of the system name the file."""
-        try:
-            yield
-        except OSError as error:
-            raise OutputError(f'cannot write {self._path}: {error.strerror or error}') from error
-
-    def add(self, row: Mapping[str, Any]) -> None:
-        """Take a row; columns that it has not are null."""
-        self._rows.append(row)
-        if len(self._rows) >= ROWS:
-            self._flush()
-
-    def add_table(self, table: 'pa.Table') -> None:
-        """Take many rows."""
-        self._flush()
-        with self._errors_named():
-            self._writer.write_table(table)
-
-    def _flush(self) -> None:
-        """Write the rows."""
-        rows, self._rows = self._rows, []
-        if rows:
-            # A path need not be UTF-8, and Parquet has no other text.
-            rows = [{name: value.encode(errors='backslashreplace').decode()
-                     if isinstance(value, str) else value for name, value in row.items()}
-                    for row in rows]
-            with self._errors_named():
-                self._writer.write_table(
-                    import_pyarrow().Table.from_pylist(rows, self._schema))
-
-    def __enter__(self) -> 'TableWriter':
-        return self
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        try:
-            if kind is None:
-                self._flush()
-            with self._errors_named():
-                self._writer.close()
-                if kind is None:
-                    self._draft.replace(self._path)
-        finally:
-            self._draft.unlink(missing_ok=True)
 
 
 def _remove(folder: Path) -> None:
@@ -296,7 +211,7 @@ def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder
                 if day not in days:
                     date = datetime.date(1970, 1, 1) + datetime.timedelta(days=day)
                     days[day] = files.enter_context(TableWriter(
-                        folder / table / f'date={date}' / f'{name}.parquet', table))
+                        folder / table / f'date={date}' / f'{name}.parquet', TABLES[table]))
                 days[day].add_table(rows.filter(pa.compute.equal(day_of, day)))
     return n
 

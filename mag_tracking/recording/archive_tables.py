@@ -1,24 +1,6 @@
 """The tables of an archive: their columns, with kind, unit and meaning."""
 
-from typing import NamedTuple
-
-VERSION = 1
-"""Version of the tables. A folder with another one is refused: rows would not be comparable."""
-
-
-class Column(NamedTuple):
-    """A column of a table."""
-
-    name: str
-    kind: str
-    """t: time of UTC, i: whole number, f: number, s: text, b: yes or no, C: (6, 6) row by row."""
-    unit: str
-    meaning: str
-
-
-def _columns(kind: str, unit: str, /, **meanings: str) -> tuple[Column, ...]:
-    """Of one kind and unit: {name: meaning}."""
-    return tuple(Column(name, kind, unit, meaning) for name, meaning in meanings.items())
+from mag_tracking.recording.parquet_table import Column, columns_of
 
 
 def _axes(prefix: str, unit: str, meaning: str) -> tuple[Column, ...]:
@@ -47,63 +29,64 @@ _POSES = (
 TABLES: dict[str, tuple[Column, ...]] = {
     'tracks': (
         *_WHERE, *_TRACK, Column('end_ns', 'i', 'ns', 'timestamp of the last pose'),
-        *_columns('i', '', poses='number of published poses'),
-        *_columns('s', '', arrival='most probable arrival', kind='most probable kind',
+        *columns_of('i', '', poses='number of published poses'),
+        *columns_of('s', '', arrival='most probable arrival', kind='most probable kind',
                   verdict='unique or ambiguous', doubts='all doubts that there were'),
-        *_columns('f', '', arrival_weight='probability of the arrival',
+        *columns_of('f', '', arrival_weight='probability of the arrival',
                   kind_weight='probability of the kind',
                   ambiguous_share='share of poses that are ambiguous',
                   nis_per_axis='mean normalised innovation squared; about one is right'),
-        *_columns('f', 'm', length='length of the row of dipoles',
+        *columns_of('f', 'm', length='length of the row of dipoles',
                   smallest_sd='smallest standard deviation of the position'),
-        *_columns('f', 'm/s', speed='speed at the surest pose'),
-        *_columns('f', 'deg', heading_deg='direction there, from x towards y'),
-        *_MOMENT, *_columns('f', 'A m^2', moment_size='length of the moment'),
-        *_columns('f', 'm/s', smoothed_speed='speed of the smoothed track; null without one'),
-        *_columns('f', 'A m^2', smoothed_moment_size='length of the moment of the smoothed track')),
+        *columns_of('f', 'm/s', speed='speed at the surest pose'),
+        *columns_of('f', 'deg', heading_deg='direction there, from x towards y'),
+        *_MOMENT, *columns_of('f', 'A m^2', moment_size='length of the moment'),
+        *columns_of('f', 'm/s', smoothed_speed='speed of the smoothed track; null without one'),
+        *columns_of('f', 'A m^2',
+                    smoothed_moment_size='length of the moment of the smoothed track')),
     'poses': (
-        *_POSES, *_columns('f', '', weight='weight of the hypothesis',
+        *_POSES, *columns_of('f', '', weight='weight of the hypothesis',
                   kind_weight='probability of the kind'),
-        *_columns('s', '', arrival='arrival that it assumes', doubts='names of the doubts')),
+        *columns_of('s', '', arrival='arrival that it assumes', doubts='names of the doubts')),
     'smoothed': _POSES,
     'passes': (
-        *_WHERE, *_columns('i', '', number='number of the detection in the recording',
+        *_WHERE, *columns_of('i', '', number='number of the detection in the recording',
                            n_dipoles='dipoles of the fitted row', n_values='measurements'),
-        *_columns('s', '', reason='why the fit is not to be believed; empty where it is',
+        *columns_of('s', '', reason='why the fit is not to be believed; empty where it is',
                   trusted='what is to be believed all the same',
                   notes='what was left out of the measurements'),
-        *_columns('f', '', normalised_cost='about one where the model is right',
+        *columns_of('f', '', normalised_cost='about one where the model is right',
                   explained='share of the energy that the fit explains'),
         *_STATE, *_STATE_SD,
-        *_columns('f', 'm/s', speed='speed of the fit', sd_speed='its standard deviation'),
-        *_columns('f', 'deg', heading_deg='direction of the fit',
+        *columns_of('f', 'm/s', speed='speed of the fit', sd_speed='its standard deviation'),
+        *columns_of('f', 'deg', heading_deg='direction of the fit',
                   sd_heading_deg='its standard deviation'),
-        *_columns('f', 'm', length='length of the row of dipoles',
+        *columns_of('f', 'm', length='length of the row of dipoles',
                   sd_length='its standard deviation'),
         *_MOMENT, *_axes('sd_m', 'A m^2', 'standard deviation of the moment'),
-        *_columns('f', 'm/s', delay_speed='speed by the delay between sensors, without a model',
+        *columns_of('f', 'm/s', delay_speed='speed by the delay between sensors, without a model',
                   sd_delay_speed='its standard deviation'),
-        *_columns('f', 'deg', delay_heading_deg='direction by the delay',
+        *columns_of('f', 'deg', delay_heading_deg='direction by the delay',
                   sd_delay_heading_deg='its standard deviation')),
     'health': (
-        *_WHERE, *_columns('s', '', sensor='name of the sensor'),
-        *_columns('i', '', accepted='readings used since the row before',
+        *_WHERE, *columns_of('s', '', sensor='name of the sensor'),
+        *columns_of('i', '', accepted='readings used since the row before',
                   rejected='readings rejected since then', times_relearnt='of the background'),
-        *_columns('b', '', ready='whether the background is known',
+        *columns_of('b', '', ready='whether the background is known',
                   stuck='whether the sensor repeats itself',
                   doubtful='whether the background is doubtful'),
         *_axes('background_', 'T', 'background, sensor frame'),
         *_axes('drift_', 'T/s', 'drift of the background'),
         *_axes('noise_', 'T', 'standard deviation of one reading')),
     'recordings': (
-        *_WHERE, *_columns('s', '', error='why the recording failed; empty where it did not',
+        *_WHERE, *columns_of('s', '', error='why the recording failed; empty where it did not',
                            lost='what could not be read', rejected='readings that were not used',
                            missing_topics='topics of the network that are not in it',
                            why_no_detection='one sentence where nothing was detected'),
-        *_columns('i', 'ns', end_ns='timestamp of the last frame'),
-        *_columns('i', '', frames='frames of the network', tracks='number of tracks',
+        *columns_of('i', 'ns', end_ns='timestamp of the last frame'),
+        *columns_of('i', '', frames='frames of the network', tracks='number of tracks',
                   passes='number of fitted passes',
                   stretches='stretches in which a target was near'),
-        *_columns('i', 'bytes', size='size of the recording')),
+        *columns_of('i', 'bytes', size='size of the recording')),
 }
 """{table: columns}. Values that are not known are null."""

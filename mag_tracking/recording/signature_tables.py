@@ -44,7 +44,7 @@ class LabelledInterval:
     sensor: str
     """Empty: all sensors."""
     row: int
-    """Of the table."""
+    """Row of the table."""
 
 
 def read_signatures(path: str | PathLike[str], is_labelled: bool = True) -> list[Signature]:
@@ -82,7 +82,7 @@ def _by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> li
     out = []
     for key, rows in found.items():
         source = f'{path}: signature {" ".join(key)}'
-        (label,), (group,) = (_only(source, column, rows) for column in (LABEL, PASS))
+        label, group = (_only(source, column, rows) for column in (LABEL, PASS))
         t = np.array([number(path, line, TIME, cells[TIME], True) for line, cells in rows])
         field = np.array([fields.of(line, cells)[0] for line, cells in rows])
         out.append(fields.signature(t, field, label, source, group))
@@ -92,12 +92,12 @@ def _by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> li
     return out
 
 
-def _only(source: str, column: str, rows: list[tuple[int, dict[str, str]]]) -> tuple[str]:
+def _only(source: str, column: str, rows: list[tuple[int, dict[str, str]]]) -> str:
     """The only value of a column, empty without it; LabelsError where there are several."""
     values = sorted({cells.get(column, '').strip() for _, cells in rows})
     if len(values) > 1:
         raise LabelsError(f'{source} has several values of {column}: {", ".join(values)}')
-    return (values[0],)
+    return values[0]
 
 
 def _by_row(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:

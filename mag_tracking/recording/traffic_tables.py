@@ -1,8 +1,7 @@
 """Passages and traffic summaries as tables: CSV, and Parquet where pyarrow is installed."""
 
 import csv
-import secrets
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -12,20 +11,57 @@ import numpy as np
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import TrafficSummary, VehiclePassage
 from mag_tracking.files import new_text_file, output_folder
+from mag_tracking.recording.parquet_table import Column, TableWriter, columns_of
 
 DIRECTIONS = {True: 'forward', False: 'backward'}
 
-_PASSAGES_BEGIN = '''
-    recording number stamp_ns line track_id direction direction_error x y z lateral vx vy vz
-    heading_deg sd_heading_deg speed sd_speed delay_speed sd_delay_speed speeds_contradict length
-    sd_length mx my mz moment_size class'''
-_PASSAGES_END = 'headway ambiguous doubts'
-_INTERVALS = '''
-    recording begin_ns end_ns line observed_s direction class count n_ambiguous mean_speed
-    mean_headway'''
-_TEXTS = ('recording', 'line', 'direction', 'class', 'vehicle', 'doubts')
-_INTEGERS = ('number', 'stamp_ns', 'track_id', 'begin_ns', 'end_ns', 'count', 'n_ambiguous')
-_FLAGS = ('ambiguous', 'speeds_contradict')
+_PASSAGE = (
+    *columns_of('s', '', recording='name of the recording'),
+    *columns_of('i', '', number='1, 2, ... in order of time'),
+    *columns_of('i', 'ns', stamp_ns='when the middle of the vehicle was on the line'),
+    *columns_of('s', '', line='name of the counting line'),
+    *columns_of('i', '', track_id='number of the track'),
+    *columns_of('s', '', direction='forward or backward'),
+    *columns_of('f', '', direction_error='probability that the direction is wrong'),
+    *columns_of('f', 'm', x='place on the line, x', y='place on the line, y',
+                z='place on the line, z', lateral='to the left of the middle, seen forward'),
+    *columns_of('f', 'm/s', vx='velocity, x', vy='velocity, y', vz='velocity, z'),
+    *columns_of('f', 'deg', heading_deg='direction of the velocity, from x towards y',
+                sd_heading_deg='its standard deviation'),
+    *columns_of('f', 'm/s', speed='horizontal speed', sd_speed='its standard deviation',
+                delay_speed='speed by the delay between sensors, without a model',
+                sd_delay_speed='its standard deviation'),
+    *columns_of('b', '', speeds_contradict='whether track and delay contradict each other'),
+    *columns_of('f', 'm', length='length of the row of dipoles; 0 = a point',
+                sd_length='its standard deviation'),
+    *columns_of('f', 'A m^2', mx='magnetic moment, x', my='magnetic moment, y',
+                mz='magnetic moment, z', moment_size='its size'),
+    Column('class', 's', '', 'most probable class, or unknown'))
+_VEHICLE = (
+    *columns_of('s', '', vehicle='enrolled vehicle, or unknown'),
+    *columns_of('f', '', p_vehicle='its probability among those that can be compared'))
+_PASSAGE_END = (
+    *columns_of('f', 's', headway='since the vehicle before in the same direction'),
+    *columns_of('b', '', ambiguous='whether the passage is doubtful'),
+    *columns_of('s', '', doubts='why'))
+_INTERVAL = (
+    *columns_of('s', '', recording='name of the recording'),
+    *columns_of('i', 'ns', begin_ns='begin of the interval', end_ns='its end'),
+    *columns_of('s', '', line='name of the counting line'),
+    *columns_of('f', 's', observed_s='time of the interval that is covered by frames'),
+    *columns_of('s', '', direction='forward or backward'),
+    Column('class', 's', '', 'class of the vehicles'),
+    *columns_of('i', '', count='number of vehicles', n_ambiguous='number of doubtful ones'),
+    *columns_of('f', 'm/s', mean_speed='mean of their speeds'),
+    *columns_of('f', 's', mean_headway='mean of their headways'))
+
+
+def tables_of(class_names: Sequence[str], with_fleet: bool) -> dict[str, tuple[Column, ...]]:
+    """{table: columns}, with a probability for each class."""
+    classes = tuple(Column(f'p_{name}', 'f', '', f'probability of the class {name}')
+                    for name in class_names)
+    vehicle = _VEHICLE if with_fleet else ()
+    return {'passages': (*_PASSAGE, *classes, *vehicle, *_PASSAGE_END), 'intervals': _INTERVAL}
 
 
 def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[str],
@@ -66,37 +102,30 @@ def summary_rows(recording: str, summary: TrafficSummary) -> list[dict[str, Any]
              'mean_headway': c.mean_headway} for c in summary.counts]
 
 
-def write_traffic(folder: Path, tables: dict[str, list[dict[str, Any]]],
-                  class_names: Sequence[str], with_fleet: bool) -> list[Path]:
-    """Write tables, {name: rows}, into a folder; returns the paths.
+def write_traffic(folder: Path, rows: Mapping[str, Sequence[Mapping[str, Any]]],
+                  tables: Mapping[str, Sequence[Column]]) -> None:
+    """Write the rows of tables into a folder, as CSV and Parquet.
 
     Tables without rows have their columns. Parquet is left out where pyarrow is not installed, and
     that of an earlier run is removed. Raises OutputError.
     """
-    folder, paths = output_folder(folder), []
+    folder = output_folder(folder)
     try:
-        for name, rows in tables.items():
-            columns = columns_of(name, class_names, with_fleet)
-            paths.append(folder / f'{name}.csv')
-            with new_text_file(paths[-1], newline='') as stream:
-                writer = csv.DictWriter(stream, columns)
+        for name, columns in tables.items():
+            with new_text_file(folder / f'{name}.csv', newline='') as stream:
+                writer = csv.DictWriter(stream, [c.name for c in columns])
                 writer.writeheader()
-                writer.writerows({k: _text(v) for k, v in row.items()} for row in rows)
+                writer.writerows({k: _text(v) for k, v in row.items()} for row in rows[name])
             parquet = folder / f'{name}.parquet'
-            parquet.unlink(missing_ok=True)
-            if find_spec('pyarrow') is not None:
-                paths.append(parquet)
-                _write_parquet(parquet, columns, rows)
+            if find_spec('pyarrow') is None:
+                parquet.unlink(missing_ok=True)
+                continue
+            with TableWriter(parquet, columns) as table:
+                for row in rows[name]:
+                    # NaN is not known: null.
+                    table.add({k: v for k, v in row.items() if v == v})
     except OSError as error:
         raise OutputError(f'cannot write to {folder}: {error.strerror or error}') from error
-    return paths
-
-
-def columns_of(table: str, class_names: Sequence[str], with_fleet: bool) -> list[str]:
-    """The columns of `passages` or `intervals`."""
-    return _INTERVALS.split() if table == 'intervals' else [
-        *_PASSAGES_BEGIN.split(), *(f'p_{name}' for name in class_names),
-        *(('vehicle', 'p_vehicle') if with_fleet else ()), *_PASSAGES_END.split()]
 
 
 def _text(value: object) -> object:
@@ -104,22 +133,3 @@ def _text(value: object) -> object:
     if isinstance(value, float):
         return f'{value:.9g}' if np.isfinite(value) else ''
     return value
-
-
-def _write_parquet(path: Path, columns: Sequence[str], rows: list[dict[str, Any]]) -> None:
-    """Write a table; the types of its columns do not depend on the rows."""
-    # It takes half a second to import.
-    import pyarrow as pa
-    import pyarrow.parquet
-
-    kinds = {**dict.fromkeys(_TEXTS, pa.string()), **dict.fromkeys(_INTEGERS, pa.int64()),
-             **dict.fromkeys(_FLAGS, pa.bool_())}
-    schema = pa.schema([(name, kinds.get(name, pa.float64())) for name in columns])
-    draft = path.with_name(f'.{secrets.token_hex(8)}.part')
-    try:
-        pyarrow.parquet.write_table(pa.Table.from_pylist([
-            {k: None if isinstance(v, float) and np.isnan(v) else v for k, v in row.items()}
-            for row in rows], schema), draft)
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)

@@ -19,7 +19,9 @@ from mag_tracking.apps.archive_stretches import StretchWriter, read_stretch
 from mag_tracking.apps.archive_work import Job, cut, join, track_stretch
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
-from mag_tracking.recording.archive_folder import TableWriter, join_tables, stamped
+from mag_tracking.recording.archive_folder import join_tables, stamped
+from mag_tracking.recording.archive_tables import TABLES
+from mag_tracking.recording.parquet_table import TableWriter
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.doubts import CLOCKS_APART
 from support.archives import command, rows, same_tables, wait_for
@@ -249,7 +251,7 @@ def test_rows_are_by_the_day_and_what_is_not_known_is_null(whole):
 
 def test_a_recording_over_midnight_is_in_two_days(tmp_path):
     midnight = 20_000 * 86_400 * 10**9
-    with TableWriter(tmp_path / 'part.parquet', 'health') as table:
+    with TableWriter(tmp_path / 'part.parquet', TABLES['health']) as table:
         for k in (-2, -1, 0, 1):
             table.add({**stamped(tmp_path / 'a.mcap', midnight + k), 'sensor': 'mag_1'})
     assert join_tables([tmp_path / 'part.parquet'], [0], 'health', tmp_path, 'a') == 4

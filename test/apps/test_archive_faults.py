@@ -16,7 +16,9 @@ from mag_tracking.apps.archive import archive, recordings_of
 from mag_tracking.cli import main
 from mag_tracking.errors import ClusterError, OutputError, RecordingError
 from mag_tracking.pipeline import settings_for
-from mag_tracking.recording.archive_folder import ArchiveFolder, TableWriter, name_of, state_of
+from mag_tracking.recording.archive_folder import ArchiveFolder, name_of, state_of
+from mag_tracking.recording.archive_tables import TABLES
+from mag_tracking.recording.parquet_table import TableWriter
 from support.archives import command, rows, same_tables, wait_for
 from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 from support.mqtt_broker import free_port
@@ -147,13 +149,14 @@ def test_a_full_disk_stops_the_run_and_another_goes_on(tmp_path, recordings, who
 
 
 def test_a_table_is_whole_or_not_there(tmp_path):
-    with pytest.raises(RuntimeError), TableWriter(tmp_path / 'a.parquet', 'health') as table:
+    health = TABLES['health']
+    with pytest.raises(RuntimeError), TableWriter(tmp_path / 'a.parquet', health) as table:
         table.add({'stamp_ns': 1})
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
     (tmp_path / 'file').write_text('')
     with pytest.raises(OutputError, match='cannot write'):
-        TableWriter(tmp_path / 'file' / 'c.parquet', 'health')
+        TableWriter(tmp_path / 'file' / 'c.parquet', health)
 
 
 def test_names_of_recordings(tmp_path, recordings):

@@ -13,8 +13,9 @@ import mag_tracking as mt
 from mag_tracking.cli import main
 from mag_tracking.errors import SettingsError
 from mag_tracking.messages.types import MAGNETIC_FIELD
+from mag_tracking.recording.traffic_tables import tables_of
 from mag_tracking.recording.writer import RecordingWriter
-from support.bundled import DATA, NETWORK_FILE, QUICK, vehicle_path
+from support.bundled import DATA, NETWORK_FILE, QUICK, ROOT, vehicle_path
 from support.busy_recordings import network_of_recording, rightly_counted
 from support.samples import field_dict
 
@@ -65,6 +66,8 @@ def test_speeds_by_track_and_by_delay_agree_along_a_road():
     assert one.passage.speed == pytest.approx(one.delay.speed, rel=0.1)
     wrong = dataclasses.replace(one.passage, speed=1.3 * one.passage.speed, speed_std=0.1)
     assert dataclasses.replace(one, passage=wrong).speeds_contradict
+    back = dataclasses.replace(one.passage, velocity=-one.passage.velocity)
+    assert dataclasses.replace(one, passage=back).speeds_contradict
     # Sensors on both sides of a road feel different fields.
     assert all(v.delay.reason and not v.speeds_contradict for v in road().vehicles)
 
@@ -119,6 +122,13 @@ def test_tables_without_rows_have_their_columns(tmp_path, capsys):
             (pd.read_csv, 'csv'), (pd.read_parquet, 'parquet')))
         assert list(csv_rows.columns) == list(rows.columns) and len(rows) == n
         assert str(rows['delay_speed'].dtype) == 'float64'
+
+
+def test_every_column_is_described():
+    text = (ROOT / 'docs' / 'traffic.md').read_text()
+    for columns in tables_of((), True).values():
+        for c in columns:
+            assert f'`{c.name}`' in text and c.meaning, c.name
 
 
 def test_what_stops_a_run_is_found_before_it(tmp_path, capsys):

@@ -1,18 +1,24 @@
-"""`make bench`: vehicle classes by moment and length, of simulated passes of both simulators."""
+"""`make bench`: vehicle classes by moment and length, and by signatures of one sensor.
+
+Both simulators; signatures are trained and tested on splits.
+"""
 
 import sys
+from functools import partial
 
 import numpy as np
 from tqdm import tqdm
 
 from bench.figures import Figures
 from mag_tracking.analysis.signature_classifier import reliability_error
+from mag_tracking.apps.classes import evaluate_classes, examples_of
 from mag_tracking.event_records import VehiclePassage
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.simulation.scenario import Imperfections
 from support.box_vehicles import BOUGHT, random_drive
 from support.bundled import NETWORK_FILE
+from support.labelled_passes import signatures
 from support.random_passes import SIMULATORS, random_course
 from support.samples import scenario
 from support.situation_worlds import car, small, truck
@@ -21,6 +27,8 @@ SHARES = {'motorcycle': 0.05, 'car': 0.8, 'truck': 0.15}
 """Those of `traffic.class_shares`."""
 N = 120
 """Passes of each simulator."""
+EXAMPLES = {'motorcycle': 30, 'car': 160, 'truck': 30}
+"""Signatures of each class."""
 LEAST_RIGHT, MOST_APART = 0.95, 0.05
 
 
@@ -67,6 +75,16 @@ def main():
         best = np.array([classes[int(np.argmax(p.class_probabilities))] == name
                          for name, p in counted])
         figures.add(f'{simulator}: reliability error', reliability_error(stated, best), '',
+                    MOST_APART)
+    for simulator in SIMULATORS:
+        examples = examples_of(signatures(EXAMPLES, simulator))
+        found = evaluate_classes(examples, progress=partial(
+            tqdm, desc='splits', disable=None, leave=False))
+        figures.add(f'{simulator}, one sensor: accuracy', float(found.accuracy.mean()), '', None,
+                    True, f' (of the largest class {found.majority:.3f})')
+        figures.add(f'{simulator}, one sensor: balanced accuracy',
+                    float(found.balanced_accuracy.mean()), '', None, True)
+        figures.add(f'{simulator}, one sensor: reliability error', found.reliability, '',
                     MOST_APART)
     return figures.save()
 

@@ -14,9 +14,8 @@ from mag_tracking.analysis.direction_likelihood import (
 )
 from mag_tracking.inference.driving_direction import (
     FieldRotation,
-    field_rotation,
     fused_log_odds,
-    lag_of,
+    rotation_of_pass,
 )
 from support.passes import EARTH
 from support.situation_worlds import car, truck
@@ -60,11 +59,8 @@ class Passing:
     def rotations(self):
         """`FieldRotation` of each sensor; none where the field tells nothing."""
         pad = int(PAD_S * RATE)
-        out = []
-        for field in self.field:
-            lag = lag_of(field, NOISE, pad)
-            out.append(field_rotation(field, NOISE, lag) if lag else FieldRotation(0.0, 1.0))
-        return out
+        return [rotation_of_pass(field, NOISE, pad) or FieldRotation(0.0, 1.0)
+                for field in self.field]
 
     def likelihood_ratio_of_north(self):
         """(log likelihood ratio of each sensor, their sum) of a vehicle along x."""

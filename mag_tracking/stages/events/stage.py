@@ -6,7 +6,11 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.event_records import SIGNATURE_SPAN, PassEvent
-from mag_tracking.inference.driving_direction import horizontal_field, turning
+from mag_tracking.inference.driving_direction import (
+    MOST_SURE,
+    horizontal_field,
+    rotation_of_pass,
+)
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Detection, Readings
 from mag_tracking.stages.align.settings import AlignSettings
@@ -149,14 +153,20 @@ class _SensorEvents:
         closest = closest_point(t, field, noise)
         horizontal = horizontal_field(field, self._R_ws)
         known = ~np.isnan(horizontal).any(axis=1)
-        _, left = turning(horizontal[known], float(np.nanmean(noise)) if known.any() else 0.0,
-                          int(np.count_nonzero(stamp < onset_ns)))
+        left = _left_to_right(horizontal[known], float(np.nanmean(noise)) if known.any() else 0.0,
+                              int(np.count_nonzero(stamp < onset_ns)))
         return PassEvent(
             self._name, self._n, ended, onset_ns, release_ns, int(stamp[peak]), field[peak],
             float(np.sum(size[inside]) * _interval(stamp)),
             ''.join(np.array(list('xyz'))[there]), noise,
             onset_ns + int(round(closest.time * NS)), closest.time_std, closest.time_scale, left,
             _signature(t, field, closest.time, closest.time_scale))
+
+
+def _left_to_right(horizontal: FloatArray, noise_std: float, n_quiet: int) -> float:
+    """Probability of a target that moves from left to right; 0.5 where the field does not tell."""
+    found = rotation_of_pass(horizontal, noise_std, n_quiet)
+    return 0.5 if found is None else float(np.clip(found.left_to_right, 1.0 - MOST_SURE, MOST_SURE))
 
 
 def _noise_of(readings: Readings) -> FloatArray:

@@ -79,15 +79,14 @@ class _Start:
 
     bank_filter: BankFilter
     bank: FilterBank | StartingBank
-    window: Window | None = None
-    """The frames with which it began again, with the paths of the hypotheses."""
+    paths: tuple[FloatArray, ...] = ()
+    """(n_hyp, n_x) states of all hypotheses at the first frames, as far as they are known."""
+    origin: IntArray | None = None
+    """(n_hyp,) of the `paths`."""
 
     def path_of(self, origin: int) -> list[FloatArray]:
-        """The path of a hypothesis through the frames of the window."""
-        if self.window is None:
-            return []
-        row = int(np.flatnonzero(self.window.anchor.origin == origin)[0])
-        return [path[row] for path in self.window.paths]
+        """The path of a hypothesis through the first frames, as far as it is known."""
+        return [path[self.origin == origin][0] for path in self.paths]
 
 
 class WholeTrack:
@@ -120,10 +119,9 @@ class WholeTrack:
         anchor = window.anchor.rows(np.arange(len(window.anchor)))
         self.begin(anchor, bank_filter)
         if self._start is not None:
-            # The window goes on, and drops what this still needs.
-            kept = replace(window, anchor=window.anchor.rows(np.arange(len(window.anchor))),
-                           paths=[path.copy() for path in window.paths])
-            self._start = replace(self._start, window=kept)
+            # The window moves its paths on.
+            self._start = replace(self._start, origin=anchor.origin.copy(),
+                                  paths=tuple(path.copy() for path in window.paths))
         self._updated = window.is_updated
         for frame, dt in zip(window.frames, window.intervals, strict=True):
             self.add(anchor, frame, dt, True)

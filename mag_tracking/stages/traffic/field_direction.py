@@ -5,12 +5,10 @@ from collections import deque
 import numpy as np
 
 from mag_tracking.inference.driving_direction import (
-    LEAST_SAMPLES,
     MOST_SURE,
-    field_rotation,
     fused_log_odds,
     horizontal_field,
-    lag_of,
+    rotation_of_pass,
 )
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.counting_line import Crossing
@@ -85,10 +83,10 @@ class FieldDirection:
         field = horizontal_field(np.array([f.field[j] for f in frames]).reshape(-1, 3),
                                  self._network.R_ws[j])
         known = ~np.isnan(field).any(axis=1)
-        if np.count_nonzero(known) < LEAST_SAMPLES:
+        if not known.any():
             return None
         variance = [np.nanmean(np.diagonal(frames[k].covariance[j]))
                     for k in np.flatnonzero(known).tolist()]
         noise = float(np.sqrt(np.median(variance)))
-        lag = lag_of(field[known], noise, len(frames) // 4)
-        return field_rotation(field[known], noise, lag).log_odds if lag else None
+        found = rotation_of_pass(field[known], noise, len(frames) // 4)
+        return None if found is None else found.log_odds

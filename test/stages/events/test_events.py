@@ -9,7 +9,7 @@ import pytest
 import mag_tracking as mt
 from mag_tracking.cli import main
 from mag_tracking.event_records import PassEvent
-from mag_tracking.inference.driving_direction import MOST_SURE, turning
+from mag_tracking.inference.driving_direction import rotation_of_pass
 from mag_tracking.messages.schema import pass_event_dict
 from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.pipeline import settings_for
@@ -67,9 +67,9 @@ def test_the_field_turns_with_the_direction_whatever_the_moment(left_to_right):
     rng = np.random.default_rng(1)
     for _ in range(200):
         _, field, _, _ = passing(rng, 1e-6, 0.0, left_to_right)
-        f, p = turning(field[:, :2], 1e-6, 50)
-        assert (f < 0.0) == left_to_right
-        assert p == pytest.approx(MOST_SURE if left_to_right else 1.0 - MOST_SURE)
+        found = rotation_of_pass(field[:, :2], 1e-6, 50)
+        assert (found.correlation < 0.0) == left_to_right
+        assert found.error_probability < 1e-6
 
 
 @pytest.mark.parametrize('noise', [0.1, 0.3, 0.5])
@@ -79,7 +79,7 @@ def test_the_probability_of_the_direction_is_calibrated(noise):
     for _ in range(600):
         way = bool(rng.integers(2))
         _, field, _, _ = passing(rng, noise, 0.0, way)
-        p = turning(field[:, :2], noise, 50)[1]
+        p = rotation_of_pass(field[:, :2], noise, 50).left_to_right
         said.append(max(p, 1.0 - p))
         right.append((p > 0.5) == way)
     # 0.05 is the aim of the specification; three standard deviations of the count come on top.
@@ -91,12 +91,13 @@ def test_the_direction_does_not_depend_on_how_the_sensor_is_turned():
     _, field, _, _ = passing(rng, 1e-3)
     c, s = np.cos(1.1), np.sin(1.1)
     turned = field[:, :2] @ np.array([[c, -s], [s, c]])
-    assert turning(turned, 1e-3, 50)[0] == pytest.approx(turning(field[:, :2], 1e-3, 50)[0])
+    assert rotation_of_pass(turned, 1e-3, 50) == pytest.approx(
+        rotation_of_pass(field[:, :2], 1e-3, 50))
 
 
 def test_nothing_is_said_of_too_few_readings():
-    assert turning(np.zeros((3, 2)), 1.0, 1) == (0.0, 0.5)
-    assert turning(np.zeros((50, 2)), 1.0, 10)[1] == pytest.approx(0.5)
+    assert rotation_of_pass(np.zeros((3, 2)), 1.0, 1) is None
+    assert rotation_of_pass(np.zeros((50, 2)), 1.0, 10) is None
     assert closest_point(np.arange(5.0), np.ones((5, 3)), np.ones(3)).time_std == np.inf
     assert np.isnan(closest_point(np.zeros(0), np.zeros((0, 3)), np.ones(3)).time)
 

@@ -115,6 +115,23 @@ def test_the_smoothed_path_is_the_one_that_counts():
     assert p.stamp_ns == pytest.approx(3.9 * NS, abs=1000) and p.speed == pytest.approx(12.0)
 
 
+def test_late_poses_of_a_lag_are_not_a_smoothed_path():
+    one = drive(2.0, 6.0, 4.0)
+    one[60] += [smoothed_pose(t, 12.0 * (t - 3.9), v=12.0, complete=False)
+                for t in np.arange(2.0, 6.0, STEP)]
+    (p,) = passages(counted(one)[0])
+    assert p.stamp_ns == pytest.approx(4.0 * NS, abs=1000) and p.speed == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize(('at_s', 'speed'), [(4.02, 10.0), (4.08, 11.0)])
+def test_a_passage_has_the_speed_of_the_pose_that_is_closest_in_time(at_s, speed):
+    one = drive(2.0, 6.0, at_s)
+    after = {k: [replace(r, velocity=1.1 * r.velocity) for r in rs]
+             for k, rs in one.items() if k * STEP > at_s}
+    (p,) = passages(counted({**one, **after})[0])
+    assert p.speed == pytest.approx(speed)
+
+
 def test_passages_come_in_order_and_have_headways():
     slow = drive(1.0, 12.0, 8.0, 2.0)
     fast = [drive(3.0, 6.0, 4.0, 20.0, id=2), drive(6.0, 11.0, 7.5, -15.0, id=3)]
