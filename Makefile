@@ -72,7 +72,7 @@ studies: $(STAMP)  ## the tests that take many runs or all of the recordings
 # All of them run, also where one misses an aim.
 bench: $(STAMP)  ## measure times and accuracies
 	@rm -f benchmarks/latest.json
-	@status=0; for figures in start replay many_sensors archive bench recordings directions classes matched ambiguous_poses extended_target two_simulators busy spoilt_passes \
+	@status=0; for figures in start replay many_sensors archive bench recordings directions classes matched joint_fits ambiguous_poses extended_target two_simulators busy spoilt_passes \
 		situations standing junction_error pass_search load pages 'load --sensors 2 --lean --minutes 2' \
 		'load --sensors 2 --lean --minutes 2 --one-process --batches' chain figures; do \
 		echo "PYTHONPATH=test $(BIN)/python -m bench.$$figures"; \

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from mag_tracking.analysis.placement import PlannedTarget, Sampling
     from mag_tracking.apps.events import EventsResult, events
-    from mag_tracking.apps.fit import FitResult, FittedPass, fit
+    from mag_tracking.apps.fit import FitResult, fit
+    from mag_tracking.apps.pass_fitter import FittedPass
     from mag_tracking.apps.plan import Plan
     from mag_tracking.apps.plan_inputs import plan
     from mag_tracking.apps.readings import RecordedReadings, read_recording, readings_from_arrays
@@ -50,7 +51,8 @@ __all__ = [
 _MODULES = {
     'analysis.placement': ('PlannedTarget', 'Sampling'),
     'apps.events': ('EventsResult', 'events'),
-    'apps.fit': ('FitResult', 'FittedPass', 'fit'),
+    'apps.fit': ('FitResult', 'fit'),
+    'apps.pass_fitter': ('FittedPass',),
     'apps.plan': ('Plan',),
     'apps.plan_inputs': ('plan',),
     'apps.readings': ('RecordedReadings', 'read_recording', 'readings_from_arrays'),

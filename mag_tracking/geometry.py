@@ -158,3 +158,28 @@ def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, flo
         return 0.0, float('inf')
     g = np.array([-vy, vx]) / (vx * vx + vy * vy)
     return float(np.arctan2(vy, vx)), float(np.sqrt(g @ covariance[:2, :2] @ g))
+
+
+def overlap(position: FloatArray, velocity: FloatArray, need: ArrayLike,
+            width: float) -> FloatArray:
+    """[m] By how much two bodies are in each other along the way of the second; 0 = not at all.
+
+    Parameters
+    ----------
+    position, velocity : (2, n, 2 or 3) [m], [m/s]
+        Of the middles of both.
+    need : float or (n,) [m]
+        So far apart they are clear of each other, along the way of the second.
+    width : float [m]
+        They are when they are so far apart across it, too.
+
+    Returns
+    -------
+    (n,)
+    """
+    away = position[0, :, :2] - position[1, :, :2]
+    size = np.maximum(np.linalg.norm(velocity[1, :, :2], axis=1), 1e-6)
+    forward = velocity[1, :, :2] / size[:, None]
+    along = np.abs(np.einsum('ni,ni->n', away, forward))
+    across = np.abs(away[:, 0] * forward[:, 1] - away[:, 1] * forward[:, 0])
+    return np.where(across < width, np.maximum(need - along, 0.0), 0.0)

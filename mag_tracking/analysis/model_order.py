@@ -31,7 +31,7 @@ def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
         return np.full(len(fits), np.inf)
     richest = max(usable, key=lambda f: f.n_dipoles)
     excess = max(1.0, richest.normalised_cost)
-    criteria: FloatArray = np.array([f.cost / excess + len(f.x) * np.log(f.data.n_values)
+    criteria: FloatArray = np.array([f.cost / excess + f.n_unknowns * np.log(f.data.n_values)
                          if f.determined else np.inf for f in fits])
     relative: FloatArray = criteria - criteria.min()
     return relative

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.inference.least_squares import SeparableModel, SeparableProblem
+from mag_tracking.inference.separable_fit import SeparableModel, SeparableProblem
 from mag_tracking.network import SensorNetwork
 from mag_tracking.units import NS
 
@@ -139,8 +139,8 @@ class PassData:
         return out
 
 
-def separable_problem(data: PassData, model_of: ModelOf,
-                      relative_error: float = 0.0) -> SeparableProblem:
+def separable_problem(data: PassData, model_of: ModelOf, relative_error: float = 0.0,
+                      prior: tuple[FloatArray, FloatArray] | None = None) -> SeparableProblem:
     """The fit of a pass as a `SeparableProblem`, the sensors' backgrounds being unknown.
 
     Parameters
@@ -151,6 +151,8 @@ def separable_problem(data: PassData, model_of: ModelOf,
         `SeparableModel`.
     relative_error : float
         Each sample counts as if its field were wrong by this share of itself, too.
+    prior : (mean, std), optional
+        Of the path; see `SeparableProblem`.
 
     Returns a `SeparableProblem`.
     """
@@ -161,7 +163,7 @@ def separable_problem(data: PassData, model_of: ModelOf,
         W = W / np.sqrt(1.0 + relative_error**2 * size2)[:, None, None]
     model = model_of(data.t, data.positions, W @ data.network.R_sw[data.sensor])
     y = np.einsum('nij,nj->ni', W, np.nan_to_num(data.field)).ravel()
-    return SeparableProblem(model, y, background_columns(data, W))
+    return SeparableProblem(model, y, background_columns(data, W), prior)
 
 
 def background_columns(data: PassData, W: FloatArray) -> FloatArray:

@@ -73,18 +73,21 @@ def _of_sensors(data: PassData, whitened: FloatArray, target: FloatArray, covari
     return total
 
 
-def velocity_change(data: PassData, whitened: FloatArray, left: FloatArray, velocity: FloatArray,
-                    seen_s: float) -> tuple[float, float]:
+def velocity_change(data: PassData, whitened: FloatArray, left: FloatArray, first: int,
+                    velocity: FloatArray, seen_s: float) -> tuple[float, float]:
     """Share of itself by which the velocity would like to change while the target is seen.
 
     One step of Gauss and Newton from the minimum, with a constant horizontal acceleration more
-    among the unknowns: it moves the target by t^2/2, as its start moves it by 1. Returns the share
-    and its deviation, by noise and by what is left over with the acceleration.
+    among the unknowns: it moves the target by t^2/2, as its start moves it by 1, whose x and y are
+    the unknowns `first` and the next one. Returns the share and its deviation, by noise and by what
+    is left over with the acceleration.
     """
-    moved = 0.5 * np.square(data.t)[:, None, None] * whitened[:, :, :2]
+    moved = 0.5 * np.square(data.t)[:, None, None] * whitened[:, :, first:first + 2]
     wider = np.concatenate([whitened, moved], axis=2)
     flat = wider.reshape(left.size, -1)
     size = np.linalg.norm(flat, axis=0)
+    # What nothing depends on has no derivative.
+    size[size == 0.0] = 1.0
     inverse = np.linalg.pinv(flat / size, rcond=1e-8) / size[:, None]
     step, covariance = inverse @ left.ravel(), inverse @ inverse.T
     rest = (left.ravel() - flat @ step).reshape(left.shape)

@@ -89,11 +89,19 @@ class PassFit:
     """(n, 3) [T], sensor frame, with the background."""
     predicted_std: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     """(n, 3) [T], by the honest covariance, without noise."""
+    n_others: int = 0
+    """How many more unknowns the fit had: those of other targets in the same window, the field of
+    which `data` are without."""
+
+    @property
+    def n_unknowns(self) -> int:
+        """How many unknowns were fitted together."""
+        return len(self.x) + self.n_others
 
     @property
     def degrees_of_freedom(self) -> float:
         """Independent measurements less unknowns."""
-        return self.data.n_independent - len(self.x)
+        return self.data.n_independent - self.n_unknowns
 
     @property
     def normalised_cost(self) -> float:

@@ -6,6 +6,9 @@ direction and time of the closest point then have deviations of their own, and e
 not by those. The whole fit is refused only where something is not determined.
 """
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
@@ -61,21 +64,27 @@ def reach(n_dipoles: int, length: float) -> float:
     return max(LEAST_ROW_REACH, ROW_REACH * abs(length) / (n_dipoles - 1))
 
 
-def left_elsewhere(data: PassData, n_dipoles: int, theta: FloatArray, target: FloatArray,
-                   left: FloatArray) -> float:
-    """Share of the whitened energy of the target's field left over where no vehicle leaves it.
+class FittedRow(NamedTuple):
+    """A row of dipoles of a fit."""
+
+    n_dipoles: int
+    theta: FloatArray
+    """(6 or 7,) the path: position at time zero, velocity, length."""
+    field: FloatArray
+    """(n, 3) [T], sensor frame."""
+
+
+def left_elsewhere(data: PassData, rows: Sequence[FittedRow], left: FloatArray) -> float:
+    """Share of the whitened energy of the targets' field left over where no vehicle leaves it.
 
     A vehicle leaves something over in proportion to its field, and the more the nearer it is; a
-    second vehicle does so at another time.
+    further vehicle does so at another time.
 
     Parameters
     ----------
     data : PassData
-    n_dipoles : int
-    theta : (6 or 7,)
-        The path: position at time zero, velocity, length.
-    target : (n, 3) [T]
-        The target's field, sensor frame.
+    rows : list of FittedRow
+        The targets, `n` samples each.
     left : (n, 3)
         Whitened residuals.
 
@@ -84,16 +93,29 @@ def left_elsewhere(data: PassData, n_dipoles: int, theta: FloatArray, target: Fl
     float
         What is beyond ICASSP11 eq. (9), with `reach` for lambda, and beyond noise.
     """
+    def energy(field: FloatArray) -> FloatArray:
+        whitened = np.einsum('nij,nj->ni', data.whitening, field)
+        size2: FloatArray = np.einsum('ni,ni->n', whitened, whitened)
+        return size2
+
+    known = sum((_share_left(data, row) * energy(row.field) for row in rows), np.zeros(len(left)))
+    beyond = np.square(left).sum(axis=1) - known - NOISE_ENERGY
+    everything = energy(np.sum([row.field for row in rows], axis=0))
+    return float(np.maximum(beyond, 0.0).sum() / everything.sum())
+
+
+def _share_left(data: PassData, row: FittedRow) -> FloatArray:
+    """(n,) share of a target's energy that it may leave over in each sample."""
+    n_dipoles, theta, _ = row
     v = theta[3:6]
     ahead = np.linspace(-0.5, 0.5, n_dipoles) * theta[6] if n_dipoles > 1 else np.zeros(1)
     forward = v / np.linalg.norm(v)
     place = theta[:3] + data.t[:, None] * v - data.positions
     distance = np.linalg.norm(place[:, None] + ahead[:, None] * forward, axis=2).min(axis=1)
-    energy = np.square(np.einsum('nij,nj->ni', data.whitening, target)).sum(axis=1)
     length = float(theta[6]) if n_dipoles > 1 else 0.0
-    share = np.minimum(1.0, np.square(reach(n_dipoles, length) / np.maximum(distance, 1e-9)))
-    beyond = np.square(left).sum(axis=1) - share * energy - NOISE_ENERGY
-    return float(np.maximum(beyond, 0.0).sum() / energy.sum())
+    share: FloatArray = np.minimum(1.0, np.square(
+        reach(n_dipoles, length) / np.maximum(distance, 1e-9)))
+    return share
 
 
 def doubt(fit: PassFit) -> str:
@@ -141,7 +163,7 @@ def _no_pass(fit: PassFit) -> str:
     """Why a minimum is no pass of one target at constant velocity, or nothing."""
     if not fit.converged:
         return 'the fit did not converge'
-    if not _describes(fit):
+    if not describes(fit):
         return (f'not one target at constant velocity: {1.0 - fit.explained:.1%} of the field is '
                 f'left over, {fit.left_elsewhere:.1%} where a vehicle at that distance leaves none '
                 '(two vehicles in the window, a turn, a wrong network file)')
@@ -153,7 +175,7 @@ def _no_pass(fit: PassFit) -> str:
     return ''
 
 
-def _describes(fit: PassFit) -> bool:
+def describes(fit: PassFit) -> bool:
     """Whether what is left over is where real vehicles leave it."""
     limit = max(LEAST_ELSEWHERE, MOST_ELSEWHERE * (1.0 - fit.explained))
     return fit.left_elsewhere <= limit
@@ -166,7 +188,7 @@ def turns(fit: PassFit) -> bool:
 
 def contradicted(fit: PassFit) -> bool:
     """Whether a fit says that there was not one target on a straight line, whatever the order."""
-    return fit.n_dipoles > 1 and (turns(fit) or not _describes(fit))
+    return fit.n_dipoles > 1 and (turns(fit) or not describes(fit))
 
 
 def _nearest(fit: PassFit) -> float:

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from mag_tracking.analysis.correlated_motion import correlated_motion
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.apps.archive_stretches import Piece
-from mag_tracking.apps.fit import FittedPass
+from mag_tracking.apps.pass_fitter import fitted_vehicles
+from mag_tracking.apps.pass_tracks import PassTracks, ground_of
 from mag_tracking.apps.replay import RunCollector
 from mag_tracking.event_records import Disturbance
 from mag_tracking.recording.archive_folder import stamped
@@ -21,6 +21,7 @@ from mag_tracking.recording.parquet_table import TableWriter
 from mag_tracking.records import Detection, FieldFrame, SmoothedPose, Track
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.stages.track.manager import TrackManager
+from mag_tracking.stages.track.settings import TrackSettings
 
 TRACKED = ('tracks', 'poses', 'smoothed', 'passes')
 """The tables that a stretch has rows of."""
@@ -34,9 +35,14 @@ class StretchTables:
     n_tracks, n_passes : int
     """
 
-    def __init__(self, recording: Path, paths: dict[str, Path], n_dipoles: int) -> None:
-        """`paths` of the tables `TRACKED`; passes are fitted with rows of `n_dipoles`."""
+    def __init__(self, recording: Path, paths: dict[str, Path], n_dipoles: int,
+                 settings: TrackSettings) -> None:
+        """`paths` of the tables `TRACKED`; passes are fitted with rows of `n_dipoles`.
+
+        `settings` are those of the tracker.
+        """
         self._recording, self._n_dipoles = recording, n_dipoles
+        self._tracks, self._ground = PassTracks(settings), ground_of(settings)
         self._files = ExitStack()
         self._tables = {name: self._files.enter_context(TableWriter(paths[name], TABLES[name]))
                         for name in TRACKED}
@@ -54,7 +60,9 @@ class StretchTables:
         for frame, doubts in piece.frames():
             if doubts is not None:
                 tracker.doubt(doubts)
-            self._collector.take([frame, *tracker.feed(frame)])
+            records = tracker.feed(frame)
+            self._tracks.take(records)
+            self._collector.take([frame, *records])
         for log in [log for log in self._collector.logs.values() if log.ended]:
             self._add_track_row(log)
         for one in piece.passes:
@@ -106,16 +114,17 @@ class StretchTables:
             | _track_columns(log, smoothed))
 
     def _add_pass(self, number: int, data: PassData, notes: tuple[str, ...]) -> None:
-        """The row of a pass, fitted as a whole."""
-        fitted = FittedPass(self._recording.stem, number, (fit_pass(data, self._n_dipoles),), notes,
-                            correlated_motion(data))
-        row = pass_rows(fitted)[0]
+        """The rows of a pass, one a vehicle, fitted as a whole."""
         self.n_passes += 1
-        self._tables['passes'].add(
-            {name: _number(value) if isinstance(value, float) else value
-             for name, value in row.items() if name not in ('recording', 'pass')}
-            | stamped(self._recording, row['stamp_ns'])
-            | {'number': number, 'notes': '; '.join(notes)})
+        alone = (fit_pass(data, self._n_dipoles),)
+        for one in fitted_vehicles(self._recording.stem, number, data, alone,
+                                   self._tracks.paths(data), self._ground, notes):
+            row = pass_rows(one)[0]
+            self._tables['passes'].add(
+                {name: _number(value) if isinstance(value, float) else value
+                 for name, value in row.items() if name not in ('recording', 'pass')}
+                | stamped(self._recording, row['stamp_ns'])
+                | {'number': number, 'notes': '; '.join(one.notes)})
 
 
 _STATE = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz', 'mx',

@@ -208,7 +208,7 @@ def _track_into(folder: Path, job: Job, k: int, evidence: NotedEvidence) -> None
     """Track a stretch by the `evidence` on the clocks of those before it; its tables."""
     tracker = TrackManager(job.network, job.settings.track, evidence)
     with StretchTables(job.recording, {name: folder / f'{name}.parquet' for name in TRACKED},
-                       N_DIPOLES) as tables:
+                       N_DIPOLES, job.settings.track) as tables:
         for piece in read_stretch(job.cut / f'stretch-{k}.pickle'):
             tables.track(piece, tracker)
         tables.finish(tracker)

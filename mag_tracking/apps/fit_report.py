@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mag_tracking.analysis.pass_result import PassFit
-from mag_tracking.apps.fit import FittedPass
+from mag_tracking.apps.pass_fitter import FittedPass
 from mag_tracking.files import replace_text
 from mag_tracking.network import SensorNetwork
 from mag_tracking.report.fit_figures import target_alone
@@ -81,7 +81,7 @@ def _track(number: int, one: FittedPass, fit: PassFit, begin: float) -> dict[str
                           begin + data.t[data.sensor == j]) for j in data.sensors]
     entry = fitted_entry(number, begin + t, state, C, fit.ambiguous, fields)
     entry['facts'] = {
-        'label': f'{one.recording}, pass {one.number}', 'kind': _dipoles(fit.n_dipoles),
+        'label': f'{one.recording}, {one.label}', 'kind': _dipoles(fit.n_dipoles),
         'speed': float(fit.speed[0]), 'moment': float(np.linalg.norm(fit.moment[0])),
         'verdict': ('ambiguous' if fit.ambiguous else 'unique')
         + f', cost {fit.normalised_cost:.2f}'}
@@ -99,7 +99,7 @@ def _order_chart(passes: Sequence[FittedPass]) -> Chart:
     for k, one in enumerate(passes):
         fits = [f for f in one.fits if len(f.x)]
         traces.append(curve([f.n_dipoles for f in fits], [f.normalised_cost for f in fits],
-                            f'{one.recording}, pass {one.number}', k, 'lines+markers'))
+                            f'{one.recording}, {one.label}', k, 'lines+markers'))
     layout = axes('number of dipoles', 'normalised cost (1 = the model is right)', log_y=True)
     layout['xaxis']['dtick'] = 1
     return Chart('How well a row of dipoles describes each pass', traces, layout)
@@ -110,7 +110,8 @@ def _table(passes: Sequence[FittedPass]) -> Table:
     rows: list[list[str | float | None]] = []
     for one in passes:
         for fit in one.fits:
-            row: list[str | float | None] = [one.recording, one.number, fit.n_dipoles]
+            row: list[str | float | None] = [one.recording, one.label.removeprefix('pass '),
+                                             fit.n_dipoles]
             known = bool(len(fit.x)) and not fit.reason
             row += [float(fit.normalised_cost) if len(fit.x) else None]
             row += [*map(float, fit.position), float(fit.speed[0]),

@@ -11,7 +11,8 @@ from tqdm import tqdm
 
 from mag_tracking.analysis.correlated_motion import disagree
 from mag_tracking.analysis.pass_result import Bearing, PassFit
-from mag_tracking.apps.fit import FittedPass, RecordingFit, check_cpa_range, check_orders
+from mag_tracking.apps.fit import RecordingFit, check_cpa_range, check_orders
+from mag_tracking.apps.pass_fitter import FittedPass
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import (
     Commands,
@@ -36,16 +37,20 @@ each as a whole: a row of 1, 2, 3, 4 dipoles at constant velocity (TSP14). For a
 vehicle on a straight road this is the most accurate that there is, and the normalised
 cost says whether to believe it: 1 = the model is right.
 
-A pass that this cannot describe (a turn, two vehicles at once, nothing but noise, one
+Two or three vehicles that are seen at once (the tracker, which runs along, says how many) are
+fitted together, and each gets a table of its own.
+
+A pass that this cannot describe (a turn, more vehicles at once, nothing but noise, one
 sensor alone, ...) gets a reason instead of numbers. Speed, direction and time of the closest
 point are judged each for itself, and given where they are determined. Where one sensor is
 behind another on the way, the delay between them gives speed and direction once more,
 without any model.
 
 Writes to DIR:
-  fits.csv, fits.json   a row a pass and order
+  fits.csv, fits.json   a row a pass, vehicle and order
   report.html           map, time slider and fields, to look at in a browser
-  *_pass_N.png          measured against fitted field, with 90 % bands
+  *_pass_N.png          measured against fitted field, with 90 % bands; of several
+                        vehicles *_pass_N_vehicle_K.png, without the others' field
   orders.png            normalised cost over the order
 
 examples:
@@ -133,7 +138,7 @@ def _check(args: argparse.Namespace, network: SensorNetwork) -> None:
 def _print_pass(one: FittedPass) -> None:
     """A table of the orders of one pass."""
     data = one.fits[0].data
-    print(f'{one.recording}, pass {one.number}: {data.n_values} measurements, '
+    print(f'{one.recording}, {one.label}: {data.n_values} measurements, '
           f'sensors: {", ".join(data.network.names[j] for j in data.sensors)}')
     for note in one.notes:
         print(f'  note: {note}')
@@ -257,9 +262,9 @@ def _draw(one: FittedPass, out: Path) -> None:
     from mag_tracking.report.figure_file import save_figure
     from mag_tracking.report.fit_figures import pass_figure
 
-    title = f'{one.recording}, pass {one.number}, {fit.n_dipoles} dipole{"s" * (fit.n_dipoles > 1)}'
+    title = f'{one.recording}, {one.label}, {fit.n_dipoles} dipole{"s" * (fit.n_dipoles > 1)}'
     save_figure(pass_figure(fit, title + (' (no answer)' if fit.reason else '')),
-                out / f'{one.recording}_pass_{one.number}.png')
+                out / f'{one.recording}_{one.label.replace(", ", "_").replace(" ", "_")}.png')
 
 
 def _draw_orders(passes: Sequence[FittedPass], out: Path) -> None:

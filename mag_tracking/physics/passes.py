@@ -4,6 +4,7 @@ The moments enter linearly, the path does not: a model gives the matrix of the f
 derivatives by the latter (`inference.least_squares` fits such models).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -57,6 +58,13 @@ class RowPass:
         d = self.n_dipoles
         return np.linspace(-0.5, 0.5, d, dtype=np.float64) if d > 1 else np.zeros(1)
 
+    def forward(self, theta: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Path (6 or 7,) and parameters (3 d,) of the same row with a length above zero."""
+        if self.n_dipoles == 1 or theta[6] >= 0.0:
+            return theta, p
+        moments = (self.combinations @ p).reshape(-1, 3)[::-1]
+        return np.append(theta[:6], -theta[6]), self.combinations.T @ moments.ravel()
+
     def basis(self, theta: FloatArray) -> FloatArray:
         """Fields of unit combinations, (n_paths, 3 n, 3 d), for paths theta (n_paths, 6 or 7)."""
         A = core.row_bases(np.ascontiguousarray(theta), self._places, self.t, self.positions,
@@ -68,3 +76,58 @@ class RowPass:
         return core.row_derivatives(
             np.ascontiguousarray(theta), np.ascontiguousarray(p @ self.combinations.T),
             self._places, self.t, self.positions, self.M)
+
+
+@dataclass(frozen=True)
+class SuperposedPasses:
+    """Several rows at once: their fields add up.
+
+    Path and linear parameters are those of the rows, one row after the other.
+    """
+
+    rows: tuple[RowPass, ...]
+
+    @classmethod
+    def of(cls, orders: Sequence[int], t: FloatArray, positions: FloatArray,
+           M: FloatArray) -> 'SuperposedPasses':
+        """Rows of `orders` dipoles; the rest is as for `RowPass`."""
+        return cls(tuple(RowPass(t, positions, M, n_dipoles) for n_dipoles in orders))
+
+    @cached_property
+    def paths(self) -> tuple[slice, ...]:
+        """Where the path of each row is."""
+        return _consecutive([len(row.names) for row in self.rows])
+
+    @cached_property
+    def moments(self) -> tuple[slice, ...]:
+        """Where the linear parameters of each row are."""
+        return _consecutive([3 * row.n_dipoles for row in self.rows])
+
+    def split(self, theta: FloatArray) -> list[FloatArray]:
+        """The path (6 or 7,) of each row."""
+        return [theta[own] for own in self.paths]
+
+    def forward(self, theta: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Paths (n_theta,) and parameters (k,) of the same rows with lengths above zero."""
+        turned = [row.forward(path, p[linear])
+                  for row, path, linear in zip(self.rows, self.split(theta), self.moments,
+                                               strict=True)]
+        return (np.concatenate([path for path, _ in turned]),
+                np.concatenate([moments for _, moments in turned]))
+
+    def basis(self, theta: FloatArray) -> FloatArray:
+        """Fields of unit parameters, (n_paths, 3 n, k), for paths theta (n_paths, n_theta)."""
+        return np.concatenate([row.basis(theta[:, own])
+                               for row, own in zip(self.rows, self.paths, strict=True)], axis=2)
+
+    def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
+        """d(basis(theta) p)/d(theta), (n_paths, 3 n, n_theta); `p` (n_paths, k)."""
+        return np.concatenate([
+            row.derivative(theta[:, own], p[:, linear])
+            for row, own, linear in zip(self.rows, self.paths, self.moments, strict=True)], axis=2)
+
+
+def _consecutive(sizes: Sequence[int]) -> tuple[slice, ...]:
+    """Slices of such sizes, one after the other."""
+    ends = np.cumsum(sizes).tolist()
+    return tuple(slice(end - size, end) for end, size in zip(ends, sizes, strict=True))

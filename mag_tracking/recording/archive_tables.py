@@ -51,6 +51,8 @@ TABLES: dict[str, tuple[Column, ...]] = {
     'smoothed': _POSES,
     'passes': (
         *_WHERE, *columns_of('i', '', number='number of the detection in the recording',
+                           vehicle='number of the vehicle among those of the detection',
+                           n_vehicles='vehicles that were fitted together',
                            n_dipoles='dipoles of the fitted row', n_values='measurements'),
         *columns_of('s', '', reason='why the fit is not to be believed; empty where it is',
                   trusted='what is to be believed all the same',

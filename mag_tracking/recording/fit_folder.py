@@ -17,8 +17,9 @@ from mag_tracking.files import new_text_file, output_folder
 from mag_tracking.report.json_text import without_nan
 
 FIT_COLUMNS = (
-    'recording', 'pass', 'n_dipoles', 'chosen', 'reason', 'stamp_ns', 'n_values', 'n_unknowns',
-    'normalised_cost', 'explained', 'left_elsewhere', 'velocity_change', 'trusted', 'ambiguous',
+    'recording', 'pass', 'vehicle', 'n_vehicles', 'n_dipoles', 'chosen', 'reason', 'stamp_ns',
+    'n_values', 'n_unknowns', 'normalised_cost', 'explained', 'left_elsewhere', 'velocity_change',
+    'trusted', 'ambiguous',
     'x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz',
     'speed', 'sd_speed', 'heading_deg', 'sd_heading_deg', 'length', 'sd_length',
     'mx', 'my', 'mz', 'sd_mx', 'sd_my', 'sd_mz', 'cpa_time', 'sd_cpa_time',
@@ -28,17 +29,21 @@ FIT_COLUMNS = (
 in seconds after `stamp_ns`. The rate is speed over CPA range, which one sensor alone tells; its
 directions are in `fits.json`. Where there is a reason not to believe a fit as a whole, there are
 the numbers that are trusted, if it is the fit of the pass that counts: speed, direction (heading)
-and time (of the CPA). The delay's columns are the same for all fits of a pass: they need no
-model."""
+and time (of the CPA). Vehicles that were fitted together have unknowns and costs in common. The
+delay's columns are the same for all fits of a pass: they need no model."""
 
 
 class _FittedPass(Protocol):
-    """See `apps.fit.FittedPass`."""
+    """See `apps.pass_fitter.FittedPass`."""
 
     @property
     def recording(self) -> str: ...
     @property
     def number(self) -> int: ...
+    @property
+    def vehicle(self) -> int: ...
+    @property
+    def n_vehicles(self) -> int: ...
     @property
     def fits(self) -> Sequence[PassFit]: ...
     @property
@@ -57,9 +62,10 @@ def fit_row(fit: PassFit, is_known: bool = True) -> dict[str, Any]:
     Where the fit has a reason not to be believed the target's numbers are NaN but for those that
     are trusted, if `is_known`: it is the fit of its pass that counts.
     """
-    row: dict[str, Any] = dict.fromkeys(FIT_COLUMNS[6:], math.nan)
+    row: dict[str, Any] = dict.fromkeys(FIT_COLUMNS[FIT_COLUMNS.index('stamp_ns'):], math.nan)
     row |= {'ambiguous': '', 'trusted': '', 'n_dipoles': fit.n_dipoles, 'reason': fit.reason,
-            'stamp_ns': fit.data.stamp_ns, 'n_values': fit.data.n_values, 'n_unknowns': len(fit.x)}
+            'stamp_ns': fit.data.stamp_ns, 'n_values': fit.data.n_values,
+            'n_unknowns': fit.n_unknowns}
     if len(fit.x):
         row |= {'normalised_cost': fit.normalised_cost, 'explained': fit.explained,
                 'left_elsewhere': fit.left_elsewhere, 'velocity_change': fit.velocity_change,
@@ -105,7 +111,8 @@ def pass_rows(one: _FittedPass) -> list[dict[str, Any]]:
     delay = {'delay_speed': c.speed, 'sd_delay_speed': c.speed_std,
              'delay_heading_deg': math.degrees(c.heading),
              'sd_delay_heading_deg': math.degrees(c.heading_std), 'no_delay': c.reason}
-    return [{'recording': one.recording, 'pass': one.number, **fit_row(fit, fit is known),
+    return [{'recording': one.recording, 'pass': one.number, 'vehicle': one.vehicle,
+             'n_vehicles': one.n_vehicles, **fit_row(fit, fit is known),
              'chosen': int(fit is chosen), **delay} for fit in one.fits]
 
 

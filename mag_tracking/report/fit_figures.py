@@ -77,7 +77,7 @@ class _FittedPass(Protocol):
     def recording(self) -> str: ...
 
     @property
-    def number(self) -> int: ...
+    def label(self) -> str: ...
 
     @property
     def fits(self) -> Sequence[_Fit]: ...
@@ -159,7 +159,7 @@ def order_figure(passes: Sequence[_FittedPass]) -> Figure:
             continue
         colour = SERIES[k % len(SERIES)]
         axes.semilogy([f.n_dipoles for f in fits], [f.normalised_cost for f in fits], 'o-',
-                      mfc='w', color=colour, label=literal(f'{one.recording}, pass {one.number}'))
+                      mfc='w', color=colour, label=literal(f'{one.recording}, {one.label}'))
         if one.chosen is not None:
             axes.semilogy([one.chosen.n_dipoles], [one.chosen.normalised_cost], 'o', ms=8,
                           color=colour)

@@ -8,7 +8,7 @@ import pytest
 from mag_tracking.analysis.pass_deviation import SensorErrors
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import PassFit
-from mag_tracking.analysis.pass_trust import left_elsewhere, reach, trusted
+from mag_tracking.analysis.pass_trust import FittedRow, left_elsewhere, reach, trusted
 from mag_tracking.apps.fit import RecordingFit
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.fit_folder import fit_row
@@ -46,11 +46,12 @@ def test_what_is_left_over_near_the_vehicle_is_not_elsewhere():
     near = np.minimum(1.0, 0.3 / np.linalg.norm(place, axis=1))[:, None]
     for left, low, high in ((0.0 * field, 0.0, 0.0), (near * field, 0.0, 1e-6),
                             (0.3 * field, 0.001, 0.2)):
-        share = left_elsewhere(data, 3, PATH, field, np.einsum('nij,nj->ni', W, left))
+        share = left_elsewhere(data, [FittedRow(3, PATH, field)], np.einsum('nij,nj->ni', W, left))
         assert low <= share <= high
     # The same energy at another time, as of a second vehicle.
     late = np.roll(field, 150, axis=0)
-    share = left_elsewhere(data, 3, PATH, field, np.einsum('nij,nj->ni', W, 0.2 * late))
+    share = left_elsewhere(data, [FittedRow(3, PATH, field)],
+                           np.einsum('nij,nj->ni', W, 0.2 * late))
     assert share > 0.02
 
 
@@ -58,8 +59,8 @@ def test_noise_is_nothing_left_over():
     data, field = field_and_data()
     left = np.random.default_rng(0).standard_normal(field.shape)
     weak = 1e-3 * field
-    assert left_elsewhere(data, 3, PATH, field, left) < 1e-6
-    assert left_elsewhere(data, 3, PATH, weak, left) < 0.05
+    assert left_elsewhere(data, [FittedRow(3, PATH, field)], left) < 1e-6
+    assert left_elsewhere(data, [FittedRow(3, PATH, weak)], left) < 0.05
 
 
 @pytest.mark.parametrize('seed', [34, 36])

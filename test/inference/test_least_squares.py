@@ -1,10 +1,12 @@
-"""Searches that run away."""
+"""Searches that run away, and what is known beforehand."""
 
 import warnings
 
 import numpy as np
+from scipy.optimize import least_squares
 
-from mag_tracking.inference.least_squares import SeparableProblem, project_out_linear, refine
+from mag_tracking.inference.least_squares import project_out_linear, refine
+from mag_tracking.inference.separable_fit import SeparableProblem
 
 
 class Grows:
@@ -37,3 +39,54 @@ def test_a_model_that_is_infinite_has_no_linear_part():
         p, _, inverse = project_out_linear(A, np.array([1.0, 2.0, 3.0]))
     np.testing.assert_allclose(p[0], [1.0, 2.0])
     assert np.isnan(inverse[1]).all()
+
+
+class Waves:
+    """a sin(f t) + b cos(f t), and a slope: of theta = (f, phase that nothing depends on)."""
+
+    t = np.linspace(0.0, 3.0, 40)
+
+    def basis(self, theta):
+        a = theta[:, :1] * self.t
+        return np.stack([np.sin(a), np.cos(a)], axis=2)
+
+    def derivative(self, theta, p):
+        a = theta[:, :1] * self.t
+        by_f = self.t * (np.cos(a) * p[:, :1] - np.sin(a) * p[:, 1:])
+        return np.stack([by_f, np.zeros_like(by_f)], axis=2)
+
+
+def waves(prior):
+    y = np.sin(2.0 * Waves.t) + 0.3 * np.random.default_rng(1).standard_normal(40)
+    return SeparableProblem(Waves(), y, prior=prior)
+
+
+def test_a_prior_counts_like_a_measurement():
+    """The minimum of Bayes' rule, by scipy on all unknowns at once."""
+    mean, std = np.array([2.4, 0.7]), np.array([0.05, 0.2])
+    problem, y = waves((mean, std)), np.sin(2.0 * Waves.t) + 0.3 * np.random.default_rng(
+        1).standard_normal(40)
+    x, cost, P, converged = refine(problem.residual_and_jacobian, mean[None] + 0.1)
+
+    def residual(u):
+        f, phase, a, b = u
+        return np.concatenate([y - a * np.sin(f * Waves.t) - b * np.cos(f * Waves.t),
+                               (mean - [f, phase]) / std])
+
+    peer = least_squares(residual, [2.4, 0.7, 1.0, 0.0], xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    np.testing.assert_allclose(x[0], peer.x[:2], rtol=1e-5)
+    assert converged[0] and np.isclose(cost[0], 2.0 * peer.cost)
+    np.testing.assert_allclose(problem.cost(x), cost)
+    # What nothing measures stays as it was known.
+    assert np.isclose(x[0, 1], 0.7) and np.isclose(P[0, 1, 1], 0.2**2)
+    covariance = np.linalg.inv(peer.jac.T @ peer.jac)
+    np.testing.assert_allclose(P[0, 0, 0], covariance[0, 0], rtol=1e-4)
+
+
+def test_an_infinite_deviation_says_nothing():
+    alone, known = waves(None), waves((np.array([9.0, 9.0]), np.full(2, np.inf)))
+    theta = np.array([[2.1, 0.0], [1.7, 3.0]])
+    np.testing.assert_array_equal(alone.cost(theta), known.cost(theta))
+    for a, b in zip(alone.residual_and_jacobian(theta), known.residual_and_jacobian(theta),
+                    strict=True):
+        np.testing.assert_array_equal(a, b)

@@ -7,12 +7,13 @@ import pytest
 
 from mag_tracking.analysis.pass_data import separable_problem
 from mag_tracking.analysis.pass_fit import fit_pass
-from mag_tracking.inference.least_squares import SeparableProblem, refine
+from mag_tracking.inference.least_squares import refine
+from mag_tracking.inference.separable_fit import SeparableProblem
 from mag_tracking.physics import pass_expansions, passes
 from mag_tracking.physics.anderson import anderson_field
 from mag_tracking.physics.multipole import multipole_moments
 from mag_tracking.physics.pass_expansions import AndersonPass, MultipolePass
-from mag_tracking.physics.passes import RowPass
+from mag_tracking.physics.passes import RowPass, SuperposedPasses
 from mag_tracking.simulation.scenario import random_vehicle
 from support.passes import NOISE, measured, network_of
 
@@ -22,7 +23,11 @@ T, PLACES, M = RNG.uniform(-1.0, 1.0, 6), RNG.uniform(-5.0, 5.0, (6, 3)), RNG.st
 EXAMPLES = {
     **{f'RowPass of {d}': RowPass(T, PLACES, M, d) for d in (1, 2, 3, 4)},
     **{f'MultipolePass of {d}': MultipolePass(T, PLACES, M, d) for d in (1, 2, 3)},
-    'AndersonPass': AndersonPass(T, M)}
+    'AndersonPass': AndersonPass(T, M),
+    'SuperposedPasses': SuperposedPasses.of((1, 3), T, PLACES, M)}
+WIDTHS = {name: model.paths[-1].stop if isinstance(model, SuperposedPasses) else len(model.names)
+          for name, model in EXAMPLES.items()}
+"""Numbers of a path."""
 
 
 def test_every_model_has_an_example():
@@ -35,13 +40,40 @@ def test_every_model_has_an_example():
 @pytest.mark.parametrize('name', EXAMPLES)
 def test_derivatives(name):
     model = EXAMPLES[name]
-    theta = np.random.default_rng(5).uniform(1.0, 4.0, (5, len(model.names)))
+    theta = np.random.default_rng(5).uniform(1.0, 4.0, (5, WIDTHS[name]))
     p = np.random.default_rng(6).standard_normal((5, model.basis(theta).shape[-1]))
     D = model.derivative(theta, p)
     for k in range(theta.shape[1]):
         h = 1e-6 * np.eye(theta.shape[1])[k]
         numeric = np.einsum('nyi,ni->ny', model.basis(theta + h) - model.basis(theta - h), p) / 2e-6
         np.testing.assert_allclose(D[:, :, k], numeric, rtol=0, atol=1e-6 * np.abs(numeric).max())
+
+
+def test_superposed_fields_add_up():
+    rng = np.random.default_rng(7)
+    rows = [RowPass(T, PLACES, M, d) for d in (2, 1, 3)]
+    paths = [rng.uniform(1.0, 4.0, len(row.names)) for row in rows]
+    moments = [rng.standard_normal(3 * row.n_dipoles) for row in rows]
+    model = SuperposedPasses.of((2, 1, 3), T, PLACES, M)
+    total = model.basis(np.concatenate(paths)[None])[0] @ np.concatenate(moments)
+    np.testing.assert_allclose(total, sum(
+        row.basis(path[None])[0] @ m for row, path, m in zip(rows, paths, moments, strict=True)))
+    for path, found in zip(paths, model.split(np.concatenate(paths)), strict=True):
+        np.testing.assert_array_equal(path, found)
+
+
+def test_a_row_from_its_other_end_is_the_same():
+    rng = np.random.default_rng(8)
+    model = SuperposedPasses.of((3, 1), T, PLACES, M)
+    theta, p = rng.uniform(1.0, 4.0, 13), rng.standard_normal(12)
+    theta[6] = -2.5
+    turned, moments = model.forward(theta, p)
+    assert turned[6] == 2.5
+    np.testing.assert_allclose(model.basis(turned[None])[0] @ moments,
+                               model.basis(theta[None])[0] @ p)
+    same, unchanged = model.forward(turned, moments)
+    np.testing.assert_array_equal(same, turned)
+    np.testing.assert_array_equal(unchanged, moments)
 
 
 def test_a_row_far_away_is_its_multipoles():

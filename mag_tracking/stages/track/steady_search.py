@@ -14,8 +14,9 @@ from functools import cached_property
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.inference.least_squares import distinct, refine
+from mag_tracking.inference.least_squares import refine
 from mag_tracking.inference.marginalised import Marginalised
+from mag_tracking.inference.separable_fit import distinct
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, SteadyPass
 from mag_tracking.stages.track.initiation_vehicle import VehicleSettings

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.geometry import overlap
 from mag_tracking.stages.track.bank_filter import BankFilter
 
 WIDTH, OVERHANG, DEPTH_STD = 1.5, 1.0, 1.0
@@ -80,14 +81,11 @@ def overlap_depth(path: FloatArray, n_one: int, n_targets: int, length: int | No
     Each has `n_one` states, of which `length` is the column of its length; None: all are points.
     """
     x = path[:, :n_one * n_targets].reshape(len(path), n_targets, n_one)
-    forward = x[:, :, 3:5] / np.maximum(np.linalg.norm(x[:, :, 3:5], axis=2), 1e-6)[:, :, None]
     depth = 0.0
     for i in range(n_targets):
         for k in range(i):
-            away = x[:, i, :2] - x[:, k, :2]
-            along = np.abs(np.einsum('ni,ni->n', away, forward[:, k]))
-            across = np.abs(away[:, 0] * forward[:, k, 1] - away[:, 1] * forward[:, k, 0])
             need = OVERHANG + (0.0 if length is None else
                                0.5 * (np.abs(x[:, i, length]) + np.abs(x[:, k, length])))
-            depth = max(depth, float(np.where(across < WIDTH, need - along, 0.0).max()))
+            pair = x[:, [i, k]].swapaxes(0, 1)
+            depth = max(depth, float(overlap(pair[:, :, :2], pair[:, :, 3:5], need, WIDTH).max()))
     return depth

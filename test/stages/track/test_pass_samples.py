@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from mag_tracking.inference.least_squares import LINEAR_RANK, SeparableProblem, refine
+from mag_tracking.inference.least_squares import LINEAR_RANK, refine
 from mag_tracking.inference.matrices import RANK, pseudo_inverse
+from mag_tracking.inference.separable_fit import SeparableProblem
 from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, PATH, SteadyPass
 from mag_tracking.stages.track import core
 from mag_tracking.stages.track.pass_samples import N_STEPS, TOLERANCE, PassSamples

@@ -1,0 +1,84 @@
+"""Fit a pass as of one target, or of several where tracks were of several."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mag_tracking.analysis.model_order import order_criteria
+from mag_tracking.analysis.pass_data import PassData
+from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.analysis.pass_trust import describes
+from mag_tracking.analysis.superposed_fit import (
+    Ground,
+    are_clear,
+    fit_superposed,
+    path_from,
+)
+from mag_tracking.arrays import FloatArray
+
+MOST_TARGETS = 3
+"""More are not fitted together: each has a dozen unknowns."""
+
+
+def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray,
+                ground: Ground) -> tuple[tuple[PassFit, ...], ...]:
+    """The fits of a pass for each of its targets.
+
+    A row of dipoles that is long enough describes two vehicles that follow each other, and two
+    straight targets describe one that turns: how many there are the fit alone does not know.
+
+    Parameters
+    ----------
+    data : PassData
+    alone : sequence of PassFit
+        As of one target, with several numbers of dipoles.
+    paths : (K, 6) [m], [m/s]
+        Of the targets that were tracked, where they are when `data.t` is zero.
+    ground : Ground
+
+    Returns
+    -------
+    tuple of tuples of PassFit
+        Of each target, with each number of dipoles. Where several were tracked, and all of them
+        together describe the field no better, those of one target, with that reason.
+    """
+    n_targets = len(paths)
+    if n_targets < 2 or len(data.sensors) < 2:
+        return (tuple(alone),)
+    if n_targets > MOST_TARGETS:
+        return (_refused(alone, n_targets, f'at most {MOST_TARGETS} are fitted together'),)
+    found = fit_superposed(data, paths, ground, [fit.n_dipoles for fit in alone])
+    if not found:
+        return (_refused(alone, n_targets,
+                         'there are too few measurements to fit them together'),)
+    best = [_best(fits) for fits in found]
+    if why := _why_not(data, best):
+        return (_refused(alone, n_targets, why),)
+    one = _best(alone)
+    if not one.reason and order_criteria([one, best[0]])[0] == 0.0:
+        return (tuple(alone),)
+    return found
+
+
+def _best(fits: Sequence[PassFit]) -> PassFit:
+    """The fit that `choose_order` looks at; the first one where none is determined."""
+    return fits[int(np.argmin(order_criteria(fits)))]
+
+
+def _why_not(data: PassData, fits: Sequence[PassFit]) -> str:
+    """Why targets that were fitted together are not believed, or nothing."""
+    if not all(fit.converged for fit in fits):
+        return 'the fit of them together did not converge'
+    if not all(describes(fit) for fit in fits):
+        return ('which at constant velocities leave over '
+                f'{1.0 - fits[0].explained:.1%} of the field (a turn, braking, a further one)')
+    if not are_clear(data, [path_from(data, fit) for fit in fits]):
+        return 'which would be in each other (a long vehicle, a turn, braking)'
+    return ''
+
+
+def _refused(fits: Sequence[PassFit], n_targets: int, why: str) -> tuple[PassFit, ...]:
+    """The same with a reason, and nothing that is trusted."""
+    reason = f'not one target: {n_targets} were tracked, {why}'
+    return tuple(replace(fit, reason=reason, trusted=()) for fit in fits)

@@ -1,0 +1,235 @@
+"""Batch fit of several targets that were seen at once: their fields add up.
+
+The targets are placed as points first: where tracks have them, and, one after the other, where what
+the others leave over is strongest. Then each gets as many dipoles as it is worth.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import combinations
+
+import numpy as np
+
+from mag_tracking.analysis.model_order import order_criteria
+from mag_tracking.analysis.pass_data import PassData, background_columns, separable_problem
+from mag_tracking.analysis.pass_description import APART, described, nearest
+from mag_tracking.analysis.pass_deviation import SensorErrors
+from mag_tracking.analysis.pass_fit import (
+    AS_BOUGHT,
+    COARSE_ERROR,
+    at_strongest,
+    shorter_rows,
+    starting_paths,
+    unusable,
+)
+from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.arrays import FloatArray
+from mag_tracking.geometry import overlap
+from mag_tracking.inference.least_squares import refine
+from mag_tracking.inference.separable_fit import coarse_minima, fine_minimum
+from mag_tracking.physics.passes import SuperposedPasses
+from mag_tracking.units import NS
+
+N_REFINED, N_STEPS = 150, 6
+"""So many of the starts get so many steps before the best of them are chosen."""
+
+N_PLACED = 10
+"""So many places of the targets are followed to their minima."""
+
+N_FINE = 2
+"""So many minima are gone on with: the best one, and its rival."""
+
+FIRST_LENGTH = 3.0
+"""[m] of a row that was a point."""
+
+CLEAR, WIDTH = 3.0, 1.5
+"""[m] The rows of two vehicles are so far apart along their way, their bodies being longer than
+their rows, or so far across it. Two that are nearer are parts of one vehicle."""
+
+SEEN_FROM = 15.0
+"""[m] A target is seen by a sensor that is no farther from it."""
+
+MOST_ROUNDS = 3
+"""So often the order of each target is chosen anew, those of the others being given."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Targets that roll: without it two that fly explain one that turns."""
+
+    height: tuple[float, float]
+    """[m] of a target's iron, and its deviation."""
+    climb_std: float
+    """[m/s] of the vertical speed, about zero."""
+
+    def prior(self, orders: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Mean and deviation (n_theta,) of the paths of rows of `orders` dipoles."""
+        means, stds = [], []
+        for n_dipoles in orders:
+            mean, std = np.zeros(6 + (n_dipoles > 1)), np.full(6 + (n_dipoles > 1), np.inf)
+            (mean[2], std[2]), std[5] = self.height, self.climb_std
+            means.append(mean)
+            stds.append(std)
+        return np.concatenate(means), np.concatenate(stds)
+
+
+def fit_superposed(data: PassData, paths: FloatArray, ground: Ground,
+                   orders: Sequence[int] = (1, 2, 3, 4),
+                   errors: SensorErrors = AS_BOUGHT) -> tuple[tuple[PassFit, ...], ...]:
+    """Fit several rows of dipoles, each at constant velocity, to the sum of their fields.
+
+    Parameters
+    ----------
+    data : PassData
+        Of two sensors or more.
+    paths : (K, 6) [m], [m/s]
+        About where each target is when `data.t` is zero, and its velocity.
+    ground : Ground
+    orders : sequence of int
+        Numbers of dipoles to try for each target.
+    errors : SensorErrors
+        Of the sensors, for the honest covariance.
+
+    Returns
+    -------
+    tuple of tuples of PassFit
+        Of each target, in the order in which they pass the middle of the sensors, the fit with
+        each of `orders`, the others having as many dipoles as they are worth. Empty where there
+        are too few measurements for so many unknowns.
+    """
+    n_targets, begin_ns = len(paths), data.stamp_ns
+    if any(unusable(data, n_targets * (n,)) for n in orders):
+        return ()
+    data, rough = at_strongest(data)
+    paths = paths.copy()
+    paths[:, :3] += (data.stamp_ns - begin_ns) / NS * paths[:, 3:]
+    placed = np.vstack([paths.ravel(), _placed(rough, n_targets, ground)])
+    fits = _JointFits(data, rough, placed, ground, errors)
+    known = [min(orders, key=lambda n: (abs(n - 2), n))] * n_targets
+    for _ in range(MOST_ROUNDS):
+        before = list(known)
+        for k in range(n_targets):
+            criteria = order_criteria(fits.of(k, known, orders))
+            if np.isfinite(criteria).any():
+                known[k] = orders[int(np.argmin(criteria))]
+        if known == before:
+            break
+    found = [(fits.of(k, known, (known[k],))[0], fits.of(k, known, orders))
+             for k in range(n_targets)]
+    return tuple(of_one for _, of_one in sorted(found, key=lambda pair: _passes_at(pair[0])))
+
+
+def _placed(rough: PassData, n_targets: int, ground: Ground) -> FloatArray:
+    """(n, 6 n_targets) Paths of points, the best ones; `rough` are few means of neighbours."""
+    rests = [rough]
+    paths: FloatArray = np.zeros((1, 0))
+    for n in range(1, n_targets + 1):
+        orders = n * (1,)
+        model_of, prior = partial(SuperposedPasses.of, orders), ground.prior(orders)
+        starts = []
+        for known, rest in zip(paths, rests, strict=True):
+            own = starting_paths(rest, 1)
+            starts.append(np.hstack([np.tile(known, (len(own), 1)), own]))
+        coarse = separable_problem(rough, model_of, prior=prior)
+        paths, _ = coarse_minima(separable_problem(rough, model_of, COARSE_ERROR, prior), coarse,
+                                 np.concatenate(starts), np.tile(APART[:6], n), N_REFINED,
+                                 N_STEPS, N_PLACED)
+        model = model_of(rough.t, rough.positions, rough.network.R_sw[rough.sensor])
+        rests = [replace(rough, field=rough.field - (
+            model.basis(path[None])[0] @ coarse.linear(path)).reshape(-1, 3)) for path in paths]
+    return paths
+
+
+class _JointFits:
+    """Fits of some targets with any numbers of dipoles, each made once.
+
+    Every one starts from the points `placed` (n, 6 K), and from what was found with other numbers.
+    """
+
+    def __init__(self, data: PassData, rough: PassData, placed: FloatArray, ground: Ground,
+                 errors: SensorErrors) -> None:
+        self._data, self._rough, self._ground, self._errors = data, rough, ground, errors
+        # The first ones are those of the tracks. All have the targets in their order.
+        split = [np.split(paths, paths.size // 6) for paths in placed]
+        self._placed = [[paths[i] for i in nearest(split[0], paths)] for paths in split]
+        self._n_free = data.n_independent - background_columns(data, data.whitening).shape[1]
+        self._known: dict[tuple[int, ...], tuple[PassFit, ...]] = {}
+
+    def of(self, k: int, orders: Sequence[int], tried: Sequence[int]) -> tuple[PassFit, ...]:
+        """The fits of target `k` with each number of dipoles `tried`, the others having those of
+        `orders`."""
+        before, fits = self._known.get(tuple(orders)), []
+        for n in tried:
+            found = (*orders[:k], n, *orders[k + 1:])
+            if found not in self._known:
+                self._known[found] = self._fitted(found, self._starts(found, k, before))
+            fits.append(self._known[found][k])
+        return tuple(fits)
+
+    def _starts(self, orders: tuple[int, ...], k: int,
+                before: Sequence[PassFit] | None) -> FloatArray:
+        """(n, n_theta) Where the search with some numbers of dipoles begins.
+
+        `before` are the fits with another number for target `k`.
+        """
+        starts = [_of_orders(paths, orders) for paths in self._placed]
+        if before is not None and all(len(fit.x) for fit in before):
+            paths = _of_orders([path_from(self._data, fit) for fit in before], orders)
+            rows = [paths[k], *(shorter_rows(paths[k]) if orders[k] > 1 else ())]
+            starts += [[*paths[:k], row, *paths[k + 1:]] for row in rows]
+        return np.array([np.concatenate(paths) for paths in starts])
+
+    def _fitted(self, orders: tuple[int, ...], starts: FloatArray) -> tuple[PassFit, ...]:
+        """The `PassFit` of each target."""
+        data, model_of = self._data, partial(SuperposedPasses.of, orders)
+        prior, split = self._ground.prior(orders), model_of(
+            data.t, data.positions, data.whitening).split
+        coarse, fine = (separable_problem(d, model_of, prior=prior) for d in (self._rough, data))
+        theta, cost, _, _ = refine(coarse.residual_and_jacobian, starts, 40, 1e-6)
+        # Where there is no such minimum the targets are no two vehicles, which `fit_targets` says.
+        in_order = tuple(range(len(orders)))
+        clear = np.array([nearest(self._placed[0], split(found)) == in_order
+                          and are_clear(self._rough, split(found)) for found in theta])
+        cost = np.where(clear | ~clear.any(), cost, np.inf)
+        found = fine_minimum(fine, theta, cost, np.concatenate(
+            [APART[:6 + (n > 1)] for n in orders]), N_FINE)
+        if not np.isfinite(found.cost):
+            return tuple(PassFit(n, data, 'no start of the search could be used') for n in orders)
+        theta, p = model_of(data.t, data.positions, data.whitening).forward(
+            found.theta, fine.linear(found.theta))
+        left = max(found.cost - self._n_free, 0.0) / (fine.energy - self._n_free)
+        return described(data, orders, replace(found, theta=theta), p, 1.0 - left, self._errors,
+                         path_std=prior[1])
+
+
+def are_clear(data: PassData, paths: Sequence[FloatArray]) -> bool:
+    """Whether targets on `paths` (6 or 7,) are beside or behind each other while they are seen."""
+    places = [path[:3] + data.t[:, None] * path[3:6] for path in paths]
+    seen = np.any([np.linalg.norm(place - data.positions, axis=1) < SEEN_FROM
+                   for place in places], axis=0)
+    for i, k in combinations(range(len(paths)), 2):
+        need = CLEAR + 0.5 * sum(abs(path[6]) for path in (paths[i], paths[k]) if len(path) > 6)
+        velocity = np.array([np.tile(paths[j][3:6], (len(data.t), 1)) for j in (i, k)])
+        if overlap(np.array([places[i], places[k]]), velocity, need, WIDTH)[seen].any():
+            return False
+    return True
+
+
+def path_from(data: PassData, fit: PassFit) -> FloatArray:
+    """(6 or 7,) The path of a fit, from time zero of `data`."""
+    path = fit.x[:6 + (fit.n_dipoles > 1)].copy()
+    path[:3] -= (fit.data.stamp_ns - data.stamp_ns) / NS * path[3:6]
+    return path
+
+
+def _of_orders(paths: Sequence[FloatArray], orders: Sequence[int]) -> list[FloatArray]:
+    """Paths (6 or 7,) with a length, or without one, as the numbers of dipoles need it."""
+    return [np.concatenate([path[:6], path[6:] if len(path) > 6 else [FIRST_LENGTH]])
+            if n > 1 else path[:6] for path, n in zip(paths, orders, strict=True)]
+
+
+def _passes_at(fit: PassFit) -> float:
+    """[s since 1970] When a target passes the middle of the sensors."""
+    centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
+    return (fit.data.stamp_ns / NS + fit.closest_approach(centre)[0]) if len(fit.x) else np.inf

@@ -1,0 +1,91 @@
+"""The targets that were tracked while a pass was seen: how many, and about where."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mag_tracking.analysis.pass_data import PassData
+from mag_tracking.analysis.superposed_fit import Ground, are_clear
+from mag_tracking.arrays import FloatArray
+from mag_tracking.records import Track
+from mag_tracking.stages.track.settings import TrackSettings
+from mag_tracking.units import NS
+
+
+@dataclass(frozen=True)
+class _Pose:
+    """Where a track is surest."""
+
+    stamp_ns: int
+    path: FloatArray
+    """(6,) position and velocity."""
+    spread: float
+    """[m^2]"""
+
+
+class PassTracks:
+    """Takes the records of a tracker, and gives the targets of each pass."""
+
+    def __init__(self, settings: TrackSettings) -> None:
+        """`settings` of the tracker."""
+        self._of_vehicles = settings.target == 'vehicle'
+        # Of each track the surest pose of the passes that were, and all that came after them.
+        self._poses: dict[int, list[_Pose]] = {}
+        self._ended: set[int] = set()
+
+    def take(self, records: Iterable[object]) -> None:
+        """Note the poses among the records of a tracker."""
+        for record in records:
+            if isinstance(record, Track) and record.ended:
+                self._ended.add(record.id)
+            elif isinstance(record, Track):
+                self._poses.setdefault(record.id, []).append(_Pose(
+                    record.stamp_ns, np.concatenate([record.position, record.velocity]),
+                    float(np.trace(record.covariance[:3, :3]))))
+
+    def paths(self, data: PassData) -> FloatArray:
+        """(K, 6) of each vehicle, where it is when `data.t` is zero, and its velocity [m], [m/s].
+
+        Those of which the surest pose is in the pass; none of magnets. A track in the place of a
+        surer one is of the same vehicle, which was lost and found again. Passes come in order.
+        """
+        end_ns = data.stamp_ns + int(NS * data.t.max())
+        mine = sorted((pose for pose in self._surest_until(end_ns)
+                       if pose.stamp_ns >= data.stamp_ns), key=lambda pose: pose.spread)
+        paths: list[FloatArray] = []
+        for pose in mine:
+            path = pose.path.copy()
+            path[:3] -= (pose.stamp_ns - data.stamp_ns) / NS * path[3:]
+            if self._of_vehicles and all(are_clear(data, (path, other)) for other in paths):
+                paths.append(path)
+        return np.array(paths).reshape(-1, 6)
+
+    def _surest_until(self, end_ns: int) -> list[_Pose]:
+        """The surest pose of each track until a time; what is not needed any more is dropped.
+
+        Not of vehicles that are still coming: that are as sure as they ever were.
+        """
+        found = []
+        for track, poses in list(self._poses.items()):
+            until = [pose for pose in poses if pose.stamp_ns <= end_ns]
+            later = poses[len(until):]
+            surest = min(until, key=lambda pose: pose.spread, default=None)
+            if surest is None:
+                continue
+            has_ended = track in self._ended and not later
+            if surest is not until[-1] or has_ended:
+                found.append(surest)
+            self._poses[track] = [surest, *later]
+            if has_ended:
+                del self._poses[track]
+                self._ended.remove(track)
+        return found
+
+
+def ground_of(settings: TrackSettings) -> Ground:
+    """Where the iron of the vehicles of the settings is."""
+    vehicle = settings.vehicle
+    height, std = np.array(vehicle.heights), np.array(vehicle.height_stds)
+    return Ground((float(height.mean()), float(np.sqrt(height.var() + np.square(std).mean()))),
+                  vehicle.climb_std)

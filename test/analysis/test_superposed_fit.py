@@ -1,0 +1,189 @@
+"""Several targets at once, fitted together: found, with honest deviations, or refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from mag_tracking.analysis.model_order import choose_order, order_criteria
+from mag_tracking.analysis.pass_fit import fit_pass
+from mag_tracking.analysis.pass_targets import fit_targets
+from mag_tracking.analysis.superposed_fit import Ground, are_clear, fit_superposed, path_from
+from support.passes import ROAD, measured, network_of, together
+
+GROUND = Ground((0.7, 0.4), 0.1)
+FOUR = network_of([[-3.0, -4.5, 0.0], [-3.0, 4.5, 0.0], [3.0, -4.5, 0.0], [3.0, 4.5, 0.0]])
+
+
+def one_path(rng, at_s, direction, n_dipoles):
+    """(path, moments) of a vehicle that passes the origin at a time [s], in its lane."""
+    speed = direction * rng.uniform(8.0, 20.0)
+    place = [-speed * at_s, -direction * rng.uniform(1.4, 2.2), rng.uniform(0.4, 1.0)]
+    whole = rng.standard_normal(3)
+    whole *= rng.uniform(200.0, 600.0) / np.linalg.norm(whole)
+    moments = np.tile(whole / n_dipoles, (n_dipoles, 1))
+    if n_dipoles > 1:
+        moments = moments + 60.0 * rng.standard_normal((n_dipoles, 3))
+    length = [rng.uniform(2.0, 3.5)] if n_dipoles > 1 else []
+    return np.concatenate([place, [speed, 0.1 * rng.standard_normal(), 0.0], length]), moments
+
+
+def world(rng, plan, n_dipoles, network=ROAD):
+    """(`PassData`, [path]) of vehicles of a plan [(time [s], direction)]."""
+    targets = [one_path(rng, *when, n_dipoles) for when in plan]
+    fields = [measured(network, path, moments, rng, seconds=6.0, noise=1.2e-8 if k == 0 else 1e-15)
+              for k, (path, moments) in enumerate(targets)]
+    data = fields[0]
+    for other in fields[1:]:
+        data = together(data, other)
+    return data, [path for path, _ in targets]
+
+
+def tracked(rng, paths):
+    """(K, 6) of the paths, as a tracker has them: half a metre and 5 % off."""
+    found = np.array([path[:6] for path in paths])
+    found[:, :2] += 0.5 * rng.standard_normal((len(paths), 2))
+    found[:, 3] *= 1.0 + 0.05 * rng.standard_normal(len(paths))
+    return found
+
+
+MEETING, FOLLOWING = ((-0.3, 1), (0.2, -1)), ((-0.8, 1), (0.8, 1))
+
+
+@pytest.mark.parametrize(('plan', 'n_dipoles'), [(MEETING, 1), (MEETING, 2), (FOLLOWING, 2)])
+def test_two_vehicles_are_found_with_honest_deviations(plan, n_dipoles):
+    z = []
+    for seed in range(6):
+        rng = np.random.default_rng([seed, n_dipoles])
+        data, paths = world(rng, plan, n_dipoles)
+        found = fit_superposed(data, tracked(rng, paths), GROUND, (n_dipoles,))
+        assert len(found) == 2
+        for (fit,), path in zip(found, paths, strict=True):
+            assert fit.converged and fit.n_others == 6 + (n_dipoles > 1) + 3 * n_dipoles
+            assert not fit.reason and abs(fit.normalised_cost - 1.0) < 0.15
+            true = path[:6].copy()
+            true[:3] += fit.data.stamp_ns / 1e9 * path[3:6]
+            e = fit.x[:6] - true
+            z.append(e @ np.linalg.solve(fit.covariance[:6, :6], e))
+    # Six numbers of each vehicle; what was known of height and climb only narrows it.
+    assert chi2.cdf(np.sum(z), 6 * len(z)) < 0.999, np.round(z, 1)
+    assert chi2.cdf(np.sum(z), 4 * len(z)) > 0.001, np.round(z, 1)
+
+
+def test_three_vehicles_are_found():
+    rng = np.random.default_rng(5)
+    data, paths = world(rng, ((-1.2, 1), (0.1, -1), (1.1, 1)), 1, FOUR)
+    found = fit_superposed(data, tracked(rng, paths), GROUND, (1, 2))
+    assert [choose_order(fits).n_dipoles for fits in found] == [1, 1, 1]
+    for fits, path in zip(found, paths, strict=True):
+        fit = choose_order(fits)
+        assert abs(fit.velocity[0] - path[3]) < 4.0 * fit.speed[1] < 1.0
+        assert fit.data.stamp_ns / 1e9 == pytest.approx(-path[0] / path[3], abs=0.5)
+
+
+def test_each_is_given_what_was_measured_without_the_others():
+    """What is left is the field of the one alone, and the noise."""
+    rng = np.random.default_rng(6)
+    data, paths = world(rng, MEETING, 1)
+    (first,), (second,) = fit_superposed(data, tracked(rng, paths), GROUND, (1,))
+    assert first.cost == second.cost and first.n_unknowns == second.n_unknowns
+    np.testing.assert_allclose(first.data.field - first.predicted,
+                               second.data.field - second.predicted, atol=1e-15)
+    assert np.std(first.data.field - first.predicted) == pytest.approx(1.2e-8, rel=0.05)
+    alone = fit_pass(first.data, 1)
+    assert abs(alone.speed[0] - first.speed[0]) < 2.0 * first.speed[1]
+
+
+def test_each_has_as_many_dipoles_as_it_is_worth():
+    rng = np.random.default_rng(9)
+    point, m = one_path(rng, -0.3, 1, 1)
+    row, moments = one_path(rng, 0.3, -1, 3)
+    data = together(measured(ROAD, point, m, rng, seconds=6.0),
+                    measured(ROAD, row, moments, rng, seconds=6.0, noise=1e-15))
+    found = fit_superposed(data, tracked(rng, (point, row)), GROUND, (1, 2, 3))
+    orders = [choose_order(fits).n_dipoles for fits in found]
+    assert orders[0] == 1 and orders[1] >= 2
+    # Whichever number one of them is given, it is the same vehicle.
+    for fits, path in zip(found, (point, row), strict=True):
+        assert [fit.n_dipoles for fit in fits] == [1, 2, 3]
+        assert all(fit.velocity[0] * path[3] > 0.0 for fit in fits if fit.converged)
+
+
+def test_a_long_row_is_not_taken_for_two_that_follow():
+    """Without tracks it is: a row of two dipoles, as long as they are apart."""
+    rng = np.random.default_rng(3)
+    one, moments = one_path(rng, -0.5, 1, 2)
+    other = one.copy()
+    other[0] -= 18.0
+    data = together(measured(ROAD, one, moments, rng, seconds=6.0),
+                    measured(ROAD, other, 0.8 * moments, rng, seconds=6.0, noise=1e-15))
+    alone = [fit_pass(data, n) for n in (1, 2)]
+    wrong = choose_order(alone)
+    assert wrong is not None and wrong.length[0] > 12.0
+    paths = tracked(rng, (one, other))
+    assert fit_targets(data, alone, paths[:1], GROUND) == (tuple(alone),)
+    found = [choose_order(fits) for fits in fit_targets(data, alone, paths, GROUND)]
+    assert len(found) == 2
+    for fit in found:
+        assert abs(fit.velocity[0] - one[3]) < 4.0 * fit.speed[1] < 2.0 and fit.length[0] < 5.0
+
+
+def test_parts_of_one_vehicle_are_no_two_vehicles():
+    rng = np.random.default_rng(4)
+    row, moments = one_path(rng, 0.0, 1, 3)
+    row[6] = 7.0
+    data = measured(ROAD, row, moments, rng, seconds=6.0)
+    alone = [fit_pass(data, n) for n in (2, 3)]
+    parts = np.array([row[:6], row[:6]])
+    parts[:, 0] += [1.7, -1.7]
+    fits, = fit_targets(data, alone, parts, GROUND)
+    assert choose_order(fits) is not None or 'in each other' in fits[0].reason
+
+
+def test_what_is_not_believed_says_why():
+    rng = np.random.default_rng(7)
+    data, paths = world(rng, MEETING, 1)
+    alone, two = [fit_pass(data, 1)], tracked(rng, paths)
+    four = np.vstack([two, two + [0.0, 20.0, 0.0, 0.0, 0.0, 0.0]])
+    cases = [('4 were tracked, at most 3', data, four),
+             ('too few measurements', replace(
+                 data, t=data.t[::200], sensor=data.sensor[::200], field=data.field[::200],
+                 covariance=data.covariance[::200]), two),
+             # A third one that nobody tracked.
+             ('leave over', together(data, measured(
+                 ROAD, *one_path(rng, 1.5, 1, 1), rng, seconds=6.0, noise=1e-15)), two)]
+    for reason, of, tracks in cases:
+        fits, = fit_targets(of, alone, tracks, GROUND)
+        assert reason in fits[0].reason and fits[0].trusted == (), fits[0].reason
+        assert choose_order(fits) is None
+    # One sensor does not tell the scale of one, let alone of two.
+    assert fit_targets(fit_pass(measured(network_of([[0.0, -4.5, 0.0]]), paths[0],
+                                         np.ones((1, 3)), rng), 1).data, alone, two,
+                       GROUND) == (tuple(alone),)
+
+
+def test_vehicles_beside_and_behind_each_other_are_clear():
+    data, _ = world(np.random.default_rng(8), MEETING, 1)
+    one = np.array([0.0, -1.75, 0.5, 10.0, 0.0, 0.0, 3.0])
+
+    def moved(*by):
+        return one + np.pad(by, (0, 7 - len(by)))
+
+    assert are_clear(data, (one, moved(0.0, 3.5)))
+    assert are_clear(data, (one, moved(-7.0)))
+    assert not are_clear(data, (one, moved(-5.0)))
+    # It catches up, but far behind the sensors' sight.
+    assert not are_clear(data, (one, moved(-9.0, 0.0, 0.0, 6.0)))
+    assert are_clear(data, (one, moved(-60.0, 0.0, 0.0, 2.0)))
+    assert are_clear(data, (one,))
+
+
+def test_paths_begin_where_the_data_do():
+    rng = np.random.default_rng(2)
+    data, paths = world(rng, MEETING, 2)
+    data = replace(data, stamp_ns=1_700_000_000_000_000_000)
+    found = fit_superposed(data, tracked(rng, paths), GROUND, (2,))
+    for (fit,), path in zip(found, paths, strict=True):
+        np.testing.assert_allclose(path_from(data, fit)[:2], path[:2], atol=1.0)
+    assert np.isfinite(order_criteria([fits[0] for fits in found])).all()

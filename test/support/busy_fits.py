@@ -1,0 +1,73 @@
+"""Batch fits of several vehicles at once, and which vehicle each is of."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mag_tracking.apps.fit import RecordingFit
+from mag_tracking.apps.pass_fitter import FittedPass, PassFitter
+from mag_tracking.apps.readings import recorded
+from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.records import Readings
+from support.busy_recordings import BUSY, network_of_recording
+
+ORDERS = (1, 2, 3, 4)
+FAR_M = 8.0
+"""[m] A fit that is farther from a vehicle is of another one."""
+
+
+class OfVehicle(NamedTuple):
+    """A fit, and the vehicle that it is of."""
+
+    one: FittedPass
+    vehicle: int
+    speed: float
+    """[m/s] of the vehicle, where its field is strongest."""
+    error: float
+    """[m] of the fit there, horizontally, along the middle of the vehicle."""
+
+
+def fits_of_world(a_world, orders=ORDERS):
+    """[FittedPass] of a `World`."""
+    fitter = PassFitter('world', a_world.network, settings_for('vehicle'), orders)
+    return [*fitter.feed(a_world.readings), *fitter.flush()]
+
+
+def fits_of_recording(name, folder=BUSY, orders=ORDERS):
+    """([FittedPass], [OfVehicle]) of a recording of several vehicles."""
+    network = network_of_recording(name, folder)
+    recording = Recording(folder / f'{name}.mcap')
+    passes = list(RecordingFit(recording, network, settings_for('vehicle'), orders).passes())
+    truth = recorded(recording, SampleReader(recording, network), Readings.joined([])).truth
+    return passes, [found for found in with_vehicles(passes, [
+        (stamps / 1e9, position[:, :2]) for stamps, position, _ in truth.values()])]
+
+
+def with_vehicles(passes, vehicles):
+    """[OfVehicle] of the fits with an answer; each vehicle once.
+
+    `vehicles` are (t (n,) [s], positions (n, 2) [m]).
+    """
+    candidates = []
+    for i, one in enumerate(passes):
+        fit = one.chosen
+        if fit is None:
+            continue
+        at = fit.data.stamp_ns / 1e9
+        for k, (t, position) in enumerate(vehicles):
+            if not t[0] + 0.5 < at < t[-1] - 0.5:
+                continue
+            here, ahead, behind = (np.array([np.interp(at + s, t, position[:, a])
+                                             for a in (0, 1)]) for s in (0.0, 0.2, -0.2))
+            velocity = (ahead - behind) / 0.4
+            error = float(np.linalg.norm(fit.position[:2] - here))
+            if error < FAR_M and velocity @ fit.velocity[:2] > 0.0:
+                candidates.append((error, i, k, float(np.linalg.norm(velocity))))
+    out, used = [], set()
+    for error, i, k, speed in sorted(candidates):
+        if ('fit', i) not in used and ('vehicle', k) not in used:
+            used |= {('fit', i), ('vehicle', k)}
+            out.append(OfVehicle(passes[i], k, speed, error))
+    return out
