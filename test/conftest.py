@@ -26,11 +26,21 @@ _HOME = tempfile.TemporaryDirectory(prefix='mag_tracking_test_')
 os.environ['ROS_HOME'] = _HOME.name
 
 
+LONGEST = ('test_wheel.py', 'test_busy.py', 'test_archive.py', 'test_archive_faults.py',
+           'test_traffic.py', 'test_situations.py', 'test_cli.py')
+"""Files that take half a minute or more."""
+
+
 def pytest_collection_modifyitems(items):
-    """Mark all tests of nodes: they are not run beside tests that compute (`make test`)."""
+    """Mark all tests of nodes: they are not run beside tests that compute (`make test`).
+
+    The files that take longest come first: the last one is not waited for alone.
+    """
     for item in items:
         if item.path.is_relative_to(ROOT / 'test' / 'nodes'):
             item.add_marker('alone')
+    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST
+               else len(LONGEST))
 
 
 @pytest.fixture(scope='session')

@@ -115,11 +115,11 @@ class StretchTables:
 
     def _add_pass(self, number: int, data: PassData, notes: tuple[str, ...]) -> None:
         """The rows of a pass, one a vehicle, fitted as a whole."""
-        self.n_passes += 1
         alone = (fit_pass(data, self._n_dipoles),)
         for one in fitted_vehicles(self._recording.stem, number, data, alone,
                                    self._tracks.paths(data), self._ground, notes):
             row = pass_rows(one)[0]
+            self.n_passes += 1
             self._tables['passes'].add(
                 {name: _number(value) if isinstance(value, float) else value
                  for name, value in row.items() if name not in ('recording', 'pass')}

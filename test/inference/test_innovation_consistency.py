@@ -23,7 +23,7 @@ def run(nis):
 
 def test_consistent_filters_fail_as_often_as_stated():
     rng = np.random.default_rng(0)
-    n = 5000
+    n = 2500
     runs = [run(rng.chisquare(3, (30, 2))) for _ in range(n)]
     # The whole network, and the two sensors with half the probability each: at most 2 x 1e-3, and
     # at least that of the network alone; four deviations of the binomial.

@@ -6,11 +6,9 @@ import numpy as np
 
 from mag_tracking.apps.fit import RecordingFit
 from mag_tracking.apps.pass_fitter import FittedPass, PassFitter
-from mag_tracking.apps.readings import recorded
+from mag_tracking.apps.readings import read_recording
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.records import Readings
 from support.busy_recordings import BUSY, network_of_recording
 
 ORDERS = (1, 2, 3, 4)
@@ -40,9 +38,9 @@ def fits_of_recording(name, folder=BUSY, orders=ORDERS):
     network = network_of_recording(name, folder)
     recording = Recording(folder / f'{name}.mcap')
     passes = list(RecordingFit(recording, network, settings_for('vehicle'), orders).passes())
-    truth = recorded(recording, SampleReader(recording, network), Readings.joined([])).truth
-    return passes, [found for found in with_vehicles(passes, [
-        (stamps / 1e9, position[:, :2]) for stamps, position, _ in truth.values()])]
+    truth = read_recording(folder / f'{name}.mcap', network).truth
+    return passes, with_vehicles(passes, [
+        (stamps / 1e9, position[:, :2]) for stamps, position, _ in truth.values()])
 
 
 def with_vehicles(passes, vehicles):

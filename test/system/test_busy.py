@@ -10,6 +10,7 @@ from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
 from support import busy_recordings, busy_worlds
 from support.bundled import NETWORK_FILE
+from support.marks import studied
 from support.random_passes import SIMULATORS, random_pass
 from support.samples import scenario
 
@@ -19,10 +20,12 @@ AIMS = {'meeting_2_sensors': (15, 1.0, 4.0), 'following_2_sensors': (16, 0.9, 4.
         'traffic_2_sensors': (11, np.inf, np.inf), 'traffic_4_sensors': (11, np.inf, np.inf)}
 """{recording: (vehicles to be found, median RMS [m], median NEES)}."""
 
+IN_EVERY_TEST = ('meeting_2_sensors', 'traffic_2_sensors')
+
 tracked_recording = cache(busy_recordings.tracked_recording)
 
 
-@pytest.mark.parametrize('name', AIMS)
+@pytest.mark.parametrize('name', studied(AIMS, kept=IN_EVERY_TEST))
 def test_every_vehicle_of_a_recording_is_followed(name):
     found, rms, nees = AIMS[name]
     got, poses, pipeline, *_ = tracked_recording(name)
@@ -34,7 +37,7 @@ def test_every_vehicle_of_a_recording_is_followed(name):
     assert pipeline.track.counts['tracks'] == len({p.id for p in poses})
 
 
-@pytest.mark.parametrize('name', AIMS)
+@pytest.mark.parametrize('name', studied(AIMS, kept=IN_EVERY_TEST))
 def test_every_vehicle_of_a_recording_is_counted(name):
     """In its direction, and no other."""
     passages = tracked_recording(name).passages
@@ -49,7 +52,7 @@ def test_every_vehicle_of_a_recording_is_counted(name):
 def test_smoothed_paths_of_newcomers_are_where_their_poses_were():
     """They are linearised where the vehicle was found: by themselves they led 50 m astray."""
     n = 0
-    for name in AIMS:
+    for name in IN_EVERY_TEST:
         got = tracked_recording(name)
         published = {(p.id, p.stamp_ns): p for p in got.poses if not p.ambiguous}
         for s in got.smoothed:
@@ -58,15 +61,16 @@ def test_smoothed_paths_of_newcomers_are_where_their_poses_were():
                 n += 1
                 away = np.hypot(*(s.position - p.position)[:2])
                 assert away < 5.0 * np.sqrt(np.trace(p.covariance[:2, :2])) + 3.0
-    assert n > 300
+    assert n > 150
 
 
 def test_poses_without_a_flag_are_hardly_ever_wrong():
-    scores = [tracked_recording(name).score for name in AIMS]
+    scores = [tracked_recording(name).score for name in IN_EVERY_TEST]
     n_sure, n_wrong = (sum(getattr(s, of) for s in scores) for of in ('n_sure', 'n_wrong'))
-    assert n_sure > 500 and n_wrong <= MOST_WRONG * n_sure
+    assert n_sure > 250 and n_wrong <= MOST_WRONG * n_sure
 
 
+@pytest.mark.study
 def test_a_tracker_of_one_vehicle_at_a_time_is_worse():
     """What all of this is for; and the setting works."""
     alone, poses, pipeline, *_ = busy_recordings.tracked_recording(
