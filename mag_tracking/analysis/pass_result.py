@@ -16,6 +16,9 @@ FAR = 22.5
 """Squared deviations, of six numbers, at which another path is another: one in a thousand."""
 
 
+NEARLY = 1.25
+"""A fit whose cost is not larger than this times that of the best describes the pass as well."""
+
 SHORTEST = 1e-2
 """A row that is shorter than this share of the way on which it was seen is a point; one that is
 longer than that way is none."""

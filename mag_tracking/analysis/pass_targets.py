@@ -20,6 +20,12 @@ from mag_tracking.arrays import FloatArray
 MOST_TARGETS = 3
 """More are not fitted together: each has a dozen unknowns."""
 
+LONGEST = 18.75
+"""[m] The iron of one vehicle is no longer: a road train (directive 96/53/EC)."""
+
+ALIKE = 0.25
+"""Parts of one vehicle are found with velocities that differ by no more than this share."""
+
 
 def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray,
                 ground: Ground) -> tuple[tuple[PassFit, ...], ...]:
@@ -40,8 +46,9 @@ def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray,
     Returns
     -------
     tuple of tuples of PassFit
-        Of each target, with each number of dipoles. Where several were tracked, and all of them
-        together describe the field no better, those of one target, with that reason.
+        Of each target, with each number of dipoles. Those of one target where it describes the
+        field as well, or where several would be parts of it: a long vehicle is now and then
+        tracked as two. With a reason where neither one nor all that were tracked describe it.
     """
     n_targets = len(paths)
     if n_targets < 2 or len(data.sensors) < 2:
@@ -52,11 +59,14 @@ def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray,
     if not found:
         return (_refused(alone, n_targets,
                          'there are too few measurements to fit them together'),)
-    best = [_best(fits) for fits in found]
+    best, one = [_best(fits) for fits in found], _best(alone)
+    is_one = not one.reason and one.length[0] <= LONGEST
     if why := _why_not(data, best):
         return (_refused(alone, n_targets, why),)
-    one = _best(alone)
-    if not one.reason and order_criteria([one, best[0]])[0] == 0.0:
+    if not are_clear(data, [path_from(data, fit) for fit in best]):
+        return (tuple(alone) if is_one and _are_alike(best) else _refused(
+            alone, n_targets, 'which would be in each other (a turn, braking)'),)
+    if is_one and order_criteria([one, best[0]])[0] == 0.0:
         return (tuple(alone),)
     return found
 
@@ -73,9 +83,14 @@ def _why_not(data: PassData, fits: Sequence[PassFit]) -> str:
     if not all(describes(fit) for fit in fits):
         return ('which at constant velocities leave over '
                 f'{1.0 - fits[0].explained:.1%} of the field (a turn, braking, a further one)')
-    if not are_clear(data, [path_from(data, fit) for fit in fits]):
-        return 'which would be in each other (a long vehicle, a turn, braking)'
     return ''
+
+
+def _are_alike(fits: Sequence[PassFit]) -> bool:
+    """Whether all targets move together."""
+    velocity = np.array([fit.velocity for fit in fits])
+    mean = velocity.mean(axis=0)
+    return bool((np.linalg.norm(velocity - mean, axis=1) <= ALIKE * np.linalg.norm(mean)).all())
 
 
 def _refused(fits: Sequence[PassFit], n_targets: int, why: str) -> tuple[PassFit, ...]:

@@ -23,8 +23,8 @@ from mag_tracking.analysis.pass_fit import (
     starting_paths,
     unusable,
 )
-from mag_tracking.analysis.pass_result import PassFit
-from mag_tracking.arrays import FloatArray
+from mag_tracking.analysis.pass_result import NEARLY, PassFit
+from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.geometry import overlap
 from mag_tracking.inference.least_squares import refine
 from mag_tracking.inference.separable_fit import coarse_minima, fine_minimum
@@ -187,11 +187,12 @@ class _JointFits:
             data.t, data.positions, data.whitening).split
         coarse, fine = (separable_problem(d, model_of, prior=prior) for d in (self._rough, data))
         theta, cost, _, _ = refine(coarse.residual_and_jacobian, starts, 40, 1e-6)
-        # Where there is no such minimum the targets are no two vehicles, which `fit_targets` says.
         in_order = tuple(range(len(orders)))
-        clear = np.array([nearest(self._placed[0], split(found)) == in_order
-                          and are_clear(self._rough, split(found)) for found in theta])
-        cost = np.where(clear | ~clear.any(), cost, np.inf)
+        cost = _of_the_best(cost, np.array([nearest(self._placed[0], split(found)) == in_order
+                                            for found in theta]), np.inf)
+        # Where the best by far are in each other they are no two vehicles: `fit_targets` says so.
+        cost = _of_the_best(cost, np.array([are_clear(self._rough, split(found))
+                                            for found in theta]), NEARLY)
         found = fine_minimum(fine, theta, cost, np.concatenate(
             [APART[:6 + (n > 1)] for n in orders]), N_FINE)
         if not np.isfinite(found.cost):
@@ -201,6 +202,13 @@ class _JointFits:
         left = max(found.cost - self._n_free, 0.0) / (fine.energy - self._n_free)
         return described(data, orders, replace(found, theta=theta), p, 1.0 - left, self._errors,
                          path_std=prior[1])
+
+
+def _of_the_best(cost: FloatArray, wanted: BoolArray, nearly: float) -> FloatArray:
+    """(n,) costs, infinite of those that are not `wanted`, if the best wanted one is not more than
+    `nearly` times the best."""
+    is_one = (cost[wanted] <= nearly * cost.min()).any()
+    return np.where(wanted, cost, np.inf) if is_one else cost
 
 
 def are_clear(data: PassData, paths: Sequence[FloatArray]) -> bool:

@@ -9,7 +9,7 @@ from mag_tracking.analysis.correlated_motion import CorrelatedMotion, correlated
 from mag_tracking.analysis.model_order import choose_order
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_fit import fit_pass
-from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.analysis.pass_result import NEARLY, PassFit
 from mag_tracking.analysis.pass_targets import fit_targets
 from mag_tracking.analysis.pass_trust import contradicted
 from mag_tracking.analysis.superposed_fit import Ground
@@ -21,9 +21,6 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.records import FieldFrame, Readings
 from mag_tracking.stages.track.manager import TrackManager
-
-NEARLY = 1.25
-"""A fit whose cost is not larger than this times that of the best describes the pass as well."""
 
 
 @dataclass(frozen=True)

@@ -137,8 +137,20 @@ def test_parts_of_one_vehicle_are_no_two_vehicles():
     alone = [fit_pass(data, n) for n in (2, 3)]
     parts = np.array([row[:6], row[:6]])
     parts[:, 0] += [1.7, -1.7]
-    fits, = fit_targets(data, alone, parts, GROUND)
-    assert choose_order(fits) is not None or 'in each other' in fits[0].reason
+    assert fit_targets(data, alone, parts, GROUND) == (tuple(alone),)
+    assert abs(choose_order(alone).velocity[0] - row[3]) < 0.5
+
+
+def test_vehicles_that_drive_through_each_other_are_refused():
+    rng = np.random.default_rng(1)
+    slow, m = one_path(rng, 0.0, 1, 1)
+    fast, more = one_path(rng, 0.3, 1, 1)
+    fast[1], fast[3] = slow[1], 2.0 * slow[3]
+    data = together(measured(ROAD, slow, m, rng, seconds=6.0),
+                    measured(ROAD, fast, more, rng, seconds=6.0, noise=1e-15))
+    alone = [fit_pass(data, n) for n in (1, 2)]
+    fits, = fit_targets(data, alone, np.array([slow, fast]), GROUND)
+    assert all('in each other' in fit.reason for fit in fits) and choose_order(alone) is not None
 
 
 def test_what_is_not_believed_says_why():
