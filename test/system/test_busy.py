@@ -11,7 +11,7 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from support import busy_recordings, busy_worlds
 from support.bundled import NETWORK_FILE
 from support.marks import studied
-from support.random_passes import SIMULATORS, random_pass
+from support.random_passes import SIMULATORS, one_random_pass, random_pass
 from support.samples import scenario
 
 MOST_WRONG = 0.01
@@ -123,3 +123,11 @@ def test_more_vehicles_than_are_tracked_together_are_counted():
         most = max(most, 0 if bank is None else bank.label.reshape(len(bank), -1).shape[1])
     assert most == 2
     assert pipeline.track.counts['newcomers not sought: too many vehicles at once'] > 0
+
+
+@pytest.mark.study
+@pytest.mark.parametrize('seed', [1, 14])
+def test_smoothed_poses_of_a_truck_that_was_taken_for_two_are_flagged(seed):
+    """Of 76 without a flag 46 were wrong."""
+    got = one_random_pass('clouds', 'truck', seed)
+    assert got.smoothed_wrong == 0 and not got.ambiguous.all()

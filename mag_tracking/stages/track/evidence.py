@@ -81,6 +81,8 @@ class TrackEvidence:
         self._found_ns: dict[str, int] = {}
         # Until when other doubts last.
         self._until_ns: dict[str, int] = {}
+        # Stretches that also smoothed poses are doubted in.
+        self._stretches: list[tuple[int, int]] = []
         self._best_spread = np.inf
         # Per sensor: whitened energy of its fields above that of noise, and number of axes.
         self._energy, self._n_axes = np.zeros(n_sensors), np.zeros(n_sensors)
@@ -126,9 +128,12 @@ class TrackEvidence:
         if len(network) == 1 or network.is_close and not starts_anywhere:
             self.doubt(doubts.SENSORS_AT_ONE_PLACE)
 
-    def doubt_for(self, reason: str, stamp_ns: int, seconds: float) -> None:
-        """The poses of so many seconds may be wrong."""
-        self._until_ns[reason] = stamp_ns + round(seconds * NS)
+    def doubt_for(self, reason: str, stamp_ns: int, seconds: float,
+                  since_ns: int | None = None) -> None:
+        """The poses of so many seconds may be wrong; those since an earlier time were, perhaps."""
+        self._until_ns[reason] = until_ns = stamp_ns + round(seconds * NS)
+        if since_ns is not None:
+            self._stretches.append((since_ns, until_ns))
 
     def watch(self, frame: FieldFrame) -> None:
         """Doubt the track where the field has grown unlike that of a target from afar."""
@@ -224,7 +229,7 @@ class TrackEvidence:
 
     def doubted_filter(self, stamp_ns: int) -> bool:
         """Whether the filter was doubted at an earlier time."""
-        return are_doubtful(self._doubtful_times, stamp_ns)
+        return are_doubtful((*self._doubtful_times, *self._stretches), stamp_ns)
 
     def support(self, by_one_sensor: bool, dt: float) -> None:
         """Count `dt` [s] for which one sensor of several supported the track, or more did.

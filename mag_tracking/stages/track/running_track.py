@@ -337,7 +337,7 @@ class RunningTrack:
             member.evidence.add(joint.log_odds)
             member.evidence.explanation.add(joint.log_odds, now_ns, ratio)
             if slot in doubtful:
-                member.evidence.doubt_for(doubts.ANOTHER_VEHICLE, now_ns, DOUBTED_S)
+                member.evidence.doubt_for(doubts.ANOTHER_VEHICLE, now_ns, DOUBTED_S, begin_ns)
 
     def hand_over(self) -> None:
         """Switch to the sensors near where the target is going, if those used are others."""

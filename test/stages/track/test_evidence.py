@@ -193,3 +193,17 @@ def test_a_passing_doubt_lasts_for_a_tenth_of_a_second():
     # The smoothed poses are doubted where the doubt was found.
     assert not evidence.doubted_filter(NS + round(0.32 * NS))
     assert evidence.doubted_filter(NS + round(0.16 * NS))
+
+
+def test_poses_before_a_doubt_are_doubted_when_they_are_smoothed():
+    """A long vehicle that was taken for two was wrong before that was seen, too."""
+    evidence = TrackEvidence(2)
+    evidence.doubt_for(doubts.ANOTHER_VEHICLE, 5 * NS, 3.0, since_ns=3 * NS)
+    assert doubts.ANOTHER_VEHICLE in evidence.note(set(), 7 * NS)
+    assert doubts.ANOTHER_VEHICLE not in evidence.note(set(), 9 * NS)
+    assert [evidence.doubted_filter(t * NS) for t in (2, 3, 5, 7, 9)] == [
+        False, True, True, True, False]
+    # One that only may be another from now on.
+    evidence = TrackEvidence(2)
+    evidence.doubt_for(doubts.ANOTHER_VEHICLE, 5 * NS, 3.0)
+    assert not any(evidence.doubted_filter(t * NS) for t in range(10))
