@@ -33,8 +33,6 @@ def described(data: PassData, orders: Sequence[int], found: Minimum, p: FloatArr
               path_std: FloatArray | None = None) -> tuple[PassFit, ...]:
     """The `PassFit` of each of the targets that were fitted together.
 
-    Time zero is where the field of the target is strongest.
-
     Parameters
     ----------
     data : PassData
@@ -67,9 +65,6 @@ def described(data: PassData, orders: Sequence[int], found: Minimum, p: FloatArr
               for paths, cost in ((np.split(theta, ends), cost) for theta, cost in found.rivals)]
     fits = [replace(fit, rivals=_rivals(fit, [(paths[k], cost) for paths, cost in rivals]))
             for k, fit in enumerate(fits)]
-    if len(fits) > 1:
-        fits = [_from(fit, float(data.t[np.argmax(np.square(field).sum(axis=1))]))
-                for fit, field in zip(fits, about.fields, strict=True)]
     return tuple(replace(fit, reason=doubt(fit), trusted=trusted(fit)) for fit in fits)
 
 
@@ -215,8 +210,8 @@ def _rivals(fit: PassFit, minima: Iterable[tuple[FloatArray, float]]) -> tuple[
     return tuple(rivals)
 
 
-def _from(fit: PassFit, seconds: float) -> PassFit:
-    """The same with time zero `seconds` later."""
+def later(fit: PassFit, seconds: float) -> PassFit:
+    """The same `PassFit` with time zero `seconds` later."""
     F = np.eye(len(fit.x))
     F[:3, 3:6] = seconds * np.eye(3)
     # An infinite variance times zero is none.

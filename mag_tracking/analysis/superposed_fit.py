@@ -13,7 +13,7 @@ import numpy as np
 
 from mag_tracking.analysis.model_order import order_criteria
 from mag_tracking.analysis.pass_data import PassData, background_columns, separable_problem
-from mag_tracking.analysis.pass_description import APART, described, nearest
+from mag_tracking.analysis.pass_description import APART, described, later, nearest
 from mag_tracking.analysis.pass_deviation import SensorErrors
 from mag_tracking.analysis.pass_fit import (
     AS_BOUGHT,
@@ -95,8 +95,9 @@ def fit_superposed(data: PassData, paths: FloatArray, ground: Ground,
     -------
     tuple of tuples of PassFit
         Of each target, in the order in which they pass the middle of the sensors, the fit with
-        each of `orders`, the others having as many dipoles as they are worth. Empty where there
-        are too few measurements for so many unknowns.
+        each of `orders`, the others having as many dipoles as they are worth. Time zero is at
+        the strongest field of the target. Empty where there are too few measurements for so many
+        unknowns.
     """
     n_targets, begin_ns = len(paths), data.stamp_ns
     if any(unusable(data, n_targets * (n,)) for n in orders):
@@ -115,9 +116,9 @@ def fit_superposed(data: PassData, paths: FloatArray, ground: Ground,
                 known[k] = orders[int(np.argmin(criteria))]
         if known == before:
             break
-    found = [(fits.of(k, known, (known[k],))[0], fits.of(k, known, orders))
+    found = [_from_its_strongest(fits.of(k, known, orders), orders.index(known[k]))
              for k in range(n_targets)]
-    return tuple(of_one for _, of_one in sorted(found, key=lambda pair: _passes_at(pair[0])))
+    return tuple(of_one for _, of_one in sorted(found, key=lambda pair: pair[0]))
 
 
 def _placed(rough: PassData, n_targets: int, ground: Ground) -> FloatArray:
@@ -175,7 +176,7 @@ class _JointFits:
         """
         starts = [_of_orders(paths, orders) for paths in self._placed]
         if before is not None and all(len(fit.x) for fit in before):
-            paths = _of_orders([path_from(self._data, fit) for fit in before], orders)
+            paths = _of_orders([fit.x[:6 + (fit.n_dipoles > 1)] for fit in before], orders)
             rows = [paths[k], *(shorter_rows(paths[k]) if orders[k] > 1 else ())]
             starts += [[*paths[:k], row, *paths[k + 1:]] for row in rows]
         return np.array([np.concatenate(paths) for paths in starts])
@@ -237,7 +238,14 @@ def _of_orders(paths: Sequence[FloatArray], orders: Sequence[int]) -> list[Float
             if n > 1 else path[:6] for path, n in zip(paths, orders, strict=True)]
 
 
-def _passes_at(fit: PassFit) -> float:
-    """[s since 1970] When a target passes the middle of the sensors."""
+def _from_its_strongest(fits: Sequence[PassFit], best: int) -> tuple[float, tuple[PassFit, ...]]:
+    """([s since 1970] when a target passes the middle of the sensors, its fits with time zero at
+    its strongest field), by the `best` one."""
+    fit = fits[best]
+    if not len(fit.x):
+        return np.inf, tuple(fits)
+    field = replace(fit.data, field=fit.predicted).departure
+    seconds = float(fit.data.t[np.argmax(np.einsum('ni,ni->n', field, field))])
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
-    return (fit.data.stamp_ns / NS + fit.closest_approach(centre)[0]) if len(fit.x) else np.inf
+    at = fit.data.stamp_ns / NS + fit.closest_approach(centre)[0]
+    return at, tuple(later(f, seconds) if len(f.x) else f for f in fits)

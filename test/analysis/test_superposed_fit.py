@@ -10,7 +10,7 @@ from mag_tracking.analysis.model_order import choose_order, order_criteria
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_targets import fit_targets
 from mag_tracking.analysis.superposed_fit import Ground, are_clear, fit_superposed, path_from
-from support.passes import ROAD, measured, network_of, together
+from support.passes import ROAD, measured, network_of, random_moments, together
 
 GROUND = Ground((0.7, 0.4), 0.1)
 FOUR = network_of([[-3.0, -4.5, 0.0], [-3.0, 4.5, 0.0], [3.0, -4.5, 0.0], [3.0, 4.5, 0.0]])
@@ -20,11 +20,7 @@ def one_path(rng, at_s, direction, n_dipoles):
     """(path, moments) of a vehicle that passes the origin at a time [s], in its lane."""
     speed = direction * rng.uniform(8.0, 20.0)
     place = [-speed * at_s, -direction * rng.uniform(1.4, 2.2), rng.uniform(0.4, 1.0)]
-    whole = rng.standard_normal(3)
-    whole *= rng.uniform(200.0, 600.0) / np.linalg.norm(whole)
-    moments = np.tile(whole / n_dipoles, (n_dipoles, 1))
-    if n_dipoles > 1:
-        moments = moments + 60.0 * rng.standard_normal((n_dipoles, 3))
+    moments = random_moments(rng, n_dipoles)
     length = [rng.uniform(2.0, 3.5)] if n_dipoles > 1 else []
     return np.concatenate([place, [speed, 0.1 * rng.standard_normal(), 0.0], length]), moments
 
@@ -104,9 +100,10 @@ def test_each_has_as_many_dipoles_as_it_is_worth():
     found = fit_superposed(data, tracked(rng, (point, row)), GROUND, (1, 2, 3))
     orders = [choose_order(fits).n_dipoles for fits in found]
     assert orders[0] == 1 and orders[1] >= 2
-    # Whichever number one of them is given, it is the same vehicle.
+    # Whichever number one of them is given, it is the same vehicle, with the same time zero.
     for fits, path in zip(found, (point, row), strict=True):
         assert [fit.n_dipoles for fit in fits] == [1, 2, 3]
+        assert len({(fit.data.stamp_ns, fit.data.t[0]) for fit in fits}) == 1
         assert all(fit.velocity[0] * path[3] > 0.0 for fit in fits if fit.converged)
 
 

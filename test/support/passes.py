@@ -23,6 +23,14 @@ def network_of(positions):
 ROAD = network_of([[0.0, -4.5, 0.0], [0.0, 4.5, 0.0]])
 
 
+def random_moments(rng, n_dipoles):
+    """(d, 3) [A m^2] of a row of dipoles."""
+    whole = rng.standard_normal(3)
+    whole *= rng.uniform(200.0, 600.0) / np.linalg.norm(whole)
+    moments = np.tile(whole / n_dipoles, (n_dipoles, 1))
+    return moments if n_dipoles == 1 else moments + 60.0 * rng.standard_normal((n_dipoles, 3))
+
+
 def random_path(rng, n_dipoles, road):
     """Path (6 or 7,) and moments (d, 3): along the road, or with any heading past its middle."""
     heading = rng.uniform(0.0, 2.0 * np.pi)
@@ -33,11 +41,7 @@ def random_path(rng, n_dipoles, road):
     offset = rng.uniform(-2.5, 2.5) if road else rng.uniform(-6.0, 6.0)
     position = np.append(offset * aside + rng.uniform(-2.0, 2.0) * along, rng.uniform(0.3, 1.0))
     velocity = np.append(rng.uniform(4.0, 20.0) * along, 0.05 * rng.standard_normal())
-    whole = rng.standard_normal(3)
-    whole *= rng.uniform(200.0, 600.0) / np.linalg.norm(whole)
-    moments = np.tile(whole / n_dipoles, (n_dipoles, 1))
-    if n_dipoles > 1:
-        moments = moments + 60.0 * rng.standard_normal((n_dipoles, 3))
+    moments = random_moments(rng, n_dipoles)
     length = [rng.uniform(2.0, 5.0)] if n_dipoles > 1 else []
     return np.concatenate([position, velocity, length]), moments
 
