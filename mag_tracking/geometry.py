@@ -162,16 +162,16 @@ def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, flo
 
 def overlap(position: FloatArray, velocity: FloatArray, need: ArrayLike,
             width: float) -> FloatArray:
-    """[m] By how much two bodies are in each other along the way of the second; 0 = not at all.
+    """[m] By how much two bodies overlap along the heading of the second; 0 = not at all.
 
     Parameters
     ----------
     position, velocity : (2, n, 2 or 3) [m], [m/s]
         Of the middles of both.
     need : float or (n,) [m]
-        So far apart they are clear of each other, along the way of the second.
+        Distance along that heading at which they do not overlap.
     width : float [m]
-        They are when they are so far apart across it, too.
+        Distance across it at which they do not overlap.
 
     Returns
     -------

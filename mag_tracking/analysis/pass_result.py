@@ -16,6 +16,9 @@ FAR = 22.5
 """Squared deviations, of six numbers, at which another path is another: one in a thousand."""
 
 
+POOR = 2.0
+"""A normalised cost beyond says that the model leaves out more than the noise covers."""
+
 NEARLY = 1.25
 """A fit whose cost is not larger than this times that of the best describes the pass as well."""
 
@@ -126,8 +129,19 @@ class PassFit:
         return bool(length_std <= max(length, 1.0) and SHORTEST * way <= length <= way)
 
     @property
+    def is_poor_mixture(self) -> bool:
+        """Whether targets that were fitted together leave over more than noise."""
+        return self.n_others > 0 and bool(self.normalised_cost > POOR)
+
+    @property
     def ambiguous(self) -> bool:
-        """Whether another path, elsewhere by its deviations, is possible at 1 %."""
+        """Whether another path, elsewhere by its deviations, is possible at 1 %.
+
+        Of targets that were fitted together also where much is left over: of which of them it is
+        nobody knows.
+        """
+        if self.is_poor_mixture:
+            return True
         P = self.honest_covariance[:6, :6]
         for d, path in self.rivals:
             e = path[:6] - self.x[:6]

@@ -1,6 +1,6 @@
 """Fit a pass as of one target, or of several where tracks were of several."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -27,8 +27,9 @@ ALIKE = 0.25
 """Parts of one vehicle are found with velocities that differ by no more than this share."""
 
 
-def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray,
-                ground: Ground) -> tuple[tuple[PassFit, ...], ...]:
+def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray, ground: Ground,
+                orders: Sequence[int], stopped: Callable[[], bool] | None = None
+                ) -> tuple[tuple[PassFit, ...], ...]:
     """The fits of a pass for each of its targets.
 
     A row of dipoles that is long enough describes two vehicles that follow each other, and two
@@ -42,6 +43,10 @@ def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray,
     paths : (K, 6) [m], [m/s]
         Of the targets that were tracked, where they are when `data.t` is zero.
     ground : Ground
+    orders : sequence of int
+        Numbers of dipoles to try where there are several.
+    stopped : function, optional
+        Whether to give up; what is returned is then of no use.
 
     Returns
     -------
@@ -55,20 +60,16 @@ def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray,
         return (tuple(alone),)
     if n_targets > MOST_TARGETS:
         return (_refused(alone, n_targets, f'at most {MOST_TARGETS} are fitted together'),)
-    found = fit_superposed(data, paths, ground, [fit.n_dipoles for fit in alone])
+    found = fit_superposed(data, paths, ground, orders, stopped=stopped)
     if not found:
         return (_refused(alone, n_targets,
                          'there are too few measurements to fit them together'),)
     best, one = [_best(fits) for fits in found], _best(alone)
-    is_one = not one.reason and one.length[0] <= LONGEST
-    if why := _why_not(data, best):
-        return (_refused(alone, n_targets, why),)
-    if not are_clear(data, [path_from(data, fit) for fit in best]):
-        return (tuple(alone) if is_one and _are_alike(best) else _refused(
-            alone, n_targets, 'which would be in each other (a turn, braking)'),)
-    if is_one and order_criteria([one, best[0]])[0] == 0.0:
+    if not one.reason and one.length[0] <= LONGEST and all(fit.determined for fit in best) and (
+            _are_parts(data, best) or order_criteria([one, best[0]])[0] == 0.0):
         return (tuple(alone),)
-    return found
+    why = _why_not(data, best)
+    return (_refused(alone, n_targets, why),) if why else found
 
 
 def _best(fits: Sequence[PassFit]) -> PassFit:
@@ -76,21 +77,32 @@ def _best(fits: Sequence[PassFit]) -> PassFit:
     return fits[int(np.argmin(order_criteria(fits)))]
 
 
+def _are_parts(data: PassData, fits: Sequence[PassFit]) -> bool:
+    """Whether targets move together, and overlap."""
+    velocity = np.array([fit.velocity for fit in fits])
+    mean = velocity.mean(axis=0)
+    return bool((np.linalg.norm(velocity - mean, axis=1) <= ALIKE * np.linalg.norm(mean)).all()
+                and not are_clear(data, [path_from(data, fit) for fit in fits]))
+
+
 def _why_not(data: PassData, fits: Sequence[PassFit]) -> str:
-    """Why targets that were fitted together are not believed, or nothing."""
+    """Why targets that were fitted together are not believed, or nothing.
+
+    What is wrong with one of them is in the answers of all.
+    """
     if not all(fit.converged for fit in fits):
         return 'the fit of them together did not converge'
     if not all(describes(fit) for fit in fits):
         return ('which at constant velocities leave over '
                 f'{1.0 - fits[0].explained:.1%} of the field (a turn, braking, a further one)')
+    if not are_clear(data, [path_from(data, fit) for fit in fits]):
+        return 'which would overlap (a turn, braking, a further one)'
+    for k, fit in enumerate(fits, 1):
+        if fit.reason:
+            return f'of vehicle {k}: {fit.reason}'
+        if fit.length[0] > LONGEST:
+            return f'of vehicle {k}: {fit.length[0]:.0f} m are longer than any vehicle'
     return ''
-
-
-def _are_alike(fits: Sequence[PassFit]) -> bool:
-    """Whether all targets move together."""
-    velocity = np.array([fit.velocity for fit in fits])
-    mean = velocity.mean(axis=0)
-    return bool((np.linalg.norm(velocity - mean, axis=1) <= ALIKE * np.linalg.norm(mean)).all())
 
 
 def _refused(fits: Sequence[PassFit], n_targets: int, why: str) -> tuple[PassFit, ...]:

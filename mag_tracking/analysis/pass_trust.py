@@ -166,7 +166,7 @@ def _no_pass(fit: PassFit) -> str:
     if not describes(fit):
         return (f'not one target at constant velocity: {1.0 - fit.explained:.1%} of the field is '
                 f'left over, {fit.left_elsewhere:.1%} where a vehicle at that distance leaves none '
-                '(two vehicles in the window, a turn, a wrong network file)')
+                '(another vehicle, a turn, a wrong network file)')
     if turns(fit):
         return ('not at constant velocity: while it was seen it changed by '
                 f'{fit.velocity_change:.0%} of itself (a turn, braking)')

@@ -4,7 +4,7 @@ The targets are placed as points first: where tracks have them, and, one after t
 the others leave over is strongest. Then each gets as many dipoles as it is worth.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -32,26 +32,30 @@ from mag_tracking.physics.passes import SuperposedPasses
 from mag_tracking.units import NS
 
 N_REFINED, N_STEPS = 150, 6
-"""So many of the starts get so many steps before the best of them are chosen."""
+"""Number of starts that are refined, and steps of each, before the best are chosen."""
 
 N_PLACED = 10
-"""So many places of the targets are followed to their minima."""
+"""Number of placements of the targets that are followed to their minima."""
 
 N_FINE = 2
-"""So many minima are gone on with: the best one, and its rival."""
+"""Number of minima that all measurements are fitted from: the best one and its rival."""
 
 FIRST_LENGTH = 3.0
 """[m] of a row that was a point."""
 
 CLEAR, WIDTH = 3.0, 1.5
-"""[m] The rows of two vehicles are so far apart along their way, their bodies being longer than
-their rows, or so far across it. Two that are nearer are parts of one vehicle."""
+"""[m] Least distance between the rows of two vehicles, along their heading (their bodies are longer
+than their rows) or across it. Two that are nearer are parts of one vehicle."""
 
 SEEN_FROM = 15.0
 """[m] A target is seen by a sensor that is no farther from it."""
 
 MOST_ROUNDS = 3
-"""So often the order of each target is chosen anew, those of the others being given."""
+"""Number of times that the order of each target is chosen, given those of the others."""
+
+SAME_SHARE, SAME_M = 0.5, 5.0
+"""Two fits are of the same target if their velocities differ by no more than this share, and their
+positions by no more than this distance [m]. A track is 5 % and half a metre off."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +79,8 @@ class Ground:
 
 
 def fit_superposed(data: PassData, paths: FloatArray, ground: Ground,
-                   orders: Sequence[int] = (1, 2, 3, 4),
-                   errors: SensorErrors = AS_BOUGHT) -> tuple[tuple[PassFit, ...], ...]:
+                   orders: Sequence[int] = (1, 2, 3, 4), errors: SensorErrors = AS_BOUGHT,
+                   stopped: Callable[[], bool] | None = None) -> tuple[tuple[PassFit, ...], ...]:
     """Fit several rows of dipoles, each at constant velocity, to the sum of their fields.
 
     Parameters
@@ -90,17 +94,21 @@ def fit_superposed(data: PassData, paths: FloatArray, ground: Ground,
         Numbers of dipoles to try for each target.
     errors : SensorErrors
         Of the sensors, for the honest covariance.
+    stopped : function, optional
+        Whether to give up.
 
     Returns
     -------
     tuple of tuples of PassFit
         Of each target, in the order in which they pass the middle of the sensors, the fit with
-        each of `orders`, the others having as many dipoles as they are worth. Time zero is at
-        the strongest field of the target. Empty where there are too few measurements for so many
-        unknowns.
+        each of `orders` that there are enough measurements for; the others have as many dipoles as
+        they are worth. Time zero is at the strongest field of the target. A fit that left its
+        track, or the best fit of its target, says so. Empty where there are too few measurements
+        for any order, or where it gave up.
     """
     n_targets, begin_ns = len(paths), data.stamp_ns
-    if any(unusable(data, n_targets * (n,)) for n in orders):
+    orders = [n for n in orders if not unusable(data, n_targets * (n,))]
+    if not orders:
         return ()
     data, rough = at_strongest(data)
     paths = paths.copy()
@@ -111,13 +119,16 @@ def fit_superposed(data: PassData, paths: FloatArray, ground: Ground,
     for _ in range(MOST_ROUNDS):
         before = list(known)
         for k in range(n_targets):
+            if stopped is not None and stopped():
+                return ()
             criteria = order_criteria(fits.of(k, known, orders))
             if np.isfinite(criteria).any():
                 known[k] = orders[int(np.argmin(criteria))]
         if known == before:
             break
-    found = [_from_its_strongest(fits.of(k, known, orders), orders.index(known[k]))
-             for k in range(n_targets)]
+    found = [_from_its_strongest(
+        _of_one_target(fits.of(k, known, orders), orders.index(known[k]), paths[k]),
+        orders.index(known[k])) for k in range(n_targets)]
     return tuple(of_one for _, of_one in sorted(found, key=lambda pair: pair[0]))
 
 
@@ -212,13 +223,14 @@ def _of_the_best(cost: FloatArray, wanted: BoolArray, nearly: float) -> FloatArr
     return np.where(wanted, cost, np.inf) if is_one else cost
 
 
-def are_clear(data: PassData, paths: Sequence[FloatArray]) -> bool:
-    """Whether targets on `paths` (6 or 7,) are beside or behind each other while they are seen."""
+def are_clear(data: PassData, paths: Sequence[FloatArray], clear: float = CLEAR) -> bool:
+    """Whether targets on `paths` (6 or 7,) are beside each other while they are seen, or their rows
+    `clear` [m] apart."""
     places = [path[:3] + data.t[:, None] * path[3:6] for path in paths]
     seen = np.any([np.linalg.norm(place - data.positions, axis=1) < SEEN_FROM
                    for place in places], axis=0)
     for i, k in combinations(range(len(paths)), 2):
-        need = CLEAR + 0.5 * sum(abs(path[6]) for path in (paths[i], paths[k]) if len(path) > 6)
+        need = clear + 0.5 * sum(abs(path[6]) for path in (paths[i], paths[k]) if len(path) > 6)
         velocity = np.array([np.tile(paths[j][3:6], (len(data.t), 1)) for j in (i, k)])
         if overlap(np.array([places[i], places[k]]), velocity, need, WIDTH)[seen].any():
             return False
@@ -238,14 +250,42 @@ def _of_orders(paths: Sequence[FloatArray], orders: Sequence[int]) -> list[Float
             if n > 1 else path[:6] for path, n in zip(paths, orders, strict=True)]
 
 
+def _of_one_target(fits: Sequence[PassFit], best: int, path: FloatArray) -> list[PassFit]:
+    """The fits of a target on a tracked `path` (6,); those that left it have a reason."""
+    out = []
+    for k, fit in enumerate(fits):
+        # The best one is that of the track, and the others are that of the best one.
+        is_same = k != best and not len(fits[best].x) or _is_same(
+            fit, path if k == best else fits[best].x)
+        why = 'it is not where it was tracked' if k == best else \
+            f'another target than with {fits[best].n_dipoles} dipoles'
+        out.append(fit if is_same or fit.reason else replace(fit, reason=why, trusted=()))
+    return out
+
+
+def _is_same(fit: PassFit, path: FloatArray) -> bool:
+    """Whether a fit is of the target on a `path` (6 or more,) from the same time on."""
+    if not len(fit.x):
+        return False
+    seconds = _strongest_at(fit)
+    away = fit.position - path[:3] + seconds * (fit.velocity - path[3:6])
+    return bool(np.linalg.norm(away[:2]) <= SAME_M and np.linalg.norm(
+        fit.velocity - path[3:6]) <= SAME_SHARE * np.linalg.norm(path[3:6]))
+
+
+def _strongest_at(fit: PassFit) -> float:
+    """[s] When the field of a target is strongest."""
+    field = replace(fit.data, field=fit.predicted).departure
+    return float(fit.data.t[np.argmax(np.einsum('ni,ni->n', field, field))])
+
+
 def _from_its_strongest(fits: Sequence[PassFit], best: int) -> tuple[float, tuple[PassFit, ...]]:
     """([s since 1970] when a target passes the middle of the sensors, its fits with time zero at
     its strongest field), by the `best` one."""
     fit = fits[best]
     if not len(fit.x):
         return np.inf, tuple(fits)
-    field = replace(fit.data, field=fit.predicted).departure
-    seconds = float(fit.data.t[np.argmax(np.einsum('ni,ni->n', field, field))])
+    seconds = _strongest_at(fit)
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
     at = fit.data.stamp_ns / NS + fit.closest_approach(centre)[0]
     return at, tuple(later(f, seconds) if len(f.x) else f for f in fits)

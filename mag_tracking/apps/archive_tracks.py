@@ -117,8 +117,10 @@ class StretchTables:
         """The rows of a pass, one a vehicle, fitted as a whole."""
         alone = (fit_pass(data, self._n_dipoles),)
         for one in fitted_vehicles(self._recording.stem, number, data, alone,
-                                   self._tracks.paths(data), self._ground, notes):
-            row = pass_rows(one)[0]
+                                   self._tracks.paths(data), self._ground,
+                                   (self._n_dipoles - 1, self._n_dipoles), notes):
+            rows = pass_rows(one)
+            row = next((row for row in rows if row['chosen']), rows[-1])
             self.n_passes += 1
             self._tables['passes'].add(
                 {name: _number(value) if isinstance(value, float) else value

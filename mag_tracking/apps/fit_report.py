@@ -39,6 +39,9 @@ def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
     notes = [Note(WARNING, text) for text in warnings]
     if not passes:
         notes.append(Note(NOTE, 'no pass: nothing was detected'))
+    if any(one.n_vehicles > 1 for one in passes):
+        notes.append(Note(NOTE, 'of vehicles that were fitted together the measured field is shown '
+                          'without that of the others'))
     begins = [ns / NS for ns in _begins_ns(passes)]
     if len({one.recording for one in passes}) > 1:
         notes.append(Note(NOTE, 'the time axis places the recordings one after another'))
@@ -47,7 +50,9 @@ def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
     ends = [begins[k] + float(one.fits[0].data.t.max()) for k, one in enumerate(passes)]
     scene = scene_of(network, 0, int(max(ends) * NS), tracks) if tracks else None
     n_answers = len(tracks)
-    return Page(f'{len(passes)} pass{"es" * (len(passes) != 1)}, {n_answers} with an answer',
+    n_passes = len({(one.recording, one.number) for one in passes})
+    several = f', {len(passes)} vehicles' if len(passes) > n_passes else ''
+    return Page(f'{n_passes} pass{"es" * (n_passes != 1)}{several}, {n_answers} with an answer',
                 'each fitted as a row of dipoles at constant velocity', notes, scene,
                 [_order_chart(passes)] if passes else [], [_table(passes)])
 

@@ -12,7 +12,7 @@ from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import NEARLY, PassFit
 from mag_tracking.analysis.pass_targets import fit_targets
 from mag_tracking.analysis.pass_trust import contradicted
-from mag_tracking.analysis.superposed_fit import Ground
+from mag_tracking.analysis.superposed_fit import Ground, are_clear, path_from
 from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.apps.pass_tracks import PassTracks, ground_of
 from mag_tracking.arrays import FloatArray
@@ -21,6 +21,9 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.records import FieldFrame, Readings
 from mag_tracking.stages.track.manager import TrackManager
+
+TRAILER = 8.0
+"""[m] A car and its trailer are rows that are nearer to each other than this."""
 
 
 @dataclass(frozen=True)
@@ -124,21 +127,29 @@ class PassFitter:
                     return
                 fits.append(fit_pass(data, n_dipoles, self._cpa_range))
             self._n += 1
-            yield from fitted_vehicles(self._recording, self._n, data, fits,
-                                       self._tracks.paths(data), self._ground, notes)
+            found = fitted_vehicles(self._recording, self._n, data, fits, self._tracks.paths(data),
+                                    self._ground, self._orders, notes, stopped)
+            if stopped is not None and stopped():
+                return
+            yield from found
 
 
 def fitted_vehicles(recording: str, number: int, data: PassData, alone: Sequence[PassFit],
-                    paths: FloatArray, ground: Ground,
-                    notes: tuple[str, ...]) -> list[FittedPass]:
+                    paths: FloatArray, ground: Ground, orders: Sequence[int],
+                    notes: tuple[str, ...],
+                    stopped: Callable[[], bool] | None = None) -> list[FittedPass]:
     """A `FittedPass` of each vehicle of a pass.
 
     `recording`, `number` and `notes` are those of the `FittedPass`; the others as for
     `analysis.pass_targets.fit_targets`.
     """
-    found = fit_targets(data, alone, paths, ground)
-    if len(found) > 1:
-        notes = (*notes, f'{len(found)} vehicles were fitted together: what was measured is given '
-                         'without the field of the others')
-    return [FittedPass(recording, number, fits, notes, correlated_motion(fits[0].data), k,
-                       len(found)) for k, fits in enumerate(found, 1)]
+    found = fit_targets(data, alone, paths, ground, orders, stopped)
+    if len(found) == 1:
+        return [FittedPass(recording, number, found[0], notes, correlated_motion(data))]
+    chosen = [fit for fit in map(choose_order, found) if fit is not None]
+    notes = (*notes, f'{len(found)} vehicles were fitted together: what was measured is given '
+                     'without the field of the others')
+    if not are_clear(data, [path_from(data, fit) for fit in chosen], TRAILER):
+        notes = (*notes, f'they are less than {TRAILER:.0f} m apart: perhaps parts of one vehicle')
+    return [FittedPass(recording, number, fits, notes, CorrelatedMotion(
+        'several vehicles were seen at once'), k, len(found)) for k, fits in enumerate(found, 1)]

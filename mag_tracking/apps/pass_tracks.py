@@ -33,10 +33,17 @@ class PassTracks:
         # Of each track the surest pose of the passes that were, and all that came after them.
         self._poses: dict[int, list[_Pose]] = {}
         self._ended: set[int] = set()
+        self._latest_ns = 0
 
     def take(self, records: Iterable[object]) -> None:
         """Note the poses among the records of a tracker."""
         for record in records:
+            if isinstance(record, Track) and record.stamp_ns < self._latest_ns:
+                # The time jumped back: what was is of another pass.
+                self._poses.clear()
+                self._ended.clear()
+            if isinstance(record, Track):
+                self._latest_ns = record.stamp_ns
             if isinstance(record, Track) and record.ended:
                 self._ended.add(record.id)
             elif isinstance(record, Track):
@@ -62,9 +69,8 @@ class PassTracks:
         return np.array(paths).reshape(-1, 6)
 
     def _surest_until(self, end_ns: int) -> list[_Pose]:
-        """The surest pose of each track until a time; what is not needed any more is dropped.
-
-        Not of vehicles that are still coming: that are as sure as they ever were.
+        """The surest pose of each track until a time, but for vehicles that are still approaching:
+        their latest pose is the surest. Older poses are dropped.
         """
         found = []
         for track, poses in list(self._poses.items()):

@@ -10,7 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from mag_tracking.analysis.correlated_motion import disagree
-from mag_tracking.analysis.pass_result import Bearing, PassFit
+from mag_tracking.analysis.pass_result import POOR, Bearing, PassFit
 from mag_tracking.apps.fit import RecordingFit, check_cpa_range, check_orders
 from mag_tracking.apps.pass_fitter import FittedPass
 from mag_tracking.arrays import FloatArray
@@ -38,7 +38,7 @@ vehicle on a straight road this is the most accurate that there is, and the norm
 cost says whether to believe it: 1 = the model is right.
 
 Two or three vehicles that are seen at once (the tracker, which runs along, says how many) are
-fitted together, and each gets a table of its own.
+fitted together, on a road at z = 0, and each gets a table of its own.
 
 A pass that this cannot describe (a turn, more vehicles at once, nothing but noise, one
 sensor alone, ...) gets a reason instead of numbers. Speed, direction and time of the closest
@@ -58,10 +58,6 @@ examples:
   mag-tracking fit north.mcap south.mcap east.mcap --same-vehicle --network network.yaml --out fits
   mag-tracking fit alone.mcap --network one_sensor.yaml --cpa-range 4.5 0.3 --out fits
 '''
-
-
-POOR = 2.0
-"""A normalised cost beyond says that the model leaves out more than the noise covers."""
 
 
 def add(commands: Commands) -> None:
@@ -153,7 +149,9 @@ def _print_pass(one: FittedPass) -> None:
             _print_bearing(fit.bearing)
         if fit.reason and fit is one.known:
             print(f'        determined: {_known(fit)}')
-        if not fit.reason and fit.ambiguous:
+        if not fit.reason and fit.is_poor_mixture:
+            print('        ambiguous: the vehicles together are described poorly')
+        elif not fit.reason and fit.ambiguous:
             behind, path = min(fit.rivals, key=lambda rival: rival[0])
             print(f'        ambiguous: {np.exp(-0.5 * behind):.2f} times as likely is '
                   f'({", ".join(f"{v:.2f}" for v in path[:3])}) m'
@@ -233,7 +231,10 @@ def _print_bearing(b: Bearing) -> None:
 
 def _iron(passes: Sequence[FittedPass], network: SensorNetwork) -> dict[str, Any] | None:
     """Hard and soft iron from the chosen fits, JSON-ready, or None with a line that says why."""
-    fits = [one.chosen for one in passes if one.chosen is not None]
+    together = [one for one in passes if one.n_vehicles > 1]
+    if together:
+        print(f'--same-vehicle: {len(together)} vehicles that were seen with others are left out')
+    fits = [one.chosen for one in passes if one.chosen is not None and one.n_vehicles == 1]
     try:
         if not fits:
             raise ValueError('no pass has an answer')

@@ -87,7 +87,7 @@ TABLES: dict[str, tuple[Column, ...]] = {
                            why_no_detection='one sentence where nothing was detected'),
         *columns_of('i', 'ns', end_ns='timestamp of the last frame'),
         *columns_of('i', '', frames='frames of the network', tracks='number of tracks',
-                  passes='number of fitted passes',
+                  passes='rows of `passes`',
                   stretches='stretches in which a target was near'),
         *columns_of('i', 'bytes', size='size of the recording')),
 }

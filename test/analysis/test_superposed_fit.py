@@ -7,12 +7,17 @@ import pytest
 from scipy.stats import chi2
 
 from mag_tracking.analysis.model_order import choose_order, order_criteria
+from mag_tracking.analysis.pass_description import described, later, nearest
+from mag_tracking.analysis.pass_deviation import SensorErrors
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_targets import fit_targets
+from mag_tracking.analysis.pass_trust import FittedRow, left_elsewhere
 from mag_tracking.analysis.superposed_fit import Ground, are_clear, fit_superposed, path_from
+from mag_tracking.inference.separable_fit import Minimum
+from mag_tracking.physics.passes import RowPass, SuperposedPasses
 from support.passes import ROAD, measured, network_of, random_moments, together
 
-GROUND = Ground((0.7, 0.4), 0.1)
+GROUND, ORDERS = Ground((0.7, 0.4), 0.1), (1, 2)
 FOUR = network_of([[-3.0, -4.5, 0.0], [-3.0, 4.5, 0.0], [3.0, -4.5, 0.0], [3.0, 4.5, 0.0]])
 
 
@@ -119,8 +124,8 @@ def test_a_long_row_is_not_taken_for_two_that_follow():
     wrong = choose_order(alone)
     assert wrong is not None and wrong.length[0] > 12.0
     paths = tracked(rng, (one, other))
-    assert fit_targets(data, alone, paths[:1], GROUND) == (tuple(alone),)
-    found = [choose_order(fits) for fits in fit_targets(data, alone, paths, GROUND)]
+    assert fit_targets(data, alone, paths[:1], GROUND, ORDERS) == (tuple(alone),)
+    found = [choose_order(fits) for fits in fit_targets(data, alone, paths, GROUND, ORDERS)]
     assert len(found) == 2
     for fit in found:
         assert abs(fit.velocity[0] - one[3]) < 4.0 * fit.speed[1] < 2.0 and fit.length[0] < 5.0
@@ -134,7 +139,7 @@ def test_parts_of_one_vehicle_are_no_two_vehicles():
     alone = [fit_pass(data, n) for n in (2, 3)]
     parts = np.array([row[:6], row[:6]])
     parts[:, 0] += [1.7, -1.7]
-    assert fit_targets(data, alone, parts, GROUND) == (tuple(alone),)
+    assert fit_targets(data, alone, parts, GROUND, ORDERS) == (tuple(alone),)
     assert abs(choose_order(alone).velocity[0] - row[3]) < 0.5
 
 
@@ -146,8 +151,8 @@ def test_vehicles_that_drive_through_each_other_are_refused():
     data = together(measured(ROAD, slow, m, rng, seconds=6.0),
                     measured(ROAD, fast, more, rng, seconds=6.0, noise=1e-15))
     alone = [fit_pass(data, n) for n in (1, 2)]
-    fits, = fit_targets(data, alone, np.array([slow, fast]), GROUND)
-    assert all('in each other' in fit.reason for fit in fits) and choose_order(alone) is not None
+    fits, = fit_targets(data, alone, np.array([slow, fast]), GROUND, ORDERS)
+    assert all('overlap' in fit.reason for fit in fits) and choose_order(alone) is not None
 
 
 def test_what_is_not_believed_says_why():
@@ -163,13 +168,12 @@ def test_what_is_not_believed_says_why():
              ('leave over', together(data, measured(
                  ROAD, *one_path(rng, 1.5, 1, 1), rng, seconds=6.0, noise=1e-15)), two)]
     for reason, of, tracks in cases:
-        fits, = fit_targets(of, alone, tracks, GROUND)
+        fits, = fit_targets(of, alone, tracks, GROUND, (1,))
         assert reason in fits[0].reason and fits[0].trusted == (), fits[0].reason
         assert choose_order(fits) is None
     # One sensor does not tell the scale of one, let alone of two.
-    assert fit_targets(fit_pass(measured(network_of([[0.0, -4.5, 0.0]]), paths[0],
-                                         np.ones((1, 3)), rng), 1).data, alone, two,
-                       GROUND) == (tuple(alone),)
+    one = measured(network_of([[0.0, -4.5, 0.0]]), paths[0], np.ones((1, 3)), rng)
+    assert fit_targets(one, alone, two, GROUND, (1,)) == (tuple(alone),)
 
 
 def test_vehicles_beside_and_behind_each_other_are_clear():
@@ -196,3 +200,108 @@ def test_paths_begin_where_the_data_do():
     for (fit,), path in zip(found, paths, strict=True):
         np.testing.assert_allclose(path_from(data, fit)[:2], path[:2], atol=1.0)
     assert np.isfinite(order_criteria([fits[0] for fits in found])).all()
+
+
+def test_a_track_of_nobody_is_no_vehicle():
+    rng = np.random.default_rng(12)
+    row, moments = one_path(rng, 0.0, 1, 2)
+    data = measured(ROAD, row, moments, rng, seconds=6.0)
+    alone = [fit_pass(data, n) for n in ORDERS]
+    nobody = row[:6] * [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0]
+    assert fit_targets(data, alone, np.array([row[:6], nobody]), GROUND, ORDERS) == (tuple(alone),)
+
+
+def test_what_is_wrong_with_one_is_in_the_answers_of_all():
+    """The second one goes at half its speed, and then at twice."""
+    rng = np.random.default_rng(11)
+    (first, m), (second, more) = one_path(rng, -0.3, 1, 1), one_path(rng, 0.2, -1, 1)
+    data = measured(ROAD, first, m, rng, seconds=6.0)
+    warped = np.where(data.t < 0.2, 0.1 + 0.5 * data.t, 2.0 * data.t - 0.2)
+    model = RowPass(warped, data.positions, ROAD.R_sw[data.sensor], 1)
+    field = (model.basis(second[None])[0] @ more[0]).reshape(-1, 3)
+    data = replace(data, field=data.field + field)
+    paths = np.array([first, second])
+    changes = [fits[0].velocity_change for fits in fit_superposed(data, paths, GROUND, (1,))]
+    assert changes[1] > 2.0 * changes[0]
+    found = fit_targets(data, [fit_pass(data, 1)], paths, GROUND, (1,))
+    assert all(choose_order(fits) is None for fits in found)
+
+
+def test_vehicles_are_in_the_order_in_which_they_pass():
+    rng = np.random.default_rng(13)
+    data, paths = world(rng, FOLLOWING, 1)
+    for order in ([0, 1], [1, 0]):
+        found = fit_superposed(data, tracked(rng, paths)[order], GROUND, (1,))
+        assert found[0][0].data.stamp_ns < found[1][0].data.stamp_ns
+
+
+def test_what_left_its_track_says_so():
+    rng = np.random.default_rng(14)
+    data, paths = world(rng, MEETING, 1)
+    astray = tracked(rng, paths)
+    # As fast as nobody was.
+    astray[1, 3] *= 3.0
+    found = fit_superposed(data, astray, GROUND, (1,))
+    assert sorted(fit.reason for fit, in found) == ['', 'it is not where it was tracked']
+    assert fit_superposed(data, astray, GROUND, (1,), stopped=lambda: True) == ()
+
+
+def two_minima(*others):
+    """The fits of two points of which the search ended in `others` (12,), too."""
+    rng = np.random.default_rng(15)
+    data, paths = world(rng, MEETING, 1)
+    theta = np.concatenate(paths)
+    model = SuperposedPasses.of((1, 1), data.t, data.positions, ROAD.R_sw[data.sensor])
+    A = model.basis(theta[None])[0]
+    p = np.linalg.lstsq(A, data.field.ravel(), rcond=None)[0]
+    found = Minimum(theta, float(data.n_values), True,
+                    tuple((x(theta), 1.01 * data.n_values) for x in others))
+    return data, theta, described(data, (1, 1), found, p, 1.0, SensorErrors()), (p, found)
+
+
+def test_targets_that_are_exchanged_are_no_rivals_and_each_has_its_own():
+    def exchanged(theta):
+        return np.concatenate([theta[6:], theta[:6]])
+
+    def second_elsewhere(theta):
+        return exchanged(theta + np.eye(12)[7] * 3.0)
+
+    _, theta, (first, second), _ = two_minima(exchanged, second_elsewhere)
+    assert first.rivals == () and len(second.rivals) == 1
+    np.testing.assert_allclose(second.rivals[0][1], theta[6:] + [0.0, 3.0, 0.0, 0.0, 0.0, 0.0])
+    assert nearest([theta[:6], theta[6:]], [theta[6:], theta[:6]]) == (1, 0)
+    # Later on, the rival is where it goes.
+    moved = later(second, 2.0)
+    np.testing.assert_allclose(moved.rivals[0][1][:3],
+                               second.rivals[0][1][:3] + 2.0 * theta[9:12])
+    np.testing.assert_allclose(moved.position, second.position + 2.0 * second.velocity)
+    assert moved.data.stamp_ns == second.data.stamp_ns + 2_000_000_000
+
+
+def test_what_was_known_beforehand_adds_to_the_information():
+    data, _, (_, second), (p, found) = two_minima()
+    std = np.full(12, np.inf)
+    std[8] = 0.05
+    _, known = described(data, (1, 1), found, p, 1.0, SensorErrors(), path_std=std)
+    # Of one number measured anew, whatever the others are: Sherman and Morrison.
+    P = second.covariance
+    gain = P[:, 2] / (P[2, 2] + 0.05**2)
+    np.testing.assert_allclose(known.covariance, P - np.outer(gain, P[2]), rtol=1e-5,
+                               atol=1e-9 * np.abs(P).max())
+
+
+def test_what_is_left_over_may_be_of_any_of_them():
+    rng = np.random.default_rng(16)
+    data, paths = world(rng, FOLLOWING, 1)
+    rows = [FittedRow(1, path, (RowPass(data.t, data.positions, ROAD.R_sw[data.sensor], 1).basis(
+        path[None])[0] @ [200.0, 100.0, -300.0]).reshape(-1, 3)) for path in paths]
+    for row in rows:
+        left = np.einsum('nij,nj->ni', data.whitening, 0.2 * row.field)
+        assert left_elsewhere(data, rows, left) < 1e-3
+
+
+def test_targets_that_are_described_poorly_together_are_ambiguous():
+    *_, (first, _), _ = two_minima()
+    assert not first.ambiguous and first.n_others == 9
+    poor = replace(first, cost=2.1 * first.degrees_of_freedom)
+    assert poor.ambiguous and not replace(poor, n_others=0).ambiguous

@@ -13,9 +13,11 @@ import numpy as np
 from tqdm import tqdm
 
 from bench.figures import Figures
+from mag_tracking.network.file import read_network
+from support.bundled import NETWORK_FILE
 from support.busy_fits import fits_of_recording, fits_of_world, with_vehicles
 from support.busy_recordings import BUSY
-from support.busy_worlds import busy
+from support.busy_worlds import TRUCKS, busy
 from support.random_passes import KINDS, SIMULATORS, random_pass
 from support.samples import scenario
 from support.worlds import World
@@ -52,6 +54,8 @@ class Tally:
                     LEAST_RIGHT if aim else None, True)
         figures.add(f'{what}: median error of the position',
                     float(np.median([of.error for of in self.found])), 'm')
+        figures.add(f'{what}: without a flag', float(sure.mean()), '',
+                    note=f' (of them wrong: {wrong.sum()})')
         figures.add(f'{what}: a pass', self.seconds / max(self.n_passes, 1), 's')
         return int(sure.sum()), int(wrong.sum())
 
@@ -67,12 +71,12 @@ def recordings(folder):
     return tally
 
 
-def worlds(how, simulator, seeds):
-    """`Tally` of worlds of pairs."""
+def worlds(how, simulator, seeds, trucks=TRUCKS):
+    """`Tally` of worlds of pairs, with a share of `trucks`."""
     tally = Tally()
     for n_sensors in (2, 4):
         for seed in tqdm(range(seeds), disable=None, leave=False):
-            a_world = busy(how, n_sensors, simulator, seed)
+            a_world = busy(how, n_sensors, simulator, seed, trucks=trucks)
             begin = time.perf_counter()
             passes = fits_of_world(a_world)
             took = time.perf_counter() - begin
@@ -83,9 +87,6 @@ def worlds(how, simulator, seeds):
 
 def of_one(simulator, passes):
     """How many single vehicles were taken for several, and of how many."""
-    from mag_tracking.network.file import read_network
-    from support.bundled import NETWORK_FILE
-
     network, split, n = read_network(NETWORK_FILE), 0, 0
     for kind in KINDS:
         for seed in tqdm(range(passes), disable=None, leave=False):
@@ -113,6 +114,8 @@ def main():
         for how in ('meeting', 'following'):
             counted.append(worlds(how, simulator, given.seeds).figures(
                 figures, f'{simulator}, {how}'))
+        counted.append(worlds('meeting', simulator, given.seeds, 0.5).figures(
+            figures, f'{simulator}, meeting, every other one a truck'))
         split, n = of_one(simulator, given.passes)
         figures.add(f'{simulator}: single vehicles taken for several', split / n, '', MOST_WRONG,
                     note=f' ({split} of {n})')

@@ -58,17 +58,17 @@ class OnWheels:
         return B
 
 
-def vehicle(rng, simulator):
-    """A car, now and then a truck; of boxes it rolls on wheels."""
-    body = (truck if rng.random() < TRUCKS else car)(rng, simulator)
+def vehicle(rng, simulator, trucks=TRUCKS):
+    """A car, or a truck in this share of cases; of boxes it rolls on wheels."""
+    body = (truck if rng.random() < trucks else car)(rng, simulator)
     return OnWheels(body, rng.normal(0.0, 2.0, (4, 2))) if simulator == 'boxes' else body
 
 
-def passing(rng, simulator, at_s, direction, speed):
+def passing(rng, simulator, at_s, direction, speed, trucks=TRUCKS):
     """(body, course) of a vehicle that is at the origin at a time [s]."""
     lane = -direction * (LANE_M + rng.uniform(-0.3, 0.3))
     path = Path(np.array([-direction * speed * at_s, lane]), 0.0 if direction > 0 else np.pi, speed)
-    return vehicle(rng, simulator), random_drive(rng, path, at_s) if simulator == 'boxes' else path
+    return vehicle(rng, simulator, trucks), random_drive(rng, path, at_s) if simulator == 'boxes' else path
 
 
 def pair(rng, how, at_s):
@@ -81,8 +81,11 @@ def pair(rng, how, at_s):
             (at_s + rng.uniform(1.2, 2.5), direction, speed * rng.uniform(0.96, 1.04))]
 
 
-def busy(how, n_sensors, simulator, seed, n=4):
-    """`World` of `n` pairs that are 'meeting' or 'following', or of 3 `n` vehicles in 'traffic'."""
+def busy(how, n_sensors, simulator, seed, n=4, trucks=TRUCKS):
+    """`World` of `n` pairs that are 'meeting' or 'following', or of 3 `n` vehicles in 'traffic'.
+
+    `trucks` is the share of long vehicles.
+    """
     rng = np.random.default_rng([seed, n_sensors, len(how), len(simulator)])
     if how == 'traffic':
         times = LEAD_S + np.cumsum(rng.exponential(3.0, 3 * n))
@@ -92,7 +95,7 @@ def busy(how, n_sensors, simulator, seed, n=4):
             q[1] == p[1] and (p[0] - q[0]) * min(p[2], q[2]) < 14.0 for q in plan[:k])]
     else:
         plan = [p for k in range(n) for p in pair(rng, how, LEAD_S + 14.0 * k)]
-    movers = [passing(rng, simulator, *p) for p in plan]
+    movers = [passing(rng, simulator, *p, trucks) for p in plan]
     return world(NETWORKS[n_sensors], movers, max(p[0] for p in plan) + 7.0, rng,
                  FLAWS[simulator], RATE)
 
