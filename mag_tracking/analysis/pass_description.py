@@ -27,7 +27,7 @@ EXACT = 1e-4
 """[m] Deviation of a CPA range that is only a unit of length."""
 
 
-def described(data: PassData, orders: Sequence[int], found: Minimum, p: FloatArray,
+def fits_at_minimum(data: PassData, orders: Sequence[int], found: Minimum, p: FloatArray,
               explained: float, errors: SensorErrors,
               cpa_range: tuple[float, float] | None = None,
               path_std: FloatArray | None = None) -> tuple[PassFit, ...]:
@@ -61,7 +61,7 @@ def described(data: PassData, orders: Sequence[int], found: Minimum, p: FloatArr
         J[of_paths, of_paths] += 1.0 / np.square(path_std)
     fits = _fits(about, found, explained, errors, bound(J))
     ends = np.cumsum([len(path) for path in about.theta])[:-1]
-    rivals = [([paths[i] for i in nearest(about.theta, paths)], cost)
+    rivals = [([paths[i] for i in assignment(about.theta, paths)], cost)
               for paths, cost in ((np.split(theta, ends), cost) for theta, cost in found.rivals)]
     fits = [replace(fit, rivals=_rivals(fit, [(paths[k], cost) for paths, cost in rivals]))
             for k, fit in enumerate(fits)]
@@ -187,10 +187,10 @@ def _fits(about: _Linearised, found: Minimum, explained: float, errors: SensorEr
     return fits
 
 
-def nearest(paths: Sequence[FloatArray], others: Sequence[FloatArray]) -> tuple[int, ...]:
-    """Which of the other K paths (6 or 7,) belongs to which of `paths`: together the nearest.
+def assignment(paths: Sequence[FloatArray], others: Sequence[FloatArray]) -> tuple[int, ...]:
+    """Index into `others` for each of K `paths` (6 or 7,) that minimises the total distance.
 
-    Which of several targets comes first means nothing.
+    The order of several targets in a solution is arbitrary.
     """
     away = [[float(np.square((other[:6] - path[:6]) / APART[:6]).sum()) for other in others]
             for path in paths]
@@ -208,19 +208,6 @@ def _rivals(fit: PassFit, minima: Iterable[tuple[FloatArray, float]]) -> tuple[
         if (np.abs(path[:n] - fit.x[:n]) > APART[:n]).any():
             rivals.append(((cost - fit.cost) / excess, path))
     return tuple(rivals)
-
-
-def later(fit: PassFit, seconds: float) -> PassFit:
-    """The same `PassFit` with time zero `seconds` later."""
-    F = np.eye(len(fit.x))
-    F[:3, 3:6] = seconds * np.eye(3)
-    # An infinite variance times zero is none.
-    with np.errstate(invalid='ignore'):
-        covariance, honest = (F @ P @ F.T for P in (fit.covariance, fit.honest_covariance))
-    rivals = tuple((cost, np.append(path[:3] + seconds * path[3:6], path[3:]))
-                   for cost, path in fit.rivals)
-    return replace(fit, data=fit.data.shifted(seconds), x=F @ fit.x, covariance=covariance,
-                   honest_covariance=honest, rivals=rivals)
 
 
 def _seen_s(data: PassData) -> float:

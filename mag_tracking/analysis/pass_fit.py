@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData, background_columns, separable_problem
-from mag_tracking.analysis.pass_description import APART, described
+from mag_tracking.analysis.pass_description import APART, fits_at_minimum
 from mag_tracking.analysis.pass_deviation import SensorErrors
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.arrays import FloatArray
@@ -74,8 +74,8 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
     theta, p = found.theta, problem.linear(found.theta)
     theta, p = model_of(data.t, data.positions, data.whitening).forward(theta, p)
     left = max(found.cost - n_free, 0.0) / (problem.energy - n_free)
-    fit, = described(data, (n_dipoles,), replace(found, theta=theta), p, 1.0 - left, errors,
-                     cpa_range)
+    fit, = fits_at_minimum(data, (n_dipoles,), replace(found, theta=theta), p, 1.0 - left, errors,
+                           cpa_range)
     return fit
 
 

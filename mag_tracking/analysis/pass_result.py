@@ -1,6 +1,6 @@
 """What a batch fit of a pass has to say."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -158,6 +158,18 @@ class PassFit:
     def velocity(self) -> FloatArray:
         """(3,) [m/s], world."""
         return self.x[3:6]
+
+    def shifted(self, seconds: float) -> 'PassFit':
+        """The same fit with time zero `seconds` later."""
+        F = np.eye(len(self.x))
+        F[:3, 3:6] = seconds * np.eye(3)
+        # An infinite variance times zero is none.
+        with np.errstate(invalid='ignore'):
+            covariance, honest = (F @ P @ F.T for P in (self.covariance, self.honest_covariance))
+        rivals = tuple((cost, np.append(path[:3] + seconds * path[3:6], path[3:]))
+                       for cost, path in self.rivals)
+        return replace(self, data=self.data.shifted(seconds), x=F @ self.x, covariance=covariance,
+                       honest_covariance=honest, rivals=rivals)
 
     @property
     def speed(self) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Fit a pass as of one target, or of several where tracks were of several."""
+"""Fit a pass as one target, or as several where several were tracked."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -10,8 +10,8 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.analysis.pass_trust import describes
 from mag_tracking.analysis.superposed_fit import (
-    Ground,
-    are_clear,
+    GroundPrior,
+    are_separate,
     fit_superposed,
     path_from,
 )
@@ -27,13 +27,13 @@ ALIKE = 0.25
 """Parts of one vehicle are found with velocities that differ by no more than this share."""
 
 
-def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray, ground: Ground,
+def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray, ground: GroundPrior,
                 orders: Sequence[int], stopped: Callable[[], bool] | None = None
                 ) -> tuple[tuple[PassFit, ...], ...]:
     """The fits of a pass for each of its targets.
 
-    A row of dipoles that is long enough describes two vehicles that follow each other, and two
-    straight targets describe one that turns: how many there are the fit alone does not know.
+    The number of targets cannot be told by the fit alone: a long row of dipoles describes two
+    vehicles that follow each other, and two straight targets describe one that turns.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray, gro
         As of one target, with several numbers of dipoles.
     paths : (K, 6) [m], [m/s]
         Of the targets that were tracked, where they are when `data.t` is zero.
-    ground : Ground
+    ground : GroundPrior
     orders : sequence of int
         Numbers of dipoles to try where there are several.
     stopped : function, optional
@@ -82,7 +82,7 @@ def _are_parts(data: PassData, fits: Sequence[PassFit]) -> bool:
     velocity = np.array([fit.velocity for fit in fits])
     mean = velocity.mean(axis=0)
     return bool((np.linalg.norm(velocity - mean, axis=1) <= ALIKE * np.linalg.norm(mean)).all()
-                and not are_clear(data, [path_from(data, fit) for fit in fits]))
+                and not are_separate(data, [path_from(data, fit) for fit in fits]))
 
 
 def _why_not(data: PassData, fits: Sequence[PassFit]) -> str:
@@ -95,7 +95,7 @@ def _why_not(data: PassData, fits: Sequence[PassFit]) -> str:
     if not all(describes(fit) for fit in fits):
         return ('which at constant velocities leave over '
                 f'{1.0 - fits[0].explained:.1%} of the field (a turn, braking, a further one)')
-    if not are_clear(data, [path_from(data, fit) for fit in fits]):
+    if not are_separate(data, [path_from(data, fit) for fit in fits]):
         return 'which would overlap (a turn, braking, a further one)'
     for k, fit in enumerate(fits, 1):
         if fit.reason:

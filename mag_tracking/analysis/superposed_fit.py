@@ -1,7 +1,7 @@
 """Batch fit of several targets that were seen at once: their fields add up.
 
-The targets are placed as points first: where tracks have them, and, one after the other, where what
-the others leave over is strongest. Then each gets as many dipoles as it is worth.
+The targets are first placed as points: at their tracked positions, and one after another where the
+residual field is strongest. Then the number of dipoles of each target is selected.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,7 +13,7 @@ import numpy as np
 
 from mag_tracking.analysis.model_order import order_criteria
 from mag_tracking.analysis.pass_data import PassData, background_columns, separable_problem
-from mag_tracking.analysis.pass_description import APART, described, later, nearest
+from mag_tracking.analysis.pass_description import APART, assignment, fits_at_minimum
 from mag_tracking.analysis.pass_deviation import SensorErrors
 from mag_tracking.analysis.pass_fit import (
     AS_BOUGHT,
@@ -41,31 +41,34 @@ N_FINE = 2
 """Number of minima that all measurements are fitted from: the best one and its rival."""
 
 FIRST_LENGTH = 3.0
-"""[m] of a row that was a point."""
+"""[m] Initial length of a row that was a point before."""
 
 CLEAR, WIDTH = 3.0, 1.5
 """[m] Least distance between the rows of two vehicles, along their heading (their bodies are longer
 than their rows) or across it. Two that are nearer are parts of one vehicle."""
 
 SEEN_FROM = 15.0
-"""[m] A target is seen by a sensor that is no farther from it."""
+"""[m] Largest distance at which a sensor detects a target."""
 
 MOST_ROUNDS = 3
 """Number of times that the order of each target is chosen, given those of the others."""
 
 SAME_SHARE, SAME_M = 0.5, 5.0
-"""Two fits are of the same target if their velocities differ by no more than this share, and their
-positions by no more than this distance [m]. A track is 5 % and half a metre off."""
+"""Largest relative difference of velocity, and largest distance [m], between two fits of the same
+target, or a fit and its track. Tracks are typically off by 5 % and half a metre."""
 
 
 @dataclass(frozen=True)
-class Ground:
-    """Targets that roll: without it two that fly explain one that turns."""
+class GroundPrior:
+    """Height and vertical speed of vehicles.
+
+    Without it two flying targets explain one that turns.
+    """
 
     height: tuple[float, float]
-    """[m] of a target's iron, and its deviation."""
+    """[m] of the magnetic centre above z = 0, and its standard deviation."""
     climb_std: float
-    """[m/s] of the vertical speed, about zero."""
+    """[m/s] Standard deviation of the vertical speed, whose mean is zero."""
 
     def prior(self, orders: Sequence[int]) -> tuple[FloatArray, FloatArray]:
         """Mean and deviation (n_theta,) of the paths of rows of `orders` dipoles."""
@@ -78,7 +81,7 @@ class Ground:
         return np.concatenate(means), np.concatenate(stds)
 
 
-def fit_superposed(data: PassData, paths: FloatArray, ground: Ground,
+def fit_superposed(data: PassData, paths: FloatArray, ground: GroundPrior,
                    orders: Sequence[int] = (1, 2, 3, 4), errors: SensorErrors = AS_BOUGHT,
                    stopped: Callable[[], bool] | None = None) -> tuple[tuple[PassFit, ...], ...]:
     """Fit several rows of dipoles, each at constant velocity, to the sum of their fields.
@@ -89,7 +92,7 @@ def fit_superposed(data: PassData, paths: FloatArray, ground: Ground,
         Of two sensors or more.
     paths : (K, 6) [m], [m/s]
         About where each target is when `data.t` is zero, and its velocity.
-    ground : Ground
+    ground : GroundPrior
     orders : sequence of int
         Numbers of dipoles to try for each target.
     errors : SensorErrors
@@ -126,14 +129,14 @@ def fit_superposed(data: PassData, paths: FloatArray, ground: Ground,
                 known[k] = orders[int(np.argmin(criteria))]
         if known == before:
             break
-    found = [_from_its_strongest(
-        _of_one_target(fits.of(k, known, orders), orders.index(known[k]), paths[k]),
+    found = [_shifted_to_strongest(
+        _checked_against_track(fits.of(k, known, orders), orders.index(known[k]), paths[k]),
         orders.index(known[k])) for k in range(n_targets)]
     return tuple(of_one for _, of_one in sorted(found, key=lambda pair: pair[0]))
 
 
-def _placed(rough: PassData, n_targets: int, ground: Ground) -> FloatArray:
-    """(n, 6 n_targets) Paths of points, the best ones; `rough` are few means of neighbours."""
+def _placed(rough: PassData, n_targets: int, ground: GroundPrior) -> FloatArray:
+    """(n, 6 n_targets) Best paths of point targets; `rough` is the averaged pass."""
     rests = [rough]
     paths: FloatArray = np.zeros((1, 0))
     for n in range(1, n_targets + 1):
@@ -156,15 +159,15 @@ def _placed(rough: PassData, n_targets: int, ground: Ground) -> FloatArray:
 class _JointFits:
     """Fits of some targets with any numbers of dipoles, each made once.
 
-    Every one starts from the points `placed` (n, 6 K), and from what was found with other numbers.
+    Each starts from the points `placed` (n, 6 K) and from the fit with another number of dipoles.
     """
 
-    def __init__(self, data: PassData, rough: PassData, placed: FloatArray, ground: Ground,
+    def __init__(self, data: PassData, rough: PassData, placed: FloatArray, ground: GroundPrior,
                  errors: SensorErrors) -> None:
         self._data, self._rough, self._ground, self._errors = data, rough, ground, errors
-        # The first ones are those of the tracks. All have the targets in their order.
+        # The first row holds the tracks; the targets of all rows are put into its order.
         split = [np.split(paths, paths.size // 6) for paths in placed]
-        self._placed = [[paths[i] for i in nearest(split[0], paths)] for paths in split]
+        self._placed = [[paths[i] for i in assignment(split[0], paths)] for paths in split]
         self._n_free = data.n_independent - background_columns(data, data.whitening).shape[1]
         self._known: dict[tuple[int, ...], tuple[PassFit, ...]] = {}
 
@@ -200,11 +203,11 @@ class _JointFits:
         coarse, fine = (separable_problem(d, model_of, prior=prior) for d in (self._rough, data))
         theta, cost, _, _ = refine(coarse.residual_and_jacobian, starts, 40, 1e-6)
         in_order = tuple(range(len(orders)))
-        cost = _of_the_best(cost, np.array([nearest(self._placed[0], split(found)) == in_order
-                                            for found in theta]), np.inf)
-        # Where the best by far are in each other they are no two vehicles: `fit_targets` says so.
-        cost = _of_the_best(cost, np.array([are_clear(self._rough, split(found))
-                                            for found in theta]), NEARLY)
+        cost = _restricted_to(cost, np.array([
+            assignment(self._placed[0], split(found)) == in_order for found in theta]), np.inf)
+        # If only much worse minima are separate, the overlap is kept: `fit_targets` rejects it.
+        cost = _restricted_to(cost, np.array([are_separate(self._rough, split(found))
+                                              for found in theta]), NEARLY)
         found = fine_minimum(fine, theta, cost, np.concatenate(
             [APART[:6 + (n > 1)] for n in orders]), N_FINE)
         if not np.isfinite(found.cost):
@@ -212,20 +215,20 @@ class _JointFits:
         theta, p = model_of(data.t, data.positions, data.whitening).forward(
             found.theta, fine.linear(found.theta))
         left = max(found.cost - self._n_free, 0.0) / (fine.energy - self._n_free)
-        return described(data, orders, replace(found, theta=theta), p, 1.0 - left, self._errors,
-                         path_std=prior[1])
+        return fits_at_minimum(data, orders, replace(found, theta=theta), p, 1.0 - left,
+                               self._errors, path_std=prior[1])
 
 
-def _of_the_best(cost: FloatArray, wanted: BoolArray, nearly: float) -> FloatArray:
-    """(n,) costs, infinite of those that are not `wanted`, if the best wanted one is not more than
-    `nearly` times the best."""
+def _restricted_to(cost: FloatArray, wanted: BoolArray, nearly: float) -> FloatArray:
+    """(n,) costs, infinite where not `wanted`, if the best wanted one is at most `nearly` times the
+    best."""
     is_one = (cost[wanted] <= nearly * cost.min()).any()
     return np.where(wanted, cost, np.inf) if is_one else cost
 
 
-def are_clear(data: PassData, paths: Sequence[FloatArray], clear: float = CLEAR) -> bool:
-    """Whether targets on `paths` (6 or 7,) are beside each other while they are seen, or their rows
-    `clear` [m] apart."""
+def are_separate(data: PassData, paths: Sequence[FloatArray], clear: float = CLEAR) -> bool:
+    """Whether targets on `paths` (6 or 7,) keep a distance while they are detected: beside each
+    other, or their rows `clear` [m] apart."""
     places = [path[:3] + data.t[:, None] * path[3:6] for path in paths]
     seen = np.any([np.linalg.norm(place - data.positions, axis=1) < SEEN_FROM
                    for place in places], axis=0)
@@ -250,8 +253,8 @@ def _of_orders(paths: Sequence[FloatArray], orders: Sequence[int]) -> list[Float
             if n > 1 else path[:6] for path, n in zip(paths, orders, strict=True)]
 
 
-def _of_one_target(fits: Sequence[PassFit], best: int, path: FloatArray) -> list[PassFit]:
-    """The fits of a target on a tracked `path` (6,); those that left it have a reason."""
+def _checked_against_track(fits: Sequence[PassFit], best: int, path: FloatArray) -> list[PassFit]:
+    """The fits of a target; those that left its tracked `path` (6,) get a reason."""
     out = []
     for k, fit in enumerate(fits):
         # The best one is that of the track, and the others are that of the best one.
@@ -279,7 +282,7 @@ def _strongest_at(fit: PassFit) -> float:
     return float(fit.data.t[np.argmax(np.einsum('ni,ni->n', field, field))])
 
 
-def _from_its_strongest(fits: Sequence[PassFit], best: int) -> tuple[float, tuple[PassFit, ...]]:
+def _shifted_to_strongest(fits: Sequence[PassFit], best: int) -> tuple[float, tuple[PassFit, ...]]:
     """([s since 1970] when a target passes the middle of the sensors, its fits with time zero at
     its strongest field), by the `best` one."""
     fit = fits[best]
@@ -288,4 +291,4 @@ def _from_its_strongest(fits: Sequence[PassFit], best: int) -> tuple[float, tupl
     seconds = _strongest_at(fit)
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
     at = fit.data.stamp_ns / NS + fit.closest_approach(centre)[0]
-    return at, tuple(later(f, seconds) if len(f.x) else f for f in fits)
+    return at, tuple(f.shifted(seconds) if len(f.x) else f for f in fits)

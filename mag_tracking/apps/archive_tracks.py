@@ -11,7 +11,7 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.apps.archive_stretches import Piece
 from mag_tracking.apps.pass_fitter import fitted_vehicles
-from mag_tracking.apps.pass_tracks import PassTracks, ground_of
+from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.apps.replay import RunCollector
 from mag_tracking.event_records import Disturbance
 from mag_tracking.recording.archive_folder import stamped
@@ -42,7 +42,7 @@ class StretchTables:
         `settings` are those of the tracker.
         """
         self._recording, self._n_dipoles = recording, n_dipoles
-        self._tracks, self._ground = PassTracks(settings), ground_of(settings)
+        self._tracks, self._ground = PassTracks(settings), ground_prior(settings)
         self._files = ExitStack()
         self._tables = {name: self._files.enter_context(TableWriter(paths[name], TABLES[name]))
                         for name in TRACKED}

@@ -1,4 +1,4 @@
-"""Readings to fitted passes: cut out, tracked, and fitted as of so many vehicles."""
+"""Readings to fitted passes: cut out, tracked, and fitted as one vehicle or several."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -12,9 +12,9 @@ from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import NEARLY, PassFit
 from mag_tracking.analysis.pass_targets import fit_targets
 from mag_tracking.analysis.pass_trust import contradicted
-from mag_tracking.analysis.superposed_fit import Ground, are_clear, path_from
+from mag_tracking.analysis.superposed_fit import GroundPrior, are_separate, path_from
 from mag_tracking.apps.pass_collector import PassCollector
-from mag_tracking.apps.pass_tracks import PassTracks, ground_of
+from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.detection_theory import energy_threshold
 from mag_tracking.network import SensorNetwork
@@ -86,7 +86,7 @@ class FittedPass:
 class PassFitter:
     """Fits every pass of a stream of readings, one after the other.
 
-    A tracker runs along: it says how many vehicles a pass is of.
+    A tracker runs in parallel and determines the number of vehicles of a pass.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class PassFitter:
         self._recording = recording
         self.collector = PassCollector(network, settings, self._track)
         self._tracker = TrackManager(network, settings.track)
-        self._tracks, self._ground = PassTracks(settings.track), ground_of(settings.track)
+        self._tracks, self._ground = PassTracks(settings.track), ground_prior(settings.track)
         self._orders, self._cpa_range = tuple(orders), cpa_range
         self._n = 0
 
@@ -135,7 +135,7 @@ class PassFitter:
 
 
 def fitted_vehicles(recording: str, number: int, data: PassData, alone: Sequence[PassFit],
-                    paths: FloatArray, ground: Ground, orders: Sequence[int],
+                    paths: FloatArray, ground: GroundPrior, orders: Sequence[int],
                     notes: tuple[str, ...],
                     stopped: Callable[[], bool] | None = None) -> list[FittedPass]:
     """A `FittedPass` of each vehicle of a pass.
@@ -149,7 +149,7 @@ def fitted_vehicles(recording: str, number: int, data: PassData, alone: Sequence
     chosen = [fit for fit in map(choose_order, found) if fit is not None]
     notes = (*notes, f'{len(found)} vehicles were fitted together: what was measured is given '
                      'without the field of the others')
-    if not are_clear(data, [path_from(data, fit) for fit in chosen], TRAILER):
+    if not are_separate(data, [path_from(data, fit) for fit in chosen], TRAILER):
         notes = (*notes, f'they are less than {TRAILER:.0f} m apart: perhaps parts of one vehicle')
     return [FittedPass(recording, number, fits, notes, CorrelatedMotion(
         'several vehicles were seen at once'), k, len(found)) for k, fits in enumerate(found, 1)]

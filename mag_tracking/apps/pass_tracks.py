@@ -1,4 +1,4 @@
-"""The targets that were tracked while a pass was seen: how many, and about where."""
+"""Number and approximate paths of the targets that were tracked during a pass."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
-from mag_tracking.analysis.superposed_fit import Ground, are_clear
+from mag_tracking.analysis.superposed_fit import GroundPrior, are_separate
 from mag_tracking.arrays import FloatArray
 from mag_tracking.records import Track
 from mag_tracking.stages.track.settings import TrackSettings
@@ -15,7 +15,7 @@ from mag_tracking.units import NS
 
 @dataclass(frozen=True)
 class _Pose:
-    """Where a track is surest."""
+    """The pose of a track with the smallest covariance."""
 
     stamp_ns: int
     path: FloatArray
@@ -64,7 +64,7 @@ class PassTracks:
         for pose in mine:
             path = pose.path.copy()
             path[:3] -= (pose.stamp_ns - data.stamp_ns) / NS * path[3:]
-            if self._of_vehicles and all(are_clear(data, (path, other)) for other in paths):
+            if self._of_vehicles and all(are_separate(data, (path, other)) for other in paths):
                 paths.append(path)
         return np.array(paths).reshape(-1, 6)
 
@@ -89,9 +89,9 @@ class PassTracks:
         return found
 
 
-def ground_of(settings: TrackSettings) -> Ground:
-    """Where the iron of the vehicles of the settings is."""
+def ground_prior(settings: TrackSettings) -> GroundPrior:
+    """The prior of height and climb that the settings of a tracker describe."""
     vehicle = settings.vehicle
     height, std = np.array(vehicle.heights), np.array(vehicle.height_stds)
-    return Ground((float(height.mean()), float(np.sqrt(height.var() + np.square(std).mean()))),
+    return GroundPrior((float(height.mean()), float(np.sqrt(height.var() + np.square(std).mean()))),
                   vehicle.climb_std)

@@ -7,17 +7,22 @@ import pytest
 from scipy.stats import chi2
 
 from mag_tracking.analysis.model_order import choose_order, order_criteria
-from mag_tracking.analysis.pass_description import described, later, nearest
+from mag_tracking.analysis.pass_description import assignment, fits_at_minimum
 from mag_tracking.analysis.pass_deviation import SensorErrors
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_targets import fit_targets
 from mag_tracking.analysis.pass_trust import FittedRow, left_elsewhere
-from mag_tracking.analysis.superposed_fit import Ground, are_clear, fit_superposed, path_from
+from mag_tracking.analysis.superposed_fit import (
+    GroundPrior,
+    are_separate,
+    fit_superposed,
+    path_from,
+)
 from mag_tracking.inference.separable_fit import Minimum
 from mag_tracking.physics.passes import RowPass, SuperposedPasses
 from support.passes import ROAD, measured, network_of, random_moments, together
 
-GROUND, ORDERS = Ground((0.7, 0.4), 0.1), (1, 2)
+GROUND, ORDERS = GroundPrior((0.7, 0.4), 0.1), (1, 2)
 FOUR = network_of([[-3.0, -4.5, 0.0], [-3.0, 4.5, 0.0], [3.0, -4.5, 0.0], [3.0, 4.5, 0.0]])
 
 
@@ -183,13 +188,13 @@ def test_vehicles_beside_and_behind_each_other_are_clear():
     def moved(*by):
         return one + np.pad(by, (0, 7 - len(by)))
 
-    assert are_clear(data, (one, moved(0.0, 3.5)))
-    assert are_clear(data, (one, moved(-7.0)))
-    assert not are_clear(data, (one, moved(-5.0)))
+    assert are_separate(data, (one, moved(0.0, 3.5)))
+    assert are_separate(data, (one, moved(-7.0)))
+    assert not are_separate(data, (one, moved(-5.0)))
     # It catches up, but far behind the sensors' sight.
-    assert not are_clear(data, (one, moved(-9.0, 0.0, 0.0, 6.0)))
-    assert are_clear(data, (one, moved(-60.0, 0.0, 0.0, 2.0)))
-    assert are_clear(data, (one,))
+    assert not are_separate(data, (one, moved(-9.0, 0.0, 0.0, 6.0)))
+    assert are_separate(data, (one, moved(-60.0, 0.0, 0.0, 2.0)))
+    assert are_separate(data, (one,))
 
 
 def test_paths_begin_where_the_data_do():
@@ -256,7 +261,7 @@ def two_minima(*others):
     p = np.linalg.lstsq(A, data.field.ravel(), rcond=None)[0]
     found = Minimum(theta, float(data.n_values), True,
                     tuple((x(theta), 1.01 * data.n_values) for x in others))
-    return data, theta, described(data, (1, 1), found, p, 1.0, SensorErrors()), (p, found)
+    return data, theta, fits_at_minimum(data, (1, 1), found, p, 1.0, SensorErrors()), (p, found)
 
 
 def test_targets_that_are_exchanged_are_no_rivals_and_each_has_its_own():
@@ -269,9 +274,9 @@ def test_targets_that_are_exchanged_are_no_rivals_and_each_has_its_own():
     _, theta, (first, second), _ = two_minima(exchanged, second_elsewhere)
     assert first.rivals == () and len(second.rivals) == 1
     np.testing.assert_allclose(second.rivals[0][1], theta[6:] + [0.0, 3.0, 0.0, 0.0, 0.0, 0.0])
-    assert nearest([theta[:6], theta[6:]], [theta[6:], theta[:6]]) == (1, 0)
+    assert assignment([theta[:6], theta[6:]], [theta[6:], theta[:6]]) == (1, 0)
     # Later on, the rival is where it goes.
-    moved = later(second, 2.0)
+    moved = second.shifted(2.0)
     np.testing.assert_allclose(moved.rivals[0][1][:3],
                                second.rivals[0][1][:3] + 2.0 * theta[9:12])
     np.testing.assert_allclose(moved.position, second.position + 2.0 * second.velocity)
@@ -282,7 +287,7 @@ def test_what_was_known_beforehand_adds_to_the_information():
     data, _, (_, second), (p, found) = two_minima()
     std = np.full(12, np.inf)
     std[8] = 0.05
-    _, known = described(data, (1, 1), found, p, 1.0, SensorErrors(), path_std=std)
+    _, known = fits_at_minimum(data, (1, 1), found, p, 1.0, SensorErrors(), path_std=std)
     # Of one number measured anew, whatever the others are: Sherman and Morrison.
     P = second.covariance
     gain = P[:, 2] / (P[2, 2] + 0.05**2)

@@ -7,7 +7,7 @@ import pytest
 
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.pass_fitter import PassFitter
-from mag_tracking.apps.pass_tracks import PassTracks, ground_of
+from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.pipeline import settings_for
 from support.busy_fits import fits_of_recording, fits_of_world, with_vehicles
 from support.busy_worlds import busy
@@ -123,7 +123,7 @@ def test_the_ground_is_that_of_the_settings():
     settings = settings_for('vehicle', {
         'track.vehicle.heights': [0.4, 0.4, 1.0], 'track.vehicle.height_stds': [0.3, 0.3, 0.3],
         'track.vehicle.climb_std': 0.2})
-    ground = ground_of(settings.track)
+    ground = ground_prior(settings.track)
     # The spread of the means, and that of each.
     assert ground.height == pytest.approx((0.6, np.sqrt(0.08 + 0.09)))
     assert ground.climb_std == 0.2

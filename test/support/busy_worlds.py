@@ -68,7 +68,8 @@ def passing(rng, simulator, at_s, direction, speed, trucks=TRUCKS):
     """(body, course) of a vehicle that is at the origin at a time [s]."""
     lane = -direction * (LANE_M + rng.uniform(-0.3, 0.3))
     path = Path(np.array([-direction * speed * at_s, lane]), 0.0 if direction > 0 else np.pi, speed)
-    return vehicle(rng, simulator, trucks), random_drive(rng, path, at_s) if simulator == 'boxes' else path
+    body = vehicle(rng, simulator, trucks)
+    return body, random_drive(rng, path, at_s) if simulator == 'boxes' else path
 
 
 def pair(rng, how, at_s):
