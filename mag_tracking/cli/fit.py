@@ -264,7 +264,7 @@ def _draw(one: FittedPass, out: Path) -> None:
     from mag_tracking.report.fit_figures import pass_figure
 
     title = f'{one.recording}, {one.label}, {fit.n_dipoles} dipole{"s" * (fit.n_dipoles > 1)}'
-    title += ' (the others taken away)' if one.n_vehicles > 1 else ''
+    title += ' (field of the others removed)' if one.n_vehicles > 1 else ''
     save_figure(pass_figure(fit, title + (' (no answer)' if fit.reason else '')),
                 out / f'{one.recording}_{one.label.replace(", ", "_").replace(" ", "_")}.png')
 
