@@ -92,6 +92,7 @@ def test_vehicles_of_both_simulators_are_followed(how, simulator):
 
 
 @pytest.mark.study
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize('simulator', SIMULATORS)
 @pytest.mark.parametrize('kind', ['car', 'truck'])
 def test_one_vehicle_is_rarely_taken_for_two(kind, simulator):
