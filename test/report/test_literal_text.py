@@ -87,7 +87,7 @@ ELLIPSOID = SimpleNamespace(coverage=1.0, correct=lambda readings: readings)
     (lambda: weights_figure(log_of_track()), '{}'),
     (lambda: field_figure(log_of_track(), NETWORK), '{}'),
     (lambda: pass_figure(fitted_pass(), ', '.join(NAMES)), '{}'),
-    (lambda: order_figure([SimpleNamespace(recording=name, number=1, fits=[fitted_pass()],
+    (lambda: order_figure([SimpleNamespace(recording=name, label='pass 1', fits=[fitted_pass()],
                                            chosen=None) for name in NAMES]), '{}, pass 1'),
     (lambda: lane_figure(plan()), '{}: whole pass'), (lambda: lane_figure(plan()), '{}'),
     (lambda: calibration_figure(calibration(), NETWORK), '{}'),
