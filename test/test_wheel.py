@@ -130,7 +130,7 @@ def test_the_wheel_holds_every_file_and_no_junk(tmp_path, copy):
     for name in JUNK:
         (copy / name).parent.mkdir(parents=True, exist_ok=True)
         (copy / name).write_text('')
-    # What the compiled modules do is of no interest here: without optimising they take a third.
+    # The compiled modules are not run here: they are built faster without optimisation.
     compiler = tmp_path / 'compiler'
     compiler.write_text('#!/bin/sh\nexec c++ "$@" -O0\n')
     compiler.chmod(0o755)

@@ -1,4 +1,4 @@
-"""What the minimum of a batch fit says of each target: unknowns, covariances, rivals, doubts."""
+"""Unknowns, covariances, rivals and doubts of each target at the minimum of a batch fit."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -28,9 +28,9 @@ EXACT = 1e-4
 
 
 def fits_at_minimum(data: PassData, orders: Sequence[int], found: Minimum, p: FloatArray,
-              explained: float, errors: SensorErrors,
-              cpa_range: tuple[float, float] | None = None,
-              path_std: FloatArray | None = None) -> tuple[PassFit, ...]:
+                    explained: float, errors: SensorErrors,
+                    cpa_range: tuple[float, float] | None = None,
+                    path_std: FloatArray | None = None) -> tuple[PassFit, ...]:
     """The `PassFit` of each of the targets that were fitted together.
 
     Parameters
@@ -109,7 +109,7 @@ class _Linearised:
     x: FloatArray
     """(n_x,) the unknowns."""
     own: tuple[IntArray, ...]
-    """Of each target, which unknowns are its own or backgrounds."""
+    """Indices of the unknowns of each target, followed by the backgrounds."""
     names: tuple[str, ...]
     fields: FloatArray
     """(K, n, 3) [T] of each target, sensor frame."""
@@ -200,7 +200,7 @@ def assignment(paths: Sequence[FloatArray], others: Sequence[FloatArray]) -> tup
 
 def _rivals(fit: PassFit, minima: Iterable[tuple[FloatArray, float]]) -> tuple[
         tuple[float, FloatArray], ...]:
-    """`PassFit.rivals` of the other minima (path, cost); a row seen from its other end is none."""
+    """`PassFit.rivals` of other minima (path, cost), without the same row from its other end."""
     rivals, excess = [], max(1.0, fit.normalised_cost)
     for path, cost in minima:
         path = np.append(path[:6], np.abs(path[6:]))

@@ -6,7 +6,7 @@ import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray
-from mag_tracking.geometry import heading_of, speed_of
+from mag_tracking.geometry import heading_of, moved_along, speed_of
 from mag_tracking.physics.anderson import closest_approach
 
 RIVAL = 9.2
@@ -163,13 +163,12 @@ class PassFit:
         """The same fit with time zero `seconds` later."""
         F = np.eye(len(self.x))
         F[:3, 3:6] = seconds * np.eye(3)
-        # An infinite variance times zero is none.
+        # An infinite variance times zero is NaN.
         with np.errstate(invalid='ignore'):
             covariance, honest = (F @ P @ F.T for P in (self.covariance, self.honest_covariance))
-        rivals = tuple((cost, np.append(path[:3] + seconds * path[3:6], path[3:]))
-                       for cost, path in self.rivals)
-        return replace(self, data=self.data.shifted(seconds), x=F @ self.x, covariance=covariance,
-                       honest_covariance=honest, rivals=rivals)
+        rivals = tuple((cost, moved_along(path, seconds)) for cost, path in self.rivals)
+        return replace(self, data=self.data.shifted(seconds), x=moved_along(self.x, seconds),
+                       covariance=covariance, honest_covariance=honest, rivals=rivals)
 
     @property
     def speed(self) -> tuple[float, float]:

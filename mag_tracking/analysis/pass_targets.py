@@ -88,7 +88,7 @@ def _are_parts(data: PassData, fits: Sequence[PassFit]) -> bool:
 def _why_not(data: PassData, fits: Sequence[PassFit]) -> str:
     """Why targets that were fitted together are not believed, or nothing.
 
-    What is wrong with one of them is in the answers of all.
+    An error in one of them affects the answers of all.
     """
     if not all(fit.converged for fit in fits):
         return 'the fit of them together did not converge'

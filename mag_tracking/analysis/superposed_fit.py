@@ -25,7 +25,7 @@ from mag_tracking.analysis.pass_fit import (
 )
 from mag_tracking.analysis.pass_result import NEARLY, PassFit
 from mag_tracking.arrays import BoolArray, FloatArray
-from mag_tracking.geometry import overlap
+from mag_tracking.geometry import moved_along, overlap
 from mag_tracking.inference.least_squares import refine
 from mag_tracking.inference.separable_fit import coarse_minima, fine_minimum
 from mag_tracking.physics.passes import SuperposedPasses
@@ -55,7 +55,7 @@ MOST_ROUNDS = 3
 
 SAME_SHARE, SAME_M = 0.5, 5.0
 """Largest relative difference of velocity, and largest distance [m], between two fits of the same
-target, or a fit and its track. Tracks are typically off by 5 % and half a metre."""
+target, or a fit and its track. Tracks have RMS errors of 0.3 to 0.9 m (`bench.busy`)."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def fit_superposed(data: PassData, paths: FloatArray, ground: GroundPrior,
     data : PassData
         Of two sensors or more.
     paths : (K, 6) [m], [m/s]
-        About where each target is when `data.t` is zero, and its velocity.
+        Approximate position of each target when `data.t` is zero, and its velocity.
     ground : GroundPrior
     orders : sequence of int
         Numbers of dipoles to try for each target.
@@ -103,19 +103,18 @@ def fit_superposed(data: PassData, paths: FloatArray, ground: GroundPrior,
     Returns
     -------
     tuple of tuples of PassFit
-        Of each target, in the order in which they pass the middle of the sensors, the fit with
-        each of `orders` that there are enough measurements for; the others have as many dipoles as
-        they are worth. Time zero is at the strongest field of the target. A fit that left its
-        track, or the best fit of its target, says so. Empty where there are too few measurements
-        for any order, or where it gave up.
+        The fits of each target with each of `orders` that there are enough measurements for; the
+        other targets have the selected number of dipoles. Targets are in the order in which they
+        pass the middle of the sensors, time zero is at the strongest field of each. A fit that left
+        its track, or the best fit of its target, has a reason. Empty if there are too few
+        measurements for any order, or if it gave up.
     """
     n_targets, begin_ns = len(paths), data.stamp_ns
     orders = [n for n in orders if not unusable(data, n_targets * (n,))]
     if not orders:
         return ()
     data, rough = at_strongest(data)
-    paths = paths.copy()
-    paths[:, :3] += (data.stamp_ns - begin_ns) / NS * paths[:, 3:]
+    paths = moved_along(paths, (data.stamp_ns - begin_ns) / NS)
     placed = np.vstack([paths.ravel(), _placed(rough, n_targets, ground)])
     fits = _JointFits(data, rough, placed, ground, errors)
     known = [min(orders, key=lambda n: (abs(n - 2), n))] * n_targets
@@ -137,8 +136,8 @@ def fit_superposed(data: PassData, paths: FloatArray, ground: GroundPrior,
 
 def _placed(rough: PassData, n_targets: int, ground: GroundPrior) -> FloatArray:
     """(n, 6 n_targets) Best paths of point targets; `rough` is the averaged pass."""
-    rests = [rough]
     paths: FloatArray = np.zeros((1, 0))
+    rests = [rough]
     for n in range(1, n_targets + 1):
         orders = n * (1,)
         model_of, prior = partial(SuperposedPasses.of, orders), ground.prior(orders)
@@ -150,9 +149,11 @@ def _placed(rough: PassData, n_targets: int, ground: GroundPrior) -> FloatArray:
         paths, _ = coarse_minima(separable_problem(rough, model_of, COARSE_ERROR, prior), coarse,
                                  np.concatenate(starts), np.tile(APART[:6], n), N_REFINED,
                                  N_STEPS, N_PLACED)
-        model = model_of(rough.t, rough.positions, rough.network.R_sw[rough.sensor])
-        rests = [replace(rough, field=rough.field - (
-            model.basis(path[None])[0] @ coarse.linear(path)).reshape(-1, 3)) for path in paths]
+        if n < n_targets:
+            model = model_of(rough.t, rough.positions, rough.network.R_sw[rough.sensor])
+            rests = [replace(rough, field=rough.field - (
+                model.basis(path[None])[0] @ coarse.linear(path)).reshape(-1, 3))
+                for path in paths]
     return paths
 
 
@@ -241,10 +242,8 @@ def are_separate(data: PassData, paths: Sequence[FloatArray], clear: float = CLE
 
 
 def path_from(data: PassData, fit: PassFit) -> FloatArray:
-    """(6 or 7,) The path of a fit, from time zero of `data`."""
-    path = fit.x[:6 + (fit.n_dipoles > 1)].copy()
-    path[:3] -= (fit.data.stamp_ns - data.stamp_ns) / NS * path[3:6]
-    return path
+    """The path (6 or 7,) of a fit, from time zero of `data`."""
+    return moved_along(fit.x[:6 + (fit.n_dipoles > 1)], (data.stamp_ns - fit.data.stamp_ns) / NS)
 
 
 def _of_orders(paths: Sequence[FloatArray], orders: Sequence[int]) -> list[FloatArray]:
@@ -271,8 +270,8 @@ def _is_same(fit: PassFit, path: FloatArray) -> bool:
     if not len(fit.x):
         return False
     seconds = _strongest_at(fit)
-    away = fit.position - path[:3] + seconds * (fit.velocity - path[3:6])
-    return bool(np.linalg.norm(away[:2]) <= SAME_M and np.linalg.norm(
+    away = moved_along(fit.x, seconds)[:2] - moved_along(path, seconds)[:2]
+    return bool(np.linalg.norm(away) <= SAME_M and np.linalg.norm(
         fit.velocity - path[3:6]) <= SAME_SHARE * np.linalg.norm(path[3:6]))
 
 

@@ -32,14 +32,15 @@ class FittedPass:
 
     recording: str
     number: int
-    """Of the detection."""
+    """Number of the detection."""
     fits: tuple[PassFit, ...]
     notes: tuple[str, ...]
-    """What was left out of the measurements, and why."""
+    """Measurements that were left out, with the reason, and remarks."""
     correlated: CorrelatedMotion = CorrelatedMotion()
-    """The velocity by the delays between the sensors, which needs no model."""
+    """The velocity by the delays between the sensors, which needs no model; missing if several
+    vehicles were fitted together."""
     vehicle: int = 1
-    """Of those that were fitted together, in the order in which they passed."""
+    """Number among the vehicles that were fitted together, in the order in which they passed."""
     n_vehicles: int = 1
 
     @property

@@ -8,6 +8,7 @@ import numpy as np
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.superposed_fit import GroundPrior, are_separate
 from mag_tracking.arrays import FloatArray
+from mag_tracking.geometry import moved_along
 from mag_tracking.records import Track
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
@@ -15,13 +16,13 @@ from mag_tracking.units import NS
 
 @dataclass(frozen=True)
 class _Pose:
-    """The pose of a track with the smallest covariance."""
+    """A pose of a track."""
 
     stamp_ns: int
     path: FloatArray
     """(6,) position and velocity."""
     spread: float
-    """[m^2]"""
+    """[m^2] Trace of the covariance of the position."""
 
 
 class PassTracks:
@@ -30,7 +31,7 @@ class PassTracks:
     def __init__(self, settings: TrackSettings) -> None:
         """`settings` of the tracker."""
         self._of_vehicles = settings.target == 'vehicle'
-        # Of each track the surest pose of the passes that were, and all that came after them.
+        # The surest pose of each track in earlier passes, and all later poses.
         self._poses: dict[int, list[_Pose]] = {}
         self._ended: set[int] = set()
         self._latest_ns = 0
@@ -52,18 +53,18 @@ class PassTracks:
                     float(np.trace(record.covariance[:3, :3]))))
 
     def paths(self, data: PassData) -> FloatArray:
-        """(K, 6) of each vehicle, where it is when `data.t` is zero, and its velocity [m], [m/s].
+        """Position and velocity (K, 6) [m], [m/s] of each vehicle when `data.t` is zero.
 
-        Those of which the surest pose is in the pass; none of magnets. A track in the place of a
-        surer one is of the same vehicle, which was lost and found again. Passes come in order.
+        A vehicle belongs to the pass if its pose with the smallest covariance does. Of tracks that
+        overlap only the most certain one counts: the vehicle was lost and found again. Passes have
+        to come in order; magnets have no paths.
         """
         end_ns = data.stamp_ns + int(NS * data.t.max())
         mine = sorted((pose for pose in self._surest_until(end_ns)
                        if pose.stamp_ns >= data.stamp_ns), key=lambda pose: pose.spread)
         paths: list[FloatArray] = []
         for pose in mine:
-            path = pose.path.copy()
-            path[:3] -= (pose.stamp_ns - data.stamp_ns) / NS * path[3:]
+            path = moved_along(pose.path, (data.stamp_ns - pose.stamp_ns) / NS)
             if self._of_vehicles and all(are_separate(data, (path, other)) for other in paths):
                 paths.append(path)
         return np.array(paths).reshape(-1, 6)
@@ -93,5 +94,5 @@ def ground_prior(settings: TrackSettings) -> GroundPrior:
     """The prior of height and climb that the settings of a tracker describe."""
     vehicle = settings.vehicle
     height, std = np.array(vehicle.heights), np.array(vehicle.height_stds)
-    return GroundPrior((float(height.mean()), float(np.sqrt(height.var() + np.square(std).mean()))),
-                  vehicle.climb_std)
+    spread = float(np.sqrt(height.var() + np.square(std).mean()))
+    return GroundPrior((float(height.mean()), spread), vehicle.climb_std)

@@ -86,7 +86,7 @@ class SeparableProblem:
 
 
 class _Prior:
-    """What is known beforehand, as whitened measurements of theta."""
+    """A Gaussian prior as whitened measurements of theta."""
 
     def __init__(self, mean: FloatArray, std: FloatArray) -> None:
         self._known = np.flatnonzero(np.isfinite(std))

@@ -32,7 +32,7 @@ class Column(NamedTuple):
 
 
 def columns_of(kind: str, unit: str, /, **meanings: str) -> tuple[Column, ...]:
-    """Of one kind and unit: {name: meaning}."""
+    """Columns of the same kind and unit: {name: meaning}."""
     return tuple(Column(name, kind, unit, meaning) for name, meaning in meanings.items())
 
 

@@ -89,7 +89,7 @@ def test_three_vehicles_are_found():
 
 
 def test_each_is_given_what_was_measured_without_the_others():
-    """What is left is the field of the one alone, and the noise."""
+    """The field of the one alone and the noise are left."""
     rng = np.random.default_rng(6)
     data, paths = world(rng, MEETING, 1)
     (first,), (second,) = fit_superposed(data, tracked(rng, paths), GROUND, (1,))
