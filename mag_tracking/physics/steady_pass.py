@@ -6,6 +6,7 @@ models).
 """
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -58,6 +59,11 @@ class SteadyPass:
         object.__setattr__(self, 'combinations',
                            np.linalg.qr(np.vander(places, increasing=True))[0])
 
+    @cached_property
+    def _mixing(self) -> FloatArray:
+        """(3 d, 3 d): moments of the row = mixing @ linear parameters."""
+        return np.kron(self.combinations, np.eye(3))
+
     def whole(self, theta: FloatArray) -> FloatArray:
         """(n_paths, N_PATH + n_clocks) path and clocks for theta (n_paths, n_free)."""
         out = np.tile(self.fixed, (len(theta), 1))
@@ -68,12 +74,13 @@ class SteadyPass:
         """Fields of unit combinations, (n_paths, 3 n, 3 d), for theta (n_paths, n_free)."""
         A = core.steady_bases(self.whole(theta), self.places, self.t, self.positions, self.M,
                               self.clock)
-        return A @ np.kron(self.combinations, np.eye(3))
+        fields: FloatArray = A @ self._mixing
+        return fields
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
         """d(basis(theta) p)/d(theta), (n_paths, 3 n, n_free); `p` (n_paths, 3 d)."""
         D = core.steady_derivatives(
-            self.whole(theta), p @ np.kron(self.combinations, np.eye(3)).T, self.places, self.t,
+            self.whole(theta), p @ self._mixing.T, self.places, self.t,
             self.positions, self.M, self.clock)
         free: FloatArray = D[:, :, self.free]
         return free

@@ -77,10 +77,9 @@ class NewcomerSearch:
         self._bank, self._window = bank, window
         self._filter_of, self._n_targets, self._vehicles = cache(filter_of), n_targets, vehicles
         self._filter, self._may_be_more = self._filter_of(n_targets), may_be_more
-        network, settings = vehicles.network, vehicles.settings
+        settings = vehicles.settings
         self._n_one = self._filter.observation.n_one
         self._search = WindowSearch(window, vehicles)
-        self._starts = self._search.prior.starts(settings, network)
         # The first pair that was found in place of a vehicle: all have its order.
         self._pairs: dict[int, FloatArray] = {}
         self._of_cell = -float(np.log(
@@ -191,22 +190,21 @@ class NewcomerSearch:
     def _beside(self, known: KnownVehicles, replaced: int | None = None) -> list[WindowStart]:
         """One vehicle beside known ones: a newcomer, or in place of vehicle `replaced`."""
         search = self._search.beside(known)
-        return [start for theta in search.best(self._starts, FIRST)
-                for start in self._started(known, theta[None], [search.moments(theta)], replaced)]
+        return [start for theta in search.best(self._search.grid, FIRST)
+                for start in self._started(known, theta[None], search.moments(theta), replaced)]
 
     def _anew(self, others: KnownVehicles, i: int) -> list[WindowStart]:
         """Two vehicles in place of vehicle `i`, whose filter may have been misled by them."""
         search = self._search.beside(others)
         starts: list[WindowStart] = []
-        for found in search.pairs(self._starts, FIRST, SECOND)[:FIRST]:
+        for found in search.pairs(self._search.grid, FIRST, SECOND)[:FIRST]:
             pair = in_order_of(self._pairs.setdefault(i, found), found)
-            moments = [search.beside(pair[1 - k]).moments(pair[k]) for k in (0, 1)]
-            starts += self._started(others, pair, moments, i)
+            starts += self._started(others, pair, search.moments(pair.ravel()), i)
         return starts
 
-    def _started(self, known: KnownVehicles, paths: FloatArray, moments: Sequence[FloatArray],
+    def _started(self, known: KnownVehicles, paths: FloatArray, moments: FloatArray,
                  replaced: int | None) -> list[WindowStart]:
-        """Known vehicles and new ones on `paths` (k, 7), of any kinds."""
+        """Known vehicles and new ones on `paths` (k, 7) with `moments` (k, 3, 3), of any kinds."""
         n_known, times = len(known.kind) * self._n_one, self._search.times
         labels = self._search.prior.nearest(paths)[0].tolist()
         starts = []

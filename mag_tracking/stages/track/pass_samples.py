@@ -10,7 +10,7 @@ from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.least_squares import LINEAR_RANK, MOST_DAMPING
 from mag_tracking.inference.matrices import FULL_RANK, RANK
 from mag_tracking.network import SensorNetwork
-from mag_tracking.physics.steady_pass import N_PATH, SteadyPass
+from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, SteadyPass
 from mag_tracking.records import FieldFrame, plain
 from mag_tracking.stages.track import core
 from mag_tracking.stages.track.bank_filter import known_covariance
@@ -118,6 +118,11 @@ class PassSamples:
             linear_rank=LINEAR_RANK, rank=RANK)
         k = int(np.argmin(cost))
         return model.whole(theta[k:k + 1])[0], float(cost[k]), P[k]
+
+    def straight_model(self, n_dipoles: int) -> SteadyPass:
+        """A row on a straight path at constant speed, whose clocks are right."""
+        return SteadyPass(self.t, self.positions, self.M, np.full(len(self.t), -1),
+                          np.arange(N_STRAIGHT), np.zeros(N_PATH), n_dipoles)
 
     @cached_property
     def _projected(self) -> tuple[FloatArray, FloatArray]:

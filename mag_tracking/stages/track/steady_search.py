@@ -18,9 +18,10 @@ from mag_tracking.inference.least_squares import refine
 from mag_tracking.inference.marginalised import Marginalised
 from mag_tracking.inference.separable_fit import distinct
 from mag_tracking.network import SensorNetwork
-from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, SteadyPass
+from mag_tracking.physics.steady_pass import N_STRAIGHT, PATH, SteadyPass
 from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
 from mag_tracking.stages.track.pass_samples import PassSamples
+from mag_tracking.stages.track.window_start import in_order_of
 
 N_DIPOLES = 3
 """Dipoles of the rows that are sought: enough for a car near a sensor."""
@@ -42,11 +43,10 @@ APART_START: FloatArray = np.array([4.0, 2.5, 1.0, 5.0, 0.3, 1.0, 3.0])
 APART: FloatArray = np.array([1.0, 1.0, 1.0, 2.0, 0.3, 1.0, 9.0])
 """[m], [m/s], [rad] Starts, and paths, that differ by no more than this are the same."""
 
+SPEED = PATH.index('speed')
+
 KNOWN_STD: FloatArray = np.array([2.0, 1.5, 0.2, 3.0, 0.1, 0.1, 1.5])
 """[m], [m/s], [rad] By so much may the path of another vehicle of the search be off."""
-
-ROUNDS, ROUND_STEPS = 3, 6
-"""Two paths are refined in turn, so often and in so many steps, each with the other not known."""
 
 
 @dataclass(frozen=True)
@@ -126,9 +126,38 @@ class PathPrior:
         return np.vstack(starts)
 
 
+class StartGrid:
+    """Paths from which a vehicle is sought, and the fields of a point on each.
+
+    What does not depend on what is known is worked out once for all searches of a window.
+
+    Attributes
+    ----------
+    theta : (n, 7) array
+        See `PathPrior.starts`.
+    bases : (3 m, 3 n) array
+        Whitened fields of unit moments.
+    squares : (n, 3, 3) array
+        Products of those of each path with themselves.
+    prior_cost : (n,) array
+    """
+
+    def __init__(self, samples: PassSamples, prior: PathPrior, theta: FloatArray) -> None:
+        """Of `theta` (n, 7) in the samples of a window."""
+        A = samples.straight_model(1).basis(theta)
+        self.theta = theta
+        self.squares: FloatArray = np.swapaxes(A, 1, 2) @ A
+        self.bases: FloatArray = np.ascontiguousarray(np.swapaxes(A, 0, 1)).reshape(A.shape[1], -1)
+        self.prior_cost: FloatArray = np.square(
+            prior.residual_and_jacobian(theta)[0]).sum(axis=1)
+
+
 @dataclass(frozen=True)
 class SteadySearch:
-    """Frames in which a vehicle is sought, and what is known of them."""
+    """Frames in which vehicles are sought, and what is known of them.
+
+    Several that are sought together have their paths (7 each) in a row.
+    """
 
     samples: PassSamples
     prior: PathPrior
@@ -137,6 +166,11 @@ class SteadySearch:
     columns: FloatArray
     """(3 n, q) whitened: what is not known of backgrounds and of those vehicles, each times its
     standard deviation."""
+
+    @cached_property
+    def _model(self) -> SteadyPass:
+        """The row that is sought."""
+        return self.samples.straight_model(N_DIPOLES)
 
     @cached_property
     def _without(self) -> Marginalised:
@@ -148,91 +182,105 @@ class SteadySearch:
         """(3 n,) what is left to be explained."""
         return self._without(self.samples.y - self.known)
 
-    def _model(self, n_dipoles: int) -> SteadyPass:
-        """The row that is sought."""
-        s = self.samples
-        return SteadyPass(s.t, s.positions, s.M, np.full(len(s.t), -1), np.arange(N_STRAIGHT),
-                          np.zeros(N_PATH), n_dipoles)
-
-    def _solved(self, theta: FloatArray, moment_std: FloatArray) -> tuple[
-            SteadyPass, FloatArray, FloatArray, FloatArray]:
-        """Model, basis (n, 3 n, k), information (n, k, k) and estimate (n, k) of the moments."""
-        model = self._model(len(moment_std) // 3)
-        A = self._without(model.basis(theta))
+    def _solved(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Basis (n, 3 n, 9 m), information (n, 9 m, 9 m) and estimate (n, 9 m) of the moments of
+        m vehicles on paths theta (n, 7 m)."""
+        basis = self._model.basis(theta.reshape(-1, N_STRAIGHT))
+        A = self._without(_side_by_side(basis, len(theta)))
         At = np.swapaxes(A, 1, 2)
-        information = At @ A + np.diag(moment_std**-2.0)
+        information = At @ A + np.diag(self._moment_std(theta)**-2.0)
         p = np.asarray(np.linalg.solve(information, (At @ self._y)[:, :, None])[:, :, 0],
                        dtype=np.float64)
-        return model, A, information, p
+        return A, information, p
 
-    def cost(self, theta: FloatArray) -> FloatArray:
-        """(n,) minus twice the log-density of the frames with a point on paths theta (n, 7)."""
-        std = np.full(3, self.prior.moment_std[0] * np.sqrt(N_DIPOLES))
-        _, A, information, p = self._solved(theta, std)
-        residual = self._y - np.einsum('nyi,ni->ny', A, p)
-        off, _ = self.prior.residual_and_jacobian(theta)
-        cost: FloatArray = (residual**2).sum(axis=1) + np.square(p / std).sum(axis=1) \
-            + (off**2).sum(axis=1) + np.linalg.slogdet(information * np.outer(std, std))[1]
+    def _moment_std(self, theta: FloatArray) -> FloatArray:
+        """(9 m,) of the moments of m vehicles on paths theta (n, 7 m)."""
+        return np.tile(self.prior.moment_std, theta.shape[1] // N_STRAIGHT)
+
+    def cost(self, grid: StartGrid) -> FloatArray:
+        """(n,) minus twice the log-density of the frames with a point on each path of a grid."""
+        n, std = len(grid.theta), self.prior.moment_std[0] * np.sqrt(N_DIPOLES)
+        lost = self._without.lost(grid.bases).reshape(-1, n, 3).swapaxes(0, 1)
+        information = grid.squares - lost.swapaxes(1, 2) @ lost + np.eye(3) / std**2
+        b = (self._without(self._y) @ grid.bases).reshape(n, 3)
+        p = np.linalg.solve(information, b[:, :, None])[:, :, 0]
+        # Not from the residuals: the starts are many, and digits enough.
+        cost: FloatArray = float(self._y @ self._y) - np.einsum('ni,ni->n', p, b) \
+            + grid.prior_cost + np.linalg.slogdet(information * std**2)[1]
         return np.where(np.isfinite(cost), cost, np.inf)
 
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Of measurements, moments and path; with the Jacobian of Kaufman (1975)."""
-        std = self.prior.moment_std
-        model, A, information, p = self._solved(theta, std)
-        D = self._without(model.derivative(theta, p))
+        """Of measurements, moments and paths (n, 7 m); with the Jacobian of Kaufman (1975)."""
+        n, std = len(theta), self._moment_std(theta)
+        paths = theta.reshape(-1, N_STRAIGHT)
+        A, information, p = self._solved(theta)
+        derivative = self._model.derivative(paths, p.reshape(len(paths), -1))
+        D = self._without(_side_by_side(derivative, n))
         moved = np.linalg.solve(information, np.swapaxes(A, 1, 2) @ D)
-        off, off_J = self.prior.residual_and_jacobian(theta)
-        return (np.hstack([self._y - np.einsum('nyi,ni->ny', A, p), -p / std, off]),
-                np.concatenate([D - A @ moved, -moved / std[:, None], off_J], axis=1))
+        off, off_J = self.prior.residual_and_jacobian(paths)
+        return (np.hstack([self._y - np.einsum('nyi,ni->ny', A, p), -p / std, off.reshape(n, -1)]),
+                np.concatenate([D - A @ moved, -moved / std[:, None], _block_diagonal(off_J, n)],
+                               axis=1))
 
     def refined(self, theta: FloatArray, n_steps: int = N_STEPS) -> tuple[FloatArray, FloatArray]:
-        """Paths (n, 7) after steps of Levenberg and Marquardt, and costs (n,); infinite where a
+        """Paths (n, 7 m) after steps of Levenberg and Marquardt, and costs (n,); infinite where a
         vehicle stands, or goes backwards."""
         path, cost, _, _ = refine(self.residual_and_jacobian, theta, n_steps, TOLERANCE)
-        return path, np.where(path[:, 3] >= self.prior.slowest, cost, np.inf)
+        come = (path[:, SPEED::N_STRAIGHT] >= self.prior.slowest).all(axis=1)
+        return path, np.where(come, cost, np.inf)
 
-    def best(self, starts: FloatArray, most: int) -> FloatArray:
+    def best(self, grid: StartGrid, most: int) -> FloatArray:
         """At most so many paths (n, 7) that explain the frames best, the best one first."""
-        path, cost = self.refined(_usable(starts, self.cost(starts), APART_START, N_STARTS))
+        path, cost = self.refined(_usable(grid.theta, self.cost(grid), APART_START, N_STARTS))
         return _usable(path, cost, APART, most)
 
-    def moments(self, path: FloatArray) -> FloatArray:
-        """(3, 3) [A m^2, world] moments of the row on a path (7,), from the tail to the head."""
-        model, _, _, p = self._solved(path[None], self.prior.moment_std)
-        moments: FloatArray = model.combinations @ p[0].reshape(-1, 3)
+    def moments(self, theta: FloatArray) -> FloatArray:
+        """(m, 3, 3) [A m^2, world] moments of the rows on paths (7 m,), from the tail to the head.
+        """
+        _, _, p = self._solved(theta[None])
+        moments: FloatArray = self._model.combinations @ p.reshape(-1, N_DIPOLES, 3)
         return moments
 
     def beside(self, path: FloatArray) -> 'SteadySearch':
         """The search for another vehicle, this one being known by about this path (7,)."""
-        model, _, _, p = self._solved(path[None], self.prior.moment_std)
+        _, _, p = self._solved(path[None])
         return replace(self, columns=np.hstack([
-            self.columns, model.basis(path[None])[0] * self.prior.moment_std,
-            model.derivative(path[None], p)[0] * KNOWN_STD]))
+            self.columns, self._model.basis(path[None])[0] * self.prior.moment_std,
+            self._model.derivative(path[None], p)[0] * KNOWN_STD]))
 
-    def pairs(self, starts: FloatArray, most: int, most_second: int) -> list[FloatArray]:
+    def pairs(self, grid: StartGrid, most: int, most_second: int) -> list[FloatArray]:
         """Pairs of paths (2, 7) that explain the frames, the best one first."""
-        found: list[tuple[float, FloatArray]] = []
-        for first in self.best(starts, most):
-            for second in self.beside(first).best(starts, most_second):
-                pair = self._refined_in_turn(first, second)
-                found.append((self._cost_of_pair(pair), pair))
-        return [pair for cost, pair in sorted(found, key=lambda f: f[0]) if np.isfinite(cost)]
+        starts = [np.append(first, second) for first in self.best(grid, most)
+                  for second in self.beside(first).best(grid, most_second)]
+        if not starts:
+            return []
+        pairs, cost = self.refined(np.array(starts))
+        cost = cost + self._spread_of_moments(pairs)
+        best = pairs[np.argmin(cost)].reshape(2, -1)
+        pairs = np.array([in_order_of(best, pair.reshape(2, -1)).ravel() for pair in pairs])
+        return list(_usable(pairs, cost, np.tile(APART, 2), len(pairs)).reshape(-1, 2, N_STRAIGHT))
 
-    def _refined_in_turn(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        """Both paths (2, 7), each refined a little while the other is not known."""
-        for _ in range(ROUNDS):
-            first = self.beside(second).refined(first[None], ROUND_STEPS)[0][0]
-            second = self.beside(first).refined(second[None], ROUND_STEPS)[0][0]
-        return np.array([first, second])
+    def _spread_of_moments(self, theta: FloatArray) -> FloatArray:
+        """(n,) what frames with paths (n, 7 m) are less probable by as their moments are not known:
+        log-determinant of their information, in units of what is known beforehand."""
+        std = self._moment_std(theta)
+        return np.asarray(np.linalg.slogdet(self._solved(theta)[1] * np.outer(std, std))[1],
+                          dtype=np.float64)
 
-    def _cost_of_pair(self, pair: FloatArray) -> float:
-        """Minus twice the log-density of the frames with both rows."""
-        bases = self._model(N_DIPOLES).basis(pair) * self.prior.moment_std
-        without = Marginalised(np.hstack([self.columns, *bases]))
-        left = without(self.samples.y - self.known)
-        off, _ = self.prior.residual_and_jacobian(pair)
-        cost = float(left @ left + without.log_determinant + (off**2).sum())
-        return cost if (pair[:, 3] >= self.prior.slowest).all() else np.inf
+
+def _side_by_side(A: FloatArray, n: int) -> FloatArray:
+    """Matrices (n, k, m c) of the `A` (n m, k, c) of m vehicles each."""
+    of_each = A.reshape(n, -1, *A.shape[1:]).swapaxes(1, 2)
+    return of_each.reshape(n, A.shape[1], -1)
+
+
+def _block_diagonal(A: FloatArray, n: int) -> FloatArray:
+    """Matrices (n, m k, m c) with the `A` (n m, k, c) of m vehicles each as their blocks."""
+    m, (k, c) = len(A) // n, A.shape[1:]
+    out = np.zeros((n, m, k, m, c))
+    for i in range(m):
+        out[:, i, :, i] = A.reshape(n, m, k, c)[:, i]
+    return out.reshape(n, m * k, m * c)
 
 
 def _usable(theta: FloatArray, cost: FloatArray, apart: FloatArray, most: int) -> FloatArray:

@@ -1,11 +1,13 @@
 """The frames of a window as the search for a vehicle takes them, without those that are known."""
 
+from functools import cached_property
+
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.stages.track.pass_samples import PassSamples
 from mag_tracking.stages.track.relinearisation import Window
-from mag_tracking.stages.track.steady_search import PathPrior, SteadySearch
+from mag_tracking.stages.track.steady_search import PathPrior, StartGrid, SteadySearch
 from mag_tracking.stages.track.vehicle_state import VehicleState
 from mag_tracking.stages.track.window_start import KnownVehicles
 from mag_tracking.units import NS
@@ -39,6 +41,12 @@ class WindowSearch:
         self.prior = PathPrior.of(vehicles.settings, network)
         self.samples = PassSamples.of(network, [frames[k] for k in self._thinned],
                                       frames[-1].stamp_ns, len(network))
+
+    @cached_property
+    def grid(self) -> StartGrid:
+        """Where a vehicle is sought."""
+        return StartGrid(self.samples, self.prior,
+                         self.prior.starts(self._vehicles.settings, self._vehicles.network))
 
     def beside(self, known: KnownVehicles) -> SteadySearch:
         """The search for a vehicle beside those that are known."""

@@ -7,7 +7,7 @@ from mag_tracking.physics.passes import RowPass
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.pass_samples import PassSamples
-from mag_tracking.stages.track.steady_search import PathPrior, SteadySearch
+from mag_tracking.stages.track.steady_search import PathPrior, StartGrid, SteadySearch
 from mag_tracking.units import NS
 from support.busy_worlds import NETWORKS
 
@@ -31,7 +31,7 @@ def field_of(path, network, t):
 
 
 def search_of(*paths, n_sensors=4, seed=0):
-    """`SteadySearch` in two seconds of frames with these vehicles, and its starts."""
+    """`SteadySearch` in two seconds of frames with these vehicles, and its grid."""
     network, rng = NETWORKS[n_sensors], np.random.default_rng(seed)
     t = np.arange(-24, 1) * 0.08
     field = sum(field_of(path, network, t) for path in paths)
@@ -42,7 +42,7 @@ def search_of(*paths, n_sensors=4, seed=0):
     samples = PassSamples.of(network, frames, 0, len(network))
     prior = PathPrior.of(VEHICLE, network)
     return (SteadySearch(samples, prior, np.zeros(len(samples.y)), 2e-8 * samples.backgrounds),
-            prior.starts(VEHICLE, network))
+            StartGrid(samples, prior, prior.starts(VEHICLE, network)))
 
 
 def assert_near(path, truth, where=0.5, speed=1.0):
@@ -52,50 +52,76 @@ def assert_near(path, truth, where=0.5, speed=1.0):
 
 @pytest.mark.parametrize('truth', [FIRST, SECOND])
 def test_a_vehicle_alone_is_found(truth):
-    search, starts = search_of(truth)
-    best = search.best(starts, 3)
+    search, grid = search_of(truth)
+    best = search.best(grid, 3)
     assert_near(best[0], truth)
-    total = search.moments(best[0]).sum(axis=0)
+    total = search.moments(best[0])[0].sum(axis=0)
     np.testing.assert_allclose(total, 3.0 * np.array(MOMENTS[id(truth)]), atol=60.0)
 
 
 @pytest.mark.parametrize('n_sensors', [2, 4])
 def test_two_that_meet_are_found_whichever_comes_first(n_sensors):
-    search, starts = search_of(FIRST, SECOND, n_sensors=n_sensors)
-    pair = search.pairs(starts, 3, 2)[0]
+    search, grid = search_of(FIRST, SECOND, n_sensors=n_sensors)
+    pair = search.pairs(grid, 3, 2)[0]
     pair = pair if pair[0, 0] > pair[1, 0] else pair[::-1]
     assert_near(pair[0], FIRST, 1.5, 1.5)
     assert_near(pair[1], SECOND, 1.5, 1.5)
 
 
 def test_beside_a_known_one_the_other_is_found():
-    search, starts = search_of(FIRST, SECOND)
-    assert_near(search.beside(FIRST).best(starts, 1)[0], SECOND, 1.0, 1.5)
+    search, grid = search_of(FIRST, SECOND)
+    assert_near(search.beside(FIRST).best(grid, 1)[0], SECOND, 1.0, 1.5)
 
 
 def test_what_is_not_known_of_a_known_field_is_not_taken_for_a_vehicle():
     """Of a vehicle alone that is known, noise is left: no path explains more than another."""
-    search, starts = search_of(FIRST)
-    alone, beside = search.cost(starts), search.beside(FIRST).cost(starts)
+    search, grid = search_of(FIRST)
+    alone, beside = search.cost(grid), search.beside(FIRST).cost(grid)
     assert np.ptp(alone) > 1000.0
     # The prior of a path and its moments costs up to some dozens.
     assert np.ptp(beside) < 100.0
 
 
-def test_residuals_have_the_stated_derivative():
-    """With Kaufman's Jacobian the gradient of the cost is exact."""
-    search, _ = search_of(FIRST)
-    theta = (FIRST + [0.3, 0.2, 0.1, -0.5, 0.02, 0.01, 0.3])[None]
+@pytest.mark.parametrize('truths', [[FIRST], [FIRST, SECOND]])
+def test_residuals_have_the_stated_derivative(truths):
+    """With Kaufman's Jacobian the gradient of the cost is exact, of two sought together, too."""
+    search, _ = search_of(*truths)
+    off = np.array([0.3, 0.2, 0.1, -0.5, 0.02, 0.01, 0.3])
+    theta = np.concatenate([truth + off for truth in truths])[None]
     r, J = search.residual_and_jacobian(theta)
     gradient = -2.0 * np.einsum('nyi,ny->ni', J, r)[0]
     step = 1e-5
-    for k in range(7):
+    for k in range(theta.shape[1]):
         moved = np.repeat(theta, 2, axis=0)
         moved[:, k] += [step, -step]
         cost = (search.residual_and_jacobian(moved)[0]**2).sum(axis=1)
         assert gradient[k] == pytest.approx((cost[0] - cost[1]) / (2.0 * step), rel=2e-2, abs=0.5)
 
 
+def test_the_cost_of_the_grid_is_that_of_the_whole_covariance():
+    """Differences of the log-density of a point's Gaussian field, backgrounds and noise."""
+    search, grid = search_of(FIRST)
+    beside, rows = search.beside(SECOND), np.arange(0, len(grid.theta), 97)
+    std = search.prior.moment_std[0] * np.sqrt(3.0)
+    expected = []
+    for k in rows:
+        C = np.hstack([beside.columns, std * grid.bases[:, 3 * k:3 * k + 3]])
+        S = np.eye(len(C)) + C @ C.T
+        expected.append(search.samples.y @ np.linalg.solve(S, search.samples.y)
+                        + np.linalg.slogdet(S)[1] + grid.prior_cost[k])
+    cost = beside.cost(grid)[rows]
+    np.testing.assert_allclose(cost - cost[0], np.array(expected) - expected[0],
+                               rtol=1e-6, atol=1e-5)
+
+
+def test_pairs_are_those_of_different_minima():
+    search, grid = search_of(FIRST, SECOND)
+    pairs = np.array(search.pairs(grid, 3, 2))
+    apart = np.abs(pairs[:, None] - pairs)
+    assert len(pairs) > 1
+    assert all((apart[i, k] > 0.3).any() for i in range(len(pairs)) for k in range(i))
+
+
 def test_what_stands_or_goes_backwards_is_not_found():
-    search, starts = search_of(FIRST)
-    assert (search.best(starts, 5)[:, 3] >= 0.2 * min(VEHICLE.speeds)).all()
+    search, grid = search_of(FIRST)
+    assert (search.best(grid, 5)[:, 3] >= 0.2 * min(VEHICLE.speeds)).all()
