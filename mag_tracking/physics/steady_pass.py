@@ -62,7 +62,7 @@ class SteadyPass:
     @cached_property
     def _mixing(self) -> FloatArray:
         """(3 d, 3 d): moments of the row = mixing @ linear parameters."""
-        return np.kron(self.combinations, np.eye(3))
+        return np.kron(self.combinations, np.eye(3)).astype(np.float64)
 
     def whole(self, theta: FloatArray) -> FloatArray:
         """(n_paths, N_PATH + n_clocks) path and clocks for theta (n_paths, n_free)."""
@@ -74,8 +74,7 @@ class SteadyPass:
         """Fields of unit combinations, (n_paths, 3 n, 3 d), for theta (n_paths, n_free)."""
         A = core.steady_bases(self.whole(theta), self.places, self.t, self.positions, self.M,
                               self.clock)
-        fields: FloatArray = A @ self._mixing
-        return fields
+        return A @ self._mixing
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
         """d(basis(theta) p)/d(theta), (n_paths, 3 n, n_free); `p` (n_paths, 3 d)."""
