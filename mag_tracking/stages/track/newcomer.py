@@ -90,28 +90,33 @@ class NewcomerSearch:
         """The best explanation with a newcomer, or with a vehicle elsewhere; None where there is
         none at all."""
         rows, of_track, log_w, paths = self._as_it_is()
-        more: list[WindowStart] = []
-        elsewhere: list[WindowStart] = []
+        # By how many vehicles there are, and which of them was sought anew.
+        starts: dict[tuple[int, int | None], list[WindowStart]] = {}
         for k in self._leaders(rows, log_w):
             known = self._known(rows[k], log_w[k] - of_track[k], paths[k])
-            if self._may_be_more and self._is_odd:
-                more += self._beside(known)
-            for i in range(self._n_targets):
-                others = self._without(known, i)
-                if self._is_odd and self._is_felt(known, i):
-                    elsewhere += self._beside(others, i)
-                if self._may_be_more and self._may_be_two(known, i):
-                    more += self._anew(others, i)
+            for start in self._sought(known):
+                starts.setdefault((len(start.kind), start.replaced), []).append(start)
         alone = float(log_sum_exp(log_w))
-        found = [self._best_of(starts, alone) for starts in (more, elsewhere) if starts]
+        found = [self._best_of(alike, alone) for alike in starts.values()]
         return max((joint for joint in found if joint is not None
                     and (are_felt_by_two(joint) if joint.adds
                          else self._is_elsewhere(joint))),
                    key=lambda joint: joint.log_odds, default=None)
 
+    def _sought(self, known: KnownVehicles) -> list[WindowStart]:
+        """All that is tried beside, and in place of, the vehicles of a hypothesis."""
+        starts = self._beside(known) if self._may_be_more and self._is_odd else []
+        for i in range(self._n_targets):
+            others = self._without(known, i)
+            if self._is_odd and self._is_felt(known, i):
+                starts += self._beside(others, i)
+            if self._may_be_more and self._may_be_two(known, i):
+                starts += self._anew(others, i)
+        return starts
+
     def _best_of(self, starts: Sequence[WindowStart], alone: float) -> Joint | None:
-        """What comes of hypotheses of as many vehicles; `alone` is the log-evidence of the track
-        as it is."""
+        """What comes of hypotheses of as many vehicles, in place of the same one; `alone` is the
+        log-evidence of the track as it is."""
         kept = self._with_turns(self._kept(starts))
         prior = ARRIVES if len(kept[0].kind) > self._n_targets else WAS_LOST
         bank, log_likelihood, log_w, paths = self._run(kept)
@@ -282,12 +287,10 @@ class NewcomerSearch:
 
     def _made(self, starts: Sequence[WindowStart], bank: FilterBank, log_likelihood: FloatArray,
               log_w: FloatArray, paths: FloatArray, log_odds: float) -> Joint | None:
-        """The `Joint` of those that can be used, and have the states of the best in their order."""
-        best = int(np.argmax(log_w))
-        if not np.isfinite(log_w[best]):
+        """The `Joint` of those that can be used."""
+        rows = np.flatnonzero(np.isfinite(log_w))
+        if not len(rows):
             return None
-        replaced = starts[best].replaced
-        rows = np.flatnonzero(np.isfinite(log_w) & [s.replaced == replaced for s in starts])
         n = len(rows)
         anchor = FilterBank(
             np.array([starts[k].x for k in rows]), np.array([starts[k].P for k in rows]),
@@ -301,6 +304,6 @@ class NewcomerSearch:
                         [np.ascontiguousarray(paths[rows, k]) for k in range(n_frames)],
                         [each.copy() for _ in range(n_frames)], float(log_sum_exp(log_w[rows])),
                         self._window.most)
-        n_targets = len(starts[best].kind)
-        return Joint(now, window, self._filter_of(n_targets), log_odds, replaced,
+        n_targets = len(starts[0].kind)
+        return Joint(now, window, self._filter_of(n_targets), log_odds, starts[0].replaced,
                      n_targets > self._n_targets)
