@@ -63,7 +63,7 @@ test: $(STAMP)  ## check style, floors, types and behaviour
 	$(BIN)/lint-imports
 	$(BIN)/mypy
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m 'not alone and not study'
-	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest -q -n 3 --dist loadfile -m 'alone and not study'
+	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest -q -n 4 --dist loadfile --no-loadscope-reorder -m 'alone and not study'
 
 studies: $(STAMP)  ## the tests that take many runs or all of the recordings
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -rP -n 2 -m 'study and not alone'

@@ -26,9 +26,10 @@ _HOME = tempfile.TemporaryDirectory(prefix='mag_tracking_test_')
 os.environ['ROS_HOME'] = _HOME.name
 
 
-LONGEST = ('test_wheel.py', 'test_busy.py', 'test_archive.py', 'test_archive_faults.py',
-           'test_traffic.py', 'test_situations.py', 'test_cli.py')
-"""Files that take half a minute or more."""
+LONGEST = ('test_wheel.py', 'test_busy.py', 'test_pass_fit.py', 'test_archive.py',
+           'test_archive_faults.py', 'test_traffic.py', 'test_situations.py', 'test_cli.py',
+           'test_nodes.py', 'test_node_faults.py', 'test_leaving.py', 'test_health_node.py')
+"""Files that take half a minute or more, first those without nodes."""
 
 
 def pytest_collection_modifyitems(items):
