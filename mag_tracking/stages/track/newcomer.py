@@ -19,7 +19,7 @@ from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_vehicle import moment_directions
 from mag_tracking.stages.track.joint import FELT, Joint, are_felt_by_two
-from mag_tracking.stages.track.newcomer_test import ODD
+from mag_tracking.stages.track.newcomer_evidence import ODD
 from mag_tracking.stages.track.reach import energy_of
 from mag_tracking.stages.track.relinearisation import Window
 from mag_tracking.stages.track.vehicle_state import VehicleState
@@ -69,7 +69,7 @@ class NewcomerSearch:
                  ) -> None:
         """`bank` of a track of `n_targets` vehicles; `filter_of` makes the filter of so many.
 
-        The `reason` is that of `NewcomerTest.due`: nobody is sought beside a long vehicle, or
+        The `reason` is that of `NewcomerEvidence.due`: nobody is sought beside a long vehicle, or
         elsewhere, if the innovations are as they should be. Without `may_be_more` no vehicle is
         added.
         """

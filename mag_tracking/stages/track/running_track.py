@@ -25,7 +25,7 @@ from mag_tracking.stages.track.evidence import LEAST_WATCHED, OUT_OF_REACH
 from mag_tracking.stages.track.joint import Joint
 from mag_tracking.stages.track.member import Member, Update, View, in_order
 from mag_tracking.stages.track.newcomer import NewcomerSearch
-from mag_tracking.stages.track.newcomer_test import UNDECIDED_NATS, NewcomerTest
+from mag_tracking.stages.track.newcomer_evidence import UNDECIDED_NATS, NewcomerEvidence
 from mag_tracking.stages.track.reach import FAINT, UNFELT, energy_of
 from mag_tracking.stages.track.sensor_selection import SensorSubset
 from mag_tracking.stages.track.settings import TrackSettings
@@ -68,7 +68,7 @@ class RunningTrack:
         self._target, self._settings = target, settings
         self._bank = TrackBank(target, settings, sensors, bank_filter, bank, counts, later)
         self.members = [Member(id, target, sensors, counts, clocks, 0)]
-        self._test = NewcomerTest()
+        self._newcomers = NewcomerEvidence()
         # A newcomer could not be sought: there are too many members.
         self._is_full = False
         self._handover_due: int | None = None
@@ -207,9 +207,10 @@ class RunningTrack:
     def _note(self, advance: Advance, best: int) -> None:
         """Count how a frame fits hypothesis `best`, for the question of newcomers."""
         bank, frame = self.bank, advance.frame
-        self._test.add(float(np.nansum(bank.nis[best])), np.count_nonzero(~np.isnan(frame.field)),
-                       frame.stamp_ns, advance.n_rejected > 0 and len(frame.field) == 2,
-                       bool(self._bank.filter.are_long(bank.kind[best:best + 1])[0]))
+        self._newcomers.add(
+            float(np.nansum(bank.nis[best])), np.count_nonzero(~np.isnan(frame.field)),
+            frame.stamp_ns, advance.n_rejected > 0 and len(frame.field) == 2,
+            bool(self._bank.filter.are_long(bank.kind[best:best + 1])[0]))
 
     def _frame_of(self, i: int, best: int, frame: FieldFrame, dt: float) -> FieldFrame:
         """A frame as member `i` alone would have made it, by hypothesis `best`."""
@@ -292,8 +293,7 @@ class RunningTrack:
         if self.ended is not None or self._target.starts_anywhere or window is None \
                 or self.members[0].last is None:
             return None
-        reason = self._test.due(window.frames[-1].stamp_ns)
-        if reason is None:
+        if (reason := self._newcomers.due(window.frames[-1].stamp_ns)) is None:
             return None
         self._is_full = n >= self._settings.most_together
         self.counts['newcomers sought'] += 1
@@ -304,7 +304,7 @@ class RunningTrack:
                 self._settings.vehicle, self._bank.sensors.network,
                 self._settings.background_std), reason, not self._is_full).find()
         # A field of something else is no vehicle more.
-        if self._test.believes(found.log_odds if found and all(
+        if self._newcomers.believes(found.log_odds if found and all(
                 m.evidence.explanation.would_lead(found.log_odds, self._settings.explained_ratio)
                 for m in self.members) else -np.inf):
             return found

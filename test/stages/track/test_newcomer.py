@@ -9,14 +9,14 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.stages.track.member import in_order
-from mag_tracking.stages.track.newcomer_test import (
+from mag_tracking.stages.track.newcomer_evidence import (
     AGAIN_NATS,
     AGAIN_S,
     LEAST_NATS,
     LONG,
     LONG_AGAIN_S,
     ODD,
-    NewcomerTest,
+    NewcomerEvidence,
 )
 from mag_tracking.stages.track.window_start import in_order_of, inserted, overlap_depth
 from mag_tracking.units import NS
@@ -28,7 +28,7 @@ PERIOD = round(0.08 * NS)
 
 def asked(nis, n=20, rejected=False, is_long=False):
     """[(frame, reason)] for which a track with innovations of this size is compared."""
-    test, found = NewcomerTest(), []
+    test, found = NewcomerEvidence(), []
     for k in range(n):
         test.add(nis, 6, k * PERIOD, rejected, is_long)
         reason = test.due(k * PERIOD)
@@ -56,7 +56,7 @@ def test_a_long_vehicle_is_compared_less_and_less_often():
 
 
 def test_what_is_less_probable_is_believed_the_second_time():
-    test, between = NewcomerTest(), 0.5 * (AGAIN_NATS + LEAST_NATS)
+    test, between = NewcomerEvidence(), 0.5 * (AGAIN_NATS + LEAST_NATS)
     assert test.believes(LEAST_NATS + 0.1)
     assert [test.believes(odds) for odds in (between, between)] == [False, True]
     assert [test.believes(odds) for odds in (between, 0.0, between)] == [False] * 3

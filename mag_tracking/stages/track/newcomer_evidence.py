@@ -25,7 +25,7 @@ ODD, LONG = 'improbable innovations', 'a long vehicle'
 """Why a track is compared with other explanations."""
 
 
-class NewcomerTest:
+class NewcomerEvidence:
     """Whether a track is to be compared with one of a vehicle more.
 
     That is so where the latest innovations are improbable. A long vehicle explains two short ones
