@@ -16,6 +16,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.least_squares import refine
 from mag_tracking.inference.marginalised import Marginalised
+from mag_tracking.inference.matrices import pseudo_inverse, running_away
 from mag_tracking.inference.separable_fit import distinct
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.steady_pass import N_STRAIGHT, PATH, SteadyPass
@@ -182,16 +183,18 @@ class SteadySearch:
         """(3 n,) what is left to be explained."""
         return self._without(self.samples.y - self.known)
 
-    def _solved(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Basis (n, 3 n, 9 m), information (n, 9 m, 9 m) and estimate (n, 9 m) of the moments of
-        m vehicles on paths theta (n, 7 m)."""
+    def _solved(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Basis (n, 3 n, 9 m), information (n, 9 m, 9 m), its inverse, and estimate (n, 9 m) of
+        the moments of m vehicles on paths theta (n, 7 m).
+
+        A path that a search leads through a sensor has no inverse that means anything.
+        """
         basis = self._model.basis(theta.reshape(-1, N_STRAIGHT))
         A = self._without(_side_by_side(basis, len(theta)))
         At = np.swapaxes(A, 1, 2)
         information = At @ A + np.diag(self._moment_std(theta)**-2.0)
-        p = np.asarray(np.linalg.solve(information, (At @ self._y)[:, :, None])[:, :, 0],
-                       dtype=np.float64)
-        return A, information, p
+        inverse = pseudo_inverse(information)
+        return A, information, inverse, np.einsum('nij,nj->ni', inverse, At @ self._y)
 
     def _moment_std(self, theta: FloatArray) -> FloatArray:
         """(9 m,) of the moments of m vehicles on paths theta (n, 7 m)."""
@@ -200,23 +203,24 @@ class SteadySearch:
     def cost(self, grid: StartGrid) -> FloatArray:
         """(n,) minus twice the log-density of the frames with a point on each path of a grid."""
         n, std = len(grid.theta), self.prior.moment_std[0] * np.sqrt(N_DIPOLES)
-        lost = self._without.lost(grid.bases).reshape(-1, n, 3).swapaxes(0, 1)
-        information = grid.squares - lost.swapaxes(1, 2) @ lost + np.eye(3) / std**2
-        b = (self._without(self._y) @ grid.bases).reshape(n, 3)
-        p = np.linalg.solve(information, b[:, :, None])[:, :, 0]
-        # Not from the residuals: the starts are many, and digits enough.
-        cost: FloatArray = float(self._y @ self._y) - np.einsum('ni,ni->n', p, b) \
-            + grid.prior_cost + np.linalg.slogdet(information * std**2)[1]
+        with running_away():
+            lost = self._without.lost(grid.bases).reshape(-1, n, 3).swapaxes(0, 1)
+            information = grid.squares - lost.swapaxes(1, 2) @ lost + np.eye(3) / std**2
+            b = (self._without(self._y) @ grid.bases).reshape(n, 3)
+            p = np.einsum('nij,nj->ni', pseudo_inverse(information), b)
+            # Not from the residuals: the starts are many, and digits enough.
+            cost: FloatArray = float(self._y @ self._y) - np.einsum('ni,ni->n', p, b) \
+                + grid.prior_cost + np.linalg.slogdet(information * std**2)[1]
         return np.where(np.isfinite(cost), cost, np.inf)
 
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Of measurements, moments and paths (n, 7 m); with the Jacobian of Kaufman (1975)."""
         n, std = len(theta), self._moment_std(theta)
         paths = theta.reshape(-1, N_STRAIGHT)
-        A, information, p = self._solved(theta)
+        A, _, inverse, p = self._solved(theta)
         derivative = self._model.derivative(paths, p.reshape(len(paths), -1))
         D = self._without(_side_by_side(derivative, n))
-        moved = np.linalg.solve(information, np.swapaxes(A, 1, 2) @ D)
+        moved = inverse @ (np.swapaxes(A, 1, 2) @ D)
         off, off_J = self.prior.residual_and_jacobian(paths)
         return (np.hstack([self._y - np.einsum('nyi,ni->ny', A, p), -p / std, off.reshape(n, -1)]),
                 np.concatenate([D - A @ moved, -moved / std[:, None], _block_diagonal(off_J, n)],
@@ -237,13 +241,13 @@ class SteadySearch:
     def moments(self, theta: FloatArray) -> FloatArray:
         """(m, 3, 3) [A m^2, world] moments of the rows on paths (7 m,), from the tail to the head.
         """
-        _, _, p = self._solved(theta[None])
+        _, _, _, p = self._solved(theta[None])
         moments: FloatArray = self._model.combinations @ p.reshape(-1, N_DIPOLES, 3)
         return moments
 
     def beside(self, path: FloatArray) -> 'SteadySearch':
         """The search for another vehicle, this one being known by about this path (7,)."""
-        _, _, p = self._solved(path[None])
+        _, _, _, p = self._solved(path[None])
         return replace(self, columns=np.hstack([
             self.columns, self._model.basis(path[None])[0] * self.prior.moment_std,
             self._model.derivative(path[None], p)[0] * KNOWN_STD]))

@@ -114,6 +114,19 @@ def test_the_cost_of_the_grid_is_that_of_the_whole_covariance():
                                rtol=1e-6, atol=1e-5)
 
 
+@pytest.mark.parametrize('miss', [0.0, 1e-12, 1e-9, 1e-6])
+def test_a_path_through_a_sensor_is_no_error(miss):
+    """A step of the search may lead there; of what it then costs nothing is asked."""
+    search, grid = search_of(FIRST, SECOND)
+    at = np.append(search.samples.positions[0] + [0.0, 0.0, miss], FIRST[3:])
+    pair = np.append(at, SECOND)
+    for theta in (at[None], pair[None]):
+        search.refined(theta, 3)
+    through = StartGrid(search.samples, search.prior, np.vstack([at, FIRST]))
+    cost = search.cost(through)
+    assert np.isfinite(cost[1]) and not np.isnan(cost).any()
+
+
 def test_pairs_are_those_of_different_minima():
     search, grid = search_of(FIRST, SECOND)
     pairs = np.array(search.pairs(grid, 3, 2))
