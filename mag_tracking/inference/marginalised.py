@@ -17,16 +17,13 @@ class Marginalised:
         self._U, size, _ = np.linalg.svd(columns, full_matrices=False)
         self._size = size
         self._taken: FloatArray = 1.0 - 1.0 / np.sqrt(1.0 + size**2)
-        self.log_determinant = float(np.log1p(size**2).sum())
-        """Log-determinant of I + C C'."""
 
     def __call__(self, A: FloatArray) -> FloatArray:
         """The inverse root times A (..., n_y, k), or (n_y,)."""
         whitened: FloatArray = A - (self._U * self._taken) @ (self._U.T @ A)
         return whitened
 
-    def lost(self, A: FloatArray) -> FloatArray:
-        """L (q', k) by which products with the inverse lack what is not known: of A (n_y, k), and
-        of B alike, A' inv(I + C C') B = A'B - lost(A)' lost(B)."""
+    def correction_factor(self, A: FloatArray) -> FloatArray:
+        """F(A) (q, k) for A (n_y, k): A' inv(I + C C') B = A'B - F(A)' F(B)."""
         share: FloatArray = self._size / np.sqrt(1.0 + self._size**2)
         return share[:, None] * (self._U.T @ A)

@@ -28,8 +28,8 @@ class SteadyPass:
 
     theta: those of `PATH` and of the clocks that are in `free`, in that order; the others stay as
     in `fixed`. Linear (3 d): combinations of the moments. The tracker fits it in compiled code
-    (`stages/track/steady_fit.hpp`); `basis` and `derivative` are for simulations, and for the tests
-    that compare.
+    (`stages/track/steady_fit.hpp`); `basis` and `derivative` are for searches that have a prior,
+    and for simulations.
     """
 
     t: FloatArray

@@ -13,6 +13,10 @@ FELT = 4.0
 """A vehicle of which the last frame has less energy, in units of its noise, is not sought again. A
 sensor does not feel one of which all frames together have less."""
 
+SURE_NATS = 15.0
+"""[nats] An explanation that is believed by less than this is doubted for a while: evidence counts
+what a model leaves out of the field as if it were independent in each frame, and says too much."""
+
 
 @dataclass(frozen=True)
 class Joint:
@@ -33,12 +37,14 @@ class Joint:
     def doubtful(self, n_one: int) -> tuple[int, ...]:
         """Places of vehicles that may be others, each of `n_one` states.
 
-        One that was found elsewhere; and two that took the place of one and go the same way: a
-        long vehicle of which the model leaves much out looks like two.
+        One that was found elsewhere; two that took the place of one and go the same way, as a long
+        vehicle of which the model leaves much out looks like two; all of a weak explanation.
         """
+        n = self.bank.label.shape[1] if self.bank.label.ndim > 1 else 1
+        if self.log_odds < SURE_NATS:
+            return tuple(range(n))
         if self.replaced is None:
             return ()
-        n = self.bank.label.shape[1] if self.bank.label.ndim > 1 else 1
         if not self.adds:
             return (n - 1,)
         places = (n - 2, n - 1)

@@ -89,34 +89,37 @@ class NewcomerSearch:
     def find(self) -> Joint | None:
         """The best explanation with a newcomer, or with a vehicle elsewhere; None where there is
         none at all."""
+        if not len(self._search.samples.t):
+            return None
         rows, of_track, log_w, paths = self._as_it_is()
-        # By how many vehicles there are, and which of them was sought anew.
-        starts: dict[tuple[int, int | None], list[WindowStart]] = {}
+        # By the number of vehicles, and which one of the track is replaced.
+        explanations: dict[tuple[int, int | None], list[WindowStart]] = {}
         for k in self._leaders(rows, log_w):
             known = self._known(rows[k], log_w[k] - of_track[k], paths[k])
-            for start in self._sought(known):
-                starts.setdefault((len(start.kind), start.replaced), []).append(start)
+            for start in self._starts_with(known):
+                explanations.setdefault((len(start.kind), start.replaced), []).append(start)
         alone = float(log_sum_exp(log_w))
-        found = [self._best_of(alike, alone) for alike in starts.values()]
+        found = [self._best_of(starts, alone) for starts in explanations.values()]
         return max((joint for joint in found if joint is not None
                     and (are_felt_by_two(joint) if joint.adds
                          else self._is_elsewhere(joint))),
                    key=lambda joint: joint.log_odds, default=None)
 
-    def _sought(self, known: KnownVehicles) -> list[WindowStart]:
-        """All that is tried beside, and in place of, the vehicles of a hypothesis."""
+    def _starts_with(self, known: KnownVehicles) -> list[WindowStart]:
+        """Starts of all explanations by a hypothesis of the track: a vehicle beside those that it
+        has, one elsewhere, two in place of one."""
         starts = self._beside(known) if self._may_be_more and self._is_odd else []
         for i in range(self._n_targets):
             others = self._without(known, i)
             if self._is_odd and self._is_felt(known, i):
                 starts += self._beside(others, i)
             if self._may_be_more and self._may_be_two(known, i):
-                starts += self._anew(others, i)
+                starts += self._pair_in_place_of(others, i)
         return starts
 
     def _best_of(self, starts: Sequence[WindowStart], alone: float) -> Joint | None:
-        """What comes of hypotheses of as many vehicles, in place of the same one; `alone` is the
-        log-evidence of the track as it is."""
+        """The `Joint` of the starts of one explanation; `alone` is the log-evidence of the track as
+        it is."""
         kept = self._with_turns(self._kept(starts))
         prior = ARRIVES if len(kept[0].kind) > self._n_targets else WAS_LOST
         bank, log_likelihood, log_w, paths = self._run(kept)
@@ -171,7 +174,7 @@ class NewcomerSearch:
         return energy_of(self._filter, i, known.path[-1], self._window.frames[-1]) > FELT
 
     def _is_elsewhere(self, joint: Joint) -> bool:
-        """Whether a vehicle that was sought anew is far from where the track has it."""
+        """Whether a vehicle that was sought elsewhere is far from where the track has it."""
         n, now = self._n_one, self._bank.x[self._bank.best()]
         assert joint.replaced is not None
         found = joint.bank.x[joint.bank.best()]
@@ -198,7 +201,7 @@ class NewcomerSearch:
         return [start for theta in search.best(self._search.grid, FIRST)
                 for start in self._started(known, theta[None], search.moments(theta), replaced)]
 
-    def _anew(self, others: KnownVehicles, i: int) -> list[WindowStart]:
+    def _pair_in_place_of(self, others: KnownVehicles, i: int) -> list[WindowStart]:
         """Two vehicles in place of vehicle `i`, whose filter may have been misled by them."""
         search = self._search.beside(others)
         starts: list[WindowStart] = []

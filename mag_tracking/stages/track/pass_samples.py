@@ -80,7 +80,8 @@ class PassSamples:
         energy = np.nansum(np.square(field), axis=2)
         measured = np.count_nonzero(~np.isnan(field).all(axis=2), axis=0)
         order = np.argsort(-energy.max(axis=0), kind='stable')
-        compared = order[measured[order] > len(frames) // 2][:most_sensors]
+        # Slow sensors whose clocks are apart may each be in few of the frames.
+        compared = order[measured[order] > measured.max(initial=0) // 2][:most_sensors]
         n = len(compared)
         C = np.array([known_covariance(f.covariance)[compared] for f in frames]).reshape(-1, 3, 3)
         t = np.array([(f.stamp_ns - stamp_ns) / NS + f.time_offset[compared] for f in frames])

@@ -30,6 +30,9 @@ N_DIPOLES = 3
 STEP_ALONG, BEYOND = 3.0, 12.0
 """[m] The grid has positions this far apart, up to so far beyond the outermost sensor."""
 
+SPEED = PATH.index('speed')
+"""Column of a path."""
+
 LEAST_STD = 1e-3
 """[m], [m/s], [A m^2] Of what the settings have without a spread, such as the length of a point."""
 
@@ -43,8 +46,6 @@ than this share."""
 APART_START: FloatArray = np.array([4.0, 2.5, 1.0, 5.0, 0.3, 1.0, 3.0])
 APART: FloatArray = np.array([1.0, 1.0, 1.0, 2.0, 0.3, 1.0, 9.0])
 """[m], [m/s], [rad] Starts, and paths, that differ by no more than this are the same."""
-
-SPEED = PATH.index('speed')
 
 KNOWN_STD: FloatArray = np.array([2.0, 1.5, 0.2, 3.0, 0.1, 0.1, 1.5])
 """[m], [m/s], [rad] By so much may the path of another vehicle of the search be off."""
@@ -136,18 +137,19 @@ class StartGrid:
     ----------
     theta : (n, 7) array
         See `PathPrior.starts`.
-    bases : (3 m, 3 n) array
-        Whitened fields of unit moments.
-    squares : (n, 3, 3) array
-        Products of those of each path with themselves.
+    bases : (3 n_samples, 3 n) array
+        Whitened fields of unit moments: three columns for each path.
+    gram : (n, 3, 3) array
+        A'A of the columns A of each path.
     prior_cost : (n,) array
+        Squared deviations of each path from the prior.
     """
 
     def __init__(self, samples: PassSamples, prior: PathPrior, theta: FloatArray) -> None:
         """Of `theta` (n, 7) in the samples of a window."""
         A = samples.straight_model(1).basis(theta)
         self.theta = theta
-        self.squares: FloatArray = np.swapaxes(A, 1, 2) @ A
+        self.gram: FloatArray = np.swapaxes(A, 1, 2) @ A
         self.bases: FloatArray = np.ascontiguousarray(np.swapaxes(A, 0, 1)).reshape(A.shape[1], -1)
         self.prior_cost: FloatArray = np.square(
             prior.residual_and_jacobian(theta)[0]).sum(axis=1)
@@ -157,15 +159,16 @@ class StartGrid:
 class SteadySearch:
     """Frames in which vehicles are sought, and what is known of them.
 
-    Several that are sought together have their paths (7 each) in a row.
+    The paths of m vehicles that are sought together stand in one row of 7 m numbers, and their
+    moments in one of 9 m. In shapes n is the number of rows, y that of whitened measurements.
     """
 
     samples: PassSamples
     prior: PathPrior
     known: FloatArray
-    """(3 n,) whitened field of the vehicles that are known."""
+    """(y,) whitened field of the vehicles that are known."""
     columns: FloatArray
-    """(3 n, q) whitened: what is not known of backgrounds and of those vehicles, each times its
+    """(y, q) whitened: what is not known of backgrounds and of those vehicles, each times its
     standard deviation."""
 
     @cached_property
@@ -180,17 +183,17 @@ class SteadySearch:
 
     @cached_property
     def _y(self) -> FloatArray:
-        """(3 n,) what is left to be explained."""
+        """(y,) what is left to be explained."""
         return self._without(self.samples.y - self.known)
 
     def _solved(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Basis (n, 3 n, 9 m), information (n, 9 m, 9 m), its inverse, and estimate (n, 9 m) of
-        the moments of m vehicles on paths theta (n, 7 m).
+        """Basis (n, y, 9 m), information (n, 9 m, 9 m), its inverse, and estimate (n, 9 m) of the
+        moments of m vehicles on paths theta (n, 7 m).
 
-        A path that a search leads through a sensor has no inverse that means anything.
+        The inverse is NaN or meaningless for a path through a sensor.
         """
         basis = self._model.basis(theta.reshape(-1, N_STRAIGHT))
-        A = self._without(_side_by_side(basis, len(theta)))
+        A = self._without(_side_by_side(basis, _number_of(theta)))
         At = np.swapaxes(A, 1, 2)
         information = At @ A + np.diag(self._moment_std(theta)**-2.0)
         inverse = pseudo_inverse(information)
@@ -198,40 +201,42 @@ class SteadySearch:
 
     def _moment_std(self, theta: FloatArray) -> FloatArray:
         """(9 m,) of the moments of m vehicles on paths theta (n, 7 m)."""
-        return np.tile(self.prior.moment_std, theta.shape[1] // N_STRAIGHT)
+        return np.tile(self.prior.moment_std, _number_of(theta))
 
     def cost(self, grid: StartGrid) -> FloatArray:
         """(n,) minus twice the log-density of the frames with a point on each path of a grid."""
         n, std = len(grid.theta), self.prior.moment_std[0] * np.sqrt(N_DIPOLES)
         with running_away():
-            lost = self._without.lost(grid.bases).reshape(-1, n, 3).swapaxes(0, 1)
-            information = grid.squares - lost.swapaxes(1, 2) @ lost + np.eye(3) / std**2
+            factor = self._without.correction_factor(grid.bases).reshape(-1, n, 3).swapaxes(0, 1)
+            information = grid.gram - factor.swapaxes(1, 2) @ factor + np.eye(3) / std**2
             b = (self._without(self._y) @ grid.bases).reshape(n, 3)
             p = np.einsum('nij,nj->ni', pseudo_inverse(information), b)
-            # Not from the residuals: the starts are many, and digits enough.
+            # Residuals are not formed: this is faster, and exact enough to rank the starts.
             cost: FloatArray = float(self._y @ self._y) - np.einsum('ni,ni->n', p, b) \
-                + grid.prior_cost + np.linalg.slogdet(information * std**2)[1]
+                + grid.prior_cost + _log_determinant(information * std**2)
         return np.where(np.isfinite(cost), cost, np.inf)
 
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Of measurements, moments and paths (n, 7 m); with the Jacobian of Kaufman (1975)."""
-        n, std = len(theta), self._moment_std(theta)
+        n, m, std = len(theta), _number_of(theta), self._moment_std(theta)
         paths = theta.reshape(-1, N_STRAIGHT)
         A, _, inverse, p = self._solved(theta)
         derivative = self._model.derivative(paths, p.reshape(len(paths), -1))
-        D = self._without(_side_by_side(derivative, n))
+        D = self._without(_side_by_side(derivative, m))
         moved = inverse @ (np.swapaxes(A, 1, 2) @ D)
         off, off_J = self.prior.residual_and_jacobian(paths)
         return (np.hstack([self._y - np.einsum('nyi,ni->ny', A, p), -p / std, off.reshape(n, -1)]),
-                np.concatenate([D - A @ moved, -moved / std[:, None], _block_diagonal(off_J, n)],
+                np.concatenate([D - A @ moved, -moved / std[:, None], _block_diagonal(off_J, m)],
                                axis=1))
 
     def refined(self, theta: FloatArray, n_steps: int = N_STEPS) -> tuple[FloatArray, FloatArray]:
         """Paths (n, 7 m) after steps of Levenberg and Marquardt, and costs (n,); infinite where a
-        vehicle stands, or goes backwards."""
+        vehicle is slower than any that comes, or goes backwards."""
+        if not len(theta):
+            return theta, np.zeros(0)
         path, cost, _, _ = refine(self.residual_and_jacobian, theta, n_steps, TOLERANCE)
-        come = (path[:, SPEED::N_STRAIGHT] >= self.prior.slowest).all(axis=1)
-        return path, np.where(come, cost, np.inf)
+        are_moving = (path[:, SPEED::N_STRAIGHT] >= self.prior.slowest).all(axis=1)
+        return path, np.where(are_moving, cost, np.inf)
 
     def best(self, grid: StartGrid, most: int) -> FloatArray:
         """At most so many paths (n, 7) that explain the frames best, the best one first."""
@@ -259,28 +264,39 @@ class SteadySearch:
         if not starts:
             return []
         pairs, cost = self.refined(np.array(starts))
-        cost = cost + self._spread_of_moments(pairs)
+        cost = cost + self._log_determinant_of_moments(pairs)
         best = pairs[np.argmin(cost)].reshape(2, -1)
         pairs = np.array([in_order_of(best, pair.reshape(2, -1)).ravel() for pair in pairs])
         return list(_usable(pairs, cost, np.tile(APART, 2), len(pairs)).reshape(-1, 2, N_STRAIGHT))
 
-    def _spread_of_moments(self, theta: FloatArray) -> FloatArray:
-        """(n,) what frames with paths (n, 7 m) are less probable by as their moments are not known:
-        log-determinant of their information, in units of what is known beforehand."""
+    def _log_determinant_of_moments(self, theta: FloatArray) -> FloatArray:
+        """(n,) log-determinant of the information of the moments of paths (n, 7 m), relative to
+        the prior."""
         std = self._moment_std(theta)
-        return np.asarray(np.linalg.slogdet(self._solved(theta)[1] * np.outer(std, std))[1],
-                          dtype=np.float64)
+        with running_away():
+            return _log_determinant(self._solved(theta)[1] * np.outer(std, std))
 
 
-def _side_by_side(A: FloatArray, n: int) -> FloatArray:
+def _log_determinant(A: FloatArray) -> FloatArray:
+    """(n,) of matrices (n, k, k); infinite of one that rounding has left indefinite."""
+    sign, value = np.linalg.slogdet(A)
+    return np.where(sign > 0.0, value, np.inf)
+
+
+def _number_of(theta: FloatArray) -> int:
+    """How many vehicles have their paths in a row of theta (n, 7 m)."""
+    return theta.shape[1] // N_STRAIGHT
+
+
+def _side_by_side(A: FloatArray, m: int) -> FloatArray:
     """Matrices (n, k, m c) of the `A` (n m, k, c) of m vehicles each."""
-    of_each = A.reshape(n, -1, *A.shape[1:]).swapaxes(1, 2)
-    return of_each.reshape(n, A.shape[1], -1)
+    n, k, c = len(A) // m, *A.shape[1:]
+    return A.reshape(n, m, k, c).swapaxes(1, 2).reshape(n, k, m * c)
 
 
-def _block_diagonal(A: FloatArray, n: int) -> FloatArray:
+def _block_diagonal(A: FloatArray, m: int) -> FloatArray:
     """Matrices (n, m k, m c) with the `A` (n m, k, c) of m vehicles each as their blocks."""
-    m, (k, c) = len(A) // n, A.shape[1:]
+    n, k, c = len(A) // m, *A.shape[1:]
     out = np.zeros((n, m, k, m, c))
     for i in range(m):
         out[:, i, :, i] = A.reshape(n, m, k, c)[:, i]

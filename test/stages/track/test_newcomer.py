@@ -1,5 +1,6 @@
 """When another vehicle is sought in the frames of a track, and what becomes of its members."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import SmoothedPose, Track
+from mag_tracking.stages.track.joint import SURE_NATS, Joint
 from mag_tracking.stages.track.member import in_order
 from mag_tracking.stages.track.newcomer_evidence import (
     AGAIN_NATS,
@@ -28,10 +30,10 @@ PERIOD = round(0.08 * NS)
 
 def asked(nis, n=20, rejected=False, is_long=False):
     """[(frame, reason)] for which a track with innovations of this size is compared."""
-    test, found = NewcomerEvidence(), []
+    evidence, found = NewcomerEvidence(), []
     for k in range(n):
-        test.add(nis, 6, k * PERIOD, rejected, is_long)
-        reason = test.due(k * PERIOD)
+        evidence.add(nis, 6, k * PERIOD, rejected, is_long)
+        reason = evidence.due(k * PERIOD)
         found += [] if reason is None else [(k, reason)]
     return found
 
@@ -56,10 +58,22 @@ def test_a_long_vehicle_is_compared_less_and_less_often():
 
 
 def test_what_is_less_probable_is_believed_the_second_time():
-    test, between = NewcomerEvidence(), 0.5 * (AGAIN_NATS + LEAST_NATS)
-    assert test.believes(LEAST_NATS + 0.1)
-    assert [test.believes(odds) for odds in (between, between)] == [False, True]
-    assert [test.believes(odds) for odds in (between, 0.0, between)] == [False] * 3
+    evidence, between = NewcomerEvidence(), 0.5 * (AGAIN_NATS + LEAST_NATS)
+    assert evidence.believes(LEAST_NATS + 0.1)
+    assert [evidence.believes(odds) for odds in (between, between)] == [False, True]
+    assert [evidence.believes(odds) for odds in (between, 0.0, between)] == [False] * 3
+
+
+@pytest.mark.parametrize('odds, replaced, doubted', [
+    (SURE_NATS - 1.0, None, (0, 1)), (SURE_NATS + 1.0, None, ()), (SURE_NATS + 1.0, 0, (0, 1))])
+def test_weak_explanations_are_doubted_and_strong_ones_of_two_in_place_of_one(
+        odds, replaced, doubted):
+    """Two go the same way here; those that meet are no long vehicle."""
+    x = np.zeros((1, 2 * 7))
+    x[:, [3, 10]] = 10.0
+    bank = FilterBank(x, np.eye(14)[None], np.zeros(1), np.zeros((1, 2), dtype=int),
+                      np.zeros((1, 2), dtype=int), np.arange(1), np.zeros((1, 2)))
+    assert Joint(bank, None, None, odds, replaced, True).doubtful(7) == doubted
 
 
 def test_vehicles_in_one_lane_may_not_be_in_each_other():
@@ -132,6 +146,24 @@ def test_they_are_smoothed_together(meeting):
         error = min(busy_worlds.errors_of(poses, a_world.t, position)[0].mean()
                     for position in a_world.positions)
         assert error <= 0.6
+
+
+def test_slow_sensors_that_take_turns_find_a_newcomer():
+    """At 5 Hz, and at times of its own, each is in less than half of the frames."""
+    rng, n_sensors = np.random.default_rng(3), 4
+    a_world = world(NETWORKS[n_sensors], [passing(rng, 'clouds', 14.0, 1, 9.0),
+                                          passing(rng, 'clouds', 14.5, -1, 9.0)], 24.0, rng,
+                    rate=5.0)
+    readings = a_world.readings
+    stamps = readings.stamp_ns + np.round(readings.sensor * 0.2 * NS / n_sensors).astype(np.int64)
+    order = np.argsort(stamps, kind='stable')
+    pipeline = Pipeline(a_world.network, settings_for('vehicle'))
+    pipeline.feed(replace(readings, sensor=readings.sensor[order], stamp_ns=stamps[order],
+                          field=readings.field[order],
+                          covariance=None if readings.covariance is None
+                          else readings.covariance[order]))
+    pipeline.flush()
+    assert pipeline.track.counts['tracks of newcomers'] == 1
 
 
 def test_it_does_not_depend_on_how_the_readings_are_split(meeting):

@@ -7,7 +7,7 @@ from mag_tracking.physics.passes import RowPass
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.pass_samples import PassSamples
-from mag_tracking.stages.track.steady_search import PathPrior, StartGrid, SteadySearch
+from mag_tracking.stages.track.steady_search import N_DIPOLES, PathPrior, StartGrid, SteadySearch
 from mag_tracking.units import NS
 from support.busy_worlds import NETWORKS
 
@@ -95,7 +95,7 @@ def test_residuals_have_the_stated_derivative(truths):
         moved = np.repeat(theta, 2, axis=0)
         moved[:, k] += [step, -step]
         cost = (search.residual_and_jacobian(moved)[0]**2).sum(axis=1)
-        assert gradient[k] == pytest.approx((cost[0] - cost[1]) / (2.0 * step), rel=2e-2, abs=0.5)
+        assert gradient[k] == pytest.approx((cost[0] - cost[1]) / (2.0 * step), rel=1e-5, abs=1e-3)
 
 
 def test_the_cost_of_the_grid_is_that_of_the_whole_covariance():
@@ -116,7 +116,7 @@ def test_the_cost_of_the_grid_is_that_of_the_whole_covariance():
 
 @pytest.mark.parametrize('miss', [0.0, 1e-12, 1e-9, 1e-6])
 def test_a_path_through_a_sensor_is_no_error(miss):
-    """A step of the search may lead there; of what it then costs nothing is asked."""
+    """A step of the search may lead there."""
     search, grid = search_of(FIRST, SECOND)
     at = np.append(search.samples.positions[0] + [0.0, 0.0, miss], FIRST[3:])
     pair = np.append(at, SECOND)
@@ -127,12 +127,54 @@ def test_a_path_through_a_sensor_is_no_error(miss):
     assert np.isfinite(cost[1]) and not np.isnan(cost).any()
 
 
+def test_pairs_are_ranked_by_the_density_of_the_frames():
+    """Of all Gaussian terms: moments of both rows, backgrounds and noise; and in one order."""
+    search, grid = search_of(FIRST, SECOND)
+    pairs = search.pairs(grid, 3, 2)
+    model, density = search.samples.straight_model(N_DIPOLES), []
+    for pair in pairs:
+        columns = [A * search.prior.moment_std for A in model.basis(pair)]
+        C = np.hstack([search.columns, *columns])
+        S = np.eye(len(C)) + C @ C.T
+        off = search.prior.residual_and_jacobian(pair)[0]
+        density.append(search.samples.y @ np.linalg.solve(S, search.samples.y)
+                       + np.linalg.slogdet(S)[1] + (off**2).sum())
+        kept, turned = (np.hypot(*(pair[order, :2] - pairs[0][:, :2]).T).sum()
+                        for order in ([0, 1], [1, 0]))
+        assert kept <= turned
+    assert density == sorted(density) and density[0] < density[-1]
+
+
+def test_moments_of_a_pair_are_those_of_its_vehicles():
+    search, _ = search_of(FIRST, SECOND)
+    for pair in ([FIRST, SECOND], [SECOND, FIRST]):
+        totals = search.moments(np.concatenate(pair)).sum(axis=1)
+        np.testing.assert_allclose(totals, [3.0 * np.array(MOMENTS[id(path)]) for path in pair],
+                                   atol=60.0)
+
+
 def test_pairs_are_those_of_different_minima():
     search, grid = search_of(FIRST, SECOND)
     pairs = np.array(search.pairs(grid, 3, 2))
     apart = np.abs(pairs[:, None] - pairs)
     assert len(pairs) > 1
     assert all((apart[i, k] > 0.3).any() for i in range(len(pairs)) for k in range(i))
+
+
+@pytest.mark.parametrize('slow', [0, 1])
+def test_a_pair_of_which_one_stands_is_none(slow):
+    search, _ = search_of(FIRST, SECOND)
+    pair = np.array([FIRST, SECOND])
+    assert np.isfinite(search.refined(pair.reshape(1, -1), 0)[1]).all()
+    pair[slow, 3] = 0.1
+    assert np.isinf(search.refined(pair.reshape(1, -1), 0)[1]).all()
+
+
+def test_where_no_start_can_be_used_nobody_is_found():
+    search, _ = search_of(FIRST)
+    at = np.append(search.samples.positions[0], FIRST[3:])
+    grid = StartGrid(search.samples, search.prior, at[None])
+    assert search.best(grid, 3).shape == (0, 7) and search.pairs(grid, 3, 2) == []
 
 
 def test_what_stands_or_goes_backwards_is_not_found():
