@@ -197,7 +197,7 @@ def line_of(vehicle: CountedVehicle) -> str:
     headway = '' if np.isnan(p.headway) else f', headway {p.headway:.1f} s'
     delay = '' if vehicle.delay.reason else f', {vehicle.delay.speed:.1f} m/s by delay'
     contradiction = ', speeds contradict each other' if vehicle.speeds_contradict else ''
-    doubts = f', ambiguous: {", ".join(p.doubts)}' if p.doubts else ''
+    doubts = f', in doubt: {", ".join(p.doubts)}' if p.doubts else ''
     return (f'{p.number} {at:%H:%M:%S}.{at.microsecond // 10000:02d} {p.line}: '
             f'{DIRECTIONS[p.forward]}{error}, {p.speed:.1f} ± {p.speed_std:.1f} m/s{delay}, '
             f'{known}{length}{headway}{contradiction}{doubts}')
