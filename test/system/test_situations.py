@@ -29,8 +29,8 @@ MISSED = {
                            'point, before the pass as a whole tells',
     'a car with a trailer': 'in part the pose is that of the car alone, 2 to 3 m before the middle '
                             'of both, until the trailer has passed; the others: unknown',
-    'one follows, four sensors': 'in one of six runs two cars 9 m apart are taken for a truck between '
-                                 'them for 0.8 s, until the second one is found',
+    'one follows, four sensors': 'in one of six runs two cars 9 m apart are taken for a truck '
+                                 'between them for 0.8 s, until the second one is found',
     'one overtakes': 'two cars side by side are taken for a truck of 8 to 12 m',
     'a train at 9 m': 'in one of six runs a wagon is taken for a newcomer: its three poses without '
                       'a flag are on the train, 31 m from its middle; none without newcomers',
