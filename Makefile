@@ -63,6 +63,7 @@ test: $(STAMP)  ## check style, floors, types and behaviour
 	$(BIN)/lint-imports
 	$(BIN)/mypy
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m 'not alone and not study'
+	@# Four at once: tests of nodes wait more than they compute.
 	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest -q -n 4 --dist loadfile --no-loadscope-reorder -m 'alone and not study'
 
 studies: $(STAMP)  ## the tests that take many runs or all of the recordings

@@ -146,7 +146,7 @@ class StartGrid:
     """
 
     def __init__(self, samples: PassSamples, prior: PathPrior, theta: FloatArray) -> None:
-        """Of `theta` (n, 7) in the samples of a window."""
+        """`samples` are those of a window, `theta` (n, 7) the paths."""
         A = samples.straight_model(1).basis(theta)
         self.theta = theta
         self.gram: FloatArray = np.swapaxes(A, 1, 2) @ A
@@ -217,7 +217,8 @@ class SteadySearch:
         return np.where(np.isfinite(cost), cost, np.inf)
 
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Of measurements, moments and paths (n, 7 m); with the Jacobian of Kaufman (1975)."""
+        """Residuals (n, y + 16 m) of measurements, moments and paths theta (n, 7 m), and the Jacobians
+        (n, y + 16 m, 7 m) of what is predicted, as by Kaufman (1975)."""
         n, m, std = len(theta), _number_of(theta), self._moment_std(theta)
         paths = theta.reshape(-1, N_STRAIGHT)
         A, _, inverse, p = self._solved(theta)

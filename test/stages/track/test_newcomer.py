@@ -68,7 +68,7 @@ def test_what_is_less_probable_is_believed_the_second_time():
     (SURE_NATS - 1.0, None, (0, 1)), (SURE_NATS + 1.0, None, ()), (SURE_NATS + 1.0, 0, (0, 1))])
 def test_weak_explanations_are_doubted_and_strong_ones_of_two_in_place_of_one(
         odds, replaced, doubted):
-    """Two go the same way here; those that meet are no long vehicle."""
+    """The two go the same way."""
     x = np.zeros((1, 2 * 7))
     x[:, [3, 10]] = 10.0
     bank = FilterBank(x, np.eye(14)[None], np.zeros(1), np.zeros((1, 2), dtype=int),

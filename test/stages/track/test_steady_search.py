@@ -128,7 +128,7 @@ def test_a_path_through_a_sensor_is_no_error(miss):
 
 
 def test_pairs_are_ranked_by_the_density_of_the_frames():
-    """Of all Gaussian terms: moments of both rows, backgrounds and noise; and in one order."""
+    """The density counts moments of both rows, backgrounds and noise; all pairs have one order."""
     search, grid = search_of(FIRST, SECOND)
     pairs = search.pairs(grid, 3, 2)
     model, density = search.samples.straight_model(N_DIPOLES), []
