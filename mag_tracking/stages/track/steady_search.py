@@ -217,8 +217,8 @@ class SteadySearch:
         return np.where(np.isfinite(cost), cost, np.inf)
 
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals (n, y + 16 m) of measurements, moments and paths theta (n, 7 m), and the Jacobians
-        (n, y + 16 m, 7 m) of what is predicted, as by Kaufman (1975)."""
+        """Residuals (n, y + 16 m) of measurements, moments and paths theta (n, 7 m), and the
+        Jacobians (n, y + 16 m, 7 m) of what is predicted, as by Kaufman (1975)."""
         n, m, std = len(theta), _number_of(theta), self._moment_std(theta)
         paths = theta.reshape(-1, N_STRAIGHT)
         A, _, inverse, p = self._solved(theta)
