@@ -39,6 +39,9 @@ LEAST_STD = 1e-3
 SLOWEST = 0.2
 """No vehicle comes that is slower than this share of the lowest starting speed."""
 
+TOO_FAR = 2.0
+"""A vehicle that was sought is not so many times farther than the farthest that comes."""
+
 N_STARTS, N_STEPS, TOLERANCE = 10, 12, 1e-3
 """So many starts that differ are refined, in so many steps, or until one improves the cost by less
 than this share."""
@@ -67,6 +70,8 @@ class PathPrior:
     """(3 d,) [A m^2] of the combinations of moments."""
     slowest: float
     """[m/s] What is slower does not come: it was there before."""
+    farthest: float
+    """[m] No vehicle is sought farther from the centre: its field would be nobody's."""
 
     @classmethod
     def of(cls, vehicle: VehicleSettings, network: SensorNetwork) -> 'PathPrior':
@@ -88,7 +93,9 @@ class PathPrior:
                    np.array([np.inf, lateral_std, height_std, speed_std, vehicle.cross_speed_std,
                              vehicle.climb_std, length_std]),
                    np.repeat([total / np.sqrt(N_DIPOLES)] + [difference] * (N_DIPOLES - 1), 3),
-                   SLOWEST * min(vehicle.speeds))
+                   SLOWEST * min(vehicle.speeds),
+                   TOO_FAR * (vehicle.farthest + float(np.hypot(
+                       *(network.positions[:, :2] - network.centre[:2]).T).max())))
 
     def nearest(self, theta: FloatArray) -> tuple[IntArray, FloatArray]:
         """The arrival line (n,) nearest in heading to paths theta (n, 7), and by how much [rad]."""
@@ -232,12 +239,16 @@ class SteadySearch:
 
     def refined(self, theta: FloatArray, n_steps: int = N_STEPS) -> tuple[FloatArray, FloatArray]:
         """Paths (n, 7 m) after steps of Levenberg and Marquardt, and costs (n,); infinite where a
-        vehicle is slower than any that comes, or goes backwards."""
+        vehicle is slower than any that comes, goes backwards, or is too far away to be felt.
+
+        Of a vehicle too many nothing is known but that it is far away."""
         if not len(theta):
             return theta, np.zeros(0)
         path, cost, _, _ = refine(self.residual_and_jacobian, theta, n_steps, TOLERANCE)
-        are_moving = (path[:, SPEED::N_STRAIGHT] >= self.prior.slowest).all(axis=1)
-        return path, np.where(are_moving, cost, np.inf)
+        each = path.reshape(len(path), -1, N_STRAIGHT)
+        are_usable = (each[:, :, SPEED] >= self.prior.slowest) & (
+            np.hypot(*np.moveaxis(each[:, :, :2] - self.prior.centre, 2, 0)) <= self.prior.farthest)
+        return path, np.where(are_usable.all(axis=1), cost, np.inf)
 
     def best(self, grid: StartGrid, most: int) -> FloatArray:
         """At most so many paths (n, 7) that explain the frames best, the best one first."""
@@ -262,10 +273,13 @@ class SteadySearch:
         """Pairs of paths (2, 7) that explain the frames, the best one first."""
         starts = [np.append(first, second) for first in self.best(grid, most)
                   for second in self.beside(first).best(grid, most_second)]
-        if not starts:
-            return []
-        pairs, cost = self.refined(np.array(starts))
+        pairs, cost = self.refined(np.array(starts).reshape(-1, 2 * N_STRAIGHT))
         cost = cost + self._log_determinant_of_moments(pairs)
+        usable = np.isfinite(cost)
+        if not usable.any():
+            return []
+        # Those that a step has thrown away have places of which the squares overflow.
+        pairs, cost = pairs[usable], cost[usable]
         best = pairs[np.argmin(cost)].reshape(2, -1)
         pairs = np.array([in_order_of(best, pair.reshape(2, -1)).ravel() for pair in pairs])
         return list(_usable(pairs, cost, np.tile(APART, 2), len(pairs)).reshape(-1, 2, N_STRAIGHT))
