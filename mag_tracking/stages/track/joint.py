@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.reach import energies_of
@@ -16,6 +17,11 @@ sensor does not feel one of which all frames together have less."""
 SURE_NATS = 15.0
 """[nats] An explanation that is believed by less than this is doubted for a while: evidence counts
 what a model leaves out of the field as if it were independent in each frame, and says too much."""
+
+STRANGE_NATS, ALONG, FASTER = 60.0, 0.9, 1.8
+"""[nats] Vehicles beside each other mostly go the same way or meet, about equally fast. Where the
+cosine of the angle between two is less than this, or one is so many times faster, it is rather the
+model that fails, and less than this is doubted."""
 
 
 @dataclass(frozen=True)
@@ -38,19 +44,29 @@ class Joint:
         """Places of vehicles that may be others, each of `n_one` states.
 
         One that was found elsewhere; two that took the place of one and go the same way, as a long
-        vehicle of which the model leaves much out looks like two; all of a weak explanation.
+        vehicle of which the model leaves much out looks like two; all of a weak explanation, and
+        of one by vehicles that go neither along nor against each other.
         """
         n = self.bank.label.shape[1] if self.bank.label.ndim > 1 else 1
-        if self.log_odds < SURE_NATS:
+        x = self.bank.x[self.bank.best()]
+        velocity = np.array([x[k * n_one + 3:k * n_one + 5] for k in range(n)])
+        is_strange = self.adds and _are_strange(velocity, 1 if self.replaced is None else 2)
+        if self.log_odds < (STRANGE_NATS if is_strange else SURE_NATS):
             return tuple(range(n))
         if self.replaced is None:
             return ()
         if not self.adds:
             return (n - 1,)
-        places = (n - 2, n - 1)
-        x = self.bank.x[self.bank.best()]
-        first, second = (x[k * n_one + 3:k * n_one + 5] for k in places)
-        return places if first @ second > 0.0 else ()
+        return (n - 2, n - 1) if velocity[-2] @ velocity[-1] > 0.0 else ()
+
+
+def _are_strange(velocity: FloatArray, n_new: int) -> bool:
+    """Whether one of the last `n_new` vehicles goes as none beside another does; `velocity` (n, 2).
+    """
+    speed = np.linalg.norm(velocity, axis=1)
+    return any(abs(velocity[i] @ velocity[k]) < ALONG * speed[i] * speed[k]
+               or max(speed[i], speed[k]) > FASTER * min(speed[i], speed[k])
+               for i in range(len(velocity) - n_new, len(velocity)) for k in range(i))
 
 
 def are_felt_by_two(joint: Joint) -> bool:

@@ -9,7 +9,7 @@ import pytest
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import SmoothedPose, Track
-from mag_tracking.stages.track.joint import SURE_NATS, Joint
+from mag_tracking.stages.track.joint import STRANGE_NATS, SURE_NATS, Joint
 from mag_tracking.stages.track.member import in_order
 from mag_tracking.stages.track.newcomer_evidence import (
     AGAIN_NATS,
@@ -64,16 +64,51 @@ def test_what_is_less_probable_is_believed_the_second_time():
     assert [evidence.believes(odds) for odds in (between, 0.0, between)] == [False] * 3
 
 
+def joint_of(velocities, odds, replaced=None, adds=True):
+    """`Joint` of vehicles of seven states with these velocities (n, 2)."""
+    n = len(velocities)
+    x = np.zeros((1, n, 7))
+    x[0, :, 3:5] = velocities
+    bank = FilterBank(x.reshape(1, -1), np.eye(7 * n)[None], np.zeros(1),
+                      np.zeros((1, n), dtype=int), np.zeros((1, n), dtype=int), np.arange(1),
+                      np.zeros((1, 2)))
+    return Joint(bank, None, None, odds, replaced, adds)
+
+
 @pytest.mark.parametrize('odds, replaced, doubted', [
     (SURE_NATS - 1.0, None, (0, 1)), (SURE_NATS + 1.0, None, ()), (SURE_NATS + 1.0, 0, (0, 1))])
 def test_weak_explanations_are_doubted_and_strong_ones_of_two_in_place_of_one(
         odds, replaced, doubted):
     """The two go the same way."""
-    x = np.zeros((1, 2 * 7))
-    x[:, [3, 10]] = 10.0
-    bank = FilterBank(x, np.eye(14)[None], np.zeros(1), np.zeros((1, 2), dtype=int),
-                      np.zeros((1, 2), dtype=int), np.arange(1), np.zeros((1, 2)))
-    assert Joint(bank, None, None, odds, replaced, True).doubtful(7) == doubted
+    assert joint_of([[10.0, 0.0], [10.0, 0.0]], odds, replaced).doubtful(7) == doubted
+
+
+@pytest.mark.parametrize('new', [[0.0, 10.0], [25.0, 0.0], [-4.0, 0.0], [8.0, 8.0]])
+@pytest.mark.parametrize('n_before', [1, 2])
+def test_vehicles_that_go_as_none_beside_another_are_doubted(new, n_before):
+    """Across, or much faster or slower; the number of those before makes no difference."""
+    velocities = [[10.0, 0.0], [-9.0, 1.0]][:n_before] + [new]
+    everybody = tuple(range(n_before + 1))
+    assert joint_of(velocities, STRANGE_NATS - 1.0).doubtful(7) == everybody
+    assert joint_of(velocities, STRANGE_NATS + 1.0).doubtful(7) == ()
+
+
+@pytest.mark.parametrize('new', [[-10.0, 2.0], [14.0, -1.0], [-6.0, 0.0]])
+def test_vehicles_that_meet_or_overtake_are_not_strange(new):
+    assert joint_of([[10.0, 0.0], new], SURE_NATS + 1.0).doubtful(7) == ()
+
+
+def test_strange_ways_of_those_before_are_not_the_newcomer_s():
+    """Two cross already; one more goes along with each of them at 26 degrees or less."""
+    before, new = [[10.0, 4.8], [10.0, -4.8]], [10.0, 0.0]
+    assert joint_of([*before, new], SURE_NATS + 1.0).doubtful(7) == ()
+    assert joint_of([new, *before], SURE_NATS + 1.0).doubtful(7) == (0, 1, 2)
+
+
+def test_of_two_in_place_of_one_both_are_compared():
+    """Those that came in its place cross each other, and meet."""
+    assert joint_of([[0.0, 10.0], [10.0, 0.0]], SURE_NATS + 1.0, 0).doubtful(7) == (0, 1)
+    assert joint_of([[-10.0, 0.0], [10.0, 0.0]], SURE_NATS + 1.0, 0).doubtful(7) == ()
 
 
 def test_vehicles_in_one_lane_may_not_be_in_each_other():
