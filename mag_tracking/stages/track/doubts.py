@@ -48,7 +48,7 @@ MEANINGS = {
     OFF_THE_ROAD: 'the target passes all sensors on one side, beyond the lanes of the settings',
     FRAMES_TOO_LONG: 'the target moves too far within a frame',
     CLOCKS_APART: 'the clocks of the sensors seem to be apart, by this pass or those before',
-    ANOTHER_VEHICLE: 'two vehicles, or one elsewhere, explain the latest frames about as well',
+    ANOTHER_VEHICLE: 'it is not yet certain how many vehicles there are, or where one of them is',
     NO_STEADY_PATH: 'no vehicle that accelerates and turns steadily explains the pass as a whole',
 }
 """{doubt: what it means}, in the order in which they are listed."""

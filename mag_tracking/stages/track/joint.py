@@ -7,21 +7,26 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.reach import energies_of
+from mag_tracking.stages.track.reach import FELT, energies_of
 from mag_tracking.stages.track.relinearisation import Window
-
-FELT = 4.0
-"""A vehicle of which the last frame has less energy, in units of its noise, is not sought again. A
-sensor does not feel one of which all frames together have less."""
 
 SURE_NATS = 15.0
 """[nats] An explanation that is believed by less than this is doubted for a while: evidence counts
 what a model leaves out of the field as if it were independent in each frame, and says too much."""
 
-STRANGE_NATS, ALONG, FASTER = 60.0, 0.9, 1.8
-"""[nats] Vehicles beside each other mostly go the same way or meet, about equally fast. Where the
-cosine of the angle between two is less than this, or one is so many times faster, it is rather the
-model that fails, and less than this is doubted."""
+STRANGE_NATS = 60.0
+"""[nats] As `SURE_NATS`, where two vehicles cross, or one goes the same way as another and much
+faster: this is rare beside what a model leaves out, as of a flipped axis or a train."""
+
+CROSSING_COSINE = 0.9
+"""Two vehicles cross where the cosine of the angle between their ways is smaller than this, and
+greater than minus this."""
+
+OVERTAKING_RATIO = 1.8
+"""A vehicle that overtakes another is at most so many times faster."""
+
+STANDING = 1.0
+"""[m/s] A slower vehicle is compared with no other: where it goes is not known."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +50,7 @@ class Joint:
 
         One that was found elsewhere; two that took the place of one and go the same way, as a long
         vehicle of which the model leaves much out looks like two; all of a weak explanation, and
-        of one by vehicles that go neither along nor against each other.
+        of one by vehicles that cross or overtake faster than they usually do.
         """
         n = self.bank.label.shape[1] if self.bank.label.ndim > 1 else 1
         x = self.bank.x[self.bank.best()]
@@ -61,12 +66,17 @@ class Joint:
 
 
 def _are_strange(velocity: FloatArray, n_new: int) -> bool:
-    """Whether one of the last `n_new` vehicles goes as none beside another does; `velocity` (n, 2).
-    """
+    """Whether one of the last `n_new` vehicles crosses another's way, or overtakes it or is
+    overtaken too fast; `velocity` (n, 2) [m/s]."""
     speed = np.linalg.norm(velocity, axis=1)
-    return any(abs(velocity[i] @ velocity[k]) < ALONG * speed[i] * speed[k]
-               or max(speed[i], speed[k]) > FASTER * min(speed[i], speed[k])
-               for i in range(len(velocity) - n_new, len(velocity)) for k in range(i))
+    for i in range(len(velocity) - n_new, len(velocity)):
+        for k in range(i):
+            slower, faster = sorted((speed[i], speed[k]))
+            cosine = velocity[i] @ velocity[k] / max(slower * faster, STANDING**2)
+            if slower >= STANDING and (abs(cosine) < CROSSING_COSINE or
+                                       cosine > 0.0 and faster > OVERTAKING_RATIO * slower):
+                return True
+    return False
 
 
 def are_felt_by_two(joint: Joint) -> bool:

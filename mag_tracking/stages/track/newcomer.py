@@ -18,9 +18,9 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_vehicle import moment_directions
-from mag_tracking.stages.track.joint import FELT, Joint, are_felt_by_two
+from mag_tracking.stages.track.joint import Joint, are_felt_by_two
 from mag_tracking.stages.track.newcomer_evidence import ODD
-from mag_tracking.stages.track.reach import energy_of
+from mag_tracking.stages.track.reach import FELT, energy_of
 from mag_tracking.stages.track.relinearisation import Window
 from mag_tracking.stages.track.vehicle_state import VehicleState
 from mag_tracking.stages.track.window_search import WindowSearch

@@ -12,6 +12,11 @@ UNFELT, FAINT = 0.1, 1.0
 """A target whose field has less energy than this in a frame, in units of its noise, is not felt;
 and with less than that it does not disturb others."""
 
+FELT = 4.0
+"""A vehicle of which the last frame has less energy, in units of its noise, is not sought again. A
+sensor does not feel one of which all frames together have less, and none is sought of which no
+frame is expected to have more."""
+
 
 def energies_of(bank_filter: BankFilter, target: int, state: FloatArray, frame: FieldFrame
                 ) -> FloatArray:

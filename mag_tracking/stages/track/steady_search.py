@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.least_squares import refine
 from mag_tracking.inference.marginalised import Marginalised
 from mag_tracking.inference.matrices import pseudo_inverse, running_away
@@ -22,6 +22,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.steady_pass import N_STRAIGHT, PATH, SteadyPass
 from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
 from mag_tracking.stages.track.pass_samples import PassSamples
+from mag_tracking.stages.track.reach import FELT
 from mag_tracking.stages.track.window_start import in_order_of
 
 N_DIPOLES = 3
@@ -38,9 +39,6 @@ LEAST_STD = 1e-3
 
 SLOWEST = 0.2
 """No vehicle comes that is slower than this share of the lowest starting speed."""
-
-TOO_FAR = 2.0
-"""A vehicle that was sought is not so many times farther than the farthest that comes."""
 
 N_STARTS, N_STEPS, TOLERANCE = 10, 12, 1e-3
 """So many starts that differ are refined, in so many steps, or until one improves the cost by less
@@ -70,8 +68,6 @@ class PathPrior:
     """(3 d,) [A m^2] of the combinations of moments."""
     slowest: float
     """[m/s] What is slower does not come: it was there before."""
-    farthest: float
-    """[m] No vehicle is sought farther from the centre: its field would be nobody's."""
 
     @classmethod
     def of(cls, vehicle: VehicleSettings, network: SensorNetwork) -> 'PathPrior':
@@ -93,9 +89,7 @@ class PathPrior:
                    np.array([np.inf, lateral_std, height_std, speed_std, vehicle.cross_speed_std,
                              vehicle.climb_std, length_std]),
                    np.repeat([total / np.sqrt(N_DIPOLES)] + [difference] * (N_DIPOLES - 1), 3),
-                   SLOWEST * min(vehicle.speeds),
-                   TOO_FAR * (vehicle.farthest + float(np.hypot(
-                       *(network.positions[:, :2] - network.centre[:2]).T).max())))
+                   SLOWEST * min(vehicle.speeds))
 
     def nearest(self, theta: FloatArray) -> tuple[IntArray, FloatArray]:
         """The arrival line (n,) nearest in heading to paths theta (n, 7), and by how much [rad]."""
@@ -239,16 +233,13 @@ class SteadySearch:
 
     def refined(self, theta: FloatArray, n_steps: int = N_STEPS) -> tuple[FloatArray, FloatArray]:
         """Paths (n, 7 m) after steps of Levenberg and Marquardt, and costs (n,); infinite where a
-        vehicle is slower than any that comes, goes backwards, or is too far away to be felt.
-
-        Of a vehicle too many nothing is known but that it is far away."""
+        vehicle is slower than any that comes, goes backwards, or is not felt: nothing but its
+        field holds one that is not there, which a step may throw any distance away."""
         if not len(theta):
             return theta, np.zeros(0)
         path, cost, _, _ = refine(self.residual_and_jacobian, theta, n_steps, TOLERANCE)
-        each = path.reshape(len(path), -1, N_STRAIGHT)
-        are_usable = (each[:, :, SPEED] >= self.prior.slowest) & (
-            np.hypot(*np.moveaxis(each[:, :, :2] - self.prior.centre, 2, 0)) <= self.prior.farthest)
-        return path, np.where(are_usable.all(axis=1), cost, np.inf)
+        are_moving = (path[:, SPEED::N_STRAIGHT] >= self.prior.slowest).all(axis=1)
+        return path, np.where(are_moving & self._are_felt(path), cost, np.inf)
 
     def best(self, grid: StartGrid, most: int) -> FloatArray:
         """At most so many paths (n, 7) that explain the frames best, the best one first."""
@@ -278,7 +269,7 @@ class SteadySearch:
         usable = np.isfinite(cost)
         if not usable.any():
             return []
-        # Those that a step has thrown away have places of which the squares overflow.
+        # Squares of the places of other pairs may overflow in the comparison of orders.
         pairs, cost = pairs[usable], cost[usable]
         best = pairs[np.argmin(cost)].reshape(2, -1)
         pairs = np.array([in_order_of(best, pair.reshape(2, -1)).ravel() for pair in pairs])
@@ -287,9 +278,23 @@ class SteadySearch:
     def _log_determinant_of_moments(self, theta: FloatArray) -> FloatArray:
         """(n,) log-determinant of the information of the moments of paths (n, 7 m), relative to
         the prior."""
-        std = self._moment_std(theta)
         with running_away():
-            return _log_determinant(self._solved(theta)[1] * np.outer(std, std))
+            return _log_determinant(self._information_of_moments(theta))
+
+    def _are_felt(self, theta: FloatArray) -> BoolArray:
+        """(n,) whether each vehicle of paths theta (n, 7 m) is expected to be felt in the frames,
+        by the prior of its moments and beside what is not known."""
+        with running_away():
+            energy = np.einsum('nii->ni', self._information_of_moments(theta)) - 1.0
+        each = energy.reshape(len(theta), -1, 3 * N_DIPOLES).sum(axis=2)
+        felt: BoolArray = (each > FELT).all(axis=1)
+        return felt
+
+    def _information_of_moments(self, theta: FloatArray) -> FloatArray:
+        """(n, 9 m, 9 m) of the moments of paths (n, 7 m), where the prior has a unit matrix."""
+        std = self._moment_std(theta)
+        information: FloatArray = self._solved(theta)[1] * np.outer(std, std)
+        return information
 
 
 def _log_determinant(A: FloatArray) -> FloatArray:
