@@ -2,6 +2,8 @@
 
 import argparse
 import io
+import os
+import select
 import signal
 import sys
 from collections.abc import Sequence
@@ -13,6 +15,9 @@ from mag_tracking.nodes.start import end_soon
 
 INTERRUPTED = 'mag-tracking: interrupted'
 """What Ctrl-C has the command say."""
+
+UNREAD = 128 + signal.SIGPIPE
+"""Exit status where nobody reads on, as that of other programs."""
 
 
 def command() -> NoReturn:
@@ -52,12 +57,26 @@ def _parse(words: Sequence[str]) -> argparse.Namespace:
     return parse(words)
 
 
+def _is_unread() -> bool:
+    """Whether nobody reads what is printed, as behind `| head`; it is then thrown away."""
+    poll = select.poll()
+    poll.register(sys.stdout.fileno(), 0)
+    if not any(event & select.POLLERR for _, event in poll.poll(0)):
+        return False
+    # Python would complain once more at its end.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return True
+
+
 def _run(args: argparse.Namespace) -> int:
     """Run a command; returns its exit status."""
     try:
         status: int = args.run_command(args)
+        sys.stdout.flush()
         return status
     except (MagTrackingError, OSError) as error:
+        if isinstance(error, BrokenPipeError) and _is_unread():
+            return UNREAD
         # An OSError here is a full disk or a lost drive; its text names the file.
         print(f'mag-tracking: {error}', file=sys.stderr)
         return 1

@@ -25,6 +25,7 @@ from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.files import output_folder
 from mag_tracking.inference.identification import Identification
+from mag_tracking.inference.log_normal_classes import UNKNOWN
 from mag_tracking.interrupts import noted_signals
 from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.fleet_file import FleetPass, read_fleet, write_fleet
@@ -128,6 +129,8 @@ def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
     if args.enrol is not None:
         if args.fleet is None:
             raise SettingsError('--enrol: --fleet names the file to add it to')
+        if args.enrol.strip() in ('', UNKNOWN):
+            raise SettingsError(f'--enrol: {args.enrol!r} is not a name of a vehicle')
         induction_of(network)
         check_writable(args.fleet)
         return None
@@ -143,8 +146,7 @@ def _enrol(args: argparse.Namespace, network: SensorNetwork, passes: list[FleetP
     write_fleet(args.fleet, fleet)
     at = 'any heading' if vehicle.iron is not None else \
         f'a heading of {np.degrees(vehicle.heading):.0f} degrees only'
-    print(f'{args.fleet}: {args.enrol} has {len(fleet[args.enrol])} passes, and is recognised at '
-          f'{at}')
+    print(f'{args.fleet}: {args.enrol} is recognised at {at}; passes: {len(fleet[args.enrol])}')
 
 
 def _vehicle(found: Identification | None) -> dict[str, Any]:

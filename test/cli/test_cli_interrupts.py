@@ -1,6 +1,8 @@
 """Interrupted commands keep finished results; a repeated signal ends them at once."""
 
+import errno
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -9,6 +11,7 @@ import time
 
 import pytest
 
+from mag_tracking.cli import main
 from support.bundled import NETWORK_FILE, vehicle_path
 from support.cli_runs import NAME, quick_file, replay_one
 
@@ -126,3 +129,22 @@ def test_the_command_works_outside_the_main_thread(tmp_path):
     thread.start()
     thread.join()
     assert status == [0]
+
+
+@pytest.mark.parametrize('unbuffered', ['', '1'])
+def test_nobody_reads_on(unbuffered):
+    """As behind `| head`: no complaint, and the exit status of other programs."""
+    command = [sys.executable, '-m', 'mag_tracking.cli', 'info', str(vehicle_path(NAME))]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                          env={**os.environ, 'PYTHONUNBUFFERED': unbuffered}) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b'' and process.wait() == 141
+
+
+def test_another_broken_pipe_is_an_error(monkeypatch, capfd):
+    def lost(path):
+        raise BrokenPipeError(errno.EPIPE, 'the sensor')
+
+    monkeypatch.setattr('mag_tracking.cli.info.Recording', lost)
+    assert main(['info', str(vehicle_path(NAME))]) == 1
+    assert 'the sensor' in capfd.readouterr().err
