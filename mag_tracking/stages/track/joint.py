@@ -15,18 +15,17 @@ SURE_NATS = 15.0
 what a model leaves out of the field as if it were independent in each frame, and says too much."""
 
 STRANGE_NATS = 60.0
-"""[nats] As `SURE_NATS`, where two vehicles cross, or one goes the same way as another and much
-faster: this is rare beside what a model leaves out, as of a flipped axis or a train."""
+"""[nats] As `SURE_NATS`, where two vehicles cross, or one overtakes the other at more than
+`OVERTAKING_RATIO`: traffic does so less often than a flipped axis or a train looks like it."""
 
 CROSSING_COSINE = 0.9
-"""Two vehicles cross where the cosine of the angle between their ways is smaller than this, and
-greater than minus this."""
+"""Two vehicles cross where the cosine of the angle between their velocities is smaller in size."""
 
 OVERTAKING_RATIO = 1.8
-"""A vehicle that overtakes another is at most so many times faster."""
+"""Largest usual ratio of the speeds of two vehicles that go the same way."""
 
 STANDING = 1.0
-"""[m/s] A slower vehicle is compared with no other: where it goes is not known."""
+"""[m/s] A slower vehicle is not compared with others: its heading is not known."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class Joint:
 
         One that was found elsewhere; two that took the place of one and go the same way, as a long
         vehicle of which the model leaves much out looks like two; all of a weak explanation, and
-        of one by vehicles that cross or overtake faster than they usually do.
+        of one by vehicles that cross, or of which one is much faster, `STRANGE_NATS`.
         """
         n = self.bank.label.shape[1] if self.bank.label.ndim > 1 else 1
         x = self.bank.x[self.bank.best()]
@@ -66,8 +65,8 @@ class Joint:
 
 
 def _are_strange(velocity: FloatArray, n_new: int) -> bool:
-    """Whether one of the last `n_new` vehicles crosses another's way, or overtakes it or is
-    overtaken too fast; `velocity` (n, 2) [m/s]."""
+    """Whether one of the last `n_new` vehicles crosses another's way, or goes the same way much
+    faster or slower; `velocity` (n, 2) [m/s]."""
     speed = np.linalg.norm(velocity, axis=1)
     for i in range(len(velocity) - n_new, len(velocity)):
         for k in range(i):

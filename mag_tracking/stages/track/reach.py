@@ -13,9 +13,9 @@ UNFELT, FAINT = 0.1, 1.0
 and with less than that it does not disturb others."""
 
 FELT = 4.0
-"""A vehicle of which the last frame has less energy, in units of its noise, is not sought again. A
-sensor does not feel one of which all frames together have less, and none is sought of which no
-frame is expected to have more."""
+"""Least energy, in units of its noise, of a field that is felt: in the last frame, of a vehicle
+that is sought again; in all frames of a window, by one sensor; in all frames at all sensors, as
+expected from what is known of its moments, of a vehicle that is sought at all."""
 
 
 def energies_of(bank_filter: BankFilter, target: int, state: FloatArray, frame: FieldFrame

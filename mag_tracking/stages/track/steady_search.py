@@ -233,8 +233,11 @@ class SteadySearch:
 
     def refined(self, theta: FloatArray, n_steps: int = N_STEPS) -> tuple[FloatArray, FloatArray]:
         """Paths (n, 7 m) after steps of Levenberg and Marquardt, and costs (n,); infinite where a
-        vehicle is slower than any that comes, goes backwards, or is not felt: nothing but its
-        field holds one that is not there, which a step may throw any distance away."""
+        vehicle is slower than any that comes, goes backwards, or is not felt.
+
+        Only its field keeps a path near the sensors: a step may throw a vehicle that explains
+        nothing any distance away.
+        """
         if not len(theta):
             return theta, np.zeros(0)
         path, cost, _, _ = refine(self.residual_and_jacobian, theta, n_steps, TOLERANCE)
