@@ -117,8 +117,10 @@ def main():
            'python': platform.python_version(), 'figures': figures}
     with HISTORY.open('a') as stream:
         stream.write(json.dumps(run, sort_keys=True) + '\n')
+    compared = f'{len(found)} got worse' if before else \
+        f'none was compared: no earlier run is of such a machine ({machine()})'
     print(f'{sum(map(len, figures.values()))} figures are kept in {HISTORY.relative_to(ROOT)}; '
-          f'{len(found)} got worse')
+          f'{compared}')
     return int(bool(found))
 
 
