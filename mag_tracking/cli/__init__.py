@@ -59,6 +59,8 @@ def _parse(words: Sequence[str]) -> argparse.Namespace:
 
 def _is_unread() -> bool:
     """Whether nobody reads what is printed, as behind `| head`; it is then thrown away."""
+    if sys.stdout is None:
+        return False
     poll = select.poll()
     poll.register(sys.stdout.fileno(), 0)
     if not any(event & select.POLLERR for _, event in poll.poll(0)):
@@ -72,7 +74,9 @@ def _run(args: argparse.Namespace) -> int:
     """Run a command; returns its exit status."""
     try:
         status: int = args.run_command(args)
-        sys.stdout.flush()
+        # Where it is closed there is none.
+        if sys.stdout is not None:
+            sys.stdout.flush()
         return status
     except (MagTrackingError, OSError) as error:
         if isinstance(error, BrokenPipeError) and _is_unread():
