@@ -74,7 +74,7 @@ def _run(args: argparse.Namespace) -> int:
     """Run a command; returns its exit status."""
     try:
         status: int = args.run_command(args)
-        # Where it is closed there is none.
+        # A process that was started with its output closed has no stdout.
         if sys.stdout is not None:
             sys.stdout.flush()
         return status
