@@ -34,16 +34,16 @@ INLINE Eight* eights(double* p) { return reinterpret_cast<Eight*>(p); }
 INLINE const Eight* eights(const double* p) { return reinterpret_cast<const Eight*>(p); }
 
 // Of one target as many states move at most, and so many targets share a state at most.
-constexpr int MOST_MOVING = 6, MOST_TARGETS = 4, MOST_ROWS = MOST_MOVING * MOST_TARGETS;
+constexpr int MAX_MOVING = 6, MAX_TARGETS = 4, MAX_ROWS = MAX_MOVING * MAX_TARGETS;
 
 // A move of the targets, and its Jacobian where that is not the one of identity: in `n` rows, each
 // of which has `width` columns that may differ from zero.
 struct Motion {
     int n, width;
-    int rows[MOST_ROWS];
-    int columns[MOST_ROWS][MOST_MOVING];
-    double f[MOST_ROWS][MOST_MOVING];
-    double moved[MOST_ROWS];  // The states of the rows.
+    int rows[MAX_ROWS];
+    int columns[MAX_ROWS][MAX_MOVING];
+    double f[MAX_ROWS][MAX_MOVING];
+    double moved[MAX_ROWS];  // The states of the rows.
 };
 
 }  // namespace mag_tracking

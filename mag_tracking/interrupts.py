@@ -12,7 +12,7 @@ from types import FrameType
 
 
 @contextmanager
-def noted_signals(*signals: signal.Signals) -> Iterator[list[int]]:
+def recorded_signals(*signals: signal.Signals) -> Iterator[list[int]]:
     """A list on which each of `signals` that comes is put, to be asked where it is safe to stop.
 
     Raised in the middle of an update or of a line of a table, it would leave half
@@ -38,17 +38,18 @@ def exit_on_signals(status: int, *signals: signal.Signals, message: str = '') ->
 
     For the imports at the start of a program, when there is nothing to clean up: an exception
     raised in the middle of an import may be swallowed, or turned into another one. No buffer is
-    flushed and no `finally` runs. Signals that are ignored, and other threads: as `noted_signals`.
+    flushed and no `finally` runs. Ignored signals and other threads are handled as in
+    `recorded_signals`.
     """
     text = f'{message}\n'.encode() if message else b''
 
-    def leave(_signum: int, _frame: FrameType | None) -> None:
+    def shut_down(_signum: int, _frame: FrameType | None) -> None:
         try:
             os.write(2, text)
         finally:
             os._exit(status)
 
-    with _handled_by(leave, signals):
+    with _handled_by(shut_down, signals):
         yield
 
 

@@ -57,7 +57,7 @@ TARGET_DEFAULTS: dict[str, dict[str, Any]] = {
         'track.relinearise_window_s': 0.0,
         'track.lookback_s': 0.0,
         'track.end_gap_s': 30.0,
-        'track.smooth_longest_s': 3600.0,
+        'track.max_smoothing_s': 3600.0,
         'track.end_std': 0.2,
     },
 }
@@ -107,7 +107,7 @@ class Pipeline:
         They do not depend on how the readings are split into batches.
         """
         calibrated = self._calibrate.feed(readings)
-        self.track.doubt(self.calibrate.doubtful_stretches())
+        self.track.doubt(self.calibrate.doubtful_intervals())
         return self._after_calibrate(calibrated)
 
     def flush(self) -> list[Output]:

@@ -10,11 +10,11 @@ import yaml
 from mag_tracking.errors import MagTrackingError
 from mag_tracking.files import checked_path
 
-MOST_NODES = 1_000_000
+MAX_NODES = 1_000_000
 """Keys, values, lists and mappings of a file, aliases expanded."""
 DEEPEST = 64
 """Levels of lists and mappings, aliases expanded."""
-LARGEST_BITS = 14_000
+MAX_BITS = 14_000
 """Size of an integer: Python converts none above 4300 decimal digits to text."""
 
 
@@ -46,9 +46,9 @@ class _UniqueKeyLoader(yaml.SafeLoader):
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
         """An integer that can be written in a message."""
         value = super().construct_yaml_int(node)
-        if value.bit_length() > LARGEST_BITS:
+        if value.bit_length() > MAX_BITS:
             raise yaml.YAMLError(f'an integer of {value.bit_length()} bits is more than '
-                                 f'{LARGEST_BITS} (line {node.start_mark.line + 1})')
+                                 f'{MAX_BITS} (line {node.start_mark.line + 1})')
         return value
 
 
@@ -79,8 +79,8 @@ def _check_size(root: yaml.Node) -> None:
             nodes = 1 + sum(n for n, _ in below)
             depth = 1 + max((d for _, d in below), default=0)
             sizes[id(node)] = nodes, depth
-            if nodes > MOST_NODES:
-                raise yaml.YAMLError(f'aliases expand to more than {MOST_NODES} values '
+            if nodes > MAX_NODES:
+                raise yaml.YAMLError(f'aliases expand to more than {MAX_NODES} values '
                                      f'(line {line})')
             if depth > DEEPEST:
                 raise yaml.YAMLError(f'nested too deeply: more than {DEEPEST} levels '

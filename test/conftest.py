@@ -92,12 +92,12 @@ def ros():
 
     from mag_tracking.nodes.middleware import begin
     from mag_tracking.nodes.stage_node import make_executor, spin
-    from support.node_processes import LONGEST_S
+    from support.node_processes import MAX_S
     begin()
     node, executor = Node('tester'), make_executor()
     executor.add_node(node)
 
-    def spin_until(condition, seconds=LONGEST_S):
+    def spin_until(condition, seconds=MAX_S):
         end = time.monotonic() + seconds
         spin(executor, lambda: condition() or time.monotonic() > end)
         return condition()

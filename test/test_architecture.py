@@ -13,7 +13,7 @@ from support.bundled import ROOT
 
 PACKAGE = ROOT / 'mag_tracking'
 FILES = sorted(PACKAGE.rglob('*.py'))
-LARGEST_FILE, LARGEST_FUNCTION, LARGEST_SHARE = 350, 40, 0.2
+MAX_FILE, MAX_FUNCTION, MAX_SHARE = 350, 40, 0.2
 """Lines of a file, lines of a function without its docstring, share of all lines in one room."""
 
 
@@ -49,7 +49,7 @@ def test_compiled_sources_include_only_what_is_below_their_floor():
     assert sources
     for source in sources:
         text = source.read_text()
-        assert text.count('\n') <= LARGEST_FILE, source
+        assert text.count('\n') <= MAX_FILE, source
         for name in re.findall(r'^#include "(.+)"$', text, re.M):
             included = (source.parent / name).resolve()
             own, other = (p.relative_to(PACKAGE).parts[0].removesuffix('.hpp')
@@ -85,7 +85,7 @@ def n_lines(path):
 
 def test_no_file_is_too_long():
     assert {str(p.relative_to(ROOT)): n_lines(p) for p in FILES
-            if n_lines(p) > LARGEST_FILE} == {}
+            if n_lines(p) > MAX_FILE} == {}
 
 
 def test_no_room_holds_too_much():
@@ -93,7 +93,7 @@ def test_no_room_holds_too_much():
     for path in FILES:
         rooms[path.relative_to(PACKAGE).parts[0]] += n_lines(path)
     largest, n = rooms.most_common(1)[0]
-    assert n <= LARGEST_SHARE * rooms.total(), f'{largest}: {n} of {rooms.total()} lines'
+    assert n <= MAX_SHARE * rooms.total(), f'{largest}: {n} of {rooms.total()} lines'
 
 
 def definitions(path):
@@ -118,7 +118,7 @@ def length(node):
 def test_functions_are_short_and_public_names_have_docstrings(path):
     assert ast.get_docstring(ast.parse(path.read_text()))
     long = {node.name: length(node) for node, _ in definitions(path)
-            if not isinstance(node, ast.ClassDef) and length(node) > LARGEST_FUNCTION}
+            if not isinstance(node, ast.ClassDef) and length(node) > MAX_FUNCTION}
     assert long == {}
     silent = [node.name for node, public in definitions(path)
               if public and ast.get_docstring(node) is None]

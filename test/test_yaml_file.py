@@ -8,7 +8,7 @@ from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.reader import Recording
 from mag_tracking.settings import read_parameter_file, replace
-from mag_tracking.yaml_file import DEEPEST, MOST_NODES, read_yaml
+from mag_tracking.yaml_file import DEEPEST, MAX_NODES, read_yaml
 
 
 def nested_aliases(n, form='[{}]', width=9):
@@ -32,7 +32,7 @@ def test_aliases_that_expand_to_gigabytes_are_refused(tmp_path, read, key):
     path = tmp_path / 'metadata.yaml'
     for n in (6, 40):
         path.write_text(f'{nested_aliases(n)}{key}: *a{n}\n')
-        assert f'{path} is not YAML as it should be: aliases expand to more than {MOST_NODES} ' \
+        assert f'{path} is not YAML as it should be: aliases expand to more than {MAX_NODES} ' \
                'values (line 7)' in message_of(read, path)
 
 

@@ -36,7 +36,7 @@ def scaled_to_range(theta: FloatArray, p: FloatArray, place: FloatArray,
 def bearing_of(fit: PassFit, place: FloatArray) -> Bearing:
     """The `Bearing` of a fit whose CPA range was taken for known; `place` (3,) of the sensor."""
     r, v = fit.position - place, fit.velocity
-    P = fit.honest_covariance
+    P = fit.robust_covariance
     time, distance, r_cpa = closest_approach(r, v)
     v2 = v @ v
     g_time = -np.concatenate([v, r + 2.0 * time * v]) / v2

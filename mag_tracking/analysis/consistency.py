@@ -10,7 +10,7 @@ from mag_tracking.physics.motion import constant_velocity, integrator_noise
 from mag_tracking.report.metrics import interpolate_truth
 from mag_tracking.report.track_log import TrackLog
 
-LEAST_MOVE = 1e-9
+MIN_MOTION = 1e-9
 """[m/s] Slower is at rest, for the width of the prior."""
 
 
@@ -97,7 +97,7 @@ def _prior(network: SensorNetwork, true: FloatArray, t: FloatArray, log: TrackLo
     """(n_x, n_x) before the first pose: as far as the way is long, as fast as it went."""
     way = max(np.ptp(true, axis=0).max(), np.ptp(network.positions, axis=0).max())
     speed = max(np.linalg.norm(np.diff(true, axis=0), axis=1).max()
-                / np.diff(t).min(), LEAST_MOVE)
+                / np.diff(t).min(), MIN_MOTION)
     std = np.full(9 + 3 * len(network), background_std)
     std[:3], std[3:6], std[6:9] = way, speed, np.linalg.norm(log.moment[known[0]])
     return np.diag(std**2)

@@ -20,10 +20,10 @@ from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.least_squares import left_out_covariance
 from mag_tracking.network.sensor_network import ONE_PLACE
 
-LEAST_ALIKE = 0.97
+MIN_CORRELATION = 0.97
 """Fields are the same where this share of one's energy is that of the other, delayed."""
 
-LEAST_PEAK = 0.7
+MIN_PEAK = 0.7
 """Maxima of the correlation that are lower than this share of the highest are not looked at."""
 
 N_COARSE = 512
@@ -33,7 +33,7 @@ SCALE_STD, GAIN_STD, TURN_STD = 0.05, 0.02, np.deg2rad(2.0)
 """How the field at one sensor may differ from that at the other: in all (the distance to the
 target), of each axis (gains), and about each axis (mounting, by a careful installer)."""
 
-LEAST_DELAY = 3.0
+MIN_DELAY = 3.0
 """A delay that is less than so many of its deviations may as well be zero."""
 
 SMOOTHING = 0.3
@@ -42,20 +42,20 @@ SMOOTHING = 0.3
 STRAYED = 4.0
 """In widths of the smoothing: a delay that moves further belongs to another maximum."""
 
-MOST_CHANGED = 22.5
+MAX_CHANGED = 22.5
 """Chi-square of turn, scale and gains together beyond which it is another field: one in
 a thousand."""
 
 DISAGREE, SAME_SPEED = 3.0, 0.1
 """Speeds contradict each other that are apart by more deviations, and by more than this share."""
 
-LEAST_ALONG = 0.3
+MIN_ALONG = 0.3
 """Cosine of the angle to the line of the sensors below which a target goes across it."""
 
-MOST_READINGS = 1_000_000
+MAX_READINGS = 1_000_000
 """A pass of more even times is not looked at: its timestamps are no even ones."""
 
-MOST_PAIRS = 12
+MAX_PAIRS = 12
 """Pairs that are compared; the closest ones."""
 
 FEWEST = 10
@@ -113,11 +113,11 @@ def correlated_motion(data: PassData) -> CorrelatedMotion:
         return CorrelatedMotion('no two sensors beside each other have readings of a field, and an '
                                 'axis, in common')
     best = max(d.alike for d in found)
-    alike = tuple(d for d in found if d.alike >= LEAST_ALIKE)
+    alike = tuple(d for d in found if d.alike >= MIN_CORRELATION)
     if not alike:
         return CorrelatedMotion(f'the sensors feel different fields ({max(best, 0.0):.0%} alike): '
                                 'none is behind another on the way', alike=best)
-    if all(abs(d.delay) < LEAST_DELAY * d.delay_std for d in alike):
+    if all(abs(d.delay) < MIN_DELAY * d.delay_std for d in alike):
         return CorrelatedMotion('the sensors feel the same at the same time', alike=best,
                                 pairs=alike)
     return _motion(data, alike, best)
@@ -136,7 +136,7 @@ def disagree(speed: tuple[float, float], heading: tuple[float, float],
     if off > 0.5 * np.pi:
         return bool(off - 0.5 * np.pi > DISAGREE * heading[1])
     along = np.cos(off) if np.isnan(delay.heading_std) else 1.0
-    if along < LEAST_ALONG:
+    if along < MIN_ALONG:
         return False
     # What the delay would be as a speed, and how far the heading makes that uncertain.
     std = np.hypot(speed[1], speed[0] * np.tan(off) * heading[1]) / along
@@ -151,7 +151,7 @@ def _pairs(data: PassData) -> list[tuple[int, int]]:
     pairs = list(combinations(data.sensors.tolist(), 2))
     apart = np.array([np.linalg.norm(place[i] - place[j]) for i, j in pairs])
     nearest = [k for k in np.argsort(apart, kind='stable') if apart[k] > ONE_PLACE]
-    return [pairs[k] for k in nearest[:MOST_PAIRS]]
+    return [pairs[k] for k in nearest[:MAX_PAIRS]]
 
 
 def _motion(data: PassData, pairs: Sequence[PairDelay], alike: float) -> CorrelatedMotion:
@@ -237,7 +237,7 @@ def _pair_of(data: PassData, i: int, j: int) -> _Pair | None:
         return None
     begin, end = max(first.t[0], second.t[0]), min(first.t[-1], second.t[-1])
     step = min(float(np.median(np.diff(s.t))) for s in (first, second))
-    if not 0.0 < step * FEWEST < end - begin < step * MOST_READINGS:
+    if not 0.0 < step * FEWEST < end - begin < step * MAX_READINGS:
         return None
     t = np.arange(begin, end, step)
     energy = np.square(first.smoothed(t, step) - np.median(first.field, axis=0)).sum(axis=1)
@@ -273,7 +273,7 @@ def _maxima(pair: _Pair) -> list[float]:
     a, b = (y[::every] - np.median(y, axis=0) for y in (pair.first, pair.second))
     c = np.sum([np.correlate(y, x, 'full') for x, y in zip(a.T, b.T, strict=True)], axis=0)
     inner = np.flatnonzero((c[1:-1] >= c[:-2]) & (c[1:-1] > c[2:])) + 1
-    high = sorted(inner[c[inner] >= LEAST_PEAK * c.max()], key=lambda k: -c[k])[:5]
+    high = sorted(inner[c[inner] >= MIN_PEAK * c.max()], key=lambda k: -c[k])[:5]
     return [float((k - (len(a) - 1)) * step) for k in high] or [0.0]
 
 
@@ -296,7 +296,7 @@ def _refined(pair: _Pair, tau: float) -> tuple[float, float, float]:
     rest = np.median(pair.second, axis=0)
     size = np.linalg.norm(y - rest)
     whole = np.linalg.norm(pair.second[::every] - rest)
-    if freedom <= 0 or not size > 0.0 or size < LEAST_ALIKE * whole:
+    if freedom <= 0 or not size > 0.0 or size < MIN_CORRELATION * whole:
         # So late that hardly anything of the one is left to compare with the other.
         return tau, np.inf, 0.0
     std = size / np.sqrt(y.size)
@@ -313,7 +313,7 @@ def _refined(pair: _Pair, tau: float) -> tuple[float, float, float]:
             return tau, np.inf, 0.0
         if abs(step[0]) < 1e-6 * pair.width:
             break
-    if abs(theta[0] - tau) > STRAYED * pair.width or theta @ prior @ theta > MOST_CHANGED:
+    if abs(theta[0] - tau) > STRAYED * pair.width or theta @ prior @ theta > MAX_CHANGED:
         return tau, np.inf, 0.0
     left, J = _left(pair, t, y, theta)
     return (float(theta[0]), _delay_std(t, J / std, left / std, prior),

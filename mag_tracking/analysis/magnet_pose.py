@@ -19,7 +19,7 @@ UNKNOWNS = 5
 NOTHING = 1e-9
 """A sum of squares below is that of exact readings: no step makes it smaller by a share."""
 
-MOST_COST = 100.0
+MAX_COST = 100.0
 """A normalised cost beyond is none of one dipole of that moment."""
 
 _Problem: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
@@ -154,7 +154,7 @@ def _pose(x: FloatArray, covariance: FloatArray, cost: float, converged: bool, l
     T[3:, 3:6] = (np.eye(3) - np.outer(u, u)) / length
     if not (np.isfinite(cost) and converged):
         reason = f'no minimum within {settings.iterations} steps'
-    elif not cost <= MOST_COST:
+    elif not cost <= MAX_COST:
         reason = f'not one dipole of that moment: the normalised cost is {cost:.0f}'
     elif not ((low <= x[:3]) & (x[:3] <= high)).all():
         reason = f'outside the box: {x[:3].tolist()} m'

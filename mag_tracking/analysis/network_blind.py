@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from mag_tracking.analysis.magnet_pose import PoseSettings, locate_magnet
 from mag_tracking.analysis.network_geometry import (
-    LEAST_POSES,
+    MIN_POSES,
     GeometrySettings,
     NetworkGeometry,
     fitted_geometry,
@@ -43,7 +43,7 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
     Raises
     ------
     ValueError
-        As `calibrate_geometry`, or fewer than `LEAST_POSES` poses found in the box.
+        As `calibrate_geometry`, or fewer than `MIN_POSES` poses found in the box.
 
     The poses begin as if each bias were the sensor's median; then biases and poses are fitted to a
     field that is believed to a tenth, and only then all the rest.
@@ -57,9 +57,9 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
     coarse = replace(s, gain_std=0.0, rotation_std_deg=0.0, position_std=0.0,
                      field_error=max(COARSE_ERROR, s.field_error))
     for how in (coarse, s):
-        if len(rows) < LEAST_POSES:
+        if len(rows) < MIN_POSES:
             raise ValueError(f'{len(rows)} of {len(field)} poses were found in the box, at least '
-                             f'{LEAST_POSES} are needed')
+                             f'{MIN_POSES} are needed')
         geometry = fitted_geometry(network, field[rows], r, u, moment, how, shared_unit,
                                    pose_unit)
         used, (r, u) = rows, geometry.poses

@@ -26,7 +26,7 @@ OUTLYING = 1e-3
 STEADY = 1e-3
 """A step is the last where its squared length, in posterior deviations, is below this."""
 
-MOST_DAMPING = 1e10
+MAX_DAMPING = 1e10
 
 Numbers: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 """Of the sensors (n, 10), shared (12,) and of the poses (K, 8)."""
@@ -237,7 +237,7 @@ def solve(problem: GeometryProblem,
         W, priors = weights[:2]
         normal = NormalEquations(problem, x, predicted, W, priors)
         cost = problem.cost(x, predicted[0], W, priors)
-        while damping < MOST_DAMPING:
+        while damping < MAX_DAMPING:
             dx, dpose = normal.step(damping)
             trial = _moved(x, dx, dpose)
             there = problem.predicted(trial)

@@ -157,10 +157,10 @@ def _places(magnet: TrackedMagnet, shared: FloatArray,
     return r, m / np.linalg.norm(m, axis=1)[:, None]
 
 
-LEAST_POSES = 3
+MIN_POSES = 3
 """With fewer, a sensor's bias cannot be told from the magnet's field."""
 
-LEAST_CHANGE = 0.1
+MIN_CHANGE = 0.1
 """[rad], and relative to the distance: a magnet that moves and turns less stays where it is."""
 
 STRANGE = 4.0
@@ -169,7 +169,7 @@ STRANGE = 4.0
 MISFIT = 3.0
 """What fits worse than the middle of its kind by this factor does not belong to it."""
 
-MOST_COST = 100.0
+MAX_COST = 100.0
 """A normalised cost beyond is none of a dipole and these sensors."""
 
 
@@ -239,7 +239,7 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
     sensor, shared, pose = problem.in_si(x)
     turn = rotation(sensor[:, 4:7])
     by_sensor, by_pose = _residuals(problem, predicted)
-    odd_sensors, odd_poses = _suspects(problem, x, by_sensor, by_pose)
+    outlier_sensors, outlier_poses = _suspects(problem, x, by_sensor, by_pose)
     reason = _doubt(problem, x, converged, cost)
     return NetworkGeometry(
         network=replace(network, positions=network.positions + sensor[:, 7:],
@@ -254,7 +254,7 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
         shared_std=shared_std, pose=pose,
         pose_covariance=P_pose * np.outer(problem.pose_unit, problem.pose_unit),
         covariance=covariance, normalised_cost=cost, sensor_residual=by_sensor,
-        pose_residual=by_pose, suspect_sensors=odd_sensors, suspect_poses=odd_poses,
+        pose_residual=by_pose, suspect_sensors=outlier_sensors, suspect_poses=outlier_poses,
         converged=not reason, reason=reason)
 
 
@@ -297,22 +297,22 @@ def _at_one_place(problem: GeometryProblem, x: Numbers) -> bool:
     """Whether the magnet neither moved, compared with its distance, nor turned."""
     r, u = _places(problem.magnet, *problem.in_si(x)[1:])
     nearest = np.linalg.norm(problem.network.positions - r.mean(axis=0), axis=1).min()
-    return bool((np.ptp(r, axis=0) < LEAST_CHANGE * nearest).all()
-                and (np.ptp(u, axis=0) < LEAST_CHANGE).all())
+    return bool((np.ptp(r, axis=0) < MIN_CHANGE * nearest).all()
+                and (np.ptp(u, axis=0) < MIN_CHANGE).all())
 
 
 def _doubt(problem: GeometryProblem, x: Numbers, converged: bool, cost: float) -> str:
     """Why it is no answer; empty where it is one."""
     K, most = len(problem.magnet.tool), problem.settings.iterations
-    if K < LEAST_POSES:
-        reason = f'{K} poses, at least {LEAST_POSES} are needed to tell biases from the magnet'
+    if K < MIN_POSES:
+        reason = f'{K} poses, at least {MIN_POSES} are needed to tell biases from the magnet'
     elif _at_one_place(problem, x):
         reason = 'the poses are at one place: nothing is learnt of the geometry'
     elif not converged:
         reason = f'no minimum within {most} steps'
     elif np.isnan(cost):
         reason = 'fewer readings than unknowns'
-    elif cost > MOST_COST:
+    elif cost > MAX_COST:
         reason = (f'not what the model describes: the normalised cost is {cost:.0f} (wrong poses '
                   'or moment, another network, or a noise_std that is too small)')
     else:

@@ -10,11 +10,11 @@ from mag_tracking.analysis.bearing import bearing_of, scaled_to_range
 from mag_tracking.analysis.pass_data import PassData, background_columns
 from mag_tracking.analysis.pass_deviation import (
     SensorErrors,
-    honest_covariance,
+    robust_covariance,
     velocity_change,
 )
 from mag_tracking.analysis.pass_result import PassFit
-from mag_tracking.analysis.pass_trust import FittedRow, doubt, left_elsewhere, trusted
+from mag_tracking.analysis.pass_trust import FittedRow, doubt, residual_elsewhere, trusted
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.crlb import bound, cpa_information, information
 from mag_tracking.inference.separable_fit import Minimum
@@ -166,11 +166,11 @@ def _fits(about: _Linearised, found: Minimum, explained: float, errors: SensorEr
     everything = about.fields.sum(axis=0)
     # An unobservable state has an infinite variance; what it is combined to has none.
     with np.errstate(invalid='ignore'):
-        honest = honest_covariance(data, about.whitened, about.left, everything, covariance,
+        honest = robust_covariance(data, about.whitened, about.left, everything, covariance,
                                    errors)
         spread = np.sqrt(np.einsum('yi,ij,yj->y', H, honest, H)).reshape(-1, 3)
         covariance, honest = (T @ P @ T.T for P in (covariance, honest))
-    elsewhere = left_elsewhere(data, [FittedRow(n, path, field) for n, path, field in zip(
+    elsewhere = residual_elsewhere(data, [FittedRow(n, path, field) for n, path, field in zip(
         about.orders, about.theta, about.fields, strict=True)], about.left)
     fits = []
     for k, (n_dipoles, own) in enumerate(zip(about.orders, about.own, strict=True)):

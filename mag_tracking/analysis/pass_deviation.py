@@ -21,7 +21,7 @@ class SensorErrors:
     """Deviation of the gain of each axis; data sheets say 1 to 3 %."""
 
 
-def honest_covariance(data: PassData, whitened: FloatArray, left: FloatArray, target: FloatArray,
+def robust_covariance(data: PassData, whitened: FloatArray, left: FloatArray, target: FloatArray,
                       covariance: FloatArray, errors: SensorErrors) -> FloatArray:
     """A covariance by noise, what the model leaves out and the sensors' errors.
 

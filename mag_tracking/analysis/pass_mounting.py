@@ -15,7 +15,7 @@ from mag_tracking.geometry import quaternion_from_rotation_vector, rotation_from
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Track
 
-LEAST_SHARE = 0.05
+MIN_SHARE = 0.05
 """A direction in which a track adds less than this share of what it adds in its best one is not
 compared with what other tracks say."""
 
@@ -97,7 +97,7 @@ def _scatter(gains: Sequence[FloatArray], pulls: Sequence[FloatArray], turn: Flo
     squares, freedom = np.zeros(len(turn)), np.zeros(len(turn))
     for gain, pull in zip(gains, pulls, strict=True):
         off = pull - np.einsum('jik,jk->ji', gain, turn)
-        inverse = np.linalg.pinv(gain, rcond=LEAST_SHARE, hermitian=True)
+        inverse = np.linalg.pinv(gain, rcond=MIN_SHARE, hermitian=True)
         squares += np.einsum('ji,jik,jk->j', off, inverse, off)
         # What is compared, less what went into the answer that it is compared with.
         projection = inverse @ gain

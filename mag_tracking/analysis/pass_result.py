@@ -68,7 +68,7 @@ class PassFit:
     covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     """(n_x, n_x) TSP14 eq. (47), which takes model and noise for right; infinite variance = not
     observable."""
-    honest_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    robust_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     """(n_x, n_x) the same and what the model leaves out: residuals that are alike for a while
     instead of noise. All deviations are of this one."""
     cost: float = np.nan
@@ -81,7 +81,7 @@ class PassFit:
     """Share of itself by which the velocity seems to change while the target is seen."""
     velocity_change_std: float = np.nan
     """By noise, and by what the model leaves out."""
-    left_elsewhere: float = np.nan
+    residual_elsewhere: float = np.nan
     """Share of the energy that is left over where no vehicle leaves any; see `pass_trust`."""
     trusted: tuple[str, ...] = ()
     """The names of those among speed, direction and time (of the closest point) that are
@@ -119,7 +119,7 @@ class PassFit:
         """Whether the measurements fix all unknowns, right or not."""
         if not (len(self.x) and self.converged):
             return False
-        variance = np.diagonal(self.honest_covariance)
+        variance = np.diagonal(self.robust_covariance)
         if not (np.isfinite(variance).all() and (variance > 0.0).all()):
             return False
         if self.n_dipoles == 1:
@@ -142,7 +142,7 @@ class PassFit:
         """
         if self.is_poor_mixture:
             return True
-        P = self.honest_covariance[:6, :6]
+        P = self.robust_covariance[:6, :6]
         for d, path in self.rivals:
             e = path[:6] - self.x[:6]
             if d < RIVAL and e @ np.linalg.pinv(P, hermitian=True) @ e > FAR:
@@ -165,27 +165,27 @@ class PassFit:
         F[:3, 3:6] = seconds * np.eye(3)
         # An infinite variance times zero is NaN.
         with np.errstate(invalid='ignore'):
-            covariance, honest = (F @ P @ F.T for P in (self.covariance, self.honest_covariance))
+            covariance, honest = (F @ P @ F.T for P in (self.covariance, self.robust_covariance))
         rivals = tuple((cost, moved_along(path, seconds)) for cost, path in self.rivals)
         return replace(self, data=self.data.shifted(seconds), x=moved_along(self.x, seconds),
-                       covariance=covariance, honest_covariance=honest, rivals=rivals)
+                       covariance=covariance, robust_covariance=honest, rivals=rivals)
 
     @property
     def speed(self) -> tuple[float, float]:
         """[m/s] and its deviation."""
-        return speed_of(self.velocity, self.honest_covariance[3:6, 3:6])
+        return speed_of(self.velocity, self.robust_covariance[3:6, 3:6])
 
     @property
     def heading(self) -> tuple[float, float]:
         """[rad] anticlockwise from x, and its deviation."""
-        return heading_of(self.velocity, self.honest_covariance[3:6, 3:6])
+        return heading_of(self.velocity, self.robust_covariance[3:6, 3:6])
 
     @property
     def length(self) -> tuple[float, float]:
         """[m] of the row and its deviation; zeros for a point."""
         if self.n_dipoles == 1:
             return 0.0, 0.0
-        return self.x[6], np.sqrt(self.honest_covariance[6, 6])
+        return self.x[6], np.sqrt(self.robust_covariance[6, 6])
 
     @property
     def moment(self) -> tuple[FloatArray, FloatArray]:
@@ -194,7 +194,7 @@ class PassFit:
         first = 6 + int(self.n_dipoles > 1)
         for i in range(self.n_dipoles):
             S[:, first + 3 * i:first + 3 * i + 3] = np.eye(3)
-        return S @ self.x, S @ self.honest_covariance @ S.T
+        return S @ self.x, S @ self.robust_covariance @ S.T
 
     def closest_approach(self, point: FloatArray) -> tuple[float, float, float, float]:
         """CPA of the row's middle to a point.
@@ -213,7 +213,7 @@ class PassFit:
         r, v = self.position - point, self.velocity
         time, distance, r_cpa = closest_approach(r, v)
         u = r_cpa / distance if distance > 0.0 else np.zeros(3)
-        P = self.honest_covariance[:6, :6]
+        P = self.robust_covariance[:6, :6]
         g_time = -np.concatenate([v, r + 2.0 * time * v]) / (v @ v)
         g_range = np.concatenate([u, time * u])
         return (time, np.float64(np.sqrt(g_time @ P @ g_time)), distance,

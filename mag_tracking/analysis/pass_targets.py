@@ -5,19 +5,19 @@ from dataclasses import replace
 
 import numpy as np
 
+from mag_tracking.analysis.joint_fit import (
+    GroundPrior,
+    are_separate,
+    fit_joint,
+    path_from,
+)
 from mag_tracking.analysis.model_order import order_criteria
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.analysis.pass_trust import describes
-from mag_tracking.analysis.superposed_fit import (
-    GroundPrior,
-    are_separate,
-    fit_superposed,
-    path_from,
-)
 from mag_tracking.arrays import FloatArray
 
-MOST_TARGETS = 3
+MAX_TARGETS = 3
 """More are not fitted together: each has a dozen unknowns."""
 
 LONGEST = 18.75
@@ -58,9 +58,9 @@ def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray, gro
     n_targets = len(paths)
     if n_targets < 2 or len(data.sensors) < 2:
         return (tuple(alone),)
-    if n_targets > MOST_TARGETS:
-        return (_refused(alone, n_targets, f'at most {MOST_TARGETS} are fitted together'),)
-    found = fit_superposed(data, paths, ground, orders, stopped=stopped)
+    if n_targets > MAX_TARGETS:
+        return (_refused(alone, n_targets, f'at most {MAX_TARGETS} are fitted together'),)
+    found = fit_joint(data, paths, ground, orders, stopped=stopped)
     if not found:
         return (_refused(alone, n_targets,
                          'there are too few measurements to fit them together'),)

@@ -26,33 +26,33 @@ ROW_REACH = 0.45
 """The same of a row, in distances of its dipoles: costs of 1.3 to 1.6 (cars) and 77 to 303 (trucks,
 of twenty times the energy) with three dipoles (T10 Table 6.5, TSP14 Table II) are 0.15 to 0.45."""
 
-LEAST_ROW_REACH = 0.4
+MIN_ROW_REACH = 0.4
 """[m] However close the dipoles of a row: the cars of those tables."""
 
 NOISE_ENERGY = 16.3
 """Whitened energy of three axes that noise exceeds once in a thousand samples."""
 
-LEAST_ELSEWHERE, MOST_ELSEWHERE = 0.003, 0.1
+MIN_ELSEWHERE, MAX_ELSEWHERE = 0.003, 0.1
 """A vehicle leaves over up to this share of its field elsewhere (gains, a swerve), and up to this
 share of all that it leaves over."""
 
-LEAST_WAY = 0.3
+MIN_DISTANCE = 0.3
 """Share of the distance of the nearest sensor that a target has to move while it is seen."""
 
-MOST_CHANGE = 0.3
+MAX_CHANGE = 0.3
 """Share of itself by which the velocity may seem to change while the target is seen: 17 degrees of
 a turn. Vehicles that are no rows of dipoles seem to change it by up to 0.2."""
 
 SIGNIFICANT = 2.5
 """A change of the velocity that is larger than so many deviations is one."""
 
-MOST_SPEED_STD = 0.25
+MAX_SPEED_STD = 0.25
 """A speed is trusted whose deviation is no larger than this share of it: it is not zero."""
 
-MOST_HEADING_STD = np.pi / 6.0
+MAX_HEADING_STD = np.pi / 6.0
 """[rad] A direction is trusted that three deviations do not turn to the side."""
 
-MOST_TIME_STD = 0.25
+MAX_TIME_STD = 0.25
 """A time of the closest point is trusted that is known to this share of the time in which the
 target moves by its distance."""
 
@@ -61,7 +61,7 @@ def reach(n_dipoles: int, length: float) -> float:
     """[m] How far iron reaches beyond a row of `n_dipoles` over `length` [m]."""
     if n_dipoles == 1:
         return POINT_REACH
-    return max(LEAST_ROW_REACH, ROW_REACH * abs(length) / (n_dipoles - 1))
+    return max(MIN_ROW_REACH, ROW_REACH * abs(length) / (n_dipoles - 1))
 
 
 class FittedRow(NamedTuple):
@@ -74,7 +74,7 @@ class FittedRow(NamedTuple):
     """(n, 3) [T], sensor frame."""
 
 
-def left_elsewhere(data: PassData, rows: Sequence[FittedRow], left: FloatArray) -> float:
+def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], left: FloatArray) -> float:
     """Share of the whitened energy of the targets' field left over where no vehicle leaves it.
 
     A vehicle leaves something over in proportion to its field, and the more the nearer it is; a
@@ -98,13 +98,14 @@ def left_elsewhere(data: PassData, rows: Sequence[FittedRow], left: FloatArray) 
         size2: FloatArray = np.einsum('ni,ni->n', whitened, whitened)
         return size2
 
-    known = sum((_share_left(data, row) * energy(row.field) for row in rows), np.zeros(len(left)))
+    known = sum((_residual_share(data, row) * energy(row.field) for row in rows),
+                np.zeros(len(left)))
     beyond = np.square(left).sum(axis=1) - known - NOISE_ENERGY
     everything = energy(np.sum([row.field for row in rows], axis=0))
     return float(np.maximum(beyond, 0.0).sum() / everything.sum())
 
 
-def _share_left(data: PassData, row: FittedRow) -> FloatArray:
+def _residual_share(data: PassData, row: FittedRow) -> FloatArray:
     """(n,) share of a target's energy that it may leave over in each sample."""
     n_dipoles, theta, _ = row
     v = theta[3:6]
@@ -133,7 +134,7 @@ def doubt(fit: PassFit) -> str:
         length, length_std = fit.length
         return (f'not determined: a length of {length:.1f} m, known to {length_std:.1f} m; '
                 'take fewer dipoles')
-    std, nearest = np.sqrt(np.trace(fit.honest_covariance[:3, :3])), _nearest(fit)
+    std, nearest = np.sqrt(np.trace(fit.robust_covariance[:3, :3])), _nearest(fit)
     if std > nearest:
         return (f'out of range: the position is known to {std:.1f} m only, and no sensor is nearer '
                 f'than {nearest:.1f} m')
@@ -153,9 +154,9 @@ def trusted(fit: PassFit) -> tuple[str, ...]:
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
     _, time_std, _, _ = fit.closest_approach(centre)
     # A comparison with NaN, where a variance is not known, is false.
-    known = {'speed': speed_std <= MOST_SPEED_STD * speed,
-             'direction': heading_std <= MOST_HEADING_STD and speed_std <= 0.5 * speed,
-             'time': time_std * speed <= MOST_TIME_STD * nearest}
+    known = {'speed': speed_std <= MAX_SPEED_STD * speed,
+             'direction': heading_std <= MAX_HEADING_STD and speed_std <= 0.5 * speed,
+             'time': time_std * speed <= MAX_TIME_STD * nearest}
     return tuple(name for name, is_known in known.items() if is_known)
 
 
@@ -165,25 +166,26 @@ def _no_pass(fit: PassFit) -> str:
         return 'the fit did not converge'
     if not describes(fit):
         return (f'not one target at constant velocity: {1.0 - fit.explained:.1%} of the field is '
-                f'left over, {fit.left_elsewhere:.1%} where a vehicle at that distance leaves none '
+                f'left over, {fit.residual_elsewhere:.1%} where a vehicle at that distance '
+                'leaves none '
                 '(another vehicle, a turn, a wrong network file)')
     if turns(fit):
         return ('not at constant velocity: while it was seen it changed by '
                 f'{fit.velocity_change:.0%} of itself (a turn, braking)')
-    if np.linalg.norm(fit.velocity) * fit.seen_s < LEAST_WAY * _nearest(fit):
+    if np.linalg.norm(fit.velocity) * fit.seen_s < MIN_DISTANCE * _nearest(fit):
         return 'no pass: while it was seen it hardly moved'
     return ''
 
 
 def describes(fit: PassFit) -> bool:
     """Whether what is left over is where real vehicles leave it."""
-    limit = max(LEAST_ELSEWHERE, MOST_ELSEWHERE * (1.0 - fit.explained))
-    return fit.left_elsewhere <= limit
+    limit = max(MIN_ELSEWHERE, MAX_ELSEWHERE * (1.0 - fit.explained))
+    return fit.residual_elsewhere <= limit
 
 
 def turns(fit: PassFit) -> bool:
     """Whether the velocity changes by much, and by more than errors of the model make it seem."""
-    return bool(fit.velocity_change > max(MOST_CHANGE, SIGNIFICANT * fit.velocity_change_std))
+    return bool(fit.velocity_change > max(MAX_CHANGE, SIGNIFICANT * fit.velocity_change_std))
 
 
 def contradicted(fit: PassFit) -> bool:

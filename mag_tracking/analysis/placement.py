@@ -20,7 +20,7 @@ DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], *(
 
 STATES = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'mx', 'my', 'mz')
 
-MOST_AT_ONCE = 200_000
+MAX_AT_ONCE = 200_000
 """Fields computed at once; more are done in turn, so that memory stays small."""
 
 
@@ -65,12 +65,12 @@ class Sampling:
     """[T] how well the backgrounds are known; inf = not at all."""
     half_window: float = 3.0
     """[s] the target is followed so long before and after the point that is asked about."""
-    most_frames: int = 60
+    max_frames: int = 60
 
     def times(self) -> tuple[FloatArray, float]:
         """(k,) [s] of the frames, and how many real ones each stands for."""
         n = 2 * int(self.half_window / self.period) + 1
-        k = min(n, self.most_frames // 2 * 2 + 1)
+        k = min(n, self.max_frames // 2 * 2 + 1)
         t = np.linspace(-self.half_window, self.half_window, k, dtype=np.float64)
         return t, n / k
 
@@ -101,7 +101,7 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
     dr_dx[..., range(3), range(3, 6)] = t[:, None]
     dm_dx[..., range(3), range(6, 9)] = 1.0
     m = np.broadcast_to(target.moment * DIRECTIONS[:, None], (*shape, 3))
-    step = max(1, MOST_AT_ONCE // (size * len(positions)))
+    step = max(1, MAX_AT_ONCE // (size * len(positions)))
     for first in range(0, len(points), step):
         some = points[first:first + step]
         n = len(some)

@@ -11,7 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from mag_tracking.apps.archive_work import N_DIPOLES, Job, cut, join, track_stretch
+from mag_tracking.apps.archive_work import N_DIPOLES, Job, cut, join, track_segment
 from mag_tracking.apps.cluster import Cluster
 from mag_tracking.apps.readings import network_of
 from mag_tracking.errors import ClusterError, MagTrackingError, OutputError, RecordingError
@@ -159,7 +159,7 @@ def archive(recordings: Iterable[str | PathLike[str]],
         try:
             if todo:
                 with _Cluster(workers, scheduler) as cluster:
-                    _Director(dataset, cluster, network, settings, run, progress, report).work(
+                    _Scheduler(dataset, cluster, network, settings, run, progress, report).work(
                         todo, stopped or (lambda: False))
                     run.lost_workers = cluster.n_lost
         finally:
@@ -177,7 +177,7 @@ def _head(network: SensorNetwork, settings: Settings) -> dict[str, Any]:
             'settings': dataclasses.asdict(settings)}
 
 
-class _Director:
+class _Scheduler:
     """Gives the tasks of all recordings to a cluster, each when those before it are done."""
 
     def __init__(self, dataset: ArchiveFolder, cluster: _Cluster, network: SensorNetwork,
@@ -186,7 +186,7 @@ class _Director:
         self._dataset, self._cluster, self._run = dataset, cluster, run
         self._network, self._settings = network, settings
         self._progress, self._report = progress or (lambda _: None), report or (lambda _: None)
-        self._stretches: Counter[Path] = Counter()
+        self._segments: Counter[Path] = Counter()
         self._states: dict[Path, list[list[Any]]] = {}
 
     def work(self, todo: Sequence[Path], stopped: Callable[[], bool]) -> None:
@@ -234,12 +234,12 @@ class _Director:
             self._progress(result['size'])
         else:
             if kind == 'cut':
-                self._stretches[path] = result['stretches']
+                self._segments[path] = result['stretches']
                 for k in range(result['stretches']):
-                    self._cluster.submit(('track', job), 1, track_stretch, job, k)
+                    self._cluster.submit(('track', job), 1, track_segment, job, k)
             else:
-                self._stretches[path] -= 1
-            if not self._stretches[path]:
+                self._segments[path] -= 1
+            if not self._segments[path]:
                 self._cluster.submit(('join', job), 2, join, job)
 
     def _fail(self, path: Path, why: str) -> None:

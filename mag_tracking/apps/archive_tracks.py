@@ -9,7 +9,7 @@ import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_fit import fit_pass
-from mag_tracking.apps.archive_stretches import Piece
+from mag_tracking.apps.archive_segments import FrameChunk
 from mag_tracking.apps.pass_fitter import fitted_vehicles
 from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.apps.replay import RunCollector
@@ -27,7 +27,7 @@ TRACKED = ('tracks', 'poses', 'smoothed', 'passes')
 """The tables that a stretch has rows of."""
 
 
-class StretchTables:
+class SegmentTables:
     """Takes what a tracker and the passes of a stretch give; a context manager.
 
     Attributes
@@ -49,13 +49,13 @@ class StretchTables:
         self._collector = RunCollector(self)
         self.n_tracks = self.n_passes = 0
 
-    def __enter__(self) -> 'StretchTables':
+    def __enter__(self) -> 'SegmentTables':
         return self
 
     def __exit__(self, *error: Any) -> None:
         self._files.__exit__(*error)
 
-    def track(self, piece: Piece, tracker: TrackManager) -> None:
+    def track(self, piece: FrameChunk, tracker: TrackManager) -> None:
         """Run the tracker over a piece of the stretch, and fit the passes of it."""
         for frame, doubts in piece.frames():
             if doubts is not None:

@@ -19,10 +19,10 @@ from typing import Any
 
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.archive_health import HealthRows
-from mag_tracking.apps.archive_stretches import StretchWriter, read_stretch
-from mag_tracking.apps.archive_tracks import TRACKED, StretchTables
-from mag_tracking.apps.first_pass import first_pass_of
+from mag_tracking.apps.archive_segments import SegmentWriter, read_segment
+from mag_tracking.apps.archive_tracks import TRACKED, SegmentTables
 from mag_tracking.apps.pass_collector import PassCollector
+from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.arrays import IntArray
 from mag_tracking.errors import OutputError
 from mag_tracking.files import replace_text
@@ -34,7 +34,7 @@ from mag_tracking.recording.parquet_table import TableWriter
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import FieldFrame
-from mag_tracking.stages.track.clock_evidence import ClockEvidence
+from mag_tracking.stages.track.clock_comparison import ClockComparison
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.rigid_pass import RigidPass
 
@@ -62,12 +62,12 @@ class Job:
         """The folder of what `cut` leaves: stretches, health, and what is known."""
         return self.work / 'cut'
 
-    def stretch(self, k: int) -> Path:
-        """The folder of what `track_stretch` leaves."""
+    def segment(self, k: int) -> Path:
+        """The folder of what `track_segment` leaves."""
         return self.work / f'stretch-{k}'
 
 
-class NotedEvidence(ClockEvidence):
+class RecordedEvidence(ClockComparison):
     """Notes the passes that it counts.
 
     Attributes
@@ -91,11 +91,11 @@ class NotedEvidence(ClockEvidence):
 
 @dataclass
 class _Tracked:
-    """The result of `track_stretch` beside its tables."""
+    """The result of `track_segment` beside its tables."""
 
     n_tracks: int
     n_passes: int
-    evidence: NotedEvidence = field(repr=False)
+    evidence: RecordedEvidence = field(repr=False)
 
 
 def cut(job: Job) -> dict[str, Any]:
@@ -153,9 +153,9 @@ class _Cut:
         self._recording, self._path = Recording(job.recording), job.recording
         self._reader = SampleReader(self._recording, job.network)
         self._passes = PassCollector(job.network, job.settings, self._see)
-        first_pass_of(self._recording, job.network, job.settings.calibrate).apply(
+        prescan_of(self._recording, job.network, job.settings.calibrate).apply(
             self._passes.calibrate)
-        self._writer = StretchWriter(folder, job.settings.track.lookback_s)
+        self._writer = SegmentWriter(folder, job.settings.track.lookback_s)
         self._health, self._health_table = HealthRows(job.recording, job.network), health
         self._first_ns: int | None = None
         self._last_ns: int | None = None
@@ -172,17 +172,17 @@ class _Cut:
         missing = self._reader.missing_topics()
         return {
             **stamped(self._path, self._first_ns), 'end_ns': self._last_ns,
-            'frames': self._writer.n_frames, 'stretches': self._writer.n_stretches,
+            'frames': self._writer.n_frames, 'stretches': self._writer.n_segments,
             'size': self._recording.size, 'lost': _text(self._recording.losses),
             'rejected': _text(self._reader.rejected + Counter(self._passes.rejected)),
             'missing_topics': ' '.join(missing),
-            'why_no_detection': self._passes.why_no_detection(missing) or ''}
+            'no_detection_reason': self._passes.no_detection_reason(missing) or ''}
 
     def _see(self, frame: FieldFrame) -> None:
         """Take a frame with its verdict."""
         self._first_ns = frame.stamp_ns if self._first_ns is None else self._first_ns
         self._last_ns = frame.stamp_ns
-        self._writer.add_frame(frame, self._passes.calibrate.doubtful_stretches())
+        self._writer.add_frame(frame, self._passes.calibrate.doubtful_intervals())
         self._add_health(self._health.due(frame.stamp_ns, self._passes.calibrate))
 
     def _add(self, passes: Iterable[tuple[PassData, tuple[str, ...]]]) -> None:
@@ -197,19 +197,19 @@ class _Cut:
             self._health_table.add(row)
 
 
-def track_stretch(job: Job, k: int) -> None:
+def track_segment(job: Job, k: int) -> None:
     """Track a stretch and fit its passes: its tables. Raises OutputError."""
-    if not job.stretch(k).exists():
-        with _attempt(job.stretch(k)) as folder:
-            _track_into(folder, job, k, NotedEvidence(len(job.network)))
+    if not job.segment(k).exists():
+        with _attempt(job.segment(k)) as folder:
+            _track_into(folder, job, k, RecordedEvidence(len(job.network)))
 
 
-def _track_into(folder: Path, job: Job, k: int, evidence: NotedEvidence) -> None:
+def _track_into(folder: Path, job: Job, k: int, evidence: RecordedEvidence) -> None:
     """Track a stretch by the `evidence` on the clocks of those before it; its tables."""
     tracker = TrackManager(job.network, job.settings.track, evidence)
-    with StretchTables(job.recording, {name: folder / f'{name}.parquet' for name in TRACKED},
+    with SegmentTables(job.recording, {name: folder / f'{name}.parquet' for name in TRACKED},
                        N_DIPOLES, job.settings.track) as tables:
-        for piece in read_stretch(job.cut / f'stretch-{k}.pickle'):
+        for piece in read_segment(job.cut / f'stretch-{k}.pickle'):
             tables.track(piece, tracker)
         tables.finish(tracker)
     with _written(folder / TRACKED_FILE), open(folder / TRACKED_FILE, 'wb') as stream:
@@ -225,11 +225,11 @@ def join(job: Job) -> dict[str, Any]:
     Raises OutputError.
     """
     known = cut(job)
-    name, evidence = name_of(job.recording), NotedEvidence(len(job.network))
+    name, evidence = name_of(job.recording), RecordedEvidence(len(job.network))
     folders, shifts, n_tracks, n_passes = [], [], 0, 0
     with tempfile.TemporaryDirectory(dir=job.work, prefix='.again.') as again:
         for k in range(known['stretches']):
-            folder = job.stretch(k)
+            folder = job.segment(k)
             found = _tracked(folder)
             evidence.passes = []
             together = copy.deepcopy(evidence)
@@ -254,7 +254,7 @@ def join(job: Job) -> dict[str, Any]:
 
 
 def _tracked(folder: Path) -> _Tracked:
-    """The result of `track_stretch` in a folder, beside its tables."""
+    """The result of `track_segment` in a folder, beside its tables."""
     with open(folder / TRACKED_FILE, 'rb') as stream:
         tracked: _Tracked = pickle.load(stream)
     return tracked

@@ -25,7 +25,7 @@ from mag_tracking.recording.pose_table import (
 ASSUMED_NOISE = 1e-7
 """[T] Of sensors of which nobody says it; near a magnet the error of the field is larger."""
 
-LEAST_TURN = 1e-7
+MIN_TURN = 1e-7
 """[rad] A smaller deviation is one of an orientation that was held fixed."""
 
 FIRST_ROW = 2
@@ -163,7 +163,7 @@ def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: 
         if network.noise_std[j] is not None:
             columns['noise_std'][j] = network.noise_std[j] / abs(gain)
         std = _world_std(geometry, j)
-        if (std > LEAST_TURN).all():
+        if (std > MIN_TURN).all():
             columns['orientation_std'][j] = std
         before = network.calibrated[j]
         columns['calibrated'][j] = network.marked(

@@ -18,7 +18,7 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.survey.stage import NetworkSurvey, Survey, with_noise
 
-LEAST_POSES = 8
+MIN_POSES = 8
 """A track with fewer tells nothing of the sensors."""
 
 
@@ -136,7 +136,7 @@ def _passes(recording: Recording, network: SensorNetwork, settings: Settings,
     except ReadingStopped:
         interrupted = True
     take(pipeline.flush())
-    return [track for n, track in poses.values() if n >= LEAST_POSES], interrupted
+    return [track for n, track in poses.values() if n >= MIN_POSES], interrupted
 
 
 def _marked(network: SensorNetwork, surveyed: SensorNetwork, date: str,

@@ -14,7 +14,7 @@ from mag_tracking.report.page import ERROR, NOTE, WARNING, Chart, Note, Page, Ta
 from mag_tracking.report.page_charts import axes, curve, plain
 from mag_tracking.report.palette import SERIES
 
-MOST_KNOCKS = 8
+MAX_KNOCKS = 8
 """Maximum number of sensors in the charts of knocks."""
 SHOWN_S = 0.25
 """[s] Time shown before and after a knock."""
@@ -42,7 +42,7 @@ def calibration_page(found: Calibration, stated: SensorNetwork, name: str) -> Pa
 
 def _knocks(found: Calibration) -> list[Chart]:
     """Charts of the first knock, before and after clock correction."""
-    shocks = dict(list(found.survey.shocks.items())[:MOST_KNOCKS])
+    shocks = dict(list(found.survey.shocks.items())[:MAX_KNOCKS])
     if not shocks:
         return []
     first, charts = first_knock(shocks), []

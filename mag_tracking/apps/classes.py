@@ -17,7 +17,7 @@ from mag_tracking.analysis.signature_classifier import (
     feature_table,
     train,
 )
-from mag_tracking.apps.first_pass import first_pass_of
+from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import LabelsError
 from mag_tracking.network import SensorNetwork
@@ -142,7 +142,7 @@ def _calibrated(path: Path, network: SensorNetwork) -> Readings:
     settings = settings_for('vehicle')
     recording = Recording(path)
     calibrate = Calibrate(network, settings.calibrate)
-    first_pass_of(recording, network, settings.calibrate).apply(calibrate)
+    prescan_of(recording, network, settings.calibrate).apply(calibrate)
     parts = [part for batch in SampleReader(recording, network).readings()
              for part in calibrate.feed(batch)]
     return Readings.joined([*parts, *calibrate.flush()])

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 
 from mag_tracking.apps.doctor_covariances import covariance_findings
-from mag_tracking.apps.first_pass import first_pass_of
+from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.agreement import consensus, disagreements
 from mag_tracking.network import SensorNetwork
@@ -100,7 +100,7 @@ def _clock_findings(network: SensorNetwork,
         if abs(delay - right) > APART_S:
             yield Finding(True, name, f'its stamps are {right - delay:+.4g} s off those of other '
                           'sensors', 'set its clock (chrony, PTP); knocks compare only what is '
-                          'within survey.longest_clock_offset_s')
+                          'within survey.max_clock_offset_s')
 
 
 def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | None,
@@ -225,7 +225,7 @@ def examine(recording: Recording, network: SensorNetwork, settings: Settings,
     Raises RecordingError where the recording has none of the network's topics.
     """
     reader, doctor = SampleReader(recording, network), Doctor(network, settings)
-    first_pass_of(recording, network, settings.calibrate, stopped).apply(doctor.calibrate)
+    prescan_of(recording, network, settings.calibrate, stopped).apply(doctor.calibrate)
     for readings, received_ns in reader.readings_as_received(progress):
         doctor.feed(readings, received_ns)
         if stopped is not None and stopped():

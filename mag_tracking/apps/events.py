@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from os import PathLike
 from typing import Any
 
-from mag_tracking.apps.first_pass import first_pass_of
+from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.apps.readings import network_of
 from mag_tracking.event_records import PassEvent
 from mag_tracking.network import SensorNetwork
@@ -78,7 +78,7 @@ def find_events(recording: Recording, network: SensorNetwork, settings: Settings
     reader = SampleReader(recording, network)
     calibrate = Calibrate(network, settings.calibrate)
     stage = Events(network, settings.align, settings.detect)
-    first_pass_of(recording, network, settings.calibrate, stopped).apply(calibrate)
+    prescan_of(recording, network, settings.calibrate, stopped).apply(calibrate)
     found: list[PassEvent] = []
     try:
         for readings in until_stopped(reader.readings, progress, stopped):

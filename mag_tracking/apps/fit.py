@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mag_tracking.apps.first_pass import first_pass_of
 from mag_tracking.apps.pass_fitter import FittedPass, PassFitter
+from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.apps.readings import network_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
@@ -64,7 +64,7 @@ class RecordingFit:
 
         `progress` and `stopped` are as for `apps.replay.replay`.
         """
-        first_pass_of(self._recording, self._network, self._settings,
+        prescan_of(self._recording, self._network, self._settings,
                       stopped).apply(self._fitter.collector.calibrate)
         for readings in self._reader.readings(progress):
             if stopped is not None and stopped():
@@ -79,7 +79,7 @@ class RecordingFit:
         lines += [f'no background was learnt for {name}: the field was not steady for long enough; '
                   'give background and noise_std in the network file'
                   for name in collector.waiting()]
-        why = collector.why_no_detection(self._reader.missing_topics())
+        why = collector.no_detection_reason(self._reader.missing_topics())
         lines += [f'nothing was detected: {why}'] if why else []
         for counts in (self._reader.rejected, collector.rejected, self._recording.losses):
             lines += [f'{cause}: {n}' for cause, n in counts.items()]

@@ -79,7 +79,7 @@ def _track(number: int, one: FittedPass, fit: PassFit, begin: float) -> dict[str
     F = np.tile(np.eye(6), (STEPS, 1, 1))
     F[:, :3, 3:] = t[:, None, None] * np.eye(3)
     state = F @ fit.x[:6]
-    C = F @ fit.honest_covariance[:6, :6] @ F.transpose(0, 2, 1)
+    C = F @ fit.robust_covariance[:6, :6] @ F.transpose(0, 2, 1)
     alone = target_alone(fit)
     level = fit.predicted - alone
     fields = [field_entry(int(j), (data.field - level)[data.sensor == j], alone[data.sensor == j],

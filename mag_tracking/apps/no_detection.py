@@ -13,7 +13,7 @@ TOO_LARGE = 3.0
 """A noise that is stated this many times larger than the readings scatter stands in the way."""
 
 
-def why_no_detection(network: SensorNetwork, settings: Settings, calibrate: Calibrate,
+def no_detection_reason(network: SensorNetwork, settings: Settings, calibrate: Calibrate,
                      detect: Detect, missing_topics: Sequence[str],
                      rejected: Mapping[str, int]) -> str | None:
     """One sentence; None where something was detected.

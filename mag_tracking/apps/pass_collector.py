@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
-from mag_tracking.apps.no_detection import why_no_detection
+from mag_tracking.apps.no_detection import no_detection_reason
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.saturation import cut_off
 from mag_tracking.network import SensorNetwork
@@ -20,7 +20,7 @@ from mag_tracking.units import NS
 
 PAD_S = 1.0
 """[s] What is taken before a detection begins: there the background is seen alone."""
-LONGEST_S = 60.0
+MAX_S = 60.0
 """[s] What is seen for longer does not pass; it is cut there."""
 
 
@@ -54,10 +54,10 @@ class PassCollector:
                 total[cause] = total.get(cause, 0) + n
         return total
 
-    def why_no_detection(self, missing_topics: Sequence[str]) -> str | None:
-        """One sentence, or None where something was detected; see `why_no_detection`."""
+    def no_detection_reason(self, missing_topics: Sequence[str]) -> str | None:
+        """One sentence, or None where something was detected; see `no_detection_reason`."""
         calibrate, _, detect = self._stages
-        return why_no_detection(self._network, self._settings, calibrate, detect, missing_topics,
+        return no_detection_reason(self._network, self._settings, calibrate, detect, missing_topics,
                                 self.rejected)
 
     def waiting(self) -> list[str]:
@@ -106,9 +106,9 @@ class PassCollector:
                 self._onset_ns = record.stamp_ns
             elif self._onset_ns is not None:
                 out.append(self._cut(self._onset_ns, record.stamp_ns))
-        if self._onset_ns is not None and frame.stamp_ns - self._onset_ns > LONGEST_S * NS:
+        if self._onset_ns is not None and frame.stamp_ns - self._onset_ns > MAX_S * NS:
             out.append(self._cut(self._onset_ns, frame.stamp_ns, 'it is seen for more than '
-                                 f'{LONGEST_S:.0f} s: what comes after, until it is gone, is '
+                                 f'{MAX_S:.0f} s: what comes after, until it is gone, is '
                                  'left out'))
         self._last_ns = frame.stamp_ns
         begin = (frame.stamp_ns if self._onset_ns is None else self._onset_ns) - PAD_S * NS

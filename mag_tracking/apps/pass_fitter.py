@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from mag_tracking.analysis.correlated_motion import CorrelatedMotion, correlated_motion
+from mag_tracking.analysis.joint_fit import GroundPrior, are_separate, path_from
 from mag_tracking.analysis.model_order import choose_order
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import NEARLY, PassFit
 from mag_tracking.analysis.pass_targets import fit_targets
 from mag_tracking.analysis.pass_trust import contradicted
-from mag_tracking.analysis.superposed_fit import GroundPrior, are_separate, path_from
 from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.arrays import FloatArray
@@ -115,7 +115,7 @@ class PassFitter:
 
     def _track(self, frame: FieldFrame) -> None:
         """Take a frame for the tracks."""
-        self._tracker.doubt(self.collector.calibrate.doubtful_stretches())
+        self._tracker.doubt(self.collector.calibrate.doubtful_intervals())
         self._tracks.take(self._tracker.feed(frame))
 
     def _fitted(self, passes: Iterable[tuple[PassData, tuple[str, ...]]],

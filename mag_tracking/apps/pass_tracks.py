@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mag_tracking.analysis.joint_fit import GroundPrior, are_separate
 from mag_tracking.analysis.pass_data import PassData
-from mag_tracking.analysis.superposed_fit import GroundPrior, are_separate
 from mag_tracking.arrays import FloatArray
 from mag_tracking.geometry import moved_along
 from mag_tracking.records import Track

@@ -24,7 +24,7 @@ from mag_tracking.physics.motion import constant_velocity, integrator_noise
 from mag_tracking.pipeline import Settings
 from mag_tracking.stages.track.settings import acceleration_density
 
-MOST_FRAMES = 1000
+MAX_FRAMES = 1000
 """Of a pass, when it is asked whether it is missed: slower ones are not missed more."""
 
 Area: TypeAlias = tuple[float, float, float, float]
@@ -273,7 +273,7 @@ def _missed(network: SensorNetwork, target: PlannedTarget, sampling: Sampling, l
     half = 0.5 * max(area[2] - area[0], area[3] - area[1])
     offsets = np.linspace(0.0, 2.0 * half, 25)
     u = np.array([np.cos(lane.heading), np.sin(lane.heading)])
-    n = int(np.clip(4.0 * half / (target.speed * sampling.period), 1, MOST_FRAMES))
+    n = int(np.clip(4.0 * half / (target.speed * sampling.period), 1, MAX_FRAMES))
     along = np.linspace(-2.0 * half, 2.0 * half, n)[:, None]
     detect, out = settings.detect, []
     for offset in offsets:

@@ -10,7 +10,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.files import replace_text
 from mag_tracking.report.page import NOTE, REPORT, Chart, Note, Page, Table, report_html
 from mag_tracking.report.page_charts import axes, curve, heat_map, places
-from mag_tracking.report.plan_figures import LEAST_MISSED, distinct, f_text
+from mag_tracking.report.plan_figures import MIN_MISSED, distinct, f_text
 from mag_tracking.report.scales import scale_of
 
 LOW_SHARE = 0.02
@@ -133,7 +133,7 @@ def _lanes(plan: Plan) -> list[Chart]:
         bounds += [curve(along, f * lane.filter_std, f'{name}: filter so far', 2 * k),
                    curve(along, f * lane.pass_std[:, 0], f'{name}: whole pass', 2 * k + 1)]
         seen.append(curve(along, lane.detection, name, k))
-    known = plan.missed[plan.missed[:, 1] >= LEAST_MISSED]
+    known = plan.missed[plan.missed[:, 1] >= MIN_MISSED]
     way = f'distance along the lane, 0 = nearest to the middle [{unit}]'
     return [Chart('Position bound along the lanes', bounds,
                   axes(way, f'deviation [{unit}]', log_y=True)),

@@ -18,7 +18,7 @@ from mag_tracking.records import Readings
 from mag_tracking.report.metrics import Truth
 from mag_tracking.units import LATEST_NS, NS
 
-LONGEST_DELAY_S = 10.0
+MAX_DELAY_S = 10.0
 """[s] Readings that are further behind are taken for unsorted, not for delayed."""
 
 
@@ -181,7 +181,7 @@ def _checked(readings: Readings) -> Readings:
                     None if C is None else np.asarray(C, dtype=float))
 
 
-def check_order(readings: Readings, tolerance: float = LONGEST_DELAY_S) -> None:
+def check_order(readings: Readings, tolerance: float = MAX_DELAY_S) -> None:
     """Raise ReadingsError where a reading is `tolerance` [s] older than one before it."""
     if not len(readings):
         return

@@ -12,8 +12,8 @@ import numpy as np
 from mag_tracking.analysis.consistency import error_over_bound
 from mag_tracking.analysis.correlated_motion import correlated_motion, disagree
 from mag_tracking.analysis.pass_data import PassData
-from mag_tracking.apps.first_pass import FirstPass, first_pass_of
-from mag_tracking.apps.no_detection import why_no_detection
+from mag_tracking.apps.no_detection import no_detection_reason
+from mag_tracking.apps.prescan import Prescan, prescan_of
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.geometry import heading_of, speed_of
@@ -105,7 +105,7 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     table = read_truth_table(truth) if truth is not None and is_table else None
     reader = SampleReader(recording, network, truth if table is None else None)
     pipeline = Pipeline(network, settings)
-    found = first_pass_of(recording, network, settings.calibrate, stopped)
+    found = prescan_of(recording, network, settings.calibrate, stopped)
     found.apply(pipeline.calibrate)
     interrupted = False
 
@@ -180,7 +180,7 @@ class RunCollector:
 
 def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
               taker: RunCollector, truth: Mapping[str, Truth],
-              found: FirstPass) -> dict[str, Any]:
+              found: Prescan) -> dict[str, Any]:
     """The content of `summary.json`."""
     rejections = dict(reader.rejected + Counter(pipeline.rejections()))
     sensors: dict[str, dict[str, Any]] = {}
@@ -189,8 +189,8 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
         sensors[name] = {'accepted': counts['accepted'], 'rejected': counts['rejected'],
                          'ready': background.ready, 'stuck': background.stuck,
                          'times_relearnt': background.n_relearnt,
-                         'doubtful_ns': [list(stretch) for stretch in background.doubtful_times],
-                         'quiet_stretch_s': found.stretch_of(name)}
+                         'doubtful_ns': [list(segment) for segment in background.doubtful_times],
+                         'quiet_stretch_s': found.segment_of(name)}
         covariance = background.covariance
         if background.ready and covariance is not None and counts['accepted']:
             std = np.sqrt(np.diagonal(covariance))
@@ -200,11 +200,11 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
     tracks = [_track_entry(log, taker.smoothed.get(log.id), pipeline, truth)
               for log in taker.logs.values()]
     disturbances = [asdict(d) for d in taker.disturbances.values()]
-    why = why_no_detection(pipeline.network, pipeline.settings, pipeline.calibrate,
+    why = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
                            pipeline.detect, reader.missing_topics(), rejections)
     return {'recording': recording.path.name, 'target': pipeline.settings.track.target,
             'counts': pipeline.counts(), 'rejected': rejections, 'lost': dict(recording.losses),
-            'why_no_detection': why,
+            'no_detection_reason': why,
             'close_network': len(pipeline.network) > 1 and pipeline.network.is_close,
             'frames_too_long': too_long(pipeline.settings.align, pipeline.network),
             'clocks_apart': pipeline.track.clocks_apart,

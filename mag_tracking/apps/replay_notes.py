@@ -26,9 +26,9 @@ def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
     sensors = summary['sensors']
     for topic in summary['missing_topics']:
         yield Note(WARNING, f'nothing on {topic}')
-    if summary['why_no_detection']:
+    if summary['no_detection_reason']:
         yield Note(NOTE, f'nothing was detected with the settings for a {summary["target"]}: '
-                   f'{summary["why_no_detection"]}')
+                   f'{summary["no_detection_reason"]}')
     for what, n in {**summary['rejected'], **summary['lost']}.items():
         yield Note(WARNING, f'{what}: {n}')
     stuck = [name for name, s in sensors.items() if s['stuck']]
@@ -45,7 +45,7 @@ def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
                        f'its most frequent level, at {begin:.1f} to {end:.1f} s')
 
 
-def why_no_track(counts: Mapping[str, int]) -> str | None:
+def no_track_reason(counts: Mapping[str, int]) -> str | None:
     """One sentence where one sensor alone measured; `counts` of the tracker."""
     if counts.get(NO_SCALE, 0) or counts.get(ALONE, 0) and not counts.get('tracks', 0):
         return ('no track: one sensor does not tell the scale. `mag-tracking events` describes '
@@ -57,7 +57,7 @@ def why_no_track(counts: Mapping[str, int]) -> str | None:
 def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
     """Notes on the limits of the tracks and their causes."""
     counts = summary['counts']['track']
-    why = why_no_track(counts)
+    why = no_track_reason(counts)
     if why:
         yield Note(NOTE, why)
     elif len(summary['sensors']) == 1 and summary['tracks']:
@@ -81,7 +81,7 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
                    'network file says: calibrate them')
     too_long = counts.get('tracks too long to smooth', 0)
     if too_long:
-        yield Note(WARNING, f'{too_long} tracks were too long to smooth (track.smooth_longest_s, '
+        yield Note(WARNING, f'{too_long} tracks were too long to smooth (track.max_smoothing_s, '
                    'or too many frames for so many sensors)')
 
 

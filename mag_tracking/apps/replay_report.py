@@ -13,8 +13,8 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.report.metrics import interpolate_truth
 from mag_tracking.report.page import NOTE, REPORT, Note, Page, Table, report_html
 from mag_tracking.report.page_scene import (
-    MOST_SENSORS,
-    MOST_TRACKS,
+    MAX_SENSORS,
+    MAX_TRACKS,
     facts_of,
     most_poses_of,
     path_entry,
@@ -40,7 +40,7 @@ def replay_page(run: Run, network: SensorNetwork) -> Page:
     if summary['interrupted']:
         notes.insert(0, Note(NOTE, 'the replay was interrupted; results are incomplete'))
     if logs:
-        scene = _scene(run, network, logs[:MOST_TRACKS], notes)
+        scene = _scene(run, network, logs[:MAX_TRACKS], notes)
     counts = summary['counts']
     return Page(f'{summary["recording"]}: {len(logs)} track{"s" * (len(logs) != 1)}',
                 f'{counts["align"].get("frames", 0)} frames, '
@@ -57,8 +57,8 @@ def _scene(run: Run, network: SensorNetwork, logs: Sequence[TrackLog],
     most = most_poses_of(logs)
     if any(len(log.stamp_ns) > most for log in logs):
         notes.append(Note(NOTE, f'the page shows {most} poses per track; poses.csv has all'))
-    if len(network) > MOST_SENSORS:
-        notes.append(Note(NOTE, f'fields are shown for the {MOST_SENSORS} sensors (of '
+    if len(network) > MAX_SENSORS:
+        notes.append(Note(NOTE, f'fields are shown for the {MAX_SENSORS} sensors (of '
                           f'{len(network)}) with the strongest field of each track'))
     begin_ns = min(log.stamp_ns[0] for log in logs)
     entries = {t['id']: t for t in run.summary['tracks']}

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
-from mag_tracking.apps.first_pass import first_pass, first_pass_of
-from mag_tracking.apps.no_detection import why_no_detection
+from mag_tracking.apps.no_detection import no_detection_reason
+from mag_tracking.apps.prescan import prescan, prescan_of
 from mag_tracking.apps.readings import (
     RecordedReadings,
     check_order,
@@ -70,7 +70,7 @@ class TrackingResult:
     """{damage: number} of what could not be read from the recording."""
     missing_topics: tuple[str, ...]
     """Topics of the network that are not in the recording."""
-    why_no_detection: str | None
+    no_detection_reason: str | None
     """One sentence where nothing was detected; else None."""
     sensors_without_background: tuple[str, ...]
     """Sensors that were not used because their background was never learnt: the readings need a
@@ -84,8 +84,8 @@ class TrackingResult:
                  *(f'nothing on {topic}' for topic in self.missing_topics),
                  *([f'{len(self.disturbances)} disturbances'] if self.disturbances else []),
                  *(f'no background of {name}' for name in self.sensors_without_background)]
-        if self.why_no_detection:
-            notes.append(f'nothing was detected: {self.why_no_detection}')
+        if self.no_detection_reason:
+            notes.append(f'nothing was detected: {self.no_detection_reason}')
         return (f'TrackingResult({len(self.tracks)} tracks, {len(self.poses)} poses, '
                 f'{len(self.smoothed)} smoothed poses, {len(self.detections)} detections'
                 + (f'; {"; ".join(notes)}' if notes else '') + ')')
@@ -211,7 +211,7 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
         source = RecordedReadings(source, {}, {}, {}, ())
     if isinstance(source, RecordedReadings):
         source = replace(source, readings=checked_readings(source.readings, network))
-        first_pass(_parts(source.readings), network,
+        prescan(_parts(source.readings), network,
                    pipeline.settings.calibrate).apply(pipeline.calibrate)
         for readings in _parts(source.readings):
             collector.take(pipeline.feed(readings))
@@ -219,7 +219,7 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
     else:
         recording = Recording(source)
         reader = SampleReader(recording, network)
-        first_pass_of(recording, network, pipeline.settings.calibrate).apply(pipeline.calibrate)
+        prescan_of(recording, network, pipeline.settings.calibrate).apply(pipeline.calibrate)
         for readings in reader.readings():
             collector.take(pipeline.feed(readings))
         info = recorded(recording, reader, Readings.joined([]))
@@ -265,7 +265,7 @@ def _result(pipeline: Pipeline, results: _Results, tracks: dict[int, TrackLog],
             recording: RecordedReadings) -> TrackingResult:
     """The results as arrays; the readings of `recording` are not used."""
     rejections = dict(Counter(recording.rejected) + Counter(pipeline.rejections()))
-    why = why_no_detection(pipeline.network, pipeline.settings, pipeline.calibrate,
+    why = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
                            pipeline.detect, recording.missing_topics, rejections)
     return TrackingResult(
         pipeline.network, pipeline.settings, pose_array(results.poses),

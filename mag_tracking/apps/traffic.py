@@ -10,10 +10,10 @@ import numpy as np
 
 from mag_tracking.analysis.correlated_motion import CorrelatedMotion, correlated_motion, disagree
 from mag_tracking.analysis.pass_data import PassData
-from mag_tracking.apps.first_pass import first_pass_of
-from mag_tracking.apps.no_detection import why_no_detection
+from mag_tracking.apps.no_detection import no_detection_reason
+from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.apps.readings import network_of
-from mag_tracking.apps.replay_notes import why_no_track
+from mag_tracking.apps.replay_notes import no_track_reason
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import TrafficSummary, VehiclePassage
 from mag_tracking.network import SensorNetwork
@@ -60,9 +60,9 @@ class TrafficResult:
     """{cause: number} of readings that were not used."""
     missing_topics: tuple[str, ...]
     sensors_without_background: tuple[str, ...]
-    why_no_detection: str | None
+    no_detection_reason: str | None
     """One sentence where nothing was detected; else None."""
-    why_no_track: str | None
+    no_track_reason: str | None
     """One sentence where one sensor alone measured, so that nothing was tracked; else None."""
 
     def __repr__(self) -> str:
@@ -113,7 +113,7 @@ def count_traffic(recording: Recording, network: SensorNetwork, settings: Settin
         raise SettingsError(f'traffic counts vehicles; the target is a {settings.track.target}')
     pipeline = Pipeline(network, settings)
     reader = SampleReader(recording, network)
-    first_pass_of(recording, network, settings.calibrate, stopped).apply(pipeline.calibrate)
+    prescan_of(recording, network, settings.calibrate, stopped).apply(pipeline.calibrate)
     counter = _Counter(network)
     try:
         for readings in until_stopped(reader.readings, progress, stopped):
@@ -122,12 +122,12 @@ def count_traffic(recording: Recording, network: SensorNetwork, settings: Settin
         pass
     counter.take(pipeline.flush())
     rejections = dict(reader.rejected + Counter(pipeline.rejections()))
-    why = why_no_detection(network, settings, pipeline.calibrate, pipeline.detect,
+    why = no_detection_reason(network, settings, pipeline.calibrate, pipeline.detect,
                            reader.missing_topics(), rejections)
     return TrafficResult(settings.traffic.class_names, tuple(counter.vehicles),
                          tuple(counter.summaries), dict(pipeline.traffic.counts), rejections,
                          tuple(reader.missing_topics()), tuple(pipeline.calibrate.unready()), why,
-                         why_no_track(pipeline.counts()['track']))
+                         no_track_reason(pipeline.counts()['track']))
 
 
 class _Counter:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
-from mag_tracking.apps.first_pass import first_pass_of
+from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.arrays import FloatArray
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Output, Pipeline, Settings
@@ -18,7 +18,7 @@ from mag_tracking.web.live_scene import LiveScene
 
 PART_S = 0.05
 """[s] Duration of a batch of readings."""
-LONGEST_WAIT_S = 5.0
+MAX_WAIT_S = 5.0
 """[s] Longer gaps of a recording are shortened."""
 HEALTH_S = 1.0
 """[s] Interval of health updates."""
@@ -43,12 +43,12 @@ def view(recording: Recording, network: SensorNetwork, settings: Settings, scene
     Raises RecordingError.
     """
     reader, pipeline = SampleReader(recording, network), Pipeline(network, settings)
-    first_pass_of(recording, network, settings.calibrate, stopped).apply(pipeline.calibrate)
+    prescan_of(recording, network, settings.calibrate, stopped).apply(pipeline.calibrate)
     due, before_ns, health_due = time.monotonic(), None, 0.0
     for readings, log_ns in _parts(reader.readings_as_received()):
         # By the time of recording: a single wrong timestamp of a sensor must not stop the page.
         step_s = 0.0 if before_ns is None else (log_ns - before_ns) / NS
-        due, before_ns = due + min(max(step_s, 0.0), LONGEST_WAIT_S) / rate, log_ns
+        due, before_ns = due + min(max(step_s, 0.0), MAX_WAIT_S) / rate, log_ns
         while time.monotonic() < due and not stopped():
             time.sleep(min(0.05, max(0.0, due - time.monotonic())))
         if stopped():

@@ -15,16 +15,16 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.calibration.background_level import BackgroundLevel
-from mag_tracking.calibration.beginning import Beginning
 from mag_tracking.calibration.blocks import Block, Blocks, block_of, pooled_covariance, stacked
-from mag_tracking.calibration.departure import SOONER, Departure
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, doubted_since, noted
 from mag_tracking.calibration.drift import FormerLevel, is_steep
 from mag_tracking.calibration.frequent_level import MORE
+from mag_tracking.calibration.learning_window import LearningWindow
 from mag_tracking.calibration.level_change import Judge, SharedChanges
+from mag_tracking.calibration.level_departure import SOONER, LevelDeparture
 from mag_tracking.calibration.provisional import SEEN_S, FrequentLevel, ProvisionalLevel
-from mag_tracking.calibration.quiet_stretch import QuietStretch, line_of
-from mag_tracking.calibration.resolution import LEAST_STD, corrected_steps
+from mag_tracking.calibration.quiet_interval import QuietInterval, line_of
+from mag_tracking.calibration.resolution import MIN_STD, corrected_steps
 from mag_tracking.units import NS
 
 
@@ -70,8 +70,8 @@ class RunningBackground:
         self._sensors, self._state = sensors, sensors[0]
         self._state['length'], self._state['phase'] = block, np.nan if phase is None else phase
         self._most = max(3, int(round(memory / block)))
-        self._quiet = QuietStretch(guard, self._most)
-        self._beginning = Beginning(learn, block, self._most)
+        self._quiet = QuietInterval(guard, self._most)
+        self._learning_window = LearningWindow(learn, block, self._most)
         self._given = None if background is None else np.asarray(background, dtype=float)
         self._given_noise: FloatArray | None = \
             None if noise_std is None else np.diag(np.asarray(noise_std, float) ** 2)
@@ -79,7 +79,7 @@ class RunningBackground:
         self.n_relearnt = 0
         self.doubtful_times: DoubtfulTimes = ()
         self._provisional = ProvisionalLevel(learn)
-        self._departure = Departure(learn, relearn, self._state, self._level,
+        self._departure = LevelDeparture(learn, relearn, self._state, self._level,
                                     judge or partial(SharedChanges().judge, 0))
         self.forget()
 
@@ -87,7 +87,7 @@ class RunningBackground:
         """Drop what was learnt; what was given beforehand stays."""
         self._state['n'], self._state['end'], self._state['is_full'] = 0, np.nan, False
         self._quiet.clear()
-        self._beginning.clear()
+        self._learning_window.clear()
         self._departure.forget()
         self.frozen = self.stuck = False
         self._resumed = self._relearns_soon = self._contested = self._steep = False
@@ -175,7 +175,7 @@ class RunningBackground:
             return
         block = block_of(self._sensors)
         self._state['is_full'] = False
-        still = (block.n > 1) & (block.scatter.diagonal() < LEAST_STD**2 * (block.n - 1))
+        still = (block.n > 1) & (block.scatter.diagonal() < MIN_STD**2 * (block.n - 1))
         if self.ready and not self._level.is_provisional:
             self._level.apply_steps()
             # An axis with coarse steps rests; one with fine steps is stuck.
@@ -192,8 +192,8 @@ class RunningBackground:
     def _begin(self, block: Block) -> None:
         """Before it is ready: collect until a quiet stretch is long enough."""
         self._since = block.time if np.isnan(self._since) else self._since
-        stretches = self._beginning.stretches(block, self.stuck)
-        if not any(self._adopt_if_steady(s) for s in stretches) and not self.stuck:
+        segments = self._learning_window.segments(block, self.stuck)
+        if not any(self._adopt_if_steady(s) for s in segments) and not self.stuck:
             self._provide(block)
 
     def _provide(self, block: Block) -> None:
@@ -202,7 +202,7 @@ class RunningBackground:
         found = self._provisional.found(corrected_steps(self._sensors))
         if found is not None and self._given is not None:
             self.begin_with(self._given, found.level.covariance)
-            self._beginning.clear()
+            self._learning_window.clear()
         elif found is not None and found.is_certain:
             self._begin_with_frequent(found)
         elif found is not None:
@@ -216,7 +216,7 @@ class RunningBackground:
         """Begin with a level that is frequent enough; others may still take its place."""
         self.begin_with(found.level.level, found.level.covariance)
         self._seen_s, self.frozen, self._contested = found.seen_s, False, False
-        self._beginning.clear()
+        self._learning_window.clear()
         self._departure.end()
 
     def _follow(self, block: Block) -> None:
@@ -278,7 +278,7 @@ class RunningBackground:
             self._change_to(latest, former_seen_s)
             return True
         is_given = self._given is not None and self._departure.former is None
-        if not self._departure.has_left(latest) or is_given:
+        if not self._departure.has_departed(latest) or is_given:
             return False
         since_ns = int(self._state['first_ns']) + round(np.nan_to_num(self._since) * NS)
         self._change_to(latest, self._learn)
@@ -318,7 +318,7 @@ class RunningBackground:
         if self._given is not None and self._level.line is not None and not self.n_relearnt \
                 and not self.frozen:
             # The background was given and only the noise had to be learnt.
-            self._beginning.clear()
+            self._learning_window.clear()
             return True
         if self.frozen and self._level.line is not None:
             self._depart_from(float(blocks.time[0]))
@@ -328,7 +328,7 @@ class RunningBackground:
         self._seen_until = float(blocks.time[-1])
         self._level.rely()
         self._quiet.begin(collected)
-        self._beginning.clear()
+        self._learning_window.clear()
         self._fit(self._quiet.blocks())
         return True
 

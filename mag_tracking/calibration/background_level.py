@@ -9,7 +9,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.calibration import core
 from mag_tracking.calibration.blocks import Block, Blocks, line_through, one_is_loud, stacked
-from mag_tracking.calibration.resolution import LEAST_STD, completed_steps, corrected_steps
+from mag_tracking.calibration.resolution import MIN_STD, completed_steps, corrected_steps
 from mag_tracking.records import plain
 
 _Line: TypeAlias = tuple[float, FloatArray, FloatArray, float]
@@ -61,16 +61,16 @@ class BackgroundLevel:
     def without_dead_axes(self, noise: FloatArray) -> FloatArray:
         """(3, 3) [T^2] `noise` with NaN for an axis that has not changed and does not rest."""
         steps, variance = corrected_steps(self._sensors), noise.diagonal()
-        if np.isfinite(steps).all() and (variance > LEAST_STD**2).all():
+        if np.isfinite(steps).all() and (variance > MIN_STD**2).all():
             return noise
         steps = completed_steps(variance, steps)
-        dead = ~np.isfinite(steps) | (steps == 0.0) & (variance <= LEAST_STD**2)
+        dead = ~np.isfinite(steps) | (steps == 0.0) & (variance <= MIN_STD**2)
         return np.where(dead[:, None] | dead, np.nan, noise)
 
     def without_unknown_noise(self, covariance: FloatArray) -> FloatArray:
         """(3, 3) [T^2] `covariance` with NaN for an axis that neither changes nor has steps."""
         steps = corrected_steps(self._sensors)
-        dead = (covariance.diagonal() <= LEAST_STD**2) & ~(np.isfinite(steps) & (steps > 0.0))
+        dead = (covariance.diagonal() <= MIN_STD**2) & ~(np.isfinite(steps) & (steps > 0.0))
         return np.where(dead[:, None] | dead, np.nan, covariance)
 
     def rely(self, deviation: FloatArray | float = 0.0, is_provisional: bool = False) -> None:

@@ -10,7 +10,7 @@
 namespace mag_tracking {
 
 // A block has at least so many readings, however slow the sensor: fewer tell nothing of noise.
-constexpr int LEAST_SAMPLES = 8;
+constexpr int MIN_SAMPLES = 8;
 
 // Field without the background at `time` [s]: from `field` (3) [T] into `out` (3).
 //
@@ -31,7 +31,7 @@ inline void begin_block_if_due(Sensor& s, double time) {
         s.end = time + s.length * (std::isnan(s.phase) ? 1.0 : 1.0 + s.phase);
         return;
     }
-    if (!(time >= s.end && s.n[s.now] >= LEAST_SAMPLES)) return;
+    if (!(time >= s.end && s.n[s.now] >= MIN_SAMPLES)) return;
     s.now = 1 - s.now, s.is_full = 1;
     s.n[s.now] = 0;
     if (std::isnan(s.phase))

@@ -11,7 +11,7 @@ using Structured = py::array;
 
 // Python may have changed what is used as an index.
 Sensor& checked(Sensor& s) {
-    if (s.now < 0 || s.now > 1 || s.n_held < 0 || s.n_held > MOST_HELD + 1 || s.n_steps < 0)
+    if (s.now < 0 || s.now > 1 || s.n_held < 0 || s.n_held > MAX_HELD + 1 || s.n_steps < 0)
         throw py::value_error("now, n_held or n_steps of a sensor: out of range");
     return s;
 }
@@ -101,14 +101,14 @@ py::object pooled_covariance(Array scatter, Array n) {
 
 void add_constants(py::module_& m) {
     m.attr("RECENT") = RECENT;
-    m.attr("MOST_HELD") = MOST_HELD;
+    m.attr("MAX_HELD") = MAX_HELD;
     m.attr("COARSE") = COARSE;
-    m.attr("LEAST_CHANGES") = LEAST_CHANGES;
+    m.attr("MIN_CHANGES") = MIN_CHANGES;
     m.attr("SAME") = SAME;
     m.attr("DITHERED") = DITHERED;
-    m.attr("LEAST_STD") = LEAST_STD;
+    m.attr("MIN_STD") = MIN_STD;
     m.attr("TOGGLE") = TOGGLE;
-    m.attr("LONGEST_REST_NS") = LONGEST_REST_NS;
+    m.attr("MAX_REST_NS") = MAX_REST_NS;
 #define CODE(name) m.attr(#name) = int(name)
     CODE(DONE), CODE(UNKNOWN_SENSOR), CODE(NO_AXIS), CODE(INFINITE), CODE(TOO_LARGE);
     CODE(BAD_COVARIANCE), CODE(AXIS_MISSING), CODE(TOO_FAR_AHEAD), CODE(DUPLICATE);

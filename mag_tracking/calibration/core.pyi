@@ -14,14 +14,14 @@ LIMITS: np.dtype[Any]
 BATCH: np.dtype[Any]
 
 RECENT: int
-MOST_HELD: int
+MAX_HELD: int
 COARSE: float
-LEAST_CHANGES: float
+MIN_CHANGES: float
 SAME: float
 DITHERED: float
-LEAST_STD: float
+MIN_STD: float
 TOGGLE: float
-LONGEST_REST_NS: int
+MAX_REST_NS: int
 
 DONE: int
 UNKNOWN_SENSOR: int

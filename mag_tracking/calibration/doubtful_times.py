@@ -41,14 +41,14 @@ def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTi
     for name, times in latest.items():
         kept = [(begin, end) for begin, end in earlier.get(name, ())
                 if not any(b <= begin and (e is None or begin < e or b == begin) for b, e in times)]
-        stretches: list[tuple[int, int | None]] = []
-        for begin, end in sorted([*kept, *times], key=lambda stretch: stretch[0]):
-            if stretches and stretches[-1][1] is None:
-                stretches[-1] = (stretches[-1][0], begin)
-            stretches.append((begin, end))
-        if stretches and stretches[-1][1] is None and not times:
-            stretches.pop()
-        out[name] = tuple(stretches[-MOST:])
+        segments: list[tuple[int, int | None]] = []
+        for begin, end in sorted([*kept, *times], key=lambda segment: segment[0]):
+            if segments and segments[-1][1] is None:
+                segments[-1] = (segments[-1][0], begin)
+            segments.append((begin, end))
+        if segments and segments[-1][1] is None and not times:
+            segments.pop()
+        out[name] = tuple(segments[-MOST:])
     return out
 
 

@@ -16,7 +16,7 @@ STEEP = 1e-8
 FORGOTTEN_S = 600.0
 """[s] A level that was the background so long ago is no longer remembered."""
 
-MOST_DRIFT = 4.0
+MAX_DRIFT = 4.0
 """By at most so many of the limits of a block such a level may have drifted meanwhile: with a wider
 tolerance any vehicle that halts would seem to be it."""
 
@@ -38,7 +38,7 @@ class FormerLevel:
     def is_at(self, block: Block, limits: FloatArray) -> bool:
         """Whether a block has this level, with `limits` (3,) [T] for its mean."""
         since = block.time - self.until
-        tolerance = limits + np.minimum(DRIFT * since, MOST_DRIFT * limits)
+        tolerance = limits + np.minimum(DRIFT * since, MAX_DRIFT * limits)
         # A comparison with NaN is false: an axis that is not reported differs from nothing.
         is_off = bool((np.abs(block.mean - self.level) > tolerance).any())
         return since <= FORGOTTEN_S and not is_off

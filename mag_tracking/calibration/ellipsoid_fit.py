@@ -20,29 +20,29 @@ from mag_tracking.calibration.ellipsoid_refinement import BASIS, Quality, refine
 from mag_tracking.calibration.quadric import DOUBT, fit_quadric
 from mag_tracking.calibration.saturation import cut_off
 
-LEAST_READINGS = 50
+MIN_READINGS = 50
 """Fewer readings than so many are refused ..."""
 
-LEAST_DIRECTIONS = 18
+MIN_DIRECTIONS = 18
 """... and fewer cells with readings: two for each of the nine parameters."""
 
-LEAST_COVERAGE = 0.01
+MIN_COVERAGE = 0.01
 """Refused below: what disturbs neighbouring directions alike enters ten times as large."""
 
 GOOD_COVERAGE = 0.1
 """Warned of below: three times as large."""
 
-LEAST_THICKNESS = 0.05
+MIN_THICKNESS = 0.05
 """Smallest over largest spread of readings about their mean; flatter is a rotation in a plane."""
 
-MOST_ELONGATED = 5.0
+MAX_ELONGATED = 5.0
 """Longest over shortest axis: soft iron on a sensor's board makes two, or little more."""
 
-MOST_SCATTER = 0.1
+MAX_SCATTER = 0.1
 """Scatter about the ellipsoid, outliers apart, over its radius. A sensor that lies still gives a
 ball of noise, which scatters 0.3 to 0.4 about any ellipsoid through it; usual is 0.01 to 0.03."""
 
-MOST_UNCERTAIN = 0.1
+MAX_UNCERTAIN = 0.1
 """Worst standard deviation of the offset, over the radius."""
 
 GOOD_RESIDUAL = 0.05
@@ -51,7 +51,7 @@ GOOD_RESIDUAL = 0.05
 MANY_OUTLIERS = 0.01
 """A larger share of outliers is warned of ..."""
 
-MOST_OUTLIERS = 0.2
+MAX_OUTLIERS = 0.2
 """... and refused: the robust scatter has lost its meaning."""
 
 GLITCH = 5.0
@@ -184,9 +184,9 @@ def fit_ellipsoid(readings: FloatArray, field_size: float | None = None) -> Elli
         return _refused(reason, counts, notes)
     o, C, P, quality = refine_ellipsoid(z, o, C)
     axes = np.linalg.eigvalsh(C)
-    if not axes[0] * MOST_ELONGATED >= axes[2]:
+    if not axes[0] * MAX_ELONGATED >= axes[2]:
         return _refused(f'axes of the ellipsoid are as {axes[0]:.2g} to {axes[2]:.2g}, at most 1 '
-                        f'to {MOST_ELONGATED:g} is plausible: {DOUBT}', counts, notes)
+                        f'to {MAX_ELONGATED:g} is plausible: {DOUBT}', counts, notes)
     counts['n_outliers'] += quality['n_outliers']
     out = _in_units(o, C, P, centre, scale, field_size)
     residual = _spread(np.linalg.norm((readings[present] - out['offset']) @ out['correction'],
@@ -239,16 +239,16 @@ def _glitches(y: FloatArray) -> BoolArray:
 
 def _too_little(y: FloatArray) -> str:
     """Why no quadric can be fitted; empty where one can."""
-    if len(y) < LEAST_READINGS:
-        return f'{len(y)} readings, needs {LEAST_READINGS}'
+    if len(y) < MIN_READINGS:
+        return f'{len(y)} readings, needs {MIN_READINGS}'
     largest = np.abs(y - y[0]).max()
     if not largest > 0.0:
         return f'all {len(y)} readings are equal: the sensor lay still, or is stuck'
     z = (y - y[0]) / largest
     thick = np.linalg.svd(z - z.mean(axis=0), compute_uv=False)
-    if not thick[2] >= LEAST_THICKNESS * thick[0]:
+    if not thick[2] >= MIN_THICKNESS * thick[0]:
         return (f'readings lie in a plane: thickness {thick[2] / thick[0]:.2g} of their extent, '
-                f'needs {LEAST_THICKNESS}; turn the sensor about more than one axis')
+                f'needs {MIN_THICKNESS}; turn the sensor about more than one axis')
     return ''
 
 
@@ -272,19 +272,19 @@ def _in_units(o: FloatArray, C: FloatArray, P: FloatArray, centre: FloatArray, s
 
 def _why_refused(C: FloatArray, P: FloatArray, quality: Quality, outliers: float) -> str:
     """Why a fit is not to be used; empty where it is."""
-    if quality['scatter'] > MOST_SCATTER:
+    if quality['scatter'] > MAX_SCATTER:
         return (f'readings scatter {quality["scatter"]:.2g} of the radius about the ellipsoid, at '
-                f'most {MOST_SCATTER}: {DOUBT}')
-    if outliers > MOST_OUTLIERS:
-        return f'a share of {outliers:.2g} of the readings are outliers, at most {MOST_OUTLIERS}'
-    if quality['directions'] < LEAST_DIRECTIONS:
-        return f'{quality["directions"]} different directions, needs {LEAST_DIRECTIONS}'
-    if quality['coverage'] < LEAST_COVERAGE:
-        return (f'coverage {quality["coverage"]:.2g}, needs {LEAST_COVERAGE}; octants without '
+                f'most {MAX_SCATTER}: {DOUBT}')
+    if outliers > MAX_OUTLIERS:
+        return f'a share of {outliers:.2g} of the readings are outliers, at most {MAX_OUTLIERS}'
+    if quality['directions'] < MIN_DIRECTIONS:
+        return f'{quality["directions"]} different directions, needs {MIN_DIRECTIONS}'
+    if quality['coverage'] < MIN_COVERAGE:
+        return (f'coverage {quality["coverage"]:.2g}, needs {MIN_COVERAGE}; octants without '
                 f'readings: {", ".join(quality["empty"]) or "none"}')
     uncertain = np.sqrt(np.linalg.eigvalsh(C @ P[:3, :3] @ C)[-1])
-    if not uncertain <= MOST_UNCERTAIN:
-        return f'offset uncertain by {uncertain:.2g} of the radius, at most {MOST_UNCERTAIN}'
+    if not uncertain <= MAX_UNCERTAIN:
+        return f'offset uncertain by {uncertain:.2g} of the radius, at most {MAX_UNCERTAIN}'
     return '' if quality['solved'] else 'least squares did not converge in 100 evaluations'
 
 

@@ -16,13 +16,13 @@ WIDTH = 4.0
 """Blocks are of one level where their means differ by at most this many of their standard
 deviations on each axis."""
 
-LEAST_WIDTH = 5e-9
+MIN_WIDTH = 5e-9
 """[T] Drift makes them differ, too."""
 
 REPORTED = 0.5
 """An axis counts where it is reported in more than this share of the blocks."""
 
-LEAST_BLOCKS = 4
+MIN_BLOCKS = 4
 """Fewer blocks of one level are no background."""
 
 APART = 3.0
@@ -78,7 +78,7 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, most: int) -> QuietLe
     Returns
     -------
     QuietLevel or None
-        None where fewer than `LEAST_BLOCKS` have one level.
+        None where fewer than `MIN_BLOCKS` have one level.
     """
     n = np.maximum(blocks.n, 1.0)
     variance = np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1.0, 1.0)
@@ -93,14 +93,14 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, most: int) -> QuietLe
     calm = (variance[:, known] <= CALM**2 * quietest).all(axis=1)
     width = np.full(3, np.nan)
     width[known] = np.maximum(WIDTH * np.sqrt(quietest / np.median(n[:, known], axis=0)),
-                              np.maximum(TOGGLE * steps[known], LEAST_WIDTH))
+                              np.maximum(TOGGLE * steps[known], MIN_WIDTH))
     rows = np.flatnonzero(calm)
-    if len(rows) < LEAST_BLOCKS:
+    if len(rows) < MIN_BLOCKS:
         return None
     means = blocks.mean[rows][:, known]
     densest = _densest(means, width[known])
     chosen = rows[densest]
-    if len(chosen) < LEAST_BLOCKS:
+    if len(chosen) < MIN_BLOCKS:
         return None
     centre = np.median(means[densest], axis=0)
     others = means[(np.abs(means - centre) > APART * width[known]).any(axis=1)]

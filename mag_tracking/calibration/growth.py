@@ -12,7 +12,7 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 
-LONGEST_GAP = 2.5
+MAX_GAP = 2.5
 """Where more than so many usual intervals are missing, the growth between them is not known."""
 
 
@@ -71,6 +71,6 @@ def growth_of(time: FloatArray, size: FloatArray, least: float, most: float) -> 
         rate = np.log(size[i] / size[i - 1]) if size[i - 1] > 0.0 else np.inf
         times.append(float(time[i] - np.log(size[i] / level) / rate * (time[i] - time[i - 1])))
         begin = begin or i
-    if np.diff(time[begin - 1:end + 1]).max() > LONGEST_GAP * np.median(np.diff(time)):
+    if np.diff(time[begin - 1:end + 1]).max() > MAX_GAP * np.median(np.diff(time)):
         return None
     return Growth(tuple(b - a for a, b in pairwise(times)))

@@ -26,7 +26,7 @@ DECIDED = 0.8
 """Binary logarithm of both ratios together from which on it is decided: it is 0 where both ends are
 alike."""
 
-LEAST_GROWTH = 3.5
+MIN_GROWTH = 3.5
 """Both ends can be seen of a change that is small up to so many times what is felt."""
 
 STALLS = 0.5
@@ -37,7 +37,7 @@ SLOW_START = 0.9
 """At the near end the first half of the growth takes less than this share of the second one. By
 theory 0.7 to 0.24, at the far end 1.3 to 2.6."""
 
-LEAST_BLOCKS = 2.0
+MIN_BLOCKS = 2.0
 """The far end takes so many blocks at least: what jumps neither comes nor leaves."""
 
 CLEAR_SIZE = 60.0
@@ -56,13 +56,13 @@ class LevelChange:
     """[s] When the later level began."""
     size: float
     """Size of the change, in standard deviations of one reading."""
-    has_left: bool | None
+    has_departed: bool | None
     """Whether a vehicle that made the earlier level has left; False: one that makes the later level
     has come; None: unknown."""
 
 
 Judge: TypeAlias = Callable[[LevelChange], bool | None]
-"""Takes the `LevelChange` of a sensor; whether a vehicle has left, as `has_left` there."""
+"""Takes the `LevelChange` of a sensor; whether a vehicle has left, as `has_departed` there."""
 
 
 def level_change(blocks: Blocks, n_steady: int, before: FloatArray, noise_std: FloatArray,
@@ -119,8 +119,8 @@ def _arrow(time: FloatArray, off_before: FloatArray, off_after: FloatArray, felt
     length = float(np.median(np.diff(time)))
     first = growth_of(time, off_before, felt, small)
     last = growth_of(-time[::-1], off_after[::-1], felt, small)
-    if small < LEAST_GROWTH * felt or first is None or last is None \
-            or max(first.whole, last.whole) < LEAST_BLOCKS * length \
+    if small < MIN_GROWTH * felt or first is None or last is None \
+            or max(first.whole, last.whole) < MIN_BLOCKS * length \
             or any(max(end.quarters) > STALLS * end.whole + length for end in (first, last)):
         return 0.0
     # It is not known where within a block an end is.
@@ -147,8 +147,8 @@ class SharedChanges:
         A change that is not clear is judged by the largest one at the same time.
         """
         self._latest[sensor] = change
-        if change.size >= CLEAR_SIZE and change.has_left is not None:
-            return change.has_left
-        together = [other for other in self._latest.values() if other.has_left is not None
+        if change.size >= CLEAR_SIZE and change.has_departed is not None:
+            return change.has_departed
+        together = [other for other in self._latest.values() if other.has_departed is not None
                     and abs(other.since - change.since) < TOGETHER_S]
-        return max(together, key=lambda other: other.size).has_left if together else None
+        return max(together, key=lambda other: other.size).has_departed if together else None

@@ -15,10 +15,10 @@ from mag_tracking.calibration.frequent_level import MORE, QuietLevel, most_frequ
 PATIENCE = 2.0
 """A quiet stretch is waited for so many times as long as it has to be."""
 
-LEAST_BLOCKS = 12
+MIN_BLOCKS = 12
 """It takes so many blocks, however slow the sensor."""
 
-MOST_BLOCKS = 240
+MAX_BLOCKS = 240
 """The level is that of the latest blocks, a minute of the usual length."""
 
 GROWTH = 1.1
@@ -58,8 +58,8 @@ class ProvisionalLevel:
 
     def clear(self) -> None:
         """Begin again."""
-        self._blocks: deque[Block] = deque(maxlen=MOST_BLOCKS)
-        self._since_last, self._due = 0, LEAST_BLOCKS
+        self._blocks: deque[Block] = deque(maxlen=MAX_BLOCKS)
+        self._since_last, self._due = 0, MIN_BLOCKS
 
     def collect(self, block: Block) -> None:
         """Take the next block."""
@@ -79,7 +79,7 @@ class ProvisionalLevel:
             return None
         self._since_last, self._due = 0, max(1, int((GROWTH - 1.0) * len(blocks)))
         all_of = stacked(blocks)
-        level = most_frequent_level(all_of, np.where(np.isfinite(steps), steps, 0.0), MOST_BLOCKS)
+        level = most_frequent_level(all_of, np.where(np.isfinite(steps), steps, 0.0), MAX_BLOCKS)
         if level is None:
             return None
         apart, known = np.full(3, np.nan), ~np.isnan(level.level)

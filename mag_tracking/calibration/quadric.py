@@ -12,7 +12,7 @@ from mag_tracking.calibration.directions import even_weights
 OUTLIER = 4.0
 """[std] Readings further from the ellipsoid are outliers."""
 
-LEAST_SCALE = 1e-9
+MIN_SCALE = 1e-9
 """Residual std, over the radius, below which it is rounding."""
 
 DOUBT = 'too few directions, a sensor that lay still, or a field that is not uniform'
@@ -58,4 +58,4 @@ def robust_std(d: FloatArray, w: FloatArray) -> float:
     order = np.argsort(np.abs(d))
     total = np.cumsum(w[order])
     middle = np.abs(d)[order][np.searchsorted(total, 0.5 * total[-1])]
-    return max(1.4826 * float(middle), LEAST_SCALE)
+    return max(1.4826 * float(middle), MIN_SCALE)

@@ -7,7 +7,7 @@ from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.blocks import Block, block_of, stacked
 from mag_tracking.calibration.drift import DRIFT
 from mag_tracking.calibration.frequent_level import (
-    LEAST_BLOCKS,
+    MIN_BLOCKS,
     MORE,
     WIDTH,
     QuietLevel,
@@ -23,7 +23,7 @@ beginning with a target that came near: there this factor is enough."""
 FOLLOWING = 0.3
 """A level that drifts is that of the latest blocks, each with this share."""
 
-MOST_BLOCKS = 4000
+MAX_BLOCKS = 4000
 """In a longer recording, an even selection of blocks is compared."""
 
 
@@ -44,20 +44,20 @@ class BlockRecorder(RunningBackground):
     def quiet_level(self, since: float = 0.0) -> QuietLevel | None:
         """The most frequent level of the sensor `since` a time [s], or None where it has none."""
         blocks = [block for block in self._blocks if block.time >= since]
-        if len(blocks) < LEAST_BLOCKS:
+        if len(blocks) < MIN_BLOCKS:
             return None
-        every = 1 + len(blocks) // MOST_BLOCKS
+        every = 1 + len(blocks) // MAX_BLOCKS
         steps = corrected_steps(self._sensors)
         return most_frequent_level(stacked(blocks[::every]),
                                    np.where(np.isfinite(steps), steps, 0.0), self._most)
 
-    def is_usual(self, beginning: FloatArray, found: QuietLevel) -> bool:
+    def is_known_level(self, initial: FloatArray, found: QuietLevel) -> bool:
         """Whether the level of the beginning, (3,) [T], is that of the background.
 
         So it is where the field drifts from there to the most frequent level, or has that other
         level for hardly longer.
         """
-        level, since, n = beginning, 0.0, 0
+        level, since, n = initial, 0.0, 0
         for block in self._blocks:
             width = found.width + DRIFT * (block.time - since)
             # A comparison with NaN is false: an axis that is not reported differs from nothing.
@@ -70,15 +70,15 @@ class BlockRecorder(RunningBackground):
                 return True
         # A target that comes near slowly moves the level by little; one that stands there, by more.
         noise = np.sqrt(found.covariance.diagonal() + (found.width / WIDTH)**2)
-        is_near = not (np.abs(beginning - found.level) > NEAR * noise).any()
+        is_near = not (np.abs(initial - found.level) > NEAR * noise).any()
         return (MORE_NEAR if is_near else MORE) * n > found.n_blocks
 
-    def is_back(self, beginning: FloatArray, found: QuietLevel, since: float) -> bool:
+    def has_returned(self, initial: FloatArray, found: QuietLevel, since: float) -> bool:
         """Whether blocks `since` a time [s] have the level of the beginning, (3,) [T], again, as
         wide as the level that was `found`.
         """
-        off = [np.abs(b.mean - beginning) > found.width for b in self._blocks if b.time >= since]
-        return sum(not o.any() for o in off) >= LEAST_BLOCKS
+        off = [np.abs(b.mean - initial) > found.width for b in self._blocks if b.time >= since]
+        return sum(not o.any() for o in off) >= MIN_BLOCKS
 
     @property
     def steps(self) -> FloatArray:

@@ -27,7 +27,7 @@ enum Reason {
 };
 
 // The correlation of two axes that a message states may differ by this from the measured one.
-constexpr double MOST_ALIKE = 0.7;
+constexpr double MAX_CORRELATION = 0.7;
 // The variance that a message states is used where it differs from the measured one by less than
 // this factor.
 constexpr double CREDIBLE = 25.0;
@@ -156,7 +156,7 @@ inline bool is_credible(const Sensor& s, const double* C) {
             const double both = std::sqrt(stated * C[4 * b]);
             const double measured = s.noise[a][b]
                                     / std::sqrt(known * (s.noise[b][b] + s.step_variance[b]));
-            if (std::abs(C[3 * a + b] / both - measured) > MOST_ALIKE) return false;
+            if (std::abs(C[3 * a + b] / both - measured) > MAX_CORRELATION) return false;
         }
     }
     return true;

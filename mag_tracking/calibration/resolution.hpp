@@ -15,14 +15,14 @@ constexpr double SAME = 3e-7;
 // works. A reading that toggles between two steps has a variance of 0.25 at most.
 constexpr double DITHERED = 0.3;
 // [T] An axis that scatters less has not changed at all.
-constexpr double LEAST_STD = 1e-11;
+constexpr double MIN_STD = 1e-11;
 // [steps] An axis that rests on one value may rest on the next one a moment later.
 constexpr double TOGGLE = 1.2;
 // An axis whose steps are larger than its noise stays the same more often than this, for each
 // change.
 constexpr double REPEATS = 0.2;
 // Readings that stay the same for longer count as several measurements, one in each such time.
-constexpr int64_t LONGEST_REST_NS = 300'000'000;
+constexpr int64_t MAX_REST_NS = 300'000'000;
 
 // Update the steps of a sensor, and since when each axis rests on one value. `raw` (3) [T] is as
 // the sensor measured it; NaN = missing axis.
@@ -32,7 +32,7 @@ inline void note_step(Sensor& s, int64_t stamp, const double* raw) {
         if (std::isnan(value)) continue;
         const double change = std::abs(value - s.raw[a]);
         if (change <= SAME * std::abs(value) && stamp >= s.rest_since_ns[a]) {
-            if (stamp - s.rest_since_ns[a] <= LONGEST_REST_NS) ++s.n_rest[a];
+            if (stamp - s.rest_since_ns[a] <= MAX_REST_NS) ++s.n_rest[a];
             continue;
         }
         // A comparison with NaN is false: the first reading changes nothing. Only a rest that has
@@ -112,7 +112,7 @@ inline void apply_steps(Sensor& s, double freeze_std, double* limits) {
     double steps[3], variance[3];
     for (int a = 0; a < 3; ++a) variance[a] = s.noise[a][a];
     corrected_steps(s, steps);
-    constexpr double least = LEAST_STD * LEAST_STD;
+    constexpr double least = MIN_STD * MIN_STD;
     for (int a = 0; a < 3; ++a)
         // An axis without any noise rests, also where it has moved with a target since.
         if (steps[a] == 0.0 && variance[a] <= least)

@@ -14,7 +14,7 @@ from mag_tracking.records import plain
 SAME = core.SAME
 """Values that differ by a smaller share than this differ by rounding only: single precision."""
 
-LEAST_STD = core.LEAST_STD
+MIN_STD = core.MIN_STD
 """[T] An axis that scatters less has not changed at all."""
 
 TOGGLE = core.TOGGLE

@@ -5,10 +5,10 @@ import numpy as np
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.screening import COARSE
 
-LEAST_RUN = 3
+MIN_RUN = 3
 """So many equal readings in a row at an extreme are cut off ..."""
 
-LEAST_JUMP = 3.0
+MIN_JUMP = 3.0
 """... where they were reached by a jump of so many of the smallest steps that the sensor makes: the
 top of a gentle curve in coarse steps is reached by one."""
 
@@ -71,7 +71,7 @@ def cut_off(values: FloatArray) -> BoolArray:
     outliers = isolated(v)
     v[outliers] = v[outliers - 1]
     if max(np.count_nonzero(v == v.min(initial=np.inf)),
-           np.count_nonzero(v == v.max(initial=-np.inf))) < LEAST_RUN:
+           np.count_nonzero(v == v.max(initial=-np.inf))) < MIN_RUN:
         return out
     jumps = np.abs(np.diff(v))
     if not (jumps > 0.0).any():
@@ -86,7 +86,7 @@ def cut_off(values: FloatArray) -> BoolArray:
         edges = np.flatnonzero(np.diff(np.concatenate([[False], at, [False]])))
         for first, end in edges.reshape(-1, 2):
             sides = [jumps[i] for i in (first - 1, end - 1) if 0 <= i < len(jumps)]
-            if end - first >= LEAST_RUN and max(sides) >= LEAST_JUMP * step:
+            if end - first >= MIN_RUN and max(sides) >= MIN_JUMP * step:
                 near = np.flatnonzero(at)[:, None] + np.arange(-MARGIN, MARGIN + 1)
                 out[present[np.clip(near, 0, len(v) - 1)]] = True
                 break

@@ -15,10 +15,10 @@ namespace mag_tracking {
 // Readings over which the usual share of repetitions is counted, about.
 constexpr double MEMORY = 20'000.0;
 // A sensor that has changed less often may have steps so coarse that it repeats itself for long.
-constexpr double LEAST_CHANGES = 50.0;
+constexpr double MIN_CHANGES = 50.0;
 // A run of equal readings is a fault where chance makes it no more often than this.
 const double LIKELY = std::log(1e-9);
-constexpr int SHORTEST_RUN = 4;
+constexpr int MIN_RUN = 4;
 // A sensor that repeats itself more often has steps so coarse that at rest it may do so for ever;
 // with a noise of one step or more, on three axes, the share is below this.
 constexpr double COARSE = 0.05;
@@ -29,7 +29,7 @@ constexpr double STEEPER = 8.0;
 constexpr double FASTEST = 30.0;
 // Largest of `RECENT` differences between readings of white noise, in its standard deviations; the
 // mean.
-constexpr double LARGEST_OF_RECENT = 2.4;
+constexpr double MAX_OF_RECENT = 2.4;
 // A dipole that moves by the share s of its distance between two readings, s above 0.4, makes a
 // difference steeper than the ones before by less than this times s^3, in 99.9 % of the cases
 // (simulated).
@@ -46,7 +46,7 @@ enum Verdict { PASSES, HELD, SPIKE, RELEASED };
 
 // Whether the present run of equal readings is longer than chance makes it.
 inline bool is_too_long(const Sensor& s) {
-    if (s.run < SHORTEST_RUN || s.changes < LEAST_CHANGES) return false;
+    if (s.run < MIN_RUN || s.changes < MIN_CHANGES) return false;
     const double usual = (s.repeats + 1.0) / (s.repeats + s.changes + 2.0);
     return usual < COARSE && double(s.run) * std::log(usual) < LIKELY;
 }
@@ -91,7 +91,7 @@ inline double usual_noise(const Sensor& s, int a) {
     const double step = std::isfinite(s.step[a])
                             ? s.step[a]
                             : std::min({s.step[0], s.step[1], s.step[2], COARSEST});
-    return std::max(largest_recent(s, a) / LARGEST_OF_RECENT, step / std::sqrt(12.0));
+    return std::max(largest_recent(s, a) / MAX_OF_RECENT, step / std::sqrt(12.0));
 }
 
 // Whether `steps` (3) [T] from the reading before are steeper than any target makes them.
@@ -150,7 +150,7 @@ inline void pass(Sensor& s, const Reading& reading, const double* steps) {
 }
 
 // Whether the field is again where it was before the held readings.
-inline bool is_back(const Sensor& s, const double* steps) {
+inline bool has_returned(const Sensor& s, const double* steps) {
     // The axis in which they are highest decides.
     int axis = 0;
     double highest = -1.0;
@@ -172,7 +172,7 @@ inline bool is_back(const Sensor& s, const double* steps) {
 inline Verdict screen_spike(Sensor& s, double threshold, const Reading& reading) {
     double steps[3] = {NAN, NAN, NAN};
     // More are never held when a reading comes.
-    if (s.n_held > MOST_HELD) throw std::out_of_range("n_held of a sensor: no room for another");
+    if (s.n_held > MAX_HELD) throw std::out_of_range("n_held of a sensor: no room for another");
     if (s.before_ns == NEVER) {
         if (s.n_held) {
             hold(s, reading, steps);
@@ -183,9 +183,9 @@ inline Verdict screen_spike(Sensor& s, double threshold, const Reading& reading)
     }
     for (int a = 0; a < 3; ++a) steps[a] = std::abs(reading.field[a] - s.before[a]);
     if (s.n_held) {
-        if (is_back(s, steps)) return SPIKE;
+        if (has_returned(s, steps)) return SPIKE;
         hold(s, reading, steps);
-        if (s.n_held <= MOST_HELD) return HELD;
+        if (s.n_held <= MAX_HELD) return HELD;
         // A step: the differences before it say nothing of what is usual now.
         s.n_steps = 0, s.n_released = s.n_held;
         pass(s, reading, nullptr);

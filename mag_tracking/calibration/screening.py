@@ -8,7 +8,7 @@ from mag_tracking.arrays import Record
 from mag_tracking.calibration import core
 from mag_tracking.units import NEVER
 
-LEAST_CHANGES = core.LEAST_CHANGES
+MIN_CHANGES = core.MIN_CHANGES
 """A sensor that has changed less often may have steps so coarse that it repeats itself for long."""
 COARSE = core.COARSE
 """A sensor that repeats itself more often has steps so coarse that at rest it may do so for ever;

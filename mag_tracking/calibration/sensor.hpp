@@ -11,7 +11,7 @@ namespace mag_tracking {
 // Differences between consecutive readings that a spike is compared with.
 constexpr int RECENT = 8;
 // A spike has at most so many readings; what lasts longer is a step.
-constexpr int MOST_HELD = 3;
+constexpr int MAX_HELD = 3;
 
 struct Sensor {
     // From the network file: clock offset, hard iron, soft iron.
@@ -47,10 +47,10 @@ struct Sensor {
     double before[3];
     int64_t n_steps;
     double steps[RECENT][3];
-    int64_t n_held, n_released, held_ns[MOST_HELD + 1];
-    double held_field[MOST_HELD + 1][3], held_steps[MOST_HELD + 1][3];
-    int64_t held_own[MOST_HELD + 1];
-    double held_covariance[MOST_HELD + 1][3][3];
+    int64_t n_held, n_released, held_ns[MAX_HELD + 1];
+    double held_field[MAX_HELD + 1][3], held_steps[MAX_HELD + 1][3];
+    int64_t held_own[MAX_HELD + 1];
+    double held_covariance[MAX_HELD + 1][3][3];
     // Blocks: length of a block, by which share the first is longer (NaN: blocks are not staggered,
     // and each is judged at once), when the present one ends, which of the two sums is collected,
     // and whether the other is complete.

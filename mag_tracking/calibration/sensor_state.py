@@ -11,7 +11,7 @@ from mag_tracking.units import NEVER
 
 RECENT = core.RECENT
 """Differences between consecutive readings that a spike is compared with."""
-MOST_HELD = core.MOST_HELD
+MAX_HELD = core.MAX_HELD
 """A spike has at most so many readings; what lasts longer is a step."""
 
 SENSOR = core.SENSOR

@@ -11,7 +11,7 @@ from typing import NoReturn
 
 from mag_tracking.errors import MagTrackingError
 from mag_tracking.interrupts import exit_on_signals
-from mag_tracking.nodes.start import end_soon
+from mag_tracking.nodes.start import limit_exit_time
 
 INTERRUPTED = 'mag-tracking: interrupted'
 """What Ctrl-C has the command say."""
@@ -26,7 +26,7 @@ def command() -> NoReturn:
     try:
         status = main()
     finally:
-        end_soon(status)
+        limit_exit_time(status)
     sys.exit(status)
 
 

@@ -11,7 +11,7 @@ from mag_tracking.apps.archive import archive, recordings_of, size_of
 from mag_tracking.cli.options import Commands, add_command, add_recorded_network, recorded_network
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
-from mag_tracking.interrupts import noted_signals
+from mag_tracking.interrupts import recorded_signals
 
 _ARCHIVE = '''
 Tracks what is in many recordings, or in long ones, on several processors or machines. The
@@ -56,7 +56,7 @@ def _archive(args: argparse.Namespace) -> int:
         raise SettingsError(f'--workers: expected 1 or more, got {args.workers}')
     network, settings = recorded_network(args), settings_of(args)
     recordings = recordings_of(args.recordings)
-    with noted_signals(signal.SIGINT) as seen, \
+    with recorded_signals(signal.SIGINT) as seen, \
             tqdm(total=sum(map(size_of, recordings)), unit='B', unit_scale=True, desc='archive',
                  disable=None) as bar:
         run = archive(recordings, network, settings, args.out, args.workers, args.scheduler,

@@ -22,7 +22,7 @@ from mag_tracking.apps.board_geometry import (
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.errors import OutputError, SettingsError
-from mag_tracking.interrupts import noted_signals
+from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import read_network, write_network
 from mag_tracking.settings import flatten, read_parameter_file, replace
 
@@ -90,7 +90,7 @@ def _geometry(args: argparse.Namespace) -> int:
               file=sys.stderr)
         return 1
     # From here on, what is begun is ended.
-    with noted_signals(signal.SIGINT):
+    with recorded_signals(signal.SIGINT):
         write_network(args.out, found.network, 'Geometry from a magnet\'s poses in '
                       f'{args.table.name}; before that {(args.sensors or args.network).name}.')
         if args.figure is not None:
@@ -198,9 +198,9 @@ def _row(found: GeometrySurvey, j: int) -> str:
     """One sensor of the table."""
     g = found.geometry
     moved = 1e3 * np.linalg.norm(found.network.positions[j] - found.stated.positions[j])
-    moved_std, turned_std = (np.sqrt(np.square(v[j]).mean())
+    moved_std, rotated_std = (np.sqrt(np.square(v[j]).mean())
                              for v in (1e3 * g.position_std, np.rad2deg(g.rotation_std)))
     bias = ' '.join(f'{1e6 * b:+8.2f}' for b in g.bias[j])
     return (f'{moved:5.2f} ({moved_std:.2f})  {np.rad2deg(found.turned[j]):6.2f} '
-            f'({turned_std:.2f})  {g.gain[j]:.4f} ({g.gain_std[j]:.4f}) {bias}  '
+            f'({rotated_std:.2f})  {g.gain[j]:.4f} ({g.gain_std[j]:.4f}) {bias}  '
             f'{g.sensor_residual[j]:8.2f}')

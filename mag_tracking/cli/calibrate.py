@@ -19,7 +19,7 @@ from mag_tracking.cli.options import (
     recorded_network,
 )
 from mag_tracking.cli.tracking_options import add_settings, settings_of
-from mag_tracking.interrupts import noted_signals
+from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import write_network
 from mag_tracking.recording.reader import Recording
 
@@ -63,7 +63,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     check_outputs(args)
     check_report(args, args.recording, args.network, args.out, args.figure)
     times = 1 if args.no_passes else 2
-    with noted_signals(signal.SIGINT) as seen:
+    with recorded_signals(signal.SIGINT) as seen:
         with tqdm(total=times * recording.size, unit='B', unit_scale=True,
                   desc=args.recording.name, disable=None) as bar:
             found = calibrate(recording, network, settings, now(), not args.no_passes, bar.update,

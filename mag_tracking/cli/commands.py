@@ -58,11 +58,11 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
     words = list(words)
     split = words.index(ROS_ARGUMENTS) if ROS_ARGUMENTS in words else len(words)
-    asked_for = _module_of(next((word for word in words[:split] if word[:1] != '-'), ''))
-    if asked_for is not None:
-        import_module(f'{PACKAGE}.cli.{asked_for}').add(commands)
+    requested = _module_of(next((word for word in words[:split] if word[:1] != '-'), ''))
+    if requested is not None:
+        import_module(f'{PACKAGE}.cli.{requested}').add(commands)
     for name, command in COMMANDS.items():
-        if command.module != asked_for:
+        if command.module != requested:
             commands.add_parser(name, help=command.short, aliases=command.aliases)
     args = parser.parse_args(words[:split])
     args.ros_arguments = words[split:]

@@ -19,7 +19,7 @@ from mag_tracking.cli.options import (
 )
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
-from mag_tracking.interrupts import noted_signals
+from mag_tracking.interrupts import recorded_signals
 from mag_tracking.recording.reader import Recording
 from mag_tracking.stages.health.sensor_health import Finding, SensorHealth
 
@@ -54,7 +54,7 @@ def _doctor(args: argparse.Namespace) -> int:
         raise SettingsError('doctor: either a RECORDING or --live SECONDS')
     network, settings = recorded_network(args), settings_of(args)
     check_report(args, args.recording, args.network)
-    with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
         if args.live is not None:
             if not 1.0 <= args.live <= 86400.0:
                 raise SettingsError(f'--live: {args.live:g} is not between 1 and 86400 s')

@@ -13,7 +13,7 @@ from mag_tracking.cli.options import Commands, add_command, add_recorded_network
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import PassEvent
-from mag_tracking.interrupts import noted_signals
+from mag_tracking.interrupts import recorded_signals
 from mag_tracking.recording.event_tables import write_events
 from mag_tracking.recording.reader import Recording
 from mag_tracking.units import NS
@@ -48,7 +48,7 @@ def _events(args: argparse.Namespace) -> int:
     recording = Recording(args.recording)
     if args.out is not None and recording.lies_in(args.out):
         raise OutputError(f'{args.out} is the folder of the recording; the tables would be in it')
-    with noted_signals(signal.SIGINT) as seen, \
+    with recorded_signals(signal.SIGINT) as seen, \
             tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
                  disable=None) as bar:
         result = find_events(recording, network, settings, bar.update, lambda: bool(seen))

@@ -23,7 +23,7 @@ from mag_tracking.cli.options import (
 )
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.inference.iron import hard_and_soft_iron
-from mag_tracking.interrupts import noted_signals
+from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import MU0
 from mag_tracking.pipeline import settings_for
@@ -90,7 +90,7 @@ def _fit(args: argparse.Namespace) -> int:
     jobs = [RecordingFit(r, network, settings, args.orders, args.cpa_range) for r in recordings]
     passes: list[FittedPass] = []
     warnings: list[str] = []
-    with noted_signals(signal.SIGINT) as seen, FitFolder(args.out) as folder:
+    with recorded_signals(signal.SIGINT) as seen, FitFolder(args.out) as folder:
         for path, recording, job in zip(args.recordings, recordings, jobs, strict=True):
             with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
                       disable=None) as bar:
@@ -203,7 +203,7 @@ def _print_delay(one: FittedPass) -> None:
 
 def _numbers(fit: PassFit) -> str:
     """Position, speed, heading, length and moment, with deviations in brackets."""
-    sd = np.sqrt(np.diagonal(fit.honest_covariance))[:3]
+    sd = np.sqrt(np.diagonal(fit.robust_covariance))[:3]
     place = ' '.join(f'{v:6.2f}({s:.2f})' for v, s in zip(fit.position, sd, strict=True))
     moment, P = fit.moment
     size = np.linalg.norm(moment)

@@ -7,7 +7,7 @@ import sys
 
 from mag_tracking.cli.options import Commands, add_command
 from mag_tracking.errors import SettingsError
-from mag_tracking.interrupts import noted_signals
+from mag_tracking.interrupts import recorded_signals
 
 _NOTE = '''
 A small substitute for those who have ROS from PyPI; with a ROS from apt `ros2` does the same
@@ -60,7 +60,7 @@ def _echo(args: argparse.Namespace) -> int:
             return False
         return not seen and n != args.count
 
-    with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
         with observer(args.ros_arguments) as graph:
             listen(graph, args.topic, show, lambda: bool(seen))
     return 0

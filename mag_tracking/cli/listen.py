@@ -17,7 +17,7 @@ from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.drivers.configuration import read_drivers
 from mag_tracking.drivers.driver import IGNORED, Driver, serve
 from mag_tracking.errors import SettingsError
-from mag_tracking.interrupts import noted_signals
+from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import read_network
 from mag_tracking.records import AccelerationSample, Readings
 
@@ -48,7 +48,7 @@ def add(commands: Commands) -> None:
                    help='end after so long (default: at Ctrl-C)')
 
 
-class _Ear:
+class _ReadingPrinter:
     """Keeps one driver going in a thread, and what it said in the last second."""
 
     def __init__(self, driver: Driver) -> None:
@@ -116,10 +116,10 @@ def _listen(args: argparse.Namespace) -> int:
     if not args.seconds > 0.0:
         raise SettingsError(f'--seconds: {args.seconds:g} is not a number above 0')
     network = read_network(args.network) if args.network else None
-    ears = [_Ear(driver) for driver in read_drivers(args.drivers, network)]
+    ears = [_ReadingPrinter(driver) for driver in read_drivers(args.drivers, network)]
     end = time.monotonic() + args.seconds
     last = time.monotonic()
-    with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
         while not seen and last < end:
             while not seen and time.monotonic() < min(last + 1.0, end):
                 time.sleep(0.02)

@@ -14,7 +14,7 @@ from mag_tracking.apps.view import view
 from mag_tracking.cli.options import Commands, add_command, add_recorded_network, recorded_network
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
-from mag_tracking.interrupts import noted_signals
+from mag_tracking.interrupts import recorded_signals
 from mag_tracking.recording.reader import Recording
 from mag_tracking.web.live_scene import LiveScene
 from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK, PageServer, check_port
@@ -76,7 +76,7 @@ def _view(args: argparse.Namespace) -> int:
     recording = Recording(args.recording)
     scene = LiveScene(args.recording.name, network)
     scene.subtitle = f'{len(network)} sensors, frame {network.frame}'
-    with noted_signals(signal.SIGINT, signal.SIGTERM) as seen, \
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen, \
             PageServer(scene, args.host, args.port) as server:
         _told(f'live page: {server.url}')
         view(recording, network, settings, scene, args.rate,

@@ -19,7 +19,7 @@ from mag_tracking.cli.options import (
     recorded_network,
 )
 from mag_tracking.cli.tracking_options import add_settings, settings_of
-from mag_tracking.interrupts import noted_signals
+from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.reader import Recording
@@ -96,7 +96,7 @@ def _replay(args: argparse.Namespace) -> int:
     names = distinct_names(args.recordings)
     if args.rerun:
         check_rerun()
-    with noted_signals(signal.SIGINT) as seen:
+    with recorded_signals(signal.SIGINT) as seen:
         for path, name in zip(args.recordings, names, strict=True):
             out = args.out / name if len(args.recordings) > 1 else args.out
             _replay_one(path, network, settings, out, seen, args)

@@ -26,7 +26,7 @@ from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.files import output_folder
 from mag_tracking.inference.identification import Identification
 from mag_tracking.inference.log_normal_classes import UNKNOWN
-from mag_tracking.interrupts import noted_signals
+from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.fleet_file import FleetPass, read_fleet, write_fleet
 from mag_tracking.recording.reader import Recording
@@ -81,7 +81,7 @@ def _traffic(args: argparse.Namespace) -> int:
     tables: dict[str, list[dict[str, Any]]] = {'passages': [], 'intervals': []}
     fleet = _fleet(args, network)
     enrolled: list[FleetPass] = []
-    with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
         for name, recording in zip(names, recordings, strict=True):
             if seen:
                 break
@@ -183,10 +183,10 @@ def _print(name: str, result: TrafficResult, recording: Recording,
     for sensor in result.sensors_without_background:
         print(f'  warning: no background was learnt for {sensor}: it was quiet for too short a '
               'time')
-    if result.why_no_detection:
-        print(f'  nothing was detected: {result.why_no_detection}')
-    if result.why_no_track:
-        print(f'  {result.why_no_track}')
+    if result.no_detection_reason:
+        print(f'  nothing was detected: {result.no_detection_reason}')
+    if result.no_track_reason:
+        print(f'  {result.no_track_reason}')
 
 
 def line_of(vehicle: CountedVehicle) -> str:

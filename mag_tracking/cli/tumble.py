@@ -17,7 +17,7 @@ from mag_tracking.cli.options import (
     recorded_network,
 )
 from mag_tracking.errors import SettingsError
-from mag_tracking.interrupts import noted_signals
+from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import write_network
 from mag_tracking.recording.reader import Recording
 
@@ -54,7 +54,7 @@ def _tumble(args: argparse.Namespace) -> int:
         raise SettingsError(f'--field-size: {args.field_size:g} is not between 1e-6 and 1e-3 tesla')
     network, recording = recorded_network(args), Recording(args.recording)
     check_outputs(args)
-    with noted_signals(signal.SIGINT) as seen:
+    with recorded_signals(signal.SIGINT) as seen:
         with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
                   disable=None) as bar:
             found, fits, readings, _ = tumble(recording, network, args.sensor, now(),

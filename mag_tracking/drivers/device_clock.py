@@ -31,8 +31,8 @@ FORWARD = 'steps forward'
 BACK = 'steps back'
 LOST = 'long times without a reading that fits'
 
-_MOST_BLOCKS = 64
-_SHORTEST_BLOCK = 1.0 / 16.0
+_MAX_BLOCKS = 64
+_MIN_BLOCK = 1.0 / 16.0
 """The first blocks of an epoch, as a part of the later ones."""
 _FEWEST_POINTS = 5
 """With fewer than these only the height of the line is estimated."""
@@ -51,20 +51,20 @@ class ClockSettings:
         's', (1e-10, 60.0))
     wrap: int = param(
         2**32, 'Ticks at which the counter goes back to 0; 0 = never.', '', (0, 2**63 - 1))
-    shortest_delay_s: float = param(
+    min_delay_s: float = param(
         0.0, 'What the quickest message needs from measurement to arrival (bytes over baud rate, '
         'delay of the filter); arrivals alone cannot tell it.', 's', (0.0, 60.0))
-    longest_delay_s: float = param(
+    max_delay_s: float = param(
         5.0, 'A message that comes later than this is of a clock that has stepped.',
         's', (0.01, 3600.0))
-    least_step_s: float = param(
+    min_step_s: float = param(
         0.1, 'Beyond the spread of the delays: a device time that goes back by more than this, or '
-        'that stays late by more than this for longest_delay_s, is of a clock that has stepped.',
+        'that stays late by more than this for max_delay_s, is of a clock that has stepped.',
         's', (1e-3, 60.0))
     window_s: float = param(
         120.0, 'Memory of the estimate; for the drift it must hold five readings.',
         's', (1.0, 86400.0))
-    most_drift_ppm: float = param(
+    max_drift_ppm: float = param(
         500.0, 'The true tick differs from tick_s by no more; crystals stay within 100, the RC '
         'oscillators of cheap boards do not.', 'ppm', (1.0, 50_000.0))
 
@@ -77,7 +77,7 @@ class ArrivalClock:
     def __init__(self, settings: ClockSettings) -> None:
         self.counts: Counter[str] = Counter()
         self.restarts: Counter[str] = Counter()
-        self._shortest_ns = round(settings.shortest_delay_s * 1e9)
+        self._shortest_ns = round(settings.min_delay_s * 1e9)
 
     def stamp(self, ticks: float | None, arrival_ns: int) -> int:
         """`arrival_ns` less the shortest delay, whatever `ticks` is."""
@@ -136,7 +136,7 @@ class DeviceClock:
         95 of 100 recent messages came less than this after the quickest; NaN as above.
     stamp_std : float [s]
         How far a stamp may be off by the delays and by a drift that changes: nine in ten
-        lowest points of blocks are closer to the line. What shortest_delay_s is off by
+        lowest points of blocks are closer to the line. What min_delay_s is off by
         comes on top. NaN until known, also after a restart.
     """
 
@@ -144,17 +144,17 @@ class DeviceClock:
         """Raises SettingsError where the settings contradict each other."""
         self._tick_ns, self._wrap = settings.tick_s * 1e9, settings.wrap
         self._top = settings.wrap or math.inf
-        self._shortest_ns = round(settings.shortest_delay_s * 1e9)
-        self._longest_ns = settings.longest_delay_s * 1e9
-        self._step_ns = self._tolerance_ns = settings.least_step_s * 1e9
-        self._window_ns, self._most = settings.window_s * 1e9, settings.most_drift_ppm * 1e-6
-        if settings.least_step_s > settings.longest_delay_s:
-            raise SettingsError(f'least_step_s: {settings.least_step_s:g} s is more than '
-                                f'longest_delay_s, {settings.longest_delay_s:g} s')
-        if 0 < settings.wrap * settings.tick_s < 4.0 * settings.least_step_s:
+        self._shortest_ns = round(settings.min_delay_s * 1e9)
+        self._longest_ns = settings.max_delay_s * 1e9
+        self._step_ns = self._tolerance_ns = settings.min_step_s * 1e9
+        self._window_ns, self._most = settings.window_s * 1e9, settings.max_drift_ppm * 1e-6
+        if settings.min_step_s > settings.max_delay_s:
+            raise SettingsError(f'min_step_s: {settings.min_step_s:g} s is more than '
+                                f'max_delay_s, {settings.max_delay_s:g} s')
+        if 0 < settings.wrap * settings.tick_s < 4.0 * settings.min_step_s:
             raise SettingsError(
                 f'wrap: the counter goes round in {settings.wrap * settings.tick_s:g} s, less than '
-                f'four times least_step_s, {settings.least_step_s:g} s')
+                f'four times min_step_s, {settings.min_step_s:g} s')
         self.counts: Counter[str] = Counter()
         self.restarts: Counter[str] = Counter()
         self.drift_ppm = self.spread_s = self.stamp_std = math.nan
@@ -167,7 +167,7 @@ class DeviceClock:
         self._height = self._middle = self._newest = self._lowest = 0.0
         self._points: list[Point] = []
         self._point: Point = (0.0, 0.0)
-        self._block = self._block_end = self._window_ns / _MOST_BLOCKS * _SHORTEST_BLOCK
+        self._block = self._block_end = self._window_ns / _MAX_BLOCKS * _MIN_BLOCK
         self._early_ns, self.stamp_std = self._longest_ns, math.nan
         self._suspect: _Suspect | None = None
         self._begun, self._unsure = True, self._most
@@ -270,13 +270,13 @@ class DeviceClock:
 
     def _close_block(self, t: float) -> None:
         """Keep the lowest point of the block that ends, and estimate again."""
-        points, longest = self._points, self._window_ns / _MOST_BLOCKS
+        points, longest = self._points, self._window_ns / _MAX_BLOCKS
         points.append(self._point)
         if t - self._newest > self._window_ns:
-            self._block = longest * _SHORTEST_BLOCK
+            self._block = longest * _MIN_BLOCK
         while points[0][0] < t - self._window_ns and len(points) > 1:
             del points[0]
-        if len(points) >= _MOST_BLOCKS and self._block < longest:
+        if len(points) >= _MAX_BLOCKS and self._block < longest:
             self._block *= 2.0
             self._points = points = [min(points[i:i + 2], key=self._above)
                                      for i in range(0, len(points), 2)]

@@ -24,7 +24,7 @@ from mag_tracking.drivers.settings import (
     DriverSettings,
     scale_of,
 )
-from mag_tracking.drivers.sole_source import SoleSource
+from mag_tracking.drivers.single_source import SingleSource
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.records import AccelerationSample, Readings
 
@@ -32,14 +32,14 @@ POLL_S = 0.2
 """[s] A driver that is served is asked to stop so often."""
 IGNORED = '-'
 """In place of a sensor's name: what comes of it is not used."""
-MOST_NAMES = 20
+MAX_NAMES = 20
 """Unknown sensors that are counted by name."""
-MOST_SOURCES = 4096
+MAX_SOURCES = 4096
 """Clocks that are kept."""
 _AXES = struct.Struct('3d')
-Heard: TypeAlias = tuple[Readings, Sequence[AccelerationSample]]
+DoctorResult: TypeAlias = tuple[Readings, Sequence[AccelerationSample]]
 """What has come."""
-NOTHING: Heard = Readings.joined([]), ()
+NOTHING: DoctorResult = Readings.joined([]), ()
 """That has come."""
 STEP_NS = 10_000_000
 """[ns] The clock of this machine was set when it differs by more from one moment to the next."""
@@ -86,7 +86,7 @@ class Driver:
         self._retry_s, self._heard_ns = settings.retry_s, 0
         self._retry_ns: int | None = None
         self._offset_ns: int | None = None
-        self._sole_source = SoleSource()
+        self._sole_source = SingleSource()
         self._unknown: set[str] = set()
         # Of the reading before: those that a device gives together were measured together.
         self._measurement: tuple[ArrivalClock | DeviceClock, float | None, int] | None = None
@@ -131,7 +131,7 @@ class Driver:
             total.update(clock.restarts.copy())
         return total
 
-    def poll(self, timeout_s: float) -> Heard:
+    def poll(self, timeout_s: float) -> DoctorResult:
         """What has come: (`Readings`, sequence of `AccelerationSample`), empty after `timeout_s`.
 
         Opens the device where it is not open and it is time to try. Never raises for
@@ -147,19 +147,20 @@ class Driver:
             return NOTHING
         now = self._monotonic_ns()
         if not arrivals:
-            if self._settings.silent_s and now - self._heard_ns > self._settings.silent_s * 1e9:
+            timeout_s = self._settings.silence_timeout_s
+            if timeout_s and now - self._heard_ns > timeout_s * 1e9:
                 self.own_counts['silent, so opened again'] += 1
-                self._give_up(f'open, but nothing has come for {self._settings.silent_s:g} s')
+                self._give_up(f'open, but nothing has come for {timeout_s:g} s')
             return NOTHING
         self._heard_ns, self._retry_s, self.trouble = now, self._settings.retry_s, ''
         return self._samples(arrivals, self._wall_offset(now))
 
     def _read(self, timeout_s: float) -> list[Arrival]:
-        """What the device has, and what comes within `gather_s` after the first of it."""
+        """What the device has, and what comes within `batch_s` after the first of it."""
         arrivals = self._device.read(timeout_s)
-        if not arrivals or not self._settings.gather_s:
+        if not arrivals or not self._settings.batch_s:
             return arrivals
-        end = self._monotonic_ns() + round(self._settings.gather_s * 1e9)
+        end = self._monotonic_ns() + round(self._settings.batch_s * 1e9)
         while (left_ns := end - self._monotonic_ns()) > 0:
             try:
                 arrivals += self._device.read(left_ns / 1e9)
@@ -210,7 +211,7 @@ class Driver:
             self.own_counts['closings that failed'] += 1
             self.trouble += f' (and it does not close: {type(error).__name__}: {error})'
         self._retry_ns = self._monotonic_ns() + round(self._retry_s * 1e9)
-        self._retry_s = min(2.0 * self._retry_s, self._settings.longest_retry_s)
+        self._retry_s = min(2.0 * self._retry_s, self._settings.max_retry_s)
 
     def _wall_offset(self, monotonic_ns: int) -> int:
         """[ns] Time of day minus monotonic time; stamps follow where somebody sets the clock."""
@@ -220,7 +221,7 @@ class Driver:
         self._offset_ns = offset
         return offset
 
-    def _samples(self, arrivals: Sequence[Arrival], offset_ns: int) -> Heard:
+    def _samples(self, arrivals: Sequence[Arrival], offset_ns: int) -> DoctorResult:
         """(`Readings`, [`AccelerationSample`]) of what has come.
 
         A field that is infinite in tesla is none; an acceleration that came with it is one.
@@ -272,13 +273,13 @@ class Driver:
             return self.sensors['']
         if sensor is None:
             name = (at_device or source)[:80]
-            if len(self._unknown) < MOST_NAMES:
+            if len(self._unknown) < MAX_NAMES:
                 self._unknown.add(name)
             self.own_counts['of unknown sensors' + (
                 f': {name}' if name in self._unknown else ' (and others)')] += 1
         if sensor is None or sensor == IGNORED:
             return None
-        if len(self._named) < MOST_SOURCES:
+        if len(self._named) < MAX_SOURCES:
             self._named[at_device, source] = sensor
         return sensor
 
@@ -288,7 +289,7 @@ class Driver:
         ticks = reading.sequence if by == 'sequence' else reading.ticks
         clock = self._clocks.get(arrival.source)
         if clock is None:
-            if len(self._clocks) >= MOST_SOURCES:
+            if len(self._clocks) >= MAX_SOURCES:
                 self.own_counts['of more sources than there can be'] += 1
                 return None
             without = by == 'arrival' or by == 'auto' and ticks is None
@@ -338,6 +339,6 @@ def serve(driver: Driver, take: Callable[[Readings, Sequence[AccelerationSample]
             what = f'errors behind the driver: {type(error).__name__}'
             text = f'{what}: {error}'[:100]
             known = sum(key.startswith(what) for key in driver.own_counts)
-            driver.own_counts[text if text in driver.own_counts or known < MOST_NAMES
+            driver.own_counts[text if text in driver.own_counts or known < MAX_NAMES
                               else f'{what} (and others)'] += 1
     driver.close()

@@ -32,12 +32,12 @@ class DriverSettings:
     retry_s: float = param(
         0.1, 'A device that is lost is opened again after so long, twice that the next time, '
         'and so on.', 's', (1e-3, 60.0))
-    longest_retry_s: float = param(
+    max_retry_s: float = param(
         1.0, 'It is never waited longer than that.', 's', (1e-3, 3600.0))
-    gather_s: float = param(
+    batch_s: float = param(
         0.0, 'Readings are gathered for so long before they go on: with `batches` they are one '
         'message then.', 's', (0.0, 1.0))
-    silent_s: float = param(
+    silence_timeout_s: float = param(
         10.0, 'A device of which nothing comes for so long is closed and opened again; 0 = '
         'never.', 's', (0.0, 86400.0))
 

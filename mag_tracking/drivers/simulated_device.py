@@ -21,9 +21,9 @@ from mag_tracking.settings import param
 from mag_tracking.simulation.scenario import Path, random_vehicle
 
 TICK_S = 1e-6
-SHORTEST_WAIT_S = 1e-3
+MIN_WAIT_S = 1e-3
 """As a port that is looked at so often."""
-LONGEST_BACKLOG_S = 5.0
+MAX_BACKLOG_S = 5.0
 """What is older when it is asked for is lost, as in the buffer of a real device."""
 
 
@@ -44,7 +44,7 @@ class SimulatorSettings:
                             'gone, if that is later.', 's', (0.1, 86400.0))
     moment: float = param(400.0, 'Magnetic moment of a vehicle.', 'A m^2', (0.0, 1e6))
     length: float = param(4.3, 'Length of a vehicle.', 'm', (0.1, 50.0))
-    in_turn: bool = param(
+    sequential: bool = param(
         False, 'The sensors measure one after the other, evenly in the interval, as they do where '
         'each runs by itself; else all at the same time.')
     seed: int = param(1, 'Of the vehicle and of the noise.', '', (0, 2**31 - 1))
@@ -73,7 +73,7 @@ class SimulatedDevice:
         self._rng = np.random.default_rng(settings.seed)
         self._table: FloatArray | None = None
         self._start_ns = self._next = 0
-        self._shift_s: list[float] = (np.arange(len(self._network)) * settings.in_turn
+        self._shift_s: list[float] = (np.arange(len(self._network)) * settings.sequential
                          / (len(self._network) * settings.rate_hz)).tolist()
 
     def open(self) -> None:
@@ -90,9 +90,9 @@ class SimulatedDevice:
         wait = self._due(self._next) - self._elapsed()
         if wait > 0.0:
             # Not for each of a thousand in turn: what is there when one looks comes together.
-            self._sleep(min(max(wait, SHORTEST_WAIT_S), timeout_s))
+            self._sleep(min(max(wait, MIN_WAIT_S), timeout_s))
         elapsed, n = self._elapsed(), len(self._network)
-        oldest = math.ceil((elapsed - LONGEST_BACKLOG_S) * self._settings.rate_hz) * n
+        oldest = math.ceil((elapsed - MAX_BACKLOG_S) * self._settings.rate_hz) * n
         if oldest > self._next:
             self.counts['readings lost, nobody took them'] += oldest - self._next
             self._next = oldest

@@ -6,7 +6,7 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference import core
 from mag_tracking.records import plain
 
-LEAST_PIVOT = 1e-12
+MIN_PIVOT = 1e-12
 """A covariance with a smaller one of `smallest_pivots` is singular, but for rounding."""
 
 
@@ -63,7 +63,7 @@ def are_covariances(y: FloatArray, C: FloatArray) -> BoolArray:
     largest = np.abs(known).max(axis=(1, 2), initial=0.0)
     asymmetry = np.abs(known - np.swapaxes(known, 1, 2)).max(axis=(1, 2), initial=0.0)
     valid: BoolArray = (finite | ~read).all(axis=(1, 2)) & (asymmetry <= 1e-6 * largest) \
-        & (smallest_pivots(y, C) > LEAST_PIVOT)
+        & (smallest_pivots(y, C) > MIN_PIVOT)
     return valid
 
 

@@ -17,10 +17,10 @@ LAG = 0.35
 """Default lag, in widths of the energy at half its height: near the best one for passes at constant
 speed (PHD15 Paper B eq. (19))."""
 
-LEAST_SAMPLES = 8
+MIN_SAMPLES = 8
 """Fewest samples of a window."""
 
-MOST_SURE = 0.98
+MAX_CONFIDENCE = 0.98
 """The sign of the correlation is exact for a target at the height of the sensor only. Half its
 lateral distance above it 0.6 % of random moments turn the other way, the whole distance 2.2 %."""
 
@@ -238,5 +238,5 @@ def rotation_of_pass(field: FloatArray, noise_std: float, n_quiet: int) -> Field
     FieldRotation or None
         None for a window that is too short, or does not exceed the noise.
     """
-    lag = lag_of(field, noise_std, n_quiet) if len(field) >= LEAST_SAMPLES else 0
+    lag = lag_of(field, noise_std, n_quiet) if len(field) >= MIN_SAMPLES else 0
     return field_rotation(field, noise_std, lag) if lag else None

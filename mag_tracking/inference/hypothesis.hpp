@@ -218,7 +218,7 @@ INLINE void before_update(double* __restrict after, const Sizes& n, const Gains&
 
 // The same over a time update.
 INLINE void before_move(double* after, const Sizes& n, const Motion& motion, const double* decay) {
-    double moved[MOST_ROWS];
+    double moved[MAX_ROWS];
     for (int r = 0; r < motion.n; ++r) {
         moved[r] = after[motion.rows[r]];
         after[motion.rows[r]] = 0.0;

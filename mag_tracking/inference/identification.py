@@ -14,7 +14,7 @@ BETWEEN_STD = 20.0
 """[A m^2] Moments of one vehicle differ by this between passes, on top of what their fits state
 (T10 Table 6.9: 14, 18 and 21 on the three axes)."""
 
-LEAST_APART = np.deg2rad(45.0)
+MIN_SEPARATION = np.deg2rad(45.0)
 """[rad] Headings that are this far apart tell hard iron from soft iron."""
 
 SAME_HEADING = np.deg2rad(10.0)
@@ -113,12 +113,12 @@ def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: Flo
         raise ValueError(f'{name}: a vehicle is enrolled by at least one pass')
     spread = np.asarray(covariances, dtype=float) + BETWEEN_STD**2 * np.eye(3)
     apart = np.abs(_turn(headings[:, None] - headings)).max()
-    if apart >= LEAST_APART:
+    if apart >= MIN_SEPARATION:
         iron = hard_and_soft_iron(moments, headings, induction, spread)
         return EnrolledVehicle(name, iron, np.nan, np.full(3, np.nan), np.full((3, 3), np.nan))
     if not np.isfinite(moments).all() or apart > SAME_HEADING:
         raise ValueError(f'{name}: expected finite moments at one heading, or at headings that '
-                         f'are {np.rad2deg(LEAST_APART):.0f} degrees apart; these are '
+                         f'are {np.rad2deg(MIN_SEPARATION):.0f} degrees apart; these are '
                          f'{np.rad2deg(apart):.0f} degrees apart')
     information = np.linalg.inv(spread)
     covariance = np.linalg.inv(information.sum(axis=0))

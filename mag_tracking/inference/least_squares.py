@@ -66,11 +66,11 @@ def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iteration
         residual[moved], J[moved] = trial_residual[better], trial_J[better]
         damping[busy] *= np.where(better, 0.2, 5.0)
         converged[busy[done]] = True
-        busy = busy[~done & (damping[busy] < MOST_DAMPING)]
+        busy = busy[~done & (damping[busy] < MAX_DAMPING)]
     return x, cost, pseudo_inverse(np.einsum('nyi,nyj->nij', J, J)), converged
 
 
-MOST_DAMPING = 1e12
+MAX_DAMPING = 1e12
 """Steps that are so small and still lead uphill lead nowhere."""
 
 

@@ -75,7 +75,7 @@ class Eigen {
     void solve(double* A) {
         std::fill(vectors.begin(), vectors.end(), 0.0);
         for (std::size_t i = 0; i < n_; ++i) vectors[i * n_ + i] = 1.0;
-        for (int sweep = 0; sweep < MOST_SWEEPS && !is_diagonal(A); ++sweep)
+        for (int sweep = 0; sweep < MAX_SWEEPS && !is_diagonal(A); ++sweep)
             for (std::size_t p = 0; p + 1 < n_; ++p)
                 for (std::size_t q = p + 1; q < n_; ++q)
                     if (A[p * n_ + q] != 0.0) rotate(A, p, q);
@@ -85,7 +85,7 @@ class Eigen {
 
   private:
     // Far more than it takes: it converges quadratically.
-    static constexpr int MOST_SWEEPS = 30;
+    static constexpr int MAX_SWEEPS = 30;
 
     bool is_diagonal(const double* A) const {
         double on = 0.0, off = 0.0;

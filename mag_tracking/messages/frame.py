@@ -5,13 +5,13 @@ from typing import Protocol
 import numpy as np
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.inference.axes import LEAST_PIVOT, smallest_pivots
+from mag_tracking.inference.axes import MIN_PIVOT, smallest_pivots
 from mag_tracking.messages.schema import doubles, header_dict, stamp_ns
 from mag_tracking.messages.shapes import MessageDict, NetworkFrame
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 
-LONGEST_OFFSET_S = 60.0
+MAX_OFFSET_S = 60.0
 """[s] The longest frame there can be (`align.period_s`)."""
 
 
@@ -62,7 +62,7 @@ def _check_numbers(frame: FieldFrame) -> None:
     """Raise RecordingError where a frame holds what no alignment gives."""
     if np.isinf(frame.field).any():
         raise RecordingError('a frame with an infinite field')
-    if not (np.abs(frame.time_offset) <= LONGEST_OFFSET_S).all():
+    if not (np.abs(frame.time_offset) <= MAX_OFFSET_S).all():
         raise RecordingError(f'a frame with time offsets of {frame.time_offset.tolist()} s')
-    if not (smallest_pivots(frame.field, frame.covariance) > LEAST_PIVOT).all():
+    if not (smallest_pivots(frame.field, frame.covariance) > MIN_PIVOT).all():
         raise RecordingError('a frame with a covariance that is not positive definite')

@@ -12,7 +12,7 @@ from mag_tracking.units import NS
 
 Pose: TypeAlias = Track | SmoothedPose
 
-LEAST_SPEED = 1.0
+MIN_SPEED = 1.0
 """[m/s] A slower vehicle may stop before the line, and is not extrapolated to it."""
 
 EXTRAPOLATED_S = 1.0
@@ -114,7 +114,7 @@ class LinePath:
         """A crossing shortly before the first pose, or shortly after the last one."""
         for pose, sign in ((first, -1.0), (last, 1.0)):
             speed = float(pose.velocity[:2] @ self.line.along)
-            if abs(speed) < LEAST_SPEED:
+            if abs(speed) < MIN_SPEED:
                 continue
             t = -self.line.forward(pose.position) / speed
             if 0.0 <= sign * t <= EXTRAPOLATED_S:

@@ -32,7 +32,7 @@ _LONGEST = 1e8
 _QUIETEST = 1e-15
 """[T] No sensor is quieter."""
 
-_LONGEST_OFFSET = 3600.0
+_MAX_OFFSET = 3600.0
 """[s] A clock that is off by more is to be set, not corrected."""
 
 
@@ -135,8 +135,8 @@ def _orientation_std(what: str, value: object) -> FloatArray | None:
 def _clock_offset(what: str, value: object) -> float:
     """[s]."""
     offset = _vector(f'{what}: clock_offset', [value], (1,))[0]
-    if abs(offset) > _LONGEST_OFFSET:
-        raise NetworkError(f'{what}: clock_offset: {offset} s is more than {_LONGEST_OFFSET:g} s; '
+    if abs(offset) > _MAX_OFFSET:
+        raise NetworkError(f'{what}: clock_offset: {offset} s is more than {_MAX_OFFSET:g} s; '
                            'set the clock')
     return float(offset)
 

@@ -17,7 +17,7 @@ from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 
 WRITE_EVERY_S = 5.0
-"""[s] Interval of writing; shorter where `calibrate.resume_s` is short."""
+"""[s] Interval of writing; shorter where `calibrate.max_resume_gap_s` is short."""
 
 
 class BackgroundStore:
@@ -46,7 +46,7 @@ class BackgroundStore:
         if kept:
             self._logger.info(
                 f'goes on with the backgrounds of {", ".join(kept)}, where their readings go on '
-                f'within {self._settings.resume_s:g} s; ~/calibrate learns anew')
+                f'within {self._settings.max_resume_gap_s:g} s; ~/calibrate learns anew')
 
     def update(self, network: SensorNetwork, j: int) -> None:
         """Take the present background of sensor `j`, if it is known."""
@@ -66,7 +66,7 @@ class BackgroundStore:
         is_new = not self._texts.keys() <= self._written
         if self._path is None or not is_live or now < self._next_write and not is_new:
             return
-        self._next_write = now + min(WRITE_EVERY_S, self._settings.resume_s / 4.0)
+        self._next_write = now + min(WRITE_EVERY_S, self._settings.max_resume_gap_s / 4.0)
         try:
             write_backgrounds(self._path, self._texts)
             self._written = frozenset(self._texts)

@@ -35,21 +35,21 @@ from mag_tracking.nodes.sensor_graph import shortened
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.sensor_rounds import SensorRounds
 from mag_tracking.nodes.sensor_transforms import SensorTransforms
-from mag_tracking.nodes.stage_node import LATCHED, READY, SENT, STREAM, StageNode, is_heard
+from mag_tracking.nodes.stage_node import LATCHED, READY, SENT, STREAM, StageNode, has_subscribers
 from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.nodes.survey_service import SurveyService
 from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.recording.background_file import (
+    default_path,
     is_background_file,
     state_folder,
-    usual_path,
 )
 from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.stage import Stage
 from mag_tracking.stages.survey.stage import Survey
 
-SHORTEST_STEP_S = 0.01
+MIN_STEP_S = 0.01
 """[s] A round over the sensors takes a second, or where they are too many for that, its steps come
 at this interval."""
 DEFERRED_S = 0.0055
@@ -81,7 +81,7 @@ class CalibrationNode(StageNode):
         self._rounds = SensorRounds(
             self.title, self.network, self._stage, self._health, self._store, self._is_live,
             lambda status: self.publish_statuses([status]), self._publish_states)
-        steady_timer(self, max(1.0 / (2 * len(self.network) + 3), SHORTEST_STEP_S),
+        steady_timer(self, max(1.0 / (2 * len(self.network) + 3), MIN_STEP_S),
                      self._rounds.tick)
         paced_service(self, CalibrateService, '~/calibrate', self._calibrate)
         paced_service(self, SurveyMessage, '~/survey', self._solve)
@@ -119,10 +119,10 @@ class CalibrationNode(StageNode):
         """File in which the backgrounds are stored; None during the replay of a recording."""
         place = fixed_parameter(self, 'state_file', '', 'File in which the backgrounds are kept '
                                 'for a restart; left out: below $ROS_HOME, or ~/.ros.')
-        if self.is_replayed or not self.settings.calibrate.resume_s:
+        if self.is_replayed or not self.settings.calibrate.max_resume_gap_s:
             return None
         if not place:
-            return usual_path(self.network_path, self.get_fully_qualified_name())
+            return default_path(self.network_path, self.get_fully_qualified_name())
         path = self._own_path('state_file', place)
         if path.exists() and not is_background_file(path):
             raise SettingsError(f'calibration_node: parameter state_file: {path} is another file '
@@ -181,7 +181,7 @@ class CalibrationNode(StageNode):
         raw = reading_of(message, sensor)
         publisher = self._publishers_by_sensor[sensor]
         for calibrated in self._calibrated(raw):
-            if self._next_steps is None or is_heard(publisher):
+            if self._next_steps is None or has_subscribers(publisher):
                 for _, content in magnetic_field_dicts(calibrated, message.header.frame_id):
                     publisher.publish(to_message(MagneticField, content))
         self._unseen.append((raw, self.now_ns))
@@ -193,7 +193,7 @@ class CalibrationNode(StageNode):
         if raw is None:
             return
         for calibrated in self._calibrated(raw):
-            if self._next_steps is None or is_heard(self._readings):
+            if self._next_steps is None or has_subscribers(self._readings):
                 self._readings.publish(to_message(FieldReadings, readings_dict(calibrated)))
         self._unseen.append((raw, self.now_ns))
         self._deferred.request()
@@ -203,7 +203,7 @@ class CalibrationNode(StageNode):
         calibrated = self._stage.feed(raw)
         if self._next_steps is not None:
             detection, tracker = self._next_steps
-            tracker.doubt(self._stage.doubtful_stretches())
+            tracker.doubt(self._stage.doubtful_intervals())
             for readings in calibrated:
                 detection.take_readings(readings)
         return calibrated

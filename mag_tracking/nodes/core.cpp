@@ -15,22 +15,22 @@
 namespace mag_tracking {
 namespace {
 
-constexpr double LONGEST_S = 1e6;
+constexpr double MAX_S = 1e6;
 // A pipe that can be written to takes as much without blocking (PIPE_BUF).
-constexpr std::size_t LONGEST_MESSAGE = 4096;
+constexpr std::size_t MAX_MESSAGE = 4096;
 
 [[noreturn]] void end_process(int status, const std::string& message) {
     pollfd error_output{STDERR_FILENO, POLLOUT, 0};
     if (poll(&error_output, 1, 0) > 0) {
         // If it cannot be written, there is no other place for it.
         [[maybe_unused]] const auto written =
-            write(STDERR_FILENO, message.data(), std::min(message.size(), LONGEST_MESSAGE));
+            write(STDERR_FILENO, message.data(), std::min(message.size(), MAX_MESSAGE));
     }
     _exit(status);
 }
 
 double checked(double seconds) {
-    if (!(seconds >= 0.0 && seconds <= LONGEST_S))
+    if (!(seconds >= 0.0 && seconds <= MAX_S))
         throw py::value_error("a deadline is between 0 and 1e6 s");
     return seconds;
 }

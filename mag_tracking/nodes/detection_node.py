@@ -20,7 +20,7 @@ from mag_tracking.messages.types import CALIBRATED_READINGS, NETWORK_FRAME, TRAC
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
-from mag_tracking.nodes.stage_node import RESULTS, SENT, STREAM, StageNode, is_heard
+from mag_tracking.nodes.stage_node import RESULTS, SENT, STREAM, StageNode, has_subscribers
 from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.records import Detection, FieldFrame, Readings
@@ -52,7 +52,7 @@ class DetectionNode(StageNode):
         if warning:
             self.get_logger().warning(warning)
         self._events = Events(self.network, self.settings.align, self.settings.detect) \
-            if len(self.network) <= self.settings.events.most_sensors else None
+            if len(self.network) <= self.settings.events.max_sensors else None
         self._undescribed: list[Readings] = []
         if self._events is not None:
             steady_timer(self, DESCRIBED_S, self._describe)
@@ -131,7 +131,7 @@ class DetectionNode(StageNode):
     def _publish_frame_behind(self) -> None:
         """Publish the frame that the tracker has, once, where somebody listens."""
         frame, self._unpublished = self._unpublished, None
-        if frame is not None and is_heard(self._frames):
+        if frame is not None and has_subscribers(self._frames):
             self._publish_frame(frame)
 
     def _publish_frame(self, frame: FieldFrame) -> None:

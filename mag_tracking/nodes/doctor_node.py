@@ -17,9 +17,9 @@ from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import reading_of, readings_of
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.network import SensorNetwork
-from mag_tracking.nodes.leaving import leave
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.sensor_graph import missing_publisher, topic_findings
+from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.nodes.stage_node import SENSORS, STREAM, make_executor, spin
 from mag_tracking.pipeline import Settings
 from mag_tracking.stages.health.sensor_health import Finding
@@ -68,7 +68,7 @@ class DoctorNode(Node):
 
 
 @dataclass
-class Heard:
+class DoctorResult:
     """Result of listening."""
 
     doctor: Doctor
@@ -80,7 +80,8 @@ class Heard:
 
 @contextmanager
 def listening(network: SensorNetwork, settings: Settings, seconds: float,
-              stopped: Callable[[], bool], ros_arguments: Sequence[str] = ()) -> Iterator[Heard]:
+              stopped: Callable[[], bool], ros_arguments: Sequence[str] = ()
+              ) -> Iterator[DoctorResult]:
     """Listen for `seconds` or until `stopped()`; leave the graph after the context.
 
     If the middleware hangs, the process ends there: see `leave`.
@@ -88,7 +89,7 @@ def listening(network: SensorNetwork, settings: Settings, seconds: float,
     begin(list(ros_arguments))
     executor = make_executor()
     node = DoctorNode(network, settings)
-    heard = Heard(node.doctor, [])
+    heard = DoctorResult(node.doctor, [])
     try:
         executor.add_node(node)
         end = time.monotonic() + seconds
@@ -96,4 +97,4 @@ def listening(network: SensorNetwork, settings: Settings, seconds: float,
         heard.findings = node.findings()
         yield heard
     finally:
-        leave([node], executor, heard.status)
+        shut_down([node], executor, heard.status)

@@ -14,11 +14,11 @@ SILENT_S = 2.0
 """[s] A sensor or a node of which nothing came for longer is silent."""
 PATIENCE_S = 8.0
 """[s] Grace period for the first message, longer than learning a background takes."""
-MOST_BUSY = 0.95
+MAX_BUSY = 0.95
 """Largest share of the time that a node can spend on messages and keep up."""
 LATE_S = 1.0
 """[s] A median latency above this is a fault: such poses are too old for control."""
-MOST_NOTED = 10_000
+MAX_RECORDED = 10_000
 """Messages between two reports whose times are kept; a second of a thousand sensors has less."""
 
 
@@ -50,7 +50,7 @@ class Flow:
         took_s = self.heard - began
         self._busy_s += took_s
         self._age_s = (came_ns - stamp_ns) / NS + took_s
-        if len(self._ages) < MOST_NOTED:
+        if len(self._ages) < MAX_RECORDED:
             self._ages.append(self._age_s)
 
     @property
@@ -90,7 +90,7 @@ class Flow:
         elif news:
             level = DiagnosticStatus.WARN
             message = f'{news} messages from {self.source} did not fit the queue'
-        elif busy > MOST_BUSY or middle > LATE_S:
+        elif busy > MAX_BUSY or middle > LATE_S:
             level = DiagnosticStatus.WARN
             message = f'{self.source}: {100.0 * busy:.0f} % busy' + (
                 f', {1e3 * middle:.0f} ms behind: this computer is too slow, or its clock is not '

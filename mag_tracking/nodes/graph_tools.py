@@ -23,8 +23,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from mag_tracking.errors import GraphError
 from mag_tracking.nodes.convert import message_class
-from mag_tracking.nodes.leaving import leave
 from mag_tracking.nodes.middleware import RCLError, begin
+from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.nodes.stage_node import make_executor, spin
 
 DISCOVERY_S = 1.5
@@ -97,7 +97,7 @@ def observer(ros_arguments: Sequence[str] = ()) -> Iterator[Observer]:
         yield Observer(node, executor)
         status = 0
     finally:
-        leave([node], executor, status)
+        shut_down([node], executor, status)
 
 
 def topics(graph: Observer) -> list[tuple[str, str, int, int]]:

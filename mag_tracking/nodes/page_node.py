@@ -18,13 +18,13 @@ from visualization_msgs.msg import MarkerArray
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
-from mag_tracking.interrupts import noted_signals
+from mag_tracking.interrupts import recorded_signals
 from mag_tracking.messages.frame import frame_of
 from mag_tracking.messages.markers import SENSOR_KINDS
 from mag_tracking.messages.types import NETWORK_FRAME
 from mag_tracking.nodes.convert import track_of
-from mag_tracking.nodes.leaving import leave
 from mag_tracking.nodes.middleware import begin
+from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.nodes.stage_node import LATCHED, RESULTS, STREAM, make_executor, spin
 from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.report.page import ERROR, WARNING, Note, Table
@@ -210,7 +210,7 @@ def watch(host: str, port: int, report: Callable[[str], object],
     report : function
         Called with a line that contains the address of the page.
     ros_arguments : sequence of str
-        Beginning with `--ros-args`.
+        LearningWindow with `--ros-args`.
     ended : function, optional
         The page is closed when it returns True.
 
@@ -218,7 +218,7 @@ def watch(host: str, port: int, report: Callable[[str], object],
     """
     os.nice(NICENESS)
     scene = LiveScene('mag_tracking', NOWHERE)
-    with noted_signals(signal.SIGINT, signal.SIGTERM) as seen, \
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen, \
             PageServer(scene, host, port) as server:
         report(f'live page: {server.url}')
         begin(list(ros_arguments))
@@ -228,5 +228,5 @@ def watch(host: str, port: int, report: Callable[[str], object],
             spin(executor, lambda: bool(seen) or not server.is_serving or ended())
             status = 0 if server.is_serving else 1
         finally:
-            leave([node], executor, status)
+            shut_down([node], executor, status)
         return status

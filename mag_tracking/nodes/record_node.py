@@ -15,7 +15,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from tqdm import tqdm
 
 from mag_tracking.apps.record import Selection, progress_line, summary
-from mag_tracking.interrupts import noted_signals
+from mag_tracking.interrupts import recorded_signals
 from mag_tracking.messages.types import (
     FIELD_READINGS,
     IMU,
@@ -23,8 +23,8 @@ from mag_tracking.messages.types import (
 )
 from mag_tracking.nodes.convert import message_class
 from mag_tracking.nodes.definitions import definition_of
-from mag_tracking.nodes.leaving import leave
 from mag_tracking.nodes.middleware import begin
+from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.recording.recorder import Recorder
 from mag_tracking.recording.writer import offered_qos
 
@@ -226,7 +226,7 @@ def run(selection: Selection, out: Path, split_bytes: int = 10**9,
     Raises OutputError where `out` cannot take a recording.
     """
     node, status = None, 1
-    with noted_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as seen:
+    with recorded_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as seen:
         try:
             with Recorder(out, split_bytes, split_ns, report=say) as recorder:
                 begin(list(ros_arguments))
@@ -237,7 +237,7 @@ def run(selection: Selection, out: Path, split_bytes: int = 10**9,
                 print(line)
             status = 1 if recorder.unfinished else 0
         finally:
-            leave([] if node is None else [node], status=status)
+            shut_down([] if node is None else [node], status=status)
     return status
 
 

@@ -34,9 +34,9 @@ from mag_tracking.recording.reader import Recording
 
 TICK_S = 0.005
 """How often the node looks for messages that are due [s]."""
-LONGEST_STEP_S = 0.02
+MAX_STEP_S = 0.02
 """Time on the wall that one look may make good for [s]."""
-MOST_AT_ONCE = 200
+MAX_AT_ONCE = 200
 """Messages published at one look; the subscribers' queues hold more than that."""
 
 
@@ -151,12 +151,12 @@ class ReplayNode(ManagedNode):
                 or not self._heard(now):
             return
         # After a stall it goes on at its pace: a burst would overrun the subscribers' queues.
-        elapsed = 0.0 if self._wall is None else min(now - self._wall, LONGEST_STEP_S)
+        elapsed = 0.0 if self._wall is None else min(now - self._wall, MAX_STEP_S)
         self._wall = now
         self._position += int(elapsed * self._rate * 1e9)
         self._clock_publisher.publish(Clock(clock=Time(sec=self._position // 10**9,
                                              nanosec=self._position % 10**9)))
-        room = MOST_AT_ONCE
+        room = MAX_AT_ONCE
         while self._next is not None and self._next.log_time_ns <= self._position:
             if room == 0:
                 # Slower than asked for, rather than more than the queues hold.

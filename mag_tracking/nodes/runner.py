@@ -14,16 +14,16 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from mag_tracking.errors import MagTrackingError
-from mag_tracking.interrupts import noted_signals
+from mag_tracking.interrupts import recorded_signals
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.network.topics import namespaces_of
 from mag_tracking.nodes.calibration_node import CalibrationNode
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.detection_node import DetectionNode
 from mag_tracking.nodes.driver_node import DriverNode
-from mag_tracking.nodes.leaving import leave
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.replay_node import ReplayNode
+from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.nodes.stage_node import STREAM, StageNode, freeze, make_executor, spin
 from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.pipeline import Settings, settings_for
@@ -33,7 +33,7 @@ from mag_tracking.settings import flatten
 PathLike = str | OsPathLike[str]
 
 
-LONGEST_DISCOVERY_S = 60.0
+MAX_DISCOVERY_S = 60.0
 """[s] Nodes that have not found each other by then never will; a busy machine takes several."""
 
 
@@ -145,7 +145,7 @@ def run(network_path: PathLike, settings: Settings, recording: PathLike | None =
 
     Returns the exit status. If the middleware hangs at the end, the process ends: see `leave`.
     """
-    with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
         # The driver node comes last, when there is somebody to hear it.
         last = [partial(driver_node, drivers, network_path, batches)] if drivers else []
         begin(list(ros_arguments))
@@ -175,7 +175,7 @@ def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Se
             _play(executor, stages, replay, stopped)
         status = 0
     finally:
-        leave(nodes, executor, status)
+        shut_down(nodes, executor, status)
     return status
 
 
@@ -183,12 +183,12 @@ def _play(executor: Executor, stages: list[StageNode], replay: ReplayNode,
           stopped: Callable[[], bool]) -> None:
     """Play the recording once all have found each other, and wait until it is worked off."""
     _check_topics(stages[0], replay)
-    deadline = time.monotonic() + LONGEST_DISCOVERY_S
+    deadline = time.monotonic() + MAX_DISCOVERY_S
     spin(executor, lambda: all_connected(stages, replay) or stopped()
          or time.monotonic() > deadline)
     if not all_connected(stages, replay) and not stopped():
         raise MagTrackingError('the nodes did not find each other within '
-                               f'{LONGEST_DISCOVERY_S:g} s')
+                               f'{MAX_DISCOVERY_S:g} s')
     replay.resume()
     spin(executor, lambda: replay.finished or stopped())
     _work_off(executor, stages, stopped)

@@ -9,7 +9,7 @@ from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.network.topics import absolute
 from mag_tracking.stages.health.sensor_health import Finding
 
-MOST_NAMED = 4
+MAX_NAMED = 4
 """Topics that a message names; of more it gives the number."""
 
 
@@ -56,5 +56,5 @@ def missing_publisher(node: Node, sensor: str, topic: str, known: Mapping[str, s
 
 def shortened(names: list[str]) -> str:
     """The first of many names, and how many more there are."""
-    more = len(names) - MOST_NAMED
-    return ', '.join(names[:MOST_NAMED]) + (f' and {more} more' if more > 0 else '')
+    more = len(names) - MAX_NAMED
+    return ', '.join(names[:MAX_NAMED]) + (f' and {more} more' if more > 0 else '')

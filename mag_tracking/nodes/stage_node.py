@@ -21,14 +21,14 @@ from rclpy.subscription import Subscription
 from rclpy.task import Future
 
 from mag_tracking.errors import MagTrackingError, RecordingError, SettingsError
-from mag_tracking.interrupts import noted_signals
+from mag_tracking.interrupts import recorded_signals
 from mag_tracking.messages.schema import readings_of, stamp_ns
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.flow import Flow, Listener
-from mag_tracking.nodes.leaving import end_soon, leave
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
 from mag_tracking.nodes.sensor_graph import node_of, shortened
+from mag_tracking.nodes.shutdown import limit_exit_time, shut_down
 from mag_tracking.nodes.status_log import StatusLog
 from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.pipeline import settings_for
@@ -250,7 +250,7 @@ class StageNode(Node):
             self._diagnostics.publish(array)
 
 
-def is_heard(publisher: Publisher) -> bool:
+def has_subscribers(publisher: Publisher) -> bool:
     """Whether somebody listens: what is large is made for nobody else."""
     return publisher.get_subscription_count() > 0
 
@@ -290,7 +290,7 @@ def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:
 
 def main(node_class: Callable[[], Node], arguments: list[str] | None = None) -> int:
     """Run one node as a process until SIGINT or SIGTERM; returns the exit status."""
-    with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
         return _run_until(seen, node_class, arguments)
 
 
@@ -312,9 +312,9 @@ def _run_until(seen: list[int], node_class: Callable[[], Node],
     except (MagTrackingError, ParameterException) as error:
         rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
         # A node that is only half built leaves the middleware when the error is deleted.
-        end_soon(status)
+        limit_exit_time(status)
     except (KeyboardInterrupt, ExternalShutdownException):
         status = 0
     finally:
-        leave([] if node is None else [node], executor, status)
+        shut_down([] if node is None else [node], executor, status)
     return status

@@ -29,14 +29,14 @@ def run_node(name: str) -> NoReturn:
         # The end of Python takes a while, too: a second signal is ignored.
         for s in ENDING:
             signal.signal(s, signal.SIG_IGN)
-        end_soon(status)
+        limit_exit_time(status)
     sys.exit(status)
 
 
-def end_soon(status: int) -> None:
+def limit_exit_time(status: int) -> None:
     """Limit the time until the process has ended, if it has used ROS."""
     if 'rclpy' in sys.modules:
-        import_module('mag_tracking.nodes.leaving').end_soon(status)
+        import_module('mag_tracking.nodes.shutdown').limit_exit_time(status)
 
 
 def driver_node() -> NoReturn:

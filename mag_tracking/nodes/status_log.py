@@ -9,9 +9,9 @@ from rclpy.impl.rcutils_logger import RcutilsLogger
 
 REPEATED_S = 60.0
 """[s] Interval at which a fault that lasts is logged again."""
-MOST_ALIKE = 4
+MAX_CORRELATION = 4
 """Lines within that interval that differ in numbers only, as those of many sensors do."""
-MOST_FAULTS = 1000
+MAX_FAULTS = 1000
 """Faults that are remembered; more are those of a loop that makes up names."""
 _NUMBER = re.compile(r'[\d.]+')
 
@@ -44,7 +44,7 @@ class StatusLog:
         fault, now = (status.name, _NUMBER.sub('#', status.message)), time.monotonic()
         if now - self._logged.get(fault, -REPEATED_S) < REPEATED_S:
             return
-        if len(self._logged) >= MOST_FAULTS:
+        if len(self._logged) >= MAX_FAULTS:
             self._logged.clear()
         self._logged[fault] = now
         self._log(status.level, f'{subject}: {status.message}')
@@ -56,13 +56,13 @@ class StatusLog:
     def _log(self, level: bytes, text: str) -> None:
         """Log a line, but of many that are alike only the first."""
         now, pattern = time.monotonic(), _NUMBER.sub('#', text)
-        if now - self._alike_since > REPEATED_S or len(self._alike) >= MOST_FAULTS:
+        if now - self._alike_since > REPEATED_S or len(self._alike) >= MAX_FAULTS:
             self._alike.clear()
             self._alike_since = now
         self._alike[pattern] += 1
-        if self._alike[pattern] > MOST_ALIKE:
+        if self._alike[pattern] > MAX_CORRELATION:
             return
-        if self._alike[pattern] == MOST_ALIKE:
+        if self._alike[pattern] == MAX_CORRELATION:
             text += ' (more that are alike are in /diagnostics only)'
         if level == DiagnosticStatus.ERROR:
             self._logger.error(text)

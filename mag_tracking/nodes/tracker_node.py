@@ -57,7 +57,7 @@ from mag_tracking.nodes.stage_node import (
     STREAM,
     TRANSFORMS,
     StageNode,
-    is_heard,
+    has_subscribers,
 )
 from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.nodes.traffic_topics import TrafficTopics
@@ -70,7 +70,7 @@ from mag_tracking.stages.traffic.stage import TrackedFrame
 
 SLACK_S = 1.0
 """[s] What the way of a frame may take on top of the longest gap."""
-LONGEST_PATH = 2000
+MAX_PATH = 2000
 """Poses kept in `~/path`."""
 
 
@@ -226,13 +226,13 @@ class TrackerNode(StageNode):
             self.behind_pose()
         if not track.ended:
             # Then the hypotheses: a subscriber of the track has them already.
-            if is_heard(self._hypotheses):
+            if has_subscribers(self._hypotheses):
                 self._hypotheses.publish(
                     to_message(HypothesisArray, hypotheses_dict(track, frame)))
         content = track_dict(track, frame)
         self._tracks.publish(to_message(
             TrackArray, {'header': content['header'], 'tracks': [content]}))
-        if is_heard(self._detections_3d):
+        if has_subscribers(self._detections_3d):
             self._detections_3d.publish(to_message(
                 Detection3DArray, detections_3d_dict(track, frame)))
         if track.ended:
@@ -257,14 +257,14 @@ class TrackerNode(StageNode):
         publish_if_any(self._odometry, Odometry, odometry_dict(track, frame, child_frame))
         if self._tf is not None:
             publish_if_any(self._tf, TFMessage, track_transform_dict(track, frame, child_frame))
-        path = self._paths.setdefault(track.id, deque(maxlen=LONGEST_PATH))
+        path = self._paths.setdefault(track.id, deque(maxlen=MAX_PATH))
         if track.topic_uncertainty is not None:
             path.append(to_message(PoseStamped, pose_dict(
                 track.stamp_ns, frame, track.position, track.orientation)))
         # One path fits the topic: that of the track that began first.
-        if path and track.id == min(self._paths) and is_heard(self._path_publisher):
+        if path and track.id == min(self._paths) and has_subscribers(self._path_publisher):
             self._path_publisher.publish(Path(header=path[-1].header, poses=list(path)))
-        if is_heard(self._markers):
+        if has_subscribers(self._markers):
             self._markers.publish(to_message(MarkerArray, track_markers(track, frame)))
 
 

@@ -111,7 +111,7 @@ py::tuple mounted_fields(const Array& h, const Array& H, const Array& angles) {
     double *to_h = out_h.mutable_data(), *to_H = out_H.mutable_data();
     {
         py::gil_scoped_release release;
-        turned_fields(h_, H_, angles_, std::size_t(n_hyp * n_sensors), std::size_t(n_t), to_h,
+        rotated_fields(h_, H_, angles_, std::size_t(n_hyp * n_sensors), std::size_t(n_t), to_h,
                       to_H);
     }
     return py::make_tuple(out_h, out_H);
@@ -291,7 +291,7 @@ PYBIND11_MODULE(core, module) {
     module.def("sensor_fields", &sensor_fields, IN(positions), IN(R_sw), IN(r), IN(m), IN(dr_dx),
                IN(dm_dx));
     module.def("multipoles", &multipoles, IN(d), IN(moments));
-    module.def("turned_fields", &mounted_fields, IN(h), IN(H), IN(angles));
+    module.def("rotated_fields", &mounted_fields, IN(h), IN(H), IN(angles));
     module.def("turned", &turned, IN(x), py::arg("dt"), py::arg("mean"), py::arg("fading"));
     module.def("row_dipoles", &row_dipoles, IN(x), IN(n_dipoles), IN(induction));
     module.def("set_moment_noise", &set_moment_noise, IN(x), IN(walk), py::arg("induction2"), IN(Q));

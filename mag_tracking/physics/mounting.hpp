@@ -32,7 +32,7 @@ INLINE void turned_field(const double* h, const double* H, const double* angles,
 }
 
 // The same of `n` sensors.
-FOR_PROCESSORS static void turned_fields(const double* h, const double* H, const double* angles,
+FOR_PROCESSORS static void rotated_fields(const double* h, const double* H, const double* angles,
                                          std::size_t n, std::size_t n_t, double* out_h,
                                          double* out_H) {
     for (std::size_t i = 0; i < n; ++i)

@@ -6,7 +6,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.physics import core
 
 
-def turned_fields(h: FloatArray, H: FloatArray, angles: FloatArray
+def rotated_fields(h: FloatArray, H: FloatArray, angles: FloatArray
                   ) -> tuple[FloatArray, FloatArray]:
     """Fields as sensors see them that are turned by small angles.
 
@@ -29,4 +29,4 @@ def turned_fields(h: FloatArray, H: FloatArray, angles: FloatArray
     at fifteen 3.4 %. Source: the small-angle rotation; T10 section 6.3 for
     why it is needed.
     """
-    return core.turned_fields(*(np.ascontiguousarray(a, dtype=float) for a in (h, H, angles)))
+    return core.rotated_fields(*(np.ascontiguousarray(a, dtype=float) for a in (h, H, angles)))

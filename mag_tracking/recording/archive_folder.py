@@ -31,7 +31,7 @@ from mag_tracking.units import NS
 if TYPE_CHECKING:
     pass
 
-MOST_BYTES = 100
+MAX_BYTES = 100
 """Of the stem of a recording, in the names of its files."""
 
 _PACKAGE = 'mag_tracking'
@@ -41,7 +41,7 @@ _HEAD, _DONE, _WORK, _LOCK = 'archive.json', 'done', 'unfinished', '.lock'
 def name_of(recording: Path) -> str:
     """What the files of a recording are named: the same in every run."""
     path = recording.resolve()
-    stem = path.stem.encode(errors='replace')[:MOST_BYTES].decode(errors='ignore')
+    stem = path.stem.encode(errors='replace')[:MAX_BYTES].decode(errors='ignore')
     return f'{stem}-{_hash(str(path))}'
 
 

@@ -84,11 +84,11 @@ TABLES: dict[str, tuple[Column, ...]] = {
         *_WHERE, *columns_of('s', '', error='why the recording failed; empty where it did not',
                            lost='what could not be read', rejected='readings that were not used',
                            missing_topics='topics of the network that are not in it',
-                           why_no_detection='one sentence where nothing was detected'),
+                           no_detection_reason='one sentence where nothing was detected'),
         *columns_of('i', 'ns', end_ns='timestamp of the last frame'),
         *columns_of('i', '', frames='frames of the network', tracks='number of tracks',
                   passes='rows of `passes`',
-                  stretches='stretches in which a target was near'),
+                  segments='stretches in which a target was near'),
         *columns_of('i', 'bytes', size='size of the recording')),
 }
 """{table: columns}. Values that are not known are null."""

@@ -23,7 +23,7 @@ VERSION = 1
 _HEAD = '{"version": '
 
 
-def usual_path(network_path: str | PathLike[str], node: str) -> Path:
+def default_path(network_path: str | PathLike[str], node: str) -> Path:
     """Where node `node` keeps the backgrounds of a network file, in the state folder."""
     path = Path(network_path).resolve()
     mark = hashlib.sha256(f'{path} {node}'.encode()).hexdigest()[:8]

@@ -18,14 +18,15 @@ from mag_tracking.report.json_text import without_nan
 
 FIT_COLUMNS = (
     'recording', 'pass', 'vehicle', 'n_vehicles', 'n_dipoles', 'chosen', 'reason', 'stamp_ns',
-    'n_values', 'n_unknowns', 'normalised_cost', 'explained', 'left_elsewhere', 'velocity_change',
+    'n_values', 'n_unknowns', 'normalised_cost', 'explained', 'residual_elsewhere',
+    'velocity_change',
     'trusted', 'ambiguous',
     'x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz',
     'speed', 'sd_speed', 'heading_deg', 'sd_heading_deg', 'length', 'sd_length',
     'mx', 'my', 'mz', 'sd_mx', 'sd_my', 'sd_mz', 'cpa_time', 'sd_cpa_time',
     'cpa_range', 'sd_cpa_range', 'rate', 'sd_rate',
     'delay_speed', 'sd_delay_speed', 'delay_heading_deg', 'sd_delay_heading_deg', 'no_delay')
-"""Deviations are of `PassFit.honest_covariance`; the CPA is to the middle of the sensors, its time
+"""Deviations are of `PassFit.robust_covariance`; the CPA is to the middle of the sensors, its time
 in seconds after `stamp_ns`. The rate is speed over CPA range, which one sensor alone tells; its
 directions are in `fits.json`. Where there is a reason not to believe a fit as a whole, there are
 the numbers that are trusted, if it is the fit of the pass that counts: speed, direction (heading)
@@ -68,7 +69,8 @@ def fit_row(fit: PassFit, is_known: bool = True) -> dict[str, Any]:
             'n_unknowns': fit.n_unknowns}
     if len(fit.x):
         row |= {'normalised_cost': fit.normalised_cost, 'explained': fit.explained,
-                'left_elsewhere': fit.left_elsewhere, 'velocity_change': fit.velocity_change,
+                'residual_elsewhere': fit.residual_elsewhere,
+                'velocity_change': fit.velocity_change,
                 'trusted': ' '.join(fit.trusted) if is_known else ''}
     if fit.bearing is not None:
         b = fit.bearing
@@ -78,7 +80,7 @@ def fit_row(fit: PassFit, is_known: bool = True) -> dict[str, Any]:
     if fit.reason:
         return row | (_trusted(fit, centre) if is_known else {})
     row['ambiguous'] = int(fit.ambiguous)
-    sd = np.sqrt(np.diagonal(fit.honest_covariance))
+    sd = np.sqrt(np.diagonal(fit.robust_covariance))
     moment, P = fit.moment
     heading = [math.degrees(v) for v in fit.heading]
     groups: tuple[tuple[str, Iterable[float]], ...] = (

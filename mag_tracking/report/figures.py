@@ -23,7 +23,7 @@ SCALE_2D = float(np.sqrt(chdtri(2, 0.1)))
 SCALE_1D = 1.645
 """Deviations to the edge of a 90 % interval."""
 
-LEAST_DRAWN = 0.01
+MIN_DRAWN = 0.01
 """Weight above which the hypotheses of an arrival are drawn: lighter ones would stretch the map."""
 
 
@@ -116,7 +116,7 @@ def _draw_arrivals(axes: Axes, log: TrackLog, f: float) -> None:
     if len(colours) < 2:
         return
     for name, colour in colours.items():
-        rows = [row[name] for row in log.arrivals if name in row and row[name][0] > LEAST_DRAWN]
+        rows = [row[name] for row in log.arrivals if name in row and row[name][0] > MIN_DRAWN]
         if not rows:
             continue
         points = _without_switches(np.array([position[:2] for _, position, _ in rows]),

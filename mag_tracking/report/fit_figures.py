@@ -89,7 +89,7 @@ class _FittedPass(Protocol):
 def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
     """Measured and fitted field with the band that 90 % of the measurements should lie in.
 
-    By noise and `PassFit.honest_covariance`; where the normalised cost is above one, what the model
+    By noise and `PassFit.robust_covariance`; where the normalised cost is above one, what the model
     does not describe counts as more noise.
 
     Parameters

@@ -11,7 +11,7 @@ from mag_tracking.report.figures import SCALE_1D
 from mag_tracking.report.literal_text import literal
 
 _SUSPECT = 'tab:red'
-_MOST_NAMES = 60
+_MAX_NAMES = 60
 """With more sensors only every second, third, ... is named."""
 
 
@@ -102,7 +102,7 @@ def geometry_figure(found: _Survey) -> Figure:
     rows[2].set_title('gain (90 %)', fontsize=10, loc='left')
     _bars(rows[3], along, g.sensor_residual, suspect,
           'residual, in its deviations (rms; about 1 where noise and field error are right)')
-    step = -(-n // _MOST_NAMES)
+    step = -(-n // _MAX_NAMES)
     rows[3].set_xticks(along[::step], [literal(name) for name in names[::step]], rotation=90,
                        fontsize=7)
     rows[3].set_xlim(-0.7, n - 0.3)
@@ -130,7 +130,7 @@ def _moves(figure: SubFigure, axes: Axes, found: _Survey, suspect: BoolArray) ->
     if suspect.any():
         axes.plot(places[suspect, a], places[suspect, b], 'o', ms=12, mfc='none', mew=1.5,
                   color=_SUSPECT, label='does not fit')
-    if len(places) <= _MOST_NAMES:
+    if len(places) <= _MAX_NAMES:
         for name, place in zip(found.network.names, places, strict=True):
             axes.annotate(literal(name), place[[a, b]], xytext=(3, -8), textcoords='offset points',
                           fontsize=6, color='0.35')

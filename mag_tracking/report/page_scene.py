@@ -12,17 +12,17 @@ from mag_tracking.report.scales import scale_of
 from mag_tracking.report.track_log import TrackLog
 from mag_tracking.units import NS
 
-MOST_SENSORS = 8
+MAX_SENSORS = 8
 """Maximum number of sensors with fields per track; those with the strongest field are shown."""
-MOST_BYTES = 4_000_000
+MAX_BYTES = 4_000_000
 """Approximate size limit of the track data; larger reports show fewer poses of each track."""
-MOST_TRACKS = 1_000
+MAX_TRACKS = 1_000
 """Maximum number of tracks in a report."""
-LEAST_POSES, TRACK_SIZE = 4, 2_500
+MIN_POSES, TRACK_SIZE = 4, 2_500
 """Minimum number of poses per track, and its size in bytes without poses."""
 WIDEST = 6.0
 """Limit of the map on each side of the network, in spans of the network."""
-LEAST_REACH_M = 10.0
+MIN_REACH_M = 10.0
 """[m] Limit of the map for a single sensor."""
 
 
@@ -59,9 +59,9 @@ def scene_of(network: Sensors, begin_ns: int, end_ns: int,
     xy = network.positions[:, :2]
     low, high = xy.min(axis=0), xy.max(axis=0)
     span = float((high - low).max())
-    far = WIDEST * span if span > 0.0 else LEAST_REACH_M
+    far = WIDEST * span if span > 0.0 else MIN_REACH_M
     spare = 0.15 * span if span > 0.0 else 1.0
-    factor, unit = scale_of(span if span > 0.0 else LEAST_REACH_M)
+    factor, unit = scale_of(span if span > 0.0 else MIN_REACH_M)
     return {'frame': network.frame, 'begin_ns': str(begin_ns), 'begin': 0.0,
             'end': (end_ns - begin_ns) / NS, 'scale': {'factor': factor, 'unit': unit},
             'sensors': {'names': list(network.names), 'x': packed(xy[:, 0]), 'y': packed(xy[:, 1])},
@@ -75,7 +75,7 @@ def _box(low: FloatArray, high: FloatArray) -> list[float]:
 
 
 def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
-                      most: int = MOST_SENSORS) -> IntArray:
+                      most: int = MAX_SENSORS) -> IntArray:
     """Indices of the `most` sensors with the strongest field during a track, ascending.
 
     `rows` are the numbers of the poses that count; all by default.
@@ -86,11 +86,11 @@ def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
     return np.sort(np.argsort(-strength, kind='stable')[:most])
 
 
-def most_poses_of(logs: Sequence[TrackLog], most_bytes: int = MOST_BYTES) -> int:
+def most_poses_of(logs: Sequence[TrackLog], most_bytes: int = MAX_BYTES) -> int:
     """Number of poses per track that keeps the size of a report below `most_bytes`, about."""
     lengths = np.array([len(log.stamp_ns) for log in logs])
     sizes = np.array([_pose_size(log) for log in logs])
-    low, high = LEAST_POSES, max(int(lengths.max()), LEAST_POSES)
+    low, high = MIN_POSES, max(int(lengths.max()), MIN_POSES)
     while low < high:
         middle = (low + high + 1) // 2
         if TRACK_SIZE * len(logs) + (np.minimum(lengths, middle) * sizes).sum() > most_bytes:
@@ -102,7 +102,7 @@ def most_poses_of(logs: Sequence[TrackLog], most_bytes: int = MOST_BYTES) -> int
 
 def _pose_size(log: TrackLog) -> int:
     """Size of a pose in bytes of base64, with its true and smoothed position."""
-    n_sensors = min(MOST_SENSORS, len(log.measured[0]))
+    n_sensors = min(MAX_SENSORS, len(log.measured[0]))
     n_arrivals = len({name for row in log.arrivals for name in row})
     # Base64 needs four bytes for three.
     return (4 * (120 + 24 * n_sensors + 32 * n_arrivals)) // 3

@@ -14,7 +14,7 @@ from mag_tracking.report.palette import SERIES
 from mag_tracking.report.scales import scale_of
 from mag_tracking.report.style import legend_beside, plain_log_ticks
 
-LEAST_MISSED = 1e-6
+MIN_MISSED = 1e-6
 """Smaller probabilities of a miss are not drawn."""
 
 
@@ -202,10 +202,10 @@ def lane_figure(plan: _Plan) -> Figure:
     middle.set_ylabel('P(one frame detects it)')
     middle.set_xlabel(f'distance along the lane [{unit}]')
     legend_beside(middle)
-    known = plan.missed[plan.missed[:, 1] >= LEAST_MISSED]
+    known = plan.missed[plan.missed[:, 1] >= MIN_MISSED]
     bottom.semilogy(f * known[:, 0], known[:, 1], '.-', color='k')
     bottom.set_xlim(f * plan.missed[0, 0], 1.02 * f * plan.missed[-1, 0])
-    bottom.set_ylim(0.5 * LEAST_MISSED, 2.0)
+    bottom.set_ylim(0.5 * MIN_MISSED, 2.0)
     bottom.set_xlabel(f'lateral distance of a pass from the middle of the sensors [{unit}]')
     bottom.set_ylabel('P(a pass is missed)')
     for axes in (top, middle, bottom):

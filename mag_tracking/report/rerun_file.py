@@ -19,7 +19,7 @@ from mag_tracking.units import NS
 RERUN_FILE = 'tracks.rrd'
 """File name in a result folder."""
 TIME = 'stamp'
-LEAST_MOMENT = 1e-12
+MIN_MOMENT = 1e-12
 """[A m^2] Smaller moments have no direction."""
 SCALE_3D = float(np.sqrt(chdtri(3, 0.1)))
 """Standard deviations to the surface of the 90 % region in 3-D."""
@@ -75,7 +75,7 @@ def _write_track(rerun: Any, stream: Any, network: Sensors, log: TrackLog) -> No
             quaternions=[rerun.Quaternion(xyzw=orientation)]))
         stream.log(f'{root}/pose', rerun.Points3D([log.position[k]], labels=[
             f'{log.id} {log.kind[k]}{"?" if log.ambiguous[k] else ""}']))
-        size_of_moment = max(float(np.linalg.norm(log.moment[k])), LEAST_MOMENT)
+        size_of_moment = max(float(np.linalg.norm(log.moment[k])), MIN_MOMENT)
         stream.log(f'{root}/moment', rerun.Arrows3D(
             origins=[log.position[k]], vectors=[log.moment[k] / size_of_moment]))
         stream.log(f'speed/track_{log.id}', rerun.Scalars(float(np.hypot(*log.velocity[k][:2]))))

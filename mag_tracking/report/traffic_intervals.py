@@ -8,7 +8,7 @@ import numpy as np
 from mag_tracking.event_records import TrafficCount, TrafficSummary, VehiclePassage
 from mag_tracking.units import NS
 
-LONGEST_GAP_S = 5.0
+MAX_GAP_S = 5.0
 """[s] Frames further apart than this observe nothing between them."""
 
 
@@ -64,7 +64,7 @@ class Intervals:
         """Add the time since the frame before to its intervals."""
         self._observed.setdefault(self._begin_of(now_ns), 0)
         last_ns, self._last_ns = self._last_ns, now_ns
-        if last_ns is None or now_ns - last_ns > LONGEST_GAP_S * NS:
+        if last_ns is None or now_ns - last_ns > MAX_GAP_S * NS:
             return
         while last_ns < now_ns:
             begin = self._begin_of(last_ns)

@@ -19,7 +19,7 @@ from mag_tracking.web.live_track import LiveTrack
 
 KEPT_S = 600.0
 """[s] Tracks that ended earlier are removed."""
-MOST_POSES = 30_000
+MAX_POSES = 30_000
 """Maximum number of poses over all tracks; the oldest tracks are removed first."""
 MATCHING_FRAMES = 64
 """Number of recent frames kept for matching with tracks."""
@@ -169,7 +169,7 @@ class LiveScene:
         n = sum(len(live.log.stamp_ns) for live in self._tracks.values())
         for key, live in list(self._tracks.items())[:-1]:
             old = (self._end_ns - live.end_ns) / NS > KEPT_S
-            if old or n > MOST_POSES:
+            if old or n > MAX_POSES:
                 n -= len(live.log.stamp_ns)
                 del self._tracks[key]
                 if self._latest.get(live.log.id) is live:

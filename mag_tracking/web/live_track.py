@@ -7,10 +7,10 @@ from mag_tracking.report.page_scene import facts_of, strongest_sensors, track_en
 from mag_tracking.report.track_log import TrackLog
 from mag_tracking.units import NS
 
-MOST_OF_TRACK, FORGOTTEN = 8_000, 1_000
+MAX_OF_TRACK, FORGOTTEN = 8_000, 1_000
 """Maximum number of poses of one track, and how many are removed when it is exceeded. The page
 script uses the same numbers."""
-LONGEST_GAP_S = 60.0
+MAX_GAP_S = 60.0
 """[s] A pose after a longer gap belongs to another track of the same number."""
 RECENT = 100
 """Number of latest poses that select the sensors whose fields are sent."""
@@ -52,12 +52,12 @@ class LiveTrack:
 
     def continues(self, track: Track) -> bool:
         """True if a pose belongs to this track."""
-        return not self.log.ended and abs(track.stamp_ns - self.end_ns) <= LONGEST_GAP_S * NS
+        return not self.log.ended and abs(track.stamp_ns - self.end_ns) <= MAX_GAP_S * NS
 
     def add(self, track: Track, frame: FieldFrame) -> None:
         """Add a pose; the oldest poses of a very long track are removed."""
         self.log.add(track, frame)
-        if len(self.log.stamp_ns) > MOST_OF_TRACK:
+        if len(self.log.stamp_ns) > MAX_OF_TRACK:
             self.log.forget(FORGOTTEN)
             self._sent = max(0, self._sent - FORGOTTEN)
 

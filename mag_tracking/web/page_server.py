@@ -25,12 +25,12 @@ LOOPBACK = '127.0.0.1'
 DEFAULT_PORT = 8765
 TICK_S = 0.05
 """[s] Interval between messages. A target at 50 km/h moves 0.7 m in this time."""
-MOST_BUFFERED = 1_000_000
+MAX_BUFFERED = 1_000_000
 """Send buffer of a viewer, in bytes. A viewer above it receives no messages until it is empty."""
 GIVE_UP_S = 20.0
 """[s] A lagging viewer whose buffer does not shrink for this time is disconnected."""
-MOST_VIEWERS = 100
-MOST_PORT = 65535
+MAX_VIEWERS = 100
+MAX_PORT = 65535
 START_S = 10.0
 PAGE, STREAM = '/', '/stream'
 LOG = getLogger('mag_tracking.web')
@@ -159,7 +159,7 @@ class PageServer:
                 self.n_behind += 1
             else:
                 # What a welcome may have left in the buffer is allowed until it has been sent.
-                self._viewers[viewer] = max(MOST_BUFFERED, min(allowed, waiting + MOST_BUFFERED))
+                self._viewers[viewer] = max(MAX_BUFFERED, min(allowed, waiting + MAX_BUFFERED))
         for message in self._messages(self._source.news):
             broadcast(self._viewers, message)
         for viewer, (since, least) in list(self._behind.items()):
@@ -180,11 +180,11 @@ class PageServer:
             broadcast(self._viewers, message)
         for message in self._messages(self._source.whole):
             broadcast([viewer], message)
-        self._viewers[viewer] = _waiting(viewer) + MOST_BUFFERED
+        self._viewers[viewer] = _waiting(viewer) + MAX_BUFFERED
 
     async def _look(self, viewer: ServerConnection) -> None:
         """Handle one connection until it closes; incoming messages are ignored."""
-        if len(self._viewers) + len(self._behind) >= MOST_VIEWERS:
+        if len(self._viewers) + len(self._behind) >= MAX_VIEWERS:
             await viewer.close(1013, 'too many viewers')
             return
         self._welcome(viewer)
@@ -262,9 +262,9 @@ def _waiting(viewer: ServerConnection) -> int:
 
 def _listening(host: str, port: int) -> socket.socket:
     """Listening socket; raises DeviceError if it cannot be opened."""
-    if not 0 <= port <= MOST_PORT:
+    if not 0 <= port <= MAX_PORT:
         raise DeviceError(f'the live page cannot be served on port {port}: expected a number up '
-                          f'to {MOST_PORT}')
+                          f'to {MAX_PORT}')
     try:
         family, _, _, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]

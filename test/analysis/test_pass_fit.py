@@ -106,7 +106,7 @@ def test_deviations_of_what_follows_from_a_fit_are_right():
         # The further from zero in time the closest point is, the more its derivatives matter.
         place = np.array([12.0, -9.0, 0.0])
         fit = fit_pass(measured(ROAD, path, moments, rng), 1)
-        fit = replace(fit, honest_covariance=fit.covariance)
+        fit = replace(fit, robust_covariance=fit.covariance)
         true = unknowns_at(path, moments, fit.data.stamp_ns / 1e9)
         r, v = true[:3] - place, true[3:6]
         t = -(r @ v) / (v @ v)
@@ -164,10 +164,10 @@ def test_the_honest_covariance_is_never_smaller_and_no_larger_where_all_is_right
         rng = np.random.default_rng([seed, n_dipoles, 9])
         fit = fit_pass(measured(ROAD, *random_path(rng, n_dipoles, True), rng), n_dipoles,
                        errors=SensorErrors(0.0, 0.0))
-        excess = fit.honest_covariance - fit.covariance
+        excess = fit.robust_covariance - fit.covariance
         scale = np.sqrt(np.diagonal(fit.covariance))
         assert np.linalg.eigvalsh(excess / np.outer(scale, scale)).min() > -1e-6
-        ratios.append(np.sqrt(np.diagonal(fit.honest_covariance)) / scale)
+        ratios.append(np.sqrt(np.diagonal(fit.robust_covariance)) / scale)
     assert 1.0 <= np.median(ratios) < 1.4
 
 
@@ -357,7 +357,7 @@ def test_order_three_describes_vehicles(recorded_passes, name):
     assert fit.normalised_cost < (8.0 if 'truck' in name else 2.0)
     assert fit.speed[0] == pytest.approx(STRAIGHT[name], rel=0.08)
     # A truck is no row of three: its deviations are several times those of noise alone.
-    honest = np.sqrt(np.diagonal(fit.honest_covariance) / np.diagonal(fit.covariance))[:6]
+    honest = np.sqrt(np.diagonal(fit.robust_covariance) / np.diagonal(fit.covariance))[:6]
     assert np.median(honest) > (5.0 if 'truck' in name else 1.0)
     # The order that is chosen may be another one.
     assert recorded_passes[name].chosen.speed[0] == pytest.approx(STRAIGHT[name], rel=0.1)

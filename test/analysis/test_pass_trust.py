@@ -8,7 +8,7 @@ import pytest
 from mag_tracking.analysis.pass_deviation import SensorErrors
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import PassFit
-from mag_tracking.analysis.pass_trust import FittedRow, left_elsewhere, reach, trusted
+from mag_tracking.analysis.pass_trust import FittedRow, reach, residual_elsewhere, trusted
 from mag_tracking.apps.fit import RecordingFit
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.fit_folder import fit_row
@@ -46,11 +46,12 @@ def test_what_is_left_over_near_the_vehicle_is_not_elsewhere():
     near = np.minimum(1.0, 0.3 / np.linalg.norm(place, axis=1))[:, None]
     for left, low, high in ((0.0 * field, 0.0, 0.0), (near * field, 0.0, 1e-6),
                             (0.3 * field, 0.001, 0.2)):
-        share = left_elsewhere(data, [FittedRow(3, PATH, field)], np.einsum('nij,nj->ni', W, left))
+        share = residual_elsewhere(data, [FittedRow(3, PATH, field)],
+                                  np.einsum('nij,nj->ni', W, left))
         assert low <= share <= high
     # The same energy at another time, as of a second vehicle.
     late = np.roll(field, 150, axis=0)
-    share = left_elsewhere(data, [FittedRow(3, PATH, field)],
+    share = residual_elsewhere(data, [FittedRow(3, PATH, field)],
                            np.einsum('nij,nj->ni', W, 0.2 * late))
     assert share > 0.02
 
@@ -59,8 +60,8 @@ def test_noise_is_nothing_left_over():
     data, field = field_and_data()
     left = np.random.default_rng(0).standard_normal(field.shape)
     weak = 1e-3 * field
-    assert left_elsewhere(data, [FittedRow(3, PATH, field)], left) < 1e-6
-    assert left_elsewhere(data, [FittedRow(3, PATH, weak)], left) < 0.05
+    assert residual_elsewhere(data, [FittedRow(3, PATH, field)], left) < 1e-6
+    assert residual_elsewhere(data, [FittedRow(3, PATH, weak)], left) < 0.05
 
 
 @pytest.mark.parametrize('seed', [34, 36])
@@ -111,7 +112,7 @@ def test_errors_of_the_sensors_are_in_the_deviations(errors):
         alone = fit_pass(data, 1, errors=SensorErrors(0.0, 0.0))
         assert fit.speed[1] > 1.2 * alone.speed[1]
         true = path[:6] + np.r_[fit.data.stamp_ns / 1e9 * path[3:6], np.zeros(3)]
-        P = fit.honest_covariance[:6, :6]
+        P = fit.robust_covariance[:6, :6]
         e = fit.x[:6] - true
         z.append(e @ np.linalg.solve(P, e) / 6.0)
     # Twelve times six numbers; the 0.1 % and 99.9 % of chi-square over its mean.
@@ -139,7 +140,7 @@ def fitted(std_speed, std_heading, change=0.0):
     P = 1e-4 * np.eye(len(x))
     P[3, 3], P[4, 4] = std_speed**2, (10.0 * std_heading)**2
     return PassFit(1, data, '', True, tuple('u' * len(x)), x, P, P, 1.0, 1.0, 1.0,
-                   velocity_change=change, velocity_change_std=0.05, left_elsewhere=0.0)
+                   velocity_change=change, velocity_change_std=0.05, residual_elsewhere=0.0)
 
 
 def test_each_answer_is_trusted_by_its_own_deviation():
@@ -149,10 +150,10 @@ def test_each_answer_is_trusted_by_its_own_deviation():
     assert 'direction' not in trusted(fitted(5.1, 0.1))
     assert 'direction' not in trusted(fitted(0.5, 0.6)) and 'speed' in trusted(fitted(0.5, 0.6))
     late = fitted(0.5, 0.1)
-    late.honest_covariance[0, 0] = 4.0
+    late.robust_covariance[0, 0] = 4.0
     assert trusted(late) == ('speed', 'direction')
     assert trusted(fitted(0.5, 0.1, change=0.5)) == ()
-    assert trusted(replace(fitted(0.5, 0.1), left_elsewhere=0.01)) == ()
+    assert trusted(replace(fitted(0.5, 0.1), residual_elsewhere=0.01)) == ()
 
 
 @pytest.mark.parametrize('name', [n for n in VEHICLES if 'turns' in n])

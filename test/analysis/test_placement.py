@@ -101,7 +101,7 @@ def test_one_sensor_knows_no_scale_and_says_so():
 def test_fits_reach_the_bound():
     """Errors of 40 batch fits of a point: their mean square over the bound is chi-square / n."""
     rng, path = np.random.default_rng(3), np.array([0.0, 1.0, 0.5, 10.0, 0.0, 0.0])
-    sampling = Sampling(0.01, NOISE, half_window=2.0, most_frames=500)
+    sampling = Sampling(0.01, NOISE, half_window=2.0, max_frames=500)
     J = pass_information(*place_of(ROAD), CAR, sampling, path[None, :2], 0.0)[0, 4].sum(axis=0)
     P = bound(J)[:2, :2]
     nees = 0.0

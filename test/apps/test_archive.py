@@ -13,10 +13,10 @@ import pyarrow.parquet as pq
 import pytest
 
 import mag_tracking as mt
-from mag_tracking.apps import archive_stretches, archive_work
+from mag_tracking.apps import archive_segments, archive_work
 from mag_tracking.apps.archive import archive
-from mag_tracking.apps.archive_stretches import StretchWriter, read_stretch
-from mag_tracking.apps.archive_work import Job, cut, join, track_stretch
+from mag_tracking.apps.archive_segments import SegmentWriter, read_segment
+from mag_tracking.apps.archive_work import Job, cut, join, track_segment
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.archive_folder import join_tables, stamped
@@ -45,10 +45,10 @@ def archived(folder, recording, network, settings, in_order=True):
     work = folder / 'unfinished'
     work.mkdir(parents=True)
     job = Job(recording, work, folder, network, settings)
-    stretches = range(cut(job)['stretches'])
-    for k in stretches if in_order else reversed(stretches):
-        track_stretch(job, k)
-    return join(job), len(stretches)
+    segments = range(cut(job)['stretches'])
+    for k in segments if in_order else reversed(segments):
+        track_segment(job, k)
+    return join(job), len(segments)
 
 
 def assert_rows_of_replay(folder, result):
@@ -74,8 +74,8 @@ def assert_rows_of_replay(folder, result):
 
 def test_a_recording_that_is_cut_gives_the_rows_of_one_that_is_not(
         tmp_path, monkeypatch, road_network_file):
-    monkeypatch.setattr(archive_stretches, 'FEWEST', 60)
-    monkeypatch.setattr(archive_stretches, 'PIECE', 50)
+    monkeypatch.setattr(archive_segments, 'FEWEST', 60)
+    monkeypatch.setattr(archive_segments, 'PIECE', 50)
     settings, network = settings_for('vehicle', QUICK), read_network(road_network_file)
     known, n = archived(tmp_path, ROAD, network, settings, in_order=False)
     result = mt.track(ROAD, network, settings=QUICK)
@@ -89,7 +89,7 @@ def test_a_recording_that_is_cut_gives_the_rows_of_one_that_is_not(
 def test_clocks_that_are_apart_are_remembered_from_stretch_to_stretch(
         tmp_path, monkeypatch, road_network_file, ahead_s):
     """Tracks are doubted then, by the passes of all stretches before."""
-    monkeypatch.setattr(archive_stretches, 'FEWEST', 60)
+    monkeypatch.setattr(archive_segments, 'FEWEST', 60)
     path = tmp_path / 'network.yaml'
     text = road_network_file.read_text()
     path.write_text(text.replace('mag_2:', f'mag_2:\n    clock_offset: {ahead_s}'))
@@ -185,10 +185,10 @@ def test_ctrl_c_keeps_what_is_done(tmp_path, recordings):
     assert 'Traceback' not in errors
 
 
-def frames(*stretches):
+def frames(*segments):
     """Frames every 0.1 s: (seconds, whether a target is near) one after the other."""
     out = []
-    for seconds, present in stretches:
+    for seconds, present in segments:
         for _ in range(round(10 * seconds)):
             out.append(FieldFrame(len(out) * 100_000_000, np.zeros((1, 3)), np.eye(3)[None],
                                   np.ones(1, dtype=np.int64), np.zeros(1), present))
@@ -197,43 +197,43 @@ def frames(*stretches):
 
 @pytest.mark.parametrize('quiet_s, n', [(0.5, 1), (2.5, 1), (3.5, 2), (30.0, 2)])
 def test_stretches_are_cut_where_no_track_looks_back(tmp_path, monkeypatch, quiet_s, n):
-    monkeypatch.setattr(archive_stretches, 'FEWEST', 10)
-    monkeypatch.setattr(archive_stretches, 'PIECE', 7)
+    monkeypatch.setattr(archive_segments, 'FEWEST', 10)
+    monkeypatch.setattr(archive_segments, 'PIECE', 7)
     given = frames((20.0, False), (2.0, True), (quiet_s, False), (2.0, True), (9.0, False))
-    writer = StretchWriter(tmp_path, 3.0)
+    writer = SegmentWriter(tmp_path, 3.0)
     for f in given:
         writer.add_frame(f, {})
     writer.close()
-    assert writer.n_stretches == n
+    assert writer.n_segments == n
     for k in range(n):
-        kept = [f for piece in read_stretch(tmp_path / f'stretch-{k}.pickle')
+        kept = [f for piece in read_segment(tmp_path / f'stretch-{k}.pickle')
                 for f, _ in piece.frames()]
         first = next(i for i, f in enumerate(kept) if f.target_present)
         # All frames that a track may look back to, and the one that ends it.
         assert kept[first].stamp_ns - kept[0].stamp_ns in (3_000_000_000, 3_100_000_000)
         assert not kept[-1].target_present
-    assert max(len(p.stamp_ns) for k in range(n) for p in read_stretch(
+    assert max(len(p.stamp_ns) for k in range(n) for p in read_segment(
         tmp_path / f'stretch-{k}.pickle')) <= 7 + 31
 
 
 def test_a_time_that_jumps_back_between_stretches_blocks_nothing(tmp_path):
-    writer = StretchWriter(tmp_path, 3.0)
+    writer = SegmentWriter(tmp_path, 3.0)
     for f in frames((60.0, False)) + frames((60.0, False), (2.0, True), (9.0, False)):
         writer.add_frame(f, {})
     writer.close()
-    kept = [f for p in read_stretch(tmp_path / 'stretch-0.pickle') for f, _ in p.frames()]
+    kept = [f for p in read_segment(tmp_path / 'stretch-0.pickle') for f, _ in p.frames()]
     assert len(kept) == 31 + 20 + 1
     assert not (tmp_path / 'stretch-1.pickle').exists()
 
 
 def test_doubts_go_with_the_frames_of_a_stretch(tmp_path):
     """Whenever they change, and at the beginning of each stretch."""
-    writer = StretchWriter(tmp_path, 3.0)
+    writer = SegmentWriter(tmp_path, 3.0)
     first, second = {'mag_1': ((1, None),)}, {'mag_1': ((1, 5),)}
     for k, f in enumerate(frames((5.0, False), (2.0, True), (9.0, False))):
         writer.add_frame(f, first if k < 60 else second)
     writer.close()
-    found = [(f.stamp_ns, doubts) for piece in read_stretch(tmp_path / 'stretch-0.pickle')
+    found = [(f.stamp_ns, doubts) for piece in read_segment(tmp_path / 'stretch-0.pickle')
              for f, doubts in piece.frames() if doubts is not None]
     assert [doubts for _, doubts in found] == [first, second]
     assert found[0][0] < 5_000_000_000 and found[1][0] == 6_000_000_000

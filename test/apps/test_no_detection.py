@@ -19,7 +19,7 @@ QUIET = QUIET.part(QUIET.stamp_ns < QUIET.stamp_ns[0] + 5_000_000_000)
 def why(*faults, network=NETWORK, readings=None, **settings):
     readings = recorded('straight_small_left').readings if readings is None else readings
     return mt.track(spoiler.apply(readings, *faults), network, settings={
-        name.replace('__', '.'): value for name, value in settings.items()}).why_no_detection
+        name.replace('__', '.'): value for name, value in settings.items()}).no_detection_reason
 
 
 def test_after_a_detection_nothing_is_to_be_explained():

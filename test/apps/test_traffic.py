@@ -54,7 +54,7 @@ def test_summaries_add_up():
     assert sum(c.count for s in result.summaries for c in s.counts) == 30
     assert sum(s.observed_s for s in result.summaries) == pytest.approx(360.0, abs=5.0)
     assert len(result.summaries) == 7 and result.counts['passages'] == 30
-    assert result.why_no_detection is None and '30 vehicles' in repr(result)
+    assert result.no_detection_reason is None and '30 vehicles' in repr(result)
 
 
 def test_speeds_by_track_and_by_delay_agree_along_a_road():

@@ -12,7 +12,7 @@ from bench.two_simulators import count_over
 from mag_tracking.stages.track.settings import BEST, HOLD, MIXTURE
 from support.random_passes import KINDS, SIMULATORS, one_random_pass
 
-MOST_ANEES = 2.0
+MAX_ANEES = 2.0
 
 
 def one_pass(policy, simulator, kind, seed):
@@ -36,9 +36,9 @@ def summary(policy, found):
         return (f'  {policy}: of {ambiguous.sum()} ambiguous poses {on_topic.sum()} on the topics, '
                 f'of {(~ambiguous).sum()} others {np.isfinite(nees[~ambiguous]).sum()}',
                 not on_topic.any())
-    met = policy != MIXTURE or nees[on_topic].mean() <= MOST_ANEES
+    met = policy != MIXTURE or nees[on_topic].mean() <= MAX_ANEES
     return (f'  {policy}: {len(found)} passes, {on_topic.sum()} ambiguous poses, ANEES '
-            f'{nees[on_topic].mean():.2f}{f" (aim {MOST_ANEES:g})" if policy == MIXTURE else ""}, '
+            f'{nees[on_topic].mean():.2f}{f" (aim {MAX_ANEES:g})" if policy == MIXTURE else ""}, '
             f'99 % below {np.quantile(nees[on_topic], 0.99):.1f}, largest error '
             f'{error[on_topic].max():.1f} m; others {nees[~ambiguous].mean():.2f}'
             f'{"" if met else "  MISSED"}', met)

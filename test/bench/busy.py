@@ -18,7 +18,7 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_vehicle import start_vehicle, vehicle_model
-from mag_tracking.stages.track.newcomer import NewcomerSearch
+from mag_tracking.stages.track.new_target_search import NewTargetSearch
 from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
 from support.busy_recordings import BUSY, rightly_counted, tracked_recording
 from support.busy_worlds import NETWORKS, busy, tracked
@@ -27,9 +27,9 @@ from support.random_passes import KINDS, are_wrong, one_random_pass
 AIMS = {'meeting': (1.0, 4.0, 1.0), 'meeting more': (0.7, 3.0, 1.0),
         'following': (0.9, None, 1.0), 'traffic': (None, None, 11 / 12)}
 """{recordings: median RMS [m], median NEES of two, share of vehicles found}; None = no aim."""
-LEAST_MEETING = 15 / 16
+MIN_MEETING = 15 / 16
 """With two sensors one of sixteen may be missed."""
-MOST_WRONG, MOST_COST = 0.01, 4.0
+MAX_WRONG, MAX_COST = 0.01, 4.0
 N_HYP, RUNS = 20, 25
 
 
@@ -38,7 +38,7 @@ def aims_of(name):
     kind = next((k for k in ('meeting', 'following', 'traffic') if name.startswith(k)), 'traffic')
     rms, nees, found = AIMS['meeting more' if kind == 'meeting' and '2_sensors' not in name
                             else kind]
-    return rms, nees, LEAST_MEETING if name.startswith('meeting_2') else found
+    return rms, nees, MIN_MEETING if name.startswith('meeting_2') else found
 
 
 def shown(items, what):
@@ -49,7 +49,7 @@ def shown(items, what):
 @contextmanager
 def searches():
     """[s] that each search for another vehicle takes."""
-    seconds, find = [], NewcomerSearch.find
+    seconds, find = [], NewTargetSearch.find
 
     def timed(search):
         begin = time.perf_counter()
@@ -58,11 +58,11 @@ def searches():
         finally:
             seconds.append(time.perf_counter() - begin)
 
-    NewcomerSearch.find = timed
+    NewTargetSearch.find = timed
     try:
         yield seconds
     finally:
-        NewcomerSearch.find = find
+        NewTargetSearch.find = find
 
 
 def recordings(figures, folder):
@@ -165,9 +165,9 @@ def main():
     counted = np.array([*recordings(figures, given.data), *simulated(figures, given.seeds),
                         *of_one(given.passes)])
     sure, wrong = counted.sum(axis=0)
-    figures.add('poses without a flag that are wrong', wrong / sure, '', MOST_WRONG,
+    figures.add('poses without a flag that are wrong', wrong / sure, '', MAX_WRONG,
                 note=f' ({wrong} of {sure})')
-    figures.add('two vehicles together over one', cost(), 'times', MOST_COST)
+    figures.add('two vehicles together over one', cost(), 'times', MAX_COST)
     return figures.save()
 
 

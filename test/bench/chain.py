@@ -41,7 +41,7 @@ def play(role):
     from geometry_msgs.msg import PoseWithCovarianceStamped
     from mag_tracking_msgs.msg import FieldReadings
 
-    from mag_tracking.interrupts import noted_signals
+    from mag_tracking.interrupts import recorded_signals
     from mag_tracking.nodes.middleware import begin
     from mag_tracking.nodes.stage_node import STREAM, make_executor, spin
     begin()
@@ -63,7 +63,7 @@ def play(role):
         source = {'last': 'c', 'second': 'b', 'first': 'a'}[role]
         node.create_subscription(FieldReadings, f'/chain/{source}', hand_on, STREAM)
     executor.add_node(node)
-    with noted_signals(signal.SIGINT, signal.SIGTERM) as seen:
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
         spin(executor, lambda: bool(seen))
 
 

@@ -29,7 +29,7 @@ N = 120
 """Passes of each simulator."""
 EXAMPLES = {'motorcycle': 30, 'car': 160, 'truck': 30}
 """Signatures of each class."""
-LEAST_RIGHT, MOST_APART = 0.95, 0.05
+MIN_RIGHT, MAX_SEPARATION = 0.95, 0.05
 
 
 def body_of(rng, name, simulator):
@@ -66,7 +66,7 @@ def main():
         counted = [(name, p) for name, p in found if p is not None]
         right = np.array([p.vehicle_class == name for name, p in counted])
         figures.add(f'{simulator}: counted', len(counted) / N, '', None, True)
-        figures.add(f'{simulator}: class right', float(right.mean()), '', LEAST_RIGHT, True)
+        figures.add(f'{simulator}: class right', float(right.mean()), '', MIN_RIGHT, True)
         for kind in classes:
             mine = np.array([name == kind for name, _ in counted])
             figures.add(f'{simulator}: recall of {kind}', float(right[mine].mean()), '', None, True,
@@ -75,7 +75,7 @@ def main():
         best = np.array([classes[int(np.argmax(p.class_probabilities))] == name
                          for name, p in counted])
         figures.add(f'{simulator}: reliability error', reliability_error(stated, best), '',
-                    MOST_APART)
+                    MAX_SEPARATION)
     for simulator in SIMULATORS:
         examples = examples_of(signatures(EXAMPLES, simulator))
         found = evaluate_classes(examples, progress=partial(
@@ -85,7 +85,7 @@ def main():
         figures.add(f'{simulator}, one sensor: balanced accuracy',
                     float(found.balanced_accuracy.mean()), '', None, True)
         figures.add(f'{simulator}, one sensor: reliability error', found.reliability, '',
-                    MOST_APART)
+                    MAX_SEPARATION)
     return figures.save()
 
 

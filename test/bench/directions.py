@@ -13,7 +13,7 @@ SEEDS = (1, 2, 3)
 PUBLISHED = {'near': 510 / 511, 'far': 454 / 511, 'fused': 494 / 511}
 LIKELIHOOD = {'near': 488 / 511, 'far': 379 / 511, 'fused': 480 / 511}
 AIMS = {'near': 0.998, 'far': None, 'fused': 0.97}
-MOST_APART = 0.05
+MAX_SEPARATION = 0.05
 """Stated error probabilities are right within this."""
 
 
@@ -36,7 +36,7 @@ def main():
                             f' (published {published[name]:.4f})')
         stated, measured = calibration(vehicles)
         figures.add(f'{simulator}, far lane: stated less measured error probability',
-                    abs(stated - measured), '', MOST_APART, False,
+                    abs(stated - measured), '', MAX_SEPARATION, False,
                     f' ({stated:.3f} stated, {measured:.3f} measured)')
     return figures.save()
 

@@ -24,7 +24,7 @@ from support.worlds import World
 
 OFF, SD = 0.1, 3.0
 """A speed that is off by more than both, this share and so many deviations, is sure and wrong."""
-LEAST_RIGHT, MOST_WRONG = 0.9, 0.01
+MIN_RIGHT, MAX_WRONG = 0.9, 0.01
 
 
 class Tally:
@@ -51,7 +51,7 @@ class Tally:
         figures.add(f'{what}: fitted in the right direction', len(off) / n, '', aim, True,
                     f' (of {self.n_vehicles})')
         figures.add(f'{what}: speed within 10 %', float((np.abs(off) < OFF).mean()), '',
-                    LEAST_RIGHT if aim else None, True)
+                    MIN_RIGHT if aim else None, True)
         figures.add(f'{what}: median error of the position',
                     float(np.median([of.error for of in self.found])), 'm')
         figures.add(f'{what}: without a flag', float(sure.mean()), '',
@@ -109,7 +109,7 @@ def main():
     given = parser.parse_args()
     figures = Figures('joint_fits')
     print('Fits of several vehicles at once')
-    counted = [recordings(given.data).figures(figures, 'recordings', LEAST_RIGHT)]
+    counted = [recordings(given.data).figures(figures, 'recordings', MIN_RIGHT)]
     for simulator in SIMULATORS:
         for how in ('meeting', 'following'):
             counted.append(worlds(how, simulator, given.seeds).figures(
@@ -117,10 +117,10 @@ def main():
         counted.append(worlds('meeting', simulator, given.seeds, 0.5).figures(
             figures, f'{simulator}, meeting, every other one a truck'))
         split, n = of_one(simulator, given.passes)
-        figures.add(f'{simulator}: single vehicles taken for several', split / n, '', MOST_WRONG,
+        figures.add(f'{simulator}: single vehicles taken for several', split / n, '', MAX_WRONG,
                     note=f' ({split} of {n})')
     sure, wrong = np.sum(counted, axis=0)
-    figures.add('answers without a flag that are wrong', wrong / sure, '', MOST_WRONG,
+    figures.add('answers without a flag that are wrong', wrong / sure, '', MAX_WRONG,
                 note=f' ({wrong} of {sure})')
     return figures.save()
 

@@ -46,12 +46,12 @@ def network_yaml(n):
                       ''])
 
 
-def drivers_yaml(n, network, in_turn):
+def drivers_yaml(n, network, sequential):
     """The simulator for all of them: a car at 20 m/s, as often as the road is free."""
-    gather = f'  gather_s: {GATHER_S}\n' if in_turn and n > MANY else ''
+    gather = f'  batch_s: {GATHER_S}\n' if sequential and n > MANY else ''
     return (f'road:\n  device: simulator\n{gather}  simulator: {{network: {network}, '
             f'rate_hz: {RATE}, speed: 20.0, period_s: 5.0, offset: 1.0, '
-            f'in_turn: {str(in_turn).lower()}}}\n  sensors: {{'
+            f'sequential: {str(sequential).lower()}}}\n  sensors: {{'
             + ', '.join(f'mag_{i + 1}: mag_{i + 1}' for i in range(n)) + '}\n')
 
 
@@ -65,7 +65,7 @@ def usage(process):
 class Ear:
     """Listens to poses and diagnostics."""
 
-    def __init__(self, node, in_turn):
+    def __init__(self, node, sequential):
         from diagnostic_msgs.msg import DiagnosticArray
         from geometry_msgs.msg import PoseWithCovarianceStamped
 
@@ -76,7 +76,7 @@ class Ear:
         self._unread = []
         # The stamp is the mean of the samples; the one that shows that they were all comes behind:
         # half a frame, and what the sensors are apart.
-        self._completed_s = PERIOD_S / 2.0 + (1.0 if in_turn else 0.5) / RATE
+        self._completed_s = PERIOD_S / 2.0 + (1.0 if sequential else 0.5) / RATE
         node.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose', self._pose,
                                  STREAM)
         # Read when all is over: what poses wait for here is no latency of theirs.
@@ -118,11 +118,11 @@ class Ear:
                     ('rejected', 'lost', 'readings lost', 'frames with a sensor'))}
 
 
-def start(folder, n, parameters, in_turn, batches, together):
+def start(folder, n, parameters, sequential, batches, together):
     """The nodes as processes, the driver last; or all `together` in one."""
     network, drivers = folder / 'network.yaml', folder / 'drivers.yaml'
     network.write_text(network_yaml(n))
-    drivers.write_text(drivers_yaml(n, network, in_turn))
+    drivers.write_text(drivers_yaml(n, network, sequential))
     if together:
         return {'all_in_one': subprocess.Popen(
             [Path(sys.executable).with_name('mag-tracking'), 'run', '--network', network,
@@ -155,7 +155,7 @@ def parameters_of(folder, lean):
     """The parameter file."""
     text = (ROOT / 'config' / 'large_network.yaml').read_text()
     if lean:
-        text = re.sub(r'most_hypotheses: \d+', 'most_hypotheses: 126', text) \
+        text = re.sub(r'max_hypotheses: \d+', 'max_hypotheses: 126', text) \
             + ''.join(f'        {key}: {value}\n' for key, value in LEAN.items())
     path = folder / 'parameters.yaml'
     path.write_text(text)
@@ -236,13 +236,13 @@ def measure(args):
     rclpy.init()  # noqa: TID251
     node, executor = rclpy.create_node('load'), make_executor()
     executor.add_node(node)
-    ear = Ear(node, args.in_turn)
+    ear = Ear(node, args.sequential)
     with tempfile.TemporaryDirectory() as folder:
         os.environ['ROS_HOME'] = folder
         # What the meter's own garbage takes is no latency of poses.
         gc.disable()
         processes = start(Path(folder), args.sensors, parameters_of(Path(folder), args.lean),
-                          args.in_turn, args.batches, args.one_process)
+                          args.sequential, args.batches, args.one_process)
         pages, viewers = open_pages(args.pages) if args.pages else ({}, None)
         processes |= pages
         try:

@@ -30,14 +30,14 @@ FRAMES = 20
 """After so many frames of the track it is enough."""
 
 
-def measured(most_sensors):
+def measured(max_sensors):
     """Print what a pass took: [s] of the start and of each frame, [MB] at most."""
     network = line_network(N_SENSORS, tilt=0.02)
     path = Path(np.array([-60.0, -1.5]), 0.0, SPEED)
     samples, *_ = simulate(network, point_body([200.0, -150.0, 80.0], 5.0, 0.5), path, 50.0,
                            12.0, np.random.default_rng(1))
     pipeline = Pipeline(network, settings_for('vehicle', {
-        'track.most_sensors': most_sensors} if most_sensors else {}))
+        'track.max_sensors': max_sensors} if max_sensors else {}))
     track, starts, frames = pipeline.track, [], []
     feed = track.feed
 

@@ -29,10 +29,10 @@ from support.situation_worlds import FOUR, car, straight, usual
 
 RUNS = 5
 """Number of simulated passes of each control and simulator."""
-LEAST_SURE = 0.95
+MIN_CONFIDENCE = 0.95
 """The least ratio to the other checkout's number of poses without a flag: of the right ones in each
 row, of all of them in the total."""
-MOST_ERROR = 1.03
+MAX_ERROR = 1.03
 """The largest ratio to an error of the other checkout that counts as no worse."""
 SURE, RIGHT = 'no flag', f'no flag, within {WRONG_M:g} m'
 ERRORS = {'rms': 'RMS [m]', 'closest': 'closest [m]', 'anees': 'ANEES', 'position_mean': 'mean [m]',
@@ -120,10 +120,10 @@ def measured_by(checkout):
 def is_worse(name, figure, now, before):
     """Whether a figure is worse than before by more than may be."""
     if RIGHT in figure or (name, figure) == ('all', SURE):
-        return now < LEAST_SURE * before
+        return now < MIN_CONFIDENCE * before
     if SURE in figure:
         return False  # Fewer are better where they were wrong.
-    return now > max(MOST_ERROR * before, 1.0 if 'ANEES' in figure else 0.0)
+    return now > max(MAX_ERROR * before, 1.0 if 'ANEES' in figure else 0.0)
 
 
 def compared(name, figure, now, before):

@@ -18,9 +18,9 @@ from support.random_passes import SIMULATORS
 from support.situations import SITUATIONS, made, verdict
 
 PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'situations.md'
-LEAST_EVENTS = 0.9
+MIN_EVENTS = 0.9
 """Share of the runs with a detection, and without a vehicle, that leave a disturbance."""
-MOST_COST = 0.1
+MAX_COST = 0.1
 """Share of a tracked frame that "something else" and the tests may take."""
 
 HEAD = """# Situations
@@ -121,10 +121,10 @@ def summary_of(found):
     sure, wrong = sum(v.n_sure for v in one), sum(v.n_wrong for v in one)
     events, detected = n_events(nothing)
     return (f'\nWithout a vehicle, {events} of {detected} runs with a detection leave a '
-            f'disturbance (aim {LEAST_EVENTS:.0%}). All situations with one vehicle or none: '
+            f'disturbance (aim {MIN_EVENTS:.0%}). All situations with one vehicle or none: '
             f'{share(wrong, sure)} of {sure} poses without a flag are wrong (aim 0.5 %). '
             f'"Something else" and the tests take {cost():.1%} of a tracked frame (aim at most '
-            f'{MOST_COST:.0%}).\n')
+            f'{MAX_COST:.0%}).\n')
 
 
 def both_simulators(name, run):

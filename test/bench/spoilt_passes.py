@@ -7,7 +7,7 @@ first pass looks for a quiet stretch. A flagged or missing track is no error her
 import argparse
 import sys
 
-from bench.two_simulators import MOST_WRONG, count_over, share_of_wrong
+from bench.two_simulators import MAX_WRONG, count_over, share_of_wrong
 from support import spoiler
 from support.dense_traffic import dense_traffic
 from support.random_passes import KINDS, SIMULATORS, one_random_pass
@@ -52,7 +52,7 @@ def summary(what, simulator, kind, found):
     _, share = share_of_wrong(found)
     n_tracked = sum(len(f.error) > 0 for f in found)
     right = sum(bool(f.heading > HEADING) for f in found)
-    met = share <= MOST_WRONG
+    met = share <= MAX_WRONG
     return (f'  {what:27s} {simulator}, {kind}: {sum(f.detected for f in found):2d} of '
             f'{len(found)} detected, {n_tracked:2d} tracked, {right:2d} in the right direction; '
             f'{sum((~f.ambiguous).any() for f in found):2d} somewhere sure, sure and wrong '
@@ -67,7 +67,7 @@ def main():
     parser.add_argument('--kinds', nargs='+', choices=KINDS, default=['car'])
     given = parser.parse_args()
     print(f'{given.passes} random passes of each product, two sensors, 100 Hz; the aim is at most '
-          f'{MOST_WRONG:.0%} sure and wrong')
+          f'{MAX_WRONG:.0%} sure and wrong')
     return count_over([(w, s, k) for w in FAULTS for s in SIMULATORS for k in given.kinds],
                       spoilt_pass, given.passes, summary)
 

@@ -13,8 +13,8 @@ from tqdm import tqdm
 
 from support.random_passes import KINDS, SIMULATORS, one_random_pass
 
-MOST_NEES = {'truck': 5.0, 'car': 2.5, 'turning': 2.5}
-MOST_WRONG, LEAST_SPEED = 0.01, 0.9
+MAX_NEES = {'truck': 5.0, 'car': 2.5, 'turning': 2.5}
+MAX_WRONG, MIN_SPEED = 0.01, 0.9
 
 
 def share_of_wrong(found):
@@ -49,11 +49,11 @@ def summary(simulator, kind, found):
     n_sure, share = share_of_wrong(sure)
     n_smoothed = sum(f.smoothed_sure for f in found)
     smoothed = sum(f.smoothed_wrong for f in found) / max(n_smoothed, 1)
-    met = share <= MOST_WRONG and nees.mean() <= MOST_NEES[kind] and within >= LEAST_SPEED
+    met = share <= MAX_WRONG and nees.mean() <= MAX_NEES[kind] and within >= MIN_SPEED
     return (f'  {simulator}, {kind}: {len(sure)} of {len(found)} tracked and somewhere '
             f'unambiguous; {n_sure} such poses, sure and wrong {share:.1%} (aim 1 %), in '
             f'{sum(f.sure_and_wrong.any() for f in sure)} passes; within 5 m NEES an axis mean '
-            f'{nees.mean():.1f} (aim {MOST_NEES[kind]:.1f}), median {np.median(nees):.1f}; speed '
+            f'{nees.mean():.1f} (aim {MAX_NEES[kind]:.1f}), median {np.median(nees):.1f}; speed '
             f'within 10 % in {within:.0%} (aim 90 %); at the closest point median '
             f'{np.median(closest):.2f} m; of {n_smoothed} unambiguous smoothed poses '
             f'{smoothed:.1%} sure and wrong{"" if met else "  MISSED"}', met)

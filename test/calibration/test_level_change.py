@@ -103,8 +103,9 @@ def test_a_vehicle_that_stops_has_come_and_one_that_starts_has_left(stops):
         blocks = blocks_of(lambda t, s=signal, b=begin: s(t + b), end - begin, seed)
         found, reverse = judged(blocks), judged(backwards(blocks))
         if found.size >= CLEAR_SIZE:
-            verdicts.append(found.has_left)
-            assert reverse.has_left in (None, not found.has_left) or found.has_left is None
+            verdicts.append(found.has_departed)
+            assert found.has_departed is None \
+                or reverse.has_departed in (None, not found.has_departed)
     assert len(verdicts) > 20
     # Wrong is worse than undecided.
     assert verdicts.count(stops) == 0
@@ -139,7 +140,7 @@ def test_a_queue_and_a_vehicle_that_parks_backwards_have_not_left(what):
             so_far = Blocks(*(values[:k] for values in blocks))
             latest = so_far.mean[-8:]
             if (np.abs(latest - latest.mean(axis=0)) < 2.0 * SIGMA).all():
-                verdicts.add(judged(so_far, 8).has_left)
+                verdicts.add(judged(so_far, 8).has_departed)
         left, came = left + (True in verdicts), came + (False in verdicts)
     assert left <= 1 and came > 20
 
@@ -161,7 +162,7 @@ def test_a_jump_a_ramp_and_a_small_change_are_not_decided():
     def ramp(t, length=2.0, size=1e-6):
         return size * np.clip((t - 6.0) / length, 0.0, 1.0) * np.ones(3)
     for signal in (lambda t: ramp(t, 1e-3), ramp, lambda t: 1e-3 * vehicle(0, True)(t)):
-        assert judged(blocks_of(signal, 16.0)).has_left is None
+        assert judged(blocks_of(signal, 16.0)).has_departed is None
 
 
 def test_a_change_that_is_not_clear_is_judged_by_a_clear_one():
@@ -173,7 +174,7 @@ def test_a_change_that_is_not_clear_is_judged_by_a_clear_one():
     assert shared.judge(0, weak) is True
     # Not by one of another time, and a clear one only by itself.
     assert shared.judge(0, dataclasses.replace(weak, since=90.0)) is False
-    assert shared.judge(2, dataclasses.replace(strong, size=1.5 * CLEAR_SIZE, has_left=False)) \
+    assert shared.judge(2, dataclasses.replace(strong, size=1.5 * CLEAR_SIZE, has_departed=False)) \
         is False
 
 

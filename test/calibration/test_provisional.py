@@ -74,12 +74,12 @@ def stood(until):
 
 def test_what_stood_there_in_the_beginning_is_doubted_and_replaced():
     """Seen for four seconds: after as long without it, nobody knows which one is the background."""
-    for seconds, is_doubtful, has_left in ((4.0, False, False), (9.5, True, False),
+    for seconds, is_doubtful, has_departed in ((4.0, False, False), (9.5, True, False),
                                            (24.0, False, True)):
         b = fed(stood(4.0), seconds)
         assert b.ready and b.doubtful == is_doubtful
         error = np.abs(b.level(seconds) - EARTH)
-        assert (error < SIGMA).all() == has_left
+        assert (error < SIGMA).all() == has_departed
 
 
 @pytest.mark.parametrize('stood_s', [4.0, 20.0])
@@ -162,7 +162,7 @@ def calibrated(parts, network=None, **changes):
 
 def test_readings_say_what_a_provisional_background_may_be_off_by():
     stage, covariance, stamps = calibrated([readings(traffic(2.0), 60.0)])
-    times = stage.doubtful_stretches()['mag_1']
+    times = stage.doubtful_intervals()['mag_1']
     doubtful = np.array([are_doubtful(times, s) for s in stamps.tolist()])
     (begin, end), = times
     assert 6e9 <= begin < 15e9 < end < 60e9
@@ -176,22 +176,22 @@ def test_what_is_doubtful_does_not_depend_on_the_batches():
     stage, covariance, _ = calibrated([whole])
     parts = [whole.part(slice(i, i + 7)) for i in range(0, len(whole), 7)]
     other, again, _ = calibrated(parts)
-    assert stage.doubtful_stretches() == other.doubtful_stretches() != {}
+    assert stage.doubtful_intervals() == other.doubtful_intervals() != {}
     np.testing.assert_array_equal(covariance, again)
 
 
 def test_the_times_of_doubt_follow_the_clock():
     network = line_network(1)
     stage, *_ = calibrated([readings(traffic(2.0), 14.0)], network)
-    (begin, _), = stage.doubtful_stretches()['mag_1']
+    (begin, _), = stage.doubtful_intervals()['mag_1']
     stage.renew(dataclasses.replace(network, clock_offset=np.array([0.5])))
-    assert stage.doubtful_stretches()['mag_1'] == ((begin - 500_000_000, None),)
+    assert stage.doubtful_intervals()['mag_1'] == ((begin - 500_000_000, None),)
 
 
 def test_what_is_given_is_not_doubted():
     network = dataclasses.replace(line_network(1), background=(EARTH,))
     stage, covariance, _ = calibrated([readings(traffic(2.0), 30.0)], network)
-    assert stage.doubtful_stretches() == {}
+    assert stage.doubtful_intervals() == {}
     np.testing.assert_array_equal(stage.background('mag_1'), EARTH)
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mag_tracking.apps.first_pass import first_pass
+from mag_tracking.apps.prescan import prescan
 from mag_tracking.records import Readings
 from mag_tracking.settings import replace
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
@@ -27,7 +27,7 @@ def readings(signal, seconds=60.0, rate=50.0, seed=0, step=0.0):
 
 
 def found(signal, settings=SETTINGS, network=NETWORK, **more):
-    return first_pass([readings(signal, **more)], network, settings)
+    return prescan([readings(signal, **more)], network, settings)
 
 
 def passing(*times, size=1e-6):
@@ -60,7 +60,7 @@ def test_a_target_that_stands_there_at_first_is_not_the_background():
     """It leaves; from then on the background is what it was after that."""
     signal = readings(stands(10.0))
     stage = Calibrate(NETWORK, SETTINGS)
-    first_pass([signal], NETWORK, SETTINGS).apply(stage)
+    prescan([signal], NETWORK, SETTINGS).apply(stage)
     out = stage.feed(signal)[0]
     t = out.stamp_ns / 1e9
     assert np.abs(out.field[t < 8.0].mean(axis=0) - 2e-6).max() < 1e-8
@@ -80,10 +80,10 @@ def test_a_target_that_comes_later_and_stays_is_not_the_background(arrives, unti
 
 def test_what_stood_there_for_most_of_the_recording_is_not_the_background():
     """It is seen to leave: the level that it leaves behind is, however short."""
-    def leaving(t):
+    def shutdown(t):
         way = 0.5 * 2.0 * max(t - 30.0, 0.0)**2
         return 4e-6 / (1.0 + (way / 5.0)**2)**1.5
-    level, = found(leaving, seconds=44.0).levels.values()
+    level, = found(shutdown, seconds=44.0).levels.values()
     assert (np.abs(level.level - EARTH) < SIGMA).all() and level.begin > 33.0
 
 
@@ -105,14 +105,14 @@ def test_sensors_that_are_slow_or_start_late_begin_quietly(rates, starts):
         parts.append(late.part(late.stamp_ns >= start * 1e9))
     joined = Readings.joined(parts)
     joined = joined.part(np.argsort(joined.stamp_ns, kind='stable'))
-    assert first_pass([joined], network, SETTINGS).levels == {}
+    assert prescan([joined], network, SETTINGS).levels == {}
 
 
 @pytest.mark.parametrize('value', [EARTH, np.zeros(3), np.array([2e-5, 0.0, 0.0]),
                                    EARTH + np.array([1.234e-8, -5.6e-9, 7.7e-9])])
 def test_a_sensor_that_never_changes_has_no_background(value):
     hung = batch([MagSample(int(k * 1e7), 'mag_1', value) for k in range(2000)])
-    stage, pass_ = Calibrate(NETWORK, SETTINGS), first_pass([hung], NETWORK, SETTINGS)
+    stage, pass_ = Calibrate(NETWORK, SETTINGS), prescan([hung], NETWORK, SETTINGS)
     pass_.apply(stage)
     assert stage.feed(hung) == [] and stage.unready() == ['mag_1']
 
@@ -130,7 +130,7 @@ def test_a_recording_of_nothing_but_a_target_has_no_level():
 
 def test_the_readings_may_come_in_batches_of_any_size():
     whole = readings(passing(1.0))
-    expected = first_pass([whole], NETWORK, SETTINGS).levels['mag_1']
+    expected = prescan([whole], NETWORK, SETTINGS).levels['mag_1']
     parts = (whole.part(slice(i, i + 7)) for i in range(0, len(whole), 7))
-    level = first_pass(parts, NETWORK, SETTINGS).levels['mag_1']
+    level = prescan(parts, NETWORK, SETTINGS).levels['mag_1']
     np.testing.assert_array_equal(level.level, expected.level)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mag_tracking.calibration import core
-from mag_tracking.calibration.core import DITHERED, LONGEST_REST_NS
+from mag_tracking.calibration.core import DITHERED, MAX_REST_NS
 from mag_tracking.calibration.resolution import (
     completed_steps,
     raw_steps,
@@ -70,7 +70,7 @@ def test_the_compiled_rule_agrees_with_the_plain_one():
 
 
 def test_a_rest_counts_as_one_measurement_for_a_while():
-    n = LONGEST_REST_NS // (10 * MS)
+    n = MAX_REST_NS // (10 * MS)
     assert noted(np.ones((3, 3)))[0]['n_rest'].tolist() == [3, 3, 3]
     assert noted(np.ones((10 * n, 3)))[0]['n_rest'].tolist() == [n + 1] * 3
     one_moves = noted([*np.ones((10 * n, 3)), [1.0, 1.0, 2.0]])

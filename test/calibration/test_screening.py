@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mag_tracking.calibration import core
 from mag_tracking.calibration.screening import HELD, PASSES, RELEASED, SPIKE
-from mag_tracking.calibration.sensor_state import MOST_HELD, new_sensors
+from mag_tracking.calibration.sensor_state import MAX_HELD, new_sensors
 from mag_tracking.simulation.scenario import Path, point_body, random_vehicle
 from support.networks import line_network
 from support.samples import simulate
@@ -187,14 +187,14 @@ def test_a_step_is_a_step(size):
     y = noise(80)
     y[30:] += size
     spikes, most, late = screened(y)
-    assert (spikes, most, late) == ([], MOST_HELD, [30, 31, 32])
+    assert (spikes, most, late) == ([], MAX_HELD, [30, 31, 32])
 
 
 def test_behind_a_step_it_learns_anew_what_is_usual():
     y = np.tile(EARTH, (60, 1))
     y[30:] += 3e-6
     y[34:] += 40.0 * SIGMA * np.arange(26)[:, None]
-    assert screened(y) == ([], MOST_HELD, [30, 31, 32])
+    assert screened(y) == ([], MAX_HELD, [30, 31, 32])
 
 
 def test_eight_steps_are_needed_to_compare_with():
@@ -274,7 +274,7 @@ def test_every_reading_comes_out_once_in_order_and_at_most_three_wait(seed):
     y[off] += rng.standard_normal((off.sum(), 3)) * 10.0 ** rng.uniform(-8, -3)
     y[rng.random((300, 3)) < 0.05] = np.nan
     _, most, _ = screened(y, float(rng.choice([10.0, 100.0, 1000.0])))
-    assert most <= MOST_HELD
+    assert most <= MAX_HELD
 
 
 # Repetition.

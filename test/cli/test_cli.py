@@ -57,7 +57,7 @@ def test_a_replay_says_what_it_replaces_and_writes_through_no_link(tmp_path, cap
 
 
 def test_a_track_that_is_too_long_to_smooth_is_said(tmp_path, capsys):
-    params = parameter_file(tmp_path / 'short.yaml', QUICK | {'track.smooth_longest_s': 1.0})
+    params = parameter_file(tmp_path / 'short.yaml', QUICK | {'track.max_smoothing_s': 1.0})
     assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--params',
                  str(params), '--no-figures', '--out', str(tmp_path / 'out')]) == 0
     assert 'warning: 1 tracks were too long to smooth' in capsys.readouterr().out

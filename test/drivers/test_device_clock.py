@@ -125,7 +125,7 @@ def test_accuracy_is_that_of_the_law(line):
         arrival = arrivals(rng, t, delay)
         fixed = 2e-3 if delay is constant else 0.0
         keep = rng.random(len(t)) >= lost
-        clock = clock_of(shortest_delay_s=fixed, **counter)
+        clock = clock_of(min_delay_s=fixed, **counter)
         e = np.full(len(t), math.nan)
         e[keep] = errors_of(stamps_of(clock, count[keep] % counter['wrap'], arrival[keep]), t[keep])
         assert not clock.counts and not clock.restarts
@@ -205,7 +205,7 @@ def test_later_arrivals_are_later_stamps(delays, shift, period_ms):
 def test_stamps_go_back_by_no_more_than_the_line_moves(delays, period_ms):
     """By the spread of the delays, and by twice the most drift over what is remembered."""
     ticks, arrival, time = sequence(delays, period_ms)
-    clock = clock_of(window_s=2.0, most_drift_ppm=20.0)
+    clock = clock_of(window_s=2.0, max_drift_ppm=20.0)
     stamps = [clock.stamp(*p) for p in zip(ticks, arrival, strict=True)]
     steps = np.diff(stamps) - np.diff(time)
     # What is remembered: the window and the blocks at its ends, one of which is one period.
@@ -218,7 +218,7 @@ def test_stamps_go_back_by_no_more_than_the_line_moves(delays, period_ms):
        st.sampled_from([0, 2**16, 2**32]))
 @settings(derandomize=True, deadline=None)
 def test_whatever_comes_is_stamped_in_the_past_or_counted(readings, wrap):
-    clock = clock_of(wrap=wrap, tick_s=1e-4, shortest_delay_s=0.25)
+    clock = clock_of(wrap=wrap, tick_s=1e-4, min_delay_s=0.25)
     stamps = [clock.stamp(*r) for r in readings]
     assert sum(s is None for s in stamps) == clock.counts.total()
     assert all(s <= a - 250_000_000
@@ -226,7 +226,7 @@ def test_whatever_comes_is_stamped_in_the_past_or_counted(readings, wrap):
 
 
 def test_without_random_delays_differences_are_those_of_the_counter():
-    clock = clock_of(shortest_delay_s=0.01)
+    clock = clock_of(min_delay_s=0.01)
     ticks = np.cumsum(np.random.default_rng(0).integers(1, 20_000, 3000))
     stamps = [clock.stamp(int(t), START + 1000 * int(t)) for t in ticks]
     assert stamps == [START + 1000 * int(t) - 10_000_000 for t in ticks]
@@ -262,7 +262,7 @@ def test_stated_error_holds_where_the_drift_wanders():
 
 def test_thirty_days_of_a_counter_of_a_megahertz():
     """Seventeen minutes in each day; the counter goes round 20 times in each silence."""
-    clock = clock_of(shortest_delay_s=2e-3)
+    clock = clock_of(min_delay_s=2e-3)
     day = 86_400_000_000
     for i in range(31):
         ticks = i * day + np.arange(0, 1000_000_000, 500_000)
@@ -325,10 +325,10 @@ def test_a_step_back_in_a_silence_is_taken_for_a_queue_at_first(reset, cause):
     late = (ticks[after][0] - 5) * 1e-4 if reset else 0.3
     ticks[after] = (ticks[after] - round(late * 1e4)) % 2**16
     # Once the drift is known, what it might have been excuses nothing.
-    clock = clock_of(most_drift_ppm=5000.0, **SMALL)
+    clock = clock_of(max_drift_ppm=5000.0, **SMALL)
     e = errors_of(stamps_of(clock, ticks, arrival), t)
     assert clock.restarts == {cause: 1} and not clock.counts
-    # For longest_delay_s it is believed to be a queue.
+    # For max_delay_s it is believed to be a queue.
     assert np.abs(e[(t > 47.9) & (t < 52.8)] + late * 1e9).max() < 1e6
     assert np.abs(e[t > 58.2]).max() * 1e-9 < law(2e-3, 100.0, 0.0, 5.0, 5.0, 12.0)
 
@@ -424,7 +424,7 @@ def test_a_step_in_a_minute_of_silence_is_a_step():
 
 def test_three_device_times_confirm_a_new_clock_however_slow_it_is():
     """Three sensors, read every 10 s, of an oscillator that is 3 % off."""
-    clock, out = clock_of(most_drift_ppm=50_000.0, window_s=600.0), []
+    clock, out = clock_of(max_drift_ppm=50_000.0, window_s=600.0), []
     for i in range(100):
         # After the step the first two come a second late.
         d = 10.0 * i
@@ -495,7 +495,7 @@ def test_points_of_one_device_time_have_no_slope():
 
 @pytest.mark.parametrize('early_us', [900, 1200])
 def test_a_message_is_believed_if_early_by_a_millisecond(early_us):
-    clock = clock_of(most_drift_ppm=1.0)
+    clock = clock_of(max_drift_ppm=1.0)
     for i in range(1000):
         clock.stamp(10_000 * i, START + 10_000_000 * i)
     stamp = clock.stamp(10_000_000, START + 10_000_000_000 - 1000 * early_us)
@@ -535,7 +535,7 @@ def test_a_line_that_becomes_quicker_is_believed(part):
     slow = (t < 50.0) | (rng.random(len(t)) > part)
     came = START + np.round((t + 2e-3 + 50e-3 * slow) * 1e9).astype(np.int64)
     order = np.argsort(came, kind='stable')
-    clock = clock_of(shortest_delay_s=2e-3)
+    clock = clock_of(min_delay_s=2e-3)
     e = errors_of(stamps_of(clock, count[order] % 2**32, came[order]), t[order])
     assert clock.restarts == {FORWARD: 1} and clock.counts[NO_FIT] <= wait_of(100.0)
     assert np.abs(e[6000:]).max() < 1e3
@@ -572,7 +572,7 @@ def test_what_cannot_be_a_count_has_no_time():
 
 
 def test_without_a_counter_it_is_the_arrival():
-    clock = ArrivalClock(replace(ClockSettings(), {'shortest_delay_s': 0.004}))
+    clock = ArrivalClock(replace(ClockSettings(), {'min_delay_s': 0.004}))
     assert clock.stamp(None, START) == clock.stamp(77, START) == START - 4_000_000
     assert not clock.counts and not clock.restarts
     assert math.isnan(clock.drift_ppm) and math.isnan(clock.spread_s)
@@ -580,7 +580,7 @@ def test_without_a_counter_it_is_the_arrival():
 
 
 @pytest.mark.parametrize('changes, text', [
-    ({'least_step_s': 2.0, 'longest_delay_s': 1.0}, 'least_step_s: 2 s is more than'),
+    ({'min_step_s': 2.0, 'max_delay_s': 1.0}, 'min_step_s: 2 s is more than'),
     ({'wrap': 256, 'tick_s': 1e-3}, 'wrap: the counter goes round in 0.256 s')])
 def test_settings_that_contradict_each_other_are_refused(changes, text):
     with pytest.raises(SettingsError, match=text):

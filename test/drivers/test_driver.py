@@ -17,7 +17,7 @@ from mag_tracking.records import AccelerationSample
 from support.samples import MagSample, samples_of
 
 DAY_NS = 1_700_000_000_000_000_000
-CLOCK = ClockSettings(tick_s=1e-6, shortest_delay_s=0.0)
+CLOCK = ClockSettings(tick_s=1e-6, min_delay_s=0.0)
 
 
 class Machine:
@@ -142,13 +142,14 @@ def test_a_port_that_opens_but_says_nothing_backs_off_too():
 
 
 def test_a_silent_device_is_opened_again():
-    driver, device, machine = driver_of([[Reading('', (1.0, 2.0, 3.0))]], {'silent_s': 3.0})
+    driver, device, machine = driver_of([[Reading('', (1.0, 2.0, 3.0))]],
+                                        {'silence_timeout_s': 3.0})
     begin = machine.now_ns
     while device.calls.count('open') < 2:
         driver.poll(0.2)
     assert 3.0 <= (machine.now_ns - begin) / 1e9 <= 3.6
     assert driver.counts()['silent, so opened again'] == 1
-    never, device, machine = driver_of([], {'silent_s': 0.0})
+    never, device, machine = driver_of([], {'silence_timeout_s': 0.0})
     for _ in range(1000):
         never.poll(0.2)
     assert device.calls == ['open']
@@ -224,12 +225,12 @@ def test_errors_of_other_peoples_devices_are_trouble_like_any_other():
 
 def test_readings_are_gathered():
     script = [[Reading('', (float(k), 0.0, 0.0))] for k in range(3)]
-    driver, _, machine = driver_of([*script, []], {'gather_s': 0.004})
+    driver, _, machine = driver_of([*script, []], {'batch_s': 0.004})
     assert [s.field[0] for s in said(driver, 0.2)] == [0.0, 1.0, 2.0]
     assert machine.slept == [pytest.approx(0.004)]
     # A loss on the way takes nothing of what has come.
     driver, *_ = driver_of([script[0], DeviceError('gone'), DeviceError('gone')],
-                           {'gather_s': 0.004})
+                           {'batch_s': 0.004})
     assert len(said(driver, 0.2)) == 1 and driver.is_open
     assert said(driver, 0.2) == [] and driver.trouble == 'gone'
 

@@ -133,7 +133,7 @@ def test_kinds_of_ones_own(tmp_path, monkeypatch):
     monkeypatch.setattr(Counting, 'SETTINGS', TextSettings)
     [driver] = read(tmp_path, {'mine': {
         **{k: v for k, v in BOARD.items() if k != 'text'}, 'framing': f'{__name__}:Counting',
-        'framing_settings': {'longest': 7}}})
+        'framing_settings': {'max_length': 7}}})
     assert isinstance(driver.device, FramedDevice)
     [driver] = read(tmp_path, {'mine': {
         'device': 'mag_tracking.drivers.transports.i2c:I2cDevice', 'sensor': 'a',

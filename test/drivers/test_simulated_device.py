@@ -9,7 +9,7 @@ import pytest
 
 from mag_tracking import cli
 from mag_tracking.drivers.simulated_device import (
-    LONGEST_BACKLOG_S,
+    MAX_BACKLOG_S,
     SimulatedDevice,
     SimulatorSettings,
 )
@@ -96,7 +96,7 @@ def test_readings_come_in_time_and_noise_is_as_stated():
 
 def test_sensors_in_turn_measure_at_their_own_times():
     """Each is a share of the interval behind the one before, and so is its field."""
-    device, _ = device_of(dataclasses.replace(QUIET, in_turn=True))
+    device, _ = device_of(dataclasses.replace(QUIET, sequential=True))
     device.open()
     network = read_network(NETWORK_FILE)
     arrivals = gathered(device, 2 * 250)
@@ -113,7 +113,7 @@ def test_what_nobody_took_in_time_is_lost_and_counted():
     device, clock = device_of()
     device.open()
     gathered(device, 2)
-    clock.sleep(LONGEST_BACKLOG_S + 10.0)
+    clock.sleep(MAX_BACKLOG_S + 10.0)
     first = device.read(0.1)[0].reading
     lost = device.counts['readings lost, nobody took them']
     assert lost == 2 * (first.sequence - 1) == pytest.approx(2 * 500, abs=4)

@@ -55,7 +55,7 @@ def tracked(n_sensors, missing=False):
                            Path(np.array([-60.0, -1.0]), 0.0, 10.0), 25.0, 12.0, rng)
     pipeline = Pipeline(network, settings_for('vehicle', {
         **POINT, 'align.period_s': 0.04, 'track.mounting_std_deg': 0.0,
-        'track.model_error_time_s': 0.0, 'track.most_sensors': 1000,
+        'track.model_error_time_s': 0.0, 'track.max_sensors': 1000,
         'track.vehicle.arrival_names': ['a'],
         'track.vehicle.arrival_headings_deg': [0.0]}))
     frame = None

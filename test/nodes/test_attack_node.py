@@ -16,7 +16,7 @@ from mag_tracking.nodes.calibration_node import CalibrationNode
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.recording.background_file import write_backgrounds
 from support.bundled import NETWORK_FILE, vehicle_path
-from support.node_processes import LONGEST_S, start, stop
+from support.node_processes import MAX_S, start, stop
 
 pytestmark = [pytest.mark.alone, pytest.mark.timeout(600)]
 
@@ -138,11 +138,11 @@ def many_at_once(ros):
     # A server may know a client a moment later than the client knows it.
     spin_until(lambda: False, 2.0)
     futures = [client.call_async(request) for client, request in clients]
-    assert spin_until(lambda: all(f.done() for f in futures), LONGEST_S), sum(
+    assert spin_until(lambda: all(f.done() for f in futures), MAX_S), sum(
         f.done() for f in futures)
     one, request = clients[0]
     futures = [one.call_async(request) for _ in range(N_AT_ONCE)]
-    assert spin_until(lambda: all(f.done() for f in futures), LONGEST_S), sum(
+    assert spin_until(lambda: all(f.done() for f in futures), MAX_S), sum(
         f.done() for f in futures)
     for client, _ in clients:
         node.destroy_client(client)

@@ -13,7 +13,7 @@ from sensor_msgs.msg import Imu, MagneticField
 from mag_tracking.messages.schema import readings_of, stamp_ns
 from mag_tracking.nodes.stage_node import RESULTS, STREAM
 from support.bundled import NETWORK_FILE
-from support.node_processes import LONGEST_S, call, start, stop
+from support.node_processes import MAX_S, call, start, stop
 from support.samples import samples_of
 from support.serial_line import SerialLine
 
@@ -183,7 +183,7 @@ def test_a_life_cycle(board):
 
 def test_readings_in_batches(board):
     node, spin_until, _, drivers, _ = board
-    drivers.write_text(drivers.read_text().replace('  unit: nT', '  unit: nT\n  gather_s: 0.05'))
+    drivers.write_text(drivers.read_text().replace('  unit: nT', '  unit: nT\n  batch_s: 0.05'))
     batches = listen(node, FieldReadings, '/field_readings')
     fields = listen(node, MagneticField, '/mag_2/imu/mag')
     process = start('driver_node', '-p', f'drivers:={drivers}', '-p', 'batches:=true')
@@ -243,7 +243,7 @@ def test_a_drivers_file_that_is_none_ends_the_node(ros, tmp_path, content, told)
     drivers = tmp_path / 'drivers.yaml'
     drivers.write_text(content)
     process = start('driver_node', '-p', f'drivers:={drivers}', '-p', f'network:={NETWORK_FILE}')
-    output = process.communicate(timeout=LONGEST_S)[0]
+    output = process.communicate(timeout=MAX_S)[0]
     assert process.returncode == 1
     assert told in output and 'Traceback' not in output
 

@@ -1,4 +1,4 @@
-"""Mistakes of a newcomer are reported in the log and in the diagnostics, within seconds."""
+"""Mistakes of a new target are reported in the log and in the diagnostics, within seconds."""
 
 import subprocess
 import sys
@@ -86,11 +86,11 @@ time.sleep(600.0)
 """In a process of its own: in one process a topic has one type."""
 
 
-def node_in(namespace, newcomer):
+def node_in(namespace, new_target):
     """A calibration node of its own for each case."""
     return CalibrationNode(namespace=namespace, parameter_overrides=[
         Parameter('network', value=str(NETWORK_FILE)),
-        Parameter('use_sim_time', value=newcomer.use_sim_time)])
+        Parameter('use_sim_time', value=new_target.use_sim_time)])
 
 
 def test_a_users_first_minutes(ros, capfd):
@@ -109,9 +109,9 @@ def test_a_users_first_minutes(ros, capfd):
     stranger = subprocess.Popen([sys.executable, '-c', OF_ANOTHER_TYPE])
     try:
         assert spin_until(lambda: node.count_publishers('/case_3/mag_1/imu/mag'))
-        for k, (case, (newcomer, _)) in enumerate(CASES.items()):
-            newcomer.connect(node, f'/case_{k}')
-            nodes.append(node_in(f'/case_{k}', newcomer))
+        for k, (case, (new_target, _)) in enumerate(CASES.items()):
+            new_target.connect(node, f'/case_{k}')
+            nodes.append(node_in(f'/case_{k}', new_target))
             began[case] = time.monotonic()
             node.executor.add_node(nodes[-1])
         spin_until(lambda: len(told) == len(CASES), 60.0)

@@ -7,7 +7,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sensor_msgs.msg import MagneticField
 
 from mag_tracking.nodes import flow as module
-from mag_tracking.nodes.flow import MOST_NOTED, Flow, Listener
+from mag_tracking.nodes.flow import MAX_RECORDED, Flow, Listener
 from mag_tracking.nodes.stage_node import RESULTS, STREAM
 from mag_tracking.nodes.tracker_node import SLACK_S, TrackerNode
 from mag_tracking.pipeline import settings_for
@@ -121,10 +121,10 @@ def test_a_computer_that_is_too_slow_is_told(clock, busy_s, age_s):
 
 def test_memory_is_bounded(clock):
     flow = Flow('a_node')
-    for _ in range(MOST_NOTED + 50):
+    for _ in range(MAX_RECORDED + 50):
         flow.note(0, 0, clock[0])
-    assert flow.n_ages == MOST_NOTED
-    assert values(status_of(flow))['messages'] == str(MOST_NOTED + 50)
+    assert flow.n_ages == MAX_RECORDED
+    assert values(status_of(flow))['messages'] == str(MAX_RECORDED + 50)
 
 
 def test_a_listener_is_missed_when_it_was_there():

@@ -10,7 +10,7 @@ import yaml
 from mag_tracking.cli import main
 from mag_tracking.messages.types import CALIBRATION_STATE
 from support.bundled import NETWORK_FILE
-from support.node_processes import LONGEST_S, start, stop
+from support.node_processes import MAX_S, start, stop
 
 pytestmark = pytest.mark.timeout(600)
 WITHIN = ('--ros-args', '-r', '__ns:=/lab')
@@ -43,7 +43,7 @@ def command(capfd):
 
 def wait_for(condition):
     """Ask until it is so; a command takes a while each time."""
-    end = time.monotonic() + LONGEST_S
+    end = time.monotonic() + MAX_S
     while not condition():
         assert time.monotonic() < end
 

@@ -21,7 +21,7 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from support.bundled import NETWORK_FILE
-from support.node_processes import LONGEST_S, scaled, start, stop
+from support.node_processes import MAX_S, scaled, start, stop
 from support.samples import MagSample, one, sample_dict
 
 STEP_NS = 10_000_000
@@ -69,7 +69,7 @@ def talking(ros):
 
     node.create_timer(0.01, catch_up)
 
-    def talk(condition, silent=(), step=0.0, seconds=LONGEST_S):
+    def talk(condition, silent=(), step=0.0, seconds=MAX_S):
         now.update(silent=silent, mag_1=step)
         return spin_until(condition, seconds)
 
@@ -187,7 +187,7 @@ def test_a_calibration_that_is_killed_goes_on_where_it_was(ros, talking, tmp_pat
     assert talking(lambda: len(calibrated) > 100 and [
         p for p in tmp_path.rglob('*.json') if '"mag_1"' in p.read_text()])
     first.kill()
-    first.communicate(timeout=LONGEST_S)
+    first.communicate(timeout=MAX_S)
     talking(lambda: False, silent=('mag_1', 'mag_2'), seconds=0.3)
     n, known = len(calibrated), endpoints(node)
     began = time.monotonic()

@@ -17,7 +17,7 @@ import setuptools
 
 from mag_tracking.nodes.ros_params import NODE_PARAMETERS
 from support.bundled import NETWORK_FILE, ROOT, vehicle_path
-from support.node_processes import LONGEST_S
+from support.node_processes import MAX_S
 
 LAUNCH_FILE = ROOT / 'launch' / 'tracking.launch.py'
 HAS_LAUNCH = importlib.util.find_spec('launch_ros') is not None
@@ -112,14 +112,14 @@ def test_the_launch_file_runs():
          f'recording:={vehicle_path("straight_car_right")}', 'rate:=3.0'], text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     # Its end, if the line never comes.
-    watch = threading.Timer(LONGEST_S, process.kill)
+    watch = threading.Timer(MAX_S, process.kill)
     watch.start()
     try:
         lines = []
         while not (lines and 'track 1 begins' in lines[-1]) and (line := process.stdout.readline()):
             lines.append(line)
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=LONGEST_S)
+        process.communicate(timeout=MAX_S)
     finally:
         watch.cancel()
     assert 'track 1 begins' in lines[-1], lines

@@ -17,7 +17,7 @@ from mag_tracking.pipeline import settings_for
 from support.bundled import NETWORK_FILE, ROOT
 from support.node_processes import environment
 
-MOST_ASKED_FOR = 256
+MAX_REQUESTS = 256
 """The sequence numbers that one ACKNACK of RTPS can name."""
 
 LISTENER = """
@@ -116,7 +116,7 @@ def test_no_node_keeps_more_than_can_be_asked_for_at_once(ros):
                 '/network_frame', '/tracker_node/tracks'} <= sent.keys()
         # The middleware's own topics of parameters are not the project's.
         assert {t: n for t, n in sent.items()
-                if n > MOST_ASKED_FOR and t not in ('/parameter_events', '/rosout')} == {}
+                if n > MAX_REQUESTS and t not in ('/parameter_events', '/rosout')} == {}
     finally:
         for node in nodes:
             node.destroy_node()

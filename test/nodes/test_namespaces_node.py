@@ -20,7 +20,7 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.writer import RecordingWriter
 from support.bundled import NETWORK_FILE, vehicle_path
-from support.node_processes import LONGEST_S, environment, start, stop
+from support.node_processes import MAX_S, environment, start, stop
 from support.samples import MagSample, sample_dict
 
 pytestmark = [pytest.mark.alone, pytest.mark.timeout(600)]
@@ -88,7 +88,7 @@ def test_two_networks_on_one_graph(ros, tmp_path, road_network):
             and statuses.get(f'{ns[1:]}/watchman: to tracker') == 'running' for ns in NETWORKS))
         lost = processes.pop(2)
         lost.kill()
-        lost.communicate(timeout=LONGEST_S)
+        lost.communicate(timeout=MAX_S)
         assert spin_until(lambda: statuses['north/watchman: to tracker'].startswith(
             '/north/follower has gone'))
         assert statuses['a/b/watchman: to tracker'] == 'running'
@@ -111,7 +111,7 @@ def test_two_networks_on_one_graph(ros, tmp_path, road_network):
 def run_command(*arguments):
     """(status, output) of the command."""
     done = subprocess.run([sys.executable, '-m', 'mag_tracking.cli', *arguments], text=True,
-                          stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=LONGEST_S * 2,
+                          stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=MAX_S * 2,
                           env=environment(ROS_HOME=os.environ['ROS_HOME']), check=False)
     return done.returncode, done.stdout
 

@@ -25,9 +25,9 @@ from support.samples import one, simulate
 pytestmark = pytest.mark.timeout(600)
 LIMIT_S = 2.0
 """[s] Everything has to go on within this, on a free machine."""
-LONGEST_UNNAMED_S = 6.0
+MAX_UNNAMED_S = 6.0
 """[s] A dead node is named within this, on a free machine: 3 s of lease, a report each second."""
-MOST_VEHICLES = 5
+MAX_VEHICLES = 5
 """On a busy machine a vehicle may be by before it is tracked; another one is."""
 
 
@@ -76,7 +76,7 @@ def call_and_wait(world):
 
     The driver says once a second how it is, and will do so 0.35 s later.
     """
-    for _ in range(MOST_VEHICLES):
+    for _ in range(MAX_VEHICLES):
         assert world.wait(world.is_quiet)
         asked = time.time_ns()
         assert world.wait(lambda asked=asked: world.told(asked, f'driver_node: {world.link}'))
@@ -91,7 +91,7 @@ def call_and_wait(world):
 
 def call_and_drive_to(world, x):
     """A vehicle comes and is tracked when it gets to `x` [m]; when it came [ns]."""
-    for _ in range(MOST_VEHICLES):
+    for _ in range(MAX_VEHICLES):
         began = world.call()
         world.drive_to(x)
         if world.tracks(began):
@@ -144,7 +144,7 @@ def test_a_dead_node_is_named_by_its_neighbour(here, name, by, words):
         [last] = ended(here, began)
         assert last.stamp_ns < killed + NS
     up, recovery = here.recovery(name)
-    assert recovery <= scaled(LIMIT_S, up) and named_s <= scaled(LONGEST_UNNAMED_S, up)
+    assert recovery <= scaled(LIMIT_S, up) and named_s <= scaled(MAX_UNNAMED_S, up)
     restarted = time.time_ns()
     assert here.wait(lambda: [s for _, s in here.told(restarted, by, 'running')])
 
@@ -209,7 +209,7 @@ def test_a_broker_that_refuses(here):
     assert here.wait(lambda: here.since(asked, 'driver_node'))
 
 
-def begin_anew(pipeline, name):
+def restart(pipeline, name):
     """What a restart of a node does to its part of the pipeline."""
     network, settings = pipeline.network, pipeline.settings
     # What was on its way to a dead node is lost.
@@ -237,7 +237,7 @@ def test_a_gap_in_the_middle_of_a_pass(tmp_path, name, x, gap_s):
     before = [s for s in samples if s.stamp_ns / NS < begin]
     after = [s for s in samples if s.stamp_ns / NS >= begin + gap_s]
     records = [r for s in before for r in pipeline.feed(one(s))]
-    begin_anew(pipeline, name)
+    restart(pipeline, name)
     records += [r for s in after for r in pipeline.feed(one(s))] + pipeline.flush()
     poses = [t for t in records if isinstance(t, Track) and not t.ended]
     assert len(poses) > 10

@@ -10,7 +10,7 @@ from sensor_msgs.msg import MagneticField
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.stage_node import STREAM
 from support.bundled import NETWORK_FILE
-from support.node_processes import LONGEST_S, call, start, stop
+from support.node_processes import MAX_S, call, start, stop
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.timeout(600)
 ])
 def test_faulty_parameters_end_the_node_with_a_clear_word(arguments, message):
     process = start('tracker_node', *arguments)
-    output, _ = process.communicate(timeout=LONGEST_S)
+    output, _ = process.communicate(timeout=MAX_S)
     assert process.returncode == 1
     assert message in output and 'Traceback' not in output
 

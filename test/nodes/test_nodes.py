@@ -46,7 +46,7 @@ from mag_tracking.recording.reader import Recording
 from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
 from support.busy_recordings import BUSY, network_of_recording
 from support.marks import studied
-from support.node_processes import LONGEST_S, call, start, stop, without_states
+from support.node_processes import MAX_S, call, start, stop, without_states
 from support.shared_memory import left_behind, segments_of
 
 pytestmark = pytest.mark.timeout(600)
@@ -360,6 +360,6 @@ def test_nodes_leave_no_shared_memory_behind(ros, how):
         used = segments_of(process.pid) - before
     finally:
         process.send_signal(how)
-        output, _ = process.communicate(timeout=LONGEST_S)
+        output, _ = process.communicate(timeout=MAX_S)
     assert (process.returncode, without_states(output)) == (0, '')
     assert used and not left_behind(used)

@@ -19,7 +19,7 @@ from mag_tracking.nodes.stage_node import STREAM
 from support.browser import Page as Opened
 from support.browser import browser, needs_browser
 from support.bundled import NETWORK_FILE, vehicle_path
-from support.node_processes import LONGEST_S, environment
+from support.node_processes import MAX_S, environment
 
 COMMAND = [sys.executable, '-m', 'mag_tracking.cli']
 RECORDING = vehicle_path('straight_car_right')
@@ -43,7 +43,7 @@ def address(process):
 
 def ended(process):
     process.terminate()
-    process.communicate(timeout=LONGEST_S)
+    process.communicate(timeout=MAX_S)
     return process.returncode
 
 
@@ -82,12 +82,12 @@ def test_the_page_of_running_nodes_has_the_values_of_the_topic(ros):
             page.wait('magTracking.scene?.tracks[0]?.smoothed')
             page.wait('document.getElementById("tables").textContent.includes("tracker_node")')
             assert page.complaints == []
-            run.communicate(timeout=LONGEST_S)
+            run.communicate(timeout=MAX_S)
     finally:
         assert ended(watch) == 0
 
 
-def messages_of(url, until, seconds=LONGEST_S):
+def messages_of(url, until, seconds=MAX_S):
     """Messages of a viewer until `until(message)`."""
     with connect(url.replace('http', 'ws') + 'stream', max_size=None) as viewer:
         end = time.monotonic() + seconds
@@ -113,7 +113,7 @@ def test_a_tracker_of_another_name_is_found_and_may_be_restarted():
                 for track in message.get('tracks', ()):
                     n += len(track['doubts'])
             assert n > 20
-            run.communicate(timeout=LONGEST_S)
+            run.communicate(timeout=MAX_S)
     finally:
         assert ended(watch) == 0
 
@@ -122,13 +122,13 @@ def test_a_page_ends_with_the_command_that_started_it():
     """Also where that is killed, and cannot tell its page."""
     run = command('run', '--network', NETWORK_FILE, '--web', 0)
     url = address(run)
-    assert urllib.request.urlopen(url, timeout=LONGEST_S).status == 200
+    assert urllib.request.urlopen(url, timeout=MAX_S).status == 200
     run.kill()
-    run.wait(LONGEST_S)
-    end = time.monotonic() + LONGEST_S
+    run.wait(MAX_S)
+    end = time.monotonic() + MAX_S
     with pytest.raises(urllib.error.URLError):
         while time.monotonic() < end:
-            urllib.request.urlopen(url, timeout=LONGEST_S).close()
+            urllib.request.urlopen(url, timeout=MAX_S).close()
             time.sleep(0.1)
     run.stdout.close()
 
@@ -144,12 +144,12 @@ def test_run_serves_the_page_and_frees_the_port():
     assert re.fullmatch(r'http://127\.0\.0\.1:\d+/', url)
     assert ended(run) == 0
     port = int(url.rstrip('/').rpartition(':')[2])
-    end = time.monotonic() + LONGEST_S
+    end = time.monotonic() + MAX_S
     again = command('watch', '--port', port)
     assert address(again) == url and time.monotonic() < end
     # The port is taken now: the command says so before any node is up.
     refused = command('run', '--network', NETWORK_FILE, '--web', port)
-    output = refused.communicate(timeout=LONGEST_S)[0]
+    output = refused.communicate(timeout=MAX_S)[0]
     assert refused.returncode == 1
     assert f'port {port}: Address already in use' in output
     assert ended(again) == 0

@@ -18,7 +18,7 @@ from mag_tracking.nodes.record_node import RecordNode
 from mag_tracking.nodes.stage_node import LATCHED, STREAM
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.recorder import Recorder
-from support.node_processes import LONGEST_S
+from support.node_processes import MAX_S
 from support.recorded_topics import FIELDS, IMUS
 
 pytestmark = pytest.mark.timeout(600)
@@ -32,7 +32,7 @@ class Desk:
         self.recorder = Recorder(folder, report=self.told.append, **arguments)
         self.node = RecordNode(self.recorder, selection, self.told.append)
 
-    def until(self, condition, seconds=LONGEST_S):
+    def until(self, condition, seconds=MAX_S):
         """Record until `condition()`; whether it came."""
         end = time.monotonic() + seconds
         while not condition() and time.monotonic() < end:
@@ -82,7 +82,7 @@ def test_what_is_selected(ros, desk):
         for p in publishers:
             p.publish(p.msg_type())
         return all(d.recorder.counts.keys() >= topics for topics, d in desks.items())
-    end = time.monotonic() + LONGEST_S
+    end = time.monotonic() + MAX_S
     while not publish_all() and time.monotonic() < end:
         for d in desks.values():
             d.until(lambda: True)
@@ -119,7 +119,7 @@ def test_what_overflows_the_queue_is_counted(ros, desk, monkeypatch):
     before, n = d.node.lost, d.recorder.counts[FIELDS[0]]
     node.destroy_publisher(publisher)
     publisher = node.create_publisher(MagneticField, FIELDS[0], STREAM)
-    end = time.monotonic() + LONGEST_S
+    end = time.monotonic() + MAX_S
     while d.recorder.counts[FIELDS[0]] == n and time.monotonic() < end:
         publish(1)
         time.sleep(0.01)

@@ -26,7 +26,7 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.repair import repair
 from support.bundled import NETWORK_FILE, vehicle_path
-from support.node_processes import LONGEST_S, call, start, stop
+from support.node_processes import MAX_S, call, start, stop
 from support.recorded_topics import FIELDS, IMUS
 from support.shared_memory import left_behind, segments_of
 
@@ -94,7 +94,7 @@ def test_a_replay_that_is_recorded_is_the_same_recording(ros, tmp_path, road_net
     finally:
         stop([player])
         process.send_signal(signal.SIGTERM)
-        output = process.communicate(timeout=LONGEST_S)[0]
+        output = process.communicate(timeout=MAX_S)[0]
     assert process.returncode == 0 and 'warning' not in output, output
     for topic, n in expected.items():
         assert f'  {topic}  {n}\n' in output, output

@@ -41,15 +41,15 @@ class Listener:
     @property
     def is_right(self):
         """True if the received stretches equal those of the calibration."""
-        return {n: t for n, t in self.times.items() if t} == self.stage.doubtful_stretches()
+        return {n: t for n, t in self.times.items() if t} == self.stage.doubtful_intervals()
 
 
 def test_every_doubt_and_its_end_are_reported_at_once_and_once():
     listener, changes = Listener(), 0
     for k in range(len(READINGS) // BATCH):
-        before = listener.stage.doubtful_stretches()
+        before = listener.stage.doubtful_intervals()
         listener.feed(k)
-        changes += listener.stage.doubtful_stretches() != before
+        changes += listener.stage.doubtful_intervals() != before
         listener.rounds.report_doubts()
         assert listener.is_right and listener.n == changes
     assert [len(t) for t in listener.times.values()] == [2, 2]
@@ -71,7 +71,7 @@ def test_rounds_of_any_length_contradict_no_report(steps, phase):
 def test_learning_anew_ends_a_doubt():
     """Also if the doubt began with the latest reading."""
     listener, n = Listener(), 0
-    while not listener.stage.doubtful_stretches():
+    while not listener.stage.doubtful_intervals():
         listener.feed(n)
         n += 1
     listener.stage.forget(())

@@ -17,7 +17,7 @@ from support.ros_domain import RosDomain
 
 pytestmark = pytest.mark.timeout(600)
 
-LONGEST_START_S = 120.0
+MAX_START_S = 120.0
 GIVEN = {'driver_node': {'drivers': ROOT / 'config' / 'drivers.yaml', 'network': NETWORK_FILE},
          'replay_node': {'recording': vehicle_path('straight_car_right')},
          **{f'{name}_node': {'network': NETWORK_FILE}
@@ -78,7 +78,7 @@ def has_loaded(pid, name):
 
 def wait_for(condition, process):
     """Ask until it is so; a process that ends meanwhile or never gets there is an error."""
-    end = time.monotonic() + LONGEST_START_S
+    end = time.monotonic() + MAX_START_S
     while not condition():
         assert process.poll() is None and time.monotonic() < end, process.communicate()[0]
         time.sleep(0.001)
@@ -87,7 +87,7 @@ def wait_for(condition, process):
 def end_of(process, how):
     """(exit status, output) of a process that is sent a signal."""
     process.send_signal(how)
-    output = process.communicate(timeout=LONGEST_START_S)[0]
+    output = process.communicate(timeout=MAX_START_S)[0]
     return process.returncode, without_states(output)
 
 
@@ -105,7 +105,7 @@ def test_a_signal_during_the_imports_ends_it(how, words):
     assert end_of(process, how) == (0, '')
     for module in ('numpy', 'rclpy', 'mag_tracking.nodes.middleware'):
         process = begun(['-c', STRUCK, int(how), module, *words])
-        output = process.communicate(timeout=LONGEST_START_S)[0]
+        output = process.communicate(timeout=MAX_START_S)[0]
         assert (process.returncode, output) == (0, ''), module
 
 
@@ -170,5 +170,5 @@ def test_a_signal_at_any_moment_of_the_start_ends_it(start_s, name, step_s):
 
 def test_other_commands_say_that_they_were_interrupted():
     process = begun(['-c', STRUCK, int(signal.SIGINT), 'numpy', '-m', 'mag_tracking.cli', 'info'])
-    output = process.communicate(timeout=LONGEST_START_S)[0]
+    output = process.communicate(timeout=MAX_START_S)[0]
     assert (process.returncode, output) == (130, 'mag-tracking: interrupted\n')

@@ -4,7 +4,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from mag_tracking.nodes import status_log
-from mag_tracking.nodes.status_log import MOST_FAULTS, REPEATED_S, StatusLog
+from mag_tracking.nodes.status_log import MAX_FAULTS, REPEATED_S, StatusLog
 
 
 class Logger:
@@ -58,20 +58,20 @@ def test_a_fault_that_lasts_or_flickers_is_told_once_a_minute(log):
 
 
 def test_memory_is_bounded(log):
-    for k in range(2 * MOST_FAULTS):
+    for k in range(2 * MAX_FAULTS):
         log(0.0, DiagnosticStatus.WARN, 'bad', f'node: {"x" * (k % 97)}{"y" * (k // 97)}')
-    assert log.statuses.n_remembered <= 2 * MOST_FAULTS
+    assert log.statuses.n_remembered <= 2 * MAX_FAULTS
 
 
 def test_a_hundred_sensors_with_one_fault_do_not_fill_the_log(log):
     lines = [line for j in range(100) for line in log(
         0.0, DiagnosticStatus.ERROR, f'nothing has come on /mag_{j}/imu/mag', f'node: mag_{j}')]
-    assert len(lines) == status_log.MOST_ALIKE
+    assert len(lines) == status_log.MAX_CORRELATION
     assert lines[0] == ('error', 'mag_0: nothing has come on /mag_0/imu/mag')
     assert lines[-1][1].endswith('(more that are alike are in /diagnostics only)')
     lines = [line for j in range(100) for line in log(
         1.0, DiagnosticStatus.OK, 'running', f'node: mag_{j}')]
-    assert len(lines) == status_log.MOST_ALIKE
+    assert len(lines) == status_log.MAX_CORRELATION
     # Another fault is told all the same, and this one in the next minute.
     assert log(2.0, DiagnosticStatus.WARN, 'noisy', 'node: mag_7') == [('warning', 'mag_7: noisy')]
     assert log(2.0 * REPEATED_S, DiagnosticStatus.ERROR, 'nothing has come on /mag_7/imu/mag',

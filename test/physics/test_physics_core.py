@@ -29,7 +29,7 @@ CALLS = {
         'dr_dx': numbers(HYPOTHESES, DIPOLES, 3, STATES),
         'dm_dx': numbers(HYPOTHESES, DIPOLES, 3, STATES)},
     'multipoles': {'d': numbers(4, 3), 'moments': numbers(4, 15)},
-    'turned_fields': {
+    'rotated_fields': {
         'h': numbers(HYPOTHESES, SENSORS, 3), 'H': numbers(HYPOTHESES, SENSORS, 3, STATES),
         'angles': numbers(HYPOTHESES, SENSORS, 3)},
     'turned': {'x': numbers(HYPOTHESES, STATES), 'dt': 0.1, 'mean': 1.0, 'fading': 1.0},
@@ -44,7 +44,7 @@ CALLS = {
     'anderson_residual': {'t': numbers(20), 'y': numbers(20, 2), 'time': 0.1, 'scale': 1.0},
 }
 FREE = {
-    ('turned_fields', 'H', 3), ('turned', 'x', 0), ('turned', 'x', 1),
+    ('rotated_fields', 'H', 3), ('turned', 'x', 0), ('turned', 'x', 1),
     ('row_dipoles', 'x', 0), ('row_dipoles', 'x', 1), ('row_bases', 'theta', 0),
     ('row_bases', 'places', 0), ('steady_bases', 'theta', 0), ('steady_bases', 'theta', 1),
     ('steady_bases', 'places', 0), ('steady_derivatives', 'theta', 1),

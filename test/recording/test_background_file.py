@@ -11,8 +11,8 @@ import pytest
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.recording.background_file import (
     background_text,
+    default_path,
     read_backgrounds,
-    usual_path,
     write_backgrounds,
 )
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
@@ -91,11 +91,11 @@ def test_after_a_restart_the_first_reading_is_calibrated(tmp_path):
     np.testing.assert_allclose(stage.background('mag_1'), EARTH, atol=6e-9)
 
 
-@pytest.mark.parametrize('begin_s, resume_s', [
+@pytest.mark.parametrize('begin_s, max_resume_gap_s', [
     (1009.0, 60.0), (1009.98, 60.0), (1080.0, 60.0), (1020.0, 5.0)])
-def test_what_is_of_another_time_is_learnt_anew(tmp_path, begin_s, resume_s):
+def test_what_is_of_another_time_is_learnt_anew(tmp_path, begin_s, max_resume_gap_s):
     network, kept = kept_in(tmp_path / 'kept.json')
-    stage = Calibrate(network, CalibrateSettings(resume_s=resume_s))
+    stage = Calibrate(network, CalibrateSettings(max_resume_gap_s=max_resume_gap_s))
     stage.resume(kept)
     assert not [c for s in readings(begin_s, 2.0, 1) for c in fed(stage, s)]
     assert stage.counts['backgrounds of another time not resumed'] == 1
@@ -225,12 +225,12 @@ def test_a_place_that_cannot_be_written_is_told(tmp_path):
 
 def test_every_network_file_has_a_place_of_its_own(monkeypatch, tmp_path):
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
-    one = usual_path('/a/network.yaml', '/calibration_node')
-    others = {usual_path('/b/network.yaml', '/calibration_node'),
-              usual_path('/a/network.yaml', '/north/calibration_node')}
+    one = default_path('/a/network.yaml', '/calibration_node')
+    others = {default_path('/b/network.yaml', '/calibration_node'),
+              default_path('/a/network.yaml', '/north/calibration_node')}
     assert len(others | {one}) == 3
     assert {p.parent for p in others | {one}} == {tmp_path / 'mag_tracking'}
     assert one.name.startswith('network_')
     monkeypatch.delenv('ROS_HOME')
-    assert usual_path('network.yaml', '/n').parent == Path(
+    assert default_path('network.yaml', '/n').parent == Path(
         os.path.expanduser('~/.ros/mag_tracking'))

@@ -46,7 +46,7 @@ def test_a_pose_is_right_that_is_right_about_any_vehicle_there():
 
 
 def test_the_share_is_reported():
-    summary = {'missing_topics': [], 'why_no_detection': None, 'rejected': {}, 'lost': {},
+    summary = {'missing_topics': [], 'no_detection_reason': None, 'rejected': {}, 'lost': {},
                'sensors': {}, 'counts': {'track': {}}, 'close_network': False, 'tracks': [],
                'frames_too_long': None, 'clocks_apart': '', 'disturbances': [],
                'target': 'vehicle', 'unflagged_poses': counted(200, 3)}

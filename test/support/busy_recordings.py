@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mag_tracking.apps.first_pass import first_pass_of
+from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.apps.readings import recorded
 from mag_tracking.event_records import VehiclePassage
 from mag_tracking.pipeline import Pipeline, settings_for
@@ -48,7 +48,7 @@ def tracked_recording(name, folder=BUSY, changes=None):
     pipeline = Pipeline(network, settings_for('vehicle', changes))
     recording = Recording(folder / f'{name}.mcap')
     reader = SampleReader(recording, network)
-    first_pass_of(recording, network, pipeline.settings.calibrate).apply(pipeline.calibrate)
+    prescan_of(recording, network, pipeline.settings.calibrate).apply(pipeline.calibrate)
     records = [r for readings in reader.readings() for r in pipeline.feed(readings)]
     records += pipeline.flush()
     poses = [r for r in records if isinstance(r, Track) and not r.ended]

@@ -80,7 +80,7 @@ def answers(seed):
     best = choose_order(fits)
     return Answers(
         truth, None if best is None else (float(best.velocity[0]), float(
-            np.sqrt(best.honest_covariance[3, 3]))),
+            np.sqrt(best.robust_covariance[3, 3]))),
         None if track is None else _of_pose(track),
         None if smoothed is None else _of_pose(smoothed), correlated_motion(data),
         track is not None and track.ambiguous)

@@ -33,7 +33,7 @@ class FedBackground(RunningBackground):
         for a in np.flatnonzero(~np.isnan(raw)):
             change = abs(raw[a] - s['raw'][a])
             if change <= 3e-7 * abs(raw[a]) and stamp >= s['rest_since_ns'][a]:
-                s['n_rest'][a] += stamp - s['rest_since_ns'][a] <= core.LONGEST_REST_NS
+                s['n_rest'][a] += stamp - s['rest_since_ns'][a] <= core.MAX_REST_NS
                 continue
             if change >= 0.0:
                 s['n_same'][a] += s['n_rest'][a] - 1

@@ -162,7 +162,7 @@ def text_frame(rng):
 def text_framing():
     """For `text_frame`."""
     return TextFraming(TextSettings(fields=('sensor', 'sequence', 'ticks', 'x', 'y', 'z'),
-                                    prefix='$MAG,', checksum='nmea', longest=120))
+                                    prefix='$MAG,', checksum='nmea', max_length=120))
 
 
 def json_frame(rng):
@@ -179,7 +179,7 @@ def json_frame(rng):
 def json_framing():
     """For `json_frame`."""
     return JsonFraming(JsonSettings(sensor='id', ticks='t', sequence='n', acceleration=('acc',),
-                                    field=('mag.x', 'mag.y', 'mag.z'), longest=256))
+                                    field=('mag.x', 'mag.y', 'mag.z'), max_length=256))
 
 
 def binary_frame(rng):

@@ -8,7 +8,7 @@ import tempfile
 
 from mag_tracking.nodes.middleware import PROFILE_VARIABLE
 
-LONGEST_S = 120.0
+MAX_S = 120.0
 """[s] Whatever a test waits for has come by then, also on a slow machine beside others."""
 
 
@@ -39,7 +39,7 @@ def stop(processes):
     for p in processes:
         p.send_signal(signal.SIGINT)
     try:
-        outputs = [p.communicate(timeout=LONGEST_S)[0] for p in processes]
+        outputs = [p.communicate(timeout=MAX_S)[0] for p in processes]
     finally:
         # One that hangs would compute beside all that comes after.
         for p in processes:

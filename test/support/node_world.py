@@ -21,7 +21,7 @@ from mag_tracking.nodes.stage_node import RESULTS, STREAM, make_executor
 from mag_tracking.simulation.scenario import point_body
 from support.bundled import NETWORK_FILE, POINT
 from support.mqtt_broker import Broker, password_lines
-from support.node_processes import LONGEST_S, start, stop
+from support.node_processes import MAX_S, start, stop
 from support.roadside import NOISE, Roadside
 from support.serial_line import SerialLine
 
@@ -115,7 +115,7 @@ class World:
             self.node.destroy_node()
             self._executor.shutdown()
 
-    def wait(self, condition, seconds=LONGEST_S):
+    def wait(self, condition, seconds=MAX_S):
         """Listen until there is something in what `condition` gives: that, or what it gives last.
 
         It is asked a hundred times a second, and what it gives is worth as much in time.
@@ -145,7 +145,7 @@ class World:
         """End a node without a word."""
         process = self._processes.pop(name)
         process.send_signal(signal.SIGKILL)
-        process.communicate(timeout=LONGEST_S)
+        process.communicate(timeout=MAX_S)
         # What is still on its way is of the dead.
         self.pause(0.05)
 
@@ -163,7 +163,7 @@ class World:
         known, began_ns = self.publishers(), time.time_ns()
         self.start(name)
         up, first_ns = None, None
-        while first_ns is None and time.time_ns() < began_ns + LONGEST_S * NS:
+        while first_ns is None and time.time_ns() < began_ns + MAX_S * NS:
             self.pause(0.01)
             first_ns = self._first_ns(name, began_ns)
             if up is None and (first_ns or self.publishers() - known):

@@ -179,13 +179,13 @@ class PlainCalibration:
     def misplaced(self, sample):
         name, stamp, last = sample.sensor, sample.stamp_ns, self.last_ns.get(sample.sensor)
         if last is not None:
-            longest = self.settings.jump_ahead_s * NS
+            longest = self.settings.max_forward_jump_s * NS
             before = self.unconfirmed.pop(name, None)
             if stamp - last > longest:
                 self.unconfirmed[name] = stamp
                 if before is None or not 0 < stamp - before <= longest:
                     return 'stamp too far ahead'
-            if stamp <= last and last - stamp <= self.settings.jump_back_s * NS:
+            if stamp <= last and last - stamp <= self.settings.max_backward_jump_s * NS:
                 return 'duplicate stamp' if stamp == last else 'out of order'
             if stamp <= last:
                 self.backgrounds[name].forget()

@@ -43,7 +43,7 @@ class StepByStep:
             else:
                 prior = bank.x.copy(), bank.P.copy()
                 of_frame, gains = self.update(bank, frame, dt, at)
-                if leaves_out and self.is_strange(bank, 0, frame):
+                if leaves_out and self.is_implausible(bank, 0, frame):
                     bank.x, bank.P = prior
                     gains, used[:, k] = None, False
                 else:

@@ -7,7 +7,7 @@ import numpy as np
 
 import mag_tracking as mt
 from mag_tracking.apps.doctor import Doctor
-from mag_tracking.apps.first_pass import first_pass
+from mag_tracking.apps.prescan import prescan
 from mag_tracking.pipeline import settings_for
 from mag_tracking.report.metrics import interpolate_truth
 from support.bundled import DATA, NETWORK_FILE, vehicle_path
@@ -78,6 +78,6 @@ def findings(name, *faults):
     settings = settings_for('vehicle')
     readings = apply(recorded(name).readings, *faults)
     doctor = Doctor(network, settings)
-    first_pass([readings], network, settings.calibrate).apply(doctor.calibrate)
+    prescan([readings], network, settings.calibrate).apply(doctor.calibrate)
     doctor.feed(readings)
     return [str(f) for f in doctor.findings()]

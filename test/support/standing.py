@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mag_tracking.apps.first_pass import first_pass
+from mag_tracking.apps.prescan import prescan
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
 from support.random_passes import SIMULATORS, errors_of
@@ -85,7 +85,7 @@ def first_after(run):
     """
     a_world = made('there at the start, then cars', SIMULATORS[run % 2], run // 2)
     pipeline = Pipeline(a_world.network, settings_for('vehicle'))
-    first_pass([a_world.readings], a_world.network,
+    prescan([a_world.readings], a_world.network,
                pipeline.settings.calibrate).apply(pipeline.calibrate)
     poses = poses_of(pipeline.feed(a_world.readings) + pipeline.flush())
     best = np.inf, 0, 0

@@ -35,7 +35,7 @@ NOISE = 3e-8
 OFFSET_STD = 5e-9
 """[T] Error of the background."""
 TRUCKS = 0.1
-LEAST_HEADWAY_S = 1.0
+MIN_HEADWAY_S = 1.0
 """[s] In one lane."""
 
 
@@ -86,9 +86,9 @@ def arrivals(rng):
     for n, is_north in ((N_NORTH, True), (N_SOUTH, False)):
         while True:
             t = np.sort(rng.uniform(0.0, 60.0 * MINUTES, n))
-            close = np.flatnonzero(np.diff(t) < LEAST_HEADWAY_S)
-            t[close + 1] = t[close] + LEAST_HEADWAY_S
-            if np.diff(t).min() >= LEAST_HEADWAY_S:
+            close = np.flatnonzero(np.diff(t) < MIN_HEADWAY_S)
+            t[close + 1] = t[close] + MIN_HEADWAY_S
+            if np.diff(t).min() >= MIN_HEADWAY_S:
                 break
         out += [(float(at), is_north, float(rng.normal(SPEED, SPEED_STD))) for at in t]
     return sorted(out)

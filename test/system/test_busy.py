@@ -14,7 +14,7 @@ from support.marks import studied
 from support.random_passes import SIMULATORS, one_random_pass, random_pass
 from support.samples import scenario
 
-MOST_WRONG = 0.01
+MAX_WRONG = 0.01
 """Aim: of the poses without a flag no more than this share is wrong."""
 AIMS = {'meeting_2_sensors': (15, 1.0, 4.0), 'following_2_sensors': (16, 0.9, 4.0),
         'traffic_2_sensors': (11, np.inf, np.inf), 'traffic_4_sensors': (11, np.inf, np.inf)}
@@ -67,16 +67,16 @@ def test_smoothed_paths_of_newcomers_are_where_their_poses_were():
 def test_poses_without_a_flag_are_hardly_ever_wrong():
     scores = [tracked_recording(name).score for name in IN_EVERY_TEST]
     n_sure, n_wrong = (sum(getattr(s, of) for s in scores) for of in ('n_sure', 'n_wrong'))
-    assert n_sure > 250 and n_wrong <= MOST_WRONG * n_sure
+    assert n_sure > 250 and n_wrong <= MAX_WRONG * n_sure
 
 
 @pytest.mark.study
 def test_a_tracker_of_one_vehicle_at_a_time_is_worse():
     """What all of this is for; and the setting works."""
     alone, poses, pipeline, *_ = busy_recordings.tracked_recording(
-        'meeting_2_sensors', changes={'track.most_together': 1})
+        'meeting_2_sensors', changes={'track.max_joint_targets': 1})
     assert alone.is_found.sum() <= 10
-    assert pipeline.track.counts['tracks of newcomers'] == 0
+    assert pipeline.track.counts['tracks of new targets'] == 0
 
 
 @pytest.mark.study
@@ -105,7 +105,7 @@ def test_one_vehicle_is_rarely_taken_for_two(kind, simulator):
                                          np.random.default_rng(seed), flaws)
         pipeline = Pipeline(network, settings_for('vehicle'))
         pipeline.feed(readings)
-        new.append(pipeline.track.counts['tracks of newcomers'])
+        new.append(pipeline.track.counts['tracks of new targets'])
     assert np.count_nonzero(new) <= (0 if kind == 'car' else 0.1 * n), new
 
 
@@ -116,14 +116,14 @@ def test_more_vehicles_than_are_tracked_together_are_counted():
     world = busy_worlds.world(
         busy_worlds.NETWORKS[4], [busy_worlds.passing(rng, 'clouds', *p) for p in plan], 26.0, rng,
         rate=50.0)
-    pipeline = Pipeline(world.network, settings_for('vehicle', {'track.most_together': 2}))
+    pipeline = Pipeline(world.network, settings_for('vehicle', {'track.max_joint_targets': 2}))
     most = 0
     for start in range(0, len(world.readings), 800):
         pipeline.feed(world.readings.part(slice(start, start + 800)))
         bank = pipeline.track.bank
         most = max(most, 0 if bank is None else bank.label.reshape(len(bank), -1).shape[1])
     assert most == 2
-    assert pipeline.track.counts['newcomers not sought: too many vehicles at once'] > 0
+    assert pipeline.track.counts['new_targets not sought: too many vehicles at once'] > 0
 
 
 @pytest.mark.study

@@ -30,7 +30,7 @@ def every(replays):
     return {name: replays[name] for name in VEHICLES}
 
 
-LARGEST_STEP = 1.5
+MAX_STEP = 1.5
 """A stated deviation may grow by this factor from a pose to the next: in 0.08 s a vehicle goes a
 fraction of its distance. New evidence may make it smaller at once."""
 
@@ -182,7 +182,7 @@ def test_a_car_is_followed_along_a_corridor(tmp_path):
         print(f'corridor, {name}: {along.sum()} poses, RMS {rms:.2f} m, ANEES {anees:.1f}')
         assert np.ptp(true[along, 0]) > 41.0
         assert rms <= 0.6
-        assert step_of(poses.covariance) < LARGEST_STEP
+        assert step_of(poses.covariance) < MAX_STEP
         # As the other cars; 1 = consistent.
         assert anees <= {'filtered': 3.0, 'smoothed': 4.0}[name]
 
@@ -258,7 +258,7 @@ def test_what_is_stated_does_not_jump(vehicle_replays):
     for name, (run, _) in every(vehicle_replays).items():
         for log in (*run.logs.values(), *run.smoothed.values()):
             print(f'{name}: a deviation grows by {step_of(log.covariance):.2f} at most')
-            assert step_of(log.covariance) < LARGEST_STEP
+            assert step_of(log.covariance) < MAX_STEP
 
 
 def test_no_sample_is_lost_without_a_word(vehicle_replays):

@@ -39,7 +39,7 @@ what the wrong poses are taken for."""
 
 NO_DISTURBANCE = {
     'a car that turns': '226 of 241: the other 15 are flagged for their height, or were before',
-    'a tram line switched': 'five of six: unknown; the same without newcomers',
+    'a tram line switched': 'five of six: unknown; the same without new_targets',
 }
 """{situation: why it misses its aim of events}."""
 

@@ -11,7 +11,7 @@ RUNS = 20
 # Twenty runs of up to a minute and a half, one after the other, on a slow machine.
 pytestmark = pytest.mark.timeout(1800)
 
-LEAST_RIGHT = 18
+MIN_RIGHT = 18
 """The aim is all 20: in the others it takes 3.0 and 3.3 s."""
 
 
@@ -22,7 +22,7 @@ def test_the_track_of_a_vehicle_that_stops_goes_on_and_leaves(runs):
 
 
 @pytest.mark.parametrize('runs, least', [
-    (2, 2), pytest.param(RUNS, LEAST_RIGHT, marks=pytest.mark.study)])
+    (2, 2), pytest.param(RUNS, MIN_RIGHT, marks=pytest.mark.study)])
 def test_the_background_is_right_soon_after_a_vehicle_that_stood_there_has_left(runs, least):
     assert sum(right_after(run) <= SOON_S for run in range(runs)) >= least
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mag_tracking.records import FieldFrame
-from mag_tracking.web.live_scene import KEPT_S, MOST_POSES, LiveScene
+from mag_tracking.web.live_scene import KEPT_S, MAX_POSES, LiveScene
 from support.live_records import NS, feed, later, poses
 
 
@@ -107,7 +107,7 @@ def test_old_tracks_are_forgotten_and_their_number_is_bounded(scene, records):
     rows = scene.news()
     late.take([*scene.whole()])
     kept = sum(map(len, late.tracks.values()))
-    assert kept <= MOST_POSES
+    assert kept <= MAX_POSES
     first = min(times[-1] for times in late.tracks.values())
     last = max(times[-1] for times in late.tracks.values())
     assert last - first <= KEPT_S

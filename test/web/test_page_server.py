@@ -141,7 +141,7 @@ def test_a_scene_larger_than_the_buffer_is_followed_by_rows(scene, server, recor
 
 
 def test_the_number_of_viewers_is_limited(scene, monkeypatch):
-    monkeypatch.setattr('mag_tracking.web.page_server.MOST_VIEWERS', 2)
+    monkeypatch.setattr('mag_tracking.web.page_server.MAX_VIEWERS', 2)
     with PageServer(scene, port=0) as server:
         url = server.url.replace('http', 'ws') + 'stream'
         viewers = [connect(url) for _ in range(2)]

@@ -18,7 +18,7 @@ from support.bundled import QUICK, vehicle_path
 pytestmark = needs_browser
 
 RECORDING = 'junction_left_turns_to_rear'
-MOST_MB = 10.0
+MAX_MB = 10.0
 EVIL = '</script><script>window.broken = true</script><b>left</b>'
 
 
@@ -107,7 +107,7 @@ def test_it_needs_nothing_from_outside_and_nothing_is_wrong(opened, report):
     opened.wait(f'!magTracking.plays && magTracking.t >= {t[-1]}')
     assert opened.complaints == []
     assert opened.requests == [report[0].as_uri()]
-    assert report[0].stat().st_size < MOST_MB * 1e6
+    assert report[0].stat().st_size < MAX_MB * 1e6
 
 
 def test_a_telephone_shows_it_in_its_width(chromium, report):
@@ -201,7 +201,7 @@ def test_a_report_of_very_many_poses_is_thinned_and_says_so(vehicle_replays, roa
     many = type(run)({**run.summary, 'tracks': [{**entry, 'id': k} for k in logs]}, logs,
                      {}, run.truth)
     path = write_report(many, road_network, tmp_path)
-    assert path.stat().st_size < MOST_MB * 1e6
+    assert path.stat().st_size < MAX_MB * 1e6
     text = path.read_text(encoding='utf-8')
     data = json.loads(text.split('id="data">')[1].split('</script>')[0])
     assert any('poses per track' in note['text'] for note in data['notes'])

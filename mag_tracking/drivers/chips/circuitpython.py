@@ -23,7 +23,7 @@ from smbus2 import i2c_msg
 from mag_tracking.drivers.chips.chip import Conversion, Measurement, Registers
 from mag_tracking.errors import DeviceError
 
-LONGEST_NS = 250_000_000
+MAX_NS = 250_000_000
 """A driver that goes on asking its chip for longer is stopped."""
 
 
@@ -110,7 +110,7 @@ class CircuitpythonChip:
     def set_up(self) -> None:
         """See `Chip`; loads the module."""
         cls = load(self._name)
-        self._i2c.begin(10 * LONGEST_NS)
+        self._i2c.begin(10 * MAX_NS)
         try:
             self._driver = cls(self._i2c, self._address)
         except (RuntimeError, ValueError) as error:
@@ -119,7 +119,7 @@ class CircuitpythonChip:
     def measure(self) -> Measurement:
         """See `Chip`."""
         yield from ()
-        self._i2c.begin(LONGEST_NS)
+        self._i2c.begin(MAX_NS)
         start_ns = self._registers.monotonic_ns()
         try:
             x, y, z = self._driver.magnetic

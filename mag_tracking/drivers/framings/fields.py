@@ -21,7 +21,7 @@ OF_THE_FRAME = ('sensor', 'ticks', 'sequence')
 SKIP = '-'
 Values: TypeAlias = Sequence[Any]
 """Of one frame; the type of each follows from its field."""
-LONGEST_NAME = 64
+MAX_NAME = 64
 """Characters of a sensor's name at most."""
 _ESCAPE = re.compile(r'\\(x[0-9A-Fa-f]{2}|.?)', re.DOTALL)
 _ESCAPED = {'n': '\n', 'r': '\r', 't': '\t', '0': '\0', '\\': '\\'}
@@ -126,7 +126,7 @@ def _expanded(fields: tuple[str, ...], each: tuple[str, ...], count: int) -> tup
             raise SettingsError(f'fields: {name!r} is none of {" ".join((*OF_THE_FRAME, *AXES))} '
                                 'or - (and only an axis may have a sensor, as in x.A)')
         if '.' in name and not _usable(sensor):
-            raise SettingsError(f'fields: {name!r}: the name of a sensor has 1 to {LONGEST_NAME} '
+            raise SettingsError(f'fields: {name!r}: the name of a sensor has 1 to {MAX_NAME} '
                                 'printable characters')
     for name in each:
         if name not in (*AXES, SKIP):
@@ -139,7 +139,7 @@ def _expanded(fields: tuple[str, ...], each: tuple[str, ...], count: int) -> tup
 
 def _usable(name: str) -> bool:
     """Whether a sensor may have this name."""
-    return 0 < len(name) <= LONGEST_NAME and name.isprintable()
+    return 0 < len(name) <= MAX_NAME and name.isprintable()
 
 
 def axis_value(value: float | bytes) -> float:

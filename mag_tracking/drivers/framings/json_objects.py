@@ -36,7 +36,8 @@ class JsonSettings:
         'of a list of three.')
     acceleration: tuple[str, ...] = param((), 'As field, of the acceleration.')
     end: str = param('\\n', 'Ends a line; a carriage return before it is dropped.')
-    longest: int = param(4096, 'Longest line or message, without its end.', 'bytes', (2, 1 << 20))
+    max_length: int = param(
+        4096, 'Longest line or message, without its end.', 'bytes', (2, 1 << 20))
 
 
 class JsonFraming:
@@ -54,7 +55,7 @@ class JsonFraming:
 
     def __init__(self, settings: JsonSettings) -> None:
         """Raises SettingsError."""
-        self._lines = Lines(settings.end, settings.longest)
+        self._lines = Lines(settings.end, settings.max_length)
         self._decode = json.JSONDecoder(object_pairs_hook=_object).decode
         self._lists: list[tuple[str, _Keys]] = []
         self._values: list[tuple[str, _Keys, _Converter]] = []
@@ -90,7 +91,7 @@ class JsonFraming:
 
     def _is_one(self, data: bytes) -> bool:
         """Whether all of a message is one piece of JSON, of several lines perhaps."""
-        if self._lines.end not in data.strip() or len(data) > self._lines.longest:
+        if self._lines.end not in data.strip() or len(data) > self._lines.max_length:
             return False
         try:
             self._json(data)

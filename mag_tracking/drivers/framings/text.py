@@ -47,24 +47,24 @@ class TextSettings:
     checksum: str = param(
         'none', "none, or nmea: a line ends in * and two hexadecimal digits, the exclusive or of "
         'what stands before it, without a $ at the beginning.')
-    longest: int = param(512, 'Longest line, without its end.', 'bytes', (1, 65536))
+    max_length: int = param(512, 'Longest line, without its end.', 'bytes', (1, 65536))
 
 
 class Lines:
     """Cuts bytes into lines and counts what cannot be read; as pure as a framing."""
 
-    def __init__(self, end: str, longest: int) -> None:
+    def __init__(self, end: str, max_length: int) -> None:
         """
         Parameters
         ----------
         end : str
             As in `TextSettings`; raises SettingsError where it is empty.
-        longest : int [bytes]
+        max_length : int [bytes]
         """
         self.end = unescaped('end', end)
         if not self.end:
             raise SettingsError('end: the end of a line is empty')
-        self.longest = longest
+        self.max_length = max_length
 
     def parse(self, data: bytes, final: bool, read: Callable[[bytes], list[Reading]]) -> Parsed:
         """All lines of `data`, as `Framing.parse`.
@@ -83,7 +83,7 @@ class Lines:
             lines += [rest] if rest else []
             return self.read(lines, len(data), read)
         # So much of a line that is too long stays that it is still too long in the next call.
-        kept = min(len(rest), self.longest + len(self.end))
+        kept = min(len(rest), self.max_length + len(self.end))
         return self.read(lines, len(data) - kept, read)
 
     def read(self, lines: Iterable[bytes], consumed: int,
@@ -100,7 +100,7 @@ class Lines:
 
     def _checked(self, line: bytes) -> bytes:
         """The line without its carriage return, or Rejected."""
-        if len(line) > self.longest:
+        if len(line) > self.max_length:
             raise Rejected('that are too long')
         if not line.isascii():
             try:
@@ -129,7 +129,7 @@ class TextFraming:
 
     def __init__(self, settings: TextSettings) -> None:
         """Raises SettingsError."""
-        self._lines = Lines(settings.end, settings.longest)
+        self._lines = Lines(settings.end, settings.max_length)
         self._layout = FieldLayout(settings.fields, settings.each, settings.count)
         self._prefix = unescaped('prefix', settings.prefix)
         self._comment = unescaped('comment', settings.comment)

@@ -41,7 +41,7 @@ _START = b'\xfa\xff'
 _MTDATA, _MTDATA2, _WAKE_UP, _ERROR = 0x32, 0x36, 0x3E, 0x42
 _DATA_MESSAGES = (_MTDATA, _MTDATA2)
 _EXTENDED = 0xFF
-_LONGEST_OVERHEAD = 7
+_MAX_OVERHEAD = 7
 """Bytes of a message with extended length that are not DATA."""
 
 
@@ -49,7 +49,7 @@ _LONGEST_OVERHEAD = 7
 class XsensSettings:
     """Settings of the Xsens protocol."""
 
-    longest_message: int = param(
+    max_message: int = param(
         512, 'Bytes of data in the longest message; a longer one is taken for garbage.',
         'bytes', (254, 4096))
     mtdata: tuple[str, ...] = param(
@@ -129,7 +129,7 @@ class XsensFraming:
     DRIVER = {'sequence_wrap': 2**16}
 
     def __init__(self, settings: XsensSettings) -> None:
-        self._longest = settings.longest_message
+        self._longest = settings.max_message
         self._layout: MTDataLayout | None = None
         if tuple(settings.mtdata) != ('none',):
             self._layout = MTDataLayout(settings.mtdata, settings.mtdata_format)
@@ -142,7 +142,7 @@ class XsensFraming:
         readings: list[Reading] = []
         rejected: Counter[str] = Counter()
         position = 0
-        longest = self._longest + _LONGEST_OVERHEAD
+        longest = self._longest + _MAX_OVERHEAD
         while True:
             start = data.find(_START, position)
             if start < 0:
@@ -199,7 +199,7 @@ class XsensFraming:
             if inner.end > len(window):
                 if more:
                     return _WAIT
-                if len(window) == self._longest + _LONGEST_OVERHEAD and not outer_is_data:
+                if len(window) == self._longest + _MAX_OVERHEAD and not outer_is_data:
                     return refused
             elif (_sum_is_right(window, place, inner)
                   and self._data_content(window, inner) is not None):

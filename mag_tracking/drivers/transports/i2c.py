@@ -66,9 +66,9 @@ class I2cSettings:
         'for CircuitPython.')
     rate_hz: float = param(50.0, 'Turns a second; each sensor is read once in a turn.', 'Hz',
                            (0.01, 1000.0))
-    most_failures: int = param(
+    max_failures: int = param(
         10, 'A chip that cannot be read so many turns in a row is lost.', '', (1, 1_000_000))
-    silent_s: float = param(
+    silence_timeout_s: float = param(
         2.0, 'A chip that gives no new conversion for so long, and for three turns, is lost: after '
         'a cut of its supply it does not measure until it is set up again.', 's', (0.0, 3600.0))
     mmc5983ma: Mmc5983maSettings = Mmc5983maSettings()
@@ -111,7 +111,7 @@ class I2cDevice(Closable):
         self._lost, self._due_ns = '', 0
         self._failed: Counter[str] = Counter()
         self._silent: Counter[str] = Counter()
-        self._most_silent = max(3, math.ceil(settings.silent_s * settings.rate_hz))
+        self._most_silent = max(3, math.ceil(settings.silence_timeout_s * settings.rate_hz))
         # To make the chips tells what is wrong with their settings.
         self._chips = self._made_on(Bus(None, monotonic_ns, sleep))
 
@@ -276,7 +276,7 @@ class I2cDevice(Closable):
         bus.forget()
         self._count('readings that failed', name)
         self._failed[name] += 1
-        if self._failed[name] >= self._settings.most_failures:
+        if self._failed[name] >= self._settings.max_failures:
             self._lost = (f'{self._name}: {name} failed {self._failed[name]} times in a row: '
                           f'{self._fault(error)}')
 

@@ -60,7 +60,7 @@ class MqttSettings:
     queue: int = param(
         10000, 'Messages held at most for the reader; with more the oldest are dropped.',
         '', (1, 10_000_000))
-    longest: int = param(65536, 'A longer message is dropped.', 'bytes', (1, 1 << 28))
+    max_length: int = param(65536, 'A longer message is dropped.', 'bytes', (1, 1 << 28))
     retained: bool = param(
         False, 'Retained messages, which were published at some time before, are handed on too.')
 
@@ -257,7 +257,7 @@ class MqttTopics:
             return 'messages whose topic is no text', ''
         if message.retain and not self._settings.retained:
             return 'retained messages skipped', topic
-        if len(message.payload) > self._settings.longest:
+        if len(message.payload) > self._settings.max_length:
             return 'messages that were too long', topic
         return ('' if message.payload else 'empty messages'), topic
 

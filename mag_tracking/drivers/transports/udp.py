@@ -61,7 +61,7 @@ class UdpSettings:
         212992, 'What the kernel holds for this program while it does not get to run, overhead of '
         'each datagram (about 0.5 KiB) included; more than net.core.rmem_max is not given.',
         'bytes', (2048, 1 << 30))
-    longest: int = param(65507, 'A longer datagram is dropped.', 'bytes', (1, 65507))
+    max_length: int = param(65507, 'A longer datagram is dropped.', 'bytes', (1, 65507))
 
 
 def clock_difference() -> int | None:
@@ -189,7 +189,7 @@ class UdpSocket(Polled[socket.socket]):
         room = socket.CMSG_SPACE(TIMESPEC.size)
         while len(came) < AT_ONCE and not empty:
             try:
-                came.append(opened.recvmsg(self._settings.longest, room))
+                came.append(opened.recvmsg(self._settings.max_length, room))
             except BlockingIOError:
                 empty = True
         difference = clock_difference()

@@ -8,7 +8,7 @@ const VERMILLION = '#D55E00', BLACK = '#000000';
 const SYMBOLS = ['circle', 'square', 'diamond'];
 // Standard deviations to the edge of a 90 % ellipse and of a 90 % interval.
 const SCALE_2D = Math.sqrt(-2 * Math.log(0.1)), SCALE_1D = 1.645;
-const LEAST_DRAWN = 0.01, MOST_LABELS = 24;
+const MIN_DRAWN = 0.01, MOST_LABELS = 24;
 const FONT = {size: 13, color: '#1b1b1b'};
 const CONFIG = {responsive: true, displaylogo: false,
   modeBarButtonsToRemove: ['select2d', 'lasso2d', 'sendDataToCloud']};
@@ -90,7 +90,7 @@ function mapTraces(scene, t) {
 function nowTraces(track, k, f, named) {
   const c = track.columns, traces = [], looks = looksOf(track);
   const arrivals = Object.entries(track.arrivals).filter(
-    ([name, a]) => name !== '' && a.weight[k] > LEAST_DRAWN);
+    ([name, a]) => name !== '' && a.weight[k] > MIN_DRAWN);
   for (const [name, a] of arrivals) {
     const [colour, dash] = looks[name];
     const [xs, ys] = ellipse(f * a.x[k], f * a.y[k], f * f * a.xx[k], f * f * a.xy[k],

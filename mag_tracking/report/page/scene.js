@@ -4,7 +4,7 @@
 const ARRAYS = {f8: Float64Array, f4: Float32Array, u1: Uint8Array};
 
 // Maximum number of poses of a live track, and how many are removed when it is exceeded.
-const MOST_OF_TRACK = 8000, FORGOTTEN = 1000;
+const MAX_OF_TRACK = 8000, FORGOTTEN = 1000;
 
 // A typed array of {f8: base64}, {f4: base64} or {u1: base64}.
 function decoded(packed) {
@@ -48,7 +48,7 @@ function append(track, rows) {
   }
   track.fields = joinedFields(track.fields, before, rows.fields, added);
   track.doubts = track.doubts.concat(rows.doubts);
-  const spare = track.columns.t.length - MOST_OF_TRACK;
+  const spare = track.columns.t.length - MAX_OF_TRACK;
   if (spare > 0) forget(track, spare + FORGOTTEN);
   track.ended = rows.ended;
   track.facts = rows.facts;

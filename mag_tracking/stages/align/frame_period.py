@@ -9,9 +9,9 @@ from mag_tracking.stages.align.settings import AlignSettings
 
 USUAL_S = 0.08
 """[s] T10 section 6.3 decimates to 12.5 Hz, with sensors nine metres apart."""
-SHORTEST_S = 0.02
+MIN_FRAME_S = 0.02
 """[s] Shorter frames cost more than they tell: tracking takes a core at 100 of them a second."""
-LEAST_S = 1e-4
+MIN_PERIOD_S = 1e-4
 """[s] No sensor is read more often."""
 FASTEST = 20.0
 """[m/s] Frames are made for targets up to this speed."""
@@ -41,15 +41,15 @@ def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
 
     Raises SettingsError for a frame that is shorter than any reading.
     """
-    if 0.0 < settings.period_s < LEAST_S:
-        raise SettingsError(f'align.period_s: {settings.period_s:g} s is shorter than {LEAST_S:g} '
-                            's; 0 = by the geometry')
+    if 0.0 < settings.period_s < MIN_PERIOD_S:
+        raise SettingsError(f'align.period_s: {settings.period_s:g} s is shorter than '
+                            f'{MIN_PERIOD_S:g} s; 0 = by the geometry')
     if settings.period_s:
         return settings.period_s
     shortest = shortest_delay(network)
     if settings.burst or shortest is None or not network.is_close:
         return USUAL_S
-    return min(USUAL_S, max(SHORTEST_S, 0.5 * shortest[0]))
+    return min(USUAL_S, max(MIN_FRAME_S, 0.5 * shortest[0]))
 
 
 def too_long(settings: AlignSettings, network: SensorNetwork) -> str | None:

@@ -19,12 +19,12 @@ class AlignSettings:
     max_wait_s: float = param(
         0.5, 'A sensor that is silent for longer is taken for dead and delays nobody.',
         's', (1e-3, 3600.0))
-    ahead_s: float = param(
+    max_clock_jump_s: float = param(
         0.5, 'A sensor whose stamps jump ahead by more than this while those of the others do not '
         'is held back until they follow: its clock has stepped. 0 = never.', 's', (0.0, 3600.0))
-    jump_back_s: float = param(
+    max_backward_jump_s: float = param(
         1.0, 'A stamp that goes back by more than this is a restart (a looped recording).',
         's', (0.0, 3600.0))
-    most_pending: int = param(
+    max_buffered: int = param(
         10000, 'Samples held per sensor at most; more than that and the oldest are rejected.',
         '', (2, 10_000_000))

@@ -20,7 +20,7 @@ from mag_tracking.units import NS
 
 FAR = np.iinfo(np.int64).max
 """[ns] Later than anything."""
-MOST_HELD = 16
+MAX_HELD = 16
 """Samples of a sensor that are held while it is not known whether its clock has stepped."""
 
 CAUSES = {
@@ -34,7 +34,7 @@ CAUSES = {
 
 
 class Align:
-    """Calibrated readings to frames; memory is bounded by `most_pending`.
+    """Calibrated readings to frames; memory is bounded by `max_buffered`.
 
     Between two frames a sample costs the same with any number of sensors: it cannot complete a
     frame while one sensor is known that the frame has to wait for.
@@ -57,12 +57,13 @@ class Align:
     def _reset(self) -> None:
         """As new."""
         settings = self._settings
-        longest_jump = int(round(settings.ahead_s * NS)) or FAR
+        longest_jump = int(round(settings.max_clock_jump_s * NS)) or FAR
         self._alignment = core.Alignment(
-            self._n, self._period, self._wait, longest_jump, int(round(settings.jump_back_s * NS)),
-            settings.most_pending, settings.burst)
+            self._n, self._period, self._wait, longest_jump,
+            int(round(settings.max_backward_jump_s * NS)),
+            settings.max_buffered, settings.burst)
         self._clock_steps = ClockStepFilter(self._n, longest_jump,
-                                            min(settings.most_pending, MOST_HELD))
+                                            min(settings.max_buffered, MAX_HELD))
 
     @property
     def n_held(self) -> int:

@@ -35,7 +35,7 @@ class CalibrateSettings:
     max_field: float = param(
         1e-3, 'A reading above this is rejected: gauss or microtesla published as tesla is the '
         'commonest fault. Near magnets millitesla are legitimate.', 'T', (1e-6, 10.0))
-    jump_ahead_s: float = param(
+    max_forward_jump_s: float = param(
         60.0, 'A stamp that is ahead by more than this has to be confirmed by the next one, else '
         'it is taken for corrupt.', 's', (1e-3, 1e9))
     spike_std: float = param(
@@ -55,9 +55,9 @@ class CalibrateSettings:
         '(a whole share of its own; 60 dB against folding, four intervals late). 0 = no: frames '
         'average anyway.',
         'Hz', (0.0, 10000.0))
-    resume_s: float = param(
+    max_resume_gap_s: float = param(
         60.0, 'A node that is started again goes on with the background that it had learnt, if by '
         'the stamps that was not longer ago; 0 = never.', 's', (0.0, 86400.0))
-    jump_back_s: float = param(
+    max_backward_jump_s: float = param(
         1.0, 'A stamp that goes back by more than this is a restart (a looped recording): '
         'what was learnt is forgotten.', 's', (0.0, 3600.0))

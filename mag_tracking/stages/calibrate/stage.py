@@ -64,7 +64,7 @@ class Calibrate:
         self._settings, self._sensors = settings, new_sensors(len(network))
         self._batches = np.zeros(1, core.BATCH)
         self._limits = np.array([(
-            settings.max_field, settings.jump_ahead_s * NS, settings.jump_back_s * NS,
+            settings.max_field, settings.max_forward_jump_s * NS, settings.max_backward_jump_s * NS,
             settings.reject_stuck, settings.spike_std, settings.decimate_to_hz > 0.0,
             settings.trust_covariances)], core.LIMITS)
         self._causes = {**CAUSES, core.TOO_LARGE: f'above {settings.max_field:g} T (gauss or '
@@ -73,7 +73,7 @@ class Calibrate:
         self._index = {name: i for i, name in enumerate(network.names)}
         self._background: dict[str, RunningBackground] = {}
         self._changes = SharedChanges()
-        self._restoration = BackgroundRestoration(settings.resume_s)
+        self._restoration = BackgroundRestoration(settings.max_resume_gap_s)
         self.renew(network)
 
     def renew(self, network: SensorNetwork) -> None:
@@ -128,7 +128,7 @@ class Calibrate:
         """Names of the sensors whose background is not known."""
         return [name for name, b in self._background.items() if not b.ready]
 
-    def doubtful_stretches(self) -> dict[str, DoubtfulTimes]:
+    def doubtful_intervals(self) -> dict[str, DoubtfulTimes]:
         """{sensor: ((begin, end) [ns], ...)} of those whose background was doubtful."""
         return {n: b.doubtful_times for n, b in self._background.items() if b.doubtful_times}
 

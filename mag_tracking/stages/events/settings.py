@@ -9,6 +9,6 @@ from mag_tracking.settings import param
 class EventsSettings:
     """Settings of the events."""
 
-    most_sensors: int = param(
+    max_sensors: int = param(
         4, 'Nodes: in networks of at most so many sensors detection_node describes what passes '
         'each sensor on ~/events; 0 = never.', '', (0, 1000))

@@ -9,10 +9,10 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.physics.anderson import anderson_residual
 from mag_tracking.records import plain
 
-MOST_SAMPLES = 200
+MAX_SAMPLES = 200
 """A pass is averaged to so many samples before the closest point is sought."""
 
-MOST_STARTS = 5
+MAX_STARTS = 5
 """The best points of a grid from which the closest point is sought: one axis has several optima."""
 
 CORRELATED = 2.0
@@ -79,7 +79,7 @@ def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> Cl
 
     found = min((minimize(cost_of, np.array([time, np.log(scale)]), method='Nelder-Mead', options={
         'xatol': 1e-4 * interval, 'fatol': 1e-9 * (1.0 + at_start), 'maxiter': 200})
-        for at_start, time, scale in starts[:MOST_STARTS]), key=lambda result: float(result.fun))
+        for at_start, time, scale in starts[:MAX_STARTS]), key=lambda result: float(result.fun))
     time, scale = float(found.x[0]), float(np.exp(found.x[1]))
     # Variance of the samples by what is left over; a vehicle leaves more than noise.
     left = max(found.fun / max(y.size - 4 * y.shape[1] - 2, 1), 0.0)
@@ -93,7 +93,7 @@ def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> Cl
 
 
 def _averaged(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Means of neighbours, at most `MOST_SAMPLES`, each of the same number of samples."""
-    n = -(-len(t) // MOST_SAMPLES) or 1
+    """Means of neighbours, at most `MAX_SAMPLES`, each of the same number of samples."""
+    n = -(-len(t) // MAX_SAMPLES) or 1
     k = len(t) // n
     return t[:k * n].reshape(k, n).mean(axis=1), y[:k * n].reshape(k, n, -1).mean(axis=1)

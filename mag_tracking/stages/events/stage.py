@@ -7,7 +7,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.event_records import SIGNATURE_SPAN, PassEvent
 from mag_tracking.inference.driving_direction import (
-    MOST_SURE,
+    MAX_CONFIDENCE,
     horizontal_field,
     rotation_of_pass,
 )
@@ -23,7 +23,7 @@ from mag_tracking.units import NS
 PAD_S = 1.0
 """[s] Before an onset and after the last loud frame, where the sensor is without the target."""
 
-LONGEST_S = 120.0
+MAX_S = 120.0
 """[s] Of a longer detection, the latest readings are described."""
 
 SIGNATURE_POINTS = 33
@@ -101,7 +101,7 @@ class _SensorEvents:
                 if isinstance(record, Detection):
                     out += self._at(record)
             begin = frame.stamp_ns if self._onset_ns is None else \
-                max(self._onset_ns, frame.stamp_ns - int(LONGEST_S * NS))
+                max(self._onset_ns, frame.stamp_ns - int(MAX_S * NS))
             while self._kept[0].stamp_ns[-1] < begin - (2 * PAD_S * NS + self._hold_ns):
                 self._kept.popleft()
         return out
@@ -131,7 +131,7 @@ class _SensorEvents:
         assert onset_ns is not None
         readings = Readings.joined(self._kept)
         pad = int(PAD_S * NS)
-        begin_ns = max(onset_ns, release_ns - int(LONGEST_S * NS)) - pad
+        begin_ns = max(onset_ns, release_ns - int(MAX_S * NS)) - pad
         readings = readings.part((begin_ns <= readings.stamp_ns)
                                  & (readings.stamp_ns <= release_ns + pad))
         if not len(readings) or np.isnan(readings.field).all():
@@ -166,7 +166,9 @@ class _SensorEvents:
 def _left_to_right(horizontal: FloatArray, noise_std: float, n_quiet: int) -> float:
     """Probability of a target that moves from left to right; 0.5 where the field does not tell."""
     found = rotation_of_pass(horizontal, noise_std, n_quiet)
-    return 0.5 if found is None else float(np.clip(found.left_to_right, 1.0 - MOST_SURE, MOST_SURE))
+    if found is None:
+        return 0.5
+    return float(np.clip(found.left_to_right, 1.0 - MAX_CONFIDENCE, MAX_CONFIDENCE))
 
 
 def _noise_of(readings: Readings) -> FloatArray:

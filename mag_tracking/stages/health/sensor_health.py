@@ -12,7 +12,7 @@ import numpy as np
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.resolution import smallest_steps
 from mag_tracking.calibration.saturation import cut_off
-from mag_tracking.calibration.screening import COARSE, LEAST_CHANGES
+from mag_tracking.calibration.screening import COARSE, MIN_CHANGES
 from mag_tracking.stages.health.window import median_field, noise_of, quantiles
 from mag_tracking.units import NEVER, NS
 
@@ -201,7 +201,7 @@ class SensorHealth:
     @property
     def is_coarse(self) -> bool:
         """Whether the sensor repeats itself at rest, or has not changed often enough to tell."""
-        return self._changes < LEAST_CHANGES \
+        return self._changes < MIN_CHANGES \
             or self._repeats >= COARSE * (self._repeats + self._changes)
 
     @property

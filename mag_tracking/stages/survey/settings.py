@@ -18,8 +18,8 @@ class SurveySettings:
     stated_std_deg: float = param(
         5.0, 'How far a sensor may be turned from its orientation in the network file, about each '
         'axis, where the file has no orientation_std_deg.', 'deg', (0.06, 180.0))
-    longest_clock_offset_s: float = param(
+    max_clock_offset_s: float = param(
         0.5, 'Clocks are no farther apart than this; two knocks should be, and unevenly so.',
         's', (1e-3, 10.0))
-    most_accelerations: int = param(
+    max_accelerations: int = param(
         60000, 'Readings kept of each accelerometer, the latest.', '', (100, 10_000_000))

@@ -29,7 +29,7 @@ from mag_tracking.records import AccelerationSample
 from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.units import NS
 
-LONGEST_GAP_S = 3600.0
+MAX_GAP_S = 3600.0
 """[s] After a longer gap, or a step back, what was collected is of another time."""
 
 SURE_STATED = 1e-3
@@ -88,7 +88,7 @@ class Survey:
         # What an earlier survey found is no further evidence.
         self._network, self._settings = network.as_stated(), settings
         self._kept: dict[str, deque[tuple[int, FloatArray]]] = {
-            name: deque(maxlen=settings.most_accelerations) for name in network.names}
+            name: deque(maxlen=settings.max_accelerations) for name in network.names}
 
     def feed(self, sample: AccelerationSample) -> list[NetworkSurvey]:
         """Take an `AccelerationSample`: []."""
@@ -97,7 +97,7 @@ class Survey:
             self.counts[f'rejected: acceleration of unknown sensor {sample.sensor}'] += 1
         elif not np.isfinite(sample.acceleration).all():
             self.counts['rejected: acceleration is not finite'] += 1
-        elif kept and not 0 < sample.stamp_ns - kept[-1][0] < LONGEST_GAP_S * NS:
+        elif kept and not 0 < sample.stamp_ns - kept[-1][0] < MAX_GAP_S * NS:
             if abs(kept[-1][0] - sample.stamp_ns) > NS:
                 kept.clear()
                 kept.append((sample.stamp_ns, sample.acceleration))
@@ -231,7 +231,7 @@ class Survey:
     def _lags(self, signals: Mapping[str, tuple[FloatArray, FloatArray]]
               ) -> tuple[str, dict[str, Lag]]:
         """(reference sensor, {sensor: Lag}) by the knocks."""
-        longest = self._settings.longest_clock_offset_s
+        longest = self._settings.max_clock_offset_s
         first: dict[str, Lag] = {}
         for reference, (t, s) in signals.items():
             lags = {name: knock_lag(t, s, *signals[name], longest)

@@ -23,7 +23,7 @@ STEADY = 0.85
 HALF_FRAME = 0.5
 """It is not known when within a frame a size was reached."""
 
-MOST_FRAMES = 1000
+MAX_FRAMES = 1000
 """A target that is not loud by then is not judged."""
 
 
@@ -43,7 +43,7 @@ class Approach:
         energy, n_axes = whitened_energy(frame.field, frame.covariance)
         # A frame that is quieter than its noise is not quieter than that.
         self._sizes.append(float(np.sqrt(max(energy.sum() / max(n_axes.sum(), 1), 1.0))))
-        self._is_open = self._sizes[-1] <= LOUD * FELT and len(self._sizes) < MOST_FRAMES
+        self._is_open = self._sizes[-1] <= LOUD * FELT and len(self._sizes) < MAX_FRAMES
         return not self._is_open and self._is_doubtful()
 
     def _is_doubtful(self) -> bool:

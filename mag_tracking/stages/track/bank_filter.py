@@ -15,7 +15,7 @@ from mag_tracking.records import FieldFrame, plain
 from mag_tracking.stages.track import core
 from mag_tracking.stages.track.observation import SAME_TIME_S, Observation
 from mag_tracking.stages.track.settings import TrackSettings
-from mag_tracking.stages.track.unseen_length import CAR_ROW
+from mag_tracking.stages.track.unobserved_length import CAR_ROW
 
 LINEAR = 0.25
 """A field is about linear in the position over this share of the distance to the nearest sensor:
@@ -236,7 +236,7 @@ class BankFilter:
         to be about linear in it."""
         return LINEAR * self.observation.nearest(x)
 
-    def is_strange(self, bank: FilterBank, i: int, frame: FieldFrame) -> bool:
+    def is_implausible(self, bank: FilterBank, i: int, frame: FieldFrame) -> bool:
         """Whether hypothesis `i`, just updated with the `frame`, is contradicted by it."""
         n_y = np.count_nonzero(~np.isnan(frame.field))
         return bool(np.nansum(bank.nis[i]) > self._settings.end_nis * n_y)

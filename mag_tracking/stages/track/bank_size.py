@@ -10,17 +10,17 @@ from mag_tracking.stages.track.initiation_vehicle import moment_directions
 from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.settings import TrackSettings
 
-MOST_BYTES = 4 << 30
+MAX_BYTES = 4 << 30
 """Limit for the covariances of all starting hypotheses, and for the grid of a magnet. Peak memory
 is 1.5 times as much."""
 START_BYTES = 250_000_000
 """The covariances of all starting hypotheses take no more than this, if need be with fewer sensors;
 the others come in when the track has run through the frames before its detection."""
-LEAST_AT_START = 4
+MIN_AT_START = 4
 """Every track starts with at least this many sensors: those nearest to the strongest."""
 WIDER_BYTES = 100_000_000
 """When they come in, the covariances of the hypotheses that are kept take no more than this."""
-LEAST_HYPOTHESES = 100
+MIN_HYPOTHESES = 100
 """No fewer hypotheses are kept, even if they take more."""
 WEIGHT_KEPT = 0.999
 """The other sensors come in only if the hypotheses that are kept have this share of the weight:
@@ -34,12 +34,12 @@ def check_vehicle_bank(settings: TrackSettings, network: SensorNetwork,
     _check_bank('track.vehicle', _vehicle_factors(settings), settings,
                 sensors_at_start(settings, network, model), model)
     n = _n_sensors(settings, network)
-    size = LEAST_HYPOTHESES * _FLOAT_BYTES * (
+    size = MIN_HYPOTHESES * _FLOAT_BYTES * (
         len(model.state_names) + _states_per_sensor(settings) * n)**2
-    if size > MOST_BYTES:
-        raise SettingsError(f'track.most_sensors: {LEAST_HYPOTHESES} hypotheses of a target that '
+    if size > MAX_BYTES:
+        raise SettingsError(f'track.max_sensors: {MIN_HYPOTHESES} hypotheses of a target that '
                             f'{n} sensors see need {_gigabytes(size)}, more than '
-                            f'{_gigabytes(MOST_BYTES)}')
+                            f'{_gigabytes(MAX_BYTES)}')
 
 
 def _vehicle_factors(settings: TrackSettings) -> dict[str, int]:
@@ -60,7 +60,7 @@ def sensors_at_start(settings: TrackSettings, network: SensorNetwork, model: Sou
                                  len(model.state_names), _states_per_sensor(settings)))
 
 
-def most_sensors(observation: Observation, n_hyp: int) -> int:
+def max_sensors(observation: Observation, n_hyp: int) -> int:
     """How many sensors so many hypotheses may have states of."""
     return _affordable(n_hyp, observation.n_target, observation.n_own + 3)
 
@@ -69,13 +69,13 @@ def _affordable(n_hyp: int, n_target: int, n_of_sensor: int) -> int:
     """How many sensors so many hypotheses may have states of, by how many states there are of the
     target and of each sensor."""
     n_states = math.isqrt(START_BYTES // (_FLOAT_BYTES * n_hyp))
-    return max((n_states - n_target) // n_of_sensor, LEAST_AT_START)
+    return max((n_states - n_target) // n_of_sensor, MIN_AT_START)
 
 
-def most_hypotheses(observation: Observation, n_sensors: int) -> int:
+def max_hypotheses(observation: Observation, n_sensors: int) -> int:
     """How many are kept of a track that from now on has states of so many sensors."""
     size = _FLOAT_BYTES * observation.n_states(n_sensors)**2
-    return max(LEAST_HYPOTHESES, WIDER_BYTES // size)
+    return max(MIN_HYPOTHESES, WIDER_BYTES // size)
 
 
 def check_magnet_bank(settings: TrackSettings, network: SensorNetwork,
@@ -84,31 +84,31 @@ def check_magnet_bank(settings: TrackSettings, network: SensorNetwork,
     magnet, n = settings.magnet, _n_sensors(settings, network)
     # Each point has the derivative (3, 3) of every sensor's field by the moment.
     size = magnet.grid_points * n * 9 * _FLOAT_BYTES
-    if size > MOST_BYTES:
+    if size > MAX_BYTES:
         raise SettingsError(f'track.magnet.grid_points: {magnet.grid_points} points x {n} sensors '
-                            f'need {_gigabytes(size)}, more than {_gigabytes(MOST_BYTES)}')
+                            f'need {_gigabytes(size)}, more than {_gigabytes(MAX_BYTES)}')
     _check_bank('track.magnet', {'starts': magnet.starts}, settings, n, model)
 
 
 def _check_bank(group: str, factors: Mapping[str, int], settings: TrackSettings, n: int,
                 model: SourceModel) -> None:
     """Compare the covariances of the product of `factors` {name: number}, with `n` sensors, with
-    `MOST_BYTES`.
+    `MAX_BYTES`.
     """
     n_hyp = math.prod(factors.values())
     n_x = len(model.state_names) + _states_per_sensor(settings) * n
     size = n_hyp * n_x**2 * _FLOAT_BYTES
-    if size > MOST_BYTES:
+    if size > MAX_BYTES:
         product = ' x '.join(f'{name} ({number})' for name, number in factors.items())
         raise SettingsError(
             f'{group}: {n_hyp} starting hypotheses, {product}, with {n_x} states each for {n} '
-            f'sensors (track.most_sensors) at the start need {_gigabytes(size)}, more than '
-            f'{_gigabytes(MOST_BYTES)}')
+            f'sensors (track.max_sensors) at the start need {_gigabytes(size)}, more than '
+            f'{_gigabytes(MAX_BYTES)}')
 
 
 def _n_sensors(settings: TrackSettings, network: SensorNetwork) -> int:
     """Sensors that a track uses."""
-    return min(len(network), settings.most_sensors)
+    return min(len(network), settings.max_sensors)
 
 
 def _states_per_sensor(settings: TrackSettings) -> int:

@@ -28,9 +28,9 @@ class CompiledFilter {
         R_sw_.assign(r, r + 9 * n);
         if ((n_angles != 0 && n_angles != 3) || (n_errors != 0 && n_errors != 3))
             throw py::value_error("a sensor has no own angles and errors, or three");
-        if (target.n() > MOST_TARGET_STATES)
+        if (target.n() > MAX_TARGET_STATES)
             throw py::value_error("more states of a target than " +
-                                  std::to_string(MOST_TARGET_STATES));
+                                  std::to_string(MAX_TARGET_STATES));
     }
 
     void advance(Array field, Array covariance, Array offset, double dt, Array decay,
@@ -190,8 +190,8 @@ RowVehicle row_vehicle(int n_states, int n_dipoles, Vector density, Vector induc
 Vehicles vehicles(int count, int n_states, int n_dipoles, Vector density, Vector induction,
                   double moment_drift, double difference_drift, double turn_acceleration,
                   double turn_time, double fastest_turn) {
-    if (count < 1 || count > MOST_TARGETS)
-        throw py::value_error("count: from 1 to " + std::to_string(MOST_TARGETS));
+    if (count < 1 || count > MAX_TARGETS)
+        throw py::value_error("count: from 1 to " + std::to_string(MAX_TARGETS));
     return {row_vehicle(n_states, n_dipoles, density, induction, moment_drift, difference_drift,
                         turn_acceleration, turn_time, fastest_turn), count};
 }
@@ -209,7 +209,7 @@ PYBIND11_MODULE(core, module) {
     add_filter(module, "RowVehicleFilter", row_vehicle);
     add_filter(module, "VehiclesFilter", vehicles);
     add_filter(module, "MagnetFilter", magnet);
-    module.attr("MOST_TARGETS") = MOST_TARGETS;
+    module.attr("MAX_TARGETS") = MAX_TARGETS;
     module.def("fit_steady_pass", &fit_steady_pass, IN(theta), IN(cost), IN(covariance), IN(free),
                IN(fixed), IN(places), IN(combinations), IN(t), IN(positions), IN(M), IN(clock),
                IN(y), IN(nuisance), IN(n_steps), IN(tolerance), IN(most_damping), IN(full_rank),

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 
-MOST_TARGETS: int
+MAX_TARGETS: int
 """Vehicles that share a state at most."""
 
 class _Filter:

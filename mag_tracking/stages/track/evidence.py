@@ -6,7 +6,7 @@ from scipy.special import chdtri
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, are_doubtful, noted
 from mag_tracking.inference.axes import whitened_energy
-from mag_tracking.inference.explanation import Explanation
+from mag_tracking.inference.bayes_factor import TargetBayesFactor
 from mag_tracking.inference.innovation_consistency import InnovationConsistency
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame, Track
@@ -16,7 +16,7 @@ from mag_tracking.stages.track.disturbances import size_of
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 
-LONGEST_SINGLE_SENSOR_S = 0.5
+MAX_SINGLE_SENSOR_S = 0.5
 """[s] A track that one sensor of several has supported alone for longer stays ambiguous."""
 
 LOST = 'lost its target'
@@ -35,7 +35,7 @@ OVERFIT_NATS = float(np.log(1e4))
 """An extended filter linearises each frame elsewhere, and may fit frames better than one path can.
 Where the path of the same hypothesis makes them less probable by this, the filter is doubted."""
 
-LEAST_WATCHED = 0.5
+MIN_WATCHED = 0.5
 """A track that begins with less than this share of its lookback is ambiguous."""
 
 FELT = 4.0
@@ -50,7 +50,7 @@ LASTS_S = 0.1
 """[s] Time for which a passing doubt outlasts the frame that it was found in: one that is missing
 in a single frame may be back in the next."""
 
-MOST_STRETCHES = 5000
+MAX_SEGMENTS = 5000
 """Stretches of doubtful poses that are remembered: more than a track has that is smoothed."""
 
 
@@ -59,7 +59,7 @@ class TrackEvidence:
 
     Attributes
     ----------
-    explanation : Explanation
+    explanation : TargetBayesFactor
         Against something else than a target.
     innovations : InnovationConsistency
     largest : (n_sensors,) array, T
@@ -67,7 +67,7 @@ class TrackEvidence:
     """
 
     def __init__(self, n_sensors: int) -> None:
-        self.explanation = Explanation()
+        self.bayes_factor = TargetBayesFactor()
         self.innovations = InnovationConsistency(n_sensors)
         self._approach = Approach()
         # For the whole track.
@@ -82,7 +82,7 @@ class TrackEvidence:
         # Until when other doubts last.
         self._until_ns: dict[str, int] = {}
         # Stretches that also smoothed poses are doubted in.
-        self._stretches: list[tuple[int, int]] = []
+        self._segments: list[tuple[int, int]] = []
         self._best_spread = np.inf
         # Per sensor: whitened energy of its fields above that of noise, and number of axes.
         self._energy, self._n_axes = np.zeros(n_sensors), np.zeros(n_sensors)
@@ -133,7 +133,7 @@ class TrackEvidence:
         """The poses of so many seconds may be wrong; those since an earlier time were, perhaps."""
         self._until_ns[reason] = until_ns = stamp_ns + round(seconds * NS)
         if since_ns is not None:
-            self._stretches.append((since_ns, until_ns))
+            self._segments.append((since_ns, until_ns))
 
     def watch(self, frame: FieldFrame) -> None:
         """Doubt the track where the field has grown unlike that of a target from afar."""
@@ -174,7 +174,7 @@ class TrackEvidence:
     def note(self, found: set[str], stamp_ns: int) -> set[str]:
         """Record the doubts about the pose of a frame; return them and those that last."""
         passing = found.intersection(PASSING_DOUBTS)
-        self._doubtful_times = noted(self._doubtful_times, stamp_ns, bool(passing), MOST_STRETCHES)
+        self._doubtful_times = noted(self._doubtful_times, stamp_ns, bool(passing), MAX_SEGMENTS)
         self._found_ns |= dict.fromkeys(passing, stamp_ns)
         return found | {reason for reason, when in self._found_ns.items()
                         if (stamp_ns - when) / NS <= LASTS_S} \
@@ -198,7 +198,7 @@ class TrackEvidence:
         a target has to explain the frames better.
         """
         found = set()
-        if self.explanation.fell_behind(ratio):
+        if self.bayes_factor.fell_behind(ratio):
             found.add(doubts.SOMETHING_ELSE)
         if self.contradicts(nis, degrees_of_freedom):
             found.add(doubts.CONTRADICTION)
@@ -229,7 +229,7 @@ class TrackEvidence:
 
     def doubted_filter(self, stamp_ns: int) -> bool:
         """Whether the filter was doubted at an earlier time."""
-        return are_doubtful((*self._doubtful_times, *self._stretches), stamp_ns)
+        return are_doubtful((*self._doubtful_times, *self._segments), stamp_ns)
 
     def support(self, by_one_sensor: bool, dt: float) -> None:
         """Count `dt` [s] for which one sensor of several supported the track, or more did.
@@ -238,7 +238,7 @@ class TrackEvidence:
         always correct the error when they are back.
         """
         self._single_sensor_s += dt if by_one_sensor else 0.0
-        if self._single_sensor_s > LONGEST_SINGLE_SENSOR_S:
+        if self._single_sensor_s > MAX_SINGLE_SENSOR_S:
             self.doubt(doubts.ONE_SENSOR)
 
     @property
@@ -259,7 +259,7 @@ class TrackEvidence:
         several explain the field, what they differ by says nothing about how far away it is. A
         target that `is_coming` nearer to the sensors is not out of reach, however uncertain.
         """
-        if self.explanation.unexplained_s(track.stamp_ns) > UNEXPLAINED_S:
+        if self.bayes_factor.unexplained_s(track.stamp_ns) > UNEXPLAINED_S:
             return UNEXPLAINED
         misfit = track.nis > settings.end_nis * track.degrees_of_freedom
         self._n_misfits = self._n_misfits + 1 if misfit else 0

@@ -12,7 +12,7 @@
 
 namespace mag_tracking {
 
-constexpr int MOST_TARGET_STATES = 256;
+constexpr int MAX_TARGET_STATES = 256;
 
 // The sensors of a network.
 struct Sensors {
@@ -67,7 +67,7 @@ class Filter {
   public:
     Filter(const Target& target, const Sensors& sensors, const Sizes& sizes)
         : target_(target), sensors_(sensors), n_(sizes), Q_(sizes.n_t * sizes.wide),
-          T_(MOST_ROWS * sizes.wide), h_(3 * sizes.n_sensors), inflation_(sizes.n_sensors),
+          T_(MAX_ROWS * sizes.wide), h_(3 * sizes.n_sensors), inflation_(sizes.n_sensors),
           x_lin_(sizes.wide) {}
 
     // Time update of `x` (wide) and `P` (n_x, wide) linearised at `at` (n_x); backwards in time
@@ -76,7 +76,7 @@ class Filter {
                         Motion& motion) {
         target_.move(at, frame.dt, motion);
         if (frame.dt > 0.0) target_.noise(at, P, n_.wide, frame.dt, motion, Q_.data());
-        double moved[MOST_ROWS];
+        double moved[MAX_ROWS];
         for (int r = 0; r < motion.n; ++r) {
             moved[r] = motion.moved[r];
             for (int m = 0; m < motion.width; ++m) {
@@ -140,7 +140,7 @@ class Filter {
                     of_frame = update(frame, x_lin, near_field_length, x, P, out.gains(k, n_),
                                       nis.data());
                 }
-                if (leaves_out && is_strange(frame.field, nis, strange)) {
+                if (leaves_out && is_implausible(frame.field, nis, strange)) {
                     copy(prior_x.data(), prior_P.data(), x, P);
                     out.used[k] = false;
                 } else {
@@ -221,7 +221,7 @@ class Filter {
         return x_lin_.data();
     }
 
-    INLINE bool is_strange(const double* y, const std::vector<double>& nis,
+    INLINE bool is_implausible(const double* y, const std::vector<double>& nis,
                            double strange) const {
         double total = 0.0;
         int axes = 0;
@@ -235,7 +235,7 @@ class Filter {
     // Fields h_, derivative `H` and inflation_ of the state `x`; false where they are not finite.
     INLINE bool see(const Frame& frame, const double* x, const double* near_field_length,
                     double* H) {
-        double at[MOST_TARGET_STATES], total = 0.0;
+        double at[MAX_TARGET_STATES], total = 0.0;
         std::copy(x, x + n_.n_t, at);
         for (int j = 0; j < n_.n_sensors; ++j, H += 3 * n_.n_seen()) {
             const double* position = sensors_.positions + 3 * j;
@@ -275,7 +275,7 @@ class Filter {
     // `H` (3, n_seen) by the moved state to that by the state before: H F.
     INLINE void to_before(const Motion& motion, double* H) const {
         for (int a = 0; a < 3; ++a, H += n_.n_seen()) {
-            double by_moved[MOST_ROWS];
+            double by_moved[MAX_ROWS];
             for (int r = 0; r < motion.n; ++r) {
                 by_moved[r] = H[motion.rows[r]];
                 H[motion.rows[r]] = 0.0;

@@ -18,7 +18,7 @@ from mag_tracking.settings import param
 class MagnetSettings:
     """The magnet: its motion and where it may appear."""
 
-    reach: float = param(
+    start_margin: float = param(
         0.15, 'It may first appear so far beyond the box of the sensors.', 'm', (1e-3, 100.0))
     grid_points: int = param(
         4000, 'Points of the coarse grid over that box.', '', (8, 1_000_000))
@@ -63,9 +63,9 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
                   + (relative_std * size[:, None]) ** 2)
     y = (frame.field / std)[present]
     low, high = network.positions.min(axis=0), network.positions.max(axis=0)
-    extent = high - low + 2.0 * settings.reach
+    extent = high - low + 2.0 * settings.start_margin
     step = float((np.prod(extent) / settings.grid_points) ** (1.0 / 3.0))
-    axes = [np.arange(a - settings.reach + step / 2, b + settings.reach, step)
+    axes = [np.arange(a - settings.start_margin + step / 2, b + settings.start_margin, step)
             for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)
     # Only the moment's Jacobian is wanted: it does not depend on the moment.

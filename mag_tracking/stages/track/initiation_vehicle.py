@@ -36,7 +36,7 @@ class VehicleSettings:
         'm', (-1000.0, 1000.0))
     lateral_std: float = param(1.5, 'Spread about a starting line.', 'm', (1e-3, 1000.0))
     along_std: float = param(3.0, 'Spread of the starting distance.', 'm', (1e-3, 1000.0))
-    farthest: float = param(
+    max_start_distance: float = param(
         30.0, 'Largest starting distance from the outermost sensor.', 'm', (0.1, 10000.0))
     speeds: tuple[float, ...] = param((5.0, 10.0, 20.0), 'Starting speeds.', 'm/s', (0.01, 200.0))
     speed_std: float = param(0.3, 'Spread of a starting speed, relative to it.', '', (1e-3, 10.0))
@@ -225,7 +225,7 @@ def _matching_positions(settings: VehicleSettings, network: SensorNetwork, measu
                         R: FloatArray, moments: FloatArray, height: float) -> FloatArray:
     """Positions (n_offsets, n_moments, 3) where on each line a field first has the energy."""
     along = (network.positions - network.centre) @ R[:, 0]
-    distance = np.linspace(settings.farthest, 0.0, 160) - along.min()
+    distance = np.linspace(settings.max_start_distance, 0.0, 160) - along.min()
     line = np.array([network.centre[0], network.centre[1], height])
     offsets = np.array(settings.lateral_offsets)
     points = line + offsets[:, None, None] * R[:, 1] - distance[:, None] * R[:, 0]

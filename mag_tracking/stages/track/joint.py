@@ -14,7 +14,7 @@ SURE_NATS = 15.0
 """[nats] An explanation that is believed by less than this is doubted for a while: evidence counts
 what a model leaves out of the field as if it were independent in each frame, and says too much."""
 
-STRANGE_NATS = 60.0
+IMPLAUSIBLE_NATS = 60.0
 """[nats] As `SURE_NATS`, where two vehicles cross, or one overtakes the other at more than
 `OVERTAKING_RATIO`: traffic does so less often than a flipped axis or a train looks like it."""
 
@@ -30,7 +30,7 @@ STANDING = 1.0
 
 @dataclass(frozen=True)
 class Joint:
-    """Hypotheses of the tracked vehicles and a newcomer; what is new comes last in their states."""
+    """Hypotheses of the tracked vehicles and a new one, whose state comes last."""
 
     bank: FilterBank
     """At the latest frame of the window."""
@@ -49,13 +49,13 @@ class Joint:
 
         One that was found elsewhere; two that took the place of one and go the same way, as a long
         vehicle of which the model leaves much out looks like two; all of a weak explanation, and
-        of one by vehicles that cross, or of which one is much faster, `STRANGE_NATS`.
+        of one by vehicles that cross, or of which one is much faster, `IMPLAUSIBLE_NATS`.
         """
         n = self.bank.label.shape[1] if self.bank.label.ndim > 1 else 1
         x = self.bank.x[self.bank.best()]
         velocity = np.array([x[k * n_one + 3:k * n_one + 5] for k in range(n)])
-        is_strange = self.adds and _are_strange(velocity, 1 if self.replaced is None else 2)
-        if self.log_odds < (STRANGE_NATS if is_strange else SURE_NATS):
+        is_implausible = self.adds and _are_implausible(velocity, 1 if self.replaced is None else 2)
+        if self.log_odds < (IMPLAUSIBLE_NATS if is_implausible else SURE_NATS):
             return tuple(range(n))
         if self.replaced is None:
             return ()
@@ -64,7 +64,7 @@ class Joint:
         return (n - 2, n - 1) if velocity[-2] @ velocity[-1] > 0.0 else ()
 
 
-def _are_strange(velocity: FloatArray, n_new: int) -> bool:
+def _are_implausible(velocity: FloatArray, n_new: int) -> bool:
     """Whether one of the last `n_new` vehicles crosses another's way, or goes the same way much
     faster or slower; `velocity` (n, 2) [m/s]."""
     speed = np.linalg.norm(velocity, axis=1)

@@ -17,9 +17,9 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.bank_size import sensors_at_start
-from mag_tracking.stages.track.clock_evidence import ClockEvidence
+from mag_tracking.stages.track.clock_comparison import ClockComparison
 from mag_tracking.stages.track.disturbances import Disturbances
-from mag_tracking.stages.track.observation import MOST_TURNED
+from mag_tracking.stages.track.observation import MAX_ROTATION
 from mag_tracking.stages.track.running_track import RunningTrack, TrackRecord
 from mag_tracking.stages.track.sensor_selection import SensorSubset
 from mag_tracking.stages.track.settings import TrackSettings
@@ -46,13 +46,13 @@ class TrackManager:
     """
 
     def __init__(self, network: SensorNetwork, settings: TrackSettings,
-                 clocks: ClockEvidence | None = None) -> None:
+                 clocks: ClockComparison | None = None) -> None:
         """
         Parameters
         ----------
         network : SensorNetwork
         settings : TrackSettings
-        clocks : ClockEvidence, optional
+        clocks : ClockComparison, optional
             Of passes before; goes on with those of the tracks.
 
         Raises
@@ -61,7 +61,7 @@ class TrackManager:
             If the settings contradict each other.
         """
         self.counts: Counter[str] = Counter()
-        self._clocks = clocks or ClockEvidence(len(network))
+        self._clocks = clocks or ClockComparison(len(network))
         self._network, self._settings = network, settings
         self._target = target_of(settings, network)
         self._tracks: list[RunningTrack] = []
@@ -77,7 +77,7 @@ class TrackManager:
         self._disturbances = Disturbances(network.names)
         self._doubtful_times: Mapping[str, DoubtfulTimes] = {}
         self._doubtful: dict[int, DoubtfulTimes] = {}
-        uncertain = sum(bool(s is not None and s.max() > MOST_TURNED)
+        uncertain = sum(bool(s is not None and s.max() > MAX_ROTATION)
                         for s in network.orientation_std)
         if uncertain:
             self.counts['sensors whose orientation is hardly known'] = uncertain
@@ -118,7 +118,7 @@ class TrackManager:
     @property
     def clocks_apart(self) -> str:
         """Which clocks seem apart, as a sentence; empty where none do."""
-        apart = self._clocks.apart if self._settings.second_opinion else None
+        apart = self._clocks.apart if self._settings.cross_check else None
         return '' if apart is None else apart.text(self._network.names)
 
     @property
@@ -131,7 +131,7 @@ class TrackManager:
         self.idle()
         if self._next_network is not None and not self._tracks:
             if not np.array_equal(self._next_network.clock_offset, self._network.clock_offset):
-                self._clocks = ClockEvidence(len(self._network))
+                self._clocks = ClockComparison(len(self._network))
             self._network, self._next_network = self._next_network, None
         out, previous = self._end_at_gap(frame), self._last_ns
         self._last_ns = frame.stamp_ns
@@ -152,11 +152,11 @@ class TrackManager:
         """Do the work that may wait until the latest records are published."""
         for track in self._tracks:
             track.hand_over()
-            joint = track.newcomer()
+            joint = track.new_target()
             if joint is not None:
                 track.admit(joint, self._next_id)
                 self.counts['tracks'] += joint.adds
-                self.counts['tracks of newcomers' if joint.adds else 'tracks found again'] += 1
+                self.counts['tracks of new targets' if joint.adds else 'tracks found again'] += 1
                 self._next_id += joint.adds
 
     def give_up(self, reason: str) -> list[TrackRecord]:
@@ -234,7 +234,7 @@ class TrackManager:
             self.counts[ALONE] += 1
             self._remember(frame)
             return []
-        later = self._sensors_at(frame, s.most_sensors)
+        later = self._sensors_at(frame, s.max_sensors)
         n_at_start = sensors_at_start(s, self._network, self._target.model)
         sensors = later if n_at_start >= len(later.rows) else self._sensors_at(frame, n_at_start)
         bank_filter = BankFilter(sensors.network, self._target.model, s)

@@ -11,20 +11,20 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.clock_evidence import ClockEvidence
+from mag_tracking.stages.track.clock_comparison import ClockComparison
+from mag_tracking.stages.track.cross_check import CrossCheck
 from mag_tracking.stages.track.disturbances import Unexplained
 from mag_tracking.stages.track.evidence import TrackEvidence
 from mag_tracking.stages.track.joint import Joint
 from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.plausibility import Plausibility
 from mag_tracking.stages.track.published_pose import ambiguities, published_track, smoothed_pose
-from mag_tracking.stages.track.second_opinion import SecondOpinion
 from mag_tracking.stages.track.sensor_selection import SensorSubset
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.stages.track.target import Target
 
-MOST_PLACES = 64
+MAX_PLACES = 64
 """Number of places of a target that are remembered, to tell it from another one."""
 
 
@@ -62,7 +62,7 @@ class Member:
     ----------
     id : int
     evidence : TrackEvidence
-    opinion : SecondOpinion
+    opinion : CrossCheck
     last : Track or None
         The latest record.
     ended : str or None
@@ -76,11 +76,11 @@ class Member:
     """
 
     def __init__(self, id: int, target: Target, sensors: SensorSubset, counts: 'Counter[str]',
-                 clocks: ClockEvidence, begin_ns: int) -> None:
+                 clocks: ClockComparison, begin_ns: int) -> None:
         self.id, self._target, self._counts, self._clocks = id, target, counts, clocks
         self.begin_ns, self._sensors = begin_ns, sensors
         self.evidence, self._plausibility = TrackEvidence(len(sensors.whole)), Plausibility()
-        self.opinion = SecondOpinion(sensors.network)
+        self.opinion = CrossCheck(sensors.network)
         self.last: Track | None = None
         self.ended: str | None = None
         self.is_lost = False
@@ -90,28 +90,28 @@ class Member:
         self._unseen = target.unseen()
         self._was_sure = False
         # Where the latest poses were published.
-        self._places: deque[tuple[int, FloatArray]] = deque(maxlen=MOST_PLACES)
+        self._places: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_PLACES)
 
     def use(self, sensors: SensorSubset) -> None:
         """From now on the target is measured by these sensors."""
         self._sensors = sensors
-        self.opinion = SecondOpinion(sensors.network)
+        self.opinion = CrossCheck(sensors.network)
 
-    def begin_again(self, sensors: SensorSubset) -> None:
+    def restart(self, sensors: SensorSubset) -> None:
         """Drop the doubts that were due to the field of another vehicle."""
         self.evidence.forgive()
         self.use(sensors)
         self._plausibility = Plausibility()
 
-    def begin_beside(self, first: 'Member', stamp_ns: int, ratio: float) -> None:
-        """It begins as a newcomer beside the `first` member of a track, whose doubts about how it
+    def start_alongside(self, first: 'Member', stamp_ns: int, ratio: float) -> None:
+        """It begins as a new target beside the `first` member of a track, whose doubts about how it
         came, and whose evidence against something else, are its own.
 
         `ratio` is that by which a target has to explain the frames better.
         """
         self.evidence.doubt_start(doubts.NOT_SEEN_APPROACHING in first.evidence.doubts,
                                   self._sensors.whole, False)
-        self.evidence.explanation.add(first.evidence.explanation.log_ratio, stamp_ns, ratio)
+        self.evidence.bayes_factor.add(first.evidence.bayes_factor.log_ratio, stamp_ns, ratio)
 
     def distance_from(self, stamps_ns: Sequence[int], path: FloatArray) -> float:
         """[m] mean distance of the latest poses from a path (n, 2) with these timestamps.
@@ -159,23 +159,23 @@ class Member:
     def is_doubted(self, settings: TrackSettings) -> bool:
         """Whether all of the track, as it stands, may be wrong."""
         return self.evidence.doubted or self.opinion.is_doubtful \
-            or not self.evidence.explanation.leads(settings.explained_ratio) \
+            or not self.evidence.bayes_factor.leads(settings.min_bayes_factor) \
             or not self._target.starts_anywhere and self.evidence.is_felt_by_one
 
     def _doubts(self, update: Update, view: View, alone: bool) -> set[str]:
         """Doubts about the pose of the best hypothesis; `alone`: one sensor measured."""
         bank, best, evidence, settings = view.bank, view.best, self.evidence, update.settings
         found = evidence.doubts | ({doubts.ONE_SENSOR} if alone else set())
-        if update.bank_filter.is_strange(bank, best, update.frame):
+        if update.bank_filter.is_implausible(bank, best, update.frame):
             found.add(doubts.MISFIT)
-        if not evidence.explanation.leads(settings.explained_ratio):
+        if not evidence.bayes_factor.leads(settings.min_bayes_factor):
             found.add(doubts.SOMETHING_ELSE)
         # A magnet may rest: it is then as smooth as anything, and is where it was.
         if self._target.starts_anywhere:
             return found
         found |= evidence.vehicle_doubts(
             bank.nis[best], int(np.count_nonzero(~np.isnan(update.frame.field))),
-            settings.explained_ratio)
+            settings.min_bayes_factor)
         if self._overfits(update, view):
             found.add(doubts.OVERFIT)
         found |= self.opinion.doubts(self._clocks.apart_s(update.sensors.rows))
@@ -206,7 +206,7 @@ class Member:
         `uniform` is the probability that it was one field over the network.
         """
         if self._was_sure or self.last is None \
-                or self.evidence.explanation.unexplained_s(self.last.stamp_ns) <= 0.0:
+                or self.evidence.bayes_factor.unexplained_s(self.last.stamp_ns) <= 0.0:
             return None
         return Unexplained(self.id, self.begin_ns, self.evidence.largest, self.evidence.felt,
                            uniform)
@@ -237,7 +237,7 @@ class Member:
 
 def in_order(members: Sequence[Member], new: Member | None, joint: Joint, n_one: int
              ) -> list[Member]:
-    """Members, and a newcomer, in the order of the states of a `Joint`.
+    """Members, and a new target, in the order of the states of a `Joint`.
 
     Where two vehicles take the place of one, that is the one of them which was where its poses
     were. Each vehicle has `n_one` states.

@@ -7,10 +7,10 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import sensor_fields
-from mag_tracking.physics.mounting import turned_fields
+from mag_tracking.physics.mounting import rotated_fields
 from mag_tracking.physics.sources import SourceModel
 
-MOST_TURNED = np.deg2rad(15.0)
+MAX_ROTATION = np.deg2rad(15.0)
 """[rad] A sensor whose orientation is less certain is tracked as if it were as certain as this: the
 angles are of first order. `TrackManager` counts such sensors."""
 
@@ -23,7 +23,7 @@ def angle_priors(network: SensorNetwork, mounting_std: float) -> FloatArray:
 
     `mounting_std` [rad] is that of a sensor whose `orientation_std` is not known.
     """
-    std = [np.full(3, mounting_std) if s is None else np.minimum(s, MOST_TURNED)
+    std = [np.full(3, mounting_std) if s is None else np.minimum(s, MAX_ROTATION)
            for s in network.orientation_std]
     # The angles are about the sensor's axes, what is known of them about the world's.
     priors: FloatArray = np.einsum('jik,jk,jlk->jil', network.R_sw, np.square(std), network.R_sw)
@@ -179,7 +179,7 @@ class Observation:
         for target in targets:
             h = h + self._field_of_one(x[None, target * n:(target + 1) * n], time_offset)[0]
         if self.n_angles:
-            h, _ = turned_fields(h, H, np.ascontiguousarray(self.own(x[None])[..., :3]))
+            h, _ = rotated_fields(h, H, np.ascontiguousarray(self.own(x[None])[..., :3]))
         field: FloatArray = h[0]
         return field
 
@@ -210,7 +210,7 @@ class Observation:
         variance = variance + _share_of_field(h, field_error)
         own = self.own(x)
         if self.n_angles:
-            h, H = turned_fields(h, H, np.ascontiguousarray(own[..., :3]))
+            h, H = rotated_fields(h, H, np.ascontiguousarray(own[..., :3]))
         if not self._error_time:
             return h, H, variance
         size = np.sqrt(variance)[:, :, None]

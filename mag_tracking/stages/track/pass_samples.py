@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.inference.least_squares import LINEAR_RANK, MOST_DAMPING
+from mag_tracking.inference.least_squares import LINEAR_RANK, MAX_DAMPING
 from mag_tracking.inference.matrices import FULL_RANK, RANK
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, SteadyPass
@@ -22,7 +22,7 @@ MODEL_ERROR = 0.04
 REACH = 0.2
 """[m] Near a sensor the error is this length over the distance, if that is more."""
 
-MOST_SENSORS = 4
+MAX_SENSORS = 4
 """Those with the strongest fields are compared."""
 
 N_STEPS, TOLERANCE = 30, 1e-3
@@ -74,14 +74,14 @@ class PassSamples:
 
     @classmethod
     def of(cls, network: SensorNetwork, frames: Sequence[FieldFrame], stamp_ns: int,
-           most_sensors: int = MOST_SENSORS) -> 'PassSamples':
+           max_sensors: int = MAX_SENSORS) -> 'PassSamples':
         """The samples of the sensors with the strongest fields."""
         field = np.array([f.field for f in frames])
         energy = np.nansum(np.square(field), axis=2)
         measured = np.count_nonzero(~np.isnan(field).all(axis=2), axis=0)
         order = np.argsort(-energy.max(axis=0), kind='stable')
         # Slow sensors whose clocks are apart may each be in few of the frames.
-        compared = order[measured[order] > measured.max(initial=0) // 2][:most_sensors]
+        compared = order[measured[order] > measured.max(initial=0) // 2][:max_sensors]
         n = len(compared)
         C = np.array([known_covariance(f.covariance)[compared] for f in frames]).reshape(-1, 3, 3)
         t = np.array([(f.stamp_ns - stamp_ns) / NS + f.time_offset[compared] for f in frames])
@@ -115,7 +115,7 @@ class PassSamples:
             theta=theta, cost=cost, covariance=P, free=plain(free, np.int64), fixed=model.fixed,
             places=model.places, combinations=model.combinations, t=self.t,
             positions=self.positions, M=self.M, clock=self.clock, y=y, nuisance=nuisance,
-            n_steps=N_STEPS, tolerance=TOLERANCE, most_damping=MOST_DAMPING, full_rank=FULL_RANK,
+            n_steps=N_STEPS, tolerance=TOLERANCE, most_damping=MAX_DAMPING, full_rank=FULL_RANK,
             linear_rank=LINEAR_RANK, rank=RANK)
         k = int(np.argmin(cost))
         return model.whole(theta[k:k + 1])[0], float(cost[k]), P[k]

@@ -20,10 +20,10 @@ LANE, LANE_LATER = 1.645, 3.0
 nearest to a sensor so far (one in twenty of that lane is farther beside it), and at any later time,
 when it may have turned off."""
 
-LEAST_SPEED = 1.0
+MIN_SPEED = 1.0
 """[m/s] A slower vehicle has no direction."""
 
-LONGEST_WAY = 0.75
+MAX_DISTANCE = 0.75
 """A target may move so far within a frame, in units of its distance to the second nearest sensor:
 fields are averaged over the frame, with a relative error of about half of the square. One sensor
 that errs more, as it is passed closely, does not mislead a track."""
@@ -93,7 +93,7 @@ def _passes_beside(x: FloatArray, settings: VehicleSettings, positions: FloatArr
     covers an area, and a vehicle may be as near to its outermost sensors as a lane to the centre.
     The sensors are at `positions` (n_sensors, 3).
     """
-    speed = np.maximum(np.hypot(x[:, 3], x[:, 4]), LEAST_SPEED)
+    speed = np.maximum(np.hypot(x[:, 3], x[:, 4]), MIN_SPEED)
     away = positions[:, :2, None] - x[:, :2].T
     aside = (x[:, 3] * away[:, 1] - x[:, 4] * away[:, 0]) / speed
     outermost = max(map(abs, settings.lateral_offsets))
@@ -107,7 +107,7 @@ def _passes_beside(x: FloatArray, settings: VehicleSettings, positions: FloatArr
 
 def _moves(x: FloatArray) -> BoolArray:
     """Which of the states `x` (n, n_x) are fast enough to have a direction."""
-    moves: BoolArray = np.hypot(x[:, 3], x[:, 4]) >= LEAST_SPEED
+    moves: BoolArray = np.hypot(x[:, 3], x[:, 4]) >= MIN_SPEED
     return moves
 
 
@@ -119,7 +119,7 @@ def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positio
     """
     away = np.sort(np.linalg.norm(position - positions, axis=1))
     way = float(np.hypot(velocity[0], velocity[1])) * dt
-    return len(away) > 1 and bool(way > LONGEST_WAY * away[1])
+    return len(away) > 1 and bool(way > MAX_DISTANCE * away[1])
 
 
 def _needs_rotated_sensors(observation: Observation, x: FloatArray, mounting_std: float) -> bool:

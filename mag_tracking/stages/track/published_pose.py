@@ -20,7 +20,7 @@ from mag_tracking.physics.sources import SourceModel
 from mag_tracking.records import Hypotheses, PoseUncertainty, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.settings import BEST, MIXTURE
-from mag_tracking.stages.track.unseen_length import UnseenLength
+from mag_tracking.stages.track.unobserved_length import UnobservedLength
 
 UNOBSERVED_VARIANCE = np.pi**2
 """[rad^2] of an angle that the field does not determine."""
@@ -127,7 +127,7 @@ class MagnetOrientation:
 
 def published_track(bank: FilterBank, best: int, model: SourceModel, orientation: Orientation,
                     names: Sequence[str], kinds: Sequence[str], found: Set[str],
-                    unseen: UnseenLength | None, *, excess: float = 1.0,
+                    unseen: UnobservedLength | None, *, excess: float = 1.0,
                     ambiguous_poses: str = MIXTURE, difference: FloatArray,
                     stamp_ns: int, id: int, ended: bool, existence: float,
                     degrees_of_freedom: int, predicted: FloatArray, mounting: FloatArray,
@@ -148,7 +148,7 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
         The name of each kind.
     found : set of str
         What speaks against the pose, of `doubts`; the bank's own ambiguity is added.
-    unseen : UnseenLength, optional
+    unseen : UnobservedLength, optional
         How the length of a vehicle moves its middle; None for a small target.
     excess : float
         The innovations are this many times larger than stated: so is the covariance, then.
@@ -275,7 +275,7 @@ def ambiguities(bank: FilterBank, best: int, apart: BoolArray) -> set[str]:
 
 
 def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray, *,
-                  unseen: UnseenLength | None, difference: FloatArray, stamp_ns: int, id: int,
+                  unseen: UnobservedLength | None, difference: FloatArray, stamp_ns: int, id: int,
                   kind: int, kinds: Sequence[str], ambiguous: bool, complete: bool
                   ) -> SmoothedPose:
     """The `SmoothedPose` of a state `x` (n_x,) with covariance `P` (n_x, n_x).
@@ -290,7 +290,7 @@ def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P
 
 
 def _said_of(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray,
-             kind: int, unseen: UnseenLength | None, difference: FloatArray
+             kind: int, unseen: UnobservedLength | None, difference: FloatArray
              ) -> tuple[PoseFields, Flags]:
     """What a target state says, as fields of a record, and which rotations it does not."""
     dipoles = model.dipoles(x[None])

@@ -31,7 +31,7 @@ def energy_of(bank_filter: BankFilter, target: int, state: FloatArray, frame: Fi
     return float(energies_of(bank_filter, target, state, frame).sum())
 
 
-def faint_from(bank_filter: BankFilter, target: int, window: Window | None, origin: int) -> int:
+def weak_from(bank_filter: BankFilter, target: int, window: Window | None, origin: int) -> int:
     """The frame of a window from which on a target is hardly felt, by the path of a hypothesis."""
     if window is None:
         return 0

@@ -48,11 +48,11 @@ anywhere."""
 TRIED, IN_VAIN = 'paths linearised anew', 'paths linearised anew in vain'
 """What is counted."""
 
-MOST_FRAMES = 64
+MAX_FRAMES = 64
 """The window is shorter where it would hold more than half of these: at 100 frames a second one of
 seconds would take more than a core."""
 
-MOST_NUMBERS = 5_000_000
+MAX_NUMBERS = 5_000_000
 """Frames times hypotheses times states squared: with many sensors it is done for fewer of them."""
 
 
@@ -109,7 +109,7 @@ class Relinearisation:
         self._stale = False
         self._gain = {}
 
-    def begin_anew(self) -> None:
+    def restart(self) -> None:
         """The filter has changed: what it did before the next frame is not to be done again."""
         self._stale = self._anchor is not None
 
@@ -194,7 +194,7 @@ class Relinearisation:
         By the `BankFilter` and the `FilterBank` with that target.
         """
         if self._anchor is None or self._stale or n >= len(self._frames):
-            self.begin_anew()
+            self.restart()
             return
         anchor = self._move_to(bank_filter, self._anchor, bank, n)
         n_one = bank_filter.observation.n_one
@@ -221,7 +221,7 @@ class Relinearisation:
 
     def _leading(self, bank: FilterBank) -> IntArray:
         """Rows of the heaviest hypotheses, as many as it is done for."""
-        affordable = MOST_NUMBERS // (len(self._frames) * bank.x.shape[1]**2)
+        affordable = MAX_NUMBERS // (len(self._frames) * bank.x.shape[1]**2)
         order = np.argsort(-bank.log_w, kind='stable')
         leading: IntArray = order[bank.log_w[order] >= bank.log_w.max() - LEADING]
         return leading[:max(1, min(self._most, affordable))]
@@ -231,10 +231,10 @@ class Relinearisation:
         """The anchor: once the frames are of twice the window, it moves to where the window begins.
         """
         now, n_frames = self._frames[-1].stamp_ns, len(self._frames)
-        if now - self._frames[0].stamp_ns <= 2 * self._window_ns and n_frames <= MOST_FRAMES:
+        if now - self._frames[0].stamp_ns <= 2 * self._window_ns and n_frames <= MAX_FRAMES:
             return anchor
         n = next(k for k, f in enumerate(self._frames) if now - f.stamp_ns <= self._window_ns
-                 and n_frames - k <= MOST_FRAMES // 2)
+                 and n_frames - k <= MAX_FRAMES // 2)
         return self._move_to(bank_filter, anchor, bank, n)
 
     def _move_to(self, bank_filter: BankFilter, anchor: FilterBank | StartingBank,

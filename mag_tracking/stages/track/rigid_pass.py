@@ -32,7 +32,7 @@ LENGTH, LONG_LENGTH = 3.0, 8.0
 NEAR, FAR = 0.1, 0.3
 """[s] The search for the clocks starts with these, either way."""
 
-OFFSET_STD, LONGEST_OFFSET = 0.15, 0.5
+OFFSET_STD, MAX_OFFSET = 0.15, 0.5
 """[s] Of clocks that nobody compared. A longer offset is no answer: a turn looks like it."""
 
 TURN = 0.4
@@ -45,7 +45,7 @@ CHANCE, BENDS = 1e-5, 1e-3
 """Probability that clocks which agree make the fit of a straight path better by as much, and that
 of a path that bends."""
 
-LEAST_WAY = 1.0
+MIN_DISTANCE = 1.0
 """[m] Clocks that move the target by less do no harm."""
 
 MIDDLE_STD = 0.5
@@ -141,7 +141,7 @@ class RigidPass:
         """Whether a straight path explains the pass with clocks that are apart, and no path does
         without."""
         offset = float(np.nanmax(np.abs(self.offset)))
-        if not self.is_explained or offset > LONGEST_OFFSET or offset * self.speed < LEAST_WAY:
+        if not self.is_explained or offset > MAX_OFFSET or offset * self.speed < MIN_DISTANCE:
             return False
         gains = np.array([self.straight - self.apart, self.bent - self.apart]) / self.widening
         improbable = float(np.nansum(np.square(self.offset / OFFSET_STD)))

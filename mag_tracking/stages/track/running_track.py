@@ -19,18 +19,18 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.bank_filter import BankFilter, NoTarget
-from mag_tracking.stages.track.clock_evidence import ClockEvidence
+from mag_tracking.stages.track.clock_comparison import ClockComparison
+from mag_tracking.stages.track.disturbance_model import DisturbanceModel
 from mag_tracking.stages.track.disturbances import Unexplained
-from mag_tracking.stages.track.evidence import LEAST_WATCHED, OUT_OF_REACH
+from mag_tracking.stages.track.evidence import MIN_WATCHED, OUT_OF_REACH
 from mag_tracking.stages.track.joint import Joint
 from mag_tracking.stages.track.member import Member, Update, View, in_order
-from mag_tracking.stages.track.newcomer import NewcomerSearch
-from mag_tracking.stages.track.newcomer_evidence import UNDECIDED_NATS, NewcomerEvidence
+from mag_tracking.stages.track.new_target_evidence import UNDECIDED_NATS, NewTargetEvidence
+from mag_tracking.stages.track.new_target_search import NewTargetSearch
 from mag_tracking.stages.track.reach import FAINT, UNFELT, energy_of
 from mag_tracking.stages.track.sensor_selection import SensorSubset
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import TrackState
-from mag_tracking.stages.track.something_else import SomethingElse
 from mag_tracking.stages.track.target import Target
 from mag_tracking.stages.track.track_bank import Advance, TrackBank
 from mag_tracking.stages.track.vehicle_state import VehicleState
@@ -60,7 +60,7 @@ class RunningTrack:
 
     def __init__(self, id: int, target: Target, settings: TrackSettings, sensors: SensorSubset,
                  bank_filter: BankFilter, bank: FilterBank, counts: 'Counter[str]',
-                 clocks: ClockEvidence, later: SensorSubset) -> None:
+                 clocks: ClockComparison, later: SensorSubset) -> None:
         """It starts with the `sensors`; `later` come in once its bank is small enough."""
         self.counts, self._clocks = counts, clocks
         self.ended: str | None = None
@@ -68,8 +68,8 @@ class RunningTrack:
         self._target, self._settings = target, settings
         self._bank = TrackBank(target, settings, sensors, bank_filter, bank, counts, later)
         self.members = [Member(id, target, sensors, counts, clocks, 0)]
-        self._newcomers = NewcomerEvidence()
-        # A newcomer could not be sought: there are too many members.
+        self._newcomers = NewTargetEvidence()
+        # A new target could not be sought: there are too many members.
         self._is_full = False
         self._handover_due: int | None = None
         self._use(False)
@@ -78,7 +78,7 @@ class RunningTrack:
         """From now on the track is of the sensors of its bank."""
         sensors = self._bank.sensors
         self._no_target = NoTarget(len(sensors.network), self._settings.background_std)
-        self._something_else = SomethingElse(sensors.network, self._settings.background_std,
+        self._disturbance_model = DisturbanceModel(sensors.network, self._settings.background_std,
                                              is_handover)
         for member in self.members:
             member.use(sensors)
@@ -97,7 +97,7 @@ class RunningTrack:
         """Apply new values of the live settings."""
         self._settings = settings
         self._bank.configure(settings)
-        if not settings.second_opinion:
+        if not settings.cross_check:
             for member in self.members:
                 member.use(self._bank.sensors)
 
@@ -126,7 +126,7 @@ class RunningTrack:
         watched_ns = frame.stamp_ns - recent[0].stamp_ns if recent else 0
         first = self.members[0]
         first.evidence.doubt_start(
-            unseen_coming or watched_ns < LEAST_WATCHED * self._settings.lookback_s * NS,
+            unseen_coming or watched_ns < MIN_WATCHED * self._settings.lookback_s * NS,
             self._seeing.whole, self._target.starts_anywhere)
         first.begin_ns = frame.stamp_ns
         self._bank.begin(recent[0] if recent else frame, frame)
@@ -190,22 +190,22 @@ class RunningTrack:
             return False
         best = self.bank.best()
         no_target = self._no_target.log_density(frame, dt, self._settings.background_drift)
-        something_else = self._something_else.log_density(
+        disturbance_model = self._disturbance_model.log_density(
             frame, dt, self._bank.filter.model_error(self.bank, best, dt))
         for i, member in enumerate(self.members):
             member.evidence.add(advance.evidence - no_target)
-            if something_else is not None:
-                member.evidence.explanation.add(
-                    advance.evidence - something_else, frame.stamp_ns,
-                    self._settings.explained_ratio)
+            if disturbance_model is not None:
+                member.evidence.bayes_factor.add(
+                    advance.evidence - disturbance_model, frame.stamp_ns,
+                    self._settings.min_bayes_factor)
             mine, first = self._frame_of(i, best, frame, dt), i * self._bank.one.n_target
             member.evidence.take(mine, self._bank.sensors.rows, self.bank.nis[best])
-            if self._settings.second_opinion and not self._target.starts_anywhere:
+            if self._settings.cross_check and not self._target.starts_anywhere:
                 member.opinion.add(mine, self.bank.x[best, first:first + self._bank.one.n_target])
         return True
 
     def _note(self, advance: Advance, best: int) -> None:
-        """Count how a frame fits hypothesis `best`, for the question of newcomers."""
+        """Count how a frame fits hypothesis `best`, for the question of new targets."""
         bank, frame = self.bank, advance.frame
         self._newcomers.add(
             float(np.nansum(bank.nis[best])), np.count_nonzero(~np.isnan(frame.field)),
@@ -284,10 +284,10 @@ class RunningTrack:
     @property
     def unexplained(self) -> list[Unexplained]:
         """The fields during tracks that have ended, where a target never explained them."""
-        found = [m.unexplained(self._something_else.uniform) for m in self.members if m.ended]
+        found = [m.unexplained(self._disturbance_model.uniform) for m in self.members if m.ended]
         return [u for u in found if u is not None]
 
-    def newcomer(self) -> Joint | None:
+    def new_target(self) -> Joint | None:
         """Another explanation of the latest frames, where they ask for one and it is believed."""
         window, n = self._bank.window, len(self.members)
         if self.ended is not None or self._target.starts_anywhere or window is None \
@@ -295,17 +295,17 @@ class RunningTrack:
             return None
         if (reason := self._newcomers.due(window.frames[-1].stamp_ns)) is None:
             return None
-        self._is_full = n >= self._settings.most_together
-        self.counts['newcomers sought'] += 1
+        self._is_full = n >= self._settings.max_joint_targets
+        self.counts['new_targets sought'] += 1
         if self._is_full:
-            self.counts['newcomers not sought: too many vehicles at once'] += 1
-        found = NewcomerSearch(
+            self.counts['new_targets not sought: too many vehicles at once'] += 1
+        found = NewTargetSearch(
             self.bank, window, self._bank.filter_of, n, VehicleState(
                 self._settings.vehicle, self._bank.sensors.network,
                 self._settings.background_std), reason, not self._is_full).find()
         # A field of something else is no vehicle more.
         if self._newcomers.believes(found.log_odds if found and all(
-                m.evidence.explanation.would_lead(found.log_odds, self._settings.explained_ratio)
+                m.evidence.bayes_factor.would_lead(found.log_odds, self._settings.min_bayes_factor)
                 for m in self.members) else -np.inf):
             return found
         if found is not None and found.log_odds > UNDECIDED_NATS:
@@ -316,26 +316,26 @@ class RunningTrack:
         return None
 
     def admit(self, joint: Joint, id: int) -> None:
-        """Go on with another explanation; a newcomer becomes the member `id`."""
+        """Go on with another explanation; a new target becomes the member `id`."""
         begin_ns, now_ns = (joint.window.frames[k].stamp_ns for k in (0, -1))
         n, sensors = self._bank.one.n_target, self._bank.sensors
-        ratio = self._settings.explained_ratio
+        ratio = self._settings.min_bayes_factor
         states = self._bank.smoothed(self.bank.best(), False)
         for member in self.members:
             member.early += member.states_of(member.slot, n, states, begin_ns)
-            member.begin_again(sensors)
+            member.restart(sensors)
         new = None
         if joint.adds:
             new = Member(id, self._target, sensors, self.counts, self._clocks,
                          now_ns - round(self._settings.lookback_s * NS))
-            new.begin_beside(self.members[0], now_ns, ratio)
+            new.start_alongside(self.members[0], now_ns, ratio)
         doubtful = joint.doubtful(n)
         self._bank.resume(joint)
         self.members, self._is_full = in_order(self.members, new, joint, n), False
         for slot, member in enumerate(self.members):
             member.slot = slot
             member.evidence.add(joint.log_odds)
-            member.evidence.explanation.add(joint.log_odds, now_ns, ratio)
+            member.evidence.bayes_factor.add(joint.log_odds, now_ns, ratio)
             if slot in doubtful:
                 member.evidence.doubt_for(doubts.ANOTHER_VEHICLE, now_ns, DOUBTED_S, begin_ns)
 

@@ -122,7 +122,7 @@ class SensorRejection:
               log_likelihood: FloatArray) -> bool:
         """Whether the frame fits the hypothesis that leads after it."""
         leader = _leader(bank, log_likelihood)
-        return leader is not None and not bank_filter.is_strange(bank, leader, frame)
+        return leader is not None and not bank_filter.is_implausible(bank, leader, frame)
 
 
 def _leader(bank: FilterBank, log_likelihood: FloatArray) -> int | None:

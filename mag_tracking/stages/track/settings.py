@@ -46,7 +46,7 @@ class TrackSettings:
         'field is 3 % too long). 0 = as the file says; with dozens of sensors that is several '
         'times faster.',
         'deg', (0.0, 15.0))
-    explained_ratio: float = param(
+    min_bayes_factor: float = param(
         20.0, 'A target has to explain the frames of its track this many times better than '
         'something else: a smooth field of each sensor\'s own (temperature, a knock), or over the '
         'network (a storm, a power line). Otherwise, or where it falls behind by this factor '
@@ -54,21 +54,21 @@ class TrackSettings:
     iterations: int = param(
         1, 'Linearisations an update: more than one helps when the field says far more than the '
         'prediction (magnets); for vehicles it locks into the wrong side.', '', (1, 20), live=True)
-    most_sensors: int = param(
+    max_sensors: int = param(
         16, 'Of a larger network a track uses the nearest so many, others as it moves on; it is '
         'not smoothed then. A vehicle starts with no more of them than its first hypotheses leave '
         'memory for (250 MB), about ten; the others come in at its detection, where its smoothing '
         'begins then, or as it moves on.', '', (2, 1000))
-    most_together: int = param(
+    max_joint_targets: int = param(
         4, 'Vehicles whose fields overlap are tracked together, so many at most. Two take 2.3 '
         'times as long as one (`bench.busy`). 1 = a track is of one vehicle, whatever the frames '
         'say.', '', (1, 4))
     prune_ratio: float = param(
         1e-12, 'A hypothesis lighter than the heaviest by this ratio is dropped (T10 Alg. 3).',
         '', (1e-300, 0.5), live=True)
-    most_hypotheses: int = param(
+    max_hypotheses: int = param(
         1200, 'No more than the heaviest so many are kept.', '', (1, 100000), live=True)
-    most_at_start: int = param(
+    max_initial_hypotheses: int = param(
         1200, 'In the frames before the detection so many are, if that is more: they say so '
         'little of where a target comes from that of few the right one is often lost.', '',
         (1, 100000), live=True)
@@ -79,9 +79,9 @@ class TrackSettings:
     relinearise_interval_s: float = param(
         0.15, 'How often that is done. What it takes grows with the number of sensors; with frames '
         'of 100 Hz rather choose 0.5.', 's', (0.0, 60.0))
-    relinearise_most: int = param(
+    relinearise_max_hypotheses: int = param(
         20, 'For how many hypotheses it is done at most.', '', (1, 100000))
-    second_opinion: bool = param(
+    cross_check: bool = param(
         True, 'Once a vehicle has passed, and about four times after that, its whole pass is '
         'fitted at once, along a path of steady acceleration and turning. That '
         'tells of clocks that are apart, of clipped sensors and of two vehicles. Where a straight '
@@ -100,7 +100,7 @@ class TrackSettings:
         '', (1.0, 1e12), live=True)
     end_gap_s: float = param(
         2.0, 'A track ends where the frames have a longer gap than this.', 's', (1e-3, 86400.0))
-    smooth_longest_s: float = param(
+    max_smoothing_s: float = param(
         60.0, 'A track that is no longer than this is smoothed when it ends, over all of its '
         'frames, which takes a twentieth of a millisecond a frame (more with many sensors); 0 = '
         'never.', 's', (0.0, 86400.0))

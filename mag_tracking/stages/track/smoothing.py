@@ -33,7 +33,7 @@ RELINEARISATIONS = 1
 filter did not yet know where to linearise. It has not settled then: four times bring turning cars
 and trucks nearer, but the car along a corridor further off."""
 
-MOST_NUMBERS = 10_000_000
+MAX_NUMBERS = 10_000_000
 """Frames times states squared that are smoothed at most: 80 MB, and less than a second."""
 
 
@@ -137,7 +137,7 @@ class WholeTrack:
             return
         self._length_s += dt
         n_numbers = (len(self._frames) + 1) * bank.x.shape[1]**2
-        if self._length_s > self._longest_s or n_numbers > MOST_NUMBERS:
+        if self._length_s > self._longest_s or n_numbers > MAX_NUMBERS:
             self.give_up()
             return
         self._frames.append(frame)

@@ -34,7 +34,7 @@ STEP_ALONG, BEYOND = 3.0, 12.0
 SPEED = PATH.index('speed')
 """Column of a path."""
 
-LEAST_STD = 1e-3
+MIN_STD = 1e-3
 """[m], [m/s], [A m^2] Of what the settings have without a spread, such as the length of a point."""
 
 SLOWEST = 0.2
@@ -74,7 +74,7 @@ class PathPrior:
         """That of all kinds of the settings together."""
         def spread(means: Iterable[float], stds: Iterable[float]) -> tuple[float, float]:
             m, s = np.array(means, dtype=float), np.array(stds, dtype=float)
-            return float(m.mean()), max(float(np.sqrt(m.var() + np.square(s).mean())), LEAST_STD)
+            return float(m.mean()), max(float(np.sqrt(m.var() + np.square(s).mean())), MIN_STD)
 
         height, height_std = spread(vehicle.heights, vehicle.height_stds)
         speeds = np.array(vehicle.speeds)
@@ -82,7 +82,7 @@ class PathPrior:
         length, length_std = spread(vehicle.lengths, vehicle.length_stds)
         lateral_std = spread(vehicle.lateral_offsets, [vehicle.lateral_std])[1]
         total = np.sqrt(np.square(vehicle.moments).mean() / 3.0)
-        difference = max(float(np.sqrt(np.square(vehicle.difference_stds).mean())), LEAST_STD)
+        difference = max(float(np.sqrt(np.square(vehicle.difference_stds).mean())), MIN_STD)
         # The first combination is the mean of the row, times the root of the number of dipoles.
         return cls(np.deg2rad(vehicle.arrival_headings_deg), network.centre[:2],
                    np.array([0.0, 0.0, height, speed, 0.0, 0.0, length]),
@@ -119,7 +119,8 @@ class PathPrior:
             along = np.array([np.cos(heading), np.sin(heading)])
             reach = float(np.abs((network.positions[:, :2] - self.centre) @ along).max())
             places, y, v = (a.ravel() for a in np.meshgrid(
-                np.arange(-vehicle.farthest - reach, BEYOND + reach, STEP_ALONG), offsets, speeds,
+                np.arange(-vehicle.max_start_distance - reach, BEYOND + reach, STEP_ALONG),
+                offsets, speeds,
                 indexing='ij'))
             grid = np.tile(self.mean, (len(places), 1))
             grid[:, :2] = self.centre + places[:, None] * along \

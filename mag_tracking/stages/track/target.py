@@ -21,7 +21,7 @@ from mag_tracking.stages.track.published_pose import (
     VehicleOrientation,
 )
 from mag_tracking.stages.track.settings import TrackSettings
-from mag_tracking.stages.track.unseen_length import UnseenLength
+from mag_tracking.stages.track.unobserved_length import UnobservedLength
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Target:
     """Name of each arrival direction."""
     kinds: Sequence[str]
     """Name of each kind of target."""
-    unseen: Callable[[], UnseenLength | None]
+    unseen: Callable[[], UnobservedLength | None]
     """For each track: how its length moves its middle; None for a small target."""
     starts_anywhere: bool
     """A magnet that was lost is found anywhere; a vehicle starts on an arrival line."""
@@ -57,7 +57,8 @@ def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
         row = vehicle_model(vehicle, network)
         check_vehicle_bank(settings, network, row)
         return Target(row, VehicleOrientation(), vehicle.arrival_names,
-                      vehicle.kinds, partial(UnseenLength, vehicle.lengths, vehicle.length_stds),
+                      vehicle.kinds,
+                      partial(UnobservedLength, vehicle.lengths, vehicle.length_stds),
                       False, _start_vehicle)
     if settings.target == 'magnet':
         magnet = settings.magnet

@@ -11,10 +11,10 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.inference.starting_bank import StartingBank
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.bank_size import WEIGHT_KEPT, most_hypotheses, most_sensors
+from mag_tracking.stages.track.bank_size import WEIGHT_KEPT, max_hypotheses, max_sensors
 from mag_tracking.stages.track.joint import Joint
 from mag_tracking.stages.track.observation import Observation
-from mag_tracking.stages.track.reach import faint_from
+from mag_tracking.stages.track.reach import weak_from
 from mag_tracking.stages.track.relinearisation import Relinearisation, Window
 from mag_tracking.stages.track.sensor_rejection import SensorRejection
 from mag_tracking.stages.track.sensor_selection import SensorSubset, hand_on
@@ -65,8 +65,8 @@ class TrackBank:
         self._rejection = SensorRejection(sensors.network.names)
         self._relinearisation = Relinearisation(
             settings.relinearise_interval_s, settings.relinearise_window_s,
-            settings.relinearise_most)
-        self._whole = WholeTrack(settings.smooth_longest_s)
+            settings.relinearise_max_hypotheses)
+        self._whole = WholeTrack(settings.max_smoothing_s)
         self._lag = FixedLag(settings.smoothing_lag_s) if settings.smoothing_lag_s else None
 
     @property
@@ -96,7 +96,7 @@ class TrackBank:
         """Apply new values of the live settings."""
         self._settings = settings
         self.filter.configure(settings)
-        self._relinearisation.begin_anew()
+        self._relinearisation.restart()
 
     def begin(self, first: FieldFrame, now: FieldFrame) -> None:
         """The bank, which is of the time of the frame `now`, begins with an earlier one."""
@@ -121,7 +121,7 @@ class TrackBank:
                                   advance.evidence, advance.frame, advance.dt)
         self._counts['hypotheses dropped'] += bank.prune(
             -np.log(s.prune_ratio),
-            s.most_hypotheses if publish else max(s.most_hypotheses, s.most_at_start))
+            s.max_hypotheses if publish else max(s.max_hypotheses, s.max_initial_hypotheses))
         self._counts.update(self._relinearisation.improve(self.filter, bank))
         self._whole.add(bank, advance.frame, advance.dt, publish)
 
@@ -145,7 +145,7 @@ class TrackBank:
     def without_target(self, i: int) -> None:
         """Target `i` of several is over."""
         best, n_targets = self.bank.best(), self.filter.observation.n_targets
-        n = faint_from(self.filter, i, self.window, int(self.bank.origin[best]))
+        n = weak_from(self.filter, i, self.window, int(self.bank.origin[best]))
         self._relinearisation.without_target(self.filter, self.bank, i, n)
         self.bank = self.bank.without_target(i, self.one.n_target)
         self.filter = self.filter_of(n_targets - 1)
@@ -168,12 +168,12 @@ class TrackBank:
     def hand_over(self, best: int) -> bool:
         """Switch to the sensors near where hypothesis `best` is going; whether they are others."""
         sensors = self.sensors.ahead_of(self.bank.x[best], min(
-            self._settings.most_sensors, most_sensors(self.filter.observation, len(self.bank))))
+            self._settings.max_sensors, max_sensors(self.filter.observation, len(self.bank))))
         if sensors is self.sensors:
             return False
         self._hand_on_to(sensors)
         self._whole.give_up()
-        self._relinearisation.begin_anew()
+        self._relinearisation.restart()
         self._counts['tracks handed on to other sensors'] += 1
         return True
 
@@ -182,7 +182,7 @@ class TrackBank:
         have made enough hypotheses improbable; else they come in with a handover. Whether it did.
         """
         sensors, self.later = self.later or self.sensors, None
-        n, most = len(sensors.rows), most_hypotheses(self.filter.observation, len(sensors.rows))
+        n, most = len(sensors.rows), max_hypotheses(self.filter.observation, len(sensors.rows))
         if n == len(self.sensors.rows) or not self.bank.outweigh(most, WEIGHT_KEPT):
             return False
         self._counts['hypotheses dropped'] += self.bank.prune(np.inf, most)

@@ -17,7 +17,7 @@ from mag_tracking.stages.track.initiation_vehicle import (
     vehicle_model,
 )
 
-LEAST_MOMENT = 1e-6
+MIN_MOMENT = 1e-6
 """[A m^2] A smaller moment has no direction."""
 
 
@@ -70,7 +70,7 @@ class VehicleState:
         s = self.settings
         R = rotation_about_z(float(np.deg2rad(s.arrival_headings_deg[label])))
         found = moments.sum(axis=0)
-        mean = s.moments[kind] * found / max(float(np.linalg.norm(found)), LEAST_MOMENT)
+        mean = s.moments[kind] * found / max(float(np.linalg.norm(found)), MIN_MOMENT)
         x = self.along(theta, mean[None], np.array([t]), kind)[0]
         x[2], x[5] = s.heights[kind], 0.0
         if self._d > 1:

@@ -12,7 +12,7 @@ from mag_tracking.stages.track.vehicle_state import VehicleState
 from mag_tracking.stages.track.window_start import KnownVehicles
 from mag_tracking.units import NS
 
-MOST_ROWS = 320
+MAX_ROWS = 320
 """Samples that a search is of: of more frames than that only every other one, or fewer."""
 
 KNOWN_STD, KNOWN_SHARE = 0.7, 0.3
@@ -36,7 +36,7 @@ class WindowSearch:
         self._window, self._vehicles = window, vehicles
         self.times: FloatArray = np.array([(f.stamp_ns - frames[-1].stamp_ns) / NS
                                            for f in frames])
-        step = -(-len(frames) * len(network) // MOST_ROWS)
+        step = -(-len(frames) * len(network) // MAX_ROWS)
         self._thinned = np.arange(len(frames))[::-1][::step][::-1]
         self.prior = PathPrior.of(vehicles.settings, network)
         self.samples = PassSamples.of(network, [frames[k] for k in self._thinned],

@@ -5,7 +5,7 @@ from collections import deque
 import numpy as np
 
 from mag_tracking.inference.driving_direction import (
-    MOST_SURE,
+    MAX_CONFIDENCE,
     fused_log_odds,
     horizontal_field,
     rotation_of_pass,
@@ -27,10 +27,10 @@ REACH = 12.0
 WIDTHS = 3.0
 """The window reaches this many distances from the path to both sides."""
 
-SHORTEST_S, LONGEST_S = 0.5, 4.0
+MIN_S, MAX_S = 0.5, 4.0
 """[s] Bounds of half the window."""
 
-MOST_LOG_ODDS = float(np.log(MOST_SURE / (1.0 - MOST_SURE)))
+MAX_LOG_ODDS = float(np.log(MAX_CONFIDENCE / (1.0 - MAX_CONFIDENCE)))
 
 
 class FieldDirection:
@@ -48,7 +48,7 @@ class FieldDirection:
         if self._frames and frame.stamp_ns <= self._frames[-1].stamp_ns:
             self._frames.clear()
         self._frames.append(frame)
-        oldest = max(since_ns - round(LONGEST_S * NS), frame.stamp_ns - round(KEPT_S * NS))
+        oldest = max(since_ns - round(MAX_S * NS), frame.stamp_ns - round(KEPT_S * NS))
         while self._frames[0].stamp_ns < oldest:
             self._frames.popleft()
 
@@ -65,11 +65,11 @@ class FieldDirection:
         along, left = r @ u, u[0] * r[:, 1] - u[1] * r[:, 0]
         odds, same_side = [], []
         for j in np.flatnonzero((np.abs(left) >= IN_LANE) & (np.abs(along) <= REACH)).tolist():
-            half = np.clip(WIDTHS * abs(left[j]) / speed, SHORTEST_S, LONGEST_S)
+            half = np.clip(WIDTHS * abs(left[j]) / speed, MIN_S, MAX_S)
             found = self._log_odds(j, crossing.stamp_ns + round(along[j] / speed * NS),
                                    round(half * NS))
             if found is not None:
-                odds.append(float(np.clip(found, -MOST_LOG_ODDS, MOST_LOG_ODDS)))
+                odds.append(float(np.clip(found, -MAX_LOG_ODDS, MAX_LOG_ODDS)))
                 # To a sensor on its left, which looks to the right, it moves from right to left.
                 same_side.append(bool(left[j] < 0.0))
         fused = fused_log_odds(odds, same_side)

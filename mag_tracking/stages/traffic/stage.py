@@ -28,7 +28,7 @@ AMBIGUOUS, CONTRADICTED, EXTRAPOLATED = 'ambiguous', 'direction_contradicted', '
 """Doubts of a passage: its track is ambiguous at the line; the fields rotate the other way; the
 track does not reach the line."""
 
-MOST_ERROR = 0.9
+MAX_ERROR = 0.9
 """A direction that is wrong with this probability by the fields is doubtful."""
 
 ALONE_S = 2.0
@@ -41,7 +41,7 @@ of one vehicle that was lost and found again."""
 BEFORE_S = 3.0
 """[s] A smoothed path begins up to this time before the first published pose of its track."""
 
-LONGEST_WAIT_S = 120.0
+MAX_WAIT_S = 120.0
 """[s] Passages and summaries do not wait longer than this for a track."""
 
 TrafficRecord: TypeAlias = VehiclePassage | TrafficSummary
@@ -142,7 +142,7 @@ class Traffic:
 
     def _complete_before(self, now_ns: int) -> int:
         """[ns] No crossing before this time can still be found."""
-        oldest = now_ns - round(LONGEST_WAIT_S * NS)
+        oldest = now_ns - round(MAX_WAIT_S * NS)
         begins = [max(one.begin_ns, oldest) for one in self._open.values()]
         return min([now_ns, *begins]) - round(BEFORE_S * NS)
 
@@ -192,7 +192,7 @@ class Traffic:
             before = self._complete_before(now_ns)
             n = sum(f.crossing.stamp_ns < before for f in self._waiting)
             self._past = [one for one in self._past
-                          if now_ns - one.last_ns < LONGEST_WAIT_S * NS]
+                          if now_ns - one.last_ns < MAX_WAIT_S * NS]
         due, self._waiting = self._waiting[:n], self._waiting[n:]
         return [p for p in map(self._passage, due) if p is not None]
 
@@ -217,7 +217,7 @@ class Traffic:
             (crossing.stamp_ns - latest.crossing.stamp_ns) / NS
         self.counts['passages'] += 1
         doubts = tuple(name for name, is_so in (
-            (AMBIGUOUS, pose.ambiguous), (CONTRADICTED, found.direction_error > MOST_ERROR),
+            (AMBIGUOUS, pose.ambiguous), (CONTRADICTED, found.direction_error > MAX_ERROR),
             (EXTRAPOLATED, crossing.is_extrapolated)) if is_so)
         moving = pose.velocity[:2], pose.covariance[3:5, 3:5]
         speed, speed_std = speed_of(*moving)

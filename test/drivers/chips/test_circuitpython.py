@@ -74,7 +74,7 @@ def test_wrong_and_missing_chips(clock):
 
 def test_a_failure_is_counted_and_the_chip_lost_in_the_end(clock):
     fake = FakeMmc5603(clock)
-    _, device = opened(clock, MMC5603, fake, most_failures=3)
+    _, device = opened(clock, MMC5603, fake, max_failures=3)
     fake.answers = False
     assert device.read(0.01) == [] and device.counts['readings that failed: A'] == 1
     fake.answers = True
@@ -86,7 +86,7 @@ def test_a_failure_is_counted_and_the_chip_lost_in_the_end(clock):
 
 def test_a_driver_that_waits_for_ever_is_stopped(clock):
     fake = FakeMmc5603(clock)
-    _, device = opened(clock, MMC5603, fake, most_failures=2)
+    _, device = opened(clock, MMC5603, fake, max_failures=2)
     assert device.read(1.0)
     fake.finish = lambda: None
     start = clock.ns
@@ -129,7 +129,7 @@ def module(monkeypatch):
 @pytest.mark.parametrize('error', [RuntimeError, ValueError, TypeError])
 def test_what_a_driver_raises_is_a_failure_and_its_lock_is_undone(module, error):
     module.Sensor = type('Sensor', (Raises,), {'error': error})
-    _, _, device = made('our_driver', Raises, most_failures=2)
+    _, _, device = made('our_driver', Raises, max_failures=2)
     device.open()
     with pytest.raises(DeviceError, match='failed 2 times in a row: .*overflow'):
         device.read(1.0)
@@ -178,7 +178,7 @@ def test_neither_lock_nor_bus_can_be_waited_for_for_ever(module, waiting):
             raise AssertionError('it was not stopped')
 
     module.Sensor = Sensor
-    clock, _, device = made('our_driver', Sensor, most_failures=1)
+    clock, _, device = made('our_driver', Sensor, max_failures=1)
     device.open()
     with pytest.raises(DeviceError, match='waited too long'):
         device.read(0.01)

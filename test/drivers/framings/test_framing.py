@@ -206,12 +206,12 @@ def test_binary_settings_that_mean_nothing_are_refused(changes, message):
 
 FRAMINGS = {
     **{name: (case.make_framing(), None) for name, case in CASES.items()},
-    'short lines': (TextFraming(TextSettings(fields=XYZ, longest=12, comment='#')), (
+    'short lines': (TextFraming(TextSettings(fields=XYZ, max_length=12, comment='#')), (
         b'1,2,3', b'4,5,6\r', b'\n', b'\n', b'123,4567,890', b'1234,5678,90\r', b'9' * 12,
         b'\xc3', b'\xa9', b'\r', b'#', b' ')),
-    'lines with a long end': (TextFraming(TextSettings(fields=XYZ, longest=8, end='\r\n\r')), (
+    'lines with a long end': (TextFraming(TextSettings(fields=XYZ, max_length=8, end='\r\n\r')), (
         b'1,2,3', b'\r', b'\n', b'\r\n\r', b'12345678', b'\r\n')),
-    'objects': (JsonFraming(JsonSettings(field=('m',), longest=24)), (
+    'objects': (JsonFraming(JsonSettings(field=('m',), max_length=24)), (
         b'{"m":[1,2,3]}', b'{"m":[4,null,6]}', b'\n', b'\n', b'\xff', b'[', b'1', b' ' * 11)),
     'no checksum': (BinaryFraming(BinarySettings(sync='01 01 02', fields=('x:i8', 'y:i16'))), (
         b'\x01', b'\x01\x01', b'\x02', b'\x03', b'\x01\x01\x02abc')),
@@ -329,7 +329,7 @@ def test_a_megabyte_of_nothing_takes_linear_time(name, piece, size):
 @pytest.mark.parametrize('value', [b'1' * 60_000 + b'x', b' ' * 60_000 + b'x', b'1.' + b'1' * 60_000
                                    + b'e', b'nan' * 20_000, b'+' * 60_000, b'.' * 60_000])
 def test_a_long_value_takes_no_time(value):
-    framing = TextFraming(TextSettings(fields=('x',), longest=65536))
+    framing = TextFraming(TextSettings(fields=('x',), max_length=65536))
     start = time.process_time()
     assert framing.parse(value, final=True).rejected == {
         'lines with something that is no number': 1}

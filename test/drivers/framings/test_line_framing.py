@@ -76,7 +76,7 @@ def test_a_line_that_is_rejected(line, cause):
     (b'A,1,18446744073709551616,?,1,2,3', 'with a sequence of more than 64 bits'),
     (b'A,1,-9223372036854775809,?,1,2,3', 'with a sequence of more than 64 bits')])
 def test_a_value_that_must_be_there(line, cause):
-    parsed = text(fields=ALL, longest=6000).parse(line, final=True)
+    parsed = text(fields=ALL, max_length=6000).parse(line, final=True)
     assert parsed.rejected == {f'lines {cause}': 1} and not parsed.readings
 
 
@@ -116,7 +116,7 @@ def test_the_checksum_of_nmea(line, cause):
     ({'prefix': 'a\n'}, 'prefix: .* holds the end'), ({'comment': '\\n'}, 'comment: .* holds'),
     ({'prefix': '$M', 'comment': '$'}, 'would be passed over'),
     ({'checksum': 'crc8'}, "checksum: 'crc8' is none of none, nmea"),
-    ({'longest': 0}, 'longest'), ({'fields': ['B']}, "'B' is none of")])
+    ({'max_length': 0}, 'max_length'), ({'fields': ['B']}, "'B' is none of")])
 def test_text_settings_that_mean_nothing_are_refused(changes, message):
     with pytest.raises(SettingsError, match=message):
         text(**changes)
@@ -168,7 +168,7 @@ def test_an_object_with_everything():
     (b' ', 'that are empty'),
     (b'{"m": [1, 2, 3]' + b' ' * 200_000 + b'}', 'that are too long')])
 def test_an_object_that_is_rejected(line, cause):
-    framing = objects(longest=200_000)
+    framing = objects(max_length=200_000)
     parsed = framing.parse(line + b'\n{"m":[1,2,3]}\n')
     assert parsed.rejected == {f'lines {cause}': 1} and parsed.readings == (ONE,)
     assert framing.parse(line, final=True).rejected == {f'lines {cause}': 1}
@@ -192,7 +192,7 @@ def test_an_object_that_is_rejected(line, cause):
 def test_a_path_that_must_lead_somewhere(old, new, cause):
     line = (b'{"id": "A", "clock": {"t": 5}, "n": 7, "m": {"x": 1, "y": [1, 2]}, '
             b'"a": [1, 2, 3]}\n')
-    framing = objects(**PATHS, longest=5000)
+    framing = objects(**PATHS, max_length=5000)
     assert len(framing.parse(line).readings) == 1 and line.count(old) == 1
     parsed = framing.parse(line.replace(old, new))
     assert parsed.rejected == {f'lines {cause}': 1} and not parsed.readings
@@ -203,7 +203,7 @@ def test_an_object_of_several_lines_is_only_read_from_a_whole_message():
     assert objects().parse(pretty).rejected == {'lines that are no JSON': 4}
     parsed = objects().parse(pretty, final=True)
     assert parsed.readings == (ONE,) and parsed.consumed == len(pretty) and not parsed.rejected
-    assert objects(longest=len(pretty) - 1).parse(pretty, final=True).rejected == {
+    assert objects(max_length=len(pretty) - 1).parse(pretty, final=True).rejected == {
         'lines that are no JSON': 4}
     # Several objects in a message are lines, whatever one of them is like.
     for bad in (b'{"m": 1, "m": 1}', b'\xff', b'['):

@@ -202,8 +202,8 @@ def test_mtdata_that_the_settings_do_not_describe_is_counted():
     ({'mtdata': ['temp', 'gyr', 'counter']}, 'neither acc nor mag in temp, gyr, counter'),
     ({'mtdata': ['mag'], 'mtdata_format': 'double'}, "'double' is none of float, fp12.20"),
     ({'mtdata_format': 'fp12.20'}, "mtdata_format is 'fp12.20', but mtdata says that there is no"),
-    ({'longest_message': 253}, 'longest_message: 253 is outside'),
-    ({'longest_message': 4097}, 'longest_message: 4097 is outside')])
+    ({'max_message': 253}, 'max_message: 253 is outside'),
+    ({'max_message': 4097}, 'max_message: 4097 is outside')])
 def test_settings_that_describe_no_message_are_refused(changes, text):
     with pytest.raises(SettingsError, match=text):
         XsensFraming(replace(XsensFraming.SETTINGS(), changes))

@@ -90,7 +90,7 @@ def test_a_longer_message_is_garbage():
     false = filled_up_to(513)
     parsed = FRAMING.parse(false + FRAME)
     assert parsed.readings == (READING,) and parsed.rejected == {BETWEEN: len(false)}
-    framing = XsensFraming(XsensSettings(longest_message=513))
+    framing = XsensFraming(XsensSettings(max_message=513))
     assert framing.parse(false + FRAME).readings == (READING, READING)
 
 

@@ -225,7 +225,7 @@ def test_a_failure_is_counted_and_tried_again(chip):
 
 @pytest.mark.parametrize('chip', FAKES)
 def test_a_chip_that_goes_on_failing_is_lost_and_set_up_again(chip):
-    clock, bus, device, fake = one(chip, most_failures=5)
+    clock, bus, device, fake = one(chip, max_failures=5)
     device.read(1.0)
     fake.answers = False
     with pytest.raises(DeviceError, match=r'A failed 5 times in a row: nothing answers'):
@@ -249,7 +249,7 @@ def test_a_chip_that_goes_on_failing_is_lost_and_set_up_again(chip):
 
 
 def test_what_the_others_said_is_not_lost_with_a_chip():
-    clock, bus, device = rig(['A:lis3mdl:0x1c', 'B:hmc5883l:0x1e'], most_failures=1)
+    clock, bus, device = rig(['A:lis3mdl:0x1c', 'B:hmc5883l:0x1e'], max_failures=1)
     device.open()
     bus.chips[0x1C].answers = False
     assert [a.reading.sensor for a in device.read(1.0)] == ['B']
@@ -259,7 +259,7 @@ def test_what_the_others_said_is_not_lost_with_a_chip():
 
 @pytest.mark.parametrize('chip', ['rm3100', 'lis3mdl'])
 def test_a_chip_whose_supply_was_cut_is_lost(chip):
-    clock, _, device, fake = one(chip, silent_s=0.5)
+    clock, _, device, fake = one(chip, silence_timeout_s=0.5)
     device.read(1.0)
     fake.power_up()
     start = clock.ns
@@ -274,7 +274,7 @@ def test_a_chip_whose_supply_was_cut_is_lost(chip):
 
 
 def test_two_silent_turns_in_a_row_are_nothing():
-    clock, _, device, fake = one('rm3100', rate_hz=10.0, silent_s=0.0)
+    clock, _, device, fake = one('rm3100', rate_hz=10.0, silence_timeout_s=0.0)
     for silent in (2, 2):
         fake.stop()
         assert device.read(0.1 * silent - 0.05) == []
@@ -299,7 +299,7 @@ def test_a_scale_that_went_with_the_supply_is_no_reading(chip):
 
 def test_a_bus_that_hangs_costs_one_wait_a_turn():
     clock, bus, device = rig(['A:lis3mdl:0x1c', 'B:hmc5883l:0x1e', 'C:rm3100:0x20'],
-                             most_failures=2)
+                             max_failures=2)
     device.open()
     device.read(1.0)
     bus.hangs = True

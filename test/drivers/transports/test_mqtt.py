@@ -160,7 +160,7 @@ def test_a_queue_that_is_just_full_loses_nothing(broker, topics):
 
 
 def test_a_message_that_is_too_long_is_counted(broker, topics):
-    mqtt = topics(broker.port, longest=1000)
+    mqtt = topics(broker.port, max_length=1000)
     mqtt.open()
     send(broker.port, [('mag/a', b'x' * 1000), ('mag/a', b'x' * 1001), ('mag/a', b'x' * 500_000),
                        ('mag/a', b''), ('mag/a', b'z')])
@@ -169,7 +169,7 @@ def test_a_message_that_is_too_long_is_counted(broker, topics):
 
 
 def test_half_a_million_bytes_come_whole_where_they_are_allowed(broker, topics):
-    mqtt = topics(broker.port, longest=1_000_000)
+    mqtt = topics(broker.port, max_length=1_000_000)
     mqtt.open()
     payload = os.urandom(500_000)
     send(broker.port, [('mag/a', payload)])

@@ -271,7 +271,7 @@ def test_drops_are_counted_anew_after_opening_again(listen, sender):
 
 
 def test_what_is_too_long_or_empty_is_counted(listen, sender):
-    udp = listen(longest=100)
+    udp = listen(max_length=100)
     sender(udp, b'x' * 101, b'y' * 100, b'', b'z' * 5000, b'a')
     assert [c.data for c in udp.read(1.0)] == [b'y' * 100, b'a']
     assert udp.counts == {'datagrams that were too long': 2, 'empty datagrams': 1}

@@ -140,7 +140,7 @@ def test_a_looped_recording_starts_anew_and_loses_nothing_before():
 
 
 def test_memory_is_bounded():
-    align = stage(2, max_wait_s=3600.0, most_pending=50)
+    align = stage(2, max_wait_s=3600.0, max_buffered=50)
     for k in range(1000):
         align.feed(one(sample(10.0 * k, 0)))
     assert align.n_held == 50
@@ -206,9 +206,9 @@ class Plain:
     """The rules of the alignment, all sensors looked at anew at every sample."""
 
     def __init__(self, n, s):
-        self.n, self.burst, self.most, self.counts = n, s.burst, s.most_pending, Counter()
+        self.n, self.burst, self.most, self.counts = n, s.burst, s.max_buffered, Counter()
         self.period, self.wait, self.jump = (
-            round(1e9 * v) for v in (s.period_s, s.max_wait_s, s.jump_back_s))
+            round(1e9 * v) for v in (s.period_s, s.max_wait_s, s.max_backward_jump_s))
         self.begin()
 
     def begin(self):
@@ -293,8 +293,8 @@ def test_frames_and_counts_are_those_of_the_plain_rules_at_every_sample(seed):
     wanted = replace(AlignSettings(), {
         'burst': bool(rng.integers(2)), 'period_s': float(rng.choice([1e-4, 0.01, 0.03, 0.2])),
         'max_wait_s': float(rng.choice([0.001, 0.02, 0.1, 0.5, 60.0])),
-        'jump_back_s': float(rng.choice([0.0, 0.05, 1.0])), 'ahead_s': 0.0,
-        'most_pending': int(rng.choice([2, 5, 20, 10000]))})
+        'max_backward_jump_s': float(rng.choice([0.0, 0.05, 1.0])), 'max_clock_jump_s': 0.0,
+        'max_buffered': int(rng.choice([2, 5, 20, 10000]))})
     align, plain = Align(line_network(n), wanted), Plain(n, wanted)
     frames, rows = [], []
     for s in disorder(rng, n):
@@ -310,7 +310,7 @@ def test_frames_and_counts_are_those_of_the_plain_rules_at_every_sample(seed):
 
 
 @pytest.mark.parametrize('changes', [{}, {'burst': True, 'period_s': 0.5, 'max_wait_s': 2.0},
-                                     {'max_wait_s': 3600.0, 'most_pending': 20}])
+                                     {'max_wait_s': 3600.0, 'max_buffered': 20}])
 def test_a_sample_costs_the_same_with_any_number_of_sensors(changes):
     """By how often it looks up anything of its own, with lost samples and a gap of one sensor."""
     class Counted(Align):

@@ -23,8 +23,8 @@ def test_batches_give_the_frames_of_single_samples(seed):
     wanted = replace(AlignSettings(), {
         'burst': bool(rng.integers(2)), 'period_s': float(rng.choice([0.01, 0.03, 0.2])),
         'max_wait_s': float(rng.choice([0.02, 0.1, 60.0])),
-        'ahead_s': float(rng.choice([0.0, 0.05, 0.5])),
-        'most_pending': int(rng.choice([2, 5, 33, 10000]))})
+        'max_clock_jump_s': float(rng.choice([0.0, 0.05, 0.5])),
+        'max_buffered': int(rng.choice([2, 5, 33, 10000]))})
     single, many = Align(line_network(n), wanted), Align(line_network(n), wanted)
     frames, held = ([], []), []
     for s in disorder(rng, n):
@@ -73,7 +73,7 @@ def reasons_of(stage, readings):
 def test_a_clock_that_stepped_is_asked_about_for_a_while_only(monkeypatch):
     """A sensor whose clock steps ahead and which then dies; later it comes back."""
     monkeypatch.setattr(core, 'Alignment', CountedAlignment)
-    stage = Align(line_network(4), replace(AlignSettings(), {'most_pending': 40,
+    stage = Align(line_network(4), replace(AlignSettings(), {'max_buffered': 40,
                                                              'max_wait_s': 2.0}))
     known = {core.DONE, core.COMPLETE}
     assert set(reasons_of(stage, steady(4, 100))) == known

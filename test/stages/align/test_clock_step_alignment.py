@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from mag_tracking.settings import replace
 from mag_tracking.stages.align.settings import AlignSettings
-from mag_tracking.stages.align.stage import MOST_HELD, Align
+from mag_tracking.stages.align.stage import MAX_HELD, Align
 from mag_tracking.stages.stage import rejected
 from support.clock_steps import sample, stepped, stream, wild
 from support.networks import line_network
@@ -35,9 +35,10 @@ def test_the_alignment_loses_nothing_uncounted(seed):
     """Samples in = in frames + rejected + waiting, at every sample, also where time jumps back."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 6))
-    stage = align(n, ahead_s=float(rng.choice([0.05, 0.5, 3.0])), burst=bool(rng.integers(2)),
-                  max_wait_s=float(rng.choice([0.1, 0.5])), jump_back_s=float(rng.choice([0.1, 1])),
-                  most_pending=int(rng.choice([2, 10_000])))
+    stage = align(n, max_clock_jump_s=float(rng.choice([0.05, 0.5, 3.0])),
+                  burst=bool(rng.integers(2)), max_wait_s=float(rng.choice([0.1, 0.5])),
+                  max_backward_jump_s=float(rng.choice([0.1, 1])),
+                  max_buffered=int(rng.choice([2, 10_000])))
     used, came = 0, 0
     for j, t in wild(rng, n, 500):
         used += sum(int(f.n_samples.sum()) for f in frames_of(stage, [(j, t)]))
@@ -79,7 +80,7 @@ def test_a_gap_of_all_is_no_fault_and_a_setting_of_zero_is_never():
     stage = align(6)
     frames = frames_of(stage, stream(6, 0, 2000) + stream(6, 12_000, 14_000)) + stage.flush()
     assert sum(int(f.n_samples.sum()) for f in frames) == 2400 and not rejected(stage.counts)
-    never = align(6, ahead_s=0.0)
+    never = align(6, max_clock_jump_s=0.0)
     frames_of(never, stepped(stream(6, 0, 3000), {2}, 1000, 9999, by=1000))
     assert set(rejected(never.counts)) == {'late'}
 
@@ -98,8 +99,8 @@ def test_who_fell_silent_ahead_is_named_by_its_own_name():
 
 
 def test_few_samples_of_a_sensor_wait_also_where_its_stamps_stand_still():
-    for most, expected in ((4, 4), (10_000, MOST_HELD)):
-        stage = align(3, most_pending=most)
+    for most, expected in ((4, 4), (10_000, MAX_HELD)):
+        stage = align(3, max_buffered=most)
         frames_of(stage, stream(3, 0, 1000))
         frames_of(stage, [(1, 9000)] * 100)
         assert stage.n_held_ahead == expected
@@ -115,7 +116,7 @@ def test_counts_name_each_sensor():
 
 def test_what_is_ahead_is_so_of_the_newest_not_of_the_latest():
     """A sensor whose samples come 0.45 s late; those of the other are 0.1 s apart."""
-    stage = align(2, period_s=0.1, ahead_s=0.5, max_wait_s=2.0)
+    stage = align(2, period_s=0.1, max_clock_jump_s=0.5, max_wait_s=2.0)
     for k in range(50):
         stage.feed(one(sample((1000 + 100 * k) * MS, 0)))
         stage.feed(one(sample((550 + 100 * k) * MS, 1)))

@@ -254,7 +254,7 @@ def test_of_two_headings_that_fit_the_stated_one_is_taken(stated_yaw, off):
 
 
 def test_what_cannot_be_used_is_counted():
-    survey = Survey(stated(2), SurveySettings(most_accelerations=100))
+    survey = Survey(stated(2), SurveySettings(max_accelerations=100))
     for stamp, sensor, a in ((1, 'mag_9', [0, 0, 9.8]), (1, 'mag_1', [0, np.nan, 9.8]),
                              (2, 'mag_1', [0, np.inf, 9.8]), (3, 'mag_1', [0, 0, 9.8]),
                              (3, 'mag_1', [0, 0, 9.8]), (2, 'mag_1', [0, 0, 9.8])):

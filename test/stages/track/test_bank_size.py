@@ -17,7 +17,7 @@ from support.networks import line_network
     ('vehicle', {'track.vehicle.speeds': [1.0 + 1e-3 * k for k in range(100_000)]},
      '75600000 starting hypotheses, kinds (3) x arrival_names (3) x lateral_offsets (3) x speeds '
      '(100000) x moment directions (14) x turning or not (2), with 44 states each for 2 sensors '
-     '(track.most_sensors) at the start need 1.17e+03 GB, more than 4.29 GB'),
+     '(track.max_sensors) at the start need 1.17e+03 GB, more than 4.29 GB'),
     ('vehicle', {**POINT, 'track.vehicle.lateral_offsets': [1e-3 * k for k in range(10_000)]},
      'lateral_offsets (10000)'),
     ('vehicle', {'track.vehicle.arrival_names': [str(k) for k in range(3000)],
@@ -36,7 +36,7 @@ def test_too_many_hypotheses_are_refused_with_their_number(target, changes, prod
      'track.magnet: 1000 starting hypotheses, starts (1000), with 822 states each for 90 sensors')])
 def test_so_are_those_of_a_magnet(changes, told):
     changes = {f'track.magnet.{name}': value for name, value in changes.items()}
-    settings = settings_for('magnet', {'track.mounting_std_deg': 5.0, 'track.most_sensors': 90,
+    settings = settings_for('magnet', {'track.mounting_std_deg': 5.0, 'track.max_sensors': 90,
                                        'track.model_error_time_s': 0.3, **changes})
     Pipeline(line_network(9), settings)
     with pytest.raises(SettingsError) as error:
@@ -61,9 +61,9 @@ def bytes_at_start(n, settings):
 def test_the_bound_is_that_of_the_bank_that_is_made(monkeypatch, n, changes):
     network, settings = line_network(n), settings_for('vehicle', changes).track
     size = bytes_at_start(n, settings)
-    monkeypatch.setattr(bank_size, 'MOST_BYTES', size)
+    monkeypatch.setattr(bank_size, 'MAX_BYTES', size)
     target_of(settings, network)
-    monkeypatch.setattr(bank_size, 'MOST_BYTES', size - 1)
+    monkeypatch.setattr(bank_size, 'MAX_BYTES', size - 1)
     with pytest.raises(SettingsError, match='starting hypotheses'):
         target_of(settings, network)
 
@@ -85,21 +85,21 @@ def test_a_vehicle_starts_with_as_many_sensors_as_its_hypotheses_allow(monkeypat
 def test_a_magnet_starts_with_all():
     settings, network = settings_for('magnet').track, line_network(40)
     model = target_of(settings, network).model
-    assert bank_size.sensors_at_start(settings, network, model) == settings.most_sensors
+    assert bank_size.sensors_at_start(settings, network, model) == settings.max_sensors
 
 
 @pytest.mark.parametrize('n', [2, 16, 32, 90])
 def test_so_many_are_kept_as_take_no_more_than_they_may(n):
     settings, network = settings_for('vehicle').track, line_network(2)
     observation = BankFilter(network, target_of(settings, network).model, settings).observation
-    kept, each = bank_size.most_hypotheses(observation, n), 8 * observation.n_states(n)**2
-    assert (kept == bank_size.LEAST_HYPOTHESES if n == 90
+    kept, each = bank_size.max_hypotheses(observation, n), 8 * observation.n_states(n)**2
+    assert (kept == bank_size.MIN_HYPOTHESES if n == 90
             else kept * each <= bank_size.WIDER_BYTES < (kept + 1) * each)
 
 
 def test_more_sensors_than_the_memory_has_room_for_are_refused():
-    changes = {'track.most_sensors': 1000}
+    changes = {'track.max_sensors': 1000}
     Pipeline(line_network(90), settings_for('vehicle', changes))
-    with pytest.raises(SettingsError, match=r'track.most_sensors: 100 hypotheses of a target that '
+    with pytest.raises(SettingsError, match=r'track.max_sensors: 100 hypotheses of a target that '
                        r'400 sensors see need 10.5 GB, more than 4.29 GB'):
         Pipeline(line_network(400), settings_for('vehicle', changes))

@@ -232,7 +232,7 @@ def test_of_a_path_that_is_nowhere_nothing_is_settled():
 
 
 def test_vehicles_that_share_a_state_are_a_few():
-    for count in (0, core.MOST_TARGETS + 1):
+    for count in (0, core.MAX_TARGETS + 1):
         with pytest.raises(ValueError, match='count: from 1 to 4'):
             core.VehiclesFilter(np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), 0, 0, count, 12,
                                 *ROW)

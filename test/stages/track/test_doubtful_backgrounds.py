@@ -37,8 +37,8 @@ def tracked(passing, times, settings=None):
     manager = TrackManager(network, settings_for('vehicle', {**QUICK, **(settings or {})}).track)
     start = frames[0].stamp_ns
     manager.doubt({name: tuple((start + round(b * 1e9), None if e is None else
-                                start + round(e * 1e9)) for b, e in stretches)
-                   for name, stretches in times.items()})
+                                start + round(e * 1e9)) for b, e in segments)
+                   for name, segments in times.items()})
     return manager, [r for f in frames for r in manager.feed(f)
                      if isinstance(r, Track) and not r.ended]
 
@@ -68,7 +68,7 @@ def test_it_is_so_from_where_the_doubt_begins(passing):
 
 
 def test_sensors_that_a_track_does_not_use_are_no_matter(passing):
-    two = {'track.most_sensors': 2}
+    two = {'track.max_sensors': 2}
     _, plain = tracked(passing, {}, two)
     unused = {name for name in passing[0].names if tracked(
         passing, {name: [(0.0, None)]}, two)[0].counts[DOUBTED] == 0}
@@ -83,7 +83,7 @@ def test_the_state_of_the_calibration_says_it():
     pipeline = Pipeline(network, settings_for('vehicle'))
     assert said(pipeline) == {name: () for name in network.names}
     pipeline.feed(after_dense_traffic('straight_small_left', 7.0))
-    times = pipeline.calibrate.doubtful_stretches()
+    times = pipeline.calibrate.doubtful_intervals()
     assert times
     assert said(pipeline) == {name: times.get(name, ())[-1:] for name in network.names}
 
@@ -105,7 +105,7 @@ def test_after_dense_traffic_a_vehicle_is_tracked_and_flagged(name):
     network, readings = read_network(NETWORK_FILE), after_dense_traffic(name, 7.0)
     pipeline, other = (Pipeline(network, SETTINGS) for _ in range(2))
     tracks = poses_of(pipeline.feed(readings) + pipeline.flush())
-    assert pipeline.calibrate.doubtful_stretches()
+    assert pipeline.calibrate.doubtful_intervals()
     assert len(tracks) > 10 and all(t.ambiguous for t in tracks)
     parts = [other.feed(readings.part(slice(i, i + 50))) for i in range(0, len(readings), 50)]
     again = poses_of([r for part in parts for r in part] + other.flush())

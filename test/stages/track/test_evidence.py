@@ -140,7 +140,7 @@ def test_a_track_that_a_target_never_explained_ends_and_one_that_it_did_goes_on(
         evidence = TrackEvidence(2)
         for k in range(200):
             stamp = round(0.08 * k * NS)
-            evidence.explanation.add(steps(k), stamp, SETTINGS.explained_ratio)
+            evidence.bayes_factor.add(steps(k), stamp, SETTINGS.min_bayes_factor)
             late = pose()
             late.stamp_ns = stamp
             reason = evidence.reason_to_end(late, 1.0, False, SETTINGS)
@@ -158,19 +158,19 @@ def test_a_track_that_a_target_never_explained_ends_and_one_that_it_did_goes_on(
 
 
 def test_a_comparison_that_failed_once_is_doubted_for_good():
-    explanation = TrackEvidence(2).explanation
+    bayes_factor = TrackEvidence(2).bayes_factor
     for k, value in enumerate([50.0, np.nan, 50.0]):
-        explanation.add(value, k, 20.0)
-        assert explanation.leads(20.0) == (k == 0)
+        bayes_factor.add(value, k, 20.0)
+        assert bayes_factor.leads(20.0) == (k == 0)
 
 
 def test_falling_behind_is_forgotten_within_a_second():
-    explanation = TrackEvidence(2).explanation
-    explanation.add(50.0, 0, 20.0)
-    explanation.add(-5.0, 2 * NS, 20.0)
-    assert explanation.leads(20.0) and explanation.fell_behind(20.0)
-    explanation.add(0.0, round(3.1 * NS), 20.0)
-    assert explanation.leads(20.0) and not explanation.fell_behind(20.0)
+    bayes_factor = TrackEvidence(2).bayes_factor
+    bayes_factor.add(50.0, 0, 20.0)
+    bayes_factor.add(-5.0, 2 * NS, 20.0)
+    assert bayes_factor.leads(20.0) and bayes_factor.fell_behind(20.0)
+    bayes_factor.add(0.0, round(3.1 * NS), 20.0)
+    assert bayes_factor.leads(20.0) and not bayes_factor.fell_behind(20.0)
 
 
 def test_published_doubts_are_listed_in_one_order_and_each_has_a_meaning():

@@ -123,9 +123,9 @@ def test_a_vehicle_starts_where_its_field_first_has_the_energy_of_the_frame(miss
     assert reached.mean() > 0.5
     # Who never has it starts where the sensors begin.
     np.testing.assert_allclose(before[~reached], 0.0, atol=1e-9)
-    coming = reached & (before < vehicle.farthest - 1e-9)
+    coming = reached & (before < vehicle.max_start_distance - 1e-9)
     assert coming.mean() > 0.5
-    assert (energy(vehicle.farthest / 159.0)[coming] < wanted).all()
+    assert (energy(vehicle.max_start_distance / 159.0)[coming] < wanted).all()
 
 
 def test_a_start_is_as_sure_as_the_model_is_good():

@@ -53,7 +53,7 @@ LAST_POSE = {76: 'of four poses the last is 4 deviations from the other; why is 
     pytest.mark.xfail(strict=True, reason=LAST_POSE[seed])] if seed in LAST_POSE else []))
 def test_more_hypotheses_would_tell_nothing_else(drive, seed):
     bounded = drive(seed, {})
-    free = drive(seed, {'track.most_hypotheses': 100_000})
+    free = drive(seed, {'track.max_hypotheses': 100_000})
     d = apart(bounded, free)
     print(f'{seed}: poses differ by {d.max():.2g} deviations at most, at the end by {d[-1]:.2g}')
     assert bounded[-1].arrival == free[-1].arrival

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from mag_tracking.geometry import quaternion_from_rotation_vector, rotation_from_quaternion
 from mag_tracking.physics.dipole import dipole_field
-from mag_tracking.physics.mounting import turned_fields
+from mag_tracking.physics.mounting import rotated_fields
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.simulation.scenario import Imperfections, Path, point_body
@@ -29,7 +29,7 @@ def case():
 
 def test_no_angle_changes_nothing():
     h, H, angles = case()
-    turned, derivative = turned_fields(h, H, 0.0 * angles)
+    turned, derivative = rotated_fields(h, H, 0.0 * angles)
     np.testing.assert_array_equal(turned, h)
     np.testing.assert_array_equal(derivative[..., :4], H)
 
@@ -38,7 +38,7 @@ def test_small_angles_are_a_rotation_to_first_order():
     h, H, angles = case()
     for scale in (1e-1, 1e-2, 1e-3):
         R = rotation_from_quaternion(quaternion_from_rotation_vector(scale * angles))
-        turned, derivative = turned_fields(h, H, scale * angles)
+        turned, derivative = rotated_fields(h, H, scale * angles)
         worst = np.linalg.norm(turned - (R @ h[..., None])[..., 0], axis=-1)
         limit = 0.5 * (scale * np.linalg.norm(angles, axis=-1)) ** 2
         assert (worst <= 1.01 * limit * np.linalg.norm(h, axis=-1)).all()
@@ -51,10 +51,10 @@ def test_derivatives_by_state_and_angle():
     h, H, angles = case()
 
     def field(v):
-        return turned_fields(h + (H @ v[:4]), H, (v[4:].reshape(3, 3) + angles))[0]
+        return rotated_fields(h + (H @ v[:4]), H, (v[4:].reshape(3, 3) + angles))[0]
 
     v = np.zeros(4 + 9)
-    derivative = turned_fields(h, H, angles)[1]
+    derivative = rotated_fields(h, H, angles)[1]
     for k in range(len(v)):
         e = 1e-6 * np.eye(len(v))[k]
         expected = (field(v + e) - field(v - e)) / 2e-6

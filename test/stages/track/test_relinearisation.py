@@ -88,7 +88,7 @@ def followed_beside_plain(filter_, anew, n=40, anew_at=(), prune=True):
             log_likelihood, _ = filter_.update(b, frame, dt)
             b.reweight(log_likelihood)
         if k in anew_at:
-            anew.begin_anew()
+            anew.restart()
         anew.add(bank, predicted, log_likelihood, 0.0, frame, dt)
         if prune and k % 6 == 3:
             mask = np.append(True, rng.uniform(size=len(bank) - 1) < 0.8)
@@ -207,20 +207,20 @@ def test_a_path_whose_covariance_is_none_is_of_no_use():
     np.testing.assert_array_equal(bank.P, P)
 
 
-@pytest.mark.parametrize('window_s, most_frames', [(0.5, 64), (60.0, 10)])
-def test_it_is_done_over_twice_the_window_at_most(monkeypatch, window_s, most_frames):
+@pytest.mark.parametrize('window_s, max_frames', [(0.5, 64), (60.0, 10)])
+def test_it_is_done_over_twice_the_window_at_most(monkeypatch, window_s, max_frames):
     """Frames are 0.05 s apart or more; beside the passes the anchor moves over half of them."""
-    monkeypatch.setattr(relinearise, 'MOST_FRAMES', most_frames)
+    monkeypatch.setattr(relinearise, 'MAX_FRAMES', max_frames)
     filter_ = LinearFilter()
     followed_beside_plain(filter_, Relinearisation(0.0, window_s, 5), n=90)
-    frames = min(2 * round(window_s / 0.05), most_frames) + 1
+    frames = min(2 * round(window_s / 0.05), max_frames) + 1
     assert relinearise.PASSES * 5 < max(filter_.lengths) <= (relinearise.PASSES + 1) * frames
 
 
 @pytest.mark.parametrize('most, affordable', [(1, 10**9), (5, 6**2 * 40)])
 def test_it_is_done_for_the_heaviest(monkeypatch, most, affordable):
     """And for fewer where many states make it expensive: here for one over forty frames."""
-    monkeypatch.setattr(relinearise, 'MOST_NUMBERS', affordable)
+    monkeypatch.setattr(relinearise, 'MAX_NUMBERS', affordable)
     filter_ = LinearFilter()
     bank, *_ = followed_beside_plain(filter_, Relinearisation(60.0, 60.0, most), prune=False)
     anew = Relinearisation(0.0, 60.0, most)

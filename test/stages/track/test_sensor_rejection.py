@@ -12,7 +12,7 @@ from mag_tracking.physics.dipole import MU0, dipole_field
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.evidence import LONGEST_SINGLE_SENSOR_S
+from mag_tracking.stages.track.evidence import MAX_SINGLE_SENSOR_S
 from mag_tracking.stages.track.initiation_vehicle import vehicle_model
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.sensor_rejection import ONE_IN, SensorRejection
@@ -161,7 +161,7 @@ def test_all_wrong_is_a_track_that_is_lost():
     assert used is lost and not counts
     assert got.tobytes() == expected.tobytes() and state(bank) == after
     best = int(np.argmax(bank.log_w + got))
-    assert bank_filter.is_strange(bank, best, lost)
+    assert bank_filter.is_implausible(bank, best, lost)
 
 
 def test_one_sensor_alone_is_never_left_out():
@@ -287,7 +287,7 @@ def test_of_two_sensors_the_track_is_flagged_from_then_on():
     for fault in (None, 'swaps axes'):
         # So short that it is not for having been alone.
         pipeline, tracks, (begin, _) = passing(
-            2, fault, seed=1, lasting_s=LONGEST_SINGLE_SENSOR_S - 0.2)
+            2, fault, seed=1, lasting_s=MAX_SINGLE_SENSOR_S - 0.2)
         flags[fault] = [t.ambiguous for t in tracks if t.stamp_ns / NS > begin + 0.5]
         contradicted = [what for what in pipeline.track.counts if 'contradicted' in what]
         assert bool(contradicted) == bool(fault)
@@ -335,8 +335,8 @@ def test_a_calibration_that_comes_while_one_is_left_out_waits_for_the_end_of_the
         (t.stamp_ns, t.position.tobytes(), t.ambiguous) for t in expected]
 
 
-@pytest.mark.parametrize('alone_s, flagged', [(LONGEST_SINGLE_SENSOR_S - 0.1, False),
-                                              (LONGEST_SINGLE_SENSOR_S + 0.2, True)])
+@pytest.mark.parametrize('alone_s, flagged', [(MAX_SINGLE_SENSOR_S - 0.1, False),
+                                              (MAX_SINGLE_SENSOR_S + 0.2, True)])
 def test_one_that_carried_a_track_alone_leaves_it_flagged(alone_s, flagged):
     network, samples, _, (begin, end) = stream(2, 0)
     pipeline, tracks = Pipeline(network, settings_for('vehicle', POINT)), []

@@ -88,7 +88,7 @@ def driven(network, changes, speed=20.0, seed=1):
 def test_a_target_is_followed_along_forty_sensors():
     """180 m, with six sensors at a time; the error stays inside its covariance all the way."""
     network = line_network(40, tilt=0.02)
-    records, pipeline, truth = driven(network, {'track.most_sensors': 6})
+    records, pipeline, truth = driven(network, {'track.max_sensors': 6})
     live = [r for r in records if isinstance(r, Track) and not r.ended]
     assert len({t.id for t in live}) == 1
     inside = [t for t in live if 0.0 < truth(t.stamp_ns / 1e9)[0] < 171.0]
@@ -118,7 +118,7 @@ def test_many_sensors_come_in_when_the_frames_before_the_detection_are_through(m
     network, runs = line_network(12, tilt=0.02), []
     for n in (1000, 4):
         monkeypatch.setattr(manager, 'sensors_at_start', lambda *_, n=n: n)
-        records, pipeline, truth = driven(network, {'track.most_sensors': most})
+        records, pipeline, truth = driven(network, {'track.max_sensors': most})
         live = [r for r in records if isinstance(r, Track) and not r.ended]
         inside = [t for t in live if 0.0 < truth(t.stamp_ns / 1e9)[0] < 45.0]
         e = np.array([t.position[:2] - truth(t.stamp_ns / 1e9) for t in inside])
@@ -171,7 +171,7 @@ def test_sensors_that_come_in_and_say_nothing_change_nothing(monkeypatch, frames
         n_samples=np.where(np.isin(np.arange(12), far), 0, f.n_samples)) for f in every]
     monkeypatch.setattr(manager, 'sensors_at_start', lambda *_: 4)
     runs = [managed((network, silent), {**POINT, 'track.relinearise_window_s': 0.0,
-                                        'track.most_sensors': most})[1] for most in (4, 12)]
+                                        'track.max_sensors': most})[1] for most in (4, 12)]
     for a, b in zip(*(tracks[:3] for tracks in runs), strict=True):
         np.testing.assert_allclose(b.position, a.position, atol=1e-6)
         np.testing.assert_allclose(b.covariance, a.covariance, rtol=1e-6, atol=1e-9)
@@ -181,11 +181,11 @@ def test_where_no_frame_came_before_the_detection_no_hypothesis_is_dropped_for_i
         monkeypatch, frames):
     """Nothing tells yet which are better: the other sensors come in later."""
     monkeypatch.setattr(manager, 'sensors_at_start', lambda *_: 4)
-    for name, value in (('WIDER_BYTES', 1), ('LEAST_HYPOTHESES', 20)):
+    for name, value in (('WIDER_BYTES', 1), ('MIN_HYPOTHESES', 20)):
         monkeypatch.setattr(bank_size, name, value)
     first = next(k for k, f in enumerate(frames[1]) if f.target_present)
     tracker, _ = managed(frames, {}, start=slice(first, first + 1))
-    assert len(tracker.bank) == settings_for('vehicle').track.most_at_start
+    assert len(tracker.bank) == settings_for('vehicle').track.max_initial_hypotheses
     _, tracks = managed(frames, POINT, start=slice(first, None))
     used = [np.count_nonzero(~np.isnan(t.nis_by_sensor)) for t in tracks]
     assert used[0] <= 4 < max(used)
@@ -198,7 +198,7 @@ def test_the_approach_is_judged_by_the_same_sensors_all_the_time(monkeypatch, fr
         looked.add(len(frame.field)), add(self, frame))[1])
     for most, expected in ((16, {12}), (8, {8})):
         looked.clear()
-        managed(frames, {**POINT, 'track.most_sensors': most})
+        managed(frames, {**POINT, 'track.max_sensors': most})
         assert looked == expected
 
 
@@ -215,7 +215,7 @@ def test_the_first_pose_is_doubted_for_a_sensor_that_comes_in_with_it(monkeypatc
 
 def test_a_network_that_is_not_larger_is_used_whole():
     network = line_network(6, tilt=0.02)
-    some, whole = ([r for r in driven(network, {'track.most_sensors': n})[0]
+    some, whole = ([r for r in driven(network, {'track.max_sensors': n})[0]
                     if isinstance(r, Track)] for n in (6, 1000))
     assert len(some) == len(whole) > 20
     for a, b in zip(some, whole, strict=True):

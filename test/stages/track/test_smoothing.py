@@ -278,11 +278,11 @@ def pass_of(body, seed=0):
 
 def test_smoothing_can_be_left_out_and_what_is_too_long_is_counted():
     body = point_body([250.0, -150.0, 80.0], 4.0, 0.5)
-    none, _ = run(body, {**POINT, 'track.smooth_longest_s': 0.0})
+    none, _ = run(body, {**POINT, 'track.max_smoothing_s': 0.0})
     assert not [r for r in none if isinstance(r, SmoothedPose)]
     network, samples, _, _ = pass_of(body)
     pipeline = Pipeline(network, settings_for('vehicle', {
-        **POINT, 'track.smooth_longest_s': 1.0}))
+        **POINT, 'track.max_smoothing_s': 1.0}))
     records = [r for s in samples for r in pipeline.feed(one(s))] + pipeline.flush()
     assert [r for r in records if isinstance(r, Track)]
     assert not [r for r in records if isinstance(r, SmoothedPose)]
@@ -375,7 +375,7 @@ def test_a_track_that_was_lost_is_smoothed_with_a_doubt():
 
 
 def test_long_tracks_of_many_states_are_bounded(monkeypatch):
-    monkeypatch.setattr(smooth_module, 'MOST_NUMBERS', 20 * 35**2)
+    monkeypatch.setattr(smooth_module, 'MAX_NUMBERS', 20 * 35**2)
     records, _ = run(point_body([250.0, -150.0, 80.0], 4.0, 0.5), {})
     assert [r for r in records if isinstance(r, Track)]
     assert not [r for r in records if isinstance(r, SmoothedPose)]

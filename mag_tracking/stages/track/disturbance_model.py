@@ -17,20 +17,20 @@ from mag_tracking.records import FieldFrame
 GRADIENT = 0.3
 """How much a field over the network may change from its centre to its edge, as a share."""
 
-LEAST_STD = 1e-15
+MIN_STD = 1e-15
 """[T] No sensor is quieter: a network file with less noise is refused."""
 
 ANY_FIELD = 1e-4
 """[T] Deviation of a field that is not known."""
 
-LEAST_FOR_GRADIENT = 3
+MIN_FOR_GRADIENT = 3
 """Sensors below which a uniform field with a gradient is any field."""
 
-MOST_FOR_ONE_FIELD = 8
+MAX_FOR_ONE_FIELD = 8
 """One field is sought over so many sensors; the cost grows with the cube of their number."""
 
 
-class SomethingElse:
+class DisturbanceModel:
     """Evidence for fields of no target."""
 
     def __init__(self, network: SensorNetwork, background_std: float,
@@ -42,7 +42,7 @@ class SomethingElse:
         self._background_std, self._is_handover = background_std, is_handover
         self._sensor, self._own_H = np.repeat(np.arange(n), 3), np.tile(np.eye(3), (n, 1))
         # One field is sought over the first sensors; the rest have fields of their own.
-        chosen = np.arange(min(n, MOST_FOR_ONE_FIELD))
+        chosen = np.arange(min(n, MAX_FOR_ONE_FIELD))
         self._common_H = _field_over(network.part(chosen) if n > len(chosen) else network)
         self._filters: tuple[GaussMarkovVectors, GaussMarkovVectors, GaussMarkovVectors] | None \
             = None
@@ -67,7 +67,7 @@ class SomethingElse:
         """
         present = np.isfinite(frame.field.ravel())
         noise = np.einsum('jii->ji', frame.covariance)
-        variance = np.maximum(noise + model_error[:, None], LEAST_STD**2).ravel()[present]
+        variance = np.maximum(noise + model_error[:, None], MIN_STD**2).ravel()[present]
         y = frame.field.ravel()[present]
         is_first = self._filters is None and self._is_handover
         if self._filters is None:
@@ -77,8 +77,8 @@ class SomethingElse:
         assert self._filters is not None
         own, rest, common = self._filters
         sensor, H = self._sensor[present], self._own_H[present]
-        k = int(np.searchsorted(sensor, MOST_FOR_ONE_FIELD))
-        of_rest = rest.log_density(sensor[k:] - MOST_FOR_ONE_FIELD, H[k:], y[k:], variance[k:], dt)
+        k = int(np.searchsorted(sensor, MAX_FOR_ONE_FIELD))
+        of_rest = rest.log_density(sensor[k:] - MAX_FOR_ONE_FIELD, H[k:], y[k:], variance[k:], dt)
         joint = self._log_w + of_rest + [
             own.log_density(sensor[:k], H[:k], y[:k], variance[:k], dt),
             common.log_density(np.zeros(k, dtype=np.int64),
@@ -92,7 +92,7 @@ class SomethingElse:
         """The first measurement has this variance [T^2]: it sets the scale."""
         scale = np.sqrt(self._background_std**2 + noise)
         n = len(self._sensor) // 3
-        n_chosen = min(n, MOST_FOR_ONE_FIELD)
+        n_chosen = min(n, MAX_FOR_ONE_FIELD)
         n_field = self._common_H.shape[1] - 3 * n_chosen
         std = ANY_FIELD if self._is_handover else self._background_std
         # Behind the field are the backgrounds, which stay as they are.
@@ -112,7 +112,7 @@ def _field_over(network: SensorNetwork) -> FloatArray:
     """
     n, R_sw = len(network), network.R_sw
     field = np.tile(np.eye(3), (n, 1, 1))
-    if n >= LEAST_FOR_GRADIENT:
+    if n >= MIN_FOR_GRADIENT:
         away = network.positions - network.centre
         radius = np.linalg.norm(away, axis=1).max()
         x, y, z = (away / (radius or 1.0)).T

@@ -19,7 +19,7 @@ signal 5 s after the first."""
 HUNG = f'the middleware did not shut down within {LEAVING_S:g} s; the process was ended\n'
 
 
-def leave(nodes: Sequence[Node], executor: Executor | None = None, status: int = 0) -> None:
+def shut_down(nodes: Sequence[Node], executor: Executor | None = None, status: int = 0) -> None:
     """Close and destroy nodes and shut ROS down; end the process if the middleware hangs.
 
     Workaround: Fast DDS 2.14 blocks for ever, and holds the interpreter's lock, when a participant
@@ -44,7 +44,7 @@ def leave(nodes: Sequence[Node], executor: Executor | None = None, status: int =
     finally:
         flush()
         with ExitStack() as stack:
-            stack.callback(Deadline(LEAVING_S, status, _last_words()).cancel)
+            stack.callback(Deadline(LEAVING_S, status, _final_message()).cancel)
             stack.callback(rclpy.try_shutdown)
             if executor is not None:
                 stack.callback(executor.shutdown)
@@ -52,7 +52,7 @@ def leave(nodes: Sequence[Node], executor: Executor | None = None, status: int =
                 stack.callback(node.destroy_node)
 
 
-def end_soon(status: int) -> None:
+def limit_exit_time(status: int) -> None:
     """Limit the time until the process has ended, as `leave` does.
 
     A node whose constructor raised is destroyed only with the interpreter.
@@ -69,7 +69,7 @@ def flush() -> None:
                 stream.flush()
 
 
-def _last_words() -> bytes:
+def _final_message() -> bytes:
     """Message of the deadline; begins with the pending error, which would not be printed."""
     error = sys.exc_info()[1]
     if error is None or isinstance(error, KeyboardInterrupt):

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from mag_tracking.analysis.joint_fit import (
+    GroundPrior,
+    are_separate,
+    fit_joint,
+    path_from,
+)
 from mag_tracking.analysis.model_order import choose_order, order_criteria
 from mag_tracking.analysis.pass_description import assignment, fits_at_minimum
 from mag_tracking.analysis.pass_deviation import SensorErrors
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_targets import fit_targets
-from mag_tracking.analysis.pass_trust import FittedRow, left_elsewhere
-from mag_tracking.analysis.superposed_fit import (
-    GroundPrior,
-    are_separate,
-    fit_superposed,
-    path_from,
-)
+from mag_tracking.analysis.pass_trust import FittedRow, residual_elsewhere
 from mag_tracking.inference.separable_fit import Minimum
 from mag_tracking.physics.passes import RowPass, SuperposedPasses
 from support.passes import ROAD, measured, network_of, random_moments, together
@@ -63,7 +63,7 @@ def test_two_vehicles_are_found_with_honest_deviations(plan, n_dipoles):
     for seed in range(6):
         rng = np.random.default_rng([seed, n_dipoles])
         data, paths = world(rng, plan, n_dipoles)
-        found = fit_superposed(data, tracked(rng, paths), GROUND, (n_dipoles,))
+        found = fit_joint(data, tracked(rng, paths), GROUND, (n_dipoles,))
         assert len(found) == 2
         for (fit,), path in zip(found, paths, strict=True):
             assert fit.converged and fit.n_others == 6 + (n_dipoles > 1) + 3 * n_dipoles
@@ -80,7 +80,7 @@ def test_two_vehicles_are_found_with_honest_deviations(plan, n_dipoles):
 def test_three_vehicles_are_found():
     rng = np.random.default_rng(5)
     data, paths = world(rng, ((-1.2, 1), (0.1, -1), (1.1, 1)), 1, FOUR)
-    found = fit_superposed(data, tracked(rng, paths), GROUND, (1, 2))
+    found = fit_joint(data, tracked(rng, paths), GROUND, (1, 2))
     assert [choose_order(fits).n_dipoles for fits in found] == [1, 1, 1]
     for fits, path in zip(found, paths, strict=True):
         fit = choose_order(fits)
@@ -92,7 +92,7 @@ def test_each_is_given_what_was_measured_without_the_others():
     """The field of the one alone and the noise are left."""
     rng = np.random.default_rng(6)
     data, paths = world(rng, MEETING, 1)
-    (first,), (second,) = fit_superposed(data, tracked(rng, paths), GROUND, (1,))
+    (first,), (second,) = fit_joint(data, tracked(rng, paths), GROUND, (1,))
     assert first.cost == second.cost and first.n_unknowns == second.n_unknowns
     np.testing.assert_allclose(first.data.field - first.predicted,
                                second.data.field - second.predicted, atol=1e-15)
@@ -107,7 +107,7 @@ def test_each_has_as_many_dipoles_as_it_is_worth():
     row, moments = one_path(rng, 0.3, -1, 3)
     data = together(measured(ROAD, point, m, rng, seconds=6.0),
                     measured(ROAD, row, moments, rng, seconds=6.0, noise=1e-15))
-    found = fit_superposed(data, tracked(rng, (point, row)), GROUND, (1, 2, 3))
+    found = fit_joint(data, tracked(rng, (point, row)), GROUND, (1, 2, 3))
     orders = [choose_order(fits).n_dipoles for fits in found]
     assert orders[0] == 1 and orders[1] >= 2
     # Whichever number one of them is given, it is the same vehicle, with the same time zero.
@@ -201,7 +201,7 @@ def test_paths_begin_where_the_data_do():
     rng = np.random.default_rng(2)
     data, paths = world(rng, MEETING, 2)
     data = replace(data, stamp_ns=1_700_000_000_000_000_000)
-    found = fit_superposed(data, tracked(rng, paths), GROUND, (2,))
+    found = fit_joint(data, tracked(rng, paths), GROUND, (2,))
     for (fit,), path in zip(found, paths, strict=True):
         np.testing.assert_allclose(path_from(data, fit)[:2], path[:2], atol=1.0)
     assert np.isfinite(order_criteria([fits[0] for fits in found])).all()
@@ -226,7 +226,7 @@ def test_what_is_wrong_with_one_is_in_the_answers_of_all():
     field = (model.basis(second[None])[0] @ more[0]).reshape(-1, 3)
     data = replace(data, field=data.field + field)
     paths = np.array([first, second])
-    changes = [fits[0].velocity_change for fits in fit_superposed(data, paths, GROUND, (1,))]
+    changes = [fits[0].velocity_change for fits in fit_joint(data, paths, GROUND, (1,))]
     assert changes[1] > 2.0 * changes[0]
     found = fit_targets(data, [fit_pass(data, 1)], paths, GROUND, (1,))
     assert all(choose_order(fits) is None for fits in found)
@@ -236,7 +236,7 @@ def test_vehicles_are_in_the_order_in_which_they_pass():
     rng = np.random.default_rng(13)
     data, paths = world(rng, FOLLOWING, 1)
     for order in ([0, 1], [1, 0]):
-        found = fit_superposed(data, tracked(rng, paths)[order], GROUND, (1,))
+        found = fit_joint(data, tracked(rng, paths)[order], GROUND, (1,))
         assert found[0][0].data.stamp_ns < found[1][0].data.stamp_ns
 
 
@@ -246,9 +246,9 @@ def test_what_left_its_track_says_so():
     astray = tracked(rng, paths)
     # As fast as nobody was.
     astray[1, 3] *= 3.0
-    found = fit_superposed(data, astray, GROUND, (1,))
+    found = fit_joint(data, astray, GROUND, (1,))
     assert sorted(fit.reason for fit, in found) == ['', 'it is not where it was tracked']
-    assert fit_superposed(data, astray, GROUND, (1,), stopped=lambda: True) == ()
+    assert fit_joint(data, astray, GROUND, (1,), stopped=lambda: True) == ()
 
 
 def two_minima(*others):
@@ -302,7 +302,7 @@ def test_what_is_left_over_may_be_of_any_of_them():
         path[None])[0] @ [200.0, 100.0, -300.0]).reshape(-1, 3)) for path in paths]
     for row in rows:
         left = np.einsum('nij,nj->ni', data.whitening, 0.2 * row.field)
-        assert left_elsewhere(data, rows, left) < 1e-3
+        assert residual_elsewhere(data, rows, left) < 1e-3
 
 
 def test_targets_that_are_described_poorly_together_are_ambiguous():

@@ -11,9 +11,9 @@ import pytest
 
 from mag_tracking.errors import MagTrackingError
 from mag_tracking.nodes.core import Deadline, end_within
-from mag_tracking.nodes.leaving import HUNG, LEAVING_S, leave
+from mag_tracking.nodes.shutdown import HUNG, LEAVING_S, shut_down
 from support.bundled import NETWORK_FILE, ROOT
-from support.node_processes import LONGEST_S, environment
+from support.node_processes import MAX_S, environment
 
 FAST_DDS = 'rmw_fastrtps_cpp'
 STUCK = '''
@@ -73,19 +73,19 @@ def test_a_node_that_cannot_leave_is_ended_with_its_status():
         process.send_signal(signal.SIGINT)
         # By the stream that has read a line, and may have read more.
         output, errors = process.stdout.read(), process.stderr.read()
-        assert process.wait(LONGEST_S) == 0 and output == 'not flushed', (output, errors)
+        assert process.wait(MAX_S) == 0 and output == 'not flushed', (output, errors)
     assert time.monotonic() - begin > LEAVING_S
     assert errors.endswith(HUNG)
 
 
 def test_an_error_on_its_way_is_printed_before_the_end():
     process = started(['-c', STUCK], 'fails')
-    _, errors = process.communicate(timeout=LONGEST_S)
+    _, errors = process.communicate(timeout=MAX_S)
     assert process.returncode == 1 and f'RuntimeError: on its way\n{HUNG}' in errors, errors
 
 
 def test_a_node_that_is_only_half_built_does_not_hold_up_the_end_of_python():
-    output, errors = started(['-c', HALF_BUILT]).communicate(timeout=LONGEST_S)
+    output, errors = started(['-c', HALF_BUILT]).communicate(timeout=MAX_S)
     assert (output, errors) == ('there is no such file', HUNG)
 
 
@@ -95,7 +95,7 @@ def test_a_node_that_is_only_half_built_does_not_hold_up_the_end_of_python():
      '/nonexistent.yaml')])
 def test_a_closed_output_is_no_obstacle(module, words, status, told):
     process = started(['-m', module], *words, stdout=None, preexec_fn=lambda: os.close(1))
-    _, errors = process.communicate(timeout=LONGEST_S)
+    _, errors = process.communicate(timeout=MAX_S)
     assert process.returncode == status and told in errors and 'Traceback' not in errors, errors
 
 
@@ -121,7 +121,7 @@ def test_what_was_said_stays_when_the_middleware_hangs(hanging_middleware, modul
                                                        told):
     process = started(['-m', module], *map(str, words), env=environment(
         ROS_HOME=os.environ['ROS_HOME'], LD_PRELOAD=str(hanging_middleware)))
-    output, errors = process.communicate(timeout=LONGEST_S)
+    output, errors = process.communicate(timeout=MAX_S)
     assert process.returncode == status and told in output + errors, (output, errors)
     assert errors.endswith(HUNG), errors
 
@@ -141,7 +141,7 @@ class Recorded:
 def test_all_nodes_are_destroyed_when_one_fails():
     nodes = [Recorded(RuntimeError('the first')), Recorded()]
     with pytest.raises(RuntimeError, match='the first'):
-        leave(nodes)
+        shut_down(nodes)
     assert all(node.is_destroyed for node in nodes)
 
 
@@ -151,7 +151,7 @@ def test_an_error_about_a_name_of_other_bytes_stays_what_it_is():
         try:
             raise MagTrackingError('\udcff: no such file')
         finally:
-            leave([node])
+            shut_down([node])
     assert node.is_destroyed
 
 
@@ -170,7 +170,7 @@ def test_the_doctor_reports_before_it_leaves(monkeypatch, capfd):
 
     def reported(nodes, executor, status):
         left.append((status, 'nothing' in capfd.readouterr().out))
-        leave(nodes, executor, status)
+        shut_down(nodes, executor, status)
 
     monkeypatch.setattr(doctor_node, 'leave', reported)
     assert main(['doctor', '--live', '1', '--network', str(NETWORK_FILE)]) == 2
@@ -182,6 +182,6 @@ def test_the_doctor_reports_before_it_leaves(monkeypatch, capfd):
 def test_ros_is_left_in_one_place(path):
     names = {ast.unparse(node) for node in ast.walk(ast.parse(path.read_text()))
              if isinstance(node, ast.Attribute)}
-    leaving = names & {'rclpy.try_shutdown', 'rclpy.shutdown', 'node.destroy_node'}
-    assert leaving == ({'rclpy.try_shutdown', 'node.destroy_node'} if path.stem == 'leaving'
+    shutdown = names & {'rclpy.try_shutdown', 'rclpy.shutdown', 'node.destroy_node'}
+    assert shutdown == ({'rclpy.try_shutdown', 'node.destroy_node'} if path.stem == 'leaving'
                        else set())

@@ -14,7 +14,7 @@ MOVES = 3.0
 """A vehicle has a heading while its speed is larger than so many of its deviations."""
 
 
-class UnseenLength:
+class UnobservedLength:
     """For one track: the part of a vehicle that no sensor has felt yet, which moves its middle.
 
     Until its rear has come near a sensor a car may be the engine of a truck: a row of dipoles

@@ -5,7 +5,7 @@ import pytest
 
 from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.stages.track.published_pose import VehicleOrientation, smoothed_pose
-from mag_tracking.stages.track.unseen_length import UnseenLength
+from mag_tracking.stages.track.unobserved_length import UnobservedLength
 
 SENSORS = np.array([[0.0, 4.0, 0.0], [1.0, -4.0, 0.0]])
 P = 0.04 * np.eye(19)
@@ -13,7 +13,7 @@ SMALL, CAR, TRUCK = range(3)
 
 
 def of_vehicles():
-    return UnseenLength([0.0, 3.0, 9.0], [0.0, 1.0, 3.0])
+    return UnobservedLength([0.0, 3.0, 9.0], [0.0, 1.0, 3.0])
 
 
 def at(place, heading=0.0, speed=8.0):
@@ -37,7 +37,7 @@ def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(comp
     x[18] = length
     for kind, usual, std in (('car', 3.0, 1.0), ('truck', 9.0, 3.0)):
         said[kind] = smoothed_pose(
-            model, VehicleOrientation(), x, P, unseen=UnseenLength([usual], [std]),
+            model, VehicleOrientation(), x, P, unseen=UnobservedLength([usual], [std]),
             difference=np.zeros(6), stamp_ns=0, id=1, kind=0, kinds=(kind,), ambiguous=False,
             complete=complete).covariance - P[:6, :6]
     assert not said['car'].any()
@@ -112,10 +112,10 @@ def test_one_that_stops_keeps_its_heading():
 
 
 def test_nothing_is_longer_than_the_longest_kind():
-    coming, cars = at([-20.0, 0.0]), UnseenLength([3.0], [1.0])
+    coming, cars = at([-20.0, 0.0]), UnobservedLength([3.0], [1.0])
     for length in (2.0, 3.0, 4.0):
         assert not cars.covariance(coming, P, length, 0).any()
-    longest = [UnseenLength(lengths, [3.0] * len(lengths)).covariance(coming, P, 8.9, -1)
+    longest = [UnobservedLength(lengths, [3.0] * len(lengths)).covariance(coming, P, 8.9, -1)
                for lengths in ([9.0], [0.0, 3.0, 9.0])]
     # Shorter kinds add nothing to what it is itself.
     np.testing.assert_array_equal(*longest)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.stages.track.rigid_pass import LEAST_WAY, LONGEST_OFFSET, RigidPass
+from mag_tracking.stages.track.rigid_pass import MAX_OFFSET, MIN_DISTANCE, RigidPass
 
 SURE = 4.0
 """Standard deviations at which clocks are called apart."""
@@ -48,7 +48,7 @@ class ClockOffset:
                 f'(clock_offset of {name}: {abs(self.offset_s):.3f} {more})')
 
 
-class ClockEvidence:
+class ClockComparison:
     """The offsets of several passes, folded into one answer.
 
     A sensor that is not where the network file says looks like one with a wrong clock as long as
@@ -97,10 +97,10 @@ class ClockEvidence:
         One that no straight path explains says nothing, nor one that is too slow to depend on
         clocks.
         """
-        is_slow = found.speed * LONGEST_OFFSET < LEAST_WAY
+        is_slow = found.speed * MAX_OFFSET < MIN_DISTANCE
         if is_slow or not (found.is_explained and found.is_straight):
             return
-        known = np.abs(found.offset) <= LONGEST_OFFSET
+        known = np.abs(found.offset) <= MAX_OFFSET
         known[found.reference] = False
         kept = KEPT_OF_CONTRADICTED if self._contradicts(found, rows, known) else KEPT
         self._information *= kept
@@ -117,7 +117,7 @@ class ClockEvidence:
         self._slowness = 1.0 / found.speed + kept * self._slowness
         offset, std = self._differences()
         # An offset in which vehicles, as fast as those so far, go less than a metre does no harm.
-        least = LEAST_WAY * self._slowness / self._weight
+        least = MIN_DISTANCE * self._slowness / self._weight
         self._apart = np.where((offset > SURE * std) & (offset > least), offset, 0.0)
 
     def _contradicts(self, found: RigidPass, rows: IntArray, known: BoolArray) -> bool:

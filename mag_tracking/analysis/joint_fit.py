@@ -50,7 +50,7 @@ than their rows) or across it. Two that are nearer are parts of one vehicle."""
 SEEN_FROM = 15.0
 """[m] Largest distance at which a sensor detects a target."""
 
-MOST_ROUNDS = 3
+MAX_ROUNDS = 3
 """Number of times that the order of each target is chosen, given those of the others."""
 
 SAME_SHARE, SAME_M = 0.5, 5.0
@@ -81,7 +81,7 @@ class GroundPrior:
         return np.concatenate(means), np.concatenate(stds)
 
 
-def fit_superposed(data: PassData, paths: FloatArray, ground: GroundPrior,
+def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
                    orders: Sequence[int] = (1, 2, 3, 4), errors: SensorErrors = AS_BOUGHT,
                    stopped: Callable[[], bool] | None = None) -> tuple[tuple[PassFit, ...], ...]:
     """Fit several rows of dipoles, each at constant velocity, to the sum of their fields.
@@ -118,7 +118,7 @@ def fit_superposed(data: PassData, paths: FloatArray, ground: GroundPrior,
     placed = np.vstack([paths.ravel(), _placed(rough, n_targets, ground)])
     fits = _JointFits(data, rough, placed, ground, errors)
     known = [min(orders, key=lambda n: (abs(n - 2), n))] * n_targets
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         before = list(known)
         for k in range(n_targets):
             if stopped is not None and stopped():

@@ -29,7 +29,7 @@ FEW = 8
 
 
 @dataclass(frozen=True)
-class FirstPass:
+class Prescan:
     """Backgrounds and steps that a first pass over a recording found."""
 
     levels: dict[str, QuietLevel]
@@ -37,7 +37,7 @@ class FirstPass:
     steps: dict[str, FloatArray]
     """{sensor: (3,) [T] smallest change of each axis}."""
 
-    def stretch_of(self, sensor: str) -> list[float] | None:
+    def segment_of(self, sensor: str) -> list[float] | None:
         """[begin, end] of the stretch of its background, in s after its first reading, or None."""
         level = self.levels.get(sensor)
         return None if level is None else [level.begin, level.end]
@@ -47,8 +47,8 @@ class FirstPass:
         calibrate.begin_with(self.levels, self.steps)
 
 
-def first_pass(batches: Iterable[Readings], network: SensorNetwork,
-               settings: CalibrateSettings) -> FirstPass:
+def prescan(batches: Iterable[Readings], network: SensorNetwork,
+               settings: CalibrateSettings) -> Prescan:
     """Find the backgrounds of sensors whose recording begins with a target.
 
     Parameters
@@ -60,19 +60,19 @@ def first_pass(batches: Iterable[Readings], network: SensorNetwork,
 
     Returns
     -------
-    FirstPass
+    Prescan
         Empty where the network file has all backgrounds, or `look_ahead_s` is 0.
     """
     wanted = [name for name, level in zip(network.names, network.background, strict=True)
               if level is None]
     if not wanted or not settings.look_ahead_s:
-        return FirstPass({}, {})
-    recorder, beginning = Calibrate(network, settings, BlockRecorder), Calibrate(network, settings)
+        return Prescan({}, {})
+    recorder, learner = Calibrate(network, settings, BlockRecorder), Calibrate(network, settings)
     first_ns: dict[str, int] = {}
     learnt: dict[str, tuple[float, FloatArray]] = {}
     for readings in batches:
         recorder.feed(readings)
-        _learn(beginning, readings, first_ns, learnt)
+        _learn(learner, readings, first_ns, learnt)
         start_ns = min(first_ns.values(), default=0)
         if len(readings) and int(readings.stamp_ns[-1]) - start_ns > settings.look_ahead_s * NS:
             break
@@ -80,14 +80,14 @@ def first_pass(batches: Iterable[Readings], network: SensorNetwork,
     for name, background in recorder.backgrounds().items():
         assert isinstance(background, BlockRecorder)
         steps[name] = background.steps
-        level, was_freed = _level_of(background, beginning.backgrounds()[name].freed_at,
+        level, was_freed = _level_of(background, learner.backgrounds()[name].freed_at,
                                      learnt.get(name)) if name in wanted else (None, False)
         if level is not None and level.n_blocks * level.block_s >= LEAST * settings.learn_s:
             found[name] = level
             is_quiet &= not was_freed \
                 and _begins_quietly(learnt.get(name), level, background, settings)
     # A target that one sensor feels at the beginning may be in the background of all.
-    return FirstPass({} if is_quiet else found, steps)
+    return Prescan({} if is_quiet else found, steps)
 
 
 def _level_of(recorder: BlockRecorder, freed_at: float | None,
@@ -98,12 +98,12 @@ def _level_of(recorder: BlockRecorder, freed_at: float | None,
     """
     level = recorder.quiet_level()
     if level is None or freed_at is None or learnt is None \
-            or recorder.is_back(learnt[1], level, freed_at):
+            or recorder.has_returned(learnt[1], level, freed_at):
         return level, False
     return recorder.quiet_level(freed_at), True
 
 
-def _learn(beginning: Calibrate, readings: Readings, first_ns: dict[str, int],
+def _learn(learner: Calibrate, readings: Readings, first_ns: dict[str, int],
            learnt: dict[str, tuple[float, FloatArray]]) -> None:
     """Note the first reading of each sensor, and when its background is known.
 
@@ -111,17 +111,17 @@ def _learn(beginning: Calibrate, readings: Readings, first_ns: dict[str, int],
     are changed.
     """
     for i in range(0, len(readings), FEW):
-        if len(learnt) == len(beginning.backgrounds()):
-            beginning.feed(readings.part(slice(i, None)))
+        if len(learnt) == len(learner.backgrounds()):
+            learner.feed(readings.part(slice(i, None)))
             return
         part = readings.part(slice(i, i + FEW))
         for name, stamp_ns in zip(part.sensor_names(), part.stamp_ns.tolist(), strict=True):
             first_ns.setdefault(name, stamp_ns)
-        beginning.feed(part)
-        for name, background in beginning.backgrounds().items():
+        learner.feed(part)
+        for name, background in learner.backgrounds().items():
             if background.ready and name not in learnt and name in first_ns:
                 since = (int(part.stamp_ns[-1]) - first_ns[name]) / NS
-                learnt[name] = since, beginning.background(name)
+                learnt[name] = since, learner.background(name)
 
 
 def _begins_quietly(learnt: tuple[float, FloatArray] | None, found: QuietLevel,
@@ -131,12 +131,12 @@ def _begins_quietly(learnt: tuple[float, FloatArray] | None, found: QuietLevel,
     if learnt is None or learnt[0] > longest:
         return False
     # Without relearning, a level stays the background whatever else lasts.
-    return not settings.relearn_s or recorder.is_usual(learnt[1], found)
+    return not settings.relearn_s or recorder.is_known_level(learnt[1], found)
 
 
-def first_pass_of(recording: Recording, network: SensorNetwork, settings: CalibrateSettings,
-                  stopped: Callable[[], bool] | None = None) -> FirstPass:
-    """`first_pass` over a recording; when `stopped` returns true it ends with what it has.
+def prescan_of(recording: Recording, network: SensorNetwork, settings: CalibrateSettings,
+                  stopped: Callable[[], bool] | None = None) -> Prescan:
+    """`prescan` over a recording; when `stopped` returns true it ends with what it has.
 
     Raises
     ------
@@ -152,4 +152,4 @@ def first_pass_of(recording: Recording, network: SensorNetwork, settings: Calibr
         except ReadingStopped:
             return
 
-    return first_pass(batches(), network, settings)
+    return prescan(batches(), network, settings)

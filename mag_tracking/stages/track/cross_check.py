@@ -9,12 +9,12 @@ from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track import doubts
-from mag_tracking.stages.track.clock_evidence import ClockEvidence
+from mag_tracking.stages.track.clock_comparison import ClockComparison
 from mag_tracking.stages.track.disturbances import size_of
 from mag_tracking.stages.track.plausibility import moves_too_far
 from mag_tracking.stages.track.rigid_pass import (
-    LEAST_WAY,
     LONG_LENGTH,
+    MIN_DISTANCE,
     MISFIT,
     RigidPass,
     fit_rigid_pass,
@@ -34,7 +34,7 @@ AGAIN = 1.7
 BEFORE_S, AFTER_S = 4.0, 3.0
 """[s] Frames from so long before to so long after the strongest field are of the pass."""
 
-LEAST_FRAMES, MOST_FRAMES = 12, 128
+MIN_FRAMES, MAX_FRAMES = 12, 128
 """A pass is fitted to no fewer frames; of more every other one is left out, or more of them."""
 
 STEADY_S = 1.5
@@ -54,7 +54,7 @@ class _Seen(NamedTuple):
     """(6,) position and velocity as they were then published."""
 
 
-class SecondOpinion:
+class CrossCheck:
     """The frames of a track, and the fits of its pass as a whole.
 
     Attributes
@@ -108,7 +108,7 @@ class SecondOpinion:
             self.difference = self._differs(self._now.stamp_ns, self._now.state)
         found = self._pass_doubts()
         speed = float(np.hypot(self._now.state[3], self._now.state[4]))
-        if clocks_apart_s * speed > LEAST_WAY:
+        if clocks_apart_s * speed > MIN_DISTANCE:
             found.add(doubts.CLOCKS_APART)
         return found
 
@@ -143,7 +143,7 @@ class SecondOpinion:
         """Whether the latest opinion doubts the track."""
         return bool(self._pass_doubts())
 
-    def conclude(self, clocks: ClockEvidence, rows: IntArray) -> None:
+    def conclude(self, clocks: ClockComparison, rows: IntArray) -> None:
         """The track ends: form a last opinion, and tell the `clocks` of the sensors `rows`."""
         self._form_if_due(0.0)
         if self.latest is not None:
@@ -156,13 +156,13 @@ class SecondOpinion:
             return
         since = (now.stamp_ns - peak.stamp_ns) / NS
         frames = [f for f in self._frames if self._is_of_pass(f)]
-        if since < self._due_s or len(frames) < LEAST_FRAMES:
+        if since < self._due_s or len(frames) < MIN_FRAMES:
             return
         self._due_s = AGAIN * since
         # The search starts from what the filter says now, and from what it said then.
         back = now.state.copy()
         back[:3] -= since * back[3:]
-        step = -(-len(frames) // MOST_FRAMES)
+        step = -(-len(frames) // MAX_FRAMES)
         found = fit_rigid_pass(self._network, frames[::step], peak.stamp_ns,
                                np.array([back, peak.state]))
         if found is None:

@@ -11,7 +11,7 @@ Source: TypeAlias = tuple[str, str]
 """(the device's name of the sensor, address)."""
 
 
-class SoleSource:
+class SingleSource:
     """The source that is taken for the only sensor: two of them at once would be neither.
 
     It is the first that is heard, until it is silent: a stray message that came before the device

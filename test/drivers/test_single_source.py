@@ -1,13 +1,13 @@
 """Which source is taken for a device's only sensor."""
 
-from mag_tracking.drivers.sole_source import RELEASED_S, SoleSource
+from mag_tracking.drivers.single_source import RELEASED_S, SingleSource
 
 DEVICE, STRAY = ('', '10.0.0.5'), ('', '10.0.0.66')
 S = 1_000_000_000
 
 
 def test_a_stray_message_before_the_device_does_not_keep_its_place():
-    source = SoleSource()
+    source = SingleSource()
     assert source.is_this(STRAY, 0)
     times = [round((0.1 + 0.1 * k) * S) for k in range(100)]
     accepted = [source.is_this(DEVICE, t) for t in times]
@@ -18,5 +18,5 @@ def test_a_stray_message_before_the_device_does_not_keep_its_place():
 
 
 def test_a_slow_device_keeps_its_place_where_nobody_else_sends():
-    source = SoleSource()
+    source = SingleSource()
     assert all(source.is_this(DEVICE, k * 60 * S) for k in range(5)) and source.changes == 0

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from mag_tracking.calibration.blocks import Block
 
 
-class Beginning:
+class LearningWindow:
     """Collects blocks until a quiet stretch of them is long enough."""
 
     def __init__(self, learn: float, length: float, most: int) -> None:
@@ -21,7 +21,7 @@ class Beginning:
         self._rested.clear()
         self._moved.clear()
 
-    def stretches(self, block: Block, is_stuck: bool) -> Iterator[deque[Block]]:
+    def segments(self, block: Block, is_stuck: bool) -> Iterator[deque[Block]]:
         """The stretches that are long enough with the next block, the best one first.
 
         `is_stuck` says whether no reading of it differs from another.

@@ -12,7 +12,7 @@ from mag_tracking.calibration.frequent_level import MORE
 from mag_tracking.calibration.level_change import NO_CHANGE, Judge, level_change
 from mag_tracking.units import NS
 
-LEAST_RELEARN_S = 10.0
+MIN_RELEARN_S = 10.0
 """[s] A background that was resumed, or seen for a moment only, gives way to another steady level
 after this time at the earliest."""
 
@@ -20,12 +20,12 @@ SOONER = 2.0 / 3.0
 """Where a vehicle has left, or a former level is back, the level has to last for this share of the
 usual time only."""
 
-MOST_JUDGED = 240
+MAX_JUDGED = 240
 """Blocks, a minute of the usual length, after which it is not judged any more whether something
 came or left: each judgement looks at all of them."""
 
 
-class Departure:
+class LevelDeparture:
     """Blocks that are off the background, since it froze.
 
     Attributes
@@ -87,12 +87,12 @@ class Departure:
         may have been moved, or its surroundings changed, since.
         """
         if relearns_soon:
-            return min(self._relearn or inf, max(self._learn, LEAST_RELEARN_S))
+            return min(self._relearn or inf, max(self._learn, MIN_RELEARN_S))
         if self.has_come:
             return self._relearn
         # A vehicle that stood there in the beginning may have left.
         return self._relearn and min(
-            self._relearn, max(self._learn, LEAST_RELEARN_S, MORE * seen_s))
+            self._relearn, max(self._learn, MIN_RELEARN_S, MORE * seen_s))
 
     def former_seen_s(self) -> float:
         """[s] For how long the level before the present one was seen, if the latest block is at it;
@@ -102,17 +102,17 @@ class Departure:
         is_at_it = former is not None and former.is_at(self.blocks[-1], self._level.limits)
         return former.seen_s if former is not None and is_at_it else 0.0
 
-    def has_left(self, latest: deque[Block]) -> bool | None:
+    def has_departed(self, latest: deque[Block]) -> bool | None:
         """Whether a vehicle that was in the background has left before the `latest` blocks; False:
         one has come; None: unknown. An answer is remembered.
         """
-        if self.has_come or not self._has_begin or len(self.blocks) > MOST_JUDGED:
+        if self.has_come or not self._has_begin or len(self.blocks) > MAX_JUDGED:
             return False if self.has_come else None
         blocks = stacked([*self._before, *self.blocks])
-        has_left = self._judge(level_change(
+        has_departed = self._judge(level_change(
             blocks, len(latest), self._level.at_all(blocks.time), self._state['noise_std'],
             int(self._state['first_ns']) / NS))
-        self.has_come = has_left is False
-        if has_left and self.former is None and self.freed_at is None:
+        self.has_come = has_departed is False
+        if has_departed and self.former is None and self.freed_at is None:
             self.freed_at = latest[0].time
-        return has_left
+        return has_departed

@@ -15,7 +15,7 @@ from mag_tracking.calibration.blocks import (
 )
 
 
-class QuietStretch:
+class QuietInterval:
     """The latest quiet blocks, a while behind the present: a target comes near gradually.
 
     Attributes

@@ -12,7 +12,7 @@ FAR_BEHIND = -30.0
 """[nats] Where something else explains a track so much better, it is no target at all."""
 
 
-class Explanation:
+class TargetBayesFactor:
     """Log of the Bayes factor of a target against something else.
 
     Attributes

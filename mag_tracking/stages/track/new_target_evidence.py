@@ -7,7 +7,7 @@ from mag_tracking.inference.latest_frames import LatestFrames
 from mag_tracking.units import NS
 
 FALSE_ALARM = 1e-3
-"""Probability that innovations as large as that of the latest frames are noise: a newcomer is then
+"""Probability below which the latest innovations are not noise, so that a new target is
 sought."""
 
 WINDOW_S, AGAIN_S = 0.25, 0.15
@@ -17,7 +17,7 @@ LONG_AGAIN_S, LONGER = 0.3, 1.5
 """[s] A long vehicle is compared with two so long after the last comparison; then after so many
 times as long."""
 
-LEAST_NATS, AGAIN_NATS, UNDECIDED_NATS = 10.0, 5.0, -5.0
+MIN_NATS, AGAIN_NATS, UNDECIDED_NATS = 10.0, 5.0, -5.0
 """Another explanation is believed if the frames are so much more probable with it; or, if less, by
 two comparisons in turn. If they are not much less probable with it, the track is in doubt."""
 
@@ -25,7 +25,7 @@ ODD, LONG = 'improbable innovations', 'a long vehicle'
 """Why a track is compared with other explanations."""
 
 
-class NewcomerEvidence:
+class NewTargetEvidence:
     """Whether a track is to be compared with one of a vehicle more.
 
     That is so where the latest innovations are improbable. A long vehicle explains two short ones
@@ -74,6 +74,6 @@ class NewcomerEvidence:
 
     def believes(self, log_odds: float) -> bool:
         """Whether another explanation is believed, given those compared before."""
-        believes = log_odds > LEAST_NATS or self._was_probable and log_odds > AGAIN_NATS
+        believes = log_odds > MIN_NATS or self._was_probable and log_odds > AGAIN_NATS
         self._was_probable = log_odds > AGAIN_NATS and not believes
         return believes

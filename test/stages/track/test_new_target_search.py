@@ -11,14 +11,14 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.stages.track.joint import SURE_NATS, Joint
 from mag_tracking.stages.track.member import in_order
-from mag_tracking.stages.track.newcomer_evidence import (
+from mag_tracking.stages.track.new_target_evidence import (
     AGAIN_NATS,
     AGAIN_S,
-    LEAST_NATS,
     LONG,
     LONG_AGAIN_S,
+    MIN_NATS,
     ODD,
-    NewcomerEvidence,
+    NewTargetEvidence,
 )
 from mag_tracking.stages.track.window_start import in_order_of, inserted, overlap_depth
 from mag_tracking.units import NS
@@ -30,7 +30,7 @@ PERIOD = round(0.08 * NS)
 
 def asked(nis, n=20, rejected=False, is_long=False):
     """[(frame, reason)] for which a track with innovations of this size is compared."""
-    evidence, found = NewcomerEvidence(), []
+    evidence, found = NewTargetEvidence(), []
     for k in range(n):
         evidence.add(nis, 6, k * PERIOD, rejected, is_long)
         reason = evidence.due(k * PERIOD)
@@ -58,8 +58,8 @@ def test_a_long_vehicle_is_compared_less_and_less_often():
 
 
 def test_what_is_less_probable_is_believed_the_second_time():
-    evidence, between = NewcomerEvidence(), 0.5 * (AGAIN_NATS + LEAST_NATS)
-    assert evidence.believes(LEAST_NATS + 0.1)
+    evidence, between = NewTargetEvidence(), 0.5 * (AGAIN_NATS + MIN_NATS)
+    assert evidence.believes(MIN_NATS + 0.1)
     assert [evidence.believes(odds) for odds in (between, between)] == [False, True]
     assert [evidence.believes(odds) for odds in (between, 0.0, between)] == [False] * 3
 
@@ -190,7 +190,7 @@ def meeting():
 def test_two_that_meet_keep_their_tracks(meeting):
     a_world, records, pipeline = meeting
     tracks = [r for r in records if isinstance(r, Track)]
-    assert {t.id for t in tracks} == {1, 2} and pipeline.track.counts['tracks of newcomers'] == 1
+    assert {t.id for t in tracks} == {1, 2} and pipeline.track.counts['tracks of new targets'] == 1
     score = busy_worlds.score([t for t in tracks if not t.ended],
                               [(a_world.t, p) for p in a_world.positions])
     assert score.is_found.all() and score.rms.max() <= 1.0, str(score)
@@ -224,7 +224,7 @@ def test_slow_sensors_that_take_turns_find_a_newcomer():
                           covariance=None if readings.covariance is None
                           else readings.covariance[order]))
     pipeline.flush()
-    assert pipeline.track.counts['tracks of newcomers'] == 1
+    assert pipeline.track.counts['tracks of new targets'] == 1
 
 
 def test_it_does_not_depend_on_how_the_readings_are_split(meeting):

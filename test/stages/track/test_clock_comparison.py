@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mag_tracking.stages.track.clock_evidence import MEMORY, ClockEvidence
+from mag_tracking.stages.track.clock_comparison import MEMORY, ClockComparison
 from mag_tracking.stages.track.rigid_pass import RigidPass
 
 TWO = np.arange(2)
@@ -18,7 +18,7 @@ def a_pass(offset, std=0.02, speed=15.0, misfit=1.0, reference=0, bent=100.0):
 
 
 def evidence(passes, rows=TWO, n_sensors=2):
-    clocks = ClockEvidence(n_sensors)
+    clocks = ClockComparison(n_sensors)
     for one in passes:
         clocks.add(one, rows)
     return clocks
@@ -103,7 +103,7 @@ def test_clocks_that_were_set_are_believed_after_some_passes():
 
 def test_clocks_are_compared_over_sensors_that_never_felt_the_same_vehicle():
     """Between the first and the second, and the second and the third; the third is ahead."""
-    clocks = ClockEvidence(3)
+    clocks = ClockComparison(3)
     for _ in range(5):
         clocks.add(a_pass(0.0), np.array([0, 1]))
         clocks.add(a_pass(0.2), np.array([1, 2]))

@@ -8,9 +8,9 @@ import pytest
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.stages.track import doubts
-from mag_tracking.stages.track.clock_evidence import ClockEvidence
+from mag_tracking.stages.track.clock_comparison import ClockComparison
+from mag_tracking.stages.track.cross_check import CrossCheck
 from mag_tracking.stages.track.rigid_pass import RigidPass
-from mag_tracking.stages.track.second_opinion import SecondOpinion
 from support import spoiler
 from support.bundled import LINEARISED_ONCE
 from support.passes import network_of
@@ -34,7 +34,7 @@ def heard(opinion, frames, path=STRAIGHT):
 
 
 def test_opinions_follow_the_closest_point_ever_more_rarely():
-    said = heard(SecondOpinion(ROAD), steady_frames(np.random.default_rng(1)))
+    said = heard(CrossCheck(ROAD), steady_frames(np.random.default_rng(1)))
     times = [t for (t, _, n), (_, _, before) in zip(said[1:], said[:-1], strict=True) if n > before]
     print(f'opinions at {times} s')
     assert min(times) > 0.0 and 2 <= len(times) <= 6
@@ -48,14 +48,14 @@ def test_opinions_follow_the_closest_point_ever_more_rarely():
     ({'change': lambda B: np.clip(B, -3e-7, 3e-7)}, STRAIGHT, doubts.NO_STEADY_PATH)])
 def test_what_the_whole_pass_tells_doubts_the_track(of_frames, path, expected):
     """Once it has passed, and for good."""
-    opinion = SecondOpinion(ROAD)
+    opinion = CrossCheck(ROAD)
     said = heard(opinion, steady_frames(np.random.default_rng(2), **of_frames), path)
     assert not said[15][1]
     assert all(expected in found for _, found, _ in said[-8:]) and opinion.is_doubtful
 
 
 def test_clocks_that_earlier_passes_found_apart_doubt_a_track_from_its_first_frame():
-    opinion = SecondOpinion(ROAD)
+    opinion = CrossCheck(ROAD)
     frame = steady_frames(np.random.default_rng(3))[0]
     opinion.add(frame, state_at(frame.stamp_ns / 1e9))
     assert opinion.doubts(0.1) == {doubts.CLOCKS_APART}
@@ -64,7 +64,7 @@ def test_clocks_that_earlier_passes_found_apart_doubt_a_track_from_its_first_fra
 
 
 def test_a_track_that_ends_tells_of_its_clocks():
-    clocks, opinion = ClockEvidence(2), SecondOpinion(ROAD)
+    clocks, opinion = ClockComparison(2), CrossCheck(ROAD)
     heard(opinion, steady_frames(np.random.default_rng(4), clocks=(0.3,)))
     for _ in range(2):
         opinion.conclude(clocks, np.arange(2))
@@ -73,16 +73,16 @@ def test_a_track_that_ends_tells_of_its_clocks():
 
 
 def test_no_frame_is_no_opinion():
-    opinion = SecondOpinion(ROAD)
+    opinion = CrossCheck(ROAD)
     assert opinion.doubts(1.0) == set()
-    clocks = ClockEvidence(2)
+    clocks = ClockComparison(2)
     opinion.conclude(clocks, np.arange(2))
     assert clocks.apart is None and not opinion.is_doubtful
 
 
 def test_a_long_track_is_judged_by_its_closest_point():
     """At 100 frames a second, and for half a minute after it."""
-    opinion, n, latest = SecondOpinion(ROAD), 0, None
+    opinion, n, latest = CrossCheck(ROAD), 0, None
     for frame in steady_frames(np.random.default_rng(6), clocks=(0.3,), period_s=0.01, until_s=30):
         opinion.add(frame, state_at(frame.stamp_ns / 1e9))
         found = opinion.doubts(0.0)
@@ -94,7 +94,7 @@ def test_a_long_track_is_judged_by_its_closest_point():
 
 def test_an_opinion_stands_where_later_frames_allow_none():
     """One of two sensors falls silent."""
-    opinion = SecondOpinion(ROAD)
+    opinion = CrossCheck(ROAD)
     frames = steady_frames(np.random.default_rng(7), clocks=(0.3,), until_s=6.0)
     for frame in frames:
         silent = frame.stamp_ns > 0.5e9
@@ -114,7 +114,7 @@ def test_it_can_be_switched_off():
     a_world = made('clocks 200 ms apart', 'clouds', 1)
     for on in (True, False):
         records, pipeline = tracks_of(a_world.readings, a_world.network,
-                                      **{'track.second_opinion': on})
+                                      **{'track.cross_check': on})
         assert any(doubts.CLOCKS_APART in t.doubts for t in records if isinstance(t, Track)) is on
         # Smoothed poses are of the whole track.
         assert all(t.ambiguous for t in records if isinstance(t, SmoothedPose)) is on
@@ -139,7 +139,7 @@ def test_the_third_car_past_a_wrong_clock_is_doubted_from_its_first_pose():
 
 def test_a_track_that_goes_another_way_than_its_pass_differs_by_that():
     """After the pass it still differs by what it did at its end."""
-    opinion = SecondOpinion(ROAD)
+    opinion = CrossCheck(ROAD)
     slow = np.where(np.arange(10) == 3, 14.0, STRAIGHT)
     away, states = [], []
     for frame in steady_frames(np.random.default_rng(9), until_s=6.0):
@@ -166,7 +166,7 @@ def test_a_track_that_goes_another_way_than_its_pass_differs_by_that():
 
 
 def test_before_the_pass_is_judged_smoothed_states_differ_by_what_they_do_at_its_begin():
-    opinion = SecondOpinion(ROAD)
+    opinion = CrossCheck(ROAD)
     heard(opinion, steady_frames(np.random.default_rng(9)))
     slow = np.where(np.arange(10) == 3, 14.0, STRAIGHT)
     states = [(round(t * 1e9), state_at(t, slow), np.eye(6)) for t in (-6.0, -4.5, -3.9, -3.0)]
@@ -178,7 +178,7 @@ def test_an_opinion_stays_one_of_its_own_peak():
     """The second two sensors feel the vehicle later, and more."""
     network = network_of([[0.0, -4.5, 0.0], [0.0, 4.5, 0.0], [12.0, -3.5, 0.0], [12.0, 3.5, 0.0]])
     path = np.where(np.arange(10) == 3, 8.0, np.where(np.arange(10) == 4, 0.0, STRAIGHT))
-    opinion, away, peaks = SecondOpinion(network), [], set()
+    opinion, away, peaks = CrossCheck(network), [], set()
     for frame in steady_frames(np.random.default_rng(3), network, path, until_s=4.0):
         state = state_at(frame.stamp_ns / 1e9, path)
         opinion.add(frame, state)
@@ -191,7 +191,7 @@ def test_an_opinion_stays_one_of_its_own_peak():
 
 
 def test_a_pass_that_begins_at_its_strongest_does_not_tell_where_the_vehicle_was():
-    opinion = SecondOpinion(ROAD)
+    opinion = CrossCheck(ROAD)
     late = [f for f in steady_frames(np.random.default_rng(2), until_s=3.0) if f.stamp_ns > 3e8]
     assert not any(found for _, found, _ in heard(opinion, late))
     assert len(opinion.latest.straight_paths) and not opinion.difference.any()
@@ -210,5 +210,5 @@ def test_what_leads_elsewhere_is_in_the_covariance_of_tracks_and_smoothed_poses(
     # Not before the pass.
     assert std.size and min(np.sqrt(r.covariance[0, 0]) for r in records
                             if isinstance(r, Track)) < 2.0
-    without, _ = tracks_of(a_world.readings, a_world.network, **{'track.second_opinion': False})
+    without, _ = tracks_of(a_world.readings, a_world.network, **{'track.cross_check': False})
     assert not any(r.covariance[0, 0] > 24.0 for r in without if isinstance(r, SmoothedPose))

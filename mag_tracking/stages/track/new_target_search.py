@@ -19,7 +19,7 @@ from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_vehicle import moment_directions
 from mag_tracking.stages.track.joint import Joint, are_felt_by_two
-from mag_tracking.stages.track.newcomer_evidence import ODD
+from mag_tracking.stages.track.new_target_evidence import ODD
 from mag_tracking.stages.track.reach import FELT, energy_of
 from mag_tracking.stages.track.relinearisation import Window
 from mag_tracking.stages.track.vehicle_state import VehicleState
@@ -41,7 +41,7 @@ KNOWN_ROWS, FIRST, SECOND = 2, 3, 2
 """Number of hypotheses of a tracked vehicle that are tried (one of several), and of paths of a
 first and of a second vehicle beside each."""
 
-NATS_KEPT, MOST_KEPT = 10.0, 12
+NATS_KEPT, MAX_KEPT = 10.0, 12
 """[nats] A kind is dropped if it is less probable than the best by more than this; and the number
 of kinds that are kept."""
 
@@ -51,17 +51,17 @@ ARRIVES = np.log(0.05)
 ELSEWHERE_M = 2.0
 """[m] A vehicle that is found nearer to its track than this was followed rightly."""
 
-MOST_TIMES = 5.0
+MAX_TIMES = 5.0
 """No vehicle is so many times faster, or stronger, than the largest of the settings."""
 
 WAS_LOST = np.log(0.01)
 """Log-probability that a vehicle has been elsewhere than its track for the whole window."""
 
 N_DISTANCES = 10
-"""Places on its line where a newcomer may be when the window begins."""
+"""Places on its line where a new target may be when the window begins."""
 
 
-class NewcomerSearch:
+class NewTargetSearch:
     """Explains a window with one vehicle more."""
 
     def __init__(self, bank: FilterBank, window: Window, filter_of: Callable[[int], BankFilter],
@@ -69,7 +69,7 @@ class NewcomerSearch:
                  ) -> None:
         """`bank` of a track of `n_targets` vehicles; `filter_of` makes the filter of so many.
 
-        The `reason` is that of `NewcomerEvidence.due`: nobody is sought beside a long vehicle, or
+        The `reason` is that of `NewTargetEvidence.due`: nobody is sought beside a long vehicle, or
         elsewhere, if the innovations are as they should be. Without `may_be_more` no vehicle is
         added.
         """
@@ -87,7 +87,7 @@ class NewcomerSearch:
             * len(settings.kinds) * len(moment_directions()) * N_DISTANCES))
 
     def find(self) -> Joint | None:
-        """The best explanation with a newcomer, or with a vehicle elsewhere; None where there is
+        """The best explanation with a new target, or with a vehicle elsewhere; None where there is
         none at all."""
         if not len(self._search.samples.t):
             return None
@@ -144,7 +144,7 @@ class NewcomerSearch:
         return order, of_track, before + of_track, paths
 
     def _leaders(self, rows: IntArray, log_w: FloatArray) -> list[int]:
-        """Which of the `rows` are tried with a newcomer: the best of each arrival and kind."""
+        """Which of the `rows` are tried with a new target: the best of each arrival and kind."""
         seen: set[tuple[int, ...]] = set()
         most = KNOWN_ROWS if self._n_targets == 1 else 1
         chosen: list[int] = []
@@ -196,7 +196,7 @@ class NewcomerSearch:
             known.log_w, self._filter_of(self._n_targets - 1))
 
     def _beside(self, known: KnownVehicles, replaced: int | None = None) -> list[WindowStart]:
-        """One vehicle beside known ones: a newcomer, or in place of vehicle `replaced`."""
+        """One vehicle beside known ones: a new target, or in place of vehicle `replaced`."""
         search = self._search.beside(known)
         return [start for theta in search.best(self._search.grid, FIRST)
                 for start in self._started(known, theta[None], search.moments(theta), replaced)]
@@ -238,7 +238,7 @@ class NewcomerSearch:
     def _kept(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
         """Those that explain the frames about as well as the best one; moved along."""
         _, _, log_w, paths = self._run(starts)
-        order = np.argsort(-log_w, kind='stable')[:MOST_KEPT]
+        order = np.argsort(-log_w, kind='stable')[:MAX_KEPT]
         return [replace(starts[k], path=paths[k]) for k in order.tolist()
                 if log_w[k] >= log_w.max() - NATS_KEPT]
 
@@ -283,8 +283,8 @@ class NewcomerSearch:
         for i in start.are_new:
             speed = np.hypot(*x[i * n + 3:i * n + 5])
             moment = np.linalg.norm(self._vehicles.hard_moments(x[i * n:]).sum(axis=0))
-            if not self._search.prior.slowest <= speed <= MOST_TIMES * max(settings.speeds) \
-                    or moment > MOST_TIMES * max(settings.moments):
+            if not self._search.prior.slowest <= speed <= MAX_TIMES * max(settings.speeds) \
+                    or moment > MAX_TIMES * max(settings.moments):
                 return False
         return True
 

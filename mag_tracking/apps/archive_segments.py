@@ -34,7 +34,7 @@ CutPass = tuple[int, PassData, tuple[str, ...]]
 
 
 @dataclasses.dataclass(frozen=True)
-class Piece:
+class FrameChunk:
     """Frames that follow each other, as arrays (n, ...), and the passes that ended with them."""
 
     stamp_ns: IntArray
@@ -58,21 +58,21 @@ class Piece:
                 int(self.degrees_of_freedom[k])), self.doubts.get(k)
 
 
-def read_stretch(path: Path) -> Iterator[Piece]:
-    """The pieces of a stretch that `StretchWriter` has written."""
+def read_segment(path: Path) -> Iterator[FrameChunk]:
+    """The pieces of a stretch that `SegmentWriter` has written."""
     with open(path, 'rb') as stream:
         while stream.peek(1):
             yield pickle.load(stream)
 
 
-class StretchWriter:
+class SegmentWriter:
     """Writes each stretch of a recording into a file of its own; memory stays bounded."""
 
     def __init__(self, folder: Path, lookback_s: float) -> None:
         """Files are `stretch-0.pickle`, ... in `folder`; a track looks `lookback_s` back."""
         self._folder = folder
         self._quiet_ns = int(max(lookback_s, QUIET_S) * NS)
-        self.n_stretches = self.n_frames = 0
+        self.n_segments = self.n_frames = 0
         # Frames and doubts: quiet ones that a track may look back to, and those of the stretch.
         self._recent: deque[tuple[FieldFrame, Doubts]] = deque()
         self._kept: list[tuple[FieldFrame, Doubts]] = []
@@ -118,7 +118,7 @@ class StretchWriter:
         """End the stretch, where there is one: the recording has ended, or it is quiet."""
         if self._kept or self._passes:
             self._write()
-        self.n_stretches += self._is_open
+        self.n_segments += self._is_open
         self._n_written, self._is_open = 0, False
 
     def _write(self) -> None:
@@ -133,8 +133,8 @@ class StretchWriter:
         arrays = {name: np.array([getattr(frame, name) for frame in frames]) for name in (
             'stamp_ns', 'field', 'covariance', 'n_samples', 'time_offset', 'target_present',
             'statistic', 'degrees_of_freedom')}
-        piece = Piece(**arrays, doubts=doubts, passes=tuple(self._passes))
-        path = self._folder / f'stretch-{self.n_stretches}.pickle'
+        piece = FrameChunk(**arrays, doubts=doubts, passes=tuple(self._passes))
+        path = self._folder / f'stretch-{self.n_segments}.pickle'
         try:
             with open(path, 'ab' if self._is_open else 'wb') as stream:
                 pickle.dump(piece, stream)

@@ -7,7 +7,7 @@ import pytest
 
 from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.records import FieldFrame
-from mag_tracking.stages.track.something_else import SomethingElse
+from mag_tracking.stages.track.disturbance_model import DisturbanceModel
 from support.networks import line_network
 
 NOISE = 4e-9
@@ -42,7 +42,7 @@ def slow(t, network, own):
 @pytest.mark.parametrize('own', [True, False])
 def test_it_tells_one_field_over_the_network_from_one_at_each_sensor(n_sensors, own):
     network = line_network(n_sensors)
-    model = SomethingElse(network, 2e-8)
+    model = DisturbanceModel(network, 2e-8)
     fields = slow(np.arange(0.0, 8.0, 0.08), network, own)
     # Backgrounds are known to two deviations.
     offsets = 2e-8 * np.random.default_rng(1).standard_normal((n_sensors, 3))
@@ -56,7 +56,7 @@ def test_a_gradient_over_the_network_is_one_field():
     G = np.array([[1.0, 0.5, 0.2], [0.5, -1.5, 0.3], [0.2, 0.3, 0.5]])
     wave = np.sin(np.arange(0.0, 8.0, 0.08))[:, None, None]
     shape = 2e-7 * np.array([1.0, -0.5, 0.7]) + 6e-9 * away @ G
-    model = SomethingElse(network, 2e-8)
+    model = DisturbanceModel(network, 2e-8)
     total(model, frames(network, wave * shape))
     assert model.uniform > 0.999
 
@@ -70,7 +70,7 @@ def test_the_faster_a_dipole_passes_the_worse_is_it_explained():
         passing = dipole_field(network.positions - r[:, None], np.array([200.0, 100.0, -300.0]))
         # Nothing is there at the beginning.
         passing -= passing[0]
-        explained.append(total(SomethingElse(network, 2e-8), frames(network, passing)[20:-20]))
+        explained.append(total(DisturbanceModel(network, 2e-8), frames(network, passing)[20:-20]))
     assert -np.diff(explained).max() > np.log(20.0)
 
 
@@ -79,21 +79,21 @@ def test_missing_axes_and_sensors_are_left_out():
     some = frames(network, slow(np.arange(0.0, 4.0, 0.08), network, True))
     without = [dataclasses.replace(f, field=np.where(
         [[False, False, True], [True, True, True]], np.nan, f.field)) for f in some]
-    of_two_axes = total(SomethingElse(network, 2e-8), without)
-    assert np.isfinite(of_two_axes) and of_two_axes < total(SomethingElse(network, 2e-8), some)
+    of_two_axes = total(DisturbanceModel(network, 2e-8), without)
+    assert np.isfinite(of_two_axes) and of_two_axes < total(DisturbanceModel(network, 2e-8), some)
     nothing = [dataclasses.replace(f, field=np.full((2, 3), np.nan)) for f in some]
-    assert total(SomethingElse(network, 2e-8), nothing) == 0.0
+    assert total(DisturbanceModel(network, 2e-8), nothing) == 0.0
 
 
 def test_the_first_frame_after_a_handover_is_not_compared():
     network = line_network(2)
     field = 1e-6 + slow(np.arange(0.0, 4.0, 0.08), network, True)
     some = frames(network, field)
-    model, none = SomethingElse(network, 2e-8, is_handover=True), np.zeros(2)
+    model, none = DisturbanceModel(network, 2e-8, is_handover=True), np.zeros(2)
     assert model.log_density(some[0], 0.0, none) is None
     # Then as if the field had not jumped: within what a fresh rate costs.
     rest = sum(model.log_density(f, 0.08, none) for f in some[1:])
-    before = SomethingElse(network, 2e-8)
+    before = DisturbanceModel(network, 2e-8)
     smooth = frames(network, field - 1e-6)
     before.log_density(smooth[0], 0.0, none)
     assert rest == pytest.approx(sum(before.log_density(f, 0.08, none) for f in smooth[1:]),
@@ -108,7 +108,7 @@ def test_it_stays_finite_over_gaps_where_sensors_are_turned(gap_s):
     turned = np.linalg.qr(rng.standard_normal((4, 3, 3)))[0]
     network = dataclasses.replace(network, R_ws=turned * np.sign(np.linalg.det(turned))[:, None,
                                                                                         None])
-    other = SomethingElse(network, 5e-9)
+    other = DisturbanceModel(network, 5e-9)
     C = np.tile(1.6e-17 * np.eye(3), (4, 1, 1))
     for k in range(2500):
         field = network.R_sw @ (1e-6 * np.sin(0.05 * k) * np.array([1.0, 0.5, -0.3])) \
