@@ -95,6 +95,11 @@ def main():
             process.terminate()
             process.wait(30.0)
     late = 1e3 * np.array(late[60:])
+    from bench.figures import Figures
+    figures = Figures('chain')
+    figures.keep('four bare nodes: pose after its readings, median', np.median(late), 'ms')
+    figures.keep('four bare nodes: pose after its readings, 99 %', np.quantile(late, 0.99), 'ms')
+    figures.save()
     print(f'{len(late)} poses of four bare nodes, after their readings were sent: median '
           f'{np.median(late):.1f} ms, p99 {np.quantile(late, 0.99):.1f} ms, worst '
           f'{late.max():.1f} ms')

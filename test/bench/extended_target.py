@@ -15,6 +15,7 @@ from pathlib import Path as FilePath
 import numpy as np
 from tqdm import tqdm
 
+from bench.figures import Figures
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.recording.reader import Recording
@@ -95,7 +96,7 @@ def one_pass(seed, kind, changes, flaws):
             bool(log.ambiguous[closest]))
 
 
-def simulated(pool, name, kind, changes, flaws, n=40):
+def simulated(figures, pool, name, kind, changes, flaws, n=40):
     """Print one line of the table: `n` passes of one kind."""
     jobs = [pool.submit(one_pass, seed, kind, changes, flaws) for seed in range(n)]
     found = [job.result() for job in tqdm(jobs, desc=name, disable=None, leave=False)]
@@ -105,6 +106,11 @@ def simulated(pool, name, kind, changes, flaws, n=40):
     anees, later = (np.array([e['anees'] for e in errors]) for errors in (filtered, smoothed))
     rms = np.array([(e['rms'], s['rms']) for e, s in zip(filtered, smoothed, strict=True)
                     if e['rms'] is not None])
+    for text, value, unit in (('RMS within 5 m', np.median(rms[:, 0]), 'm'),
+                              ('RMS within 5 m, smoothed', np.median(rms[:, 1]), 'm'),
+                              ('error at the closest point', np.median(closest), 'm'),
+                              ('ANEES', anees.mean(), '')):
+        figures.keep(f'{name}: {text}', value, unit, note=f'{len(sure)} of {n} passes')
     print(f'  {name}: {len(sure)} of {n} tracked and unambiguous; within 5 m RMS '
           f'{np.median(rms[:, 0]):.2f} m, smoothed {np.median(rms[:, 1]):.2f} m (ratio '
           f'{np.median(rms[:, 1] / rms[:, 0]):.2f}); at the closest point '
@@ -113,7 +119,7 @@ def simulated(pool, name, kind, changes, flaws, n=40):
           f'{later.mean():.1f}, {np.median(later):.1f}', flush=True)
 
 
-def grids(n=8, period=0.08):
+def grids(figures, n=8, period=0.08):
     """Print the errors of the bundled recordings for `n` beginnings of the grid of frames."""
     network = read_network(NETWORK)
     print(f'error at the closest point for {n} beginnings of the grid of frames')
@@ -129,6 +135,8 @@ def grids(n=8, period=0.08):
                 closest.append([pass_errors(log, truth, network.centre)['closest']
                                 for log in found])
         filtered, smoothed = np.array(closest).T
+        figures.keep(f'{path.stem}: error at the closest point, mean of {n} frame grids',
+                     filtered.mean(), 'm', note=f'{filtered.min():.2f} to {filtered.max():.2f} m')
         print(f'  {path.stem}: {len(closest)} of {n} tracked; mean {filtered.mean():.2f} m, '
               f'{filtered.min():.2f} .. {filtered.max():.2f} m; smoothed {smoothed.mean():.2f} m, '
               f'{smoothed.min():.2f} .. {smoothed.max():.2f} m', flush=True)
@@ -136,11 +144,13 @@ def grids(n=8, period=0.08):
 
 def main():
     """Print both studies."""
+    figures = Figures('extended_target')
     print('simulated vehicles, half of them turning')
     with ProcessPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
         for study in STUDIES:
-            simulated(pool, *study)
-    grids()
+            simulated(figures, pool, *study)
+    grids(figures)
+    figures.save()
     return 0
 
 

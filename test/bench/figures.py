@@ -1,10 +1,11 @@
-"""Figures that are remembered: what a benchmark measured, and what it was in the runs before.
+"""Benchmark results: the latest figures of each benchmark, and the history of all runs.
 
     PYTHONPATH=test python -m bench.figures
 
-Each benchmark puts its figures into `benchmarks/latest.json`. This command, the last of
-`make bench`, adds them to `benchmarks/history.jsonl`, one line a run, and names those that are
-worse than the best of the latest five runs by more than 15 %.
+Each benchmark writes its figures to `benchmarks/latest.json`, with commit, date and machine; the
+Benchmarks page of the documentation is generated from that file. This command, the last one of
+`make bench`, appends the figures to `benchmarks/history.jsonl`, one line per run, and lists those
+that are more than 15 % worse than the best of the latest five runs on the same kind of machine.
 """
 
 import datetime
@@ -26,29 +27,40 @@ RED, PLAIN = '\033[31m', '\033[0m'
 
 
 class Figures:
-    """The figures of one benchmark, by their names."""
+    """The figures of one benchmark, by name."""
 
     def __init__(self, benchmark):
         self._benchmark, self._figures, self.missed = benchmark, {}, 0
 
-    def add(self, name, value, unit, aim=None, more_is_better=False, note=''):
-        """Print a figure and keep it; `aim` is the worst that is good enough."""
+    def keep(self, name, value, unit='', aim=None, more_is_better=False, note=''):
+        """Record a figure; `aim` is the worst acceptable value. Returns whether it is missed."""
         # NaN reaches no aim.
         is_missed = aim is not None and not (value >= aim if more_is_better else value <= aim)
         self.missed += is_missed
         self._figures[name] = {'value': float(value), 'unit': unit, 'aim': aim,
-                               'more_is_better': more_is_better}
+                               'more_is_better': more_is_better, 'note': note.strip(' ()')}
+        return is_missed
+
+    def add(self, name, value, unit, aim=None, more_is_better=False, note=''):
+        """Record a figure and print it."""
+        is_missed = self.keep(name, value, unit, aim, more_is_better, note)
         text = '' if aim is None else f'; aim {"at least" if more_is_better else "at most"} {aim:g}'
         print(f'  {name}: {value:.4g} {unit}'.rstrip() + note + text
               + (' (missed)' if is_missed else ''), flush=True)
 
     def save(self):
-        """Put them to those of the other benchmarks; 1 where an aim is missed, else 0."""
+        """Write them beside those of the other benchmarks; 1 if an aim is missed, else 0."""
         FOLDER.mkdir(exist_ok=True)
         found = json.loads(LATEST.read_text()) if LATEST.exists() else {}
-        found[self._benchmark] = self._figures
+        found[self._benchmark] = run_facts() | {'figures': self._figures}
         LATEST.write_text(json.dumps(found, indent=1, sort_keys=True) + '\n')
         return int(self.missed > 0)
+
+
+def run_facts():
+    """Commit, date, machine and Python version of a run."""
+    return {'date': datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds'),
+            'commit': commit(), 'machine': machine(), 'python': platform.python_version()}
 
 
 def read_history():
@@ -106,15 +118,13 @@ def main():
     if not LATEST.exists():
         print('no benchmark has been run: there is no benchmarks/latest.json')
         return 1
-    figures = json.loads(LATEST.read_text())
+    figures = {name: run['figures'] for name, run in json.loads(LATEST.read_text()).items()}
     before = [run for run in read_history() if run['machine'] == machine()]
     found = worse(figures, before)
     for benchmark, name, figure, best in found:
         print(f'{RED}worse: {benchmark}: {name}: {figure["value"]:.4g} {figure["unit"]}, the best '
               f'of the latest runs was {best:.4g}{PLAIN}')
-    run = {'date': datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds'),
-           'commit': commit(), 'machine': machine(),
-           'python': platform.python_version(), 'figures': figures}
+    run = run_facts() | {'figures': figures}
     with HISTORY.open('a') as stream:
         stream.write(json.dumps(run, sort_keys=True) + '\n')
     compared = f'{len(found)} got worse' if before else \

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import least_squares
 
+from bench.figures import Figures
 from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.apps.replay import replay
 from mag_tracking.network.file import read_network
@@ -49,10 +50,13 @@ def replayed(network, changes):
         return replay(Recording(vehicle_path(NAME)), network, settings_for('vehicle', changes), out)
 
 
-def errors(network, changes):
-    """One line of the errors of the track."""
+def errors(network, changes, figures=None, name=''):
+    """One line with the errors of the track, which are also added to `figures`."""
     track, = replayed(network, changes).summary['tracks']
     truth, smoothed = track['truth'], track['smoothed']['truth']
+    if figures is not None:
+        figures.keep(f'{name}: error at the closest point', truth['closest'], 'm')
+        figures.keep(f'{name}: error at the closest point, smoothed', smoothed['closest'], 'm')
     return (f'closest {truth["closest"]:.2f} m, ANEES {truth["anees"]:.1f}; '
             f'smoothed {smoothed["closest"]:.2f} m')
 
@@ -101,9 +105,10 @@ def magnetic_centre(network, row):
 
 def main():
     """Print the table."""
+    figures = Figures('junction_error')
     for name, exact in (('network file', (False, False)), ('exact clocks', (False, True)),
                         ('exact mountings', (True, False)), ('both exact', (True, True))):
-        print(f'{name}: {errors(network_with(*exact), {})}', flush=True)
+        print(f'{name}: {errors(network_with(*exact), {}, figures, name)}', flush=True)
     for name, changes in SETTINGS.items():
         print(f'{name}: {errors(network_with(False, False), changes)}; '
               f'both exact: {errors(network_with(True, True), changes)}', flush=True)
@@ -113,6 +118,7 @@ def main():
         shape = f', half length {half:.2f} m' if len(row) > 1 else ''
         print(f'  {name}: {centre.round(2)} m{shape}, moments {moments.round()} A m^2, rear first; '
               f'normalised cost {cost:.2f}')
+    figures.save()
 
 
 if __name__ == '__main__':

@@ -23,6 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.figures import Figures
+
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 os.environ.setdefault('ROS_DOMAIN_ID', str(101 + os.getpid() % 100))
 ROOT = Path(__file__).resolve().parents[2]
@@ -179,12 +181,15 @@ def watch(processes, ear, executor, minutes):
     return rows
 
 
-def report(ear, rows):
-    """Print what was measured; (99 % quantile of the latency [ms], whether anything was lost)."""
+def report(ear, rows, figures, aim):
+    """Print and record the results; (99 % quantile of the latency [ms], whether any is lost)."""
     late = 1e3 * np.array(ear.latencies)
     if not len(late):
         print('no pose has come')
     else:
+        figures.keep('pose after the last sample of its frame, median', np.median(late), 'ms', aim)
+        figures.keep('pose after the last sample of its frame, 99 %', np.quantile(late, 0.99),
+                     'ms')
         print(f'{len(late)} poses, after the sample that completed the frame: median '
           f'{np.median(late):.1f} ms, p99 {np.quantile(late, 0.99):.1f} ms, '
           f'worst {late.max():.1f} ms')
@@ -203,7 +208,12 @@ def report(ear, rows):
         print(f'{node}: {100.0 * share:.1f} % of a core, {last[1][node][1]:.1f} MB, '
               f'{last[1][node][1] - minute[1][node][1]:+.1f} MB since the first minute')
     print(f'together: {100.0 * total:.1f} % of a core')
+    figures.keep('all nodes', 100.0 * total, '% of a core')
+    figures.keep('growth of the largest process after the first minute',
+                 max(last[1][node][1] - minute[1][node][1] for node in last[1]), 'MB')
     losses = ear.losses()
+    figures.keep('kinds of losses', len(losses), '', 0)
+    figures.save()
     print(f'lost: {losses or "nothing"}')
     for text, n in Counter(ear.troubles.values()).most_common(5):
         print(f'diagnostics of {n}: {text}')
@@ -225,6 +235,13 @@ def main():
     parser.add_argument('--pages', type=int, default=0, help='so many look at the live page')
     found = measure(parser.parse_args())
     return 1 if found is None else int(found[1])
+
+
+def name_of(args):
+    """The name of the benchmark with these options."""
+    return (f'load, {args.sensors} sensors'
+            + (', one process' if args.one_process else ', four processes')
+            + (f', {args.pages} pages' if args.pages else ''))
 
 
 def measure(args):
@@ -261,7 +278,9 @@ def measure(args):
     node.destroy_node()
     executor.shutdown()
     rclpy.try_shutdown()
-    return report(ear, rows) if rows else None
+    if not rows:
+        return None
+    return report(ear, rows, Figures(name_of(args)), 5.0 if args.one_process else 10.0)
 
 
 if __name__ == '__main__':

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from tqdm import tqdm
 
+from bench.figures import Figures
 from mag_tracking.inference.crlb import path_bound
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import MU0, sensor_fields
@@ -106,6 +107,7 @@ def one_run(target, seed):
 
 def main(n=200):
     """Print a line for each kind of target."""
+    figures = Figures('matched')
     print(f'{n} matched runs, two sensors, wide prior, the last half of each pass')
     with ProcessPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
         for target in TARGETS:
@@ -116,12 +118,18 @@ def main(n=200):
             ratios = []
             for share in (0.05, 0.1):
                 kept = np.argsort(size)[:round(n * (1.0 - share))]
-                ratios.append(f'{np.sqrt((error[kept]**2).mean() / (bound[kept]**2).mean()):.2f} '
-                              f'without the worst {share:.0%}')
+                ratio = np.sqrt((error[kept]**2).mean() / (bound[kept]**2).mean())
+                figures.keep(f'{target}: error over the path bound, without the worst {share:.0%}',
+                             ratio)
+                ratios.append(f'{ratio:.2f} without the worst {share:.0%}')
             median = np.median(size / np.sqrt((bound**2).mean(axis=1)))
+            figures.keep(f'{target}: error over the path bound, median of the runs', median)
+            figures.keep(f'{target}: failures (> 2 m at the end)',
+                         100.0 * np.mean(error[:, -1] > 2.0), '%')
             print(f'  {target}: error over path bound {", ".join(ratios)}, median of the runs '
                   f'{median:.2f}; failures (> 2 m at the end) {np.mean(error[:, -1] > 2.0):.1%}',
                   flush=True)
+    figures.save()
     return 0
 
 

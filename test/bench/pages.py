@@ -11,6 +11,7 @@ import sys
 
 import numpy as np
 
+from bench.figures import Figures
 from bench.load import measure
 
 PAGES, MAX_WORSE = 10, 1.10
@@ -37,6 +38,10 @@ def main():
     print(f'99 % of the poses within {without:.1f} ms, with {PAGES} pages within '
           f'{with_pages:.1f} ms: {with_pages / without:.2f} times (aim {MAX_WORSE}); '
           f'{"something" if lost else "nothing"} was lost')
+    figures = Figures('pages')
+    figures.keep(f'99 % latency with {PAGES} pages over that without', with_pages / without,
+                 'times', MAX_WORSE)
+    figures.save()
     return int(lost or not with_pages <= MAX_WORSE * without)
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from bench.figures import Figures
 from mag_tracking.apps.replay import replay
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
@@ -147,6 +148,11 @@ def main():
     if given.json:
         print(json.dumps(found))
         return 0
+    results = Figures('recordings')
+    for name, figures in found.items():
+        for figure, value in figures.items():
+            results.keep(f'{name}: {figure}', value)
+    results.save()
     before = measured_by(given.against) if given.against else {}
     n_worse = 0
     for name, figures in found.items():

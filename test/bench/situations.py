@@ -1,15 +1,12 @@
-"""`make bench`: how often poses without a flag are wrong, in situations that no model assumes.
-
-`--write` keeps the table in docs/situations.md, with the number of runs that it is of.
-"""
+"""`make bench`: how often poses without a flag are wrong, in situations that no model assumes."""
 
 import argparse
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 
+from bench.figures import Figures
 from bench.two_simulators import count_over
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.stages.track.member import Member
@@ -17,19 +14,18 @@ from mag_tracking.stages.track.running_track import RunningTrack
 from support.random_passes import SIMULATORS
 from support.situations import SITUATIONS, made, verdict
 
-PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'situations.md'
 MIN_EVENTS = 0.9
 """Share of the runs with a detection, and without a vehicle, that leave a disturbance."""
 MAX_COST = 0.1
-"""Share of a tracked frame that "something else" and the tests may take."""
+"""Share of a tracked frame that the disturbance model and the tests may take."""
 
 HEAD = """# Situations
 
-Written by `PYTHONPATH=test .venv/bin/python -m bench.situations --write`; do not edit. Simulated
-worlds that the tracker's model does not assume, past two sensors 9 m apart unless said, live (no
-first pass), {n} runs of each of two simulators: clouds of magnetised points, and boxes of sheets
-with imperfect sensors. A published pose without the `ambiguous` flag is wrong if it is off by more
-than 2 m and three stated deviations from every vehicle. Without a vehicle every such pose is wrong.
+Simulated worlds that the tracker's model does not assume, past two sensors 9 m apart unless
+stated, live (no prescan), {n} runs of each of two simulators: clouds of magnetised points, and
+boxes of sheets with imperfect sensors. A published pose without the `ambiguous` flag is wrong if it
+is more than 2 m and three standard deviations from every vehicle. Without a vehicle every such
+pose is wrong.
 
 | situation | poses | without a flag | of them wrong | smoothed, wrong | disturbances | aim |
 |---|---|---|---|---|---|---|
@@ -54,13 +50,23 @@ def row(name, found):
             f'{with_events} of {detected} detected | {aim:.0%}{missed} |')
 
 
+def keep(figures, name, found):
+    """Record the share of wrong poses of a situation; whether its aim is missed."""
+    sure, wrong = sum(v.n_sure for v in found), sum(v.n_wrong for v in found)
+    if not sure:
+        return False
+    n = sum(len(v.wrong) for v in found)
+    return figures.keep(f'{name}: wrong', 100.0 * wrong / sure, '%',
+                        100.0 * SITUATIONS[name].aim, note=f'{wrong} of {sure}; {n} poses in all')
+
+
 def n_events(found):
     """(runs with a disturbance, runs with a detection) of `Verdict`s."""
     return sum(v.n_disturbances > 0 for v in found), sum(v.n_tracks > 0 for v in found)
 
 
 def cost():
-    """Share of a tracked frame that "something else" and the tests take."""
+    """Share of a tracked frame that the disturbance model and the tests take."""
     spent = {'_weigh': 0.0, '_doubts': 0.0, 'step': 0.0}
     owner = {'_weigh': RunningTrack, '_doubts': Member, 'step': RunningTrack}
 
@@ -96,35 +102,41 @@ def main():
     parser.add_argument('--runs', type=int, default=5, help='of each simulator')
     parser.add_argument('--only', nargs='+', default=list(SITUATIONS), choices=list(SITUATIONS),
                         metavar='SITUATION')
-    parser.add_argument('--write', action='store_true', help=f'write {PAGE.name}')
     given = parser.parse_args()
-    rows, everything = [], []
+    figures, everything, missed = Figures('situations'), [], []
 
     def summary(name, found):
         everything.extend(found)
-        rows.append(row(name, found))
-        return rows[-1], 'missed' not in rows[-1]
+        missed.append(keep(figures, name, found))
+        return row(name, found), not missed[-1]
 
     print(HEAD.format(n=given.runs), end='')
     status = count_over([(name,) for name in given.only], both_simulators, 2 * given.runs, summary)
-    end = summary_of(list(zip(np.repeat(given.only, 2 * given.runs), everything, strict=True)))
-    print(end)
-    if given.write:
-        PAGE.write_text(HEAD.format(n=given.runs) + '\n'.join(rows) + '\n' + end, encoding='utf-8')
+    print(summary_of(figures,
+                     list(zip(np.repeat(given.only, 2 * given.runs), everything, strict=True))))
+    if given.only == list(SITUATIONS):
+        figures.save()
     return status
 
 
-def summary_of(found):
+def summary_of(figures, found):
     """The text below the table, of [(situation, `Verdict`)]."""
     one = [v for name, v in found if SITUATIONS[name].group != 'several']
     nothing = [v for name, v in found if SITUATIONS[name].group == 'nothing']
     sure, wrong = sum(v.n_sure for v in one), sum(v.n_wrong for v in one)
     events, detected = n_events(nothing)
+    figures.keep('all with one vehicle or none: wrong', 100.0 * wrong / max(sure, 1), '%', 0.5,
+                 note=f'{wrong} of {sure}')
+    figures.keep('without a vehicle: runs with a disturbance', events / max(detected, 1), '',
+                 MIN_EVENTS, True, note=f'{events} of {detected}')
+    share_of_frame = cost()
+    figures.keep('disturbance model and tests, share of a frame', 100.0 * share_of_frame, '%',
+                 100.0 * MAX_COST)
     return (f'\nWithout a vehicle, {events} of {detected} runs with a detection leave a '
             f'disturbance (aim {MIN_EVENTS:.0%}). All situations with one vehicle or none: '
             f'{share(wrong, sure)} of {sure} poses without a flag are wrong (aim 0.5 %). '
-            f'"Something else" and the tests take {cost():.1%} of a tracked frame (aim at most '
-            f'{MAX_COST:.0%}).\n')
+            f'The disturbance model and the tests take {share_of_frame:.1%} of a tracked frame '
+            f'(aim at most {MAX_COST:.0%}).\n')
 
 
 def both_simulators(name, run):

@@ -6,7 +6,9 @@ first pass looks for a quiet stretch. A flagged or missing track is no error her
 
 import argparse
 import sys
+from functools import partial
 
+from bench.figures import Figures
 from bench.two_simulators import MAX_WRONG, count_over, share_of_wrong
 from support import spoiler
 from support.dense_traffic import dense_traffic
@@ -47,12 +49,14 @@ def spoilt_pass(what, simulator, kind, seed):
     return one_random_pass(simulator, kind, seed, faults=spoil_with(what))
 
 
-def summary(what, simulator, kind, found):
+def summary(figures, what, simulator, kind, found):
     """(line, whether the aim is met) of the `Tracked` of one product."""
-    _, share = share_of_wrong(found)
+    n_sure, share = share_of_wrong(found)
     n_tracked = sum(len(f.error) > 0 for f in found)
     right = sum(bool(f.heading > HEADING) for f in found)
-    met = share <= MAX_WRONG
+    met = not figures.keep(f'{what}; {simulator}, {kind}: sure and wrong', 100.0 * share, '%',
+                           100.0 * MAX_WRONG, note=f'of {n_sure} poses')
+    figures.keep(f'{what}; {simulator}, {kind}: tracked', n_tracked / len(found), '', None, True)
     return (f'  {what:27s} {simulator}, {kind}: {sum(f.detected for f in found):2d} of '
             f'{len(found)} detected, {n_tracked:2d} tracked, {right:2d} in the right direction; '
             f'{sum((~f.ambiguous).any() for f in found):2d} somewhere sure, sure and wrong '
@@ -68,8 +72,11 @@ def main():
     given = parser.parse_args()
     print(f'{given.passes} random passes of each product, two sensors, 100 Hz; the aim is at most '
           f'{MAX_WRONG:.0%} sure and wrong')
-    return count_over([(w, s, k) for w in FAULTS for s in SIMULATORS for k in given.kinds],
-                      spoilt_pass, given.passes, summary)
+    figures = Figures('spoilt_passes')
+    status = count_over([(w, s, k) for w in FAULTS for s in SIMULATORS for k in given.kinds],
+                        spoilt_pass, given.passes, partial(summary, figures))
+    figures.save()
+    return status
 
 
 if __name__ == '__main__':

@@ -7,10 +7,12 @@ import argparse
 import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 
 import numpy as np
 from tqdm import tqdm
 
+from bench.figures import Figures
 from support.random_passes import KINDS, SIMULATORS, one_random_pass
 
 MAX_NEES = {'truck': 5.0, 'car': 2.5, 'turning': 2.5}
@@ -37,7 +39,7 @@ def count_over(products, one_pass, n, summary):
     return 0 if met else 1
 
 
-def summary(simulator, kind, found):
+def summary(figures, simulator, kind, found):
     """(line, whether the aims are met) of the `Tracked` of one kind of one simulator."""
     sure = [f for f in found if (~f.ambiguous).any()]
     near = [~f.ambiguous & (f.distance < 5.0) for f in sure]
@@ -49,7 +51,16 @@ def summary(simulator, kind, found):
     n_sure, share = share_of_wrong(sure)
     n_smoothed = sum(f.smoothed_sure for f in found)
     smoothed = sum(f.smoothed_wrong for f in found) / max(n_smoothed, 1)
-    met = share <= MAX_WRONG and nees.mean() <= MAX_NEES[kind] and within >= MIN_SPEED
+    name = f'{simulator}, {kind}'
+    missed = [
+        figures.keep(f'{name}: sure and wrong', 100.0 * share, '%', 100.0 * MAX_WRONG,
+                     note=f'of {n_sure} poses'),
+        figures.keep(f'{name}: NEES per axis within 5 m, mean', nees.mean(), '', MAX_NEES[kind]),
+        figures.keep(f'{name}: speed within 10 %', 100.0 * within, '%', 100.0 * MIN_SPEED, True)]
+    figures.keep(f'{name}: median error at the closest point', np.median(closest), 'm')
+    figures.keep(f'{name}: smoothed, sure and wrong', 100.0 * smoothed, '%',
+                 note=f'of {n_smoothed} poses')
+    met = not any(missed)
     return (f'  {simulator}, {kind}: {len(sure)} of {len(found)} tracked and somewhere '
             f'unambiguous; {n_sure} such poses, sure and wrong {share:.1%} (aim 1 %), in '
             f'{sum(f.sure_and_wrong.any() for f in sure)} passes; within 5 m NEES an axis mean '
@@ -65,7 +76,11 @@ def main():
     parser.add_argument('--passes', type=int, default=40)
     n = parser.parse_args().passes
     print(f'{n} random passes of each kind of each simulator, two sensors, 100 Hz')
-    return count_over([(s, k) for s in SIMULATORS for k in KINDS], one_random_pass, n, summary)
+    figures = Figures('two_simulators')
+    status = count_over([(s, k) for s in SIMULATORS for k in KINDS], one_random_pass, n,
+                        partial(summary, figures))
+    figures.save()
+    return status
 
 
 if __name__ == '__main__':
