@@ -230,7 +230,7 @@ def main():
     parser.add_argument('--one-process', action='store_true',
                         help='the nodes in one process, as `mag-tracking run` has them')
     parser.add_argument('--lean', action='store_true', help='126 hypotheses')
-    parser.add_argument('--in-turn', action='store_true',
+    parser.add_argument('--sequential', action='store_true',
                         help='the sensors measure one after the other, not all at the same time')
     parser.add_argument('--pages', type=int, default=0, help='so many look at the live page')
     found = measure(parser.parse_args())

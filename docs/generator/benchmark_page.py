@@ -1,0 +1,79 @@
+"""The Benchmarks page, from `benchmarks/latest.json`."""
+
+import ast
+import json
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+LATEST = ROOT / 'benchmarks' / 'latest.json'
+
+
+class Numbers(dict):
+    """Figures of one benchmark by name; an unknown name is an error of the build."""
+
+    def __missing__(self, name):
+        raise KeyError(f'benchmarks/latest.json has no figure {name!r}; it has {sorted(self)}')
+
+
+def text_of(figure):
+    """A figure as text, with its unit."""
+    value, unit = figure['value'], figure['unit']
+    return f'{value:.3g} {unit}'.strip() if abs(value) < 1000.0 else f'{value:.0f} {unit}'.strip()
+
+
+def benchmark_figures():
+    """{benchmark: {figure: text}}, for the text of other pages."""
+    latest = json.loads(LATEST.read_text(encoding='utf-8'))
+    return Numbers({name: Numbers({f: text_of(value) for f, value in run['figures'].items()})
+                    for name, run in latest.items()})
+
+
+def description_of(name):
+    """The module docstring of a benchmark, without its command."""
+    module = {'bank': 'bench'}.get(name, name).split(',')[0]
+    source = ROOT / 'test' / 'bench' / f'{module}.py'
+    text = ast.get_docstring(ast.parse(source.read_text(encoding='utf-8')))
+    paragraphs = [p for p in text.split('\n\n') if not p.startswith('    ')]
+    return module, '\n\n'.join(paragraphs).removeprefix('`make bench`: ')
+
+
+def benchmark_page():
+    """Markdown: one section per benchmark."""
+    latest = json.loads(LATEST.read_text(encoding='utf-8'))
+    n = sum(len(run['figures']) for run in latest.values())
+    aims = [f for run in latest.values() for f in run['figures'].values() if f['aim'] is not None]
+    lines = ['# Benchmarks', '',
+             f'`make bench` measures these {n} figures and writes them to `benchmarks/latest.json`, from '
+             f'which this page is generated. {sum(map(is_met, aims))} of {len(aims)} figures with an aim '
+             'meet it. An aim is what theory or a user asks for, not what was once reached. '
+             '`benchmarks/history.jsonl` has all earlier runs.', '',
+             'Simulators: *clouds* are clouds of magnetised points, *boxes* are magnetised sheets with '
+             'imperfect sensors. *Wrong* poses carry no flag, and are more than 2 m and more than three '
+             'standard deviations from every vehicle.', '']
+    for name, run in sorted(latest.items()):
+        module, text = description_of(name)
+        text = text[:1].upper() + text[1:]
+        lines += [f'## {name}', '', text, '',
+                  f'`PYTHONPATH=test .venv/bin/python -m bench.{module}`, commit {run["commit"]}, '
+                  f'{run["date"][:10]}, {run["machine"]}, Python {run["python"]}.', '',
+                  '| figure | measured | aim | met | remark |', '|---|---|---|---|---|']
+        for figure, value in run['figures'].items():
+            lines.append('| {} | {} | {} | {} | {} |'.format(
+                figure.replace('|', '\\|'), text_of(value), aim_of(value),
+                '' if value['aim'] is None else 'yes' if is_met(value) else '**no**',
+                value.get('note', '')))
+        lines.append('')
+    return '\n'.join(lines)
+
+
+def is_met(figure):
+    """Whether a figure meets its aim."""
+    value, aim = figure['value'], figure['aim']
+    return value >= aim if figure['more_is_better'] else value <= aim
+
+
+def aim_of(figure):
+    """The aim as text."""
+    if figure['aim'] is None:
+        return ''
+    return f'{"≥" if figure["more_is_better"] else "≤"} {figure["aim"]:g} {figure["unit"]}'.strip()

@@ -1,0 +1,67 @@
+"""Reference pages of the settings: parameters, drivers file, ambiguity, archive tables."""
+
+from mag_tracking.drivers.configuration import settings_by_kind
+from mag_tracking.pipeline import Settings, settings_for
+from mag_tracking.recording.archive_tables import TABLES
+from mag_tracking.settings import flatten, to_reference
+from mag_tracking.stages.track.doubts import MEANINGS
+
+
+def settings_pages():
+    """{file name: Markdown}."""
+    return {'parameters.md': parameters(), 'drivers.md': drivers(), 'doubts.md': doubts(),
+            'archive_tables.md': archive_tables()}
+
+
+def parameters():
+    """All settings of the pipeline, one table per stage."""
+    lines = ['# Parameters', '',
+             'Every setting of the pipeline, for parameter files (`--params`), `settings=` in Python and '
+             'ROS parameters. {doc}`/guides/own_recording` shows how to set them. Nodes read them once, '
+             'when they start; those marked *live* may change while a node runs.', '']
+    rows = to_reference(Settings()).splitlines()
+    head, body = rows[:2], rows[2:]
+    groups = {}
+    for row in body:
+        name = row.split('`')[1]
+        group = '.'.join(name.split('.')[:-1])
+        groups.setdefault(group, []).append(row)
+    for group, some in groups.items():
+        lines += [f'## {group}', '', *head, *some, '']
+    default = {p.name: p.value for p in flatten(Settings())}
+    lines += ['## Defaults for a magnet', '', '`target: magnet` (`--target magnet`) changes these '
+              'defaults.', '', '| parameter | vehicle | magnet |', '|---|---|---|']
+    lines += [f'| `{p.name}` | `{default[p.name]}` | `{p.value}` |'
+              for p in flatten(settings_for('magnet')) if p.value != default[p.name]]
+    return '\n'.join(lines) + '\n'
+
+
+def drivers():
+    """All settings of a drivers file, one table per transport, framing and device."""
+    lines = ['# Drivers file', '', 'Every setting of a drivers file. {doc}`/guides/connect_sensors` '
+             'explains what they are for.', '']
+    for group, settings in settings_by_kind().items():
+        lines += [f'## {group or "Every device"}', '', to_reference(settings, live=False)]
+    return '\n'.join(lines)
+
+
+def doubts():
+    """The reasons of an ambiguous pose."""
+    return '\n'.join(
+        ['# Reasons for an ambiguous pose', '', 'A pose is `ambiguous` while at least one of these '
+         'reasons applies. They are listed in the field `doubts` of a `Track` message, in the column '
+         '`doubts` of `poses.csv`, and with the number of poses in `summary.json`. '
+         '{doc}`/concepts/uncertainty` explains what the flag promises.', '',
+         '| reason | meaning |', '|---|---|',
+         *(f'| `{name}` | {meaning} |' for name, meaning in MEANINGS.items())]) + '\n'
+
+
+def archive_tables():
+    """The columns of an archive."""
+    lines = ['# Tables of an archive', '', 'Columns of the Parquet tables that `mag-tracking archive` '
+             'writes ({doc}`/guides/archive`). Unknown values are null. The unit and the meaning of each '
+             'column are also stored in the metadata of the files.', '']
+    for table, columns in TABLES.items():
+        lines += [f'## {table}', '', '| column | unit | meaning |', '|---|---|---|',
+                  *(f'| `{c.name}` | {c.unit} | {c.meaning} |' for c in columns), '']
+    return '\n'.join(lines)

@@ -1,0 +1,17 @@
+"""
+Published figures: number of dipoles (TSP14)
+============================================
+
+Normalised cost of the fit over the number of dipoles for the bundled passes, as in Figure 7 of Wahlström
+and Gustafsson (2014).
+"""
+
+# %%
+import tsp14_model_order as tsp14
+
+from mag_tracking.report.fit_figures import order_figure
+
+rate = next(iter(tsp14.RATES))
+found = tsp14.passes(rate)
+figure = order_figure(found)
+title = figure.axes[0].set_title(f'simulated passes at {rate} (filled: selected order)')
