@@ -20,7 +20,7 @@ MAX_TRACKS = 1_000
 """Maximum number of tracks in a report."""
 MIN_POSES, TRACK_SIZE = 4, 2_500
 """Minimum number of poses per track, and its size in bytes without poses."""
-WIDEST = 6.0
+MAX_EXTENT = 6.0
 """Limit of the map on each side of the network, in spans of the network."""
 MIN_REACH_M = 10.0
 """[m] Limit of the map for a single sensor."""
@@ -59,7 +59,7 @@ def scene_of(network: Sensors, begin_ns: int, end_ns: int,
     xy = network.positions[:, :2]
     low, high = xy.min(axis=0), xy.max(axis=0)
     span = float((high - low).max())
-    far = WIDEST * span if span > 0.0 else MIN_REACH_M
+    far = MAX_EXTENT * span if span > 0.0 else MIN_REACH_M
     spare = 0.15 * span if span > 0.0 else 1.0
     factor, unit = scale_of(span if span > 0.0 else MIN_REACH_M)
     return {'frame': network.frame, 'begin_ns': str(begin_ns), 'begin': 0.0,
@@ -86,7 +86,7 @@ def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
     return np.sort(np.argsort(-strength, kind='stable')[:most])
 
 
-def most_poses_of(logs: Sequence[TrackLog], most_bytes: int = MAX_BYTES) -> int:
+def max_poses_of(logs: Sequence[TrackLog], most_bytes: int = MAX_BYTES) -> int:
     """Number of poses per track that keeps the size of a report below `most_bytes`, about."""
     lengths = np.array([len(log.stamp_ns) for log in logs])
     sizes = np.array([_pose_size(log) for log in logs])
@@ -109,12 +109,12 @@ def _pose_size(log: TrackLog) -> int:
 
 
 def thinned(log: TrackLog, most: int) -> list[int]:
-    """Numbers of at most `most` poses, evenly spaced; the first, last and surest are included."""
+    """Numbers of at most `most` poses, evenly spaced; the first, last and most_certain are included."""
     n = len(log.stamp_ns)
     if n <= most:
         return list(range(n))
     rows = np.linspace(0, n - 1, most - 1).round().astype(int)
-    return sorted({*rows.tolist(), log.surest()})
+    return sorted({*rows.tolist(), log.most_certain()})
 
 
 def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,

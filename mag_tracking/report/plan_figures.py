@@ -146,7 +146,7 @@ def sensor_figure(plan: _Plan) -> Figure:
     possible = np.isfinite(gain).any()
     figure, axes, f, unit = _map(
         plan, f'Where one more sensor helps: the median bound near the sensors is now '
-        f'{f_text(plan.without)}')
+        f'{length_text(plan.without)}')
     ny, nx = gain.shape
     x, y = np.linspace(plan.x[0], plan.x[-1], nx), np.linspace(plan.y[0], plan.y[-1], ny)
     mesh = axes.pcolormesh(f * x, f * y, 100.0 * gain, cmap='cividis', shading='nearest',
@@ -156,18 +156,18 @@ def sensor_figure(plan: _Plan) -> Figure:
     best = plan.best_place
     axes.plot(f * best[0], f * best[1], 'r*', ms=15, mec='w', clip_on=False, zorder=6,
               label=f'best: ({f * best[0]:.3g}, {f * best[1]:.3g}) {unit}, then '
-              f'{f_text(np.nanmin(plan.with_one_more))}')
+              f'{length_text(np.nanmin(plan.with_one_more))}')
     axes.legend(fontsize=9, loc='upper right')
     figure.colorbar(mesh, ax=axes, label='smaller by [%]')
     return figure
 
 
-def f_text(metres: float) -> str:
+def length_text(metres: float) -> str:
     """A length in a readable unit."""
     return f'{metres:.3g} m' if metres >= 0.01 else f'{1e3 * metres:.2g} mm'
 
 
-def distinct(lanes: Sequence[_Lane]) -> list[tuple[str, _Lane]]:
+def distinct_lanes(lanes: Sequence[_Lane]) -> list[tuple[str, _Lane]]:
     """[(names, lane)], one for lanes whose curves are the same: one would hide the other."""
     out: list[tuple[list[str], _Lane]] = []
     for lane in lanes:
@@ -187,7 +187,7 @@ def lane_figure(plan: _Plan) -> Figure:
     figure = Figure(figsize=(10.0, 9.0), layout='constrained')
     top, middle, bottom = figure.subplots(3, 1)
     f, unit = scale_of(np.ptp(plan.x))
-    for k, (name, lane) in enumerate(distinct(plan.lanes)):
+    for k, (name, lane) in enumerate(distinct_lanes(plan.lanes)):
         colour = SERIES[k % len(SERIES)]
         top.semilogy(f * lane.along, f * lane.filter_std, '-', color=colour,
                      label=f'{name}: filter so far')

@@ -3,7 +3,7 @@
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-FEW_DECADES = 1.5
+MINOR_LABEL_DECADES = 1.5
 """Range below which a logarithmic axis has labels between the powers of ten."""
 
 
@@ -20,4 +20,5 @@ def plain_log_ticks(axes: Axes) -> None:
     if low <= 0.0 or high / low > 1e6:
         return
     axes.yaxis.set_major_formatter(plain)
-    axes.yaxis.set_minor_formatter(plain if high / low < 10.0**FEW_DECADES else NullFormatter())
+    axes.yaxis.set_minor_formatter(
+        plain if high / low < 10.0**MINOR_LABEL_DECADES else NullFormatter())

@@ -96,7 +96,7 @@ class TrackLog:
         seconds: FloatArray = (stamps - stamps[0]) / 1e9
         return seconds
 
-    def surest(self) -> int:
+    def most_certain(self) -> int:
         """Index of the pose at which most is known: what is said of the whole is read there.
 
         By the horizontal position of a magnet, and the velocity of a vehicle: its position may
@@ -107,8 +107,8 @@ class TrackLog:
                               for C in self.covariance]))
 
     def mounting_of(self, names: Sequence[str]) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """{sensor: (angles (3,), their deviations (3,)) [deg]} at the surest pose; may be empty."""
-        k = self.surest()
+        """{sensor: (angles (3,), their deviations (3,)) [deg]} at the most_certain pose; may be empty."""
+        k = self.most_certain()
         return {name: (np.degrees(a), np.degrees(sd)) for name, a, sd in
                 zip(names, self.mounting[k], self.mounting_std[k], strict=False)}
 
@@ -125,10 +125,10 @@ class TrackLog:
     def summary(self) -> dict[str, Any]:
         """The track in a few JSON-ready numbers.
 
-        Speed and moment are those of the `surest` pose; arrival and kind those of the last one.
+        Speed and moment are those of the `most_certain` pose; arrival and kind those of the last one.
         The verdict is `unique` where neither is ambiguous.
         """
-        sure = self.surest()
+        sure = self.most_certain()
         final = self.arrivals[-1]
         arrival = max(final, key=lambda name: final[name][0])
         nis = np.array(self.nis) / np.maximum(1, self.degrees_of_freedom)

@@ -12,7 +12,7 @@ MAX_GAP_S = 5.0
 """[s] Frames further apart than this observe nothing between them."""
 
 
-class Intervals:
+class TrafficIntervals:
     """Summaries of equal intervals, each as soon as no passage of it can come any more."""
 
     def __init__(self, line_names: Sequence[str], interval_s: float,

@@ -17,16 +17,16 @@ from mag_tracking.stages.track.observation import SAME_TIME_S, Observation
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.unobserved_length import CAR_ROW
 
-LINEAR = 0.25
+LINEAR_SHARE = 0.25
 """A field is about linear in the position over this share of the distance to the nearest sensor:
 the cube of that distance changes by a factor of two."""
 
-ONE_TIME = 0.05
+SAME_TIME_SHARE = 0.05
 """A frame that is shorter than this share of the time since the frame before is one time, and so
 is the first of a track: velocities are better learnt from frame to frame than within one."""
 
 
-class Along(NamedTuple):
+class PathResult(NamedTuple):
     """What came of `BankFilter.run_along`, for each hypothesis."""
 
     log_likelihood: FloatArray
@@ -122,8 +122,8 @@ class BankFilter:
 
     def run_along(self, bank: FilterBank, frames: Sequence[FieldFrame],
                   intervals: Sequence[float], paths: FloatArray, *, passes: int, step: float,
-                  first_is_updated: bool, leaves_out: bool = False,
-                  wants_covariances: bool = False) -> Along:
+                  first_is_updated: bool, rejects_outliers: bool = False,
+                  wants_covariances: bool = False) -> PathResult:
         """Filter and smooth each hypothesis along its path, and end with the last frame.
 
         Parameters
@@ -142,17 +142,17 @@ class BankFilter:
             The share of the way that a path is moved to where the smoother has it.
         first_is_updated : bool
             The bank has been updated with the first frame.
-        leaves_out : bool
+        rejects_outliers : bool
             Frames that contradict a hypothesis are left out.
         wants_covariances : bool
         """
         n_hyp, n, n_x = paths.shape
-        out = Along(np.empty(n_hyp), np.empty(n_hyp), np.empty((n_hyp, n), dtype=bool),
+        out = PathResult(np.empty(n_hyp), np.empty(n_hyp), np.empty((n_hyp, n), dtype=bool),
                     np.empty((n_hyp, n, n_x, n_x) if wants_covariances else 0))
         new_x, new_P = np.empty_like(bank.x), np.empty_like(bank.P)
         self._compiled.run_along(
             **self._frames(frames, intervals), first_is_updated=first_is_updated,
-            strange=self._settings.end_nis if leaves_out else np.inf,
+            strange=self._settings.end_nis if rejects_outliers else np.inf,
             iterations=self._settings.iterations, passes=passes, step=step,
             field_error=self._settings.field_error,
             near_field_length=self._lengths(bank.kind), x=bank.x, P=bank.P,
@@ -175,7 +175,7 @@ class BankFilter:
     def time_offset(self, frame: FieldFrame, dt: float) -> FloatArray:
         """(n_sensors,) [s] of the samples of a frame that comes `dt` [s] after the one before."""
         offset: FloatArray = frame.time_offset
-        if dt <= 0.0 or offset.max() - offset.min() < ONE_TIME * dt:
+        if dt <= 0.0 or offset.max() - offset.min() < SAME_TIME_SHARE * dt:
             return self._no_offset
         return np.round(offset / SAME_TIME_S) * SAME_TIME_S
 
@@ -234,7 +234,7 @@ class BankFilter:
     def nearly_linear(self, x: FloatArray) -> FloatArray:
         """(n_hyp,) [m] how far the position of the states `x` (n_hyp, n_x) may be off for the field
         to be about linear in it."""
-        return LINEAR * self.observation.nearest(x)
+        return LINEAR_SHARE * self.observation.nearest(x)
 
     def is_implausible(self, bank: FilterBank, i: int, frame: FieldFrame) -> bool:
         """Whether hypothesis `i`, just updated with the `frame`, is contradicted by it."""

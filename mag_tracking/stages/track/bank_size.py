@@ -16,7 +16,7 @@ is 1.5 times as much."""
 START_BYTES = 250_000_000
 """The covariances of all starting hypotheses take no more than this, if need be with fewer sensors;
 the others come in when the track has run through the frames before its detection."""
-MIN_AT_START = 4
+MIN_SENSORS_AT_START = 4
 """Every track starts with at least this many sensors: those nearest to the strongest."""
 WIDER_BYTES = 100_000_000
 """When they come in, the covariances of the hypotheses that are kept take no more than this."""
@@ -69,7 +69,7 @@ def _affordable(n_hyp: int, n_target: int, n_of_sensor: int) -> int:
     """How many sensors so many hypotheses may have states of, by how many states there are of the
     target and of each sensor."""
     n_states = math.isqrt(START_BYTES // (_FLOAT_BYTES * n_hyp))
-    return max((n_states - n_target) // n_of_sensor, MIN_AT_START)
+    return max((n_states - n_target) // n_of_sensor, MIN_SENSORS_AT_START)
 
 
 def max_hypotheses(observation: Observation, n_sensors: int) -> int:

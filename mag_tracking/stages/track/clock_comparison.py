@@ -8,16 +8,16 @@ import numpy as np
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.stages.track.rigid_pass import MAX_OFFSET, MIN_DISTANCE, RigidPass
 
-SURE = 4.0
+SIGNIFICANT_STD = 4.0
 """Standard deviations at which clocks are called apart."""
 
-MEMORY = 20
+MEMORY_PASSES = 20
 """About so many passes count: clocks are set, and drift."""
 
-KEPT, KEPT_OF_CONTRADICTED = 1.0 - 1.0 / MEMORY, 0.5
+FORGETTING_FACTOR, CONTRADICTED_FACTOR = 1.0 - 1.0 / MEMORY_PASSES, 0.5
 """Share of the evidence that is kept with each pass, and with one that contradicts it."""
 
-LOOSE_S = 1e3
+PRIOR_STD_S = 1e3
 """[s] Deviation of a clock that nothing is known of."""
 
 
@@ -102,7 +102,7 @@ class ClockComparison:
             return
         known = np.abs(found.offset) <= MAX_OFFSET
         known[found.reference] = False
-        kept = KEPT_OF_CONTRADICTED if self._contradicts(found, rows, known) else KEPT
+        kept = CONTRADICTED_FACTOR if self._contradicts(found, rows, known) else FORGETTING_FACTOR
         self._information *= kept
         self._vector *= kept
         for j in np.flatnonzero(known):
@@ -118,19 +118,19 @@ class ClockComparison:
         offset, std = self._differences()
         # An offset in which vehicles, as fast as those so far, go less than a metre does no harm.
         least = MIN_DISTANCE * self._slowness / self._weight
-        self._apart = np.where((offset > SURE * std) & (offset > least), offset, 0.0)
+        self._apart = np.where((offset > SIGNIFICANT_STD * std) & (offset > least), offset, 0.0)
 
     def _contradicts(self, found: RigidPass, rows: IntArray, known: BoolArray) -> bool:
         """Whether a pass says otherwise than those before it, of one of the clocks `known`."""
         offset, std = self._differences()
         reference = rows[found.reference]
-        return any(abs(found.offset[j] - offset[rows[j], reference]) > SURE * np.sqrt(
+        return any(abs(found.offset[j] - offset[rows[j], reference]) > SIGNIFICANT_STD * np.sqrt(
             found.clock_variance(j) + std[rows[j], reference]**2) for j in np.flatnonzero(known))
 
     def _differences(self) -> tuple[FloatArray, FloatArray]:
         """(n, n) [s]: how far each clock (row) is ahead of each (column), and the deviation."""
         # What all clocks have in common is arbitrary.
-        loose = np.eye(len(self._vector)) / LOOSE_S**2
+        loose = np.eye(len(self._vector)) / PRIOR_STD_S**2
         covariance: FloatArray = np.linalg.inv(self._information + loose).astype(np.float64)
         offset = covariance @ self._vector
         variance = np.diagonal(covariance)

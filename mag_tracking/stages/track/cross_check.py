@@ -10,7 +10,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.clock_comparison import ClockComparison
-from mag_tracking.stages.track.disturbances import size_of
+from mag_tracking.stages.track.disturbances import field_magnitudes
 from mag_tracking.stages.track.plausibility import moves_too_far
 from mag_tracking.stages.track.rigid_pass import (
     LONG_LENGTH,
@@ -22,13 +22,13 @@ from mag_tracking.stages.track.rigid_pass import (
 from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.units import NS
 
-PASSED = 0.6
+PASSED_SHARE = 0.6
 """A vehicle has passed once the field is below this share of its largest."""
 
-FIRST_S = 0.12
+FIRST_CHECK_S = 0.12
 """[s] The first opinion follows so long after the strongest field."""
 
-AGAIN = 1.7
+CHECK_INTERVAL_RATIO = 1.7
 """The next opinion follows after so many times as long."""
 
 BEFORE_S, AFTER_S = 4.0, 3.0
@@ -40,11 +40,11 @@ MIN_FRAMES, MAX_FRAMES = 12, 128
 STEADY_S = 1.5
 """[s] After the strongest field: until then a vehicle goes on as steadily as it passed."""
 
-MISFIT_LATER = 8.0
+LATE_MISFIT = 8.0
 """The limit for later opinions, when a car may have turned otherwise than steadily."""
 
 
-class _Seen(NamedTuple):
+class _FrameSummary(NamedTuple):
     """A frame of the track, in short."""
 
     stamp_ns: int
@@ -69,25 +69,25 @@ class CrossCheck:
         self.latest: RigidPass | None = None
         self._network = network
         self._frames: list[FieldFrame] = []
-        self._peak: _Seen | None = None
-        self._now: _Seen | None = None
+        self._peak: _FrameSummary | None = None
+        self._now: _FrameSummary | None = None
         self._period_s = np.inf
-        self._due_s = FIRST_S
+        self._due_s = FIRST_CHECK_S
         self._is_misfit = False
         self._smallest = np.inf
-        self._has_risen, self._is_of_whole = False, False
+        self._has_risen, self._has_whole_pass = False, False
         self.difference: FloatArray = np.zeros(6)
 
     def add(self, frame: FieldFrame, state: FloatArray) -> None:
         """Take a frame, and the `state` (n_x,) of the best hypothesis."""
-        size = float(size_of(frame).max(initial=0.0))
+        size = float(field_magnitudes(frame).max(initial=0.0))
         if self._now is not None:
             # A gap is no frame period.
             self._period_s = min(self._period_s, (frame.stamp_ns - self._now.stamp_ns) / NS)
-        self._now = _Seen(frame.stamp_ns, size, state[:6].copy())
+        self._now = _FrameSummary(frame.stamp_ns, size, state[:6].copy())
         if self._peak is None or size > self._peak.size:
-            self._peak, self._due_s = self._now, FIRST_S
-            self._has_risen = self._smallest <= PASSED * size
+            self._peak, self._due_s = self._now, FIRST_CHECK_S
+            self._has_risen = self._smallest <= PASSED_SHARE * size
         self._smallest = min(self._smallest, size)
         # What is no longer of this pass, and will not be of another.
         earliest = frame.stamp_ns - BEFORE_S * NS
@@ -103,9 +103,9 @@ class CrossCheck:
         """Doubts about the track by now; earlier ones say that the clocks are so far apart [s]."""
         if self._now is None:
             return set()
-        self._form_if_due(self._now.size)
+        self._fit_if_due(self._now.size)
         if self._covers(self._now.stamp_ns):
-            self.difference = self._differs(self._now.stamp_ns, self._now.state)
+            self.difference = self._difference_at(self._now.stamp_ns, self._now.state)
         found = self._pass_doubts()
         speed = float(np.hypot(self._now.state[3], self._now.state[4]))
         if clocks_apart_s * speed > MIN_DISTANCE:
@@ -121,7 +121,7 @@ class CrossCheck:
         if not covered:
             return [self.difference] * len(states)
         first, last = covered[0], covered[-1]
-        inside = [self._differs(stamp_ns, x[:6]) for stamp_ns, x, _ in states[first:last + 1]]
+        inside = [self._difference_at(stamp_ns, x[:6]) for stamp_ns, x, _ in states[first:last + 1]]
         return [inside[min(max(k, first), last) - first] for k in range(len(states))]
 
     def _covers(self, stamp_ns: int) -> bool:
@@ -130,10 +130,10 @@ class CrossCheck:
         Where a track begins with its strongest field, that is a part of a pass, which many paths
         explain.
         """
-        return self.latest is not None and self._is_of_whole \
+        return self.latest is not None and self._has_whole_pass \
             and -BEFORE_S * NS <= stamp_ns - self.latest.stamp_ns <= AFTER_S * NS
 
-    def _differs(self, stamp_ns: int, state: FloatArray) -> FloatArray:
+    def _difference_at(self, stamp_ns: int, state: FloatArray) -> FloatArray:
         """(6,) difference of a `state` (6,) at a time that the latest opinion covers."""
         assert self.latest is not None
         return self.latest.difference(stamp_ns, state)
@@ -145,20 +145,20 @@ class CrossCheck:
 
     def conclude(self, clocks: ClockComparison, rows: IntArray) -> None:
         """The track ends: form a last opinion, and tell the `clocks` of the sensors `rows`."""
-        self._form_if_due(0.0)
+        self._fit_if_due(0.0)
         if self.latest is not None:
             clocks.add(self.latest, rows)
 
-    def _form_if_due(self, size: float) -> None:
+    def _fit_if_due(self, size: float) -> None:
         """Form an opinion if it is time to; the field is now of this `size` [T]."""
         now, peak = self._now, self._peak
-        if now is None or peak is None or self._due_s > AFTER_S or size > PASSED * peak.size:
+        if now is None or peak is None or self._due_s > AFTER_S or size > PASSED_SHARE * peak.size:
             return
         since = (now.stamp_ns - peak.stamp_ns) / NS
         frames = [f for f in self._frames if self._is_of_pass(f)]
         if since < self._due_s or len(frames) < MIN_FRAMES:
             return
-        self._due_s = AGAIN * since
+        self._due_s = CHECK_INTERVAL_RATIO * since
         # The search starts from what the filter says now, and from what it said then.
         back = now.state.copy()
         back[:3] -= since * back[3:]
@@ -167,7 +167,7 @@ class CrossCheck:
                                np.array([back, peak.state]))
         if found is None:
             return
-        self.latest, self._is_of_whole = found, self._has_risen
+        self.latest, self._has_whole_pass = found, self._has_risen
         if since <= STEADY_S:
             self._is_misfit = found.misfit > MISFIT
 
@@ -180,7 +180,7 @@ class CrossCheck:
         # The middle of a long vehicle is uncertain by as much as it is long, and not by more.
         if np.hypot(self.difference[0], self.difference[1]) > LONG_LENGTH:
             found.add(doubts.ANOTHER_PLACE)
-        if self._is_misfit or latest.misfit > MISFIT_LATER:
+        if self._is_misfit or latest.misfit > LATE_MISFIT:
             found.add(doubts.NO_STEADY_PATH)
         if not latest.is_explained:
             return found

@@ -14,19 +14,19 @@ from mag_tracking.inference.gauss_markov import GaussMarkovVectors
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 
-GRADIENT = 0.3
+GRADIENT_SHARE = 0.3
 """How much a field over the network may change from its centre to its edge, as a share."""
 
 MIN_STD = 1e-15
 """[T] No sensor is quieter: a network file with less noise is refused."""
 
-ANY_FIELD = 1e-4
+UNKNOWN_FIELD_STD = 1e-4
 """[T] Deviation of a field that is not known."""
 
-MIN_FOR_GRADIENT = 3
+MIN_GRADIENT_SENSORS = 3
 """Sensors below which a uniform field with a gradient is any field."""
 
-MAX_FOR_ONE_FIELD = 8
+MAX_COMMON_SENSORS = 8
 """One field is sought over so many sensors; the cost grows with the cube of their number."""
 
 
@@ -42,8 +42,8 @@ class DisturbanceModel:
         self._background_std, self._is_handover = background_std, is_handover
         self._sensor, self._own_H = np.repeat(np.arange(n), 3), np.tile(np.eye(3), (n, 1))
         # One field is sought over the first sensors; the rest have fields of their own.
-        chosen = np.arange(min(n, MAX_FOR_ONE_FIELD))
-        self._common_H = _field_over(network.part(chosen) if n > len(chosen) else network)
+        chosen = np.arange(min(n, MAX_COMMON_SENSORS))
+        self._common_H = _common_field_matrix(network.part(chosen) if n > len(chosen) else network)
         self._filters: tuple[GaussMarkovVectors, GaussMarkovVectors, GaussMarkovVectors] | None \
             = None
         # Log-weights of a field of each sensor's own, and of one field over the network.
@@ -77,8 +77,8 @@ class DisturbanceModel:
         assert self._filters is not None
         own, rest, common = self._filters
         sensor, H = self._sensor[present], self._own_H[present]
-        k = int(np.searchsorted(sensor, MAX_FOR_ONE_FIELD))
-        of_rest = rest.log_density(sensor[k:] - MAX_FOR_ONE_FIELD, H[k:], y[k:], variance[k:], dt)
+        k = int(np.searchsorted(sensor, MAX_COMMON_SENSORS))
+        of_rest = rest.log_density(sensor[k:] - MAX_COMMON_SENSORS, H[k:], y[k:], variance[k:], dt)
         joint = self._log_w + of_rest + [
             own.log_density(sensor[:k], H[:k], y[:k], variance[:k], dt),
             common.log_density(np.zeros(k, dtype=np.int64),
@@ -92,11 +92,11 @@ class DisturbanceModel:
         """The first measurement has this variance [T^2]: it sets the scale."""
         scale = np.sqrt(self._background_std**2 + noise)
         n = len(self._sensor) // 3
-        n_chosen = min(n, MAX_FOR_ONE_FIELD)
+        n_chosen = min(n, MAX_COMMON_SENSORS)
         n_field = self._common_H.shape[1] - 3 * n_chosen
-        std = ANY_FIELD if self._is_handover else self._background_std
+        std = UNKNOWN_FIELD_STD if self._is_handover else self._background_std
         # Behind the field are the backgrounds, which stay as they are.
-        scales = scale * np.concatenate([np.ones(3), np.full(n_field - 3, GRADIENT),
+        scales = scale * np.concatenate([np.ones(3), np.full(n_field - 3, GRADIENT_SHARE),
                                          np.zeros(3 * n_chosen)])
         each = np.full(3, scale)
         self._filters = (GaussMarkovVectors(n_chosen, each, std),
@@ -104,7 +104,7 @@ class DisturbanceModel:
                          GaussMarkovVectors(1, scales, std))
 
 
-def _field_over(network: SensorNetwork) -> FloatArray:
+def _common_field_matrix(network: SensorNetwork) -> FloatArray:
     """(3 n_sensors, m) each sensor's axes of a field over the network, and of the backgrounds.
 
     The field is uniform, with a gradient. Without sources in the network that is symmetric and free
@@ -112,7 +112,7 @@ def _field_over(network: SensorNetwork) -> FloatArray:
     """
     n, R_sw = len(network), network.R_sw
     field = np.tile(np.eye(3), (n, 1, 1))
-    if n >= MIN_FOR_GRADIENT:
+    if n >= MIN_GRADIENT_SENSORS:
         away = network.positions - network.centre
         radius = np.linalg.norm(away, axis=1).max()
         x, y, z = (away / (radius or 1.0)).T

@@ -15,15 +15,15 @@ FALSE_ALARM = 1e-6
 
 
 @dataclass(frozen=True)
-class Unexplained:
+class UnexplainedField:
     """The field during a track that no target explained."""
 
     track_id: int
     begin_ns: int
     largest: FloatArray
     """(n_sensors,) [T] size of the largest field at each sensor."""
-    felt: BoolArray
-    """(n_sensors,) which of them felt it."""
+    sensed: BoolArray
+    """(n_sensors,) which of them sensed it."""
     uniform: float
 
 
@@ -35,16 +35,16 @@ class Disturbances:
         self._next_id = 1
         self._current: Disturbance | None = None
         self._largest: FloatArray = np.zeros(len(names))
-        self._felt: BoolArray = np.zeros(len(names), dtype=bool)
+        self._sensed: BoolArray = np.zeros(len(names), dtype=bool)
 
-    def begin(self, found: Unexplained, stamp_ns: int) -> list[Disturbance]:
-        """A track was `Unexplained`: the record of a new disturbance, or none where one goes on."""
+    def begin(self, found: UnexplainedField, stamp_ns: int) -> list[Disturbance]:
+        """A track was `UnexplainedField`: the record of a new disturbance, or none where one goes on."""
         if self._current is not None:
             self._largest = np.maximum(self._largest, found.largest)
-            self._felt |= found.felt
+            self._sensed |= found.sensed
             self._current = replace(self._current, uniform=found.uniform, track_id=found.track_id)
             return []
-        self._largest, self._felt = found.largest.copy(), found.felt.copy()
+        self._largest, self._sensed = found.largest.copy(), found.sensed.copy()
         self._current = Disturbance(stamp_ns, self._next_id, False, found.begin_ns,
                                     float(self._largest.max()), self._sensors(), found.uniform,
                                     found.track_id)
@@ -55,8 +55,8 @@ class Disturbances:
         """Take a frame of the disturbance alone: it may be larger now, and reach other sensors."""
         if self._current is not None:
             energy, n_axes = whitened_energy(frame.field, frame.covariance)
-            self._largest = np.maximum(self._largest, size_of(frame))
-            self._felt |= energy > chdtri(np.maximum(n_axes, 1), FALSE_ALARM)
+            self._largest = np.maximum(self._largest, field_magnitudes(frame))
+            self._sensed |= energy > chdtri(np.maximum(n_axes, 1), FALSE_ALARM)
 
     def end(self, stamp_ns: int) -> list[Disturbance]:
         """The network is quiet again, or nothing is known of it any more."""
@@ -67,12 +67,12 @@ class Disturbances:
                         sensors=self._sensors())]
 
     def _sensors(self) -> tuple[str, ...]:
-        """Names of those that felt it, the strongest first."""
+        """Names of those that sensed it, the strongest first."""
         order = np.argsort(-self._largest, kind='stable')
-        return tuple(self._names[j] for j in order if self._felt[j])
+        return tuple(self._names[j] for j in order if self._sensed[j])
 
 
-def size_of(frame: FieldFrame) -> FloatArray:
+def field_magnitudes(frame: FieldFrame) -> FloatArray:
     """(n_sensors,) [T] size of the field of a frame; 0 where it is missing."""
     size: FloatArray = np.sqrt(np.nansum(np.square(frame.field), axis=1))
     return size

@@ -13,7 +13,7 @@ SENSORS_CONTRADICT = 'sensors_contradict'
 MISFIT = 'misfit'
 CONTRADICTION = 'contradiction'
 OVERFIT = 'overfit'
-SOMETHING_ELSE = 'disturbance_model'
+DISTURBANCE_MODEL = 'disturbance_model'
 INNOVATIONS = 'innovations'
 SENSORS_ROTATED = 'sensors_rotated'
 HEIGHT = 'height'
@@ -23,7 +23,7 @@ CLOCKS_APART = 'clocks_apart'
 NO_STEADY_PATH = 'no_steady_path'
 ANOTHER_VEHICLE = 'another_vehicle'
 
-FOR_GOOD = frozenset({SENSORS_ROTATED, FRAMES_TOO_LONG, CLOCKS_APART})
+PERMANENT = frozenset({SENSORS_ROTATED, FRAMES_TOO_LONG, CLOCKS_APART})
 """These doubts stay: the track was bent. A state that no vehicle has may soon be right again."""
 
 MEANINGS = {
@@ -41,7 +41,7 @@ MEANINGS = {
     MISFIT: 'the field does not fit the best hypothesis',
     CONTRADICTION: 'the field is less probable than 1e-5',
     OVERFIT: 'the filter fits the latest frames much better than the path of its own hypothesis',
-    SOMETHING_ELSE: 'a smooth field of no target explains the frames about as well',
+    DISTURBANCE_MODEL: 'a smooth field of no target explains the frames about as well',
     INNOVATIONS: 'the innovations of the latest frames, or of the track, are larger than stated',
     SENSORS_ROTATED: 'the track needs sensors that are rotated by more than stated',
     HEIGHT: 'the iron is where no vehicle of the kind has it',
@@ -51,9 +51,9 @@ MEANINGS = {
     ANOTHER_VEHICLE: 'it is not yet certain how many vehicles there are, or where one of them is',
     NO_STEADY_PATH: 'no vehicle that accelerates and turns steadily explains the pass as a whole',
 }
-"""{doubt: what it means}, in the order in which they are listed."""
+"""{doubt: what it means}, in the order in which they are ordered."""
 
 
-def listed(doubts: Set[str]) -> tuple[str, ...]:
+def ordered(doubts: Set[str]) -> tuple[str, ...]:
     """The doubts in the order of `MEANINGS`."""
     return tuple(name for name in MEANINGS if name in doubts)

@@ -12,7 +12,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.approach import Approach
-from mag_tracking.stages.track.disturbances import size_of
+from mag_tracking.stages.track.disturbances import field_magnitudes
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 
@@ -35,18 +35,18 @@ OVERFIT_NATS = float(np.log(1e4))
 """An extended filter linearises each frame elsewhere, and may fit frames better than one path can.
 Where the path of the same hypothesis makes them less probable by this, the filter is doubted."""
 
-MIN_WATCHED = 0.5
+MIN_OBSERVED_SHARE = 0.5
 """A track that begins with less than this share of its lookback is ambiguous."""
 
-FELT = 4.0
+SENSED_LEVEL = 4.0
 """Standard deviations of the noise's energy by which that of a sensor's fields must exceed it for
-the sensor to have felt the target."""
+the sensor to have sensed the target."""
 
-PASSING_DOUBTS = (doubts.OVERFIT, doubts.SOMETHING_ELSE, doubts.INNOVATIONS, doubts.MISFIT,
+TRANSIENT_DOUBTS = (doubts.OVERFIT, doubts.DISTURBANCE_MODEL, doubts.INNOVATIONS, doubts.MISFIT,
                   doubts.HEIGHT, doubts.OFF_THE_ROAD, doubts.NO_STEADY_PATH)
 """Doubts about the filter at one time, which smoothing removes only in part."""
 
-LASTS_S = 0.1
+TRANSIENT_S = 0.1
 """[s] Time for which a passing doubt outlasts the frame that it was found in: one that is missing
 in a single frame may be back in the next."""
 
@@ -83,7 +83,7 @@ class TrackEvidence:
         self._until_ns: dict[str, int] = {}
         # Stretches that also smoothed poses are doubted in.
         self._segments: list[tuple[int, int]] = []
-        self._best_spread = np.inf
+        self._min_spread = np.inf
         # Per sensor: whitened energy of its fields above that of noise, and number of axes.
         self._energy, self._n_axes = np.zeros(n_sensors), np.zeros(n_sensors)
         self.largest: FloatArray = np.zeros(n_sensors)
@@ -106,22 +106,22 @@ class TrackEvidence:
         """From now on all of the track may be wrong."""
         self._doubts.add(reason)
 
-    def forgive(self) -> None:
+    def drop_explained_doubts(self) -> None:
         """Drop the doubts that another vehicle explains."""
         self._doubts -= {doubts.CONTRADICTION, doubts.INNOVATIONS, doubts.SENSORS_CONTRADICT,
-                         *doubts.FOR_GOOD}
+                         *doubts.PERMANENT}
         self.innovations = InnovationConsistency(len(self.largest))
         self._n_misfits, self._doubts_filter_until_ns = 0, -1
         self._found_ns.clear()
 
-    def doubt_start(self, unseen_coming: bool, network: SensorNetwork, starts_anywhere: bool
+    def doubt_start(self, unseen_approach: bool, network: SensorNetwork, starts_anywhere: bool
                     ) -> None:
         """Doubt a track whose target was not seen approaching, or whose range nothing tells.
 
         `starts_anywhere` is that of the target.
         """
         # One that was not seen approaching may already have passed.
-        if unseen_coming and not starts_anywhere:
+        if unseen_approach and not starts_anywhere:
             self.doubt(doubts.NOT_SEEN_APPROACHING)
         # The range of a single sensor's target is what the settings say, and that of a vehicle near
         # a few sensors at one place what the model leaves out of its field.
@@ -135,13 +135,13 @@ class TrackEvidence:
         if since_ns is not None:
             self._segments.append((since_ns, until_ns))
 
-    def watch(self, frame: FieldFrame) -> None:
+    def check_approach(self, frame: FieldFrame) -> None:
         """Doubt the track where the field has grown unlike that of a target from afar."""
         if self._approach.add(frame):
             self.doubt(doubts.NOT_SEEN_APPROACHING)
 
-    def take(self, frame: FieldFrame, rows: IntArray, nis: FloatArray) -> None:
-        """Count what the sensors felt in a frame, and how it fits.
+    def add_frame(self, frame: FieldFrame, rows: IntArray, nis: FloatArray) -> None:
+        """Count what the sensors sensed in a frame, and how it fits.
 
         Parameters
         ----------
@@ -155,29 +155,30 @@ class TrackEvidence:
         energy, n_axes = whitened_energy(frame.field, frame.covariance)
         self._energy[rows] += energy - n_axes
         self._n_axes[rows] += n_axes
-        self.largest[rows] = np.maximum(self.largest[rows], size_of(frame))
+        self.largest[rows] = np.maximum(self.largest[rows], field_magnitudes(frame))
         of_all, axes_of_all = np.full(len(self.largest), np.nan), np.zeros(len(self.largest))
         of_all[rows], axes_of_all[rows] = nis, n_axes
         self.innovations.add(of_all, axes_of_all, frame.stamp_ns)
 
     @property
-    def felt(self) -> BoolArray:
-        """(n_sensors,) whether they have felt the target."""
-        felt: BoolArray = self._energy > FELT * np.sqrt(2.0 * np.maximum(self._n_axes, 1.0))
-        return felt
+    def sensed(self) -> BoolArray:
+        """(n_sensors,) whether they have sensed the target."""
+        sensed: BoolArray = self._energy > SENSED_LEVEL * np.sqrt(
+            2.0 * np.maximum(self._n_axes, 1.0))
+        return sensed
 
     @property
-    def is_felt_by_one(self) -> bool:
-        """Whether fewer than two sensors have felt the target."""
-        return int(np.count_nonzero(self.felt)) < 2
+    def is_sensed_by_one(self) -> bool:
+        """Whether fewer than two sensors have sensed the target."""
+        return int(np.count_nonzero(self.sensed)) < 2
 
     def note(self, found: set[str], stamp_ns: int) -> set[str]:
         """Record the doubts about the pose of a frame; return them and those that last."""
-        passing = found.intersection(PASSING_DOUBTS)
+        passing = found.intersection(TRANSIENT_DOUBTS)
         self._doubtful_times = noted(self._doubtful_times, stamp_ns, bool(passing), MAX_SEGMENTS)
         self._found_ns |= dict.fromkeys(passing, stamp_ns)
         return found | {reason for reason, when in self._found_ns.items()
-                        if (stamp_ns - when) / NS <= LASTS_S} \
+                        if (stamp_ns - when) / NS <= TRANSIENT_S} \
             | {reason for reason, until in self._until_ns.items() if stamp_ns <= until}
 
     def contradicts(self, nis: FloatArray, degrees_of_freedom: int) -> bool:
@@ -199,10 +200,10 @@ class TrackEvidence:
         """
         found = set()
         if self.bayes_factor.fell_behind(ratio):
-            found.add(doubts.SOMETHING_ELSE)
+            found.add(doubts.DISTURBANCE_MODEL)
         if self.contradicts(nis, degrees_of_freedom):
             found.add(doubts.CONTRADICTION)
-        if self.is_felt_by_one:
+        if self.is_sensed_by_one:
             found.add(doubts.FELT_BY_ONE_SENSOR)
         if self.innovations.excess > 1.0:
             found.add(doubts.INNOVATIONS)
@@ -227,7 +228,7 @@ class TrackEvidence:
             self._doubts_filter_until_ns = stamp_ns + round(window_s * NS)
         return stamp_ns <= self._doubts_filter_until_ns
 
-    def doubted_filter(self, stamp_ns: int) -> bool:
+    def was_filter_doubted(self, stamp_ns: int) -> bool:
         """Whether the filter was doubted at an earlier time."""
         return are_doubtful((*self._doubtful_times, *self._segments), stamp_ns)
 
@@ -265,7 +266,7 @@ class TrackEvidence:
         self._n_misfits = self._n_misfits + 1 if misfit else 0
         if self._n_misfits > 1:
             return LOST
-        if spread > settings.end_std > self._best_spread and not is_coming:
+        if spread > settings.end_std > self._min_spread and not is_coming:
             return LOST if misfit else OUT_OF_REACH
-        self._best_spread = min(self._best_spread, spread)
+        self._min_spread = min(self._min_spread, spread)
         return None

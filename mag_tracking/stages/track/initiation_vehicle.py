@@ -18,7 +18,7 @@ from mag_tracking.settings import param
 SHARE_FIELD = 5e-5
 """[T] The field in which `VehicleSettings.induced_share` is stated."""
 
-TURNS_AT_START = 0.5
+START_TURN_RATIO = 0.5
 """A vehicle comes along a line: its turn rate is then smaller than that of one that turns."""
 
 
@@ -174,7 +174,7 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
     covariances: list[FloatArray] = []
     labels: list[int] = []
     kinds: list[int] = []
-    measured = _Measured(network, frame)
+    measured = _MeasuredEnergy(network, frame)
     for kind in range(len(settings.kinds)):
         moments = settings.moments[kind] * moment_directions()
         for label, heading in enumerate(np.deg2rad(settings.arrival_headings_deg)):
@@ -203,12 +203,12 @@ def _with_turns(bank: FilterBank, model: RowVehicle, share: float) -> FilterBank
     both = bank.rows(np.tile(np.arange(n), 2))
     both.origin = np.arange(2 * n)
     both.log_w = np.log(np.repeat([1.0 - share, share], n) / n)
-    both.P[n:, w, w] = TURNS_AT_START**2 * model.turn_variance(np.hypot(bank.x[:, 3],
+    both.P[n:, w, w] = START_TURN_RATIO**2 * model.turn_variance(np.hypot(bank.x[:, 3],
                                                                         bank.x[:, 4]))
     return both
 
 
-class _Measured:
+class _MeasuredEnergy:
     """What a frame says of how near a target is."""
 
     def __init__(self, network: SensorNetwork, frame: FieldFrame) -> None:
@@ -221,8 +221,9 @@ class _Measured:
         """(n_sensors, 3, 3) [1/T] from a field in the world to one in units of its noise."""
 
 
-def _matching_positions(settings: VehicleSettings, network: SensorNetwork, measured: _Measured,
-                        R: FloatArray, moments: FloatArray, height: float) -> FloatArray:
+def _matching_positions(settings: VehicleSettings, network: SensorNetwork,
+                        measured: _MeasuredEnergy, R: FloatArray, moments: FloatArray,
+                        height: float) -> FloatArray:
     """Positions (n_offsets, n_moments, 3) where on each line a field first has the energy."""
     along = (network.positions - network.centre) @ R[:, 0]
     distance = np.linspace(settings.max_start_distance, 0.0, 160) - along.min()

@@ -7,15 +7,15 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.reach import FELT, energies_of
+from mag_tracking.stages.track.reach import SENSED_LEVEL, energies_of
 from mag_tracking.stages.track.relinearisation import Window
 
-SURE_NATS = 15.0
+CONFIDENT_NATS = 15.0
 """[nats] An explanation that is believed by less than this is doubted for a while: evidence counts
 what a model leaves out of the field as if it were independent in each frame, and says too much."""
 
 IMPLAUSIBLE_NATS = 60.0
-"""[nats] As `SURE_NATS`, where two vehicles cross, or one overtakes the other at more than
+"""[nats] As `CONFIDENT_NATS`, where two vehicles cross, or one overtakes the other at more than
 `OVERTAKING_RATIO`: traffic does so less often than a flipped axis or a train looks like it."""
 
 CROSSING_COSINE = 0.9
@@ -24,7 +24,7 @@ CROSSING_COSINE = 0.9
 OVERTAKING_RATIO = 1.8
 """Largest usual ratio of the speeds of two vehicles that go the same way."""
 
-STANDING = 1.0
+MIN_MOVING_SPEED = 1.0
 """[m/s] A slower vehicle is not compared with others: its heading is not known."""
 
 
@@ -55,7 +55,7 @@ class Joint:
         x = self.bank.x[self.bank.best()]
         velocity = np.array([x[k * n_one + 3:k * n_one + 5] for k in range(n)])
         is_implausible = self.adds and _are_implausible(velocity, 1 if self.replaced is None else 2)
-        if self.log_odds < (IMPLAUSIBLE_NATS if is_implausible else SURE_NATS):
+        if self.log_odds < (IMPLAUSIBLE_NATS if is_implausible else CONFIDENT_NATS):
             return tuple(range(n))
         if self.replaced is None:
             return ()
@@ -71,20 +71,20 @@ def _are_implausible(velocity: FloatArray, n_new: int) -> bool:
     for i in range(len(velocity) - n_new, len(velocity)):
         for k in range(i):
             slower, faster = sorted((speed[i], speed[k]))
-            cosine = velocity[i] @ velocity[k] / max(slower * faster, STANDING**2)
-            if slower >= STANDING and (abs(cosine) < CROSSING_COSINE or
+            cosine = velocity[i] @ velocity[k] / max(slower * faster, MIN_MOVING_SPEED**2)
+            if slower >= MIN_MOVING_SPEED and (abs(cosine) < CROSSING_COSINE or
                                        cosine > 0.0 and faster > OVERTAKING_RATIO * slower):
                 return True
     return False
 
 
-def are_felt_by_two(joint: Joint) -> bool:
+def are_sensed_by_two(joint: Joint) -> bool:
     """Whether two sensors feel each of the vehicles that were sought: what one alone feels may be a
     fault of that sensor."""
     n, best = joint.bank.label.shape[1], joint.bank.best()
     for i in range(n - (1 if joint.replaced is None else 2), n):
         energy = sum(energies_of(joint.bank_filter, i, path[best], frame) for path, frame in
                      zip(joint.window.paths, joint.window.frames, strict=True))
-        if np.count_nonzero(energy > FELT) < 2:
+        if np.count_nonzero(energy > SENSED_LEVEL) < 2:
             return False
     return True

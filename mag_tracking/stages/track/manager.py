@@ -29,11 +29,11 @@ from mag_tracking.units import NS
 NO_SCALE = 'detections not tracked (one sensor does not tell the scale)'
 ALONE = 'frames without a start (one sensor alone does not tell the scale)'
 
-DISTURBED = 'tracks of something else'
+DISTURBANCE_TRACKS = 'tracks of something else'
 
-LOUDER_THAN_LOST = 'tracks begun in a field larger than that of a lost one'
+STARTED_IN_TAIL = 'tracks begun in a field larger than that of a lost one'
 
-LOUDER = 4.0
+RESTART_ENERGY_RATIO = 4.0
 """Where a target was lost, another one is started in a frame whose field has this times the energy
 of any frame of the lost track: twice the field. In the tail of a pass the field only falls."""
 
@@ -69,7 +69,7 @@ class TrackManager:
         self._recent: deque[FieldFrame] = deque()
         self._last_ns: int | None = None
         # [T^2] Largest energy of the field since a track was started.
-        self._loudest = 0.0
+        self._max_energy = 0.0
         # A target that was lost is not started again in the tail of its own detection: while the
         # energy is no larger than this. None: there is no such tail.
         self._tail_until: float | None = None
@@ -191,14 +191,14 @@ class TrackManager:
         """The disturbances that tracks which have ended leave behind."""
         out: list[TrackRecord] = []
         for found in (found for track in tracks for found in track.unexplained):
-            self.counts[DISTURBED] += 1
+            self.counts[DISTURBANCE_TRACKS] += 1
             out += self._disturbances.begin(found, stamp_ns)
         return out
 
     def _maintain(self, frame: FieldFrame, dt: float) -> list[TrackRecord]:
         """Move every running track on to the frame; drop those that end."""
         doubtful = self._doubtful_sensors(frame)
-        self._loudest = max(self._loudest, _energy(frame))
+        self._max_energy = max(self._max_energy, _energy(frame))
         for track in self._tracks:
             track.doubt(doubtful)
         out = [record for track in self._tracks for record in track.step(frame, dt)]
@@ -210,7 +210,7 @@ class TrackManager:
                                 stamp_ns)
         # In the tail of its own detection a vehicle would be started on the wrong line.
         if any(track.is_lost for track in self._tracks) and not self._target.starts_anywhere:
-            self._tail_until = LOUDER * self._loudest
+            self._tail_until = RESTART_ENERGY_RATIO * self._max_energy
         self._tracks = [track for track in self._tracks if track.ended is None]
         return out
 
@@ -247,15 +247,15 @@ class TrackManager:
         self.counts['tracks'] += 1
         in_tail = self._tail_until is not None
         if in_tail:
-            self.counts[LOUDER_THAN_LOST] += 1
-        self._tail_until, self._loudest = None, _energy(frame)
+            self.counts[STARTED_IN_TAIL] += 1
+        self._tail_until, self._max_energy = None, _energy(frame)
         track = RunningTrack(self._next_id, self._target, s, sensors, bank_filter, bank,
                              self.counts, self._clocks, later)
         self._next_id += 1
         self._tracks.append(track)
         track.doubt(self._doubtful_sensors(*recent, frame))
         out = track.begin(frame, recent,
-                          unseen_coming=in_tail or bool(recent) and _n_sensors(*recent) < 2)
+                          unseen_approach=in_tail or bool(recent) and _n_sensors(*recent) < 2)
         return out + self._delete_ended(frame.stamp_ns)
 
     def _sensors_at(self, frame: FieldFrame, n: int) -> SensorSubset:

@@ -13,7 +13,7 @@ from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.clock_comparison import ClockComparison
 from mag_tracking.stages.track.cross_check import CrossCheck
-from mag_tracking.stages.track.disturbances import Unexplained
+from mag_tracking.stages.track.disturbances import UnexplainedField
 from mag_tracking.stages.track.evidence import TrackEvidence
 from mag_tracking.stages.track.joint import Joint
 from mag_tracking.stages.track.observation import Observation
@@ -24,7 +24,7 @@ from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.stages.track.target import Target
 
-MAX_PLACES = 64
+MAX_POSITIONS = 64
 """Number of places of a target that are remembered, to tell it from another one."""
 
 
@@ -62,7 +62,7 @@ class Member:
     ----------
     id : int
     evidence : TrackEvidence
-    opinion : CrossCheck
+    cross_check : CrossCheck
     last : Track or None
         The latest record.
     ended : str or None
@@ -80,7 +80,7 @@ class Member:
         self.id, self._target, self._counts, self._clocks = id, target, counts, clocks
         self.begin_ns, self._sensors = begin_ns, sensors
         self.evidence, self._plausibility = TrackEvidence(len(sensors.whole)), Plausibility()
-        self.opinion = CrossCheck(sensors.network)
+        self.cross_check = CrossCheck(sensors.network)
         self.last: Track | None = None
         self.ended: str | None = None
         self.is_lost = False
@@ -88,18 +88,18 @@ class Member:
         self.slot = 0
         self._spread = np.inf
         self._unseen = target.unseen()
-        self._was_sure = False
+        self._was_unambiguous = False
         # Where the latest poses were published.
-        self._places: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_PLACES)
+        self._recent_positions: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_POSITIONS)
 
     def use(self, sensors: SensorSubset) -> None:
         """From now on the target is measured by these sensors."""
         self._sensors = sensors
-        self.opinion = CrossCheck(sensors.network)
+        self.cross_check = CrossCheck(sensors.network)
 
     def restart(self, sensors: SensorSubset) -> None:
         """Drop the doubts that were due to the field of another vehicle."""
-        self.evidence.forgive()
+        self.evidence.drop_explained_doubts()
         self.use(sensors)
         self._plausibility = Plausibility()
 
@@ -119,16 +119,16 @@ class Member:
         0 where no pose was published at them.
         """
         at = dict(zip(stamps_ns, path, strict=True))
-        away = [float(np.hypot(*(place - at[stamp_ns]))) for stamp_ns, place in self._places
-                if stamp_ns in at]
+        away = [float(np.hypot(*(place - at[stamp_ns])))
+                for stamp_ns, place in self._recent_positions if stamp_ns in at]
         return float(np.mean(away)) if away else 0.0
 
     def publish(self, update: Update, view: View) -> Track:
         """The `Track` of a frame."""
         self.last = self._published(update, view)
         self._spread = float(np.sqrt(np.trace(view.bank.P[view.best, :2, :2])))
-        self._was_sure |= not self.last.ambiguous
-        self._places.append((self.last.stamp_ns, self.last.position[:2]))
+        self._was_unambiguous |= not self.last.ambiguous
+        self._recent_positions.append((self.last.stamp_ns, self.last.position[:2]))
         self._counts['poses'] += 1
         return self.last
 
@@ -149,7 +149,7 @@ class Member:
             view.bank, best, self._target.model, self._target.orientation, self._target.arrivals,
             self._target.kinds, stamp_ns=frame.stamp_ns, id=self.id, ended=False,
             existence=self.evidence.existence, degrees_of_freedom=int(measured.sum()),
-            found=found, excess=excess, unseen=self._unseen, difference=self.opinion.difference,
+            found=found, excess=excess, unseen=self._unseen, difference=self.cross_check.difference,
             ambiguous_poses=update.settings.ambiguous_poses,
             predicted=update.bank_filter.predicted_field(update.bank, best, frame, dt),
             mounting=view.observation.angles(view.bank.x[best].copy()),
@@ -158,9 +158,9 @@ class Member:
 
     def is_doubted(self, settings: TrackSettings) -> bool:
         """Whether all of the track, as it stands, may be wrong."""
-        return self.evidence.doubted or self.opinion.is_doubtful \
+        return self.evidence.doubted or self.cross_check.is_doubtful \
             or not self.evidence.bayes_factor.leads(settings.min_bayes_factor) \
-            or not self._target.starts_anywhere and self.evidence.is_felt_by_one
+            or not self._target.starts_anywhere and self.evidence.is_sensed_by_one
 
     def _doubts(self, update: Update, view: View, alone: bool) -> set[str]:
         """Doubts about the pose of the best hypothesis; `alone`: one sensor measured."""
@@ -169,7 +169,7 @@ class Member:
         if update.bank_filter.is_implausible(bank, best, update.frame):
             found.add(doubts.MISFIT)
         if not evidence.bayes_factor.leads(settings.min_bayes_factor):
-            found.add(doubts.SOMETHING_ELSE)
+            found.add(doubts.DISTURBANCE_MODEL)
         # A magnet may rest: it is then as smooth as anything, and is where it was.
         if self._target.starts_anywhere:
             return found
@@ -178,11 +178,11 @@ class Member:
             settings.min_bayes_factor)
         if self._overfits(update, view):
             found.add(doubts.OVERFIT)
-        found |= self.opinion.doubts(self._clocks.apart_s(update.sensors.rows))
+        found |= self.cross_check.doubts(self._clocks.apart_s(update.sensors.rows))
         found |= self._plausibility.judge(
             view.observation, bank, best, settings.vehicle,
             np.deg2rad(settings.mounting_std_deg), update.dt)
-        for reason in found & doubts.FOR_GOOD:
+        for reason in found & doubts.PERMANENT:
             evidence.doubt(reason)
         return found | evidence.doubts
 
@@ -200,15 +200,15 @@ class Member:
         is_coming = not self._target.starts_anywhere and sensors.is_neared_by(self.last)
         return self.evidence.reason_to_end(self.last, self._spread, is_coming, settings)
 
-    def unexplained(self, uniform: float) -> Unexplained | None:
+    def unexplained(self, uniform: float) -> UnexplainedField | None:
         """The field during the track, if a target never explained it; else None.
 
         `uniform` is the probability that it was one field over the network.
         """
-        if self._was_sure or self.last is None \
+        if self._was_unambiguous or self.last is None \
                 or self.evidence.bayes_factor.unexplained_s(self.last.stamp_ns) <= 0.0:
             return None
-        return Unexplained(self.id, self.begin_ns, self.evidence.largest, self.evidence.felt,
+        return UnexplainedField(self.id, self.begin_ns, self.evidence.largest, self.evidence.sensed,
                            uniform)
 
     def states_of(self, slot: int, n_one: int, states: Iterable[TrackState],
@@ -230,12 +230,12 @@ class Member:
             self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,
             kind=int(bank.kind[best]), kinds=self._target.kinds, unseen=self._unseen,
             complete=complete, difference=difference,
-            ambiguous=ambiguous or self.evidence.doubted_filter(stamp_ns))
-            for (stamp_ns, x, P), difference in zip(states, self.opinion.differences(states),
+            ambiguous=ambiguous or self.evidence.was_filter_doubted(stamp_ns))
+            for (stamp_ns, x, P), difference in zip(states, self.cross_check.differences(states),
                                                     strict=True)]
 
 
-def in_order(members: Sequence[Member], new: Member | None, joint: Joint, n_one: int
+def members_in_order(members: Sequence[Member], new: Member | None, joint: Joint, n_one: int
              ) -> list[Member]:
     """Members, and a new target, in the order of the states of a `Joint`.
 

@@ -10,18 +10,18 @@ FALSE_ALARM = 1e-3
 """Probability below which the latest innovations are not noise, so that a new target is
 sought."""
 
-WINDOW_S, AGAIN_S = 0.25, 0.15
+WINDOW_S, MIN_INTERVAL_S = 0.25, 0.15
 """[s] The latest frames; and at least so much time is between two searches."""
 
-LONG_AGAIN_S, LONGER = 0.3, 1.5
+LONG_INTERVAL_S, INTERVAL_GROWTH = 0.3, 1.5
 """[s] A long vehicle is compared with two so long after the last comparison; then after so many
 times as long."""
 
-MIN_NATS, AGAIN_NATS, UNDECIDED_NATS = 10.0, 5.0, -5.0
+ACCEPT_NATS, REPEATED_NATS, UNDECIDED_NATS = 10.0, 5.0, -5.0
 """Another explanation is believed if the frames are so much more probable with it; or, if less, by
 two comparisons in turn. If they are not much less probable with it, the track is in doubt."""
 
-ODD, LONG = 'improbable innovations', 'a long vehicle'
+IMPROBABLE, LONG_VEHICLE = 'improbable innovations', 'a long vehicle'
 """Why a track is compared with other explanations."""
 
 
@@ -37,7 +37,7 @@ class NewTargetEvidence:
         self._last_ns: int | None = None
         self._was_probable = False
         self._was_rejected = self._is_long = False
-        self._long_wait_s = LONG_AGAIN_S
+        self._long_wait_s = LONG_INTERVAL_S
 
     def add(self, nis: float, degrees_of_freedom: int, stamp_ns: int, rejected: bool,
             is_long: bool) -> None:
@@ -59,21 +59,21 @@ class NewTargetEvidence:
         self._was_rejected, self._is_long = rejected, is_long
 
     def due(self, stamp_ns: int) -> str | None:
-        """`ODD` or `LONG` if the track is to be compared now, else None."""
+        """`IMPROBABLE` or `LONG_VEHICLE` if the track is to be compared now, else None."""
         total, freedom = self._latest.total
         since = np.inf if self._last_ns is None else (stamp_ns - self._last_ns) / NS
         reason = None
         if self._was_rejected or chdtrc(max(freedom, 1.0), total) <= FALSE_ALARM:
-            reason = ODD if since >= AGAIN_S else None
+            reason = IMPROBABLE if since >= MIN_INTERVAL_S else None
         elif self._is_long and since >= self._long_wait_s:
-            reason = LONG
-            self._long_wait_s *= LONGER
+            reason = LONG_VEHICLE
+            self._long_wait_s *= INTERVAL_GROWTH
         if reason is not None:
             self._last_ns = stamp_ns
         return reason
 
-    def believes(self, log_odds: float) -> bool:
+    def accepts(self, log_odds: float) -> bool:
         """Whether another explanation is believed, given those compared before."""
-        believes = log_odds > MIN_NATS or self._was_probable and log_odds > AGAIN_NATS
-        self._was_probable = log_odds > AGAIN_NATS and not believes
-        return believes
+        accepts = log_odds > ACCEPT_NATS or self._was_probable and log_odds > REPEATED_NATS
+        self._was_probable = log_odds > REPEATED_NATS and not accepts
+        return accepts

@@ -18,9 +18,9 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_vehicle import moment_directions
-from mag_tracking.stages.track.joint import Joint, are_felt_by_two
-from mag_tracking.stages.track.new_target_evidence import ODD
-from mag_tracking.stages.track.reach import FELT, energy_of
+from mag_tracking.stages.track.joint import Joint, are_sensed_by_two
+from mag_tracking.stages.track.new_target_evidence import IMPROBABLE
+from mag_tracking.stages.track.reach import SENSED_LEVEL, energy_of
 from mag_tracking.stages.track.relinearisation import Window
 from mag_tracking.stages.track.vehicle_state import VehicleState
 from mag_tracking.stages.track.window_search import WindowSearch
@@ -37,7 +37,7 @@ from mag_tracking.stages.track.window_start import (
 PASSES, STEP = 3, 0.5
 """Gauss-Newton steps along each path, and the share that each goes."""
 
-KNOWN_ROWS, FIRST, SECOND = 2, 3, 2
+MAX_KNOWN, MAX_FIRST, MAX_SECOND = 2, 3, 2
 """Number of hypotheses of a tracked vehicle that are tried (one of several), and of paths of a
 first and of a second vehicle beside each."""
 
@@ -45,16 +45,16 @@ NATS_KEPT, MAX_KEPT = 10.0, 12
 """[nats] A kind is dropped if it is less probable than the best by more than this; and the number
 of kinds that are kept."""
 
-ARRIVES = np.log(0.05)
+LOG_P_ARRIVAL = np.log(0.05)
 """Log-probability that another vehicle comes while one passes."""
 
-ELSEWHERE_M = 2.0
+MIN_DISPLACEMENT_M = 2.0
 """[m] A vehicle that is found nearer to its track than this was followed rightly."""
 
-MAX_TIMES = 5.0
+MAX_RATIO = 5.0
 """No vehicle is so many times faster, or stronger, than the largest of the settings."""
 
-WAS_LOST = np.log(0.01)
+LOG_P_LOST = np.log(0.01)
 """Log-probability that a vehicle has been elsewhere than its track for the whole window."""
 
 N_DISTANCES = 10
@@ -65,24 +65,24 @@ class NewTargetSearch:
     """Explains a window with one vehicle more."""
 
     def __init__(self, bank: FilterBank, window: Window, filter_of: Callable[[int], BankFilter],
-                 n_targets: int, vehicles: VehicleState, reason: str, may_be_more: bool
+                 n_targets: int, vehicles: VehicleState, reason: str, may_add: bool
                  ) -> None:
         """`bank` of a track of `n_targets` vehicles; `filter_of` makes the filter of so many.
 
         The `reason` is that of `NewTargetEvidence.due`: nobody is sought beside a long vehicle, or
-        elsewhere, if the innovations are as they should be. Without `may_be_more` no vehicle is
+        elsewhere, if the innovations are as they should be. Without `may_add` no vehicle is
         added.
         """
-        self._is_odd = reason == ODD
+        self._is_improbable = reason == IMPROBABLE
         self._bank, self._window = bank, window
         self._filter_of, self._n_targets, self._vehicles = cache(filter_of), n_targets, vehicles
-        self._filter, self._may_be_more = self._filter_of(n_targets), may_be_more
+        self._filter, self._may_add = self._filter_of(n_targets), may_add
         settings = vehicles.settings
         self._n_one = self._filter.observation.n_one
         self._search = WindowSearch(window, vehicles)
         # The first pair that was found in place of a vehicle: all have its order.
         self._pairs: dict[int, FloatArray] = {}
-        self._of_cell = -float(np.log(
+        self._log_prior = -float(np.log(
             len(settings.arrival_names) * len(settings.lateral_offsets) * len(settings.speeds)
             * len(settings.kinds) * len(moment_directions()) * N_DISTANCES))
 
@@ -91,7 +91,7 @@ class NewTargetSearch:
         none at all."""
         if not len(self._search.samples.t):
             return None
-        rows, of_track, log_w, paths = self._as_it_is()
+        rows, of_track, log_w, paths = self._current_track()
         # By the number of vehicles, and which one of the track is replaced.
         explanations: dict[tuple[int, int | None], list[WindowStart]] = {}
         for k in self._leaders(rows, log_w):
@@ -101,19 +101,19 @@ class NewTargetSearch:
         alone = float(log_sum_exp(log_w))
         found = [self._best_of(starts, alone) for starts in explanations.values()]
         return max((joint for joint in found if joint is not None
-                    and (are_felt_by_two(joint) if joint.adds
+                    and (are_sensed_by_two(joint) if joint.adds
                          else self._is_elsewhere(joint))),
                    key=lambda joint: joint.log_odds, default=None)
 
     def _starts_with(self, known: KnownVehicles) -> list[WindowStart]:
         """Starts of all explanations by a hypothesis of the track: a vehicle beside those that it
         has, one elsewhere, two in place of one."""
-        starts = self._beside(known) if self._may_be_more and self._is_odd else []
+        starts = self._beside(known) if self._may_add and self._is_improbable else []
         for i in range(self._n_targets):
             others = self._without(known, i)
-            if self._is_odd and self._is_felt(known, i):
+            if self._is_improbable and self._is_sensed(known, i):
                 starts += self._beside(others, i)
-            if self._may_be_more and self._may_be_two(known, i):
+            if self._may_add and self._may_be_two(known, i):
                 starts += self._pair_in_place_of(others, i)
         return starts
 
@@ -121,12 +121,12 @@ class NewTargetSearch:
         """The `Joint` of the starts of one explanation; `alone` is the log-evidence of the track as
         it is."""
         kept = self._with_turns(self._kept(starts))
-        prior = ARRIVES if len(kept[0].kind) > self._n_targets else WAS_LOST
+        prior = LOG_P_ARRIVAL if len(kept[0].kind) > self._n_targets else LOG_P_LOST
         bank, log_likelihood, log_w, paths = self._run(kept)
         return self._made(kept, bank, log_likelihood, log_w, paths,
                           float(log_sum_exp(log_w)) + prior - alone)
 
-    def _as_it_is(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    def _current_track(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
         """The leading hypotheses of the track along their paths: rows of the bank (n,), the
         log-likelihood of each, its log-weight with that, and its path (n, n_frames, n_x)."""
         window, bank = self._window, self._bank
@@ -146,7 +146,7 @@ class NewTargetSearch:
     def _leaders(self, rows: IntArray, log_w: FloatArray) -> list[int]:
         """Which of the `rows` are tried with a new target: the best of each arrival and kind."""
         seen: set[tuple[int, ...]] = set()
-        most = KNOWN_ROWS if self._n_targets == 1 else 1
+        most = MAX_KNOWN if self._n_targets == 1 else 1
         chosen: list[int] = []
         for k in np.argsort(-log_w, kind='stable').tolist():
             what = (*np.ravel(self._bank.label[rows[k]]).tolist(),
@@ -169,9 +169,9 @@ class NewTargetSearch:
         return self._n_targets == 1 or bool(
             self._filter.are_long(np.array([known.kind[i]]))[0])
 
-    def _is_felt(self, known: KnownVehicles, i: int) -> bool:
+    def _is_sensed(self, known: KnownVehicles, i: int) -> bool:
         """Whether the sensors feel vehicle `i` in the last frame."""
-        return energy_of(self._filter, i, known.path[-1], self._window.frames[-1]) > FELT
+        return energy_of(self._filter, i, known.path[-1], self._window.frames[-1]) > SENSED_LEVEL
 
     def _is_elsewhere(self, joint: Joint) -> bool:
         """Whether a vehicle that was sought elsewhere is far from where the track has it."""
@@ -180,7 +180,7 @@ class NewTargetSearch:
         found = joint.bank.x[joint.bank.best()]
         last = n * (self._n_targets - 1)
         before = now[joint.replaced * n:joint.replaced * n + 2]
-        return bool(np.hypot(*(found[last:last + 2] - before)) > ELSEWHERE_M)
+        return bool(np.hypot(*(found[last:last + 2] - before)) > MIN_DISPLACEMENT_M)
 
     def _without(self, known: KnownVehicles, i: int) -> KnownVehicles:
         """The same without vehicle `i`; of one alone nothing is left that is known."""
@@ -198,19 +198,19 @@ class NewTargetSearch:
     def _beside(self, known: KnownVehicles, replaced: int | None = None) -> list[WindowStart]:
         """One vehicle beside known ones: a new target, or in place of vehicle `replaced`."""
         search = self._search.beside(known)
-        return [start for theta in search.best(self._search.grid, FIRST)
-                for start in self._started(known, theta[None], search.moments(theta), replaced)]
+        return [start for theta in search.best(self._search.grid, MAX_FIRST)
+                for start in self._starts_on(known, theta[None], search.moments(theta), replaced)]
 
     def _pair_in_place_of(self, others: KnownVehicles, i: int) -> list[WindowStart]:
         """Two vehicles in place of vehicle `i`, whose filter may have been misled by them."""
         search = self._search.beside(others)
         starts: list[WindowStart] = []
-        for found in search.pairs(self._search.grid, FIRST, SECOND)[:FIRST]:
+        for found in search.pairs(self._search.grid, MAX_FIRST, MAX_SECOND)[:MAX_FIRST]:
             pair = in_order_of(self._pairs.setdefault(i, found), found)
-            starts += self._started(others, pair, search.moments(pair.ravel()), i)
+            starts += self._starts_on(others, pair, search.moments(pair.ravel()), i)
         return starts
 
-    def _started(self, known: KnownVehicles, paths: FloatArray, moments: FloatArray,
+    def _starts_on(self, known: KnownVehicles, paths: FloatArray, moments: FloatArray,
                  replaced: int | None) -> list[WindowStart]:
         """Known vehicles and new ones on `paths` (k, 7) with `moments` (k, 3, 3), of any kinds."""
         n_known, times = len(known.kind) * self._n_one, self._search.times
@@ -225,7 +225,7 @@ class NewTargetSearch:
                 path.append(self._vehicles.along(theta, m, times, kind))
             starts.append(WindowStart(
                 x, P, np.hstack([*path, known.path[:, n_known:]]), (*known.label, *labels),
-                (*known.kind, *kinds), known.log_w + len(paths) * self._of_cell, len(paths),
+                (*known.kind, *kinds), known.log_w + len(paths) * self._log_prior, len(paths),
                 replaced))
         return starts
 
@@ -269,22 +269,22 @@ class NewTargetSearch:
             first_is_updated=window.is_updated)
         usable: BoolArray = np.isfinite(along.log_likelihood) \
             & np.isfinite(paths).all(axis=(1, 2)) & np.isfinite(bank.x).all(axis=1) \
-            & [self._all_come(s, x) for s, x in zip(starts, bank.x, strict=True)]
+            & [self._are_plausible(s, x) for s, x in zip(starts, bank.x, strict=True)]
         log_likelihood = np.where(usable, along.log_likelihood, -np.inf)
         log_w = log_likelihood + [s.log_w for s in starts] - 0.5 * np.square(
             [overlap_depth(path, self._n_one, len(s.kind), self._vehicles.length_column) / DEPTH_STD
              for s, path in zip(starts, paths, strict=True)])
         return bank, log_likelihood, log_w, paths
 
-    def _all_come(self, start: WindowStart, x: FloatArray) -> bool:
+    def _are_plausible(self, start: WindowStart, x: FloatArray) -> bool:
         """Whether the vehicles that were sought are as fast and as strong, in the state `x` (n_x,),
         as what comes: what stands was there before."""
         settings, n = self._vehicles.settings, self._n_one
         for i in start.are_new:
             speed = np.hypot(*x[i * n + 3:i * n + 5])
             moment = np.linalg.norm(self._vehicles.hard_moments(x[i * n:]).sum(axis=0))
-            if not self._search.prior.slowest <= speed <= MAX_TIMES * max(settings.speeds) \
-                    or moment > MAX_TIMES * max(settings.moments):
+            if not self._search.prior.slowest <= speed <= MAX_RATIO * max(settings.speeds) \
+                    or moment > MAX_RATIO * max(settings.moments):
                 return False
         return True
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mag_tracking.stages.track.clock_comparison import MEMORY, ClockComparison
+from mag_tracking.stages.track.clock_comparison import MEMORY_PASSES, ClockComparison
 from mag_tracking.stages.track.rigid_pass import RigidPass
 
 TWO = np.arange(2)
@@ -98,7 +98,7 @@ def test_clocks_that_were_set_are_believed_after_some_passes():
         clocks.add(a_pass(0.0), TWO)
         n += 1
     print(f'{n} passes after the clocks were set')
-    assert n < MEMORY // 2
+    assert n < MEMORY_PASSES // 2
 
 
 def test_clocks_are_compared_over_sensors_that_never_felt_the_same_vehicle():
