@@ -182,5 +182,5 @@ def test_where_a_vehicle_was_lost_one_of_twice_the_field_is_started_and_flagged(
         'vehicle', {'track.lookback_s': lookback_s}).track)
     tracks = contradicted(stage, [1e-4] * 19 + [2.1e-4])
     assert stage.counts['tracks'] == 2
-    assert stage.counts['tracks begun in a field larger than that of a lost one'] == 1
+    assert stage.counts['tracks started in a larger field than that of a lost track'] == 1
     assert tracks[-1].id == 2 and tracks[-1].ambiguous
