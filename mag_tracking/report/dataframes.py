@@ -46,7 +46,7 @@ def dataframe(columns: Mapping[str, Any], units: Mapping[str, str]) -> 'pd.DataF
         import pandas as pd
     except ModuleNotFoundError as error:
         raise MissingDependencyError(
-            'a DataFrame needs pandas: pip install mag_tracking[pandas]') from error
+            'DataFrames need pandas: pip install mag_tracking[pandas]') from error
     frame = pd.DataFrame(dict(columns))
     frame.attrs['units'] = {name: unit for name, unit in units.items() if name in frame}
     return frame

@@ -115,8 +115,7 @@ standard deviations in the direction of the error."""
 
 
 def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> UnflaggedPoses:
-    """Count the poses of vehicles that are not flagged as ambiguous, and those of them that are
-    wrong.
+    """Count the vehicle poses that are not flagged as ambiguous, and those of them that are wrong.
 
     Parameters
     ----------

@@ -25,12 +25,16 @@ class Note:
     """Message at the top of a page."""
 
     level: str
+    """One of `ERROR`, `WARNING` and `NOTE`."""
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Table. Numbers are shown with four significant digits, None as a dash."""
+    """Table of a page.
+
+    Numbers are shown with four significant digits, None as a dash.
+    """
 
     title: str
     columns: Sequence[str]

@@ -98,7 +98,8 @@ def places(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:
 
     Parameters
     ----------
-    points : (n, 2) or (n, 3) array, m, world frame
+    points : (n, 2) or (n, 3) array
+        Sensor positions in the unit of the map.
     names : sequence of str
 
     Returns
