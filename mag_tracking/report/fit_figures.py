@@ -140,7 +140,7 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
 
 
 def target_alone(fit: _Fit) -> FloatArray:
-    """Fitted field without the backgrounds, which are the last unknowns.
+    """Fitted field without the backgrounds, which are the last parameters of the fit.
 
     Parameters
     ----------

@@ -134,20 +134,20 @@ class TrackEvidence:
         self._n_misfits, self._doubts_filter_until_ns = 0, -1
         self._found_ns.clear()
 
-    def doubt_start(self, unseen_approach: bool, network: SensorNetwork, starts_anywhere: bool
+    def doubt_start(self, approach_unobserved: bool, network: SensorNetwork, starts_anywhere: bool
                     ) -> None:
         """Doubt a track whose target was not seen approaching, or whose range is not observable.
 
         Parameters
         ----------
-        unseen_approach : bool
+        approach_unobserved : bool
             The frames before the detection do not show the target approaching.
         network : SensorNetwork
         starts_anywhere : bool
             `Target.starts_anywhere`.
         """
-        # One that was not seen approaching may already have passed.
-        if unseen_approach and not starts_anywhere:
+        # A target that was not seen approaching may already have passed.
+        if approach_unobserved and not starts_anywhere:
             self.doubt(doubts.NOT_SEEN_APPROACHING)
         # With a single sensor the range follows from the settings. With a few sensors at one place
         # the range of a vehicle follows from errors of its field model.

@@ -7,7 +7,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.reach import SENSED_LEVEL, energies_of
+from mag_tracking.stages.track.reach import DETECTABLE_ENERGY, energies_of
 from mag_tracking.stages.track.relinearisation import Window
 
 CONFIDENT_NATS = 15.0
@@ -44,8 +44,8 @@ class Joint:
     log_odds: float
     """Log-odds of this explanation against the current track [nats]."""
     replaced: int | None
-    """Index of the vehicle of the track that was searched again. It is now the last vehicle, or one
-    of the last two."""
+    """Index of the vehicle of the track that was searched for again. It is now the last vehicle, or
+    one of the last two."""
     adds: bool
     """Whether the explanation has one vehicle more than the track."""
 
@@ -112,6 +112,6 @@ def are_sensed_by_two(joint: Joint) -> bool:
     for i in range(n - (1 if joint.replaced is None else 2), n):
         energy = sum(energies_of(joint.bank_filter, i, path[best], frame) for path, frame in
                      zip(joint.window.paths, joint.window.frames, strict=True))
-        if np.count_nonzero(energy > SENSED_LEVEL) < 2:
+        if np.count_nonzero(energy > DETECTABLE_ENERGY) < 2:
             return False
     return True

@@ -89,7 +89,7 @@ class TrackManager:
             self.counts['sensors whose orientation is hardly known'] = uncertain
 
     def use_network(self, network: SensorNetwork) -> None:
-        """Apply another calibration of the same sensors when no track is running.
+        """Apply another calibration of the same sensors as soon as no track is running.
 
         Parameters
         ----------
@@ -258,7 +258,7 @@ class TrackManager:
         return out
 
     def _remember(self, frame: FieldFrame) -> None:
-        """Keep a frame without a track for the lookback of a later one."""
+        """Keep a frame for the lookback of a later track."""
         self._recent.append(frame)
         oldest = frame.stamp_ns - self._settings.lookback_s * NS
         while self._recent and self._recent[0].stamp_ns < oldest:
@@ -298,7 +298,7 @@ class TrackManager:
         self._tracks.append(track)
         track.doubt(self._doubtful_sensors(*recent, frame))
         out = track.begin(frame, recent,
-                          unseen_approach=in_tail or bool(recent) and _n_sensors(*recent) < 2)
+                          approach_unobserved=in_tail or bool(recent) and _n_sensors(*recent) < 2)
         return out + self._delete_ended(frame.stamp_ns)
 
     def _sensors_at(self, frame: FieldFrame, n: int) -> SensorSubset:

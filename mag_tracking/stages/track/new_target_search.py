@@ -20,7 +20,7 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_vehicle import moment_directions
 from mag_tracking.stages.track.joint import Joint, are_sensed_by_two
 from mag_tracking.stages.track.new_target_evidence import IMPROBABLE
-from mag_tracking.stages.track.reach import SENSED_LEVEL, energy_of
+from mag_tracking.stages.track.reach import DETECTABLE_ENERGY, energy_of
 from mag_tracking.stages.track.relinearisation import Window
 from mag_tracking.stages.track.vehicle_state import VehicleState
 from mag_tracking.stages.track.window_search import WindowSearch
@@ -77,7 +77,7 @@ class NewTargetSearch:
     vehicles : VehicleState
     reason : str
         Reason from `NewTargetEvidence.due`. If the innovations are not improbable, no vehicle is
-        searched beside a long one or elsewhere.
+        searched for beside a long one or elsewhere.
     may_add : bool
         Whether a vehicle may be added.
     """
@@ -189,10 +189,11 @@ class NewTargetSearch:
 
     def _is_sensed(self, known: KnownVehicles, i: int) -> bool:
         """Whether the sensors sense vehicle `i` in the last frame."""
-        return energy_of(self._filter, i, known.path[-1], self._window.frames[-1]) > SENSED_LEVEL
+        return energy_of(
+            self._filter, i, known.path[-1], self._window.frames[-1]) > DETECTABLE_ENERGY
 
     def _is_elsewhere(self, joint: Joint) -> bool:
-        """Whether a vehicle that was searched elsewhere was found far from its track."""
+        """Whether a vehicle that was searched for elsewhere was found far from its track."""
         n, now = self._n_one, self._bank.x[self._bank.best()]
         assert joint.replaced is not None
         found = joint.bank.x[joint.bank.best()]

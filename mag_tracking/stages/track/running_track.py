@@ -110,7 +110,7 @@ class RunningTrack:
                 self.counts['tracks of a doubtful background'] += 1
                 member.evidence.doubt(doubts.DOUBTFUL_BACKGROUND)
 
-    def begin(self, frame: FieldFrame, recent: list[FieldFrame], unseen_approach: bool = False
+    def begin(self, frame: FieldFrame, recent: list[FieldFrame], approach_unobserved: bool = False
               ) -> list[TrackRecord]:
         """Run through the `recent` frames before the detection, and publish the first one after.
 
@@ -120,13 +120,13 @@ class RunningTrack:
             Of the whole network, with the detection.
         recent : list of FieldFrame
             Those before it, oldest first.
-        unseen_approach : bool
+        approach_unobserved : bool
             What came before says nothing of how this target came.
         """
         watched_ns = frame.stamp_ns - recent[0].stamp_ns if recent else 0
         first = self.members[0]
         first.evidence.doubt_start(
-            unseen_approach or watched_ns < MIN_OBSERVED_SHARE * self._settings.lookback_s * NS,
+            approach_unobserved or watched_ns < MIN_OBSERVED_SHARE * self._settings.lookback_s * NS,
             self._seeing.whole, self._target.starts_anywhere)
         first.begin_ns = frame.stamp_ns
         self._bank.begin(recent[0] if recent else frame, frame)
