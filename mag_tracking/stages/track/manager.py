@@ -34,9 +34,9 @@ DISTURBANCE_TRACKS = 'tracks explained by a disturbance'
 STARTED_IN_TAIL = 'tracks started in a larger field than that of a lost track'
 
 RESTART_ENERGY_RATIO = 4.0
-"""After a target was lost, a new track is started only in a frame whose field has this multiple of
-the energy of any frame of the lost track, which is twice the field. In the tail of a pass the field
-only decreases."""
+"""After a target was lost, a new track is started only in a frame with more than this multiple of
+the energy of any frame of the lost track (twice its field). In the tail of a pass the field only
+decreases."""
 
 
 class TrackManager:

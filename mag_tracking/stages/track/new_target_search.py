@@ -42,8 +42,8 @@ MAX_KNOWN, MAX_FIRST, MAX_SECOND = 2, 3, 2
 vehicles), and of paths of a first and of a second new vehicle for each."""
 
 NATS_KEPT, MAX_KEPT = 10.0, 12
-"""An explanation is dropped if its log-probability is lower than that of the best by more than this
-[nats]; and maximum number of explanations that are kept."""
+"""Maximum difference in log-probability from the best explanation at which another one is kept
+[nats], and maximum number of explanations kept."""
 
 LOG_P_ARRIVAL = np.log(0.05)
 """Log-probability that another vehicle arrives during a pass."""
