@@ -10,7 +10,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.files import replace_text
 from mag_tracking.report.page import NOTE, REPORT, Chart, Note, Page, Table, report_html
 from mag_tracking.report.page_charts import axes, curve, heat_map, places
-from mag_tracking.report.plan_figures import MIN_MISSED, distinct, f_text
+from mag_tracking.report.plan_figures import MIN_MISSED, distinct_lanes, length_text
 from mag_tracking.report.scales import scale_of
 
 LOW_SHARE = 0.02
@@ -37,7 +37,7 @@ def answers(p: Plan) -> list[str]:
             else f'observable, condition number {o.condition_number:.3g}')
     out.append(f'one pass on lane {p.lanes[0].name}, without priors: {seen}')
     for name, (r, v, m) in p.blocks.items():
-        out.append(f'  closest point, {name}: position {f_text(r)}, velocity {v:.3g} m/s, '
+        out.append(f'  closest point, {name}: position {length_text(r)}, velocity {v:.3g} m/s, '
               f'moment {m:.3g} A m^2')
     for lane in p.lanes:
         good = np.flatnonzero(lane.detection >= GOOD_PD)
@@ -45,8 +45,8 @@ def answers(p: Plan) -> list[str]:
                  else 'nowhere')
         closest = int(np.argmin(np.abs(lane.along)))
         out.append(f'lane {lane.name}: a frame detects it with {GOOD_PD:.0%} {first}; '
-              f'at the middle a filter knows it to {f_text(lane.filter_std[closest])}, a whole '
-              f'pass to {f_text(lane.pass_std[closest, 0])}')
+              f'at the middle a filter knows it to {length_text(lane.filter_std[closest])}, a '
+              f'whole pass to {length_text(lane.pass_std[closest, 0])}')
     caught = p.missed[p.missed[:, 1] < 0.01, 0]
     out.append(f'99 % of passes are detected up to {caught.max():.3g} m from the middle'
                if len(caught) else 'nowhere are 99 % of the passes detected')
@@ -59,8 +59,8 @@ def answers(p: Plan) -> list[str]:
         x, y = p.best_place
         edge = ' (on the edge of the area)' if x in p.x[[0, -1]] or y in p.y[[0, -1]] else ''
         out.append(f'one more sensor helps most at ({x:.2f}, {y:.2f}) m{edge}: the median bound '
-                   f'near the sensors becomes {f_text(np.nanmin(p.with_one_more))}, now '
-                   f'{f_text(p.without)}')
+                   f'near the sensors becomes {length_text(np.nanmin(p.with_one_more))}, now '
+                   f'{length_text(p.without)}')
     return out
 
 
@@ -128,7 +128,7 @@ def _lanes(plan: Plan) -> list[Chart]:
     """Charts of bounds and detection along the lanes, and of missed passes."""
     f, unit = scale_of(np.ptp(plan.x))
     bounds, seen = [], []
-    for k, (name, lane) in enumerate(distinct(plan.lanes)):
+    for k, (name, lane) in enumerate(distinct_lanes(plan.lanes)):
         along: FloatArray = f * lane.along
         bounds += [curve(along, f * lane.filter_std, f'{name}: filter so far', 2 * k),
                    curve(along, f * lane.pass_std[:, 0], f'{name}: whole pass', 2 * k + 1)]

@@ -239,7 +239,7 @@ def _delay_entry(log: TrackLog, network: SensorNetwork) -> dict[str, Any]:
     found = correlated_motion(PassData.of_frames(network, log.stamp_ns, log.measured, log.noise))
     if found.reason:
         return {'reason': found.reason}
-    k = log.surest()
+    k = log.most_certain()
     moving = log.velocity[k][:2], log.covariance[k][3:5, 3:5]
     return {'speed': found.speed, 'speed_sd': found.speed_std,
             'heading_deg': float(np.degrees(found.heading)),

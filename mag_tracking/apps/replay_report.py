@@ -16,7 +16,7 @@ from mag_tracking.report.page_scene import (
     MAX_SENSORS,
     MAX_TRACKS,
     facts_of,
-    most_poses_of,
+    max_poses_of,
     path_entry,
     scene_of,
     strongest_sensors,
@@ -54,7 +54,7 @@ def _scene(run: Run, network: SensorNetwork, logs: Sequence[TrackLog],
     """Map of the tracks; what it leaves out is added to the notes."""
     if len(logs) < len(run.logs):
         notes.append(Note(NOTE, f'the page shows the first {len(logs)} of {len(run.logs)} tracks'))
-    most = most_poses_of(logs)
+    most = max_poses_of(logs)
     if any(len(log.stamp_ns) > most for log in logs):
         notes.append(Note(NOTE, f'the page shows {most} poses per track; poses.csv has all'))
     if len(network) > MAX_SENSORS:

@@ -1,1 +1,1 @@
-"""Figures and numbers about a run."""
+"""Figures, tables, pages and metrics of a run."""

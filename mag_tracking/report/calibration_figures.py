@@ -1,4 +1,4 @@
-"""Figures of a calibration: one function a figure, each returns the figure."""
+"""Figures of a calibration; each function returns one figure."""
 
 from collections.abc import Mapping
 from typing import Protocol
@@ -14,7 +14,7 @@ from mag_tracking.report.literal_text import literal
 
 
 class _Network(Protocol):
-    """What the figures read of a `SensorNetwork`."""
+    """Attributes of a `SensorNetwork` that the figures use."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -34,7 +34,7 @@ class _Network(Protocol):
 
 
 class _Survey(Protocol):
-    """What the figures read of a `NetworkSurvey`."""
+    """Attributes of a `NetworkSurvey` that the figures use."""
 
     @property
     def network(self) -> _Network: ...
@@ -44,7 +44,7 @@ class _Survey(Protocol):
 
 
 class _Calibration(Protocol):
-    """What the figures read of a `Calibration`."""
+    """Attributes of a `Calibration` that the figures use."""
 
     @property
     def network(self) -> _Network: ...
@@ -57,7 +57,7 @@ class _Calibration(Protocol):
 
 
 class _EllipsoidFit(Protocol):
-    """What the figures read of an `EllipsoidFit`."""
+    """Attributes of an `EllipsoidFit` that the figures use."""
 
     @property
     def coverage(self) -> float: ...
@@ -66,15 +66,19 @@ class _EllipsoidFit(Protocol):
 
 
 def calibration_figure(found: _Calibration, stated: _Network, most: int = 8) -> Figure:
-    """The knocks by the clocks as they were and as they are now, and the headings.
+    """Plot the knocks before and after clock calibration, and the headings of the sensors.
 
     Parameters
     ----------
     found : Calibration
     stated : SensorNetwork
-        As it was installed.
+        Network as installed.
     most : int
-        Sensors whose knocks are drawn.
+        Maximum number of sensors whose knocks are drawn.
+
+    Returns
+    -------
+    Figure
     """
     figure = Figure(figsize=(11.0, 4.6), layout='constrained')
     left, middle, right = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
@@ -84,16 +88,24 @@ def calibration_figure(found: _Calibration, stated: _Network, most: int = 8) -> 
 
 
 def first_knock(shocks: Mapping[str, tuple[FloatArray, FloatArray]]) -> float:
-    """[s] Start of the first strong knock; 0 without any knock.
+    """Start time of the first strong knock.
 
-    `shocks` is {sensor: (times (n,) [s], sizes (n,))}.
+    Parameters
+    ----------
+    shocks : dict of str to ((n,) array, s, and (n,) array, m/s²)
+        Times and accelerations of each sensor.
+
+    Returns
+    -------
+    float, s
+        0 without any knock.
     """
     return min((float(t[s > 0.3 * s.max()][0]) for t, s in shocks.values()
                 if len(s) and s.max() > 0.0), default=0.0)
 
 
 def _knocks(before: Axes, after: Axes, found: _Calibration, most: int) -> None:
-    """The first loud second of each sensor."""
+    """Plot the time around the first knock for each sensor, before and after the correction."""
     shocks = {name: found.survey.shocks[name] for name in list(found.survey.shocks)[:most]}
     first = first_knock(shocks)
     for k, (name, (t, s)) in enumerate(shocks.items()):
@@ -102,56 +114,60 @@ def _knocks(before: Axes, after: Axes, found: _Calibration, most: int) -> None:
             near = np.abs(t - shift - first) < 0.25
             axes.plot(t[near] - shift - first, s[near], '.-', ms=4, lw=0.8, color=f'C{k}',
                       label=literal(name))
-    for axes, title in ((before, 'a knock, clocks as they were'), (after, 'clocks set by it')):
+    for axes, title in ((before, 'knock, uncorrected clocks'), (after, 'knock, corrected clocks')):
         axes.set_title(title, fontsize=10)
         axes.set_xlabel('time [s]')
         axes.grid(alpha=0.3)
-    before.set_ylabel('acceleration from rest [m/s²]')
+    before.set_ylabel('acceleration relative to rest [m/s²]')
     if shocks:
         after.legend(fontsize=8)
 
 
 def _headings(axes: Axes, found: _Calibration, stated: _Network) -> None:
-    """How far each sensor is turned from what was stated, by what is known when."""
+    """Plot the rotation of each sensor from its stated orientation, by calibration step."""
     n = len(stated)
     steps = [('compass', found.survey.network, 'tab:orange', 0.12)]
     if found.evidence is not None:
-        steps.append(('and passes', found.network, 'tab:blue', -0.12))
+        steps.append(('compass and passes', found.network, 'tab:blue', -0.12))
     for label, network, colour, shift in steps:
         yaw = [np.degrees(yaw_between(stated.R_ws[j], network.R_ws[j])) for j in range(n)]
         std = [0.0 if s is None else SCALE_1D * np.degrees(s[2]) for s in network.orientation_std]
         axes.errorbar(yaw, np.arange(n) + shift, xerr=std, fmt='o', ms=4, capsize=3, color=colour,
                       label=label)
-    axes.axvline(0.0, color='k', lw=0.8, ls=':', label='as stated')
+    axes.axvline(0.0, color='k', lw=0.8, ls=':', label='network file')
     axes.set_yticks(range(n), [literal(name) for name in stated.names])
     axes.invert_yaxis()
-    axes.set_title('turned about the vertical (90 %)', fontsize=10)
+    axes.set_title('rotation about the vertical (90 %)', fontsize=10)
     axes.set_xlabel('[degrees]')
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
 
 
 def tumble_figure(fits: Mapping[str, _EllipsoidFit], readings: Mapping[str, FloatArray]) -> Figure:
-    """Field sizes before and after, and the directions that the sensors were turned to.
+    """Plot field magnitudes before and after the correction, and the directions of the field.
 
     Parameters
     ----------
-    fits : {sensor: EllipsoidFit}
-    readings : {sensor: (n, 3)}
-        In order of time.
+    fits : dict of str to EllipsoidFit
+    readings : dict of str to (n, 3) array
+        Readings of each sensor, in order of time.
+
+    Returns
+    -------
+    Figure
     """
     figure = Figure(figsize=(10.0, 0.6 + 2.7 * len(fits)), layout='constrained')
     rows = figure.subplots(len(fits), 2, squeeze=False, width_ratios=(1.5, 1.0))
     for (left, right), (name, fit) in zip(rows, fits.items(), strict=True):
         y = readings[name][~np.isnan(readings[name]).any(axis=1)]
         B = fit.correct(y)
-        for values, colour, label in ((y, 'tab:orange', 'as read'), (B, 'tab:blue', 'corrected')):
+        for values, colour, label in ((y, 'tab:orange', 'raw data'), (B, 'tab:blue', 'corrected')):
             size = np.linalg.norm(values, axis=1)
             left.plot(size / size.mean(), '.', ms=2, color=colour, rasterized=True,
-                      label=f'{label}: scatters by {100 * size.std() / size.mean():.2f} %')
+                      label=f'{label}: std {100 * size.std() / size.mean():.2f} %')
         left.set_title(literal(name), fontsize=9)
         left.set_xlabel('reading')
-        left.set_ylabel('size of the field\nover its mean')
+        left.set_ylabel('field magnitude\nrelative to its mean')
         left.legend(fontsize=8, loc='upper right')
         u = B / np.linalg.norm(B, axis=1, keepdims=True)
         right.plot(np.degrees(np.arctan2(u[:, 1], u[:, 0])), u[:, 2], '.', ms=2,
@@ -159,8 +175,8 @@ def tumble_figure(fits: Mapping[str, _EllipsoidFit], readings: Mapping[str, Floa
         right.set_xlim(-180.0, 180.0)
         right.set_ylim(-1.0, 1.0)
         right.set_xlabel('azimuth of the field [degrees]')
-        right.set_ylabel('upward part')
-        right.set_title(f'directions (equal areas), coverage {fit.coverage:.2f}', fontsize=9)
+        right.set_ylabel('z component')
+        right.set_title(f'directions (equal-area), coverage {fit.coverage:.2f}', fontsize=9)
         for axes in (left, right):
             axes.grid(alpha=0.3)
     return figure

@@ -1,6 +1,6 @@
 """Results as pandas DataFrames, with the columns of the CSV files that `mag-tracking` writes.
 
-`DataFrame.attrs['units']` is {column: unit}; a column without an entry is dimensionless.
+`DataFrame.attrs['units']` maps columns to units; a column without an entry is dimensionless.
 """
 
 from collections.abc import Mapping
@@ -25,12 +25,13 @@ STATE_UNITS = {
 
 
 def dataframe(columns: Mapping[str, Any], units: Mapping[str, str]) -> 'pd.DataFrame':
-    """A DataFrame with units.
+    """Return a DataFrame with units.
 
     Parameters
     ----------
-    columns : {column: (n,) array}
-    units : {column: unit}
+    columns : dict of str to (n,) array
+    units : dict of str to str
+        Unit of each column; other columns are ignored.
 
     Returns
     -------
@@ -45,18 +46,19 @@ def dataframe(columns: Mapping[str, Any], units: Mapping[str, str]) -> 'pd.DataF
         import pandas as pd
     except ModuleNotFoundError as error:
         raise MissingDependencyError(
-            'a DataFrame needs pandas: pip install mag_tracking[pandas]') from error
+            'DataFrames need pandas: pip install mag_tracking[pandas]') from error
     frame = pd.DataFrame(dict(columns))
     frame.attrs['units'] = {name: unit for name, unit in units.items() if name in frame}
     return frame
 
 
 def poses_dataframe(poses: StructArray) -> 'pd.DataFrame':
-    """Poses with the columns of `poses.csv`.
+    """Return poses with the columns of `poses.csv`.
 
     Parameters
     ----------
-    poses : (n,) structured array of `pose_array`
+    poses : (n,) structured array
+        As returned by `pose_array`.
 
     Returns
     -------
@@ -69,11 +71,12 @@ def poses_dataframe(poses: StructArray) -> 'pd.DataFrame':
 
 
 def smoothed_dataframe(smoothed: StructArray) -> 'pd.DataFrame':
-    """Smoothed poses with the columns of `poses_smoothed.csv`, and `complete`.
+    """Return smoothed poses with the columns of `poses_smoothed.csv`, and `complete`.
 
     Parameters
     ----------
-    smoothed : (n,) structured array of `smoothed_array`
+    smoothed : (n,) structured array
+        As returned by `smoothed_array`.
 
     Returns
     -------
@@ -86,11 +89,12 @@ def smoothed_dataframe(smoothed: StructArray) -> 'pd.DataFrame':
 
 
 def detections_dataframe(detections: StructArray) -> 'pd.DataFrame':
-    """Onsets and releases with the columns of `detections.csv`.
+    """Return onsets and releases with the columns of `detections.csv`.
 
     Parameters
     ----------
-    detections : (n,) structured array of `detection_array`
+    detections : (n,) structured array
+        As returned by `detection_array`.
 
     Returns
     -------
@@ -105,7 +109,7 @@ def detections_dataframe(detections: StructArray) -> 'pd.DataFrame':
 
 
 def _state_columns(rows: StructArray) -> dict[str, Any]:
-    """{column: (n,) array} of stamp, track, position, velocity, standard deviations and moment."""
+    """Columns of timestamp, track, position, velocity, standard deviations and moment."""
     std = np.sqrt(np.diagonal(rows['covariance'], axis1=1, axis2=2))
     columns: dict[str, Any] = {'stamp_ns': rows['stamp_ns'], 'track_id': rows['track_id']}
     for names, values in ((_POSITION, rows['position']), (_VELOCITY, rows['velocity']),

@@ -1,4 +1,4 @@
-"""Files of figures."""
+"""Figure files."""
 
 import io
 from os import PathLike
@@ -12,9 +12,17 @@ _DOTS_PER_INCH = 110
 
 
 def save_figure(figure: Figure, path: str | PathLike[str]) -> None:
-    """Write a figure in the format of the suffix, replacing any file or link of that name.
+    """Write a figure in the format given by the suffix, replacing any file or link of that name.
 
-    Raises OSError where it cannot be written.
+    Parameters
+    ----------
+    figure : Figure
+    path : str or path
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
     """
     drawn = io.BytesIO()
     figure.savefig(drawn, format=Path(path).suffix.removeprefix('.').lower(), dpi=_DOTS_PER_INCH)

@@ -1,4 +1,4 @@
-"""Figures of a run: one function a figure, each returns the figure.
+"""Figures of a run; each function returns one figure.
 
 Uncertainty is drawn as 90 % regions throughout.
 """
@@ -19,16 +19,16 @@ from mag_tracking.report.style import legend_beside
 from mag_tracking.report.track_log import TrackLog
 
 SCALE_2D = float(np.sqrt(chdtri(2, 0.1)))
-"""Deviations to the edge of a 90 % ellipse in the plane."""
+"""Standard deviations to the edge of a 90 % ellipse in the plane."""
 SCALE_1D = 1.645
-"""Deviations to the edge of a 90 % interval."""
+"""Standard deviations to the edge of a 90 % interval."""
 
 MIN_DRAWN = 0.01
-"""Weight above which the hypotheses of an arrival are drawn: lighter ones would stretch the map."""
+"""Minimum weight of a drawn hypothesis of an arrival; lighter ones would extend the map."""
 
 
 class _Network(Protocol):
-    """What the figures read of a `SensorNetwork`."""
+    """Attributes of a `SensorNetwork` that the figures use."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -49,13 +49,13 @@ def _ellipse(position: FloatArray, covariance: FloatArray, n: int = 48) -> Float
 
 
 def _colours(log: TrackLog) -> dict[str, str]:
-    """{arrival: colour}, in a fixed order."""
+    """Colour of each arrival, in a fixed order."""
     names = sorted({name for row in log.arrivals for name in row})
     return {name: SERIES[i % len(SERIES)] for i, name in enumerate(names)}
 
 
 def _without_switches(points: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Points (n, 2), with NaN where another hypothesis begins, which is suddenly elsewhere."""
+    """Points (n, 2), with NaN where the best hypothesis changes and the position jumps."""
     certain = 3.0 * np.sqrt(np.trace(covariances, axis1=1, axis2=2))
     steps = np.hypot(*np.diff(points, axis=0).T)
     usual = 4.0 * np.median(steps) if len(steps) else 0.0
@@ -65,14 +65,18 @@ def _without_switches(points: FloatArray, covariances: FloatArray) -> FloatArray
 
 def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None,
                smoothed: ArrayLike | None = None) -> Figure:
-    """The map: trajectories of the hypotheses with 90 % ellipses, sensors and truth.
+    """Plot the trajectories of the hypotheses with 90 % ellipses, the sensors and the truth.
 
     Parameters
     ----------
     log : TrackLog
     network : SensorNetwork
-    truth : (n, 3) [m], optional
-    smoothed : (n, 3) [m], optional
+    truth : (n, 3) array, m, world frame, optional
+    smoothed : (n, 3) array, m, world frame, optional
+
+    Returns
+    -------
+    Figure
     """
     figure = Figure(figsize=(8.5, 6.5), layout='constrained')
     axes = figure.add_subplot()
@@ -111,7 +115,7 @@ def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None
 
 
 def _draw_arrivals(axes: Axes, log: TrackLog, f: float) -> None:
-    """The best hypothesis of each arrival, while it weighs something, where there are several."""
+    """Plot the best hypothesis of each arrival while it has weight, if there are several."""
     colours = _colours(log)
     if len(colours) < 2:
         return
@@ -127,11 +131,15 @@ def _draw_arrivals(axes: Axes, log: TrackLog, f: float) -> None:
 
 
 def weights_figure(log: TrackLog) -> Figure:
-    """The weight of each arrival over time, linear and logarithmic.
+    """Plot the weight of each arrival over time, linear and logarithmic.
 
     Parameters
     ----------
     log : TrackLog
+
+    Returns
+    -------
+    Figure
     """
     figure = Figure(figsize=(8.5, 4.5), layout='constrained')
     top, bottom = figure.subplots(2, 1, sharex=True)
@@ -143,7 +151,7 @@ def weights_figure(log: TrackLog) -> Figure:
     top.set_ylim(-0.03, 1.03)
     top.set_ylabel('weight')
     legend_beside(top)
-    what = 'each arrival direction (a line ends where it was dropped)' \
+    what = 'each arrival direction (a line ends when its direction is pruned)' \
         if any(_colours(log)) else 'the hypotheses, which have no arrival directions'
     top.set_title(f'Track {log.id}: weight of {what}')
     bottom.set_ylim(1e-13, 3.0)
@@ -155,14 +163,19 @@ def weights_figure(log: TrackLog) -> Figure:
 
 
 def field_figure(log: TrackLog, network: _Network, most: int = 8) -> Figure:
-    """Measured field against that of the best hypothesis, per sensor and axis.
+    """Plot the measured field and that of the best hypothesis, per sensor and axis.
 
     Parameters
     ----------
     log : TrackLog
     network : SensorNetwork
     most : int
-        Sensors drawn; with more, those with the strongest field (the title says so).
+        Maximum number of sensors; with more, those with the strongest field are drawn, as the title
+        states.
+
+    Returns
+    -------
+    Figure
     """
     measured, predicted = np.array(log.measured), np.array(log.predicted)
     strength = np.nan_to_num(np.nanmax(np.abs(np.where(np.isnan(measured), 0.0, measured)),

@@ -1,4 +1,4 @@
-"""Figures of fitted passes: one function a figure, each returns the figure."""
+"""Figures of fitted passes; each function returns one figure."""
 
 from collections.abc import Sequence
 from typing import Protocol
@@ -15,7 +15,7 @@ from mag_tracking.report.style import legend_beside, plain_log_ticks
 
 
 class _Network(Protocol):
-    """What the figures read of a `SensorNetwork`."""
+    """Attributes of a `SensorNetwork` that the figures use."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -24,7 +24,7 @@ class _Network(Protocol):
 
 
 class _Data(Protocol):
-    """What the figures read of a `PassData`."""
+    """Attributes of a `PassData` that the figures use."""
 
     @property
     def network(self) -> _Network: ...
@@ -46,7 +46,7 @@ class _Data(Protocol):
 
 
 class _Fit(Protocol):
-    """What the figures read of a `PassFit`."""
+    """Attributes of a `PassFit` that the figures use."""
 
     @property
     def n_dipoles(self) -> int: ...
@@ -71,7 +71,7 @@ class _Fit(Protocol):
 
 
 class _FittedPass(Protocol):
-    """What the figures read of a `FittedPass`."""
+    """Attributes of a `FittedPass` that the figures use."""
 
     @property
     def recording(self) -> str: ...
@@ -87,19 +87,25 @@ class _FittedPass(Protocol):
 
 
 def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
-    """Measured and fitted field with the band that 90 % of the measurements should lie in.
+    """Plot the measured and the fitted field with bands that should contain 90 % of the readings.
 
-    By noise and `PassFit.robust_covariance`; where the normalised cost is above one, what the model
-    does not describe counts as more noise.
+    The bands include noise and `PassFit.robust_covariance`. If the normalised cost exceeds 1,
+    errors of the model are treated as additional noise.
 
     Parameters
     ----------
     fit : PassFit
     title : str
     most : int
-        Sensors drawn; with more, those with the strongest field.
+        Maximum number of sensors; with more, those with the strongest field are drawn.
 
-    Source: TSP14 Fig. 6.
+    Returns
+    -------
+    Figure
+
+    References
+    ----------
+    [TSP14]_ Fig. 6.
     """
     data = fit.data
     level = fit.predicted - target_alone(fit)
@@ -112,7 +118,8 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
                        strict=True):
         mine = data.sensor == j
         t = data.t[mine]
-        # A coarse sensor at rest has a larger one, so that all its readings count as one.
+        # The minimum excludes the covariance of a coarse sensor at rest, which is enlarged so that
+        # all its readings count as one.
         noise = np.nanmin(np.einsum('nii->ni', data.covariance[mine]), axis=0, initial=np.inf)
         for a, colour in enumerate(AXIS_COLOURS):
             if np.isnan(data.field[mine, a]).all():
@@ -133,7 +140,16 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
 
 
 def target_alone(fit: _Fit) -> FloatArray:
-    """(n, 3) [T] the fitted field without the backgrounds, which are the last unknowns."""
+    """Fitted field without the backgrounds, which are the last parameters of the fit.
+
+    Parameters
+    ----------
+    fit : PassFit
+
+    Returns
+    -------
+    (n, 3) array, T, sensor frame
+    """
     out = fit.predicted.copy()
     for name, value in zip(fit.names, fit.x, strict=True):
         if name.startswith('B '):
@@ -143,13 +159,21 @@ def target_alone(fit: _Fit) -> FloatArray:
 
 
 def order_figure(passes: Sequence[_FittedPass]) -> Figure:
-    """Normalised cost over the number of dipoles, a line a pass; filled = the order chosen.
+    """Plot the normalised cost over the number of dipoles, one line per pass.
+
+    The chosen order is marked by a filled symbol.
 
     Parameters
     ----------
     passes : sequence of FittedPass
 
-    Source: TSP14 Fig. 7.
+    Returns
+    -------
+    Figure
+
+    References
+    ----------
+    [TSP14]_ Fig. 7.
     """
     figure = Figure(figsize=(7.5, 5.0), layout='constrained')
     axes = figure.add_subplot()
@@ -166,10 +190,10 @@ def order_figure(passes: Sequence[_FittedPass]) -> Figure:
     axes.axhline(1.0, color='k', lw=0.8, ls='--')
     axes.set_xticks(sorted({f.n_dipoles for one in passes for f in one.fits}))
     axes.set_xlabel('number of dipoles')
-    axes.set_ylabel('normalised cost (1 = the model is right)')
+    axes.set_ylabel('normalised cost (1 = residuals match the noise)')
     axes.grid(alpha=0.3, which='both')
     legend_beside(axes)
     plain_log_ticks(axes)
-    figure.suptitle('How well a row of dipoles describes each pass (filled: the order chosen)',
+    figure.suptitle('Fit of a row of dipoles to each pass (filled: chosen order)',
                     fontsize=11)
     return figure

@@ -1,4 +1,4 @@
-"""Figures of a board's geometry: one function a figure, each returns the figure."""
+"""Figures of the geometry of a board; each function returns one figure."""
 
 from typing import Protocol
 
@@ -12,11 +12,12 @@ from mag_tracking.report.literal_text import literal
 
 _SUSPECT = 'tab:red'
 _MAX_NAMES = 60
-"""With more sensors only every second, third, ... is named."""
+"""Maximum number of sensor names on an axis; with more sensors only every second, third, ... is
+named."""
 
 
 class _Network(Protocol):
-    """What the figures read of a `SensorNetwork`."""
+    """Attributes of a `SensorNetwork` that the figures use."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -26,7 +27,7 @@ class _Network(Protocol):
 
 
 class _Geometry(Protocol):
-    """What the figures read of a `NetworkGeometry`."""
+    """Attributes of a `NetworkGeometry` that the figures use."""
 
     @property
     def position_std(self) -> FloatArray: ...
@@ -54,7 +55,7 @@ class _Geometry(Protocol):
 
 
 class _Survey(Protocol):
-    """What the figures read of a `GeometrySurvey`."""
+    """Attributes of a `GeometrySurvey` that the figures use."""
 
     @property
     def stated(self) -> _Network: ...
@@ -76,11 +77,15 @@ class _Survey(Protocol):
 
 
 def geometry_figure(found: _Survey) -> Figure:
-    """Where the sensors moved to, how they are turned, their gains, and what is left over.
+    """Plot corrections of positions, orientations and gains of the sensors, and the residuals.
 
     Parameters
     ----------
     found : GeometrySurvey
+
+    Returns
+    -------
+    Figure
     """
     g, names = found.geometry, found.network.names
     n = len(names)
@@ -94,14 +99,15 @@ def geometry_figure(found: _Survey) -> Figure:
     along = np.arange(n)
     moved = found.network.positions - found.stated.positions
     _spread(rows[0], along, 1e3 * np.linalg.norm(moved, axis=1), 1e3 * g.position_std,
-            'moved [mm]')
-    _spread(rows[1], along, np.rad2deg(found.turned), np.rad2deg(g.rotation_std), 'turned [deg]')
+            'displacement [mm]')
+    _spread(rows[1], along, np.rad2deg(found.turned), np.rad2deg(g.rotation_std),
+            'rotation [deg]')
     rows[2].errorbar(along, g.gain, yerr=SCALE_1D * g.gain_std, fmt='o', ms=4, capsize=2,
                      color='tab:blue')
     rows[2].axhline(1.0, color='k', lw=0.8, ls=':')
     rows[2].set_title('gain (90 %)', fontsize=10, loc='left')
     _bars(rows[3], along, g.sensor_residual, suspect,
-          'residual, in its deviations (rms; about 1 where noise and field error are right)')
+          'residual in standard deviations (RMS; about 1 if noise and field error are right)')
     step = -(-n // _MAX_NAMES)
     rows[3].set_xticks(along[::step], [literal(name) for name in names[::step]], rotation=90,
                        fontsize=7)
@@ -110,7 +116,7 @@ def geometry_figure(found: _Survey) -> Figure:
 
 
 def _moves(figure: SubFigure, axes: Axes, found: _Survey, suspect: BoolArray) -> None:
-    """The board from its flattest side: arrows of the moves, much enlarged."""
+    """Plot the board from its flattest side, with magnified arrows of the corrections."""
     places = found.stated.positions
     a, b = _widest(places)
     c = 3 - a - b
@@ -126,7 +132,7 @@ def _moves(figure: SubFigure, axes: Axes, found: _Survey, suspect: BoolArray) ->
         clim=(-most, most), angles='xy', scale_units='xy', width=0.006, edgecolor='k',
         linewidth=0.4, scale=8.0 * (longest or 1.0) / extent, zorder=2)
     axes.quiverkey(arrows, 0.86, 1.03, key, f'{key:g} mm', labelpos='E')
-    axes.plot(places[:, a], places[:, b], 'k.', ms=3, zorder=3, label='sensors as stated')
+    axes.plot(places[:, a], places[:, b], 'k.', ms=3, zorder=3, label='stated positions')
     if suspect.any():
         axes.plot(places[suspect, a], places[suspect, b], 'o', ms=12, mfc='none', mew=1.5,
                   color=_SUSPECT, label='does not fit')
@@ -134,27 +140,27 @@ def _moves(figure: SubFigure, axes: Axes, found: _Survey, suspect: BoolArray) ->
         for name, place in zip(found.network.names, places, strict=True):
             axes.annotate(literal(name), place[[a, b]], xytext=(3, -8), textcoords='offset points',
                           fontsize=6, color='0.35')
-    # Not stretched by a few poses far off.
+    # A few distant poses do not extend the axes.
     low, high = places.min(axis=0) - 0.15 * extent, places.max(axis=0) + 0.15 * extent
     axes.set_xlim(low[a], high[a])
     axes.set_ylim(low[b], high[b])
     axes.set_aspect('equal')
     axes.set_xlabel(f'{"xyz"[a]} [m]')
     axes.set_ylabel(f'{"xyz"[b]} [m]')
-    axes.set_title('moved from where it was stated', fontsize=10, loc='left')
+    axes.set_title('displacement from the stated positions', fontsize=10, loc='left')
     axes.legend(fontsize=7, ncols=3, loc='upper center', bbox_to_anchor=(0.5, -0.12),
                 frameon=False)
-    figure.colorbar(arrows, ax=axes, shrink=0.7, label=f'moved along {"xyz"[c]} [mm]')
+    figure.colorbar(arrows, ax=axes, shrink=0.7, label=f'displacement along {"xyz"[c]} [mm]')
 
 
 def _widest(places: FloatArray) -> tuple[int, int]:
-    """The two axes along which the board is widest, in their order."""
+    """Axes along which the board is widest, in ascending order."""
     a, b = sorted(np.argsort(np.ptp(places, axis=0), kind='stable')[1:])
     return int(a), int(b)
 
 
 def _round_down(value: float) -> float:
-    """The largest of 1, 2, 5, 10, ... that is not above; zero of zero."""
+    """Largest of 1, 2, 5, 10, ... that does not exceed the value; 0 for 0."""
     if not value > 0.0:
         return 0.0
     power = 10.0 ** np.floor(np.log10(value))
@@ -162,9 +168,9 @@ def _round_down(value: float) -> float:
 
 
 def _spread(axes: Axes, along: IntArray, size: FloatArray, std: FloatArray, title: str) -> None:
-    """Sizes of the corrections as dots, over what one axis of them is known to."""
+    """Plot the sizes of the corrections, and their uncertainty per axis."""
     axes.bar(along, SCALE_1D * np.sqrt(np.square(std).mean(axis=1)), color='0.85', width=0.8,
-             label='known to (90 %, per axis)')
+             label='uncertainty (90 %, per axis)')
     axes.plot(along, size, 'o', ms=4, color='tab:blue', label='found')
     axes.set_title(title, fontsize=10, loc='left')
     axes.legend(fontsize=7, ncols=2, loc='lower right', bbox_to_anchor=(1.0, 1.0), frameon=False)
@@ -173,7 +179,7 @@ def _spread(axes: Axes, along: IntArray, size: FloatArray, std: FloatArray, titl
 
 def _bars(axes: Axes, along: IntArray, residual: FloatArray, suspect: BoolArray,
           title: str) -> None:
-    """Residuals; what does not fit in red."""
+    """Plot residuals as bars, suspect sensors in red."""
     axes.bar(along, np.nan_to_num(residual), width=0.8,
              color=np.where(suspect, _SUSPECT, 'tab:blue').tolist())
     axes.axhline(1.0, color='k', lw=0.8, ls=':')
@@ -182,14 +188,14 @@ def _bars(axes: Axes, along: IntArray, residual: FloatArray, suspect: BoolArray,
 
 
 def _poses(axes: Axes, found: _Survey) -> None:
-    """Residuals of the poses by their row of the table."""
+    """Plot the residual of each pose by its row in the table."""
     suspect = np.isin(found.rows, found.suspect_rows)
     residual = found.geometry.pose_residual
     axes.plot(found.rows[~suspect], residual[~suspect], '.', ms=4, color='tab:blue')
     axes.plot(found.rows[suspect], residual[suspect], 'o', ms=5, color=_SUSPECT)
     axes.set_ylim(0.0)
     axes.axhline(1.0, color='k', lw=0.8, ls=':')
-    axes.set_title('residual of the poses, over that of the noise'
+    axes.set_title('residual of the poses, relative to the noise'
                    + (f'; do not fit: {suspect.sum()} (red)' if suspect.any() else ''),
                    fontsize=10, loc='left')
     axes.grid(alpha=0.3)

@@ -1,4 +1,4 @@
-"""JSON without NaN, which is not valid JSON."""
+"""JSON text in which NaN, which is invalid in JSON, is replaced."""
 
 import json
 import math
@@ -6,7 +6,17 @@ from typing import Any
 
 
 def without_nan(value: Any) -> Any:
-    """Nested dicts and lists in which None replaces NaN and infinity."""
+    """Replace NaN and infinity by None in nested dicts and lists.
+
+    Parameters
+    ----------
+    value : any
+
+    Returns
+    -------
+    any
+        Copy; tuples become lists.
+    """
     if isinstance(value, dict):
         return {k: without_nan(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -15,5 +25,14 @@ def without_nan(value: Any) -> Any:
 
 
 def json_text(value: Any) -> str:
-    """Valid JSON of nested dicts and lists."""
+    """Return nested dicts and lists as valid JSON.
+
+    Parameters
+    ----------
+    value : any
+
+    Returns
+    -------
+    str
+    """
     return json.dumps(without_nan(value), allow_nan=False)

@@ -1,14 +1,22 @@
-"""Names in figures, drawn as they are."""
+"""Text that figures draw literally."""
 
 _ZERO_WIDTH_SPACE = '\u200b'
 
 
 def literal(text: str) -> str:
-    r"""Text for matplotlib that it draws character by character.
+    r"""Return text that matplotlib draws character by character.
 
     Matplotlib parses text between two `$` as mathematics, and fails on invalid mathematics such as
     `$\road$`. It omits labels that begin with `_` from a legend. Lone surrogates, such as those of
     a file name that is not UTF-8, are drawn as `\udcff`.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    str
     """
     drawable = text.encode('utf-8', 'backslashreplace').decode()
     escaped = drawable.replace('$', r'\$')

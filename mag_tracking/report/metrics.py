@@ -1,4 +1,4 @@
-"""Tracks against truth: errors, and whether the covariance told the truth about them."""
+"""Errors of tracks with respect to the truth, and consistency of their covariances."""
 
 from collections.abc import Iterable
 from typing import TypeAlias, TypedDict
@@ -11,31 +11,53 @@ from mag_tracking.geometry import rotation_from_quaternion
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
 
 Truth: TypeAlias = tuple[IntArray, FloatArray, FloatArray]
-"""Stamps (n,) [ns], positions (n, 3) [m], quaternions (n, 4) xyzw."""
+"""Timestamps (n,) [ns], positions (n, 3) [m] and quaternions (n, 4) xyzw of a target."""
 
 
 class PassErrors(TypedDict):
-    """What `pass_errors` returns."""
+    """Errors of a vehicle's track, as returned by `pass_errors`."""
 
     rms: float | None
+    """Horizontal RMS error within the radius of the centre [m]; None if the target was never
+    there."""
     closest: float
+    """Horizontal error at the pose closest to the centre [m]."""
     closest_distance: float
+    """Distance of that pose from the centre [m]."""
     anees: float
+    """Mean NEES per axis of the poses within the radius, or of the closest one."""
     n: int
+    """Number of poses within the radius."""
 
 
 class MagnetErrors(TypedDict):
-    """What `magnet_errors` returns."""
+    """Errors of a magnet's track, as returned by `magnet_errors`."""
 
     position_mean: float
+    """Mean position error [m]."""
     position_max: float
+    """Maximum position error [m]."""
     axis_median_deg: float
+    """Median angle between the estimated and the true axis [deg]."""
     anees: float
+    """Mean NEES per axis of the position."""
     n: int
+    """Number of poses."""
 
 
 def interpolate_truth(truth: Truth, stamps_ns: ArrayLike) -> FloatArray:
-    """Positions (n, 3) of `truth` (stamps, positions, quaternions) at `stamps_ns`; NaN outside."""
+    """Interpolate the true positions at given times.
+
+    Parameters
+    ----------
+    truth : Truth
+    stamps_ns : (n,) int array, ns
+
+    Returns
+    -------
+    (n, 3) array, m, world frame
+        NaN outside the time range of the truth.
+    """
     t, position, _ = truth
     seconds = (t - t[0]) / 1e9
     at = (np.asarray(stamps_ns, dtype=np.int64) - t[0]) / 1e9
@@ -45,23 +67,21 @@ def interpolate_truth(truth: Truth, stamps_ns: ArrayLike) -> FloatArray:
 
 def pass_errors(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
                 radius: float = 5.0) -> PassErrors | None:
-    """Errors of a vehicle's track.
+    """Return the errors of a vehicle's track.
 
     Parameters
     ----------
-    log : TrackLog
-    truth : (stamps (n,), positions (n, 3), quaternions (n, 4))
-    centre : (3,) [m]
-        The pass is measured about this point.
-    radius : float [m]
+    log : TrackLog or SmoothedLog
+    truth : Truth
+    centre : (3,) array, m, world frame
+        Centre of the region that is evaluated.
+    radius : float, m
+        Radius of that region.
 
     Returns
     -------
-    dict
-        rms : horizontal RMS error within `radius` of the centre, None if it was
-        never there; closest : error at the closest point; closest_distance;
-        anees : mean of NEES / 2 over the same poses (or the closest one); n.
-        None where the track has no truth.
+    PassErrors or None
+        None if the truth does not cover the track.
     """
     true = interpolate_truth(truth, log.stamp_ns)[:, :2]
     rows = near_poses(log, truth, centre, radius)
@@ -79,32 +99,33 @@ def pass_errors(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
 
 
 class UnflaggedPoses(TypedDict):
-    """What `unflagged_poses` returns."""
+    """Counts of poses that are not flagged as ambiguous, as returned by `unflagged_poses`."""
 
     n: int
+    """Number of poses with a truth at their time."""
     wrong: int
+    """Number of these that are wrong."""
     without_truth: int
+    """Number of poses without a truth at their time."""
 
 
 WRONG_M, WRONG_STD = 2.0, 3.0
-"""A pose is wrong whose horizontal error is larger than this, and than so many standard deviations
-in its direction."""
+"""A pose is wrong if its horizontal error exceeds both this distance [m] and this number of
+standard deviations in the direction of the error."""
 
 
 def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> UnflaggedPoses:
-    """Poses of vehicles that are not flagged as ambiguous, and how many of them are wrong.
+    """Count the vehicle poses that are not flagged as ambiguous, and those of them that are wrong.
 
     Parameters
     ----------
     logs : iterable of TrackLog
-    truths : iterable of (stamps (n,), positions (n, 3), quaternions (n, 4))
-        A pose is wrong if it is wrong about every one that was there at its time.
+    truths : iterable of Truth
+        A pose is wrong if it is wrong for every target that was present at its time.
 
     Returns
     -------
-    dict
-        n : poses without a flag at whose time there is a true one; wrong : of them;
-        without_truth : poses without a flag at whose time there is none.
+    UnflaggedPoses
     """
     truths, n, n_wrong, n_without = list(truths), 0, 0, 0
     for log in logs:
@@ -130,9 +151,19 @@ def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> Unflag
 
 def near_poses(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
                radius: float = 5.0) -> IntArray:
-    """Indices (k,) of the poses whose truth is within `radius` [m] of `centre`.
+    """Return the indices of the poses whose truth is near a point.
 
-    The closest one where it was never there; none without truth.
+    Parameters
+    ----------
+    log : TrackLog or SmoothedLog
+    truth : Truth
+    centre : (3,) array, m, world frame
+    radius : float, m
+
+    Returns
+    -------
+    (k,) int array
+        The closest pose if the target was never within the radius; empty without truth.
     """
     true = interpolate_truth(truth, log.stamp_ns)[:, :2]
     known = np.isfinite(true).all(axis=1)
@@ -144,27 +175,26 @@ def near_poses(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
 
 
 MAGNET_SKIP = 3
-"""Poses at the start of a magnet's track that do not count."""
+"""Number of poses at the start of a magnet's track that are not evaluated."""
 
 
 def magnet_errors(log: TrackLog | SmoothedLog, truth: Truth, axis: ArrayLike = (0.0, 0.0, 1.0),
                   skip: int = MAGNET_SKIP) -> MagnetErrors | None:
-    """Errors of a magnet's track, each pose against the truth nearest in time.
+    """Return the errors of a magnet's track, each pose compared with the truth nearest in time.
 
     Parameters
     ----------
-    log : TrackLog
-    truth : (stamps (n,), positions (n, 3), quaternions (n, 4))
-    axis : (3,)
-        Direction of the moment in the magnet's frame.
+    log : TrackLog or SmoothedLog
+    truth : Truth
+    axis : (3,) array
+        Direction of the moment in the frame of the magnet.
     skip : int
-        Poses at the start that do not count.
+        Number of poses at the start that are not evaluated.
 
     Returns
     -------
-    dict
-        position_mean, position_max [m], axis_median_deg, anees (3 axes), n;
-        None with no pose left.
+    MagnetErrors or None
+        None if no pose is left.
     """
     stamps = np.array(log.stamp_ns, dtype=np.int64)[skip:]
     if not len(stamps):

@@ -6,17 +6,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 Packed = dict[str, str]
-"""{type: base64 of little-endian numbers}; `scene.js` decodes the types."""
+"""Maps the number type to base64 text of little-endian numbers; `scene.js` decodes it."""
 
 
 def packed(values: ArrayLike, kind: str = 'f8') -> Packed:
-    """Array as a JSON object.
+    """Return an array as a JSON object.
 
     Parameters
     ----------
     values : (n,) array
     kind : 'f8', 'f4' or 'u1'
         'f4' is sufficient for values that are only plotted.
+
+    Returns
+    -------
+    Packed
     """
     raw = np.ascontiguousarray(values, dtype=f'<{kind}').tobytes()
     return {kind: base64.b64encode(raw).decode('ascii')}

@@ -1,6 +1,7 @@
-"""Self-contained HTML page of reports and of the live view.
+"""Self-contained HTML pages of reports and of the live view.
 
-Template and scripts are in the folder `page`; the plotting library comes from the package plotly.
+The template and the scripts are in the folder `page`. The plotting library comes from the package
+plotly.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,9 +13,9 @@ from typing import Any
 from mag_tracking.report.json_text import json_text
 
 SCRIPTS = ('scene', 'map', 'curves', 'tables', 'live', 'main', 'start')
-"""Script files, in load order."""
+"""Script files, in loading order."""
 REPORT = 'report.html'
-"""File name of a report in a result folder."""
+"""File name of the report in a result folder."""
 ERROR, WARNING, NOTE = 'error', 'warning', 'note'
 """Severities of a note."""
 
@@ -24,12 +25,16 @@ class Note:
     """Message at the top of a page."""
 
     level: str
+    """One of `ERROR`, `WARNING` and `NOTE`."""
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Table; numbers are shown with four significant digits, None as a dash."""
+    """Table of a page.
+
+    Numbers are shown with four significant digits, None as a dash.
+    """
 
     title: str
     columns: Sequence[str]
@@ -60,12 +65,26 @@ class Page:
 
 
 def report_html(page: Page) -> str:
-    """HTML of a report; it loads no external resources."""
+    """Return a report as HTML that loads no external resources.
+
+    Parameters
+    ----------
+    page : Page
+
+    Returns
+    -------
+    str
+    """
     return _html(page.title, asdict(page))
 
 
 def live_html() -> str:
-    """HTML of the live page, which receives its data from the WebSocket `stream`."""
+    """Return the HTML of the live page, which receives its data from the WebSocket `stream`.
+
+    Returns
+    -------
+    str
+    """
     return _html('mag_tracking', {'title': 'mag_tracking', 'live': True})
 
 

@@ -14,12 +14,30 @@ DASHES = ('solid', 'dash', 'dot', 'dashdot', 'longdash')
 
 
 def plain(text: str) -> str:
-    """Text with the markup characters of Plotly escaped."""
+    """Return text with the markup characters of Plotly escaped.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    str
+    """
     return text.replace('&', '&amp;').replace('<', '&lt;').replace('>', '&gt;')
 
 
 def numbers(values: ArrayLike) -> list[Any]:
-    """Nested lists of numbers; non-finite values become None."""
+    """Return nested lists of numbers, in which None replaces non-finite values.
+
+    Parameters
+    ----------
+    values : (...) array
+
+    Returns
+    -------
+    list
+    """
     array = np.asarray(values, dtype=float)
     if array.ndim > 1:
         return [numbers(row) for row in array]
@@ -27,7 +45,22 @@ def numbers(values: ArrayLike) -> list[Any]:
 
 
 def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') -> dict[str, Any]:
-    """Curve in the `k`-th colour and dash style."""
+    """Return the trace of a curve.
+
+    Parameters
+    ----------
+    x, y : (n,) array
+    name : str
+        Legend entry; empty for none.
+    k : int
+        Index of the colour and the dash style.
+    mode : str
+        Plotly mode, for example 'lines+markers'.
+
+    Returns
+    -------
+    dict
+    """
     colour = SERIES[k % len(SERIES)]
     return {'type': 'scatter', 'mode': mode, 'x': numbers(x), 'y': numbers(y),
             'name': plain(name), 'showlegend': bool(name),
@@ -37,14 +70,42 @@ def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') ->
 
 def heat_map(x: FloatArray, y: FloatArray, z: FloatArray, scale: str, title: str,
              low: float | None = None, high: float | None = None) -> dict[str, Any]:
-    """Heat map of z (n_y, n_x) in a perceptually uniform colour scale."""
+    """Return the trace of a heat map in a perceptually uniform colour scale.
+
+    Parameters
+    ----------
+    x : (n_x,) array
+    y : (n_y,) array
+    z : (n_y, n_x) array
+    scale : str
+        Plotly colour scale.
+    title : str
+        Title of the colour bar.
+    low, high : float, optional
+        Limits of the colour scale; by default those of the values.
+
+    Returns
+    -------
+    dict
+    """
     return {'type': 'heatmap', 'x': numbers(x), 'y': numbers(y), 'z': numbers(z),
             'colorscale': scale, 'zmin': low, 'zmax': high, 'hoverongaps': False,
             'colorbar': {'title': {'text': title, 'side': 'right'}}}
 
 
 def places(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:
-    """Sensors on a map; `points` is (n, 2 or 3) [m]."""
+    """Return the trace of the sensors on a map.
+
+    Parameters
+    ----------
+    points : (n, 2) or (n, 3) array
+        Sensor positions in the unit of the map.
+    names : sequence of str
+
+    Returns
+    -------
+    dict
+    """
     return {'type': 'scatter', 'mode': 'markers', 'x': numbers(points[:, 0]),
             'y': numbers(points[:, 1]), 'text': [plain(name) for name in names],
             'hoverinfo': 'text', 'name': 'magnetometers', 'showlegend': False,
@@ -53,7 +114,21 @@ def places(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:
 
 
 def axes(x: str, y: str, is_map: bool = False, log_y: bool = False) -> dict[str, Any]:
-    """Layout with axis titles; the axes of a map have the same scale."""
+    """Return a layout with axis titles.
+
+    Parameters
+    ----------
+    x, y : str
+        Axis titles.
+    is_map : bool
+        Both axes have the same scale.
+    log_y : bool
+        The y axis is logarithmic.
+
+    Returns
+    -------
+    dict
+    """
     grid = {'gridcolor': '#e3e3e3', 'zeroline': False, 'exponentformat': 'none',
             'automargin': True}
     return {'xaxis': {'title': {'text': x}, **grid, **({'constrain': 'domain'} if is_map else {})},

@@ -1,4 +1,4 @@
-"""JSON of the map with time slider: sensors, tracks, hypotheses, fields."""
+"""JSON of the map with time slider: sensors, tracks, hypotheses and fields."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol
@@ -20,10 +20,10 @@ MAX_TRACKS = 1_000
 """Maximum number of tracks in a report."""
 MIN_POSES, TRACK_SIZE = 4, 2_500
 """Minimum number of poses per track, and its size in bytes without poses."""
-WIDEST = 6.0
+MAX_EXTENT = 6.0
 """Limit of the map on each side of the network, in spans of the network."""
 MIN_REACH_M = 10.0
-"""[m] Limit of the map for a single sensor."""
+"""Limit of the map for a single sensor [m]."""
 
 
 class Sensors(Protocol):
@@ -35,7 +35,7 @@ class Sensors(Protocol):
 
     @property
     def positions(self) -> FloatArray:
-        """(n, 3) [m] sensor positions, world frame."""
+        """Sensor positions, (n, 3) m, world frame."""
 
     @property
     def frame(self) -> str:
@@ -46,20 +46,24 @@ class Sensors(Protocol):
 
 def scene_of(network: Sensors, begin_ns: int, end_ns: int,
              tracks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Map with a time slider, as JSON.
+    """Return a map with a time slider as JSON.
 
     Parameters
     ----------
     network : SensorNetwork
-    begin_ns, end_ns : int [ns]
+    begin_ns, end_ns : int, ns
         Time range; the page shows seconds since `begin_ns`.
     tracks : sequence of dict
         As returned by `track_entry`.
+
+    Returns
+    -------
+    dict
     """
     xy = network.positions[:, :2]
     low, high = xy.min(axis=0), xy.max(axis=0)
     span = float((high - low).max())
-    far = WIDEST * span if span > 0.0 else MIN_REACH_M
+    far = MAX_EXTENT * span if span > 0.0 else MIN_REACH_M
     spare = 0.15 * span if span > 0.0 else 1.0
     factor, unit = scale_of(span if span > 0.0 else MIN_REACH_M)
     return {'frame': network.frame, 'begin_ns': str(begin_ns), 'begin': 0.0,
@@ -70,15 +74,26 @@ def scene_of(network: Sensors, begin_ns: int, end_ns: int,
 
 
 def _box(low: FloatArray, high: FloatArray) -> list[float]:
-    """[x0, x1, y0, y1] [m]."""
+    """Limits [x0, x1, y0, y1] [m]."""
     return [float(low[0]), float(high[0]), float(low[1]), float(high[1])]
 
 
 def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
                       most: int = MAX_SENSORS) -> IntArray:
-    """Indices of the `most` sensors with the strongest field during a track, ascending.
+    """Return the sensors with the strongest field during a track.
 
-    `rows` are the numbers of the poses that count; all by default.
+    Parameters
+    ----------
+    log : TrackLog
+    rows : iterable of int, optional
+        Indices of the poses that are evaluated; all by default.
+    most : int
+        Maximum number of sensors.
+
+    Returns
+    -------
+    (k,) int array
+        Indices of the sensors, ascending.
     """
     chosen = log.measured if rows is None else [log.measured[k] for k in rows]
     measured = np.abs(np.array(chosen).reshape(-1, len(log.measured[0]), 3))
@@ -86,8 +101,19 @@ def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
     return np.sort(np.argsort(-strength, kind='stable')[:most])
 
 
-def most_poses_of(logs: Sequence[TrackLog], most_bytes: int = MAX_BYTES) -> int:
-    """Number of poses per track that keeps the size of a report below `most_bytes`, about."""
+def max_poses_of(logs: Sequence[TrackLog], most_bytes: int = MAX_BYTES) -> int:
+    """Return the number of poses per track that keeps a report within a size limit, approximately.
+
+    Parameters
+    ----------
+    logs : sequence of TrackLog
+    most_bytes : int
+
+    Returns
+    -------
+    int
+        At least `MIN_POSES`.
+    """
     lengths = np.array([len(log.stamp_ns) for log in logs])
     sizes = np.array([_pose_size(log) for log in logs])
     low, high = MIN_POSES, max(int(lengths.max()), MIN_POSES)
@@ -109,27 +135,44 @@ def _pose_size(log: TrackLog) -> int:
 
 
 def thinned(log: TrackLog, most: int) -> list[int]:
-    """Numbers of at most `most` poses, evenly spaced; the first, last and surest are included."""
-    n = len(log.stamp_ns)
-    if n <= most:
-        return list(range(n))
-    rows = np.linspace(0, n - 1, most - 1).round().astype(int)
-    return sorted({*rows.tolist(), log.surest()})
+    """Return the indices of evenly spaced poses of a track.
 
-
-def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
-                rows: Sequence[int] | None = None) -> dict[str, Any]:
-    """Poses of a track, as JSON.
+    The first, the last and the most certain pose are included.
 
     Parameters
     ----------
     log : TrackLog
-    begin_ns : int [ns]
+    most : int
+        Maximum number of poses.
+
+    Returns
+    -------
+    list of int
+    """
+    n = len(log.stamp_ns)
+    if n <= most:
+        return list(range(n))
+    rows = np.linspace(0, n - 1, most - 1).round().astype(int)
+    return sorted({*rows.tolist(), log.most_certain()})
+
+
+def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
+                rows: Sequence[int] | None = None) -> dict[str, Any]:
+    """Return the poses of a track as JSON.
+
+    Parameters
+    ----------
+    log : TrackLog
+    begin_ns : int, ns
         Start of the scene.
-    sensors : (k,) int
+    sensors : (k,) int array
         Sensors whose fields are included.
-    rows : sequence of int
-        Numbers of the poses; all by default.
+    rows : sequence of int, optional
+        Indices of the poses; all by default.
+
+    Returns
+    -------
+    dict
     """
     rows = range(len(log.stamp_ns)) if rows is None else rows
     times = (np.array([log.stamp_ns[k] for k in rows], dtype=np.int64) - begin_ns) / NS
@@ -147,17 +190,22 @@ def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
 
 def fitted_entry(track_id: int, times: FloatArray, state: FloatArray, covariance: FloatArray,
                  ambiguous: bool, fields: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Track at constant velocity, as JSON.
+    """Return a track at constant velocity as JSON.
 
     Parameters
     ----------
     track_id : int
-    times : (n,) [s], scene time
-    state : (n, 6) [m], [m/s], world
-    covariance : (n, 6, 6)
+    times : (n,) array, s
+        Scene time.
+    state : (n, 6) array, m and m/s, world frame
+    covariance : (n, 6, 6) array
     ambiguous : bool
     fields : sequence of dict
         As returned by `field_entry`.
+
+    Returns
+    -------
+    dict
     """
     n = len(times)
     columns = _columns(times, state[:, :3], state[:, 3:], covariance, np.full(n, ambiguous))
@@ -169,9 +217,18 @@ def fitted_entry(track_id: int, times: FloatArray, state: FloatArray, covariance
 
 def field_entry(sensor: int, measured: FloatArray, predicted: FloatArray,
                 times: FloatArray | None = None) -> dict[str, Any]:
-    """Measured and predicted field (n, 3) [T] of one sensor, as JSON.
+    """Return the measured and the predicted field of one sensor as JSON.
 
-    `times` is (n,) [s], scene time; None if the field was measured at the times of the poses.
+    Parameters
+    ----------
+    sensor : int
+    measured, predicted : (n, 3) array, T, sensor frame
+    times : (n,) array, s, optional
+        Scene time; None if the field was measured at the times of the poses.
+
+    Returns
+    -------
+    dict
     """
     return {'sensor': sensor, 't': None if times is None else packed(times), **{
         name: [packed(column, 'f4') for column in values.T]
@@ -179,17 +236,31 @@ def field_entry(sensor: int, measured: FloatArray, predicted: FloatArray,
 
 
 def path_entry(track_id: int, points: FloatArray) -> dict[str, Any]:
-    """Smoothed or true path (n, 2 or 3) [m] of a track, as JSON."""
+    """Return the smoothed or true path of a track as JSON.
+
+    Parameters
+    ----------
+    track_id : int
+    points : (n, 2) or (n, 3) array, m, world frame
+
+    Returns
+    -------
+    dict
+    """
     return {'id': track_id, 'x': packed(points[:, 0]), 'y': packed(points[:, 1])}
 
 
 def facts_of(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Row of the table of tracks, as JSON.
+    """Return a row of the table of tracks as JSON.
 
     Parameters
     ----------
     entry : dict
         `TrackLog.summary()`, or the entry of a track in `summary.json`, which may contain `truth`.
+
+    Returns
+    -------
+    dict
     """
     truth = entry.get('truth', {})
     error = next((truth[key] for key in ('closest', 'position_mean')
@@ -209,7 +280,7 @@ def _array(values: Sequence[FloatArray], *shape: int) -> FloatArray:
 
 
 def _speed_std(velocity: FloatArray, C: FloatArray) -> FloatArray:
-    """(n,) [m/s] standard deviation of the horizontal speed, to first order."""
+    """Standard deviation (n,) [m/s] of the horizontal speed, to first order."""
     flat = velocity[:, :2]
     u = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
     variance = np.einsum('na,nab,nb->n', u, C[:, 3:5, 3:5], u)
@@ -237,7 +308,7 @@ def _innovation(nis: FloatArray, degrees_of_freedom: FloatArray) -> dict[str, Pa
 
 
 def _arrivals(log: TrackLog, rows: Sequence[int]) -> dict[str, dict[str, Packed]]:
-    """{arrival: columns of its weight and best hypothesis}; NaN after it was pruned."""
+    """Columns of the weight and the best hypothesis of each arrival; NaN after it was pruned."""
     log_rows = [log.arrivals[k] for k in rows]
     out = {}
     for name in sorted({name for row in log_rows for name in row}):
@@ -247,7 +318,7 @@ def _arrivals(log: TrackLog, rows: Sequence[int]) -> dict[str, dict[str, Packed]
             if name in row:
                 weight, position, C = row[name]
                 values[k] = weight, position[0], position[1], C[0, 0], C[0, 1], C[1, 1]
-        # Coordinates of a large frame need all digits.
+        # Coordinates in a large frame need double precision.
         out[name] = {key: packed(column, 'f8' if key in 'xy' else 'f4') for key, column in zip(
             ('weight', 'x', 'y', 'xx', 'xy', 'yy'), values.T, strict=True)}
     return out

@@ -1,4 +1,4 @@
-"""Figures of a plan: one function a figure, each returns the figure."""
+"""Figures of a plan; each function returns one figure."""
 
 from collections.abc import Sequence
 from typing import Protocol
@@ -15,18 +15,18 @@ from mag_tracking.report.scales import scale_of
 from mag_tracking.report.style import legend_beside, plain_log_ticks
 
 MIN_MISSED = 1e-6
-"""Smaller probabilities of a miss are not drawn."""
+"""Probabilities of a missed pass below this value are not drawn."""
 
 
 class _Network(Protocol):
-    """What the figures read of a `SensorNetwork`."""
+    """Attributes of a `SensorNetwork` that the figures use."""
 
     @property
     def positions(self) -> FloatArray: ...
 
 
 class _Lane(Protocol):
-    """What the figures read of a `Lane`."""
+    """Attributes of a `Lane` that the figures use."""
 
     @property
     def name(self) -> str: ...
@@ -48,7 +48,7 @@ class _Lane(Protocol):
 
 
 class _Plan(Protocol):
-    """What the figures read of a `Plan`."""
+    """Attributes of a `Plan` that the figures use."""
 
     @property
     def network(self) -> _Network: ...
@@ -82,7 +82,7 @@ class _Plan(Protocol):
 
 
 def _map(plan: _Plan, title: str) -> tuple[Figure, Axes, float, str]:
-    """(figure, axes, factor, unit) with the sensors and the lanes."""
+    """Figure, axes, factor and unit of a map with the sensors and the lanes."""
     f, unit = scale_of(np.ptp(plan.x))
     figure = Figure(figsize=(8.0, 6.8), layout='constrained')
     axes = figure.add_subplot()
@@ -104,7 +104,7 @@ def _map(plan: _Plan, title: str) -> tuple[Figure, Axes, float, str]:
 
 
 def _levels(values: FloatArray, factor: float) -> FloatArray:
-    """Round contour levels, 1-2-5, within the values."""
+    """Round contour levels (1-2-5) within the range of the values."""
     tens = 10.0 ** np.arange(-6, 7)
     levels = np.sort(np.concatenate([tens, 2.0 * tens, 5.0 * tens]))
     low, high = factor * np.nanmin(values), factor * np.nanmax(values)
@@ -113,22 +113,40 @@ def _levels(values: FloatArray, factor: float) -> FloatArray:
 
 
 def position_figure(plan: _Plan) -> Figure:
-    """Map of the position's bound by a whole pass through each point."""
+    """Plot a map of the position bound from a whole pass through each point.
+
+    Parameters
+    ----------
+    plan : Plan
+
+    Returns
+    -------
+    Figure
+    """
     figure, axes, f, unit = _map(
-        plan, 'How well a position can be known by a whole pass through it (standard deviation)')
+        plan, 'Position bound from a whole pass through each point (standard deviation)')
     z = f * np.clip(plan.position_std, None, np.ptp(plan.x))
     mesh = axes.pcolormesh(f * plan.x, f * plan.y, z, norm=LogNorm(), cmap='viridis',
                            shading='nearest', rasterized=True)
     lines = axes.contour(f * plan.x, f * plan.y, z, levels=_levels(z, 1.0), colors='w',
                          linewidths=0.8)
     axes.clabel(lines, fmt=f'%g {unit}', fontsize=8)
-    figure.colorbar(mesh, ax=axes, label=f'standard deviation in the plane [{unit}]')
+    figure.colorbar(mesh, ax=axes, label=f'horizontal standard deviation [{unit}]')
     return figure
 
 
 def detection_figure(plan: _Plan) -> Figure:
-    """Map of the probability that one frame detects the target."""
-    figure, axes, f, _ = _map(plan, 'Probability that one frame detects the target there')
+    """Plot a map of the probability that one frame detects the target.
+
+    Parameters
+    ----------
+    plan : Plan
+
+    Returns
+    -------
+    Figure
+    """
+    figure, axes, f, _ = _map(plan, 'Probability that one frame detects the target')
     mesh = axes.pcolormesh(f * plan.x, f * plan.y, plan.detection, vmin=0.0, vmax=1.0,
                            cmap='magma', shading='nearest', rasterized=True)
     levels = [p for p in (0.1, 0.5, 0.9, 0.99) if plan.detection.min() < p < plan.detection.max()]
@@ -141,12 +159,21 @@ def detection_figure(plan: _Plan) -> Figure:
 
 
 def sensor_figure(plan: _Plan) -> Figure:
-    """Map of what one more sensor would bring; left white where none may stand."""
+    """Plot a map of the improvement by one more sensor; white where none may be placed.
+
+    Parameters
+    ----------
+    plan : Plan
+
+    Returns
+    -------
+    Figure
+    """
     gain = 1.0 - plan.with_one_more / plan.without
     possible = np.isfinite(gain).any()
     figure, axes, f, unit = _map(
-        plan, f'Where one more sensor helps: the median bound near the sensors is now '
-        f'{f_text(plan.without)}')
+        plan, f'Improvement by one more sensor; the median bound near the sensors is now '
+        f'{length_text(plan.without)}')
     ny, nx = gain.shape
     x, y = np.linspace(plan.x[0], plan.x[-1], nx), np.linspace(plan.y[0], plan.y[-1], ny)
     mesh = axes.pcolormesh(f * x, f * y, 100.0 * gain, cmap='cividis', shading='nearest',
@@ -156,19 +183,38 @@ def sensor_figure(plan: _Plan) -> Figure:
     best = plan.best_place
     axes.plot(f * best[0], f * best[1], 'r*', ms=15, mec='w', clip_on=False, zorder=6,
               label=f'best: ({f * best[0]:.3g}, {f * best[1]:.3g}) {unit}, then '
-              f'{f_text(np.nanmin(plan.with_one_more))}')
+              f'{length_text(np.nanmin(plan.with_one_more))}')
     axes.legend(fontsize=9, loc='upper right')
-    figure.colorbar(mesh, ax=axes, label='smaller by [%]')
+    figure.colorbar(mesh, ax=axes, label='reduction of the bound [%]')
     return figure
 
 
-def f_text(metres: float) -> str:
-    """A length in a readable unit."""
+def length_text(metres: float) -> str:
+    """Return a length in a readable unit.
+
+    Parameters
+    ----------
+    metres : float, m
+
+    Returns
+    -------
+    str
+    """
     return f'{metres:.3g} m' if metres >= 0.01 else f'{1e3 * metres:.2g} mm'
 
 
-def distinct(lanes: Sequence[_Lane]) -> list[tuple[str, _Lane]]:
-    """[(names, lane)], one for lanes whose curves are the same: one would hide the other."""
+def distinct_lanes(lanes: Sequence[_Lane]) -> list[tuple[str, _Lane]]:
+    """Return the lanes with distinct curves; of identical curves, one would hide the other.
+
+    Parameters
+    ----------
+    lanes : sequence of Lane
+
+    Returns
+    -------
+    list of (str, Lane)
+        The name combines the names of lanes with the same curves.
+    """
     out: list[tuple[list[str], _Lane]] = []
     for lane in lanes:
         for names, other in out:
@@ -183,14 +229,23 @@ def distinct(lanes: Sequence[_Lane]) -> list[tuple[str, _Lane]]:
 
 
 def lane_figure(plan: _Plan) -> Figure:
-    """Bounds and detection along the lanes, and how many passes are missed by their distance."""
+    """Plot the bounds and the probability of detection along the lanes, and the missed passes.
+
+    Parameters
+    ----------
+    plan : Plan
+
+    Returns
+    -------
+    Figure
+    """
     figure = Figure(figsize=(10.0, 9.0), layout='constrained')
     top, middle, bottom = figure.subplots(3, 1)
     f, unit = scale_of(np.ptp(plan.x))
-    for k, (name, lane) in enumerate(distinct(plan.lanes)):
+    for k, (name, lane) in enumerate(distinct_lanes(plan.lanes)):
         colour = SERIES[k % len(SERIES)]
         top.semilogy(f * lane.along, f * lane.filter_std, '-', color=colour,
-                     label=f'{name}: filter so far')
+                     label=f'{name}: filter')
         top.semilogy(f * lane.along, f * lane.pass_std[:, 0], '--', color=colour,
                      label=f'{name}: whole pass')
         middle.plot(f * lane.along, lane.detection, color=colour, label=name)
@@ -198,16 +253,16 @@ def lane_figure(plan: _Plan) -> Figure:
     top.set_ylim(top=min(top.get_ylim()[1], f * np.ptp(plan.x)))
     legend_beside(top)
     plain_log_ticks(top)
-    top.set_title('Along the lanes (in the direction of travel, 0 = nearest to the middle)')
-    middle.set_ylabel('P(one frame detects it)')
+    top.set_title('Along the lanes (in the direction of travel, 0 = nearest to the centre)')
+    middle.set_ylabel('P(detection by one frame)')
     middle.set_xlabel(f'distance along the lane [{unit}]')
     legend_beside(middle)
     known = plan.missed[plan.missed[:, 1] >= MIN_MISSED]
     bottom.semilogy(f * known[:, 0], known[:, 1], '.-', color='k')
     bottom.set_xlim(f * plan.missed[0, 0], 1.02 * f * plan.missed[-1, 0])
     bottom.set_ylim(0.5 * MIN_MISSED, 2.0)
-    bottom.set_xlabel(f'lateral distance of a pass from the middle of the sensors [{unit}]')
-    bottom.set_ylabel('P(a pass is missed)')
+    bottom.set_xlabel(f'lateral distance of a pass from the centre of the sensors [{unit}]')
+    bottom.set_ylabel('P(missed pass)')
     for axes in (top, middle, bottom):
         axes.grid(alpha=0.3)
     return figure

@@ -1,4 +1,4 @@
-"""Recording for the Rerun viewer; needs the optional package rerun-sdk."""
+"""Recordings for the Rerun viewer; they need the optional package rerun-sdk."""
 
 from collections.abc import Mapping
 from importlib.util import find_spec
@@ -19,16 +19,23 @@ from mag_tracking.units import NS
 RERUN_FILE = 'tracks.rrd'
 """File name in a result folder."""
 TIME = 'stamp'
+"""Name of the timeline."""
 MIN_MOMENT = 1e-12
-"""[A m^2] Smaller moments have no direction."""
+"""Minimum moment that has a direction [A m²]."""
 SCALE_3D = float(np.sqrt(chdtri(3, 0.1)))
 """Standard deviations to the surface of the 90 % region in 3-D."""
 
 
 def check_rerun() -> None:
-    """Raise MissingDependencyError if rerun-sdk is not installed."""
+    """Check that rerun-sdk is installed.
+
+    Raises
+    ------
+    MissingDependencyError
+        If it is not installed.
+    """
     if find_spec('rerun') is None:
-        raise MissingDependencyError('a recording for Rerun needs its SDK: pip install rerun-sdk')
+        raise MissingDependencyError('Rerun recordings need rerun-sdk: pip install rerun-sdk')
 
 
 def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, TrackLog],
@@ -37,18 +44,26 @@ def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, 
 
     Parameters
     ----------
-    path : path
+    path : str or path
     network : SensorNetwork
-    logs, smoothed : {track id: log}
+    logs : dict of int to TrackLog
+        Tracks by identifier.
+    smoothed : dict of int to SmoothedLog
+        Smoothed tracks by identifier.
 
-    Raises MissingDependencyError and OutputError.
+    Raises
+    ------
+    MissingDependencyError
+        If rerun-sdk is not installed.
+    OutputError
+        If the file cannot be written.
     """
     check_rerun()
     import rerun
 
     stream = rerun.RecordingStream('mag_tracking')
     try:
-        # A new file: a link of this name is not followed.
+        # Create a new file first, so that a link of this name is not followed.
         new_binary_file(path).close()
         stream.save(path)
     except (OSError, RuntimeError) as error:
@@ -82,14 +97,14 @@ def _write_track(rerun: Any, stream: Any, network: Sensors, log: TrackLog) -> No
         for j, name in enumerate(network.names):
             for what, fields in (('measured', log.measured[k]), ('predicted', log.predicted[k])):
                 stream.log(f'field/{name}/{what}', rerun.Scalars(1e9 * fields[j]))
-    # One period after the last pose, which stays visible until then.
+    # The last pose stays visible for one period.
     period = log.stamp_ns[-1] - log.stamp_ns[-2] if len(log.stamp_ns) > 1 else NS
     stream.set_time(TIME, timestamp=np.datetime64(log.stamp_ns[-1] + period, 'ns'))
     stream.log(root, rerun.Clear(recursive=True))
 
 
 def _ellipsoid(C: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(half sizes (3,) [m], quaternion xyzw) of the 90 % region of a covariance."""
+    """Half axes (3,) [m] and quaternion xyzw of the 90 % region of a covariance."""
     values, R = np.linalg.eigh(C)
     if np.linalg.det(R) < 0.0:
         R = -R

@@ -1,4 +1,4 @@
-"""Poses, smoothed poses and detections as structured arrays: one element a record."""
+"""Poses, smoothed poses and detections as structured arrays, one element per record."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
@@ -9,10 +9,10 @@ from mag_tracking.arrays import StructArray
 from mag_tracking.records import Detection, SmoothedPose, Track
 
 _Fields: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
-"""{name: (type, shape of one element)}."""
+"""Maps field names to (type, shape of one element)."""
 
 _TEXT_WIDTH = 16
-"""Characters of a text field; it is wider where a name is longer."""
+"""Minimum width of a text field in characters; longer names widen it."""
 
 _STATE_FIELDS: _Fields = {
     'stamp_ns': ('i8', ()), 'track_id': ('i8', ()),
@@ -21,7 +21,7 @@ _STATE_FIELDS: _Fields = {
     'position_orientation_covariance': ('f8', (3, 3)),
     'moment': ('f8', (3,)), 'moment_covariance': ('f8', (3, 3)),
     'kind': ('U', ()), 'length': ('f8', ()), 'length_std': ('f8', ()), 'ambiguous': ('?', ())}
-"""Fields that `Track` and `SmoothedPose` share; their documentation has the units."""
+"""Common fields of `Track` and `SmoothedPose`, which document the units."""
 
 _POSE_FIELDS: _Fields = {
     **_STATE_FIELDS, 'doubts': ('U', ()), 'arrival': ('U', ()), 'weight': ('f8', ()),
@@ -37,12 +37,12 @@ _DETECTION_FIELDS: _Fields = {
 
 
 def pose_array(tracks: Sequence[Track]) -> StructArray:
-    """Poses of tracks.
+    """Return poses of tracks as a structured array.
 
     Parameters
     ----------
     tracks : sequence of Track
-        The closing record of a track (`ended`) is skipped; it repeats the last pose.
+        The closing record of a track (`ended`) is skipped, because it repeats the last pose.
 
     Returns
     -------
@@ -53,7 +53,7 @@ def pose_array(tracks: Sequence[Track]) -> StructArray:
 
 
 def smoothed_array(poses: Sequence[SmoothedPose]) -> StructArray:
-    """Smoothed poses.
+    """Return smoothed poses as a structured array.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def smoothed_array(poses: Sequence[SmoothedPose]) -> StructArray:
 
 
 def detection_array(detections: Sequence[Detection]) -> StructArray:
-    """Onsets and releases of the detector.
+    """Return onsets and releases of the detector as a structured array.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def detection_array(detections: Sequence[Detection]) -> StructArray:
 
 
 def _array(records: Sequence[Track | SmoothedPose | Detection], fields: _Fields) -> StructArray:
-    """(n,) structured array with the attributes of `records` that `fields` names."""
+    """Structured array (n,) with the attributes of `records` that `fields` names."""
     columns = {name: [_value(r, name) for r in records] for name in fields}
     dtype = [(name, f'U{max(_TEXT_WIDTH, *map(len, columns[name]), 1)}' if kind == 'U' else kind,
               shape) for name, (kind, shape) in fields.items()]
@@ -94,6 +94,6 @@ def _array(records: Sequence[Track | SmoothedPose | Detection], fields: _Fields)
 
 
 def _value(record: Track | SmoothedPose | Detection, name: str) -> Any:
-    """The value of a field of the array; several texts are joined by blanks."""
+    """Value of an array field; several doubts are joined by blanks."""
     value = getattr(record, 'id' if name == 'track_id' else name)
     return ' '.join(value) if name == 'doubts' else value

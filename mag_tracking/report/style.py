@@ -3,21 +3,34 @@
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-FEW_DECADES = 1.5
-"""Range below which a logarithmic axis has labels between the powers of ten."""
+MINOR_LABEL_DECADES = 1.5
+"""Maximum range of a logarithmic axis with labels between the powers of ten, in decades."""
 
 
 def legend_beside(axes: Axes, **named: float) -> None:
-    """A legend to the right of the axes, where it hides nothing."""
+    """Draw a legend to the right of the axes, outside the plot area.
+
+    Parameters
+    ----------
+    axes : Axes
+    **named : float
+        Further arguments of `Axes.legend`.
+    """
     axes.legend(fontsize=8, loc='upper left', bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0,
                 **named)
 
 
 def plain_log_ticks(axes: Axes) -> None:
-    """Numbers such as 0.02 and 3 on a logarithmic y axis, in place of powers of ten."""
+    """Label a logarithmic y axis with plain numbers such as 0.02 and 3 instead of powers of ten.
+
+    Parameters
+    ----------
+    axes : Axes
+    """
     low, high = axes.get_ylim()
     plain = FuncFormatter(lambda value, _: f'{value:g}')
     if low <= 0.0 or high / low > 1e6:
         return
     axes.yaxis.set_major_formatter(plain)
-    axes.yaxis.set_minor_formatter(plain if high / low < 10.0**FEW_DECADES else NullFormatter())
+    axes.yaxis.set_minor_formatter(
+        plain if high / low < 10.0**MINOR_LABEL_DECADES else NullFormatter())

@@ -1,4 +1,4 @@
-"""What a report remembers of a run: per track the poses, the weights, the fields."""
+"""Record of a run for reports: poses, weights and fields of each track."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -11,12 +11,12 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.records import FieldFrame, SmoothedPose, Track, best_of_arrivals
 
 Arrival: TypeAlias = tuple[float, FloatArray, FloatArray]
-"""Weight of an arrival, position and covariance (2, 2) of its best hypothesis."""
+"""Weight of an arrival, and position and covariance (2, 2) of its best hypothesis."""
 
 
 @dataclass
 class SmoothedLog:
-    """One smoothed track; lists grow together."""
+    """Record of one smoothed track; all lists have the same length."""
 
     id: int
     stamp_ns: list[int] = field(default_factory=list)
@@ -27,12 +27,23 @@ class SmoothedLog:
     orientation: list[FloatArray] = field(default_factory=list)
 
     def add(self, pose: SmoothedPose) -> None:
-        """Take a `SmoothedPose`."""
+        """Add a smoothed pose.
+
+        Parameters
+        ----------
+        pose : SmoothedPose
+        """
         for name in ('stamp_ns', 'position', 'velocity', 'covariance', 'moment', 'orientation'):
             getattr(self, name).append(getattr(pose, name))
 
     def summary(self) -> dict[str, float]:
-        """Speed and moment where the position is most certain, JSON-ready."""
+        """Summarise the track at the pose with the most certain position.
+
+        Returns
+        -------
+        dict of str to float
+            Speed, size of the moment and standard deviation of the position, JSON-ready.
+        """
         sure = int(np.argmin([np.trace(C[:2, :2]) for C in self.covariance]))
         return {'speed': float(np.hypot(*self.velocity[sure][:2])),
                 'moment_size': float(np.linalg.norm(self.moment[sure])),
@@ -41,7 +52,7 @@ class SmoothedLog:
 
 @dataclass
 class TrackLog:
-    """One track, frame by frame; lists grow together."""
+    """Record of one track, frame by frame; all lists have the same length."""
 
     id: int
     stamp_ns: list[int] = field(default_factory=list)
@@ -55,14 +66,14 @@ class TrackLog:
     degrees_of_freedom: list[int] = field(default_factory=list)
     ambiguous: list[bool] = field(default_factory=list)
     arrivals: list[dict[str, Arrival]] = field(default_factory=list)
-    """Per frame {arrival: (weight, position, covariance (2, 2) of its best hypothesis)}."""
+    """Arrivals of each frame: weight, and position and covariance (2, 2) of the best hypothesis."""
     doubts: list[tuple[str, ...]] = field(default_factory=list)
     kind: list[str] = field(default_factory=list)
     kind_weight: list[float] = field(default_factory=list)
     length: list[float] = field(default_factory=list)
     measured: list[FloatArray] = field(default_factory=list)
     noise: list[FloatArray] = field(default_factory=list)
-    """Per frame (n_sensors, 3, 3) [T^2] covariance of what was measured."""
+    """Noise covariances of each frame, (n_sensors, 3, 3) T²."""
     predicted: list[FloatArray] = field(default_factory=list)
     mounting: list[FloatArray] = field(default_factory=list)
     mounting_std: list[FloatArray] = field(default_factory=list)
@@ -70,7 +81,13 @@ class TrackLog:
     ended: bool = False
 
     def add(self, track: Track, frame: FieldFrame) -> None:
-        """Take a `Track` and the `FieldFrame` that it came from."""
+        """Add a pose and the frame that produced it.
+
+        Parameters
+        ----------
+        track : Track
+        frame : FieldFrame
+        """
         if track.ended:
             self.ended = True
             return
@@ -85,37 +102,74 @@ class TrackLog:
                               for h in best_of_arrivals(track.hypotheses)})
 
     def forget(self, n: int) -> None:
-        """Remove the first `n` poses."""
+        """Remove the first poses.
+
+        Parameters
+        ----------
+        n : int
+            Number of poses to remove.
+        """
         for values in vars(self).values():
             if isinstance(values, list):
                 del values[:n]
 
     def seconds(self) -> FloatArray:
-        """(n,) [s] since the first pose."""
+        """Time since the first pose.
+
+        Returns
+        -------
+        (n,) array, s
+        """
         stamps = np.array(self.stamp_ns, dtype=np.int64)
         seconds: FloatArray = (stamps - stamps[0]) / 1e9
         return seconds
 
-    def surest(self) -> int:
-        """Index of the pose at which most is known: what is said of the whole is read there.
+    def most_certain(self) -> int:
+        """Index of the most certain pose, which represents the whole track in summaries.
 
-        By the horizontal position of a magnet, and the velocity of a vehicle: its position may
-        become more certain later, once all of its length has passed.
+        The criterion is the horizontal position of a magnet and the horizontal velocity of a
+        vehicle. The position of a vehicle may become more certain later, when its whole length has
+        passed.
+
+        Returns
+        -------
+        int
         """
         first = 3 if self.kind[-1] else 0
         return int(np.argmin([np.trace(C[first:first + 2, first:first + 2])
                               for C in self.covariance]))
 
     def mounting_of(self, names: Sequence[str]) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """{sensor: (angles (3,), their deviations (3,)) [deg]} at the surest pose; may be empty."""
-        k = self.surest()
+        """Estimated mounting errors of the sensors at the most certain pose.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Sensor names.
+
+        Returns
+        -------
+        dict of str to ((3,) array, deg, and (3,) array, deg)
+            Angles and standard deviations of each sensor; empty if they are not estimated.
+        """
+        k = self.most_certain()
         return {name: (np.degrees(a), np.degrees(sd)) for name, a, sd in
                 zip(names, self.mounting[k], self.mounting_std[k], strict=False)}
 
     def nis_of(self, names: Sequence[str]) -> dict[str, float | None]:
-        """{sensor: mean normalised innovation squared per axis}; None where it was never there.
+        """Mean normalised innovation squared per axis of each sensor.
 
-        About one or less where the sensor agrees with the model and with the others.
+        It is about 1 or less if the sensor agrees with the model and the other sensors.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Sensor names.
+
+        Returns
+        -------
+        dict of str to float or None
+            None for a sensor without readings.
         """
         axes = (~np.isnan(np.array(self.measured))).sum(axis=(0, 2))
         total = np.nansum(np.array(self.nis_by_sensor), axis=0)
@@ -123,12 +177,16 @@ class TrackLog:
                 for name, q, n in zip(names, total, axes, strict=True)}
 
     def summary(self) -> dict[str, Any]:
-        """The track in a few JSON-ready numbers.
+        """Summarise the track in JSON-ready numbers.
 
-        Speed and moment are those of the `surest` pose; arrival and kind those of the last one.
-        The verdict is `unique` where neither is ambiguous.
+        Speed and moment are those of the `most_certain` pose, arrival and kind those of the last
+        pose. The verdict is `unique` if neither pose is ambiguous.
+
+        Returns
+        -------
+        dict
         """
-        sure = self.surest()
+        sure = self.most_certain()
         final = self.arrivals[-1]
         arrival = max(final, key=lambda name: final[name][0])
         nis = np.array(self.nis) / np.maximum(1, self.degrees_of_freedom)

@@ -1,4 +1,4 @@
-"""Counts of passages in intervals of time."""
+"""Counts of passages in time intervals."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -9,25 +9,40 @@ from mag_tracking.event_records import TrafficCount, TrafficSummary, VehiclePass
 from mag_tracking.units import NS
 
 MAX_GAP_S = 5.0
-"""[s] Frames further apart than this observe nothing between them."""
+"""Maximum interval between two frames that counts as observed time [s]."""
 
 
-class Intervals:
-    """Summaries of equal intervals, each as soon as no passage of it can come any more."""
+class TrafficIntervals:
+    """Summaries of equal time intervals, each reported when it is complete.
+
+    Parameters
+    ----------
+    line_names : sequence of str
+        Names of the counting lines.
+    interval_s : float, s
+        Length of an interval.
+    counts : Counter
+        Counted events, updated in place.
+    """
 
     def __init__(self, line_names: Sequence[str], interval_s: float,
                  counts: 'Counter[str]') -> None:
         self._names, self._length, self._counts = tuple(line_names), round(interval_s * NS), counts
-        # No interval before this time is summarised again.
+        # End of the latest interval that has been summarised.
         self._closed_ns: int | None = None
-        # Each with the begin of its interval.
+        # Start of the interval, and passage.
         self._passages: list[tuple[int, VehiclePassage]] = []
-        # {begin of an interval: [ns] observed}
+        # Observed time [ns] of each open interval, by its start.
         self._observed: dict[int, int] = {}
         self._last_ns: int | None = None
 
     def add(self, passage: VehiclePassage) -> None:
-        """Take a passage; one that comes too late counts in the earliest interval that is open."""
+        """Add a passage; a late one counts in the earliest interval that is open.
+
+        Parameters
+        ----------
+        passage : VehiclePassage
+        """
         begin = self._begin_of(passage.stamp_ns)
         if self._closed_ns is not None and begin < self._closed_ns:
             self._counts['passages counted in a later interval'] += 1
@@ -36,32 +51,41 @@ class Intervals:
         self._observed.setdefault(begin, 0)
 
     def due(self, before_ns: int, now_ns: int) -> list[TrafficSummary]:
-        """Summaries of the intervals that are complete.
+        """Return the summaries of the intervals that are complete.
 
         Parameters
         ----------
-        before_ns : int
+        before_ns : int, ns
             All passages before this time have been added.
-        now_ns : int
+        now_ns : int, ns
             Time of the latest frame.
+
+        Returns
+        -------
+        list of TrafficSummary
         """
         self._observe(now_ns)
         return self._close([begin for begin in self._observed
                             if begin + self._length <= before_ns])
 
     def flush(self) -> list[TrafficSummary]:
-        """The intervals that have begun."""
+        """Return the summaries of all open intervals.
+
+        Returns
+        -------
+        list of TrafficSummary
+        """
         self._last_ns = None
         out = self._close(list(self._observed))
         self._closed_ns = None
         return out
 
     def _begin_of(self, stamp_ns: int) -> int:
-        """Begin of the interval that holds a time."""
+        """Start of the interval that contains a time."""
         return stamp_ns // self._length * self._length
 
     def _observe(self, now_ns: int) -> None:
-        """Add the time since the frame before to its intervals."""
+        """Add the time since the previous frame to its intervals."""
         self._observed.setdefault(self._begin_of(now_ns), 0)
         last_ns, self._last_ns = self._last_ns, now_ns
         if last_ns is None or now_ns - last_ns > MAX_GAP_S * NS:
@@ -73,7 +97,7 @@ class Intervals:
             last_ns = until
 
     def _close(self, begins: list[int]) -> list[TrafficSummary]:
-        """The summaries of intervals, for each line."""
+        """Summaries of intervals, for each line; the intervals are removed."""
         out: list[TrafficSummary] = []
         for begin in sorted(begins):
             end, observed_s = begin + self._length, self._observed.pop(begin) / NS
@@ -87,7 +111,16 @@ class Intervals:
 
 
 def counts_of(passages: Sequence[VehiclePassage]) -> tuple[TrafficCount, ...]:
-    """Counts of the directions and classes that there are, forward first."""
+    """Count passages by direction and class, forward first.
+
+    Parameters
+    ----------
+    passages : sequence of VehiclePassage
+
+    Returns
+    -------
+    tuple of TrafficCount
+    """
     groups = sorted({(not p.forward, p.vehicle_class) for p in passages})
     out = []
     for backward, name in groups:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mag_tracking.stages.track.bank_filter import Along, BankFilter
+from mag_tracking.stages.track.bank_filter import BankFilter, PathResult
 from support import plain_kalman
 from support.plain_smoother import Step, smoothed_covariances, smoothed_states
 
@@ -11,12 +11,12 @@ class StepByStep:
     """Runs a bank along paths, by its `predict` and `update`; see `BankFilter.run_along`."""
 
     def run_along(self, bank, frames, intervals, paths, *, passes, step, first_is_updated,
-                  leaves_out=False, wants_covariances=False):
+                  rejects_outliers=False, wants_covariances=False):
         start = bank.copy()
         for _ in range(passes):
             bank.x, bank.P = start.x.copy(), start.P.copy()
             steps, log_likelihood, used = self.filtered(
-                bank, frames, intervals, paths, first_is_updated, leaves_out)
+                bank, frames, intervals, paths, first_is_updated, rejects_outliers)
             smoothed = np.stack(smoothed_states(steps), axis=1)
             variance = np.array([np.einsum('pii->p', step.P[:, :3, :3]) for step in steps]).T
             log_likelihood[~(variance >= 0.0).all(axis=1)] = -np.inf
@@ -27,9 +27,9 @@ class StepByStep:
             paths[new] = smoothed[new]
         covariances = np.stack(smoothed_covariances(steps), axis=1) if wants_covariances \
             else np.empty(0)
-        return Along(log_likelihood, away.max(axis=1), used, covariances)
+        return PathResult(log_likelihood, away.max(axis=1), used, covariances)
 
-    def filtered(self, bank, frames, intervals, paths, first_is_updated, leaves_out):
+    def filtered(self, bank, frames, intervals, paths, first_is_updated, rejects_outliers):
         """(`Step`s, log-likelihood, which frames were used) of one way through the frames."""
         steps, total = [], np.zeros(len(bank))
         used = np.ones((len(bank), len(frames)), dtype=bool)
@@ -43,7 +43,7 @@ class StepByStep:
             else:
                 prior = bank.x.copy(), bank.P.copy()
                 of_frame, gains = self.update(bank, frame, dt, at)
-                if leaves_out and self.is_implausible(bank, 0, frame):
+                if rejects_outliers and self.is_implausible(bank, 0, frame):
                     bank.x, bank.P = prior
                     gains, used[:, k] = None, False
                 else:

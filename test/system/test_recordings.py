@@ -109,7 +109,7 @@ def speed_error(vehicle_replays, name):
     run, _ = vehicle_replays[name]
     log = run.logs[pass_of(vehicle_replays, name)['id']]
     stamps, positions, _ = next(iter(run.truth.values()))
-    sure = log.surest()
+    sure = log.most_certain()
     i = int(np.abs(stamps - log.stamp_ns[sure]).argmin())
     i = min(max(i, 2), len(stamps) - 3)
     true = np.hypot(*(positions[i + 2] - positions[i - 2])[:2]) / (

@@ -16,7 +16,7 @@ IN_EVERY_TEST = ('a bicycle', 'a sensor knocked', 'a car, four sensors')
 EXPECTED_DOUBTS = {
     'a trolley at 1.3 m/s': doubts.FELT_BY_ONE_SENSOR,
     'a bicycle': doubts.FELT_BY_ONE_SENSOR,
-    'a tram line switched': doubts.SOMETHING_ELSE,
+    'a tram line switched': doubts.DISTURBANCE_MODEL,
     'a temperature step': doubts.SENSORS_ROTATED,
     'a sensor knocked': doubts.INNOVATIONS,
     'stops for 5 s': doubts.HEIGHT,

@@ -1,1 +1,1 @@
-"""Track: from frames to tracks."""
+"""Tracking stage: turns frames with a detection verdict into tracks."""

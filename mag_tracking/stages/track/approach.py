@@ -1,4 +1,4 @@
-"""Whether a target came from afar, by how its field grew."""
+"""Test whether the field of a track grew like that of a target approaching from afar."""
 
 import numpy as np
 
@@ -7,28 +7,29 @@ from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.records import FieldFrame
 from mag_tracking.units import NS
 
-FELT = 2.5
-"""Root mean square of the whitened field where it is first felt."""
+SENSED_LEVEL = 2.5
+"""RMS of the whitened field above which the target counts as sensed."""
 
-LOUD = 10.0
-"""The growth from there to so many times as much is looked at."""
+GROWTH_RATIO = 10.0
+"""The growth is examined from `SENSED_LEVEL` up to this multiple of it."""
 
-LEAST = -0.25
-"""Binary logarithm of the ratio of both halves of the growth. 0.55 by theory where the distance
-falls evenly, -0.83 where a target starts from rest beside a sensor, less where the field jumps."""
+MIN_LOG2_RATIO = -0.25
+"""Minimum log2 of the ratio of the durations of the first and second half of the growth. In theory
+it is 0.55 for a uniformly decreasing distance and -0.83 for a target that starts from rest beside a
+sensor. A field that jumps gives less."""
 
-STEADY = 0.85
-"""It does not grow steadily where it falls to this share of what it was."""
+STEADY_SHARE = 0.85
+"""The growth is not steady if the field falls to this share of its previous maximum."""
 
 HALF_FRAME = 0.5
-"""It is not known when within a frame a size was reached."""
+"""Uncertainty, in frame periods, of the time at which the field reached a level."""
 
 MAX_FRAMES = 1000
-"""A target that is not loud by then is not judged."""
+"""The test is skipped if the field has not grown by `GROWTH_RATIO` within this number of frames."""
 
 
 class Approach:
-    """The first frames of a track, until its field is loud."""
+    """Approach test on the first frames of a track, until its field has grown by `GROWTH_RATIO`."""
 
     def __init__(self) -> None:
         self._times: list[float] = []
@@ -36,23 +37,35 @@ class Approach:
         self._is_open = True
 
     def add(self, frame: FieldFrame) -> bool:
-        """Whether the field has grown, with this frame, unlike that of a target from afar."""
+        """Add a frame to the test.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+
+        Returns
+        -------
+        bool
+            True if this frame completes the test and the field did not grow like that of a target
+            approaching from afar.
+        """
         if not self._is_open:
             return False
         self._times.append(frame.stamp_ns / NS)
         energy, n_axes = whitened_energy(frame.field, frame.covariance)
-        # A frame that is quieter than its noise is not quieter than that.
+        # The RMS of pure noise is 1; smaller values carry no information.
         self._sizes.append(float(np.sqrt(max(energy.sum() / max(n_axes.sum(), 1), 1.0))))
-        self._is_open = self._sizes[-1] <= LOUD * FELT and len(self._sizes) < MAX_FRAMES
+        self._is_open = self._sizes[-1] <= GROWTH_RATIO * SENSED_LEVEL \
+            and len(self._sizes) < MAX_FRAMES
         return not self._is_open and self._is_doubtful()
 
     def _is_doubtful(self) -> bool:
-        """Whether the frames tell that the target did not come from afar."""
+        """Whether the growth contradicts a target approaching from afar."""
         time, sizes = np.array(self._times), np.array(self._sizes)
-        growth = growth_of(time, sizes, FELT, LOUD * FELT)
-        # What falls meanwhile is of a target that has passed a first sensor.
-        falls = sizes < STEADY * np.maximum.accumulate(sizes)
-        if growth is None or (falls & (sizes > FELT)).any():
+        growth = growth_of(time, sizes, SENSED_LEVEL, GROWTH_RATIO * SENSED_LEVEL)
+        # A field that falls in between belongs to a target that has passed its first sensor.
+        falls = sizes < STEADY_SHARE * np.maximum.accumulate(sizes)
+        if growth is None or (falls & (sizes > SENSED_LEVEL)).any():
             return False
         half = HALF_FRAME * float(np.median(np.diff(time)))
-        return bool(np.log2((growth.early + half) / (growth.late + half)) < LEAST)
+        return bool(np.log2((growth.early + half) / (growth.late + half)) < MIN_LOG2_RATIO)

@@ -1,4 +1,4 @@
-// A frame of a bank, and the paths of a bank: one hypothesis after the other, for each target.
+// Update of a bank with a frame, and filtering along the paths of a bank, for each target type.
 
 #pragma once
 
@@ -12,15 +12,16 @@ struct Bank {
     int n_hyp, n_targets;
     const double *near_field_length, *x, *P;
 
-    // (n_targets) of hypothesis p.
+    // Near-field lengths (n_targets) of hypothesis p.
     INLINE const double* lengths(int p) const { return near_field_length + p * n_targets; }
 };
 
-// May be where the bank is: one hypothesis is done before the next is looked at.
+// Output; may alias the bank, because each hypothesis is completed before the next is read.
 struct Advanced {
     double *x, *P, *predicted, *log_likelihood, *nis;
 };
 
+// Parameters and outputs of `run_along`.
 struct Along {
     bool first_is_updated;
     double strange;
@@ -63,8 +64,8 @@ INLINE void advance_all(const Target& target, const Sensors& sensors, const Size
     }
 }
 
-// How far smoothed positions are from those of a path `at`, both (n, n_x): the largest distance in
-// deviations `deviation` (n). NaN stays: of such a path nothing is settled.
+// Largest distance of smoothed positions from those of a path `at`, both (n, n_x), in standard
+// deviations `deviation` (n). NaN propagates: such a path has not converged.
 INLINE double farthest(const double* smoothed, const double* at, const double* deviation,
                        int n, int n_x) {
     double farthest = 0.0;
@@ -114,7 +115,7 @@ INLINE void run_along_all(const Target& target, const Sensors& sensors, const Si
     }
 }
 
-// The compiler does not make templates for several processors, so each target has functions.
+// Function multiversioning does not work with templates, so each target type has its functions.
 [[maybe_unused]]
 FOR_PROCESSORS static void advance(const RowVehicle& target, const Sensors& sensors, const Sizes& n,
                             const Frame& frame, bool moves, int iterations, const Bank& bank,

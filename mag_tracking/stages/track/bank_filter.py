@@ -1,4 +1,4 @@
-"""Prediction and update of a bank: where the target's physics meets the filter."""
+"""Prediction and update of a `FilterBank` with the motion and field model of the target."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -17,31 +17,43 @@ from mag_tracking.stages.track.observation import SAME_TIME_S, Observation
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.unobserved_length import CAR_ROW
 
-LINEAR = 0.25
-"""A field is about linear in the position over this share of the distance to the nearest sensor:
-the cube of that distance changes by a factor of two."""
+LINEAR_SHARE = 0.25
+"""The field is approximately linear in the position within this share of the distance to the
+nearest sensor. The cube of that distance then changes by a factor of two."""
 
-ONE_TIME = 0.05
-"""A frame that is shorter than this share of the time since the frame before is one time, and so
-is the first of a track: velocities are better learnt from frame to frame than within one."""
+SAME_TIME_SHARE = 0.05
+"""A frame that spans less than this share of the interval since the previous frame is treated as
+simultaneous. So is the first frame of a track: velocities are better estimated between frames than
+within one."""
 
 
-class Along(NamedTuple):
-    """What came of `BankFilter.run_along`, for each hypothesis."""
+class PathResult(NamedTuple):
+    """Result of `BankFilter.run_along` for each hypothesis."""
 
     log_likelihood: FloatArray
-    """(n_hyp,) of all frames along the path; -inf where it is of no use."""
+    """Log-likelihood of all frames along the path, (n_hyp,); -inf if the path is unusable."""
     unsettled: FloatArray
-    """(n_hyp,) how far the last pass moved a path at most, in deviations of its position."""
+    """Largest change of the path in the last pass, (n_hyp,), in standard deviations of its
+    position."""
     used: BoolArray
-    """(n_hyp, n) whether it was updated with a frame."""
+    """Whether the hypothesis was updated with each frame, (n_hyp, n)."""
     covariances: FloatArray
-    """(n_hyp, n, n_x, n_x) at each frame given all of them; empty where nobody wants them."""
+    """Smoothed covariance at each frame, (n_hyp, n, n_x, n_x); empty if not requested."""
 
 
 def compiled_filter(model: SourceModel, observation: Observation
                     ) -> core.RowVehicleFilter | core.VehiclesFilter | core.MagnetFilter:
-    """The compiled filter of targets that are seen as `observation` says."""
+    """Return the compiled filter for a source model and its observation model.
+
+    Parameters
+    ----------
+    model : SourceModel
+    observation : Observation
+
+    Returns
+    -------
+    core.RowVehicleFilter, core.VehiclesFilter or core.MagnetFilter
+    """
     sensors = (observation.positions, observation.R_sw, observation.n_angles,
                observation.n_own - observation.n_angles)
     if isinstance(model, RowVehicle):
@@ -55,12 +67,24 @@ def compiled_filter(model: SourceModel, observation: Observation
 
 
 class BankFilter:
-    """Moves a `FilterBank` through frames; has no memory of its own."""
+    """Predict and update a `FilterBank`; the filter itself keeps no state between calls.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    model : SourceModel
+    settings : TrackSettings
+        The live settings may be changed by `configure`.
+    n_targets : int
+        Number of targets that share a state; their fields add up.
+
+    Attributes
+    ----------
+    observation : Observation
+    """
 
     def __init__(self, network: SensorNetwork, model: SourceModel, settings: TrackSettings,
                  n_targets: int = 1) -> None:
-        """`settings` is a `TrackSettings`; the live ones may be changed by `configure`. The states
-        are those of `n_targets` targets whose fields add up."""
         self._n_sensors = len(network)
         self._no_offset = np.zeros(len(network))
         self.observation = Observation(network, model, np.deg2rad(settings.mounting_std_deg),
@@ -69,7 +93,12 @@ class BankFilter:
         self.configure(settings)
 
     def configure(self, settings: TrackSettings) -> None:
-        """Take new values of the live settings."""
+        """Apply new values of the live settings.
+
+        Parameters
+        ----------
+        settings : TrackSettings
+        """
         self._settings = settings
         is_vehicle = settings.target == 'vehicle'
         self._near_field_lengths: FloatArray = np.atleast_1d(
@@ -79,7 +108,14 @@ class BankFilter:
             settings.vehicle.lengths if is_vehicle else [0.0]) > CAR_ROW
 
     def move(self, bank: FilterBank, dt: float) -> None:
-        """Time update over `dt` [s]; backwards in time without process noise."""
+        """Time update of a bank in place, without a measurement.
+
+        Parameters
+        ----------
+        bank : FilterBank
+        dt : float, s
+            Negative values move the bank backwards in time, without process noise.
+        """
         n = self._n_sensors
         nowhere = FieldFrame(0, np.full((n, 3), np.nan), np.tile(np.eye(3), (n, 1, 1)),
                              np.zeros(n, dtype=np.int64), np.zeros(n))
@@ -87,31 +123,41 @@ class BankFilter:
 
     def advance(self, bank: FilterBank, frame: FieldFrame, dt: float, keeps_prior: bool = False
                 ) -> tuple[FloatArray, FloatArray]:
-        """Time update to a frame that comes `dt` [s] after the one before, and update with it.
+        """Time update of a bank to a frame, and measurement update with it.
 
-        The update is linearised as often as the settings say. With `keeps_prior` the arrays that
-        `bank.x` and `bank.P` were stay as they are, which takes longer; else they are written into.
+        The update is linearised `iterations` times (a setting).
+
+        Parameters
+        ----------
+        bank : FilterBank
+            Updated in place.
+        frame : FieldFrame
+        dt : float, s
+            Time since the previous frame.
+        keeps_prior : bool
+            Leave the arrays that were `bank.x` and `bank.P` unchanged, which is slower. By default
+            they are overwritten.
 
         Returns
         -------
-        predicted : (n_hyp, n_x)
-            The states before the update.
-        log_likelihood : (n_hyp,)
-            Of the frame; -inf where a dipole sits on a sensor.
+        predicted : (n_hyp, n_x) array
+            States before the update.
+        log_likelihood : (n_hyp,) array
+            Log-likelihood of the frame; -inf if a dipole is at a sensor.
         """
         return self._advance(bank, frame, dt, dt > 0.0, self._settings.iterations, keeps_prior)
 
     def _advance(self, bank: FilterBank, frame: FieldFrame, dt: float, moves: bool,
                  iterations: int, keeps_prior: bool = False) -> tuple[FloatArray, FloatArray]:
-        """(predicted (n_hyp, n_x), log-likelihood (n_hyp,)); without iterations it only moves."""
+        """Predicted states (n_hyp, n_x) and log-likelihoods (n_hyp,); 0 iterations only predict."""
         n_hyp = len(bank)
         decay, variance = self.observation.drift(np.asarray(dt), self._settings.background_drift)
-        # Memory limits the speed with a thousand hypotheses: writing to new arrays takes twice as
-        # long.
+        # With a thousand hypotheses the speed is limited by memory: writing to new arrays takes
+        # twice as long.
         new_x, new_P = (np.empty_like(a) if keeps_prior else a for a in (bank.x, bank.P))
         predicted = np.empty_like(bank.x)
         log_likelihood, nis = np.zeros(n_hyp), np.full((n_hyp, self._n_sensors), np.nan)
-        # By position: names of so many arguments would take as long as a few hypotheses.
+        # Positional arguments: parsing this many keywords costs as much as a few hypotheses.
         self._compiled.advance(
             plain(frame.field), plain(known_covariance(frame.covariance)),
             self.time_offset(frame, dt), dt, decay, variance, moves, iterations,
@@ -122,37 +168,44 @@ class BankFilter:
 
     def run_along(self, bank: FilterBank, frames: Sequence[FieldFrame],
                   intervals: Sequence[float], paths: FloatArray, *, passes: int, step: float,
-                  first_is_updated: bool, leaves_out: bool = False,
-                  wants_covariances: bool = False) -> Along:
-        """Filter and smooth each hypothesis along its path, and end with the last frame.
+                  first_is_updated: bool, rejects_outliers: bool = False,
+                  wants_covariances: bool = False) -> PathResult:
+        """Filter and smooth each hypothesis along its path.
 
         Parameters
         ----------
         bank : FilterBank
-            At the first frame; `bank.x` and `bank.P` are replaced by those at the last one.
-        frames : list of n FieldFrame
-        intervals : list of n float [s]
-            Time from the frame before.
-        paths : (n_hyp, n, n_x)
-            Where they are linearised; NaN: at the predictions, iterated as `advance` does. Moved,
-            in place.
+            State at the first frame; replaced by the state at the last one.
+        frames : list of FieldFrame
+            The n frames of the path.
+        intervals : list of float, s
+            Time since the previous frame, for each frame.
+        paths : (n_hyp, n, n_x) array
+            Linearisation points, updated in place. NaN linearises at the prediction and iterates as
+            in `advance`.
         passes : int
-            How often it is done; each time it is linearised where the time before led.
+            Number of passes; each is linearised along the path of the previous one.
         step : float
-            The share of the way that a path is moved to where the smoother has it.
+            Share of the difference from the path to its smoothed states by which each pass moves
+            it.
         first_is_updated : bool
-            The bank has been updated with the first frame.
-        leaves_out : bool
-            Frames that contradict a hypothesis are left out.
+            The bank has already been updated with the first frame.
+        rejects_outliers : bool
+            Skip the update with frames whose normalised innovation exceeds `end_nis` per axis.
         wants_covariances : bool
+            Also return the smoothed covariances.
+
+        Returns
+        -------
+        PathResult
         """
         n_hyp, n, n_x = paths.shape
-        out = Along(np.empty(n_hyp), np.empty(n_hyp), np.empty((n_hyp, n), dtype=bool),
+        out = PathResult(np.empty(n_hyp), np.empty(n_hyp), np.empty((n_hyp, n), dtype=bool),
                     np.empty((n_hyp, n, n_x, n_x) if wants_covariances else 0))
         new_x, new_P = np.empty_like(bank.x), np.empty_like(bank.P)
         self._compiled.run_along(
             **self._frames(frames, intervals), first_is_updated=first_is_updated,
-            strange=self._settings.end_nis if leaves_out else np.inf,
+            strange=self._settings.end_nis if rejects_outliers else np.inf,
             iterations=self._settings.iterations, passes=passes, step=step,
             field_error=self._settings.field_error,
             near_field_length=self._lengths(bank.kind), x=bank.x, P=bank.P,
@@ -163,7 +216,7 @@ class BankFilter:
 
     def _frames(self, frames: Sequence[FieldFrame], intervals: Sequence[float]
                 ) -> dict[str, FloatArray]:
-        """Frames as compiled code takes them, one after the other."""
+        """Frames as consecutive arrays, keyed by the argument names of the compiled filter."""
         dt = np.array(intervals, dtype=float)
         decay, variance = self.observation.drift(dt, self._settings.background_drift)
         return {'field': np.array([frame.field for frame in frames]),
@@ -173,16 +226,40 @@ class BankFilter:
                 'dt': dt, 'decay': decay, 'variance': variance}
 
     def time_offset(self, frame: FieldFrame, dt: float) -> FloatArray:
-        """(n_sensors,) [s] of the samples of a frame that comes `dt` [s] after the one before."""
+        """Sampling time of each sensor relative to the timestamp of a frame.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+        dt : float, s
+            Time since the previous frame.
+
+        Returns
+        -------
+        (n_sensors,) array, s
+            Multiples of `SAME_TIME_S`; 0 for a frame that is treated as simultaneous.
+        """
         offset: FloatArray = frame.time_offset
-        if dt <= 0.0 or offset.max() - offset.min() < ONE_TIME * dt:
+        if dt <= 0.0 or offset.max() - offset.min() < SAME_TIME_SHARE * dt:
             return self._no_offset
         return np.round(offset / SAME_TIME_S) * SAME_TIME_S
 
     def model_error(self, bank: FilterBank, i: int, dt: float) -> FloatArray:
-        """(n_sensors,) [T^2] variance of what the model of hypothesis `i` leaves out of a field.
+        """Variance of the model error of the field of a hypothesis.
 
-        Only of what is new after `dt` [s].
+        Only the part that is uncorrelated with the previous frame is returned.
+
+        Parameters
+        ----------
+        bank : FilterBank
+        i : int
+            Row of the hypothesis.
+        dt : float, s
+            Time since the previous frame.
+
+        Returns
+        -------
+        (n_sensors,) array, T²
         """
         error = self.observation.model_error(
             bank.x[i], self._lengths(bank.kind[i:i + 1])[0], self._settings.field_error)
@@ -192,9 +269,22 @@ class BankFilter:
 
     def predicted_field(self, bank: FilterBank, i: int, frame: FieldFrame,
                         dt: float) -> FloatArray:
-        """(n_sensors, 3) [T] the field of the frame as hypothesis `i` has it, with backgrounds.
+        """Field of a frame predicted by a hypothesis, with backgrounds.
 
-        Without what it takes for errors of its model: with them anything would seem to fit.
+        The estimated model errors are left out: with them, almost any field would fit.
+
+        Parameters
+        ----------
+        bank : FilterBank
+        i : int
+            Row of the hypothesis.
+        frame : FieldFrame
+        dt : float, s
+            Time since the previous frame.
+
+        Returns
+        -------
+        (n_sensors, 3) array, T, sensor frame
         """
         x = self.observation.without_errors(bank.x[i:i + 1])
         h, _, _ = self.observation.fields(
@@ -205,10 +295,23 @@ class BankFilter:
 
     def fields_at(self, x: FloatArray, kind: IntArray, frame: FieldFrame, dt: float
                   ) -> tuple[FloatArray, FloatArray]:
-        """The fields (n_sensors, 3) [T] of the targets of a state (n_x,), without backgrounds and
-        errors, at the times of a frame; and their derivative (n_sensors, 3, n_target).
+        """Fields of the targets of a state at the sampling times of a frame, and their derivatives.
 
-        `kind` (1,) or (1, n_targets).
+        Backgrounds and model errors are left out.
+
+        Parameters
+        ----------
+        x : (n_x,) array
+        kind : (1,) or (1, n_targets) int array
+        frame : FieldFrame
+        dt : float, s
+            Time since the previous frame.
+
+        Returns
+        -------
+        h : (n_sensors, 3) array, T, sensor frame
+        H : (n_sensors, 3, n_target) array
+            Derivative with respect to the state of the targets.
         """
         h, H, _ = self.observation.fields(
             self.observation.without_errors(x[None]), self.time_offset(frame, dt),
@@ -217,44 +320,111 @@ class BankFilter:
 
     def field_of_others(self, bank: FilterBank, i: int, target: int, frame: FieldFrame,
                         dt: float) -> FloatArray:
-        """(n_sensors, 3) [T] the field of a frame that hypothesis `i` has of all but one target."""
+        """Field of all targets of a hypothesis but one, at the sampling times of a frame.
+
+        Parameters
+        ----------
+        bank : FilterBank
+        i : int
+            Row of the hypothesis.
+        target : int
+            The target to leave out.
+        frame : FieldFrame
+        dt : float, s
+            Time since the previous frame.
+
+        Returns
+        -------
+        (n_sensors, 3) array, T, sensor frame
+        """
         others = [k for k in range(self.observation.n_targets) if k != target]
         return self.observation.field_of(bank.x[i], others, self.time_offset(frame, dt))
 
     def _lengths(self, kind: IntArray) -> FloatArray:
-        """(n, n_targets) [m] near-field lengths of the kinds `kind` (n,) or (n, n_targets)."""
+        """Near-field lengths (n, n_targets) [m] of `kind` (n,) or (n, n_targets)."""
         return self._near_field_lengths[kind].reshape(len(kind), -1)
 
     def are_long(self, kind: IntArray) -> BoolArray:
-        """(n,) whether any target of the kinds `kind` (n,) or (n, n_targets) is longer than a car.
+        """Whether any target of each hypothesis is longer than a car.
+
+        Parameters
+        ----------
+        kind : (n,) or (n, n_targets) int array
+
+        Returns
+        -------
+        (n,) bool array
         """
         are_long: BoolArray = np.any(self._are_long[kind].reshape(len(kind), -1), axis=1)
         return are_long
 
     def nearly_linear(self, x: FloatArray) -> FloatArray:
-        """(n_hyp,) [m] how far the position of the states `x` (n_hyp, n_x) may be off for the field
-        to be about linear in it."""
-        return LINEAR * self.observation.nearest(x)
+        """Distance from the position within which the field is approximately linear in it.
+
+        Parameters
+        ----------
+        x : (n_hyp, n_x) array
+
+        Returns
+        -------
+        (n_hyp,) array, m
+        """
+        return LINEAR_SHARE * self.observation.nearest(x)
 
     def is_implausible(self, bank: FilterBank, i: int, frame: FieldFrame) -> bool:
-        """Whether hypothesis `i`, just updated with the `frame`, is contradicted by it."""
+        """Whether the normalised innovation of a hypothesis exceeds `end_nis` per axis.
+
+        Parameters
+        ----------
+        bank : FilterBank
+            Just updated with `frame`.
+        i : int
+            Row of the hypothesis.
+        frame : FieldFrame
+
+        Returns
+        -------
+        bool
+        """
         n_y = np.count_nonzero(~np.isnan(frame.field))
         return bool(np.nansum(bank.nis[i]) > self._settings.end_nis * n_y)
 
 
 class NoTarget:
-    """The filter of no target at all, only backgrounds that wander: what evidence is against."""
+    """Filter of the hypothesis that there is no target, only drifting backgrounds.
+
+    Its log-density is the reference for the evidence of a target.
+
+    Parameters
+    ----------
+    n_sensors : int
+    background_std : float, T
+        Initial standard deviation of each background, per axis.
+    """
 
     def __init__(self, n_sensors: int, background_std: float) -> None:
         self._x = np.zeros((n_sensors, 3))
         self._P = np.tile(background_std**2 * np.eye(3), (n_sensors, 1, 1))
 
     def log_density(self, frame: FieldFrame, dt: float, background_drift: float) -> float:
-        """Log-density of the frame given those before; `dt` [s] since the last one."""
+        """Log-density of a frame given the previous ones.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+        dt : float, s
+            Time since the previous frame.
+        background_drift : float, T/√s
+            Random walk of the backgrounds.
+
+        Returns
+        -------
+        float
+        """
         self._P += background_drift**2 * dt * np.eye(3)
         there = ~np.isnan(frame.field)
         both = there[:, :, None] & there[:, None, :]
-        # An axis that is missing has no innovation, and a variance of its own.
+        # A missing axis has zero innovation and an independent unit variance.
         u = np.where(there, frame.field - self._x, 0.0)
         S = np.where(both, self._P + frame.covariance, np.eye(3))
         L = np.linalg.cholesky(S)
@@ -268,6 +438,17 @@ class NoTarget:
 
 
 def known_covariance(covariance: FloatArray) -> FloatArray:
-    """(..., 3, 3) [T^2] those of frames; identity where an axis is missing."""
+    """Covariances of frames with the missing axes filled in.
+
+    Parameters
+    ----------
+    covariance : (..., 3, 3) array, T²
+        NaN where an axis is missing.
+
+    Returns
+    -------
+    (..., 3, 3) array, T²
+        NaN replaced by the elements of the identity.
+    """
     missing = np.isnan(covariance)
     return np.where(missing, np.eye(3), covariance) if missing.any() else covariance

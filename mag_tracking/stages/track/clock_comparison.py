@@ -1,4 +1,4 @@
-"""How far the clocks of the sensors are apart, by all the passes so far."""
+"""Clock offsets between the sensors, estimated from all passes so far."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,74 +8,100 @@ import numpy as np
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.stages.track.rigid_pass import MAX_OFFSET, MIN_DISTANCE, RigidPass
 
-SURE = 4.0
-"""Standard deviations at which clocks are called apart."""
+SIGNIFICANT_STD = 4.0
+"""An offset is reported if it exceeds this number of standard deviations."""
 
-MEMORY = 20
-"""About so many passes count: clocks are set, and drift."""
+MEMORY_PASSES = 20
+"""Effective number of passes in the estimate; clocks are set and drift."""
 
-KEPT, KEPT_OF_CONTRADICTED = 1.0 - 1.0 / MEMORY, 0.5
-"""Share of the evidence that is kept with each pass, and with one that contradicts it."""
+FORGETTING_FACTOR, CONTRADICTED_FACTOR = 1.0 - 1.0 / MEMORY_PASSES, 0.5
+"""Share of the evidence that is kept with each pass, and with a pass that contradicts it."""
 
-LOOSE_S = 1e3
-"""[s] Deviation of a clock that nothing is known of."""
+PRIOR_STD_S = 1e3
+"""Standard deviation of an unknown clock [s]."""
 
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """The clock that is off."""
+    """Clock with a significant offset."""
 
     sensor: int
-    """Its row."""
+    """Row of its sensor."""
     against: int | None
-    """Row of the sensor that it is compared to; None = the others."""
+    """Row of the sensor that it is compared with; None means all others."""
     offset_s: float
-    """How far it is ahead; negative = behind."""
+    """Time by which the clock is ahead [s]; negative if it is slow."""
     std_s: float
+    """Standard deviation of the offset [s]."""
     n_passes: int
-    """Number of passes that compared it."""
+    """Number of passes in which the clock was compared."""
 
     def text(self, names: Sequence[str]) -> str:
-        """A sentence about it; `names` are those of the sensors."""
+        """Describe the offset in a sentence, with the correction to make.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Sensor names.
+
+        Returns
+        -------
+        str
+        """
         name = names[self.sensor]
         others = 'those of the others' if self.against is None else f'that of {names[self.against]}'
         where = 'ahead of' if self.offset_s > 0.0 else 'behind'
-        more = 'more' if self.offset_s > 0.0 else 'less'
+        more = 'increase' if self.offset_s > 0.0 else 'decrease'
         passes = f'{self.n_passes} passes' if self.n_passes > 1 else 'one pass'
-        return (f'the clock of {name} seems {1e3 * abs(self.offset_s):.0f} ms {where} {others} '
-                f'(standard deviation {1e3 * self.std_s:.0f} ms, by {passes}), or a sensor is not '
-                'where the network file says; tracks are ambiguous until that is put right '
-                f'(clock_offset of {name}: {abs(self.offset_s):.3f} {more})')
+        return (f'the clock of {name} is {1e3 * abs(self.offset_s):.0f} ms {where} {others} '
+                f'(standard deviation {1e3 * self.std_s:.0f} ms, from {passes}), or a sensor '
+                'position in the network file is wrong. Tracks are ambiguous until this is fixed: '
+                f'{more} clock_offset of {name} by {abs(self.offset_s):.3f} s')
 
 
 class ClockComparison:
-    """The offsets of several passes, folded into one answer.
+    """Clock offsets of several passes, combined by recursive least squares.
 
-    A sensor that is not where the network file says looks like one with a wrong clock as long as
-    all vehicles go the same way at the same speed.
+    A wrong sensor position has the same effect as a wrong clock as long as all vehicles pass in the
+    same direction at the same speed.
+
+    Parameters
+    ----------
+    n_sensors : int
     """
 
     def __init__(self, n_sensors: int) -> None:
-        # Information on the clocks' offsets, and its product with them.
+        # Information matrix of the clock offsets, and its product with them.
         self._information = np.zeros((n_sensors, n_sensors))
         self._vector = np.zeros(n_sensors)
         self._n_passes = np.zeros(n_sensors, dtype=np.int64)
-        # Passes that count, and the sum of one over their speeds.
+        # Weighted number of passes, and weighted sum of the inverse of their speeds.
         self._weight, self._slowness = 0.0, 0.0
-        # [s] Differences of the clocks that are apart for sure, else 0; all at once, with a pass.
+        # [s] Significant differences of the clocks, else 0; computed once a pass.
         self._apart: FloatArray = np.zeros((n_sensors, n_sensors))
 
     def apart_s(self, rows: IntArray) -> float:
-        """[s] How far two clocks of the sensors `rows` are apart.
+        """Largest significant offset between two clocks.
 
-        Clocks that a single pass compared do not count: it may have been of two vehicles.
+        Clocks that were compared in a single pass do not count: that pass may have been of two
+        vehicles.
+
+        Parameters
+        ----------
+        rows : (n,) int array
+            Sensors to compare.
+
+        Returns
+        -------
+        float, s
+            0 if no offset is significant.
         """
         repeated = rows[self._n_passes[rows] > 1]
         return float(self._apart[np.ix_(repeated, repeated)].max(initial=0.0))
 
     @property
     def apart(self) -> ClockOffset | None:
-        """The clock that is off, where one is for sure."""
+        """Clock with the largest significant offset; None if there is no such clock."""
         ahead, behind = map(int, np.unravel_index(np.argmax(self._apart), self._apart.shape))
         if self._apart[ahead, behind] == 0.0:
             return None
@@ -84,7 +110,7 @@ class ClockComparison:
         if len(compared) == 2:
             return ClockOffset(ahead, behind, float(offset[ahead, behind]),
                                float(std[ahead, behind]), int(self._n_passes[compared].min()))
-        # Of several clocks the one that most others disagree with is off.
+        # With several clocks, the wrong one is the one that disagrees with most others.
         middle = np.median(offset[np.ix_(compared, compared)], axis=1)
         k = int(np.argmax(np.abs(middle)))
         j = int(compared[k])
@@ -92,17 +118,23 @@ class ClockComparison:
         return ClockOffset(j, None, float(middle[k]), float(std[j, other]), int(self._n_passes[j]))
 
     def add(self, found: RigidPass, rows: IntArray) -> None:
-        """Count a pass of the sensors `rows`.
+        """Add a pass to the estimate.
 
-        One that no straight path explains says nothing, nor one that is too slow to depend on
+        A pass that no straight path explains is ignored, and so is one too slow to depend on the
         clocks.
+
+        Parameters
+        ----------
+        found : RigidPass
+        rows : (n,) int array
+            Sensors of the pass, by row in the network.
         """
         is_slow = found.speed * MAX_OFFSET < MIN_DISTANCE
         if is_slow or not (found.is_explained and found.is_straight):
             return
         known = np.abs(found.offset) <= MAX_OFFSET
         known[found.reference] = False
-        kept = KEPT_OF_CONTRADICTED if self._contradicts(found, rows, known) else KEPT
+        kept = CONTRADICTED_FACTOR if self._contradicts(found, rows, known) else FORGETTING_FACTOR
         self._information *= kept
         self._vector *= kept
         for j in np.flatnonzero(known):
@@ -116,21 +148,21 @@ class ClockComparison:
         self._weight = 1.0 + kept * self._weight
         self._slowness = 1.0 / found.speed + kept * self._slowness
         offset, std = self._differences()
-        # An offset in which vehicles, as fast as those so far, go less than a metre does no harm.
+        # An offset is harmless if vehicles of the usual speed travel less than a metre in it.
         least = MIN_DISTANCE * self._slowness / self._weight
-        self._apart = np.where((offset > SURE * std) & (offset > least), offset, 0.0)
+        self._apart = np.where((offset > SIGNIFICANT_STD * std) & (offset > least), offset, 0.0)
 
     def _contradicts(self, found: RigidPass, rows: IntArray, known: BoolArray) -> bool:
-        """Whether a pass says otherwise than those before it, of one of the clocks `known`."""
+        """Whether a pass contradicts the previous ones about one of the `known` clocks."""
         offset, std = self._differences()
         reference = rows[found.reference]
-        return any(abs(found.offset[j] - offset[rows[j], reference]) > SURE * np.sqrt(
+        return any(abs(found.offset[j] - offset[rows[j], reference]) > SIGNIFICANT_STD * np.sqrt(
             found.clock_variance(j) + std[rows[j], reference]**2) for j in np.flatnonzero(known))
 
     def _differences(self) -> tuple[FloatArray, FloatArray]:
-        """(n, n) [s]: how far each clock (row) is ahead of each (column), and the deviation."""
-        # What all clocks have in common is arbitrary.
-        loose = np.eye(len(self._vector)) / LOOSE_S**2
+        """Time (n, n) [s] by which each clock (row) is ahead of each (column), and its std."""
+        # The common offset of all clocks is not observable; the prior fixes it.
+        loose = np.eye(len(self._vector)) / PRIOR_STD_S**2
         covariance: FloatArray = np.linalg.inv(self._information + loose).astype(np.float64)
         offset = covariance @ self._vector
         variance = np.diagonal(covariance)

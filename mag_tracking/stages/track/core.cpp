@@ -1,4 +1,4 @@
-// What of the tracker is compiled, as a Python module, for `bank_filter.py` and `pass_samples.py`.
+// Python module with the compiled part of the tracker, for bank_filter.py and pass_samples.py.
 
 #include <array>
 #include <string>
@@ -10,7 +10,7 @@
 namespace mag_tracking {
 namespace {
 
-// Targets that share a state.
+// Number of targets that share a state.
 template <class Target>
 Size number_of(const Target&) { return 1; }
 Size number_of(const Vehicles& vehicles) { return vehicles.count; }
@@ -109,7 +109,7 @@ class CompiledFilter {
         return {n_angles_, n_errors_, positions_.data(), R_sw_.data(), field_error};
     }
 
-    // Raises ValueError where one of n covariances C (3, 3) is not positive definite.
+    // Raises ValueError if one of n covariances C (3, 3) is not positive definite.
     static void check_noise(const double* C, Size n) {
         for (; n; --n, C += 9) {
             const double l10 = C[3] / C[0], l20 = C[6] / C[0], e1 = C[4] - l10 * C[3];
@@ -124,7 +124,7 @@ class CompiledFilter {
     std::vector<double> positions_, R_sw_;
 };
 
-// What both filters have in common, `name`d for Python.
+// Binds the filter of one target type as the Python class `name`.
 template <class Target, class... Numbers>
 void add_filter(py::module_& module, const char* name, Target (*target)(Numbers...)) {
     using Class = CompiledFilter<Target>;

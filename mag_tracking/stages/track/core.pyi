@@ -1,12 +1,14 @@
-"""The filters and the pass fit of the tracker, compiled; `bank_filter.py` and `pass_samples.py` say
-what the arguments are."""
+"""Compiled filters and pass fit of the tracker.
+
+The arguments are described in `bank_filter.py` and `pass_samples.py`.
+"""
 
 from collections.abc import Sequence
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 
 MAX_TARGETS: int
-"""Vehicles that share a state at most."""
+"""Maximum number of vehicles that share a state."""
 
 class _Filter:
     def advance(self, field: FloatArray, covariance: FloatArray, offset: FloatArray, dt: float,
@@ -28,7 +30,7 @@ class RowVehicleFilter(_Filter):
                  turn_acceleration: float, turn_time: float, fastest_turn: float) -> None: ...
 
 class VehiclesFilter(_Filter):
-    """Of `count` vehicles whose fields add up."""
+    """Filter of `count` vehicles whose fields add up."""
 
     def __init__(self, positions: FloatArray, R_sw: FloatArray, n_angles: int, n_errors: int,
                  count: int, n_states: int, n_dipoles: int, density: Sequence[float],
@@ -44,6 +46,9 @@ def fit_steady_pass(*, theta: FloatArray, cost: FloatArray, covariance: FloatArr
                     positions: FloatArray, M: FloatArray, clock: IntArray, y: FloatArray,
                     nuisance: FloatArray, n_steps: int, tolerance: float, most_damping: float,
                     full_rank: float, linear_rank: float, rank: float) -> None:
-    """`least_squares.refine` of a `SteadyPass` with `nuisance` (n_y, q), of orthonormal columns,
-    which `y` is without: from the starts `theta` (n, n_free), which become the points found, with
-    their `cost` (n,) and `covariance` (n, n_free, n_free)."""
+    """Refine a `SteadyPass` like `least_squares.refine`.
+
+    The starts `theta` (n, n_free) are replaced by the minima, with their `cost` (n,) and
+    `covariance` (n, n_free, n_free). The columns of `nuisance` (n_y, q) are orthonormal, and have
+    been projected out of `y`.
+    """

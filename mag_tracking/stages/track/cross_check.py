@@ -1,4 +1,4 @@
-"""A second opinion on a running track, once its vehicle has passed: see `rigid_pass`."""
+"""Check of a running track against a fit of its whole pass, see `rigid_pass`."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.clock_comparison import ClockComparison
-from mag_tracking.stages.track.disturbances import size_of
+from mag_tracking.stages.track.disturbances import field_magnitudes
 from mag_tracking.stages.track.plausibility import moves_too_far
 from mag_tracking.stages.track.rigid_pass import (
     LONG_LENGTH,
@@ -22,90 +22,114 @@ from mag_tracking.stages.track.rigid_pass import (
 from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.units import NS
 
-PASSED = 0.6
-"""A vehicle has passed once the field is below this share of its largest."""
+PASSED_SHARE = 0.6
+"""A vehicle has passed when the field is below this share of its maximum."""
 
-FIRST_S = 0.12
-"""[s] The first opinion follows so long after the strongest field."""
+FIRST_CHECK_S = 0.12
+"""Delay of the first fit after the maximum of the field [s]."""
 
-AGAIN = 1.7
-"""The next opinion follows after so many times as long."""
+CHECK_INTERVAL_RATIO = 1.7
+"""Ratio of the delays of successive fits."""
 
 BEFORE_S, AFTER_S = 4.0, 3.0
-"""[s] Frames from so long before to so long after the strongest field are of the pass."""
+"""Frames from `BEFORE_S` before to `AFTER_S` after the maximum of the field belong to the pass
+[s]."""
 
 MIN_FRAMES, MAX_FRAMES = 12, 128
-"""A pass is fitted to no fewer frames; of more every other one is left out, or more of them."""
+"""Minimum and maximum number of frames in a fit. A longer pass is decimated."""
 
 STEADY_S = 1.5
-"""[s] After the strongest field: until then a vehicle goes on as steadily as it passed."""
+"""Time after the maximum of the field for which the motion of a vehicle is assumed to stay steady
+[s]."""
 
-MISFIT_LATER = 8.0
-"""The limit for later opinions, when a car may have turned otherwise than steadily."""
+LATE_MISFIT = 8.0
+"""Limit for the misfit of later fits, when a car may have turned unsteadily."""
 
 
-class _Seen(NamedTuple):
-    """A frame of the track, in short."""
+class _FrameSummary(NamedTuple):
+    """Summary of a frame of the track."""
 
     stamp_ns: int
     size: float
-    """[T] largest field of a sensor."""
+    """Largest field of any sensor [T]."""
     state: FloatArray
-    """(6,) position and velocity as they were then published."""
+    """Position and velocity (6,) at that time, as published."""
 
 
 class CrossCheck:
-    """The frames of a track, and the fits of its pass as a whole.
+    """Frames of a track, and fits of its whole pass.
+
+    Parameters
+    ----------
+    network : SensorNetwork
 
     Attributes
     ----------
     latest : RigidPass or None
-        None before the vehicle has passed.
+        Latest fit; None before the vehicle has passed.
     difference : (6,) array, m and m/s
-        As `RigidPass.difference`, of the latest state; after the pass that at its end.
+        `RigidPass.difference` of the latest state; after the pass, that of the last state of the
+        pass.
     """
 
     def __init__(self, network: SensorNetwork) -> None:
         self.latest: RigidPass | None = None
         self._network = network
         self._frames: list[FieldFrame] = []
-        self._peak: _Seen | None = None
-        self._now: _Seen | None = None
+        self._peak: _FrameSummary | None = None
+        self._now: _FrameSummary | None = None
         self._period_s = np.inf
-        self._due_s = FIRST_S
+        self._due_s = FIRST_CHECK_S
         self._is_misfit = False
         self._smallest = np.inf
-        self._has_risen, self._is_of_whole = False, False
+        self._has_risen, self._has_whole_pass = False, False
         self.difference: FloatArray = np.zeros(6)
 
     def add(self, frame: FieldFrame, state: FloatArray) -> None:
-        """Take a frame, and the `state` (n_x,) of the best hypothesis."""
-        size = float(size_of(frame).max(initial=0.0))
+        """Add a frame.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+        state : (n_x,) array
+            State of the best hypothesis.
+        """
+        size = float(field_magnitudes(frame).max(initial=0.0))
         if self._now is not None:
-            # A gap is no frame period.
+            # The minimum excludes gaps.
             self._period_s = min(self._period_s, (frame.stamp_ns - self._now.stamp_ns) / NS)
-        self._now = _Seen(frame.stamp_ns, size, state[:6].copy())
+        self._now = _FrameSummary(frame.stamp_ns, size, state[:6].copy())
         if self._peak is None or size > self._peak.size:
-            self._peak, self._due_s = self._now, FIRST_S
-            self._has_risen = self._smallest <= PASSED * size
+            self._peak, self._due_s = self._now, FIRST_CHECK_S
+            self._has_risen = self._smallest <= PASSED_SHARE * size
         self._smallest = min(self._smallest, size)
-        # What is no longer of this pass, and will not be of another.
+        # Drop frames that belong neither to this pass nor to a later one.
         earliest = frame.stamp_ns - BEFORE_S * NS
         self._frames = [f for f in self._frames if f.stamp_ns >= earliest or self._is_of_pass(f)]
         self._frames.append(frame)
 
     def _is_of_pass(self, frame: FieldFrame) -> bool:
-        """Whether a frame is near the strongest field in time."""
+        """Whether a frame is within the pass, by its time from the maximum of the field."""
         assert self._peak is not None
         return -BEFORE_S * NS <= frame.stamp_ns - self._peak.stamp_ns <= AFTER_S * NS
 
     def doubts(self, clocks_apart_s: float) -> set[str]:
-        """Doubts about the track by now; earlier ones say that the clocks are so far apart [s]."""
+        """Return the doubts about the track, after a new fit if one is due.
+
+        Parameters
+        ----------
+        clocks_apart_s : float, s
+            Largest significant offset between the clocks, from earlier passes.
+
+        Returns
+        -------
+        set of str
+        """
         if self._now is None:
             return set()
-        self._form_if_due(self._now.size)
+        self._fit_if_due(self._now.size)
         if self._covers(self._now.stamp_ns):
-            self.difference = self._differs(self._now.stamp_ns, self._now.state)
+            self.difference = self._difference_at(self._now.stamp_ns, self._now.state)
         found = self._pass_doubts()
         speed = float(np.hypot(self._now.state[3], self._now.state[4]))
         if clocks_apart_s * speed > MIN_DISTANCE:
@@ -113,53 +137,71 @@ class CrossCheck:
         return found
 
     def differences(self, states: Sequence[TrackState]) -> list[FloatArray]:
-        """`difference` of each of the smoothed `states`, oldest first.
+        """Differences of smoothed states from the fitted pass.
 
-        Earlier and later states than those of the pass have the difference of its first and last.
+        States before or after the pass get the difference of its first or last state.
+
+        Parameters
+        ----------
+        states : sequence of TrackState
+            In order of time.
+
+        Returns
+        -------
+        list of (6,) array, m and m/s
+            `RigidPass.difference` of each state.
         """
         covered = [k for k, (stamp_ns, _, _) in enumerate(states) if self._covers(stamp_ns)]
         if not covered:
             return [self.difference] * len(states)
         first, last = covered[0], covered[-1]
-        inside = [self._differs(stamp_ns, x[:6]) for stamp_ns, x, _ in states[first:last + 1]]
+        inside = [self._difference_at(stamp_ns, x[:6]) for stamp_ns, x, _ in states[first:last + 1]]
         return [inside[min(max(k, first), last) - first] for k in range(len(states))]
 
     def _covers(self, stamp_ns: int) -> bool:
-        """Whether the latest opinion says where the vehicle was at a time.
+        """Whether the latest fit determines the position of the vehicle at a time.
 
-        Where a track begins with its strongest field, that is a part of a pass, which many paths
-        explain.
+        A track that begins at the maximum of the field contains only a part of a pass, which many
+        paths explain.
         """
-        return self.latest is not None and self._is_of_whole \
+        return self.latest is not None and self._has_whole_pass \
             and -BEFORE_S * NS <= stamp_ns - self.latest.stamp_ns <= AFTER_S * NS
 
-    def _differs(self, stamp_ns: int, state: FloatArray) -> FloatArray:
-        """(6,) difference of a `state` (6,) at a time that the latest opinion covers."""
+    def _difference_at(self, stamp_ns: int, state: FloatArray) -> FloatArray:
+        """Difference (6,) of a state (6,) at a time that the latest fit covers."""
         assert self.latest is not None
         return self.latest.difference(stamp_ns, state)
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether the latest opinion doubts the track."""
+        """Whether the latest fit contradicts the track."""
         return bool(self._pass_doubts())
 
     def conclude(self, clocks: ClockComparison, rows: IntArray) -> None:
-        """The track ends: form a last opinion, and tell the `clocks` of the sensors `rows`."""
-        self._form_if_due(0.0)
+        """Fit the pass a last time at the end of the track, and update the clock comparison.
+
+        Parameters
+        ----------
+        clocks : ClockComparison
+            Updated in place.
+        rows : (n,) int array
+            Sensors of the track, by row in the network.
+        """
+        self._fit_if_due(0.0)
         if self.latest is not None:
             clocks.add(self.latest, rows)
 
-    def _form_if_due(self, size: float) -> None:
-        """Form an opinion if it is time to; the field is now of this `size` [T]."""
+    def _fit_if_due(self, size: float) -> None:
+        """Fit the pass if a fit is due; `size` [T] is the current field."""
         now, peak = self._now, self._peak
-        if now is None or peak is None or self._due_s > AFTER_S or size > PASSED * peak.size:
+        if now is None or peak is None or self._due_s > AFTER_S or size > PASSED_SHARE * peak.size:
             return
         since = (now.stamp_ns - peak.stamp_ns) / NS
         frames = [f for f in self._frames if self._is_of_pass(f)]
         if since < self._due_s or len(frames) < MIN_FRAMES:
             return
-        self._due_s = AGAIN * since
-        # The search starts from what the filter says now, and from what it said then.
+        self._due_s = CHECK_INTERVAL_RATIO * since
+        # Starts: the state now, extrapolated back, and the state at the maximum of the field.
         back = now.state.copy()
         back[:3] -= since * back[3:]
         step = -(-len(frames) // MAX_FRAMES)
@@ -167,20 +209,20 @@ class CrossCheck:
                                np.array([back, peak.state]))
         if found is None:
             return
-        self.latest, self._is_of_whole = found, self._has_risen
+        self.latest, self._has_whole_pass = found, self._has_risen
         if since <= STEADY_S:
             self._is_misfit = found.misfit > MISFIT
 
     def _pass_doubts(self) -> set[str]:
-        """Doubts by the latest opinion."""
+        """Doubts from the latest fit."""
         found: set[str] = set()
         latest = self.latest
         if latest is None:
             return found
-        # The middle of a long vehicle is uncertain by as much as it is long, and not by more.
+        # The middle of a long vehicle is uncertain by up to its length.
         if np.hypot(self.difference[0], self.difference[1]) > LONG_LENGTH:
             found.add(doubts.ANOTHER_PLACE)
-        if self._is_misfit or latest.misfit > MISFIT_LATER:
+        if self._is_misfit or latest.misfit > LATE_MISFIT:
             found.add(doubts.NO_STEADY_PATH)
         if not latest.is_explained:
             return found

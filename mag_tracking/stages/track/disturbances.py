@@ -1,4 +1,4 @@
-"""Disturbances: what is left of tracks that something else explained better than a target."""
+"""Disturbances: fields during tracks that no target explained."""
 
 from dataclasses import dataclass, replace
 
@@ -11,40 +11,60 @@ from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.records import FieldFrame
 
 FALSE_ALARM = 1e-6
-"""Probability that a sensor is taken to feel a disturbance when a frame of it is noise."""
+"""Probability that noise alone marks a sensor as affected, per frame."""
 
 
 @dataclass(frozen=True)
-class Unexplained:
-    """The field during a track that no target explained."""
+class UnexplainedField:
+    """Field during a track that no target explained."""
 
     track_id: int
+    """Identifier of the track."""
     begin_ns: int
+    """Start of the track [ns]."""
     largest: FloatArray
-    """(n_sensors,) [T] size of the largest field at each sensor."""
-    felt: BoolArray
-    """(n_sensors,) which of them felt it."""
+    """Largest field measured by each sensor, (n_sensors,) T."""
+    sensed: BoolArray
+    """Whether each sensor sensed the field, (n_sensors,)."""
     uniform: float
+    """Probability of one field over the network."""
 
 
 class Disturbances:
-    """Follows one disturbance at a time, from the end of its first track to the release."""
+    """Follow one disturbance at a time, from the end of its first track to the release.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Sensor names.
+    """
 
     def __init__(self, names: tuple[str, ...]) -> None:
         self._names = names
         self._next_id = 1
         self._current: Disturbance | None = None
         self._largest: FloatArray = np.zeros(len(names))
-        self._felt: BoolArray = np.zeros(len(names), dtype=bool)
+        self._sensed: BoolArray = np.zeros(len(names), dtype=bool)
 
-    def begin(self, found: Unexplained, stamp_ns: int) -> list[Disturbance]:
-        """A track was `Unexplained`: the record of a new disturbance, or none where one goes on."""
+    def begin(self, found: UnexplainedField, stamp_ns: int) -> list[Disturbance]:
+        """Start a disturbance after a track that no target explained, or extend the current one.
+
+        Parameters
+        ----------
+        found : UnexplainedField
+        stamp_ns : int, ns
+
+        Returns
+        -------
+        list of Disturbance
+            Record of the new disturbance; empty if one is in progress.
+        """
         if self._current is not None:
             self._largest = np.maximum(self._largest, found.largest)
-            self._felt |= found.felt
+            self._sensed |= found.sensed
             self._current = replace(self._current, uniform=found.uniform, track_id=found.track_id)
             return []
-        self._largest, self._felt = found.largest.copy(), found.felt.copy()
+        self._largest, self._sensed = found.largest.copy(), found.sensed.copy()
         self._current = Disturbance(stamp_ns, self._next_id, False, found.begin_ns,
                                     float(self._largest.max()), self._sensors(), found.uniform,
                                     found.track_id)
@@ -52,14 +72,31 @@ class Disturbances:
         return [self._current]
 
     def feed(self, frame: FieldFrame) -> None:
-        """Take a frame of the disturbance alone: it may be larger now, and reach other sensors."""
+        """Update the current disturbance with a frame without a track.
+
+        The field may become stronger and reach other sensors.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+        """
         if self._current is not None:
             energy, n_axes = whitened_energy(frame.field, frame.covariance)
-            self._largest = np.maximum(self._largest, size_of(frame))
-            self._felt |= energy > chdtri(np.maximum(n_axes, 1), FALSE_ALARM)
+            self._largest = np.maximum(self._largest, field_magnitudes(frame))
+            self._sensed |= energy > chdtri(np.maximum(n_axes, 1), FALSE_ALARM)
 
     def end(self, stamp_ns: int) -> list[Disturbance]:
-        """The network is quiet again, or nothing is known of it any more."""
+        """End the current disturbance, at the release or when the frames are interrupted.
+
+        Parameters
+        ----------
+        stamp_ns : int, ns
+
+        Returns
+        -------
+        list of Disturbance
+            Closing record; empty without a disturbance.
+        """
         if self._current is None:
             return []
         last, self._current = self._current, None
@@ -67,12 +104,22 @@ class Disturbances:
                         sensors=self._sensors())]
 
     def _sensors(self) -> tuple[str, ...]:
-        """Names of those that felt it, the strongest first."""
+        """Names of the affected sensors, strongest field first."""
         order = np.argsort(-self._largest, kind='stable')
-        return tuple(self._names[j] for j in order if self._felt[j])
+        return tuple(self._names[j] for j in order if self._sensed[j])
 
 
-def size_of(frame: FieldFrame) -> FloatArray:
-    """(n_sensors,) [T] size of the field of a frame; 0 where it is missing."""
+def field_magnitudes(frame: FieldFrame) -> FloatArray:
+    """Magnitude of the field of a frame at each sensor.
+
+    Parameters
+    ----------
+    frame : FieldFrame
+
+    Returns
+    -------
+    (n_sensors,) array, T
+        0 if the reading is missing.
+    """
     size: FloatArray = np.sqrt(np.nansum(np.square(frame.field), axis=1))
     return size

@@ -1,4 +1,4 @@
-"""Why a pose is ambiguous: the names that are published, and what each means."""
+"""Doubts: the reasons why a pose is ambiguous, as published, and their meanings."""
 
 from collections.abc import Set
 
@@ -13,7 +13,7 @@ SENSORS_CONTRADICT = 'sensors_contradict'
 MISFIT = 'misfit'
 CONTRADICTION = 'contradiction'
 OVERFIT = 'overfit'
-SOMETHING_ELSE = 'disturbance_model'
+DISTURBANCE_MODEL = 'disturbance_model'
 INNOVATIONS = 'innovations'
 SENSORS_ROTATED = 'sensors_rotated'
 HEIGHT = 'height'
@@ -23,37 +23,47 @@ CLOCKS_APART = 'clocks_apart'
 NO_STEADY_PATH = 'no_steady_path'
 ANOTHER_VEHICLE = 'another_vehicle'
 
-FOR_GOOD = frozenset({SENSORS_ROTATED, FRAMES_TOO_LONG, CLOCKS_APART})
-"""These doubts stay: the track was bent. A state that no vehicle has may soon be right again."""
+PERMANENT = frozenset({SENSORS_ROTATED, FRAMES_TOO_LONG, CLOCKS_APART})
+"""Doubts that persist to the end of a track, because its path was distorted. Other implausible
+states may be corrected by later frames."""
 
 MEANINGS = {
-    ANOTHER_PLACE: 'another place is still possible',
+    ANOTHER_PLACE: 'another position is still possible',
     ANOTHER_ARRIVAL: 'another arrival direction is still possible',
-    NOT_SEEN_APPROACHING: 'the target was not seen approaching: it stood there, or the track began '
-                          'in the tail of a lost one',
-    SENSORS_AT_ONE_PLACE: 'there is one sensor, or all sensors are within two metres: range and '
-                          'size are those of the settings',
-    ONE_SENSOR: 'a single sensor of several measures, or did for too long',
-    FELT_BY_ONE_SENSOR: 'only one sensor feels the target: range and size are those of the '
-                        'settings',
+    NOT_SEEN_APPROACHING: 'the target was not seen approaching: it started near the sensors, or '
+                          'the track began in the tail of a lost track',
+    SENSORS_AT_ONE_PLACE: 'the network has one sensor, or all sensors are within two metres: range '
+                          'and size are not observable and follow from the settings',
+    ONE_SENSOR: 'only one of several sensors measures, or did so for too long',
+    FELT_BY_ONE_SENSOR: 'only one sensor senses the target: range and size are not observable and '
+                        'follow from the settings',
     DOUBTFUL_BACKGROUND: 'the background of a sensor is doubtful',
-    SENSORS_CONTRADICT: 'the sensors contradict each other, and no majority is left',
+    SENSORS_CONTRADICT: 'the sensors contradict each other without a majority',
     MISFIT: 'the field does not fit the best hypothesis',
-    CONTRADICTION: 'the field is less probable than 1e-5',
-    OVERFIT: 'the filter fits the latest frames much better than the path of its own hypothesis',
-    SOMETHING_ELSE: 'a smooth field of no target explains the frames about as well',
-    INNOVATIONS: 'the innovations of the latest frames, or of the track, are larger than stated',
-    SENSORS_ROTATED: 'the track needs sensors that are rotated by more than stated',
-    HEIGHT: 'the iron is where no vehicle of the kind has it',
-    OFF_THE_ROAD: 'the target passes all sensors on one side, beyond the lanes of the settings',
-    FRAMES_TOO_LONG: 'the target moves too far within a frame',
-    CLOCKS_APART: 'the clocks of the sensors seem to be apart, by this pass or those before',
-    ANOTHER_VEHICLE: 'it is not yet certain how many vehicles there are, or where one of them is',
-    NO_STEADY_PATH: 'no vehicle that accelerates and turns steadily explains the pass as a whole',
+    CONTRADICTION: 'the probability of the field given the best hypothesis is below 1e-5',
+    OVERFIT: 'the filter fits the latest frames much better than the path of its hypothesis does',
+    DISTURBANCE_MODEL: 'a smooth field without a target explains the frames about as well',
+    INNOVATIONS: 'the innovations of the latest frames, or of the track, exceed their covariance',
+    SENSORS_ROTATED: 'the track requires mounting errors larger than stated',
+    HEIGHT: 'the height of the source is implausible for its kind of vehicle',
+    OFF_THE_ROAD: 'the target passes all sensors on one side, outside the lanes of the settings',
+    FRAMES_TOO_LONG: 'the target moves too far within one frame',
+    CLOCKS_APART: 'the clocks of the sensors appear to differ, in this pass or in earlier ones',
+    ANOTHER_VEHICLE: 'the number of vehicles, or the position of one of them, is still uncertain',
+    NO_STEADY_PATH: 'no path with steady acceleration and turning explains the whole pass',
 }
-"""{doubt: what it means}, in the order in which they are listed."""
+"""Meaning of each doubt, in the order of publication."""
 
 
-def listed(doubts: Set[str]) -> tuple[str, ...]:
-    """The doubts in the order of `MEANINGS`."""
+def ordered(doubts: Set[str]) -> tuple[str, ...]:
+    """Return doubts in the order of `MEANINGS`.
+
+    Parameters
+    ----------
+    doubts : set of str
+
+    Returns
+    -------
+    tuple of str
+    """
     return tuple(name for name in MEANINGS if name in doubts)

@@ -1,4 +1,4 @@
-"""Whether a running track is to be believed, and whether it is still there."""
+"""Evidence for the target of a running track, doubts about the track, and the reasons to end it."""
 
 import numpy as np
 from scipy.special import chdtri
@@ -12,179 +12,244 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.approach import Approach
-from mag_tracking.stages.track.disturbances import size_of
+from mag_tracking.stages.track.disturbances import field_magnitudes
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 
 MAX_SINGLE_SENSOR_S = 0.5
-"""[s] A track that one sensor of several has supported alone for longer stays ambiguous."""
+"""Maximum time for which only one of several sensors may support a track; after that it stays
+ambiguous [s]."""
 
-LOST = 'lost its target'
+LOST = 'target lost'
 OUT_OF_REACH = 'out of reach'
 UNEXPLAINED = 'unexplained'
 """Reasons for the end of a track."""
 
 UNEXPLAINED_S = 3.0
-"""[s] A track that something else has explained better for so long ends, if a target never did."""
+"""A track ends when a disturbance has explained it better for this time, and a target never did
+[s]."""
 
 CONTRADICTION = 1e-5
-"""A field that is less probable than this contradicts the track of a vehicle. The filter takes it
-in, and may afterwards be wrong and agree with all that comes."""
+"""A field less probable than this contradicts the track of a vehicle. The filter is still updated
+with it, and may afterwards be wrong and yet agree with all later frames."""
 
 OVERFIT_NATS = float(np.log(1e4))
-"""An extended filter linearises each frame elsewhere, and may fit frames better than one path can.
-Where the path of the same hypothesis makes them less probable by this, the filter is doubted."""
+"""An extended filter linearises each frame at another state, and may fit the frames better than any
+single path can. The filter is doubted if the frames are less probable along the path of the same
+hypothesis by this log-ratio."""
 
-MIN_WATCHED = 0.5
-"""A track that begins with less than this share of its lookback is ambiguous."""
+MIN_OBSERVED_SHARE = 0.5
+"""A track is ambiguous if the frames before its detection cover less than this share of the
+lookback."""
 
-FELT = 4.0
-"""Standard deviations of the noise's energy by which that of a sensor's fields must exceed it for
-the sensor to have felt the target."""
+SENSED_LEVEL = 4.0
+"""A sensor has sensed the target if the energy of its fields exceeds that of its noise by this
+number of standard deviations."""
 
-PASSING_DOUBTS = (doubts.OVERFIT, doubts.SOMETHING_ELSE, doubts.INNOVATIONS, doubts.MISFIT,
+TRANSIENT_DOUBTS = (doubts.OVERFIT, doubts.DISTURBANCE_MODEL, doubts.INNOVATIONS, doubts.MISFIT,
                   doubts.HEIGHT, doubts.OFF_THE_ROAD, doubts.NO_STEADY_PATH)
 """Doubts about the filter at one time, which smoothing removes only in part."""
 
-LASTS_S = 0.1
-"""[s] Time for which a passing doubt outlasts the frame that it was found in: one that is missing
-in a single frame may be back in the next."""
+TRANSIENT_S = 0.1
+"""Time for which a transient doubt persists after the frame in which it was found [s]. A doubt that
+is absent from a single frame may reappear in the next."""
 
 MAX_SEGMENTS = 5000
-"""Stretches of doubtful poses that are remembered: more than a track has that is smoothed."""
+"""Maximum number of segments of doubtful poses that are kept: more than a smoothed track has."""
 
 
 class TrackEvidence:
-    """Evidence for a target, and what speaks against its track.
+    """Evidence for a target, and doubts about its track.
+
+    Parameters
+    ----------
+    n_sensors : int
 
     Attributes
     ----------
-    explanation : TargetBayesFactor
-        Against something else than a target.
+    bayes_factor : TargetBayesFactor
+        Evidence for a target against a disturbance.
     innovations : InnovationConsistency
     largest : (n_sensors,) array, T
-        Size of the largest field that each sensor measured.
+        Magnitude of the largest field measured by each sensor.
     """
 
     def __init__(self, n_sensors: int) -> None:
         self.bayes_factor = TargetBayesFactor()
         self.innovations = InnovationConsistency(n_sensors)
         self._approach = Approach()
-        # For the whole track.
+        # Doubts about the whole track.
         self._doubts: set[str] = set()
         self._log_odds = 0.0
         self._single_sensor_s = 0.0
         self._n_misfits = 0
         self._doubts_filter_until_ns = -1
         self._doubtful_times: DoubtfulTimes = ()
-        # The latest timestamp of each passing doubt.
+        # Latest timestamp of each transient doubt.
         self._found_ns: dict[str, int] = {}
-        # Until when other doubts last.
+        # End of the other doubts of limited time.
         self._until_ns: dict[str, int] = {}
-        # Stretches that also smoothed poses are doubted in.
+        # Segments in which smoothed poses are doubted as well.
         self._segments: list[tuple[int, int]] = []
-        self._best_spread = np.inf
-        # Per sensor: whitened energy of its fields above that of noise, and number of axes.
+        self._min_spread = np.inf
+        # Per sensor: whitened energy of its fields in excess of noise, and number of axes.
         self._energy, self._n_axes = np.zeros(n_sensors), np.zeros(n_sensors)
         self.largest: FloatArray = np.zeros(n_sensors)
 
     @property
     def doubted(self) -> bool:
-        """Whether all of the track may be wrong."""
+        """Whether the whole track is doubted."""
         return bool(self._doubts)
 
     @property
     def doubts(self) -> set[str]:
-        """Doubts about the whole track; a copy."""
+        """Copy of the doubts about the whole track."""
         return set(self._doubts)
 
     def add(self, log_likelihood_ratio: float) -> None:
-        """Count a frame: its log-likelihood with a target less that without one."""
+        """Add the evidence of a frame.
+
+        Parameters
+        ----------
+        log_likelihood_ratio : float, nats
+            Log-likelihood of the frame with the target, minus that without a target.
+        """
         self._log_odds += log_likelihood_ratio
 
     def doubt(self, reason: str) -> None:
-        """From now on all of the track may be wrong."""
+        """Doubt the whole track from now on.
+
+        Parameters
+        ----------
+        reason : str
+            One of `doubts`.
+        """
         self._doubts.add(reason)
 
-    def forgive(self) -> None:
+    def drop_explained_doubts(self) -> None:
         """Drop the doubts that another vehicle explains."""
         self._doubts -= {doubts.CONTRADICTION, doubts.INNOVATIONS, doubts.SENSORS_CONTRADICT,
-                         *doubts.FOR_GOOD}
+                         *doubts.PERMANENT}
         self.innovations = InnovationConsistency(len(self.largest))
         self._n_misfits, self._doubts_filter_until_ns = 0, -1
         self._found_ns.clear()
 
-    def doubt_start(self, unseen_coming: bool, network: SensorNetwork, starts_anywhere: bool
+    def doubt_start(self, approach_unobserved: bool, network: SensorNetwork, starts_anywhere: bool
                     ) -> None:
-        """Doubt a track whose target was not seen approaching, or whose range nothing tells.
+        """Doubt a track whose target was not seen approaching, or whose range is not observable.
 
-        `starts_anywhere` is that of the target.
+        Parameters
+        ----------
+        approach_unobserved : bool
+            The frames before the detection do not show the target approaching.
+        network : SensorNetwork
+        starts_anywhere : bool
+            `Target.starts_anywhere`.
         """
-        # One that was not seen approaching may already have passed.
-        if unseen_coming and not starts_anywhere:
+        # A target that was not seen approaching may already have passed.
+        if approach_unobserved and not starts_anywhere:
             self.doubt(doubts.NOT_SEEN_APPROACHING)
-        # The range of a single sensor's target is what the settings say, and that of a vehicle near
-        # a few sensors at one place what the model leaves out of its field.
+        # With a single sensor the range follows from the settings. With a few sensors at one place
+        # the range of a vehicle follows from errors of its field model.
         if len(network) == 1 or network.is_close and not starts_anywhere:
             self.doubt(doubts.SENSORS_AT_ONE_PLACE)
 
     def doubt_for(self, reason: str, stamp_ns: int, seconds: float,
                   since_ns: int | None = None) -> None:
-        """The poses of so many seconds may be wrong; those since an earlier time were, perhaps."""
+        """Doubt the poses of a limited time.
+
+        Parameters
+        ----------
+        reason : str
+            One of `doubts`.
+        stamp_ns : int, ns
+            Start of the doubt.
+        seconds : float, s
+            Duration of the doubt.
+        since_ns : int, ns, optional
+            Smoothed poses since this earlier time are doubted as well.
+        """
         self._until_ns[reason] = until_ns = stamp_ns + round(seconds * NS)
         if since_ns is not None:
             self._segments.append((since_ns, until_ns))
 
-    def watch(self, frame: FieldFrame) -> None:
-        """Doubt the track where the field has grown unlike that of a target from afar."""
-        if self._approach.add(frame):
-            self.doubt(doubts.NOT_SEEN_APPROACHING)
-
-    def take(self, frame: FieldFrame, rows: IntArray, nis: FloatArray) -> None:
-        """Count what the sensors felt in a frame, and how it fits.
+    def check_approach(self, frame: FieldFrame) -> None:
+        """Doubt the track if its field did not grow like that of a target approaching from afar.
 
         Parameters
         ----------
         frame : FieldFrame
-            Of the sensors that the track uses.
+        """
+        if self._approach.add(frame):
+            self.doubt(doubts.NOT_SEEN_APPROACHING)
+
+    def add_frame(self, frame: FieldFrame, rows: IntArray, nis: FloatArray) -> None:
+        """Add the fields and the innovations of a frame.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+            Readings of the sensors that the track uses.
         rows : (n,) int array
-            Those, in the network.
+            Rows of these sensors in the network.
         nis : (n,) array
-            Normalised innovation squared of the published hypothesis, of each of them.
+            Normalised innovation squared of the published hypothesis, per sensor.
         """
         energy, n_axes = whitened_energy(frame.field, frame.covariance)
         self._energy[rows] += energy - n_axes
         self._n_axes[rows] += n_axes
-        self.largest[rows] = np.maximum(self.largest[rows], size_of(frame))
+        self.largest[rows] = np.maximum(self.largest[rows], field_magnitudes(frame))
         of_all, axes_of_all = np.full(len(self.largest), np.nan), np.zeros(len(self.largest))
         of_all[rows], axes_of_all[rows] = nis, n_axes
         self.innovations.add(of_all, axes_of_all, frame.stamp_ns)
 
     @property
-    def felt(self) -> BoolArray:
-        """(n_sensors,) whether they have felt the target."""
-        felt: BoolArray = self._energy > FELT * np.sqrt(2.0 * np.maximum(self._n_axes, 1.0))
-        return felt
+    def sensed(self) -> BoolArray:
+        """Whether each sensor has sensed the target, (n_sensors,)."""
+        sensed: BoolArray = self._energy > SENSED_LEVEL * np.sqrt(
+            2.0 * np.maximum(self._n_axes, 1.0))
+        return sensed
 
     @property
-    def is_felt_by_one(self) -> bool:
-        """Whether fewer than two sensors have felt the target."""
-        return int(np.count_nonzero(self.felt)) < 2
+    def is_sensed_by_one(self) -> bool:
+        """Whether fewer than two sensors have sensed the target."""
+        return int(np.count_nonzero(self.sensed)) < 2
 
     def note(self, found: set[str], stamp_ns: int) -> set[str]:
-        """Record the doubts about the pose of a frame; return them and those that last."""
-        passing = found.intersection(PASSING_DOUBTS)
+        """Record the doubts about the pose of a frame.
+
+        Parameters
+        ----------
+        found : set of str
+        stamp_ns : int, ns
+
+        Returns
+        -------
+        set of str
+            These doubts and the earlier ones that persist.
+        """
+        passing = found.intersection(TRANSIENT_DOUBTS)
         self._doubtful_times = noted(self._doubtful_times, stamp_ns, bool(passing), MAX_SEGMENTS)
         self._found_ns |= dict.fromkeys(passing, stamp_ns)
         return found | {reason for reason, when in self._found_ns.items()
-                        if (stamp_ns - when) / NS <= LASTS_S} \
+                        if (stamp_ns - when) / NS <= TRANSIENT_S} \
             | {reason for reason, until in self._until_ns.items() if stamp_ns <= until}
 
     def contradicts(self, nis: FloatArray, degrees_of_freedom: int) -> bool:
-        """Whether a normalised innovation is one that no target of ours makes.
+        """Whether a normalised innovation is too large for any target of the model.
 
-        `nis` (n_sensors,) of each sensor, NaN where it is missing. Two sensors agree with many
-        paths: all of the track is then doubted. More of them correct it.
+        With two sensors, many paths fit the fields, and the whole track is doubted from then on.
+        More sensors correct it.
+
+        Parameters
+        ----------
+        nis : (n_sensors,) array
+            Normalised innovation squared of each sensor; NaN if missing.
+        degrees_of_freedom : int
+
+        Returns
+        -------
+        bool
         """
         contradicted = bool(np.nansum(nis) > chdtri(degrees_of_freedom, CONTRADICTION))
         if contradicted and len(nis) <= 2:
@@ -192,17 +257,26 @@ class TrackEvidence:
         return contradicted
 
     def vehicle_doubts(self, nis: FloatArray, degrees_of_freedom: int, ratio: float) -> set[str]:
-        """Doubts about the pose of a vehicle by what was measured so far.
+        """Doubts about the pose of a vehicle from the measurements so far.
 
-        `nis` and `degrees_of_freedom` of the frame as for `contradicts`; `ratio` is that by which
-        a target has to explain the frames better.
+        Parameters
+        ----------
+        nis : (n_sensors,) array
+            Normalised innovation squared of the frame, as for `contradicts`.
+        degrees_of_freedom : int
+        ratio : float
+            Bayes factor by which a target must explain the frames better than a disturbance.
+
+        Returns
+        -------
+        set of str
         """
         found = set()
         if self.bayes_factor.fell_behind(ratio):
-            found.add(doubts.SOMETHING_ELSE)
+            found.add(doubts.DISTURBANCE_MODEL)
         if self.contradicts(nis, degrees_of_freedom):
             found.add(doubts.CONTRADICTION)
-        if self.is_felt_by_one:
+        if self.is_sensed_by_one:
             found.add(doubts.FELT_BY_ONE_SENSOR)
         if self.innovations.excess > 1.0:
             found.add(doubts.INNOVATIONS)
@@ -213,29 +287,47 @@ class TrackEvidence:
     def doubts_filter(self, gain: float, stamp_ns: int, window_s: float) -> bool:
         """Whether the filter fits the frames much better than the path of its hypothesis does.
 
-        Once it did, it is doubted for `window_s`: the frames of the comparison are as old as that.
+        The doubt persists for `window_s`, the age of the frames that are compared.
 
         Parameters
         ----------
-        gain : float [nats]
+        gain : float, nats
             Log-likelihood of the latest frames along the path, minus that in the filter.
-        stamp_ns : int
-            Of the latest frame.
-        window_s : float
+        stamp_ns : int, ns
+            Timestamp of the latest frame.
+        window_s : float, s
+
+        Returns
+        -------
+        bool
         """
         if gain < -OVERFIT_NATS:
             self._doubts_filter_until_ns = stamp_ns + round(window_s * NS)
         return stamp_ns <= self._doubts_filter_until_ns
 
-    def doubted_filter(self, stamp_ns: int) -> bool:
-        """Whether the filter was doubted at an earlier time."""
+    def was_filter_doubted(self, stamp_ns: int) -> bool:
+        """Whether the filter was doubted at an earlier time.
+
+        Parameters
+        ----------
+        stamp_ns : int, ns
+
+        Returns
+        -------
+        bool
+        """
         return are_doubtful((*self._doubtful_times, *self._segments), stamp_ns)
 
     def support(self, by_one_sensor: bool, dt: float) -> None:
-        """Count `dt` [s] for which one sensor of several supported the track, or more did.
+        """Count the time for which only one of several sensors supported the track.
 
-        A single sensor tells neither the scale nor the mirror image, and the other sensors do not
-        always correct the error when they are back.
+        A single sensor determines neither the scale nor the mirror image, and the other sensors do
+        not always correct the error when they return.
+
+        Parameters
+        ----------
+        by_one_sensor : bool
+        dt : float, s
         """
         self._single_sensor_s += dt if by_one_sensor else 0.0
         if self._single_sensor_s > MAX_SINGLE_SENSOR_S:
@@ -253,11 +345,23 @@ class TrackEvidence:
 
     def reason_to_end(self, track: Track, spread: float, is_coming: bool,
                       settings: TrackSettings) -> str | None:
-        """Why the track is over after its pose `track`; None while it goes on.
+        """Why the track ends after a pose; None if it continues.
 
-        `spread` [m] is the deviation of the horizontal position of its hypothesis alone: while
-        several explain the field, what they differ by says nothing about how far away it is. A
-        target that `is_coming` nearer to the sensors is not out of reach, however uncertain.
+        Parameters
+        ----------
+        track : Track
+            The latest pose.
+        spread : float, m
+            Standard deviation of the horizontal position of its hypothesis alone. If several
+            hypotheses explain the field, their differences do not measure the distance of the
+            target.
+        is_coming : bool
+            The target is approaching the sensors. It is then not out of reach, however uncertain.
+        settings : TrackSettings
+
+        Returns
+        -------
+        str or None
         """
         if self.bayes_factor.unexplained_s(track.stamp_ns) > UNEXPLAINED_S:
             return UNEXPLAINED
@@ -265,7 +369,7 @@ class TrackEvidence:
         self._n_misfits = self._n_misfits + 1 if misfit else 0
         if self._n_misfits > 1:
             return LOST
-        if spread > settings.end_std > self._best_spread and not is_coming:
+        if spread > settings.end_std > self._min_spread and not is_coming:
             return LOST if misfit else OUT_OF_REACH
-        self._best_spread = min(self._best_spread, spread)
+        self._min_spread = min(self._min_spread, spread)
         return None

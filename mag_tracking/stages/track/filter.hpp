@@ -1,8 +1,7 @@
-// The filter of one hypothesis after the other: a frame of a bank, and a whole path.
+// Extended Kalman filter and smoother of one hypothesis, for a single frame and for a whole path.
 //
-// All that is done with a hypothesis is done before the next one, while its covariance is at hand.
-// Each rule stands here once: for the bank that runs, for paths that are linearised anew, and for
-// smoothing.
+// Each hypothesis is completed before the next one, while its covariance is in the cache. The same
+// code serves the running bank, relinearised paths and smoothing.
 
 #pragma once
 
@@ -16,23 +15,23 @@ constexpr int MAX_TARGET_STATES = 256;
 
 // The sensors of a network.
 struct Sensors {
-    int n_angles, n_errors;   // States of each for its mounting, and for errors of the model.
-    const double* positions;  // (n_sensors, 3) [m], world.
-    const double* R_sw;       // (n_sensors, 3, 3) world to sensor.
+    int n_angles, n_errors;   // States of each sensor: mounting angles, and model errors.
+    const double* positions;  // (n_sensors, 3) [m], world frame.
+    const double* R_sw;       // (n_sensors, 3, 3) rotation from world to sensor.
     double field_error;
 };
 
 // One frame.
 struct Frame {
-    const double* field;       // (n_sensors, 3) [T]; NaN where an axis is missing.
+    const double* field;       // (n_sensors, 3) [T]; NaN for a missing axis.
     const double* covariance;  // (n_sensors, 3, 3) [T^2], without NaN.
-    const double* offset;      // (n_sensors) [s] of a sensor's samples from the time of the frame.
-    double dt;                 // [s] since the frame before.
-    const double* decay;       // (n_x - n_t): over that time the sensors' states are multiplied,
-    const double* variance;    // and this is added.
+    const double* offset;      // (n_sensors) [s] time of the samples, relative to the frame.
+    double dt;                 // [s] time since the previous frame.
+    const double* decay;       // (n_x - n_t) factor of the sensors' states over this time.
+    const double* variance;    // (n_x - n_t) process noise added to their variance.
 };
 
-// Frames that come after each other.
+// Consecutive frames, stored one after the other.
 struct Frames {
     int n;
     const double *field, *covariance, *offset, *dt, *decay, *variance;
@@ -44,7 +43,7 @@ struct Frames {
     }
 };
 
-// What a filter did to a hypothesis in each frame.
+// States, covariances and gains of a hypothesis in each frame, for the smoother.
 struct Path {
     Numbers x, P, H, G, z, W;
     std::vector<Motion> motion;
@@ -70,8 +69,8 @@ class Filter {
           T_(MAX_ROWS * sizes.wide), h_(3 * sizes.n_sensors), inflation_(sizes.n_sensors),
           x_lin_(sizes.wide) {}
 
-    // Time update of `x` (wide) and `P` (n_x, wide) linearised at `at` (n_x); backwards in time
-    // without noise.
+    // Time update of `x` (wide) and `P` (n_x, wide), linearised at `at` (n_x). No process noise is
+    // added backwards in time.
     INLINE void predict(const Frame& frame, const double* at, double* x, double* P,
                         Motion& motion) {
         target_.move(at, frame.dt, motion);
@@ -93,14 +92,14 @@ class Filter {
                     eights(P + a * n_.wide)[v] += eights(Q_.data() + a * n_.wide)[v];
     }
 
-    // Measurement update linearised at `x_lin` (n_x); its log-likelihood. `near_field_length` has
-    // one value a target. What it did goes into
-    // `gains`, the normalised innovation squared of each sensor into `nis`.
+    // Measurement update linearised at `x_lin` (n_x); returns its log-likelihood.
+    // `near_field_length` has one value per target. The outputs are the gains and the normalised
+    // innovation squared `nis` of each sensor.
     INLINE double update(const Frame& frame, const double* x_lin, const double* near_field_length,
                          double* x, double* P, const Gains& gains, double* nis) {
-        const bool is_lost = !see(frame, x_lin, near_field_length, gains.H);
+        const bool is_lost = !evaluate(frame, x_lin, near_field_length, gains.H);
         if (is_lost) {
-            // A dipole sits on a sensor: such a hypothesis is as good as ruled out.
+            // A dipole is at a sensor: the hypothesis gets zero likelihood.
             std::fill(h_.data(), h_.data() + 3 * n_.n_sensors, 0.0);
             std::fill(inflation_.data(), inflation_.data() + n_.n_sensors, 0.0);
             std::fill(gains.H, gains.H + n_.n_sensors * 3 * n_.n_seen(), 0.0);
@@ -115,10 +114,10 @@ class Filter {
         return is_lost ? -std::numeric_limits<double>::infinity() : log_likelihood;
     }
 
-    // A hypothesis, `x` (wide) and `P` (n_x, wide), through all frames; the log-likelihood.
-    // Linearised along `path` (n, n_x), or where that is NaN at the predictions and then, in all
-    // `iterations` times, at what came of that. A frame whose normalised innovation is larger than
-    // `strange` per axis is left out.
+    // Filters a hypothesis, `x` (wide) and `P` (n_x, wide), through all frames; returns the
+    // log-likelihood. The linearisation points are `path` (n, n_x). NaN linearises at the
+    // prediction, and repeats the update at its own result, `iterations` times in total. A frame
+    // whose normalised innovation exceeds `strange` per axis is not used for an update.
     INLINE double run(const Frames& frames, bool first_is_updated, double strange, int iterations,
                       const double* near_field_length, const double* path, double* x, double* P,
                       Path& out) {
@@ -152,8 +151,8 @@ class Filter {
         return total;
     }
 
-    // States (n, n_x) at each frame given all of them, and the deviation (n) of the filtered
-    // position; false where a variance is negative.
+    // Smoothed states (n, n_x), and the standard deviation (n) of the filtered position. Returns
+    // false if a variance is negative.
     INLINE bool smooth(const Frames& frames, Path& path, double* smoothed, double* std) {
         bool is_valid = true;
         Numbers after(n_.wide), moved(n_.wide);
@@ -174,7 +173,7 @@ class Filter {
         return is_valid;
     }
 
-    // Covariances (n, n_x, n_x) at each frame given all of them: P - P L P.
+    // Smoothed covariances (n, n_x, n_x): P - P L P.
     INLINE void smooth_covariances(const Frames& frames, Path& path, double* out) {
         const int n_x = n_.n_x;
         Numbers information(n_.square()), once(n_.square()), twice(n_.square()), B(3 * n_.wide);
@@ -197,7 +196,7 @@ class Filter {
         }
     }
 
-    // A state and its covariance, both of `wide` rows.
+    // Copies a state and its covariance, both with rows of `wide` numbers.
     INLINE void copy(const double* x, const double* P, double* to_x, double* to_P) const {
         std::memcpy(to_x, x, n_.wide * sizeof(double));
         std::memcpy(to_P, P, n_.square() * sizeof(double));
@@ -232,15 +231,16 @@ class Filter {
         return total > strange * axes;
     }
 
-    // Fields h_, derivative `H` and inflation_ of the state `x`; false where they are not finite.
-    INLINE bool see(const Frame& frame, const double* x, const double* near_field_length,
-                    double* H) {
+    // Computes the fields h_, their derivative `H` and inflation_ at the state `x`; returns false
+    // if they are not finite.
+    INLINE bool evaluate(const Frame& frame, const double* x, const double* near_field_length,
+                         double* H) {
         double at[MAX_TARGET_STATES], total = 0.0;
         std::copy(x, x + n_.n_t, at);
         for (int j = 0; j < n_.n_sensors; ++j, H += 3 * n_.n_seen()) {
             const double* position = sensors_.positions + 3 * j;
             double R[9], world[3], error;
-            turn(j, x + n_.own(j), R);
+            mounting_rotation(j, x + n_.own(j), R);
             if (frame.offset[j] == 0.0) {
                 error = field_and_error(target_, at, position, R, near_field_length, world, H,
                                         n_.n_seen());
@@ -250,18 +250,18 @@ class Filter {
                 for (int r = 0; r < motion.n; ++r) at[motion.rows[r]] = motion.moved[r];
                 error = field_and_error(target_, at, position, R, near_field_length, world, H,
                                         n_.n_seen());
-                to_before(motion, H);
+                to_prior_state(motion, H);
                 for (int r = 0; r < motion.n; ++r) at[motion.rows[r]] = x[motion.rows[r]];
             }
-            see_own(j, x + n_.own(j), R, world, error, H);
-            // The derivative grows with nearness as the error does.
+            evaluate_own(j, x + n_.own(j), R, world, error, H);
+            // Near a dipole the derivative diverges only together with the error.
             total += error + h_[3 * j] + h_[3 * j + 1] + h_[3 * j + 2];
         }
         return std::isfinite(total);
     }
 
-    // (I + [a]x) R_sw of sensor j, with the mounting angles a, into `R`.
-    INLINE void turn(int j, const double* angles, double* R) const {
+    // Rotation `R` = (I + [a]x) R_sw of sensor j, with the mounting angles a.
+    INLINE void mounting_rotation(int j, const double* angles, double* R) const {
         const double* R_sw = sensors_.R_sw + 9 * j;
         std::copy(R_sw, R_sw + 9, R);
         if (!sensors_.n_angles) return;
@@ -272,8 +272,8 @@ class Filter {
         }
     }
 
-    // `H` (3, n_seen) by the moved state to that by the state before: H F.
-    INLINE void to_before(const Motion& motion, double* H) const {
+    // Converts `H` (3, n_seen) from the moved state to the state before the motion: H F.
+    INLINE void to_prior_state(const Motion& motion, double* H) const {
         for (int a = 0; a < 3; ++a, H += n_.n_seen()) {
             double by_moved[MAX_ROWS];
             for (int r = 0; r < motion.n; ++r) {
@@ -286,9 +286,9 @@ class Filter {
         }
     }
 
-    // Field and inflation of sensor j, and what of its `H` belongs to its own states.
-    INLINE void see_own(int j, const double* own, const double* R, const double* world,
-                        double error, double* H) {
+    // Field and inflation of sensor j, and the columns of its `H` for its own states.
+    INLINE void evaluate_own(int j, const double* own, const double* R, const double* world,
+                             double error, double* H) {
         double plain[3], *h = &h_[3 * j];
         for (int a = 0; a < 3; ++a) {
             plain[a] = h[a] = 0.0;

@@ -1,4 +1,4 @@
-"""Where a magnet's track begins: its settings, its model and the first hypotheses."""
+"""Initiation of a magnet's track: settings, model and first hypotheses."""
 
 from dataclasses import dataclass
 
@@ -16,44 +16,71 @@ from mag_tracking.settings import param
 
 @dataclass(frozen=True)
 class MagnetSettings:
-    """The magnet: its motion and where it may appear."""
+    """Motion of the magnet, and the region in which it may appear."""
 
     start_margin: float = param(
-        0.15, 'It may first appear so far beyond the box of the sensors.', 'm', (1e-3, 100.0))
+        0.15, 'Margin around the bounding box of the sensors within which the magnet may first '
+        'appear.', 'm', (1e-3, 100.0))
     grid_points: int = param(
-        4000, 'Points of the coarse grid over that box.', '', (8, 1_000_000))
-    starts: int = param(24, 'Best points of the grid that are refined.', '', (1, 1000))
-    speed_std: float = param(0.05, 'Spread of the starting speed, per axis.', 'm/s', (1e-9, 100.0))
-    spin_std: float = param(0.5, 'Spread of the starting angular speed, per axis.',
+        4000, 'Number of points of the coarse grid over that region.', '', (8, 1_000_000))
+    starts: int = param(24, 'Number of best grid points that are refined.', '', (1, 1000))
+    speed_std: float = param(0.05, 'Standard deviation of the initial velocity, per axis.', 'm/s',
+                             (1e-9, 100.0))
+    spin_std: float = param(0.5, 'Standard deviation of the initial angular velocity, per axis.',
                             'rad/s', (1e-9, 1000.0))
     acceleration: float = param(
         0.02, 'Root spectral density of the acceleration.', 'm/s^1.5', (0.0, 1000.0))
     angular_acceleration: float = param(
         0.2, 'Root spectral density of the angular acceleration.', 'rad/s^1.5', (0.0, 1000.0))
     near_field_length: float = param(
-        5e-4, 'How far the magnet is from a point: near it the model errs by the first neglected '
-        'multipole term (ICASSP11 eq. (9), there lambda).', 'm', (0.0, 1000.0), live=True)
+        5e-4, 'Near-field length of the magnet (lambda in ICASSP11 eq. (9)): near it, the model '
+        'error is the first neglected multipole term.', 'm', (0.0, 1000.0), live=True)
     axis: tuple[float, ...] = param(
-        (0.0, 0.0, 1.0), 'Direction of the moment in the magnet\'s own frame.',
+        (0.0, 0.0, 1.0), 'Direction of the moment in the frame of the magnet.',
         '', (-1.0, 1.0), length=3)
 
 
 def magnet_model(settings: MagnetSettings) -> Magnet:
-    """The `Magnet` of the settings."""
+    """Return the source model of the settings.
+
+    Parameters
+    ----------
+    settings : MagnetSettings
+
+    Returns
+    -------
+    Magnet
+    """
     return Magnet(np.full(3, settings.acceleration**2), settings.angular_acceleration**2)
 
 
 def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldFrame,
                  background_std: float, own_covariance: FloatArray, relative_std: float
                  ) -> FilterBank | None:
-    """Hypotheses of a magnet at its first frame, wherever it is.
+    """Return the hypotheses of a magnet at its first frame, at any position.
 
-    On a coarse grid the moment is projected out; the best points are refined,
-    and every distinct optimum is a hypothesis, weighted by its fit.
-    `relative_std` is the model's error relative to the field.
+    The moment is projected out on a coarse grid. The best grid points are refined, and every
+    distinct optimum becomes a hypothesis, weighted by its fit.
 
-    Returns a `FilterBank` with all labels 0, or None where the frame has fewer
-    than six axes or nothing fits. Source: PHD15 Paper A eq. (3).
+    Parameters
+    ----------
+    settings : MagnetSettings
+    network : SensorNetwork
+    frame : FieldFrame
+    background_std : float, T
+    own_covariance : (n_sensors, n_own, n_own) array
+        Covariances of the states of each sensor.
+    relative_std : float
+        Model error relative to the field.
+
+    Returns
+    -------
+    FilterBank or None
+        All labels are 0. None if the frame has fewer than six axes or nothing fits.
+
+    References
+    ----------
+    [PHD15]_ Paper A eq. (3).
     """
     present = ~np.isnan(frame.field)
     if np.count_nonzero(present) < 6:
@@ -68,7 +95,7 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
     axes = [np.arange(a - settings.start_margin + step / 2, b + settings.start_margin, step)
             for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)
-    # Only the moment's Jacobian is wanted: it does not depend on the moment.
+    # The Jacobian with respect to the moment does not depend on the moment.
     dB_dm = dipole_jacobians(network.positions[None] - grid[:, None], np.zeros(3))[1]
     A = np.einsum('jik,gjkl->gjil', network.R_sw, dB_dm) / std[:, :, None]
     A = A[:, present]
@@ -89,7 +116,7 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
 def _distinct_optima(settings: MagnetSettings, network: SensorNetwork, start: FloatArray,
                      y: FloatArray, std: FloatArray, present: BoolArray
                      ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Refine the starts; states, covariances and costs of the optima that differ, perhaps none."""
+    """States, covariances and costs of the distinct optima after refinement; may be empty."""
     identity = np.zeros((len(start), 1, 3, 6))
     dr_dx, dm_dx = identity.copy(), identity.copy()
     dr_dx[:, 0, :, :3] = np.eye(3)
@@ -116,7 +143,7 @@ def _distinct_optima(settings: MagnetSettings, network: SensorNetwork, start: Fl
     state[:, :3], state[:, 6:9] = x[keep, :3], x[keep, 3:]
     P = np.zeros((n, 12, 12))
     rm = np.r_[0:3, 6:9]
-    # What the fit leaves over says how far the model can be trusted.
+    # Residuals larger than the noise widen the covariance.
     excess = np.maximum(1.0, cost[keep] / max(1, len(y) - 6))
     P[np.ix_(range(n), rm, rm)] = covariance[keep] * excess[:, None, None]
     P[:, [3, 4, 5], [3, 4, 5]] = settings.speed_std**2

@@ -1,4 +1,4 @@
-"""Where a vehicle's track begins: its settings, its model and the first hypotheses."""
+"""Initiation of a vehicle's track: settings, model and first hypotheses."""
 
 from dataclasses import dataclass
 
@@ -16,102 +16,123 @@ from mag_tracking.records import FieldFrame
 from mag_tracking.settings import param
 
 SHARE_FIELD = 5e-5
-"""[T] The field in which `VehicleSettings.induced_share` is stated."""
+"""Field for which `VehicleSettings.induced_share` is defined [T]."""
 
-TURNS_AT_START = 0.5
-"""A vehicle comes along a line: its turn rate is then smaller than that of one that turns."""
+START_TURN_RATIO = 0.5
+"""Initial standard deviation of the turn rate, relative to that of a turning vehicle. A vehicle
+arrives along a line, so it hardly turns at first."""
 
 
 @dataclass(frozen=True)
 class VehicleSettings:
-    """Vehicles: their motion, their magnetism and where they may come from."""
+    """Motion, magnetism and arrival directions of vehicles."""
 
     arrival_names: tuple[str, ...] = param(
         ('left', 'right', 'rear'), 'Names of the arrival directions.')
     arrival_headings_deg: tuple[float, ...] = param(
-        (0.0, 180.0, 90.0), 'Heading on arrival, one per name; 0 = along x, anticlockwise. '
-        'The lines go through the centre of the network.', 'deg', (-360.0, 360.0))
+        (0.0, 180.0, 90.0), 'Heading on arrival, one per arrival name; 0 = along x, '
+        'anticlockwise. The arrival lines pass through the centre of the network.',
+        'deg', (-360.0, 360.0))
     lateral_offsets: tuple[float, ...] = param(
-        (-4.0, 0.0, 4.0), 'Starting lines left (+) and right (-) of the arrival line.',
-        'm', (-1000.0, 1000.0))
-    lateral_std: float = param(1.5, 'Spread about a starting line.', 'm', (1e-3, 1000.0))
-    along_std: float = param(3.0, 'Spread of the starting distance.', 'm', (1e-3, 1000.0))
+        (-4.0, 0.0, 4.0), 'Lateral offsets of the starting lines from each arrival line; positive '
+        'to the left.', 'm', (-1000.0, 1000.0))
+    lateral_std: float = param(1.5, 'Standard deviation of the lateral distance from a starting '
+                               'line.', 'm', (1e-3, 1000.0))
+    along_std: float = param(3.0, 'Standard deviation of the starting distance along the line.',
+                             'm', (1e-3, 1000.0))
     max_start_distance: float = param(
-        30.0, 'Largest starting distance from the outermost sensor.', 'm', (0.1, 10000.0))
-    speeds: tuple[float, ...] = param((5.0, 10.0, 20.0), 'Starting speeds.', 'm/s', (0.01, 200.0))
-    speed_std: float = param(0.3, 'Spread of a starting speed, relative to it.', '', (1e-3, 10.0))
+        30.0, 'Maximum starting distance from the outermost sensor.', 'm', (0.1, 10000.0))
+    speeds: tuple[float, ...] = param((5.0, 10.0, 20.0), 'Initial speeds.', 'm/s', (0.01, 200.0))
+    speed_std: float = param(0.3, 'Standard deviation of an initial speed, relative to it.', '',
+                             (1e-3, 10.0))
     cross_speed_std: float = param(
-        0.1, 'Spread of the speed across the heading, relative to it.', '', (1e-3, 10.0))
-    climb_std: float = param(0.1, 'Spread of the vertical speed.', 'm/s', (1e-9, 100.0))
+        0.1, 'Standard deviation of the velocity across the heading, relative to the initial '
+        'speed.', '', (1e-3, 10.0))
+    climb_std: float = param(0.1, 'Standard deviation of the vertical velocity.', 'm/s',
+                             (1e-9, 100.0))
     dipoles: int = param(
-        5, 'Dipoles of the row that a vehicle with a length is taken for. Three do for cars; a '
-        'truck that passes close by is then followed worse.', '', (2, 20))
+        5, 'Number of dipoles in the row that models a vehicle with a length. Three are '
+        'sufficient for cars; a truck that passes close by is then tracked less accurately.', '',
+        (2, 20))
     kinds: tuple[str, ...] = param(
-        ('small', 'car', 'truck'), 'Names of the kinds of vehicle; the evidence picks one per '
+        ('small', 'car', 'truck'), 'Names of the kinds of vehicle; the evidence selects one per '
         'track. The settings down to near_field_lengths have one value per kind.')
     lengths: tuple[float, ...] = param(
-        (0.0, 3.0, 9.0), 'Starting length of the row of dipoles that a vehicle is taken for '
-        '(TSP14 eq. (10)); somewhat shorter than the vehicle. 0 = a point. If all are points the '
-        'filter is several times faster. Of kinds above 4 m the middle is published with what '
-        'they are longer than their iron.', 'm', (0.0, 1000.0))
+        (0.0, 3.0, 9.0), 'Initial length of the row of dipoles (TSP14 eq. (10)), which is somewhat '
+        'shorter than the vehicle. 0 = a point target. If all kinds are points, the filter is '
+        'several times faster. For kinds above 4 m, the covariance of the published middle covers '
+        'the part of the vehicle beyond its magnetic row.', 'm', (0.0, 1000.0))
     length_stds: tuple[float, ...] = param(
-        (0.0, 1.0, 3.0), 'Spread of the length; 0 for points.', 'm', (0.0, 1000.0))
+        (0.0, 1.0, 3.0), 'Standard deviation of the length; 0 for points.', 'm', (0.0, 1000.0))
     moments: tuple[float, ...] = param(
-        (120.0, 400.0, 1600.0), 'Starting size of the moment; by default a truck starts at 1600. '
-        'TSP14 has cars of 300 to 600 and trucks of about 1800, within moment_stds of it.',
-        'A m^2', (1e-6, 1e6))
+        (120.0, 400.0, 1600.0), 'Initial size of the moment. TSP14 gives 300 to 600 for cars and '
+        'about 1800 for trucks, which moment_stds covers.', 'A m^2', (1e-6, 1e6))
     moment_stds: tuple[float, ...] = param(
-        (45.0, 150.0, 600.0), 'Spread of the whole hard iron moment, per axis.',
+        (45.0, 150.0, 600.0), 'Standard deviation of the total hard iron moment, per axis.',
         'A m^2', (1e-6, 1e6))
     difference_stds: tuple[float, ...] = param(
-        (0.0, 45.0, 240.0), 'Spread of what each dipole of a row differs from their mean, per '
-        'axis: engine and axles are not spread evenly.', 'A m^2', (0.0, 1e6))
+        (0.0, 45.0, 240.0), 'Standard deviation of the difference of each dipole of a row from '
+        'their mean, per axis. Engine and axles are not spread evenly.', 'A m^2', (0.0, 1e6))
     heights: tuple[float, ...] = param(
-        (0.5, 0.5, 1.0), 'Height of the magnetic centre above the sensors\' plane z = 0.',
+        (0.5, 0.5, 1.0), 'Height of the magnetic centre above the plane z = 0 of the sensors.',
         'm', (-100.0, 100.0))
     height_stds: tuple[float, ...] = param(
-        (0.2, 0.2, 0.4), 'Spread of the height.', 'm', (1e-6, 100.0))
+        (0.2, 0.2, 0.4), 'Standard deviation of the height.', 'm', (1e-6, 100.0))
     near_field_lengths: tuple[float, ...] = param(
-        (0.8, 0.3, 0.3), 'How far the iron reaches from where the model has it: near a vehicle '
-        'the model errs by the first neglected multipole term (ICASSP11 eq. (9), there lambda).',
-        'm', (0.0, 1000.0))
+        (0.8, 0.3, 0.3), 'Near-field length (lambda in ICASSP11 eq. (9)): distance of the iron '
+        'from the modelled dipoles. Near a vehicle, the model error is the first neglected '
+        'multipole term.', 'm', (0.0, 1000.0))
     induced_share: float = param(
-        0.4, 'Part of the starting moment that a field of 50 uT would induce: soft iron D = share '
+        0.4, 'Share of the initial moment that a field of 50 uT would induce: soft iron D = share '
         'x moment x mu0 / 50 uT along each axis of the vehicle, m = Rz (m0 + D Rz^T B0/mu0). '
-        'TSP14 Tables V and VI have 0.26 for a car (its D times three), T10 Table 6.9 as fitted '
-        'here 0.42. '
-        'Without an earth field it has no effect.', '', (0.0, 10.0))
+        'TSP14 Tables V and VI give 0.26 for a car (its D times three); T10 Table 6.9, as fitted '
+        'here, gives 0.42. No effect without an earth field.', '', (0.0, 10.0))
     induced_share_std: float = param(
-        0.3, 'Spread of that share: once of what the three axes have in common, and once more of '
-        'each axis. Those of MITRE12\'s car deviate by a third of their mean (RMS), which is 0.13 '
-        'here; wider makes up for what the model leaves out.', '', (0.0, 10.0))
+        0.3, 'Standard deviation of the induced share: once common to the three axes, and once '
+        'more for each axis. The axes of the car in MITRE12 differ by a third of their mean (RMS), '
+        'which is 0.13 here; a larger value compensates for errors of the model.', '',
+        (0.0, 10.0))
     acceleration: float = param(
         1.0, 'Root spectral density of the horizontal acceleration.', 'm/s^1.5', (0.0, 1000.0))
     turn_acceleration: float = param(
-        3.0, 'Standard deviation of the lateral acceleration of turning hypotheses, one beside '
-        'each that goes straight on. 0 = nothing turns: half as many hypotheses.',
-        'm/s^2', (0.0, 100.0))
+        3.0, 'Standard deviation of the lateral acceleration of turning hypotheses; each straight '
+        'hypothesis has a turning one beside it. 0 = no turning hypotheses, half the number of '
+        'hypotheses.', 'm/s^2', (0.0, 100.0))
     turn_time: float = param(1.5, 'Correlation time of the turn rate.', 's', (0.01, 1000.0))
     turn_share: float = param(
         0.5, 'Share of the vehicles that turn near the sensors.', '', (1e-6, 0.999999))
     climb_acceleration: float = param(
         0.1, 'Root spectral density of the vertical acceleration.', 'm/s^1.5', (0.0, 1000.0))
     moment_drift: float = param(
-        0.03, 'Random walk of the hard iron moment relative to the size of the iron: a vehicle '
-        'shows another moment from every side.', '1/s^0.5', (0.0, 1e3))
+        0.03, 'Random walk of the hard iron moment, relative to the size of the iron. A vehicle '
+        'has a different effective moment from every side.', '1/s^0.5', (0.0, 1e3))
     difference_drift: float = param(
-        0.0125, 'The same of what each dipole of a row differs from their mean.',
-        '1/s^0.5', (0.0, 1e3))
+        0.0125, 'Random walk of the difference of each dipole of a row from their mean, relative '
+        'to the size of the iron.', '1/s^0.5', (0.0, 1e3))
 
 
 PER_KIND = ('lengths', 'length_stds', 'moments', 'moment_stds', 'difference_stds', 'heights',
             'height_stds', 'near_field_lengths')
+"""Settings with one value per kind of vehicle."""
 
 
 def vehicle_model(settings: VehicleSettings, network: SensorNetwork) -> RowVehicle:
-    """The `RowVehicle` of the settings; without an earth field there is no soft iron.
+    """Return the source model of the settings; it has no soft iron without an earth field.
 
-    Raises SettingsError where lists that belong together differ in length.
+    Parameters
+    ----------
+    settings : VehicleSettings
+    network : SensorNetwork
+
+    Returns
+    -------
+    RowVehicle
+
+    Raises
+    ------
+    SettingsError
+        If lists that belong together differ in length, a kind is listed twice, or a point has a
+        spread.
     """
     for names, lists in (('arrival_names', ('arrival_headings_deg',)), ('kinds', PER_KIND)):
         n = len(getattr(settings, names))
@@ -120,13 +141,13 @@ def vehicle_model(settings: VehicleSettings, network: SensorNetwork) -> RowVehic
                 raise SettingsError(f'track.vehicle.{name}: expected {n} values (one per {names}), '
                                     f'got {len(getattr(settings, name))}')
     if len(set(settings.kinds)) < len(settings.kinds):
-        raise SettingsError(f'track.vehicle.kinds: a name is there twice in {settings.kinds}')
+        raise SettingsError(f'track.vehicle.kinds: a name is duplicated in {settings.kinds}')
     for name in ('length_stds', 'difference_stds'):
         for kind, length, spread in zip(settings.kinds, settings.lengths, getattr(settings, name),
                                         strict=True):
             if spread and not length:
                 raise SettingsError(f'track.vehicle.{name}: {spread:g} for {kind}, which is a '
-                                    'point (its length is 0)')
+                                    'point (its length is 0); use 0')
     horizontal, vertical = settings.acceleration**2, settings.climb_acceleration**2
     return RowVehicle(_earth_field(network), np.array([horizontal, horizontal, vertical]),
                       settings.moment_drift, settings.difference_drift,
@@ -134,27 +155,44 @@ def vehicle_model(settings: VehicleSettings, network: SensorNetwork) -> RowVehic
 
 
 def _n_dipoles(settings: VehicleSettings) -> int:
-    """The setting, where any kind has a length; a point's dipoles coincide. Else one."""
+    """Number of dipoles: the setting if any kind has a length, else 1."""
     return settings.dipoles if any(settings.lengths) else 1
 
 
 def _soft_iron_per_share(settings: VehicleSettings, kind: int) -> float:
-    """[m^3] soft iron of a kind for a share of one."""
+    """Soft iron [m³] of a kind for a share of one."""
     return settings.moments[kind] * MU0 / SHARE_FIELD
 
 
 def soft_iron(settings: VehicleSettings, kind: int) -> float:
-    """[m^3] D that a kind starts with, along each axis."""
+    """Initial soft iron D of a kind of vehicle, along each axis.
+
+    Parameters
+    ----------
+    settings : VehicleSettings
+    kind : int
+        Index in `settings.kinds`.
+
+    Returns
+    -------
+    float, m³
+    """
     return settings.induced_share * _soft_iron_per_share(settings, kind)
 
 
 def _earth_field(network: SensorNetwork) -> FloatArray:
-    """(3,) [T], zeros where it is not known."""
+    """Earth field (3,) [T]; zero if unknown."""
     return np.zeros(3) if network.earth_field is None else network.earth_field
 
 
 def moment_directions() -> FloatArray:
-    """Fourteen unit vectors (14, 3): the axes and the diagonals of a cube, both ways."""
+    """Return the axes and the diagonals of a cube, both ways.
+
+    Returns
+    -------
+    (14, 3) array
+        Unit vectors.
+    """
     axes = np.vstack([np.eye(3), -np.eye(3)])
     diagonals = np.array([[a, b, c] for a in (1, -1) for b in (1, -1) for c in (1, -1)])
     return np.vstack([axes, diagonals / np.sqrt(3.0)])
@@ -162,19 +200,35 @@ def moment_directions() -> FloatArray:
 
 def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: FieldFrame,
                   background_std: float, own_covariance: FloatArray) -> FilterBank:
-    """Hypotheses of a vehicle at its first frame.
+    """Return the hypotheses of a vehicle at its first frame.
 
-    Kinds x arrival lines x moment directions x lateral offsets x speeds, each at the
-    distance at which its field, coming nearer, first has the measured energy.
+    There is one hypothesis for each combination of kind, arrival line, moment direction, lateral
+    offset and speed. It starts at the distance at which its field first has the measured energy as
+    it approaches.
 
-    Returns a `FilterBank` whose labels index `settings.arrival_names`, its kinds `settings.kinds`.
-    Source: ICASSP11 section 2.2, T10 Alg. 3 (there one hypothesis an arrival).
+    Parameters
+    ----------
+    settings : VehicleSettings
+    network : SensorNetwork
+    frame : FieldFrame
+    background_std : float, T
+    own_covariance : (n_sensors, n_own, n_own) array
+        Covariances of the states of each sensor.
+
+    Returns
+    -------
+    FilterBank
+        Labels index `settings.arrival_names`, kinds index `settings.kinds`.
+
+    References
+    ----------
+    [ICASSP11]_ section 2.2; [T10]_ Alg. 3, which has one hypothesis per arrival.
     """
     states: list[FloatArray] = []
     covariances: list[FloatArray] = []
     labels: list[int] = []
     kinds: list[int] = []
-    measured = _Measured(network, frame)
+    measured = _MeasuredEnergy(network, frame)
     for kind in range(len(settings.kinds)):
         moments = settings.moments[kind] * moment_directions()
         for label, heading in enumerate(np.deg2rad(settings.arrival_headings_deg)):
@@ -196,40 +250,41 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
 
 
 def _with_turns(bank: FilterBank, model: RowVehicle, share: float) -> FilterBank:
-    """Each hypothesis twice, going straight on and turning; or as they are if nothing turns."""
+    """Duplicate each hypothesis, straight and turning; return the bank itself if nothing turns."""
     if not model.turn_acceleration:
         return bank
     n, w = len(bank), len(model.state_names) - 1
     both = bank.rows(np.tile(np.arange(n), 2))
     both.origin = np.arange(2 * n)
     both.log_w = np.log(np.repeat([1.0 - share, share], n) / n)
-    both.P[n:, w, w] = TURNS_AT_START**2 * model.turn_variance(np.hypot(bank.x[:, 3],
+    both.P[n:, w, w] = START_TURN_RATIO**2 * model.turn_variance(np.hypot(bank.x[:, 3],
                                                                         bank.x[:, 4]))
     return both
 
 
-class _Measured:
-    """What a frame says of how near a target is."""
+class _MeasuredEnergy:
+    """Energy of a frame, which determines the distance of the target."""
 
     def __init__(self, network: SensorNetwork, frame: FieldFrame) -> None:
         present = ~np.isnan(frame.field)
         energy = float(whitened_energy(frame.field, frame.covariance)[0].sum())
-        # Noise alone brings one unit of energy an axis.
+        # The expected energy of noise is one per axis.
         self.energy = max(energy - np.count_nonzero(present), 1.0)
         std = np.sqrt(np.einsum('jii->ji', frame.covariance))
         self.whitening = network.R_sw / np.where(present, std, np.inf)[:, :, None]
-        """(n_sensors, 3, 3) [1/T] from a field in the world to one in units of its noise."""
+        """Matrix (n_sensors, 3, 3) [1/T] from the field (world frame) to units of the noise."""
 
 
-def _matching_positions(settings: VehicleSettings, network: SensorNetwork, measured: _Measured,
-                        R: FloatArray, moments: FloatArray, height: float) -> FloatArray:
-    """Positions (n_offsets, n_moments, 3) where on each line a field first has the energy."""
+def _matching_positions(settings: VehicleSettings, network: SensorNetwork,
+                        measured: _MeasuredEnergy, R: FloatArray, moments: FloatArray,
+                        height: float) -> FloatArray:
+    """First position (n_offsets, n_moments, 3) on each line where the field has the energy."""
     along = (network.positions - network.centre) @ R[:, 0]
     distance = np.linspace(settings.max_start_distance, 0.0, 160) - along.min()
     line = np.array([network.centre[0], network.centre[1], height])
     offsets = np.array(settings.lateral_offsets)
     points = line + offsets[:, None, None] * R[:, 1] - distance[:, None] * R[:, 0]
-    # The field is linear in the moment: its derivative tells that of any.
+    # The field is linear in the moment, so its derivative gives the field of any moment.
     _, field_of_moment = dipole_jacobians(network.positions - points[:, :, None], np.zeros(3))
     A = (measured.whitening @ field_of_moment).reshape(*points.shape[:2], -1, 3)
     energy = np.einsum('lpmk,mk->lpm', moments @ (np.swapaxes(A, 2, 3) @ A), moments)
@@ -242,8 +297,8 @@ def _states(settings: VehicleSettings, kind: int, positions: FloatArray, velocit
             hard: FloatArray) -> FloatArray:
     """States (n_offsets n_speeds n_moments, n_t) of `RowVehicle`.
 
-    `positions` (n_offsets, n_moments, 3), `velocities` (n_speeds, 3), whole hard iron moments
-    `hard` (n_moments, 3).
+    The inputs are `positions` (n_offsets, n_moments, 3), `velocities` (n_speeds, 3) and the total
+    hard iron moments `hard` (n_moments, 3).
     """
     d = _n_dipoles(settings)
     turns = int(settings.turn_acceleration > 0.0)
@@ -257,9 +312,22 @@ def _states(settings: VehicleSettings, kind: int, positions: FloatArray, velocit
 
 def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, speed: float,
                         moment_std: float) -> FloatArray:
-    """Covariance (n_t, n_t) of one hypothesis that arrives along the x axis of `R` (3, 3).
+    """Initial covariance of a hypothesis that arrives along a direction.
 
-    `speed` [m/s]; `moment_std` [A m^2] of its whole hard iron moment.
+    Parameters
+    ----------
+    settings : VehicleSettings
+    kind : int
+        Index in `settings.kinds`.
+    R : (3, 3) array
+        Rotation whose x axis is the arrival direction, world frame.
+    speed : float, m/s
+    moment_std : float, A m²
+        Standard deviation of the total hard iron moment, per axis.
+
+    Returns
+    -------
+    (n_t, n_t) array
     """
     d = _n_dipoles(settings)
     hard = 6 + 3 * d

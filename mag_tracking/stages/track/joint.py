@@ -1,4 +1,4 @@
-"""Another explanation of the latest frames of a track: with other vehicles, or one more."""
+"""Joint explanation of the latest frames of a track by its vehicles and a new one."""
 
 from dataclasses import dataclass
 
@@ -7,55 +7,70 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.reach import FELT, energies_of
+from mag_tracking.stages.track.reach import DETECTABLE_ENERGY, energies_of
 from mag_tracking.stages.track.relinearisation import Window
 
-SURE_NATS = 15.0
-"""[nats] An explanation that is believed by less than this is doubted for a while: evidence counts
-what a model leaves out of the field as if it were independent in each frame, and says too much."""
+CONFIDENT_NATS = 15.0
+"""A weaker explanation is flagged as doubtful for a limited time [nats]. The evidence treats model
+errors as independent between frames, and is therefore overconfident."""
 
 IMPLAUSIBLE_NATS = 60.0
-"""[nats] As `SURE_NATS`, where two vehicles cross, or one overtakes the other at more than
-`OVERTAKING_RATIO`: traffic does so less often than a flipped axis or a train looks like it."""
+"""The same limit if two vehicles cross, or if one overtakes another at a speed ratio above
+`OVERTAKING_RATIO` [nats]. In traffic this is rarer than a flipped axis or a train that resembles
+it."""
 
 CROSSING_COSINE = 0.9
-"""Two vehicles cross where the cosine of the angle between their velocities is smaller in size."""
+"""Two vehicles cross if the cosine of the angle between their velocities is smaller than this in
+magnitude."""
 
 OVERTAKING_RATIO = 1.8
-"""Largest usual ratio of the speeds of two vehicles that go the same way."""
+"""Maximum usual speed ratio of two vehicles moving in the same direction."""
 
-STANDING = 1.0
-"""[m/s] A slower vehicle is not compared with others: its heading is not known."""
+MIN_MOVING_SPEED = 1.0
+"""Vehicles slower than this are not compared with others, because their heading is unknown
+[m/s]."""
 
 
 @dataclass(frozen=True)
 class Joint:
-    """Hypotheses of the tracked vehicles and a new one, whose state comes last."""
+    """Joint hypotheses of the tracked vehicles and a new one, whose state comes last."""
 
     bank: FilterBank
-    """At the latest frame of the window."""
+    """Hypotheses at the latest frame of the window."""
     window: Window
-    """With the hypotheses of all as its anchor."""
+    """Window whose anchor contains the joint hypotheses."""
     bank_filter: BankFilter
+    """Filter of the joint hypotheses."""
     log_odds: float
-    """[nats] Against the track as it is."""
+    """Log-odds of this explanation against the current track [nats]."""
     replaced: int | None
-    """The vehicle of the track that was sought anew, and is now the last or one of the last two."""
+    """Index of the vehicle of the track that was searched for again. It is now the last vehicle, or
+    one of the last two."""
     adds: bool
-    """There is a vehicle more."""
+    """Whether the explanation has one vehicle more than the track."""
 
     def doubtful(self, n_one: int) -> tuple[int, ...]:
-        """Places of vehicles that may be others, each of `n_one` states.
+        """Indices of the vehicles that may be wrong.
 
-        One that was found elsewhere; two that took the place of one and go the same way, as a long
-        vehicle of which the model leaves much out looks like two; all of a weak explanation, and
-        of one by vehicles that cross, or of which one is much faster, `IMPLAUSIBLE_NATS`.
+        These are: a vehicle that was found elsewhere; two vehicles that replace one and move in the
+        same direction, because a long vehicle with large model errors resembles two; and all
+        vehicles of a weak explanation, with the limit `IMPLAUSIBLE_NATS` if vehicles cross or one
+        is much faster.
+
+        Parameters
+        ----------
+        n_one : int
+            Number of states of one vehicle.
+
+        Returns
+        -------
+        tuple of int
         """
         n = self.bank.label.shape[1] if self.bank.label.ndim > 1 else 1
         x = self.bank.x[self.bank.best()]
         velocity = np.array([x[k * n_one + 3:k * n_one + 5] for k in range(n)])
         is_implausible = self.adds and _are_implausible(velocity, 1 if self.replaced is None else 2)
-        if self.log_odds < (IMPLAUSIBLE_NATS if is_implausible else SURE_NATS):
+        if self.log_odds < (IMPLAUSIBLE_NATS if is_implausible else CONFIDENT_NATS):
             return tuple(range(n))
         if self.replaced is None:
             return ()
@@ -65,26 +80,38 @@ class Joint:
 
 
 def _are_implausible(velocity: FloatArray, n_new: int) -> bool:
-    """Whether one of the last `n_new` vehicles crosses another's way, or goes the same way much
-    faster or slower; `velocity` (n, 2) [m/s]."""
+    """Whether one of the last `n_new` vehicles crosses another, or differs too much in speed.
+
+    The `velocity` is (n, 2) [m/s].
+    """
     speed = np.linalg.norm(velocity, axis=1)
     for i in range(len(velocity) - n_new, len(velocity)):
         for k in range(i):
             slower, faster = sorted((speed[i], speed[k]))
-            cosine = velocity[i] @ velocity[k] / max(slower * faster, STANDING**2)
-            if slower >= STANDING and (abs(cosine) < CROSSING_COSINE or
+            cosine = velocity[i] @ velocity[k] / max(slower * faster, MIN_MOVING_SPEED**2)
+            if slower >= MIN_MOVING_SPEED and (abs(cosine) < CROSSING_COSINE or
                                        cosine > 0.0 and faster > OVERTAKING_RATIO * slower):
                 return True
     return False
 
 
-def are_felt_by_two(joint: Joint) -> bool:
-    """Whether two sensors feel each of the vehicles that were sought: what one alone feels may be a
-    fault of that sensor."""
+def are_sensed_by_two(joint: Joint) -> bool:
+    """Whether two sensors sense each of the new vehicles.
+
+    A field that only one sensor senses may be a fault of that sensor.
+
+    Parameters
+    ----------
+    joint : Joint
+
+    Returns
+    -------
+    bool
+    """
     n, best = joint.bank.label.shape[1], joint.bank.best()
     for i in range(n - (1 if joint.replaced is None else 2), n):
         energy = sum(energies_of(joint.bank_filter, i, path[best], frame) for path, frame in
                      zip(joint.window.paths, joint.window.frames, strict=True))
-        if np.count_nonzero(energy > FELT) < 2:
+        if np.count_nonzero(energy > DETECTABLE_ENERGY) < 2:
             return False
     return True

@@ -1,7 +1,7 @@
 """Track management: initiation, maintenance and deletion of tracks.
 
-Frames with a verdict go in, `Track`s come out. A track starts with a detection, is maintained by
-each frame, and ends with the release, or when its target is lost.
+The manager turns frames with a detection verdict into tracks. A track starts with a detection, is
+maintained by each frame, and ends with the release or when its target is lost.
 """
 
 from collections import Counter, deque
@@ -26,40 +26,46 @@ from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.target import target_of
 from mag_tracking.units import NS
 
-NO_SCALE = 'detections not tracked (one sensor does not tell the scale)'
-ALONE = 'frames without a start (one sensor alone does not tell the scale)'
+NO_SCALE = 'detections not tracked (scale not observable with one sensor)'
+ALONE = 'frames without a start (scale not observable with one sensor)'
 
-DISTURBED = 'tracks of something else'
+DISTURBANCE_TRACKS = 'tracks explained by a disturbance'
 
-LOUDER_THAN_LOST = 'tracks begun in a field larger than that of a lost one'
+STARTED_IN_TAIL = 'tracks started in a larger field than that of a lost track'
 
-LOUDER = 4.0
-"""Where a target was lost, another one is started in a frame whose field has this times the energy
-of any frame of the lost track: twice the field. In the tail of a pass the field only falls."""
+RESTART_ENERGY_RATIO = 4.0
+"""After a target was lost, a new track is started only in a frame with more than this multiple of
+the energy of any frame of the lost track (twice its field). In the tail of a pass the field only
+decreases."""
 
 
 class TrackManager:
-    """Frames with a verdict to `Track`s, one a frame while a target is present.
+    """Turn frames with a detection verdict into tracks.
 
-    With them come `SmoothedPose`s: each track's when it ends, and those of a fixed lag. While a
-    track runs, further vehicles become members of it.
+    There is one `Track` per frame and target while a target is present. In addition there are
+    smoothed poses: those of a fixed lag during the track, and those of the complete track at its
+    end. Other vehicles that appear during a track become members of it.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    settings : TrackSettings
+    clocks : ClockComparison, optional
+        Comparison of earlier passes, which is continued.
+
+    Attributes
+    ----------
+    counts : Counter
+        Counted events, by description.
+
+    Raises
+    ------
+    SettingsError
+        If the settings contradict each other.
     """
 
     def __init__(self, network: SensorNetwork, settings: TrackSettings,
                  clocks: ClockComparison | None = None) -> None:
-        """
-        Parameters
-        ----------
-        network : SensorNetwork
-        settings : TrackSettings
-        clocks : ClockComparison, optional
-            Of passes before; goes on with those of the tracks.
-
-        Raises
-        ------
-        SettingsError
-            If the settings contradict each other.
-        """
         self.counts: Counter[str] = Counter()
         self._clocks = clocks or ClockComparison(len(network))
         self._network, self._settings = network, settings
@@ -68,10 +74,10 @@ class TrackManager:
         self._next_id = 1
         self._recent: deque[FieldFrame] = deque()
         self._last_ns: int | None = None
-        # [T^2] Largest energy of the field since a track was started.
-        self._loudest = 0.0
-        # A target that was lost is not started again in the tail of its own detection: while the
-        # energy is no larger than this. None: there is no such tail.
+        # [T^2] Largest energy of the field since the start of a track.
+        self._max_energy = 0.0
+        # No track is started in the tail of the detection of a lost target, while the energy does
+        # not exceed this limit. None: there is no such tail.
         self._tail_until: float | None = None
         self._next_network: SensorNetwork | None = None
         self._disturbances = Disturbances(network.names)
@@ -83,28 +89,42 @@ class TrackManager:
             self.counts['sensors whose orientation is hardly known'] = uncertain
 
     def use_network(self, network: SensorNetwork) -> None:
-        """Apply another calibration of the same sensors, as soon as no track runs.
+        """Apply another calibration of the same sensors as soon as no track is running.
+
+        Parameters
+        ----------
+        network : SensorNetwork
 
         Raises
         ------
         NetworkError
-            If the sensors are others.
+            If the sensors differ.
         """
         if network.names != self._network.names:
-            raise NetworkError(f'a network of {", ".join(network.names)} in place of one of '
-                               f'{", ".join(self._network.names)}')
+            raise NetworkError(f'calibration of other sensors: {", ".join(network.names)}; the '
+                               f'tracker uses {", ".join(self._network.names)}')
         self._next_network = network
 
     def configure(self, settings: TrackSettings) -> None:
-        """Apply new values of the live settings, to running tracks too."""
+        """Apply new values of the live settings, also to running tracks.
+
+        Parameters
+        ----------
+        settings : TrackSettings
+        """
         self._settings = settings
         for track in self._tracks:
             track.configure(settings)
 
     def doubt(self, times: Mapping[str, DoubtfulTimes]) -> None:
-        """Doubt all tracks of frames in which the background of one of their sensors is doubtful.
+        """Set the times at which the backgrounds of the sensors are doubtful.
 
-        `times` {sensor: ((begin, end) [ns], ...)} take the place of those before.
+        All tracks with frames at these times are doubted.
+
+        Parameters
+        ----------
+        times : dict of str to DoubtfulTimes
+            Intervals of each sensor; they replace those set before.
         """
         if times != self._doubtful_times:
             self._doubtful_times = times
@@ -117,17 +137,26 @@ class TrackManager:
 
     @property
     def clocks_apart(self) -> str:
-        """Which clocks seem apart, as a sentence; empty where none do."""
+        """Significant clock offset, as a sentence; empty if there is none."""
         apart = self._clocks.apart if self._settings.cross_check else None
         return '' if apart is None else apart.text(self._network.names)
 
     @property
     def bank(self) -> FilterBank | None:
-        """Hypotheses of the first running track; None where none runs."""
+        """Hypotheses of the first running track; None without a track."""
         return self._tracks[0].bank if self._tracks else None
 
     def feed(self, frame: FieldFrame) -> list[TrackRecord]:
-        """The records that follow from a `FieldFrame`."""
+        """Process a frame.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+
+        Returns
+        -------
+        list of TrackRecord
+        """
         self.idle()
         if self._next_network is not None and not self._tracks:
             if not np.array_equal(self._next_network.clock_offset, self._network.clock_offset):
@@ -149,7 +178,7 @@ class TrackManager:
         return out
 
     def idle(self) -> None:
-        """Do the work that may wait until the latest records are published."""
+        """Do the work that was deferred until the latest records are published."""
         for track in self._tracks:
             track.hand_over()
             joint = track.new_target()
@@ -160,17 +189,31 @@ class TrackManager:
                 self._next_id += joint.adds
 
     def give_up(self, reason: str) -> list[TrackRecord]:
-        """End all tracks and forget the recent frames; nothing is known of what came since."""
+        """End all tracks and forget the recent frames after an interruption of the frames.
+
+        Parameters
+        ----------
+        reason : str
+
+        Returns
+        -------
+        list of TrackRecord
+        """
         self._recent.clear()
         self._tail_until = None
         return self._end_all(reason, self._last_ns)
 
     def flush(self) -> list[TrackRecord]:
-        """End all tracks."""
+        """End all tracks.
+
+        Returns
+        -------
+        list of TrackRecord
+        """
         return self._end_all('input ended', self._last_ns)
 
     def _end_at_gap(self, frame: FieldFrame) -> list[TrackRecord]:
-        """End what cannot go on with a frame: time jumped back, or the gap is too long."""
+        """End everything if time jumped back or the gap before the frame is too long."""
         if self._last_ns is None:
             return []
         dt = (frame.stamp_ns - self._last_ns) / NS
@@ -180,7 +223,7 @@ class TrackManager:
         return self.give_up('gap in the frames') if dt > self._settings.end_gap_s else []
 
     def _end_all(self, reason: str, stamp_ns: int | None) -> list[TrackRecord]:
-        """End every running track, and a disturbance, at the latest frame that is known of it."""
+        """End every running track and disturbance, at the latest frame."""
         tracks, self._tracks = self._tracks, []
         out = [record for track in tracks for record in track.end(reason)]
         if stamp_ns is None:
@@ -188,34 +231,34 @@ class TrackManager:
         return [*out, *self._unexplained(tracks, stamp_ns), *self._disturbances.end(stamp_ns)]
 
     def _unexplained(self, tracks: list[RunningTrack], stamp_ns: int) -> list[TrackRecord]:
-        """The disturbances that tracks which have ended leave behind."""
+        """Records of the disturbances that ended tracks reveal."""
         out: list[TrackRecord] = []
         for found in (found for track in tracks for found in track.unexplained):
-            self.counts[DISTURBED] += 1
+            self.counts[DISTURBANCE_TRACKS] += 1
             out += self._disturbances.begin(found, stamp_ns)
         return out
 
     def _maintain(self, frame: FieldFrame, dt: float) -> list[TrackRecord]:
-        """Move every running track on to the frame; drop those that end."""
+        """Update every running track with the frame, and delete those that end."""
         doubtful = self._doubtful_sensors(frame)
-        self._loudest = max(self._loudest, _energy(frame))
+        self._max_energy = max(self._max_energy, _energy(frame))
         for track in self._tracks:
             track.doubt(doubtful)
         out = [record for track in self._tracks for record in track.step(frame, dt)]
         return out + self._delete_ended(frame.stamp_ns)
 
     def _delete_ended(self, stamp_ns: int) -> list[TrackRecord]:
-        """Drop the tracks that have ended; the disturbances that they leave behind."""
+        """Delete the ended tracks; return the records of the disturbances that they reveal."""
         out = self._unexplained([track for track in self._tracks if track.ended is not None],
                                 stamp_ns)
-        # In the tail of its own detection a vehicle would be started on the wrong line.
+        # In the tail of its own detection, a vehicle would start on the wrong line.
         if any(track.is_lost for track in self._tracks) and not self._target.starts_anywhere:
-            self._tail_until = LOUDER * self._loudest
+            self._tail_until = RESTART_ENERGY_RATIO * self._max_energy
         self._tracks = [track for track in self._tracks if track.ended is None]
         return out
 
     def _remember(self, frame: FieldFrame) -> None:
-        """Keep a frame without a track for one that may begin soon."""
+        """Keep a frame for the lookback of a later track."""
         self._recent.append(frame)
         oldest = frame.stamp_ns - self._settings.lookback_s * NS
         while self._recent and self._recent[0].stamp_ns < oldest:
@@ -247,20 +290,19 @@ class TrackManager:
         self.counts['tracks'] += 1
         in_tail = self._tail_until is not None
         if in_tail:
-            self.counts[LOUDER_THAN_LOST] += 1
-        self._tail_until, self._loudest = None, _energy(frame)
+            self.counts[STARTED_IN_TAIL] += 1
+        self._tail_until, self._max_energy = None, _energy(frame)
         track = RunningTrack(self._next_id, self._target, s, sensors, bank_filter, bank,
                              self.counts, self._clocks, later)
         self._next_id += 1
         self._tracks.append(track)
         track.doubt(self._doubtful_sensors(*recent, frame))
         out = track.begin(frame, recent,
-                          unseen_coming=in_tail or bool(recent) and _n_sensors(*recent) < 2)
+                          approach_unobserved=in_tail or bool(recent) and _n_sensors(*recent) < 2)
         return out + self._delete_ended(frame.stamp_ns)
 
     def _sensors_at(self, frame: FieldFrame, n: int) -> SensorSubset:
-        """At most `n` sensors for a track that starts: of a large network those near the strongest.
-        """
+        """Up to `n` sensors for a new track; in a large network those nearest to the strongest."""
         if len(self._network) <= n:
             return SensorSubset(self._network)
         strongest = int(np.argmax(whitened_energy(frame.field, frame.covariance)[0]))
@@ -268,13 +310,14 @@ class TrackManager:
 
 
 def _energy(frame: FieldFrame) -> float:
-    """[T^2] Sum of the squared field of all sensors.
+    """Sum of the squared field of all sensors [T²].
 
-    It is not weighed by its noise: what the detector allows for grows while a detection lasts.
+    It is not weighted with the noise, because the noise that the detector allows for grows during a
+    detection.
     """
     return float(np.nansum(np.square(frame.field)))
 
 
 def _n_sensors(*frames: FieldFrame) -> int:
-    """How many sensors measured in one frame or another."""
+    """Number of sensors that measured in at least one frame."""
     return int(np.count_nonzero(np.any([~np.isnan(f.field) for f in frames], axis=(0, 2))))

@@ -1,4 +1,4 @@
-"""One target of a running track: its evidence, its doubts, and what is published of it."""
+"""One target of a running track: its evidence, its doubts and its published records."""
 
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
@@ -13,7 +13,7 @@ from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.clock_comparison import ClockComparison
 from mag_tracking.stages.track.cross_check import CrossCheck
-from mag_tracking.stages.track.disturbances import Unexplained
+from mag_tracking.stages.track.disturbances import UnexplainedField
 from mag_tracking.stages.track.evidence import TrackEvidence
 from mag_tracking.stages.track.joint import Joint
 from mag_tracking.stages.track.observation import Observation
@@ -24,20 +24,20 @@ from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.stages.track.target import Target
 
-MAX_PLACES = 64
-"""Number of places of a target that are remembered, to tell it from another one."""
+MAX_POSITIONS = 64
+"""Number of recent positions of a target that are kept to distinguish it from another one."""
 
 
 @dataclass(frozen=True)
 class Update:
-    """The bank of a running track after a frame."""
+    """Bank of a running track after a frame."""
 
     frame: FieldFrame
-    """The used fields, of the sensors that the track uses."""
+    """Readings that were used, of the sensors of the track."""
     dt: float
-    """[s] Since the frame before."""
+    """Time since the previous frame [s]."""
     bank: FilterBank
-    """The hypotheses of all members."""
+    """Hypotheses of all members."""
     bank_filter: BankFilter
     sensors: SensorSubset
     settings: TrackSettings
@@ -45,34 +45,49 @@ class Update:
 
 @dataclass(frozen=True)
 class View:
-    """The bank of a running track, of one member alone."""
+    """Bank of a running track, restricted to one member."""
 
     bank: FilterBank
     best: int
-    """Row of the hypothesis that is published of it."""
+    """Row of the published hypothesis."""
     observation: Observation
     gain: float
-    """[nats] Of the latest frames along the path of that hypothesis, less than in its filter."""
+    """Log-likelihood of the latest frames along the path of that hypothesis, minus that in the
+    filter [nats]."""
 
 
 class Member:
-    """A target of a running track.
+    """Target of a running track.
+
+    Parameters
+    ----------
+    id : int
+    target : Target
+    sensors : SensorSubset
+        Sensors that the track uses.
+    counts : Counter
+        Counted events of the track manager, updated in place.
+    clocks : ClockComparison
+    begin_ns : int, ns
+        Start of the track.
 
     Attributes
     ----------
     id : int
+    begin_ns : int
+        Start of the track [ns].
     evidence : TrackEvidence
-    opinion : CrossCheck
+    cross_check : CrossCheck
     last : Track or None
-        The latest record.
+        Latest record.
     ended : str or None
-        Why it is over; None while it is followed.
+        Reason for the end; None while the target is tracked.
     is_lost : bool
-        It ended while the target was still detected.
+        The track ended while the target was still detected.
     early : list of TrackState
         Smoothed states before the target shared its state with others.
     slot : int
-        Where its states are among those of the frames that are kept for smoothing.
+        Index of its states among those of the frames that are kept for smoothing.
     """
 
     def __init__(self, id: int, target: Target, sensors: SensorSubset, counts: 'Counter[str]',
@@ -80,7 +95,7 @@ class Member:
         self.id, self._target, self._counts, self._clocks = id, target, counts, clocks
         self.begin_ns, self._sensors = begin_ns, sensors
         self.evidence, self._plausibility = TrackEvidence(len(sensors.whole)), Plausibility()
-        self.opinion = CrossCheck(sensors.network)
+        self.cross_check = CrossCheck(sensors.network)
         self.last: Track | None = None
         self.ended: str | None = None
         self.is_lost = False
@@ -88,52 +103,89 @@ class Member:
         self.slot = 0
         self._spread = np.inf
         self._unseen = target.unseen()
-        self._was_sure = False
-        # Where the latest poses were published.
-        self._places: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_PLACES)
+        self._was_unambiguous = False
+        # Timestamps and positions of the latest published poses.
+        self._recent_positions: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_POSITIONS)
 
     def use(self, sensors: SensorSubset) -> None:
-        """From now on the target is measured by these sensors."""
+        """Change the sensors that measure the target.
+
+        Parameters
+        ----------
+        sensors : SensorSubset
+        """
         self._sensors = sensors
-        self.opinion = CrossCheck(sensors.network)
+        self.cross_check = CrossCheck(sensors.network)
 
     def restart(self, sensors: SensorSubset) -> None:
-        """Drop the doubts that were due to the field of another vehicle."""
-        self.evidence.forgive()
+        """Drop the doubts that were caused by the field of another vehicle.
+
+        Parameters
+        ----------
+        sensors : SensorSubset
+            Sensors that the track uses from now on.
+        """
+        self.evidence.drop_explained_doubts()
         self.use(sensors)
         self._plausibility = Plausibility()
 
     def start_alongside(self, first: 'Member', stamp_ns: int, ratio: float) -> None:
-        """It begins as a new target beside the `first` member of a track, whose doubts about how it
-        came, and whose evidence against something else, are its own.
+        """Start as a new target beside the first member of a track.
 
-        `ratio` is that by which a target has to explain the frames better.
+        The new target inherits the doubts about the approach of the first member, and its evidence
+        against a disturbance.
+
+        Parameters
+        ----------
+        first : Member
+        stamp_ns : int, ns
+        ratio : float
+            Bayes factor by which a target must explain the frames better than a disturbance.
         """
         self.evidence.doubt_start(doubts.NOT_SEEN_APPROACHING in first.evidence.doubts,
                                   self._sensors.whole, False)
         self.evidence.bayes_factor.add(first.evidence.bayes_factor.log_ratio, stamp_ns, ratio)
 
     def distance_from(self, stamps_ns: Sequence[int], path: FloatArray) -> float:
-        """[m] mean distance of the latest poses from a path (n, 2) with these timestamps.
+        """Mean distance of the recent positions from a path.
 
-        0 where no pose was published at them.
+        Parameters
+        ----------
+        stamps_ns : sequence of int, ns
+            Timestamps of the path.
+        path : (n, 2) array, m, world frame
+
+        Returns
+        -------
+        float, m
+            0 if no position was published at these timestamps.
         """
         at = dict(zip(stamps_ns, path, strict=True))
-        away = [float(np.hypot(*(place - at[stamp_ns]))) for stamp_ns, place in self._places
-                if stamp_ns in at]
+        away = [float(np.hypot(*(place - at[stamp_ns])))
+                for stamp_ns, place in self._recent_positions if stamp_ns in at]
         return float(np.mean(away)) if away else 0.0
 
     def publish(self, update: Update, view: View) -> Track:
-        """The `Track` of a frame."""
+        """Return the record of a frame.
+
+        Parameters
+        ----------
+        update : Update
+        view : View
+
+        Returns
+        -------
+        Track
+        """
         self.last = self._published(update, view)
         self._spread = float(np.sqrt(np.trace(view.bank.P[view.best, :2, :2])))
-        self._was_sure |= not self.last.ambiguous
-        self._places.append((self.last.stamp_ns, self.last.position[:2]))
+        self._was_unambiguous |= not self.last.ambiguous
+        self._recent_positions.append((self.last.stamp_ns, self.last.position[:2]))
         self._counts['poses'] += 1
         return self.last
 
     def _published(self, update: Update, view: View) -> Track:
-        """The `Track` of a frame, with what it says of the sensors."""
+        """`Track` of a frame, after the evidence of the sensors has been updated."""
         frame, dt, sensors, best = update.frame, update.dt, update.sensors, view.best
         measured: BoolArray = ~np.isnan(frame.field)
         by = np.flatnonzero(measured.any(axis=1))
@@ -149,7 +201,7 @@ class Member:
             view.bank, best, self._target.model, self._target.orientation, self._target.arrivals,
             self._target.kinds, stamp_ns=frame.stamp_ns, id=self.id, ended=False,
             existence=self.evidence.existence, degrees_of_freedom=int(measured.sum()),
-            found=found, excess=excess, unseen=self._unseen, difference=self.opinion.difference,
+            found=found, excess=excess, unseen=self._unseen, difference=self.cross_check.difference,
             ambiguous_poses=update.settings.ambiguous_poses,
             predicted=update.bank_filter.predicted_field(update.bank, best, frame, dt),
             mounting=view.observation.angles(view.bank.x[best].copy()),
@@ -157,20 +209,29 @@ class Member:
             update.settings)
 
     def is_doubted(self, settings: TrackSettings) -> bool:
-        """Whether all of the track, as it stands, may be wrong."""
-        return self.evidence.doubted or self.opinion.is_doubtful \
+        """Whether the whole track is doubted at present.
+
+        Parameters
+        ----------
+        settings : TrackSettings
+
+        Returns
+        -------
+        bool
+        """
+        return self.evidence.doubted or self.cross_check.is_doubtful \
             or not self.evidence.bayes_factor.leads(settings.min_bayes_factor) \
-            or not self._target.starts_anywhere and self.evidence.is_felt_by_one
+            or not self._target.starts_anywhere and self.evidence.is_sensed_by_one
 
     def _doubts(self, update: Update, view: View, alone: bool) -> set[str]:
-        """Doubts about the pose of the best hypothesis; `alone`: one sensor measured."""
+        """Doubts about the pose of the best hypothesis; `alone`: only one sensor measured."""
         bank, best, evidence, settings = view.bank, view.best, self.evidence, update.settings
         found = evidence.doubts | ({doubts.ONE_SENSOR} if alone else set())
         if update.bank_filter.is_implausible(bank, best, update.frame):
             found.add(doubts.MISFIT)
         if not evidence.bayes_factor.leads(settings.min_bayes_factor):
-            found.add(doubts.SOMETHING_ELSE)
-        # A magnet may rest: it is then as smooth as anything, and is where it was.
+            found.add(doubts.DISTURBANCE_MODEL)
+        # A magnet may rest: its field is then as smooth as a disturbance, and its pose is right.
         if self._target.starts_anywhere:
             return found
         found |= evidence.vehicle_doubts(
@@ -178,11 +239,11 @@ class Member:
             settings.min_bayes_factor)
         if self._overfits(update, view):
             found.add(doubts.OVERFIT)
-        found |= self.opinion.doubts(self._clocks.apart_s(update.sensors.rows))
+        found |= self.cross_check.doubts(self._clocks.apart_s(update.sensors.rows))
         found |= self._plausibility.judge(
             view.observation, bank, best, settings.vehicle,
             np.deg2rad(settings.mounting_std_deg), update.dt)
-        for reason in found & doubts.FOR_GOOD:
+        for reason in found & doubts.PERMANENT:
             evidence.doubt(reason)
         return found | evidence.doubts
 
@@ -191,56 +252,116 @@ class Member:
         overfits = self.evidence.doubts_filter(view.gain, update.frame.stamp_ns,
                                                update.settings.relinearise_window_s)
         if overfits:
-            self._counts['poses in doubt: the filter fits better than its path'] += 1
+            self._counts['poses doubted: the filter fits better than its path'] += 1
         return overfits
 
     def reason_to_end(self, sensors: SensorSubset, settings: TrackSettings) -> str | None:
-        """Why the target is over by its latest record; None while it goes on."""
+        """Why the track of the target ends with its latest record; None if it continues.
+
+        Parameters
+        ----------
+        sensors : SensorSubset
+        settings : TrackSettings
+
+        Returns
+        -------
+        str or None
+        """
         assert self.last is not None
         is_coming = not self._target.starts_anywhere and sensors.is_neared_by(self.last)
         return self.evidence.reason_to_end(self.last, self._spread, is_coming, settings)
 
-    def unexplained(self, uniform: float) -> Unexplained | None:
-        """The field during the track, if a target never explained it; else None.
+    def unexplained(self, uniform: float) -> UnexplainedField | None:
+        """Field during the track, if a target never explained it.
 
-        `uniform` is the probability that it was one field over the network.
+        Parameters
+        ----------
+        uniform : float
+            Probability of one field over the network.
+
+        Returns
+        -------
+        UnexplainedField or None
         """
-        if self._was_sure or self.last is None \
+        if self._was_unambiguous or self.last is None \
                 or self.evidence.bayes_factor.unexplained_s(self.last.stamp_ns) <= 0.0:
             return None
-        return Unexplained(self.id, self.begin_ns, self.evidence.largest, self.evidence.felt,
+        return UnexplainedField(self.id, self.begin_ns, self.evidence.largest, self.evidence.sensed,
                            uniform)
 
     def states_of(self, slot: int, n_one: int, states: Iterable[TrackState],
                   end_ns: float = np.inf) -> list[TrackState]:
-        """Its states from when it began until before `end_ns`, which have this place among the
-        `states` of all members, each of which has `n_one`."""
+        """States of the target among those of all members, within its lifetime.
+
+        Parameters
+        ----------
+        slot : int
+            Index of the target among the members.
+        n_one : int
+            Number of states of each member.
+        states : iterable of TrackState
+            States of all members.
+        end_ns : int, ns, optional
+            Only states before this time are returned.
+
+        Returns
+        -------
+        list of TrackState
+        """
         rows = slice(n_one * slot, n_one * (slot + 1))
         return [(stamp_ns, x[rows], P[rows, rows]) for stamp_ns, x, P in states
                 if self.begin_ns <= stamp_ns < end_ns]
 
     def smoothed(self, bank: FilterBank, best: int, complete: bool, states: list[TrackState],
                  doubtful: bool) -> list[SmoothedPose]:
-        """The `SmoothedPose`s of states of the hypothesis `best` of this member's `bank`.
+        """Return smoothed poses for the states of a hypothesis.
 
-        Smoothing removes the doubts about its filter only in part.
+        Smoothing removes the doubts about the filter only in part.
+
+        Parameters
+        ----------
+        bank : FilterBank
+            Bank of this member.
+        best : int
+            Row of the hypothesis.
+        complete : bool
+            The states are those of the complete track.
+        states : list of TrackState
+        doubtful : bool
+            All poses are ambiguous.
+
+        Returns
+        -------
+        list of SmoothedPose
         """
         ambiguous = doubtful or bool(ambiguities(bank, best, bank.apart(best)))
         return [smoothed_pose(
             self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,
             kind=int(bank.kind[best]), kinds=self._target.kinds, unseen=self._unseen,
             complete=complete, difference=difference,
-            ambiguous=ambiguous or self.evidence.doubted_filter(stamp_ns))
-            for (stamp_ns, x, P), difference in zip(states, self.opinion.differences(states),
+            ambiguous=ambiguous or self.evidence.was_filter_doubted(stamp_ns))
+            for (stamp_ns, x, P), difference in zip(states, self.cross_check.differences(states),
                                                     strict=True)]
 
 
-def in_order(members: Sequence[Member], new: Member | None, joint: Joint, n_one: int
+def members_in_order(members: Sequence[Member], new: Member | None, joint: Joint, n_one: int
              ) -> list[Member]:
-    """Members, and a new target, in the order of the states of a `Joint`.
+    """Return the members and a new target in the order of the states of a joint explanation.
 
-    Where two vehicles take the place of one, that is the one of them which was where its poses
-    were. Each vehicle has `n_one` states.
+    If two vehicles replace one, the old member becomes the vehicle that is nearer to its published
+    positions.
+
+    Parameters
+    ----------
+    members : sequence of Member
+    new : Member or None
+    joint : Joint
+    n_one : int
+        Number of states of each vehicle.
+
+    Returns
+    -------
+    list of Member
     """
     others = list(members)
     old = others.pop(joint.replaced) if joint.replaced is not None else None

@@ -1,4 +1,4 @@
-"""When a track is compared with other explanations of its frames, and which are believed."""
+"""Decision when to compare a track with other explanations of its frames, and which to accept."""
 
 import numpy as np
 from scipy.special import chdtrc
@@ -7,29 +7,29 @@ from mag_tracking.inference.latest_frames import LatestFrames
 from mag_tracking.units import NS
 
 FALSE_ALARM = 1e-3
-"""Probability below which the latest innovations are not noise, so that a new target is
-sought."""
+"""A new target is searched for if noise explains the latest innovations with a lower
+probability."""
 
-WINDOW_S, AGAIN_S = 0.25, 0.15
-"""[s] The latest frames; and at least so much time is between two searches."""
+WINDOW_S, MIN_INTERVAL_S = 0.25, 0.15
+"""Length of the latest frames, and minimum interval between two searches [s]."""
 
-LONG_AGAIN_S, LONGER = 0.3, 1.5
-"""[s] A long vehicle is compared with two so long after the last comparison; then after so many
-times as long."""
+LONG_INTERVAL_S, INTERVAL_GROWTH = 0.3, 1.5
+"""Interval after which a long vehicle is compared with two vehicles [s], and the factor by which it
+grows with each comparison."""
 
-MIN_NATS, AGAIN_NATS, UNDECIDED_NATS = 10.0, 5.0, -5.0
-"""Another explanation is believed if the frames are so much more probable with it; or, if less, by
-two comparisons in turn. If they are not much less probable with it, the track is in doubt."""
+ACCEPT_NATS, REPEATED_NATS, UNDECIDED_NATS = 10.0, 5.0, -5.0
+"""Limits for the log-odds of another explanation [nats]: accepted at once, accepted in two
+successive comparisons, and, if not accepted, minimum for the track to be doubted."""
 
-ODD, LONG = 'improbable innovations', 'a long vehicle'
-"""Why a track is compared with other explanations."""
+IMPROBABLE, LONG_VEHICLE = 'improbable innovations', 'a long vehicle'
+"""Reasons to compare a track with other explanations."""
 
 
 class NewTargetEvidence:
-    """Whether a track is to be compared with one of a vehicle more.
+    """Decide when to compare a track with an explanation that has one more vehicle.
 
-    That is so where the latest innovations are improbable. A long vehicle explains two short ones
-    without any; it is compared from time to time.
+    The comparison is due when the latest innovations are improbable. A long vehicle explains two
+    short ones without improbable innovations, so it is also compared at intervals.
     """
 
     def __init__(self) -> None:
@@ -37,21 +37,21 @@ class NewTargetEvidence:
         self._last_ns: int | None = None
         self._was_probable = False
         self._was_rejected = self._is_long = False
-        self._long_wait_s = LONG_AGAIN_S
+        self._long_wait_s = LONG_INTERVAL_S
 
     def add(self, nis: float, degrees_of_freedom: int, stamp_ns: int, rejected: bool,
             is_long: bool) -> None:
-        """Count a frame.
+        """Add a frame.
 
         Parameters
         ----------
         nis : float
             Normalised innovation squared.
         degrees_of_freedom : int
-        stamp_ns : int
+        stamp_ns : int, ns
         rejected : bool
-            One of two sensors was left out, which is as good as a large innovation. Where more
-            agree, it is the sensor that is wrong.
+            One of two sensors was rejected, which counts like a large innovation. With more sensors
+            that agree, the rejected sensor is the one that is wrong.
         is_long : bool
             The best hypothesis is a long vehicle.
         """
@@ -59,21 +59,41 @@ class NewTargetEvidence:
         self._was_rejected, self._is_long = rejected, is_long
 
     def due(self, stamp_ns: int) -> str | None:
-        """`ODD` or `LONG` if the track is to be compared now, else None."""
+        """Return the reason for a comparison now.
+
+        Parameters
+        ----------
+        stamp_ns : int, ns
+
+        Returns
+        -------
+        str or None
+            `IMPROBABLE` or `LONG_VEHICLE`; None if no comparison is due.
+        """
         total, freedom = self._latest.total
         since = np.inf if self._last_ns is None else (stamp_ns - self._last_ns) / NS
         reason = None
         if self._was_rejected or chdtrc(max(freedom, 1.0), total) <= FALSE_ALARM:
-            reason = ODD if since >= AGAIN_S else None
+            reason = IMPROBABLE if since >= MIN_INTERVAL_S else None
         elif self._is_long and since >= self._long_wait_s:
-            reason = LONG
-            self._long_wait_s *= LONGER
+            reason = LONG_VEHICLE
+            self._long_wait_s *= INTERVAL_GROWTH
         if reason is not None:
             self._last_ns = stamp_ns
         return reason
 
-    def believes(self, log_odds: float) -> bool:
-        """Whether another explanation is believed, given those compared before."""
-        believes = log_odds > MIN_NATS or self._was_probable and log_odds > AGAIN_NATS
-        self._was_probable = log_odds > AGAIN_NATS and not believes
-        return believes
+    def accepts(self, log_odds: float) -> bool:
+        """Whether another explanation is accepted, given the previous comparisons.
+
+        Parameters
+        ----------
+        log_odds : float, nats
+            Log-odds of the explanation against the current track.
+
+        Returns
+        -------
+        bool
+        """
+        accepts = log_odds > ACCEPT_NATS or self._was_probable and log_odds > REPEATED_NATS
+        self._was_probable = log_odds > REPEATED_NATS and not accepts
+        return accepts

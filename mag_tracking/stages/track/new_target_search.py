@@ -1,9 +1,9 @@
-"""Newcomers: a vehicle more in the frames of a running track, believed only if evidence demands it.
+"""Search for a new vehicle in the frames of a running track.
 
-The frames of the window that is kept for relinearising are explained once more: by a vehicle beside
-those that are tracked, by two in place of one, whose filter two may have misled, or by one of them
-elsewhere. Each explanation is filtered and smoothed along its path like any hypothesis, and its
-evidence is compared with that of the track as it is.
+The frames of the relinearisation window are explained in another way: with a vehicle beside the
+tracked ones, with two vehicles in place of one (two vehicles may have misled the filter of one), or
+with one of them elsewhere. Each explanation is filtered and smoothed along its path like any
+hypothesis. Its evidence is compared with that of the current track.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,9 +18,9 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_vehicle import moment_directions
-from mag_tracking.stages.track.joint import Joint, are_felt_by_two
-from mag_tracking.stages.track.new_target_evidence import ODD
-from mag_tracking.stages.track.reach import FELT, energy_of
+from mag_tracking.stages.track.joint import Joint, are_sensed_by_two
+from mag_tracking.stages.track.new_target_evidence import IMPROBABLE
+from mag_tracking.stages.track.reach import DETECTABLE_ENERGY, energy_of
 from mag_tracking.stages.track.relinearisation import Window
 from mag_tracking.stages.track.vehicle_state import VehicleState
 from mag_tracking.stages.track.window_search import WindowSearch
@@ -35,64 +35,81 @@ from mag_tracking.stages.track.window_start import (
 )
 
 PASSES, STEP = 3, 0.5
-"""Gauss-Newton steps along each path, and the share that each goes."""
+"""Number of Gauss-Newton steps along each path, and the share of each step that is taken."""
 
-KNOWN_ROWS, FIRST, SECOND = 2, 3, 2
-"""Number of hypotheses of a tracked vehicle that are tried (one of several), and of paths of a
-first and of a second vehicle beside each."""
+MAX_KNOWN, MAX_FIRST, MAX_SECOND = 2, 3, 2
+"""Maximum number of hypotheses that are tried for a single tracked vehicle (one for several
+vehicles), and of paths of a first and of a second new vehicle for each."""
 
 NATS_KEPT, MAX_KEPT = 10.0, 12
-"""[nats] A kind is dropped if it is less probable than the best by more than this; and the number
-of kinds that are kept."""
+"""Maximum difference in log-probability from the best explanation at which another one is kept
+[nats], and maximum number of explanations kept."""
 
-ARRIVES = np.log(0.05)
-"""Log-probability that another vehicle comes while one passes."""
+LOG_P_ARRIVAL = np.log(0.05)
+"""Log-probability that another vehicle arrives during a pass."""
 
-ELSEWHERE_M = 2.0
-"""[m] A vehicle that is found nearer to its track than this was followed rightly."""
+MIN_DISPLACEMENT_M = 2.0
+"""Minimum distance of a vehicle that is found elsewhere from its track [m]. A nearer vehicle was
+tracked correctly."""
 
-MAX_TIMES = 5.0
-"""No vehicle is so many times faster, or stronger, than the largest of the settings."""
+MAX_RATIO = 5.0
+"""Maximum speed and moment of a new vehicle, relative to the largest of the settings."""
 
-WAS_LOST = np.log(0.01)
-"""Log-probability that a vehicle has been elsewhere than its track for the whole window."""
+LOG_P_LOST = np.log(0.01)
+"""Log-probability that a vehicle has been elsewhere than its track during the whole window."""
 
 N_DISTANCES = 10
-"""Places on its line where a new target may be when the window begins."""
+"""Number of positions on its line at which a new target may be at the start of the window."""
 
 
 class NewTargetSearch:
-    """Explains a window with one vehicle more."""
+    """Explain a window with one more vehicle.
+
+    Parameters
+    ----------
+    bank : FilterBank
+        Bank of the track.
+    window : Window
+    filter_of : callable
+        Returns the `BankFilter` for a number of vehicles.
+    n_targets : int
+        Number of vehicles of the track.
+    vehicles : VehicleState
+    reason : str
+        Reason from `NewTargetEvidence.due`. If the innovations are not improbable, no vehicle is
+        searched for beside a long one or elsewhere.
+    may_add : bool
+        Whether a vehicle may be added.
+    """
 
     def __init__(self, bank: FilterBank, window: Window, filter_of: Callable[[int], BankFilter],
-                 n_targets: int, vehicles: VehicleState, reason: str, may_be_more: bool
+                 n_targets: int, vehicles: VehicleState, reason: str, may_add: bool
                  ) -> None:
-        """`bank` of a track of `n_targets` vehicles; `filter_of` makes the filter of so many.
-
-        The `reason` is that of `NewTargetEvidence.due`: nobody is sought beside a long vehicle, or
-        elsewhere, if the innovations are as they should be. Without `may_be_more` no vehicle is
-        added.
-        """
-        self._is_odd = reason == ODD
+        self._is_improbable = reason == IMPROBABLE
         self._bank, self._window = bank, window
         self._filter_of, self._n_targets, self._vehicles = cache(filter_of), n_targets, vehicles
-        self._filter, self._may_be_more = self._filter_of(n_targets), may_be_more
+        self._filter, self._may_add = self._filter_of(n_targets), may_add
         settings = vehicles.settings
         self._n_one = self._filter.observation.n_one
         self._search = WindowSearch(window, vehicles)
-        # The first pair that was found in place of a vehicle: all have its order.
+        # First pair that was found in place of each vehicle; it defines the order of the others.
         self._pairs: dict[int, FloatArray] = {}
-        self._of_cell = -float(np.log(
+        self._log_prior = -float(np.log(
             len(settings.arrival_names) * len(settings.lateral_offsets) * len(settings.speeds)
             * len(settings.kinds) * len(moment_directions()) * N_DISTANCES))
 
     def find(self) -> Joint | None:
-        """The best explanation with a new target, or with a vehicle elsewhere; None where there is
-        none at all."""
+        """Return the best explanation with a new target, or with a vehicle elsewhere.
+
+        Returns
+        -------
+        Joint or None
+            None if there is no such explanation.
+        """
         if not len(self._search.samples.t):
             return None
-        rows, of_track, log_w, paths = self._as_it_is()
-        # By the number of vehicles, and which one of the track is replaced.
+        rows, of_track, log_w, paths = self._current_track()
+        # Keys: number of vehicles, and the replaced vehicle of the track.
         explanations: dict[tuple[int, int | None], list[WindowStart]] = {}
         for k in self._leaders(rows, log_w):
             known = self._known(rows[k], log_w[k] - of_track[k], paths[k])
@@ -101,34 +118,35 @@ class NewTargetSearch:
         alone = float(log_sum_exp(log_w))
         found = [self._best_of(starts, alone) for starts in explanations.values()]
         return max((joint for joint in found if joint is not None
-                    and (are_felt_by_two(joint) if joint.adds
+                    and (are_sensed_by_two(joint) if joint.adds
                          else self._is_elsewhere(joint))),
                    key=lambda joint: joint.log_odds, default=None)
 
     def _starts_with(self, known: KnownVehicles) -> list[WindowStart]:
-        """Starts of all explanations by a hypothesis of the track: a vehicle beside those that it
-        has, one elsewhere, two in place of one."""
-        starts = self._beside(known) if self._may_be_more and self._is_odd else []
+        """Starts of all explanations that are based on one hypothesis of the track."""
+        starts = self._beside(known) if self._may_add and self._is_improbable else []
         for i in range(self._n_targets):
             others = self._without(known, i)
-            if self._is_odd and self._is_felt(known, i):
+            if self._is_improbable and self._is_sensed(known, i):
                 starts += self._beside(others, i)
-            if self._may_be_more and self._may_be_two(known, i):
+            if self._may_add and self._may_be_two(known, i):
                 starts += self._pair_in_place_of(others, i)
         return starts
 
     def _best_of(self, starts: Sequence[WindowStart], alone: float) -> Joint | None:
-        """The `Joint` of the starts of one explanation; `alone` is the log-evidence of the track as
-        it is."""
+        """`Joint` of one explanation; `alone` is the log-evidence of the current track."""
         kept = self._with_turns(self._kept(starts))
-        prior = ARRIVES if len(kept[0].kind) > self._n_targets else WAS_LOST
+        prior = LOG_P_ARRIVAL if len(kept[0].kind) > self._n_targets else LOG_P_LOST
         bank, log_likelihood, log_w, paths = self._run(kept)
         return self._made(kept, bank, log_likelihood, log_w, paths,
                           float(log_sum_exp(log_w)) + prior - alone)
 
-    def _as_it_is(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-        """The leading hypotheses of the track along their paths: rows of the bank (n,), the
-        log-likelihood of each, its log-weight with that, and its path (n, n_frames, n_x)."""
+    def _current_track(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+        """Leading hypotheses of the current track, along their paths.
+
+        Returns their rows in the bank (n,), log-likelihoods (n,), log-weights with these (n,) and
+        paths (n, n_frames, n_x).
+        """
         window, bank = self._window, self._bank
         order = np.argsort(-bank.log_w, kind='stable')[:window.most]
         rows = np.searchsorted(window.anchor.origin, bank.origin[order])
@@ -144,9 +162,9 @@ class NewTargetSearch:
         return order, of_track, before + of_track, paths
 
     def _leaders(self, rows: IntArray, log_w: FloatArray) -> list[int]:
-        """Which of the `rows` are tried with a new target: the best of each arrival and kind."""
+        """Indices into `rows` to be tried with a new target: the best of each arrival and kind."""
         seen: set[tuple[int, ...]] = set()
-        most = KNOWN_ROWS if self._n_targets == 1 else 1
+        most = MAX_KNOWN if self._n_targets == 1 else 1
         chosen: list[int] = []
         for k in np.argsort(-log_w, kind='stable').tolist():
             what = (*np.ravel(self._bank.label[rows[k]]).tolist(),
@@ -157,7 +175,7 @@ class NewTargetSearch:
         return chosen
 
     def _known(self, row: int, log_w: float, path: FloatArray) -> KnownVehicles:
-        """The vehicles of a hypothesis of the track, with its log-weight at the anchor."""
+        """Vehicles of a hypothesis of the track, with its log-weight at the anchor."""
         at = np.searchsorted(self._window.anchor.origin, self._bank.origin[[row]])
         before = self._window.anchor.rows(at)
         label, kind = (tuple(np.ravel(of[row]).tolist())
@@ -165,25 +183,26 @@ class NewTargetSearch:
         return KnownVehicles(before.x[0], before.P[0], path, label, kind, log_w, self._filter)
 
     def _may_be_two(self, known: KnownVehicles, i: int) -> bool:
-        """Whether vehicle `i` is long, or alone."""
+        """Whether vehicle `i` is long, or the only one."""
         return self._n_targets == 1 or bool(
             self._filter.are_long(np.array([known.kind[i]]))[0])
 
-    def _is_felt(self, known: KnownVehicles, i: int) -> bool:
-        """Whether the sensors feel vehicle `i` in the last frame."""
-        return energy_of(self._filter, i, known.path[-1], self._window.frames[-1]) > FELT
+    def _is_sensed(self, known: KnownVehicles, i: int) -> bool:
+        """Whether the sensors sense vehicle `i` in the last frame."""
+        return energy_of(
+            self._filter, i, known.path[-1], self._window.frames[-1]) > DETECTABLE_ENERGY
 
     def _is_elsewhere(self, joint: Joint) -> bool:
-        """Whether a vehicle that was sought elsewhere is far from where the track has it."""
+        """Whether a vehicle that was searched for elsewhere was found far from its track."""
         n, now = self._n_one, self._bank.x[self._bank.best()]
         assert joint.replaced is not None
         found = joint.bank.x[joint.bank.best()]
         last = n * (self._n_targets - 1)
         before = now[joint.replaced * n:joint.replaced * n + 2]
-        return bool(np.hypot(*(found[last:last + 2] - before)) > ELSEWHERE_M)
+        return bool(np.hypot(*(found[last:last + 2] - before)) > MIN_DISPLACEMENT_M)
 
     def _without(self, known: KnownVehicles, i: int) -> KnownVehicles:
-        """The same without vehicle `i`; of one alone nothing is left that is known."""
+        """The same without vehicle `i`; without any vehicle, only the states of the sensors."""
         n = self._n_one
         if self._n_targets == 1:
             own = self._sensors_at_start()
@@ -196,23 +215,23 @@ class NewTargetSearch:
             known.log_w, self._filter_of(self._n_targets - 1))
 
     def _beside(self, known: KnownVehicles, replaced: int | None = None) -> list[WindowStart]:
-        """One vehicle beside known ones: a new target, or in place of vehicle `replaced`."""
+        """Starts of one vehicle beside known ones: a new one, or instead of vehicle `replaced`."""
         search = self._search.beside(known)
-        return [start for theta in search.best(self._search.grid, FIRST)
-                for start in self._started(known, theta[None], search.moments(theta), replaced)]
+        return [start for theta in search.best(self._search.grid, MAX_FIRST)
+                for start in self._starts_on(known, theta[None], search.moments(theta), replaced)]
 
     def _pair_in_place_of(self, others: KnownVehicles, i: int) -> list[WindowStart]:
-        """Two vehicles in place of vehicle `i`, whose filter may have been misled by them."""
+        """Starts of two vehicles in place of vehicle `i`."""
         search = self._search.beside(others)
         starts: list[WindowStart] = []
-        for found in search.pairs(self._search.grid, FIRST, SECOND)[:FIRST]:
+        for found in search.pairs(self._search.grid, MAX_FIRST, MAX_SECOND)[:MAX_FIRST]:
             pair = in_order_of(self._pairs.setdefault(i, found), found)
-            starts += self._started(others, pair, search.moments(pair.ravel()), i)
+            starts += self._starts_on(others, pair, search.moments(pair.ravel()), i)
         return starts
 
-    def _started(self, known: KnownVehicles, paths: FloatArray, moments: FloatArray,
+    def _starts_on(self, known: KnownVehicles, paths: FloatArray, moments: FloatArray,
                  replaced: int | None) -> list[WindowStart]:
-        """Known vehicles and new ones on `paths` (k, 7) with `moments` (k, 3, 3), of any kinds."""
+        """Starts of known vehicles and new ones on `paths` (k, 7) with moments (k, 3, 3)."""
         n_known, times = len(known.kind) * self._n_one, self._search.times
         labels = self._search.prior.nearest(paths)[0].tolist()
         starts = []
@@ -225,25 +244,25 @@ class NewTargetSearch:
                 path.append(self._vehicles.along(theta, m, times, kind))
             starts.append(WindowStart(
                 x, P, np.hstack([*path, known.path[:, n_known:]]), (*known.label, *labels),
-                (*known.kind, *kinds), known.log_w + len(paths) * self._of_cell, len(paths),
+                (*known.kind, *kinds), known.log_w + len(paths) * self._log_prior, len(paths),
                 replaced))
         return starts
 
     def _sensors_at_start(self) -> FloatArray:
-        """Covariance of the states of the sensors when a track begins."""
+        """Covariance of the states of the sensors at the start of a track."""
         observation, std = self._filter.observation, self._vehicles.background_std
         return block_diag(*observation.own_covariance,
                           std**2 * np.eye(3 * len(observation.positions)))
 
     def _kept(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
-        """Those that explain the frames about as well as the best one; moved along."""
+        """Starts that explain the frames about as well as the best, with their paths refined."""
         _, _, log_w, paths = self._run(starts)
         order = np.argsort(-log_w, kind='stable')[:MAX_KEPT]
         return [replace(starts[k], path=paths[k]) for k in order.tolist()
                 if log_w[k] >= log_w.max() - NATS_KEPT]
 
     def _with_turns(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
-        """Each as it is, and with one of the new vehicles turning."""
+        """Each start as it is, and with one of the new vehicles turning."""
         share = self._vehicles.settings.turn_share
         out = []
         for start in starts:
@@ -269,28 +288,30 @@ class NewTargetSearch:
             first_is_updated=window.is_updated)
         usable: BoolArray = np.isfinite(along.log_likelihood) \
             & np.isfinite(paths).all(axis=(1, 2)) & np.isfinite(bank.x).all(axis=1) \
-            & [self._all_come(s, x) for s, x in zip(starts, bank.x, strict=True)]
+            & [self._are_plausible(s, x) for s, x in zip(starts, bank.x, strict=True)]
         log_likelihood = np.where(usable, along.log_likelihood, -np.inf)
         log_w = log_likelihood + [s.log_w for s in starts] - 0.5 * np.square(
             [overlap_depth(path, self._n_one, len(s.kind), self._vehicles.length_column) / DEPTH_STD
              for s, path in zip(starts, paths, strict=True)])
         return bank, log_likelihood, log_w, paths
 
-    def _all_come(self, start: WindowStart, x: FloatArray) -> bool:
-        """Whether the vehicles that were sought are as fast and as strong, in the state `x` (n_x,),
-        as what comes: what stands was there before."""
+    def _are_plausible(self, start: WindowStart, x: FloatArray) -> bool:
+        """Whether speeds and moments of the new vehicles in the state `x` (n_x,) are plausible.
+
+        A vehicle that stands still is not new.
+        """
         settings, n = self._vehicles.settings, self._n_one
         for i in start.are_new:
             speed = np.hypot(*x[i * n + 3:i * n + 5])
             moment = np.linalg.norm(self._vehicles.hard_moments(x[i * n:]).sum(axis=0))
-            if not self._search.prior.slowest <= speed <= MAX_TIMES * max(settings.speeds) \
-                    or moment > MAX_TIMES * max(settings.moments):
+            if not self._search.prior.slowest <= speed <= MAX_RATIO * max(settings.speeds) \
+                    or moment > MAX_RATIO * max(settings.moments):
                 return False
         return True
 
     def _made(self, starts: Sequence[WindowStart], bank: FilterBank, log_likelihood: FloatArray,
               log_w: FloatArray, paths: FloatArray, log_odds: float) -> Joint | None:
-        """The `Joint` of those that can be used."""
+        """`Joint` of the usable starts; None if there are none."""
         rows = np.flatnonzero(np.isfinite(log_w))
         if not len(rows):
             return None

@@ -165,7 +165,7 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
     P = covariance_about(bank, best, model, apart)
     said, flags = _said_of(model, orientation, bank.x[best, :n_t], excess * P,
                            int(bank.kind[best]), unseen, difference)
-    reasons = doubts.listed({*found, *ambiguities(bank, best, apart)})
+    reasons = doubts.ordered({*found, *ambiguities(bank, best, apart)})
     uncertainty: PoseUncertainty | None = own_uncertainty(said)
     if reasons and ambiguous_poses != BEST:
         uncertainty = mixture_uncertainty(bank, best, apart, model, orientation, said, P, excess) \

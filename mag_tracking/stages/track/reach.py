@@ -12,7 +12,7 @@ UNFELT, FAINT = 0.1, 1.0
 """A target whose field has less energy than this in a frame, in units of its noise, is not felt;
 and with less than that it does not disturb others."""
 
-FELT = 4.0
+DETECTABLE_ENERGY = 4.0
 """Least energy, in units of its noise, of a field that is felt: in the last frame, of a vehicle
 that is sought again; in all frames of a window, by one sensor; in all frames at all sensors, as
 expected from what is known of its moments, of a vehicle that is sought at all."""

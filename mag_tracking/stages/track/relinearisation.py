@@ -29,7 +29,7 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.inference.starting_bank import StartingBank
 from mag_tracking.records import FieldFrame
-from mag_tracking.stages.track.bank_filter import Along, BankFilter
+from mag_tracking.stages.track.bank_filter import BankFilter, PathResult
 from mag_tracking.units import NS
 
 LEADING = np.log(1e3)
@@ -250,7 +250,7 @@ class Relinearisation:
         return moved
 
     def _run_along(self, bank_filter: BankFilter, bank: FilterBank, paths: FloatArray,
-                   passes: int) -> Along:
+                   passes: int) -> PathResult:
         """Run rows of the anchor, `bank`, along their `paths` (n_rows, n, n_x) through the first n
         of the frames; both are moved.
         """

@@ -21,10 +21,10 @@ from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.bank_filter import BankFilter, NoTarget
 from mag_tracking.stages.track.clock_comparison import ClockComparison
 from mag_tracking.stages.track.disturbance_model import DisturbanceModel
-from mag_tracking.stages.track.disturbances import Unexplained
-from mag_tracking.stages.track.evidence import MIN_WATCHED, OUT_OF_REACH
+from mag_tracking.stages.track.disturbances import UnexplainedField
+from mag_tracking.stages.track.evidence import MIN_OBSERVED_SHARE, OUT_OF_REACH
 from mag_tracking.stages.track.joint import Joint
-from mag_tracking.stages.track.member import Member, Update, View, in_order
+from mag_tracking.stages.track.member import Member, Update, View, members_in_order
 from mag_tracking.stages.track.new_target_evidence import UNDECIDED_NATS, NewTargetEvidence
 from mag_tracking.stages.track.new_target_search import NewTargetSearch
 from mag_tracking.stages.track.reach import FAINT, UNFELT, energy_of
@@ -110,7 +110,7 @@ class RunningTrack:
                 self.counts['tracks of a doubtful background'] += 1
                 member.evidence.doubt(doubts.DOUBTFUL_BACKGROUND)
 
-    def begin(self, frame: FieldFrame, recent: list[FieldFrame], unseen_coming: bool = False
+    def begin(self, frame: FieldFrame, recent: list[FieldFrame], approach_unobserved: bool = False
               ) -> list[TrackRecord]:
         """Run through the `recent` frames before the detection, and publish the first one after.
 
@@ -120,13 +120,13 @@ class RunningTrack:
             Of the whole network, with the detection.
         recent : list of FieldFrame
             Those before it, oldest first.
-        unseen_coming : bool
+        approach_unobserved : bool
             What came before says nothing of how this target came.
         """
         watched_ns = frame.stamp_ns - recent[0].stamp_ns if recent else 0
         first = self.members[0]
         first.evidence.doubt_start(
-            unseen_coming or watched_ns < MIN_WATCHED * self._settings.lookback_s * NS,
+            approach_unobserved or watched_ns < MIN_OBSERVED_SHARE * self._settings.lookback_s * NS,
             self._seeing.whole, self._target.starts_anywhere)
         first.begin_ns = frame.stamp_ns
         self._bank.begin(recent[0] if recent else frame, frame)
@@ -137,7 +137,7 @@ class RunningTrack:
         if self.ended is None:
             before_rows = self._bank.sensors.rows
             if self._bank.widen(dt):
-                first.opinion.conclude(self._clocks, before_rows)
+                first.cross_check.conclude(self._clocks, before_rows)
                 self._use(True)
         return self.step(frame, dt)
 
@@ -149,7 +149,7 @@ class RunningTrack:
         if self.ended is not None:
             return []
         for member in () if self._target.starts_anywhere else self.members:
-            member.evidence.watch(self._seeing.part_of(frame))
+            member.evidence.check_approach(self._seeing.part_of(frame))
         advance = self._bank.advance(self._bank.sensors.part_of(frame), dt)
         if not self._weigh(advance):
             return self.end('no hypothesis explains the field')
@@ -199,9 +199,10 @@ class RunningTrack:
                     advance.evidence - disturbance_model, frame.stamp_ns,
                     self._settings.min_bayes_factor)
             mine, first = self._frame_of(i, best, frame, dt), i * self._bank.one.n_target
-            member.evidence.take(mine, self._bank.sensors.rows, self.bank.nis[best])
+            member.evidence.add_frame(mine, self._bank.sensors.rows, self.bank.nis[best])
             if self._settings.cross_check and not self._target.starts_anywhere:
-                member.opinion.add(mine, self.bank.x[best, first:first + self._bank.one.n_target])
+                member.cross_check.add(
+                    mine, self.bank.x[best, first:first + self._bank.one.n_target])
         return True
 
     def _note(self, advance: Advance, best: int) -> None:
@@ -261,7 +262,7 @@ class RunningTrack:
         member = self.members[i]
         member.ended = reason
         if len(self.members) == 1:
-            member.opinion.conclude(self._clocks, self._bank.sensors.rows)
+            member.cross_check.conclude(self._clocks, self._bank.sensors.rows)
         self.counts[f'tracks ended: {reason}'] += 1
         if member.last is None:
             return []
@@ -282,7 +283,7 @@ class RunningTrack:
                                [*member.early, *mine] if complete else mine, doubtful)
 
     @property
-    def unexplained(self) -> list[Unexplained]:
+    def unexplained(self) -> list[UnexplainedField]:
         """The fields during tracks that have ended, where a target never explained them."""
         found = [m.unexplained(self._disturbance_model.uniform) for m in self.members if m.ended]
         return [u for u in found if u is not None]
@@ -304,7 +305,7 @@ class RunningTrack:
                 self._settings.vehicle, self._bank.sensors.network,
                 self._settings.background_std), reason, not self._is_full).find()
         # A field of something else is no vehicle more.
-        if self._newcomers.believes(found.log_odds if found and all(
+        if self._newcomers.accepts(found.log_odds if found and all(
                 m.evidence.bayes_factor.would_lead(found.log_odds, self._settings.min_bayes_factor)
                 for m in self.members) else -np.inf):
             return found
@@ -331,7 +332,7 @@ class RunningTrack:
             new.start_alongside(self.members[0], now_ns, ratio)
         doubtful = joint.doubtful(n)
         self._bank.resume(joint)
-        self.members, self._is_full = in_order(self.members, new, joint, n), False
+        self.members, self._is_full = members_in_order(self.members, new, joint, n), False
         for slot, member in enumerate(self.members):
             member.slot = slot
             member.evidence.add(joint.log_odds)
@@ -346,5 +347,5 @@ class RunningTrack:
             return
         rows = self._bank.sensors.rows
         if self._bank.hand_over(best):
-            self.members[0].opinion.conclude(self._clocks, rows)
+            self.members[0].cross_check.conclude(self._clocks, rows)
             self._use(True)

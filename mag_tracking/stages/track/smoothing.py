@@ -68,7 +68,7 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
         at[:] = known
     along = bank_filter.run_along(
         bank.alone(0), frames, intervals, paths, passes=relinearisations + 1, step=1.0,
-        first_is_updated=updated, leaves_out=True, wants_covariances=True)
+        first_is_updated=updated, rejects_outliers=True, wants_covariances=True)
     left_out = np.count_nonzero(~along.used[0, int(updated):])
     return list(zip(paths[0], along.covariances[0], strict=True)), int(left_out)
 

@@ -1,4 +1,4 @@
-// The fit of a row of dipoles on a steady path to the samples of a pass (pass_samples.py).
+// Fit of a row of dipoles on a steady path to the samples of a pass (pass_samples.py).
 
 #pragma once
 
@@ -10,10 +10,10 @@
 
 namespace mag_tracking {
 
-// `physics.steady_pass.SteadyPass`, as `SeparableFit` takes it.
+// Model of `physics.steady_pass.SteadyPass` for `SeparableFit`.
 class SteadyModel {
   public:
-    // `combinations` (d, d): the moments of the dipoles are these times the linear parameters.
+    // The moments of the dipoles are `combinations` (d, d) times the linear parameters.
     SteadyModel(const Row& row, const double* combinations, const Samples& samples,
                 const std::int64_t* clocks, const double* fixed, int n_whole,
                 const std::int64_t* free, int n_free)
@@ -25,7 +25,7 @@ class SteadyModel {
     INLINE int n_theta() const { return n_free_; }
 
     INLINE void set_basis(const double* theta, Rows& out) {
-        take(theta);
+        set_free(theta);
         const int d = row_.n;
         for (long s = 0; s < samples_.n; ++s) {
             steady_basis(whole_.data(), row_, samples_, s, long(clocks_[s]), unit_.data());
@@ -43,7 +43,7 @@ class SteadyModel {
     }
 
     INLINE void set_derivative(const double* theta, const double* p, Rows& out) {
-        take(theta);
+        set_free(theta);
         const int d = row_.n, n_whole = int(whole_.size());
         for (int i = 0; i < d; ++i)
             for (int b = 0; b < 3; ++b) {
@@ -61,8 +61,8 @@ class SteadyModel {
     }
 
   private:
-    // The parameters that are free.
-    INLINE void take(const double* theta) {
+    // Sets the free parameters.
+    INLINE void set_free(const double* theta) {
         for (int c = 0; c < n_free_; ++c) whole_[free_[c]] = theta[c];
     }
 
@@ -74,7 +74,7 @@ class SteadyModel {
     std::vector<double> whole_, unit_, moments_, by_, derivative_;
 };
 
-// From each of `n` starts theta (n, n_free), in place; into cost (n) and covariance
+// Refines each of `n` starts theta (n, n_free) in place. The outputs are cost (n) and covariance
 // (n, n_free, n_free).
 FOR_PROCESSORS static void fit_steady(SteadyModel& model, const double* y, Rows& nuisance,
                                       const SearchLimits& limits, long n, double* theta,

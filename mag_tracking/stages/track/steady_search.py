@@ -22,7 +22,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.steady_pass import N_STRAIGHT, PATH, SteadyPass
 from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
 from mag_tracking.stages.track.pass_samples import PassSamples
-from mag_tracking.stages.track.reach import FELT
+from mag_tracking.stages.track.reach import DETECTABLE_ENERGY
 from mag_tracking.stages.track.window_start import in_order_of
 
 N_DIPOLES = 3
@@ -291,7 +291,7 @@ class SteadySearch:
         with running_away():
             energy = np.einsum('nii->ni', self._information_of_moments(theta)) - 1.0
         each = energy.reshape(len(theta), -1, 3 * N_DIPOLES).sum(axis=2)
-        felt: BoolArray = (each > FELT).all(axis=1)
+        felt: BoolArray = (each > DETECTABLE_ENERGY).all(axis=1)
         return felt
 
     def _information_of_moments(self, theta: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ from mag_tracking.geometry import rotation_about_z
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.stages.track.initiation_vehicle import (
-    TURNS_AT_START,
+    START_TURN_RATIO,
     VehicleSettings,
     soft_iron,
     starting_covariance,
@@ -114,7 +114,7 @@ class VehicleState:
         n = len(self._model.state_names)
         first, w = target * n, (target + 1) * n - 1
         out = P.copy()
-        out[w, w] = TURNS_AT_START**2 * self._model.turn_variance(
+        out[w, w] = START_TURN_RATIO**2 * self._model.turn_variance(
             np.hypot(x[first + 3], x[first + 4]))
         return out
 

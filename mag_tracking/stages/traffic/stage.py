@@ -19,7 +19,7 @@ from mag_tracking.inference.log_normal_classes import (
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.counting_line import Crossing, Line, LinePath, Pose, lines_of
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
-from mag_tracking.report.traffic_intervals import Intervals
+from mag_tracking.report.traffic_intervals import TrafficIntervals
 from mag_tracking.stages.traffic.field_direction import FieldDirection
 from mag_tracking.stages.traffic.settings import PER_CLASS, PER_LINE, TrafficSettings
 from mag_tracking.units import NS
@@ -101,7 +101,7 @@ class Traffic:
                                settings.line_offsets, settings.line_half_widths,
                                network.centre) if is_of_vehicles else []
         self._direction = FieldDirection(network)
-        self._intervals = Intervals(settings.line_names, settings.interval_s, self.counts)
+        self._intervals = TrafficIntervals(settings.line_names, settings.interval_s, self.counts)
         self._open: dict[int, _Seen] = {}
         self._past: list[_Seen] = []
         self._waiting: list[_Found] = []

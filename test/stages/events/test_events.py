@@ -163,7 +163,8 @@ def test_a_single_sensor_is_tracked_with_a_stated_prior_only_and_never_unique():
     readings = spoiler.only_sensor('mag_1')(recorded('straight_car_right').readings)
     result = mt.track(readings, one)
     assert not len(result.poses)
-    assert result.counts['track']['detections not tracked (one sensor does not tell the scale)'] > 0
+    assert result.counts['track'][
+        'detections not tracked (scale not observable with one sensor)'] > 0
     result = mt.track(readings, one, settings={'track.single_sensor_prior': True})
     assert len(result.poses) and result.poses['ambiguous'].all()
     assert result.smoothed['ambiguous'].all()

@@ -6,7 +6,7 @@ import pytest
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track import doubts
-from mag_tracking.stages.track.approach import FELT, LOUD, Approach
+from mag_tracking.stages.track.approach import GROWTH_RATIO, SENSED_LEVEL, Approach
 from support.situations import made
 
 STD = 1e-8
@@ -29,11 +29,11 @@ def test_a_field_that_grows_with_the_cube_of_a_distance_is_not_doubted():
     """At any speed that takes two frames or more from the threshold to ten times as much."""
     for step in (0.02, 0.05, 0.1, 0.2):
         distance = np.arange(2.0, 0.2, -step)
-        assert not any(is_doubted(FELT * LOUD * (0.4 / distance)**3))
+        assert not any(is_doubted(SENSED_LEVEL * GROWTH_RATIO * (0.4 / distance)**3))
 
 
 @pytest.mark.parametrize('sizes', [
-    2.0 * LOUD * FELT * np.linspace(0.0, 1.0, 30)**2,
+    2.0 * GROWTH_RATIO * SENSED_LEVEL * np.linspace(0.0, 1.0, 30)**2,
     np.concatenate([np.full(10, 0.5), np.linspace(0.5, 40.0, 30)])])
 def test_a_field_that_grows_otherwise_is_doubted_once(sizes):
     """From rest beside a sensor; steadily, as a current or a temperature."""
@@ -41,15 +41,15 @@ def test_a_field_that_grows_otherwise_is_doubted_once(sizes):
 
 
 def test_a_jump_is_too_short_to_tell_and_a_fall_is_that_of_a_first_sensor():
-    jump = np.where(np.arange(30) < 12, 0.5, 30.0 * FELT)
-    rises = 2.0 * LOUD * FELT * np.linspace(0.0, 1.0, 30)**2
+    jump = np.where(np.arange(30) < 12, 0.5, 30.0 * SENSED_LEVEL)
+    rises = 2.0 * GROWTH_RATIO * SENSED_LEVEL * np.linspace(0.0, 1.0, 30)**2
     falls = np.where(np.arange(30) == 15, 0.5 * rises, rises)
     assert not any(is_doubted(jump)) and not any(is_doubted(falls))
 
 
 def test_what_begins_loud_or_stays_quiet_says_nothing():
-    assert not any(is_doubted(np.linspace(2.0 * FELT, 30.0 * FELT, 20)))
-    assert not any(is_doubted(np.full(20, 2.0 * FELT)))
+    assert not any(is_doubted(np.linspace(2.0 * SENSED_LEVEL, 30.0 * SENSED_LEVEL, 20)))
+    assert not any(is_doubted(np.full(20, 2.0 * SENSED_LEVEL)))
 
 
 @pytest.mark.parametrize('name, is_expected', [('there at the start, leaves', True),

@@ -170,7 +170,7 @@ def contradicted(manager, sizes):
 def test_a_vehicle_that_the_field_contradicts_is_lost_and_not_started_anew():
     stage = TrackManager(line_network(2), settings_for('vehicle').track)
     tracks = contradicted(stage, [1e-4] * 10 + [1.9e-4] * 10)
-    assert stage.counts['tracks ended: lost its target'] == 1
+    assert stage.counts['tracks ended: target lost'] == 1
     assert tracks[-1].ended and tracks[-2].ambiguous
     assert stage.counts['tracks'] == 1 and stage.bank is None
 
@@ -182,5 +182,5 @@ def test_where_a_vehicle_was_lost_one_of_twice_the_field_is_started_and_flagged(
         'vehicle', {'track.lookback_s': lookback_s}).track)
     tracks = contradicted(stage, [1e-4] * 19 + [2.1e-4])
     assert stage.counts['tracks'] == 2
-    assert stage.counts['tracks begun in a field larger than that of a lost one'] == 1
+    assert stage.counts['tracks started in a larger field than that of a lost track'] == 1
     assert tracks[-1].id == 2 and tracks[-1].ambiguous

@@ -16,8 +16,8 @@ from support.networks import line_network
 @pytest.mark.parametrize('target, changes, product', [
     ('vehicle', {'track.vehicle.speeds': [1.0 + 1e-3 * k for k in range(100_000)]},
      '75600000 starting hypotheses, kinds (3) x arrival_names (3) x lateral_offsets (3) x speeds '
-     '(100000) x moment directions (14) x turning or not (2), with 44 states each for 2 sensors '
-     '(track.max_sensors) at the start need 1.17e+03 GB, more than 4.29 GB'),
+     '(100000) x moment directions (14) x straight or turning (2), with 44 states each for 2 '
+     'sensors (track.max_sensors) need 1.17e+03 GB of memory; the limit is 4.29 GB'),
     ('vehicle', {**POINT, 'track.vehicle.lateral_offsets': [1e-3 * k for k in range(10_000)]},
      'lateral_offsets (10000)'),
     ('vehicle', {'track.vehicle.arrival_names': [str(k) for k in range(3000)],
@@ -31,7 +31,8 @@ def test_too_many_hypotheses_are_refused_with_their_number(target, changes, prod
 
 @pytest.mark.parametrize('changes, told', [
     ({'grid_points': 1_000_000},
-     'track.magnet.grid_points: 1000000 points x 90 sensors need 6.48 GB, more than 4.29 GB'),
+     'track.magnet.grid_points: 1000000 points x 90 sensors need 6.48 GB of memory; '
+     'the limit is 4.29 GB'),
     ({'starts': 1000},
      'track.magnet: 1000 starting hypotheses, starts (1000), with 822 states each for 90 sensors')])
 def test_so_are_those_of_a_magnet(changes, told):
@@ -100,6 +101,6 @@ def test_so_many_are_kept_as_take_no_more_than_they_may(n):
 def test_more_sensors_than_the_memory_has_room_for_are_refused():
     changes = {'track.max_sensors': 1000}
     Pipeline(line_network(90), settings_for('vehicle', changes))
-    with pytest.raises(SettingsError, match=r'track.max_sensors: 100 hypotheses of a target that '
-                       r'400 sensors see need 10.5 GB, more than 4.29 GB'):
+    with pytest.raises(SettingsError, match=r'track.max_sensors: 100 hypotheses with the '
+                       r'states of 400 sensors need 10.5 GB of memory; the limit is 4.29 GB'):
         Pipeline(line_network(400), settings_for('vehicle', changes))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mag_tracking.stages.track.clock_comparison import MEMORY, ClockComparison
+from mag_tracking.stages.track.clock_comparison import MEMORY_PASSES, ClockComparison
 from mag_tracking.stages.track.rigid_pass import RigidPass
 
 TWO = np.arange(2)
@@ -30,8 +30,8 @@ def test_passes_that_agree_name_the_clock_that_is_ahead():
     assert clocks.apart.offset_s == pytest.approx(0.1, rel=1e-6)
     assert clocks.apart_s(TWO) == pytest.approx(0.1, rel=1e-6)
     text = clocks.apart.text(('left', 'right'))
-    assert 'right seems 100 ms ahead of that of left' in text and '4 passes' in text
-    assert 'clock_offset of right: 0.100 more' in text
+    assert 'right is 100 ms ahead of that of left' in text and '4 passes' in text
+    assert 'increase clock_offset of right by 0.100 s' in text
     # Seen from the other sensor.
     assert evidence([a_pass(-0.1, reference=1)] * 4).apart.sensor == 1
 
@@ -98,7 +98,7 @@ def test_clocks_that_were_set_are_believed_after_some_passes():
         clocks.add(a_pass(0.0), TWO)
         n += 1
     print(f'{n} passes after the clocks were set')
-    assert n < MEMORY // 2
+    assert n < MEMORY_PASSES // 2
 
 
 def test_clocks_are_compared_over_sensors_that_never_felt_the_same_vehicle():

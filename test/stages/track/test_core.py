@@ -109,12 +109,12 @@ def test_a_bank_moves_through_frames_as_step_by_step(name, n_sensors):
 
 
 @pytest.mark.parametrize('first_is_updated', [False, True])
-@pytest.mark.parametrize('passes, step, leaves_out, at_predictions', [
+@pytest.mark.parametrize('passes, step, rejects_outliers, at_predictions', [
     (1, 0.5, False, False), (3, 0.5, False, False), (2, 1.0, True, True)])
 @pytest.mark.parametrize('name, n_sensors', [*((name, 3) for name in CASES), ('mounting', MANY)])
 def test_paths_are_filtered_and_smoothed_as_step_by_step(
-        name, n_sensors, passes, step, leaves_out, at_predictions, first_is_updated):
-    compiled, plain, bank, frames, intervals = case(name, n_sensors, 1 if leaves_out else 4)
+        name, n_sensors, passes, step, rejects_outliers, at_predictions, first_is_updated):
+    compiled, plain, bank, frames, intervals = case(name, n_sensors, 1 if rejects_outliers else 4)
     paths = np.repeat(bank.x[:, None], len(frames), axis=1)
     if at_predictions:
         paths[:] = np.nan
@@ -122,7 +122,7 @@ def test_paths_are_filtered_and_smoothed_as_step_by_step(
     with np.errstate(invalid='ignore'):
         got, expected = (filter_.run_along(
             b, frames, intervals, p, passes=passes, step=step, first_is_updated=first_is_updated,
-            leaves_out=leaves_out, wants_covariances=True)
+            rejects_outliers=rejects_outliers, wants_covariances=True)
             for filter_, b, p in ((compiled, bank, paths), (plain, other, other_paths)))
     std = np.sqrt(np.einsum('pkii->pki', expected.covariances))
     std = np.where(std > 0.0, std, 1.0)

@@ -9,7 +9,7 @@ import pytest
 from mag_tracking.event_records import Disturbance
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
-from mag_tracking.stages.track.disturbances import Disturbances, Unexplained
+from mag_tracking.stages.track.disturbances import Disturbances, UnexplainedField
 from mag_tracking.stages.track.evidence import UNEXPLAINED
 from mag_tracking.stages.track.manager import TrackManager
 from support.situations import made, verdict
@@ -81,7 +81,7 @@ def test_a_disturbance_grows_and_reaches_other_sensors_until_it_ends():
     disturbances = Disturbances(('a', 'b'))
     quiet = FieldFrame(0, np.array([[3e-8, 0, 0], [0, 0, 0]]),
                        np.tile(1e-18 * np.eye(3), (2, 1, 1)), np.ones(2, dtype=int), np.zeros(2))
-    found = Unexplained(1, 0, np.array([2e-8, 0.0]), np.array([True, False]), 0.1)
+    found = UnexplainedField(1, 0, np.array([2e-8, 0.0]), np.array([True, False]), 0.1)
     first, = disturbances.begin(found, 10)
     assert (first.largest, first.sensors, first.ended) == (2e-8, ('a',), False)
     disturbances.feed(quiet)

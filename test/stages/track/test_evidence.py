@@ -57,7 +57,7 @@ def test_a_filter_that_fits_better_than_its_path_is_doubted_as_long_as_the_windo
     # What it says of later poses is up to them: the track itself is not.
     assert not evidence.doubted
     # Of its smoothed poses those of the same time are.
-    assert [evidence.doubted_filter(round(t * NS)) for t in (1.0, 1.1, 3.0, 3.2)] == [
+    assert [evidence.was_filter_doubted(round(t * NS)) for t in (1.0, 1.1, 3.0, 3.2)] == [
         False, True, True, False]
 
 
@@ -122,17 +122,17 @@ def test_noise_is_felt_by_no_sensor_and_a_field_by_those_that_measure_it():
     for _ in range(50):
         noise = 1e-8 * rng.standard_normal((2, 3))
         # The second sensor of the network is not used.
-        evidence.take(frame(noise + [[3e-8, 0.0, 0.0], [0.0, 0.0, 0.0]]), np.array([0, 2]),
+        evidence.add_frame(frame(noise + [[3e-8, 0.0, 0.0], [0.0, 0.0, 0.0]]), np.array([0, 2]),
                       np.ones(2))
-    assert evidence.felt.tolist() == [True, False, False] and evidence.is_felt_by_one
+    assert evidence.sensed.tolist() == [True, False, False] and evidence.is_sensed_by_one
     assert evidence.largest[0] > 3e-8 and evidence.largest[1] == 0.0
 
 
 def test_smoothed_poses_are_flagged_for_misfits_and_not_for_what_smoothing_settles():
     evidence = TrackEvidence(2)
     evidence.note({doubts.ANOTHER_ARRIVAL}, 1)
-    evidence.note({doubts.SOMETHING_ELSE, doubts.ANOTHER_PLACE}, 2)
-    assert [evidence.doubted_filter(k) for k in (1, 2)] == [False, True]
+    evidence.note({doubts.DISTURBANCE_MODEL, doubts.ANOTHER_PLACE}, 2)
+    assert [evidence.was_filter_doubted(k) for k in (1, 2)] == [False, True]
 
 
 def test_a_track_that_a_target_never_explained_ends_and_one_that_it_did_goes_on():
@@ -177,7 +177,7 @@ def test_published_doubts_are_listed_in_one_order_and_each_has_a_meaning():
     names = [value for name, value in vars(doubts).items()
              if name.isupper() and isinstance(value, str)]
     assert sorted(names) == sorted(doubts.MEANINGS)
-    assert doubts.listed({doubts.HEIGHT, doubts.ANOTHER_PLACE}) == ('another_place', 'height')
+    assert doubts.ordered({doubts.HEIGHT, doubts.ANOTHER_PLACE}) == ('another_place', 'height')
 
 
 def test_a_passing_doubt_lasts_for_a_tenth_of_a_second():
@@ -191,8 +191,8 @@ def test_a_passing_doubt_lasts_for_a_tenth_of_a_second():
     assert evidence.note(set(), NS + round(0.24 * NS)) == {doubts.OVERFIT}
     assert evidence.note(set(), NS + round(0.32 * NS)) == set()
     # The smoothed poses are doubted where the doubt was found.
-    assert not evidence.doubted_filter(NS + round(0.32 * NS))
-    assert evidence.doubted_filter(NS + round(0.16 * NS))
+    assert not evidence.was_filter_doubted(NS + round(0.32 * NS))
+    assert evidence.was_filter_doubted(NS + round(0.16 * NS))
 
 
 def test_poses_before_a_doubt_are_doubted_when_they_are_smoothed():
@@ -201,9 +201,9 @@ def test_poses_before_a_doubt_are_doubted_when_they_are_smoothed():
     evidence.doubt_for(doubts.ANOTHER_VEHICLE, 5 * NS, 3.0, since_ns=3 * NS)
     assert doubts.ANOTHER_VEHICLE in evidence.note(set(), 7 * NS)
     assert doubts.ANOTHER_VEHICLE not in evidence.note(set(), 9 * NS)
-    assert [evidence.doubted_filter(t * NS) for t in (2, 3, 5, 7, 9)] == [
+    assert [evidence.was_filter_doubted(t * NS) for t in (2, 3, 5, 7, 9)] == [
         False, True, True, True, False]
     # One that only may be another from now on.
     evidence = TrackEvidence(2)
     evidence.doubt_for(doubts.ANOTHER_VEHICLE, 5 * NS, 3.0)
-    assert not any(evidence.doubted_filter(t * NS) for t in range(10))
+    assert not any(evidence.was_filter_doubted(t * NS) for t in range(10))

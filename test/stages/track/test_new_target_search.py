@@ -9,15 +9,15 @@ import pytest
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import SmoothedPose, Track
-from mag_tracking.stages.track.joint import SURE_NATS, Joint
-from mag_tracking.stages.track.member import in_order
+from mag_tracking.stages.track.joint import CONFIDENT_NATS, Joint
+from mag_tracking.stages.track.member import members_in_order
 from mag_tracking.stages.track.new_target_evidence import (
-    AGAIN_NATS,
-    AGAIN_S,
-    LONG,
-    LONG_AGAIN_S,
-    MIN_NATS,
-    ODD,
+    ACCEPT_NATS,
+    IMPROBABLE,
+    LONG_INTERVAL_S,
+    LONG_VEHICLE,
+    MIN_INTERVAL_S,
+    REPEATED_NATS,
     NewTargetEvidence,
 )
 from mag_tracking.stages.track.window_start import in_order_of, inserted, overlap_depth
@@ -45,23 +45,23 @@ def test_innovations_as_they_should_be_ask_for_nobody():
 @pytest.mark.parametrize('given', [{'nis': 30.0}, {'nis': 1.0, 'rejected': True}])
 def test_improbable_innovations_and_rejected_sensors_ask_for_a_newcomer(given):
     found = asked(**given)
-    assert {reason for _, reason in found} == {ODD}
+    assert {reason for _, reason in found} == {IMPROBABLE}
     # Not in every frame: a search takes longer than a frame.
-    assert np.diff([k for k, _ in found]).min() * PERIOD >= AGAIN_S * NS
+    assert np.diff([k for k, _ in found]).min() * PERIOD >= MIN_INTERVAL_S * NS
 
 
 def test_a_long_vehicle_is_compared_less_and_less_often():
     found = asked(6.0, n=60, is_long=True)
-    assert {reason for _, reason in found} == {LONG}
+    assert {reason for _, reason in found} == {LONG_VEHICLE}
     waits = np.diff([k for k, _ in found]) * PERIOD / NS
-    assert waits[0] >= LONG_AGAIN_S and (np.diff(waits) > 0.0).all()
+    assert waits[0] >= LONG_INTERVAL_S and (np.diff(waits) > 0.0).all()
 
 
 def test_what_is_less_probable_is_believed_the_second_time():
-    evidence, between = NewTargetEvidence(), 0.5 * (AGAIN_NATS + MIN_NATS)
-    assert evidence.believes(MIN_NATS + 0.1)
-    assert [evidence.believes(odds) for odds in (between, between)] == [False, True]
-    assert [evidence.believes(odds) for odds in (between, 0.0, between)] == [False] * 3
+    evidence, between = NewTargetEvidence(), 0.5 * (REPEATED_NATS + ACCEPT_NATS)
+    assert evidence.accepts(ACCEPT_NATS + 0.1)
+    assert [evidence.accepts(odds) for odds in (between, between)] == [False, True]
+    assert [evidence.accepts(odds) for odds in (between, 0.0, between)] == [False] * 3
 
 
 def joint_of(velocities, odds, replaced=None, adds=True):
@@ -76,7 +76,8 @@ def joint_of(velocities, odds, replaced=None, adds=True):
 
 
 @pytest.mark.parametrize('odds, replaced, doubted', [
-    (SURE_NATS - 1.0, None, (0, 1)), (SURE_NATS + 1.0, None, ()), (SURE_NATS + 1.0, 0, (0, 1))])
+    (CONFIDENT_NATS - 1.0, None, (0, 1)), (CONFIDENT_NATS + 1.0, None, ()),
+    (CONFIDENT_NATS + 1.0, 0, (0, 1))])
 def test_weak_explanations_are_doubted_and_strong_ones_of_two_in_place_of_one(
         odds, replaced, doubted):
     """The two go the same way."""
@@ -284,5 +285,5 @@ def test_of_two_in_place_of_one_that_is_it_which_was_where_it_was(is_first):
             frames=[SimpleNamespace(stamp_ns=k) for k in range(3)])
 
     other, old, new = object(), Known(), object()
-    order = in_order([other, old], new, Found, 2)
+    order = members_in_order([other, old], new, Found, 2)
     assert order == ([other, old, new] if is_first else [other, new, old])

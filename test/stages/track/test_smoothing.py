@@ -369,7 +369,7 @@ def test_a_track_that_was_lost_is_smoothed_with_a_doubt():
     first = next(k for k, f in enumerate(frames) if f.target_present)
     stage = TrackManager(network, settings_for('vehicle').track)
     out = spiked(stage, frames, first + 15, 1e-4, n=2)
-    assert stage.counts['tracks ended: lost its target'] == 1
+    assert stage.counts['tracks ended: target lost'] == 1
     smoothed = [r for r in out if isinstance(r, SmoothedPose)]
     assert smoothed and all(r.ambiguous for r in smoothed)
 

@@ -19,7 +19,7 @@ from support.networks import line_network
 from support.samples import one, simulate
 from support.track_runs import drive, magnet_frames
 
-OVERFITS = 'poses in doubt: the filter fits better than its path'
+OVERFITS = 'poses doubted: the filter fits better than its path'
 
 
 def test_a_matched_target_is_tracked_inside_its_covariance():
