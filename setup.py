@@ -1,10 +1,13 @@
 import os
 from glob import glob
+from xml.etree import ElementTree
 
 from pybind11.setup_helpers import Pybind11Extension
 from setuptools import Distribution, find_packages, setup
 
 NAME = 'mag_tracking'
+# Version, description and licence stand in package.xml, where ROS tools expect them.
+PACKAGE = ElementTree.parse('package.xml').getroot()
 NODES = ('driver_node', 'replay_node', 'calibration_node', 'detection_node', 'tracker_node')
 
 class DataFilesDistribution(Distribution):
@@ -27,10 +30,10 @@ CORES = [
 setup(
     name=NAME,
     distclass=DataFilesDistribution,
-    version='0.1.0',
-    description='Detects and tracks magnetic targets with a network of magnetometers',
+    version=PACKAGE.findtext('version'),
+    description=PACKAGE.findtext('description'),
     author='The mag_tracking authors',
-    license='Apache-2.0',
+    license=PACKAGE.findtext('license'),
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     ext_modules=CORES,
@@ -77,6 +80,16 @@ setup(
         'classes': ['scikit-learn'],
         'pandas': ['pandas'],
         'rerun': ['rerun-sdk'],
+        'docs': [
+            'furo',
+            'myst-parser',
+            'numpydoc',
+            'pandas',
+            'sphinx',
+            'sphinx-copybutton',
+            'sphinx-design',
+            'sphinx-gallery',
+        ],
         # `colcon test` runs pytest only where the extra "test" names it.
         'test': [
             # Drivers for CircuitPython, as users have them.

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
@@ -82,7 +83,7 @@ class CMakeBuild(build_ext):
 
 setup(
     name=NAME,
-    version='0.1.0',
+    version=ElementTree.parse(SOURCE / 'package.xml').findtext('version'),
     description='ROS 2 messages and services of mag_tracking',
     author='The mag_tracking authors',
     license='Apache-2.0',

@@ -1,0 +1,100 @@
+"""The documentation site: builds without warnings, runs its examples, has no broken link."""
+
+import os
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from urllib.parse import unquote, urlsplit
+
+import pytest
+
+from support.bundled import ROOT
+
+BUILD_S = 900.0
+"""[s] Time limit of a build on a machine that is four times slower."""
+PAGES = ('index', 'getting_started', 'benchmarks', 'limitations', 'changelog', 'gallery/index',
+         'guides/own_recording', 'concepts/uncertainty', 'reference/command_line',
+         'reference/topics', 'reference/python/interface', 'contributing/extending')
+
+
+def sphinx(builder, source, out, *options):
+    """Run a builder; every warning is an error."""
+    done = subprocess.run(
+        [sys.executable, '-m', 'sphinx', '-W', '--keep-going', '-q', '-b', builder, *options,
+         str(source), str(out)], capture_output=True, text=True, timeout=BUILD_S, check=False,
+        cwd=ROOT, env=os.environ | {'OPENBLAS_NUM_THREADS': '1', 'ROS_DOMAIN_ID': '99'})
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-8000:]
+    return out
+
+
+class Page(HTMLParser):
+    """Links and anchors of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.links, self.anchors = [], set()
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        for name, value in attributes:
+            if name in ('href', 'src') and value:
+                self.links.append(value)
+            elif name in ('id', 'name') and value:
+                self.anchors.add(value)
+
+
+@pytest.fixture(scope='module')
+def site(tmp_path_factory):
+    return sphinx('html', ROOT / 'docs', tmp_path_factory.mktemp('site') / 'html')
+
+
+@pytest.mark.timeout(BUILD_S)
+def test_the_site_builds_without_a_warning(site):
+    assert [page for page in PAGES if not (site / f'{page}.html').is_file()] == []
+    examples = {p.stem for p in (ROOT / 'examples' / 'gallery').glob('plot_*.py')}
+    assert {p.stem for p in (site / 'gallery').glob('plot_*.html')} == examples
+    drawn = {re.sub(r'sphx_glr_(.+)_\d+\.png', r'\1', p.name)
+             for p in (site / '_images').glob('sphx_glr_*_0*.png')}
+    assert examples - drawn == set()
+
+
+@pytest.mark.timeout(BUILD_S)
+def test_every_internal_link_leads_to_a_page_and_an_anchor(site):
+    pages = {path: Page(path.read_text(encoding='utf-8')) for path in site.rglob('*.html')}
+    broken, n = [], 0
+    for path, page in pages.items():
+        for link in page.links:
+            parts = urlsplit(link)
+            if parts.scheme or parts.netloc or link.startswith(('#', 'data:')) and link == '#':
+                continue
+            target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            anchor = unquote(parts.fragment)
+            n += 1
+            if not target.exists() or anchor and target in pages \
+                    and anchor not in pages[target].anchors:
+                broken.append((str(path.relative_to(site)), link))
+    assert n > 1000 and broken == []
+
+
+@pytest.mark.timeout(BUILD_S)
+def test_examples_in_the_text_print_what_they_say(site, tmp_path):
+    """After the build of the site, whose generated pages and doctrees are not made again."""
+    sphinx('doctest', ROOT / 'docs', tmp_path, '-d', str(site / '.doctrees'), '-D',
+           'plot_gallery=0')
+    text = (tmp_path / 'output.txt').read_text(encoding='utf-8')
+    n, = re.findall(r'(\d+) tests?\n', text)[:1]
+    assert int(n) >= 3 and ' 0 failures in tests' in text
+
+
+def test_every_figure_in_the_text_is_one_of_the_benchmarks():
+    """A number that is not generated would grow old: text has no percentages of its own."""
+    typed = []
+    for path in [ROOT / 'README.md', *(ROOT / 'docs').glob('*.md'),
+                 *(ROOT / 'docs' / 'concepts').glob('*.md')]:
+        if path.name in ('benchmarks.md', 'changelog.md'):
+            continue
+        text = re.sub(r'\{\{.*?\}\}|`[^`]*`', '', path.read_text(encoding='utf-8'), flags=re.S)
+        typed += [(path.name, found) for found in re.findall(r'\d[\d.,]* %', text)
+                  if found != '90 %']  # The ellipses of the maps.
+    assert typed == []

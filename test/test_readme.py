@@ -1,0 +1,70 @@
+"""README: its length, its pictures and links, and every command in it."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+from mag_tracking.cli import main
+from support.bundled import ROOT
+
+TEXT = (ROOT / 'README.md').read_text(encoding='utf-8')
+MAX_WORDS = 600
+SHELL = re.findall(r'^\$ (.+)$', TEXT, re.M)
+PYTHON, = re.findall(r'```python\n(.+?)```', TEXT, re.S)
+
+
+def recipe(target):
+    """The commands that `make` would run, without the set-up."""
+    done = subprocess.run(['make', '-n', target], cwd=ROOT, capture_output=True, text=True,
+                          check=True)
+    return done.stdout
+
+
+def test_it_is_short_and_has_two_pictures():
+    assert len(TEXT.split()) <= MAX_WORDS
+    pictures = re.findall(r'!\[.+?\]\((.+?)\)', TEXT)
+    assert len(pictures) == 2 and all((ROOT / p).is_file() for p in pictures)
+
+
+def test_its_links_lead_to_files():
+    links = re.findall(r'\]\(((?!http)[^)]+)\)', TEXT)
+    assert len(links) > 8 and [link for link in links if not (ROOT / link).exists()] == []
+
+
+def test_every_command_is_known_here():
+    """A new command in README needs a test."""
+    assert [line for line in SHELL if not line.startswith('mag-tracking ')] == [
+        '. .venv/bin/activate']
+    assert re.findall(r'^    (make \w+)', TEXT, re.M) == ['make demo', 'make test']
+    assert set(re.findall(r'`(make \w+)`', TEXT)) == {'make docs'}
+    assert set(re.findall(r'`(mag-tracking [^`]+)`', TEXT)) == {
+        'mag-tracking run --network network.yaml --drivers drivers.yaml'}
+
+
+def test_make_demo_runs_the_demonstration():
+    """`test/cli/test_cli.py` runs the script."""
+    assert 'examples/demo.py --out out/demo' in recipe('demo')
+
+
+def test_make_test_runs_pytest_and_docs_builds_the_site():
+    assert 'pytest' in recipe('test') and 'sphinx' in recipe('docs')
+
+
+@pytest.mark.parametrize('line', [line for line in SHELL if line.startswith('mag-tracking ')])
+def test_commands_run(line, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    words = [str(tmp_path) if word.startswith('out/') else word for word in line.split()[1:]]
+    assert main(words) == 0 and capsys.readouterr().out
+    assert '--out' not in words or (tmp_path / 'report.html').is_file()
+
+
+def test_python_runs(tmp_path):
+    """From the root of the project, as it is written there."""
+    assert len(PYTHON.split('\n\n')[1].strip().splitlines()) + 1 <= 5
+    code = PYTHON.replace("'map.png'", repr(str(tmp_path / 'map.png')))
+    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True,
+                          check=False)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / 'map.png').stat().st_size > 10_000

@@ -1,0 +1,52 @@
+"""Version, licence and description stand once and agree everywhere."""
+
+import re
+from importlib.metadata import metadata, version
+from xml.etree import ElementTree
+
+import yaml
+
+import mag_tracking
+from support.bundled import ROOT
+
+PACKAGE = ElementTree.parse(ROOT / 'package.xml').getroot()
+MESSAGES = ElementTree.parse(ROOT / 'msg_defs' / 'package.xml').getroot()
+VERSION = PACKAGE.findtext('version')
+
+
+def test_the_version_is_that_of_package_xml():
+    assert re.fullmatch(r'\d+\.\d+\.\d+', VERSION)
+    assert mag_tracking.__version__ == version('mag_tracking') == VERSION
+    assert MESSAGES.findtext('version') == version('mag_tracking_msgs') == VERSION
+    for path in (ROOT / 'setup.py', ROOT / 'msg_defs' / 'setup.py',
+                 ROOT / 'mag_tracking' / '__init__.py'):
+        assert VERSION not in path.read_text(encoding='utf-8')
+
+
+def test_the_changelog_has_the_version():
+    text = (ROOT / 'CHANGELOG.md').read_text(encoding='utf-8')
+    assert re.findall(r'^## \[(.+?)\]', text, re.M)[:2] == ['Unreleased', VERSION]
+
+
+def test_licence_and_description_agree():
+    wheel = metadata('mag_tracking')
+    citation = yaml.safe_load((ROOT / 'CITATION.cff').read_text(encoding='utf-8'))
+    licence = PACKAGE.findtext('license')
+    assert licence == MESSAGES.findtext('license') == citation['license'] == 'Apache-2.0'
+    assert licence in (wheel['License'], wheel['License-Expression'])
+    assert 'Apache License' in (ROOT / 'LICENSE').read_text(encoding='utf-8')
+    assert wheel['Summary'].rstrip('.') == ' '.join(PACKAGE.findtext('description').split()
+                                                    ).rstrip('.')
+    assert citation['version'] == VERSION and citation['title'] == PACKAGE.findtext('name')
+
+
+def test_dependencies_of_package_xml_are_those_of_the_wheel():
+    """`python3-X` of apt is X of PyPI; what apt lacks is named in a comment there."""
+    text = (ROOT / 'package.xml').read_text(encoding='utf-8')
+    names = {'python3-serial': 'pyserial', 'python3-yaml': 'PyYAML'}
+    stated = {names.get(e.text, e.text.removeprefix('python3-')).lower()
+              for e in PACKAGE.iter('exec_depend') if e.text.startswith('python3-')}
+    needed = {re.match(r'[\w-]+', r).group().lower()
+              for r in metadata('mag_tracking').get_all('Requires-Dist') if 'extra ==' not in r}
+    assert stated <= needed
+    assert [n for n in needed - stated if n not in text.lower()] == []
