@@ -178,7 +178,7 @@ def test_faults_of_a_calibration_are_named(tmp_path, old, new, message):
 
 
 @pytest.mark.parametrize('old, new, message', [
-    ('  b:', '  a:', 'a is there twice'),
+    ('  b:', '  a:', 'duplicate key a'),
     ('/other/mag', '/a/imu/mag', 'topic /a/imu/mag is that of two sensors'),
     ('/other/mag', '~/other', 'not a ROS topic'),
     ('position: [0, -4.5, 0]', 'position: [0, -4.5]', 'sensor a: position: expected 3'),
@@ -194,7 +194,7 @@ def test_faults_of_a_calibration_are_named(tmp_path, old, new, message):
     ('0.7071067811865476, 0.7', '0.1, 0.7', 'needs norm 1'),
     ('[2.0e-6, 1.55e-5, -4.9e-5]', '[0.02, 0.155, -0.49]', 'microtesla or gauss'),
     ('frame: map', 'fram: map', 'unknown key'),
-    ('frame: map', 'frame: [', 'not YAML'),
+    ('frame: map', 'frame: [', 'not valid YAML'),
     ('frame: map', 'frame: "a b"', 'frame: expected a name'),
     ('  b:', '  b/c:', "'b/c' is no name for a sensor"),
     ('  b:', '  "\\ud800":', r"'\\ud800' is no name for a sensor"),

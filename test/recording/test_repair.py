@@ -154,6 +154,6 @@ def test_repair_names_a_topic_whose_qos_is_not_yaml(tmp_path, qos):
         writer.register_channel('/x', 'cdr', schema, {'offered_qos_profiles': qos})
         writer.add_message(1, 1, b'\0\1\0\0', 1)
         writer.finish()
-    with pytest.raises(RecordingError, match='offered_qos_profiles of /x is not YAML'):
+    with pytest.raises(RecordingError, match='offered_qos_profiles of /x is not valid YAML'):
         repair(tmp_path)
     assert not (tmp_path / 'metadata.yaml').exists()
