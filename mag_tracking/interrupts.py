@@ -31,12 +31,12 @@ def recorded_signals(*signals: signal.Signals) -> Iterator[list[int]]:
     """
     seen: list[int] = []
 
-    def record(signum: int, _: FrameType | None) -> None:
+    def note(signum: int, _: FrameType | None) -> None:
         seen.append(signum)
         if len(seen) > 2:
             raise KeyboardInterrupt
 
-    with _handler_installed(record, signals):
+    with _handler_installed(note, signals):
         yield seen
 
 

@@ -125,7 +125,7 @@ class TrackEvidence:
             self.doubt(doubts.NOT_SEEN_APPROACHING)
         # The range of a single sensor's target is what the settings say, and that of a vehicle near
         # a few sensors at one place what the model leaves out of its field.
-        if len(network) == 1 or network.is_close and not starts_anywhere:
+        if len(network) == 1 or network.is_compact and not starts_anywhere:
             self.doubt(doubts.SENSORS_AT_ONE_PLACE)
 
     def doubt_for(self, reason: str, stamp_ns: int, seconds: float,
