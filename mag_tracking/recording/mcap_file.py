@@ -18,7 +18,7 @@ from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.self_described import type_of
 from mag_tracking.recording import core
-from mag_tracking.recording.damage import DAMAGE
+from mag_tracking.recording.decode_errors import DECODE_ERRORS
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.message_block import ChannelKind, MessageBlock
 from mag_tracking.units import LATEST_NS
@@ -57,7 +57,7 @@ class McapFile:
             stream.seek(0)
             try:
                 summary = make_reader(stream).get_summary()
-            except DAMAGE:
+            except DECODE_ERRORS:
                 summary = None
         if summary is None:
             self._losses[f'{file.name} has no usable end (cut off?): read up to the damage'] = 1
@@ -107,7 +107,7 @@ class McapFile:
                 if not isinstance(chunk, Chunk):
                     raise ValueError('no chunk where the index says')
                 waiting = waiting.merged(channels.block_of(chunk))
-            except DAMAGE as error:
+            except DECODE_ERRORS as error:
                 self._lose_chunk(entry, error)
             if progress:
                 progress(entry.chunk_length)
@@ -136,7 +136,7 @@ class McapFile:
                     yield from loose.taken(channels)
                     try:
                         yield channels.block_of(record)
-                    except DAMAGE as error:
+                    except DECODE_ERRORS as error:
                         self._losses[f'a damaged chunk ({type(error).__name__})'] += 1
                 elif isinstance(record, Schema | Channel):
                     channels.add(record)
@@ -149,7 +149,7 @@ class McapFile:
                     progress(here - done)
                     done = here
             yield from loose.taken(channels)
-        except DAMAGE as error:
+        except DECODE_ERRORS as error:
             yield from loose.taken(channels)
             self._losses[f'{os.path.basename(stream.name)}: nothing readable after byte '
                         f'{stream.tell()} of {os.fstat(stream.fileno()).st_size} '

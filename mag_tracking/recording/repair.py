@@ -31,7 +31,7 @@ from mcap.summary import Summary
 
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import checked_path, new_binary_file
-from mag_tracking.recording.damage import DAMAGE
+from mag_tracking.recording.decode_errors import DECODE_ERRORS
 from mag_tracking.recording.rosbag2_folder import FileSummary, Topic, WholeStream, write_metadata
 
 _MAGIC = b'\x89MCAP0\r\n'
@@ -57,7 +57,7 @@ class _Scan:
                     break
                 self._take(record, stream.tell())
                 self.end = stream.tell()
-        except DAMAGE:
+        except DECODE_ERRORS:
             pass
         self._remade = b''
         if self._lacks_index():
@@ -76,7 +76,7 @@ class _Scan:
                 self._drop_index()
             try:
                 self._take_chunk(record, end)
-            except DAMAGE:
+            except DECODE_ERRORS:
                 self.damaged += 1
         elif isinstance(record, MessageIndex) and self.chunks:
             index, length = self.chunks[-1], 15 + 16 * len(record.records)
@@ -156,7 +156,7 @@ def _summary(stream: BinaryIO) -> Summary | None:
     stream.seek(0)
     try:
         return make_reader(stream).get_summary()
-    except DAMAGE:
+    except DECODE_ERRORS:
         return None
 
 
