@@ -79,7 +79,7 @@ class Readings:
     def __len__(self) -> int:
         return len(self.sensor)
 
-    def without_covariance(self) -> BoolArray:
+    def has_unknown_covariance(self) -> BoolArray:
         """Whether the covariance of each reading is unknown.
 
         Returns
