@@ -82,12 +82,12 @@ def test_poses_are_taken_in_blocks_and_put_in_order_of_their_stamps():
         message('/ground_truth/car/pose', 30), message('/ground_truth/car/pose', 20),
         message('/ground_truth/car/pose', 10, 'utm'), message('/elsewhere', 40),
         message('/ground_truth/truck/pose', 50)])
-    assert sorted(topics.take(block).tolist()) == [0, 1, 4]
+    assert sorted(topics.add_block(block).tolist()) == [0, 1, 4]
     coded = MessageBlock(block.data, {n: kind._replace(is_cdr=False)
                                       for n, kind in block.kinds.items()}, block.channel,
                          block.log_time_ns, block.begin, block.end)
-    assert not len(topics.take(coded))
-    assert not len(topics.take(block.part(slice(0, 0))))
+    assert not len(topics.add_block(coded))
+    assert not len(topics.add_block(block.part(slice(0, 0))))
     arrays = topics.arrays()
     assert list(arrays) == ['car', 'truck']
     stamps, position, _ = arrays['car']
