@@ -138,7 +138,8 @@ class Pipeline:
 
         Returns
         -------
-        list of FieldFrame, Detection, Track and the other `Output` records
+        list of Output
+            Frames, detections, tracks and further records, in order of processing.
         """
         calibrated = self._calibrate.feed(readings)
         self.track.doubt(self.calibrate.doubtful_intervals())

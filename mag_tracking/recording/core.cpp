@@ -12,8 +12,8 @@ namespace mag_tracking {
 namespace {
 
 constexpr std::uint8_t SCHEMA = 3, CHANNEL = 4, MESSAGE = 5;
-// A record begins with opcode and length. The data of a message follow its channel, sequence number,
-// log time and publish time.
+// A record begins with opcode and length. Message data follow channel, sequence number, log time
+// and publish time.
 constexpr std::size_t RECORD_HEADER = 9, MESSAGE_HEADER = 22;
 
 // MCAP is little-endian.

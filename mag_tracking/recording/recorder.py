@@ -259,7 +259,7 @@ class Recorder:
         """Report that messages are written again, after the first of them."""
         if self._failing and self._file and self._file.counts:
             self._failing = False
-            self._report(f'writing again; dropped so far: {self.dropped.total()}')
+            self._report(f'recording resumed; messages dropped so far: {self.dropped.total()}')
 
     def _open(self, log_ns: int = 0) -> None:
         """Begin the next file; raises OSError and leaves no file if that fails."""

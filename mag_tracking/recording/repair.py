@@ -130,7 +130,7 @@ class _Scan:
         self.chunks[-1].message_index_length = 0
 
     def _rebuild_index(self) -> None:
-        """Rebuild the indexes of the last chunk, which must directly follow it."""
+        """Rebuild the indexes of the last chunk; their place is directly after the chunk."""
         self._drop_index()
         chunk, builder = self.chunks[-1], RecordBuilder()
         self.end = chunk.chunk_start_offset + chunk.chunk_length

@@ -75,7 +75,7 @@ class SampleReader:
             poses = sorted(t for t, kind in recording.types.items() if kind in TRUTH_TYPES)
             raise RecordingError(f'{recording.path}: the truth topic {truth} is '
                                  f'{recording.types.get(truth, "not in the recording")}; '
-                                 f'topics with poses: {", ".join(poses) or "none at all"}')
+                                 f'topics with poses: {", ".join(poses) or "none found"}')
         self.rejected: Counter[str] = Counter()
         self._is_batched = recording.types.get(self._batch_topic) == FIELD_READINGS
         if recording.types and not self._is_batched \
@@ -83,7 +83,7 @@ class SampleReader:
             fields = sorted(t for t, k in recording.types.items() if k == MAGNETIC_FIELD)
             raise RecordingError(
                 f'{recording.path} has none of the network\'s topics ({", ".join(self._sensors)}); '
-                f'topics with magnetic fields: {", ".join(fields) or "none at all"}')
+                f'topics with magnetic fields: {", ".join(fields) or "none found"}')
         for topic in self._sensors:
             kind = recording.types.get(topic)
             if kind not in (None, MAGNETIC_FIELD):

@@ -107,7 +107,7 @@ def _by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> li
 
 
 def _unique_value(source: str, column: str, rows: list[tuple[int, dict[str, str]]]) -> str:
-    """Unique value of a column, empty without it; raises LabelsError if there are several."""
+    """Unique value of a column, or empty if it is missing; raises LabelsError for several."""
     values = sorted({cells.get(column, '').strip() for _, cells in rows})
     if len(values) > 1:
         raise LabelsError(f'{source} has several values of {column}: {", ".join(values)}')
@@ -306,7 +306,7 @@ def _check_model(model: SignatureModel) -> None:
     for name, shape in shapes.items():
         values = getattr(model, name)
         if values.shape != shape or not np.isfinite(values).all():
-            raise ValueError(f'{name}: expected {shape} finite numbers')
+            raise ValueError(f'{name}: expected finite numbers of shape {shape}')
     if k < 2 or k < len(model.classes) or not n:
         raise ValueError('classes: expected at least two different names')
     for name in ('temperature', 'limit'):
