@@ -1,6 +1,6 @@
 """Tracks and poses of magnetic targets from a network of stationary magnetometers.
 
-The names below are the public interface for Python; docs/api.md shows them at work:
+The names below are the public Python interface; docs/api.md has examples:
 
     import mag_tracking as mt
 
@@ -46,8 +46,8 @@ __all__ = [
     'TrafficResult', 'UnknownTrackError', 'events', 'fit', 'plan', 'read_network',
     'read_parameter_file', 'read_recording', 'readings_from_arrays', 'track', 'traffic']
 
-# The modules of the names above, imported on first use: `import mag_tracking` is done by every
-# command and node at once, and compiled code and the figures take seconds.
+# Modules of the names above. They are imported on first use, because every command and node imports
+# `mag_tracking` at its start, and the compiled code and the figures take seconds to load.
 _MODULES = {
     'analysis.placement': ('PlannedTarget', 'Sampling'),
     'apps.events': ('EventsResult', 'events'),
@@ -67,9 +67,9 @@ _MODULES = {
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 
-if not TYPE_CHECKING:  # A type checker knows the names above, and reports all others.
+if not TYPE_CHECKING:  # A type checker uses the imports above and reports all other names.
     def __getattr__(name: str) -> object:
-        """A public name, imported on first use (PEP 562)."""
+        """Import a public name on first use (PEP 562)."""
         if name not in _MODULE_OF:
             raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
         module = importlib.import_module(f'{__name__}.{_MODULE_OF[name]}')
@@ -78,5 +78,5 @@ if not TYPE_CHECKING:  # A type checker knows the names above, and reports all o
 
 
 def __dir__() -> list[str]:
-    """The public names, imported or not."""
+    """Return the public names, imported or not."""
     return sorted({*globals(), *__all__})

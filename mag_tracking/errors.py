@@ -1,8 +1,8 @@
-"""The errors that a caller can act on; each message names the thing, the value and the bound."""
+"""Exceptions that a caller can act on. Each message names the object, the value and the bound."""
 
 
 class MagTrackingError(Exception):
-    """Base of all errors that this package raises on purpose."""
+    """Base class of all exceptions that this package raises deliberately."""
 
 
 class SettingsError(MagTrackingError):
@@ -14,15 +14,15 @@ class NetworkError(MagTrackingError):
 
 
 class RecordingError(MagTrackingError):
-    """A recording cannot be read, or does not hold what is needed."""
+    """A recording cannot be read, or lacks required data."""
 
 
 class OutputError(MagTrackingError):
-    """A result cannot be written where it was asked for."""
+    """A result cannot be written to the requested location."""
 
 
 class DeviceError(MagTrackingError):
-    """A device cannot be opened or read: a port, a socket, a broker or a bus."""
+    """A device (port, socket, broker or bus) cannot be opened or read."""
 
 
 class ReadingsError(MagTrackingError, ValueError):
@@ -38,12 +38,12 @@ class MissingDependencyError(MagTrackingError, ImportError):
 
 
 class GraphError(MagTrackingError):
-    """A topic, service or node of the ROS graph is missing, refuses, or does not answer."""
+    """A topic, service or node of the ROS graph is missing, rejects a request, or times out."""
 
 
 class ClusterError(MagTrackingError):
-    """A Dask scheduler does not answer, has no worker, or is gone."""
+    """A Dask scheduler does not respond, has no worker, or has disconnected."""
 
 
 class LabelsError(MagTrackingError):
-    """Labelled examples are missing, overlap, or are too few to learn from."""
+    """Labelled examples are missing, overlap, or are too few for training."""

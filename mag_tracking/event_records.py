@@ -1,112 +1,122 @@
-"""Event records: passes described by one sensor, disturbances, vehicles that crossed a line."""
+"""Event records: passes of a single sensor, disturbances, vehicles that crossed a counting line."""
 
 from dataclasses import dataclass
 
 from mag_tracking.arrays import FloatArray
 
 SIGNATURE_SPAN = 4.0
-"""[time scales] A signature reaches so far to both sides of the closest point."""
+"""A signature extends this many time scales to either side of the closest point."""
 
 
 @dataclass(frozen=True, slots=True)
 class PassEvent:
-    """A pass described by one sensor alone, which cannot observe the scale."""
+    """A pass described by a single sensor, for which the spatial scale is unobservable."""
 
     sensor: str
+    """Name of the sensor."""
     number: int
-    """Counts the events of this sensor, from 1."""
+    """Number of the event of this sensor, from 1."""
     ended: bool
-    """The target was gone again; else the readings ended before."""
+    """True if the target left. False if the readings ended first."""
     onset_ns: int
+    """Time of the onset, ns since 1970."""
     release_ns: int
-    """The last time at which it was loud."""
+    """Last time at which the target was detected, without the hold time, ns since 1970."""
     peak_ns: int
+    """Time of `peak`, ns since 1970."""
     peak: FloatArray
-    """(3,) [T] largest field, sensor frame; NaN = missing axis."""
+    """Largest field, (3,) T, sensor frame. NaN = missing axis."""
     energy: float
-    """[T^2 s] from onset to release, over all axes."""
+    """Energy of the field from onset to release, summed over all axes, T² s."""
     axes: str
-    """Those that were measured, such as 'xy'."""
+    """Measured axes, such as 'xy'."""
     noise_std: FloatArray
-    """(3,) [T] of one reading."""
+    """Standard deviation of one reading, (3,) T, sensor frame."""
     closest_ns: int
-    """Time of the closest point, if the target was a dipole on a straight line."""
+    """Time of the closest point of approach of a dipole on a straight line, ns since 1970."""
     closest_std: float
-    """[s] of it; inf where the field does not tell."""
+    """Standard deviation of `closest_ns`, s. inf if unobservable."""
     time_scale: float
-    """[s] range at the closest point over the speed; NaN where the field does not tell."""
+    """Range at the closest point divided by the speed, s. NaN if unobservable."""
     left_to_right: float
-    """Probability that it moved from left to right, seen from the sensor towards the target; 0.5
-    without two horizontal axes."""
+    """Probability of motion from left to right, seen from the sensor towards the target. 0.5 if
+    unknown, for example without two horizontal axes."""
     signature: FloatArray
-    """(33, 3) [T] field, at equal steps from -4 to 4 time scales about the closest point."""
+    """Field at equal steps from -4 to 4 time scales about the closest point, (33, 3) T, sensor
+    frame. NaN outside of the readings."""
 
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
-    """A field that something else than a target explains better, from its onset on."""
+    """A field that something other than a target explains better, from its onset on."""
 
     stamp_ns: int
-    """The latest time that is known of it."""
+    """Time of the latest information about it, ns since 1970."""
     id: int
-    """Counts the disturbances, from 1."""
+    """Number of the disturbance, from 1."""
     ended: bool
-    """The network was quiet again, or the frames ended; else it goes on."""
+    """True if the network is quiet again or the frames have ended. False while it continues."""
     begin_ns: int
+    """Time of its beginning, ns since 1970."""
     largest: float
-    """[T] Size of the largest field at a sensor."""
+    """Magnitude of the largest field at any sensor, T."""
     sensors: tuple[str, ...]
-    """Those that felt it, the strongest first."""
+    """Names of the affected sensors, the strongest first."""
     uniform: float
-    """Probability that one field over the network made it, and not one at each sensor."""
+    """Probability that a single field across the network caused it, rather than a separate field at
+    each sensor."""
     track_id: int
-    """The latest track that it made ambiguous."""
+    """Number of the latest track that it made ambiguous."""
 
 
 @dataclass(frozen=True, slots=True)
 class VehiclePassage:
-    """A vehicle that crossed a counting line, from its whole track."""
+    """A vehicle that crossed a counting line, estimated from its whole track."""
 
     stamp_ns: int
-    """When its middle was on the line."""
+    """Time at which the middle of the vehicle was on the line, ns since 1970."""
     number: int
-    """Counts the passages of all lines, from 1, in order of time."""
+    """Number of the passage, from 1, over all lines in order of time."""
     line: str
+    """Name of the counting line."""
     track_id: int
+    """Number of the track."""
     forward: bool
     """Whether it moved in the forward direction of the line."""
     direction_error: float
-    """Probability that the direction is wrong, by the rotation of the field at each sensor beside
-    its path and not by the track; NaN where that tells nothing or another vehicle was near."""
+    """Probability that the direction is wrong. It is derived from the rotation of the field at each
+    sensor beside the path, independently of the track. NaN if the rotation is inconclusive or
+    another vehicle was near."""
     position: FloatArray
-    """(3,) [m] on the line, world."""
+    """Position on the line, (3,) m, world frame."""
     lateral: float
-    """[m] to the left of the line's middle, seen in its forward direction."""
+    """Distance to the left of the middle of the line, seen in its forward direction, m."""
     velocity: FloatArray
-    """(3,) [m/s], world."""
+    """Velocity, (3,) m/s, world frame."""
     speed: float
-    """[m/s], horizontal."""
+    """Horizontal speed, m/s."""
     speed_std: float
+    """Standard deviation of `speed`, m/s."""
     heading_std: float
-    """[rad] of the direction of `velocity`."""
+    """Standard deviation of the direction of `velocity`, rad."""
     length: float
-    """[m] of the row of dipoles that it is taken for; 0 for a point."""
+    """Length of the row of dipoles that models the vehicle, m. 0 for a point target."""
     length_std: float
-    """[m]; 0 for a point."""
+    """Standard deviation of `length`, m. 0 for a point target."""
     moment: FloatArray
-    """(3,) [A m^2], world."""
+    """Magnetic moment, (3,) A m², world frame."""
     moment_covariance: FloatArray
-    """(3, 3)."""
+    """Covariance of `moment`, (3, 3) (A m²)², world frame."""
     vehicle_class: str
-    """The most probable class, or `unknown`."""
+    """Most probable class, or `unknown`."""
     class_probabilities: FloatArray
-    """(n_classes,) in the order of `traffic.class_names`."""
+    """Probability of each class, (n_classes,), in the order of `traffic.class_names`."""
     headway: float
-    """[s] since the passage before in the same direction; NaN of the first one."""
+    """Time since the previous passage in the same direction, s. NaN for the first passage."""
     ambiguous: bool
-    """Whether the track is doubtful at the line."""
+    """Whether the passage is ambiguous: `doubts` is not empty."""
     doubts: tuple[str, ...]
-    """Why: names of `stages.traffic.stage`."""
+    """Reasons why the passage is ambiguous: names from `stages.traffic.stage`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,14 +124,17 @@ class TrafficCount:
     """Vehicles of one direction and class in an interval."""
 
     forward: bool
+    """Whether they moved in the forward direction of the line."""
     vehicle_class: str
+    """Class of the vehicles, or `unknown`."""
     count: int
+    """Number of passages."""
     ambiguous: int
     """Number of ambiguous passages among them."""
     mean_speed: float
-    """[m/s]"""
+    """Mean horizontal speed, m/s."""
     mean_headway: float
-    """[s]; NaN where none is known."""
+    """Mean headway, s. NaN if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,9 +142,12 @@ class TrafficSummary:
     """Traffic across one line in one interval."""
 
     begin_ns: int
+    """Beginning of the interval, ns since 1970."""
     end_ns: int
+    """End of the interval, ns since 1970."""
     line: str
+    """Name of the counting line."""
     observed_s: float
-    """[s] of the interval that are covered by frames."""
+    """Part of the interval that is covered by frames, s."""
     counts: tuple[TrafficCount, ...]
-    """One for each direction and class that was observed."""
+    """One count per observed direction and class."""

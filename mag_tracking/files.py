@@ -1,4 +1,5 @@
-"""Validated paths, and result files created from scratch, never written through a link."""
+"""Validated paths, and result files that are created from scratch and never written through a
+link."""
 
 import os
 import secrets
@@ -10,14 +11,39 @@ from mag_tracking.errors import MagTrackingError, OutputError
 
 
 def checked_path(path: str | PathLike[str], error: type[MagTrackingError]) -> Path:
-    """`path` as a `Path`; raises `error` where no file can have that name."""
+    """Convert a path to a `Path`.
+
+    Parameters
+    ----------
+    path : path_like
+    error : type of MagTrackingError
+        Exception to raise if no file can have this name.
+
+    Returns
+    -------
+    Path
+    """
     if '\0' in fspath(path):
         raise error(f'{fspath(path)!r} is not a valid path: it contains a NUL character')
     return Path(path)
 
 
 def output_folder(path: str | PathLike[str]) -> Path:
-    """A folder for results, made if it does not exist; raises OutputError."""
+    """Create a folder for results if it does not exist.
+
+    Parameters
+    ----------
+    path : path_like
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be created.
+    """
     folder = checked_path(path, OutputError)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -27,28 +53,68 @@ def output_folder(path: str | PathLike[str]) -> Path:
 
 
 def new_text_file(path: str | PathLike[str], newline: str | None = None) -> TextIO:
-    """A new, empty UTF-8 file, open for writing.
+    """Create an empty UTF-8 file and open it for writing.
 
     A file or link of that name is removed first; the target of a link stays untouched. Lone
     surrogates, such as those of a file name that is not UTF-8, are written as `\\udcff`.
 
-    Raises OSError, and OutputError where no file can have that name.
+    Parameters
+    ----------
+    path : path_like
+    newline : str, optional
+        As for `open`.
+
+    Returns
+    -------
+    text stream
+
+    Raises
+    ------
+    OSError
+        If the file cannot be created.
+    OutputError
+        If no file can have this name.
     """
-    return open(_free(path), 'x', newline=newline, encoding='utf-8', errors='backslashreplace')
+    return open(_unlinked_path(path), 'x', newline=newline, encoding='utf-8',
+                errors='backslashreplace')
 
 
 def new_binary_file(path: str | PathLike[str]) -> BinaryIO:
-    """A new, empty file for bytes, created in the same way as a text file."""
-    return open(_free(path), 'xb')
+    """Create an empty binary file and open it for writing, as `new_text_file` does.
+
+    Parameters
+    ----------
+    path : path_like
+
+    Returns
+    -------
+    binary stream
+
+    Raises
+    ------
+    OSError
+        If the file cannot be created.
+    OutputError
+        If no file can have this name.
+    """
+    return open(_unlinked_path(path), 'xb')
 
 
 def replace_text(path: str | PathLike[str], text: str) -> None:
-    """Write a UTF-8 file as a whole: until it is complete, what was there stays.
+    """Write a UTF-8 file atomically: an existing file stays in place until the new one is complete.
 
-    It is written under a fresh name and moved into place, so that no link is written through,
-    neither one of that name nor one that was planted under the temporary name.
+    The text is written under a random name and moved into place. No link is written through,
+    neither one of the final name nor one that was planted under the temporary name.
 
-    Raises OutputError.
+    Parameters
+    ----------
+    path : path_like
+    text : str
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
     """
     path = checked_path(path, OutputError)
     draft = path.parent / f'.{path.name}.{secrets.token_hex(8)}.part'
@@ -56,7 +122,7 @@ def replace_text(path: str | PathLike[str], text: str) -> None:
         with open(draft, 'x', encoding='utf-8', errors='backslashreplace') as stream:
             stream.write(text)
             stream.flush()
-            # Else a power cut might leave an empty file in the place of the old one.
+            # Without this, a power cut could leave an empty file in place of the old one.
             os.fsync(stream.fileno())
         draft.replace(path)
     except OSError as error:
@@ -64,8 +130,8 @@ def replace_text(path: str | PathLike[str], text: str) -> None:
         raise OutputError(f'cannot write {path}: {error.strerror}') from error
 
 
-def _free(path: str | PathLike[str]) -> Path:
-    """The path, unlinked: the exclusive creation that follows would fail on a link."""
+def _unlinked_path(path: str | PathLike[str]) -> Path:
+    """Remove the file or link at `path`, on which an exclusive creation would fail."""
     path = checked_path(path, OutputError)
     path.unlink(missing_ok=True)
     return path

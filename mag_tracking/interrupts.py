@@ -1,6 +1,6 @@
-"""Signals that end a program, taken note of or obeyed at once instead of raised.
+"""Termination signals that are recorded or obeyed at once instead of raising an exception.
 
-Nothing is imported here that takes time: programs come here first.
+Programs import this module first, so it imports nothing that takes time.
 """
 
 import os
@@ -13,13 +13,21 @@ from types import FrameType
 
 @contextmanager
 def recorded_signals(*signals: signal.Signals) -> Iterator[list[int]]:
-    """A list on which each of `signals` that comes is put, to be asked where it is safe to stop.
+    """Record termination signals, so that a program can check them where it is safe to stop.
 
-    Raised in the middle of an update or of a line of a table, it would leave half
-    of it, and a library on the way might swallow it or turn it into an error of its
-    own. The third is raised all the same, as KeyboardInterrupt. A signal that is
-    ignored (SIGINT in a background job) stays so, and outside the main thread,
-    where no handler can be set, the list stays empty.
+    An exception raised in the middle of an update or of a table row would leave half of it, and a
+    library could swallow the exception or convert it. The third signal nevertheless raises
+    KeyboardInterrupt. A signal that is ignored (SIGINT in a background job) remains ignored.
+    Outside the main thread, where no handler can be set, the list stays empty.
+
+    Parameters
+    ----------
+    *signals : signal.Signals
+
+    Yields
+    ------
+    list of int
+        Numbers of the signals received so far.
     """
     seen: list[int] = []
 
@@ -28,18 +36,29 @@ def recorded_signals(*signals: signal.Signals) -> Iterator[list[int]]:
         if len(seen) > 2:
             raise KeyboardInterrupt
 
-    with _handled_by(note, signals):
+    with _handler_installed(note, signals):
         yield seen
 
 
 @contextmanager
 def exit_on_signals(status: int, *signals: signal.Signals, message: str = '') -> Iterator[None]:
-    """End the process at once, with `status` and a `message`, when one of `signals` comes.
+    """End the process at once when one of `signals` arrives.
 
     For the imports at the start of a program, when there is nothing to clean up: an exception
-    raised in the middle of an import may be swallowed, or turned into another one. No buffer is
-    flushed and no `finally` runs. Ignored signals and other threads are handled as in
-    `recorded_signals`.
+    raised in the middle of an import may be swallowed or converted. No buffer is flushed and no
+    `finally` runs. Ignored signals and other threads are handled as in `recorded_signals`.
+
+    Parameters
+    ----------
+    status : int
+        Exit status of the process.
+    *signals : signal.Signals
+    message : str, optional
+        Line to write to standard error.
+
+    Yields
+    ------
+    None
     """
     text = f'{message}\n'.encode() if message else b''
 
@@ -49,14 +68,14 @@ def exit_on_signals(status: int, *signals: signal.Signals, message: str = '') ->
         finally:
             os._exit(status)
 
-    with _handled_by(shut_down, signals):
+    with _handler_installed(shut_down, signals):
         yield
 
 
 @contextmanager
-def _handled_by(handler: Callable[[int, FrameType | None], None],
-                signals: tuple[signal.Signals, ...]) -> Iterator[None]:
-    """Have `handler` called with `signals`, but for those that are ignored."""
+def _handler_installed(handler: Callable[[int, FrameType | None], None],
+                       signals: tuple[signal.Signals, ...]) -> Iterator[None]:
+    """Install `handler` for those `signals` that are not ignored."""
     before = {}
     if threading.current_thread() is threading.main_thread():
         before = {s: signal.getsignal(s) for s in signals}

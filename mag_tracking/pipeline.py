@@ -1,4 +1,4 @@
-"""The settings tree and the one chain of stages, for nodes and offline alike."""
+"""The settings tree and the chain of processing stages, shared by nodes and offline programs."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -27,7 +27,7 @@ from mag_tracking.stages.traffic.stage import TrackedFrame, Traffic
 
 @dataclass(frozen=True)
 class Settings:
-    """All settings, one group a stage."""
+    """All settings, one group per stage."""
 
     calibrate: CalibrateSettings = field(default_factory=CalibrateSettings)
     align: AlignSettings = field(default_factory=AlignSettings)
@@ -61,30 +61,57 @@ TARGET_DEFAULTS: dict[str, dict[str, Any]] = {
         'track.end_std': 0.2,
     },
 }
-"""What differs from the defaults for each target."""
+"""Overrides of the default settings by type of target."""
 
 
 def settings_for(target: str, changes: Mapping[str, Any] | None = None) -> Settings:
-    """Settings of a target with `changes` ({dotted name: value}) on top; raises SettingsError.
+    """Settings of a type of target.
 
-    A `track.target` among the changes has to agree.
+    Parameters
+    ----------
+    target : str
+        Key of `TARGET_DEFAULTS`.
+    changes : mapping of str to setting, optional
+        Values by dotted name, applied on top. A `track.target` among them must equal `target`.
+
+    Returns
+    -------
+    Settings
+
+    Raises
+    ------
+    SettingsError
+        If `target` is unknown or contradicts `changes`, or a change is invalid.
     """
     if target not in TARGET_DEFAULTS:
         raise SettingsError(f'target: expected {" or ".join(TARGET_DEFAULTS)}, got {target!r}')
     changes = dict(changes or {})
     if changes.setdefault('track.target', target) != target:
         raise SettingsError(f'track.target: {changes["track.target"]!r} in the parameters, '
-                            f'but {target!r} was asked for')
+                            f'but the requested target is {target!r}')
     return replace(replace(Settings(), TARGET_DEFAULTS[target]), changes)
 
 
 Output: TypeAlias = (FieldFrame | Detection | Track | SmoothedPose | Disturbance | VehiclePassage
                      | TrafficSummary)
-"""What leaves the chain."""
+"""Records that the pipeline returns."""
 
 
 class Pipeline:
-    """Raw readings in, frames, detections and tracks out; no ROS, no clock."""
+    """Raw readings in; frames, detections and tracks out. Uses neither ROS nor a clock.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    settings : Settings
+
+    Attributes
+    ----------
+    network : SensorNetwork
+    settings : Settings
+    calibrate, align, detect, track, traffic : Stage
+        The stages, in order of processing.
+    """
 
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         self.network = network
@@ -94,7 +121,7 @@ class Pipeline:
         self.detect = Detect(network, settings.detect)
         self.track = TrackManager(network, settings.track)
         self.traffic = Traffic(network, settings.traffic, settings.track.target == 'vehicle')
-        # The same as links of the chain: a type checker compares them with the protocol.
+        # Aliases with protocol types, so that a type checker verifies each stage.
         self._calibrate: Stage[Readings, Readings] = self.calibrate
         self._align: Stage[Readings, FieldFrame] = self.align
         self._detect: Stage[FieldFrame, FieldFrame | Detection] = self.detect
@@ -102,38 +129,52 @@ class Pipeline:
         self._traffic: Stage[TrackedFrame, VehiclePassage | TrafficSummary] = self.traffic
 
     def feed(self, readings: Readings) -> list[Output]:
-        """Raw `Readings` give the `FieldFrame | Detection | Track` records that follow.
+        """Process raw readings.
 
-        They do not depend on how the readings are split into batches.
+        Parameters
+        ----------
+        readings : Readings
+            Raw readings. The outputs do not depend on how they are split into batches.
+
+        Returns
+        -------
+        list of Output
+            Frames, detections, tracks and further records, in order of processing.
         """
         calibrated = self._calibrate.feed(readings)
         self.track.doubt(self.calibrate.doubtful_intervals())
-        return self._after_calibrate(calibrated)
+        return self._process_calibrated(calibrated)
 
     def flush(self) -> list[Output]:
-        """The input has ended: what was still held back."""
-        out = [*self._after_calibrate(self._calibrate.flush()),
-               *self._after_align(self._align.flush()),
-               *self._after_detect(self._detect.flush())]
+        """Process what is still buffered after the end of the input.
+
+        Returns
+        -------
+        list of Output
+        """
+        out = [*self._process_calibrated(self._calibrate.flush()),
+               *self._process_frames(self._align.flush()),
+               *self._process_detected(self._detect.flush())]
         tracked = self._track.flush()
         return [*out, *tracked, *self._traffic.feed(TrackedFrame(None, tracked)),
                 *self._traffic.flush()]
 
     def _stages(self) -> dict[str, Stage[Any, Any]]:
-        """{name: stage}, in the order of the way."""
+        """Stages by name, in order of processing."""
         return {'calibrate': self._calibrate, 'align': self._align, 'detect': self._detect,
                 'track': self._track, 'traffic': self._traffic}
 
-    def _after_calibrate(self, batches: Iterable[Readings]) -> list[Output]:
-        """The outputs that follow from calibrated readings."""
-        return self._after_align([f for b in batches for f in self._align.feed(b)])
+    def _process_calibrated(self, batches: Iterable[Readings]) -> list[Output]:
+        """Process calibrated readings."""
+        return self._process_frames([f for b in batches for f in self._align.feed(b)])
 
-    def _after_align(self, frames: Iterable[FieldFrame]) -> list[Output]:
-        """What follows from frames."""
-        return self._after_detect([r for f in frames for r in self._detect.feed(f)])
+    def _process_frames(self, frames: Iterable[FieldFrame]) -> list[Output]:
+        """Process frames."""
+        return self._process_detected([r for f in frames for r in self._detect.feed(f)])
 
-    def _after_detect(self, records: Iterable[FieldFrame | Detection]) -> list[Output]:
-        """What follows from detections and frames with a verdict; they come first themselves."""
+    def _process_detected(self, records: Iterable[FieldFrame | Detection]) -> list[Output]:
+        """Process frames with a detection flag and detections; each precedes the records it
+        causes."""
         out: list[Output] = []
         for record in records:
             out.append(record)
@@ -143,11 +184,23 @@ class Pipeline:
         return out
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """{stage: {what: number}}."""
+        """Counters of all stages.
+
+        Returns
+        -------
+        dict of str to dict of str to int
+            Counters of each stage by name.
+        """
         return {name: dict(sorted(stage.counts.items())) for name, stage in self._stages().items()}
 
     def rejections(self) -> dict[str, int]:
-        """{cause: number} over all stages."""
+        """Rejections of all stages.
+
+        Returns
+        -------
+        dict of str to int
+            Number of rejections by cause.
+        """
         total: Counter[str] = Counter()
         for stage in self._stages().values():
             total.update(rejected(stage.counts))

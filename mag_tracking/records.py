@@ -1,6 +1,6 @@
-"""The records that flow: frozen, SI units, time as integer nanoseconds.
+"""Records that flow between the stages: frozen, SI units, time as integer nanoseconds since 1970.
 
-A missing axis or sensor is NaN. Arrays in a record are not to be changed.
+A missing axis or sensor is NaN. The arrays of a record must not be modified.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,17 +18,29 @@ _Number = TypeVar('_Number', bound=np.generic)
 
 @overload
 def plain(values: ArrayLike) -> FloatArray:
-    """Of float64."""
+    """Return `values` as a float64 array."""
 
 
 @overload
 def plain(values: ArrayLike, dtype: type[_Number]) -> NDArray[_Number]:
-    """Of the type `dtype`."""
+    """Return `values` as an array of type `dtype`."""
 
 
 def plain(values: ArrayLike, dtype: type[Any] = float) -> NDArray[Any]:
-    """The array itself, or a copy where it is none that compiled code takes."""
-    # Nearly always it is one, and asking is a fifth of the cost of `np.require`.
+    """C-contiguous, writable array that compiled code accepts.
+
+    Parameters
+    ----------
+    values : array_like
+    dtype : type, optional
+        Type of the elements.
+
+    Returns
+    -------
+    array
+        `values` itself if it already fulfils the requirements, otherwise a copy.
+    """
+    # Most arrays fulfil the requirements, and this test costs a fifth of `np.require`.
     if isinstance(values, np.ndarray) and values.dtype == dtype and values.flags.carray:
         return values
     return np.require(values, dtype, ['C', 'W'])
@@ -36,24 +48,26 @@ def plain(values: ArrayLike, dtype: type[Any] = float) -> NDArray[Any]:
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """A batch of magnetometer readings of any sensors, in the order in which they came.
+    """A batch of magnetometer readings of any sensors, in the order of arrival.
 
-    A single reading is a batch of one.
+    A single reading is a batch of one. Raises ReadingsError if the shapes do not match.
     """
 
     names: tuple[str, ...]
-    """Names of sensors."""
+    """Names of the sensors."""
     sensor: IntArray
-    """(n,) which of `names`."""
+    """Sensor of each reading, an index of `names`, (n,)."""
     stamp_ns: IntArray
-    """(n,) int64."""
+    """Time of each measurement, (n,) int64 ns since 1970."""
     field: FloatArray
-    """(n, 3) [T], sensor frame; after calibration without the background."""
+    """Flux density, (n, 3) T, sensor frame. NaN where an axis is missing. Calibrated readings
+    exclude the background."""
     covariance: FloatArray | None = None
-    """(n, 3, 3) [T^2], sensor frame; a row of NaN, or None for all: unknown."""
+    """Noise covariance, (n, 3, 3) T², sensor frame. A matrix of NaN is unknown; None if all are
+    unknown."""
 
     def __post_init__(self) -> None:
-        """Compiled code does not look at shapes. Raises ReadingsError."""
+        """Check the shapes, which compiled code does not."""
         n = len(self.sensor)
         for name, values, shape in (
                 ('sensor', self.sensor, (n,)), ('stamp_ns', self.stamp_ns, (n,)),
@@ -65,8 +79,13 @@ class Readings:
     def __len__(self) -> int:
         return len(self.sensor)
 
-    def without_covariance(self) -> BoolArray:
-        """(n,) whether the covariance of a reading is unknown."""
+    def has_unknown_covariance(self) -> BoolArray:
+        """Whether the covariance of each reading is unknown.
+
+        Returns
+        -------
+        (n,) bool array
+        """
         if self.covariance is None:
             return np.ones(len(self), dtype=bool)
         missing: BoolArray = np.isnan(self.covariance).reshape(-1, 9)
@@ -74,22 +93,58 @@ class Readings:
         return unknown
 
     def rows(self, index: Mapping[str, int]) -> IntArray:
-        """(n,) row of each reading's sensor in `index`, {name: row}; -1: not in it."""
+        """Row of each reading's sensor in an index.
+
+        Parameters
+        ----------
+        index : mapping of str to int
+            Row of each sensor by name.
+
+        Returns
+        -------
+        (n,) int array
+            -1 for a sensor that is not in `index`.
+        """
         return np.array([index.get(name, -1) for name in self.names], dtype=np.int64)[self.sensor]
 
     def sensor_names(self) -> list[str]:
-        """The name of each reading's sensor."""
+        """Name of the sensor of each reading.
+
+        Returns
+        -------
+        list of str, length n
+        """
         return [self.names[j] for j in self.sensor.tolist()]
 
     def part(self, which: BoolArray | IntArray | slice) -> 'Readings':
-        """The readings of `which`: (n,) bool, rows in any order, or a slice."""
+        """Select readings.
+
+        Parameters
+        ----------
+        which : (n,) bool array, (k,) int array, or slice
+            Rows in any order.
+
+        Returns
+        -------
+        Readings
+        """
         C = self.covariance
         return Readings(self.names, self.sensor[which], self.stamp_ns[which], self.field[which],
                         None if C is None else C[which])
 
     @classmethod
     def joined(cls, parts: Iterable['Readings']) -> 'Readings':
-        """One after the other, those of `parts`, [`Readings`]."""
+        """Concatenate batches.
+
+        Parameters
+        ----------
+        parts : iterable of Readings
+
+        Returns
+        -------
+        Readings
+            In the order of `parts`.
+        """
         parts = [p for p in parts if len(p)]
         if len(parts) <= 1:
             return parts[0] if parts else cls.by_name([], [], np.empty((0, 3)))
@@ -106,14 +161,40 @@ class Readings:
     @classmethod
     def single(cls, sensor: str, stamp_ns: int, field: FloatArray,
                covariance: FloatArray | None = None) -> 'Readings':
-        """One reading: (3,) [T], and (3, 3) [T^2] or None."""
+        """Create a batch of one reading.
+
+        Parameters
+        ----------
+        sensor : str
+            Name of the sensor.
+        stamp_ns : int, ns
+        field : (3,) array, T, sensor frame
+        covariance : (3, 3) array, T², sensor frame, optional
+
+        Returns
+        -------
+        Readings
+        """
         return cls((sensor,), np.zeros(1, dtype=np.int64), np.array([stamp_ns], dtype=np.int64),
                    field[None], None if covariance is None else covariance[None])
 
     @classmethod
     def by_name(cls, sensors: Sequence[str], stamps: Sequence[int] | IntArray, field: FloatArray,
                 covariance: FloatArray | None = None) -> 'Readings':
-        """Readings from lists of sensor names and timestamps [ns], and fields (n, 3) [T]."""
+        """Create a batch from one sensor name per reading.
+
+        Parameters
+        ----------
+        sensors : sequence of str, length n
+            Name of the sensor of each reading.
+        stamps : (n,) sequence of int, ns
+        field : (n, 3) array, T, sensor frame
+        covariance : (n, 3, 3) array, T², sensor frame, optional
+
+        Returns
+        -------
+        Readings
+        """
         names = tuple(dict.fromkeys(sensors))
         rows = {name: j for j, name in enumerate(names)}
         return cls(names, np.array([rows[s] for s in sensors], dtype=np.int64),
@@ -125,80 +206,98 @@ class AccelerationSample:
     """One reading of a sensor's accelerometer."""
 
     stamp_ns: int
+    """Time of the measurement, ns since 1970."""
     sensor: str
+    """Name of the sensor."""
     acceleration: FloatArray
-    """(3,) [m/s^2], sensor frame; at rest it points up."""
+    """Specific force, (3,) m/s², sensor frame. Points up at rest."""
 
 
 @dataclass(frozen=True, slots=True)
 class FieldFrame:
-    """One look of the whole network."""
+    """The samples of all sensors within one period, averaged per sensor."""
 
     stamp_ns: int
+    """Mean time of the samples, ns since 1970."""
     field: FloatArray
-    """(n_sensors, 3) [T], sensor frames, background removed."""
+    """Mean flux density without the background, (n_sensors, 3) T, sensor frames. NaN = missing."""
     covariance: FloatArray
-    """(n_sensors, 3, 3) [T^2] of `field`; rows of a missing sensor are NaN."""
+    """Covariance of `field`, (n_sensors, 3, 3) T², sensor frames. NaN for a missing sensor."""
     n_samples: IntArray
-    """(n_sensors,) samples averaged; 0 = missing."""
+    """Number of averaged samples per sensor, (n_sensors,). 0 = missing."""
     time_offset: FloatArray
-    """(n_sensors,) [s] mean time of a sensor's samples, from `stamp_ns`; 0 where it is missing."""
+    """Mean time of each sensor's samples relative to `stamp_ns`, (n_sensors,) s. 0 for a missing
+    sensor."""
     target_present: bool = False
-    """The detector's verdict; false before detection."""
+    """Whether the detector reports a target, including its hold time. False before detection."""
     statistic: float = float('nan')
-    """Whitened energy, chi-square under noise; NaN before detection."""
+    """Whitened energy of the frame, chi-square distributed under noise. NaN before detection."""
     degrees_of_freedom: int = 0
+    """Degrees of freedom of `statistic`: the number of axes that were measured. 0 before
+    detection."""
 
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """The network began (onset) or ceased to see a target."""
+    """Onset or release of a detection by the network."""
 
     stamp_ns: int
+    """Time of the frame, ns since 1970."""
     id: int
+    """Number of the onset. A release has the number of its onset."""
     onset: bool
+    """True for an onset, false for a release."""
     statistic: float
+    """Whitened energy of the frame, chi-square distributed under noise."""
     degrees_of_freedom: int
+    """Degrees of freedom of `statistic`."""
     threshold: float
+    """Threshold of `statistic` for an onset. NaN if no axis was measured."""
     false_alarm_probability: float
+    """Probability that noise alone exceeds `threshold` in a single frame."""
     strongest_sensor: str
+    """Name of the sensor with the most whitened energy per axis."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """One member of the bank, as published."""
+    """One hypothesis of a track's bank, as published."""
 
     arrival: str
+    """Name of the assumed arrival direction. Empty for a magnet."""
     weight: float
+    """Probability within the bank, 0 to 1."""
     position: FloatArray
-    """(3,) [m], world."""
+    """Position, (3,) m, world frame."""
     velocity: FloatArray
-    """(3,) [m/s], world."""
+    """Velocity, (3,) m/s, world frame."""
     covariance: FloatArray
-    """(6, 6) of position and velocity."""
+    """Covariance of [position, velocity], (6, 6) m and m/s, world frame."""
     moment: FloatArray
-    """(3,) [A m^2], world."""
+    """Magnetic moment, (3,) A m², world frame."""
     kind: str
-    """The kind of target that it assumed; empty for a magnet."""
+    """Assumed kind of vehicle. Empty for a magnet."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypotheses(Sequence[Hypothesis]):
-    """Members of a bank as arrays; each is a `Hypothesis`, made when it is asked for.
+    """The hypotheses of a bank as arrays, a sequence of `Hypothesis`.
 
-    There may be hundreds in every frame, and hardly anybody looks at them.
+    There may be hundreds in every frame, so a `Hypothesis` is created only on access.
     """
 
     arrivals: tuple[str, ...]
+    """Name of the assumed arrival direction of each hypothesis."""
     weights: FloatArray
-    """(n,)"""
+    """Probability of each hypothesis within the bank, (n,)."""
     states: FloatArray
-    """(n, 6) position and velocity, world."""
+    """[Position, velocity] of each hypothesis, (n, 6) m and m/s, world frame."""
     covariances: FloatArray
-    """(n, 6, 6)"""
+    """Covariance of each state, (n, 6, 6) m and m/s, world frame."""
     moments: FloatArray
-    """(n, 3)"""
+    """Magnetic moment of each hypothesis, (n, 3) A m², world frame."""
     kinds: tuple[str, ...]
+    """Assumed kind of vehicle of each hypothesis. Empty for a magnet."""
 
     def __len__(self) -> int:
         return len(self.weights)
@@ -217,7 +316,17 @@ class Hypotheses(Sequence[Hypothesis]):
 
 
 def best_of_arrivals(members: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Best hypothesis of each arrival with the arrival's total weight, heaviest first."""
+    """Best hypothesis of each arrival direction.
+
+    Parameters
+    ----------
+    members : sequence of Hypothesis
+
+    Returns
+    -------
+    list of Hypothesis
+        Heaviest first. `weight` is the total weight of the arrival direction.
+    """
     if isinstance(members, Hypotheses):
         arrivals, weights = members.arrivals, members.weights.tolist()
     else:
@@ -236,110 +345,124 @@ class PoseUncertainty:
     """Covariances about a pose."""
 
     covariance: FloatArray
-    """(6, 6) of position and velocity, world."""
+    """Covariance of [position, velocity], (6, 6) m and m/s, world frame."""
     orientation_covariance: FloatArray
-    """(3, 3) [rad^2], small rotations about the fixed world axes."""
+    """Covariance of small rotations about the fixed world axes, (3, 3) rad²."""
     position_orientation_covariance: FloatArray
-    """(3, 3) [m rad]."""
+    """Cross-covariance of position and orientation, (3, 3) m rad, world frame."""
 
 
 @dataclass(frozen=True, slots=True)
 class SmoothedPose:
-    """A target at one time, by what came before it and after."""
+    """Pose of a target, smoothed with the measurements before and after it."""
 
     stamp_ns: int
+    """Time of the pose, ns since 1970."""
     id: int
-    """Of the track."""
+    """Number of the track."""
     position: FloatArray
-    """(3,) [m], world."""
+    """Position, (3,) m, world frame."""
     velocity: FloatArray
-    """(3,) [m/s], world."""
+    """Velocity, (3,) m/s, world frame."""
     covariance: FloatArray
-    """(6, 6) of position and velocity, world."""
+    """Covariance of [position, velocity], (6, 6) m and m/s, world frame."""
     orientation: FloatArray
-    """(4,) quaternion xyzw, body to world."""
+    """Orientation, (4,) quaternion xyzw, body to world frame."""
     orientation_covariance: FloatArray
-    """(3, 3) [rad^2], small rotations about the fixed world axes."""
+    """Covariance of small rotations about the fixed world axes, (3, 3) rad²."""
     position_orientation_covariance: FloatArray
-    """(3, 3) [m rad]."""
+    """Cross-covariance of position and orientation, (3, 3) m rad, world frame."""
     moment: FloatArray
-    """(3,) [A m^2], world."""
+    """Magnetic moment, (3,) A m², world frame."""
     moment_covariance: FloatArray
-    """(3, 3)."""
+    """Covariance of `moment`, (3, 3) (A m²)², world frame."""
     kind: str
+    """Kind of vehicle. Empty for a magnet."""
     length: float
-    """[m] of the row of dipoles that the target is taken for; 0 for a point."""
+    """Length of the row of dipoles that models the target, m. 0 for a point target."""
     length_std: float
-    """[m]; 0 for a point."""
+    """Standard deviation of `length`, m. 0 for a point target."""
     ambiguous: bool
-    """Something else was still possible when it was smoothed."""
+    """Whether another explanation was still possible at the time of smoothing, or the pose is
+    doubtful."""
     complete: bool
-    """All of the track was used; else what came within a fixed lag."""
+    """True if the whole track was used, false for fixed-lag smoothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """A target at one time: the best hypothesis and what is known of the others."""
+    """State of a track at one time: its best hypothesis, and a summary of the others."""
 
     stamp_ns: int
+    """Time of the frame, ns since 1970."""
     id: int
+    """Number of the track."""
     ended: bool
+    """Whether the track has ended. This is the last record of the track."""
     position: FloatArray
-    """(3,) [m], world."""
+    """Position, (3,) m, world frame."""
     velocity: FloatArray
-    """(3,) [m/s], world."""
+    """Velocity, (3,) m/s, world frame."""
     covariance: FloatArray
-    """(6, 6) of position and velocity, world: about this pose, of all hypotheses at this place.
-    That of a vehicle also covers what of its length is not yet seen, and a straight path that
-    explains its whole pass and leads elsewhere; those of its `hypotheses` do not."""
+    """Covariance of [position, velocity] about this pose, (6, 6) m and m/s, world frame. It covers
+    all hypotheses at this place. For a vehicle it also covers the part of its length that has not
+    been observed yet, and a straight path that explains the whole pass but leads elsewhere. The
+    covariances of `hypotheses` include neither."""
     orientation: FloatArray
-    """(4,) quaternion xyzw, body to world."""
+    """Orientation, (4,) quaternion xyzw, body to world frame."""
     orientation_covariance: FloatArray
-    """(3, 3) [rad^2], small rotations about the fixed world axes; it and those below are also of
-    all hypotheses at this place."""
+    """Covariance of small rotations about the fixed world axes, (3, 3) rad². This and the following
+    covariances cover all hypotheses at this place."""
     position_orientation_covariance: FloatArray
-    """(3, 3) [m rad]."""
+    """Cross-covariance of position and orientation, (3, 3) m rad, world frame."""
     moment: FloatArray
-    """(3,) [A m^2], world."""
+    """Magnetic moment, (3,) A m², world frame."""
     moment_covariance: FloatArray
-    """(3, 3)."""
+    """Covariance of `moment`, (3, 3) (A m²)², world frame."""
     existence: float
+    """Probability that there is a target, against noise alone."""
     weight: float
-    """Of the published hypothesis, 0..1."""
+    """Probability of the published hypothesis within the bank, 0 to 1."""
     nis: float
-    """Normalised innovation squared of the published hypothesis; NaN without a measurement."""
+    """Normalised innovation squared of the published hypothesis. NaN without a measurement."""
     nis_by_sensor: FloatArray
-    """(n_sensors,) its parts, each given the sensors before it; NaN of a missing sensor."""
+    """Contribution of each sensor to `nis`, conditional on the sensors before it, (n_sensors,). NaN
+    for a missing sensor."""
     degrees_of_freedom: int
+    """Degrees of freedom of `nis`: the number of axes that were measured."""
     arrival: str
+    """Arrival direction of the published hypothesis. Empty for a magnet."""
     kind: str
-    """Of target, that of the published hypothesis; empty for a magnet."""
+    """Kind of vehicle of the published hypothesis. Empty for a magnet."""
     kind_weight: float
-    """Of all hypotheses of that kind, 0..1."""
+    """Total weight of all hypotheses of that kind, 0 to 1."""
     length: float
-    """[m] of the row of dipoles that the target is taken for; 0 for a point."""
+    """Length of the row of dipoles that models the target, m. 0 for a point target."""
     length_std: float
-    """[m]; 0 for a point."""
+    """Standard deviation of `length`, m. 0 for a point target."""
     ambiguous: bool
+    """Whether the pose is ambiguous: `doubts` is not empty."""
     unobservable: tuple[bool, ...]
-    """(6): x, y, z, and rotation about the body's x, y, z."""
+    """Whether x, y, z, and the rotations about the body's x, y and z axes are unobservable, (6,).
+    An unobservable rotation has variance π² and is not an estimate."""
     predicted: FloatArray
-    """(n_sensors, 3) [T], sensor frames: the frame's field as the published hypothesis has it,
-    without what it takes for errors of its model."""
+    """Field of the frame as predicted by the published hypothesis, without its estimated model
+    errors, (n_sensors, 3) T, sensor frames."""
     mounting: FloatArray
-    """(n_sensors, 3) [rad] angles as in `physics.mounting`; (0, 3) where they are not estimated."""
+    """Estimated mounting error of each sensor, (n_sensors, 3) rad: small angles as in
+    `physics.mounting`. (0, 3) if not estimated."""
     mounting_covariance: FloatArray
-    """(n_sensors, 3, 3) [rad^2], or (0, 3, 3)."""
+    """Covariance of `mounting`, (n_sensors, 3, 3) rad². (0, 3, 3) if not estimated."""
     hypotheses: Sequence[Hypothesis] = field(default=())
-    """Heaviest first; the published one is among them."""
+    """All hypotheses including the published one, heaviest first."""
     doubts: tuple[str, ...] = ()
-    """Why it is ambiguous: names of `stages.track.doubts`."""
+    """Reasons why the pose is ambiguous: names from `stages.track.doubts`."""
     topic_uncertainty: PoseUncertainty | None = None
-    """For messages without a flag. About the pose of an ambiguous track, that of all hypotheses at
-    any place; None: no such message is sent (`track.ambiguous_poses`)."""
+    """Uncertainty for messages that carry no ambiguity flag. For an ambiguous track it covers the
+    hypotheses at all places. None: such messages are not published (`track.ambiguous_poses`)."""
 
     @property
     def mounting_std(self) -> FloatArray:
-        """(n_sensors, 3) [rad], or (0, 3)."""
+        """Standard deviation of `mounting`, (n_sensors, 3) or (0, 3) rad."""
         std: FloatArray = np.sqrt(np.einsum('jii->ji', self.mounting_covariance))
         return std

@@ -1,7 +1,7 @@
-"""Settings, declared once: defaults, documentation, units and ranges in one place.
+"""Settings, declared once with default, description, unit and range.
 
-ROS parameters, the YAML file of defaults and the parameter reference are all
-made from these declarations.
+ROS parameters, the YAML file of defaults and the parameter reference are generated from these
+declarations.
 """
 
 import dataclasses
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 Scalar: TypeAlias = bool | int | float | str
 Value: TypeAlias = Scalar | tuple[Scalar, ...]
-"""What a setting can be."""
+"""Type of a setting."""
 
-REPLACED = {'track.vehicle.soft_iron': 'track.vehicle.induced_share',
+REPLACED_SETTINGS = {'track.vehicle.soft_iron': 'track.vehicle.induced_share',
             'track.vehicle.soft_iron_std': 'track.vehicle.induced_share_std'}
-"""Settings of before, and those that have taken their place."""
+"""Former settings and their replacements."""
 
 _Class: TypeAlias = type[object]
 _Default = TypeVar('_Default')
@@ -37,18 +37,22 @@ def param(default: _Default, doc: str, unit: str = '', range: tuple[float, float
 
     Parameters
     ----------
-    default : float, int, bool, str, or a tuple of float or of str
+    default : float, int, bool, str, or tuple of float or str
     doc : str
-        One sentence, for the reference and the ROS descriptor.
-    unit : str
+        Description for the reference and the ROS descriptor.
+    unit : str, optional
     range : (low, high), optional
-        Inclusive, for numbers and for every element of a tuple.
-    live : bool
-        May change while running (a ROS parameter that is not read-only).
+        Inclusive bounds of a number, or of every element of a tuple.
+    live : bool, optional
+        Whether it may change at run time (a ROS parameter that is not read-only).
     length : int, optional
-        Required length of a tuple; None = any but zero.
+        Required length of a tuple. None allows any length except zero.
     choices : tuple of str, optional
-        The values that a text may have.
+        Permitted values of a string.
+
+    Returns
+    -------
+    dataclass field
     """
     return dataclasses.field(default=default, metadata={
         'doc': doc, 'unit': unit, 'range': range, 'live': live, 'length': length,
@@ -57,34 +61,56 @@ def param(default: _Default, doc: str, unit: str = '', range: tuple[float, float
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """One setting, flattened: its dotted name, its value and its declaration."""
+    """One setting with its value and its declaration."""
 
     name: str
+    """Dotted name."""
     value: Value
+    """Current value."""
     type: _Class
+    """Type of the value."""
     element: _Class | None
+    """Type of the elements of a tuple, otherwise None."""
     doc: str
+    """Description."""
     unit: str
+    """Unit. Empty if there is none."""
     range: tuple[float, float] | None
+    """Inclusive bounds, or None."""
     live: bool
+    """Whether it may change at run time."""
     length: int | None
+    """Required length of a tuple, or None."""
     choices: tuple[str, ...]
+    """Permitted values of a string. Empty if any is allowed."""
 
 
-def _kind(hint: Any) -> tuple[_Class, _Class | None]:
-    """(type, element type) of an annotation such as float or tuple[float, ...]."""
+def _types_of_hint(hint: Any) -> tuple[_Class, _Class | None]:
+    """Type and element type of an annotation such as float or tuple[float, ...]."""
     if typing.get_origin(hint) is tuple:
         return tuple, typing.get_args(hint)[0]
     return hint, None
 
 
 def _is_group(value: object) -> 'TypeGuard[DataclassInstance]':
-    """Whether a field of a settings dataclass holds settings of its own."""
+    """Whether a field of a settings dataclass is itself a group of settings."""
     return dataclasses.is_dataclass(value)
 
 
 def flatten(settings: 'DataclassInstance', prefix: str = '') -> list[Parameter]:
-    """All settings below `settings` as a list of `Parameter`, in the order declared."""
+    """List all settings of a tree.
+
+    Parameters
+    ----------
+    settings : dataclass instance
+    prefix : str, optional
+        Prefix of the names.
+
+    Returns
+    -------
+    list of Parameter
+        In the order of declaration.
+    """
     hints = typing.get_type_hints(type(settings))
     out: list[Parameter] = []
     for f in dataclasses.fields(settings):
@@ -92,13 +118,13 @@ def flatten(settings: 'DataclassInstance', prefix: str = '') -> list[Parameter]:
         if _is_group(value):
             out += flatten(value, name + '.')
         else:
-            kind, element = _kind(hints[f.name])
+            kind, element = _types_of_hint(hints[f.name])
             out.append(Parameter(name, value, kind, element, **f.metadata))
     return out
 
 
 def _scalar(name: str, value: object, kind: _Class) -> Scalar:
-    """`value` as `kind`, or a SettingsError that names the setting."""
+    """Convert `value` to `kind`; raises SettingsError naming the setting."""
     if isinstance(value, int) and value.bit_length() > 1000:
         raise SettingsError(f'{name}: an integer of {value.bit_length()} bits is too large')
     if kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
@@ -112,8 +138,8 @@ def _scalar(name: str, value: object, kind: _Class) -> Scalar:
     raise SettingsError(f'{name}: expected {kind.__name__}, got {shown(value)}')
 
 
-def _checked(p: Parameter, value: object) -> Value:
-    """`value` in the type of the declaration `p`, within its range and length."""
+def _validated(p: Parameter, value: object) -> Value:
+    """Convert `value` to the declared type of `p` and check its range and length."""
     if p.element is not None:
         if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
             raise SettingsError(f'{p.name}: expected a list of {p.element.__name__}, '
@@ -130,7 +156,7 @@ def _checked(p: Parameter, value: object) -> Value:
             raise SettingsError(f'{p.name}: expected {", ".join(p.choices[:-1])} or '
                                 f'{p.choices[-1]}, got {shown(v)}')
         if isinstance(v, float) and math.isnan(v):
-            raise SettingsError(f'{p.name}: NaN is not a value')
+            raise SettingsError(f'{p.name}: NaN is not a valid value')
         if isinstance(v, str) or p.range is None:
             continue
         if not p.range[0] <= v <= p.range[1]:
@@ -139,50 +165,64 @@ def _checked(p: Parameter, value: object) -> Value:
     return values if p.element is not None else values[0]
 
 
-def _dotted(mapping: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
-    """Nested mappings as one flat dict with dotted names."""
+def _flattened(mapping: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
+    """Flatten nested mappings to one dict with dotted names."""
     out: dict[str, Any] = {}
     for key, value in mapping.items():
         if isinstance(value, Mapping):
-            _join(out, _dotted(value, f'{prefix}{key}.'))
+            _merge(out, _flattened(value, f'{prefix}{key}.'))
         else:
-            _join(out, {f'{prefix}{key}': value})
+            _merge(out, {f'{prefix}{key}': value})
     return out
 
 
-def _join(out: dict[str, Any], more: Mapping[str, Any]) -> None:
-    """Put `more` into `out`; raises SettingsError where the two disagree."""
+def _merge(out: dict[str, Any], more: Mapping[str, Any]) -> None:
+    """Merge `more` into `out`; raises SettingsError if two values differ."""
     for name, value in more.items():
         if out.setdefault(name, value) is not value and out[name] != value:
-            raise SettingsError(f'{name} is there twice, as {shown(out[name])} and as '
+            raise SettingsError(f'{name} is given twice, as {shown(out[name])} and as '
                                 f'{shown(value)}')
 
 
 def replace(settings: _Settings, changes: Mapping[str, Any]) -> _Settings:
-    """A copy of `settings` with `changes`, a mapping of (dotted or nested) names to values.
+    """Copy settings with changes applied.
 
-    Raises SettingsError for an unknown name (with the nearest known one), a
-    wrong type, a wrong length, or a value out of range.
+    Parameters
+    ----------
+    settings : dataclass instance
+    changes : mapping of str to setting
+        Values by dotted or nested name.
+
+    Returns
+    -------
+    dataclass instance
+        Of the type of `settings`.
+
+    Raises
+    ------
+    SettingsError
+        If a name is unknown (the message suggests the closest known name), or a value has a wrong
+        type, a wrong length, or is out of range.
     """
     known = {p.name: p for p in flatten(settings)}
     checked = {}
-    for name, value in _dotted(changes).items():
+    for name, value in _flattened(changes).items():
         if name not in known:
-            raise SettingsError(f'unknown setting {name}{_hint(name, known)}')
-        checked[name] = _checked(known[name], value)
+            raise SettingsError(f'unknown setting {name}{_suggestion(name, known)}')
+        checked[name] = _validated(known[name], value)
     return _rebuild(settings, checked, '')
 
 
-def _hint(name: str, known: Iterable[str]) -> str:
-    """Suggest a setting of the `known` ones for an unknown `name`; empty if none is near."""
-    if name in REPLACED:
-        return f'; {REPLACED[name]} has taken its place, in another unit'
+def _suggestion(name: str, known: Iterable[str]) -> str:
+    """Suggestion for an unknown setting: its replacement or the closest name, or empty."""
+    if name in REPLACED_SETTINGS:
+        return f'; it was replaced by {REPLACED_SETTINGS[name]}, which has another unit'
     near = difflib.get_close_matches(name, known, n=1)
     return f'; did you mean {near[0]}?' if near else ''
 
 
 def _rebuild(settings: _Settings, checked: Mapping[str, Value], prefix: str) -> _Settings:
-    """Copy of the tree with the checked values put in."""
+    """Copy of the tree with the validated values inserted."""
     changes: dict[str, Any] = {}
     for f in dataclasses.fields(settings):
         name, value = prefix + f.name, getattr(settings, f.name)
@@ -194,10 +234,23 @@ def _rebuild(settings: _Settings, checked: Mapping[str, Value], prefix: str) -> 
 
 
 def read_parameter_file(path: str | PathLike[str]) -> dict[str, Any]:
-    """The settings in a YAML file, as a flat dict of dotted names.
+    """Read settings from a YAML file.
 
-    Takes a plain mapping, or a ROS parameter file (`node: ros__parameters:`),
-    whose sections of all nodes are joined. Raises SettingsError.
+    Parameters
+    ----------
+    path : path_like
+        A plain mapping, or a ROS parameter file (`node: ros__parameters:`), whose sections of all
+        nodes are merged.
+
+    Returns
+    -------
+    dict of str to setting
+        Values by dotted name.
+
+    Raises
+    ------
+    SettingsError
+        If the file cannot be read, is not a mapping, or gives a setting two values.
     """
     content = read_yaml(path, SettingsError)
     if content is None:
@@ -205,15 +258,27 @@ def read_parameter_file(path: str | PathLike[str]) -> dict[str, Any]:
     if not isinstance(content, Mapping):
         raise SettingsError(f'{path}: expected a mapping of settings, got {shown(content)}')
     try:
-        return _joined_sections(content)
+        return _merged_sections(content)
     except SettingsError as error:
         raise SettingsError(f'{path}: {error}') from error
 
 
 def as_ros_parameters(path: str | PathLike[str]) -> str | None:
-    """Plain parameter file converted to a ROS parameter file; None if it already is one.
+    """Convert a plain parameter file to a ROS parameter file.
 
-    Raises SettingsError.
+    Parameters
+    ----------
+    path : path_like
+
+    Returns
+    -------
+    str or None
+        YAML text. None if the file is already a ROS parameter file or is not a mapping.
+
+    Raises
+    ------
+    SettingsError
+        If the file cannot be read.
     """
     content = read_yaml(path, SettingsError)
     if not isinstance(content, Mapping) or any(
@@ -225,36 +290,47 @@ def as_ros_parameters(path: str | PathLike[str]) -> str | None:
     return '\n'.join(['/**:', '  ros__parameters:', *lines, ''])
 
 
-def _joined_sections(content: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a plain mapping, or of all the nodes of a ROS parameter file."""
+def _merged_sections(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a plain mapping, or of all nodes of a ROS parameter file."""
     nodes = [k for k, v in content.items() if isinstance(v, Mapping) and 'ros__parameters' in v]
     if not nodes:
-        return _dotted(content)
+        return _flattened(content)
     joined: dict[str, Any] = {}
     for name, node in content.items():
         section = node.get('ros__parameters') if isinstance(node, Mapping) else None
         if name not in nodes or len(node) > 1 or not isinstance(section, Mapping | None):
-            raise SettingsError(f'{name}: expected nothing but a mapping under ros__parameters, as '
-                                f'for {nodes[0]}, got {shown(node)}')
-        _join(joined, _dotted(section or {}))
+            raise SettingsError(f'{name}: expected only a mapping under ros__parameters, as for '
+                                f'{nodes[0]}, got {shown(node)}')
+        _merge(joined, _flattened(section or {}))
     return joined
 
 
 def _yaml_value(value: Value) -> str:
-    """One value as YAML that reads back as the same value of the same type."""
+    """Write a value as YAML that reads back with the same type."""
     if isinstance(value, tuple):
         return '[' + ', '.join(_yaml_value(v) for v in value) + ']'
     if isinstance(value, bool):
         return 'true' if value else 'false'
     if isinstance(value, float):
         text = repr(value)
-        # YAML 1.1 reads 1e-08 as a string: a mantissa needs its point.
+        # YAML 1.1 reads 1e-08 as a string: the mantissa needs a decimal point.
         return text.replace('e', '.0e') if 'e' in text and '.' not in text else text
     return str(value) if isinstance(value, int) else f"'{value}'"
 
 
 def to_yaml(settings: 'DataclassInstance', node: str = '/**') -> str:
-    """The settings as a ROS parameter file with documentation."""
+    """Format settings as a ROS parameter file with comments.
+
+    Parameters
+    ----------
+    settings : dataclass instance
+    node : str, optional
+        Name of the node, or a wildcard.
+
+    Returns
+    -------
+    str
+    """
     lines = ['# Generated from the settings by `make config`; do not edit.',
              f'{node}:', '  ros__parameters:']
     group = None
@@ -275,8 +351,19 @@ def to_yaml(settings: 'DataclassInstance', node: str = '/**') -> str:
 
 
 def to_reference(settings: 'DataclassInstance', live: bool = True) -> str:
-    """The parameter reference, as a Markdown table; without the column `live` if it is false."""
-    head = ['parameter', 'default', 'unit', 'range', *(['live'] if live else []), 'what']
+    """Format settings as the Markdown table of the parameter reference.
+
+    Parameters
+    ----------
+    settings : dataclass instance
+    live : bool, optional
+        Whether to include the column `live`.
+
+    Returns
+    -------
+    str
+    """
+    head = ['parameter', 'default', 'unit', 'range', *(['live'] if live else []), 'description']
     lines = [f'| {" | ".join(head)} |', '|' + '---|' * len(head)]
     for p in flatten(settings):
         bounds = f'{p.range[0]} .. {p.range[1]}' if p.range else ', '.join(p.choices)

@@ -1,4 +1,4 @@
-"""Reading YAML that people write by hand."""
+"""Reading of YAML that people write by hand."""
 
 from collections.abc import Hashable
 from os import PathLike
@@ -11,18 +11,19 @@ from mag_tracking.errors import MagTrackingError
 from mag_tracking.files import checked_path
 
 MAX_NODES = 1_000_000
-"""Keys, values, lists and mappings of a file, aliases expanded."""
-DEEPEST = 64
-"""Levels of lists and mappings, aliases expanded."""
+"""Maximum number of keys, values, lists and mappings in a file, aliases expanded."""
+MAX_DEPTH = 64
+"""Maximum depth of lists and mappings, aliases expanded."""
 MAX_BITS = 14_000
-"""Size of an integer: Python converts none above 4300 decimal digits to text."""
+"""Maximum size of an integer. Python does not convert integers of more than 4300 decimal digits to
+text."""
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
-    """YAML lets a key appear twice and keeps the last: a sensor would vanish without a word."""
+    """Loader that rejects duplicate keys, of which YAML keeps the last: a sensor would be lost."""
 
     def get_single_node(self) -> yaml.Node | None:
-        """The root, once its size is known to be bounded."""
+        """Return the root after checking that its expanded size is bounded."""
         node = super().get_single_node()
         if node is not None:
             _check_size(node)
@@ -37,18 +38,18 @@ class _UniqueKeyLoader(yaml.SafeLoader):
             key = self.construct_object(key_node, deep=True)
             line = key_node.start_mark.line + 1
             if not isinstance(key, Hashable):
-                raise yaml.YAMLError(f'{shown(key)} is no name (line {line})')
+                raise yaml.YAMLError(f'{shown(key)} is not a valid key (line {line})')
             if key in seen:
-                raise yaml.YAMLError(f'{key} is there twice (line {line})')
+                raise yaml.YAMLError(f'duplicate key {key} (line {line})')
             seen.add(key)
         return super().construct_mapping(node, deep)
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
-        """An integer that can be written in a message."""
+        """Return an integer that is small enough to be written in a message."""
         value = super().construct_yaml_int(node)
         if value.bit_length() > MAX_BITS:
-            raise yaml.YAMLError(f'an integer of {value.bit_length()} bits is more than '
-                                 f'{MAX_BITS} (line {node.start_mark.line + 1})')
+            raise yaml.YAMLError(f'an integer of {value.bit_length()} bits exceeds the maximum of '
+                                 f'{MAX_BITS} bits (line {node.start_mark.line + 1})')
         return value
 
 
@@ -56,11 +57,12 @@ _UniqueKeyLoader.add_constructor('tag:yaml.org,2002:int', _UniqueKeyLoader.const
 
 
 def _check_size(root: yaml.Node) -> None:
-    """Raise YAMLError where aliases make a file large, deep or endless.
+    """Raise YAMLError if aliases make a file too large, too deep or endless.
 
-    A node that several aliases refer to is one object, and is counted once: nothing is expanded.
+    A node that several aliases refer to is a single object and is visited once: nothing is
+    expanded.
     """
-    # {id of a node: (nodes, depth)}; None while what it holds is counted.
+    # {id of a node: (nodes, depth)}; None while its children are being counted.
     sizes: dict[int, tuple[int, int] | None] = {}
     stack = [root]
     while stack:
@@ -73,7 +75,7 @@ def _check_size(root: yaml.Node) -> None:
                 if id(child) not in sizes:
                     stack.append(child)
                 elif sizes[id(child)] is None:
-                    raise yaml.YAMLError(f'an alias holds itself (line {line})')
+                    raise yaml.YAMLError(f'an alias contains itself (line {line})')
         else:
             below = [size for c in _children(node) if (size := sizes[id(c)]) is not None]
             nodes = 1 + sum(n for n, _ in below)
@@ -82,23 +84,32 @@ def _check_size(root: yaml.Node) -> None:
             if nodes > MAX_NODES:
                 raise yaml.YAMLError(f'aliases expand to more than {MAX_NODES} values '
                                      f'(line {line})')
-            if depth > DEEPEST:
-                raise yaml.YAMLError(f'nested too deeply: more than {DEEPEST} levels '
+            if depth > MAX_DEPTH:
+                raise yaml.YAMLError(f'nested too deeply: more than {MAX_DEPTH} levels '
                                      f'(line {line})')
 
 
 def _children(node: yaml.Node) -> list[yaml.Node]:
-    """The nodes that a node holds, keys included."""
+    """Child nodes of a node, including keys."""
     if isinstance(node, yaml.MappingNode):
         return [child for pair in node.value for child in pair]
     return list(node.value) if isinstance(node, yaml.SequenceNode) else []
 
 
 def read_yaml(path: str | PathLike[str], error: type[MagTrackingError]) -> Any:
-    """The content of a YAML file.
+    """Read a YAML file.
 
-    Raises `error` with a message that names the file: where
-    it cannot be read, is no YAML, says something twice, or is too large or too deep.
+    Parameters
+    ----------
+    path : path_like
+    error : type of MagTrackingError
+        Exception to raise if the file cannot be read, is not valid YAML, has duplicate keys, or is
+        too large or too deep. Its message names the file.
+
+    Returns
+    -------
+    object
+        Content of the file.
     """
     path = checked_path(path, error)
     try:
@@ -109,26 +120,46 @@ def read_yaml(path: str | PathLike[str], error: type[MagTrackingError]) -> Any:
 
 
 def parse_yaml(text: str | TextIO, name: str, error: type[MagTrackingError]) -> Any:
-    """The content of YAML text, or of a stream of it.
+    """Parse YAML.
 
-    Raises `error` as `read_yaml` does, with a message that begins with `name`.
+    Parameters
+    ----------
+    text : str or text stream
+    name : str
+        Name of the text, with which error messages begin.
+    error : type of MagTrackingError
+        Exception to raise, as for `read_yaml`.
+
+    Returns
+    -------
+    object
+        Content of the text.
     """
     try:
         return yaml.load(text, Loader=_UniqueKeyLoader)
-    # ValueError: a date or a number that is none (2001-13-45); also bytes that are no text.
+    # ValueError: an invalid date or number (2001-13-45), or bytes that are not text.
     except (yaml.YAMLError, ValueError) as problem:
-        raise error(f'{name} is not YAML as it should be: {problem}') from problem
+        raise error(f'{name} is not valid YAML: {problem}') from problem
     except RecursionError as problem:
         raise error(f'{name} is nested too deeply') from problem
 
 
 def is_text(value: str) -> bool:
-    """Whether a string can be written as UTF-8: lone surrogates, as "\\ud800" in YAML, cannot."""
+    """Whether a string can be encoded as UTF-8. Lone surrogates, such as "\\ud800" in YAML, cannot.
+
+    Parameters
+    ----------
+    value : str
+
+    Returns
+    -------
+    bool
+    """
     return not any('\ud800' <= c <= '\udfff' for c in value)
 
 
 class _ShortRepr(Repr):
-    """`repr` of bounded length."""
+    """`repr` of limited length."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -137,5 +168,15 @@ class _ShortRepr(Repr):
 
 
 def shown(value: object) -> str:
-    """`repr` of a value for an error message, shortened where it is long."""
+    """Representation of a value for an error message.
+
+    Parameters
+    ----------
+    value : object
+
+    Returns
+    -------
+    str
+        `repr` of the value, shortened if it is long.
+    """
     return _ShortRepr().repr(value)

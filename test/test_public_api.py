@@ -298,7 +298,7 @@ def test_readings_that_are_late_by_little_are_tracked(recorded):
 
 
 def test_bad_files_are_refused(tmp_path):
-    with pytest.raises(mt.RecordingError, match='there is no'):
+    with pytest.raises(mt.RecordingError, match='does not exist'):
         mt.track(tmp_path / 'none.mcap', NETWORK_FILE)
     with pytest.raises(mt.NetworkError):
         mt.read_recording(vehicle_path(NAME), tmp_path / 'none.yaml')

@@ -36,7 +36,7 @@ def test_every_setting_is_documented_and_its_default_is_in_range():
 
 
 @pytest.mark.parametrize('changes, message', [
-    ({'track.vehicle.soft_iron': 4.0}, 'track.vehicle.induced_share has taken its place'),
+    ({'track.vehicle.soft_iron': 4.0}, 'it was replaced by track.vehicle.induced_share'),
     ({'align': {'perod_s': 0.1}}, 'unknown setting align.perod_s; did you mean align.period_s'),
     ({'align.period_s': 'long'}, 'align.period_s: expected float'),
     ({'align.period_s': -1.0}, 'align.period_s: -1.0 is outside'),
@@ -84,16 +84,16 @@ def test_parameter_files(tmp_path):
     path.write_text('')
     assert read_parameter_file(path) == {}
     for content, message in (
-            ('- 1', 'expected a mapping'), ('{a: [', 'not YAML'),
-            ('track: 2001-13-45', 'not YAML'), ('{? [1] : 2}', 'is no name'),
-            ('[' * 3000, 'nested too deeply'), ('track: &t {a: *t}', 'an alias holds itself'),
-            ('n: {ros__parameters: 5}', 'expected nothing but a mapping'),
+            ('- 1', 'expected a mapping'), ('{a: [', 'not valid YAML'),
+            ('track: 2001-13-45', 'not valid YAML'), ('{? [1] : 2}', 'is not a valid key'),
+            ('[' * 3000, 'nested too deeply'), ('track: &t {a: *t}', 'an alias contains itself'),
+            ('n: {ros__parameters: 5}', 'expected only a mapping'),
             ('n: {ros__parameters: {track.iterations: 2}}\ntrack: {iterations: 3}',
-             'track: expected nothing but'),
-            ('track: {iterations: 2, iterations: 3}', 'iterations is there twice'),
-            ('track: {iterations: 2}\ntrack.iterations: 3', 'track.iterations is there twice'),
+             'track: expected only'),
+            ('track: {iterations: 2, iterations: 3}', 'duplicate key iterations'),
+            ('track: {iterations: 2}\ntrack.iterations: 3', 'track.iterations is given twice'),
             ('a:\n  ros__parameters: {track.iterations: 2}\n'
-             'b:\n  ros__parameters: {track.iterations: 3}', 'track.iterations is there twice')):
+             'b:\n  ros__parameters: {track.iterations: 3}', 'track.iterations is given twice')):
         path.write_text(content)
         with pytest.raises(SettingsError, match=message):
             read_parameter_file(path)

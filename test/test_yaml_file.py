@@ -8,7 +8,7 @@ from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.reader import Recording
 from mag_tracking.settings import read_parameter_file, replace
-from mag_tracking.yaml_file import DEEPEST, MAX_NODES, read_yaml
+from mag_tracking.yaml_file import MAX_DEPTH, MAX_NODES, read_yaml
 
 
 def nested_aliases(n, form='[{}]', width=9):
@@ -32,20 +32,20 @@ def test_aliases_that_expand_to_gigabytes_are_refused(tmp_path, read, key):
     path = tmp_path / 'metadata.yaml'
     for n in (6, 40):
         path.write_text(f'{nested_aliases(n)}{key}: *a{n}\n')
-        assert f'{path} is not YAML as it should be: aliases expand to more than {MAX_NODES} ' \
+        assert f'{path} is not valid YAML: aliases expand to more than {MAX_NODES} ' \
                'values (line 7)' in message_of(read, path)
 
 
 @pytest.mark.parametrize('text, told', [
     (nested_aliases(40, '{{<<: [{}]}}', 2), 'aliases expand to more than'),
     (nested_aliases(40, '{{a: [{}]}}', 2), 'aliases expand to more than'),
-    (nested_aliases(100, width=1), f'more than {DEEPEST} levels (line 64)'),
-    ('[' * 80 + ']' * 80, f'nested too deeply: more than {DEEPEST} levels (line 1)'),
+    (nested_aliases(100, width=1), f'more than {MAX_DEPTH} levels (line 64)'),
+    ('[' * 80 + ']' * 80, f'nested too deeply: more than {MAX_DEPTH} levels (line 1)'),
     ('[' * 5000, 'nested too deeply'),
-    ('a: 1\nb: &b {c: *b}', 'an alias holds itself (line 2)'),
-    ('&a [[*a]]', 'an alias holds itself (line 1)'),
-    ('a: &a {<<: *a}', 'an alias holds itself (line 1)'),
-    ('a: 0x' + 'f' * 9000, 'an integer of 36000 bits is more than')])
+    ('a: 1\nb: &b {c: *b}', 'an alias contains itself (line 2)'),
+    ('&a [[*a]]', 'an alias contains itself (line 1)'),
+    ('a: &a {<<: *a}', 'an alias contains itself (line 1)'),
+    ('a: 0x' + 'f' * 9000, 'an integer of 36000 bits exceeds the maximum of')])
 def test_what_has_no_bound_is_named_with_its_line(tmp_path, text, told):
     path = tmp_path / 'a.yaml'
     path.write_text(text)

@@ -18,7 +18,7 @@ import numpy as np
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.least_squares import left_out_covariance
-from mag_tracking.network.sensor_network import ONE_PLACE
+from mag_tracking.network.sensor_network import MIN_DELAY_BASELINE
 
 MIN_CORRELATION = 0.97
 """Fields are the same where this share of one's energy is that of the other, delayed."""
@@ -150,7 +150,7 @@ def _pairs(data: PassData) -> list[tuple[int, int]]:
     place = data.network.positions[:, :2]
     pairs = list(combinations(data.sensors.tolist(), 2))
     apart = np.array([np.linalg.norm(place[i] - place[j]) for i, j in pairs])
-    nearest = [k for k in np.argsort(apart, kind='stable') if apart[k] > ONE_PLACE]
+    nearest = [k for k in np.argsort(apart, kind='stable') if apart[k] > MIN_DELAY_BASELINE]
     return [pairs[k] for k in nearest[:MAX_PAIRS]]
 
 

@@ -18,7 +18,7 @@ from mag_tracking.errors import ClusterError, MagTrackingError, OutputError, Rec
 from mag_tracking.files import checked_path
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
-from mag_tracking.recording.archive_folder import ArchiveFolder, stamped, state_of
+from mag_tracking.recording.archive_folder import ArchiveFolder, common_columns, recording_state
 from mag_tracking.recording.parquet_table import import_pyarrow
 from mag_tracking.recording.reader import SUFFIXES
 
@@ -92,7 +92,7 @@ def _recordings_at(path: Path, seen: set[Path]) -> list[Path]:
 def size_of(recording: Path) -> int:
     """Bytes of the files of a recording; 0 where it cannot be read, and will fail."""
     try:
-        return sum(size for _, size, _ in state_of(recording))
+        return sum(size for _, size, _ in recording_state(recording))
     except OSError:
         return 0
 
@@ -164,7 +164,7 @@ def archive(recordings: Iterable[str | PathLike[str]],
                     run.lost_workers = cluster.n_lost
         finally:
             dataset.write_recordings([*dataset.known(), *(
-                stamped(path, None) | {'error': why} for path, why in run.failed.items())])
+                common_columns(path, None) | {'error': why} for path, why in run.failed.items())])
     return run
 
 
@@ -208,7 +208,7 @@ class _Scheduler:
     def _begin(self, path: Path) -> None:
         """Cut a recording."""
         try:
-            self._states[path] = state_of(path)
+            self._states[path] = recording_state(path)
         except OSError as error:
             self._fail(path, f'cannot read it: {error.strerror}')
             return

@@ -8,7 +8,7 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.network import SensorNetwork
-from mag_tracking.recording.archive_folder import stamped
+from mag_tracking.recording.archive_folder import common_columns
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.units import NS
 
@@ -43,7 +43,7 @@ class HealthRows:
                 else np.sqrt(np.diagonal(covariance))
             known = background.ready and counts['accepted'] > 0
             level = calibrate.background(name) if known else np.full(3, np.nan)
-            yield {**stamped(self._recording, stamp_ns), 'sensor': name,
+            yield {**common_columns(self._recording, stamp_ns), 'sensor': name,
                    'accepted': now[0] - before[0], 'rejected': now[1] - before[1],
                    'times_relearnt': background.n_relearnt, 'ready': background.ready,
                    'stuck': background.stuck, 'doubtful': background.doubtful,

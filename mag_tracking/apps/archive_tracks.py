@@ -14,7 +14,7 @@ from mag_tracking.apps.pass_fitter import fitted_vehicles
 from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.apps.replay import RunCollector
 from mag_tracking.event_records import Disturbance
-from mag_tracking.recording.archive_folder import stamped
+from mag_tracking.recording.archive_folder import common_columns
 from mag_tracking.recording.archive_tables import TABLES
 from mag_tracking.recording.fit_folder import pass_rows
 from mag_tracking.recording.parquet_table import TableWriter
@@ -99,7 +99,7 @@ class SegmentTables:
         """The columns of any pose."""
         sd = np.sqrt(np.diagonal(pose.covariance))
         values = np.concatenate([pose.position, pose.velocity, sd, pose.moment]).tolist()
-        return {**stamped(self._recording, pose.stamp_ns), 'track_id': pose.id,
+        return {**common_columns(self._recording, pose.stamp_ns), 'track_id': pose.id,
                 **dict(zip(_STATE, map(_number, values), strict=True)),
                 'covariance': pose.covariance.ravel().tolist(), 'kind': pose.kind,
                 'length': _number(pose.length), 'ambiguous': pose.ambiguous}
@@ -110,7 +110,7 @@ class SegmentTables:
         smoothed = self._collector.smoothed.pop(log.id, None)
         self.n_tracks += 1
         self._tables['tracks'].add(
-            stamped(self._recording, log.stamp_ns[0]) | {'track_id': log.id}
+            common_columns(self._recording, log.stamp_ns[0]) | {'track_id': log.id}
             | _track_columns(log, smoothed))
 
     def _add_pass(self, number: int, data: PassData, notes: tuple[str, ...]) -> None:
@@ -125,7 +125,7 @@ class SegmentTables:
             self._tables['passes'].add(
                 {name: _number(value) if isinstance(value, float) else value
                  for name, value in row.items() if name not in ('recording', 'pass')}
-                | stamped(self._recording, row['stamp_ns'])
+                | common_columns(self._recording, row['stamp_ns'])
                 | {'number': number, 'notes': '; '.join(one.notes)})
 
 

@@ -28,7 +28,7 @@ from mag_tracking.errors import OutputError
 from mag_tracking.files import replace_text
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
-from mag_tracking.recording.archive_folder import join_tables, name_of, stamped
+from mag_tracking.recording.archive_folder import common_columns, join_tables, recording_key
 from mag_tracking.recording.archive_tables import TABLES
 from mag_tracking.recording.parquet_table import TableWriter
 from mag_tracking.recording.reader import Recording
@@ -171,7 +171,7 @@ class _Cut:
             self._add_health(self._health.rows(self._last_ns, self._passes.calibrate))
         missing = self._reader.missing_topics()
         return {
-            **stamped(self._path, self._first_ns), 'end_ns': self._last_ns,
+            **common_columns(self._path, self._first_ns), 'end_ns': self._last_ns,
             'frames': self._writer.n_frames, 'stretches': self._writer.n_segments,
             'size': self._recording.size, 'lost': _text(self._recording.losses),
             'rejected': _text(self._reader.rejected + Counter(self._passes.rejected)),
@@ -225,7 +225,7 @@ def join(job: Job) -> dict[str, Any]:
     Raises OutputError.
     """
     known = cut(job)
-    name, evidence = name_of(job.recording), RecordedEvidence(len(job.network))
+    name, evidence = recording_key(job.recording), RecordedEvidence(len(job.network))
     folders, shifts, n_tracks, n_passes = [], [], 0, 0
     with tempfile.TemporaryDirectory(dir=job.work, prefix='.again.') as again:
         for k in range(known['stretches']):

@@ -166,7 +166,7 @@ def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: 
         if (std > MIN_TURN).all():
             columns['orientation_std'][j] = std
         before = network.calibrated[j]
-        columns['calibrated'][j] = network.marked(
+        columns['calibrated'][j] = network.calibration_record(
             j, date, by, np.nan if before is None else before.clock_offset_std)
     changes: dict[str, Any] = {name: tuple(column) for name, column in columns.items()}
     return replace(network, positions=found.positions, R_ws=found.R_ws, **changes)

@@ -144,6 +144,6 @@ def _marked(network: SensorNetwork, surveyed: SensorNetwork, date: str,
     """The `network` whose calibration says that passes are in it; before them it was `surveyed`."""
     passes = f'{n_tracks} pass{"es" if n_tracks > 1 else ""}'
     return replace(network, calibrated=tuple(
-        surveyed.marked(j, date, f'as stated; {passes}') if c is None
+        surveyed.calibration_record(j, date, f'as stated; {passes}') if c is None
         else replace(c, date=date, by=f'{c.by}; {passes}')
         for j, c in enumerate(surveyed.calibrated)))

@@ -68,7 +68,7 @@ def tumble(recording: Recording, network: SensorNetwork, sensors: Collection[str
         # They were of readings that were not corrected so; both are learnt anew.
         columns['background'][j] = columns['noise_std'][j] = None
         done = network.calibrated[j]
-        columns['calibrated'][j] = network.marked(
+        columns['calibrated'][j] = network.calibration_record(
             j, date, f'{"as stated" if done is None else done.by}; tumbled to '
             f'{100 * fit.residual:.1f} % of the field', float('nan') if done is None
             else done.clock_offset_std)

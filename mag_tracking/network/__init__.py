@@ -1,5 +1,5 @@
 """The sensor network and its file."""
 
-from mag_tracking.network.sensor_network import Calibrated, SensorNetwork
+from mag_tracking.network.sensor_network import CalibrationRecord, SensorNetwork
 
-__all__ = ['Calibrated', 'SensorNetwork']
+__all__ = ['CalibrationRecord', 'SensorNetwork']

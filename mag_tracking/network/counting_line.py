@@ -1,4 +1,4 @@
-"""Counting lines on the ground, and where and when a track crosses one."""
+"""Counting lines on the ground, and the crossings of a line by a track."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,42 +13,78 @@ from mag_tracking.units import NS
 Pose: TypeAlias = Track | SmoothedPose
 
 MIN_SPEED = 1.0
-"""[m/s] A slower vehicle may stop before the line, and is not extrapolated to it."""
+"""Minimum speed for extrapolation to a line [m/s]. A slower vehicle may stop before the line."""
 
-EXTRAPOLATED_S = 1.0
-"""[s] A track that begins or ends this close to a line is extrapolated to it."""
+MAX_EXTRAPOLATION_S = 1.0
+"""Maximum time of extrapolation from the beginning or end of a track to a line [s]."""
 
 
 @dataclass(frozen=True)
-class Line:
+class CountingLine:
     """A counting line."""
 
     name: str
+    """Name of the line."""
     point: FloatArray
-    """(2,) [m] its middle."""
+    """Middle of the line, (2,) m, world frame."""
     along: FloatArray
-    """(2,) unit vector of the forward direction, across the line."""
+    """Unit vector of the forward direction, perpendicular to the line, (2,), world frame."""
     half_width: float
-    """[m]"""
+    """Half of the length of the line, m."""
 
     def forward(self, position: FloatArray) -> float:
-        """[m] of a position (3,) beyond the line, in its forward direction."""
+        """Distance of a position beyond the line, in its forward direction.
+
+        Parameters
+        ----------
+        position : (2,) or (3,) array, m, world frame
+
+        Returns
+        -------
+        float, m
+            Negative before the line.
+        """
         return float((position[:2] - self.point) @ self.along)
 
     def lateral(self, position: FloatArray) -> float:
-        """[m] of a position (3,) to the left of the line's middle, seen in forward direction."""
+        """Distance of a position to the left of the line's middle, in the forward direction.
+
+        Parameters
+        ----------
+        position : (2,) or (3,) array, m, world frame
+
+        Returns
+        -------
+        float, m
+        """
         r = position[:2] - self.point
         return float(self.along[0] * r[1] - self.along[1] * r[0])
 
 
-def lines_of(names: Sequence[str], headings_deg: Sequence[float], offsets: Sequence[float],
-             half_widths: Sequence[float], centre: FloatArray) -> list[Line]:
-    """The `Line`s of a network with a `centre` (2 or 3,) [m]."""
+def counting_lines(names: Sequence[str], headings_deg: Sequence[float], offsets: Sequence[float],
+                   half_widths: Sequence[float], centre: FloatArray) -> list[CountingLine]:
+    """Create the counting lines of a network from lists of their parameters.
+
+    Parameters
+    ----------
+    names : sequence of str
+    headings_deg : sequence of float, deg
+        Forward direction of each line, anticlockwise from x.
+    offsets : sequence of float, m
+        Distance of each line from the centre, in its forward direction.
+    half_widths : sequence of float, m
+    centre : (2,) or (3,) array, m, world frame
+        Centre of the network.
+
+    Returns
+    -------
+    list of CountingLine
+    """
     out = []
     for name, heading, offset, half_width in zip(names, np.deg2rad(headings_deg), offsets,
                                                  half_widths, strict=True):
         along = np.array([np.cos(heading), np.sin(heading)])
-        out.append(Line(name, centre[:2] + offset * along, along, half_width))
+        out.append(CountingLine(name, centre[:2] + offset * along, along, half_width))
     return out
 
 
@@ -56,30 +92,47 @@ class Crossing(NamedTuple):
     """A crossing of a line by a track."""
 
     stamp_ns: int
+    """Time of the crossing, ns since 1970."""
     position: FloatArray
-    """(3,) [m] on the line, world."""
+    """Position on the line, (3,) m, world frame."""
     forward: bool
+    """Whether the track moved in the forward direction of the line."""
     pose: Pose
-    """That of the track which is closest in time."""
+    """Pose of the track that is closest in time."""
     is_extrapolated: bool
+    """Whether the track begins after the crossing or ends before it."""
 
 
-class LinePath:
-    """The poses of one track, one after the other, as far as a line needs them."""
+class CrossingDetector:
+    """Detects the crossing of a line by one track from its successive poses.
 
-    def __init__(self, line: Line) -> None:
+    Parameters
+    ----------
+    line : CountingLine
+
+    Attributes
+    ----------
+    line : CountingLine
+    """
+
+    def __init__(self, line: CountingLine) -> None:
         self.line = line
         self._first: Pose | None = None
         self._last: Pose | None = None
         self._pair: tuple[Pose, Pose] | None = None
 
     @property
-    def is_begun(self) -> bool:
-        """Whether there is a pose."""
+    def has_pose(self) -> bool:
+        """Whether a pose has been added."""
         return self._first is not None
 
     def add(self, pose: Pose) -> None:
-        """Take the next pose."""
+        """Add the next pose of the track.
+
+        Parameters
+        ----------
+        pose : Track or SmoothedPose
+        """
         if self._first is None:
             self._first = pose
         if self._last is not None and self._is_beyond(self._last) != self._is_beyond(pose):
@@ -87,11 +140,17 @@ class LinePath:
         self._last = pose
 
     def _is_beyond(self, pose: Pose) -> bool:
-        """Whether a pose has crossed the line."""
+        """Whether a pose is beyond the line."""
         return self.line.forward(pose.position) >= 0.0
 
     def crossing(self) -> Crossing | None:
-        """The last crossing; None for a track that ends on the side on which it began."""
+        """Last crossing of the line.
+
+        Returns
+        -------
+        Crossing or None
+            None if the track begins and ends on the same side, or misses the line.
+        """
         if self._first is None or self._last is None:
             return None
         found = self._interpolated() if self._is_beyond(self._first) != self._is_beyond(
@@ -101,7 +160,7 @@ class LinePath:
         return found
 
     def _interpolated(self) -> Crossing:
-        """The crossing between two poses."""
+        """Interpolate the crossing between two poses."""
         assert self._pair is not None
         before, after = self._pair
         s = [self.line.forward(p.position) for p in self._pair]
@@ -111,13 +170,13 @@ class LinePath:
                         before if share < 0.5 else after, False)
 
     def _extrapolated(self, first: Pose, last: Pose) -> Crossing | None:
-        """A crossing shortly before the first pose, or shortly after the last one."""
+        """Extrapolate to a crossing shortly before the first or after the last pose."""
         for pose, sign in ((first, -1.0), (last, 1.0)):
             speed = float(pose.velocity[:2] @ self.line.along)
             if abs(speed) < MIN_SPEED:
                 continue
             t = -self.line.forward(pose.position) / speed
-            if 0.0 <= sign * t <= EXTRAPOLATED_S:
+            if 0.0 <= sign * t <= MAX_EXTRAPOLATION_S:
                 return Crossing(pose.stamp_ns + round(t * NS), pose.position + t * pose.velocity,
                                 speed > 0.0, pose, True)
         return None

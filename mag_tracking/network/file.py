@@ -14,174 +14,190 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import NetworkError
 from mag_tracking.files import replace_text
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
-from mag_tracking.network import Calibrated, SensorNetwork
+from mag_tracking.network import CalibrationRecord, SensorNetwork
 from mag_tracking.network.geomagnetic import Site, decimal_year, earth_field
 from mag_tracking.network.topics import NAME
 from mag_tracking.yaml_file import is_text, read_yaml, shown
 
 _NAME = re.compile(r'[A-Za-z0-9_.-]+')
 _FRAME = re.compile(r'[A-Za-z0-9_./-]+')
-_TOP = {'frame', 'earth_field', 'site', 'sensors'}
-_SITE = ('latitude', 'longitude', 'height', 'date', 'x_azimuth_deg')
-_SENSOR = {'position', 'orientation', 'orientation_std_deg', 'clock_offset', 'noise_std',
-           'background', 'offset', 'correction', 'topic', 'imu_topic', 'calibrated'}
+_TOP_KEYS = {'frame', 'earth_field', 'site', 'sensors'}
+_SITE_KEYS = ('latitude', 'longitude', 'height', 'date', 'x_azimuth_deg')
+_SENSOR_KEYS = {'position', 'orientation', 'orientation_std_deg', 'clock_offset', 'noise_std',
+                'background', 'offset', 'correction', 'topic', 'imu_topic', 'calibrated'}
 
-_LONGEST = 1e8
-"""[m] No position is farther from the origin: room for any frame of the Earth."""
+_MAX_COORDINATE = 1e8
+"""Maximum distance of a position from the origin along an axis [m]: any frame of the Earth fits."""
 
-_QUIETEST = 1e-15
-"""[T] No sensor is quieter."""
+_MIN_NOISE_STD = 1e-15
+"""Minimum standard deviation of the noise [T]."""
 
-_MAX_OFFSET = 3600.0
-"""[s] A clock that is off by more is to be set, not corrected."""
+_MAX_CLOCK_OFFSET = 3600.0
+"""Maximum clock offset [s]. A clock with a larger error must be set instead of corrected."""
 
 
-def _vector(what: str, value: object, lengths: tuple[int, ...]) -> FloatArray:
-    """A list of finite numbers of one of `lengths`, as an array."""
+def _vector(label: str, value: object, lengths: tuple[int, ...]) -> FloatArray:
+    """Convert a list of finite numbers to an array; its length must be one of `lengths`."""
     if not isinstance(value, list) or len(value) not in lengths:
-        raise NetworkError(f'{what}: expected {" or ".join(map(str, lengths))} numbers, '
+        raise NetworkError(f'{label}: expected {" or ".join(map(str, lengths))} numbers, '
                            f'got {shown(value)}')
     for v in value:
-        # YAML 1.1 reads 1e-8, without a point, as text, and 1.0e8, without a sign, too.
+        # YAML 1.1 reads numbers without a point (1e-8) or without a sign (1.0e8) as text.
         if isinstance(v, str):
-            raise NetworkError(f'{what}: {shown(v)} is text; write numbers as 1.0e-8 or 1.0e+8')
+            raise NetworkError(f'{label}: {shown(v)} is text; write numbers as 1.0e-8 or 1.0e+8')
         if isinstance(v, bool) or not isinstance(v, (int, float)) or not abs(v) < 1e300:
-            raise NetworkError(f'{what}: {shown(v)} is not a finite number')
+            raise NetworkError(f'{label}: {shown(v)} is not a finite number')
     return np.array(value, dtype=float)
 
 
-def _known(what: str, mapping: object, keys: Collection[str]) -> None:
+def _check_keys(label: str, mapping: object, keys: Collection[str]) -> None:
     """Raise NetworkError for a key that is not among `keys`."""
     if not isinstance(mapping, dict):
-        raise NetworkError(f'{what}: expected a mapping, got {shown(mapping)}')
+        raise NetworkError(f'{label}: expected a mapping, got {shown(mapping)}')
     for key in mapping:
         if key not in keys:
-            raise NetworkError(f'{what}: unknown key {shown(key)}; known are '
+            raise NetworkError(f'{label}: unknown key {shown(key)}; expected one of '
                                f'{", ".join(sorted(keys))}')
 
 
 def _sensor(name: str, entry: Any) -> dict[str, Any]:
-    """The values of one entry, by the names that `SensorNetwork` has for them."""
-    what = f'sensor {name}'
-    _known(what, entry, _SENSOR)
+    """Values of one entry by the field names of `SensorNetwork`."""
+    label = f'sensor {name}'
+    _check_keys(label, entry, _SENSOR_KEYS)
     if 'position' not in entry:
-        raise NetworkError(f'{what}: position is missing')
-    position = _vector(f'{what}: position', entry['position'], (3,))
-    if np.abs(position).max() > _LONGEST:
-        raise NetworkError(f'{what}: position: {position.tolist()} m is nowhere on Earth')
-    q = _vector(f'{what}: orientation', entry.get('orientation', [0, 0, 0, 1]), (4,))
-    R_ws = _rotation(f'{what}: orientation', q)
-    topic = _topic(what, 'topic', entry.get('topic', f'{name}/imu/mag'))
-    # Where a driver puts a sensor's accelerometer, by REP-145, beside its magnetometer.
+        raise NetworkError(f'{label}: position is missing')
+    position = _vector(f'{label}: position', entry['position'], (3,))
+    if np.abs(position).max() > _MAX_COORDINATE:
+        raise NetworkError(f'{label}: position: {position.tolist()} m is too far from the '
+                           'origin for any place on Earth')
+    q = _vector(f'{label}: orientation', entry.get('orientation', [0, 0, 0, 1]), (4,))
+    R_ws = _rotation(f'{label}: orientation', q)
+    topic = _topic(label, 'topic', entry.get('topic', f'{name}/imu/mag'))
+    # REP-145: a driver publishes the accelerometer on data_raw beside the magnetometer on mag.
     beside = topic.removesuffix('/mag') + '/data_raw' if topic.endswith('/mag') else None
     imu_topic = entry.get('imu_topic', beside)
     return {'positions': position, 'R_ws': R_ws, 'topics': topic,
-            'imu_topics': None if imu_topic is None else _topic(what, 'imu_topic', imu_topic),
-            'noise_std': _noise(what, entry.get('noise_std')),
-            'background': _small_field(what, 'background', entry.get('background')),
-            'offset': _small_field(what, 'offset', entry.get('offset')),
-            'correction': _correction(what, entry.get('correction')),
-            'orientation_std': _orientation_std(what, entry.get('orientation_std_deg')),
-            'clock_offset': _clock_offset(what, entry.get('clock_offset', 0.0)),
-            'calibrated': _calibrated(what, entry.get('calibrated'))}
+            'imu_topics': None if imu_topic is None else _topic(label, 'imu_topic', imu_topic),
+            'noise_std': _noise(label, entry.get('noise_std')),
+            'background': _small_field(label, 'background', entry.get('background')),
+            'offset': _small_field(label, 'offset', entry.get('offset')),
+            'correction': _correction(label, entry.get('correction')),
+            'orientation_std': _orientation_std(label, entry.get('orientation_std_deg')),
+            'clock_offset': _clock_offset(label, entry.get('clock_offset', 0.0)),
+            'calibrated': _calibrated(label, entry.get('calibrated'))}
 
 
-def _noise(what: str, noise: object) -> FloatArray | None:
-    """(3,) [T] of one number or three."""
+def _noise(label: str, noise: object) -> FloatArray | None:
+    """Noise standard deviation (3,) [T] from one or three numbers."""
     if noise is None:
         return None
     numbers = noise if isinstance(noise, list) else [noise]
-    std = _vector(f'{what}: noise_std', numbers, (1, 3)) * np.ones(3)
-    if not ((std >= _QUIETEST) & (std < 1e-3)).all():
-        raise NetworkError(f'{what}: noise_std must be above a femtotesla and below a '
+    std = _vector(f'{label}: noise_std', numbers, (1, 3)) * np.ones(3)
+    if not ((std >= _MIN_NOISE_STD) & (std < 1e-3)).all():
+        raise NetworkError(f'{label}: noise_std must be above a femtotesla and below a '
                            f'millitesla, got {std.tolist()} T')
     return std
 
 
-def _small_field(what: str, key: str, value: object) -> FloatArray | None:
-    """(3,) [T] of three numbers."""
+def _small_field(label: str, key: str, value: object) -> FloatArray | None:
+    """Field (3,) [T] from three numbers."""
     if value is None:
         return None
-    B = _vector(f'{what}: {key}', value, (3,))
+    B = _vector(f'{label}: {key}', value, (3,))
     if np.abs(B).max() > 0.1:
-        raise NetworkError(f'{what}: {key}: {B.tolist()} T is more than 0.1 T; is it in '
+        raise NetworkError(f'{label}: {key}: {B.tolist()} T is more than 0.1 T; is it in '
                            'microtesla or gauss?')
     return B
 
 
-def _correction(what: str, value: object) -> FloatArray | None:
-    """(3, 3) of nine numbers."""
+def _correction(label: str, value: object) -> FloatArray | None:
+    """Correction matrix (3, 3) from nine numbers."""
     if value is None:
         return None
-    matrix = _vector(f'{what}: correction', value, (9,)).reshape(3, 3)
+    matrix = _vector(f'{label}: correction', value, (9,)).reshape(3, 3)
     singular = np.linalg.svd(matrix, compute_uv=False)
     if not singular[-1] > 0.02 * singular[0]:
-        raise NetworkError(f'{what}: correction: {matrix.ravel().tolist()} takes away a direction')
+        raise NetworkError(f'{label}: correction: {matrix.ravel().tolist()} is singular or almost '
+                           'singular')
     return matrix
 
 
-def _orientation_std(what: str, value: object) -> FloatArray | None:
-    """(3,) [rad] of one number or three [deg]."""
+def _orientation_std(label: str, value: object) -> FloatArray | None:
+    """Orientation standard deviation (3,) [rad] from one or three numbers [deg]."""
     if value is None:
         return None
     numbers = value if isinstance(value, list) else [value]
-    std = _vector(f'{what}: orientation_std_deg', numbers, (1, 3)) * np.ones(3)
+    std = _vector(f'{label}: orientation_std_deg', numbers, (1, 3)) * np.ones(3)
     if not ((std > 0.0) & (std <= 180.0)).all():
-        raise NetworkError(f'{what}: orientation_std_deg must be above 0 and at most 180 degrees, '
+        raise NetworkError(f'{label}: orientation_std_deg must be above 0 and at most 180 degrees, '
                            f'got {std.tolist()}')
     return np.deg2rad(std)
 
 
-def _clock_offset(what: str, value: object) -> float:
-    """[s]."""
-    offset = _vector(f'{what}: clock_offset', [value], (1,))[0]
-    if abs(offset) > _MAX_OFFSET:
-        raise NetworkError(f'{what}: clock_offset: {offset} s is more than {_MAX_OFFSET:g} s; '
-                           'set the clock')
+def _clock_offset(label: str, value: object) -> float:
+    """Clock offset [s]."""
+    offset = _vector(f'{label}: clock_offset', [value], (1,))[0]
+    if abs(offset) > _MAX_CLOCK_OFFSET:
+        raise NetworkError(f'{label}: clock_offset: {offset} s exceeds {_MAX_CLOCK_OFFSET:g} s; '
+                           "set the sensor's clock")
     return float(offset)
 
 
-def _calibrated(what: str, value: Any) -> Calibrated | None:
-    """`Calibrated`."""
+def _calibrated(label: str, value: Any) -> CalibrationRecord | None:
+    """Calibration record from a mapping."""
     if value is None:
         return None
-    what = f'{what}: calibrated'
-    _known(what, value, {'date', 'by', 'clock_offset_std', 'stated', 'stated_std_deg'})
+    label = f'{label}: calibrated'
+    _check_keys(label, value, {'date', 'by', 'clock_offset_std', 'stated', 'stated_std_deg'})
     for key in ('date', 'by'):
         if not isinstance(value.get(key), str) or not is_text(value[key]):
-            raise NetworkError(f"{what}: {key} must be text ('...'), "
+            raise NetworkError(f"{label}: {key} must be text ('...'), "
                                f'got {shown(value.get(key))}')
     std, stated = value.get('clock_offset_std'), value.get('stated')
-    std = float('nan') if std is None else float(_vector(what, [std], (1,))[0])
+    std = float('nan') if std is None else float(_vector(label, [std], (1,))[0])
     if std < 0.0:
-        raise NetworkError(f'{what}: clock_offset_std: {std} s is negative')
+        raise NetworkError(f'{label}: clock_offset_std: {std} s is negative')
     if stated is not None:
-        stated = _vector(f'{what}: stated', stated, (4,))
-        _rotation(f'{what}: stated', stated)
+        stated = _vector(f'{label}: stated', stated, (4,))
+        _rotation(f'{label}: stated', stated)
         stated = tuple(stated.tolist())
-    spread = _orientation_std(what, value.get('stated_std_deg'))
-    return Calibrated(value['date'], value['by'], std, stated,
+    spread = _orientation_std(label, value.get('stated_std_deg'))
+    return CalibrationRecord(value['date'], value['by'], std, stated,
                       None if spread is None else tuple(spread.tolist()))
 
 
-def _rotation(what: str, q: FloatArray) -> FloatArray:
-    """(3, 3) of a quaternion."""
+def _rotation(label: str, q: FloatArray) -> FloatArray:
+    """Rotation matrix (3, 3) from a quaternion."""
     try:
         return rotation_from_quaternion(q)
     except ValueError as error:
-        raise NetworkError(f'{what}: {error}') from error
+        raise NetworkError(f'{label}: {error}') from error
 
 
-def _topic(what: str, key: str, topic: object) -> str:
-    """A topic's name."""
+def _topic(label: str, key: str, topic: object) -> str:
+    """Validated topic name."""
     if not isinstance(topic, str) or not NAME.fullmatch(topic):
-        raise NetworkError(f'{what}: {key}: {shown(topic)} is not a ROS topic: letters, digits and '
-                           '_, and no part begins with a digit')
+        raise NetworkError(f'{label}: {key}: {shown(topic)} is not a valid ROS topic: use letters, '
+                           'digits and _; no part may begin with a digit')
     return topic
 
 
 def read_network(path: str | PathLike[str]) -> SensorNetwork:
-    """The `SensorNetwork` in a file; raises NetworkError, which names file and key."""
+    """Read a network file.
+
+    Parameters
+    ----------
+    path : path_like
+
+    Returns
+    -------
+    SensorNetwork
+
+    Raises
+    ------
+    NetworkError
+        If the file is not valid. The message names the file and the key.
+    """
     content = read_yaml(path, NetworkError)
     try:
         return _network(content)
@@ -190,8 +206,8 @@ def read_network(path: str | PathLike[str]) -> SensorNetwork:
 
 
 def _network(content: Any) -> SensorNetwork:
-    """The network of the parsed file."""
-    _known('the file', content, _TOP)
+    """Network of the parsed file."""
+    _check_keys('the file', content, _TOP_KEYS)
     sensors = content.get('sensors')
     if not isinstance(sensors, dict) or not sensors:
         raise NetworkError('sensors: expected at least one sensor')
@@ -202,7 +218,8 @@ def _network(content: Any) -> SensorNetwork:
     names = tuple(str(name) for name in sensors)
     for name in names:
         if not _NAME.fullmatch(name):
-            raise NetworkError(f'{shown(name)} is no name for a sensor: letters, digits, _ . and -')
+            raise NetworkError(f'{shown(name)} is not a valid sensor name: use letters, digits, '
+                               '_ . and -')
     entries = [_sensor(n, e) for n, e in zip(names, sensors.values(), strict=True)]
     columns: dict[str, Any] = {key: tuple(e[key] for e in entries) for key in entries[0]}
     for key in ('positions', 'R_ws', 'clock_offset'):
@@ -211,11 +228,12 @@ def _network(content: Any) -> SensorNetwork:
 
 
 def _earth_field(content: dict[str, Any]) -> FloatArray | None:
-    """(3,) [T] as it is given, or by the World Magnetic Model at the site; None without both."""
+    """Field of the Earth (3,) [T] as given, or by the World Magnetic Model at the site, else
+    None."""
     earth, site = content.get('earth_field'), content.get('site')
     if earth is not None and site is not None:
-        raise NetworkError('earth_field and site are both there, and each says the field: '
-                           'leave one out')
+        raise NetworkError('earth_field and site both define the field of the Earth: remove one '
+                           'of them')
     if earth is not None:
         earth = _vector('earth_field', earth, (3,))
         if np.linalg.norm(earth) > 1e-3:
@@ -223,13 +241,13 @@ def _earth_field(content: dict[str, Any]) -> FloatArray | None:
                                'is it in microtesla or gauss?')
     if site is None:
         return earth
-    _known('site', site, _SITE)
-    missing = [key for key in _SITE if key not in site]
+    _check_keys('site', site, _SITE_KEYS)
+    missing = [key for key in _SITE_KEYS if key not in site]
     if missing:
         raise NetworkError(f'site: {missing[0]} is missing')
     day = site['date']
     if not isinstance(day, datetime.date) or isinstance(day, datetime.datetime):
-        raise NetworkError(f'site: date: expected a day such as 2026-05-01, got {shown(day)}')
+        raise NetworkError(f'site: date: expected a date such as 2026-05-01, got {shown(day)}')
     latitude, longitude, height, azimuth = _vector('site', [
         site[key] for key in ('latitude', 'longitude', 'height', 'x_azimuth_deg')], (4,))
     try:
@@ -237,23 +255,23 @@ def _earth_field(content: dict[str, Any]) -> FloatArray | None:
     except ValueError as error:
         raise NetworkError(f'site: {error}') from error
     except ModuleNotFoundError as error:
-        raise NetworkError('site: the World Magnetic Model needs pygeomag (pip install pygeomag); '
-                           'or give earth_field instead') from error
+        raise NetworkError('site: the World Magnetic Model requires pygeomag: run pip install '
+                           'pygeomag, or set earth_field instead') from error
 
 
 def _numbers(values: Iterable[float]) -> str:
-    """A flow list that YAML reads back as floats."""
+    """Flow list that YAML reads back as floats."""
     return '[' + ', '.join(_number(v) for v in values) + ']'
 
 
 def _number(value: float) -> str:
-    """A float with a point, which YAML 1.1 wants before an exponent."""
+    """Float with a decimal point, which YAML 1.1 requires before an exponent."""
     text = repr(float(value))
     return text.replace('e', '.0e') if 'e' in text and '.' not in text else text
 
 
 def _sensor_lines(network: SensorNetwork, i: int) -> list[str]:
-    """The entry of sensor `i`."""
+    """Entry of sensor `i` as lines of YAML."""
     lines = [f'  {_text(network.names[i])}:', f'    position: {_numbers(network.positions[i])}',
              f'    orientation: {_numbers(quaternion_from_rotation(network.R_ws[i]))}']
     std = network.orientation_std[i]
@@ -281,21 +299,24 @@ def _sensor_lines(network: SensorNetwork, i: int) -> list[str]:
 
 
 def _text(text: str) -> str:
-    """Text as YAML that reads back as the same text: 'no' and '01' would not."""
+    """Text as YAML that reads back as the same text, unlike 'no' or '01' without quotes."""
     return text if yaml.safe_load(text) == text else json.dumps(text)
 
 
 def write_network(path: str | PathLike[str], network: SensorNetwork, comment: str = '') -> None:
-    """Write a network file; one that was there is replaced as a whole, or not at all.
+    """Write a network file atomically.
 
     Parameters
     ----------
-    path : path-like
+    path : path_like
     network : SensorNetwork
-    comment : str
+    comment : str, optional
         Lines for the head of the file.
 
-    Raises OutputError where the file cannot be written.
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
     """
     lines = [f'# {line}' for line in comment.splitlines()] + [f'frame: {_text(network.frame)}']
     if network.earth_field is not None:

@@ -1,7 +1,7 @@
-"""The Earth's field at a place and time, by the World Magnetic Model.
+"""The field of the Earth at a place and time, by the World Magnetic Model.
 
-The model itself is pygeomag's, which ships the coefficients of NOAA and the British
-Geological Survey; T10 section 6.3.1 uses its declination.
+The model is that of pygeomag, which includes the coefficients of NOAA and the British
+Geological Survey. T10 section 6.3.1 uses its declination.
 """
 
 import datetime
@@ -12,44 +12,62 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 
 COEFFICIENTS = 'wmm/WMM_2025.COF'
+"""Coefficient file of WMM2025 within pygeomag."""
 FIRST_YEAR, LAST_YEAR = 2025.0, 2030.0
-"""The span of WMM2025."""
+"""First and last year of WMM2025."""
 
 
 @dataclass(frozen=True)
 class Site:
-    """Where and when a network stands, and how its frame lies there."""
+    """Place and time of a network, and the orientation of its frame."""
 
     latitude: float
-    """[deg] geodetic, north positive."""
+    """Geodetic latitude, deg, north positive."""
     longitude: float
-    """[deg], east positive."""
+    """Longitude, deg, east positive."""
     height: float
-    """[m] above the ellipsoid."""
+    """Height above the ellipsoid, m."""
     year: float
-    """With its fraction."""
+    """Decimal year."""
     x_azimuth: float
-    """[deg] Bearing of the frame's x axis, clockwise from true north: 90 for east (ENU), or the
-    bearing of the road that x runs along."""
+    """Bearing of the frame's x axis, deg, clockwise from true north: 90 for east (ENU), or the
+    bearing of the road along which x points."""
 
 
 def decimal_year(day: datetime.date) -> float:
-    """The year with its fraction of a `datetime.date`."""
+    """Convert a date to a decimal year.
+
+    Parameters
+    ----------
+    day : datetime.date
+
+    Returns
+    -------
+    float
+    """
     first = datetime.date(day.year, 1, 1)
     return day.year + (day - first).days / (datetime.date(day.year + 1, 1, 1) - first).days
 
 
 def earth_field(site: Site) -> FloatArray:
-    """Flux density of the Earth at a `Site`.
+    """Flux density of the Earth at a site.
+
+    Parameters
+    ----------
+    site : Site
 
     Returns
     -------
-    (3,) [T], world (z up)
+    (3,) array, T, world frame (z up)
 
-    Raises ValueError for a place or a year that the model does not cover, and
-    ModuleNotFoundError without pygeomag.
+    Raises
+    ------
+    ValueError
+        If the model does not cover the place or the year.
+    ModuleNotFoundError
+        If pygeomag is not installed.
     """
-    # Only who gives a site instead of a field needs it.
+    # Required only for networks that define a site instead of a field.
     from pygeomag import GeoMag
 
     for name, value, low, high, unit in (

@@ -1,4 +1,4 @@
-"""Names of topics: as a network file has them, and as a graph or a recording does."""
+"""Topic names in a network file, a ROS graph or a recording."""
 
 import re
 from collections.abc import Collection, Iterable
@@ -6,19 +6,41 @@ from collections.abc import Collection, Iterable
 from mag_tracking.errors import NetworkError
 
 NAME = re.compile(r'/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
-"""A relative or absolute name."""
+"""Pattern of a relative or absolute name."""
 _NAMESPACE = re.compile(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+')
 
 
 def absolute(topic: str, namespace: str = '/') -> str:
-    """The absolute name of a topic in a namespace; one that begins with / stays as it is."""
+    """Resolve a topic name in a namespace.
+
+    Parameters
+    ----------
+    topic : str
+        Relative or absolute name.
+    namespace : str, optional
+
+    Returns
+    -------
+    str
+        Absolute name. A `topic` that begins with / is returned unchanged.
+    """
     return topic if topic.startswith('/') else f'{namespace.rstrip("/")}/{topic}'
 
 
 def namespaces_of(topics: Iterable[str], recorded: Collection[str]) -> list[str]:
-    """The namespaces in which at least one of the relative `topics` was recorded, in order.
+    """Find the namespaces in which at least one of the relative topics was recorded.
 
-    The root, '/', alone where it is one of them.
+    Parameters
+    ----------
+    topics : iterable of str
+        Absolute names are ignored.
+    recorded : collection of str
+        Absolute names of the recorded topics.
+
+    Returns
+    -------
+    list of str
+        Sorted. Only the root, '/', if it is one of them.
     """
     found = {name.removesuffix(f'/{topic}') or '/' for topic in topics if not topic.startswith('/')
              for name in recorded if name.endswith(f'/{topic}')}
@@ -26,8 +48,23 @@ def namespaces_of(topics: Iterable[str], recorded: Collection[str]) -> list[str]
 
 
 def checked_namespace(namespace: str) -> str:
-    """An absolute namespace; raises NetworkError for anything else."""
+    """Validate an absolute namespace.
+
+    Parameters
+    ----------
+    namespace : str
+
+    Returns
+    -------
+    str
+        `namespace`, unchanged.
+
+    Raises
+    ------
+    NetworkError
+        If it is not a valid absolute namespace.
+    """
     if not _NAMESPACE.fullmatch(namespace):
-        raise NetworkError(f'{namespace!r} is not a namespace: it begins with /, has letters, '
-                           'digits and _, and no part of it begins with a digit')
+        raise NetworkError(f'{namespace!r} is not a valid namespace: it must begin with / and '
+                           'contain only letters, digits and _; no part may begin with a digit')
     return namespace

@@ -1,1 +1,1 @@
-"""Recordings and other files: read, write, record, repair, import."""
+"""Recordings and other files: reading, writing, recording, repair and import."""

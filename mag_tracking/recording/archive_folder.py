@@ -1,12 +1,12 @@
-"""The dataset of an archive: tables in Parquet files, one for each recording and day.
+"""The dataset of an archive: tables in Parquet files, one per recording and day.
 
     DIR/archive.json                    schema, network and settings
     DIR/TABLE/date=2026-03-01/NAME.parquet
     DIR/done/NAME.json                  written last: the recording is complete
-    DIR/unfinished/NAME.STATE/          what the next run continues with
+    DIR/unfinished/NAME.STATE/          partial results from which the next run continues
 
-NAME is the stem of the recording and a hash of its path, STATE a hash of what its files are.
-pyarrow is imported when a table is written or read.
+NAME is the stem of the recording and a hash of its path; STATE is a hash of the names, sizes and
+modification times of its files. pyarrow is imported when a table is written or read.
 """
 
 import datetime
@@ -31,47 +31,82 @@ from mag_tracking.units import NS
 if TYPE_CHECKING:
     pass
 
-MAX_BYTES = 100
-"""Of the stem of a recording, in the names of its files."""
+MAX_STEM_BYTES = 100
+"""Maximum length of the recording's stem in file names [bytes]."""
 
 _PACKAGE = 'mag_tracking'
 _HEAD, _DONE, _WORK, _LOCK = 'archive.json', 'done', 'unfinished', '.lock'
 
 
-def name_of(recording: Path) -> str:
-    """What the files of a recording are named: the same in every run."""
+def recording_key(recording: Path) -> str:
+    """Name of a recording's files, the same in every run.
+
+    Parameters
+    ----------
+    recording : Path
+
+    Returns
+    -------
+    str
+    """
     path = recording.resolve()
-    stem = path.stem.encode(errors='replace')[:MAX_BYTES].decode(errors='ignore')
+    stem = path.stem.encode(errors='replace')[:MAX_STEM_BYTES].decode(errors='ignore')
     return f'{stem}-{_hash(str(path))}'
 
 
-def state_of(recording: Path) -> list[list[Any]]:
-    """[[name, size, time of change], ...] of the files of a recording: equal while it is the same.
+def recording_state(recording: Path) -> list[list[Any]]:
+    """State of a recording's files, which changes whenever the recording does.
 
-    Raises OSError.
+    Parameters
+    ----------
+    recording : Path
+        File or folder.
+
+    Returns
+    -------
+    list of [name, size in bytes, modification time in ns]
+
+    Raises
+    ------
+    OSError
+        If the files cannot be read.
     """
     files = sorted(recording.iterdir()) if recording.is_dir() else [recording]
     return [[f.name, f.stat().st_size, f.stat().st_mtime_ns] for f in files if f.is_file()]
 
 
 def _hash(text: str) -> str:
-    """Eight digits that hardly any two texts share."""
+    """Eight hexadecimal digits of a hash."""
     return hashlib.sha256(text.encode(errors='backslashreplace')).hexdigest()[:8]
 
 
 class ArchiveFolder:
-    """The folder of an archive, for the one process that directs it."""
+    """The folder of an archive, used by the one process that coordinates a run; a context manager.
+
+    Parameters
+    ----------
+    folder : Path
+        Opened, or created if it does not exist.
+    head : mapping
+        Data that all runs into this folder must have in common.
+
+    Attributes
+    ----------
+    path : Path
+
+    Raises
+    ------
+    OutputError
+        If the folder was created with other data or another table version, or another run is
+        writing to it.
+    """
 
     def __init__(self, folder: Path, head: Mapping[str, Any]) -> None:
-        """Open it, or make it; `head` is what all runs into it have to have in common.
-
-        Raises OutputError where it belongs to other settings, to another version of the tables, or
-        to a run that is still going on.
-        """
         self.path = output_folder(folder)
         if not (self.path / _HEAD).exists() and any(p.name != _LOCK for p in self.path.iterdir()):
-            raise OutputError(f'{self.path} is not empty and is no archive; take another folder')
-        self._lock = self._locked()
+            raise OutputError(f'{self.path} is not empty and is not an archive; choose another '
+                              'folder')
+        self._lock = self._acquire_lock()
         try:
             self._check_head({'schema': VERSION, **head})
             for name in (_DONE, _WORK):
@@ -80,8 +115,8 @@ class ArchiveFolder:
             self.close()
             raise
 
-    def _locked(self) -> int:
-        """Descriptor of the lock that only one run can have; raises OutputError."""
+    def _acquire_lock(self) -> int:
+        """Acquire the exclusive lock and return its descriptor; raises OutputError."""
         import fcntl
 
         path = self.path / _LOCK
@@ -93,12 +128,12 @@ class ArchiveFolder:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             os.close(lock)
-            raise OutputError(f'another archive is being written into {self.path}: wait until it '
-                              'is done, or take another folder') from error
+            raise OutputError(f'another run is writing to {self.path}: wait until it has finished, '
+                              'or choose another folder') from error
         return lock
 
     def close(self) -> None:
-        """Let others write into it."""
+        """Release the lock."""
         os.close(self._lock)
 
     def __enter__(self) -> 'ArchiveFolder':
@@ -108,7 +143,7 @@ class ArchiveFolder:
         self.close()
 
     def _check_head(self, head: dict[str, Any]) -> None:
-        """Compare with those before, or write it; raises OutputError."""
+        """Compare `head` with that of earlier runs, or write it; raises OutputError."""
         path = self.path / _HEAD
         if not path.exists():
             replace_text(path, json.dumps(head, indent=1, sort_keys=True) + '\n')
@@ -116,28 +151,51 @@ class ArchiveFolder:
         before = _read_json(path)
         if before.get('schema') != VERSION:
             raise OutputError(f'{self.path} has tables of version {before.get("schema")}; this '
-                              f'program writes version {VERSION}. Take another folder')
+                              f'program writes version {VERSION}. Choose another folder')
         differs = sorted(key for key in {*head, *before}
                          if json.dumps(head.get(key), sort_keys=True)
                          != json.dumps(before.get(key), sort_keys=True))
         if differs:
-            raise OutputError(f'{self.path} was begun with another {", another ".join(differs)}: '
-                              'its rows would not be comparable. Take another folder')
+            raise OutputError(f'{self.path} was created with other values of '
+                              f'{", ".join(differs)}: rows would not be comparable. '
+                              'Choose another folder')
 
     def done(self, recording: Path) -> dict[str, Any] | None:
-        """What is known of a recording that is complete and has not changed since, or None."""
-        path = self.path / _DONE / f'{name_of(recording)}.json'
+        """Summary of a recording that is complete and has not changed since.
+
+        Parameters
+        ----------
+        recording : Path
+
+        Returns
+        -------
+        dict or None
+        """
+        path = self.path / _DONE / f'{recording_key(recording)}.json'
         if not path.exists():
             return None
         known = _read_json(path)
-        return known if known.get('state') == state_of(recording) else None
+        return known if known.get('state') == recording_state(recording) else None
 
     def begin(self, recording: Path, state: list[list[Any]]) -> Path:
-        """The folder of what is not complete; results of another state of it are removed.
+        """Prepare the folder of partial results, and remove results of other states.
 
-        Raises OutputError.
+        Parameters
+        ----------
+        recording : Path
+        state : list
+            Result of `recording_state`.
+
+        Returns
+        -------
+        Path
+
+        Raises
+        ------
+        OutputError
+            If the archive cannot be written.
         """
-        name, work = name_of(recording), self.path / _WORK
+        name, work = recording_key(recording), self.path / _WORK
         own = work / f'{name}.{_hash(json.dumps([VERSION, version(_PACKAGE), state]))}'
         try:
             (self.path / _DONE / f'{name}.json').unlink(missing_ok=True)
@@ -152,28 +210,47 @@ class ArchiveFolder:
 
     def complete(self, recording: Path, work: Path, state: list[list[Any]],
                  known: Mapping[str, Any]) -> None:
-        """All tables of a recording are written: note what is `known` of it.
+        """Mark a recording as complete after all of its tables have been written.
 
-        `state` is that of the time when it was begun: had it changed meanwhile, the next run would
-        track it again.
+        Parameters
+        ----------
+        recording : Path
+        work : Path
+            Folder of the partial results, which is removed.
+        state : list
+            State of the recording when its processing began. If it has changed since, the next run
+            processes the recording again.
+        known : mapping
+            Summary of the recording.
         """
-        replace_text(self.path / _DONE / f'{name_of(recording)}.json',
+        replace_text(self.path / _DONE / f'{recording_key(recording)}.json',
                      json.dumps({**known, 'state': state}, indent=1) + '\n')
         _remove(work)
 
     def write_recordings(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """The table `recordings`, as a whole."""
+        """Write the table `recordings` atomically.
+
+        Parameters
+        ----------
+        rows : iterable of mapping
+            Values by column.
+        """
         with TableWriter(self.path / 'recordings.parquet', TABLES['recordings']) as table:
             for row in rows:
                 table.add(row)
 
     def known(self) -> list[dict[str, Any]]:
-        """What is known of each recording that is complete, also of earlier runs."""
+        """Summaries of all complete recordings, including those of earlier runs.
+
+        Returns
+        -------
+        list of dict
+        """
         return [_read_json(path) for path in sorted((self.path / _DONE).glob('*.json'))]
 
 
 def _remove(folder: Path) -> None:
-    """Remove a folder; a part of it is never found under its name."""
+    """Remove a folder; a partly removed folder never keeps its name."""
     away = folder.with_name(f'.{secrets.token_hex(8)}.{folder.name}')
     folder.rename(away)
     shutil.rmtree(away, ignore_errors=True)
@@ -181,19 +258,30 @@ def _remove(folder: Path) -> None:
 
 def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder: Path,
                 name: str) -> int:
-    """Put the tables of the stretches of a recording together, one file for each day.
+    """Concatenate the tables of a recording's segments and write one file per day.
 
     Parameters
     ----------
-    parts, shifts
-        Files of the same table, in order, and what is added to the `track_id`s of each.
-    table, folder, name
-        Written is `folder`/`table`/date=.../`name`.parquet.
+    parts : iterable of Path
+        Files of the same table, in order of time.
+    shifts : iterable of int
+        Offset to add to the `track_id` of each part.
+    table : str
+        Name of the table.
+    folder : Path
+        Folder of the archive.
+    name : str
+        The files are `folder`/`table`/date=.../`name`.parquet.
 
     Returns
     -------
     int
-        Number of rows. Raises OutputError.
+        Number of rows.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
     """
     pa = import_pyarrow()
     n, a_day = 0, pa.scalar(86_400 * NS)
@@ -216,18 +304,29 @@ def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder
     return n
 
 
-def stamped(recording: Path, stamp_ns: int | None) -> dict[str, Any]:
-    """The columns that every row begins with."""
+def common_columns(recording: Path, stamp_ns: int | None) -> dict[str, Any]:
+    """Columns with which every row begins.
+
+    Parameters
+    ----------
+    recording : Path
+    stamp_ns : int, ns, or None
+
+    Returns
+    -------
+    dict
+        Values by column.
+    """
     return {'recording': recording.stem, 'source': str(recording), 'stamp_ns': stamp_ns,
             'time': stamp_ns}
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    """Its content; raises OutputError."""
+    """Content of a JSON file of the archive; raises OutputError."""
     try:
         content = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise OutputError(f'cannot read {path}: {error}') from error
     if not isinstance(content, dict):
-        raise OutputError(f'{path} is not of an archive')
+        raise OutputError(f'{path} is not a file of an archive')
     return content

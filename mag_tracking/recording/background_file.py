@@ -1,6 +1,7 @@
-"""What a calibration had learnt of the backgrounds, kept for the case that it is started again.
+"""Learnt backgrounds of a running calibration, stored so that a restart can restore them.
 
-A network file says what holds for years; this is of the last minute, and goes with the readings.
+A network file holds what remains valid for years. This file holds the state of the last minute,
+and becomes outdated with the readings.
 """
 
 import hashlib
@@ -24,25 +25,51 @@ _HEAD = '{"version": '
 
 
 def default_path(network_path: str | PathLike[str], node: str) -> Path:
-    """Where node `node` keeps the backgrounds of a network file, in the state folder."""
+    """Path of the file in which a node stores the backgrounds of a network, in the state folder.
+
+    Parameters
+    ----------
+    network_path : path_like
+        Network file.
+    node : str
+        Fully qualified name of the node.
+
+    Returns
+    -------
+    Path
+    """
     path = Path(network_path).resolve()
     mark = hashlib.sha256(f'{path} {node}'.encode()).hexdigest()[:8]
     return state_folder() / f'{path.stem}_{mark}.json'
 
 
 def is_background_file(path: Path) -> bool:
-    """Whether a file begins as one with backgrounds does."""
+    """Whether a file begins like one with backgrounds.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    bool
+    """
     with open(path, 'rb') as stream:
         return stream.read(len(_HEAD)) == _HEAD.encode()
 
 
 def state_folder() -> Path:
-    """The folder of what nodes keep: below $ROS_HOME, or ~/.ros."""
+    """Folder of the nodes' persistent state, below $ROS_HOME or ~/.ros.
+
+    Returns
+    -------
+    Path
+    """
     return Path(os.environ.get('ROS_HOME') or Path.home() / '.ros') / 'mag_tracking'
 
 
-def _made_of(network: SensorNetwork, j: int, settings: CalibrateSettings) -> list[Any]:
-    """All that a background of sensor `j` rests on, as lists: where that differs, it is another."""
+def _dependencies(network: SensorNetwork, j: int, settings: CalibrateSettings) -> list[Any]:
+    """All parameters that a background of sensor `j` depends on, as lists for a comparison."""
     arrays = (network.offset[j], network.correction[j], network.clock_offset[j],
               network.background[j], network.noise_std[j], network.positions[j], network.R_ws[j])
     return [None if a is None else np.asarray(a).tolist() for a in arrays] \
@@ -51,16 +78,38 @@ def _made_of(network: SensorNetwork, j: int, settings: CalibrateSettings) -> lis
 
 def background_text(stored: StoredBackground, network: SensorNetwork, j: int,
                     settings: CalibrateSettings) -> str:
-    """JSON of the background of sensor `j`; `settings` are `CalibrateSettings`."""
+    """JSON text of the background of a sensor.
+
+    Parameters
+    ----------
+    stored : StoredBackground
+    network : SensorNetwork
+    j : int
+        Row of the sensor.
+    settings : CalibrateSettings
+
+    Returns
+    -------
+    str
+    """
     return json.dumps({'stamp_ns': stored.stamp_ns, 'background': stored.background.tolist(),
                        'covariance': stored.covariance.tolist(),
-                       'made_of': _made_of(network, j, settings)})
+                       'made_of': _dependencies(network, j, settings)})
 
 
 def write_backgrounds(path: str | PathLike[str], texts: Mapping[str, str]) -> None:
-    """Write {sensor: `background_text`}; what was there stays whole until the new is.
+    """Write the backgrounds of all sensors atomically.
 
-    Raises OutputError.
+    Parameters
+    ----------
+    path : path_like
+    texts : mapping of str to str
+        `background_text` by sensor.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
     """
     path = Path(path)
     rows = ',\n'.join(f'{json.dumps(name)}: {text}' for name, text in texts.items())
@@ -74,16 +123,25 @@ def write_backgrounds(path: str | PathLike[str], texts: Mapping[str, str]) -> No
 def read_backgrounds(path: str | PathLike[str], network: SensorNetwork,
                      settings: CalibrateSettings
                      ) -> tuple[dict[str, StoredBackground], dict[str, str]]:
-    """What was kept of the sensors of `network`, as far as it rests on the same.
+    """Read the stored backgrounds that match a network and its settings.
+
+    Parameters
+    ----------
+    path : path_like
+    network : SensorNetwork
+    settings : CalibrateSettings
 
     Returns
     -------
-    stored : {sensor: `StoredBackground`}
-        {} where there is no file.
-    refused : {sensor: why}
-        Of what cannot be used.
+    stored : dict of str to StoredBackground
+        By sensor. Empty if the file does not exist.
+    refused : dict of str to str
+        Reason by sensor for each background that cannot be used.
 
-    Raises RecordingError where the file is none of this kind.
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read or is not a background file of this version.
     """
     try:
         content = json.loads(Path(path).read_text())
@@ -93,13 +151,13 @@ def read_backgrounds(path: str | PathLike[str], network: SensorNetwork,
         raise RecordingError(f'{path}: {error}') from error
     entries = content.get('sensors') if isinstance(content, dict) else None
     if not isinstance(entries, dict) or content.get('version') != VERSION:
-        raise RecordingError(f'{path}: not what calibration_node keeps, version {VERSION}')
+        raise RecordingError(f'{path} is not a background file of version {VERSION}')
     stored: dict[str, StoredBackground] = {}
     refused: dict[str, str] = {}
     for j, name in enumerate(network.names):
         try:
-            if name in entries and entries[name]['made_of'] != _made_of(network, j, settings):
-                refused[name] = 'it is of another network file or of other settings'
+            if name in entries and entries[name]['made_of'] != _dependencies(network, j, settings):
+                refused[name] = 'it belongs to another network file or other settings'
             elif name in entries:
                 stored[name] = _stored(entries[name])
         except (KeyError, TypeError, ValueError) as error:
@@ -108,14 +166,14 @@ def read_backgrounds(path: str | PathLike[str], network: SensorNetwork,
 
 
 def _stored(entry: Any) -> StoredBackground:
-    """`StoredBackground` of an entry; raises ValueError where its numbers are none."""
+    """Background of an entry; raises ValueError if its numbers are invalid."""
     background = np.array(entry['background'], dtype=float)
     covariance = np.array(entry['covariance'], dtype=float)
     if background.shape != (3,) or covariance.shape != (3, 3) or np.isinf(background).any() \
             or not isinstance(entry['stamp_ns'], int):
-        raise ValueError(f'a background of {background.tolist()} at {entry["stamp_ns"]}')
+        raise ValueError(f'invalid background {background.tolist()} at {entry["stamp_ns"]}')
     there = ~np.isnan(background)
     C = covariance[np.ix_(there, there)]
     if not there.any() or not np.isfinite(C).all() or np.linalg.eigvalsh(C)[0] <= 0.0:
-        raise ValueError('a covariance that is not positive definite')
+        raise ValueError('the covariance is not positive definite')
     return StoredBackground(entry['stamp_ns'], background, covariance)

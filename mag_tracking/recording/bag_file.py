@@ -1,4 +1,4 @@
-"""One SQLite bag (`.db3`) or ROS 1 bag (`.bag`), read by `rosbags`."""
+"""One SQLite bag (`.db3`) or ROS 1 bag (`.bag`), read with `rosbags`."""
 
 import dataclasses
 import functools
@@ -14,7 +14,7 @@ import numpy as np
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.definitions import DEFINITIONS
 from mag_tracking.messages.types import encoder, schema_of
-from mag_tracking.recording.damage import DAMAGE
+from mag_tracking.recording.decode_errors import DECODE_ERRORS
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.message_block import MessageBlock
 from mag_tracking.recording.raw_message import RawMessage
@@ -26,23 +26,35 @@ if TYPE_CHECKING:
 
 ROS1_SUFFIX = '.bag'
 BAG_SUFFIXES = ('.db3', ROS1_SUFFIX)
-BLOCK = 256
-"""Messages that are read at once."""
+BLOCK_SIZE = 256
+"""Number of messages that are read at once."""
 
 
 class BagFile:
     """One bag of a recording.
 
+    Parameters
+    ----------
+    path : Path
+    losses : Counter
+        Incremented for everything that cannot be read, by description.
+
     Attributes
     ----------
-    types : {topic: message type}
-    message_counts : {topic: int}
-    start_ns, end_ns : int or None
-        Log times; None without a message.
+    types : dict of str to str
+        Message type by topic.
+    message_counts : Counter
+        Number of messages by topic.
+    start_ns, end_ns : int, ns, or None
+        Log times of the first and last message. None without messages.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read as a bag.
     """
 
     def __init__(self, path: Path, losses: 'Counter[str]') -> None:
-        """`losses` {what: number} grows with what cannot be read. Raises RecordingError."""
         self._path, self._is_ros1, self._losses = path, path.suffix == ROS1_SUFFIX, losses
         self.types: dict[str, str] = {}
         self.message_counts: Counter[str] = Counter()
@@ -54,11 +66,11 @@ class BagFile:
                 self.message_counts[connection.topic] += connection.msgcount
             times = reader if self._is_ros1 else reader.metadata
             if self.message_counts.total():
-                # The library's end is a nanosecond after the last message.
+                # The end time of the library is one nanosecond after the last message.
                 self.start_ns, self.end_ns = times.start_time, times.end_time - 1
 
     def _reading(self) -> AbstractContextManager[Any]:
-        """The library's reader, open; raises RecordingError."""
+        """Open the reader of the library; raises RecordingError."""
         try:
             reader = self._reader()
             reader.open()
@@ -67,8 +79,8 @@ class BagFile:
         return closing(reader)
 
     def _reader(self) -> 'Ros1Reader | Sqlite3Reader':
-        """The library's reader of this bag."""
-        # Most recordings are MCAP, and should not wait for another library.
+        """Reader of the library for this type of bag."""
+        # Imported here because most recordings are MCAP and do not need the library.
         if self._is_ros1:
             from rosbags.rosbag1 import Reader
 
@@ -79,18 +91,22 @@ class BagFile:
 
     def blocks(self, start_ns: int | None = None,
                progress: Progress | None = None) -> Iterator[MessageBlock]:
-        """Iterate over the messages, CDR, in order of log time, a block after the other.
+        """Iterate over blocks of CDR messages in order of log time.
 
         Parameters
         ----------
-        start_ns : int, optional
-            Leave out what was logged before.
-        progress : function, optional
-            Called with the bytes done since the last call.
+        start_ns : int, ns, optional
+            Skip messages that were logged earlier.
+        progress : callable, optional
+            Called with the number of bytes read since the last call.
+
+        Yields
+        ------
+        MessageBlock
         """
         size, total, done, n = self._path.stat().st_size, self.message_counts.total(), 0, 0
         raw = self._raw(start_ns)
-        while found := list(islice(raw, BLOCK)):
+        while found := list(islice(raw, BLOCK_SIZE)):
             yield MessageBlock.of_messages([
                 RawMessage(topic, kind, log_time_ns,
                            cdr_of_ros1(data, kind) if self._is_ros1 else data, schema_of(kind))
@@ -101,7 +117,7 @@ class BagFile:
                 done = here
 
     def _raw(self, start_ns: int | None) -> Iterator[tuple[str, str, int, bytes]]:
-        """Iterate over (topic, type, log time, bytes); damage ends it and is counted."""
+        """Iterate over (topic, type, log time, bytes); damage ends the iteration and is counted."""
         n = 0
         with self._reading() as reader:
             try:
@@ -109,25 +125,41 @@ class BagFile:
                     n += 1
                     yield connection.topic, connection.msgtype, log_time_ns, bytes(data)
             except bag_errors() as error:
-                self._losses[f'{self._path.name}: nothing readable after message {n} of '
+                self._losses[f'{self._path.name}: unreadable after message {n} of '
                              f'{self.message_counts.total()} ({type(error).__name__})'] += 1
 
 
 @functools.cache
 def bag_errors() -> tuple[type[Exception], ...]:
-    """Exceptions that the library raises on damaged or invalid bags."""
+    """Exceptions that the library raises for damaged or invalid bags.
+
+    Returns
+    -------
+    tuple of exception types
+    """
     import apsw
     from rosbags.rosbag1 import ReaderError as Ros1Error
     from rosbags.rosbag2 import ReaderError
     from rosbags.serde import SerdeError
 
-    # On damaged bytes the library's own assertions fail, too.
+    # Damaged bytes can also trigger assertions of the library.
     return (Ros1Error, ReaderError, SerdeError, apsw.Error, OSError, AssertionError, IndexError,
-            TypeError, OverflowError, *DAMAGE)
+            TypeError, OverflowError, *DECODE_ERRORS)
 
 
 def cdr_of_ros1(data: bytes, type_name: str) -> bytes:
-    """CDR bytes of a ROS 1 message; b'' where it is damaged, or of a type that is not used here."""
+    """Convert a serialised ROS 1 message to CDR.
+
+    Parameters
+    ----------
+    data : bytes
+    type_name : str
+
+    Returns
+    -------
+    bytes
+        Empty if the message is damaged or its type is not supported.
+    """
     if type_name not in DEFINITIONS:
         return b''
     try:
@@ -139,14 +171,14 @@ def cdr_of_ros1(data: bytes, type_name: str) -> bytes:
 
 @functools.cache
 def _ros1_types() -> 'Typestore':
-    """The message types of ROS 1."""
+    """Message types of ROS 1."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS1_NOETIC)
 
 
 def _plain(value: Any) -> Any:
-    """A message as nested dicts."""
+    """Message as nested dicts."""
     if dataclasses.is_dataclass(value):
         return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)
                 if not f.name.startswith('__')}

@@ -1,5 +1,5 @@
-// What is read and written many thousand times, as a Python module; core.pyi says what the arguments
-// are.
+// Python module of compiled functions for work that is repeated many thousand times; core.pyi
+// documents the arguments.
 
 #include <algorithm>
 #include <charconv>
@@ -12,9 +12,9 @@ namespace mag_tracking {
 namespace {
 
 constexpr std::uint8_t SCHEMA = 3, CHANNEL = 4, MESSAGE = 5;
-// Kind and length before a record; channel, sequence number, log time and time of publication before
-// the data of a message.
-constexpr std::size_t RECORD = 9, HEAD = 22;
+// A record begins with opcode and length. Message data follow channel, sequence number, log time
+// and publish time.
+constexpr std::size_t RECORD_HEADER = 9, MESSAGE_HEADER = 22;
 
 // MCAP is little-endian.
 template <class T>
@@ -25,8 +25,8 @@ T number_at(const char* p) {
     return value;
 }
 
-[[noreturn]] void damaged(const char* what) {
-    PyErr_SetString(PyExc_EOFError, what);
+[[noreturn]] void raise_damaged(const char* message) {
+    PyErr_SetString(PyExc_EOFError, message);
     throw py::error_already_set();
 }
 
@@ -35,19 +35,19 @@ py::tuple records_of(const py::bytes& data, std::int64_t latest_ns) {
     std::vector<std::int64_t> rows;
     py::list definitions;
     for (std::size_t at = 0; at < all.size();) {
-        if (all.size() - at < RECORD) damaged("a chunk that ends in the middle of a record");
+        if (all.size() - at < RECORD_HEADER) raise_damaged("chunk ends within a record");
         const auto kind = static_cast<std::uint8_t>(all[at]);
         const auto length = number_at<std::uint64_t>(all.data() + at + 1);
-        const std::size_t begin = at + RECORD;
-        if (length > all.size() - begin) damaged("a record that is longer than its chunk");
+        const std::size_t begin = at + RECORD_HEADER;
+        if (length > all.size() - begin) raise_damaged("record exceeds its chunk");
         const std::size_t end = begin + length;
         if (kind == MESSAGE) {
-            if (length < HEAD) damaged("a message that is shorter than its head");
+            if (length < MESSAGE_HEADER) raise_damaged("message is shorter than its header");
             const char* p = all.data() + begin;
             const auto log_time = number_at<std::uint64_t>(p + 6);
             rows.insert(rows.end(), {std::int64_t(number_at<std::uint16_t>(p)),
                                      std::int64_t(std::min<std::uint64_t>(log_time, latest_ns)),
-                                     std::int64_t(begin + HEAD), std::int64_t(end)});
+                                     std::int64_t(begin + MESSAGE_HEADER), std::int64_t(end)});
         } else if (kind == SCHEMA || kind == CHANNEL) {
             definitions.append(py::make_tuple(int(kind), begin, end));
         }
@@ -59,7 +59,7 @@ py::tuple records_of(const py::bytes& data, std::int64_t latest_ns) {
     return py::make_tuple(out, definitions);
 }
 
-// The shortest text that reads back as the same number.
+// Append the shortest text that reads back as the same number.
 void append(std::string& text, double value) {
     if (std::isnan(value)) {
         text += "nan";
@@ -90,7 +90,7 @@ py::list number_rows(Array values) {
 
 PYBIND11_MODULE(core, m) {
     using namespace mag_tracking;
-    m.doc() = "What is read and written many thousand times, compiled.";
+    m.doc() = "Compiled functions for work that is repeated many thousand times.";
     m.def("number_rows", &number_rows, IN(values));
     m.def("records_of", &records_of, py::arg("data"), py::arg("latest_ns"));
 }

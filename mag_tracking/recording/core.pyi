@@ -1,26 +1,39 @@
-"""What is read and written many thousand times, compiled."""
+"""Compiled functions for work that is repeated many thousand times."""
 
 from mag_tracking.arrays import FloatArray, IntArray
 
 def number_rows(values: FloatArray) -> list[str]:
-    """Each row of `values` (n, m) as m numbers with commas, which read back as the same."""
+    """Format the rows of a matrix as comma-separated numbers.
+
+    Parameters
+    ----------
+    values : (n, m) array
+
+    Returns
+    -------
+    list of str, length n
+        Shortest texts that read back as the same numbers.
+    """
 
 def records_of(data: bytes, latest_ns: int) -> tuple[IntArray, list[tuple[int, int, int]]]:
-    """The messages, and the schemas and channels.
+    """Locate the records of an MCAP chunk.
 
     Parameters
     ----------
     data : bytes
-        The records of a chunk, as they are in the file.
-    latest_ns : int
-        Later log times, which MCAP may have, count as this.
+        Uncompressed records of the chunk.
+    latest_ns : int, ns
+        Upper limit of the log times; later ones, which MCAP permits, are clipped.
 
     Returns
     -------
     messages : (n, 4) int array
-        Channel, log time [ns], and where the bytes of each begin and end.
+        Channel, log time [ns], and begin and end of the message bytes in `data`.
     definitions : list of (int, int, int)
-        The kind of each record, and where it begins and ends.
+        Opcode, begin and end of each schema and channel record.
 
-    Raises EOFError where the chunk is damaged.
+    Raises
+    ------
+    EOFError
+        If the chunk is damaged.
     """

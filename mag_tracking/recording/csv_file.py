@@ -1,4 +1,4 @@
-"""CSV files: lines, header, numbers, and errors that name the place."""
+"""CSV files: lines, headers and numbers, with errors that name file and row."""
 
 import csv
 from os import PathLike
@@ -11,11 +11,27 @@ from mag_tracking.files import checked_path
 
 CsvPath: TypeAlias = str | PathLike[str]
 Lines: TypeAlias = list[tuple[int, list[str]]]
-"""Number of each line, and its cells."""
+"""Line number and cells of each line."""
 
 
 def read_csv(path: CsvPath) -> tuple[list[str], Lines]:
-    """Header and rows of a CSV file; raises RecordingError, which names file and row."""
+    """Read header and rows of a CSV file.
+
+    Parameters
+    ----------
+    path : path_like
+
+    Returns
+    -------
+    header : list of str
+    rows : list of (int, list of str)
+        Line number and cells.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read, has no rows, or a row has a wrong number of columns.
+    """
     lines = csv_lines(path)
     if len(lines) < 2:
         raise RecordingError(f'{path} has no rows')
@@ -28,7 +44,22 @@ def read_csv(path: CsvPath) -> tuple[list[str], Lines]:
 
 
 def csv_lines(path: CsvPath) -> Lines:
-    """The lines that are not empty; raises RecordingError."""
+    """Read the lines of a CSV file that are not empty.
+
+    Parameters
+    ----------
+    path : path_like
+
+    Returns
+    -------
+    list of (int, list of str)
+        Line number and cells.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read.
+    """
     path = checked_path(path, RecordingError)
     try:
         with open(path, newline='', encoding='utf-8-sig') as stream:
@@ -41,11 +72,32 @@ def csv_lines(path: CsvPath) -> Lines:
 
 
 def number(path: CsvPath, line: int, column: str, text: str, finite: bool) -> float:
-    """One cell as a number, NaN where it is empty and that is allowed; raises RecordingError."""
+    """Convert a cell to a number.
+
+    Parameters
+    ----------
+    path : path_like
+    line : int
+    column : str
+    text : str
+        Content of the cell.
+    finite : bool
+        Whether an empty or NaN cell is an error.
+
+    Returns
+    -------
+    float
+        NaN for an empty cell.
+
+    Raises
+    ------
+    RecordingError
+        If the cell is not a number or is not finite. The message names file, row and column.
+    """
     try:
         value = float(text) if text.strip() else np.nan
     except ValueError:
-        raise RecordingError(f'{path}: row {line}: {column} is {text!r}, no number') from None
+        raise RecordingError(f'{path}: row {line}: {column} is {text!r}, not a number') from None
     if np.isinf(value) or (finite and np.isnan(value)):
         raise RecordingError(f'{path}: row {line}: {column} is not a finite number')
     return value

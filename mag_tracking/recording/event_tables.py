@@ -1,4 +1,4 @@
-"""Events as CSV tables."""
+"""Pass events as CSV tables."""
 
 import csv
 from collections.abc import Iterable
@@ -18,7 +18,16 @@ SIGNATURE_COLUMNS = ('sensor', 'number', 'time_s', 'x_nt', 'y_nt', 'z_nt')
 
 
 def event_row(event: PassEvent) -> list[object]:
-    """The values of `EVENT_COLUMNS`."""
+    """Values of `EVENT_COLUMNS` for an event.
+
+    Parameters
+    ----------
+    event : PassEvent
+
+    Returns
+    -------
+    list
+    """
     return [event.sensor, event.number, event.ended, event.onset_ns, event.release_ns,
             event.peak_ns, *(_number(1e9 * v) for v in event.peak), _number(1e18 * event.energy),
             event.axes, event.closest_ns, _number(event.closest_std), _number(event.time_scale),
@@ -26,12 +35,23 @@ def event_row(event: PassEvent) -> list[object]:
 
 
 def _number(value: float) -> str:
-    """Short text; empty where it is unknown."""
+    """Short text of a number; empty if it is unknown."""
     return f'{value:.6g}' if np.isfinite(value) else ''
 
 
 def write_events(folder: str | PathLike[str], events: Iterable[PassEvent]) -> None:
-    """Write `events.csv` and `signatures.csv` into a folder; raises OutputError."""
+    """Write `events.csv` and `signatures.csv` to a folder.
+
+    Parameters
+    ----------
+    folder : path_like
+    events : iterable of PassEvent
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    """
     folder, events = output_folder(folder), list(events)
     try:
         with new_text_file(folder / 'events.csv', newline='') as stream:

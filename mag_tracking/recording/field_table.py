@@ -1,4 +1,4 @@
-"""Tables of magnetometer readings (CSV) to recordings; columns and units are given."""
+"""Import of CSV tables of magnetometer readings with user-defined columns and units."""
 
 import csv
 import re
@@ -19,84 +19,89 @@ from mag_tracking.records import Readings
 from mag_tracking.units import LATEST_NS
 
 FIELD_UNITS = {'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'gauss': 1e-4, 'mgauss': 1e-7}
-"""{unit: T}."""
+"""Tesla per unit."""
 TIME_UNITS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
-"""{unit: ns}."""
+"""Nanoseconds per unit."""
 
 _Path: TypeAlias = str | PathLike[str]
 _Axes: TypeAlias = dict[str, dict[str, str]]
-"""{sensor, or '' where a column tells: {axis: column}}."""
+"""{sensor: {axis: column}}; the sensor is '' if a column of the table holds it."""
 
 
 def parse_columns(texts: Sequence[str]) -> tuple[str, str | None, _Axes]:
-    """The columns of a table.
+    """Parse the assignment of table columns.
 
     Parameters
     ----------
     texts : sequence of str
-        `time=COLUMN`, and either `sensor=COLUMN` with `x=COLUMN` and so on (a row a reading), or
-        `NAME.x=COLUMN` (a row for all sensors). Axes that are not measured are left out.
+        `time=COLUMN`, and either `sensor=COLUMN` with `x=COLUMN` and so on (one row per reading),
+        or `NAME.x=COLUMN` and so on (one row for all sensors). Axes that were not measured are
+        omitted.
 
     Returns
     -------
-    time, sensor : str, str or None
-        Names of columns.
-    axes : {sensor: {axis: column}}
+    time : str
+        Column of the time.
+    sensor : str or None
+        Column of the sensor name.
+    axes : dict of str to dict of str to str
+        Column by sensor and axis.
 
     Raises
     ------
     RecordingError
-        If a text cannot be read, or something is missing.
+        If an assignment is invalid, duplicated or missing.
     """
     found: dict[str, str] = {}
     for text in texts:
         key, equals, column = text.partition('=')
         if not (equals and column) or key in found:
             raise RecordingError(f'columns: {text!r} is given twice' if key in found else
-                                 f'columns: expected e.g. time=t, got {text!r}')
+                                 f'columns: expected KEY=COLUMN such as time=t, got {text!r}')
         found[key] = column
     time, sensor = found.pop('time', None), found.pop('sensor', None)
     axes: _Axes = {}
     for key, column in found.items():
         name, _, axis = key.rpartition('.')
         if axis not in ('x', 'y', 'z') or bool(name) == (sensor is not None):
-            raise RecordingError('columns: expected time, sensor, x, y, z, or without sensor '
-                                 f'time, NAME.x, NAME.y, NAME.z; got {key!r}')
+            raise RecordingError('columns: expected time, sensor, x, y, z (one row per reading) or '
+                                 'time, NAME.x, NAME.y, NAME.z (one row for all sensors); '
+                                 f'got {key!r}')
         axes.setdefault(_sensor_name(name, 'columns') if name else '', {})[axis] = column
     if time is None or not axes:
-        raise RecordingError('columns: time and at least one axis are needed, such as time=t '
+        raise RecordingError('columns: time and at least one axis are required, such as time=t '
                              'mag_1.x=bx mag_1.y=by mag_1.z=bz')
     return time, sensor, axes
 
 
 def import_field_table(table: _Path, columns: Sequence[str], unit: str, out: _Path,
                        time_unit: str = 's') -> tuple[Path, dict[str, int]]:
-    """A table of readings as a recording.
+    """Import a table of readings as a recording.
 
     Parameters
     ----------
-    table : path
-        CSV with a header.
+    table : path_like
+        CSV file with a header.
     columns : sequence of str
-        As for `parse_columns`. An empty field is not measured.
+        As for `parse_columns`. An empty field is a missing measurement.
     unit : str
-        Of the fields, one of `FIELD_UNITS`.
-    out : path
+        Unit of the field, a key of `FIELD_UNITS`.
+    out : path_like
         Folder for `<table>.mcap` and `metadata.yaml`.
-    time_unit : str
-        Of the times, one of `TIME_UNITS`.
+    time_unit : str, optional
+        Unit of the time, a key of `TIME_UNITS`.
 
     Returns
     -------
     recording : Path
-        The readings are on `/NAME/imu/mag`.
-    counts : {sensor: number of readings}
-        A row in which a sensor has no axis at all gives none.
+        Recording with the readings on `/NAME/imu/mag`.
+    counts : dict of str to int
+        Number of readings by sensor. A row in which no axis of a sensor was measured gives none.
 
     Raises
     ------
     RecordingError
-        If the table does not fit.
+        If a unit is unknown or the table does not match the columns.
     OutputError
         If `out` cannot be written.
     """
@@ -116,7 +121,7 @@ def import_field_table(table: _Path, columns: Sequence[str], unit: str, out: _Pa
 
 def _readings(table: Path, columns: tuple[str, str | None, _Axes], scale: float,
               time_scale: int) -> Readings:
-    """The readings of a table in order of time."""
+    """Readings of a table in order of time."""
     time, sensor, axes = columns
     names: list[str] = []
     stamps: list[int] = []
@@ -148,7 +153,7 @@ def _rows(table: Path, wanted: Sequence[str]) -> list[tuple[int, dict[str, str]]
             reader = csv.DictReader(stream, skipinitialspace=True)
             missing = [c for c in wanted if c not in (reader.fieldnames or ())]
             if missing:
-                raise RecordingError(f'{table}: there is no column {missing[0]}; it has '
+                raise RecordingError(f'{table}: column {missing[0]} is missing; the columns are '
                                      f'{", ".join(reader.fieldnames or ["none"])}')
             rows = [(reader.line_num, row) for row in reader]
     except OSError as error:
@@ -164,7 +169,7 @@ def _rows(table: Path, wanted: Sequence[str]) -> list[tuple[int, dict[str, str]]
 
 
 def _number(text: str, where: str) -> float:
-    """A number; NaN of an empty field. Raises RecordingError."""
+    """Convert a field to a number, NaN if it is empty; raises RecordingError."""
     if not text.strip():
         return float('nan')
     try:
@@ -177,7 +182,7 @@ def _number(text: str, where: str) -> float:
 
 
 def _stamp(text: str, scale: int, where: str) -> int:
-    """[ns] of a time; whole numbers keep every digit. Raises RecordingError."""
+    """Convert a time to [ns] without rounding whole numbers; raises RecordingError."""
     text = text.strip()
     is_whole = re.fullmatch(r'[+-]?[0-9]{1,20}', text)
     value = int(text) * scale if is_whole else _number(text, where) * scale
@@ -187,9 +192,9 @@ def _stamp(text: str, scale: int, where: str) -> int:
 
 
 def _sensor_name(text: str, where: str) -> str:
-    """A sensor's name, as in a topic: a number n is `mag_n`. Raises RecordingError."""
+    """Valid sensor name for a topic: a number n becomes `mag_n`; raises RecordingError."""
     name = f'mag_{text.strip()}' if re.fullmatch('[0-9]+', text.strip()) else text.strip()
     if not re.fullmatch('[A-Za-z_][A-Za-z0-9_]*', name):
-        raise RecordingError(f'{where}: {text!r} cannot be the name of a sensor: letters, digits '
-                             'and _ only')
+        raise RecordingError(f'{where}: {text!r} is not a valid sensor name: use only letters, '
+                             'digits and _')
     return name

@@ -1,4 +1,4 @@
-"""The table of fitted passes: CSV as it goes, JSON at the end."""
+"""Table of fitted passes: CSV during the run, JSON at its end."""
 
 import csv
 import json
@@ -26,16 +26,17 @@ FIT_COLUMNS = (
     'mx', 'my', 'mz', 'sd_mx', 'sd_my', 'sd_mz', 'cpa_time', 'sd_cpa_time',
     'cpa_range', 'sd_cpa_range', 'rate', 'sd_rate',
     'delay_speed', 'sd_delay_speed', 'delay_heading_deg', 'sd_delay_heading_deg', 'no_delay')
-"""Deviations are of `PassFit.robust_covariance`; the CPA is to the middle of the sensors, its time
-in seconds after `stamp_ns`. The rate is speed over CPA range, which one sensor alone tells; its
-directions are in `fits.json`. Where there is a reason not to believe a fit as a whole, there are
-the numbers that are trusted, if it is the fit of the pass that counts: speed, direction (heading)
-and time (of the CPA). Vehicles that were fitted together have unknowns and costs in common. The
-delay's columns are the same for all fits of a pass: they need no model."""
+"""Columns of `fits.csv`. Standard deviations are from `PassFit.robust_covariance`. The closest
+point of approach (CPA) refers to the centre of the sensors; its time is in seconds after
+`stamp_ns`. `rate` is the speed divided by the CPA range, which a single sensor can observe; the
+corresponding directions are in `fits.json`. A fit that is not trusted as a whole has only its
+trusted quantities (speed, heading, time of the CPA), and only if it is the fit selected for its
+pass. Jointly fitted vehicles share unknowns and costs. The columns of the delay are model-free and
+the same for all fits of a pass."""
 
 
 class _FittedPass(Protocol):
-    """See `apps.pass_fitter.FittedPass`."""
+    """Interface of `apps.pass_fitter.FittedPass`."""
 
     @property
     def recording(self) -> str: ...
@@ -58,10 +59,19 @@ class _FittedPass(Protocol):
 
 
 def fit_row(fit: PassFit, is_known: bool = True) -> dict[str, Any]:
-    """{column: number} of one `PassFit`, without those that say which pass it is.
+    """Values of a fit by column, without the columns that identify the pass.
 
-    Where the fit has a reason not to be believed the target's numbers are NaN but for those that
-    are trusted, if `is_known`: it is the fit of its pass that counts.
+    Parameters
+    ----------
+    fit : PassFit
+    is_known : bool, optional
+        Whether it is the fit selected for its pass. Only then does a fit with a reason not to be
+        trusted keep its trusted quantities.
+
+    Returns
+    -------
+    dict
+        NaN for quantities that are not trusted.
     """
     row: dict[str, Any] = dict.fromkeys(FIT_COLUMNS[FIT_COLUMNS.index('stamp_ns'):], math.nan)
     row |= {'ambiguous': '', 'trusted': '', 'n_dipoles': fit.n_dipoles, 'reason': fit.reason,
@@ -95,7 +105,7 @@ def fit_row(fit: PassFit, is_known: bool = True) -> dict[str, Any]:
 
 
 def _trusted(fit: PassFit, centre: FloatArray) -> dict[str, float]:
-    """{column: number} of what is trusted."""
+    """Trusted quantities by column."""
     found: dict[str, Iterable[float]] = {}
     if 'speed' in fit.trusted:
         found['speed sd_speed'] = fit.speed
@@ -108,7 +118,17 @@ def _trusted(fit: PassFit, centre: FloatArray) -> dict[str, float]:
 
 
 def pass_rows(one: _FittedPass) -> list[dict[str, Any]]:
-    """[{column: value}] of a `FittedPass`, one for each of its fits: `FIT_COLUMNS`."""
+    """Rows of a fitted pass, one per fit.
+
+    Parameters
+    ----------
+    one : FittedPass
+
+    Returns
+    -------
+    list of dict
+        Values by `FIT_COLUMNS`.
+    """
     chosen, known, c = one.chosen, one.known, one.correlated
     delay = {'delay_speed': c.speed, 'sd_delay_speed': c.speed_std,
              'delay_heading_deg': math.degrees(c.heading),
@@ -119,14 +139,30 @@ def pass_rows(one: _FittedPass) -> list[dict[str, Any]]:
 
 
 class FitFolder:
-    """`fits.csv` and `fits.json` in a folder; a context manager.
+    """Writes `fits.csv` and `fits.json` to a folder; a context manager.
 
-    Rows are written as they come, `fits.json` at the end, whatever ended it; what is put into
-    `summary` is in it, too.
+    Rows are written immediately, `fits.json` on exit, even after an error.
+
+    Parameters
+    ----------
+    folder : path_like
+        Created if it does not exist.
+
+    Attributes
+    ----------
+    folder : Path
+    rows : list of dict
+        Rows written so far.
+    summary : dict
+        Further content of `fits.json`, to be filled by the caller.
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be created or written.
     """
 
     def __init__(self, folder: str | PathLike[str]) -> None:
-        """Raises OutputError where the folder cannot be made or written."""
         self.folder = output_folder(folder)
         self.rows: list[dict[str, Any]] = []
         self.summary: dict[str, Any] = {}
@@ -148,7 +184,12 @@ class FitFolder:
             stream.write('\n')
 
     def add(self, one: _FittedPass) -> None:
-        """Write the rows of a `FittedPass`."""
+        """Write the rows of a fitted pass.
+
+        Parameters
+        ----------
+        one : FittedPass
+        """
         for fit, row in zip(one.fits, pass_rows(one), strict=True):
             self.rows.append(row | {'notes': list(one.notes), 'bearing': _bearing(fit.bearing)})
             self._writer.writerow([repr(v) if isinstance(v, float) else v
@@ -157,7 +198,7 @@ class FitFolder:
 
 
 def _bearing(bearing: Bearing | None) -> dict[str, Any] | None:
-    """A `Bearing` for JSON, or None."""
+    """Content of a `Bearing` for JSON."""
     if bearing is None:
         return None
     return {'to_closest_point': bearing.cpa_direction.tolist(),

@@ -1,4 +1,4 @@
-"""Enrolled vehicles in JSON: the passes of each, so that more can be added."""
+"""Enrolled vehicles in JSON, stored with the passes of each so that more can be added."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -12,6 +12,7 @@ from mag_tracking.errors import RecordingError
 from mag_tracking.files import checked_path, replace_text
 
 VERSION = 1
+"""Version of the file format."""
 
 
 @dataclass(frozen=True)
@@ -19,24 +20,39 @@ class FleetPass:
     """One pass of an enrolled vehicle."""
 
     moment: FloatArray
-    """(3,) [A m^2], world."""
+    """Magnetic moment, (3,) A m², world frame."""
     covariance: FloatArray
-    """(3, 3)"""
+    """Covariance of `moment`, (3, 3) (A m²)², world frame."""
     heading: float
-    """[rad] anticlockwise from x."""
+    """Heading, rad, anticlockwise from x."""
     source: str
     """Recording and number of the passage."""
 
 
 def read_fleet(path: str | PathLike[str]) -> dict[str, list[FleetPass]]:
-    """{name: passes} of a file; raises RecordingError."""
+    """Read enrolled vehicles.
+
+    Parameters
+    ----------
+    path : path_like
+
+    Returns
+    -------
+    dict of str to list of FleetPass
+        Passes by vehicle.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read or is not a valid fleet file.
+    """
     path = checked_path(path, RecordingError)
     try:
         with open(path, encoding='utf-8') as stream:
             content = json.load(stream)
         if content['mag_tracking.fleet'] != VERSION:
-            raise RecordingError(f'{path}: a fleet of version {content["mag_tracking.fleet"]}; '
-                                 f'this reads {VERSION}')
+            raise RecordingError(f'{path}: fleet version {content["mag_tracking.fleet"]} is not '
+                                 f'supported; expected {VERSION}')
         return {str(name): [FleetPass(
             np.array(p['moment'], dtype=float).reshape(3),
             np.array(p['covariance'], dtype=float).reshape(3, 3), float(p['heading']),
@@ -44,11 +60,23 @@ def read_fleet(path: str | PathLike[str]) -> dict[str, list[FleetPass]]:
     except OSError as error:
         raise RecordingError(f'cannot read {path}: {error.strerror}') from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise RecordingError(f'{path} holds no enrolled vehicles ({error})') from error
+        raise RecordingError(f'{path} is not a valid fleet file ({error})') from error
 
 
 def write_fleet(path: Path, fleet: dict[str, list[FleetPass]]) -> None:
-    """Write a file as a whole; raises OutputError."""
+    """Write enrolled vehicles atomically.
+
+    Parameters
+    ----------
+    path : Path
+    fleet : dict of str to list of FleetPass
+        Passes by vehicle.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
     vehicles = {name: [{k: v.tolist() if isinstance(v, np.ndarray) else v
                         for k, v in asdict(p).items()} for p in passes]
                 for name, passes in fleet.items()}

@@ -1,4 +1,4 @@
-"""Importers: other people's tables to recordings and network files."""
+"""Import of third-party tables as recordings and network files."""
 
 import csv
 from os import PathLike
@@ -24,30 +24,39 @@ _COLUMNS = ('id', 'timestamp', 'Bx', 'By', 'Bz', 'sensor_x', 'sensor_y', 'sensor
 
 def import_pose_table(table: _Path, background: _Path, out: _Path,
                       noise_std: float) -> tuple[Path, Path, int]:
-    """A table of magnet poses seen by fixed sensors, as recording and network file.
+    """Import a table of magnet poses observed by fixed sensors, as recording and network file.
+
+    The sensor positions and orientations were measured again for every pose; their medians are
+    used.
 
     Parameters
     ----------
-    table : path
-        CSV with a row a sensor and pose: `id`, `timestamp` [s], `Bx By Bz`
-        [microtesla, sensor frame, background included], `sensor_x..z` [mm] and
-        `sensor_ox..oz` (rotation vector, sensor to world), the true magnet
-        `m_x..z` [mm] and `m_ox..oz` (its axis is the rotated z).
-    background : path
-        CSV with a row a sensor, in the order of their ids: field without the
-        magnet [microtesla, sensor frame].
-    out : path
+    table : path_like
+        CSV file with one row per sensor and pose: `id`, `timestamp` [s], `Bx By Bz` [µT, sensor
+        frame, including the background], `sensor_x..z` [mm] and `sensor_ox..oz` (rotation vector,
+        sensor to world), and the true pose of the magnet `m_x..z` [mm] and `m_ox..oz` (rotation
+        vector; the magnet's axis is the rotated z axis).
+    background : path_like
+        CSV file with one row per sensor, in the order of their ids: field without the magnet
+        [µT, sensor frame].
+    out : path_like
         Folder for `<table>.mcap`, `metadata.yaml` and `network.yaml`.
-    noise_std : float [T]
-        Of one reading; the table does not tell.
+    noise_std : float, T
+        Standard deviation of one reading, which the table does not contain.
 
     Returns
     -------
-    (recording, network file, number of readings)
+    recording : Path
+    network : Path
+        Network file.
+    n_readings : int
 
-    Raises RecordingError where the tables do not fit, OutputError where `out`
-    cannot be written. The sensors were measured anew for every pose: the
-    median of each is taken.
+    Raises
+    ------
+    RecordingError
+        If the tables cannot be read or do not match.
+    OutputError
+        If `out` cannot be written.
     """
     rows = _read_table(table)
     field_free = _read_background(background)
@@ -82,7 +91,7 @@ def import_pose_table(table: _Path, background: _Path, out: _Path,
 
 
 def _read_table(path: _Path) -> dict[str, FloatArray]:
-    """The columns of the table as arrays."""
+    """Columns of the table as arrays."""
     try:
         with open(path, newline='', encoding='utf-8') as stream:
             reader = csv.DictReader(stream)
@@ -101,13 +110,13 @@ def _read_table(path: _Path) -> dict[str, FloatArray]:
         row, column = np.argwhere(~np.isfinite(a))[0]
         raise RecordingError(f'{path}: row {row + 2}: {_COLUMNS[column]} is not a finite number')
     if (a[:, 0] != a[:, 0].astype(int)).any():
-        raise RecordingError(f'{path}: column id has numbers that are not whole')
+        raise RecordingError(f'{path}: column id contains numbers that are not integers')
     return {'id': a[:, 0], 'timestamp': a[:, 1], 'field': a[:, 2:5], 'sensor': a[:, 5:8],
             'sensor_rotation': a[:, 8:11], 'magnet': a[:, 11:14], 'magnet_rotation': a[:, 14:17]}
 
 
 def _read_background(path: _Path) -> FloatArray:
-    """(n_sensors, 3) [microtesla]."""
+    """Background of each sensor, (n_sensors, 3) [µT]."""
     try:
         values = np.loadtxt(path, delimiter=',', ndmin=2)
     except OSError as error:

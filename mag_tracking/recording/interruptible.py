@@ -4,11 +4,11 @@ from collections.abc import Callable, Iterator
 from typing import TypeAlias, TypeVar
 
 Progress: TypeAlias = Callable[[int], object]
-"""Called with the bytes done since the last call."""
+"""Function that is called with the number of bytes read since the last call."""
 _Item = TypeVar('_Item')
 
 class ReadingStopped(Exception):
-    """The caller asked for the reading to end here."""
+    """The caller stopped the reading."""
 
 
 def until_stopped(read: Callable[[Progress], Iterator[_Item]], progress: Progress | None = None,
@@ -17,13 +17,18 @@ def until_stopped(read: Callable[[Progress], Iterator[_Item]], progress: Progres
 
     Parameters
     ----------
-    read : function
-        Takes a function that it calls with the bytes done since the last call; returns an
-        iterator.
-    progress : function, optional
-        Called with the bytes done since the last call.
-    stopped : function, optional
-        Asked after every item, and whenever the reading has advanced.
+    read : callable
+        Returns an iterator. Its argument is a function to be called with the number of bytes read
+        since the last call.
+    progress : callable, optional
+        Called with the number of bytes read since the last call.
+    stopped : callable, optional
+        Returns whether to stop. Called after every item and after every progress report.
+
+    Yields
+    ------
+    object
+        The items.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""One MCAP file: read chunk by chunk, checked, and as far as it is whole."""
+"""One MCAP file, read chunk by chunk with checksums, as far as it is intact."""
 
 import os
 from collections import Counter
@@ -18,13 +18,13 @@ from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.self_described import type_of
 from mag_tracking.recording import core
-from mag_tracking.recording.damage import DAMAGE
+from mag_tracking.recording.decode_errors import DECODE_ERRORS
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.message_block import ChannelKind, MessageBlock
 from mag_tracking.units import LATEST_NS
 
-GATHERED = 256
-"""Messages without a chunk that are read at once."""
+BATCH_SIZE = 256
+"""Maximum number of messages outside of chunks that are read at once."""
 _DEFINITIONS: dict[int, type[Schema] | type[Channel]] = {
     Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
 
@@ -32,16 +32,28 @@ _DEFINITIONS: dict[int, type[Schema] | type[Channel]] = {
 class McapFile:
     """One MCAP file of a recording.
 
+    Parameters
+    ----------
+    path : Path
+    losses : Counter
+        Incremented for everything that cannot be read, by description.
+
     Attributes
     ----------
-    types : {topic: message type}
-    message_counts : {topic: int}, empty for a file that was cut off
-    start_ns, end_ns : int or None
-        Log times; None where the file does not tell.
+    types : dict of str to str
+        Message type by topic.
+    message_counts : Counter
+        Number of messages by topic. Empty for a truncated file.
+    start_ns, end_ns : int, ns, or None
+        Log times of the first and last message. None if unknown.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not an MCAP file.
     """
 
     def __init__(self, path: Path, losses: 'Counter[str]') -> None:
-        """`losses` {what: number} grows with what cannot be read. Raises RecordingError."""
         self.types: dict[str, str] = {}
         self.message_counts: Counter[str] = Counter()
         self.start_ns: int | None = None
@@ -50,17 +62,18 @@ class McapFile:
         self._index = self._inspect(path)
 
     def _inspect(self, file: Path) -> list[ChunkIndex] | None:
-        """Read topics, counts and times of one file; its chunk index, or None without one."""
+        """Read topics, counts and times of the file; returns its chunk index, or None without
+        one."""
         with open(file, 'rb') as stream:
             if stream.read(5) != b'\x89MCAP':
                 raise RecordingError(f'{file} is not an MCAP file')
             stream.seek(0)
             try:
                 summary = make_reader(stream).get_summary()
-            except DAMAGE:
+            except DECODE_ERRORS:
                 summary = None
         if summary is None:
-            self._losses[f'{file.name} has no usable end (cut off?): read up to the damage'] = 1
+            self._losses[f'{file.name} has no valid index (truncated?): read up to the damage'] = 1
             return None
         for channel in summary.channels.values():
             schema = summary.schemas.get(channel.schema_id)
@@ -76,15 +89,18 @@ class McapFile:
 
     def blocks(self, start_ns: int | None = None,
                progress: Progress | None = None) -> Iterator[MessageBlock]:
-        """Iterate over the messages, chunk by chunk; in order of log time where the file has an
-        index.
+        """Iterate over the messages chunk by chunk, in order of log time if the file has an index.
 
         Parameters
         ----------
-        start_ns : int, optional
-            Chunks that end before are left out.
-        progress : function, optional
-            Called with the bytes done since the last call.
+        start_ns : int, ns, optional
+            Skip chunks that end earlier, if the file has an index.
+        progress : callable, optional
+            Called with the number of bytes read since the last call.
+
+        Yields
+        ------
+        MessageBlock
         """
         with open(self._path, 'rb') as stream:
             if self._index:
@@ -94,9 +110,9 @@ class McapFile:
 
     def _from_index(self, stream: BinaryIO, index: list[ChunkIndex], start_ns: int | None,
                     progress: Progress | None) -> Iterator[MessageBlock]:
-        """Messages of an intact file, in order of log time across chunks."""
+        """Iterate over the messages of an intact file, in order of log time across chunks."""
         channels = _Channels()
-        waiting = MessageBlock.of_messages([])
+        pending = MessageBlock.of_messages([])
         for k, entry in enumerate(index):
             if start_ns is not None and entry.message_end_time < start_ns:
                 continue
@@ -105,59 +121,59 @@ class McapFile:
                 chunk = next(iter(StreamReader(stream, skip_magic=True,
                                                emit_chunks=True).records))
                 if not isinstance(chunk, Chunk):
-                    raise ValueError('no chunk where the index says')
-                waiting = waiting.merged(channels.block_of(chunk))
-            except DAMAGE as error:
-                self._lose_chunk(entry, error)
+                    raise ValueError('no chunk at the indexed offset')
+                pending = pending.merged(channels.block_of(chunk))
+            except DECODE_ERRORS as error:
+                self._count_lost_chunk(entry, error)
             if progress:
                 progress(entry.chunk_length)
-            n = len(waiting)
+            n = len(pending)
             if k + 1 < len(index):
-                n = int(np.searchsorted(waiting.log_time_ns, index[k + 1].message_start_time))
-            yield waiting.part(slice(n))
-            waiting = waiting.part(slice(n, None))
-        yield waiting
+                n = int(np.searchsorted(pending.log_time_ns, index[k + 1].message_start_time))
+            yield pending.part(slice(n))
+            pending = pending.part(slice(n, None))
+        yield pending
 
-    def _lose_chunk(self, entry: ChunkIndex, error: Exception) -> None:
-        """Report a chunk that cannot be read."""
+    def _count_lost_chunk(self, entry: ChunkIndex, error: Exception) -> None:
+        """Count a chunk that cannot be read."""
         seconds = (entry.message_end_time - entry.message_start_time) / 1e9
         after = (entry.message_start_time - (self.start_ns or entry.message_start_time)) / 1e9
-        self._losses[f'a damaged stretch of {seconds:.1f} s at {after:.1f} s '
+        self._losses[f'damaged segment of {seconds:.1f} s at {after:.1f} s '
                     f'({type(error).__name__})'] += 1
 
     def _from_stream(self, stream: BinaryIO, progress: Progress | None
                      ) -> Iterator[MessageBlock]:
-        """Messages in the order of the file, up to where it breaks off."""
+        """Iterate over the messages in file order, up to the first damage outside of a chunk."""
         channels, loose = _Channels(), _LooseMessages()
         done = 0
         try:
             for record in StreamReader(stream, emit_chunks=True).records:
                 if isinstance(record, Chunk):
-                    yield from loose.taken(channels)
+                    yield from loose.collected(channels)
                     try:
                         yield channels.block_of(record)
-                    except DAMAGE as error:
-                        self._losses[f'a damaged chunk ({type(error).__name__})'] += 1
+                    except DECODE_ERRORS as error:
+                        self._losses[f'damaged chunk ({type(error).__name__})'] += 1
                 elif isinstance(record, Schema | Channel):
                     channels.add(record)
                 elif isinstance(record, Message) and channels.has_schema(record.channel_id):
                     loose.add(record)
-                    if len(loose) >= GATHERED:
-                        yield from loose.taken(channels)
+                    if len(loose) >= BATCH_SIZE:
+                        yield from loose.collected(channels)
                 if progress:
                     here = stream.tell()
                     progress(here - done)
                     done = here
-            yield from loose.taken(channels)
-        except DAMAGE as error:
-            yield from loose.taken(channels)
-            self._losses[f'{os.path.basename(stream.name)}: nothing readable after byte '
+            yield from loose.collected(channels)
+        except DECODE_ERRORS as error:
+            yield from loose.collected(channels)
+            self._losses[f'{os.path.basename(stream.name)}: unreadable after byte '
                         f'{stream.tell()} of {os.fstat(stream.fileno()).st_size} '
                         f'({type(error).__name__})'] += 1
 
 
 class _LooseMessages:
-    """Messages that are in no chunk, gathered: one by one each would cost as much as many."""
+    """Buffer of messages outside of chunks: reading many at once costs as much as reading one."""
 
     def __init__(self) -> None:
         self._messages: list[Message] = []
@@ -166,11 +182,11 @@ class _LooseMessages:
         return len(self._messages)
 
     def add(self, message: Message) -> None:
-        """Take one more."""
+        """Add a message."""
         self._messages.append(message)
 
-    def taken(self, channels: '_Channels') -> Iterator[MessageBlock]:
-        """What was gathered, if anything was; nothing is left."""
+    def collected(self, channels: '_Channels') -> Iterator[MessageBlock]:
+        """Empty the buffer and iterate over its block, if there is one."""
         messages, self._messages = self._messages, []
         if not messages:
             return
@@ -181,7 +197,7 @@ class _LooseMessages:
 
 
 class _Channels:
-    """The channels of a file that are known by now."""
+    """Channels of a file that have been read so far."""
 
     def __init__(self) -> None:
         self._schemas: dict[int, Schema] = {}
@@ -189,7 +205,7 @@ class _Channels:
         self.kinds: dict[int, ChannelKind] = {}
 
     def add(self, record: Schema | Channel) -> None:
-        """A record of the file; raises KeyError where the schema of a channel is not known."""
+        """Add a record of the file; raises KeyError if the schema of a channel is unknown."""
         if isinstance(record, Schema):
             self._schemas[record.id] = record
         else:
@@ -199,13 +215,14 @@ class _Channels:
                                                        self._schemas[record.schema_id])
 
     def has_schema(self, channel: int) -> bool:
-        """Whether its messages have a type at all; MCAP allows channels without (id 0), ROS does
-        not. Raises KeyError for an unknown channel.
+        """Whether the messages of a channel have a type; raises KeyError for an unknown channel.
+
+        MCAP permits channels without a schema (id 0), ROS does not.
         """
         return self._schema_of[channel] != 0
 
     def block_of(self, chunk: Chunk) -> MessageBlock:
-        """The messages of one chunk; raises where it is damaged."""
+        """Messages of one chunk; raises one of `DECODE_ERRORS` if it is damaged."""
         stream, size = get_chunk_data_stream(chunk, validate_crc=True)
         data = stream.read(size)
         rows, definitions = core.records_of(data, LATEST_NS)

@@ -1,4 +1,4 @@
-"""Messages that are read at once: rows of arrays over their bytes."""
+"""Blocks of messages that are read at once: arrays that index their common bytes."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,18 +14,30 @@ from mag_tracking.recording.raw_message import RawMessage
 
 
 class ChannelKind(NamedTuple):
-    """What the messages of a channel are."""
+    """Topic and type of the messages of a channel."""
 
     topic: str
+    """Name of the topic."""
     type: str
-    """A magnetic field in JSON or protobuf counts as sensor_msgs/MagneticField."""
+    """Message type. A magnetic field in JSON or protobuf has the type sensor_msgs/MagneticField."""
     schema: Schema
+    """Schema in the file."""
     is_cdr: bool
-    """False: the bytes have to be turned into CDR."""
+    """Whether the messages are CDR. Otherwise they must be converted."""
 
     @classmethod
     def of(cls, topic: str, schema: Schema) -> 'ChannelKind':
-        """Of a channel in a file."""
+        """Create the description of a channel in a file.
+
+        Parameters
+        ----------
+        topic : str
+        schema : Schema
+
+        Returns
+        -------
+        ChannelKind
+        """
         kind = type_of(schema) if schema.encoding in SCHEMAS else schema.name
         return cls(topic, kind, schema, kind == schema.name)
 
@@ -35,20 +47,34 @@ class MessageBlock:
     """Messages in order of log time."""
 
     data: bytes
+    """Bytes of all messages."""
     kinds: Mapping[int, ChannelKind]
-    """By the number of a channel."""
+    """Topic and type by channel number."""
     channel: IntArray
-    """(n,) channel of each message."""
+    """Channel number of each message, (n,)."""
     log_time_ns: IntArray
-    """(n,)"""
+    """Log time of each message, (n,) ns."""
     begin: IntArray
+    """Index in `data` of the first byte of each message, (n,)."""
     end: IntArray
-    """(n,) where its bytes are in `data`."""
+    """Index in `data` after the last byte of each message, (n,)."""
 
     @classmethod
     def of_rows(cls, data: bytes, kinds: Mapping[int, ChannelKind],
                 rows: IntArray) -> 'MessageBlock':
-        """Of (n, 4) channel, log time, begin and end, in any order."""
+        """Create a block from the rows of a chunk.
+
+        Parameters
+        ----------
+        data : bytes
+        kinds : mapping of int to ChannelKind
+        rows : (n, 4) int array
+            Channel, log time [ns], begin and end, in any order.
+
+        Returns
+        -------
+        MessageBlock
+        """
         block = cls(data, kinds, *np.ascontiguousarray(rows.T))
         if np.all(rows[1:, 1] >= rows[:-1, 1]):
             return block
@@ -56,7 +82,17 @@ class MessageBlock:
 
     @classmethod
     def of_messages(cls, messages: Sequence[RawMessage]) -> 'MessageBlock':
-        """Of messages in order of log time."""
+        """Create a block from individual messages.
+
+        Parameters
+        ----------
+        messages : sequence of RawMessage
+            In order of log time.
+
+        Returns
+        -------
+        MessageBlock
+        """
         numbers: dict[tuple[str, str], int] = {}
         kinds: dict[int, ChannelKind] = {}
         channel = []
@@ -76,7 +112,16 @@ class MessageBlock:
         return (self.message(k) for k in range(len(self)))
 
     def message(self, k: int) -> RawMessage:
-        """The message of a row."""
+        """Message of a row, converted to CDR.
+
+        Parameters
+        ----------
+        k : int
+
+        Returns
+        -------
+        RawMessage
+        """
         topic, kind, schema, is_cdr = self.kinds[int(self.channel[k])]
         data = self.data[self.begin[k]:self.end[k]]
         if not is_cdr:
@@ -84,15 +129,34 @@ class MessageBlock:
         return RawMessage(topic, kind, int(self.log_time_ns[k]), data, schema)
 
     def part(self, which: IntArray | slice) -> 'MessageBlock':
-        """The messages of some of the rows, in that order."""
+        """Select messages.
+
+        Parameters
+        ----------
+        which : int array or slice
+            Rows in any order.
+
+        Returns
+        -------
+        MessageBlock
+        """
         return MessageBlock(self.data, self.kinds, self.channel[which], self.log_time_ns[which],
                             self.begin[which], self.end[which])
 
     def merged(self, other: 'MessageBlock') -> 'MessageBlock':
-        """With those of another one of the same file, in order of log time."""
+        """Merge two blocks of the same file in order of log time.
+
+        Parameters
+        ----------
+        other : MessageBlock
+
+        Returns
+        -------
+        MessageBlock
+        """
         if not len(self):
             return other
-        # Few are left from the chunk before: only their bytes are kept.
+        # Few messages remain from the previous chunk, so only their bytes are copied.
         kept = [self.data[b:e] for b, e in zip(self.begin, self.end, strict=True)]
         size = np.array([len(m) for m in kept], dtype=np.int64)
         end = len(other.data) + np.cumsum(size)

@@ -1,4 +1,4 @@
-"""Tables in Parquet files, with the unit and the meaning of each column.
+"""Tables in Parquet files, with unit and meaning of each column.
 
 pyarrow is imported when a table is written or read.
 """
@@ -15,40 +15,81 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 VERSION = 1
-"""Version of the tables. A folder with another one is refused: rows would not be comparable."""
+"""Version of the tables. Folders of other versions are rejected: rows would not be comparable."""
 
-ROWS = 5000
-"""Rows that are kept in memory at once."""
+MAX_BUFFERED_ROWS = 5000
+"""Maximum number of rows that are buffered in memory."""
 
 
 class Column(NamedTuple):
     """A column of a table."""
 
     name: str
+    """Name of the column."""
     kind: str
-    """t: time of UTC, i: whole number, f: number, s: text, b: yes or no, C: (6, 6) row by row."""
+    """Type: t = UTC time, i = integer, f = float, s = text, b = boolean, C = (6, 6) matrix,
+    row-major."""
     unit: str
+    """Unit. Empty if there is none."""
     meaning: str
+    """Description."""
 
 
 def columns_of(kind: str, unit: str, /, **meanings: str) -> tuple[Column, ...]:
-    """Columns of the same kind and unit: {name: meaning}."""
+    """Create columns of the same type and unit.
+
+    Parameters
+    ----------
+    kind : str
+        As `Column.kind`.
+    unit : str
+    **meanings : str
+        Description by name.
+
+    Returns
+    -------
+    tuple of Column
+    """
     return tuple(Column(name, kind, unit, meaning) for name, meaning in meanings.items())
 
 
 def import_pyarrow() -> Any:
-    """pyarrow, with its Parquet part; raises MissingDependencyError."""
+    """Import pyarrow with its Parquet module.
+
+    Returns
+    -------
+    module
+
+    Raises
+    ------
+    MissingDependencyError
+        If pyarrow is not installed.
+    """
     try:
         import pyarrow.compute
         import pyarrow.parquet
     except ImportError as error:
         raise MissingDependencyError(
-            'Parquet needs pyarrow: pip install "mag_tracking[archive]"') from error
+            'Parquet requires pyarrow: run pip install "mag_tracking[archive]"') from error
     return pyarrow
 
 
 def schema_of(columns: Iterable[Column]) -> 'pa.Schema':
-    """Columns with their meaning and unit; raises MissingDependencyError."""
+    """Arrow schema of a table, with unit and meaning of each column as metadata.
+
+    Parameters
+    ----------
+    columns : iterable of Column
+
+    Returns
+    -------
+    pyarrow.Schema
+
+    Raises
+    ------
+    MissingDependencyError
+        If pyarrow is not installed.
+    """
     pa = import_pyarrow()
     kinds = {'i': pa.int64(), 'f': pa.float64(), 's': pa.string(), 'b': pa.bool_(),
              't': pa.timestamp('ns', 'UTC'), 'C': pa.list_(pa.float64(), 36)}
@@ -57,14 +98,25 @@ def schema_of(columns: Iterable[Column]) -> 'pa.Schema':
 
 
 class TableWriter:
-    """Writes a table piece by piece; until it is complete, what was there stays.
+    """Writes a table piece by piece, and replaces an existing file only on success.
 
-    A context manager, left with an error it leaves nothing. Raises OutputError.
+    A context manager; on an error it leaves no file.
+
+    Parameters
+    ----------
+    path : Path
+        Parent folders are created.
+    columns : iterable of Column
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
     """
 
     def __init__(self, path: Path, columns: Iterable[Column]) -> None:
         self._path, self._schema = path, schema_of(columns)
-        # Another attempt at the same table may be going on, on a worker that was taken for lost.
+        # A worker that was assumed to be lost may still be writing the same table.
         self._draft = path.with_name(f'.{secrets.token_hex(8)}.part')
         self._rows: list[Mapping[str, Any]] = []
         with self._errors_named():
@@ -74,29 +126,40 @@ class TableWriter:
 
     @contextmanager
     def _errors_named(self) -> Iterator[None]:
-        """Errors of the system name the file."""
+        """Convert OSError to OutputError that names the file."""
         try:
             yield
         except OSError as error:
             raise OutputError(f'cannot write {self._path}: {error.strerror or error}') from error
 
     def add(self, row: Mapping[str, Any]) -> None:
-        """Take a row; columns that it has not are null."""
+        """Add a row.
+
+        Parameters
+        ----------
+        row : mapping
+            Values by column. Missing columns are null.
+        """
         self._rows.append(row)
-        if len(self._rows) >= ROWS:
+        if len(self._rows) >= MAX_BUFFERED_ROWS:
             self._flush()
 
     def add_table(self, table: 'pa.Table') -> None:
-        """Take many rows."""
+        """Add a table of rows.
+
+        Parameters
+        ----------
+        table : pyarrow.Table
+        """
         self._flush()
         with self._errors_named():
             self._writer.write_table(table)
 
     def _flush(self) -> None:
-        """Write the rows."""
+        """Write the buffered rows."""
         rows, self._rows = self._rows, []
         if rows:
-            # A path need not be UTF-8, and Parquet has no other text.
+            # Parquet stores only UTF-8 text, but a path may contain other bytes.
             rows = [{name: value.encode(errors='backslashreplace').decode()
                      if isinstance(value, str) else value for name, value in row.items()}
                     for row in rows]

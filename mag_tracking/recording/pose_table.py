@@ -1,4 +1,4 @@
-"""Tables of a magnet's poses over a board of sensors: a row a pose, all sensors in it."""
+"""Tables of a magnet's poses above a board of sensors, with one row per pose."""
 
 import numpy as np
 
@@ -10,22 +10,26 @@ _POSE = ('mag_x0', 'mag_y0', 'mag_z0', 'mag_mx0', 'mag_my0', 'mag_mz0')
 
 
 def read_pose_table(path: CsvPath) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Readings of fixed sensors and the tracked poses of a magnet.
+    """Read the field at fixed sensors and the tracked poses of a magnet.
 
     Parameters
     ----------
-    path : path
-        CSV with the columns `x0,y0,z0,x1...` [T, sensor frame; empty or nan = not measured],
-        `mag_x0..z0` [m, tracker] and `mag_mx0..mz0` (unit vector, tracker).
+    path : path_like
+        CSV file with the columns `x0,y0,z0,x1...` [T, sensor frame; empty or nan = not measured],
+        `mag_x0..z0` [m, tracker frame] and `mag_mx0..mz0` (unit vector, tracker frame).
 
     Returns
     -------
-    field : (K, n, 3) [T], sensor frame
-    positions : (K, 3) [m], tracker
-    axes : (K, 3)
-        Made unit, of lengths that are one to 1e-3.
+    field : (K, n, 3) array, T, sensor frames
+    positions : (K, 3) array, m, tracker frame
+    axes : (K, 3) array, tracker frame
+        Normalised unit vectors of the magnet's axis.
 
-    Raises RecordingError, which names file, row and column.
+    Raises
+    ------
+    RecordingError
+        If the file is invalid or the length of an axis differs from 1 by more than 1e-3. The
+        message names file, row and column.
     """
     rows, values = _values(path, _POSE)
     axes = values[:, -3:]
@@ -38,18 +42,40 @@ def read_pose_table(path: CsvPath) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def read_readings(path: CsvPath) -> FloatArray:
-    """Readings (K, n, 3) [T, sensor frame] alone of such a table, which needs no poses.
+    """Read only the field from a pose table, which need not contain poses.
 
-    Raises RecordingError, which names file, row and column.
+    Parameters
+    ----------
+    path : path_like
+
+    Returns
+    -------
+    (K, n, 3) array, T, sensor frames
+
+    Raises
+    ------
+    RecordingError
+        If the file is invalid. The message names file, row and column.
     """
     rows, values = _values(path, ())
     return values.reshape(len(rows), -1, 3)
 
 
 def read_sensor_positions(path: CsvPath) -> FloatArray:
-    """Positions (n, 3) [m] of a CSV of x,y,z with comments after #.
+    """Read sensor positions from a CSV file of x, y, z with comments after #.
 
-    Raises RecordingError, which names file, row and column.
+    Parameters
+    ----------
+    path : path_like
+
+    Returns
+    -------
+    (n, 3) array, m
+
+    Raises
+    ------
+    RecordingError
+        If the file is invalid. The message names file, row and column.
     """
     rows = [(line, row) for line, row in csv_lines(path) if not row[0].lstrip().startswith('#')]
     if not rows:
@@ -62,7 +88,7 @@ def read_sensor_positions(path: CsvPath) -> FloatArray:
 
 
 def _values(path: CsvPath, pose: tuple[str, ...]) -> tuple[Lines, FloatArray]:
-    """[(line, row)] and the numbers of all readings, then of the columns `pose`."""
+    """[(line, row)], and the numbers of all readings followed by those of the columns `pose`."""
     header, rows = read_csv(path)
     n = sum(name[:1] == 'x' and name[1:].isdigit() for name in header)
     fields = [f'{a}{j}' for j in range(n) for a in 'xyz']
@@ -70,7 +96,7 @@ def _values(path: CsvPath, pose: tuple[str, ...]) -> tuple[Lines, FloatArray]:
         raise RecordingError(f'{path}: column x0 is missing')
     for name in (*fields, *pose):
         if header.count(name) != 1:
-            there = 'missing' if name not in header else 'there twice'
+            there = 'missing' if name not in header else 'given twice'
             raise RecordingError(f'{path}: column {name} is {there}')
     places = [header.index(name) for name in (*fields, *pose)]
     values = np.array([[number(path, line, name, row[i], name in pose)

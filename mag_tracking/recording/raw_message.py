@@ -1,4 +1,4 @@
-"""A message as it is in a recording."""
+"""A message as stored in a recording."""
 
 from typing import NamedTuple
 
@@ -6,10 +6,15 @@ from mcap.records import Schema
 
 
 class RawMessage(NamedTuple):
-    """One message as it is in the file."""
+    """One message as stored in the file."""
 
     topic: str
+    """Name of the topic."""
     type: str
+    """Message type."""
     log_time_ns: int
+    """Log time, ns since 1970."""
     data: bytes
+    """Serialised message, CDR."""
     schema: Schema
+    """Schema of the message type."""

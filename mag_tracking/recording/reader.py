@@ -1,7 +1,7 @@
-"""Reader of recordings that survives damage and reports it: MCAP, SQLite bags, ROS 1 bags.
+"""Reader of recordings (MCAP, SQLite bags, ROS 1 bags) that tolerates and reports damage.
 
-A damaged chunk of an MCAP file is skipped and reported, a truncated file is read up to the cut.
-Memory stays at about one chunk.
+A damaged chunk of an MCAP file is skipped and reported; a truncated file is read up to the cut.
+Memory is limited to about one chunk.
 """
 
 from collections import Counter
@@ -25,19 +25,30 @@ SUFFIXES = ('.mcap', *BAG_SUFFIXES)
 class Recording:
     """One file (MCAP, an SQLite bag `.db3`, a ROS 1 `.bag`), or a rosbag2 folder.
 
+    Parameters
+    ----------
+    path : path_like
+
     Attributes
     ----------
     path : Path
-    types : {topic: message type}
-    message_counts : {topic: int}, empty for a file that was cut off
-    start_ns, end_ns : int or None
-        Log times; None where the file does not tell.
+    types : dict of str to str
+        Message type by topic.
+    message_counts : Counter
+        Number of messages by topic. Empty for a truncated file.
+    start_ns, end_ns : int, ns, or None
+        Log times of the first and last message. None if unknown.
     losses : Counter
-        {what: number}, grows while reading.
+        Number of occurrences of everything that could not be read, by description; grows while
+        reading.
+
+    Raises
+    ------
+    RecordingError
+        If there is no readable recording at `path`.
     """
 
     def __init__(self, path: str | PathLike[str]) -> None:
-        """Raises RecordingError where there is no readable recording at `path`."""
         self.path = checked_path(path, RecordingError)
         self.types: dict[str, str] = {}
         self.message_counts: Counter[str] = Counter()
@@ -45,7 +56,7 @@ class Recording:
         self._files = _files(self.path)
         empty = [f for f in self._files if f.stat().st_size == 0]
         if len(empty) < len(self._files):
-            # A crash at a split leaves one; an only file is told when it is opened.
+            # A crash at a split leaves an empty file. A single empty file is an error on opening.
             self._files = [f for f in self._files if f not in empty]
             self.losses.update(f'{f.name} is empty (0 bytes)' for f in empty)
         self._opened = [(BagFile if f.suffix in BAG_SUFFIXES else McapFile)(f, self.losses)
@@ -58,29 +69,42 @@ class Recording:
         self.start_ns, self.end_ns = min(starts, default=None), max(ends, default=None)
 
     def lies_in(self, folder: str | PathLike[str]) -> bool:
-        """Whether a file of this recording, or a link to it, is in `folder` itself."""
+        """Whether a file of this recording, or a link to it, is directly in a folder.
+
+        Parameters
+        ----------
+        folder : path_like
+
+        Returns
+        -------
+        bool
+        """
         folder = checked_path(folder, OutputError).resolve()
         return any(folder in (f.resolve().parent, f.parent.resolve()) for f in self._files)
 
     @property
     def size(self) -> int:
-        """Bytes of all files."""
+        """Total size of all files, bytes."""
         return sum(f.stat().st_size for f in self._files)
 
     def messages(self, topics: Collection[str] | None = None, start_ns: int | None = None,
                  progress: Progress | None = None) -> Iterator[RawMessage]:
-        """Iterate over the `RawMessage`s, in order of log time.
+        """Iterate over the messages in order of log time.
+
+        Unreadable parts are counted in `losses`.
 
         Parameters
         ----------
         topics : collection of str, optional
-            All if left out.
-        start_ns : int, optional
-            Leave out what was logged before.
-        progress : function, optional
-            Called with the bytes done since the last call.
+            All topics if None.
+        start_ns : int, ns, optional
+            Skip messages that were logged earlier.
+        progress : callable, optional
+            Called with the number of bytes read since the last call.
 
-        What could not be read is counted in `losses`.
+        Yields
+        ------
+        RawMessage
         """
         for block in self.blocks(start_ns, progress):
             for m in block:
@@ -90,9 +114,18 @@ class Recording:
 
     def blocks(self, start_ns: int | None = None, progress: Progress | None = None
                ) -> Iterator[MessageBlock]:
-        """Iterate over the messages, as many at once as are read at once.
+        """Iterate over blocks of messages.
 
-        Of those before `start_ns` some are among them; see `messages`.
+        Parameters
+        ----------
+        start_ns : int, ns, optional
+            Earlier messages may be skipped. Unlike in `messages`, some of them can remain.
+        progress : callable, optional
+            Called with the number of bytes read since the last call.
+
+        Yields
+        ------
+        MessageBlock
         """
         for file in self._opened:
             for block in file.blocks(start_ns, progress):
@@ -102,9 +135,9 @@ class Recording:
 
 
 def _files(path: Path) -> list[Path]:
-    """The files of a recording, in order."""
+    """Files of a recording, in order."""
     if not path.exists():
-        raise RecordingError(f'there is no {path}')
+        raise RecordingError(f'{path} does not exist')
     if path.is_file():
         if path.stat().st_size == 0:
             raise RecordingError(f'{path} is empty (0 bytes)')
@@ -119,10 +152,10 @@ def _files(path: Path) -> list[Path]:
         except (KeyError, TypeError) as error:
             raise RecordingError(f'{metadata} is not rosbag2 metadata: {error}') from error
     if not files:
-        raise RecordingError(f'{path} holds no recording ({", ".join(SUFFIXES)})')
+        raise RecordingError(f'{path} contains no recording ({", ".join(SUFFIXES)})')
     for file in files:
         if not file.exists():
-            raise RecordingError(f'{file}, which metadata.yaml names, is not there')
+            raise RecordingError(f'{file} is listed in metadata.yaml but does not exist')
         if file.suffix not in SUFFIXES:
             raise RecordingError(f'{file} has none of the suffixes {", ".join(SUFFIXES)}: '
                                  'decompress it, or convert it with `ros2 bag convert`')

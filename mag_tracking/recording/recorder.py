@@ -1,8 +1,8 @@
-"""Records serialised messages into a rosbag2 folder of MCAP files, and loses little to a crash.
+"""Recorder of serialised messages in a rosbag2 folder of MCAP files, with limited loss on a crash.
 
-A chunk is closed and handed to the operating system every `FLUSH_NS`, so a killed
-program loses less than a second. What it leaves has no index: this package reads
-it as it is, others after `recording_repair.repair`.
+A chunk is completed and passed to the operating system every `FLUSH_INTERVAL_NS`, so a killed
+program loses less than a second. The file that it leaves has no index: this package can read it
+as it is, other readers after `recording.repair.repair`.
 """
 
 import errno
@@ -18,63 +18,71 @@ from typing import TypeAlias
 
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import checked_path
-from mag_tracking.recording.open_file import OpenFile
+from mag_tracking.recording.mcap_file_writer import McapFileWriter
 from mag_tracking.recording.repair import finish_file
 from mag_tracking.recording.rosbag2_folder import (
     FileSummary,
     Opener,
     Topic,
-    check_is_free,
+    check_no_recording,
     open_new,
     write_metadata,
 )
 from mag_tracking.recording.writer import offered_qos
 
-FLUSH_NS = 400_000_000
-"""What a crash may cost, less the time between two ticks [ns]."""
-ROOM = 4 << 20
-"""A disk with less free than this is not tried again [bytes]."""
+FLUSH_INTERVAL_NS = 400_000_000
+"""Interval between flushes [ns]. A crash loses at most this plus the time between two ticks."""
+MIN_FREE_BYTES = 4 << 20
+"""Minimum free disk space for a new file after a failure [bytes]."""
 
 
 _Message: TypeAlias = tuple[int, bytes, int, int]
-"""Sequence number, CDR, log time, publish time."""
+"""Sequence number, CDR, log time [ns] and publish time [ns]."""
 
 
 class Recorder:
-    """Writes messages into a rosbag2 folder, file after file.
+    """Records messages in a rosbag2 folder, in a sequence of files.
 
-    While the disk is full, messages are dropped, counted and reported; as soon as
-    there is space it goes on in a new file.
+    While the disk is full, messages are dropped, counted and reported; as soon as there is space,
+    recording continues in a new file.
+
+    Parameters
+    ----------
+    folder : path_like
+        Created if it does not exist. Must not contain a recording.
+    split_bytes : int, bytes, optional
+        Size at which a new file begins.
+    split_ns : int, ns, optional
+        Duration after which a new file begins.
+    retry_ns : int, ns, optional
+        Delay before the next attempt after a failure.
+    report : callable, optional
+        Called with each line of text for the user.
+    opener : callable, optional
+        Creates a file and returns an unbuffered stream.
 
     Attributes
     ----------
-    counts, dropped : Counter
-        Messages by topic: recorded, and lost because they could not be written.
+    folder : Path
+    counts : Counter
+        Number of recorded messages by topic.
+    dropped : Counter
+        Number of messages by topic that were lost because they could not be written.
     repeated : int
-        Latched messages that a further file begins with, so that it can be used alone.
+        Number of latched messages that were repeated at the start of a file to make it usable
+        alone.
     unfinished : list of Path
         Files without an index.
+
+    Raises
+    ------
+    OutputError
+        If the folder contains a recording or cannot be written.
     """
 
     def __init__(self, folder: str | PathLike[str], split_bytes: int = 10**9,
                  split_ns: int = 3600 * 10**9, retry_ns: int = 2 * 10**9,
                  report: Callable[[str], object] = print, opener: Opener = open_new) -> None:
-        """
-        Parameters
-        ----------
-        folder : path
-            Made if need be; must not hold a recording.
-        split_bytes, split_ns : int
-            A new file begins when one is that large, or has been open for that long.
-        retry_ns : int
-            How long to wait after a failure.
-        report : function
-            Takes a line of text for the user.
-        opener : function
-            From a path to an unbuffered stream.
-
-        Raises OutputError where the folder holds a recording or cannot be written.
-        """
         self.folder = checked_path(folder, OutputError)
         self._split_bytes, self._split_ns, self._retry_ns = split_bytes, split_ns, retry_ns
         self._report, self._opener = report, opener
@@ -87,10 +95,10 @@ class Recorder:
         self._latched: dict[str, deque[_Message]] = {}
         self._sequence: Counter[str] = Counter()
         self._now = self._flushed = self._retry_at = self._metadata_at = self._done_bytes = 0
-        self._file: OpenFile | None = None
+        self._file: McapFileWriter | None = None
         self._opened: int | None = None
-        self._failing = self._stale = False
-        check_is_free(self.folder)
+        self._failing = self._metadata_is_stale = False
+        check_no_recording(self.folder)
         try:
             self._open()
         except OSError as error:
@@ -104,42 +112,50 @@ class Recorder:
 
     @property
     def size(self) -> int:
-        """Bytes written so far."""
+        """Number of bytes written so far."""
         return self._done_bytes + (self._file.size if self._file else 0)
 
     def add_topic(self, name: str, type_name: str, definition: str = '', qos: str | None = None,
                   latched: int = 0) -> None:
-        """Tell about a topic before its first message.
+        """Register a topic before its first message.
 
         Parameters
         ----------
-        definition : str
-            Text of the type, as a `ros2msg` schema; without it only ROS reads the messages.
-        qos : str
-            `offered_qos`; its defaults if left out.
-        latched : int
-            How many of the latest messages each further file begins with.
+        name : str
+        type_name : str
+            Message type.
+        definition : str, optional
+            Definition of the type as a `ros2msg` schema. Without it, only ROS can read the
+            messages.
+        qos : str, optional
+            QoS profiles from `offered_qos`. None uses its defaults.
+        latched : int, optional
+            Number of latest messages that are repeated at the start of each further file.
         """
-        # One profile for all files: readers match the files' channels by it.
+        # All files use the same profile, because readers match the channels of the files by it.
         self._topics.setdefault(name, Topic(type_name, definition, qos or offered_qos()))
         if latched:
             self._latched[name] = deque(self._latched.get(name, ()), latched)
 
     def write(self, name: str, data: bytes, log_ns: int, publish_ns: int | None = None) -> None:
-        """Record a serialised message of a topic that was added.
+        """Record a serialised message of a registered topic.
 
         Parameters
         ----------
+        name : str
+            Name of the topic.
         data : bytes
-            CDR.
-        log_ns, publish_ns : int
-            When it was received and sent; the same if left out.
+            Serialised message, CDR.
+        log_ns : int, ns
+            Time at which the message was received.
+        publish_ns : int, ns, optional
+            Time at which the message was published. Defaults to `log_ns`.
         """
         message = (self._sequence[name], data, log_ns, publish_ns or log_ns)
         self._sequence[name] += 1
         if self._file and self._file.counts and self._file.size >= self._split_bytes:
             self._finish(self._file)
-        file = self._file or self._reopened(log_ns)
+        file = self._file or self._reopen(log_ns)
         if file is None:
             self.dropped[name] += 1
         else:
@@ -149,20 +165,26 @@ class Recorder:
             self._latched[name].append(message)
 
     def tick(self, now_ns: int) -> None:
-        """To be called several times a second, with the time of a clock that never goes back."""
+        """Flush, split and retry when due. Must be called several times per second.
+
+        Parameters
+        ----------
+        now_ns : int, ns
+            Time of a monotonic clock.
+        """
         self._now = now_ns
         self._opened = now_ns if self._opened is None else self._opened
-        if self._file and now_ns - self._flushed >= FLUSH_NS:
+        if self._file and now_ns - self._flushed >= FLUSH_INTERVAL_NS:
             self._flushed = now_ns
             self._try(self._file, self._file.flush)
-            self._recovered()
+            self._report_recovery()
         if self._file and self._file.counts and now_ns - self._opened >= self._split_ns:
             self._finish(self._file)
-        if self._stale and now_ns >= self._metadata_at:
+        if self._metadata_is_stale and now_ns >= self._metadata_at:
             self._write_metadata()
 
     def close(self) -> None:
-        """Finish the file and `metadata.yaml`; what cannot be finished is in `unfinished`."""
+        """Complete the file and `metadata.yaml`; incomplete files remain in `unfinished`."""
         if self._file:
             self._finish(self._file)
         for path in list(self.unfinished):
@@ -170,80 +192,81 @@ class Recorder:
                 finish_file(path)
                 self.unfinished.remove(path)
         self._write_metadata()
-        if self.unfinished or self._stale:
-            self._report(f'{self.folder} could not be finished: when there is space again, run '
+        if self.unfinished or self._metadata_is_stale:
+            self._report(f'{self.folder} could not be completed: free disk space, then run '
                          f'mag-tracking repair {self.folder}')
 
-    def _try(self, file: OpenFile, action: Callable[..., None], *arguments: object) -> bool:
-        """Whether `action` of the open file went well; if not, the file is given up."""
+    def _try(self, file: McapFileWriter, action: Callable[..., None], *arguments: object) -> bool:
+        """Whether `action` of the open file succeeded. The file is abandoned if it failed."""
         try:
             action(*arguments)
         except OSError as error:
-            self._give_up(file, error)
+            self._abandon(file, error)
             return False
         return True
 
-    def _finish(self, file: OpenFile) -> None:
+    def _finish(self, file: McapFileWriter) -> None:
         """Complete the open file."""
         if self._try(file, file.finish):
-            self._recovered()
-            self._end_of(file)
+            self._report_recovery()
+            self._add_finished(file)
             self._file = None
             self._write_metadata()
 
-    def _end_of(self, file: OpenFile) -> None:
-        """Note a file that is not written to any more."""
+    def _add_finished(self, file: McapFileWriter) -> None:
+        """Add a file to which nothing more is written."""
         self._done.append(file.summary())
         self._done_bytes += file.size
 
-    def _give_up(self, file: OpenFile, error: OSError) -> None:
-        """Keep what is whole of the open file, count the rest as dropped, wait."""
+    def _abandon(self, file: McapFileWriter, error: OSError) -> None:
+        """Keep the intact part of the open file, count the rest as dropped, and schedule a
+        retry."""
         self._file = None
         lost = file.pending if file.path.exists() else file.counts
         self.dropped += lost
         self.counts -= lost
         file.abandon()
         if file.counts and file.path.exists():
-            self._end_of(file)
+            self._add_finished(file)
             self.unfinished.append(file.path)
         else:
             file.path.unlink(missing_ok=True)
-        self._wait(error)
+        self._schedule_retry(error)
 
-    def _wait(self, error: OSError) -> None:
-        """No writing for a while; said once."""
+    def _schedule_retry(self, error: OSError) -> None:
+        """Suspend writing until the next retry; reported once."""
         self._retry_at = self._now + self._retry_ns
         if not self._failing:
-            self._report(f'cannot write in {self.folder} ({error.strerror}): messages are dropped '
-                         'until it can be written again')
+            self._report(f'cannot write to {self.folder} ({error.strerror}): messages are dropped '
+                         'until writing is possible again')
         self._failing = True
 
-    def _reopened(self, log_ns: int) -> OpenFile | None:
-        """A file to write to again, with the latched messages in it; None while there is none."""
+    def _reopen(self, log_ns: int) -> McapFileWriter | None:
+        """New file with the latched messages, or None while none can be written."""
         if self._failing and self._now < self._retry_at:
             return None
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            if self._failing and shutil.disk_usage(self.folder).free < ROOM:
+            if self._failing and shutil.disk_usage(self.folder).free < MIN_FREE_BYTES:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             self._open(log_ns)
         except OSError as error:
-            self._wait(error)
+            self._schedule_retry(error)
             return None
         return self._file
 
-    def _recovered(self) -> None:
-        """Say that messages could be written again, when some have been."""
+    def _report_recovery(self) -> None:
+        """Report that messages are written again, after the first of them."""
         if self._failing and self._file and self._file.counts:
             self._failing = False
-            self._report(f'writing again; dropped so far: {self.dropped.total()}')
+            self._report(f'recording resumed; messages dropped so far: {self.dropped.total()}')
 
     def _open(self, log_ns: int = 0) -> None:
-        """Begin the next file; raises OSError, and leaves none behind then."""
+        """Begin the next file; raises OSError and leaves no file if that fails."""
         self.folder.mkdir(parents=True, exist_ok=True)
         names = (self.folder / f'{self.folder.resolve().name}_{n}.mcap'
                  for n in itertools.count(len(self._done)))
-        file = OpenFile(next(p for p in names if not p.exists()), self._opener)
+        file = McapFileWriter(next(p for p in names if not p.exists()), self._opener)
         try:
             file.start()
             for name, messages in self._latched.items():
@@ -259,11 +282,11 @@ class Recorder:
         self._write_metadata()
 
     def _write_metadata(self) -> None:
-        """Bring `metadata.yaml` up to date, now or some time later."""
+        """Update `metadata.yaml`, or schedule a retry."""
         files = self._done + ([self._file.summary()] if self._file else [])
         try:
             write_metadata(self.folder, files, self._topics, self._opener)
-            self._stale = False
+            self._metadata_is_stale = False
         except OSError:
-            # The messages are what counts: their files are written all the same.
-            self._stale, self._metadata_at = True, self._now + self._retry_ns
+            # Messages have priority: recording continues without up-to-date metadata.
+            self._metadata_is_stale, self._metadata_at = True, self._now + self._retry_ns

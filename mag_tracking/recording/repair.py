@@ -1,4 +1,4 @@
-"""Gives recordings that were cut off (a crash, a full disk) the index that other readers need."""
+"""Repair of recordings that were truncated by a crash or a full disk: adds the missing index."""
 
 import fcntl
 import io
@@ -31,17 +31,22 @@ from mcap.summary import Summary
 
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import checked_path, new_binary_file
-from mag_tracking.recording.damage import DAMAGE
-from mag_tracking.recording.rosbag2_folder import FileSummary, Topic, WholeStream, write_metadata
+from mag_tracking.recording.decode_errors import DECODE_ERRORS
+from mag_tracking.recording.rosbag2_folder import (
+    FileSummary,
+    Topic,
+    UnbufferedWriter,
+    write_metadata,
+)
 
 _MAGIC = b'\x89MCAP0\r\n'
 
 
 class _Scan:
-    """What is whole in a file: where it ends, and all that its index is to say."""
+    """Scan of the intact part of a file up to the first damage: its end, and the data of its
+    index."""
 
     def __init__(self, stream: BinaryIO) -> None:
-        """Read `stream` up to where it breaks off."""
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.counts: Counter[int] = Counter()
@@ -55,16 +60,16 @@ class _Scan:
                 if isinstance(record, (DataEnd, Footer)):
                     self.has_data_end = True
                     break
-                self._take(record, stream.tell())
+                self._add_record(record, stream.tell())
                 self.end = stream.tell()
-        except DAMAGE:
+        except DECODE_ERRORS:
             pass
-        self._remade = b''
+        self._rebuilt_index = b''
         if self._lacks_index():
-            self._remake_index()
+            self._rebuild_index()
 
-    def _take(self, record: McapRecord, end: int) -> None:
-        """Note a record that ends at byte `end`."""
+    def _add_record(self, record: McapRecord, end: int) -> None:
+        """Add a record that ends at byte `end`."""
         if isinstance(record, Schema):
             self.schemas[record.id] = record
         elif isinstance(record, Channel):
@@ -75,8 +80,8 @@ class _Scan:
             if self._lacks_index():
                 self._drop_index()
             try:
-                self._take_chunk(record, end)
-            except DAMAGE:
+                self._add_chunk(record, end)
+            except DECODE_ERRORS:
                 self.damaged += 1
         elif isinstance(record, MessageIndex) and self.chunks:
             index, length = self.chunks[-1], 15 + 16 * len(record.records)
@@ -89,8 +94,8 @@ class _Scan:
         low, high = self.times or (time_ns, time_ns)
         self.times = [min(low, time_ns), max(high, time_ns)]
 
-    def _take_chunk(self, chunk: Chunk, end: int) -> None:
-        """Note a chunk and what is in it; raises where it is damaged."""
+    def _add_chunk(self, chunk: Chunk, end: int) -> None:
+        """Add a chunk and its records; raises one of `DECODE_ERRORS` if it is damaged."""
         stream, length = get_chunk_data_stream(chunk, validate_crc=True)
         data = stream.read(length)
         self._index, offset = {}, 0
@@ -105,7 +110,8 @@ class _Scan:
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 kind: type[Schema] | type[Channel] = (
                     Schema if opcode == Opcode.SCHEMA else Channel)
-                self._take(kind.read(ReadDataStream(io.BytesIO(data[offset:offset + size]))), end)
+                self._add_record(
+                    kind.read(ReadDataStream(io.BytesIO(data[offset:offset + size]))), end)
             offset += size
         whole = 9 + 40 + len(chunk.compression.encode()) + len(chunk.data)
         self.chunks.append(ChunkIndex(
@@ -113,17 +119,18 @@ class _Scan:
             chunk.message_start_time, chunk.uncompressed_size))
 
     def _lacks_index(self) -> bool:
-        """Whether the last chunk has not an index of each of its channels."""
+        """Whether the message index of any channel in the last chunk is missing."""
         return bool(self.chunks) and (
             set(self.chunks[-1].message_index_offsets) != set(self._index))
 
     def _drop_index(self) -> None:
-        """Forget the last chunk's indexes: a part of them would hide the other channels."""
+        """Discard the indexes of the last chunk: an incomplete set would hide the other
+        channels."""
         self.chunks[-1].message_index_offsets = {}
         self.chunks[-1].message_index_length = 0
 
-    def _remake_index(self) -> None:
-        """Make the last chunk's indexes anew; they belong right behind it."""
+    def _rebuild_index(self) -> None:
+        """Rebuild the indexes of the last chunk; their place is directly after the chunk."""
         self._drop_index()
         chunk, builder = self.chunks[-1], RecordBuilder()
         self.end = chunk.chunk_start_offset + chunk.chunk_length
@@ -131,13 +138,13 @@ class _Scan:
             chunk.message_index_offsets[channel] = self.end + builder.count
             index.write(builder)
         chunk.message_index_length = builder.count
-        self._remade = builder.end()
+        self._rebuilt_index = builder.end()
 
     def index(self) -> bytes:
-        """All that a file ends with, as bytes that belong at `end`."""
+        """Complete end section of the file, to be written at byte `end`."""
         builder = RecordBuilder()
         DataEnd(0).write(builder)
-        data_end: bytes = self._remade + builder.end()
+        data_end: bytes = self._rebuilt_index + builder.end()
         times = self.times or [0, 0]
         for record in (*self.schemas.values(), *self.channels.values(), Statistics(
                 0, len(self.channels), dict(self.counts), len(self.chunks), self.counts.total(),
@@ -152,33 +159,43 @@ class _Scan:
 
 
 def _summary(stream: BinaryIO) -> Summary | None:
-    """The index of a file that has one, else None."""
+    """Index of a file, or None if it has none."""
     stream.seek(0)
     try:
         return make_reader(stream).get_summary()
-    except DAMAGE:
+    except DECODE_ERRORS:
         return None
 
 
 def finish_file(path: str | PathLike[str]) -> list[str]:
-    """Give a file that was cut off its index, in place; a file that has one stays as it is.
+    """Add the index to a truncated file in place; a complete file is not modified.
 
-    A torn record at the end, which nobody can read, goes to `<name>.cut`.
+    A torn record at the end, which cannot be read, is moved to `<name>.cut`.
+
+    Parameters
+    ----------
+    path : path_like
 
     Returns
     -------
     list of str
-        What was found and done, as lines for the user; empty for a whole file.
+        Report for the user. Empty for a complete file.
 
-    Raises RecordingError for what is not MCAP, OutputError for a file that is still
-    recorded, OSError where it cannot be written; the messages are untouched then.
+    Raises
+    ------
+    RecordingError
+        If the file is not an MCAP file.
+    OutputError
+        If the file is still being recorded.
+    OSError
+        If the file cannot be written. Its messages are then unchanged.
     """
     path = Path(path)
     with open(path, 'r+b', buffering=0) as raw, open(path, 'rb') as stream:
         try:
             fcntl.flock(raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise OutputError(f'{path} is being recorded: end that first') from None
+            raise OutputError(f'{path} is being recorded: stop the recording first') from None
         if _summary(stream) is not None:
             return []
         stream.seek(0)
@@ -194,48 +211,59 @@ def finish_file(path: str | PathLike[str]) -> list[str]:
         _replace_end(raw, scan.end, scan.index())
     lines = [f'{path.name}: {scan.counts.total()} messages, index written']
     if torn:
-        lines.append(f'{path.name}: the last {torn} bytes are torn; they are in {path.name}.cut')
+        lines.append(f'{path.name}: the last {torn} bytes are incomplete and were moved to '
+                     f'{path.name}.cut')
     if scan.damaged:
-        lines.append(f'{path.name}: damaged chunks, left out: {scan.damaged}')
+        lines.append(f'{path.name}: damaged chunks skipped: {scan.damaged}')
     return lines
 
 
 def _replace_end(raw: io.FileIO, end: int, index: bytes) -> None:
-    """Put the index where the whole records end; nothing, if there is no room for it."""
+    """Write the index at the end of the intact records; writes nothing if there is no space for
+    it."""
     raw.truncate(end)
     raw.seek(end)
     try:
-        WholeStream(raw).write(index)
+        UnbufferedWriter(raw).write(index)
     except OSError:
         raw.truncate(end)
         raise
 
 
 def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -> int:
-    """Make a recording whole that was cut off.
+    """Repair a truncated recording.
 
     Parameters
     ----------
-    path : path
-        An MCAP file, or a folder of them; the folder gets a new `metadata.yaml`.
-    report : function
-        Takes lines of text for the user.
+    path : path_like
+        An MCAP file, or a folder of them. A folder gets a new `metadata.yaml`.
+    report : callable, optional
+        Called with each line of text for the user.
 
-    Returns the number of files that were not whole. Raises RecordingError where there
-    is no recording, OutputError where it cannot be written or is still recorded.
+    Returns
+    -------
+    int
+        Number of files that were repaired.
+
+    Raises
+    ------
+    RecordingError
+        If there is no recording.
+    OutputError
+        If the recording cannot be written or is still being recorded.
     """
     path = checked_path(path, RecordingError)
     files = [path] if path.is_file() else sorted(path.glob('*.mcap'), key=_number)
     if not files:
-        raise RecordingError(f'{path} holds no .mcap file')
+        raise RecordingError(f'{path} contains no .mcap file')
     n, summaries = 0, []
     topics: dict[str, Topic] = {}
-    # A crash at a split leaves a file without a first byte.
+    # A crash at a split leaves an empty file.
     empty = [file for file in files if file.stat().st_size < len(_MAGIC)]
     if len(empty) == len(files):
-        raise RecordingError(f'{path}: {len(files)} files, and nothing in any')
+        raise RecordingError(f'{path}: all {len(files)} files are empty')
     for file in empty:
-        report(f'{file} is empty: it is left out')
+        report(f'{file} is empty and was skipped')
     for file in [file for file in files if file not in empty]:
         try:
             lines = finish_file(file)
@@ -254,13 +282,13 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
 
 
 def _number(file: Path) -> tuple[int, str]:
-    """Sorts by the number at the end of the name, as recorders count."""
+    """Sort key of a file: the number at the end of its name, as recorders count."""
     number = file.stem.rpartition('_')[2]
     return (int(number) if number.isdigit() else -1, file.name)
 
 
 def _summary_of(file: Path, topics: dict[str, Topic]) -> FileSummary:
-    """`FileSummary` of a whole file; its topics are added to `topics`."""
+    """`FileSummary` of a complete file; its topics are added to `topics`."""
     with open(file, 'rb') as stream:
         summary = make_reader(stream).get_summary()
     if summary is None or summary.statistics is None:

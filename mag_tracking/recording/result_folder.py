@@ -1,4 +1,4 @@
-"""What an offline run writes: CSV tables as it goes, a summary at the end, a recording."""
+"""Results of an offline run: CSV tables during the run, a summary at its end, and a recording."""
 
 import csv
 import json
@@ -41,28 +41,50 @@ _TABLES = {'poses.csv': POSE_COLUMNS, 'poses_smoothed.csv': SMOOTHED_COLUMNS,
 _QUOTE, _SPECIAL = '"', {'"', ',', '\r', '\n'}
 _SUMMARY, _RECORDING = 'summary.json', 'tracks.mcap'
 _RESULTS = (*_TABLES, _SUMMARY, _RECORDING, 'metadata.yaml', REPORT, RERUN_FILE)
-_OF_A_TRACK = re.compile(r'(map|weights|field)_track_[0-9]+\.png|track_[0-9]+(_smoothed)?\.tum')
+_TRACK_FILE = re.compile(r'(map|weights|field)_track_[0-9]+\.png|track_[0-9]+(_smoothed)?\.tum')
 
 
 def figure_name(kind: str, track_id: int) -> str:
-    """File name of a figure, 'map', 'weights' or 'field', of a track."""
+    """File name of a figure of a track.
+
+    Parameters
+    ----------
+    kind : str
+        `map`, `weights` or `field`.
+    track_id : int
+
+    Returns
+    -------
+    str
+    """
     return f'{kind}_track_{track_id}.png'
 
 
 class ResultFolder:
-    """The tables and the recording of one run; a context manager.
+    """Writes the tables and the recording of one run; a context manager.
 
-    Rows are written as they come, so that an interrupted run keeps them.
+    Rows are written immediately, so an interrupted run keeps them.
+
+    Parameters
+    ----------
+    folder : path_like
+        Created if it does not exist.
+    network : SensorNetwork
 
     Attributes
     ----------
+    folder : Path
     replaces_earlier : bool
-        The folder held results of an earlier run, which were removed with the figures and
-        trajectories of its tracks. All other files stay.
+        Whether the folder contained results of an earlier run. They are removed, including the
+        figures and trajectories of its tracks. All other files remain.
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be created or written, or contains another recording.
     """
 
     def __init__(self, folder: str | PathLike[str], network: SensorNetwork) -> None:
-        """Raises OutputError where the folder cannot be made or written."""
         self.folder = output_folder(folder)
         refuse_other_recording(self.folder / _RECORDING)
         self._files = ExitStack()
@@ -81,17 +103,17 @@ class ResultFolder:
             raise OutputError(f'cannot write to {self.folder}: {error.strerror}') from error
 
     def _remove_earlier(self) -> bool:
-        """Remove the results of an earlier run; whether there were any."""
-        # Its summary and the figures of its tracks would be taken for those of this run.
+        """Remove the results of an earlier run; returns whether there were any."""
+        # The summary and figures of an earlier run could be mistaken for those of this run.
         earlier = [path for path in self.folder.iterdir()
-                   if (path.name in _RESULTS or _OF_A_TRACK.fullmatch(path.name))
+                   if (path.name in _RESULTS or _TRACK_FILE.fullmatch(path.name))
                    and (path.is_symlink() or not path.is_dir())]
         for path in earlier:
             path.unlink()
         return bool(earlier)
 
     def _stream(self, name: str, columns: tuple[str, ...]) -> TextIO:
-        """Open one CSV file and write its head."""
+        """Open a CSV file and write its header."""
         stream = self._files.enter_context(new_text_file(self.folder / name, newline=''))
         csv.writer(stream).writerow(columns)
         return stream
@@ -100,25 +122,40 @@ class ResultFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
-        # A full disk shows when a file is closed: the others are closed all the same.
+        # Closing a file fails on a full disk; the other files must be closed nevertheless.
         try:
             self._files.close()
         finally:
             self._recording.close()
 
     def add_detection(self, d: Detection) -> None:
-        """One row for a `Detection`."""
+        """Write a row for a detection.
+
+        Parameters
+        ----------
+        d : Detection
+        """
         self._detections.writerow([
             d.stamp_ns, d.id, 'onset' if d.onset else 'release', repr(d.statistic),
             d.degrees_of_freedom, repr(d.threshold), repr(d.false_alarm_probability),
             d.strongest_sensor])
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Take a frame with a target in it."""
+        """Write a frame with a target to the recording.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+        """
         self._recording.add_frame(frame)
 
     def add_track(self, track: Track) -> None:
-        """One row a pose and one a hypothesis; the closing record of a track has no row."""
+        """Write a row for a pose and one per hypothesis. The final record of a track has none.
+
+        Parameters
+        ----------
+        track : Track
+        """
         self._recording.add_track(track)
         if track.ended:
             return
@@ -130,10 +167,10 @@ class ResultFolder:
         self._add_hypotheses(track)
 
     def _add_hypotheses(self, track: Track) -> None:
-        """One row a hypothesis."""
+        """Write one row per hypothesis."""
         h = track.hypotheses
         if not isinstance(h, Hypotheses):
-            assert not h, 'those of a bank come as arrays'
+            assert not h, 'the hypotheses of a bank are arrays'
             return
         sd = np.sqrt(np.diagonal(h.covariances, axis1=1, axis2=2))
         rows = core.number_rows(np.column_stack([h.weights, h.states, sd, h.moments]))
@@ -144,14 +181,24 @@ class ResultFolder:
             f'{begin}{names[pair]},{row}\r\n' for pair, row in zip(pairs, rows, strict=True)))
 
     def add_disturbance(self, d: Disturbance) -> None:
-        """One row when a `Disturbance` is found, and one when it has ended."""
+        """Write a row for a disturbance, when it is found and again when it has ended.
+
+        Parameters
+        ----------
+        d : Disturbance
+        """
         self._recording.add_disturbance(d)
         self._disturbances.writerow([
             d.stamp_ns, d.id, int(d.ended), d.begin_ns, repr(d.largest), ' '.join(d.sensors),
             repr(d.uniform), d.track_id])
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
-        """One row for a `SmoothedPose` of a whole track; those of a fixed lag have none."""
+        """Write a row for a smoothed pose of a whole track. Poses of a fixed lag are ignored.
+
+        Parameters
+        ----------
+        pose : SmoothedPose
+        """
         if pose.complete:
             self._recording.add_smoothed(pose)
             sd = np.sqrt(np.diagonal(pose.covariance))
@@ -160,17 +207,22 @@ class ResultFolder:
                 int(pose.ambiguous), pose.kind, *_floats([pose.length, pose.length_std])])
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
-        """`summary.json`."""
+        """Write `summary.json`.
+
+        Parameters
+        ----------
+        summary : mapping
+        """
         with new_text_file(self.folder / _SUMMARY) as stream:
             json.dump(without_nan(summary), stream, indent=1, allow_nan=False)
             stream.write('\n')
 
 
 def _quoted(text: str) -> str:
-    """As one field of a CSV file."""
+    """Text as one field of a CSV file."""
     return f'"{text.replace(_QUOTE, 2 * _QUOTE)}"' if _SPECIAL & {*text} else text
 
 
 def _floats(*groups: Iterable[float]) -> list[str]:
-    """The shortest texts that read back as the same numbers."""
+    """Shortest texts that read back as the same numbers."""
     return [repr(float(v)) for group in groups for v in group]

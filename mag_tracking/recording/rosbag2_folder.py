@@ -1,4 +1,4 @@
-"""What a rosbag2 folder of MCAP files consists of: new files, `metadata.yaml`."""
+"""Parts of a rosbag2 folder of MCAP files: new files and `metadata.yaml`."""
 
 import fcntl
 import io
@@ -16,43 +16,80 @@ from mag_tracking.recording.writer import OFFERED_QOS
 from mag_tracking.yaml_file import parse_yaml
 
 Opener: TypeAlias = Callable[[Path], io.FileIO]
-"""From the path of a new file to a stream without a buffer."""
+"""Creates a file at a path and returns an unbuffered stream."""
 
 
 class Topic(NamedTuple):
-    """What a recording says about a topic."""
+    """Description of a topic in a recording."""
 
     type: str
+    """Message type."""
     definition: str = ''
+    """Definition of the type as a `ros2msg` schema. Empty if unknown."""
     qos: str = OFFERED_QOS
+    """Offered QoS profiles as YAML text."""
 
 
 class FileSummary(NamedTuple):
-    """What `metadata.yaml` says about one file."""
+    """Entry of one file in `metadata.yaml`."""
 
     name: str
+    """Name of the file."""
     counts: Counter[str]
+    """Number of messages by topic."""
     first_ns: int | None = None
+    """Log time of the first message, ns. None without messages."""
     last_ns: int | None = None
+    """Log time of the last message, ns. None without messages."""
 
 
 def open_new(path: Path) -> io.FileIO:
-    """A file of one's own to write to, without a buffer that a crash would lose."""
+    """Create a file and open it without a buffer, which a crash would lose.
+
+    Parameters
+    ----------
+    path : Path
+        Must not exist.
+
+    Returns
+    -------
+    binary stream
+        Locked, if the file system supports locks.
+    """
     stream = open(path, 'xb', buffering=0)
-    # A repair of a file that is still written would spoil it. Some file systems know no locks.
+    # The lock prevents a repair of a file that is still being written. Some file systems do not
+    # support locks.
     with suppress(OSError):
         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
     return stream
 
 
-class WholeStream:
-    """Writes all of what it is given, or raises: a full disk takes a part of it without a word."""
+class UnbufferedWriter:
+    """Stream that writes all bytes or raises OSError.
+
+    On a full disk, an unbuffered write may write a part of its data without an error.
+
+    Parameters
+    ----------
+    raw : io.FileIO
+
+    Attributes
+    ----------
+    raw : io.FileIO
+    offset : int
+        Number of bytes written.
+    """
 
     def __init__(self, raw: io.FileIO) -> None:
         self.raw, self.offset = raw, 0
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Append `data`."""
+        """Append data.
+
+        Parameters
+        ----------
+        data : bytes-like
+        """
         rest = memoryview(data)
         while rest:
             n = self.raw.write(rest)
@@ -60,34 +97,58 @@ class WholeStream:
             rest = rest[n:]
 
     def tell(self) -> int:
-        """Bytes written."""
+        """Number of bytes written.
+
+        Returns
+        -------
+        int
+        """
         return self.offset
 
     def flush(self) -> None:
-        """Nothing waits here."""
+        """Do nothing: there is no buffer."""
 
 
-def check_is_free(folder: Path) -> None:
-    """Raise OutputError where `folder` is no place for a new recording."""
+def check_no_recording(folder: Path) -> None:
+    """Check that a folder can hold a new recording.
+
+    Parameters
+    ----------
+    folder : Path
+
+    Raises
+    ------
+    OutputError
+        If `folder` is not a folder or contains a recording.
+    """
     if folder.exists() and not folder.is_dir():
         raise OutputError(f'{folder} is not a folder')
     there = sorted(p.name for pattern in ('metadata.yaml', '*.mcap', '*.db3')
                    for p in folder.glob(pattern))
     if there:
-        raise OutputError(f'{folder} holds a recording already ({there[0]}); choose another '
-                          f'folder (one that was cut off is made whole by mag-tracking repair)')
+        raise OutputError(f'{folder} already contains a recording ({there[0]}): choose another '
+                          f'folder, or run mag-tracking repair to complete a truncated recording')
 
 
 def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[str, Topic],
                    opener: Opener = open_new) -> None:
-    """Write rosbag2's `metadata.yaml`, all or nothing.
+    """Write the `metadata.yaml` of rosbag2 atomically.
 
     Parameters
     ----------
-    files : list of FileSummary
-    topics : {name: Topic}
+    folder : Path
+    files : sequence of FileSummary
+    topics : mapping of str to Topic
+        By name.
+    opener : callable, optional
+        Creates a file and returns an unbuffered stream.
 
-    Raises OSError, and RecordingError where a topic's QoS is not YAML.
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    RecordingError
+        If the QoS profiles of a topic are not valid YAML.
     """
     nothing: Counter[str] = Counter()
     counts = sum((f.counts for f in files), nothing)
@@ -109,7 +170,7 @@ def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[s
         'custom_data': None, 'ros_distro': 'jazzy'}}
     new = folder / '.metadata.yaml.new'
     new.unlink(missing_ok=True)
-    stream = WholeStream(opener(new))
+    stream = UnbufferedWriter(opener(new))
     try:
         stream.write(yaml.safe_dump(content, sort_keys=False).encode())
         os.replace(new, folder / 'metadata.yaml')
@@ -119,12 +180,12 @@ def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[s
 
 
 def _qos_profiles(name: str, topic: Topic) -> object:
-    """The QoS profiles of a topic as a list; recordings, and `Topic`, have them as YAML text."""
+    """List of the QoS profiles of a topic, which recordings and `Topic` store as YAML text."""
     return parse_yaml(topic.qos, f'offered_qos_profiles of {name}', RecordingError)
 
 
 def _span(firsts: Sequence[int], lasts: Sequence[int]) -> dict[str, dict[str, int]]:
-    """Start and duration, as rosbag2 has them."""
+    """Start and duration in the format of rosbag2."""
     first, last = min(firsts, default=0), max(lasts, default=0)
     return {'starting_time': {'nanoseconds_since_epoch': first},
             'duration': {'nanoseconds': last - first}}

@@ -1,4 +1,4 @@
-"""From a recording to readings and truth."""
+"""Extraction of readings and true poses from a recording."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -26,29 +26,39 @@ from mag_tracking.records import AccelerationSample, Readings
 from mag_tracking.report.metrics import Truth
 
 TRUTH_PREFIX = 'ground_truth/'
-"""Poses on topics below this, in the namespace of the sensors, are truth: for reports, never for
-tracking."""
-GATHERED = 256
-"""Messages at most whose readings are gathered in one batch: each batch costs as much as a few
-readings, and a reader may want to stop after any."""
+"""Prefix of topics with true poses, in the namespace of the sensors. Truth is used for reports,
+never for tracking."""
+BATCH_SIZE = 256
+"""Maximum number of messages per batch of readings. A batch costs as much as a few readings, and
+the caller can stop only between batches."""
 
 
 class SampleReader:
-    """Iterates over the readings of a network in a recording; collects the truth beside them.
+    """Iterates over the readings of a network in a recording and collects the true poses.
+
+    Parameters
+    ----------
+    recording : Recording
+    network : SensorNetwork
+    truth : str, optional
+        Topic of the true poses. None = all topics below `TRUTH_PREFIX`.
 
     Attributes
     ----------
     rejected : Counter
-        {cause: number} of messages and readings that cannot be used.
+        Number of messages and readings that cannot be used, by cause.
     namespace : str
-        Of the network's relative topics in the recording.
+        Namespace of the network's relative topics in the recording.
+
+    Raises
+    ------
+    RecordingError
+        If the recording has none of the network's topics, its namespace is ambiguous, or `truth`
+        is not a topic with poses.
     """
 
     def __init__(self, recording: Recording, network: SensorNetwork,
                  truth: str | None = None) -> None:
-        """Raises RecordingError where the recording has none of the network's topics, or nothing
-        that can be `truth`, the name of a topic.
-        """
         self._recording = recording
         self.namespace = _namespace(recording, network)
         self._sensors = {absolute(topic, self.namespace): name for topic, name in zip(
@@ -57,23 +67,23 @@ class SampleReader:
         for topic, name in zip(network.imu_topics, network.names, strict=True):
             if topic is not None:
                 self._imus.setdefault(absolute(topic, self.namespace), []).append(name)
-        self._many = absolute(RAW_READINGS, self.namespace)
+        self._batch_topic = absolute(RAW_READINGS, self.namespace)
         truth = None if truth is None else absolute(truth, self.namespace)
         self._truth = TruthTopics(absolute(TRUTH_PREFIX, self.namespace), network.frame, truth)
-        if truth is not None and recording.types and not self._truth.wants(
+        if truth is not None and recording.types and not self._truth.accepts(
                 truth, recording.types.get(truth, '')):
             poses = sorted(t for t, kind in recording.types.items() if kind in TRUTH_TYPES)
-            raise RecordingError(f'{recording.path}: the truth on {truth} is '
-                                 f'{recording.types.get(truth, "not in the recording")}; its poses '
-                                 f'are on: {", ".join(poses) or "no topic at all"}')
+            raise RecordingError(f'{recording.path}: the truth topic {truth} is '
+                                 f'{recording.types.get(truth, "not in the recording")}; '
+                                 f'topics with poses: {", ".join(poses) or "none found"}')
         self.rejected: Counter[str] = Counter()
-        self._together = recording.types.get(self._many) == FIELD_READINGS
-        if recording.types and not self._together \
+        self._is_batched = recording.types.get(self._batch_topic) == FIELD_READINGS
+        if recording.types and not self._is_batched \
                 and not any(t in recording.types for t in self._sensors):
             fields = sorted(t for t, k in recording.types.items() if k == MAGNETIC_FIELD)
             raise RecordingError(
                 f'{recording.path} has none of the network\'s topics ({", ".join(self._sensors)}); '
-                f'its magnetic fields are on: {", ".join(fields) or "no topic at all"}')
+                f'topics with magnetic fields: {", ".join(fields) or "none found"}')
         for topic in self._sensors:
             kind = recording.types.get(topic)
             if kind not in (None, MAGNETIC_FIELD):
@@ -81,89 +91,128 @@ class SampleReader:
                                      f'not {MAGNETIC_FIELD}')
 
     def missing_topics(self) -> list[str]:
-        """The network's topics that are not in the recording; none where readings came together."""
-        if self._together:
+        """List the network's topics that are not in the recording.
+
+        Returns
+        -------
+        list of str
+            Empty if one topic carries the readings of all sensors.
+        """
+        if self._is_batched:
             return []
         return [t for t in self._sensors if t not in self._recording.types]
 
     def readings(self, progress: Progress | None = None) -> Iterator[Readings]:
-        """Iterate over batches of `Readings` in order of log time; see `Recording.messages`."""
+        """Iterate over batches of readings in order of log time.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Called with the number of bytes read since the last call.
+
+        Yields
+        ------
+        Readings
+        """
         for block in self._recording.blocks(progress=progress):
-            for first in range(0, len(block), GATHERED):
-                readings = self._of_block(block.part(slice(first, first + GATHERED)))
+            for first in range(0, len(block), BATCH_SIZE):
+                readings = self._block_readings(block.part(slice(first, first + BATCH_SIZE)))
                 if len(readings):
                     yield readings
 
-    def _of_block(self, block: MessageBlock) -> Readings:
-        """`Readings` of all messages that are of the network's sensors, in their order."""
+    def _block_readings(self, block: MessageBlock) -> Readings:
+        """Readings of all messages from the network's sensors, in order."""
         names = {number: self._sensors[kind.topic] for number, kind in block.kinds.items()
                  if kind.topic in self._sensors and kind.type == MAGNETIC_FIELD and kind.is_cdr}
         rows = np.flatnonzero(np.isin(block.channel, list(names)))
         fields = magnetic_fields(block.data, block.begin[rows], block.end[rows])
         rows = rows[fields.is_read]
-        # A sensor may have several channels.
+        # The same sensor may have several channels.
         sensors = tuple(dict.fromkeys(names.values()))
         place = np.zeros(max(names, default=0) + 1, dtype=np.int64)
         place[list(names)] = [sensors.index(name) for name in names.values()]
         C = fields.covariance
-        together = Readings(
+        batch = Readings(
             sensors, place[block.channel[rows]], fields.stamp_ns[fields.is_read],
             fields.field[fields.is_read], None if C is None else C[fields.is_read])
-        others = np.setdiff1d(np.arange(len(block)), np.append(rows, self._truth.take(block)))
+        others = np.setdiff1d(np.arange(len(block)), np.append(rows, self._truth.add_block(block)))
         parts, done = [], 0
         for k in others:
             for record, _ in self._records_of([block.message(k)], {}):
                 if isinstance(record, Readings):
                     n = int(np.searchsorted(rows, k))
-                    parts += [together.part(slice(done, n)), record]
+                    parts += [batch.part(slice(done, n)), record]
                     done = n
-        return Readings.joined([*parts, together.part(slice(done, None))])
+        return Readings.joined([*parts, batch.part(slice(done, None))])
 
     def readings_as_received(self, progress: Progress | None = None
                              ) -> Iterator[tuple[Readings, int]]:
-        """Iterate over (`Readings` of one message, log time [ns]) in order of the latter."""
+        """Iterate over the readings message by message, in order of log time.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Called with the number of bytes read since the last call.
+
+        Yields
+        ------
+        readings : Readings
+            Readings of one message.
+        log_time_ns : int, ns
+        """
         for record, log_time_ns in self._records({}, progress):
             if isinstance(record, Readings):
                 yield record, log_time_ns
 
     def readings_and_accelerations(self, progress: Progress | None = None
                                    ) -> Iterator[Readings | AccelerationSample]:
-        """Iterate over `Readings` and `AccelerationSample`s, message by message."""
+        """Iterate over readings and accelerations message by message, in order of log time.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Called with the number of bytes read since the last call.
+
+        Returns
+        -------
+        iterator of Readings or AccelerationSample
+        """
         return (record for record, _ in self._records(self._imus, progress))
 
     def _records(self, imus: Mapping[str, Sequence[str]], progress: Progress | None
                  ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
-        """(record, log time) of the sensors, and of the accelerometers {topic: sensors}."""
+        """(record, log time) of the sensors and of the accelerometers in `imus`, {topic:
+        sensors}."""
         return self._records_of(self._recording.messages(progress=progress), imus)
 
     def _records_of(self, messages: Iterable[RawMessage], imus: Mapping[str, Sequence[str]]
                     ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
-        """The same of some of the messages; what cannot be used is counted."""
+        """As `_records`, for given messages. Unusable messages are counted."""
         for message in messages:
             sensor = self._sensors.get(message.topic)
-            truth = self._truth.wants(message.topic, message.type)
-            many = message.topic == self._many and message.type == FIELD_READINGS
-            shaken = imus.get(message.topic) if message.type == IMU else None
-            if sensor is None and shaken is None and not truth and not many:
+            truth = self._truth.accepts(message.topic, message.type)
+            is_batch = message.topic == self._batch_topic and message.type == FIELD_READINGS
+            imu_sensors = imus.get(message.topic) if message.type == IMU else None
+            if sensor is None and imu_sensors is None and not truth and not is_batch:
                 continue
             try:
                 content = decode(message)
-                readings = readings_of(content) if many else None
+                readings = readings_of(content) if is_batch else None
             except RecordingError:
                 self.rejected[f'undecodable message on {message.topic}'] += 1
                 continue
             if truth:
                 self._truth.add(message.topic, content)
             elif readings is not None:
-                yield self._of_network(readings), message.log_time_ns
-            elif shaken is not None:
-                for name in shaken:
+                yield self._network_readings(readings), message.log_time_ns
+            elif imu_sensors is not None:
+                for name in imu_sensors:
                     yield acceleration_of(content, name), message.log_time_ns
             elif sensor is not None:
                 yield reading_of(content, sensor), message.log_time_ns
 
-    def _of_network(self, readings: Readings) -> Readings:
-        """Those of the network's sensors; the others are counted."""
+    def _network_readings(self, readings: Readings) -> Readings:
+        """Readings of the network's sensors. Readings of other sensors are counted."""
         known = set(self._sensors.values())
         is_known = np.array([name in known for name in readings.names], dtype=bool)[readings.sensor]
         if is_known.all():
@@ -173,16 +222,22 @@ class SampleReader:
         return readings.part(is_known)
 
     def truth_arrays(self) -> dict[str, Truth]:
-        """{name: arrays} of the true poses that were read."""
+        """True poses that have been read so far.
+
+        Returns
+        -------
+        dict of str to Truth
+            Arrays by name of the target.
+        """
         self.rejected.update(self._truth.rejected)
         self._truth.rejected.clear()
         return self._truth.arrays()
 
 
 def _namespace(recording: Recording, network: SensorNetwork) -> str:
-    """Namespace of the network's relative topics in a recording; the root where none is recorded.
+    """Namespace of the network's relative topics in a recording, or the root if none is recorded.
 
-    Raises RecordingError where several are possible.
+    Raises RecordingError if several namespaces are possible.
     """
     if network.namespace is not None:
         return network.namespace

@@ -1,8 +1,8 @@
 """Labelled signatures in CSV, labelled intervals of a recording, and trained classes in JSON.
 
-A table of signatures has a row for each sample (`label`, `signature`, `time_s`, and fields) or for
-each signature (`label`, and its samples in order). A table of intervals has `label`, `begin_s` and
-`end_s` (or `begin_ns` and `end_ns`), and maybe `sensor`.
+A table of signatures has one row per sample (`label`, `signature`, `time_s` and fields) or one row
+per signature (`label`, and its samples in order). A table of intervals has `label`, `begin_s` and
+`end_s` (or `begin_ns` and `end_ns`), and optionally `sensor`.
 """
 
 import json
@@ -21,14 +21,14 @@ from mag_tracking.recording.csv_file import Lines, number, read_csv
 from mag_tracking.units import NS
 
 LABEL, TIME, PASS = 'label', 'time_s', 'pass'
-EPOCH_S = 1e8
-"""Seconds that are larger are since 1970, others since the first reading."""
+MIN_EPOCH_S = 1e8
+"""Larger times are since 1970, smaller ones since the first reading [s]."""
 
-LATEST_S = 1e11
-"""Seconds that are larger are no time."""
+MAX_TIME_S = 1e11
+"""Maximum valid time [s]."""
 
 UNITS = {'t': 1.0, 'ut': 1e-6, 'nt': 1e-9}
-"""{suffix of a column: [T]}"""
+"""Tesla per unit, by suffix of the column."""
 
 _AXIS = re.compile(r'b?(?P<axis>[xyz])(_(?P<unit>t|ut|nt))?')
 _SAMPLE = re.compile(r'b?(?P<axis>[xyz])(_(?P<unit>t|ut|nt))?_?(?P<number>\d+)')
@@ -36,44 +36,58 @@ _SAMPLE = re.compile(r'b?(?P<axis>[xyz])(_(?P<unit>t|ut|nt))?_?(?P<number>\d+)')
 
 @dataclass(frozen=True)
 class LabelledInterval:
-    """A stretch of a recording in which one target passed."""
+    """An interval of a recording in which one target passed."""
 
     begin_ns: int
+    """Beginning of the interval, ns since 1970."""
     end_ns: int
+    """End of the interval, ns since 1970."""
     label: str
+    """Name of the class."""
     sensor: str
-    """Empty: all sensors."""
+    """Name of the sensor. Empty for all sensors."""
     row: int
     """Row of the table."""
 
 
 def read_signatures(path: str | PathLike[str], is_labelled: bool = True) -> list[Signature]:
-    """The signatures of a table; `is_labelled`: without labels it is of no use.
+    """Read the signatures of a table.
+
+    Parameters
+    ----------
+    path : path_like
+    is_labelled : bool, optional
+        Whether labels are required.
+
+    Returns
+    -------
+    list of Signature
 
     Raises
     ------
     RecordingError
         If the table cannot be read.
     LabelsError
-        If it has no labels, or a signature has several.
+        If required labels are missing, a signature has several labels, or the columns are invalid.
     """
     header, lines = read_csv(path)
     if LABEL not in header and is_labelled:
         other = next((c for c in ';\t' if c in header[0]), None)
         hint = f'; the delimiter is {other!r}, expected a comma' if other else ''
-        raise LabelsError(f'{path}: there is no column {LABEL!r}; there are {", ".join(header)}'
-                          f'{hint}')
+        raise LabelsError(f'{path}: column {LABEL!r} is missing; the columns are '
+                          f'{", ".join(header)}{hint}')
     return _by_sample(path, header, lines) if TIME in header else _by_row(path, header, lines)
 
 
 def _by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:
-    """Signatures with a row for each sample; the other columns name the signature."""
+    """Signatures with one row per sample; the other columns identify the signature."""
     axes = {name: match for name in header if (match := _AXIS.fullmatch(name.lower()))}
     names = [name for name in header if name not in (*axes, LABEL, TIME, PASS)]
     if not axes:
-        raise LabelsError(f'{path}: no column is a field; expected x, y, z (or x_nt and so on)')
+        raise LabelsError(f'{path}: no column holds a field; expected x, y, z (or x_nt and so on)')
     if not names:
-        raise LabelsError(f'{path}: no column names the signature; expected one such as signature')
+        raise LabelsError(f'{path}: no column identifies the signature; expected one such as '
+                          'signature')
     fields = _Fields(path, [(m['axis'], m['unit'] or '', [name]) for name, m in axes.items()])
     found: dict[tuple[str, ...], list[tuple[int, dict[str, str]]]] = {}
     for line, row in lines:
@@ -82,18 +96,18 @@ def _by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> li
     out = []
     for key, rows in found.items():
         source = f'{path}: signature {" ".join(key)}'
-        label, group = (_only(source, column, rows) for column in (LABEL, PASS))
+        label, group = (_unique_value(source, column, rows) for column in (LABEL, PASS))
         t = np.array([number(path, line, TIME, cells[TIME], True) for line, cells in rows])
         field = np.array([fields.of(line, cells)[0] for line, cells in rows])
         out.append(fields.signature(t, field, label, source, group))
     if len(out) > 1 and all(len(s.t) == 1 for s in out):
-        raise LabelsError(f'{path}: each signature has one sample; the columns {", ".join(names)} '
-                          'are taken for names of signatures')
+        raise LabelsError(f'{path}: each signature has only one sample; the columns '
+                          f'{", ".join(names)} were treated as names of signatures')
     return out
 
 
-def _only(source: str, column: str, rows: list[tuple[int, dict[str, str]]]) -> str:
-    """The only value of a column, empty without it; LabelsError where there are several."""
+def _unique_value(source: str, column: str, rows: list[tuple[int, dict[str, str]]]) -> str:
+    """Unique value of a column, or empty if it is missing; raises LabelsError for several."""
     values = sorted({cells.get(column, '').strip() for _, cells in rows})
     if len(values) > 1:
         raise LabelsError(f'{source} has several values of {column}: {", ".join(values)}')
@@ -101,7 +115,7 @@ def _only(source: str, column: str, rows: list[tuple[int, dict[str, str]]]) -> s
 
 
 def _by_row(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:
-    """Signatures with a row each: columns x0, x1, ... (and y0, ...)."""
+    """Signatures with one row each: columns x0, x1, ... (and y0, ...)."""
     axes: dict[tuple[str, str], list[tuple[int, str]]] = {}
     for name in header:
         match = _SAMPLE.fullmatch(name.lower())
@@ -111,11 +125,11 @@ def _by_row(path: str | PathLike[str], header: list[str], lines: Lines) -> list[
     for found in axes.values():
         numbers = sorted(n for n, _ in found)
         if numbers != list(range(numbers[0], numbers[0] + len(numbers))):
-            raise LabelsError(f'{path}: the columns {found[0][1]}, ... are not numbered one after '
-                              'the other')
+            raise LabelsError(f'{path}: the columns {found[0][1]}, ... are not numbered '
+                              'consecutively')
     if not axes or len({len(found) for found in axes.values()}) > 1:
-        raise LabelsError(f'{path}: expected numbered columns of samples, as many for each axis '
-                          f'(x0, x1, ..., y0, y1, ...), or a column {TIME}')
+        raise LabelsError(f'{path}: expected numbered columns of samples, the same number for each '
+                          f'axis (x0, x1, ..., y0, y1, ...), or a column {TIME}')
     fields = _Fields(path, [(axis, unit, [name for _, name in sorted(found)])
                             for (axis, unit), found in axes.items()])
     out = []
@@ -129,31 +143,33 @@ def _by_row(path: str | PathLike[str], header: list[str], lines: Lines) -> list[
 
 
 class _Fields:
-    """The columns of a table that hold fields, by axis."""
+    """Field columns of a table by axis.
+
+    Raises LabelsError if an axis is duplicated, or only some of the `columns`,
+    [(axis, unit, names)], have a unit.
+    """
 
     def __init__(self, path: str | PathLike[str], columns: list[tuple[str, str, list[str]]]
                  ) -> None:
-        """`columns` [(axis, unit, names)]; raises LabelsError for an axis that is there twice, and
-        for units that are known in part."""
         columns = sorted(columns)
         axes = [axis for axis, _, _ in columns]
         twice = sorted({axis for axis in axes if axes.count(axis) > 1})
         if twice:
-            raise LabelsError(f'{path}: several columns are the axis {twice[0]}')
+            raise LabelsError(f'{path}: several columns hold the axis {twice[0]}')
         known = [unit for _, unit, _ in columns if unit]
         if known and len(known) < len(columns):
-            raise LabelsError(f'{path}: some fields have a unit (_t, _ut or _nt), others none')
+            raise LabelsError(f'{path}: only some fields have a unit (_t, _ut or _nt)')
         self._path, self._columns, self._unit = path, columns, 'T' if known else ''
 
     def of(self, line: int, cells: dict[str, str]) -> FloatArray:
-        """(n, n_axes) of a row of the table."""
+        """Field of a row of the table, (n, n_axes)."""
         return np.array([[number(self._path, line, name, cells[name], False)
                           * UNITS.get(unit, 1.0) for name in names]
                          for _, unit, names in self._columns]).T
 
     def signature(self, t: FloatArray, field: FloatArray, label: str, source: str,
                   group: str) -> Signature:
-        """The signature, without axes and ends that were not measured."""
+        """Signature without unmeasured axes, and without unmeasured samples at its ends."""
         there = np.flatnonzero(~np.isnan(field).all(axis=0))
         field = field[:, there]
         whole = np.flatnonzero(~np.isnan(field).any(axis=1)) if len(there) else there
@@ -163,20 +179,30 @@ class _Fields:
 
 
 def read_intervals(path: str | PathLike[str], first_ns: int) -> list[LabelledInterval]:
-    """The labelled intervals of a recording whose first reading is at `first_ns`.
+    """Read the labelled intervals of a recording.
+
+    Parameters
+    ----------
+    path : path_like
+    first_ns : int, ns
+        Timestamp of the first reading of the recording.
+
+    Returns
+    -------
+    list of LabelledInterval
 
     Raises
     ------
     RecordingError
         If the table cannot be read.
     LabelsError
-        If a label is missing, an interval ends before it begins, or two overlap.
+        If a column or label is missing, an interval ends before it begins, or two overlap.
     """
     header, lines = read_csv(path)
     unit = 'ns' if 'begin_ns' in header else 's'
     missing = [n for n in (LABEL, f'begin_{unit}', f'end_{unit}') if n not in header]
     if missing:
-        raise LabelsError(f'{path}: there is no column {", ".join(missing)}; there are '
+        raise LabelsError(f'{path}: missing columns: {", ".join(missing)}; the columns are '
                           f'{", ".join(header)}')
     out = []
     for line, row in lines:
@@ -195,18 +221,18 @@ def read_intervals(path: str | PathLike[str], first_ns: int) -> list[LabelledInt
 
 def _stamp(path: str | PathLike[str], line: int, column: str, cells: dict[str, str],
            first_ns: int) -> int:
-    """[ns] of a cell."""
+    """Time of a cell [ns]."""
     value = number(path, line, column, cells[column], True)
-    if abs(value) > (LATEST_S * NS if column.endswith('_ns') else LATEST_S):
-        raise LabelsError(f'{path}: row {line}: {column} is no time')
+    if abs(value) > (MAX_TIME_S * NS if column.endswith('_ns') else MAX_TIME_S):
+        raise LabelsError(f'{path}: row {line}: {column} is not a valid time')
     if column.endswith('_ns'):
-        # A float does not hold all nanoseconds since 1970.
+        # A float cannot represent nanoseconds since 1970 exactly.
         return int(cells[column]) if cells[column].strip().isdigit() else int(value)
-    return round(value * NS) + (0 if value > EPOCH_S else first_ns)
+    return round(value * NS) + (0 if value > MIN_EPOCH_S else first_ns)
 
 
 def _check_overlaps(path: str | PathLike[str], intervals: list[LabelledInterval]) -> None:
-    """Raise LabelsError where two intervals of a sensor overlap."""
+    """Raise LabelsError if two intervals of a sensor overlap."""
     ordered = sorted(intervals, key=lambda i: i.begin_ns)
     for k, first in enumerate(ordered):
         for second in ordered[k + 1:]:
@@ -214,25 +240,51 @@ def _check_overlaps(path: str | PathLike[str], intervals: list[LabelledInterval]
                 break
             if first.sensor == second.sensor or '' in (first.sensor, second.sensor):
                 raise LabelsError(f'{path}: rows {first.row} and {second.row} overlap: a '
-                                  'signature would hold two targets')
+                                  'signature must contain only one target')
 
 
 def write_model(path: str | PathLike[str], model: SignatureModel) -> None:
-    """Write a model as JSON; raises OutputError."""
+    """Write a trained model as JSON.
+
+    Parameters
+    ----------
+    path : path_like
+    model : SignatureModel
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
     content = {name: value.tolist() if isinstance(value, np.ndarray) else value
                for name, value in asdict(model).items()}
     replace_text(path, json.dumps({'mag_tracking.classes': VERSION, **content}, indent=1) + '\n')
 
 
 def read_model(path: str | PathLike[str]) -> SignatureModel:
-    """A model that `write_model` wrote; raises RecordingError."""
+    """Read a model written by `write_model`.
+
+    Parameters
+    ----------
+    path : path_like
+
+    Returns
+    -------
+    SignatureModel
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read or is not a valid model.
+    """
     path = checked_path(path, RecordingError)
     try:
         with open(path, encoding='utf-8') as stream:
             content = json.load(stream)
         version = content.pop('mag_tracking.classes')
         if version != VERSION:
-            raise RecordingError(f'{path}: classes of version {version}; this reads {VERSION}')
+            raise RecordingError(f'{path}: class version {version} is not supported; '
+                                 f'expected {VERSION}')
         names = ('mean', 'scale', 'weights', 'offsets', 'centres', 'precision')
         content.update({name: np.array(content[name], dtype=float) for name in names})
         content.update({name: float(content[name]) for name in ('temperature', 'limit')})
@@ -243,18 +295,18 @@ def read_model(path: str | PathLike[str]) -> SignatureModel:
     except OSError as error:
         raise RecordingError(f'cannot read {path}: {error.strerror}') from error
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise RecordingError(f'{path} holds no trained classes ({error})') from error
+        raise RecordingError(f'{path} is not a valid file of trained classes ({error})') from error
 
 
 def _check_model(model: SignatureModel) -> None:
-    """Raise ValueError where the numbers of a model do not fit together."""
+    """Raise ValueError if the arrays of a model are inconsistent or not finite."""
     n, k = len(model.mean), len(set(model.classes))
     shapes = {'mean': (n,), 'scale': (n,), 'weights': (k, n), 'offsets': (k,), 'centres': (k, n),
               'precision': (n, n)}
     for name, shape in shapes.items():
         values = getattr(model, name)
         if values.shape != shape or not np.isfinite(values).all():
-            raise ValueError(f'{name}: expected {shape} finite numbers')
+            raise ValueError(f'{name}: expected finite numbers of shape {shape}')
     if k < 2 or k < len(model.classes) or not n:
         raise ValueError('classes: expected at least two different names')
     for name in ('temperature', 'limit'):

@@ -1,6 +1,6 @@
-"""`tracks.mcap`: the messages of the nodes, for the viewers of ROS.
+"""`tracks.mcap`: the messages of the nodes, for ROS viewers.
 
-Fields, tracks, poses, odometry, path, smoothed tracks, markers, transforms, disturbances.
+Fields, tracks, poses, odometry, path, smoothed tracks, markers, transforms and disturbances.
 """
 
 from os import PathLike
@@ -39,14 +39,17 @@ LATCHED = ('/tf_static', '/tracker_node/sensor_markers')
 
 
 class TrackRecording:
-    """Writer of tracks, and of the fields and sensors that belong to them, as messages.
+    """Writer of tracks and the corresponding fields and sensors as messages.
 
     Parameters
     ----------
-    path : path
+    path : path_like
     network : SensorNetwork
 
-    Raises OutputError where the file cannot be written.
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
     """
 
     def __init__(self, path: str | PathLike[str], network: SensorNetwork) -> None:
@@ -59,12 +62,12 @@ class TrackRecording:
         self._is_begun = False
 
     def close(self) -> None:
-        """Finish the file."""
+        """Complete the file."""
         self._write_smoothed()
         self._writer.close()
 
     def _begin(self, stamp_ns: int) -> None:
-        """Write where the sensors are, once, at the time of the first message."""
+        """Write the poses of the sensors, once, at the time of the first message."""
         if self._is_begun:
             return
         self._is_begun = True
@@ -74,7 +77,12 @@ class TrackRecording:
                            sensor_markers(self._network), stamp_ns)
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Write the calibrated field of each sensor in a frame."""
+        """Write the calibrated field of each sensor in a frame.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+        """
         self._write_smoothed()
         self._begin(frame.stamp_ns)
         for j, name in enumerate(self._network.names):
@@ -85,7 +93,12 @@ class TrackRecording:
                 self._writer.write(self._topics[name], MAGNETIC_FIELD, content, frame.stamp_ns)
 
     def add_track(self, track: Track) -> None:
-        """Write a pose of a track with its markers and transform, or its end."""
+        """Write a pose of a track with its markers and transform, or the end of the track.
+
+        Parameters
+        ----------
+        track : Track
+        """
         self._write_smoothed()
         self._begin(track.stamp_ns)
         stamp_ns, frame = track.stamp_ns, self._frame
@@ -111,13 +124,18 @@ class TrackRecording:
             self._path.append(pose_dict(stamp_ns, frame, track.position, track.orientation))
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
-        """Take a smoothed pose; a whole track is one message."""
+        """Add a smoothed pose. The poses of a track are written as a single message.
+
+        Parameters
+        ----------
+        pose : SmoothedPose
+        """
         if self._smoothed and pose.id != self._smoothed[0].id:
             self._write_smoothed()
         self._smoothed.append(pose)
 
     def _write_smoothed(self) -> None:
-        """Write a whole smoothed track."""
+        """Write the collected poses of a smoothed track."""
         poses = self._smoothed
         if not poses:
             return
@@ -129,7 +147,12 @@ class TrackRecording:
                       for p in poses]}, last_ns)
 
     def add_disturbance(self, disturbance: Disturbance) -> None:
-        """Write a disturbance, when it is found and once more when it has ended."""
+        """Write a disturbance, when it is found and again when it has ended.
+
+        Parameters
+        ----------
+        disturbance : Disturbance
+        """
         self._write('disturbances', DISTURBANCE, disturbance_dict(disturbance, self._frame),
                     disturbance.stamp_ns)
 

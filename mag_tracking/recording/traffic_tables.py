@@ -1,4 +1,4 @@
-"""Passages and traffic summaries as tables: CSV, and Parquet where pyarrow is installed."""
+"""Passages and traffic summaries as tables: CSV, and Parquet if pyarrow is installed."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -17,47 +17,61 @@ DIRECTIONS = {True: 'forward', False: 'backward'}
 
 _PASSAGE = (
     *columns_of('s', '', recording='name of the recording'),
-    *columns_of('i', '', number='1, 2, ... in order of time'),
-    *columns_of('i', 'ns', stamp_ns='when the middle of the vehicle was on the line'),
+    *columns_of('i', '', number='number of the passage in order of time'),
+    *columns_of('i', 'ns', stamp_ns='time at which the middle of the vehicle was on the line'),
     *columns_of('s', '', line='name of the counting line'),
     *columns_of('i', '', track_id='number of the track'),
     *columns_of('s', '', direction='forward or backward'),
     *columns_of('f', '', direction_error='probability that the direction is wrong'),
-    *columns_of('f', 'm', x='place on the line, x', y='place on the line, y',
-                z='place on the line, z', lateral='to the left of the middle, seen forward'),
+    *columns_of('f', 'm', x='position on the line, x', y='position on the line, y',
+                z='position on the line, z',
+                lateral='distance to the left of the middle of the line, in forward direction'),
     *columns_of('f', 'm/s', vx='velocity, x', vy='velocity, y', vz='velocity, z'),
     *columns_of('f', 'deg', heading_deg='direction of the velocity, from x towards y',
                 sd_heading_deg='its standard deviation'),
     *columns_of('f', 'm/s', speed='horizontal speed', sd_speed='its standard deviation',
-                delay_speed='speed by the delay between sensors, without a model',
+                delay_speed='model-free speed from the delay between sensors',
                 sd_delay_speed='its standard deviation'),
     *columns_of('b', '', speeds_contradict='whether track and delay contradict each other'),
-    *columns_of('f', 'm', length='length of the row of dipoles; 0 = a point',
+    *columns_of('f', 'm', length='length of the row of dipoles; 0 = point target',
                 sd_length='its standard deviation'),
     *columns_of('f', 'A m^2', mx='magnetic moment, x', my='magnetic moment, y',
-                mz='magnetic moment, z', moment_size='its size'),
+                mz='magnetic moment, z', moment_size='magnitude of the magnetic moment'),
     Column('class', 's', '', 'most probable class, or unknown'))
 _VEHICLE = (
     *columns_of('s', '', vehicle='enrolled vehicle, or unknown'),
-    *columns_of('f', '', p_vehicle='its probability among those that can be compared'))
+    *columns_of('f', '', p_vehicle='its probability among the comparable vehicles'))
 _PASSAGE_END = (
-    *columns_of('f', 's', headway='since the vehicle before in the same direction'),
-    *columns_of('b', '', ambiguous='whether the passage is doubtful'),
-    *columns_of('s', '', doubts='why'))
+    *columns_of('f', 's', headway='time since the previous vehicle in the same direction'),
+    *columns_of('b', '', ambiguous='whether the passage is ambiguous'),
+    *columns_of('s', '', doubts='reasons why the passage is ambiguous'))
 _INTERVAL = (
     *columns_of('s', '', recording='name of the recording'),
-    *columns_of('i', 'ns', begin_ns='begin of the interval', end_ns='its end'),
+    *columns_of('i', 'ns', begin_ns='beginning of the interval', end_ns='its end'),
     *columns_of('s', '', line='name of the counting line'),
-    *columns_of('f', 's', observed_s='time of the interval that is covered by frames'),
+    *columns_of('f', 's', observed_s='part of the interval that is covered by frames'),
     *columns_of('s', '', direction='forward or backward'),
     Column('class', 's', '', 'class of the vehicles'),
-    *columns_of('i', '', count='number of vehicles', n_ambiguous='number of doubtful ones'),
+    *columns_of('i', '', count='number of vehicles', n_ambiguous='number of ambiguous passages'),
     *columns_of('f', 'm/s', mean_speed='mean of their speeds'),
     *columns_of('f', 's', mean_headway='mean of their headways'))
 
 
 def tables_of(class_names: Sequence[str], with_fleet: bool) -> dict[str, tuple[Column, ...]]:
-    """{table: columns}, with a probability for each class."""
+    """Columns of each table.
+
+    Parameters
+    ----------
+    class_names : sequence of str
+        Each class has a column for its probability.
+    with_fleet : bool
+        Whether to include the columns of enrolled vehicles.
+
+    Returns
+    -------
+    dict of str to tuple of Column
+        By table.
+    """
     classes = tuple(Column(f'p_{name}', 'f', '', f'probability of the class {name}')
                     for name in class_names)
     vehicle = _VEHICLE if with_fleet else ()
@@ -66,10 +80,22 @@ def tables_of(class_names: Sequence[str], with_fleet: bool) -> dict[str, tuple[C
 
 def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[str],
                 delay: dict[str, Any], vehicle: dict[str, Any]) -> dict[str, Any]:
-    """The columns of `passages`; SI units, NaN = unknown.
+    """Values of a passage by column, in SI units. NaN = unknown.
 
-    `delay` has those of the speed by the delay between sensors, `vehicle` those of the enrolled
-    vehicle that it is.
+    Parameters
+    ----------
+    recording : str
+        Name of the recording.
+    passage : VehiclePassage
+    class_names : sequence of str
+    delay : dict
+        Columns of the speed from the delay between sensors.
+    vehicle : dict
+        Columns of the matching enrolled vehicle.
+
+    Returns
+    -------
+    dict
     """
     x, y, z = passage.position.tolist()
     vx, vy, vz = passage.velocity.tolist()
@@ -91,7 +117,19 @@ def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[s
 
 
 def summary_rows(recording: str, summary: TrafficSummary) -> list[dict[str, Any]]:
-    """Rows of `intervals`, one for each direction and class; one with zero if there is none."""
+    """Rows of `intervals`: one per direction and class, or one row with count 0.
+
+    Parameters
+    ----------
+    recording : str
+        Name of the recording.
+    summary : TrafficSummary
+
+    Returns
+    -------
+    list of dict
+        Values by column.
+    """
     head = {'recording': recording, 'begin_ns': summary.begin_ns, 'end_ns': summary.end_ns,
             'line': summary.line, 'observed_s': summary.observed_s}
     if not summary.counts:
@@ -104,10 +142,23 @@ def summary_rows(recording: str, summary: TrafficSummary) -> list[dict[str, Any]
 
 def write_traffic(folder: Path, rows: Mapping[str, Sequence[Mapping[str, Any]]],
                   tables: Mapping[str, Sequence[Column]]) -> None:
-    """Write the rows of tables into a folder, as CSV and Parquet.
+    """Write tables to a folder as CSV and Parquet.
 
-    Tables without rows have their columns. Parquet is left out where pyarrow is not installed, and
-    that of an earlier run is removed. Raises OutputError.
+    Tables without rows have only a header. If pyarrow is not installed, no Parquet is written and
+    that of an earlier run is removed.
+
+    Parameters
+    ----------
+    folder : Path
+    rows : mapping of str to sequence of mapping
+        Rows by table, as values by column.
+    tables : mapping of str to sequence of Column
+        Columns by table.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
     """
     folder = output_folder(folder)
     try:
@@ -122,14 +173,14 @@ def write_traffic(folder: Path, rows: Mapping[str, Sequence[Mapping[str, Any]]],
                 continue
             with TableWriter(parquet, columns) as table:
                 for row in rows[name]:
-                    # NaN is not known: null.
+                    # Unknown values are NaN here and null in Parquet.
                     table.add({k: v for k, v in row.items() if v == v})
     except OSError as error:
         raise OutputError(f'cannot write to {folder}: {error.strerror or error}') from error
 
 
 def _text(value: object) -> object:
-    """A cell of CSV; empty where the value is unknown."""
+    """Cell of a CSV file; empty if the value is unknown."""
     if isinstance(value, float):
         return f'{value:.9g}' if np.isfinite(value) else ''
     return value

@@ -1,4 +1,4 @@
-"""True poses, from topics of a recording or from a table: for reports, never for tracking."""
+"""True poses from topics of a recording or from a table, for reports and never for tracking."""
 
 from collections import Counter
 from os import PathLike
@@ -22,7 +22,7 @@ TRUTH_TYPES = (POSE, POSE_WITH_COVARIANCE, ODOMETRY)
 _Rows: TypeAlias = tuple[IntArray, FloatArray]
 """Times (n,) [ns], and positions and quaternions (n, 7)."""
 _TIMES = {'stamp_ns': 1, 't': NS, 'time': NS}
-"""{column: ns}."""
+"""Nanoseconds per unit, by column."""
 
 
 class TruthTopics:
@@ -31,15 +31,16 @@ class TruthTopics:
     Parameters
     ----------
     prefix : str
-        Poses on topics below this are truth, unless a topic is given.
+        Prefix of the topics with true poses, unless `topic` is given.
     frame : str
-        Of the network. Poses in another frame are not comparable, and are counted.
+        World frame of the network. Poses in other frames cannot be compared and are rejected.
     topic : str, optional
+        Topic of the true poses.
 
     Attributes
     ----------
     rejected : Counter
-        {cause: number} of messages.
+        Number of rejected messages by cause.
     """
 
     def __init__(self, prefix: str, frame: str, topic: str | None = None) -> None:
@@ -47,13 +48,31 @@ class TruthTopics:
         self.rejected: Counter[str] = Counter()
         self._rows: dict[str, list[_Rows]] = {}
 
-    def wants(self, topic: str, kind: str) -> bool:
-        """Whether a topic of a type carries truth."""
+    def accepts(self, topic: str, kind: str) -> bool:
+        """Whether a topic carries true poses.
+
+        Parameters
+        ----------
+        topic : str
+        kind : str
+            Message type.
+
+        Returns
+        -------
+        bool
+        """
         is_truth = topic.startswith(self._prefix) if self._topic is None else topic == self._topic
         return is_truth and kind in TRUTH_TYPES
 
     def add(self, topic: str, content: Any) -> None:
-        """Take a decoded message of a topic that it `wants`."""
+        """Add a decoded message of a topic with true poses.
+
+        Parameters
+        ----------
+        topic : str
+        content : object
+            Message.
+        """
         frame = content.header.frame_id
         if frame and frame != self._frame:
             self.rejected[f'truth on {topic} is in frame {frame}, not {self._frame}'] += 1
@@ -64,20 +83,36 @@ class TruthTopics:
             (np.array([stamp_ns(content.header.stamp)]),
              np.array([[p.x, p.y, p.z, q.x, q.y, q.z, q.w]])))
 
-    def take(self, block: MessageBlock) -> IntArray:
-        """Take the poses of a block that need no decoder; their rows."""
-        taken: list[IntArray] = [np.zeros(0, dtype=np.int64)]
+    def add_block(self, block: MessageBlock) -> IntArray:
+        """Add the poses of a block that can be read without a decoder.
+
+        Parameters
+        ----------
+        block : MessageBlock
+
+        Returns
+        -------
+        (n,) int array
+            Rows of the poses that were read.
+        """
+        collected: list[IntArray] = [np.zeros(0, dtype=np.int64)]
         for channel, kind in block.kinds.items():
             rows: IntArray = np.flatnonzero(block.channel == channel)
-            if len(rows) and kind.type == POSE and kind.is_cdr and self.wants(kind.topic, POSE):
+            if len(rows) and kind.type == POSE and kind.is_cdr and self.accepts(kind.topic, POSE):
                 found = poses(block.data, block.begin[rows], block.end[rows], self._frame)
-                taken.append(rows[found.is_read])
+                collected.append(rows[found.is_read])
                 self._rows.setdefault(kind.topic, []).append(
                     (found.stamp_ns[found.is_read], found.pose[found.is_read]))
-        return np.concatenate(taken)
+        return np.concatenate(collected)
 
     def arrays(self) -> dict[str, Truth]:
-        """{name: arrays} of the topics, in order of time."""
+        """True poses of each topic in order of time.
+
+        Returns
+        -------
+        dict of str to Truth
+            Arrays by name of the target.
+        """
         out = {}
         for topic, rows in self._rows.items():
             stamps, pose = (np.concatenate(arrays) for arrays in zip(*rows, strict=True))
@@ -89,19 +124,23 @@ class TruthTopics:
 
 
 def read_truth_table(path: str | PathLike[str]) -> dict[str, Truth]:
-    """True poses of a CSV file, in the frame of the network.
+    """Read true poses in the frame of the network from a CSV file.
 
     Parameters
     ----------
-    path : path
-        Columns: `stamp_ns` [ns], or `t` or `time` [s], since 1970; `x`, `y` [m]; `z` [m] and
-        `qx`, `qy`, `qz`, `qw` may be left out. Others are not read.
+    path : path_like
+        Columns: `stamp_ns` [ns], or `t` or `time` [s], since 1970; `x`, `y` [m]; optionally `z` [m]
+        and `qx`, `qy`, `qz`, `qw`. Other columns are ignored.
 
     Returns
     -------
-    {stem of the file: arrays}
+    dict of str to Truth
+        Arrays by stem of the file name.
 
-    Raises RecordingError, which names file, row and column.
+    Raises
+    ------
+    RecordingError
+        If the file is invalid. The message names file, row and column.
     """
     header, rows = read_csv(path)
     time = next((name for name in _TIMES if name in header), None)
@@ -121,12 +160,12 @@ def read_truth_table(path: str | PathLike[str]) -> dict[str, Truth]:
 
 
 def _stamp(path: str | PathLike[str], line: int, column: str, text: str) -> int:
-    """[ns] A cell of a column of times; nanoseconds do not fit a float."""
+    """Time of a cell [ns], without conversion of nanoseconds to a float, which would round them."""
     try:
         stamp = int(text) if column == 'stamp_ns' else None
     except ValueError:
         stamp = None
     exact = stamp if stamp is not None else number(path, line, column, text, True) * _TIMES[column]
     if abs(exact) > LATEST_NS:
-        raise RecordingError(f'{path}: row {line}: {column} is {text.strip()}, which is no time')
+        raise RecordingError(f'{path}: row {line}: {column} is {text.strip()}, not a valid time')
     return round(exact)

@@ -1,4 +1,4 @@
-"""Trajectories in the format of the TUM RGB-D benchmark, which evo and others read."""
+"""Trajectories in the format of the TUM RGB-D benchmark, which evo and other tools read."""
 
 from collections.abc import Sequence
 from os import PathLike
@@ -13,17 +13,20 @@ def write_tum(path: str | PathLike[str], stamp_ns: Sequence[int], position: Sequ
 
     Parameters
     ----------
-    path : path
-    stamp_ns : (n,) sequence of int
+    path : path_like
+    stamp_ns : (n,) sequence of int, ns
     position : (n,) sequence of (3,) arrays, m
     orientation : (n,) sequence of (4,) arrays
         Quaternions xyzw.
 
-    Raises OutputError.
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
     """
     lines = []
     for stamp, p, q in zip(stamp_ns, position, orientation, strict=True):
-        # In full: as a float a time of today has a resolution of 0.2 us only.
+        # Written from integers: as a float, the present time has a resolution of only 0.2 us.
         seconds = f'{stamp // 1_000_000_000}.{stamp % 1_000_000_000:09d}'
         lines.append(' '.join([seconds, *(f'{float(v):.9g}' for v in (*p, *q))]))
     replace_text(path, '\n'.join(lines) + '\n')

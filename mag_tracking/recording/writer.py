@@ -1,4 +1,4 @@
-"""Writer of MCAP recordings that rosbag2 plays."""
+"""Writer of MCAP recordings that rosbag2 can play."""
 
 from collections import Counter
 from collections.abc import Collection
@@ -15,30 +15,53 @@ from mag_tracking.messages.types import definition, encoder
 
 
 def refuse_other_recording(path: Path) -> None:
-    """Raise OutputError where the folder of an MCAP file to be is that of another recording."""
+    """Check that the folder of a new MCAP file does not contain another recording.
+
+    Parameters
+    ----------
+    path : Path
+        Path of the MCAP file.
+
+    Raises
+    ------
+    OutputError
+        If `metadata.yaml` does not list the file, or cannot be read.
+    """
     metadata = path.parent / 'metadata.yaml'
     try:
-        # Reading a pipe or a device might never end.
+        # Only a regular file is read: a pipe or a device could block.
         if metadata.is_file() and f'- {path.name}\n' not in metadata.read_text(
                 encoding='utf-8', errors='replace'):
-            raise OutputError(f'{path.parent} holds another recording (its metadata.yaml does not '
-                              f'name {path.name}); choose another folder')
+            raise OutputError(f'{path.parent} contains another recording (its metadata.yaml does '
+                              f'not list {path.name}): choose another folder')
     except OSError as error:
         raise OutputError(f'cannot read {metadata}: {error.strerror}') from error
 
 
 class RecordingWriter:
-    """Writes messages to an MCAP file that rosbag2 plays; a context manager.
+    """Writes messages to an MCAP file that rosbag2 can play; a context manager.
 
-    Beside the file goes a `metadata.yaml`, so that its folder is a rosbag2
-    recording. Chunks are small, so that a crash loses little.
+    A `metadata.yaml` beside the file makes its folder a rosbag2 recording. Chunks are small, so
+    that a crash loses little.
+
+    Parameters
+    ----------
+    path : path_like
+        Parent folders are created.
+    latched : collection of str, optional
+        Topics with transient local durability.
+
+    Attributes
+    ----------
+    path : Path
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written, or its folder contains another recording.
     """
 
     def __init__(self, path: str | PathLike[str], latched: Collection[str] = ()) -> None:
-        """Open the file; the topics `latched` are transient local.
-
-        Raises OutputError where the file cannot be written, or its folder holds another recording.
-        """
         self._latched = frozenset(latched)
         self.path = checked_path(path, OutputError)
         refuse_other_recording(self.path)
@@ -63,9 +86,22 @@ class RecordingWriter:
         self.close()
 
     def write(self, topic: str, type_name: str, message: MessageDict, time_ns: int) -> None:
-        """Append a message, given as nested dicts, logged at `time_ns`.
+        """Append a message.
 
-        Raises RecordingError for a type that `schema` has no definition of.
+        Parameters
+        ----------
+        topic : str
+        type_name : str
+            Message type.
+        message : nested dict
+            Fields of the message.
+        time_ns : int, ns
+            Log time.
+
+        Raises
+        ------
+        RecordingError
+            If the definition of the type is unknown.
         """
         if topic not in self._channels:
             self._open_channel(topic, type_name)
@@ -88,7 +124,7 @@ class RecordingWriter:
         self._channels[topic] = channel, type_name
 
     def close(self) -> None:
-        """Finish the file and write `metadata.yaml`."""
+        """Complete the file and write `metadata.yaml`."""
         if self._stream.closed:
             return
         self._writer.finish()
@@ -127,10 +163,24 @@ OFFERED_QOS = '''- history: keep_last
   liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}
   avoid_ros_namespace_conventions: false
 '''
+"""Default QoS profile of a topic: reliable and volatile, depth 10."""
 
 
 def offered_qos(reliable: bool = True, latched: bool = False) -> str:
-    """`offered_qos_profiles` of a topic, as rosbag2 writes it."""
+    """QoS profile of a topic as rosbag2 writes it in `offered_qos_profiles`.
+
+    Parameters
+    ----------
+    reliable : bool, optional
+        Reliable instead of best-effort.
+    latched : bool, optional
+        Transient local instead of volatile.
+
+    Returns
+    -------
+    str
+        YAML text.
+    """
     text = OFFERED_QOS if reliable else OFFERED_QOS.replace('reliability: reliable',
                                                             'reliability: best_effort')
     return text.replace('durability: volatile', 'durability: transient_local') if latched else text

@@ -19,7 +19,7 @@ from mag_tracking.apps.archive_segments import SegmentWriter, read_segment
 from mag_tracking.apps.archive_work import Job, cut, join, track_segment
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
-from mag_tracking.recording.archive_folder import join_tables, stamped
+from mag_tracking.recording.archive_folder import common_columns, join_tables
 from mag_tracking.recording.archive_tables import TABLES
 from mag_tracking.recording.parquet_table import TableWriter
 from mag_tracking.records import FieldFrame
@@ -253,7 +253,7 @@ def test_a_recording_over_midnight_is_in_two_days(tmp_path):
     midnight = 20_000 * 86_400 * 10**9
     with TableWriter(tmp_path / 'part.parquet', TABLES['health']) as table:
         for k in (-2, -1, 0, 1):
-            table.add({**stamped(tmp_path / 'a.mcap', midnight + k), 'sensor': 'mag_1'})
+            table.add({**common_columns(tmp_path / 'a.mcap', midnight + k), 'sensor': 'mag_1'})
     assert join_tables([tmp_path / 'part.parquet'], [0], 'health', tmp_path, 'a') == 4
     assert {p.parent.name: pq.read_table(p, partitioning=None).num_rows
             for p in tmp_path.glob('health/*/a.parquet')} == {

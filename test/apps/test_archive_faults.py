@@ -16,7 +16,7 @@ from mag_tracking.apps.archive import archive, recordings_of
 from mag_tracking.cli import main
 from mag_tracking.errors import ClusterError, OutputError, RecordingError
 from mag_tracking.pipeline import settings_for
-from mag_tracking.recording.archive_folder import ArchiveFolder, name_of, state_of
+from mag_tracking.recording.archive_folder import ArchiveFolder, recording_key, recording_state
 from mag_tracking.recording.archive_tables import TABLES
 from mag_tracking.recording.parquet_table import TableWriter
 from support.archives import command, rows, same_tables, wait_for
@@ -48,13 +48,13 @@ def test_a_folder_of_something_else_is_refused(tmp_path, recordings, whole):
     some = [recordings / 'straight_car_right.mcap']
     (tmp_path / 'taken').mkdir()
     (tmp_path / 'taken' / 'photo.jpg').write_text('')
-    with pytest.raises(OutputError, match='is not empty and is no archive'):
+    with pytest.raises(OutputError, match='is not empty and is not an archive'):
         archive(some, NETWORK_FILE, settings, tmp_path / 'taken')
-    with pytest.raises(OutputError, match='begun with another settings'):
+    with pytest.raises(OutputError, match='other values of settings'):
         archive(some, NETWORK_FILE, settings_for('vehicle'), whole)
     other = tmp_path / 'network.yaml'
     other.write_text(NETWORK_FILE.read_text().replace('4.5', '4.6'))
-    with pytest.raises(OutputError, match='begun with another network'):
+    with pytest.raises(OutputError, match='other values of network'):
         archive(some, other, settings, whole)
     old = tmp_path / 'old'
     shutil.copytree(whole, old)
@@ -73,7 +73,7 @@ def test_two_archives_into_one_folder(tmp_path, recordings):
 
     def second():
         if not lines:
-            with pytest.raises(OutputError, match='another archive is being written into'):
+            with pytest.raises(OutputError, match='another run is writing to'):
                 archive([recordings], NETWORK_FILE, settings, out)
             lines.append('refused')
         return True
@@ -202,15 +202,15 @@ def test_nothing_of_another_state_of_a_recording_is_used(tmp_path):
     path = tmp_path / 'a[1] = ö.mcap'
     shutil.copy(vehicle_path('straight_car_right'), path)
     with ArchiveFolder(tmp_path / 'out', {}) as dataset:
-        work = dataset.begin(path, state_of(path))
+        work = dataset.begin(path, recording_state(path))
         (work / 'cut').mkdir()
-        table = tmp_path / 'out' / 'poses' / 'date=2026-01-01' / f'{name_of(path)}.parquet'
+        table = tmp_path / 'out' / 'poses' / 'date=2026-01-01' / f'{recording_key(path)}.parquet'
         table.parent.mkdir(parents=True)
         table.write_text('')
-        assert dataset.begin(path, state_of(path)) == work and (work / 'cut').is_dir()
+        assert dataset.begin(path, recording_state(path)) == work and (work / 'cut').is_dir()
         assert not table.exists()
         shutil.copy(vehicle_path('straight_small_left'), path)
-        other = dataset.begin(path, state_of(path))
+        other = dataset.begin(path, recording_state(path))
         assert other != work and not work.exists() and not list(other.iterdir())
 
 

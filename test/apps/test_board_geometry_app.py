@@ -8,7 +8,7 @@ import pytest
 from mag_tracking.analysis.network_geometry import GeometrySettings, calibrate_geometry
 from mag_tracking.analysis.network_readings import TrackedMagnet, rotation, tool_rotations
 from mag_tracking.apps.board_geometry import survey_geometry
-from mag_tracking.network import Calibrated
+from mag_tracking.network import CalibrationRecord
 from mag_tracking.network.file import read_network, write_network
 from support.geometry_command import command, through_calibrate, write_table
 from support.magnet_boards import HIGH, LOW, MOMENT, simulated
@@ -22,7 +22,7 @@ def before(network):
     return replace(
         network, offset=tuple(1e-5 * rng.standard_normal((n, 3))), correction=tuple(C),
         clock_offset=np.full(n, 0.02), orientation_std=(np.full(3, 0.5),) * n,
-        calibrated=(Calibrated('2020-01-01', 'hand', 1e-3),) * n)
+        calibrated=(CalibrationRecord('2020-01-01', 'hand', 1e-3),) * n)
 
 
 def raw(network, field):

@@ -99,7 +99,7 @@ def test_bad_tables_are_named(tmp_path, tables, capsys):
     by_row = str(tables / 'by_row.csv')
     (tmp_path / 'other.json').write_text('{"a": 1}')
     assert main(['classes', 'predict', by_row, '--model', str(tmp_path / 'other.json')]) == 1
-    assert 'holds no trained classes' in capsys.readouterr().err
+    assert 'is not a valid file of trained classes' in capsys.readouterr().err
     assert main(['classes', 'train', str(vehicle_path('straight_car_right')), '--out',
                  str(tmp_path / 'm.json')]) == 1
     assert 'needs a table of labelled intervals' in capsys.readouterr().err
@@ -152,7 +152,7 @@ def test_a_model_that_does_not_fit_together_is_refused(tables, tmp_path, capsys)
                         ('classes', ['car']), ('classes', ['car', 'car']), ('mean', [1.0])):
         model.write_text(json.dumps({**good, name: value}))
         assert main(['classes', 'predict', str(tables / 'by_row.csv'), '--model', str(model)]) == 1
-        assert 'holds no trained classes' in capsys.readouterr().err
+        assert 'is not a valid file of trained classes' in capsys.readouterr().err
     model.write_text(json.dumps(good))
     table = tmp_path / 'table.csv'
     table.write_text((tables / 'by_row.csv').read_text())

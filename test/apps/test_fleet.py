@@ -68,7 +68,7 @@ def test_what_cannot_be_enrolled_is_named(recordings, tmp_path, capsys):
                  'nothing'):
         file.write_text(text)
         assert command(recordings['van_east'], '--fleet', str(file)) == 1
-        assert 'holds no enrolled vehicles' in capsys.readouterr().err
+        assert 'is not a valid fleet file' in capsys.readouterr().err
     file.write_text(json.dumps({'mag_tracking.fleet': 1, 'vehicles': {'empty': []}}))
     assert command(recordings['van_east'], '--fleet', str(file)) == 1
     assert 'empty: a vehicle is enrolled by at least one pass' in capsys.readouterr().err

@@ -122,8 +122,8 @@ def test_a_flipped_axis_is_named(tmp_path, capsys):
 
 
 @pytest.mark.parametrize('arguments, message', [
-    (['calibrate', 'nothing.mcap'], 'there is no nothing.mcap'),
-    (['tumble', 'nothing.mcap'], 'there is no nothing.mcap'),
+    (['calibrate', 'nothing.mcap'], 'nothing.mcap does not exist'),
+    (['tumble', 'nothing.mcap'], 'nothing.mcap does not exist'),
     (['tumble', str(ROAD), '--sensor', 'mag_9'], 'unknown sensor mag_9'),
     (['calibrate', str(ROAD), '--figure', 'found.xyz'], 'found.xyz ends in none of .png, .pdf'),
     (['tumble', str(ROAD), '--field-size', '50'], '--field-size: 50 is not between'),

@@ -117,7 +117,7 @@ def test_bad_options_are_named(tmp_path, options, message):
 def test_another_recording_is_not_touched(tmp_path):
     (tmp_path / 'a_0.mcap').write_text('theirs')
     args = arguments_of('record', '--network', NETWORK_FILE, '--out', tmp_path)
-    with pytest.raises(OutputError, match='holds a recording already'):
+    with pytest.raises(OutputError, match='already contains a recording'):
         args.run_command(args)
     assert not rclpy.ok() and [p.name for p in tmp_path.iterdir()] == ['a_0.mcap']
 

@@ -91,7 +91,7 @@ def test_what_is_known_of_a_kind_need_not_be_said(tmp_path):
     ({**without(), 'other': BOARD}, 'other: sensor mag_1 comes from board already'),
     ({'board': 7}, 'board: expected a mapping of settings, got 7'),
     ('[1, 2]', 'expected a mapping of devices'), ('', 'expected a mapping of devices'),
-    ('a: [', 'is not YAML as it should be'), ('a: 1\na: 2', 'a is there twice')])
+    ('a: [', 'is not valid YAML'), ('a: 1\na: 2', 'duplicate key a')])
 def test_files_that_are_none(tmp_path, content, told):
     with pytest.raises(SettingsError) as error:
         read(tmp_path, content)

@@ -12,7 +12,7 @@ from mag_tracking.geometry import (
     quaternion_from_rotation_vector,
     rotation_from_quaternion,
 )
-from mag_tracking.network import Calibrated
+from mag_tracking.network import CalibrationRecord
 from mag_tracking.network.file import read_network, write_network
 from mag_tracking.network.geomagnetic import Site, earth_field
 
@@ -81,7 +81,7 @@ def test_what_is_known_of_a_calibrated_sensor(tmp_path):
     np.testing.assert_array_equal(n.correction[0],
                                   [[1.01, 0.02, 0.0], [0.02, 0.98, 0.0], [0.0, -0.01, 1.0]])
     assert n.offset[1] is n.correction[1] is n.calibrated[1] is None
-    assert n.calibrated[0] == Calibrated('2026-05-01', 'accelerometer and compass', 2e-5)
+    assert n.calibrated[0] == CalibrationRecord('2026-05-01', 'accelerometer and compass', 2e-5)
     assert n.calibrated[2].by == 'as stated' and np.isnan(n.calibrated[2].clock_offset_std)
     # Beside a topic that ends as REP-145 has it, else nobody knows.
     assert n.imu_topics == ('a/imu/data_raw', None, '/imu_of_c')
@@ -140,7 +140,8 @@ def test_a_sensor_without_an_accelerometer_stays_so(tmp_path):
 
 def test_any_words_read_back(tmp_path):
     n = read(tmp_path, GOOD)
-    n = replace(n, calibrated=(Calibrated('2026-05-01', "the installer's eye: # 1", np.nan), None))
+    n = replace(n, calibrated=(
+        CalibrationRecord('2026-05-01', "the installer's eye: # 1", np.nan), None))
     write_network(tmp_path / 'copy.yaml', n)
     assert_agree(read_network(tmp_path / 'copy.yaml'), n)
 
@@ -149,15 +150,15 @@ def test_any_words_read_back(tmp_path):
     ('orientation_std_deg: 5', 'orientation_std_deg: 0', 'must be above 0'),
     ('orientation_std_deg: 5', 'orientation_std_deg: -2.0', 'must be above 0'),
     ('orientation_std_deg: 5', 'orientation_std_deg: [1, 2]', 'expected 1 or 3 numbers'),
-    ('clock_offset: -0.0223', 'clock_offset: 4000', 'clock_offset: 4000.0 s is more'),
+    ('clock_offset: -0.0223', 'clock_offset: 4000', 'clock_offset: 4000.0 s exceeds 3600'),
     ('clock_offset: -0.0223', 'clock_offset: soon', "'soon' is text"),
     ('clock_offset: -0.0223', 'clock_offset: .nan', 'not a finite number'),
     ('offset: [1.0e-6', 'offset: [1.0', 'offset: .* microtesla or gauss'),
     ('[1.01, 0.02, 0.0,', '[1.01, 0.02,', 'correction: expected 9 numbers'),
-    ('0.0, -0.01, 1.0]', '0.0, 0.0, 0.0]', 'takes away a direction'),
-    ('imu_topic: /imu_of_c', 'imu_topic: imu/', "imu_topic: 'imu/' is not a ROS topic"),
-    ('imu_topic: /imu_of_c', 'imu_topic: /imu of c', 'not a ROS topic'),
-    ('topic: /b/field', 'topic: null', 'topic: None is not a ROS topic'),
+    ('0.0, -0.01, 1.0]', '0.0, 0.0, 0.0]', 'singular or almost singular'),
+    ('imu_topic: /imu_of_c', 'imu_topic: imu/', "imu_topic: 'imu/' is not a valid ROS topic"),
+    ('imu_topic: /imu_of_c', 'imu_topic: /imu of c', 'is not a valid ROS topic'),
+    ('topic: /b/field', 'topic: null', 'topic: None is not a valid ROS topic'),
     ("date: '2026-05-02'", 'date: 2026-05-02', 'date must be text'),
     (', by: as stated', '', 'by must be text'),
     ('by: as stated', 'by: "\\udc80"', r"calibrated: by must be text .* got '\\udc80'"),
@@ -167,9 +168,9 @@ def test_any_words_read_back(tmp_path):
     ('latitude: 58.4', 'latitude: 98.4', 'site: latitude: 98.4 is outside'),
     ('latitude: 58.4', 'latitude: north', "'north' is text"),
     ('date: 2026-05-01,', 'date: 2024-05-01,', 'site: year: 2024.33 is outside'),
-    ('date: 2026-05-01,', "date: '2026-05-01',", 'site: date: expected a day'),
+    ('date: 2026-05-01,', "date: '2026-05-01',", 'site: date: expected a date'),
     ('x_azimuth_deg: 90', 'x_azimuth: 90', "site: unknown key 'x_azimuth'"),
-    ('site:', 'earth_field: [2.0e-6, 1.55e-5, -4.9e-5]\nsite:', 'leave one out'),
+    ('site:', 'earth_field: [2.0e-6, 1.55e-5, -4.9e-5]\nsite:', 'both define the field'),
 ])
 def test_faults_of_a_calibration_are_named(tmp_path, old, new, message):
     assert old in CALIBRATED
@@ -178,9 +179,9 @@ def test_faults_of_a_calibration_are_named(tmp_path, old, new, message):
 
 
 @pytest.mark.parametrize('old, new, message', [
-    ('  b:', '  a:', 'a is there twice'),
-    ('/other/mag', '/a/imu/mag', 'topic /a/imu/mag is that of two sensors'),
-    ('/other/mag', '~/other', 'not a ROS topic'),
+    ('  b:', '  a:', 'duplicate key a'),
+    ('/other/mag', '/a/imu/mag', 'topic /a/imu/mag is assigned to two sensors'),
+    ('/other/mag', '~/other', 'is not a valid ROS topic'),
     ('position: [0, -4.5, 0]', 'position: [0, -4.5]', 'sensor a: position: expected 3'),
     ('position: [0, -4.5, 0]', 'positon: [0, -4.5, 0]', "unknown key 'positon'"),
     ('position: [0, -4.5, 0]', 'position: [0, .nan, 0]', 'not a finite number'),
@@ -188,19 +189,19 @@ def test_faults_of_a_calibration_are_named(tmp_path, old, new, message):
     ('1.2e-8', '-1.2e-8', 'noise_std must be above a femto'),
     ('1.2e-8', '1e-8', 'write numbers as 1.0e-8'),
     ('1.2e-8', '1.0e-100', 'above a femtotesla'),
-    ('position: [0, -4.5, 0]', 'position: [0, 1.0e+200, 0]', 'nowhere on Earth'),
+    ('position: [0, -4.5, 0]', 'position: [0, 1.0e+200, 0]', 'too far from the origin'),
     ('position: [0, -4.5, 0]', 'position: [0, 1.0e9, 0]', "'1.0e9' is text"),
     ('position: [0, -4.5, 0]', 'position: [0, 4.5, 0]', 'sensors a and b are both at'),
     ('0.7071067811865476, 0.7', '0.1, 0.7', 'needs norm 1'),
     ('[2.0e-6, 1.55e-5, -4.9e-5]', '[0.02, 0.155, -0.49]', 'microtesla or gauss'),
     ('frame: map', 'fram: map', 'unknown key'),
-    ('frame: map', 'frame: [', 'not YAML'),
+    ('frame: map', 'frame: [', 'not valid YAML'),
     ('frame: map', 'frame: "a b"', 'frame: expected a name'),
-    ('  b:', '  b/c:', "'b/c' is no name for a sensor"),
-    ('  b:', '  "\\ud800":', r"'\\ud800' is no name for a sensor"),
+    ('  b:', '  b/c:', "'b/c' is not a valid sensor name"),
+    ('  b:', '  "\\ud800":', r"'\\ud800' is not a valid sensor name"),
     ('background: [1.0e-6', 'background: [0.2', 'background: .* is it in microtesla'),
     ('[2.0e-6, 1.55e-5, -4.9e-5]', '[2.0e-3, 0.0, 0.0]', 'more than a millitesla'),
-    ('position: [0, -4.5, 0]', 'position: [0, 2.0e+8, 0]', 'nowhere on Earth'),
+    ('position: [0, -4.5, 0]', 'position: [0, 2.0e+8, 0]', 'too far from the origin'),
 ])
 def test_faults_are_named(tmp_path, old, new, message):
     assert old in GOOD

@@ -59,5 +59,5 @@ def test_names():
     assert namespaces_of(['/mag'], ['/x/mag']) == []
     assert checked_namespace('/') == '/' and checked_namespace('/a/b_1') == '/a/b_1'
     for name in ('', 'a', '/a/', '//', '/1a', '/a b', '/a//b', '/ä'):
-        with pytest.raises(NetworkError, match='is not a namespace'):
+        with pytest.raises(NetworkError, match='is not a valid namespace'):
             checked_namespace(name)

@@ -171,9 +171,9 @@ def test_other_settings_are_another_noise(tmp_path):
 
 @pytest.mark.parametrize('change, told', [
     (lambda c: 'not json', 'Expecting value'), (lambda c: '[' * 100_000, 'recursion'),
-    (lambda c: json.dumps([1]), 'not what calibration_node keeps'),
-    (lambda c: json.dumps({**c, 'version': 2}), 'keeps, version 1'),
-    (lambda c: json.dumps({'version': 1}), 'not what calibration_node keeps')])
+    (lambda c: json.dumps([1]), 'is not a background file of version'),
+    (lambda c: json.dumps({**c, 'version': 2}), 'background file of version 1'),
+    (lambda c: json.dumps({'version': 1}), 'is not a background file of version')])
 def test_a_file_that_is_none_is_told(tmp_path, change, told):
     path = tmp_path / 'kept.json'
     network, _ = kept_in(path)
@@ -183,7 +183,7 @@ def test_a_file_that_is_none_is_told(tmp_path, change, told):
 
 
 @pytest.mark.parametrize('key, value, told', [
-    ('background', [1.0, 2.0], 'ValueError: a background of'),
+    ('background', [1.0, 2.0], 'ValueError: invalid background'),
     ('covariance', [[0.0] * 3] * 3, 'not positive definite'), ('stamp_ns', None, 'at None'),
     ('made_of', None, 'another network file')])
 def test_one_bad_entry_costs_no_other(tmp_path, key, value, told):

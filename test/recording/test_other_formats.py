@@ -247,7 +247,7 @@ def test_a_row_may_have_all_sensors(tmp_path):
 
 @pytest.mark.parametrize('columns, unit, text, message', [
     (['time=t', 'a.x=x'], 'tesla', 't,x\n1,2\n', 'unit: expected one of T, mT'),
-    (['time=t', 'a.x=x'], 'T', 't,y\n1,2\n', 'there is no column x; it has t, y'),
+    (['time=t', 'a.x=x'], 'T', 't,y\n1,2\n', 'column x is missing; the columns are t, y'),
     (['time=t', 'a.x=x'], 'T', 't,x\n1,b\n', "row 2: x: expected a number, got 'b'"),
     (['time=t', 'a.x=x'], 'T', 't,x\n1,inf\n', 'row 2: x is infinite'),
     (['time=t', 'a.x=x'], 'T', 't,x\n-1,2\n', 'row 2: t: -1 is not a time'),
@@ -257,15 +257,15 @@ def test_a_row_may_have_all_sensors(tmp_path):
     (['time=t', 'a.x=x'], 'T', 't,x\n--5,1\n', "row 2: t: expected a number, got '--5'"),
     (['time=t', 'a.x=x'], 'T', 't,x\n\u00b2,1\n', 'row 2: t: expected a number'),
     (['time=t', 'a.x=x'], 'T', f't,x\n{"9" * 5000},1\n', 'is infinite|is not a time'),
-    (['time=t', 'sensor=s', 'x=x'], 'T', 't,s,x\n1,,2\n', "'' cannot be the name of a sensor"),
-    (['time=t', 'sensor=s', 'x=x'], 'T', 't,s,x\n1,a b,2\n', "'a b' cannot be the name"),
-    (['time=t', 'a/b.x=x'], 'T', 't,x\n1,2\n', "'a/b' cannot be the name"),
+    (['time=t', 'sensor=s', 'x=x'], 'T', 't,s,x\n1,,2\n', "'' is not a valid sensor name"),
+    (['time=t', 'sensor=s', 'x=x'], 'T', 't,s,x\n1,a b,2\n', "'a b' is not a valid sensor name"),
+    (['time=t', 'a/b.x=x'], 'T', 't,x\n1,2\n', "'a/b' is not a valid sensor name"),
     (['time=t', 'a.x=x'], 'T', 't,x\n1,\n', 'has no readings'),
     (['time=t', 'x=x'], 'T', 't,x\n1,2\n', "got 'x'"),
     (['time=t', 'sensor=s', 'a.x=x'], 'T', 't,x\n1,2\n', "got 'a.x'"),
     (['a.x=x'], 'T', 't,x\n1,2\n', 'time and at least one axis'),
     (['time=t', 'time=u', 'a.x=x'], 'T', 't,x\n1,2\n', 'is given twice'),
-    (['time'], 'T', 't,x\n1,2\n', 'expected e.g. time=t')])
+    (['time'], 'T', 't,x\n1,2\n', 'expected KEY=COLUMN such as time=t')])
 def test_a_table_that_does_not_fit_is_named(columns, unit, text, message, tmp_path):
     table = tmp_path / 'a.csv'
     table.write_text(text)

@@ -39,7 +39,7 @@ def test_columns_are_found_by_name_and_readings_may_be_missing(tmp_path):
     (HEADER, 'has no rows'), ('', 'has no rows'),
     ('a,b\n1,2\n', 'column x0 is missing'),
     (HEADER.replace('y0,z0', 'z0', 1) + '1,0,0,0,0,0,0,0\n', 'column y0 is missing'),
-    (HEADER.replace('mag_y0', 'mag_x0') + '1,0,0,0,0,0,0,0,0\n', 'column mag_x0 is there twice'),
+    (HEADER.replace('mag_y0', 'mag_x0') + '1,0,0,0,0,0,0,0,0\n', 'column mag_x0 is given twice'),
     (HEADER + '1,0,0,0,0,0,0,0\n', 'row 2: expected 9 columns, got 8'),
     (HEADER + '1,0,0,0,0,0,0,0,0\n1,0,spam,0,0,0,0,0,0\n', "row 3: y0 is 'spam'"),
     (HEADER + '1,0,0,0,,0,0,0,0\n', 'row 2: mag_x0 is not a finite number'),

@@ -10,7 +10,7 @@ from rosbags.rosbag2 import Reader
 from mag_tracking.errors import OutputError
 from mag_tracking.messages.types import MAGNETIC_FIELD, definition, encoder
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.recorder import FLUSH_NS, Recorder
+from mag_tracking.recording.recorder import FLUSH_INTERVAL_NS, Recorder
 from mag_tracking.recording.writer import offered_qos
 from support.recorded_numbers import TOPIC, S, by_rosbags, field, numbers, started
 
@@ -49,10 +49,10 @@ def test_what_is_recorded_is_read_by_others(tmp_path):
 def test_what_waits_is_written_though_nothing_more_comes(tmp_path):
     recorder, _ = started(tmp_path / 'a')
     recorder.write(TOPIC, field(0), 5)
-    recorder.tick(S + FLUSH_NS - 1)
+    recorder.tick(S + FLUSH_INTERVAL_NS - 1)
     assert numbers(tmp_path / 'a')[0] == []
-    recorder.tick(S + FLUSH_NS)
-    assert numbers(tmp_path / 'a')[0] == [0] and FLUSH_NS <= S // 2
+    recorder.tick(S + FLUSH_INTERVAL_NS)
+    assert numbers(tmp_path / 'a')[0] == [0] and FLUSH_INTERVAL_NS <= S // 2
     recorder.close()
     assert numbers(tmp_path / 'a')[0] == [0]
 
@@ -118,7 +118,7 @@ def test_more_publishers_more_latched_messages(tmp_path):
 def test_a_folder_with_another_recording_is_refused(tmp_path, name):
     (tmp_path / 'network.yaml').write_text('')
     (tmp_path / name).write_text('kept')
-    with pytest.raises(OutputError, match=f'holds a recording already .{name}'):
+    with pytest.raises(OutputError, match=f'already contains a recording .{name}'):
         Recorder(tmp_path)
     assert (tmp_path / name).read_text() == 'kept' and len(list(tmp_path.iterdir())) == 2
 

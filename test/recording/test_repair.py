@@ -107,7 +107,7 @@ def test_an_empty_file_of_a_crash_costs_nothing_else(tmp_path, name):
     assert whole.losses[f'{name} is empty (0 bytes)'] == 1
     said = []
     repair(tmp_path / 'a', said.append)
-    assert said == [f'{tmp_path / "a" / name} is empty: it is left out']
+    assert said == [f'{tmp_path / "a" / name} is empty and was skipped']
     assert numbers(tmp_path / 'a')[0] == kept
 
 
@@ -121,7 +121,7 @@ def test_repair_leaves_out_and_tells_a_damaged_chunk(tmp_path):
     before, told = numbers(file)[0], []
     assert 0 < len(before) < 200
     assert repair(file, told.append) == 1
-    assert any('damaged chunks, left out: 1' in line for line in told), told
+    assert any('damaged chunks skipped: 1' in line for line in told), told
     assert [k for _, k in by_rosbags(file)] == before
 
 
@@ -135,7 +135,7 @@ def test_what_is_being_recorded_is_not_repaired(tmp_path):
 
 
 def test_repair_names_what_is_no_recording(tmp_path):
-    with pytest.raises(RecordingError, match='holds no .mcap file'):
+    with pytest.raises(RecordingError, match='contains no .mcap file'):
         repair(tmp_path / 'nothing')
     (tmp_path / 'x.mcap').write_text('nonsense of some length')
     with pytest.raises(RecordingError, match='x.mcap is not an MCAP file'):
@@ -154,6 +154,6 @@ def test_repair_names_a_topic_whose_qos_is_not_yaml(tmp_path, qos):
         writer.register_channel('/x', 'cdr', schema, {'offered_qos_profiles': qos})
         writer.add_message(1, 1, b'\0\1\0\0', 1)
         writer.finish()
-    with pytest.raises(RecordingError, match='offered_qos_profiles of /x is not YAML'):
+    with pytest.raises(RecordingError, match='offered_qos_profiles of /x is not valid YAML'):
         repair(tmp_path)
     assert not (tmp_path / 'metadata.yaml').exists()

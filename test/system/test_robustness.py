@@ -172,14 +172,14 @@ def test_no_second_detection_in_the_wake_of_a_target(seed):
 
 
 @pytest.mark.parametrize('content, message', [
-    (b'sensors: {"m\xff": 1}', 'not YAML'),
+    (b'sensors: {"m\xff": 1}', 'not valid YAML'),
     (b'sensors:\n  "m 1": {position: [0, 0, 0]}', 'no name for a sensor'),
     (b'sensors:\n  1abc: {position: [0, 0, 0]}', 'not a ROS topic'),
     (b'frame:\nsensors:\n  a: {position: [0, 0, 0]}', 'frame: expected a name'),
     (b'sensors:\n  a: {position: [0, 0, 0], noise_std: 12.0}', 'below a millitesla'),
     (b'sensors:\n  a: {position: [0, 0, 0], background: [15.0, 0, 0]}', 'microtesla'),
     (b'sensors:\n  a: {position: [0, 0, ' + b'9' * 400 + b']}', 'not a finite number'),
-    (b'sensors:\n  [a]: {position: [0, 0, 0]}', 'is no name'),
+    (b'sensors:\n  [a]: {position: [0, 0, 0]}', 'is not a valid key'),
 ])
 def test_more_faulty_network_files(tmp_path, content, message):
     path = tmp_path / 'network.yaml'

@@ -4,7 +4,7 @@ import numpy as np
 
 from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.network.sensor_network import ONE_PLACE
+from mag_tracking.network.sensor_network import MIN_DELAY_BASELINE
 from mag_tracking.stages.align.settings import AlignSettings
 
 USUAL_S = 0.08
@@ -25,7 +25,7 @@ def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
     shortest, found = np.inf, None
     for j, place in enumerate(network.positions):
         distance = np.linalg.norm((network.positions[:j] - place)[:, :2], axis=1)
-        distance[distance <= ONE_PLACE] = np.inf
+        distance[distance <= MIN_DELAY_BASELINE] = np.inf
         if distance.min(initial=np.inf) < shortest:
             i = int(np.argmin(distance))
             shortest, found = float(distance[i]), (network.names[i], network.names[j])
@@ -47,7 +47,7 @@ def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
     if settings.period_s:
         return settings.period_s
     shortest = shortest_delay(network)
-    if settings.burst or shortest is None or not network.is_close:
+    if settings.burst or shortest is None or not network.is_compact:
         return USUAL_S
     return min(USUAL_S, max(MIN_FRAME_S, 0.5 * shortest[0]))
 

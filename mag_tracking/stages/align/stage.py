@@ -81,7 +81,7 @@ class Align:
         if C is None:
             C = self._noise[rows]
         else:
-            unknown = readings.without_covariance()
+            unknown = readings.has_unknown_covariance()
             if unknown.any():
                 C = np.where(unknown[:, None, None], self._noise[rows], C)
         return self._hold(rows, plain(readings.stamp_ns, np.int64), plain(readings.field),

@@ -342,7 +342,7 @@ def _own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
         return np.zeros(len(readings), dtype=np.int64), np.empty((0, 3, 3))
     C = plain(readings.covariance)
     valid = np.where(are_covariances(plain(readings.field), C), core.VALID, core.INVALID)
-    return np.where(readings.without_covariance(), core.NONE, valid), C
+    return np.where(readings.has_unknown_covariance(), core.NONE, valid), C
 
 
 def _same(a: FloatArray | None, b: FloatArray | None) -> bool:

@@ -86,7 +86,7 @@ class Survey:
     def __init__(self, network: SensorNetwork, settings: SurveySettings) -> None:
         self.counts: Counter[str] = Counter()
         # What an earlier survey found is no further evidence.
-        self._network, self._settings = network.as_stated(), settings
+        self._network, self._settings = network.with_stated_orientations(), settings
         self._kept: dict[str, deque[tuple[int, FloatArray]]] = {
             name: deque(maxlen=settings.max_accelerations) for name in network.names}
 
@@ -257,7 +257,7 @@ class Survey:
                 R_ws[j], std[j] = s.orientation.R_ws, s.orientation.std
             if s.orientation is not None or lag is not None or s.sensor == reference:
                 lag_std = lag.std if lag is not None else 0.0 if s.sensor == reference else np.nan
-                done[j] = network.marked(j, date, s.by, lag_std)
+                done[j] = network.calibration_record(j, date, s.by, lag_std)
         return replace(network, R_ws=R_ws, orientation_std=tuple(std), clock_offset=clock,
                        calibrated=tuple(done))
 

@@ -151,7 +151,7 @@ class TrackEvidence:
             self.doubt(doubts.NOT_SEEN_APPROACHING)
         # With a single sensor the range follows from the settings. With a few sensors at one place
         # the range of a vehicle follows from errors of its field model.
-        if len(network) == 1 or network.is_close and not starts_anywhere:
+        if len(network) == 1 or network.is_compact and not starts_anywhere:
             self.doubt(doubts.SENSORS_AT_ONE_PLACE)
 
     def doubt_for(self, reason: str, stamp_ns: int, seconds: float,

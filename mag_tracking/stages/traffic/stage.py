@@ -17,7 +17,13 @@ from mag_tracking.inference.log_normal_classes import (
     class_posterior,
 )
 from mag_tracking.network import SensorNetwork
-from mag_tracking.network.counting_line import Crossing, Line, LinePath, Pose, lines_of
+from mag_tracking.network.counting_line import (
+    CountingLine,
+    Crossing,
+    CrossingDetector,
+    Pose,
+    counting_lines,
+)
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.report.traffic_intervals import TrafficIntervals
 from mag_tracking.stages.traffic.field_direction import FieldDirection
@@ -63,8 +69,8 @@ class _Seen:
 
     begin_ns: int
     last_ns: int
-    published: list[LinePath]
-    smoothed: list[LinePath]
+    published: list[CrossingDetector]
+    smoothed: list[CrossingDetector]
     ended: bool = False
 
     def overlaps(self, begin_ns: int, end_ns: int) -> bool:
@@ -76,7 +82,7 @@ class _Found(NamedTuple):
     """A crossing that waits for earlier ones."""
 
     crossing: Crossing
-    line: Line
+    line: CountingLine
     track_id: int
     track: _Seen
     direction_error: float
@@ -97,7 +103,7 @@ class Traffic:
         _check(settings)
         self.counts: Counter[str] = Counter()
         self._settings = settings
-        self._lines = lines_of(settings.line_names, settings.line_headings_deg,
+        self._lines = counting_lines(settings.line_names, settings.line_headings_deg,
                                settings.line_offsets, settings.line_half_widths,
                                network.centre) if is_of_vehicles else []
         self._direction = FieldDirection(network)
@@ -165,8 +171,8 @@ class Traffic:
             return
         if track.id not in self._open:
             self._open[track.id] = _Seen(track.stamp_ns, track.stamp_ns,
-                                         [LinePath(line) for line in self._lines],
-                                         [LinePath(line) for line in self._lines])
+                                         [CrossingDetector(line) for line in self._lines],
+                                         [CrossingDetector(line) for line in self._lines])
         one = self._open[track.id]
         one.last_ns = track.stamp_ns
         for path in one.published:
@@ -181,7 +187,7 @@ class Traffic:
         for id, one in ended.items():
             del self._open[id]
             crossings = [(path.line, path.crossing()) for path in (
-                smoothed if smoothed.is_begun else published
+                smoothed if smoothed.has_pose else published
                 for smoothed, published in zip(one.smoothed, one.published, strict=True))]
             self.counts['tracks that crossed no line'] += all(c is None for _, c in crossings)
             self._waiting += [_Found(c, line, id, one, self._error_of(c, one))

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mag_tracking.geometry import rotation_about_z
-from mag_tracking.network import Calibrated, SensorNetwork
+from mag_tracking.network import CalibrationRecord, SensorNetwork
 from mag_tracking.network.file import read_network, write_network
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
@@ -280,7 +280,7 @@ def test_a_restart_begins_anew():
 
 
 def test_a_calibration_of_before_is_replaced_where_it_was_measured():
-    before = Calibrated('2025-01-01', 'by hand', np.nan)
+    before = CalibrationRecord('2025-01-01', 'by hand', np.nan)
     found, _ = surveyed(stated(calibrated=(before,) * 3),
                         change=lambda readings: readings.pop('mag_3'))
     assert [c.date for c in found.network.calibrated] == [DATE, DATE, '2025-01-01']

@@ -1,4 +1,4 @@
-"""One MCAP file of a recording while it is written, and how much of it is whole."""
+"""Writer of one MCAP file that tracks how much of the file is intact on disk."""
 
 import errno
 import os
@@ -9,45 +9,69 @@ from typing import IO, cast
 
 from mcap.writer import CompressionType, Writer
 
-from mag_tracking.recording.rosbag2_folder import FileSummary, Opener, Topic, WholeStream
+from mag_tracking.recording.rosbag2_folder import FileSummary, Opener, Topic, UnbufferedWriter
 
 
-class OpenFile:
-    """One MCAP file in the making; whatever writes may raise OSError.
+class McapFileWriter:
+    """Writer of one MCAP file of a recording.
+
+    If the disk rejects a write, the methods raise OSError.
+
+    Parameters
+    ----------
+    path : Path
+    opener : callable
+        Creates the file and returns an unbuffered stream.
 
     Attributes
     ----------
-    counts, pending : Counter
-        Messages by topic: all, and those of them that no whole chunk holds yet.
+    path : Path
+    counts : Counter
+        Number of messages by topic.
+    pending : Counter
+        Number of messages by topic that are not in a complete chunk yet.
     """
 
     def __init__(self, path: Path, opener: Opener) -> None:
         self.path = path
-        self._stream = WholeStream(opener(path))
+        self._stream = UnbufferedWriter(opener(path))
         self.counts: Counter[str] = Counter()
         self.pending: Counter[str] = Counter()
         self._times: list[int] = []
         self._span: tuple[int | None, int | None] = (None, None)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        self._good = self._waiting = 0
-        # Of a stream the writer takes only what `WholeStream` has.
+        self._intact_size = self._waiting = 0
+        # The writer uses only those methods of a stream that `UnbufferedWriter` has.
         self._writer = Writer(cast(IO[bytes], self._stream), chunk_size=1 << 20,
                               compression=CompressionType.ZSTD)
 
     def start(self) -> None:
         """Write the header."""
         self._writer.start(profile='ros2', library='mag_tracking')
-        self._mark()
+        self._mark_intact()
 
     @property
     def size(self) -> int:
-        """Bytes, at most, if it were flushed now."""
+        """Upper limit of the size after a flush, bytes."""
         return self._stream.offset + self._waiting
 
     def add(self, name: str, topic: Topic, sequence: int, data: bytes, log_ns: int,
             publish_ns: int) -> None:
-        """Append a message."""
+        """Append a message.
+
+        Parameters
+        ----------
+        name : str
+            Name of the topic.
+        topic : Topic
+        sequence : int
+            Sequence number of the message.
+        data : bytes
+            Serialised message, CDR.
+        log_ns, publish_ns : int, ns
+            Times at which the message was received and published.
+        """
         self.counts[name] += 1
         self.pending[name] += 1
         if name not in self._channels:
@@ -58,7 +82,7 @@ class OpenFile:
                                  sequence & 0xFFFFFFFF)
         self._times.append(log_ns)
         if self._stream.offset != before:
-            self._mark()
+            self._mark_intact()
 
     def _open_channel(self, name: str, topic: Topic) -> None:
         """Register schema and channel."""
@@ -70,36 +94,47 @@ class OpenFile:
             name, 'cdr', self._schemas[topic.type], {'offered_qos_profiles': topic.qos})
 
     def flush(self) -> None:
-        """Close the chunk; from here on a crash cannot take its messages."""
+        """Complete the current chunk. A later crash cannot lose its messages.
+
+        Raises
+        ------
+        OSError
+            If the chunk cannot be written or the file was removed.
+        """
         if self.pending:
             self._writer.flush()
-            self._mark()
+            self._mark_intact()
         if os.fstat(self._stream.raw.fileno()).st_nlink == 0:
             raise OSError(errno.ENOENT, 'the file was removed')
 
-    def _mark(self) -> None:
-        """All that is in the file so far is whole."""
-        self._good, self._waiting = self._stream.offset, 0
+    def _mark_intact(self) -> None:
+        """Mark everything that is in the file so far as intact."""
+        self._intact_size, self._waiting = self._stream.offset, 0
         self.pending.clear()
         if self._times:
             self._span = min(self._times), max(self._times)
             self._times = [*self._span]
 
     def finish(self) -> None:
-        """Write the index and close."""
+        """Write the index and close the file."""
         self.flush()
         self._writer.finish()
         os.fsync(self._stream.raw.fileno())
         self._stream.raw.close()
 
     def abandon(self) -> None:
-        """Close after a failure; what is whole stays, without an index."""
+        """Close the file after a failure. Complete chunks remain, without an index."""
         self.counts -= self.pending
         with suppress(OSError):
-            self._stream.raw.truncate(self._good)
+            self._stream.raw.truncate(self._intact_size)
         with suppress(OSError):
             self._stream.raw.close()
 
     def summary(self) -> FileSummary:
-        """What `metadata.yaml` is to say."""
+        """Entry of the file in `metadata.yaml`.
+
+        Returns
+        -------
+        FileSummary
+        """
         return FileSummary(self.path.name, Counter(self.counts), *self._span)

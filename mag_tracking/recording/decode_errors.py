@@ -1,4 +1,4 @@
-"""Exceptions that the MCAP library and its decompressors raise on damaged bytes."""
+"""Exceptions that the MCAP library and its decompressors raise for damaged bytes."""
 
 import struct
 import zlib
@@ -7,6 +7,6 @@ import zstandard
 from mcap.exceptions import McapError
 from mcap.stream_reader import CRCValidationError
 
-DAMAGE: tuple[type[Exception], ...] = (
+DECODE_ERRORS: tuple[type[Exception], ...] = (
     McapError, CRCValidationError, ValueError, KeyError, EOFError, struct.error, zlib.error,
     zstandard.ZstdError, RuntimeError, UnicodeDecodeError, MemoryError)
