@@ -17,11 +17,11 @@ from mag_tracking.report.page_scene import Sensors, path_entry, scene_of
 from mag_tracking.units import NS
 from mag_tracking.web.live_track import LiveTrack
 
-KEPT_S = 600.0
+HISTORY_S = 600.0
 """[s] Tracks that ended earlier are removed."""
 MAX_POSES = 30_000
 """Maximum number of poses over all tracks; the oldest tracks are removed first."""
-MATCHING_FRAMES = 64
+MAX_FRAMES = 64
 """Number of recent frames kept for matching with tracks."""
 JUMP_BACK_S = 1.0
 """[s] A larger backward jump of frames starts a new scene, for example when a bag is looped."""
@@ -70,10 +70,10 @@ class LiveScene:
             if self._frame_ns - frame.stamp_ns > JUMP_BACK_S * NS:
                 self._clear()
             self._frame_ns = frame.stamp_ns
-            self._note_time(frame.stamp_ns)
+            self._extend_time(frame.stamp_ns)
             self._frames[frame.stamp_ns] = frame
             self._is_frame_new = True
-            while len(self._frames) > MATCHING_FRAMES:
+            while len(self._frames) > MAX_FRAMES:
                 self._frames.popitem(last=False)
 
     def add_track(self, track: Track) -> None:
@@ -86,7 +86,7 @@ class LiveScene:
                 self._n_tracks += 1
                 live = LiveTrack(self._n_tracks, track.id)
                 self._tracks[live.key] = self._latest[track.id] = live
-            self._note_time(track.stamp_ns)
+            self._extend_time(track.stamp_ns)
             live.add(track, self._frames.get(track.stamp_ns) or self._no_frame(track))
             self._forget()
 
@@ -127,7 +127,7 @@ class LiveScene:
             out = [self._health()] if self._is_health_new else []
             self._is_health_new = False
             begin_ns, frame = self._begin_ns or 0, None
-            tracks = [live.news(begin_ns) for live in self._tracks.values() if live.is_news]
+            tracks = [live.news(begin_ns) for live in self._tracks.values() if live.has_unsent]
             smoothed = [live.smoothed for live in self._tracks.values() if live.is_smoothed_new]
             for live in self._tracks.values():
                 live.is_smoothed_new = False
@@ -156,7 +156,7 @@ class LiveScene:
         return json_text({'type': 'health', 'notes': [asdict(note) for note in self._notes],
                           'tables': [asdict(table) for table in self._tables]})
 
-    def _note_time(self, stamp_ns: int) -> None:
+    def _extend_time(self, stamp_ns: int) -> None:
         """Update begin and end of the scene."""
         if self._begin_ns is None:
             self._begin_ns = stamp_ns
@@ -168,7 +168,7 @@ class LiveScene:
         """Remove tracks that ended long ago, and the oldest ones if there are too many poses."""
         n = sum(len(live.log.stamp_ns) for live in self._tracks.values())
         for key, live in list(self._tracks.items())[:-1]:
-            old = (self._end_ns - live.end_ns) / NS > KEPT_S
+            old = (self._end_ns - live.end_ns) / NS > HISTORY_S
             if old or n > MAX_POSES:
                 n -= len(live.log.stamp_ns)
                 del self._tracks[key]

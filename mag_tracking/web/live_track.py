@@ -7,12 +7,12 @@ from mag_tracking.report.page_scene import facts_of, strongest_sensors, track_en
 from mag_tracking.report.track_log import TrackLog
 from mag_tracking.units import NS
 
-MAX_OF_TRACK, FORGOTTEN = 8_000, 1_000
+MAX_TRACK_POSES, N_REMOVED = 8_000, 1_000
 """Maximum number of poses of one track, and how many are removed when it is exceeded. The page
 script uses the same numbers."""
 MAX_GAP_S = 60.0
 """[s] A pose after a longer gap belongs to another track of the same number."""
-RECENT = 100
+N_RECENT = 100
 """Number of latest poses that select the sensors whose fields are sent."""
 
 
@@ -46,7 +46,7 @@ class LiveTrack:
         return self.log.stamp_ns[-1]
 
     @property
-    def is_news(self) -> bool:
+    def has_unsent(self) -> bool:
         """True if there are poses, or an end, that were not sent yet."""
         return self._sent < len(self.log.stamp_ns) or self.log.ended and not self._is_end_sent
 
@@ -57,9 +57,9 @@ class LiveTrack:
     def add(self, track: Track, frame: FieldFrame) -> None:
         """Add a pose; the oldest poses of a very long track are removed."""
         self.log.add(track, frame)
-        if len(self.log.stamp_ns) > MAX_OF_TRACK:
-            self.log.forget(FORGOTTEN)
-            self._sent = max(0, self._sent - FORGOTTEN)
+        if len(self.log.stamp_ns) > MAX_TRACK_POSES:
+            self.log.forget(N_REMOVED)
+            self._sent = max(0, self._sent - N_REMOVED)
 
     def news(self, begin_ns: int) -> dict[str, Any]:
         """JSON of what was not sent yet; it counts as sent from now on."""
@@ -73,7 +73,7 @@ class LiveTrack:
 
     def _entry(self, begin_ns: int, rows: range) -> dict[str, Any]:
         """JSON of some poses, with the fields that were strongest during the latest of them."""
-        recent = range(max(0, rows.stop - max(RECENT, len(rows))), rows.stop)
+        recent = range(max(0, rows.stop - max(N_RECENT, len(rows))), rows.stop)
         entry = track_entry(self.log, begin_ns, strongest_sensors(self.log, recent), rows)
         entry['key'], entry['smoothed'] = self.key, self.smoothed
         if self.log.ended:

@@ -27,7 +27,7 @@ TICK_S = 0.05
 """[s] Interval between messages. A target at 50 km/h moves 0.7 m in this time."""
 MAX_BUFFERED = 1_000_000
 """Send buffer of a viewer, in bytes. A viewer above it receives no messages until it is empty."""
-GIVE_UP_S = 20.0
+LAG_TIMEOUT_S = 20.0
 """[s] A lagging viewer whose buffer does not shrink for this time is disconnected."""
 MAX_VIEWERS = 100
 MAX_PORT = 65535
@@ -62,7 +62,7 @@ class PageServer:
     url : str
         Address of the page, including the token if there is one.
     n_viewers : int
-    n_behind : int
+    n_lagged : int
         How many times a viewer lagged and had to wait.
 
     Raises DeviceError where the port cannot be opened.
@@ -75,10 +75,10 @@ class PageServer:
         # {viewer: bytes that its buffer may hold}
         self._viewers: dict[ServerConnection, int] = {}
         # {viewer: (time of the latest progress [s], bytes in its buffer then)}
-        self._behind: dict[ServerConnection, tuple[float, int]] = {}
+        self._lagging: dict[ServerConnection, tuple[float, int]] = {}
         self._faults: set[str] = set()
-        self.n_behind = 0
-        self._socket = _listening(host, port)
+        self.n_lagged = 0
+        self._socket = _open_socket(host, port)
         self.port = int(self._socket.getsockname()[1])
         shown = _reachable_name(host)
         self.url = f'http://{shown}:{self.port}/' + (
@@ -96,7 +96,7 @@ class PageServer:
     @property
     def n_viewers(self) -> int:
         """Number of connected viewers."""
-        return len(self._viewers) + len(self._behind)
+        return len(self._viewers) + len(self._lagging)
 
     def close(self) -> None:
         """Disconnect all viewers and release the port."""
@@ -123,12 +123,12 @@ class PageServer:
         # Malformed requests from the network must not fill the log.
         LOG.addFilter(lambda record: record.msg != 'opening handshake failed')
         # Compression would run separately for each viewer.
-        async with serve(self._look, sock=self._socket, process_request=self._answer,
-                         compression=None, max_size=1024, max_queue=4, logger=LOG,
-                         open_timeout=10.0, close_timeout=1.0, ping_interval=10.0,
-                         ping_timeout=60.0):
+        async with serve(self._handle_viewer, sock=self._socket,
+                         process_request=self._process_request, compression=None, max_size=1024,
+                         max_queue=4, logger=LOG, open_timeout=10.0, close_timeout=1.0,
+                         ping_interval=10.0, ping_timeout=60.0):
             while not self._stop.is_set():
-                self._tell()
+                self._send_updates()
                 try:
                     await asyncio.wait_for(self._stop.wait(), TICK_S)
                 except asyncio.TimeoutError:
@@ -146,48 +146,48 @@ class PageServer:
                 LOG.exception('fault of the live page')
             return [json_text({'type': 'fault', 'text': text})]
 
-    def _tell(self) -> None:
+    def _send_updates(self) -> None:
         """Send new messages to all viewers, and the whole scene to those that have caught up."""
-        if not self._viewers and not self._behind:
+        if not self._viewers and not self._lagging:
             return
         now = self._loop.time()
         for viewer, allowed in list(self._viewers.items()):
-            waiting = _waiting(viewer)
+            waiting = _buffered_bytes(viewer)
             if waiting > allowed:
                 del self._viewers[viewer]
-                self._behind[viewer] = now, waiting
-                self.n_behind += 1
+                self._lagging[viewer] = now, waiting
+                self.n_lagged += 1
             else:
                 # What a welcome may have left in the buffer is allowed until it has been sent.
                 self._viewers[viewer] = max(MAX_BUFFERED, min(allowed, waiting + MAX_BUFFERED))
         for message in self._messages(self._source.news):
             broadcast(self._viewers, message)
-        for viewer, (since, least) in list(self._behind.items()):
-            waiting = _waiting(viewer)
+        for viewer, (since, least) in list(self._lagging.items()):
+            waiting = _buffered_bytes(viewer)
             if not waiting:
-                del self._behind[viewer]
-                self._welcome(viewer)
+                del self._lagging[viewer]
+                self._send_snapshot(viewer)
             elif waiting < least:
-                self._behind[viewer] = now, waiting
-            elif now - since > GIVE_UP_S:
-                del self._behind[viewer]
+                self._lagging[viewer] = now, waiting
+            elif now - since > LAG_TIMEOUT_S:
+                del self._lagging[viewer]
                 viewer.transport.abort()
 
-    def _welcome(self, viewer: ServerConnection) -> None:
+    def _send_snapshot(self, viewer: ServerConnection) -> None:
         """Send the whole scene to a viewer; new messages follow."""
         # Pending messages go out first: they are part of the whole scene and must not be repeated.
         for message in self._messages(self._source.news):
             broadcast(self._viewers, message)
         for message in self._messages(self._source.whole):
             broadcast([viewer], message)
-        self._viewers[viewer] = _waiting(viewer) + MAX_BUFFERED
+        self._viewers[viewer] = _buffered_bytes(viewer) + MAX_BUFFERED
 
-    async def _look(self, viewer: ServerConnection) -> None:
+    async def _handle_viewer(self, viewer: ServerConnection) -> None:
         """Handle one connection until it closes; incoming messages are ignored."""
-        if len(self._viewers) + len(self._behind) >= MAX_VIEWERS:
+        if len(self._viewers) + len(self._lagging) >= MAX_VIEWERS:
             await viewer.close(1013, 'too many viewers')
             return
-        self._welcome(viewer)
+        self._send_snapshot(viewer)
         try:
             async for _ in viewer:
                 pass
@@ -195,9 +195,9 @@ class PageServer:
             pass
         finally:
             self._viewers.pop(viewer, None)
-            self._behind.pop(viewer, None)
+            self._lagging.pop(viewer, None)
 
-    def _answer(self, _: ServerConnection, request: Request) -> Response | None:
+    def _process_request(self, _: ServerConnection, request: Request) -> Response | None:
         """Response to an HTTP request; None accepts a WebSocket."""
         address = urlsplit(request.path)
         refusal = self._refusal(request, parse_qs(address.query).get('token', [''])[0])
@@ -234,7 +234,7 @@ def _reachable_name(host: str) -> str:
 
 def check_port(host: str, port: int) -> None:
     """Raise DeviceError if the page cannot be served on this port."""
-    _listening(host, port).close()
+    _open_socket(host, port).close()
 
 
 def is_loopback(host: str) -> bool:
@@ -255,12 +255,12 @@ def _host_name(host: str) -> str:
         return ''
 
 
-def _waiting(viewer: ServerConnection) -> int:
+def _buffered_bytes(viewer: ServerConnection) -> int:
     """Number of bytes in the send buffer of a viewer."""
     return viewer.transport.get_write_buffer_size()
 
 
-def _listening(host: str, port: int) -> socket.socket:
+def _open_socket(host: str, port: int) -> socket.socket:
     """Listening socket; raises DeviceError if it cannot be opened."""
     if not 0 <= port <= MAX_PORT:
         raise DeviceError(f'the live page cannot be served on port {port}: expected a number up '
