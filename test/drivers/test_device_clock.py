@@ -580,8 +580,8 @@ def test_without_a_counter_it_is_the_arrival():
 
 
 @pytest.mark.parametrize('changes, text', [
-    ({'min_step_s': 2.0, 'max_delay_s': 1.0}, 'min_step_s: 2 s is more than'),
-    ({'wrap': 256, 'tick_s': 1e-3}, 'wrap: the counter goes round in 0.256 s')])
+    ({'min_step_s': 2.0, 'max_delay_s': 1.0}, 'min_step_s: 2 s is longer than'),
+    ({'wrap': 256, 'tick_s': 1e-3}, 'wrap: the counter wraps every 0.256 s')])
 def test_settings_that_contradict_each_other_are_refused(changes, text):
     with pytest.raises(SettingsError, match=text):
         clock_of(**changes)
