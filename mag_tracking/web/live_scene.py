@@ -30,10 +30,17 @@ JUMP_BACK_S = 1.0
 class LiveScene:
     """Collects records and creates messages for the page. Thread-safe.
 
+    Parameters
+    ----------
+    title : str
+    network : Sensors
+
     Attributes
     ----------
-    title, subtitle : str
-        Sent with the next whole scene.
+    title : str
+        Title, sent with the next complete scene.
+    subtitle : str
+        Subtitle, sent with the next complete scene.
     """
 
     def __init__(self, title: str, network: Sensors) -> None:
@@ -47,7 +54,12 @@ class LiveScene:
         self._clear()
 
     def use_network(self, network: Sensors) -> None:
-        """Start a new scene with another network."""
+        """Start a new scene with another network.
+
+        Parameters
+        ----------
+        network : Sensors
+        """
         with self._lock:
             self._network = network
             self._clear()
@@ -59,14 +71,19 @@ class LiveScene:
         self._frames: OrderedDict[int, FieldFrame] = OrderedDict()
         self._is_frame_new = False
         self._tracks: dict[int, LiveTrack] = {}
-        # {number of a track: its latest `LiveTrack`}
+        # {track id: latest track with this id}
         self._latest: dict[int, LiveTrack] = {}
         self._is_new = True
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Add a frame; call it before `add_track` of the same time."""
+        """Add a frame; call it before `add_track` with the same timestamp.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+        """
         with self._lock:
-            # Frames only: the record of a track may be late, or repeat its last pose.
+            # Only frames are checked: the record of a track may be late or repeat its last pose.
             if self._frame_ns - frame.stamp_ns > JUMP_BACK_S * NS:
                 self._clear()
             self._frame_ns = frame.stamp_ns
@@ -77,7 +94,12 @@ class LiveScene:
                 self._frames.popitem(last=False)
 
     def add_track(self, track: Track) -> None:
-        """Add a pose or the closing record of a track."""
+        """Add a pose or the closing record of a track.
+
+        Parameters
+        ----------
+        track : Track
+        """
         with self._lock:
             live = self._latest.get(track.id)
             if live is None or not live.continues(track):
@@ -91,13 +113,19 @@ class LiveScene:
             self._forget()
 
     def _no_frame(self, track: Track) -> FieldFrame:
-        """Empty frame, used when the frame of a track was not received."""
+        """Empty frame, used if the frame of a track was not received."""
         n = len(self._network)
         return FieldFrame(track.stamp_ns, np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan),
                           np.zeros(n, dtype=int), np.zeros(n))
 
     def add_smoothed(self, track_id: int, points: FloatArray) -> None:
-        """Add the smoothed path (n, 3) [m] of an ended track."""
+        """Add the smoothed path of an ended track.
+
+        Parameters
+        ----------
+        track_id : int
+        points : (n, 3) array, m
+        """
         with self._lock:
             live = self._latest.get(track_id)
             if live is not None:
@@ -105,21 +133,39 @@ class LiveScene:
                 live.is_smoothed_new = True
 
     def set_health(self, notes: Iterable[Note], tables: Iterable[Table]) -> None:
-        """Replace the notes and tables of the page."""
+        """Replace the notes and tables of the page.
+
+        Parameters
+        ----------
+        notes : iterable of Note
+        tables : iterable of Table
+        """
         notes, tables = list(notes), list(tables)
         with self._lock:
             if (notes, tables) != (self._notes, self._tables):
                 self._notes, self._tables, self._is_health_new = notes, tables, True
 
     def whole(self) -> list[str]:
-        """JSON messages with everything sent so far, for a new viewer."""
+        """Messages with everything sent so far, for a new viewer.
+
+        Returns
+        -------
+        list of str
+            JSON messages.
+        """
         with self._lock:
             begin_ns = self._begin_ns or 0
             tracks = [live.sent(begin_ns) for live in self._tracks.values()]
             return [*self._scene([t for t in tracks if t is not None]), self._health()]
 
     def news(self) -> list[str]:
-        """JSON messages with everything new since the last call."""
+        """Messages with everything new since the last call.
+
+        Returns
+        -------
+        list of str
+            JSON messages.
+        """
         with self._lock:
             if self._is_new:
                 self._is_new = False
@@ -157,7 +203,7 @@ class LiveScene:
                           'tables': [asdict(table) for table in self._tables]})
 
     def _extend_time(self, stamp_ns: int) -> None:
-        """Update begin and end of the scene."""
+        """Extend the time range of the scene."""
         if self._begin_ns is None:
             self._begin_ns = stamp_ns
             # An empty scene that was sent before had no start time.
@@ -165,7 +211,7 @@ class LiveScene:
         self._end_ns = max(self._end_ns, stamp_ns)
 
     def _forget(self) -> None:
-        """Remove tracks that ended long ago, and the oldest ones if there are too many poses."""
+        """Remove tracks that ended long ago, and the oldest tracks if there are too many poses."""
         n = sum(len(live.log.stamp_ns) for live in self._tracks.values())
         for key, live in list(self._tracks.items())[:-1]:
             old = (self._end_ns - live.end_ns) / NS > HISTORY_S

@@ -168,7 +168,7 @@ def test_a_fault_of_the_source_is_said_and_ends_nothing(caplog):
         assert messages[-1]['text'] == 'ValueError: broken'
         received(server.url, lambda m: m['type'] == 'fault')
         assert server.is_serving
-    assert len([r for r in caplog.records if 'fault of the live page' in r.message]) == 1
+    assert len([r for r in caplog.records if 'error in the live page' in r.message]) == 1
     assert not server.is_serving
 
 
