@@ -179,17 +179,17 @@ def _number(value: object, path: str) -> int | float:
 
 
 def _axis(value: object, path: str) -> float:
-    """An axis; NaN for null."""
+    """Value of an axis; NaN for null."""
     return float('nan') if value is None else axis_value(_number(value, path))
 
 
 def _ticks(value: object, path: str) -> float:
-    """The device time, which is required."""
+    """Device time, which is required."""
     return ticks_value(_number(value, path))
 
 
 def _sequence(value: object, path: str) -> int:
-    """The sequence number; JSON does not distinguish 12 from 12.0."""
+    """Sequence number; JSON does not distinguish 12 from 12.0."""
     value = _number(value, path)
     if isinstance(value, float):
         if not value.is_integer():

@@ -236,7 +236,7 @@ def _converter(quantity: str) -> Callable[[bytes], object]:
 
 
 def _axis(text: bytes) -> float:
-    """An axis; NaN if empty."""
+    """Value of an axis; NaN if empty."""
     text = text.strip(b' \t')
     if _NUMBER(text):
         return axis_value(text)
@@ -247,12 +247,12 @@ def _axis(text: bytes) -> float:
 
 
 def _ticks(text: bytes) -> float:
-    """The device time, which is required."""
+    """Device time, which is required."""
     return ticks_value(_axis(text))
 
 
 def _sequence(text: bytes) -> int:
-    """The sequence number, which is required."""
+    """Sequence number, which is required."""
     text = text.strip(b' \t')
     if not _INTEGER(text):
         raise Rejected('with a sequence that is not an integer')
