@@ -1,4 +1,4 @@
-"""Fixtures that several tests share."""
+"""Shared fixtures."""
 
 import os
 import signal
@@ -15,13 +15,13 @@ from mag_tracking.recording.reader import Recording
 from support.bundled import DATA, NETWORK_FILE, ROOT, vehicle_path
 from support.ros_domain import RosDomain
 
-# Keep the middleware to this machine, and apart from other runs on it.
+# Restrict the middleware to this machine, and separate it from other test runs.
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 DOMAIN = RosDomain()
 os.environ['ROS_DOMAIN_ID'] = str(DOMAIN.number)
-# A background job of a shell ignores SIGINT, and so would every process that a test interrupts.
+# A background job of a shell ignores SIGINT, and its child processes would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-# What nodes keep and log is no business of who runs the tests.
+# Nodes must not write to the home folder of the user who runs the tests.
 _HOME = tempfile.TemporaryDirectory(prefix='mag_tracking_test_')
 os.environ['ROS_HOME'] = _HOME.name
 
@@ -29,14 +29,11 @@ os.environ['ROS_HOME'] = _HOME.name
 LONGEST = ('test_wheel.py', 'test_busy.py', 'test_pass_fit.py', 'test_archive.py',
            'test_archive_faults.py', 'test_traffic.py', 'test_situations.py', 'test_cli.py',
            'test_nodes.py', 'test_node_faults.py', 'test_leaving.py', 'test_health_node.py')
-"""Files that take longest, first those without nodes."""
+"""Files with the longest run times; those without nodes come first."""
 
 
 def pytest_collection_modifyitems(items):
-    """Mark all tests of nodes: they are not run beside tests that compute (`make test`).
-
-    The files that take longest come first: the last one is not waited for alone.
-    """
+    """Mark the node tests as `alone`, and start the files with the longest run times first."""
     for item in items:
         if item.path.is_relative_to(ROOT / 'test' / 'nodes'):
             item.add_marker('alone')
@@ -61,8 +58,7 @@ def magnet_runs(tmp_path_factory):
 
 @pytest.fixture(scope='session')
 def vehicle_replays(tmp_path_factory, road_network):
-    """{name: (Run, folder)}: a bundled vehicle recording, replayed with the defaults when it is
-    first asked for."""
+    """{name: (Run, folder)} of the bundled vehicle recordings, replayed on first access."""
     out = tmp_path_factory.mktemp('replays')
 
     class Replays(dict):
@@ -85,8 +81,8 @@ def magnet_replays(tmp_path_factory, magnet_runs):
 
 @pytest.fixture
 def ros():
-    """A node of the test's own in an executor: (node, spin_until)."""
-    # Only the tests of the nodes need ROS.
+    """(node, spin_until): a node of the test in an executor."""
+    # Imported here because only the node tests require ROS.
     import rclpy
     from rclpy.node import Node
 

@@ -80,7 +80,7 @@ class _ReadingPrinter:
         counts = self.driver.counts()
         odd = ', '.join(f'{what}: {n}' for what, n in sorted(counts.items())
                         if not what.startswith('samples: '))
-        state = self.driver.trouble or ('open' if self.driver.is_open else 'not open yet')
+        state = self.driver.fault or ('open' if self.driver.is_open else 'not open yet')
         out = [f'{self.driver.name}: {state}' + (f'  ({odd})' if odd else '')]
         for sensor, heard in self._heard.items():
             samples = [heard.popleft() for _ in range(len(heard))]

@@ -1,1 +1,1 @@
-"""Drivers: what devices say, as samples. One file a transport, a framing or a kind of chip."""
+"""Drivers: samples from sensor hardware. One file per transport, framing or kind of chip."""

@@ -1,4 +1,4 @@
-"""The drivers file: which devices there are, how they speak, and which sensors they carry.
+"""Drivers file: devices, their protocols and their sensors.
 
     roadside:
       transport: serial
@@ -9,11 +9,11 @@
       unit: nT
       sensors: {A: mag_1, B: mag_2}
 
-A kind is a name in `KINDS`, or `package.module:Class` of one's own, a class with
-an attribute `SETTINGS` and the methods of `reading.Transport`, `Framing` or
-`Device`; `CLOCK` and `DRIVER`, mappings of settings, say what is so for every
-device of a framing or kind. Its settings stand under its own name, or under `transport_settings`,
-`framing_settings`, `device_settings`.
+A kind is a name in `KINDS`, or `package.module:Class` for a custom class. Such a class has an
+attribute `SETTINGS` and the methods of `reading.Transport`, `Framing` or `Device`. Its attributes
+`CLOCK` and `DRIVER`, mappings of settings, replace the defaults for every device of that kind. The
+settings of a kind are under its own name; those of a custom class under `transport_settings`,
+`framing_settings` or `device_settings`.
 """
 
 import importlib
@@ -44,24 +44,33 @@ KINDS = {
     'device': {'i2c': f'{_HERE}.transports.i2c:I2cDevice',
                'simulator': f'{_HERE}.simulated_device:SimulatedDevice'},
 }
+"""Class of each kind of transport, framing and device."""
 
 METHODS = {'transport': ('open', 'read', 'close'), 'framing': ('parse',),
            'device': ('open', 'read', 'close')}
+"""Methods required of a transport, framing and device."""
 _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_/]*')
 Settings = TypeVar('Settings', ClockSettings, DriverSettings)
 
 
 def read_drivers(path: str | PathLike[str], network: SensorNetwork | None = None) -> list[Driver]:
-    """The drivers that a file describes.
+    """Read a drivers file.
 
     Parameters
     ----------
     path : path
     network : SensorNetwork, optional
-        Where it is given, every sensor has to be one of it.
+        Network that must contain every sensor of the file.
 
-    Returns a list of `Driver`, none of which is open. Raises SettingsError, which
-    names the file and the device.
+    Returns
+    -------
+    list of Driver
+        None of them is open.
+
+    Raises
+    ------
+    SettingsError
+        If an entry is not valid. The message names the file and the device.
     """
     content = read_yaml(path, SettingsError)
     if not isinstance(content, Mapping) or not content:
@@ -74,8 +83,25 @@ def read_drivers(path: str | PathLike[str], network: SensorNetwork | None = None
     return drivers
 
 
-def kind_of(role: str, name: object) -> Any:
-    """The class of a kind of transport, framing or device; raises SettingsError."""
+def load_class(role: str, name: object) -> Any:
+    """Class of a kind of transport, framing or device.
+
+    Parameters
+    ----------
+    role : str
+        'transport', 'framing' or 'device'.
+    name : str
+        Key of `KINDS[role]`, or package.module:Class.
+
+    Returns
+    -------
+    type
+
+    Raises
+    ------
+    SettingsError
+        If the class cannot be loaded, or lacks `SETTINGS` or a method.
+    """
     target = KINDS[role].get(name, name) if isinstance(name, str) else ''
     module, colon, leaf = target.partition(':')
     if not colon:
@@ -83,7 +109,7 @@ def kind_of(role: str, name: object) -> Any:
                             f'package.module:Class, got {shown(name)}')
     try:
         cls = getattr(importlib.import_module(module), leaf)
-    # A module of somebody else's may fail with anything.
+    # A third-party module may raise anything.
     except Exception as error:
         raise SettingsError(f'{role}: {name}: {type(error).__name__}: {error}') from error
     lacking = [what for what in ('SETTINGS', *METHODS[role]) if not hasattr(cls, what)]
@@ -93,7 +119,24 @@ def kind_of(role: str, name: object) -> Any:
 
 
 def driver_of(name: object, entry: object) -> Driver:
-    """The `Driver` of one entry of the file; raises SettingsError that names the device."""
+    """Create the driver of one entry of a drivers file.
+
+    Parameters
+    ----------
+    name : str
+        Name of the device.
+    entry : dict
+        Settings of the device.
+
+    Returns
+    -------
+    Driver
+
+    Raises
+    ------
+    SettingsError
+        If the entry is not valid. The message names the device.
+    """
     if not isinstance(name, str) or not isinstance(entry, Mapping):
         raise SettingsError(f'{name}: expected a mapping of settings, got {shown(entry)}')
     if not is_text(name):
@@ -101,46 +144,46 @@ def driver_of(name: object, entry: object) -> Driver:
     rest = dict(entry)
     try:
         device = _device(rest)
-        clock = replace(_usual(ClockSettings(), device, 'CLOCK'), _group(rest, 'clock'))
+        clock = replace(_class_defaults(ClockSettings(), device, 'CLOCK'), _group(rest, 'clock'))
         sensors = _sensors(rest)
         for unit in ('unit', 'acceleration_unit'):
             if isinstance(rest.get(unit), (int, float)) and not isinstance(rest[unit], bool):
                 rest[unit] = repr(rest[unit])
-        settings = replace(_usual(DriverSettings(), device, 'DRIVER'), rest)
+        settings = replace(_class_defaults(DriverSettings(), device, 'DRIVER'), rest)
         return Driver(name, device, settings, clock, sensors)
     except SettingsError as error:
         raise SettingsError(f'{name}: {error}') from error
 
 
-def _usual(settings: Settings, device: Device, name: str) -> Settings:
-    """`settings` with what the device's class says of all of its kind."""
+def _class_defaults(settings: Settings, device: Device, name: str) -> Settings:
+    """`settings` with the defaults of the device's class."""
     return replace(settings, getattr(device, name, {}))
 
 
 def _device(rest: dict[str, Any]) -> Device:
-    """The device that an entry describes; takes what it used out of `rest`."""
+    """Device described by an entry; removes the keys used from `rest`."""
     if 'device' in rest:
         if 'transport' in rest or 'framing' in rest:
-            raise SettingsError('a device has no transport and no framing beside it')
-        device: Device = _made('device', rest)
+            raise SettingsError('device excludes transport and framing; remove one or the other')
+        device: Device = _create('device', rest)
         return device
     for role in ('transport', 'framing'):
         if role not in rest:
-            raise SettingsError(f'there is no {role} (one of {", ".join(KINDS[role])}), and no '
+            raise SettingsError(f'{role} is missing (one of {", ".join(KINDS[role])}), and so is '
                                 f'device (one of {", ".join(KINDS["device"])})')
-    return FramedDevice(_made('transport', rest), _made('framing', rest))
+    return FramedDevice(_create('transport', rest), _create('framing', rest))
 
 
-def _made(role: str, rest: dict[str, Any]) -> Any:
-    """The transport, framing or device of an entry, with its settings."""
+def _create(role: str, rest: dict[str, Any]) -> Any:
+    """Transport, framing or device of an entry, created with its settings."""
     kind = rest.pop(role)
-    cls = kind_of(role, kind)
+    cls = load_class(role, kind)
     group = kind if kind in KINDS[role] else f'{role}_settings'
     return cls(replace(cls.SETTINGS(), _group(rest, group)))
 
 
 def _group(rest: dict[str, Any], name: str) -> Mapping[str, Any]:
-    """The mapping of settings under `name`, with the name before each; taken out of `rest`."""
+    """Mapping of settings under `name`; removed from `rest`."""
     group = rest.pop(name, {})
     if not isinstance(group, Mapping):
         raise SettingsError(f'{name}: expected a mapping of settings, got {shown(group)}')
@@ -148,7 +191,7 @@ def _group(rest: dict[str, Any], name: str) -> Mapping[str, Any]:
 
 
 def _sensors(rest: dict[str, Any]) -> dict[str, str]:
-    """{name at the device: name in the network}."""
+    """{name at the device: network name}."""
     if 'sensor' in rest:
         if 'sensors' in rest:
             raise SettingsError('sensor and sensors exclude each other')
@@ -156,32 +199,33 @@ def _sensors(rest: dict[str, Any]) -> dict[str, str]:
     else:
         sensors = rest.pop('sensors', None)
     if not isinstance(sensors, Mapping) or not sensors:
-        raise SettingsError('expected `sensor: mag_1`, or `sensors:` with the name in the network '
-                            f'for each name at the device, got {shown(sensors)}')
+        raise SettingsError('expected `sensor: mag_1`, or `sensors:` with the network name of each '
+                            f'sensor of the device, got {shown(sensors)}')
     for key, value in sensors.items():
         if isinstance(key, bool) or not isinstance(key, (str, int)):
-            raise SettingsError(f'sensors: {shown(key)} is no name; put it in quotes')
+            raise SettingsError(f'sensors: {shown(key)} is not a name; put it in quotes')
         if not is_text(str(key)):
-            raise SettingsError(f'sensors: {shown(key)} is not a name: it has a lone surrogate')
+            raise SettingsError(f'sensors: {shown(key)} is not a name: it contains a lone '
+                                'surrogate')
         if not isinstance(value, str) or not (value == IGNORED or _NAME.fullmatch(value)):
-            raise SettingsError(f'sensors: {key}: expected the name of a sensor (letters, digits, '
-                                f'_ and /), or - to ignore it, got {shown(value)}')
+            raise SettingsError(f'sensors: {key}: expected a sensor name (letters, digits, _ and '
+                                f'/), or - to ignore the sensor, got {shown(value)}')
     out = {str(key): value for key, value in sensors.items()}
     if len(out) < len(sensors):
-        raise SettingsError('sensors: two of them have the same name at the device')
+        raise SettingsError('sensors: the same name at the device appears twice')
     return out
 
 
 def _check_sensors(drivers: Iterable[Driver], network: SensorNetwork | None) -> None:
-    """Each sensor comes from one device only, and is one of the network; or SettingsError."""
+    """Check that each sensor belongs to one device only, and to the network."""
     owner: dict[str, str] = {}
     for driver in drivers:
         for key, sensor in driver.sensors.items():
             if sensor == IGNORED:
                 continue
             if sensor in owner:
-                raise SettingsError(f'{driver.name}: sensor {sensor} comes from {owner[sensor]} '
-                                    'already')
+                raise SettingsError(f'{driver.name}: sensor {sensor} is already assigned to '
+                                    f'{owner[sensor]}')
             owner[sensor] = f'{driver.name} ({key})' if key else driver.name
             if network is not None and sensor not in network.names:
                 raise SettingsError(f'{driver.name}: sensor {sensor} is not in the network, whose '
@@ -189,9 +233,15 @@ def _check_sensors(drivers: Iterable[Driver], network: SensorNetwork | None) -> 
 
 
 def settings_by_kind() -> dict[str, Any]:
-    """{group in the file: its settings with their defaults}, for the reference."""
+    """Default settings of all kinds, for the reference.
+
+    Returns
+    -------
+    dict of str to settings
+        By the name of the group in the drivers file.
+    """
     out = {'': DriverSettings(), 'clock': ClockSettings()}
     for role, kinds in KINDS.items():
         for name in kinds:
-            out[name] = kind_of(role, name).SETTINGS()
+            out[name] = load_class(role, name).SETTINGS()
     return out

@@ -1,17 +1,16 @@
-"""The time of measurement, from a device's counter and from when its messages came.
+"""Times of measurement from a device's counter and the arrival times of its messages.
 
-A message comes after a fixed shortest delay and a random, always positive one. So
-all points (device time, arrival - device time) lie above a line, whose slope is the
-drift of the device's oscillator. The line under all points of the last minutes that
-is closest to them on average is the estimate: the edge of their lower convex hull
-over their mean abscissa.
+A message arrives after a fixed minimum delay plus a random, non-negative one. All points
+(device time, arrival - device time) therefore lie above a line whose slope is the drift of the
+device's oscillator. The estimate is the line under all points of the last minutes that is closest
+to them on average: the edge of their lower convex hull over their mean abscissa.
 
-Source: Moon, Skelly & Towsley, 'Estimation and removal of clock skew from network
-delay measurements', IEEE INFOCOM 1999. Departures: of each short block of device
-time only the lowest point is kept, the window slides, and of the slopes about as
-likely as the best the one nearest to the slope before is taken. For exponential
-delays Moon's line is the most likely, and one that is lower by a K-th of the mean
-height of K points above it is e times less so; slopes within that are about as likely.
+Source: Moon, Skelly & Towsley, 'Estimation and removal of clock skew from network delay
+measurements', IEEE INFOCOM 1999. Departures: only the lowest point of each short block of device
+time is kept; the window slides; and of all slopes about as likely as the best one, the slope
+nearest to the previous estimate is used. For exponential delays, Moon's line is the most likely
+one. A line that is lower by 1/K of the mean height of the K points above it is less likely by a
+factor of e; slopes within that range count as about as likely.
 """
 
 import math
@@ -23,23 +22,23 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
 
 NO_TICKS = 'readings without a device time'
-OUTSIDE = 'stamps outside the counter'
-NO_FIT = 'stamps that fit no clock'
+OUT_OF_RANGE = 'device times outside the counter range'
+NO_FIT = 'device times that do not fit the clock'
 
-RESET = 'resets of the device'
-FORWARD = 'steps forward'
-BACK = 'steps back'
-LOST = 'long times without a reading that fits'
+RESET = 'device resets'
+STEP_FORWARD = 'device clock steps forward'
+STEP_BACK = 'device clock steps back'
+LOST = 'clock restarts after a long interval without a fitting reading'
 
 _MAX_BLOCKS = 64
 _MIN_BLOCK = 1.0 / 16.0
-"""The first blocks of an epoch, as a part of the later ones."""
-_FEWEST_POINTS = 5
-"""With fewer than these only the height of the line is estimated."""
-_CONFIRMING = 3
-"""Different device times that must agree upon a new clock."""
+"""Length of the first blocks after a start, as a fraction of the final block length."""
+_MIN_POINTS = 5
+"""Minimum number of points for estimating the slope; with fewer, only the height is estimated."""
+_MIN_AGREEING = 3
+"""Number of different device times that must agree on a new clock."""
 _EARLY_NS = 1e6
-"""How far below the line a message is always believed."""
+"""[ns] Distance below the line at which a message is always accepted."""
 
 
 @dataclass(frozen=True)
@@ -47,54 +46,78 @@ class ClockSettings:
     """Settings of a device's clock."""
 
     tick_s: float = param(
-        1e-6, 'Nominal length of a tick; of a sequence number used as a clock, 1 / rate.',
-        's', (1e-10, 60.0))
+        1e-6, 'Nominal duration of a tick. With `stamp_by: sequence`, 1 / rate.', 's',
+        (1e-10, 60.0))
     wrap: int = param(
-        2**32, 'Ticks at which the counter goes back to 0; 0 = never.', '', (0, 2**63 - 1))
+        2**32, 'Number of ticks at which the counter returns to 0; 0 = never.', '', (0, 2**63 - 1))
     min_delay_s: float = param(
-        0.0, 'What the quickest message needs from measurement to arrival (bytes over baud rate, '
-        'delay of the filter); arrivals alone cannot tell it.', 's', (0.0, 60.0))
+        0.0, 'Delay of the fastest message from measurement to arrival (bytes / baud rate, filter '
+        'delay). It is not observable from arrival times.', 's', (0.0, 60.0))
     max_delay_s: float = param(
-        5.0, 'A message that comes later than this is of a clock that has stepped.',
-        's', (0.01, 3600.0))
+        5.0, 'Maximum delay of a message. A message delayed by more indicates a step of the device '
+        'clock.', 's', (0.01, 3600.0))
     min_step_s: float = param(
-        0.1, 'Beyond the spread of the delays: a device time that goes back by more than this, or '
-        'that stays late by more than this for max_delay_s, is of a clock that has stepped.',
-        's', (1e-3, 60.0))
+        0.1, 'Minimum clock step, beyond the spread of the delays. A device time that goes back by '
+        'more, or is late by more for max_delay_s, indicates a step of the device clock.', 's',
+        (1e-3, 60.0))
     window_s: float = param(
-        120.0, 'Memory of the estimate; for the drift it must hold five readings.',
-        's', (1.0, 86400.0))
+        120.0, 'Memory of the estimate. It must hold at least five readings for the drift to be '
+        'estimated.', 's', (1.0, 86400.0))
     max_drift_ppm: float = param(
-        500.0, 'The true tick differs from tick_s by no more; crystals stay within 100, the RC '
-        'oscillators of cheap boards do not.', 'ppm', (1.0, 50_000.0))
+        500.0, 'Maximum deviation of the true tick from tick_s. Crystals stay within 100 ppm, the '
+        'RC oscillators of low-cost boards do not.', 'ppm', (1.0, 50_000.0))
 
 
 class ArrivalClock:
-    """For a device without a counter; otherwise as `DeviceClock`, what is not known NaN."""
+    """Clock of a device without a counter. Same interface as `DeviceClock`; unknown values are NaN.
+
+    Parameters
+    ----------
+    settings : ClockSettings
+
+    Attributes
+    ----------
+    counts : Counter
+        Always empty.
+    restarts : Counter
+        Always empty.
+    """
 
     drift_ppm = spread_s = stamp_std = math.nan
 
     def __init__(self, settings: ClockSettings) -> None:
         self.counts: Counter[str] = Counter()
         self.restarts: Counter[str] = Counter()
-        self._shortest_ns = round(settings.min_delay_s * 1e9)
+        self._min_delay_ns = round(settings.min_delay_s * 1e9)
 
     def stamp(self, ticks: float | None, arrival_ns: int) -> int:
-        """`arrival_ns` less the shortest delay, whatever `ticks` is."""
-        return arrival_ns - self._shortest_ns
+        """Time of arrival minus the minimum delay.
+
+        Parameters
+        ----------
+        ticks : float or None
+            Not used.
+        arrival_ns : int, ns
+            Monotonic time of arrival.
+
+        Returns
+        -------
+        int, ns
+        """
+        return arrival_ns - self._min_delay_ns
 
 
-class _Suspect:
+class _ClockCandidate:
     """Readings that may be the beginning of a new clock."""
 
-    def __init__(self, ticks: float, arrival_ns: int, heard_ns: int, near: bool) -> None:
-        self.since_ns, self.heard_ns, self._near = arrival_ns, heard_ns, near
+    def __init__(self, ticks: float, arrival_ns: int, last_fit_ns: int, near: bool) -> None:
+        self.since_ns, self.last_fit_ns, self._near = arrival_ns, last_fit_ns, near
         self.first, self.agreeing, self.total, self._fitted = (ticks, arrival_ns), 1, 0, 0
         self._last = ticks
 
     def add(self, ticks: float, arrival_ns: int, tick_ns: float, wrap: int,
             tolerance_ns: float) -> int:
-        """Take a reading; returns how long those that agree have lasted [ns]."""
+        """Add a reading; return for how long the agreeing readings have lasted [ns]."""
         first, first_ns = self.first
         span = arrival_ns - first_ns
         turns = round((span / tick_ns - (ticks - first)) / wrap) if wrap else 0
@@ -107,8 +130,8 @@ class _Suspect:
         return span
 
     def is_refuted(self) -> bool:
-        """Whether a reading that fits the old clock is enough to forget these."""
-        # Messages may have become a little quicker, and come between others that have not.
+        """Whether a reading that fits the old clock discards the candidate."""
+        # Messages that have become slightly faster may alternate with others that have not.
         self._fitted += 1
         return not self._near or self._fitted > 4 * self.total
 
@@ -116,44 +139,52 @@ class _Suspect:
 class DeviceClock:
     """Times of measurement on the host's monotonic clock; one for all sensors of a device.
 
-    Until there are a few points, the line is under the lowest with the nominal tick, or
-    with the drift before a restart. A reading that fits no clock has no time. A new one
-    begins when three different device times in a row agree upon it, for so long that it
-    cannot be a queue that empties; or when nothing has fitted for `window_s`. Of two
-    clocks in turn the one that was there first goes on.
+    Until there are a few points, the line passes under the lowest one with the nominal tick, or
+    with the drift known from before a restart. A reading that does not fit the clock gets no time.
+    A new clock starts when three different device times in a row agree on it for longer than an
+    emptying queue could explain, or when no reading has fitted for `window_s`. If readings of two
+    clocks alternate, the older clock is kept.
 
-    float64 keeps stamps within 1 ns for 30 days, and within 0.1 us for ten years.
+    float64 keeps the times within 1 ns for 30 days, and within 0.1 µs for ten years.
+
+    Parameters
+    ----------
+    settings : ClockSettings
 
     Attributes
     ----------
     counts : Counter
-        Readings that got no time, by cause.
+        Number of readings without a time, by cause.
     restarts : Counter
-        Clocks begun after the first, by cause.
-    drift_ppm : float [ppm]
-        True over nominal tick, less 1: positive of a slow device. NaN = not yet known.
-    spread_s : float [s]
-        95 of 100 recent messages came less than this after the quickest; NaN as above.
-    stamp_std : float [s]
-        How far a stamp may be off by the delays and by a drift that changes: nine in ten
-        lowest points of blocks are closer to the line. What min_delay_s is off by
-        comes on top. NaN until known, also after a restart.
+        Number of clocks started after the first, by cause.
+    drift_ppm : float, ppm
+        True over nominal tick, minus 1; positive for a slow device. NaN until known.
+    spread_s : float, s
+        95th percentile of the delays of recent messages, relative to the fastest. NaN until known.
+    stamp_std : float, s
+        Error of a timestamp due to the delays and to changes of the drift: the 90th percentile of
+        the distance from the line of the lowest point of each block. An error of `min_delay_s` is
+        not included. NaN until known, also after a restart.
+
+    Raises
+    ------
+    SettingsError
+        If `min_step_s` exceeds `max_delay_s`, or the counter wraps within 4 `min_step_s`.
     """
 
     def __init__(self, settings: ClockSettings) -> None:
-        """Raises SettingsError where the settings contradict each other."""
         self._tick_ns, self._wrap = settings.tick_s * 1e9, settings.wrap
         self._top = settings.wrap or math.inf
-        self._shortest_ns = round(settings.min_delay_s * 1e9)
-        self._longest_ns = settings.max_delay_s * 1e9
+        self._min_delay_ns = round(settings.min_delay_s * 1e9)
+        self._max_delay_ns = settings.max_delay_s * 1e9
         self._step_ns = self._tolerance_ns = settings.min_step_s * 1e9
-        self._window_ns, self._most = settings.window_s * 1e9, settings.max_drift_ppm * 1e-6
+        self._window_ns, self._max_drift = settings.window_s * 1e9, settings.max_drift_ppm * 1e-6
         if settings.min_step_s > settings.max_delay_s:
-            raise SettingsError(f'min_step_s: {settings.min_step_s:g} s is more than '
+            raise SettingsError(f'min_step_s: {settings.min_step_s:g} s is longer than '
                                 f'max_delay_s, {settings.max_delay_s:g} s')
         if 0 < settings.wrap * settings.tick_s < 4.0 * settings.min_step_s:
             raise SettingsError(
-                f'wrap: the counter goes round in {settings.wrap * settings.tick_s:g} s, less than '
+                f'wrap: the counter wraps every {settings.wrap * settings.tick_s:g} s, less than '
                 f'four times min_step_s, {settings.min_step_s:g} s')
         self.counts: Counter[str] = Counter()
         self.restarts: Counter[str] = Counter()
@@ -162,36 +193,36 @@ class DeviceClock:
         self._slope, self._begun = 0.0, False
 
     def _begin(self, ticks: float, arrival_ns: int) -> None:
-        """Begin a new clock with its first point; what is known of the drift remains."""
+        """Start a new clock at its first point; the drift estimate is kept."""
         self._ticks, self._arrival_ns, self._last_ns = ticks, arrival_ns, arrival_ns
         self._height = self._middle = self._newest = self._lowest = 0.0
         self._points: list[Point] = []
         self._point: Point = (0.0, 0.0)
         self._block = self._block_end = self._window_ns / _MAX_BLOCKS * _MIN_BLOCK
-        self._early_ns, self.stamp_std = self._longest_ns, math.nan
-        self._suspect: _Suspect | None = None
-        self._begun, self._unsure = True, self._most
+        self._early_tolerance_ns, self.stamp_std = self._max_delay_ns, math.nan
+        self._candidate: _ClockCandidate | None = None
+        self._begun, self._drift_bound = True, self._max_drift
 
     def stamp(self, ticks: float | None, arrival_ns: int) -> int | None:
-        """When a reading was measured.
+        """Time at which a reading was measured.
 
         Parameters
         ----------
-        ticks : int or float
-            The device's counter, 0 .. wrap; equal and slightly earlier ones are fine.
-        arrival_ns : int
-            `time.monotonic_ns()` when it came.
+        ticks : float or None
+            Device counter, 0 .. wrap. Repeated and slightly earlier values are accepted.
+        arrival_ns : int, ns
+            `time.monotonic_ns()` at arrival.
 
         Returns
         -------
-        int or None
-            Time [ns], at most `arrival_ns` less the shortest delay; None = unknown, counted.
+        int or None, ns
+            Not later than `arrival_ns` minus the minimum delay. None = unknown, and counted.
         """
         if ticks is None:
             self.counts[NO_TICKS] += 1
             return None
         if not 0 <= ticks < self._top:
-            self.counts[OUTSIDE] += 1
+            self.counts[OUT_OF_RANGE] += 1
             return None
         if not self._begun:
             self._begin(ticks, arrival_ns)
@@ -199,32 +230,32 @@ class DeviceClock:
         t = self._device_time(ticks, elapsed)
         low = elapsed - t - self._slope * (t - self._middle)
         delay = low - self._height
-        fits = (delay <= self._longest_ns and t >= self._newest - self._tolerance_ns
-                and (delay >= 0.0 or -delay <= self._earliest(t, arrival_ns)))
-        if not fits or delay > self._tolerance_ns + self._unsure * t:
-            if self._suspect is None:
-                self._suspect = _Suspect(ticks, arrival_ns, self._last_ns,
+        fits = (delay <= self._max_delay_ns and t >= self._newest - self._tolerance_ns
+                and (delay >= 0.0 or -delay <= self._early_limit(t, arrival_ns)))
+        if not fits or delay > self._tolerance_ns + self._drift_bound * t:
+            if self._candidate is None:
+                self._candidate = _ClockCandidate(ticks, arrival_ns, self._last_ns,
                                          abs(delay) <= self._tolerance_ns)
-            if self._has_stepped(ticks, arrival_ns, fits, self._suspect):
-                self._restart(ticks, arrival_ns, delay, self._suspect)
-                return arrival_ns - self._shortest_ns
+            if self._has_stepped(ticks, arrival_ns, fits, self._candidate):
+                self._restart(ticks, arrival_ns, delay, self._candidate)
+                return arrival_ns - self._min_delay_ns
             if not fits:
                 self.counts[NO_FIT] += 1
                 return None
-        elif self._suspect is not None and self._suspect.is_refuted():
-            self._suspect = None
-        return arrival_ns - self._shortest_ns - self._take(t, elapsed - t, low, arrival_ns)
+        elif self._candidate is not None and self._candidate.is_refuted():
+            self._candidate = None
+        return arrival_ns - self._min_delay_ns - self._add_point(t, elapsed - t, low, arrival_ns)
 
     def _device_time(self, ticks: float, elapsed: int) -> float:
-        """Nominal time since the first reading [ns], by as many turns as the arrival says."""
+        """Nominal time since the first reading [ns]; the arrival resolves the counter's wraps."""
         count = ticks - self._ticks
         if self._wrap:
             t = (elapsed - self._height + self._slope * self._middle) / (1.0 + self._slope)
             count += round((t / self._tick_ns - count) / self._wrap) * self._wrap
         return count * self._tick_ns
 
-    def _take(self, t: float, offset: float, low: float, arrival_ns: int) -> int:
-        """Use a point that fits; returns its delay [ns]."""
+    def _add_point(self, t: float, offset: float, low: float, arrival_ns: int) -> int:
+        """Add a point that fits; return its delay [ns]."""
         if t >= self._block_end:
             self._close_block(t)
             low = offset - self._slope * (t - self._middle)
@@ -235,41 +266,42 @@ class DeviceClock:
         self._delays.append(low - self._height)
         return int(low - self._height + 0.5)
 
-    def _earliest(self, t: float, arrival_ns: int) -> float:
-        """How far below the line a message is believed [ns]."""
-        # The first messages may all have waited, in a port that was opened late.
-        if arrival_ns - self._arrival_ns < self._longest_ns:
-            return self._longest_ns
+    def _early_limit(self, t: float, arrival_ns: int) -> float:
+        """Maximum distance below the line at which a message is accepted [ns]."""
+        # All of the first messages may have been delayed in the buffer of a port opened late.
+        if arrival_ns - self._arrival_ns < self._max_delay_ns:
+            return self._max_delay_ns
         since = t - (self._points[-1][0] if self._points else 0.0)
-        return self._early_ns + self._most * since
+        return self._early_tolerance_ns + self._max_drift * since
 
-    def _restart(self, ticks: float, arrival_ns: int, delay: float, suspect: _Suspect) -> None:
-        """Begin a new clock where `delay` after the line of the old one was too much."""
+    def _restart(self, ticks: float, arrival_ns: int, delay: float,
+                 suspect: _ClockCandidate) -> None:
+        """Start a new clock and count its cause; `delay` is relative to the old line [ns]."""
         first, first_ns = suspect.first
-        silence = first_ns - suspect.heard_ns
+        silence = first_ns - suspect.last_fit_ns
         if silence > self._window_ns:
             cause = LOST
-        # It was counting from 0 only since it was last heard.
+        # The counter started at 0 after the last fitting reading.
         elif first * self._tick_ns < silence + self._tolerance_ns:
             cause = RESET
         else:
-            cause = BACK if delay > 0.0 else FORWARD
+            cause = STEP_BACK if delay > 0.0 else STEP_FORWARD
         self.restarts[cause] += 1
         self._begin(ticks, arrival_ns)
 
     def _has_stepped(self, ticks: float, arrival_ns: int, fits: bool,
-                     suspect: _Suspect) -> bool:
-        """Hold a reading against the clock; whether it is one too many."""
+                     suspect: _ClockCandidate) -> bool:
+        """Add a reading to the candidate; return whether the device clock has stepped."""
         wait = arrival_ns - suspect.since_ns
         lasted = suspect.add(ticks, arrival_ns, self._tick_ns, self._wrap,
-                             self._tolerance_ns + self._most * wait)
-        # A queue that empties comes all at once, or in other steps than it was measured.
-        needed = self._longest_ns if fits else 2.0 * self._tolerance_ns
-        return (suspect.agreeing >= _CONFIRMING and lasted >= needed
-                or suspect.total >= _CONFIRMING and wait > self._window_ns)
+                             self._tolerance_ns + self._max_drift * wait)
+        # An emptying queue arrives all at once, or at intervals other than those of measurement.
+        needed = self._max_delay_ns if fits else 2.0 * self._tolerance_ns
+        return (suspect.agreeing >= _MIN_AGREEING and lasted >= needed
+                or suspect.total >= _MIN_AGREEING and wait > self._window_ns)
 
     def _close_block(self, t: float) -> None:
-        """Keep the lowest point of the block that ends, and estimate again."""
+        """Keep the lowest point of the block that ends, and update the estimate."""
         points, longest = self._points, self._window_ns / _MAX_BLOCKS
         points.append(self._point)
         if t - self._newest > self._window_ns:
@@ -280,14 +312,14 @@ class DeviceClock:
             self._block *= 2.0
             self._points = points = [min(points[i:i + 2], key=self._above)
                                      for i in range(0, len(points), 2)]
-        # A message that overtook another may be the lowest of a later block.
+        # A message that overtook another may be the lowest point of a later block.
         points.sort()
         self._estimate(points)
         self._block_end, self._lowest = t + self._block, math.inf
         delays = sorted(self._delays)
         self.spread_s = delays[int(0.95 * (len(delays) - 1))] * 1e-9
-        # What is late may be of another clock, and must not excuse itself.
-        if self._suspect is None:
+        # Late messages of a new clock must not widen the tolerance by which they are detected.
+        if self._candidate is None:
             self._tolerance_ns = self._step_ns + 2e9 * self.spread_s
 
     def _above(self, point: Point) -> float:
@@ -295,17 +327,17 @@ class DeviceClock:
         return point[1] - self._height - self._slope * (point[0] - self._middle)
 
     def _estimate(self, points: list[Point]) -> None:
-        """The line under the points."""
+        """Update height and slope of the line under the points."""
         self._middle = sum(t for t, _ in points) / len(points)
-        if len(points) >= _FEWEST_POINTS and points[0][0] < points[-1][0]:
+        if len(points) >= _MIN_POINTS and points[0][0] < points[-1][0]:
             low, high = likely_slopes(points)
             slope = min(max(self._slope, low), high)
-            self._slope = min(max(slope, -self._most), self._most)
+            self._slope = min(max(slope, -self._max_drift), self._max_drift)
             self.drift_ppm = self._slope * 1e6
         self._height = 0.0
         above = sorted(map(self._above, points))
         self._height = above[0]
-        if len(points) >= _FEWEST_POINTS:
+        if len(points) >= _MIN_POINTS:
             error = above[int(0.9 * (len(above) - 1))] - above[0]
             self.stamp_std = error * 1e-9
-            self._early_ns, self._unsure = _EARLY_NS + 8.0 * error, 0.0
+            self._early_tolerance_ns, self._drift_bound = _EARLY_NS + 8.0 * error, 0.0

@@ -1,8 +1,8 @@
-"""A driver: one device, kept open, and its readings as samples.
+"""Driver: keeps one device open and converts its readings to samples.
 
-It opens the device and opens it again, with back-off, whenever it is lost; names
-the sensors, turns units into SI, stamps every reading with the time of its
-measurement on this machine's clock, and counts what is missing.
+A driver opens its device and, with back-off, reopens it when the connection is lost. It names the
+sensors, converts units to SI, timestamps every reading with its time of measurement on the host
+clock, and counts losses.
 """
 
 import struct
@@ -29,20 +29,20 @@ from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.records import AccelerationSample, Readings
 
 POLL_S = 0.2
-"""[s] A driver that is served is asked to stop so often."""
+"""[s] Interval at which `serve` checks whether to stop."""
 IGNORED = '-'
-"""In place of a sensor's name: what comes of it is not used."""
+"""Name of a sensor whose readings are discarded."""
 MAX_NAMES = 20
-"""Unknown sensors that are counted by name."""
+"""Maximum number of unknown sensors, and of errors of one type, that are counted individually."""
 MAX_SOURCES = 4096
-"""Clocks that are kept."""
+"""Maximum number of sources, each with its own clock."""
 _AXES = struct.Struct('3d')
-DoctorResult: TypeAlias = tuple[Readings, Sequence[AccelerationSample]]
-"""What has come."""
-NOTHING: DoctorResult = Readings.joined([]), ()
-"""That has come."""
-STEP_NS = 10_000_000
-"""[ns] The clock of this machine was set when it differs by more from one moment to the next."""
+PollResult: TypeAlias = tuple[Readings, Sequence[AccelerationSample]]
+"""Fields and accelerations."""
+NOTHING: PollResult = Readings.joined([]), ()
+"""Result of a poll without data."""
+MIN_CLOCK_STEP_NS = 10_000_000
+"""[ns] Larger changes of wall clock minus monotonic clock are steps of the host clock."""
 
 
 class Driver:
@@ -51,15 +51,32 @@ class Driver:
     Parameters
     ----------
     name : str
-        Of the device, for people.
+        Name of the device, for messages.
     device : reading.Device
     settings : DriverSettings
     clock_settings : ClockSettings
-    sensors : {str: str}
-        The device's name of each sensor, or the source that it sends from: the
-        network's name of it. `{'': name}`: all is of the one sensor there is.
-    monotonic_ns, wall_ns, sleep : functions
-        The clocks of this machine; tests have their own.
+    sensors : dict of str to str
+        Network name of each sensor, by its name at the device or by its source. The key '' stands
+        for the only sensor of the device.
+    monotonic_ns : callable, optional
+        Monotonic clock of the host; tests replace it.
+    wall_ns : callable, optional
+        Wall clock of the host.
+    sleep : callable, optional
+
+    Attributes
+    ----------
+    name : str
+    sensors : dict of str to str
+    own_counts : Counter
+        Number of losses and faults detected by the driver itself, by cause.
+    fault : str
+        Why the device is closed or silent; empty if there is no fault.
+
+    Raises
+    ------
+    SettingsError
+        If a unit or `stamp_by` is not valid.
     """
 
     def __init__(self, name: str, device: Device, settings: DriverSettings,
@@ -82,31 +99,32 @@ class Driver:
         self._sequences = {s: SequenceCheck(settings.sequence_wrap) for s in sensors.values()
                            if s != IGNORED}
         self._clocks: dict[str, ArrivalClock | DeviceClock] = {}
-        self._open, self.trouble = False, ''
-        self._retry_s, self._heard_ns = settings.retry_s, 0
+        self._open, self.fault = False, ''
+        self._retry_s, self._last_receipt_ns = settings.retry_s, 0
         self._retry_ns: int | None = None
         self._offset_ns: int | None = None
         self._sole_source = SingleSource()
         self._unknown: set[str] = set()
-        # Of the reading before: those that a device gives together were measured together.
+        # (clock, ticks, arrival) of the previous reading: readings with the same ticks and
+        # arrival were measured together and share a timestamp.
         self._measurement: tuple[ArrivalClock | DeviceClock, float | None, int] | None = None
         self._measured_ns: int | None = None
-        self._named: dict[tuple[str, str], str] = {}
+        self._resolved: dict[tuple[str, str], str] = {}
         self._sample_counts = {s: f'samples: {s}' for s in sensors.values()}
 
     @property
     def device(self) -> Device:
-        """What it keeps open."""
+        """Device that the driver keeps open."""
         return self._device
 
     @property
     def settings(self) -> DriverSettings:
-        """As they were given."""
+        """Settings of the driver."""
         return self._settings
 
     @property
     def clock_settings(self) -> ClockSettings:
-        """Of the clock of each source."""
+        """Clock settings, which apply to every source."""
         return self._clock_settings
 
     @property
@@ -115,14 +133,26 @@ class Driver:
         return self._open
 
     def clocks(self) -> dict[str, ArrivalClock | DeviceClock]:
-        """{source: DeviceClock or ArrivalClock} of those that something has come from."""
+        """Clocks of all sources received so far.
+
+        Returns
+        -------
+        dict of str to ArrivalClock or DeviceClock
+            By source.
+        """
         return dict(self._clocks)
 
     def counts(self) -> Counter[str]:
-        """{what: number} of all that was lost, refused or found odd, and of the samples."""
-        # Copied as wholes: the thread that polls may count something new in the meantime.
+        """Number of samples, losses and suspect readings.
+
+        Returns
+        -------
+        Counter
+            By cause.
+        """
+        # Each counter is copied at once, because the polling thread may add a cause meanwhile.
         total = self.own_counts.copy()
-        total.update({'sources changed': n} if (n := self._sole_source.changes) else {})
+        total.update({'source changes': n} if (n := self._sole_source.changes) else {})
         total.update(self._device.counts.copy())
         for sensor, check in self._sequences.items():
             total.update({f'{what}: {sensor}': n for what, n in check.counts.copy().items() if n})
@@ -131,11 +161,22 @@ class Driver:
             total.update(clock.restarts.copy())
         return total
 
-    def poll(self, timeout_s: float) -> DoctorResult:
-        """What has come: (`Readings`, sequence of `AccelerationSample`), empty after `timeout_s`.
+    def poll(self, timeout_s: float) -> PollResult:
+        """Return the samples received since the last call.
 
-        Opens the device where it is not open and it is time to try. Never raises for
-        the device's sake: what is wrong stands in `trouble`.
+        A closed device is opened when the retry interval has elapsed. Device errors are not raised
+        but stored in `fault`.
+
+        Parameters
+        ----------
+        timeout_s : float, s
+            Maximum time to wait for data.
+
+        Returns
+        -------
+        readings : Readings
+            Empty if nothing arrived in time.
+        accelerations : sequence of AccelerationSample
         """
         if not self._open and not self._try_to_open(timeout_s):
             return NOTHING
@@ -143,20 +184,20 @@ class Driver:
             arrivals = self._read(timeout_s)
         except DeviceError as error:
             self.own_counts['connections lost'] += 1
-            self._give_up(error)
+            self._schedule_retry(error)
             return NOTHING
         now = self._monotonic_ns()
         if not arrivals:
             timeout_s = self._settings.silence_timeout_s
-            if timeout_s and now - self._heard_ns > timeout_s * 1e9:
-                self.own_counts['silent, so opened again'] += 1
-                self._give_up(f'open, but nothing has come for {timeout_s:g} s')
+            if timeout_s and now - self._last_receipt_ns > timeout_s * 1e9:
+                self.own_counts['reopened after silence'] += 1
+                self._schedule_retry(f'open, but no data received for {timeout_s:g} s')
             return NOTHING
-        self._heard_ns, self._retry_s, self.trouble = now, self._settings.retry_s, ''
+        self._last_receipt_ns, self._retry_s, self.fault = now, self._settings.retry_s, ''
         return self._samples(arrivals, self._wall_offset(now))
 
     def _read(self, timeout_s: float) -> list[Arrival]:
-        """What the device has, and what comes within `batch_s` after the first of it."""
+        """Return the available readings and those that arrive within `batch_s` after the first."""
         arrivals = self._device.read(timeout_s)
         if not arrivals or not self._settings.batch_s:
             return arrivals
@@ -165,14 +206,14 @@ class Driver:
             try:
                 arrivals += self._device.read(left_ns / 1e9)
             except DeviceError:
-                # What has come goes on; the next read says so again.
+                # Readings received so far are kept; the next read raises the error again.
                 break
         return arrivals
 
     def close(self) -> None:
         """Close the device; the next `poll` opens it again.
 
-        What the device measures until then is not lost.
+        Readings that the device measures until then are not counted as lost.
         """
         for check in self._sequences.values():
             check.pause()
@@ -180,12 +221,17 @@ class Driver:
         self._open, self._retry_ns = False, None
 
     def fail(self, error: Exception) -> None:
-        """Something else went wrong with the device: close it, and open it again after a while."""
+        """Close the device after an unexpected error; it is reopened after the retry interval.
+
+        Parameters
+        ----------
+        error : Exception
+        """
         self.own_counts['errors'] += 1
-        self._give_up(f'{type(error).__name__}: {error}')
+        self._schedule_retry(f'{type(error).__name__}: {error}')
 
     def _try_to_open(self, timeout_s: float) -> bool:
-        """Open the device if it is time to; whether it is open. Waits at most `timeout_s`."""
+        """Open the device if the retry interval has elapsed; return whether it is open."""
         if self._retry_ns is not None:
             wait_s = (self._retry_ns - self._monotonic_ns()) / 1e9
             if wait_s > 0.0:
@@ -194,46 +240,42 @@ class Driver:
         try:
             self._device.open()
         except DeviceError as error:
-            self.own_counts['openings that failed'] += 1
-            self._give_up(error)
+            self.own_counts['failed attempts to open'] += 1
+            self._schedule_retry(error)
             return False
-        # What was wrong before stays said until something has come.
-        self._open, self._heard_ns = True, self._monotonic_ns()
+        # The previous fault remains until data arrive.
+        self._open, self._last_receipt_ns = True, self._monotonic_ns()
         return True
 
-    def _give_up(self, why: object) -> None:
-        """Close the device, and wait longer than the last time before it is opened again."""
-        self._open, self.trouble = False, str(why)
+    def _schedule_retry(self, why: object) -> None:
+        """Close the device and double the delay before it is reopened."""
+        self._open, self.fault = False, str(why)
         try:
             self._device.close()
-        # Of somebody else's device, or of a port that has vanished: it is given up all the same.
+        # A third-party device or a vanished port may raise anything; the device is reopened anyway.
         except Exception as error:
-            self.own_counts['closings that failed'] += 1
-            self.trouble += f' (and it does not close: {type(error).__name__}: {error})'
+            self.own_counts['failed attempts to close'] += 1
+            self.fault += f'; closing failed as well: {type(error).__name__}: {error}'
         self._retry_ns = self._monotonic_ns() + round(self._retry_s * 1e9)
         self._retry_s = min(2.0 * self._retry_s, self._settings.max_retry_s)
 
     def _wall_offset(self, monotonic_ns: int) -> int:
-        """[ns] Time of day minus monotonic time; stamps follow where somebody sets the clock."""
+        """Wall clock minus monotonic clock [ns]; timestamps follow steps of the wall clock."""
         offset = self._wall_ns() - monotonic_ns
-        if self._offset_ns is not None and abs(offset - self._offset_ns) > STEP_NS:
-            self.own_counts["steps of this machine's clock"] += 1
+        if self._offset_ns is not None and abs(offset - self._offset_ns) > MIN_CLOCK_STEP_NS:
+            self.own_counts['steps of the host clock'] += 1
         self._offset_ns = offset
         return offset
 
-    def _samples(self, arrivals: Sequence[Arrival], offset_ns: int) -> DoctorResult:
-        """(`Readings`, [`AccelerationSample`]) of what has come.
-
-        A field that is infinite in tesla is none; an acceleration that came with it is one.
-        Raises ValueError for other than three axes.
-        """
+    def _samples(self, arrivals: Sequence[Arrival], offset_ns: int) -> PollResult:
+        """Convert arrivals to samples; raises ValueError for other than three axes."""
         sensors: list[str] = []
         stamps: list[int] = []
         fields: list[Axes] = []
         accelerations: list[AccelerationSample] = []
         for arrival in arrivals:
             reading = arrival.reading
-            sensor, stamp_ns = self._measured(reading, arrival)
+            sensor, stamp_ns = self._resolve(reading, arrival)
             if sensor is None or stamp_ns is None:
                 continue
             if reading.field is not None:
@@ -244,20 +286,21 @@ class Driver:
                 accelerations.append(AccelerationSample(
                     stamp_ns + offset_ns, sensor,
                     self._acceleration_scale * np.array(reading.acceleration)))
+        # A field that overflows is discarded; the acceleration of the same reading is kept.
         with np.errstate(over='ignore'):
             field = self._scale * np.array(fields, dtype=float).reshape(len(fields), 3)
         readings = Readings.by_name(sensors, stamps, field)
         infinite: BoolArray = np.any(np.isinf(readings.field), axis=1)
         if infinite.any():
-            self.own_counts['readings that are infinite in tesla'] += int(infinite.sum())
+            self.own_counts['readings that overflow in tesla'] += int(infinite.sum())
             readings = readings.part(~infinite)
         self.own_counts.update([self._sample_counts[readings.names[j]]
                                 for j in readings.sensor.tolist()])
         return readings, accelerations
 
-    def _measured(self, reading: Reading, arrival: Arrival) -> tuple[str | None, int | None]:
-        """(the network's name of the sensor, monotonic ns) of a reading; None for what is not."""
-        sensor = self._named.get((reading.sensor, arrival.source)) \
+    def _resolve(self, reading: Reading, arrival: Arrival) -> tuple[str | None, int | None]:
+        """(network name of the sensor, monotonic ns) of a reading; None if unknown or not new."""
+        sensor = self._resolved.get((reading.sensor, arrival.source)) \
             or self._sensor_of(reading.sensor, arrival.source)
         if sensor is None or reading.sequence is not None and not self._sequences[sensor].is_new(
                 reading.sequence, _bytes_of(reading.field) + _bytes_of(reading.acceleration)):
@@ -265,53 +308,51 @@ class Driver:
         return sensor, self._stamp(reading, arrival)
 
     def _sensor_of(self, at_device: str, source: str) -> str | None:
-        """The network's name of a sensor; None for one that nobody has named."""
+        """Network name of a sensor; None if it is unknown or ignored."""
         sensor = next((self.sensors[name] for name in (at_device, source)
                        if name and name in self.sensors), None)
-        if sensor is None and '' in self.sensors and self._sole_source.is_this(
+        if sensor is None and '' in self.sensors and self._sole_source.accepts(
                 (at_device, source), self._monotonic_ns()):
             return self.sensors['']
         if sensor is None:
             name = (at_device or source)[:80]
             if len(self._unknown) < MAX_NAMES:
                 self._unknown.add(name)
-            self.own_counts['of unknown sensors' + (
+            self.own_counts['readings of unknown sensors' + (
                 f': {name}' if name in self._unknown else ' (and others)')] += 1
         if sensor is None or sensor == IGNORED:
             return None
-        if len(self._named) < MAX_SOURCES:
-            self._named[at_device, source] = sensor
+        if len(self._resolved) < MAX_SOURCES:
+            self._resolved[at_device, source] = sensor
         return sensor
 
     def _stamp(self, reading: Reading, arrival: Arrival) -> int | None:
-        """Monotonic ns of the measurement; None where no clock can tell."""
+        """Monotonic time of the measurement [ns]; None if no clock provides it."""
         by = self._settings.stamp_by
         ticks = reading.sequence if by == 'sequence' else reading.ticks
         clock = self._clocks.get(arrival.source)
         if clock is None:
             if len(self._clocks) >= MAX_SOURCES:
-                self.own_counts['of more sources than there can be'] += 1
+                self.own_counts['readings beyond the maximum number of sources'] += 1
                 return None
             without = by == 'arrival' or by == 'auto' and ticks is None
             clock = (ArrivalClock if without else DeviceClock)(self._clock_settings)
             self._clocks[arrival.source] = clock
         if ticks is None and isinstance(clock, DeviceClock):
-            self.own_counts['readings without the time of the device'] += 1
+            self.own_counts['readings without a device time'] += 1
             return None
         measurement = clock, ticks, arrival.arrival_ns
         if self._measurement != measurement or self._measured_ns is None:
-            # Each that has no time is counted.
+            # Repeated for a reading without a time, so that each one is counted.
             self._measured_ns = clock.stamp(ticks, arrival.arrival_ns)
             self._measurement = measurement
         return self._measured_ns
 
 
 def _bytes_of(axes: Axes | None) -> bytes:
-    """Three numbers, or None, as bytes; ValueError for anything else.
-
-    They are kept by the thousand. As tuples they would be looked through for garbage, all of them
-    at once: as many as come go, and that is what Python counts before it looks.
-    """
+    """Three numbers, or None, as bytes; raises ValueError for anything else."""
+    # Thousands of them are kept. Tuples would be tracked by the garbage collector, whose full
+    # collections would then scan all of them.
     try:
         return b'-' if axes is None else _AXES.pack(*axes)
     except struct.error as error:
@@ -320,10 +361,18 @@ def _bytes_of(axes: Axes | None) -> bytes:
 
 def serve(driver: Driver, take: Callable[[Readings, Sequence[AccelerationSample]], object],
           stopping: Callable[[], bool]) -> None:
-    """Hand what `driver` says to `take`, a function as of `poll`'s result, until `stopping()`.
+    """Poll a driver and pass its samples to a function until `stopping()` is true.
 
-    For a thread of its own, which nobody would see die: what the device raises stands in
-    `driver.trouble`, what `take` raises in `driver.own_counts`.
+    Intended for a thread of its own, so it does not raise: errors of the device are stored in
+    `driver.fault`, errors of `take` are counted in `driver.own_counts`.
+
+    Parameters
+    ----------
+    driver : Driver
+    take : callable
+        Receives `Readings` and a sequence of `AccelerationSample`.
+    stopping : callable
+        Returns whether to stop.
     """
     while not stopping():
         try:
@@ -335,8 +384,8 @@ def serve(driver: Driver, take: Callable[[Readings, Sequence[AccelerationSample]
             if len(readings) or len(accelerations):
                 take(readings, accelerations)
         except Exception as error:
-            # Not the device's fault, which goes on.
-            what = f'errors behind the driver: {type(error).__name__}'
+            # The device is not affected and keeps running.
+            what = f'errors while processing readings: {type(error).__name__}'
             text = f'{what}: {error}'[:100]
             known = sum(key.startswith(what) for key in driver.own_counts)
             driver.own_counts[text if text in driver.own_counts or known < MAX_NAMES

@@ -1,4 +1,4 @@
-"""A device that is a transport with a framing."""
+"""Device composed of a transport and a framing."""
 
 from collections import Counter
 
@@ -6,32 +6,55 @@ from mag_tracking.drivers.reading import Arrival, Framing, Transport
 
 
 class FramedDevice:
-    """Readings that `framing` finds in what `transport` brings; see `reading.Device`."""
+    """Readings that a framing finds in the data of a transport. Implements `reading.Device`.
+
+    Parameters
+    ----------
+    transport : Transport
+    framing : Framing
+
+    Attributes
+    ----------
+    CLOCK : dict of str to float
+        Clock settings common to all devices with this framing.
+    DRIVER : dict of str to int
+        Driver settings common to all devices with this framing.
+    """
 
     def __init__(self, transport: Transport, framing: Framing) -> None:
         self._transport, self._framing = transport, framing
         self._rest = b''
         self._found: Counter[str] = Counter()
-        # What is known of the devices that speak so, without being told.
         self.CLOCK, self.DRIVER = (getattr(framing, name, {}) for name in ('CLOCK', 'DRIVER'))
 
     @property
     def counts(self) -> Counter[str]:
-        """What was lost on the way or was no frame, by cause."""
-        # Copied as wholes: the other thread may count something new in the meantime.
+        """Number of losses and of bytes outside frames, by cause."""
+        # Each counter is copied at once, because the polling thread may add a cause meanwhile.
         total = self._found.copy()
         total.update(self._transport.counts.copy())
         return total
 
     def open(self) -> None:
-        """Open the transport; what was left of the last connection is no beginning of a frame."""
+        """Open the transport. Bytes left from the previous connection are discarded and counted."""
         if self._rest:
-            self._found['bytes of a frame that was cut off'] += len(self._rest)
+            self._found['bytes of truncated frames'] += len(self._rest)
             self._rest = b''
         self._transport.open()
 
     def read(self, timeout_s: float) -> list[Arrival]:
-        """The readings that came, as `Arrival`s; [] after `timeout_s`. Raises DeviceError."""
+        """Return the readings received.
+
+        Parameters
+        ----------
+        timeout_s : float, s
+            Maximum time to wait for data.
+
+        Returns
+        -------
+        list of Arrival
+            Empty if nothing arrived in time.
+        """
         out: list[Arrival] = []
         for chunk in self._transport.read(timeout_s):
             data = chunk.data if self._transport.whole else self._rest + chunk.data

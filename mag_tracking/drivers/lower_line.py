@@ -1,7 +1,7 @@
-"""Slopes of the line under a set of points, for the skew of a clock.
+"""Slopes of the line under a set of points, used to estimate the skew of a clock.
 
-Source: Moon, Skelly & Towsley, 'Estimation and removal of clock skew from network
-delay measurements', IEEE INFOCOM 1999; `device_clock` says how its use departs from it.
+Source: Moon, Skelly & Towsley, 'Estimation and removal of clock skew from network delay
+measurements', IEEE INFOCOM 1999. `device_clock` lists the departures.
 """
 
 import itertools
@@ -14,7 +14,18 @@ Point: TypeAlias = tuple[float, float]
 
 
 def lower_hull(points: Sequence[Point]) -> list[Point]:
-    """Corners of the lower convex hull, from left to right, of a sorted list of (x, y)."""
+    """Corners of the lower convex hull.
+
+    Parameters
+    ----------
+    points : sequence of Point
+        Sorted.
+
+    Returns
+    -------
+    list of Point
+        From left to right.
+    """
     hull: list[Point] = []
     for x, y in points:
         while len(hull) > 1:
@@ -27,19 +38,20 @@ def lower_hull(points: Sequence[Point]) -> list[Point]:
 
 
 def likely_slopes(points: Sequence[Point]) -> tuple[float, float]:
-    """Slopes of lines under the points that are about as likely as the best.
+    """Slopes of lines under the points that are about as likely as the best one.
+
+    The best line is that of Moon et al.: the edge of the hull over the mean of x.
 
     Parameters
     ----------
-    points : list of (x, y)
-        Sorted, three or more, of more than one x.
+    points : sequence of Point
+        Sorted, three or more, with at least two different x.
 
     Returns
     -------
-    low, high : float
-        Equal if all points are on the closest line.
-
-    Source: see the module; closest is Moon et al.'s (the hull's edge over the mean x).
+    low : float
+    high : float
+        Equal to `low` if all points are on the best line.
     """
     hull = lower_hull(points)
     middle = sum(x for x, _ in points) / len(points)
@@ -48,7 +60,7 @@ def likely_slopes(points: Sequence[Point]) -> tuple[float, float]:
             slope = (y - v) / (x - u)
             height = v + slope * (middle - u)
             break
-    # Two are on the line whatever the delays are; the median, because a stall is no delay.
+    # Two points are always on the line. The median is insensitive to stalls, which are not delays.
     above = sorted(y - height - slope * (x - middle) for x, y in points)[2:]
     floor = height - above[len(above) // 2] / math.log(2.0) / len(points)
     low = max((y - floor) / (x - middle) for x, y in hull if x < middle)

@@ -1,8 +1,8 @@
-"""What the rooms of the drivers share: a device's reading, and the three small protocols.
+"""Reading of a device, and the protocols `Transport`, `Framing` and `Device`.
 
-A *transport* moves bytes (serial line, UDP, MQTT). A *framing* finds readings in
-bytes and is a pure function. A *device* gives readings with the time when they
-came: a transport with a framing, a chip on a bus, or the simulator.
+A *transport* moves bytes (serial line, UDP, MQTT). A *framing* finds readings in bytes and is a
+pure function. A *device* returns readings with their time of arrival: a transport with a framing,
+a chip on a bus, or the simulator.
 """
 
 from collections import Counter
@@ -15,99 +15,153 @@ Axes: TypeAlias = tuple[float, float, float]
 
 
 class Reading(NamedTuple):
-    """What one device said once of one sensor, in the device's own units."""
+    """One measurement of one sensor, in the device's own units."""
 
     sensor: str = ''
-    """The device's name of the sensor; empty where it names none."""
+    """Name of the sensor at the device; empty if the device names none."""
     field: Axes | None = None
-    """In the device's unit, sensor frame; NaN = an axis that it does not report, or that was over
-    its range; None = it says nothing of the field."""
+    """Field in the device's unit, sensor frame. NaN = the axis is not reported or over its range;
+    None = no field."""
     acceleration: Axes | None = None
-    """In the device's unit, sensor frame; None = none."""
+    """Acceleration in the device's unit, sensor frame; None = not reported."""
     ticks: float | None = None
-    """The device's clock when it measured; None = it has none."""
+    """Device clock at the time of measurement; None = the device has no clock."""
     sequence: int | None = None
-    """Its count of readings; None = it does not count."""
+    """Sequence number; None = the device sends none."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parsed:
-    """What a framing found in some bytes."""
+    """Result of a framing."""
 
     readings: tuple[Reading, ...] = ()
     consumed: int = 0
-    """Bytes from the beginning that need not be seen again."""
+    """Number of bytes from the beginning that are not needed again."""
     rejected: Mapping[str, int] = field(default_factory=dict)
-    """{cause: how many}, the cause in the plural: 'frames with a wrong checksum',
+    """Number of rejections by cause. The cause is a plural: 'frames with a wrong checksum',
     'bytes between frames'."""
 
 
 class Framing(Protocol):
-    """Finds readings in bytes; holds settings, and nothing of what it has seen."""
+    """Finds readings in bytes. It holds settings, but no state."""
 
     def parse(self, data: bytes, final: bool = False) -> Parsed:
-        """All readings in `data`.
+        """Find all readings in `data`.
 
-        What may be the beginning of a frame stays unconsumed, never more than the
-        longest frame; with `final` nothing follows (a datagram), all is consumed, and
-        what is no frame is counted. The same bytes in other pieces, each time with
-        the rest of the time before in front, give the same readings and counts.
+        A possible beginning of a frame remains unconsumed; it is never longer than the longest
+        frame. With `final`, nothing follows (a datagram): all bytes are consumed, and those outside
+        frames are counted. Splitting the same bytes differently, each piece preceded by the
+        unconsumed rest of the previous one, gives the same readings and counts.
+
+        Parameters
+        ----------
+        data : bytes
+        final : bool, optional
+            Whether no bytes follow.
+
+        Returns
+        -------
+        Parsed
         """
 
 
 class Chunk(NamedTuple):
-    """Bytes that came together."""
+    """Bytes that arrived together."""
 
     arrival_ns: int
-    """`time.monotonic_ns()` when they came."""
+    """`time.monotonic_ns()` at arrival."""
     data: bytes
     source: str = ''
-    """Where they came from, if the transport can tell: an MQTT topic, a UDP address."""
+    """Origin of the bytes, if the transport knows it: an MQTT topic, a UDP address."""
 
 
 class Transport(Protocol):
-    """Moves bytes. None of its methods is called before `open` or from two threads, but `close`."""
+    """Moves bytes.
+
+    No method except `close` is called before `open`, or from two threads at the same time.
+    """
 
     whole: bool
-    """Each chunk is a message of its own (a datagram), and no frame reaches into the next."""
+    """Whether each chunk is a complete message (a datagram), so that no frame spans two chunks."""
     counts: Counter[str]
-    """What was lost on the way, by cause ('messages dropped, queue full')."""
+    """Number of losses by cause, such as 'empty datagrams'."""
 
     def open(self) -> None:
-        """Open it; raises DeviceError that says what to do, and leaves nothing open then."""
+        """Open the connection.
+
+        Raises
+        ------
+        DeviceError
+            If it cannot be opened. The message states the remedy, and nothing remains open.
+        """
 
     def read(self, timeout_s: float) -> list[Chunk]:
-        """What has come, at once if something has; [] after `timeout_s` if nothing has.
+        """Return received data, without waiting if there is any.
 
-        Raises DeviceError where the connection is lost.
+        Parameters
+        ----------
+        timeout_s : float, s
+            Maximum time to wait for data.
+
+        Returns
+        -------
+        list of Chunk
+            Empty if nothing arrived in time.
+
+        Raises
+        ------
+        DeviceError
+            If the connection is lost.
         """
 
     def close(self) -> None:
-        """Close it; may be called twice, and before `open`."""
+        """Close the connection. May be called twice, and before `open`."""
 
 
 class Arrival(NamedTuple):
-    """A reading that came."""
+    """Reading with its time of arrival."""
 
     arrival_ns: int
-    """`time.monotonic_ns()` when it came."""
+    """`time.monotonic_ns()` at arrival."""
     reading: Reading
     source: str = ''
-    """As of its `Chunk`. What comes from one source is stamped by one clock."""
+    """Source of its `Chunk`. All readings of one source share one clock."""
 
 
 class Device(Protocol):
-    """Gives readings; otherwise as `Transport`."""
+    """Returns readings; otherwise like `Transport`."""
 
     @property
     def counts(self) -> Counter[str]:
-        """As `Transport.counts`."""
+        """Number of losses by cause."""
 
     def open(self) -> None:
-        """As `Transport.open`."""
+        """Open the device.
+
+        Raises
+        ------
+        DeviceError
+            If it cannot be opened. The message states the remedy, and nothing remains open.
+        """
 
     def read(self, timeout_s: float) -> list[Arrival]:
-        """As `Transport.read`."""
+        """Return received readings, without waiting if there are any.
+
+        Parameters
+        ----------
+        timeout_s : float, s
+            Maximum time to wait for a reading.
+
+        Returns
+        -------
+        list of Arrival
+            Empty if nothing arrived in time.
+
+        Raises
+        ------
+        DeviceError
+            If the connection is lost.
+        """
 
     def close(self) -> None:
-        """As `Transport.close`."""
+        """Close the device. May be called twice, and before `open`."""

@@ -1,6 +1,6 @@
-"""A simulated roadside: vehicles pass the sensors of a network, in real time, for ever.
+"""Simulated roadside: vehicles pass the sensors of a network in real time.
 
-For trying the whole chain without hardware, and for measuring what it costs.
+For trying the complete system without hardware, and for measuring its computational cost.
 """
 
 import bisect
@@ -21,37 +21,61 @@ from mag_tracking.settings import param
 from mag_tracking.simulation.scenario import Path, random_vehicle
 
 TICK_S = 1e-6
+"""Resolution of the simulated device clock."""
 MIN_WAIT_S = 1e-3
-"""As a port that is looked at so often."""
+"""Minimum waiting time, so that several readings arrive together, as from a polled port."""
 MAX_BACKLOG_S = 5.0
-"""What is older when it is asked for is lost, as in the buffer of a real device."""
+"""Readings older than this are lost when they are read, as in the buffer of a real device."""
 
 
 @dataclass(frozen=True)
 class SimulatorSettings:
     """Settings of the simulated roadside."""
 
-    network: str = param('', 'Path of the network.yaml whose sensors are simulated.')
-    rate_hz: float = param(100.0, 'Readings of each sensor a second.', 'Hz', (0.1, 10_000.0))
-    noise: float = param(1.2e-8, 'Standard deviation of the noise.', 'T', (0.0, 1e-3))
+    network: str = param('', 'Path of the network.yaml with the sensors to simulate.')
+    rate_hz: float = param(100.0, 'Sampling rate of each sensor.', 'Hz', (0.1, 10_000.0))
+    noise: float = param(1.2e-8, 'Standard deviation of the measurement noise.', 'T', (0.0, 1e-3))
     speed: float = param(10.0, 'Speed of the vehicles.', 'm/s', (0.01, 100.0))
-    heading_deg: float = param(0.0, 'Where they head; 0 = along x.', 'deg', (-360.0, 360.0))
+    heading_deg: float = param(0.0, 'Heading of the vehicles; 0 = along x.', 'deg', (-360.0, 360.0))
     offset: float = param(
-        0.0, 'How far to the left of the middle of the network they pass.', 'm', (-1e4, 1e4))
-    lead: float = param(60.0, 'How far before the first sensor they begin, and how far behind '
-                        'the last they end.', 'm', (0.0, 1e4))
-    period_s: float = param(30.0, 'A vehicle comes every so often, or when the one before it is '
-                            'gone, if that is later.', 's', (0.1, 86400.0))
+        0.0, 'Distance from the centre of the network at which the vehicles pass, positive to the '
+        'left.', 'm', (-1e4, 1e4))
+    lead: float = param(
+        60.0, 'Distance before the first and after the last sensor at which a pass begins and '
+        'ends.', 'm', (0.0, 1e4))
+    period_s: float = param(
+        30.0, 'Interval between vehicles. It is extended if a pass takes longer.', 's',
+        (0.1, 86400.0))
     moment: float = param(400.0, 'Magnetic moment of a vehicle.', 'A m^2', (0.0, 1e6))
     length: float = param(4.3, 'Length of a vehicle.', 'm', (0.1, 50.0))
     sequential: bool = param(
-        False, 'The sensors measure one after the other, evenly in the interval, as they do where '
-        'each runs by itself; else all at the same time.')
-    seed: int = param(1, 'Of the vehicle and of the noise.', '', (0, 2**31 - 1))
+        False, 'Whether the sensors measure one after the other, evenly spread over the sampling '
+        'interval, as free-running sensors do. Otherwise all measure at the same time.')
+    seed: int = param(1, 'Random seed of the vehicle and of the noise.', '', (0, 2**31 - 1))
 
 
 class SimulatedDevice:
-    """All sensors of a network as one device; see `reading.Device`. The field is in tesla."""
+    """All sensors of a network as one device, with the field in tesla. Implements `reading.Device`.
+
+    Parameters
+    ----------
+    settings : SimulatorSettings
+    monotonic_ns : callable, optional
+        Monotonic clock; tests replace it.
+    sleep : callable, optional
+
+    Attributes
+    ----------
+    counts : Counter
+        Number of lost readings.
+
+    Raises
+    ------
+    SettingsError
+        If no network is given, or if it has no Earth field.
+    NetworkError
+        If the network file is not valid.
+    """
 
     SETTINGS = SimulatorSettings
     CLOCK = {'tick_s': TICK_S}
@@ -59,12 +83,12 @@ class SimulatedDevice:
     def __init__(self, settings: SimulatorSettings,
                  monotonic_ns: Callable[[], int] = time.monotonic_ns,
                  sleep: Callable[[float], object] = time.sleep) -> None:
-        """Raises SettingsError or NetworkError where there is no usable network."""
         if not settings.network:
-            raise SettingsError('simulator: network: the path of a network.yaml is needed')
+            raise SettingsError('simulator: network: the path of a network.yaml is required')
         self._network = read_network(settings.network)
         if self._network.earth_field is None:
-            raise SettingsError(f'{settings.network} has no earth_field, which the simulator needs')
+            raise SettingsError(f'{settings.network}: earth_field is missing; the simulator '
+                                'requires it')
         self._earth_field: FloatArray = self._network.earth_field
         self.counts: Counter[str] = Counter()
         self._settings = settings
@@ -77,24 +101,39 @@ class SimulatedDevice:
                          / (len(self._network) * settings.rate_hz)).tolist()
 
     def open(self) -> None:
-        """Compute one pass, and begin."""
+        """Compute one pass, and start."""
         if self._table is None:
             self._table = self._one_pass()
             self._start_ns = self._monotonic_ns()
         self._next = math.ceil(self._elapsed() * self._settings.rate_hz) * len(self._network)
 
     def read(self, timeout_s: float) -> list[Arrival]:
-        """The readings that are due; waits for the next if none is."""
+        """Return the readings that are due; wait for the next one if none is.
+
+        Parameters
+        ----------
+        timeout_s : float, s
+            Maximum time to wait.
+
+        Returns
+        -------
+        list of Arrival
+
+        Raises
+        ------
+        DeviceError
+            If the device has not been opened.
+        """
         if self._table is None:
-            raise DeviceError('the simulator is not open')
+            raise DeviceError('the simulator is not open; call open() first')
         wait = self._due(self._next) - self._elapsed()
         if wait > 0.0:
-            # Not for each of a thousand in turn: what is there when one looks comes together.
+            # Waiting for each of a thousand readings separately would be too slow.
             self._sleep(min(max(wait, MIN_WAIT_S), timeout_s))
         elapsed, n = self._elapsed(), len(self._network)
         oldest = math.ceil((elapsed - MAX_BACKLOG_S) * self._settings.rate_hz) * n
         if oldest > self._next:
-            self.counts['readings lost, nobody took them'] += oldest - self._next
+            self.counts['readings dropped, not read in time'] += oldest - self._next
             self._next = oldest
         first, self._next = self._next, max(self._next, self._n_due(elapsed))
         while self._due(self._next) <= elapsed:
@@ -102,33 +141,33 @@ class SimulatedDevice:
         return self._readings(self._table, first, self._next)
 
     def close(self) -> None:
-        """There is nothing to close; time goes on."""
+        """Do nothing; the simulated time continues."""
 
     @property
     def _period_s(self) -> float:
-        """[s] From one vehicle to the next."""
+        """Interval between vehicles [s]."""
         return max(self._settings.period_s, self._passing_s)
 
     def _elapsed(self) -> float:
-        """[s] since the first `open`."""
+        """Time since the first `open` [s]."""
         return (self._monotonic_ns() - self._start_ns) / 1e9
 
     def _due(self, i: int) -> float:
-        """[s] When reading `i` is measured; the sensors take turns."""
+        """Time at which reading `i` is measured [s]; the sensors take turns."""
         index, j = divmod(i, len(self._network))
         return index / self._settings.rate_hz + self._shift_s[j]
 
     def _n_due(self, elapsed: float) -> int:
-        """How many readings have been measured; by rounding those of one interval fewer."""
+        """Number of readings measured so far; rounding may omit some of one interval."""
         whole = math.floor(elapsed * self._settings.rate_hz)
         return whole * len(self._network) + bisect.bisect_right(
             self._shift_s, elapsed - whole / self._settings.rate_hz)
 
     def _readings(self, table: FloatArray, first: int, end: int) -> list[Arrival]:
-        """The readings from `first` to before `end`."""
+        """Readings from `first` up to, but not including, `end`."""
         index, j = np.divmod(np.arange(first, end), len(self._network))
         due_s = index / self._settings.rate_hz + np.array(self._shift_s)[j]
-        # The table is that of the pass alone; before the next vehicle there is none.
+        # The table covers the pass only; its last row, without a vehicle, serves until the next.
         row = index % round(self._period_s * self._settings.rate_hz)
         B = table[np.minimum(row, len(table) - 1), j]
         B = B + self._settings.noise * self._rng.standard_normal(B.shape)
@@ -138,7 +177,7 @@ class SimulatedDevice:
                                       index.tolist(), j.tolist(), B.tolist(), strict=True)]
 
     def _one_pass(self) -> FloatArray:
-        """(n, n_sensors, 3) [T], sensor frames; the last row is without a vehicle."""
+        """Field during a pass, (n, n_sensors, 3) T, sensor frames; no vehicle in the last row."""
         s, network = self._settings, self._network
         t = np.arange(0.0, self._passing_s, 1.0 / s.rate_hz)
         body = random_vehicle(np.random.default_rng(s.seed), length=s.length, moment=s.moment)
@@ -152,7 +191,7 @@ class SimulatedDevice:
 
 
 def _path_along(network: SensorNetwork, settings: SimulatorSettings) -> tuple[Path, float]:
-    """The straight way past all sensors, and the seconds that it takes."""
+    """Straight path past all sensors, and its duration [s]."""
     heading = math.radians(settings.heading_deg)
     forward = np.array([math.cos(heading), math.sin(heading)])
     left = np.array([-forward[1], forward[0]])
@@ -161,5 +200,6 @@ def _path_along(network: SensorNetwork, settings: SimulatorSettings) -> tuple[Pa
     start = (along.min() - settings.lead) * forward + middle * left
     way = along.max() - along.min() + 2.0 * settings.lead
     if way <= 0.0:
-        raise SettingsError('simulator: lead: a way of length 0')
+        raise SettingsError('simulator: lead: the path past the sensors has length 0; increase '
+                            'lead')
     return Path(start, heading, settings.speed), way / settings.speed

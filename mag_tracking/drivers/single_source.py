@@ -1,40 +1,52 @@
-"""Selection of the source of a device's only sensor, where the drivers file does not name it."""
+"""Selection of the source of a device's only sensor, if the drivers file does not name it."""
 
 from typing import TypeAlias
 
 from mag_tracking.units import NS
 
-RELEASED_S = 5.0
-"""[s] A source that is silent for longer gives its place to another."""
+RELEASE_TIMEOUT_S = 5.0
+"""[s] Silence after which another source may be selected."""
 
 Source: TypeAlias = tuple[str, str]
-"""(the device's name of the sensor, address)."""
+"""(device's name of the sensor, address)."""
 
 
 class SingleSource:
-    """The source that is taken for the only sensor: two of them at once would be neither.
+    """Selects one of several sources as that of the only sensor.
 
-    It is the first that is heard, until it is silent: a stray message that came before the device
-    does not keep its place.
+    The first source is selected until it falls silent. A stray message received before the device
+    started therefore does not block the device.
 
     Attributes
     ----------
     changes : int
+        Number of times another source was selected.
     """
 
     def __init__(self) -> None:
         self.changes = 0
         self._source: Source | None = None
-        self._heard_ns = 0
+        self._last_receipt_ns = 0
 
-    def is_this(self, source: Source, now_ns: int) -> bool:
-        """Whether `source`, heard at `now_ns` (monotonic), is the sole source."""
+    def accepts(self, source: Source, now_ns: int) -> bool:
+        """Whether `source` is the selected source.
+
+        Parameters
+        ----------
+        source : Source
+        now_ns : int, ns
+            Monotonic time of arrival.
+
+        Returns
+        -------
+        bool
+        """
         if self._source is not None and self._source != source \
-                and now_ns - self._heard_ns > RELEASED_S * NS:
+                and now_ns - self._last_receipt_ns > RELEASE_TIMEOUT_S * NS:
             self.changes += 1
             self._source = None
         self._source = self._source or source
         if self._source != source:
             return False
-        self._heard_ns = now_ns
+        self._last_receipt_ns = now_ns
         return True

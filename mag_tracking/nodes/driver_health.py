@@ -9,7 +9,7 @@ from mag_tracking.drivers.driver import Driver
 from mag_tracking.nodes.stage_node import title_of
 from mag_tracking.nodes.status_log import StatusLog
 
-HARMLESS = ('samples: ', 'came late: ', 'other messages: ', 'lines that are comments',
+HARMLESS = ('samples: ', 'late arrivals: ', 'other messages: ', 'lines that are comments',
             'lines without the prefix', 'lines that are empty', 'retained messages skipped',
             'conversions overwritten', 'packets not used')
 """What begins so is counted, but nothing to be warned of."""
@@ -40,8 +40,8 @@ class DriverDiagnostics:
             message = 'not active'
         elif not served:
             level, message = DiagnosticStatus.ERROR, 'its thread has ended: start the node again'
-        elif driver.trouble:
-            level, message = DiagnosticStatus.ERROR, driver.trouble
+        elif driver.fault:
+            level, message = DiagnosticStatus.ERROR, driver.fault
         elif not driver.is_open:
             # It has no trouble, and some devices take seconds.
             message = 'opening'

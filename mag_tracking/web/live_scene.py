@@ -17,11 +17,11 @@ from mag_tracking.report.page_scene import Sensors, path_entry, scene_of
 from mag_tracking.units import NS
 from mag_tracking.web.live_track import LiveTrack
 
-KEPT_S = 600.0
+HISTORY_S = 600.0
 """[s] Tracks that ended earlier are removed."""
 MAX_POSES = 30_000
 """Maximum number of poses over all tracks; the oldest tracks are removed first."""
-MATCHING_FRAMES = 64
+MAX_FRAMES = 64
 """Number of recent frames kept for matching with tracks."""
 JUMP_BACK_S = 1.0
 """[s] A larger backward jump of frames starts a new scene, for example when a bag is looped."""
@@ -30,10 +30,17 @@ JUMP_BACK_S = 1.0
 class LiveScene:
     """Collects records and creates messages for the page. Thread-safe.
 
+    Parameters
+    ----------
+    title : str
+    network : Sensors
+
     Attributes
     ----------
-    title, subtitle : str
-        Sent with the next whole scene.
+    title : str
+        Title, sent with the next complete scene.
+    subtitle : str
+        Subtitle, sent with the next complete scene.
     """
 
     def __init__(self, title: str, network: Sensors) -> None:
@@ -47,7 +54,12 @@ class LiveScene:
         self._clear()
 
     def use_network(self, network: Sensors) -> None:
-        """Start a new scene with another network."""
+        """Start a new scene with another network.
+
+        Parameters
+        ----------
+        network : Sensors
+        """
         with self._lock:
             self._network = network
             self._clear()
@@ -59,25 +71,35 @@ class LiveScene:
         self._frames: OrderedDict[int, FieldFrame] = OrderedDict()
         self._is_frame_new = False
         self._tracks: dict[int, LiveTrack] = {}
-        # {number of a track: its latest `LiveTrack`}
+        # {track id: latest track with this id}
         self._latest: dict[int, LiveTrack] = {}
         self._is_new = True
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Add a frame; call it before `add_track` of the same time."""
+        """Add a frame; call it before `add_track` with the same timestamp.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+        """
         with self._lock:
-            # Frames only: the record of a track may be late, or repeat its last pose.
+            # Only frames are checked: the record of a track may be late or repeat its last pose.
             if self._frame_ns - frame.stamp_ns > JUMP_BACK_S * NS:
                 self._clear()
             self._frame_ns = frame.stamp_ns
-            self._note_time(frame.stamp_ns)
+            self._extend_time(frame.stamp_ns)
             self._frames[frame.stamp_ns] = frame
             self._is_frame_new = True
-            while len(self._frames) > MATCHING_FRAMES:
+            while len(self._frames) > MAX_FRAMES:
                 self._frames.popitem(last=False)
 
     def add_track(self, track: Track) -> None:
-        """Add a pose or the closing record of a track."""
+        """Add a pose or the closing record of a track.
+
+        Parameters
+        ----------
+        track : Track
+        """
         with self._lock:
             live = self._latest.get(track.id)
             if live is None or not live.continues(track):
@@ -86,18 +108,24 @@ class LiveScene:
                 self._n_tracks += 1
                 live = LiveTrack(self._n_tracks, track.id)
                 self._tracks[live.key] = self._latest[track.id] = live
-            self._note_time(track.stamp_ns)
+            self._extend_time(track.stamp_ns)
             live.add(track, self._frames.get(track.stamp_ns) or self._no_frame(track))
             self._forget()
 
     def _no_frame(self, track: Track) -> FieldFrame:
-        """Empty frame, used when the frame of a track was not received."""
+        """Empty frame, used if the frame of a track was not received."""
         n = len(self._network)
         return FieldFrame(track.stamp_ns, np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan),
                           np.zeros(n, dtype=int), np.zeros(n))
 
     def add_smoothed(self, track_id: int, points: FloatArray) -> None:
-        """Add the smoothed path (n, 3) [m] of an ended track."""
+        """Add the smoothed path of an ended track.
+
+        Parameters
+        ----------
+        track_id : int
+        points : (n, 3) array, m
+        """
         with self._lock:
             live = self._latest.get(track_id)
             if live is not None:
@@ -105,21 +133,39 @@ class LiveScene:
                 live.is_smoothed_new = True
 
     def set_health(self, notes: Iterable[Note], tables: Iterable[Table]) -> None:
-        """Replace the notes and tables of the page."""
+        """Replace the notes and tables of the page.
+
+        Parameters
+        ----------
+        notes : iterable of Note
+        tables : iterable of Table
+        """
         notes, tables = list(notes), list(tables)
         with self._lock:
             if (notes, tables) != (self._notes, self._tables):
                 self._notes, self._tables, self._is_health_new = notes, tables, True
 
     def whole(self) -> list[str]:
-        """JSON messages with everything sent so far, for a new viewer."""
+        """Messages with everything sent so far, for a new viewer.
+
+        Returns
+        -------
+        list of str
+            JSON messages.
+        """
         with self._lock:
             begin_ns = self._begin_ns or 0
             tracks = [live.sent(begin_ns) for live in self._tracks.values()]
             return [*self._scene([t for t in tracks if t is not None]), self._health()]
 
     def news(self) -> list[str]:
-        """JSON messages with everything new since the last call."""
+        """Messages with everything new since the last call.
+
+        Returns
+        -------
+        list of str
+            JSON messages.
+        """
         with self._lock:
             if self._is_new:
                 self._is_new = False
@@ -127,7 +173,7 @@ class LiveScene:
             out = [self._health()] if self._is_health_new else []
             self._is_health_new = False
             begin_ns, frame = self._begin_ns or 0, None
-            tracks = [live.news(begin_ns) for live in self._tracks.values() if live.is_news]
+            tracks = [live.news(begin_ns) for live in self._tracks.values() if live.has_unsent]
             smoothed = [live.smoothed for live in self._tracks.values() if live.is_smoothed_new]
             for live in self._tracks.values():
                 live.is_smoothed_new = False
@@ -156,8 +202,8 @@ class LiveScene:
         return json_text({'type': 'health', 'notes': [asdict(note) for note in self._notes],
                           'tables': [asdict(table) for table in self._tables]})
 
-    def _note_time(self, stamp_ns: int) -> None:
-        """Update begin and end of the scene."""
+    def _extend_time(self, stamp_ns: int) -> None:
+        """Extend the time range of the scene."""
         if self._begin_ns is None:
             self._begin_ns = stamp_ns
             # An empty scene that was sent before had no start time.
@@ -165,10 +211,10 @@ class LiveScene:
         self._end_ns = max(self._end_ns, stamp_ns)
 
     def _forget(self) -> None:
-        """Remove tracks that ended long ago, and the oldest ones if there are too many poses."""
+        """Remove tracks that ended long ago, and the oldest tracks if there are too many poses."""
         n = sum(len(live.log.stamp_ns) for live in self._tracks.values())
         for key, live in list(self._tracks.items())[:-1]:
-            old = (self._end_ns - live.end_ns) / NS > KEPT_S
+            old = (self._end_ns - live.end_ns) / NS > HISTORY_S
             if old or n > MAX_POSES:
                 n -= len(live.log.stamp_ns)
                 del self._tracks[key]

@@ -1,4 +1,4 @@
-"""Track of a live page, and how much of it the viewers have."""
+"""Track of a live page, and which part of it has been sent to the viewers."""
 
 from typing import Any
 
@@ -7,13 +7,13 @@ from mag_tracking.report.page_scene import facts_of, strongest_sensors, track_en
 from mag_tracking.report.track_log import TrackLog
 from mag_tracking.units import NS
 
-MAX_OF_TRACK, FORGOTTEN = 8_000, 1_000
-"""Maximum number of poses of one track, and how many are removed when it is exceeded. The page
-script uses the same numbers."""
+MAX_TRACK_POSES, N_REMOVED = 8_000, 1_000
+"""Maximum number of poses of one track, and number removed when it is exceeded. `scene.js` uses the
+same numbers."""
 MAX_GAP_S = 60.0
-"""[s] A pose after a longer gap belongs to another track of the same number."""
-RECENT = 100
-"""Number of latest poses that select the sensors whose fields are sent."""
+"""[s] A pose after a longer gap belongs to another track with the same id."""
+N_RECENT = 100
+"""Number of latest poses by which the sensors are selected whose fields are sent."""
 
 
 class LiveTrack:
@@ -22,16 +22,17 @@ class LiveTrack:
     Parameters
     ----------
     key : int
-        Unique on the page; the numbers of tracks are not, as a restarted tracker begins again at 1.
+        Unique on the page. Track ids are not, because a restarted tracker begins at 1 again.
     track_id : int
 
     Attributes
     ----------
+    key : int
     log : TrackLog
     smoothed : dict or None
-        Path of the smoothed track, as JSON.
+        Smoothed path, as JSON.
     is_smoothed_new : bool
-        The path was not sent yet.
+        Whether the smoothed path has not been sent yet.
     """
 
     def __init__(self, key: int, track_id: int) -> None:
@@ -42,38 +43,76 @@ class LiveTrack:
 
     @property
     def end_ns(self) -> int:
-        """[ns] Time of the latest pose."""
+        """Time of the latest pose [ns]."""
         return self.log.stamp_ns[-1]
 
     @property
-    def is_news(self) -> bool:
-        """True if there are poses, or an end, that were not sent yet."""
+    def has_unsent(self) -> bool:
+        """Whether there are poses, or an end, that have not been sent yet."""
         return self._sent < len(self.log.stamp_ns) or self.log.ended and not self._is_end_sent
 
     def continues(self, track: Track) -> bool:
-        """True if a pose belongs to this track."""
+        """Whether a pose belongs to this track.
+
+        Parameters
+        ----------
+        track : Track
+
+        Returns
+        -------
+        bool
+        """
         return not self.log.ended and abs(track.stamp_ns - self.end_ns) <= MAX_GAP_S * NS
 
     def add(self, track: Track, frame: FieldFrame) -> None:
-        """Add a pose; the oldest poses of a very long track are removed."""
+        """Add a pose. The oldest poses of a very long track are removed.
+
+        Parameters
+        ----------
+        track : Track
+        frame : FieldFrame
+            Frame with the same timestamp.
+        """
         self.log.add(track, frame)
-        if len(self.log.stamp_ns) > MAX_OF_TRACK:
-            self.log.forget(FORGOTTEN)
-            self._sent = max(0, self._sent - FORGOTTEN)
+        if len(self.log.stamp_ns) > MAX_TRACK_POSES:
+            self.log.forget(N_REMOVED)
+            self._sent = max(0, self._sent - N_REMOVED)
 
     def news(self, begin_ns: int) -> dict[str, Any]:
-        """JSON of what was not sent yet; it counts as sent from now on."""
+        """Entry with everything that has not been sent yet; it counts as sent from now on.
+
+        Parameters
+        ----------
+        begin_ns : int, ns
+            Start of the scene.
+
+        Returns
+        -------
+        dict
+            JSON.
+        """
         first, self._sent = self._sent, len(self.log.stamp_ns)
         self._is_end_sent = self.log.ended
         return self._entry(begin_ns, range(first, self._sent))
 
     def sent(self, begin_ns: int) -> dict[str, Any] | None:
-        """JSON of everything that was sent; None if there is nothing."""
+        """Entry with everything that has been sent.
+
+        Parameters
+        ----------
+        begin_ns : int, ns
+            Start of the scene.
+
+        Returns
+        -------
+        dict or None
+            JSON; None if nothing has been sent.
+        """
         return self._entry(begin_ns, range(self._sent)) if self._sent else None
 
     def _entry(self, begin_ns: int, rows: range) -> dict[str, Any]:
         """JSON of some poses, with the fields that were strongest during the latest of them."""
-        recent = range(max(0, rows.stop - max(RECENT, len(rows))), rows.stop)
+        recent = range(max(0, rows.stop - max(N_RECENT, len(rows))), rows.stop)
         entry = track_entry(self.log, begin_ns, strongest_sensors(self.log, recent), rows)
         entry['key'], entry['smoothed'] = self.key, self.smoothed
         if self.log.ended:

@@ -26,12 +26,14 @@ DEFAULT_PORT = 8765
 TICK_S = 0.05
 """[s] Interval between messages. A target at 50 km/h moves 0.7 m in this time."""
 MAX_BUFFERED = 1_000_000
-"""Send buffer of a viewer, in bytes. A viewer above it receives no messages until it is empty."""
-GIVE_UP_S = 20.0
+"""[bytes] Maximum size of a viewer's send buffer. A viewer that exceeds it receives no messages
+until the buffer is empty."""
+LAG_TIMEOUT_S = 20.0
 """[s] A lagging viewer whose buffer does not shrink for this time is disconnected."""
 MAX_VIEWERS = 100
 MAX_PORT = 65535
 START_S = 10.0
+"""[s] Maximum time to wait for the server thread to end."""
 PAGE, STREAM = '/', '/stream'
 LOG = getLogger('mag_tracking.web')
 
@@ -40,10 +42,20 @@ class Source(Protocol):
     """Source of the messages, such as a `LiveScene`."""
 
     def whole(self) -> list[str]:
-        """Messages that bring a new viewer up to date."""
+        """Messages that bring a new viewer up to date.
+
+        Returns
+        -------
+        list of str
+        """
 
     def news(self) -> list[str]:
-        """New messages for all viewers."""
+        """New messages for all viewers.
+
+        Returns
+        -------
+        list of str
+        """
 
 
 class PageServer:
@@ -51,34 +63,37 @@ class PageServer:
 
     Parameters
     ----------
-    source : LiveScene
-    host : str
+    source : Source
+    host : str, optional
         Local address to listen on. Addresses other than loopback require a token.
-    port : int
+    port : int, optional
         0 selects a free port.
 
     Attributes
     ----------
     url : str
         Address of the page, including the token if there is one.
-    n_viewers : int
-    n_behind : int
-        How many times a viewer lagged and had to wait.
+    port : int
+    n_lagged : int
+        Number of times a viewer lagged and had to wait.
 
-    Raises DeviceError where the port cannot be opened.
+    Raises
+    ------
+    DeviceError
+        If the port cannot be opened.
     """
 
     def __init__(self, source: Source, host: str = LOOPBACK, port: int = DEFAULT_PORT) -> None:
         self._source, self._host = source, host
         self._token = '' if is_loopback(host) else secrets.token_urlsafe(16)
         self._page = gzip.compress(live_html().encode('utf-8'), 6)
-        # {viewer: bytes that its buffer may hold}
+        # {viewer: permitted size of its buffer [bytes]}
         self._viewers: dict[ServerConnection, int] = {}
-        # {viewer: (time of the latest progress [s], bytes in its buffer then)}
-        self._behind: dict[ServerConnection, tuple[float, int]] = {}
+        # {viewer: (time of the latest progress [s], size of its buffer at that time [bytes])}
+        self._lagging: dict[ServerConnection, tuple[float, int]] = {}
         self._faults: set[str] = set()
-        self.n_behind = 0
-        self._socket = _listening(host, port)
+        self.n_lagged = 0
+        self._socket = _open_socket(host, port)
         self.port = int(self._socket.getsockname()[1])
         shown = _reachable_name(host)
         self.url = f'http://{shown}:{self.port}/' + (
@@ -90,13 +105,13 @@ class PageServer:
 
     @property
     def is_serving(self) -> bool:
-        """True until the server is closed or has failed."""
+        """Whether the server is running; false after `close` or a failure."""
         return self._thread.is_alive()
 
     @property
     def n_viewers(self) -> int:
         """Number of connected viewers."""
-        return len(self._viewers) + len(self._behind)
+        return len(self._viewers) + len(self._lagging)
 
     def close(self) -> None:
         """Disconnect all viewers and release the port."""
@@ -120,74 +135,74 @@ class PageServer:
 
     async def _serve(self) -> None:
         """Serve until `close` is called."""
-        # Malformed requests from the network must not fill the log.
+        # Malformed requests must not fill the log.
         LOG.addFilter(lambda record: record.msg != 'opening handshake failed')
-        # Compression would run separately for each viewer.
-        async with serve(self._look, sock=self._socket, process_request=self._answer,
-                         compression=None, max_size=1024, max_queue=4, logger=LOG,
-                         open_timeout=10.0, close_timeout=1.0, ping_interval=10.0,
-                         ping_timeout=60.0):
+        # Compression would be repeated for every viewer.
+        async with serve(self._handle_viewer, sock=self._socket,
+                         process_request=self._process_request, compression=None, max_size=1024,
+                         max_queue=4, logger=LOG, open_timeout=10.0, close_timeout=1.0,
+                         ping_interval=10.0, ping_timeout=60.0):
             while not self._stop.is_set():
-                self._tell()
+                self._send_updates()
                 try:
                     await asyncio.wait_for(self._stop.wait(), TICK_S)
                 except asyncio.TimeoutError:
                     continue
 
     def _messages(self, ask: Callable[[], list[str]]) -> list[str]:
-        """Messages of the source; a fault of it is logged once and shown on the page."""
+        """Messages of the source; an error is logged once and shown on the page."""
         try:
             return ask()
         except Exception as error:
-            # The page is an addition: a fault of it must end neither the server nor the nodes.
+            # The page is optional: an error in it must stop neither the server nor the nodes.
             text = f'{type(error).__name__}: {error}'
             if text not in self._faults:
                 self._faults.add(text)
-                LOG.exception('fault of the live page')
+                LOG.exception('error in the live page')
             return [json_text({'type': 'fault', 'text': text})]
 
-    def _tell(self) -> None:
-        """Send new messages to all viewers, and the whole scene to those that have caught up."""
-        if not self._viewers and not self._behind:
+    def _send_updates(self) -> None:
+        """Send new messages to all viewers, and the complete scene to those that have caught up."""
+        if not self._viewers and not self._lagging:
             return
         now = self._loop.time()
         for viewer, allowed in list(self._viewers.items()):
-            waiting = _waiting(viewer)
+            waiting = _buffered_bytes(viewer)
             if waiting > allowed:
                 del self._viewers[viewer]
-                self._behind[viewer] = now, waiting
-                self.n_behind += 1
+                self._lagging[viewer] = now, waiting
+                self.n_lagged += 1
             else:
-                # What a welcome may have left in the buffer is allowed until it has been sent.
+                # A complete scene may exceed MAX_BUFFERED; the excess is allowed until it is sent.
                 self._viewers[viewer] = max(MAX_BUFFERED, min(allowed, waiting + MAX_BUFFERED))
         for message in self._messages(self._source.news):
             broadcast(self._viewers, message)
-        for viewer, (since, least) in list(self._behind.items()):
-            waiting = _waiting(viewer)
+        for viewer, (since, least) in list(self._lagging.items()):
+            waiting = _buffered_bytes(viewer)
             if not waiting:
-                del self._behind[viewer]
-                self._welcome(viewer)
+                del self._lagging[viewer]
+                self._send_snapshot(viewer)
             elif waiting < least:
-                self._behind[viewer] = now, waiting
-            elif now - since > GIVE_UP_S:
-                del self._behind[viewer]
+                self._lagging[viewer] = now, waiting
+            elif now - since > LAG_TIMEOUT_S:
+                del self._lagging[viewer]
                 viewer.transport.abort()
 
-    def _welcome(self, viewer: ServerConnection) -> None:
-        """Send the whole scene to a viewer; new messages follow."""
-        # Pending messages go out first: they are part of the whole scene and must not be repeated.
+    def _send_snapshot(self, viewer: ServerConnection) -> None:
+        """Send the complete scene to a viewer; new messages follow."""
+        # Pending messages are sent first: the scene contains them, so they must not follow it.
         for message in self._messages(self._source.news):
             broadcast(self._viewers, message)
         for message in self._messages(self._source.whole):
             broadcast([viewer], message)
-        self._viewers[viewer] = _waiting(viewer) + MAX_BUFFERED
+        self._viewers[viewer] = _buffered_bytes(viewer) + MAX_BUFFERED
 
-    async def _look(self, viewer: ServerConnection) -> None:
+    async def _handle_viewer(self, viewer: ServerConnection) -> None:
         """Handle one connection until it closes; incoming messages are ignored."""
-        if len(self._viewers) + len(self._behind) >= MAX_VIEWERS:
+        if len(self._viewers) + len(self._lagging) >= MAX_VIEWERS:
             await viewer.close(1013, 'too many viewers')
             return
-        self._welcome(viewer)
+        self._send_snapshot(viewer)
         try:
             async for _ in viewer:
                 pass
@@ -195,9 +210,9 @@ class PageServer:
             pass
         finally:
             self._viewers.pop(viewer, None)
-            self._behind.pop(viewer, None)
+            self._lagging.pop(viewer, None)
 
-    def _answer(self, _: ServerConnection, request: Request) -> Response | None:
+    def _process_request(self, _: ServerConnection, request: Request) -> Response | None:
         """Response to an HTTP request; None accepts a WebSocket."""
         address = urlsplit(request.path)
         refusal = self._refusal(request, parse_qs(address.query).get('token', [''])[0])
@@ -211,7 +226,7 @@ class PageServer:
         return _response(HTTPStatus.OK, self._page, 'text/html', 'gzip')
 
     def _refusal(self, request: Request, token: str) -> str:
-        """Reason to refuse a request; empty if it is allowed."""
+        """Reason for refusing a request; empty if it is permitted."""
         host = request.headers.get('Host', '')
         if self._token:
             if not secrets.compare_digest(token.encode('utf-8'), self._token.encode('utf-8')):
@@ -233,12 +248,32 @@ def _reachable_name(host: str) -> str:
 
 
 def check_port(host: str, port: int) -> None:
-    """Raise DeviceError if the page cannot be served on this port."""
-    _listening(host, port).close()
+    """Check that the page can be served on a port.
+
+    Parameters
+    ----------
+    host : str
+    port : int
+
+    Raises
+    ------
+    DeviceError
+        If the port cannot be opened.
+    """
+    _open_socket(host, port).close()
 
 
 def is_loopback(host: str) -> bool:
-    """True if a host name or address is a loopback address."""
+    """Whether a host name or address is a loopback address.
+
+    Parameters
+    ----------
+    host : str
+
+    Returns
+    -------
+    bool
+    """
     if host == 'localhost':
         return True
     try:
@@ -255,12 +290,12 @@ def _host_name(host: str) -> str:
         return ''
 
 
-def _waiting(viewer: ServerConnection) -> int:
-    """Number of bytes in the send buffer of a viewer."""
+def _buffered_bytes(viewer: ServerConnection) -> int:
+    """Size of a viewer's send buffer [bytes]."""
     return viewer.transport.get_write_buffer_size()
 
 
-def _listening(host: str, port: int) -> socket.socket:
+def _open_socket(host: str, port: int) -> socket.socket:
     """Listening socket; raises DeviceError if it cannot be opened."""
     if not 0 <= port <= MAX_PORT:
         raise DeviceError(f'the live page cannot be served on port {port}: expected a number up '

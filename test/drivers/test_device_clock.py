@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from mag_tracking.drivers.device_clock import (
-    BACK,
-    FORWARD,
     LOST,
     NO_FIT,
     NO_TICKS,
-    OUTSIDE,
+    OUT_OF_RANGE,
     RESET,
+    STEP_BACK,
+    STEP_FORWARD,
     ArrivalClock,
     ClockSettings,
     DeviceClock,
@@ -291,8 +291,8 @@ def wait_of(rate):
 
 
 @pytest.mark.parametrize('change, cause, counter', [
-    (1.0, FORWARD, MHZ), (-1.0, BACK, MHZ), ('late', RESET, MHZ), ('at once', RESET, MHZ),
-    (1.0, FORWARD, SMALL), (-1.0, BACK, SMALL)])
+    (1.0, STEP_FORWARD, MHZ), (-1.0, STEP_BACK, MHZ), ('late', RESET, MHZ), ('at once', RESET, MHZ),
+    (1.0, STEP_FORWARD, SMALL), (-1.0, STEP_BACK, SMALL)])
 def test_a_clock_that_steps_begins_anew(change, cause, counter):
     ticks, arrival, t = simulate(counter=counter, ppm=50.0)
     after = t > 50.0
@@ -315,7 +315,7 @@ def test_a_clock_that_steps_begins_anew(change, cause, counter):
     assert np.abs(new[1000:]).max() * 1e-9 < law(2e-3, 100.0, 0.0, 10.0, 10.0, 12.0)
 
 
-@pytest.mark.parametrize('reset, cause', [(False, BACK), (True, RESET)])
+@pytest.mark.parametrize('reset, cause', [(False, STEP_BACK), (True, RESET)])
 def test_a_step_back_in_a_silence_is_taken_for_a_queue_at_first(reset, cause):
     """A counter that stood still for 0.3 s, or a small one that began anew."""
     ticks, arrival, t = simulate(counter=SMALL, first=3 if reset else 4_294_000_000)
@@ -367,7 +367,7 @@ def test_two_clocks_by_the_second_are_many_restarts_and_nothing_worse():
     ticks[t % 2.0 > 1.0] += 777_000_000
     clock = clock_of()
     stamps = stamps_of(clock, ticks % 2**32, arrival)
-    assert 150 <= clock.restarts.total() <= 199 and set(clock.restarts) == {FORWARD, BACK}
+    assert 150 <= clock.restarts.total() <= 199 and set(clock.restarts) == {STEP_FORWARD, STEP_BACK}
     assert np.isnan(stamps).sum() == clock.counts[NO_FIT] <= 200 * wait_of(100.0)
 
 
@@ -419,7 +419,7 @@ def test_a_step_in_a_minute_of_silence_is_a_step():
     ticks[out] += 70_000_000
     clock = clock_of()
     stamps_of(clock, ticks % 2**32, arrival)
-    assert clock.restarts == {FORWARD: 1}
+    assert clock.restarts == {STEP_FORWARD: 1}
 
 
 def test_three_device_times_confirm_a_new_clock_however_slow_it_is():
@@ -434,7 +434,7 @@ def test_three_device_times_confirm_a_new_clock_however_slow_it_is():
         if i in (59, 62):
             assert math.isnan(clock.stamp_std) == (i == 62)
     assert [i for i, s in enumerate(out) if s is None] == list(range(180, 186))
-    assert clock.restarts == {FORWARD: 1}
+    assert clock.restarts == {STEP_FORWARD: 1}
     assert clock.drift_ppm == pytest.approx(30_000.0, abs=0.1)
     assert out[-1] == START + round(1.03 * 990.0 * 1e9)
 
@@ -537,7 +537,7 @@ def test_a_line_that_becomes_quicker_is_believed(part):
     order = np.argsort(came, kind='stable')
     clock = clock_of(min_delay_s=2e-3)
     e = errors_of(stamps_of(clock, count[order] % 2**32, came[order]), t[order])
-    assert clock.restarts == {FORWARD: 1} and clock.counts[NO_FIT] <= wait_of(100.0)
+    assert clock.restarts == {STEP_FORWARD: 1} and clock.counts[NO_FIT] <= wait_of(100.0)
     assert np.abs(e[6000:]).max() < 1e3
 
 
@@ -566,7 +566,7 @@ def test_what_cannot_be_a_count_has_no_time():
     for ticks in (2**16, 1e9, -1, math.nan, math.inf, -math.inf):
         assert clock.stamp(ticks, START) is None
     assert clock.stamp(None, START) is None
-    assert clock.counts == {OUTSIDE: 6, NO_TICKS: 1} and not clock.restarts
+    assert clock.counts == {OUT_OF_RANGE: 6, NO_TICKS: 1} and not clock.restarts
     assert clock.stamp(2**16 - 1, START) == START
     assert clock_of(wrap=0).stamp(math.inf, START) is None
 
@@ -580,8 +580,8 @@ def test_without_a_counter_it_is_the_arrival():
 
 
 @pytest.mark.parametrize('changes, text', [
-    ({'min_step_s': 2.0, 'max_delay_s': 1.0}, 'min_step_s: 2 s is more than'),
-    ({'wrap': 256, 'tick_s': 1e-3}, 'wrap: the counter goes round in 0.256 s')])
+    ({'min_step_s': 2.0, 'max_delay_s': 1.0}, 'min_step_s: 2 s is longer than'),
+    ({'wrap': 256, 'tick_s': 1e-3}, 'wrap: the counter wraps every 0.256 s')])
 def test_settings_that_contradict_each_other_are_refused(changes, text):
     with pytest.raises(SettingsError, match=text):
         clock_of(**changes)

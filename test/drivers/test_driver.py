@@ -10,7 +10,7 @@ from mag_tracking.drivers.device_clock import ClockSettings
 from mag_tracking.drivers.driver import Driver, serve
 from mag_tracking.drivers.framed_device import FramedDevice
 from mag_tracking.drivers.reading import Arrival, Chunk, Parsed, Reading
-from mag_tracking.drivers.sequence import MEMORY, SequenceCheck
+from mag_tracking.drivers.sequence import MAX_REMEMBERED, SequenceCheck
 from mag_tracking.drivers.settings import DriverSettings
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.records import AccelerationSample
@@ -120,13 +120,13 @@ def test_a_lost_device_is_opened_again_with_back_off():
             times.append(machine.now_ns / 1e9)
             assert driver.is_open == (opened in (7, 9))
         if opened == 3:
-            assert driver.trouble == 'no port'
+            assert driver.fault == 'no port'
     waits = np.diff(times)
     # Twice as long each time, up to a second; from the beginning once something has come.
     np.testing.assert_allclose(waits[:6], [0.1, 0.2, 0.4, 0.8, 1.0, 1.0], atol=0.011)
     np.testing.assert_allclose(waits[6:], [0.1, 0.2], atol=0.011)
-    assert driver.trouble == ''
-    assert driver.counts()['openings that failed'] == 7
+    assert driver.fault == ''
+    assert driver.counts()['failed attempts to open'] == 7
     assert driver.counts()['connections lost'] == 1
     # What failed to open has been closed, too: it may hold half of what it needs.
     assert device.calls.count('close') == 8
@@ -148,7 +148,7 @@ def test_a_silent_device_is_opened_again():
     while device.calls.count('open') < 2:
         driver.poll(0.2)
     assert 3.0 <= (machine.now_ns - begin) / 1e9 <= 3.6
-    assert driver.counts()['silent, so opened again'] == 1
+    assert driver.counts()['reopened after silence'] == 1
     never, device, machine = driver_of([], {'silence_timeout_s': 0.0})
     for _ in range(1000):
         never.poll(0.2)
@@ -165,7 +165,7 @@ def test_steps_of_the_machines_clock_move_stamps_at_once_and_are_counted():
         stamps.append(said(driver, 0.1)[0].stamp_ns)
     assert stamps[1] - stamps[0] == pytest.approx(1_000_000, abs=2)
     assert stamps[2] - stamps[1] == pytest.approx(3_600_001_000_000, abs=2)
-    assert driver.counts()["steps of this machine's clock"] == 1
+    assert driver.counts()['steps of the host clock'] == 1
 
 
 def test_what_stamps():
@@ -189,7 +189,7 @@ def test_what_stamps():
     assert auto == by_arrival
     driver, mixed = stamps({}, [ticked[0], Reading('', field), ticked[2]])
     assert len(mixed) == 2
-    assert driver.counts()['readings without the time of the device'] == 1
+    assert driver.counts()['readings without a device time'] == 1
 
 
 def test_each_source_has_its_own_clock_and_its_name():
@@ -200,7 +200,7 @@ def test_each_source_has_its_own_clock_and_its_name():
     assert [(s.sensor, s.field[0]) for s in samples] == [('mag_1', 1.0), ('mag_2', 2.0)]
     assert samples[0].stamp_ns == samples[1].stamp_ns
     assert set(driver.clocks()) == {'road/a', 'road/b'}
-    assert driver.counts()['of unknown sensors: road/c'] == 1
+    assert driver.counts()['readings of unknown sensors: road/c'] == 1
     # The device's own name counts before the place that it sends from.
     driver, _, _ = driver_of([[(Reading('A', (1.0, 0.0, 0.0)), 'road/b')]],
                              sensors={'A': 'mag_1', 'road/b': 'mag_2'})
@@ -216,7 +216,7 @@ def test_errors_of_other_peoples_devices_are_trouble_like_any_other():
     driver, device, machine = driver_of([])
     driver.poll(0.01)
     driver.fail(ZeroDivisionError('division by zero'))
-    assert driver.trouble == 'ZeroDivisionError: division by zero' and not driver.is_open
+    assert driver.fault == 'ZeroDivisionError: division by zero' and not driver.is_open
     assert driver.counts()['errors'] == 1
     machine.now_ns += 200_000_000
     driver.poll(0.01)
@@ -232,7 +232,7 @@ def test_readings_are_gathered():
     driver, *_ = driver_of([script[0], DeviceError('gone'), DeviceError('gone')],
                            {'batch_s': 0.004})
     assert len(said(driver, 0.2)) == 1 and driver.is_open
-    assert said(driver, 0.2) == [] and driver.trouble == 'gone'
+    assert said(driver, 0.2) == [] and driver.fault == 'gone'
 
 
 def checked(numbers, wrap=0, values=None):
@@ -246,14 +246,14 @@ def test_losses_by_sequence_number():
     assert checked(range(5, 50)) == ([True] * 45, {})
     assert checked([0, 1, 5, 6, 16]) == ([True] * 5, {'lost': 3 + 9})
     # A late one was not lost, and is handed on.
-    assert checked([0, 1, 4, 2, 5]) == ([True] * 5, {'lost': 1, 'came late': 1})
+    assert checked([0, 1, 4, 2, 5]) == ([True] * 5, {'lost': 1, 'late arrivals': 1})
     assert checked([254, 255, 0, 1], wrap=256) == ([True] * 4, {})
-    assert checked([250, 3, 255], wrap=256) == ([True] * 3, {'lost': 7, 'came late': 1})
+    assert checked([250, 3, 255], wrap=256) == ([True] * 3, {'lost': 7, 'late arrivals': 1})
     assert checked([0, 300, -1], wrap=256)[1] == {'sequence numbers out of range': 2}
     assert checked([0, 1000, 1001])[1] == {'lost': 999}
     # One corrupt number is not a billion that were lost.
     assert checked([0, 1, 2**64 - 1, 2, 3]) == (
-        [True] * 5, {'sequence jumped': 1, 'sequence begun anew': 1})
+        [True] * 5, {'sequence jumps': 1, 'sequence restarts': 1})
 
 
 def test_duplicates_are_not_restarts():
@@ -263,21 +263,21 @@ def test_duplicates_are_not_restarts():
     # With other values the device has begun anew, near its beginning or far from it.
     for begin in (3, 500, 100_000):
         assert checked([begin, begin + 1, 0, 1, 2]) == (
-            [True] * 5, {'sequence begun anew': 1})
+            [True] * 5, {'sequence restarts': 1})
 
 
 def test_the_memory_of_a_sequence_is_bounded():
-    even = range(0, 100 * MEMORY, 2)
+    even = range(0, 100 * MAX_REMEMBERED, 2)
 
     def told_of(number):
         return checked([*even, number], values=[0] * (len(even) + 1))[1].keys() - {'lost'}
 
     # Of those that came and of those that did not.
     last = even[-1]
-    assert told_of(last - 2 * (MEMORY - 1)) == {'duplicates'}
-    assert told_of(last - 2 * MEMORY) == {'sequence begun anew'}
-    assert told_of(last - 1 - 2 * (MEMORY - 1)) == {'came late'}
-    assert told_of(last - 1 - 2 * MEMORY) == {'sequence begun anew'}
+    assert told_of(last - 2 * (MAX_REMEMBERED - 1)) == {'duplicates'}
+    assert told_of(last - 2 * MAX_REMEMBERED) == {'sequence restarts'}
+    assert told_of(last - 1 - 2 * (MAX_REMEMBERED - 1)) == {'late arrivals'}
+    assert told_of(last - 1 - 2 * MAX_REMEMBERED) == {'sequence restarts'}
 
 
 def test_a_reading_that_comes_twice_is_one():
@@ -288,7 +288,7 @@ def test_a_reading_that_comes_twice_is_one():
         [reading(1.0, 1), reading(1.0, 1), reading(2.0, 2), reading(2.0, 2, (0.0, 0.0, 9.8))]])
     assert [type(s) for s in said(driver, 0.1)] == [MagSample] * 3 + [AccelerationSample]
     counts = driver.counts()
-    assert (counts['duplicates: mag_1'], counts['sequence begun anew: mag_1']) == (1, 1)
+    assert (counts['duplicates: mag_1'], counts['sequence restarts: mag_1']) == (1, 1)
 
 
 def test_what_is_kept_by_the_thousand_is_not_looked_through_for_garbage():
@@ -297,9 +297,9 @@ def test_what_is_kept_by_the_thousand_is_not_looked_through_for_garbage():
     try:
         before = len(gc.get_objects())
         driver, *_ = driver_of([[Reading('', (float(k), 2.0, 3.0), (0.0, float(k), 9.8), sequence=k)
-                                 for k in range(MEMORY)]])
-        assert len(said(driver, 0.1)) == 2 * MEMORY
-        assert len(gc.get_objects()) - before < MEMORY // 4
+                                 for k in range(MAX_REMEMBERED)]])
+        assert len(said(driver, 0.1)) == 2 * MAX_REMEMBERED
+        assert len(gc.get_objects()) - before < MAX_REMEMBERED // 4
     finally:
         gc.enable()
 
@@ -318,14 +318,14 @@ def test_an_infinite_field_is_none_but_its_acceleration_is_one():
                              Reading('', (1.0, 2.0, 3.0))]])
     field, acceleration = said(driver, 0.1)
     assert field.field.tolist() == [1.0, 2.0, 3.0] and isinstance(acceleration, AccelerationSample)
-    assert driver.counts()['readings that are infinite in tesla'] == 1
+    assert driver.counts()['readings that overflow in tesla'] == 1
 
 
 def test_one_topic_is_of_one_sensor():
     driver, *_ = driver_of([[Reading('A', (1.0, 0.0, 0.0)), Reading('B', (2.0, 0.0, 0.0)),
                              Reading('A', (3.0, 0.0, 0.0))]])
     assert [s.field[0] for s in said(driver, 0.1)] == [1.0, 3.0]
-    assert driver.counts()['of unknown sensors: B'] == 1
+    assert driver.counts()['readings of unknown sensors: B'] == 1
 
 
 def test_a_sensor_that_is_not_used_is_no_news():
@@ -341,17 +341,17 @@ def test_unknown_names_do_not_pile_up():
     driver, *_ = driver_of([readings, [readings[0], readings[-1]]], sensors={'A': 'mag_1'})
     assert said(driver, 0.1) == []
     assert len(driver.counts()) == 21
-    assert driver.counts()['of unknown sensors (and others)'] == 980
+    assert driver.counts()['readings of unknown sensors (and others)'] == 980
     assert said(driver, 0.1) == []
-    assert len(driver.counts()) == 21 and driver.counts()['of unknown sensors: x0'] == 2
-    assert driver.counts()['of unknown sensors (and others)'] == 981
+    assert len(driver.counts()) == 21 and driver.counts()['readings of unknown sensors: x0'] == 2
+    assert driver.counts()['readings of unknown sensors (and others)'] == 981
 
 
 def test_a_reading_beyond_all_numbers_is_none():
     driver, *_ = driver_of([[Reading('', (1e308, 0.0, 0.0)), Reading('', (1.0, 0.0, 0.0))]],
                            {'unit': '1e10'})
     assert len(said(driver, 0.1)) == 1
-    assert driver.counts()['readings that are infinite in tesla'] == 1
+    assert driver.counts()['readings that overflow in tesla'] == 1
 
 
 def test_a_device_that_does_not_even_close_is_opened_again():
@@ -361,12 +361,12 @@ def test_a_device_that_does_not_even_close_is_opened_again():
         raise OSError('stuck')
     device.close = close
     driver.poll(0.1)
-    assert not driver.is_open and 'gone (and it does not close: OSError: stuck)' in driver.trouble
+    assert not driver.is_open and 'gone; closing failed as well: OSError: stuck' in driver.fault
     machine.now_ns += 10**9
     driver.poll(0.1)
-    assert driver.is_open and driver.counts()['closings that failed'] == 1
+    assert driver.is_open and driver.counts()['failed attempts to close'] == 1
     # What was wrong stays said until something has come.
-    assert driver.trouble
+    assert driver.fault
 
 
 def test_errors_behind_a_driver_are_not_the_devices():
@@ -380,7 +380,7 @@ def test_errors_behind_a_driver_are_not_the_devices():
             raise ValueError('nobody expected it')
     serve(driver, take, lambda: len(taken) == 3)
     assert device.calls == ['open', 'close']
-    assert driver.counts()['errors behind the driver: ValueError: nobody expected it'] == 1
+    assert driver.counts()['errors while processing readings: ValueError: nobody expected it'] == 1
 
 
 class Lines:
@@ -418,7 +418,7 @@ def test_frames_are_put_together_from_a_stream():
     # The connection is lost in the middle of a frame: its beginning fits no other end.
     device.open()
     assert [a.reading.field[0] for a in device.read(0.0)] == [4.0]
-    assert device.counts == {'dropped': 2, 'bytes of a frame that was cut off': 1}
+    assert device.counts == {'dropped': 2, 'bytes of truncated frames': 1}
 
 
 def test_messages_are_whole():

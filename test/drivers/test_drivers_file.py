@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
-from mag_tracking.drivers.configuration import KINDS, kind_of, read_drivers
+from mag_tracking.drivers.configuration import KINDS, load_class, read_drivers
 from mag_tracking.drivers.framed_device import FramedDevice
 from mag_tracking.drivers.transports.i2c import I2cDevice
 from mag_tracking.errors import SettingsError
@@ -61,9 +61,9 @@ def test_what_is_known_of_a_kind_need_not_be_said(tmp_path):
 
 
 @pytest.mark.parametrize('content, told', [
-    (without('framing'), 'board: there is no framing (one of text, json, binary, xsens)'),
-    (without('transport'), 'board: there is no transport (one of serial, udp, mqtt)'),
-    (without(device='i2c'), 'a device has no transport and no framing beside it'),
+    (without('framing'), 'board: framing is missing (one of text, json, binary, xsens)'),
+    (without('transport'), 'board: transport is missing (one of serial, udp, mqtt)'),
+    (without(device='i2c'), 'device excludes transport and framing'),
     (without(transport='carrier pigeon'), "transport: expected serial, udp, mqtt or package.mod"),
     (without(framing=['text']), 'framing: expected text'),
     (without(transport='no_such_module:Port'), "no_such_module:Port: ModuleNotFoundError: No"),
@@ -80,15 +80,15 @@ def test_what_is_known_of_a_kind_need_not_be_said(tmp_path):
     ('{"\\ud800": {}}', "'\\ud800' is not a device name: it contains a lone surrogate"),
     (without('sensor', sensors={'\ud800': 'a'}), "sensors: '\\ud800' is not a name"),
     (without(text={'fields': ['\udcff']}), "fields: '\\udcff' is not text"),
-    (without('sensor', sensors={'A': 3}), 'sensors: A: expected the name of a sensor (letters'),
-    (without('sensor', sensors={'1': 'a', 1: 'b'}), 'two of them have the same name'),
-    (without('sensor', sensors={1.1: 'a'}), 'sensors: 1.1 is no name; put it in quotes'),
-    (without('sensor', sensors={None: 'a'}), 'sensors: None is no name; put it in quotes'),
-    (without(sensor='mag 1'), 'expected the name of a sensor (letters, digits'),
+    (without('sensor', sensors={'A': 3}), 'sensors: A: expected a sensor name (letters'),
+    (without('sensor', sensors={'1': 'a', 1: 'b'}), 'the same name at the device appears twice'),
+    (without('sensor', sensors={1.1: 'a'}), 'sensors: 1.1 is not a name; put it in quotes'),
+    (without('sensor', sensors={None: 'a'}), 'sensors: None is not a name; put it in quotes'),
+    (without(sensor='mag 1'), 'expected a sensor name (letters, digits'),
     (without(framing='collections:OrderedDict'), 'OrderedDict has no SETTINGS, parse'),
     (without(framing='.x:Y'), 'framing: .x:Y: TypeError'),
-    (without('sensor', sensors={'A': 'a', 'B': 'a'}), 'sensor a comes from board (A) already'),
-    ({**without(), 'other': BOARD}, 'other: sensor mag_1 comes from board already'),
+    (without('sensor', sensors={'A': 'a', 'B': 'a'}), 'sensor a is already assigned to board (A)'),
+    ({**without(), 'other': BOARD}, 'other: sensor mag_1 is already assigned to board'),
     ({'board': 7}, 'board: expected a mapping of settings, got 7'),
     ('[1, 2]', 'expected a mapping of devices'), ('', 'expected a mapping of devices'),
     ('a: [', 'is not valid YAML'), ('a: 1\na: 2', 'duplicate key a')])
@@ -113,7 +113,7 @@ def test_a_file_that_is_not_there(tmp_path):
 
 @pytest.mark.parametrize('role, name', [(r, n) for r, kinds in KINDS.items() for n in kinds])
 def test_every_kind_is_there_and_says_its_settings(role, name):
-    assert kind_of(role, name).SETTINGS()
+    assert load_class(role, name).SETTINGS()
 
 
 class Counting:

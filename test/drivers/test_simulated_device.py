@@ -115,7 +115,7 @@ def test_what_nobody_took_in_time_is_lost_and_counted():
     gathered(device, 2)
     clock.sleep(MAX_BACKLOG_S + 10.0)
     first = device.read(0.1)[0].reading
-    lost = device.counts['readings lost, nobody took them']
+    lost = device.counts['readings dropped, not read in time']
     assert lost == 2 * (first.sequence - 1) == pytest.approx(2 * 500, abs=4)
 
 
@@ -138,7 +138,7 @@ def test_networks_that_cannot_be_simulated(tmp_path):
         SimulatedDevice(SimulatorSettings(network=str(tmp_path / 'none.yaml')))
     path = tmp_path / 'no_earth.yaml'
     path.write_text('sensors: {a: {position: [0, 0, 0]}}')
-    with pytest.raises(SettingsError, match='has no earth_field'):
+    with pytest.raises(SettingsError, match='earth_field is missing'):
         SimulatedDevice(SimulatorSettings(network=str(path)))
     with pytest.raises(SettingsError, match='length 0'):
         SimulatedDevice(SimulatorSettings(network=str(NETWORK_FILE), lead=0.0))
@@ -165,7 +165,7 @@ def test_listening_to_nothing_is_told(tmp_path, capsys):
     path = drivers_file(tmp_path, '{mag_1: mag_1, north: mag_2}')
     assert cli.main(['listen', str(path), '--seconds', '1']) == 1
     said = capsys.readouterr().out
-    assert 'of unknown sensors: mag_2' in said
+    assert 'readings of unknown sensors: mag_2' in said
     assert re.search(r'^  mag_2 +nothing$', said, re.M)
     assert cli.main(['listen', str(path), '--network', str(NETWORK_FILE), '--seconds', '0']) == 1
     assert '--seconds: 0 is not a number above 0' in capsys.readouterr().err

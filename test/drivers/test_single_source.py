@@ -1,6 +1,6 @@
 """Which source is taken for a device's only sensor."""
 
-from mag_tracking.drivers.single_source import RELEASED_S, SingleSource
+from mag_tracking.drivers.single_source import RELEASE_TIMEOUT_S, SingleSource
 
 DEVICE, STRAY = ('', '10.0.0.5'), ('', '10.0.0.66')
 S = 1_000_000_000
@@ -8,15 +8,16 @@ S = 1_000_000_000
 
 def test_a_stray_message_before_the_device_does_not_keep_its_place():
     source = SingleSource()
-    assert source.is_this(STRAY, 0)
+    assert source.accepts(STRAY, 0)
     times = [round((0.1 + 0.1 * k) * S) for k in range(100)]
-    accepted = [source.is_this(DEVICE, t) for t in times]
+    accepted = [source.accepts(DEVICE, t) for t in times]
     first = accepted.index(True)
-    assert all(accepted[first:]) and times[first] / S <= RELEASED_S + 0.2 and source.changes == 1
+    assert (all(accepted[first:]) and times[first] / S <= RELEASE_TIMEOUT_S + 0.2
+            and source.changes == 1)
     # Nor does one that comes while it sends.
-    assert not source.is_this(STRAY, times[-1] + 1) and source.is_this(DEVICE, times[-1] + 2)
+    assert not source.accepts(STRAY, times[-1] + 1) and source.accepts(DEVICE, times[-1] + 2)
 
 
 def test_a_slow_device_keeps_its_place_where_nobody_else_sends():
     source = SingleSource()
-    assert all(source.is_this(DEVICE, k * 60 * S) for k in range(5)) and source.changes == 0
+    assert all(source.accepts(DEVICE, k * 60 * S) for k in range(5)) and source.changes == 0

@@ -236,8 +236,8 @@ def test_readings_in_batches_reach_the_tracker(ros, tmp_path):
     (BOARD.replace('PORT', '/dev/null').replace('B: mag_2', 'B: mag_9'),
      'sensor mag_9 is not in the network'),
     (BOARD.replace('PORT', '/dev/null').replace('B: mag_2', 'B: mag_1'),
-     'sensor mag_1 comes from board'),
-    (BOARD.replace('PORT', '/dev/null').replace('  framing: text\n', ''), 'there is no framing'),
+     'sensor mag_1 is already assigned to board'),
+    (BOARD.replace('PORT', '/dev/null').replace('  framing: text\n', ''), 'framing is missing'),
     ('', 'expected a mapping of devices')])
 def test_a_drivers_file_that_is_none_ends_the_node(ros, tmp_path, content, told):
     drivers = tmp_path / 'drivers.yaml'

@@ -185,11 +185,11 @@ def test_two_boards_of_one_name(here):
     here.use('mqtt')
     asked = time.time_ns()
     assert here.wait(lambda: here.told(asked, 'driver_node: mqtt'))
-    assert not here.told(0, 'driver_node: mqtt', 'begun anew')
+    assert not here.told(0, 'driver_node: mqtt', 'sequence restarts')
     began = time.time_ns()
     here.roadside.twin = True
     # By its count, and by its clock, which keeps what it says from being used.
-    for words in ('begun anew: mag_1', 'fit no clock'):
+    for words in ('sequence restarts: mag_1', 'do not fit the clock'):
         assert here.wait(lambda words=words: here.told(
             began, 'driver_node: mqtt', words)), words
     here.roadside.twin = False

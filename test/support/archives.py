@@ -13,7 +13,7 @@ NAMES = ('straight_car_right', 'straight_small_left', 'junction_left_to_right')
 
 
 def archive_recordings(folder):
-    """The folder with three recordings, one in a folder below, and one that is none."""
+    """Folder with three recordings, one of them in a subfolder, and a file that is no recording."""
     (folder / 'below').mkdir()
     for name in NAMES:
         shutil.copy(vehicle_path(name), folder / ('below' if 'junction' in name else '.'))
@@ -23,30 +23,30 @@ def archive_recordings(folder):
 
 
 def rows(folder, table):
-    """All rows of a table, in order."""
-    # DuckDB needs another library for times with a zone.
+    """All rows of a table, sorted."""
+    # DuckDB requires another library for times with a time zone.
     columns = [c.name for c in TABLES[table] if c.kind != 't']
     files = folder / ('recordings.parquet' if table == 'recordings' else f'{table}/**/*.parquet')
-    # Of equal names and stamps the number decides.
+    # Rows with equal names and timestamps are sorted by number.
     order = [n for n in ('source', 'track_id', 'number', 'stamp_ns', 'sensor') if n in columns]
     return duckdb.sql(f"SELECT {', '.join(columns)} FROM read_parquet('{files}') "
                       f"ORDER BY {', '.join(order)}").fetchall()
 
 
 def same_tables(a, b):
-    """Whether two archives have the same rows; NULL is no NaN."""
+    """Whether two archives have the same rows; NULL differs from NaN."""
     return all(rows(a, table) == rows(b, table) for table in TABLES)
 
 
 def command(recordings, out, folder, *options):
-    """The command with fast settings."""
+    """The archive command with fast settings."""
     return [sys.executable, '-m', 'mag_tracking.cli', 'archive', str(recordings), '--network',
             str(NETWORK_FILE), '--params', str(parameter_file(folder / 'quick.yaml', QUICK)),
             '--out', str(out), *options]
 
 
 def wait_for(condition, seconds=120.0):
-    """Wait until it holds."""
+    """Wait until a condition holds."""
     until = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < until

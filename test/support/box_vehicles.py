@@ -1,10 +1,9 @@
-"""The second vehicle simulator: uniformly magnetised boxes and plates, by magpylib.
+"""Second vehicle simulator: uniformly magnetised boxes and plates, computed by magpylib.
 
-Where the first one scatters magnetised points, this one builds a body of sheets, an engine,
-axles and frame rails, each a cuboid with a permanent magnetisation and an induced one that
-depends on its shape: a sheet is magnetised in its plane, an axle along itself. Its driver brakes
-and swerves, and its sensors have errors of gain. Nothing of it was tuned to what our models can
-describe.
+The first simulator scatters magnetised points. This one builds a body of sheets, an engine, axles
+and frame rails. Each is a cuboid with a permanent magnetisation and an induced one that depends on
+its shape: a sheet is magnetised in its plane, an axle along its length. The driver brakes and
+swerves, and the sensors have gain errors. Nothing was tuned to the tracker's models.
 """
 
 from dataclasses import dataclass
@@ -17,32 +16,32 @@ from mag_tracking.simulation.scenario import Imperfections, Path, body_axes
 from support.passes import EARTH
 
 BOUGHT = Imperfections(noise_std=1.2e-8, tilt_std=np.deg2rad(1.0), gain_std=0.01)
-"""Sensors as they are bought, mounted with care."""
+"""Uncalibrated sensors, mounted with care."""
 
 SHEET = 0.01
-"""[m], thickness of a sheet; the field outside hardly depends on it."""
+"""[m] Thickness of a sheet; the field outside hardly depends on it."""
 
 CHI = 60.0
-"""Apparent susceptibility of iron that no shape demagnetises: parts are not of one piece."""
+"""Apparent susceptibility of iron without demagnetisation; low, because parts have gaps."""
 
 
 @dataclass(frozen=True)
 class BoxVehicle:
-    """Cuboids in a body frame (x forward, z up), origin on the ground below the middle."""
+    """Cuboids in a body frame (x forward, z up) with its origin on the ground below the centre."""
 
     centres: np.ndarray
     """(n, 3) [m]."""
     sides: np.ndarray
     """(n, 3) [m]."""
     permanent: np.ndarray
-    """(n, 3) [A m^2]."""
+    """(n, 3) [A m²]."""
     induced: np.ndarray
-    """(n, 3) [m^3]: induced moment = induced * B0 / mu0, body frame."""
+    """(n, 3) [m³]: induced moment = induced * B0 / mu0, body frame."""
     length: float
     """[m]."""
 
     def moments(self, B_body):
-        """(k, n, 3) [A m^2] in ambient fields (k, 3) [T] of the body frame."""
+        """(k, n, 3) [A m²] in ambient fields (k, 3) [T], body frame."""
         return self.permanent + self.induced * B_body[:, None] / MU0
 
     def field(self, earth_field, position, heading, points):
@@ -62,15 +61,13 @@ class BoxVehicle:
 
 
 def magnetised(rng, parts, length, moment):
-    """A `BoxVehicle` of [(centre, sides, weight)] with a whole moment of `moment` [A m^2].
-
-    That is what real ones were found to have (TSP14 Table V), heading along x in the field of
-    `support.passes.EARTH`; the permanent and the induced part are about `moment` / 1.4 each.
-    """
+    """`BoxVehicle` of [(centre, sides, weight)] with a total moment of `moment` [A m²]."""
+    # Total moments are as measured on real vehicles (TSP14 Table V), heading along x in `EARTH`.
+    # The permanent and the induced part are about `moment` / 1.4 each.
     centres, sides, weights = (np.array(column, dtype=float) for column in zip(*parts, strict=True))
     share = weights * rng.lognormal(0.0, 0.4, len(weights))
     share /= share.sum()
-    # Roughly: the longer a side, the less the poles at its ends are felt.
+    # Approximation: the longer a side, the weaker the demagnetisation by the poles at its ends.
     N = (1.0 / sides) / (1.0 / sides).sum(axis=1, keepdims=True)
     easy = 1.0 / (N + 1.0 / CHI)
     easy *= share[:, None] / easy.mean(axis=1, keepdims=True)
@@ -80,14 +77,14 @@ def magnetised(rng, parts, length, moment):
         along = common / np.linalg.norm(common) + 0.6 * rng.standard_normal((len(share), 3))
         permanent = share[:, None] * along * moment / 1.4
         whole = np.linalg.norm((permanent + induced * EARTH / MU0).sum(axis=0))
-        # Where the two parts nearly cancel each other, scaling them up would not be a vehicle.
+        # If the two parts nearly cancel, scaling them up would not give a realistic vehicle.
         if whole > 0.6 * moment:
             return BoxVehicle(centres, sides, permanent * moment / whole,
                               induced * moment / whole, length)
 
 
 def box_car(rng, length=None, moment=None):
-    """A car: floor, roof, bonnet, boot, sides, engine, two axles."""
+    """Car: floor, roof, bonnet, boot, sides, engine, two axles."""
     length = rng.uniform(3.6, 4.8) if length is None else length
     width, height = rng.uniform(1.55, 1.85), rng.uniform(1.35, 1.7)
     rear = 1.0 if rng.random() < 0.85 else -1.0
@@ -102,7 +99,7 @@ def box_car(rng, length=None, moment=None):
 
 
 def box_truck(rng, length=None, moment=None):
-    """A truck: frame rails, cab, engine, axles; a bed, a steel box or a load somewhere on it."""
+    """Truck: frame rails, cab, engine, axles; a bed, a steel box or a load at a random position."""
     length = rng.uniform(7.0, 16.0) if length is None else length
     width, front = rng.uniform(2.3, 2.55), 0.5 * length
     parts = [((0.0, side * 0.4, 0.85), (0.95 * length, 0.08, 0.25), 2.0) for side in (-1, 1)]
@@ -127,31 +124,31 @@ def box_truck(rng, length=None, moment=None):
 
 @dataclass(frozen=True)
 class Drive:
-    """A course along a `Path` whose driver changes speed once and swerves once."""
+    """Course along a `Path` on which the speed changes once and the vehicle swerves once."""
 
     path: Path
     change: float = 0.0
-    """Of the speed, as a share; negative = brakes."""
+    """Relative change of the speed; negative = braking."""
     change_at: float = 0.0
-    """[s], the middle of the change."""
+    """[s] Middle of the change."""
     change_s: float = 2.0
-    """[s] that the change lasts, roughly."""
+    """[s] Approximate duration of the change."""
     aside: float = 0.0
-    """[m] to the left that the vehicle swerves and comes back."""
+    """[m] Lateral displacement of the swerve, positive to the left."""
     aside_at: float = 0.0
-    """[s]."""
+    """[s] Middle of the swerve."""
     aside_s: float = 2.0
-    """[s] that it lasts, roughly."""
+    """[s] Approximate duration of the swerve."""
 
     def _on_path(self, t):
-        """Time (n,) on the `Path`: the way over the speed at the beginning."""
+        """Time (n,) on the `Path`: travelled distance over the initial speed."""
         width = self.change_s / 4.0
         z, z0 = (t - self.change_at) / width, -self.change_at / width
-        # The integral of a logistic step.
+        # Integral of a logistic step.
         return t + self.change * width * (np.logaddexp(0.0, z) - np.logaddexp(0.0, z0))
 
     def speed(self, t):
-        """[m/s] along the path at times (n,)."""
+        """Speed along the path [m/s] at times (n,)."""
         z = (np.asarray(t, dtype=float) - self.change_at) / (self.change_s / 4.0)
         return self.path.speed * (1.0 + self.change / (1.0 + np.exp(-z)))
 
@@ -167,7 +164,7 @@ class Drive:
 
 
 def random_drive(rng, path, at):
-    """A `Drive`: up to a fifth slower or a tenth faster, up to 0.4 m aside, around a time [s]."""
+    """`Drive`: up to 20 % slower or 10 % faster, up to 0.4 m aside, around a time [s]."""
     return Drive(path, change=rng.uniform(-0.2, 0.1), change_at=at + rng.uniform(-2.0, 2.0),
                  change_s=rng.uniform(1.5, 4.0), aside=rng.uniform(-0.4, 0.4),
                  aside_at=at + rng.uniform(-2.0, 2.0), aside_s=rng.uniform(1.5, 4.0))

@@ -1,4 +1,4 @@
-"""Headless Chromium, as people open a page, for tests."""
+"""Headless Chromium for tests of pages."""
 
 import contextlib
 import shutil
@@ -10,7 +10,7 @@ NAMES = ('chromium', 'chromium-browser', 'google-chrome', 'chrome')
 
 
 def chromium():
-    """The path of a browser, or None."""
+    """Path of a browser, or None."""
     return next(filter(None, map(shutil.which, NAMES)), None)
 
 
@@ -19,12 +19,12 @@ needs_browser = pytest.mark.skipif(chromium() is None, reason='there is no Chrom
 
 @contextlib.contextmanager
 def browser():
-    """A browser of Playwright."""
+    """Playwright browser."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        # In a container root may not make a sandbox; the pages are our own.
-        # Its shared memory is small there, too.
+        # In a container, root cannot create a sandbox, and shared memory is small. The pages are
+        # trusted.
         found = playwright.chromium.launch(executable_path=chromium(), args=[
             '--no-sandbox', '--disable-dev-shm-usage'])
         try:
@@ -34,7 +34,7 @@ def browser():
 
 
 class Page:
-    """A page, and what its console has said."""
+    """Page, with the messages of its console."""
 
     def __init__(self, browser, url, **options):
         self.page = browser.new_page(**options)
@@ -54,17 +54,15 @@ class Page:
         return self.page.evaluate(expression)
 
     def wait(self, expression, seconds=60.0):
-        """Wait until JavaScript gives something true.
-
-        Playwright's own function to wait evaluates text, which the page does not allow.
-        """
+        """Wait until a JavaScript expression is true."""
+        # Playwright's own wait function uses `eval`, which the page's security policy forbids.
         end = time.monotonic() + seconds
         while not self.value(expression):
             assert time.monotonic() < end, f'{expression} has not become true'
             self.page.wait_for_timeout(20)
 
     def move_slider(self, t):
-        """Move it as a hand does, and wait until that is drawn."""
+        """Move the slider as a user does, and wait until the page is redrawn."""
         drawn = self.value('magTracking.drawn')
         self.page.evaluate(
             't => { const s = document.getElementById("slider"); s.value = t;'
@@ -78,7 +76,7 @@ class Page:
             return pose ? [pose.x[0], pose.y[0]] : null; })()''')
 
     def lines(self):
-        """The times at which the curves have their lines."""
+        """Times of the time lines of the plots."""
         return self.value('''[...document.querySelectorAll('#field .plot'),
             ...['weights', 'innovation', 'speed'].map(id => document.getElementById(id))]
             .map(plot => plot.layout.shapes[0].x0)''')

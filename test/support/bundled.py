@@ -1,4 +1,4 @@
-"""Where the bundled recordings are, and settings that several tests use."""
+"""Paths of the bundled recordings, and settings that several tests use."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ POINT = {f'track.vehicle.{name}': [value] for name, value in {
     'kinds': 'car', 'lengths': 0.0, 'length_stds': 0.0, 'moments': 400.0, 'moment_stds': 150.0,
     'difference_stds': 0.0, 'heights': 0.5, 'height_stds': 0.2,
     'near_field_lengths': 1.0}.items()} | {'track.vehicle.turn_acceleration': 0.0}
-"""Settings of a tracker that knows only point targets which go straight on."""
+"""Settings of a tracker that knows only point targets on straight paths."""
 LINEARISED_ONCE = {'track.relinearise_window_s': 0.0}
 """Settings without relinearisation, which takes most of the computing time."""
 QUICK = POINT | LINEARISED_ONCE
@@ -22,7 +22,7 @@ that do not check tracking itself."""
 
 
 def parameter_file(path, changes):
-    """Write `changes` ({dotted name: value}) as a parameter file; returns its path."""
+    """Write `changes` ({dotted name: value}) as a parameter file; return its path."""
     content = {}
     for name, value in changes.items():
         *groups, last = name.split('.')

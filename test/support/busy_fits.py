@@ -1,4 +1,4 @@
-"""Batch fits of several vehicles at once, and which vehicle each is of."""
+"""Batch fits of several vehicles at once, and their assignment to vehicles."""
 
 from typing import NamedTuple
 
@@ -13,18 +13,18 @@ from support.busy_recordings import BUSY, network_of_recording
 
 ORDERS = (1, 2, 3, 4)
 FAR_M = 8.0
-"""[m] A fit that is farther from a vehicle is of another one."""
+"""[m] A fit at a larger distance from a vehicle belongs to another one."""
 
 
 class OfVehicle(NamedTuple):
-    """A fit, and the vehicle that it is of."""
+    """Fit, and the vehicle it belongs to."""
 
     one: FittedPass
     vehicle: int
     speed: float
-    """[m/s] of the vehicle, where its field is strongest."""
+    """[m/s] Speed of the vehicle where its field is strongest."""
     error: float
-    """[m] of the fit there, horizontally, along the middle of the vehicle."""
+    """[m] Horizontal error of the fit there, along the centre line of the vehicle."""
 
 
 def fits_of_world(a_world, orders=ORDERS):
@@ -44,10 +44,7 @@ def fits_of_recording(name, folder=BUSY, orders=ORDERS):
 
 
 def with_vehicles(passes, vehicles):
-    """[OfVehicle] of the fits with an answer; each vehicle once.
-
-    `vehicles` are (t (n,) [s], positions (n, 2) [m]).
-    """
+    """[OfVehicle] of the fits with a result, for vehicles [(t (n,) [s], positions (n, 2) [m])]."""
     candidates = []
     for i, one in enumerate(passes):
         fit = one.chosen

@@ -1,6 +1,6 @@
-"""The recordings of several vehicles at once, tracked, and how well each vehicle is followed.
+"""Tracking of the recordings with several vehicles at once, compared with the true vehicles.
 
-Those in `test/data/busy` are some of nine; `folder` takes the others.
+`test/data/busy` contains some of nine recordings; `folder` selects others.
 """
 
 import json
@@ -25,18 +25,18 @@ NAMES = tuple(sorted(p.name.removesuffix('.truth.json') for p in BUSY.glob('*.tr
 
 
 class TrackedRecording(NamedTuple):
-    """What came of a recording."""
+    """Results of a recording."""
 
     score: Score
     poses: list[Track]
     pipeline: Pipeline
     smoothed: list[SmoothedPose]
-    """Of complete tracks."""
+    """Poses of complete tracks."""
     passages: list[VehiclePassage]
 
 
 def network_of_recording(name, folder=BUSY):
-    """What an installer would know."""
+    """Network as an installer would describe it."""
     truth = json.loads((folder / f'{name}.truth.json').read_text())
     return replace(network_of(truth['sensors_m']),
                    earth_field=np.array(truth['earth_field_T']))
@@ -60,8 +60,7 @@ def tracked_recording(name, folder=BUSY, changes=None):
 
 
 def rightly_counted(name, passages, folder=BUSY):
-    """[(passage, vehicle)] of the passages that are within a second of a vehicle of the truth, in
-    its direction; each vehicle once."""
+    """[(passage, vehicle)] of passages within 1 s of a true vehicle in the same direction."""
     truth, out = json.loads((folder / f'{name}.truth.json').read_text()), []
     left = list(truth['vehicles'])
     for p in passages:

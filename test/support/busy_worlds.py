@@ -1,7 +1,7 @@
-"""Worlds of several vehicles at once, and how well tracks follow each of them.
+"""Worlds with several vehicles at once, and a score of the tracks of each vehicle.
 
-The traffic is like that of the bundled recordings (meeting, following, free), the vehicles and
-sensors are not: boxes with spinning wheels, drivers who brake and swerve, gain errors.
+The traffic resembles that of the bundled recordings (meeting, following, free). The vehicles and
+sensors differ: boxes with spinning wheels, drivers who brake and swerve, gain errors.
 """
 
 from dataclasses import dataclass
@@ -24,19 +24,19 @@ NETWORKS = {
     8: network_of([[6.0 * k - 21.0, 5.5 * (-1.0)**k, 0.0] for k in range(8)])}
 LEAD_S, RATE = 12.0, 50.0
 NEAR_M = 8.0
-"""[m] The error of a track is that within this distance of the origin."""
+"""[m] Errors of a track are evaluated within this distance of the origin."""
 LANE_M = 1.75
 TRUCKS = 0.1
-"""Share of the vehicles that are long."""
+"""Share of long vehicles."""
 
 
 @dataclass(frozen=True)
 class OnWheels:
-    """A body with a steel belt in each of four tyres, which turns as it rolls."""
+    """Body with a steel belt in each of four tyres, which rotates as the vehicle moves."""
 
     body: object
     moments: np.ndarray
-    """(4, 2) [A m^2] across the axle, in the plane of the wheel."""
+    """(4, 2) [A m²] across the axle and in the plane of the wheel."""
     radius: float = 0.3
 
     def field(self, earth_field, position, heading, points):
@@ -59,13 +59,13 @@ class OnWheels:
 
 
 def vehicle(rng, simulator, trucks=TRUCKS):
-    """A car, or a truck in this share of cases; of boxes it rolls on wheels."""
+    """Car, or truck with probability `trucks`; a vehicle of boxes has rolling wheels."""
     body = (truck if rng.random() < trucks else car)(rng, simulator)
     return OnWheels(body, rng.normal(0.0, 2.0, (4, 2))) if simulator == 'boxes' else body
 
 
 def passing(rng, simulator, at_s, direction, speed, trucks=TRUCKS):
-    """(body, course) of a vehicle that is at the origin at a time [s]."""
+    """(body, course) of a vehicle that passes the origin at a time [s]."""
     lane = -direction * (LANE_M + rng.uniform(-0.3, 0.3))
     path = Path(np.array([-direction * speed * at_s, lane]), 0.0 if direction > 0 else np.pi, speed)
     body = vehicle(rng, simulator, trucks)
@@ -83,16 +83,13 @@ def pair(rng, how, at_s):
 
 
 def busy(how, n_sensors, simulator, seed, n=4, trucks=TRUCKS):
-    """`World` of `n` pairs that are 'meeting' or 'following', or of 3 `n` vehicles in 'traffic'.
-
-    `trucks` is the share of long vehicles.
-    """
+    """`World` of `n` pairs 'meeting' or 'following', or of 3 `n` vehicles in 'traffic'."""
     rng = np.random.default_rng([seed, n_sensors, len(how), len(simulator)])
     if how == 'traffic':
         times = LEAD_S + np.cumsum(rng.exponential(3.0, 3 * n))
         plan = [(t, int(rng.choice([-1, 1])), rng.uniform(8.0, 20.0)) for t in times]
         plan = [p for k, p in enumerate(plan) if not any(
-            # One does not drive through another in its lane.
+            # Vehicles do not drive through others in the same lane.
             q[1] == p[1] and (p[0] - q[0]) * min(p[2], q[2]) < 14.0 for q in plan[:k])]
     else:
         plan = [p for k in range(n) for p in pair(rng, how, LEAD_S + 14.0 * k)]
@@ -103,20 +100,20 @@ def busy(how, n_sensors, simulator, seed, n=4, trucks=TRUCKS):
 
 @dataclass(frozen=True)
 class Score:
-    """How a set of tracks follows a set of vehicles."""
+    """Agreement of a set of tracks with a set of vehicles."""
 
     rms: np.ndarray
-    """(n_vehicles,) [m] within `NEAR_M` of the origin; NaN of one without a track."""
+    """(n_vehicles,) [m] within `NEAR_M` of the origin; NaN without a track."""
     nees: np.ndarray
-    """(n_vehicles,) median, of two degrees of freedom; NaN where there is no track."""
+    """(n_vehicles,) Median, two degrees of freedom; NaN without a track."""
     is_found: np.ndarray
-    """(n_vehicles,) its track goes the right way."""
+    """(n_vehicles,) Whether the track has the right direction."""
     n_extra: int
-    """Tracks that belong to nobody."""
+    """Tracks that belong to no vehicle."""
     n_sure: int
-    """Poses without a flag."""
+    """Unflagged poses."""
     n_wrong: int
-    """Of them wrong about every vehicle."""
+    """Unflagged poses that are wrong for every vehicle."""
 
     def __str__(self):
         return (f'found {self.is_found.sum()} of {len(self.rms)}, RMS {np.nanmedian(self.rms):.2f} '
@@ -125,18 +122,11 @@ class Score:
 
 
 FOUND_M = 5.0
-"""[m] A track with a larger RMS error is not that of the vehicle."""
+"""[m] A track with a larger RMS error does not belong to the vehicle."""
 
 
 def score(poses, vehicles):
-    """`Score` of `Track`s.
-
-    Parameters
-    ----------
-    poses : list of Track
-        Without the closing ones.
-    vehicles : list of (t (n,) [s], positions (n, 2) [m])
-    """
+    """`Score` of `Track`s without closing records, for vehicles [(t (n,) [s], position (n, 2))]."""
     of_track = {i: [p for p in poses if p.id == i] for i in sorted({p.id for p in poses})}
     candidates, sure = [], [p for p in poses if not p.ambiguous]
     wrong = np.ones(len(sure), dtype=bool)
@@ -163,7 +153,7 @@ def score(poses, vehicles):
 
 
 def _outside(poses, t):
-    """(n,) poses before or after the truth."""
+    """(n,) Whether poses are before or after the truth."""
     stamps = np.array([p.stamp_ns for p in poses]) / 1e9
     return (stamps < t[0]) | (stamps > t[-1])
 

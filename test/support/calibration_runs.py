@@ -1,4 +1,4 @@
-"""Samples for a calibration, and a running background."""
+"""Samples for a calibration, and a background that is fed with them."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Replays on the command line with fast settings."""
+"""Command-line replays with fast settings."""
 
 from mag_tracking.cli import main
 from support.bundled import NETWORK_FILE, QUICK, parameter_file, vehicle_path
@@ -8,7 +8,7 @@ NAME = 'junction_left_to_right'
 
 
 def quick_file(folder):
-    """A parameter file in `folder` with the settings `QUICK`."""
+    """Parameter file in `folder` with the settings `QUICK`."""
     return parameter_file(folder / 'quick.yaml', QUICK)
 
 

@@ -1,4 +1,4 @@
-"""Streams of samples of sensors whose clocks step."""
+"""Sample streams of sensors whose clocks step."""
 
 import numpy as np
 
@@ -12,17 +12,17 @@ def sample(t, j):
 
 
 def stream(n, begin, end, step=10, skip=()):
-    """[(sensor, stamp)] of `n` sensors, each `step` apart, one after the other."""
+    """[(sensor, timestamp)] of `n` sensors that take turns, with interval `step` each."""
     return [(j, t + j) for t in range(begin, end, step) for j in range(n) if j not in skip]
 
 
 def stepped(arrivals, which, begin, end, by):
-    """The clocks of `which` step ahead at `begin` by `by`, and back at `end`."""
+    """Arrivals with the clocks of `which` ahead by `by` from `begin` to `end`."""
     return [(j, t + by if j in which and begin <= t < end else t) for j, t in arrivals]
 
 
 def wild(rng, n, length):
-    """Arrivals [(sensor, stamp)] with clocks that step, stop, run apart, and gaps of all."""
+    """Arrivals [(sensor, timestamp)] with clock steps, dead sensors, time jumps and gaps."""
     offset, t, dead = [0] * n, 0, set()
     for _ in range(length):
         t += int(rng.choice([0, 1, 10, 10, 10, 400, 700, 5000],

@@ -1,7 +1,7 @@
-"""A car of boxes past two coarse sensors half a metre apart, and what is made of it.
+"""Car of boxes past two coarse sensors 0.5 m apart, and the speeds estimated from it.
 
-As in real installations beside a lane: 200 readings a second in steps of 1 microtesla, a glitch on
-the bus in a thousand of them, the side of the car 0.8 m away, 5 to 20 m/s.
+As in real installations beside a lane: 200 Hz, a resolution of 1 µT, one reading in a thousand with
+a bus error, the side of the car at 0.8 m, 5 to 20 m/s.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ STEP, RATE, SIDE = 1e-6, 200.0, 0.8
 
 
 def readings_of(seed):
-    """(`Readings`, velocity along x [m/s], time of the closest point [s]) of a random pass."""
+    """(`Readings`, velocity along x [m/s], time of the CPA [s]) of a random pass."""
     rng = np.random.default_rng([seed, 77])
     body = box_car(rng)
     half = 0.5 * body.sides[0, 1] / 0.9
@@ -41,7 +41,7 @@ def readings_of(seed):
 
 @dataclass(frozen=True)
 class Answers:
-    """What is said of a pass; each answer is (velocity along x, its deviation) [m/s] or None."""
+    """Estimates for a pass, each (velocity along x, its standard deviation) [m/s] or None."""
 
     truth: float
     fit: tuple[float, float] | None
@@ -49,7 +49,7 @@ class Answers:
     smoothed: tuple[float, float] | None
     delay: CorrelatedMotion
     ambiguous: bool
-    """The track at the closest point."""
+    """Of the track at the CPA."""
 
 
 def _of_pose(pose):
@@ -58,7 +58,7 @@ def _of_pose(pose):
 
 @cache
 def pass_of(seed):
-    """The `PassData` of a random pass."""
+    """`PassData` of a random pass."""
     collector = PassCollector(PAIR, settings_for('vehicle'))
     passes = collector.feed(readings_of(seed)[0]) + collector.flush()
     return max((data for data, _ in passes), key=lambda data: data.n_values)

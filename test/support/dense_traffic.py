@@ -1,4 +1,4 @@
-"""Vehicles one after the other, so that no stretch of a recording's beginning is quiet."""
+"""Dense traffic, so that the beginning of a recording has no quiet interval."""
 
 import dataclasses
 
@@ -9,8 +9,7 @@ from support.spoilt_runs import recorded
 
 
 def traffic(gap, begin=0.0, end=np.inf, size=2e-6, seed=0):
-    """Field (3,) [T] over time [s]: vehicles about every `gap` [s], each with a field of its own.
-    """
+    """Field (3,) [T] over time [s] of vehicles about every `gap` [s], each with its own field."""
     rng = np.random.default_rng(seed)
     times = np.cumsum(rng.uniform(0.7, 1.3, 200) * gap) + begin
     times, sizes = times[times < end], size * rng.normal(size=(200, 3))

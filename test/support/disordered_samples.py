@@ -1,4 +1,4 @@
-"""Samples with all that can go wrong on their way."""
+"""Samples with all kinds of transport faults."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ C = 1.44e-16 * np.eye(3)
 
 
 def disorder(rng, n):
-    """Samples of `n` sensors with all that can go wrong; None = a flush."""
+    """Samples of `n` sensors with losses, delays, reordering and invalid axes; None = flush."""
     arrivals = []
     for j in range(n):
         step, count = rng.choice([10.0, 10.0, 10.0, 31.7]), rng.integers(5, 80)

@@ -1,4 +1,4 @@
-"""A vehicle passes while one sensor is at fault: streams of samples for the tests."""
+"""Sample streams of a vehicle's pass while one sensor is faulty."""
 
 from dataclasses import replace
 
@@ -12,17 +12,17 @@ START_S = 1000.0
 SPEED = 10.0
 FIRST = np.array([-60.0, -1.5])
 FULL_SCALE = 8e-4
-"""[T] of a sensor; a spike of 2000 times that is 1.6 T."""
+"""[T] Full scale of a sensor; a spike of 2000 times full scale is 1.6 T."""
 NS = 1_000_000_000
 
 
 def swapped(sample, rng):
-    """Two axes in each other's place."""
+    """Swap two axes."""
     return [replace(sample, field=sample.field[[1, 0, 2]])]
 
 
 def spiky(size):
-    """One reading in twenty is off by `size` [T], up or down, on every axis."""
+    """Add a spike of `size` [T] to one reading in twenty, up or down, on every axis."""
     def spoil(sample, rng):
         off = size * rng.choice([-1.0, 1.0], 3) if rng.random() < 0.05 else 0.0
         return [replace(sample, field=sample.field + off)]
@@ -30,12 +30,12 @@ def spiky(size):
 
 
 def late_by(seconds):
-    """The clock is behind by so much (ahead where negative)."""
+    """Delay the clock by `seconds` (negative = ahead)."""
     return lambda sample, rng: [replace(sample, stamp_ns=sample.stamp_ns - round(seconds * NS))]
 
 
 class Frozen:
-    """The first reading over and over."""
+    """Repeat the first reading."""
 
     def __init__(self):
         self._field = None
@@ -60,12 +60,7 @@ FAULTS = {
 
 
 def stream(n_sensors, seed, fault=None, lasting_s=1.5, sensor='mag_2'):
-    """Samples of a pass in the order in which they come, and when the fault begins and ends.
-
-    Returns
-    -------
-    network, samples, truth : function of t [s] to (2,) [m], (begin, end) [s]
-    """
+    """(network, samples of a pass, truth: t [s] -> (2,) [m], (begin, end) of the fault [s])."""
     network = line_network(n_sensors, tilt=0.0)
     rng = np.random.default_rng(seed)
     farthest = float(network.positions[:, 0].max())

@@ -1,4 +1,4 @@
-"""A background that is fed reading by reading, as the calibration does it."""
+"""Background that is fed reading by reading, as the calibration does it."""
 
 import numpy as np
 
@@ -8,27 +8,27 @@ from mag_tracking.calibration.sensor_state import new_sensors
 
 
 class FedBackground(RunningBackground):
-    """A background that is given its readings one by one, as the calibration does."""
+    """Background fed reading by reading."""
 
     def __init__(self, *arguments, **named):
         self.sensors = new_sensors(1)
         super().__init__(*arguments, **named, sensors=self.sensors)
 
     def add(self, time, field):
-        """Take a reading: `time` [s], `field` (3,) [T]."""
+        """Add a reading: `time` [s], `field` (3,) [T]."""
         self.judge_block()
         self.note(round(time * 1e9), field)
         self.collect(time, field)
 
     def collect(self, time, field):
-        """Take a reading whose steps are noted."""
+        """Add a reading whose quantisation steps have been noted."""
         self.judge_block()
         core.collect(self.sensors, time, np.array(field, dtype=float))
         if np.isnan(self.sensors[0]['phase']):
             self.judge_block()
 
     def note(self, stamp, raw):
-        """`core.note_step` in plain Python."""
+        """Plain Python version of `core.note_step`."""
         s = self.sensors[0]
         for a in np.flatnonzero(~np.isnan(raw)):
             change = abs(raw[a] - s['raw'][a])

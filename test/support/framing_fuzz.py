@@ -1,9 +1,9 @@
-"""Sends frames between garbage through the framings; finds what is lost or invented.
+"""Fuzz test of the framings: frames between garbage must be found, and none invented.
 
 PYTHONPATH=test python -m support.framing_fuzz --frames 1000000
 
-prints per framing the frames sent and found, the bytes of garbage and the seconds
-of parsing, and exits with 1 on any loss. A framing joins by an entry in `CASES`.
+prints per framing the frames sent and found, the bytes of garbage and the parsing time, and exits
+with 1 on any loss. A framing is added by an entry in `CASES`.
 """
 
 import argparse
@@ -28,50 +28,50 @@ GARBAGE = ('random', 'head', 'half', 'damaged')
 
 
 class Case(NamedTuple):
-    """A framing and frames for it."""
+    """Framing, and a generator of its frames."""
 
     make_framing: Callable
-    """Gives a framing."""
+    """Creates the framing."""
     encode_random_frame: Callable
     """From a `random.Random` to (bytes, [Reading, ...])."""
     end_of_garbage: bytes = b''
-    """Stands behind garbage that could not be told from the next frame without it."""
+    """Appended to garbage that would otherwise merge with the next frame."""
     garbage: tuple = GARBAGE
-    """Kinds that cannot be valid frames."""
+    """Kinds of garbage that cannot be valid frames."""
     chance: float = 0.0
-    """That a false frame passes the checksum."""
+    """Probability that a false frame passes the checksum."""
 
 
 class Result(NamedTuple):
-    """What came of one framing."""
+    """Result for one framing."""
 
     sent: int
-    """Frames."""
+    """Number of frames."""
     readings: int
-    """In the frames that were sent."""
+    """Number of readings in the frames sent."""
     found: int
-    """Readings, as are the lost and the invented."""
+    """Number of readings, like `lost` and `invented`."""
     lost: int
     invented: int
     garbage: int
-    """Bytes."""
+    """Number of bytes."""
     suspects: int
-    """Frames that failed a checksum."""
+    """Number of frames with a wrong checksum."""
     seconds: float
-    """Of the processor, for parsing."""
+    """Processor time for parsing."""
     worst_rest: int
-    """Bytes."""
+    """Longest unconsumed rest in bytes."""
 
     def failed(self, chance):
-        """Whether more went wrong than a `chance` that a false frame passes explains."""
+        """Whether there are more errors than a probability `chance` of false frames explains."""
         mean = chance * self.suspects
         most = math.floor(mean + 6.0 * math.sqrt(mean)) if mean > 0.01 else 0
-        # A false frame hides one true frame at most, for it is as long.
+        # A false frame hides at most one true frame, because it has the same length.
         return max(self.invented, self.lost) > most * self.readings / self.sent
 
 
 def some_garbage(rng, case, frame):
-    """Garbage made of `frame` (bytes) or of nothing."""
+    """Random garbage, partly derived from `frame` (bytes)."""
     out = b''
     for _ in range(rng.randint(1, 3)):
         kind = rng.choice(case.garbage)
@@ -82,7 +82,7 @@ def some_garbage(rng, case, frame):
         elif kind == 'half':
             out += frame[:rng.randint(1, len(frame) - 2)]
         else:
-            # A bit of 0x20 would make a lower case digit, which is as good.
+            # Flipping 0x20 would give a lower-case hexadecimal digit, which is valid.
             at, flip = rng.randrange(len(frame) - 1), rng.choice((1, 2, 7, 64, 128, 255))
             out += frame[:at] + bytes([frame[at] ^ flip]) + frame[at + 1:]
         out += case.end_of_garbage
@@ -90,7 +90,7 @@ def some_garbage(rng, case, frame):
 
 
 def fuzz(case, n_frames, seed=0, share=0.4):
-    """Send `n_frames` with garbage before a `share` of them; a `Result`."""
+    """`Result` of `n_frames` with garbage before a `share` of them."""
     rng, framing = random.Random(seed), case.make_framing()
     expected, sent, n_readings = deque(), 0, 0
     found = lost = invented = n_garbage = suspects = worst = 0
@@ -131,7 +131,7 @@ def fuzz(case, n_frames, seed=0, share=0.4):
 
 
 def _skipped(expected, reading):
-    """How many of `expected` came before `reading`, taken off with it; None = it is not there."""
+    """Number of `expected` before `reading`, both removed; None if it is not expected."""
     for i in range(min(200, len(expected))):
         if expected[i] == reading:
             for _ in range(i + 1):
@@ -141,7 +141,7 @@ def _skipped(expected, reading):
 
 
 def _axes(rng, scale, digits):
-    """Three axes, one of them missing now and then."""
+    """Three axes, one of them missing in 5 % of cases."""
     axes = [round(rng.uniform(-scale, scale), digits) for _ in range(3)]
     if rng.random() < 0.05:
         axes[rng.randrange(3)] = math.nan
@@ -149,7 +149,7 @@ def _axes(rng, scale, digits):
 
 
 def text_frame(rng):
-    """$MAG,sensor,sequence,ticks,x,y,z*hh, as `text_framing` below."""
+    """$MAG,sensor,sequence,ticks,x,y,z*hh, for `text_framing`."""
     sensor, axes = rng.choice(('A', 'B7', 'north', 'ß')), _axes(rng, 6e4, 2)
     sequence, ticks = rng.randrange(1 << 32), rng.randrange(1 << 40)
     numbers = ','.join(rng.choice(('', 'nan')) if math.isnan(v) else str(v) for v in axes)
@@ -160,13 +160,13 @@ def text_frame(rng):
 
 
 def text_framing():
-    """For `text_frame`."""
+    """Framing of `text_frame`."""
     return TextFraming(TextSettings(fields=('sensor', 'sequence', 'ticks', 'x', 'y', 'z'),
                                     prefix='$MAG,', checksum='nmea', max_length=120))
 
 
 def json_frame(rng):
-    """{"id", "n", "t", "mag": {x, y, z}, "acc": [...]} on one line, as `json_framing` below."""
+    """{"id", "n", "t", "mag": {x, y, z}, "acc": [...]} on one line, for `json_framing`."""
     sensor, axes, acceleration = rng.choice('ABC'), _axes(rng, 6e4, 2), _axes(rng, 20.0, 3)
     sequence, ticks = rng.randrange(1 << 32), rng.random() * 1e6
     x, y, z = ('null' if math.isnan(v) else str(v) for v in axes)
@@ -177,13 +177,13 @@ def json_frame(rng):
 
 
 def json_framing():
-    """For `json_frame`."""
+    """Framing of `json_frame`."""
     return JsonFraming(JsonSettings(sensor='id', ticks='t', sequence='n', acceleration=('acc',),
                                     field=('mag.x', 'mag.y', 'mag.z'), max_length=256))
 
 
 def binary_frame(rng):
-    """A5 5A, u16, u32, three of f32, CRC-32, as `binary_framing` below."""
+    """A5 5A, u16, u32, three f32, CRC-32, for `binary_framing`."""
     sequence, ticks = rng.randrange(1 << 16), rng.choice((rng.randrange(1 << 32), 0x5AA55AA5))
     packed = struct.pack('<3f', *_axes(rng, 6e4, 2))
     payload = struct.pack('<HI', sequence, ticks) + packed
@@ -192,7 +192,7 @@ def binary_frame(rng):
 
 
 def binary_framing():
-    """For `binary_frame`."""
+    """Framing of `binary_frame`."""
     return BinaryFraming(BinarySettings(
         sync='A5 5A', fields=('sequence:u16', 'ticks:u32', 'x:f32', 'y:f32', 'z:f32'),
         checksum='crc32'))
@@ -207,9 +207,9 @@ def _eight_steps(crc):
 
 
 def board_frame(rng):
-    """FF, u8, four sensors of three i24, CRC-16 from the sync on, 0D, big endian."""
+    """FF, u8, four sensors of three i24, CRC-16 including the sync, 0D, big endian."""
     sequence = rng.randrange(256)
-    # Many bytes are like the sync.
+    # Many bytes equal the sync.
     counts = [tuple(rng.choice((-1, -256, 255, rng.randrange(-1 << 23, 1 << 23)))
                     for _ in range(3)) for _ in range(4)]
     covered = bytes([0xFF, sequence]) + b''.join(
@@ -221,7 +221,7 @@ def board_frame(rng):
 
 
 def board_framing():
-    """For `board_frame`."""
+    """Framing of `board_frame`."""
     return BinaryFraming(BinarySettings(
         sync='FF', fields=('sequence:u8',), each=('x:i24', 'y:i24', 'z:i24'), count=4, tail='0D',
         byte_order='big', checksum='crc16_modbus', checksum_from='sync'))
@@ -233,11 +233,11 @@ CASES = {
     'binary': Case(binary_framing, binary_frame),
     'binary of a board': Case(board_framing, board_frame, chance=2.0**-16),
 }
-"""By the name that is printed."""
+"""Cases by their printed names."""
 
 
 def main():
-    """The command; 1 on any loss."""
+    """Run the command; 1 on any loss."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--frames', type=int, default=20_000, help='per framing')
     parser.add_argument('--seed', type=int, default=0)

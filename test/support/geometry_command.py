@@ -1,4 +1,4 @@
-"""The command `mag-tracking board-geometry` and what it needs and writes, for the tests."""
+"""The command `mag-tracking board-geometry` with its input and output files."""
 
 import csv
 
@@ -12,7 +12,7 @@ from support.samples import MagSample, fed
 
 
 def write_table(path, field, positions, axes):
-    """A pose table of readings (K, n, 3), positions and axes (K, 3)."""
+    """Write a pose table of readings (K, n, 3), positions and axes (K, 3)."""
     names = [f'{a}{j}' for j in range(field.shape[1]) for a in 'xyz']
     names += [f'mag_{v}0' for v in ('x', 'y', 'z', 'mx', 'my', 'mz')]
     with open(path, 'w', newline='') as stream:
@@ -23,13 +23,13 @@ def write_table(path, field, positions, axes):
 
 
 def command(table, *options, out):
-    """The exit status."""
+    """Exit status of the command."""
     return main(['board-geometry', str(table), '--moment', str(MOMENT), '--out', str(out),
                  *map(str, options)])
 
 
 def through_calibrate(network, readings):
-    """Calibrated fields (K, n, 3) of raw readings, as the stage has them; NaN where it has none."""
+    """Calibrated fields (K, n, 3) of raw readings by the stage; NaN if it returns none."""
     stage = Calibrate(network, settings_for('magnet').calibrate)
     out = np.full(readings.shape, np.nan)
     for k, frame in enumerate(readings):

@@ -1,4 +1,4 @@
-"""A bus of simulated chips, with multiplexers and faults, in place of smbus2.SMBus."""
+"""Bus of simulated chips with multiplexers and faults, in place of `smbus2.SMBus`."""
 
 import errno
 
@@ -19,11 +19,11 @@ B = (2e-5, -1e-5, 4e-5)
 FAKES = {'mmc5983ma': (FakeMmc5983ma, 0x30), 'mmc5603': (FakeMmc5603, 0x30),
          'hmc5883l': (FakeHmc5883l, 0x1E), 'hmc5983': (FakeHmc5883l, 0x1E),
          'rm3100': (FakeRm3100, 0x20), 'lis3mdl': (FakeLis3mdl, 0x1C)}
-"""{chip: (its simulation, address)}."""
+"""{chip: (simulated chip, address)}."""
 
 
 class FakeMultiplexer(FakeChip):
-    """TCA9548A: one register, with a bit for each channel; `channels` are {number: {address}}."""
+    """TCA9548A: one register with a bit for each channel; `channels` are {number: {address}}."""
 
     def __init__(self, clock, channels):
         self.channels, self.mask = channels, 0xFF
@@ -39,19 +39,11 @@ class FakeMultiplexer(FakeChip):
 
 
 class FakeBus:
-    """`open_bus` gives it.
-
-    Attributes
-    ----------
-    chips : {int: FakeChip}
-    next_errors : list of OSError or None
-        What the next transactions end with; None = as it should.
-    hangs : bool
-    open, opened, closed : bool, int, int
-    """
+    """Simulated bus, to be returned by `open_bus`."""
 
     def __init__(self, clock, chips, hz=400_000):
         self.clock, self.chips, self._hz = clock, chips, hz
+        # Results of the next transactions: an OSError, or None for success.
         self.next_errors, self.hangs = [], False
         self.open, self.opened, self.closed = False, 0, 0
 
@@ -65,7 +57,7 @@ class FakeBus:
         self.closed += 1
 
     def _chip(self, address, n_bytes):
-        """The one that answers."""
+        """Chip that answers at an address."""
         assert self.open
         if self.hangs:
             self.clock.ns += 1000 * MS
@@ -113,7 +105,7 @@ class FakeBus:
 
 
 def rig(entries, chips=None, clock=None, **changes):
-    """(clock, bus, device); of every entry without a multiplexer there is a chip."""
+    """(clock, bus, device); there is a chip for every entry without a multiplexer."""
     clock = clock or Clock()
     if chips is None:
         chips = {}
@@ -126,7 +118,7 @@ def rig(entries, chips=None, clock=None, **changes):
 
 
 def one(chip, **changes):
-    """(clock, bus, device, simulated chip) with the one sensor A, opened, at its address."""
+    """(clock, bus, device, simulated chip), opened, with one sensor A."""
     address = FAKES[chip][1]
     clock, bus, device = rig([f'A:{chip}:{address:#04x}'], **changes)
     device.open()

@@ -1,8 +1,7 @@
-"""Magnetometer chips that behave as their data sheets say, register by register, in a time of
-their own.
+"""Simulated magnetometer chips that follow their data sheets register by register.
 
-Written from the data sheets, not from the drivers: what a chip does not promise it does not
-do here either.
+They are written from the data sheets, not from the drivers: behaviour that a data sheet does not
+guarantee is not provided.
 """
 
 import math
@@ -12,7 +11,7 @@ MS = 1_000_000
 
 
 class Clock:
-    """Time that passes only where somebody waits."""
+    """Clock that advances only while someone waits."""
 
     def __init__(self):
         self.ns = 5_000_000_000
@@ -26,7 +25,7 @@ class Clock:
 
 
 class FakeChip:
-    """Registers with a pointer that counts up; `field` [T] is constant, or a function of ns."""
+    """Registers with an auto-incremented pointer; `field` [T] is constant or a function of ns."""
 
     def __init__(self, clock, field=(2e-5, -1e-5, 4e-5)):
         self.clock = clock
@@ -41,7 +40,7 @@ class FakeChip:
         self.reset()
 
     def reset(self):
-        """Defaults of the registers."""
+        """Restore the default values of the registers."""
 
     def write(self, data):
         if data:
@@ -69,7 +68,7 @@ class FakeChip:
 
 
 class FakeMmc5983ma(FakeChip):
-    """18 bits about 131072, 16384 counts a gauss; its bridge has an offset in counts."""
+    """18 bits about 131072, 16384 counts per gauss; the bridge has an offset in counts."""
 
     ID, STATUS, DONE, CONTROL = (0x2F, 0x30), 0x08, 0x01, 0x09
     RESET_MS, CONVERSION_MS = 10, (8.0, 4.0, 2.0, 0.5)
@@ -78,7 +77,7 @@ class FakeMmc5983ma(FakeChip):
 
     def reset(self):
         self.memory[self.ID[0]] = self.ID[1]
-        # The calibration was read from the chip's own memory.
+        # The calibration has been loaded from the chip's own memory.
         self.memory[self.STATUS] = 0x10
         self.polarity = 0
         self.ready_ns = self.pulse_ns = 0
@@ -101,7 +100,7 @@ class FakeMmc5983ma(FakeChip):
         elif register == self.CONTROL:
             assert value in (0x01, 0x08, 0x10), 'one thing at a time'
             if value != 0x01:
-                # The direction after RESET is the one of the axes as drawn.
+                # The direction after RESET is that of the axes as drawn in the data sheet.
                 self.polarity, self.pulse_ns = (-1 if value == 0x08 else 1), now
                 self.pulses.append((now, value))
             elif now >= self.pulse_ns + MS and not self.memory[self.CONTROL + 2]:
@@ -133,7 +132,7 @@ class FakeMmc5983ma(FakeChip):
 
 
 class FakeMmc5603(FakeMmc5983ma):
-    """20 bits about 524288, 16384 counts a gauss."""
+    """20 bits about 524288, 16384 counts per gauss."""
 
     ID, STATUS, DONE, CONTROL = (0x39, 0x10), 0x18, 0x40, 0x1B
     RESET_MS, CONVERSION_MS = 20, (6.6, 3.5, 2.0, 1.2)
@@ -146,7 +145,7 @@ class FakeMmc5603(FakeMmc5983ma):
 
 
 class FakeHmc5883l(FakeChip):
-    """Single measurements; the one after a change of gain still has the old gain."""
+    """Single measurements; the first one after a change of gain still has the old gain."""
 
     GAINS = (1370, 1090, 820, 660, 440, 390, 330, 230)
 
@@ -164,7 +163,7 @@ class FakeHmc5883l(FakeChip):
             self.start_ns, self.end_ns = self.clock.ns, self.clock.ns + 6 * MS
 
     def advance(self):
-        # After the last register of the output the pointer goes back to the first.
+        # After the last output register, the pointer returns to the first one.
         self.pointer = 3 if self.pointer == 8 else (self.pointer + 1) % 13
 
     def fetch(self, register):
@@ -174,7 +173,7 @@ class FakeHmc5883l(FakeChip):
     def finish(self):
         if self.end_ns is None or self.clock.ns < self.end_ns:
             return
-        # The bias of the self-test, where it is on.
+        # Bias of the self-test, if enabled.
         bias = 1.16 * GAUSS if self.memory[0] & 3 else 0.0
         x, y, z = (b + bias for b in self.field((self.start_ns + self.end_ns) // 2))
         for i, b in enumerate((x, z, y)):
@@ -187,7 +186,7 @@ class FakeHmc5883l(FakeChip):
 
 
 class Continuous(FakeChip):
-    """A chip that measures by itself from `start_ns` on, every `period_ns`."""
+    """Chip that measures continuously from `start_ns` on, every `period_ns`."""
 
     start_ns = None
 
@@ -200,7 +199,7 @@ class Continuous(FakeChip):
 
     @property
     def complete(self):
-        """Conversions that are complete."""
+        """Number of complete conversions."""
         return 0 if self.start_ns is None else (self.clock.ns - self.start_ns) // self.period_ns
 
     @property
@@ -208,14 +207,14 @@ class Continuous(FakeChip):
         return self.start_ns is not None and self.complete > self.taken
 
     def latest(self):
-        """(3,) [T] in the middle of the last complete conversion."""
+        """(3,) [T] at the middle of the last complete conversion."""
         if not self.complete:
             return 0.0, 0.0, 0.0
         return self.field(self.start_ns + round((self.complete - 0.5) * self.period_ns))
 
 
 class FakeRm3100(Continuous):
-    """Its results are latched when their first byte is read."""
+    """Results are latched when their first byte is read."""
 
     GAIN = {50: (20.0, 534.0), 100: (38.0, 283.0), 200: (75.0, 147.0)}
 
@@ -257,7 +256,7 @@ class FakeRm3100(Continuous):
 
 
 class FakeLis3mdl(Continuous):
-    """With `strict`, bit 7 of the register's number says whether the pointer counts up."""
+    """With `strict`, bit 7 of the register number enables auto-increment."""
 
     GAIN = (6842, 3421, 2281, 1711)
     strict = True

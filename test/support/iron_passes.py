@@ -1,4 +1,4 @@
-"""Recordings of simulated passes of a vehicle whose hard and soft iron are known."""
+"""Recordings of simulated passes of a vehicle with known hard and soft iron."""
 
 import numpy as np
 
@@ -11,14 +11,14 @@ from support.bundled import NETWORK_FILE
 from support.samples import sample_dict, simulate
 
 HARD, SOFT = [240.0, -130.0, 90.0], 6.0
-"""m0 [A m^2] in the vehicle's frame and D [m^3] of the simulated vehicle."""
+"""m0 [A m²] in the vehicle frame and D [m³] of the simulated vehicle."""
 ERRORS = Imperfections(tilt_std=SensorErrors().turn_std, gain_std=SensorErrors().gain_std)
-"""As the fit assumes them of sensors that are as they were bought."""
+"""Sensor errors that the fit assumes for uncalibrated sensors."""
 START_S, DURATION_S, SPEED = 1_000.0, 24.0, 10.0
 
 
 def recorded(folder, heading_deg, rng, hard=HARD, soft=SOFT):
-    """A recording of one pass, half of it before the closest point; its path."""
+    """Recording of one pass with the CPA at its middle; return its path."""
     network, heading = read_network(NETWORK_FILE), np.deg2rad(heading_deg)
     way = np.array([np.cos(heading), np.sin(heading)])
     start = np.array([0.3, 0.4]) - 0.5 * DURATION_S * SPEED * way

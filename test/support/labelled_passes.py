@@ -1,4 +1,4 @@
-"""Labelled signatures of simulated vehicles past one sensor beside a road."""
+"""Labelled signatures of simulated vehicles past one roadside sensor."""
 
 import csv
 
@@ -20,7 +20,7 @@ def body_of(rng, name, simulator):
 
 
 def signature(rng, name, simulator, n_axes=3):
-    """One pass at a random speed and distance, with a drift and noise."""
+    """One pass at a random speed and distance, with drift and noise."""
     body, speed = body_of(rng, name, simulator), rng.uniform(8.0, 25.0)
     lateral = rng.uniform(2.0, 4.0)
     half = 20.0 / speed + rng.uniform(0.0, 1.0)
@@ -35,7 +35,7 @@ def signature(rng, name, simulator, n_axes=3):
 
 
 def signatures(counts, simulator, seed=0, n_axes=3):
-    """{class: number} signatures."""
+    """Signatures in the numbers {class: number}."""
     rng = np.random.default_rng(seed)
     return [signature(rng, name, simulator, n_axes) for name, n in counts.items()
             for _ in range(n)]
@@ -51,7 +51,7 @@ def write_by_sample(path, found, unit=1e9):
 
 
 def write_by_row(path, found, n=80):
-    """Resampled to `n` samples."""
+    """Write signatures resampled to `n` samples, one per row."""
     with open(path, 'w', newline='') as stream:
         writer = csv.writer(stream)
         writer.writerow(['label', *(f'{a}_nt_{k}' for a in 'xyz' for k in range(n))])

@@ -1,4 +1,4 @@
-"""Frames and poses as a tracker publishes them, for tests of live pages."""
+"""Frames and poses as published by a tracker, for tests of live pages."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ NS = 1_000_000_000
 
 
 def records_of(name, network):
-    """Frames and tracks of a recording, in their order."""
+    """Frames and tracks of a recording, in order."""
     pipeline, out = Pipeline(network, settings_for('vehicle', QUICK)), []
     for readings in SampleReader(Recording(vehicle_path(name)), network).readings():
         out += pipeline.feed(readings)

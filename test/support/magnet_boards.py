@@ -1,4 +1,4 @@
-"""Simulated boards of sensors under a magnet, for the tests."""
+"""Simulated sensor boards below a magnet."""
 
 from functools import cache
 
@@ -19,7 +19,7 @@ LOW, HIGH = np.array([-0.08, -0.08, 0.03]), np.array([0.2, 0.2, 0.25])
 
 
 def board(n_side=3, spacing=0.06, noise=1e-7, seed=3):
-    """Sensors on a grid, each turned anyhow."""
+    """Sensors on a grid, each with a random orientation."""
     places = np.array([(x, y, 0.0) for y in range(n_side) for x in range(n_side)]) * spacing
     R = rotation(np.random.default_rng(seed).standard_normal((n_side**2, 3)))
     names = tuple(f'mag_{j}' for j in range(len(places)))
@@ -28,14 +28,14 @@ def board(n_side=3, spacing=0.06, noise=1e-7, seed=3):
 
 
 def tracked(n_poses, rng):
-    """Positions and axes of a tool over the board."""
+    """Positions and axes of a tool above the board."""
     positions = rng.uniform([0.0, 0.0, 0.05], [0.12, 0.12, 0.13], (n_poses, 3))
     axes = np.array([0.0, 0.0, 1.0]) + 0.6 * rng.uniform(-1.0, 1.0, (n_poses, 3))
     return positions, axes / np.linalg.norm(axes, axis=1)[:, None]
 
 
 def truth(network, n_poses, rng, settings=SETTINGS):
-    """Unknowns as the priors have them: sensors (n, 10), shared (12,), poses (K, 8)."""
+    """Unknowns drawn from their priors: sensors (n, 10), shared (12,), poses (K, 8)."""
     s, deg = settings, np.pi / 180.0
     n = len(network)
     sensor = rng.standard_normal((n, 10)) * np.repeat(
@@ -49,7 +49,7 @@ def truth(network, n_poses, rng, settings=SETTINGS):
 
 
 def simulated(seed, n_poses=40, network=None, settings=SETTINGS):
-    """(network, field (K, n, 3), positions, axes, truth) of a board with all that may be wrong."""
+    """(network, field (K, n, 3), positions, axes, truth) of a board with all modelled errors."""
     rng = np.random.default_rng(seed)
     network = network or board()
     positions, axes = tracked(n_poses, rng)
@@ -64,7 +64,7 @@ def simulated(seed, n_poses=40, network=None, settings=SETTINGS):
 
 
 def estimated(geometry, network):
-    """(10 n + 12,) in the order of the covariance."""
+    """Estimates (10 n + 12,) in the order of the covariance."""
     n = len(network)
     turn = [_rotation_vector(a.T @ b)
             for a, b in zip(network.R_ws, geometry.network.R_ws, strict=True)]
@@ -74,7 +74,7 @@ def estimated(geometry, network):
 
 
 def _rotation_vector(R):
-    """(3,) of a rotation by less than a right angle."""
+    """(3,) rotation vector of a rotation by less than 90 degrees."""
     v = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     s = np.linalg.norm(v)
     return v if s == 0.0 else v * np.arcsin(s) / s
@@ -82,7 +82,7 @@ def _rotation_vector(R):
 
 @cache
 def calibrated_boards():
-    """((simulated, geometry), ...) of several boards, not to be changed."""
+    """((simulated, geometry), ...) of several boards; not to be modified."""
     out = []
     for seed in range(16):
         case = simulated(seed)

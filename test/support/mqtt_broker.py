@@ -1,4 +1,4 @@
-"""A real MQTT broker (mosquitto) for the tests, and one that says what it is told to."""
+"""Real MQTT broker (mosquitto) for tests, and a scripted one."""
 
 import base64
 import hashlib
@@ -20,7 +20,7 @@ CONNECTED = bytes([0x20, 2, 0, 0])
 
 
 def free_port(kind=socket.SOCK_STREAM):
-    """A port that nobody has, and that the kernel gives to nobody by itself."""
+    """Free port outside the range that the kernel assigns automatically."""
     while True:
         port = random.randrange(20000, 32000)
         with closing(socket.socket(socket.AF_INET, kind)) as probe, suppress(OSError):
@@ -29,7 +29,7 @@ def free_port(kind=socket.SOCK_STREAM):
 
 
 def executable(name):
-    """Path of a program of mosquitto's; `make test` installs it where it may."""
+    """Path of a program of mosquitto; `make test` installs it if permitted."""
     path = shutil.which(name, path='/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin')
     if not path:
         pytest.skip(f'{name} is not installed: sudo apt install mosquitto')
@@ -37,15 +37,7 @@ def executable(name):
 
 
 class Broker:
-    """A mosquitto with a configuration of its own, on a port that stays the same.
-
-    Parameters
-    ----------
-    folder : Path
-        For its files.
-    lines : str
-        Further lines of its configuration.
-    """
+    """Mosquitto with its own configuration, on a fixed port; `lines` extend the configuration."""
 
     def __init__(self, folder, *lines):
         self.port = free_port()
@@ -62,7 +54,7 @@ class Broker:
         self.kill()
 
     def start(self):
-        """Start it, and wait until it listens."""
+        """Start the broker, and wait until it listens."""
         with open(self._folder / 'mosquitto.log', 'ab') as log:
             self._process = subprocess.Popen([executable('mosquitto'), '-c', self._config],
                                              stdout=log, stderr=log)
@@ -75,21 +67,21 @@ class Broker:
         raise AssertionError(f'mosquitto does not start:\n{self.log()}')
 
     def log(self):
-        """What it has written so far."""
+        """Output so far."""
         return (self._folder / 'mosquitto.log').read_text()
 
     def kill(self):
-        """End it without a word to its clients; may be called twice."""
+        """Kill the broker without notice to its clients; may be called twice."""
         self._process.kill()
         self._process.wait(timeout=10)
 
     def freeze(self):
-        """Stop it where it is: its connections stay, but it answers nothing."""
+        """Suspend the broker: connections remain open, but it does not answer."""
         self._process.send_signal(signal.SIGSTOP)
 
 
 def password_lines(folder, user, password):
-    """Lines for a broker that lets in nobody but `user`."""
+    """Configuration of a broker that admits only `user`."""
     path = folder / 'passwords'
     path.touch(mode=0o600)
     subprocess.run([executable('mosquitto_passwd'), '-b', path, user, password], check=True,
@@ -98,7 +90,7 @@ def password_lines(folder, user, password):
 
 
 def subscription_lines(folder, user, password, pattern):
-    """Lines for a broker where `user` may subscribe to nothing but what fits `pattern`."""
+    """Configuration of a broker that permits `user` to subscribe only to `pattern`."""
     executable('mosquitto')
     salt = b'twelve bytes'
     hashed = hashlib.pbkdf2_hmac('sha512', password.encode(), salt, 101)
@@ -121,7 +113,7 @@ def subscription_lines(folder, user, password, pattern):
 
 
 def certificate(folder):
-    """(certificate, key) of localhost, signed by itself, as paths."""
+    """(certificate, key) of localhost, self-signed, as paths."""
     cert, key = folder / 'cert.pem', folder / 'key.pem'
     subprocess.run(['openssl', 'req', '-x509', '-newkey', 'rsa:2048', '-nodes', '-days', '2',
                     '-subj', '/CN=localhost', '-addext', 'subjectAltName=DNS:localhost',
@@ -130,10 +122,7 @@ def certificate(folder):
 
 
 class ScriptedBroker:
-    """Takes one connection, and says one thing each time after the other side has said something.
-
-    After that it says nothing, until it hangs up.
-    """
+    """Accept one connection, answer each message with the next scripted one, then stay silent."""
 
     def __init__(self, *says):
         self._says = says
@@ -153,7 +142,7 @@ class ScriptedBroker:
         assert not self._thread.is_alive()
 
     def hang_up(self):
-        """End the connection, and take no other."""
+        """Close the connection, and accept no other."""
         self._server.close()
         if self._connection is not None:
             with suppress(OSError):
@@ -171,12 +160,12 @@ class ScriptedBroker:
 
 
 def granted(subscribe, *codes):
-    """SUBACK for the SUBSCRIBE packet `subscribe`; a code per filter (0x80 = refused)."""
+    """SUBACK for the SUBSCRIBE packet `subscribe`; one code per filter (0x80 = refused)."""
     return bytes([0x90, 2 + len(codes or (0,)), *subscribe[2:4], *(codes or (0,))])
 
 
 def publish_packet(topic, payload, flags=0):
-    """PUBLISH with QoS 0 as bytes; `flags` are the low four bits of its first byte."""
+    """PUBLISH with QoS 0; `flags` are the low four bits of its first byte."""
     body = len(topic).to_bytes(2, 'big') + topic + payload
     assert len(body) < 128
     return bytes([0x30 | flags, len(body)]) + body

@@ -1,4 +1,4 @@
-"""Nodes as processes of their own, for the tests."""
+"""Nodes as separate processes."""
 
 import os
 import signal
@@ -9,20 +9,20 @@ import tempfile
 from mag_tracking.nodes.middleware import PROFILE_VARIABLE
 
 MAX_S = 120.0
-"""[s] Whatever a test waits for has come by then, also on a slow machine beside others."""
+"""[s] Time limit for any event, also on a slow and busy machine."""
 
 
 USUAL_START_S = 1.8
-"""[s] From the start of a node's process until it is up, on a free machine."""
+"""[s] Start-up time of a node's process on an idle machine."""
 
 
 def scaled(limit_s, start_s):
-    """A limit of a free machine, longer in proportion where a node takes `start_s` to start."""
+    """Time limit for an idle machine, extended in proportion if a node takes `start_s` to start."""
     return limit_s * max(1.0, start_s / USUAL_START_S)
 
 
 def start(module, *arguments, home=None):
-    """A node in a process of its own, with no memory but what it finds in `home`."""
+    """Start a node as a process without files from earlier runs."""
     return subprocess.Popen(
         [sys.executable, '-m', f'mag_tracking.nodes.{module}', '--ros-args', *arguments],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
@@ -30,38 +30,36 @@ def start(module, *arguments, home=None):
 
 
 def environment(**more):
-    """That of a process that has to find the profile of the middleware by itself."""
+    """Environment of a process that must find the middleware profile itself."""
     return {n: v for n, v in os.environ.items() if n != PROFILE_VARIABLE} | more
 
 
 def stop(processes):
-    """End them as Ctrl-C does; (exit codes, outputs)."""
+    """Interrupt processes as Ctrl-C does; return (exit codes, outputs)."""
     for p in processes:
         p.send_signal(signal.SIGINT)
     try:
         outputs = [p.communicate(timeout=MAX_S)[0] for p in processes]
     finally:
-        # One that hangs would compute beside all that comes after.
+        # A process that hangs would slow down all later tests.
         for p in processes:
             p.kill()
     return [p.returncode for p in processes], outputs
 
 
 def without_states(output):
-    """The output of nodes without the lines that tell what they wait for."""
+    """Output of nodes without the lines about what they wait for."""
     return ''.join(line for line in output.splitlines(keepends=True)
                    if not line.startswith('[INFO]'))
 
 
 def call(ros, kind, name, request):
-    """The response of a service; asked again where none comes.
-
-    A client that finds a server is not yet known to it, and a response to nobody is dropped by
-    the middleware.
-    """
+    """Response of a service, requested again if none arrives."""
     node, spin_until = ros
     client = node.create_client(kind, name)
     assert spin_until(client.service_is_ready), f'there is no {name}'
+    # A client may find a server before the server knows the client. The middleware then drops
+    # the response.
     for _ in range(12):
         future = client.call_async(request)
         if spin_until(future.done, 10.0):

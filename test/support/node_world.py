@@ -1,4 +1,4 @@
-"""A world for tests of faults: a roadside, a broker, a serial line, and the nodes as processes."""
+"""World for tests of faults: a roadside, a broker, a serial line, and the nodes as processes."""
 
 import signal
 import time
@@ -26,25 +26,25 @@ from support.roadside import NOISE, Roadside
 from support.serial_line import SerialLine
 
 WRONG = chi2.ppf(1.0 - 1e-4, 2)
-"""A pose whose squared error is beyond this, in its own covariance, is wrong."""
+"""A pose is wrong if its squared error in its own covariance exceeds this."""
 BODY = point_body([0.0, 300.0, -300.0], 5.0, 0.5)
-"""Its hard and soft iron do not cancel: it is noticed from 12 m."""
+"""Hard and soft iron do not cancel, so the vehicle is detected at 12 m."""
 TOPICS = {'driver_node': (MagneticField, '/mag_1/imu/mag'),
           'calibration_node': (MagneticField, '/mag_1/imu/mag_calibrated'),
           'detection_node': (NetworkFrame, '/network_frame'),
           'tracker_node': (TrackArray, '/tracker_node/tracks')}
-"""What each node gives."""
+"""Output of each node."""
 FRAME_S = 0.2
-"""[s] `align.period_s`: longer than by default, so that a tracker on a busy machine keeps up."""
+"""[s] `align.period_s`: longer than the default, so that a tracker on a busy machine keeps up."""
 NS = 1_000_000_000
 STEADY = {'calibration_node': {'calibrate.learn_s': 3600.0},
           'detection_node': {'detect.background_drift': 0.0}}
-"""Settings of a background that is as the network file says: nothing is learnt of it between two
-vehicles, and nothing is allowed for it."""
+"""Settings of a constant background as in the network file: it is not learnt between vehicles,
+and has no uncertainty."""
 
 
 def network_file(folder):
-    """A copy of the network of the road with noise and backgrounds, so that nothing is learnt."""
+    """Copy of the road network with noise and backgrounds, so that nothing is learnt."""
     content = yaml.safe_load(NETWORK_FILE.read_text())
     for sensor in content['sensors'].values():
         sensor.update(noise_std=NOISE, background=content['earth_field'])
@@ -54,10 +54,7 @@ def network_file(folder):
 
 
 def drivers_files(folder, broker, guarded, line):
-    """{name: path} of the files of one device: `mqtt`, `serial`.
-
-    To `mqtt` belongs a device at a broker that does not let it in, `guarded`.
-    """
+    """{link: path} of drivers files for `mqtt` and `serial`; one device of `mqtt` is refused."""
     common = {'clock': {'tick_s': 1e-6, 'wrap': 0}, 'unit': 'nT'}
     content = {
         'mqtt': {'transport': 'mqtt', 'framing': 'json',
@@ -79,14 +76,7 @@ def drivers_files(folder, broker, guarded, line):
 
 
 class World:
-    """The nodes, which may be killed, and all that is heard of them.
-
-    Attributes
-    ----------
-    heard : {node: [(came_ns, message)]}
-        Of the topics in `TOPICS`.
-    statuses : [(came_ns, DiagnosticStatus)]
-    """
+    """The nodes, which may be killed, and all their messages."""
 
     def __init__(self, folder, broker, guarded, roadside, line):
         self.broker, self.guarded, self.roadside, self.line = broker, guarded, roadside, line
@@ -94,6 +84,7 @@ class World:
         self.drivers = drivers_files(folder, broker, guarded, line)
         self.node, self._executor = Node('tester'), make_executor()
         self._executor.add_node(self.node)
+        # `heard`: {node: [(arrival [ns], message)]}; `statuses`: [(arrival [ns], DiagnosticStatus)]
         self._processes, self.heard, self.statuses = {}, {name: [] for name in TOPICS}, []
         self.link = None
         for name, (kind, topic) in TOPICS.items():
@@ -102,12 +93,12 @@ class World:
             (heard[0], status) for status in heard[1].status))
 
     def _listen(self, kind, topic, qos, take):
-        """Have `take` called with (when it came [ns], message)."""
+        """Pass (arrival [ns], message) to `take`."""
         self.node.create_subscription(
             kind, topic, lambda m: take((time.time_ns(), m)), qos)
 
     def close(self):
-        """End what runs, as Ctrl-C does; (exit codes, outputs)."""
+        """Interrupt all processes as Ctrl-C does; return (exit codes, outputs)."""
         try:
             return stop(list(self._processes.values()))
         finally:
@@ -116,50 +107,45 @@ class World:
             self._executor.shutdown()
 
     def wait(self, condition, seconds=MAX_S):
-        """Listen until there is something in what `condition` gives: that, or what it gives last.
-
-        It is asked a hundred times a second, and what it gives is worth as much in time.
-        """
+        """Spin until `condition()` is true, at 100 Hz; return its last value."""
         end = time.monotonic() + seconds
         while not (found := condition()) and time.monotonic() < end:
             self._executor.spin_until_future_complete(Future(), 0.01)
         return found
 
     def pause(self, seconds):
-        """Listen for a while."""
+        """Spin for some seconds."""
         self.wait(lambda: False, seconds)
 
     def start(self, name):
-        """Start a node as a process, with what it is given in this world."""
+        """Start a node as a process with the parameters of this world."""
         given = {'driver_node': {'drivers': self.drivers[self.link]},
                  'tracker_node': POINT, **STEADY}[name]
         if name == 'detection_node':
             given = {'align.period_s': FRAME_S, **given}
         if name != 'driver_node':
-            # To the driver a sensor of no network (`guarded`) would be an error.
+            # The driver refuses sensors outside the network, such as that of `guarded`.
             given = {'network': self.network, **given}
         self._processes[name] = start(name, *(
             a for key, value in given.items() for a in ('-p', f'{key}:={value}')))
 
     def kill(self, name):
-        """End a node without a word."""
+        """Kill a node without notice."""
         process = self._processes.pop(name)
         process.send_signal(signal.SIGKILL)
         process.communicate(timeout=MAX_S)
-        # What is still on its way is of the dead.
+        # Messages still in transit belong to the killed node.
         self.pause(0.05)
 
     def publishers(self):
-        """The publishers of diagnostics that were announced, also those of the dead."""
+        """Publishers of diagnostics that were announced, including those of killed nodes."""
         return {tuple(p.endpoint_gid) for p in
                 self.node.get_publishers_info_by_topic('/diagnostics')}
 
     def recovery(self, name):
-        """Start a node: (seconds until it is up, seconds from then to the first that it gives).
-
-        It is up when its publisher appears, or at the first that it gives. The tracker gives
-        nothing while nobody comes: of it that is the first frame that it takes, by its count.
-        """
+        """Start a node: (seconds until it is up, seconds from then to its first output)."""
+        # It is up when its publisher appears, or at its first output. The tracker has no output
+        # without a vehicle; its first output is the first frame that it counts.
         known, began_ns = self.publishers(), time.time_ns()
         self.start(name)
         up, first_ns = None, None
@@ -173,7 +159,7 @@ class World:
         return up, (first_ns - began_ns) / NS - up
 
     def _first_ns(self, name, since_ns):
-        """When the first came that a node gives since then; None = not yet."""
+        """Time of the first output of a node after `since_ns`; None = none yet."""
         if name != 'tracker_node':
             return next((came for came, _ in self.since(since_ns, name)), None)
         for came, status in self.told(since_ns, 'tracker_node: track'):
@@ -183,7 +169,7 @@ class World:
         return None
 
     def use(self, link):
-        """Have the driver listen to `link`, 'mqtt' or 'serial', and wait until something comes."""
+        """Connect the driver to `link`, 'mqtt' or 'serial', and wait for its first output."""
         if link == self.link:
             return
         if self.link is not None:
@@ -194,52 +180,50 @@ class World:
         assert self.wait(lambda: self.since(began_ns, 'driver_node'))
 
     def since(self, came_ns, name):
-        """[(came_ns, message)] of a node since then."""
+        """[(arrival [ns], message)] of a node after `came_ns`."""
         return [h for h in self.heard[name] if h[0] > came_ns]
 
     def told(self, since_ns, name, *words):
-        """[(came_ns, DiagnosticStatus)] of a name since then that have all the `words`."""
+        """[(arrival [ns], DiagnosticStatus)] of a name after `since_ns` with all `words`."""
         return [(came, s) for came, s in self.statuses if came > since_ns and s.name == name
                 and all(word in s.message for word in words)]
 
     def tracks(self, since_ns):
-        """[Track] with a timestamp after `since_ns`.
-
-        On a busy machine, poses of the previous vehicle arrive while the next one is here.
-        """
+        """[Track] with a timestamp after `since_ns`."""
+        # On a busy machine, poses of the previous vehicle arrive while the next one is passing.
         tracks = (track_of(t) for _, m in self.since(since_ns, 'tracker_node') for t in m.tracks)
         return [t for t in tracks if t.stamp_ns > since_ns]
 
     def is_quiet(self):
-        """Whether the vehicle before is gone and forgotten."""
+        """Whether the previous vehicle has left and its detection has ended."""
         frames = self.heard['detection_node']
         return frames and not frames[-1][1].target_present and self.roadside.is_gone()
 
     def call(self):
-        """A vehicle comes, as soon as the one before is forgotten; returns the time [ns]."""
+        """Start a vehicle after the previous one has left; return the time [ns]."""
         assert self.wait(self.is_quiet)
         self.roadside.call()
         return time.time_ns()
 
     def drive_to(self, x):
-        """Listen until the vehicle is at `x` [m]."""
+        """Spin until the vehicle is at `x` [m]."""
         assert self.wait(lambda: self.roadside.truth(time.time_ns())[0] >= x)
 
     def wrong(self, since_ns):
-        """The wrong poses with a timestamp after `since_ns`."""
+        """Wrong poses with a timestamp after `since_ns`."""
         return [t for t in self.tracks(since_ns)
                 if not t.ended and is_wrong(t, self.roadside.truth(t.stamp_ns))]
 
 
 def is_wrong(track, truth):
-    """Whether a pose is not where it says to be, within its covariance, and is not flagged."""
+    """Whether an unflagged pose is inconsistent with the truth by its covariance."""
     e = track.position[:2] - truth
     return not track.ambiguous and e @ np.linalg.solve(track.covariance[:2, :2], e) > WRONG
 
 
 @contextmanager
 def world(folder):
-    """A `World` whose nodes run and give frames; at the end all have to end cleanly."""
+    """`World` with running nodes, all of which must end cleanly."""
     line = SerialLine(folder / 'port')
     own = folder / 'guarded'
     own.mkdir()

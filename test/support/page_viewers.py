@@ -1,7 +1,7 @@
-"""Viewers of a live page, who read all that comes: `page_viewers.py URL N`.
+"""Viewers of a live page that read all messages: `page_viewers.py URL N`.
 
-At its end it prints how much came: a viewer that hears nothing would cost nothing. They are
-browsers of other machines, and give way here to what is measured.
+They print the amount received, because a viewer without messages would cost nothing. They stand for
+browsers on other machines, and run at a lower priority than the measured process.
 """
 
 import asyncio
@@ -13,7 +13,7 @@ from websockets.asyncio.client import connect
 
 
 async def look(url, heard):
-    """One viewer."""
+    """Read all messages of one viewer."""
     async with connect(url.replace('http', 'ws') + 'stream', max_size=None,
                        compression=None) as viewer:
         async for message in viewer:
@@ -21,7 +21,7 @@ async def look(url, heard):
 
 
 async def main(url, n):
-    """All of them, until SIGTERM."""
+    """Run all viewers until SIGTERM."""
     heard = [[] for _ in range(n)]
     tasks = [asyncio.create_task(look(url, one)) for one in heard]
     asyncio.get_running_loop().add_signal_handler(

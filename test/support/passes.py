@@ -1,4 +1,4 @@
-"""Passes drawn at random, for the tests and the bench of the batch fit."""
+"""Random passes for the tests and the benchmark of the batch fit."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
 
 
 def network_of(positions):
-    """Sensors that stand upright at `positions`."""
+    """Upright sensors at `positions`."""
     positions = np.asarray(positions, dtype=float)
     names = tuple(f'mag_{i + 1}' for i in range(len(positions)))
     return SensorNetwork(names, positions, np.tile(np.eye(3), (len(names), 1, 1)),
@@ -24,7 +24,7 @@ ROAD = network_of([[0.0, -4.5, 0.0], [0.0, 4.5, 0.0]])
 
 
 def random_moments(rng, n_dipoles):
-    """(d, 3) [A m^2] of a row of dipoles."""
+    """Moments (d, 3) [A m²] of a row of dipoles."""
     whole = rng.standard_normal(3)
     whole *= rng.uniform(200.0, 600.0) / np.linalg.norm(whole)
     moments = np.tile(whole / n_dipoles, (n_dipoles, 1))
@@ -32,7 +32,7 @@ def random_moments(rng, n_dipoles):
 
 
 def random_path(rng, n_dipoles, road):
-    """Path (6 or 7,) and moments (d, 3): along the road, or with any heading past its middle."""
+    """Path (6 or 7,) and moments (d, 3): along the road, or with any heading past its centre."""
     heading = rng.uniform(0.0, 2.0 * np.pi)
     if road:
         heading = np.pi * rng.integers(2) + 0.03 * rng.standard_normal()
@@ -47,7 +47,7 @@ def random_path(rng, n_dipoles, road):
 
 
 def measured(network, path, moments, rng, rate=100.0, seconds=4.0, noise=NOISE):
-    """`PassData` of a row of dipoles, half of the time before and half after the path's zero."""
+    """`PassData` of a row of dipoles; time zero of the path is at the middle."""
     n = int(seconds * rate)
     t = np.tile((np.arange(n) - n / 2) / rate, len(network))
     sensor = np.repeat(np.arange(len(network)), n)
@@ -58,12 +58,12 @@ def measured(network, path, moments, rng, rate=100.0, seconds=4.0, noise=NOISE):
 
 
 def together(first, second):
-    """Two targets at once: the fields of both, the noise of the first."""
+    """Two targets at once: the sum of the fields, the noise of the first."""
     return replace(first, field=first.field + second.field)
 
 
 def unknowns_at(path, moments, seconds):
-    """What a fit should find whose time zero is `seconds` after that of `path`."""
+    """Unknowns of a fit whose time zero is `seconds` after that of `path`."""
     moved = path.copy()
     moved[:3] += seconds * path[3:6]
     return np.concatenate([moved, moments.ravel()])

@@ -1,4 +1,4 @@
-"""The permissions of files, also for root."""
+"""Permissions of files, also for root."""
 
 import ctypes
 from contextlib import contextmanager
@@ -11,9 +11,9 @@ OVERRIDING = 1 << 1 | 1 << 2
 
 @contextmanager
 def as_files_say():
-    """Have this thread bound by the permissions of files, which root otherwise is not."""
+    """Make this thread respect file permissions, which root otherwise overrides."""
     libc = ctypes.CDLL(None, use_errno=True)
-    # Version, thread (0 = this one); two rows of effective, permitted, inheritable.
+    # Header: version, thread (0 = this one). Two rows: effective, permitted, inheritable.
     header, rows = (ctypes.c_uint32 * 2)(VERSION, 0), (ctypes.c_uint32 * 6)()
     assert libc.capget(header, rows) == 0
     before = rows[0]

@@ -1,6 +1,6 @@
-"""The rules of the calibration in plain Python, sample by sample: an oracle for the compiled ones.
+"""Rules of the calibration in plain Python, sample by sample: an oracle for the compiled ones.
 
-The background itself is the package's; the rules for what enters it are here.
+The background itself is that of the package; the rules for updating it are here.
 """
 
 from collections import Counter
@@ -16,7 +16,7 @@ NS = 1_000_000_000
 
 
 class Repetition:
-    """A sensor is stuck where a run of equal readings is less likely than 1e-9."""
+    """A sensor is stuck if a run of equal readings has a probability below 1e-9."""
 
     def __init__(self):
         self.last, self.run, self.repeats, self.changes = None, 0, 0.0, 0.0
@@ -41,7 +41,7 @@ class Repetition:
 
 
 class Spikes:
-    """Holds up to three readings that are far steeper than the eight differences before."""
+    """Holds up to three readings whose steps far exceed the eight previous ones."""
 
     def __init__(self, threshold):
         self.threshold = threshold
@@ -51,7 +51,7 @@ class Spikes:
         self.held, self.before, self.steps = [], None, []
 
     def feed(self, sample, noise_std, step):
-        """[(sample, whether it is a spike)] of what is known by now."""
+        """[(sample, whether it is a spike)] of the samples classified so far."""
         if self.before is None:
             return self.step(sample)
         steps = np.abs(sample.field - self.before.field)
@@ -91,14 +91,14 @@ class Spikes:
         return False
 
     def step(self, sample):
-        """The held samples pass, and this one without a comparison."""
+        """Release the held samples, and this one without a comparison."""
         known = [(h, False) for h, _ in self.held] + [(sample, False)]
         self.held, self.before = [], sample
         return known
 
 
 class PlainCalibration:
-    """As `Calibrate`, without restoring and without another calibration in the middle."""
+    """Like `Calibrate`, without restored backgrounds and without a change of the calibration."""
 
     def __init__(self, network, settings):
         self.network, self.settings = network, settings
@@ -231,7 +231,7 @@ class PlainCalibration:
         return [MagSample(sample.stamp_ns, sample.sensor, field, C)]
 
     def is_credible(self, own, noise):
-        """Positive definite over the known axes, a variance within 25 times, alike correlations."""
+        """Positive definite, variances within a factor of 25, similar correlations."""
         there = ~np.isnan(noise.diagonal())
         own, noise = own[np.ix_(there, there)], noise[np.ix_(there, there)]
         if not np.isfinite(own).all() \

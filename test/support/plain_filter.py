@@ -1,4 +1,4 @@
-"""The filters of a bank step by step in NumPy, as an oracle for the compiled ones."""
+"""Filters of a bank step by step in NumPy: an oracle for the compiled ones."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from support.plain_smoother import Step, smoothed_covariances, smoothed_states
 
 
 class StepByStep:
-    """Runs a bank along paths, by its `predict` and `update`; see `BankFilter.run_along`."""
+    """Runs a bank along paths by its `predict` and `update`; see `BankFilter.run_along`."""
 
     def run_along(self, bank, frames, intervals, paths, *, passes, step, first_is_updated,
                   rejects_outliers=False, wants_covariances=False):
@@ -30,7 +30,7 @@ class StepByStep:
         return PathResult(log_likelihood, away.max(axis=1), used, covariances)
 
     def filtered(self, bank, frames, intervals, paths, first_is_updated, rejects_outliers):
-        """(`Step`s, log-likelihood, which frames were used) of one way through the frames."""
+        """(`Step`s, log-likelihood, which frames were used) of one pass through the frames."""
         steps, total = [], np.zeros(len(bank))
         used = np.ones((len(bank), len(frames)), dtype=bool)
         for k, (frame, dt) in enumerate(zip(frames, intervals, strict=True)):
@@ -53,7 +53,7 @@ class StepByStep:
 
 
 class PlainFilter(StepByStep, BankFilter):
-    """A `BankFilter` whose steps are taken one after the other, each for the whole bank."""
+    """`BankFilter` whose steps are made one after the other, each for the whole bank."""
 
     def __init__(self, network, model, settings, n_targets=1):
         super().__init__(network, model, settings, n_targets)
@@ -70,7 +70,7 @@ class PlainFilter(StepByStep, BankFilter):
         return moved, F, Q
 
     def predict(self, bank, dt, x_lin=None):
-        """Time update in place, linearised at `x_lin` or the bank; (Jacobian, decay)."""
+        """Time update in place, linearised at `x_lin` or the bank; return (Jacobian, decay)."""
         n_t = self.observation.n_target
         at = (bank.x if x_lin is None else x_lin)[:, :n_t]
         x_target, F, Q = self._propagate(at, dt, bank.P[:, :n_t, :n_t])
@@ -83,9 +83,7 @@ class PlainFilter(StepByStep, BankFilter):
         return F, decay
 
     def update(self, bank, frame, dt, x_lin=None):
-        """Measurement update in place, linearised at `x_lin`, or iterated from the bank;
-        (log-likelihood, `plain_kalman.Gains`).
-        """
+        """Measurement update in place at `x_lin`, or iterated; return (log-likelihood, `Gains`)."""
         iterations = self._settings.iterations if x_lin is None else 1
         covariance = np.where(np.isnan(frame.covariance), np.eye(3), frame.covariance)
         x_prior, P_prior = bank.x, bank.P

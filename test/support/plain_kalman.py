@@ -1,4 +1,4 @@
-"""A Kalman filter in NumPy, batched over hypotheses, sensor by sensor: an oracle.
+"""Kalman filter in NumPy, batched over hypotheses, sensor by sensor: an oracle.
 
 The states are those of `inference/hypothesis.hpp`: n_t of the target, n_own of each sensor, and
 three backgrounds of each sensor.
@@ -11,14 +11,14 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Gains:
-    """What an update did, sensor after sensor, as `plain_smoother` wants it.
+    """Gains of an update, sensor by sensor, as `plain_smoother` uses them.
 
-    Of each sensor given those before it: z = W u whitens its innovation u, and x += G' z,
+    For each sensor, given those before it: z = W u whitens its innovation u, and x += G' z,
     P -= G' G, with G = W [H | I] P. Rows of missing axes are zero.
     """
 
     A: np.ndarray
-    """(n_hyp, n_sensors, 3, n_x) the whole derivative [H | I]."""
+    """(n_hyp, n_sensors, 3, n_x) Complete derivative [H | I]."""
     G: np.ndarray
     """(n_hyp, n_sensors, 3, n_x)"""
     z: np.ndarray
@@ -28,8 +28,9 @@ class Gains:
 
 
 def predict(x, P, x_target, F, Q, variance, decay=1.0):
-    """Time update in place: the target's states become `x_target` (n_hyp, n_t), with the Jacobian
-    `F` and the noise `Q`; the others are multiplied by `decay`, and `variance` is added.
+    """Time update in place: `x_target` (n_hyp, n_t) with Jacobian `F` and noise `Q`.
+
+    The other states are multiplied by `decay`, and `variance` is added.
     """
     n_hyp, n_t = x_target.shape
     rest = np.arange(n_t, x.shape[1])
@@ -42,7 +43,7 @@ def predict(x, P, x_target, F, Q, variance, decay=1.0):
 
 
 def whole_derivative(H, n_own):
-    """(n_hyp, n_sensors, 3, n_x) of `H` (n_hyp, n_sensors, 3, n_t + n_own)."""
+    """(n_hyp, n_sensors, 3, n_x) complete derivative of `H` (n_hyp, n_sensors, 3, n_t + n_own)."""
     n_hyp, n_sensors, _, n_seen = H.shape
     n_t = n_seen - n_own
     A = np.zeros((n_hyp, n_sensors, 3, n_t + (n_own + 3) * n_sensors))
@@ -57,11 +58,11 @@ def whole_derivative(H, n_own):
 def update(x, P, y, h, H, C, inflation, x_lin=None, n_own=0):
     """Measurement update of every hypothesis, in place.
 
-    `y` (n_sensors, 3), NaN where an axis is missing; `h` (n_hyp, n_sensors, 3) without the
-    backgrounds and `H` (n_hyp, n_sensors, 3, n_t + n_own), at `x_lin` (n_hyp, n_x) or the
-    prediction; `C` (n_sensors, 3, 3); `inflation` (n_hyp, n_sensors) of each axis' variance.
-    Returns the log-likelihood (n_hyp,), the normalised innovation squared (n_hyp, n_sensors) of
-    each sensor given those before it, and the `Gains`.
+    `y` (n_sensors, 3), NaN for a missing axis; `h` (n_hyp, n_sensors, 3) without the backgrounds
+    and `H` (n_hyp, n_sensors, 3, n_t + n_own), at `x_lin` (n_hyp, n_x) or the prediction; `C`
+    (n_sensors, 3, 3); `inflation` (n_hyp, n_sensors) of the variance of each axis. Returns the
+    log-likelihood (n_hyp,), the NIS (n_hyp, n_sensors) of each sensor given those before it, and
+    the `Gains`.
     """
     x_lin = x.copy() if x_lin is None else x_lin
     n_hyp, n_sensors, n_x = len(x), len(y), x.shape[1]

@@ -1,10 +1,10 @@
-"""The backward pass of a smoother in NumPy, batched over hypotheses: an oracle.
+"""Backward pass of a smoother in NumPy, batched over hypotheses: an oracle.
 
-In the form of Bryson and Frazier: what comes later is carried backwards as a vector l and a
-matrix L, so that a state that was filtered as (x, P) is x + P l given everything, with covariance
-P - P L P. No covariance is inverted, so states that are known exactly, or that are one, need no
-care. Source: Bierman 1973, Fixed interval smoothing with discrete measurements (modified
-Bryson-Frazier), here sensor by sensor as `plain_kalman.update` goes.
+It has the form of Bryson and Frazier: later measurements are carried backwards as a vector l and a
+matrix L, so that a state filtered as (x, P) is smoothed to x + P l, with covariance P - P L P. No
+covariance is inverted, so singular covariances need no special treatment. Source: Bierman 1973,
+Fixed interval smoothing with discrete measurements (modified Bryson-Frazier), applied sensor by
+sensor like `plain_kalman.update`.
 """
 
 from collections.abc import Sequence
@@ -18,36 +18,23 @@ from support.plain_kalman import Gains
 
 @dataclass(frozen=True)
 class Step:
-    """What a filter did at one time."""
+    """State of a filter at one time."""
 
     x: FloatArray
-    """(n_hyp, n_x) states after the update."""
+    """(n_hyp, n_x) States after the update."""
     P: FloatArray
-    """(n_hyp, n_x, n_x) their covariances."""
+    """(n_hyp, n_x, n_x) Covariances."""
     gains: Gains | None
-    """Of the update; None where there was none."""
+    """Gains of the update; None without an update."""
     F: FloatArray | None = None
-    """(n_t, n_t) or (n_hyp, n_t, n_t) Jacobian of the propagation to this time; None at the first
-    one."""
+    """(n_t, n_t) or (n_hyp, n_t, n_t) Jacobian of the propagation to this time; None for the first
+    step."""
     decay: FloatArray | None = None
-    """(n_x - n_t,) what the other states were multiplied by, each on its own; None at the first
-    one."""
+    """(n_x - n_t,) Factors of the other states; None for the first step."""
 
 
 def smoothed_states(steps: Sequence[Step]) -> list[FloatArray]:
-    """States at each time given the measurements of all times.
-
-    Parameters
-    ----------
-    steps : list of Step
-        In the order of time. Where one has no gains nothing was measured.
-
-    Returns
-    -------
-    list of (n_hyp, n_x)
-
-    Raises ValueError where the gains are not of as many hypotheses and states as the steps.
-    """
+    """[(n_hyp, n_x)] states at each of the `steps`, in order of time, given all measurements."""
     for step in steps:
         if step.gains is not None and step.gains.G.shape[::3] != step.x.shape:
             raise ValueError(f'gains {step.gains.G.shape} of states {step.x.shape}')
@@ -75,21 +62,21 @@ def smoothed_covariances(steps: Sequence[Step]) -> list[FloatArray]:
 
 
 def _adjoint_of_update(after, gains):
-    """`after` (n_hyp, n_x) carried back over an update, in place, sensor by sensor."""
+    """Carry `after` (n_hyp, n_x) back over an update, in place, sensor by sensor."""
     for j in range(gains.G.shape[1] - 1, -1, -1):
         v = gains.z[:, j] - np.einsum('pai,pi->pa', gains.G[:, j], after)
         after += np.einsum('pab,pbi,pa->pi', gains.W[:, j], gains.A[:, j], v)
 
 
 def _before(step, after):
-    """Phi' `after` (n_hyp, n_x, m), where Phi is the propagation to `step`, which has one."""
+    """Phi' `after` (n_hyp, n_x, m), where Phi is the propagation to `step`."""
     n_t = step.F.shape[-1]
     return np.concatenate([np.swapaxes(step.F, -1, -2) @ after[:, :n_t],
                            step.decay[:, None] * after[:, n_t:]], axis=1)
 
 
 def _information_before_update(after, gains):
-    """(n_hyp, n_x, n_x): `after` carried back over an update, sensor by sensor."""
+    """Carry `after` (n_hyp, n_x, n_x) back over an update, sensor by sensor."""
     for j in range(gains.G.shape[1] - 1, -1, -1):
         G, W_A = gains.G[:, j], gains.W[:, j] @ gains.A[:, j]
         kept = np.eye(after.shape[1]) - np.swapaxes(G, 1, 2) @ W_A

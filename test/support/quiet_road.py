@@ -1,4 +1,4 @@
-"""A road on which nothing moves, as a recording."""
+"""Recording of a road without vehicles."""
 
 import numpy as np
 
@@ -10,11 +10,11 @@ from mag_tracking.units import NS
 
 BEGIN_NS = 1_790_000_000 * NS
 NOISE, DRIFT, STEP = 1.2e-8, 3e-10, 6.25e-9
-"""[T] of a reading, [T/s^0.5] of the background, [T] between two values of the sensors."""
+"""[T] Noise of a reading, [T/s^0.5] drift of the background, [T] quantisation step."""
 
 
 def write_quiet_road(path, network, duration_s, rate_hz=100.0, seed=0):
-    """Readings of a network in the earth's field, which drifts a little; an .mcap file."""
+    """Write readings of a network in the Earth's field, which drifts slightly, as an .mcap file."""
     rng, n = np.random.default_rng(seed), round(duration_s * rate_hz)
     t_ns = BEGIN_NS + np.round(np.arange(n) * NS / rate_hz).astype(np.int64)
     with RecordingWriter(path) as writer:

@@ -1,4 +1,4 @@
-"""Passes of random vehicles of both simulators, and what the tracker makes of them."""
+"""Passes of random vehicles of both simulators, and their tracks."""
 
 from dataclasses import dataclass, replace
 
@@ -16,14 +16,12 @@ from support.spoiler import apply
 SIMULATORS = ('clouds', 'boxes')
 KINDS = ('truck', 'car', 'turning')
 WRONG_M, WRONG_SD = 2.0, 3.0
-"""A pose that is off by more than both, and not flagged, is sure and wrong."""
+"""A pose whose error exceeds both is wrong; it is sure and wrong if it is not flagged."""
 
 
 def random_course(rng, turns):
-    """(`Path`, duration [s], time of the closest point [s], roughly) past sensors at the origin.
-
-    A turn takes 2 to 5 m/s^2 across, as a tight one at a junction does.
-    """
+    """(`Path`, duration [s], approximate time of the CPA [s]) past sensors at the origin."""
+    # A turn has a lateral acceleration of 2 to 5 m/s², like a tight turn at a junction.
     lane, radius = rng.uniform(0.8, 1.6), rng.uniform(4.5, 8.0)
     speed = np.sqrt(radius * rng.uniform(2.0, 5.0)) if turns else rng.uniform(7.0, 20.0)
     away = 6.0 * speed + (15.0 if turns else 25.0)
@@ -36,7 +34,7 @@ def random_course(rng, turns):
 
 
 def random_pass(simulator, kind, seed):
-    """(body, course, duration [s], `Imperfections`) of one pass of a kind of `KINDS`."""
+    """(body, course, duration [s], `Imperfections`) of one pass of a kind in `KINDS`."""
     rng = np.random.default_rng([seed, KINDS.index(kind), SIMULATORS.index(simulator)])
     path, duration, closest_s = random_course(rng, kind == 'turning')
     if simulator == 'clouds':
@@ -50,45 +48,43 @@ def random_pass(simulator, kind, seed):
 
 @dataclass(frozen=True)
 class Tracked:
-    """What the tracker said of one pass; the arrays are over its poses."""
+    """Tracking results of one pass; the arrays are over its poses."""
 
     error: np.ndarray
-    """(n,) [m], horizontal."""
+    """(n,) [m] Horizontal error."""
     deviation: np.ndarray
-    """(n,) [m], as stated, along the error."""
+    """(n,) [m] Stated standard deviation in the direction of the error."""
     nees: np.ndarray
-    """(n,), an axis."""
+    """(n,) NEES per axis."""
     topic_nees: np.ndarray
-    """(n,) the same by the covariance of the pose topics; NaN where they carry nothing."""
+    """(n,) NEES by the covariance of the pose topics; NaN if they have none."""
     distance: np.ndarray
-    """(n,) [m] of the truth from the sensors' middle."""
+    """(n,) [m] True distance from the centre of the sensors."""
     ambiguous: np.ndarray
-    """(n,)"""
+    """(n,)."""
     speed_ratio: float
-    """Stated over true speed at the closest point; NaN without a pose."""
+    """Tracked over true speed at the CPA; NaN without a pose."""
     heading: float
-    """Cosine of the angle between the two velocities there; NaN without a pose."""
+    """Cosine of the angle between tracked and true velocity at the CPA; NaN without a pose."""
     detected: bool
     smoothed_sure: int
-    """Smoothed poses that are not flagged."""
+    """Number of unflagged smoothed poses."""
     smoothed_wrong: int
-    """Those of them that are wrong."""
+    """Number of unflagged smoothed poses that are wrong."""
 
     @property
     def sure_and_wrong(self):
-        """(n,)"""
+        """(n,) Whether a pose is wrong and not flagged."""
         return ~self.ambiguous & are_wrong(self.error, self.deviation)
 
 
 def are_wrong(error, deviation):
-    """Whether errors [m] of these stated deviations [m] are wrong."""
+    """Whether errors [m] with these stated standard deviations [m] are wrong."""
     return (error > WRONG_M) & (error > WRONG_SD * deviation)
 
 
 def errors_of(poses, t, position):
-    """Horizontal error (n,) [m] of `Track`s or `SmoothedPose`s from the positions at times `t` [s],
-    its stated deviation (n,) [m], its square over what is stated, an axis, and the truth (n, 2).
-    """
+    """Horizontal (error [m], stated std [m], NEES per axis, true position (n, 2) [m]) of poses."""
     stamps = np.array([r.stamp_ns for r in poses]) / 1e9
     true = np.stack([np.interp(stamps, t, position[:, k]) for k in (0, 1)], axis=1)
     error = np.array([r.position[:2] for r in poses]).reshape(-1, 2) - true
@@ -100,7 +96,7 @@ def errors_of(poses, t, position):
 
 
 def tracked(network, body, course, duration, flaws, seed, changes=None, faults=()):
-    """`Tracked` of a simulated pass, with `faults` of `support.spoiler`."""
+    """`Tracked` of a simulated pass with `faults` of `support.spoiler`."""
     readings, t, position, _ = scenario.simulate(network, body, course, 100.0, duration,
                                                  np.random.default_rng(seed), flaws)
     readings = apply(readings, *faults)
@@ -130,6 +126,6 @@ def tracked(network, body, course, duration, flaws, seed, changes=None, faults=(
 
 
 def one_random_pass(simulator, kind, seed, changes=None, faults=()):
-    """`Tracked` of a random pass through the bundled network; {setting: value} and faults."""
+    """`Tracked` of a random pass through the bundled network, with {setting: value} and faults."""
     return tracked(read_network(NETWORK_FILE), *random_pass(simulator, kind, seed), seed, changes,
                    faults)

@@ -1,4 +1,4 @@
-"""Real readings for the tests: 41 sensors, a magnet, an optical tracker."""
+"""Real readings of 41 sensors, a magnet and an optical tracker."""
 
 import numpy as np
 
@@ -23,7 +23,7 @@ def board_of_41():
 
 
 def errors(geometry, field, positions, axes, poses):
-    """Errors of single poses [m] and of their axes [deg]; `poses` maps tracked ones to world."""
+    """Errors of single poses [m] and of their axes [deg]; `poses` maps the tracker to the world."""
     r, u = poses(positions, axes)
     found = [locate_magnet(geometry.network, B, geometry.moment[0], *BOX, PoseSettings())
              for B in geometry.signal(field)]
@@ -39,7 +39,7 @@ def said(what, place, turn, low):
 
 
 def within_limits(place, turn, low):
-    """The project's limits, and those of what it has reached."""
+    """Check the project's limits, and the tighter ones that it has reached."""
     assert np.median(place) <= 2.0e-3 and np.median(place[low]) <= 0.8e-3
     assert np.median(turn) <= 2.5
     assert np.median(place) <= 1.0e-3 and np.median(place[low]) <= 0.55e-3

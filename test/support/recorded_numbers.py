@@ -1,4 +1,4 @@
-"""Numbers as messages, and recordings of them, for the tests."""
+"""Numbers as messages, and recordings of them."""
 
 import numpy as np
 from rosbags.highlevel import AnyReader
@@ -15,13 +15,13 @@ S = 10**9
 
 
 def field(k):
-    """A serialised magnetic field that carries the number `k` as its stamp."""
+    """Serialised magnetic field with the number `k` as its timestamp."""
     noise = np.random.default_rng(k).standard_normal(3) * 1e-5
     return encoder(MAGNETIC_FIELD)(sample_dict(MagSample(k, 'mag', noise, None), 'mag_1'))
 
 
 def started(folder, **arguments):
-    """A recorder that knows the topic, ticked once; and what it reports."""
+    """(recorder with the topic, ticked once, list of its reports)."""
     told = []
     recorder = Recorder(folder, report=told.append, **arguments)
     recorder.add_topic(TOPIC, MAGNETIC_FIELD, definition(MAGNETIC_FIELD))
@@ -30,13 +30,13 @@ def started(folder, **arguments):
 
 
 def numbers(path, topic=TOPIC):
-    """The numbers of the messages in a recording, in its order, and the recording."""
+    """(numbers of the messages in a recording in its order, recording)."""
     recording = Recording(path)
     return [stamp_ns(decode(m).header.stamp) for m in recording.messages([topic])], recording
 
 
 def by_rosbags(path, topic=TOPIC):
-    """[(time, number)] as rosbags reads them."""
+    """[(time, number)] as read by rosbags."""
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         rows = [(t, reader.deserialize(raw, c.msgtype).header.stamp)
                 for c, t, raw in reader.messages() if c.topic == topic]

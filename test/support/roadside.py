@@ -1,7 +1,8 @@
-"""A roadside in real time for the tests: two boards measure, and a vehicle comes when it is called.
+"""Roadside in real time: two boards measure, and a vehicle passes on request.
 
-The boards count and have a clock, and say what they measure over MQTT and over a serial line at
-once. What nobody takes is lost, and a connection that is lost is made again soon, as by a board.
+The boards have a sample counter and a clock, and send their readings over MQTT and a serial line at
+the same time. Readings that are not received are lost. A lost connection is soon re-established, as
+by a real board.
 """
 
 import json
@@ -18,25 +19,25 @@ from support.mqtt_broker import publish_packet
 
 RATE_HZ = 100.0
 NOISE = 1.2e-8
-"""[T]."""
+"""[T] Noise of a reading."""
 FIRST = np.array([-20.0, -1.5])
-"""[m] Where a vehicle appears; it is noticed some metres later."""
+"""[m] Position where a vehicle appears; it is detected some metres later."""
 SPEED = 6.0
 PASSING_S = 8.0
-"""[s] Then it is 28 m away, and its field below two nanotesla."""
+"""[s] Duration of a pass. The vehicle is then 28 m away, and its field below 2 nT."""
 CONNECT = b'\x10\x12\x00\x04MQTT\x04\x02\x00\x00\x00\x06boards'
 """MQTT 3.1.1, 3.1: CONNECT of the client `boards`, clean session, no keep-alive."""
 TWIN_S = 3.0
 
 
 class MqttSender:
-    """The boards' connection to a broker, which they try anew in every round."""
+    """Connection of the boards to a broker, retried in every round."""
 
     def __init__(self, port):
         self._port, self._socket = port, None
 
     def send(self, readings):
-        """A message for each reading (board, sequence, ticks, field [nT])."""
+        """Send one message for each reading (board, sequence, ticks, field [nT])."""
         with suppress(OSError):
             if self._socket is None:
                 self._connect()
@@ -48,41 +49,26 @@ class MqttSender:
         self.close()
 
     def _connect(self):
-        """Connect; raises OSError where nobody listens."""
+        """Connect; raises OSError if the broker does not listen."""
         self._socket = socket.create_connection(('127.0.0.1', self._port), 1.0)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket.sendall(CONNECT)
 
     def close(self):
-        """Hang up; may be called twice."""
+        """Disconnect; may be called twice."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
 
 def nmea_line(board, k, ticks, field):
-    """A line of text with the reading [nT] and the checksum of NMEA 0183."""
+    """Line of text with the reading [nT] and the checksum of NMEA 0183."""
     body = ','.join([board, str(k), str(ticks), *(f'{v:.1f}' for v in field)]).encode()
     return body + b'*%02X\n' % reduce(lambda a, b: a ^ b, body)
 
 
 class Roadside:
-    """The boards of a network, in a thread of their own.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-        With an earth field; board `A` is its first sensor, `B` the second.
-    body : MagneticBody
-    port : int
-        Of the MQTT broker; the topics are `road/A`, `road/B`.
-    line : SerialLine
-
-    Attributes
-    ----------
-    twin : bool
-        Whether a third board, which was switched on `TWIN_S` later, says that it is `A`, too.
-    """
+    """Boards of a network, in their own thread; board `A` is the first sensor, `B` the second."""
 
     def __init__(self, network, body, port, line):
         assert len(network) == 2
@@ -94,6 +80,7 @@ class Roadside:
             network.earth_field, position, heading, network.positions), network.R_ws)
         self._rng = np.random.default_rng(1)
         self._called, self._start_ns = None, None
+        # `twin`: whether a third board, switched on `TWIN_S` later, also sends as `A`.
         self.plugged, self.twin = True, False
         self._line_lock, self._stopping = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._measure, name='boards')
@@ -113,21 +100,21 @@ class Roadside:
         assert not self._thread.is_alive()
 
     def pull_out(self):
-        """The serial port vanishes."""
+        """Remove the serial port."""
         with self._line_lock:
             self._line.pull_out()
             self.plugged = False
 
     def plug_in(self):
-        """The serial port is back."""
+        """Restore the serial port."""
         with self._line_lock:
             self._line.plug_in()
             self.plugged = True
 
     def call(self):
-        """A vehicle appears at once; the one before has to be gone."""
+        """Start a vehicle; the previous one must have left."""
         assert self.is_gone()
-        # One round later, for this one may be half told.
+        # It starts in the next round, because this one may have been sent in part.
         self._called = round((time.time_ns() - self._start_ns) / 1e9 * RATE_HZ) + 1
 
     def is_gone(self):
@@ -135,17 +122,17 @@ class Roadside:
         return self._called is None or self._elapsed(time.time_ns()) > PASSING_S
 
     def truth(self, stamp_ns):
-        """(2,) [m] Where the vehicle is, or would be when it is out of reach; NaN before any."""
+        """(2,) [m] Position of the vehicle, also out of range; NaN before the first one."""
         if self._called is None:
             return np.full(2, np.nan)
         return FIRST + [SPEED * self._elapsed(stamp_ns), 0.0]
 
     def _elapsed(self, stamp_ns):
-        """[s] since the vehicle was called."""
+        """Time since the start of the vehicle [s]."""
         return (stamp_ns - self._start_ns) / 1e9 - self._called / RATE_HZ
 
     def _measure(self):
-        """A round of readings every so often, each as soon as it is due."""
+        """Send rounds of readings, each as soon as it is due."""
         k = 0
         while not self._stopping.wait(max(
                 0.0, k / RATE_HZ - (time.time_ns() - self._start_ns) / 1e9)):
@@ -161,7 +148,7 @@ class Roadside:
             k += 1
 
     def _readings(self, k, field):
-        """[(board, sequence, ticks [us], field [nT])] of round `k`."""
+        """[(board, sequence, ticks [µs], field [nT])] of round `k`."""
         said = [('A', k, field[0]), ('B', k, field[1])]
         if self.twin:
             said.append(('A', k - round(TWIN_S * RATE_HZ), field[0] + 50.0))

@@ -1,4 +1,4 @@
-"""A ROS domain that no other test run on this machine uses."""
+"""ROS domain that no other test run on this machine uses."""
 
 import fcntl
 import os
@@ -6,11 +6,11 @@ import tempfile
 from pathlib import Path
 
 N_DOMAINS = 100
-"""Domains 1 to 101 are safe from the ports that Linux gives to anybody."""
+"""Domains 1 to 101 do not use ports that Linux assigns automatically."""
 
 
 class RosDomain:
-    """The first free domain from one on that depends on the process; free again when closed."""
+    """First free domain from one that depends on the process; released when closed."""
 
     def __init__(self):
         folder = Path(tempfile.gettempdir()) / f'mag_tracking_domains_{os.getuid()}'
@@ -32,5 +32,5 @@ class RosDomain:
         self.close()
 
     def close(self):
-        """Also done where the process ends."""
+        """Release the domain; the end of the process also releases it."""
         self._lock.close()

@@ -1,4 +1,4 @@
-"""Single samples, which tests change and reorder, and batches of readings made of them."""
+"""Single samples, which tests modify and reorder, and batches of readings made from them."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from mag_tracking.simulation import scenario
 
 @dataclass(frozen=True)
 class MagSample:
-    """One reading of one sensor; covariance None = unknown."""
+    """Reading of one sensor; covariance None = unknown."""
 
     stamp_ns: int
     sensor: str
@@ -20,13 +20,13 @@ class MagSample:
 
 
 def one(sample):
-    """A batch of one `MagSample`."""
+    """Batch of one `MagSample`."""
     return Readings.single(sample.sensor, sample.stamp_ns, np.asarray(sample.field, dtype=float),
                            sample.covariance)
 
 
 def batch(samples):
-    """One batch of [`MagSample`]."""
+    """Batch of [`MagSample`]."""
     return Readings.joined([one(s) for s in samples])
 
 
@@ -43,12 +43,12 @@ def samples_of(*batches):
 
 
 def fed(stage, sample):
-    """[`MagSample`] that a `Calibrate` makes of a `MagSample`."""
+    """[`MagSample`] that a `Calibrate` returns for a `MagSample`."""
     return samples_of(*stage.feed(one(sample)))
 
 
 def flushed(stage):
-    """[`MagSample`] that a `Calibrate` held."""
+    """[`MagSample`] that a `Calibrate` has held."""
     return samples_of(*stage.flush())
 
 
@@ -58,7 +58,7 @@ def recorded(reader):
 
 
 def simulate(*arguments, **named):
-    """`scenario.simulate` with [`MagSample`]."""
+    """`scenario.simulate` that returns [`MagSample`]."""
     readings, *truth = scenario.simulate(*arguments, **named)
     return samples_of(readings), *truth
 

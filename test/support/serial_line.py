@@ -1,4 +1,4 @@
-"""A serial line for the tests: a pseudo-terminal under a path, which can vanish and come back."""
+"""Serial line: a pseudo-terminal under a path, which can be removed and restored."""
 
 import os
 import tty
@@ -12,7 +12,7 @@ class SerialLine:
         self._master = None
 
     def plug_in(self):
-        """The port appears."""
+        """Create the port."""
         self._master, slave = os.openpty()
         tty.setraw(slave)
         os.set_blocking(self._master, False)
@@ -20,14 +20,14 @@ class SerialLine:
         os.close(slave)
 
     def send(self, data):
-        """The device says something; what nobody reads is lost."""
+        """Send bytes from the device; bytes that are not read are lost."""
         try:
             os.write(self._master, data)
         except BlockingIOError:
             pass
 
     def pull_out(self):
-        """The port vanishes."""
+        """Remove the port."""
         os.unlink(self.path)
         os.close(self._master)
         self._master = None

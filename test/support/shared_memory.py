@@ -1,4 +1,4 @@
-"""Segments of shared memory that processes leave in /dev/shm."""
+"""Shared memory segments that processes leave in /dev/shm."""
 
 import os
 from contextlib import suppress
@@ -13,10 +13,8 @@ def segments_of(pid):
 
 
 def left_behind(names):
-    """Those of `names` that are in /dev/shm and that no living process has open.
-
-    A process also opens what belongs to others, such as those of another test.
-    """
+    """Those of `names` that remain in /dev/shm and that no running process has open."""
+    # A process also opens segments of others, such as those of another test.
     left = {n for n in names & set(os.listdir('/dev/shm')) if not n.startswith('sem.')}
     for pid in filter(str.isdigit, os.listdir('/proc') if left else ()):
         with suppress(OSError):

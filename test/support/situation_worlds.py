@@ -1,7 +1,7 @@
 """Worlds for `support.situations`: bodies, courses, disturbances.
 
-Each function takes a random generator and the name of a simulator ('clouds' or 'boxes'), and gives
-a body or a `World`. Sizes, speeds and lanes are drawn for each seed.
+Each function takes a random generator and the name of a simulator ('clouds' or 'boxes'), and
+returns a body or a `World`. Sizes, speeds and lanes are random for each seed.
 """
 
 from dataclasses import replace
@@ -20,7 +20,7 @@ from support.worlds import FLAWS, Convoy, Ride, box_two_wheeler, world
 ROAD = read_network(NETWORK_FILE)
 FOUR = network_of([[0.0, -4.5, 0.0], [0.0, 4.5, 0.0], [9.0, -4.5, 0.0], [9.0, 4.5, 0.0]])
 QUIET_S = 7.0
-"""[s] without a vehicle near, in which a background is learnt."""
+"""[s] Interval without a vehicle nearby, for learning the background."""
 
 
 # Bodies.
@@ -40,7 +40,7 @@ def truck(rng, simulator, length=None, moment=None):
 
 
 def small(rng, simulator, length, moment, iron=1.0):
-    """A motorcycle, a bicycle or a trolley."""
+    """Motorcycle, bicycle or trolley."""
     if simulator == 'boxes':
         return box_two_wheeler(rng, length, moment, iron)
     return random_vehicle(rng, length, 0.5, 1.0, n_parts=20, moment=moment)
@@ -59,7 +59,7 @@ def wagon(rng, simulator):
 # Courses.
 
 def lane(rng, speed, away=None, y=None):
-    """A straight `Path` along the road; the vehicle is at the sensors after away / speed [s]."""
+    """Straight `Path` along the road; the vehicle passes the sensors after away / speed [s]."""
     away = QUIET_S * speed + 25.0 if away is None else away
     y = rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 1.6) if y is None else y
     forward = rng.random() < 0.5
@@ -67,14 +67,13 @@ def lane(rng, speed, away=None, y=None):
 
 
 def straight(rng, simulator, body, speed, network=ROAD, **of_lane):
-    """A body straight past the sensors."""
+    """Body on a straight path past the sensors."""
     path, away = lane(rng, speed, **of_lane)
     return world(network, [(body, path)], 2.0 * away / speed + 4.0, rng, FLAWS[simulator])
 
 
 def stop_and(rng, stop_s, then):
-    """(`Ride`, duration [s]): a vehicle stops near the sensors, and then goes on at `then` times
-    its speed (0: never)."""
+    """(`Ride`, duration [s]) with a stop near the sensors, then `then` times the speed."""
     speed = rng.uniform(6.0, 12.0)
     brake = rng.uniform(1.5, 3.0)
     path, away = lane(rng, speed, y=rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 1.6))
@@ -103,7 +102,7 @@ def u_turn(rng, simulator):
 
 
 def leaves(rng, simulator, cars=0):
-    """A car stands near the sensors from the beginning and leaves; then others may pass."""
+    """A car is parked near the sensors from the beginning and leaves; other cars may then pass."""
     at, y = rng.uniform(-4.0, 4.0), rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 2.0)
     stands = rng.uniform(10.0, 20.0)
     top = rng.uniform(6.0, 12.0)
@@ -121,7 +120,7 @@ def leaves(rng, simulator, cars=0):
 
 
 def parked(rng, simulator):
-    """A car stands 5 to 8 m beside the sensors for good; another one passes."""
+    """A car is parked permanently 5 to 8 m beside the sensors; another one passes."""
     place = np.array([rng.uniform(-4.0, 4.0), rng.choice([-1.0, 1.0]) * rng.uniform(7.0, 9.0)])
     stands = Ride(Path(place, 0.0, 1.0), (0.0, 1.0), (0.0, 0.0))
     speed = rng.uniform(7.0, 15.0)
@@ -149,22 +148,22 @@ def two(rng, simulator, how, network=ROAD):
 
 
 def spoilt_car(rng, simulator, *faults):
-    """A car past sensors with faults of `support.spoiler`."""
+    """Car past sensors with faults of `support.spoiler`."""
     made = straight(rng, simulator, car(rng, simulator), rng.uniform(7.0, 20.0))
     return replace(made, readings=spoiler.apply(made.readings, *faults))
 
 
 def usual(rng, simulator, kind):
-    """A pass of `support.random_passes`."""
+    """Pass of `support.random_passes`."""
     seed = int(rng.integers(1 << 30))
     body, course, duration, flaws = random_pass(simulator, kind, seed)
     return world(ROAD, [(body, course)], duration, rng, flaws)
 
 
-# Without any target, or with one in a disturbance.
+# Worlds without a target, or with one during a disturbance.
 
 def ambient_world(rng, simulator, ambient, duration, rate=100.0, cars=0):
-    """A field over the whole network, and perhaps cars."""
+    """Field over the whole network, optionally with cars."""
     movers = []
     for k in range(cars):
         speed = rng.uniform(7.0, 15.0)
@@ -174,7 +173,7 @@ def ambient_world(rng, simulator, ambient, duration, rate=100.0, cars=0):
 
 
 def uniform(vector, of_time):
-    """A field (3,) [T] that is the same at all sensors, times a function of time."""
+    """Field (3,) [T] equal at all sensors, times a function of time."""
     return lambda t: np.broadcast_to(of_time(t)[:, None, None] * vector, (len(t), len(ROAD), 3))
 
 
@@ -184,7 +183,7 @@ def direction(rng):
 
 
 def hum(rng, simulator, frequency, rate):
-    """A power line to one side: its field is larger at the nearer sensor."""
+    """Power line to one side; its field is larger at the nearer sensor."""
     near = rng.uniform(0.5, 1.0, 2)
     v = rng.uniform(1e-7, 3e-7) * direction(rng)
     turns = 2.0 * np.pi * frequency * rng.uniform(0.9995, 1.0005)
@@ -193,11 +192,11 @@ def hum(rng, simulator, frequency, rate):
 
 
 def tram(rng, simulator):
-    """The current of a line 30 to 60 m away is switched on and off: 100 to 500 A, with ramps."""
+    """Current of 100 to 500 A in a line 30 to 60 m away, switched on and off with ramps."""
     times = np.sort(rng.uniform(12.0, 55.0, 4))
     away, current = rng.uniform(30.0, 60.0), rng.uniform(100.0, 500.0)
     y = ROAD.positions[:, 1]
-    # Of an infinite wire along x, 5 m above the ground.
+    # Field of an infinite wire along x, 5 m above the ground.
     r2 = (away - y)**2 + 25.0
     B = 2e-7 * current * np.stack([0.0 * y, 5.0 / r2, (away - y) / r2], axis=1)
     ramp = rng.uniform(0.2, 2.0)
@@ -207,7 +206,7 @@ def tram(rng, simulator):
 
 
 def storm(rng, simulator, cars=0):
-    """500 nT in ten minutes, as a sum of slow waves; here the steepest minutes of it."""
+    """500 nT in ten minutes as a sum of slow waves; the steepest minutes are used."""
     v = 5e-7 * direction(rng)
     periods, phases = rng.uniform(60.0, 400.0, 6), rng.uniform(0.0, 2.0 * np.pi, 6)
     return ambient_world(rng, simulator, uniform(v, lambda t: sum(
@@ -216,14 +215,14 @@ def storm(rng, simulator, cars=0):
 
 
 def pulsations(rng, simulator):
-    """20 nT with a period of 20 to 60 s."""
+    """Geomagnetic pulsations of 20 nT with a period of 20 to 60 s."""
     p = rng.uniform(20.0, 60.0)
     return ambient_world(rng, simulator, uniform(
         2e-8 * direction(rng), lambda t: np.sin(2.0 * np.pi * t / p)), 120.0)
 
 
 def knocked(rng, simulator):
-    """A sensor is turned by some degrees within a tenth of a second."""
+    """A sensor is rotated by some degrees within 0.1 s."""
     made = ambient_world(rng, simulator, None, 40.0)
     angles = np.deg2rad(rng.uniform(1.0, 5.0)) * direction(rng)
     n = int(15.0 * 100.0) * 2
@@ -235,7 +234,7 @@ def knocked(rng, simulator):
 
 
 def ramps(rng, simulator):
-    """Each sensor warms up on its own: up to 5 nT/s for 10 to 30 s, then back."""
+    """Each sensor warms up independently: up to 5 nT/s for 10 to 30 s, then back."""
     rates = rng.uniform(1e-9, 5e-9, (2, 1)) * np.array([direction(rng), direction(rng)])
     lasts = rng.uniform(10.0, 30.0)
     return ambient_world(rng, simulator, lambda t: np.interp(
@@ -243,13 +242,13 @@ def ramps(rng, simulator):
 
 
 def far(rng, simulator, body):
-    """Something large passes far away: hardly a field is felt."""
+    """A large object passes far away; its field is hardly measurable."""
     return straight(rng, simulator, body, rng.uniform(15.0, 25.0), away=200.0,
                     y=rng.choice([-1.0, 1.0]) * rng.uniform(30.0, 60.0))
 
 
 def train(rng, simulator, y):
-    """Five wagons of 18 m; a pose at any of them is right."""
+    """Five wagons of 18 m; a pose at any of them is correct."""
     speed = rng.uniform(10.0, 20.0)
     path, away = lane(rng, speed, away=250.0, y=rng.choice([-1.0, 1.0]) * y)
     along = np.array([np.cos(path.heading), np.sin(path.heading)])

@@ -1,4 +1,4 @@
-"""Situations that the tracker's model does not assume, and how often it is sure and wrong."""
+"""Situations outside the assumptions of the tracker's model, and how often it is sure and wrong."""
 
 from dataclasses import dataclass
 
@@ -36,14 +36,14 @@ from support.situation_worlds import (
 
 @dataclass(frozen=True)
 class Situation:
-    """A row of the table."""
+    """Row of the table of situations."""
 
     make: object
-    """Takes a generator and a simulator's name, gives a `World`."""
+    """Function from a random generator and a simulator's name to a `World`."""
     aim: float = 0.02
-    """At most this share of the unflagged poses may be wrong."""
+    """Maximum share of wrong poses among the unflagged ones."""
     group: str = 'one'
-    """'control' (tracked well), 'one' vehicle or none, 'several' vehicles, 'nothing' at all."""
+    """'control' (tracked well), 'one' vehicle or none, 'several' vehicles, or 'nothing'."""
 
 
 SITUATIONS = {
@@ -77,11 +77,11 @@ SITUATIONS = {
         r, s, small(r, s, 2.1, r.uniform(40.0, 60.0)), r.uniform(8.0, 18.0))),
     'a car with a trailer': Situation(lambda r, s: straight(
         r, s, car_with_trailer(r, s), r.uniform(7.0, 15.0))),
-    # From the nearer sensor.
+    # Distance from the nearer sensor.
     'a train at 9 m': Situation(lambda r, s: train(r, s, 13.5)),
     'there at the start, leaves': Situation(leaves),
     'there at the start, then cars': Situation(lambda r, s: leaves(r, s, cars=2)),
-    # Longer than `relearn_s`: it has become background when it leaves.
+    # Longer than `relearn_s`: it has become part of the background when it leaves.
     'was parked for minutes, leaves': Situation(lambda r, s: stopping(r, s, 150.0)),
     'parked beside a passing car': Situation(parked),
     'one sensor alone': Situation(lambda r, s: spoilt_car(r, s, spoiler.only_sensor('mag_1'))),
@@ -108,11 +108,11 @@ SITUATIONS = {
     'a truck far away': Situation(lambda r, s: far(r, s, truck(r, s))),
     'a train far away': Situation(lambda r, s: train(r, s, r.uniform(40.0, 60.0))),
 }
-"""{situation: `Situation`}."""
+"""Situations by name."""
 
 
 def made(name, simulator, seed):
-    """The `World` of a situation."""
+    """`World` of a situation."""
     rng = np.random.default_rng([seed, sorted(SITUATIONS).index(name),
                                  SIMULATORS.index(simulator)])
     return SITUATIONS[name].make(rng, simulator)
@@ -120,22 +120,22 @@ def made(name, simulator, seed):
 
 @dataclass(frozen=True)
 class Verdict:
-    """What was said of one `World`; the arrays are over its published poses."""
+    """Evaluation of one `World`; the arrays are over its published poses."""
 
     stamps: np.ndarray
-    """(n,) [s]"""
+    """(n,) [s]."""
     ids: np.ndarray
     ambiguous: np.ndarray
     wrong: np.ndarray
-    """(n,) off by more than 2 m and 3 deviations from every body."""
+    """(n,) Whether the error exceeds 2 m and 3 standard deviations for every body."""
     smoothed_sure: int
     smoothed_wrong: int
     n_tracks: int
     n_disturbances: int
     n_mistaken: int
-    """Disturbances that a body is taken for: their tracks follow it."""
+    """Number of disturbances that are in fact a body: their tracks follow it."""
     doubts: tuple
-    """(n,) of each pose."""
+    """(n,) Doubts of each pose."""
 
     @property
     def n_sure(self):
@@ -147,7 +147,7 @@ class Verdict:
 
 
 def wrong_of(poses, a_world):
-    """(n,) whether `Track`s or `SmoothedPose`s are wrong of every body of a `World`."""
+    """(n,) Whether `Track`s or `SmoothedPose`s are wrong for every body of a `World`."""
     wrong = np.ones(len(poses), dtype=bool)
     for position in a_world.positions:
         size, along, *_ = errors_of(poses, a_world.t, position)
@@ -156,7 +156,7 @@ def wrong_of(poses, a_world):
 
 
 def mistaken(disturbances, tracks, a_world):
-    """Those of [`Disturbance`] whose tracks follow a body of a `World`, within 5 m."""
+    """Those of [`Disturbance`] whose tracks follow a body of a `World` within 5 m."""
     out = []
     for d in disturbances:
         poses = [r for r in tracks if r.id == d.track_id]
@@ -167,7 +167,7 @@ def mistaken(disturbances, tracks, a_world):
 
 
 def verdict(name, simulator, seed, changes=None):
-    """`Verdict` on a situation, with {setting: value} as `changes`."""
+    """`Verdict` on a situation with the settings `changes` ({name: value})."""
     a_world = made(name, simulator, seed)
     pipeline = Pipeline(a_world.network, settings_for('vehicle', changes))
     records = pipeline.feed(a_world.readings) + pipeline.flush()

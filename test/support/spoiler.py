@@ -1,5 +1,4 @@
-"""Faults and poor sensors, applied to any recording: each function takes `Readings` and returns
-spoilt ones.
+"""Faults and poor sensors for any recording: each function modifies `Readings`.
 
     readings = apply(readings, steps(1e-7), covariance(1e-2), beginning_cut(5.0))
 """
@@ -12,7 +11,7 @@ from mag_tracking.units import NS
 
 
 def apply(readings, *faults):
-    """The readings with one fault after the other."""
+    """Apply faults one after the other."""
     for fault in faults:
         readings = fault(readings)
     return readings
@@ -23,19 +22,19 @@ def _with(readings, field):
 
 
 def _seconds(readings):
-    """(n,) [s] since the first reading."""
+    """(n,) [s] Time since the first reading."""
     return (readings.stamp_ns - readings.stamp_ns.min()) / NS
 
 
 def _of(readings, sensor):
-    """(n,) whether a reading is of `sensor`; of all for None."""
+    """(n,) Whether a reading belongs to `sensor`; all for None."""
     if sensor is None:
         return np.ones(len(readings), dtype=bool)
     return np.array(readings.sensor_names()) == sensor
 
 
 def covariance(variance):
-    """Every message states this variance [T^2]; 0 and -1: unknown, as the messages have it."""
+    """Every message states this variance [T²]; 0 and -1 mean unknown, as in ROS messages."""
     def spoil(readings):
         if variance in (0.0, -1.0):
             return dataclasses.replace(readings, covariance=None)
@@ -45,7 +44,7 @@ def covariance(variance):
 
 
 def steps(size, sensor=None):
-    """Readings in steps of `size` [T]."""
+    """Quantise readings in steps of `size` [T]."""
     def spoil(readings):
         coarse = size * np.round(readings.field / size)
         return _with(readings, np.where(_of(readings, sensor)[:, None], coarse, readings.field))
@@ -53,7 +52,7 @@ def steps(size, sensor=None):
 
 
 def glitches(share, size, seed=0):
-    """A `share` of the readings has one axis off by up to `size` [T]: errors on a bus."""
+    """A `share` of the readings has an error of up to `size` [T] on one axis: bus errors."""
     def spoil(readings):
         rng, field = np.random.default_rng(seed), readings.field.copy()
         hit = np.flatnonzero(rng.random(len(readings)) < share)
@@ -64,7 +63,7 @@ def glitches(share, size, seed=0):
 
 
 def clipped(share):
-    """Each axis of each sensor is cut off at `share` of its largest excursion."""
+    """Each axis of each sensor is clipped at `share` of its largest excursion."""
     def spoil(readings):
         field = readings.field.copy()
         for j in range(len(readings.names)):
@@ -79,7 +78,7 @@ def clipped(share):
 
 
 def only_axes(axes):
-    """Other axes than e.g. 'xz' are missing."""
+    """Axes other than e.g. 'xz' are missing."""
     def spoil(readings):
         field = readings.field.copy()
         field[:, [k for k, a in enumerate('xyz') if a not in axes]] = np.nan
@@ -88,7 +87,7 @@ def only_axes(axes):
 
 
 def only_sensor(sensor):
-    """The other sensors are missing."""
+    """All other sensors are missing."""
     return lambda readings: readings.part(_of(readings, sensor))
 
 
@@ -100,7 +99,7 @@ def dropped(share, seed=0):
 
 
 def thinned(every):
-    """Only one in `every` readings of each sensor is left."""
+    """Keep one in `every` readings of each sensor."""
     def spoil(readings):
         keep = np.zeros(len(readings), dtype=bool)
         for j in range(len(readings.names)):
@@ -110,7 +109,7 @@ def thinned(every):
 
 
 def delayed(sensor, seconds):
-    """The clock of a sensor is late."""
+    """The clock of a sensor is behind by `seconds`."""
     def spoil(readings):
         stamp = readings.stamp_ns + np.where(_of(readings, sensor), int(seconds * NS), 0)
         order = np.argsort(stamp, kind='stable')
@@ -119,15 +118,12 @@ def delayed(sensor, seconds):
 
 
 def beginning_cut(seconds):
-    """The recording begins later."""
+    """The recording begins later by `seconds`."""
     return lambda readings: readings.part(_seconds(readings) >= seconds)
 
 
 def vehicle_at_start(source, begin, seconds):
-    """What `source` recorded from `begin` [s] on, for `seconds`, happens also at the start.
-
-    A second vehicle: what it adds to the median field of each sensor is added here.
-    """
+    """Add what `source` recorded from `begin` [s] for `seconds`, above its median, at the start."""
     def spoil(readings):
         field, t, t_source = readings.field.copy(), _seconds(readings), _seconds(source)
         for j, name in enumerate(readings.names):
@@ -142,7 +138,7 @@ def vehicle_at_start(source, begin, seconds):
 
 
 def wrong_sign(sensor, axis):
-    """An axis of a sensor is flipped."""
+    """The sign of an axis of a sensor is inverted."""
     def spoil(readings):
         field = readings.field.copy()
         field[_of(readings, sensor), 'xyz'.index(axis)] *= -1.0
@@ -151,7 +147,7 @@ def wrong_sign(sensor, axis):
 
 
 def hum(amplitude, frequency=50.0):
-    """A power line: `amplitude` (3,) [T] at `frequency` [Hz]."""
+    """Power line: `amplitude` (3,) [T] at `frequency` [Hz]."""
     def spoil(readings):
         phase = 2.0 * np.pi * frequency * _seconds(readings)
         return _with(readings, readings.field + np.sin(phase)[:, None] * np.asarray(amplitude))
@@ -167,7 +163,7 @@ def drift(rate, sensor=None):
 
 
 def temperature_step(size, at, time_constant=3.0, sensor=None):
-    """From `at` [s] on the field of a sensor moves by `size` [T] as its temperature settles."""
+    """From `at` [s] the field of a sensor approaches an offset of `size` [T] exponentially."""
     def spoil(readings):
         since = np.maximum(_seconds(readings) - at, 0.0)
         added = size * -np.expm1(-since / time_constant) * _of(readings, sensor)

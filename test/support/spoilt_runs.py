@@ -1,4 +1,4 @@
-"""A bundled vehicle recording, spoilt, through the tracker and the doctor."""
+"""Runs of bundled vehicle recordings with faults through the tracker and the doctor."""
 
 import dataclasses
 import functools
@@ -14,17 +14,17 @@ from support.bundled import DATA, NETWORK_FILE, vehicle_path
 from support.spoiler import apply
 
 HEADING = np.cos(np.deg2rad(45.0))
-"""Cosine of the largest angle between the velocity at the closest point and the true one."""
+"""Cosine of the largest permitted angle between tracked and true velocity at the CPA."""
 
 
 ROADS = {'two_way_road_start': (DATA / 'two_way_road', NETWORK_FILE),
          'corridor_8_sensors': (DATA / 'corridor', DATA / 'corridor' / 'network.yaml')}
-"""{name: (folder, network file)} of the recordings with other networks than those of `VEHICLES`."""
+"""{name: (folder, network file)} of recordings with other networks than those of `VEHICLES`."""
 
 
 @functools.cache
 def recorded(name):
-    """`RecordedReadings` of a bundled recording of vehicles."""
+    """`RecordedReadings` of a bundled vehicle recording."""
     if name in ROADS:
         folder, network = ROADS[name]
         return mt.read_recording(folder / f'{name}.mcap', network)
@@ -33,15 +33,15 @@ def recorded(name):
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What the tracker made of a spoilt recording: of the track that is nearest to the truth."""
+    """Tracking results of a recording with faults, for the track nearest to the truth."""
 
     result: mt.TrackingResult
     detected: int
     tracked: bool
     heading: float
-    """Cosine of the angle between true and tracked velocity at the closest point."""
+    """Cosine of the angle between true and tracked velocity at the CPA."""
     ambiguous: bool
-    """At the closest point."""
+    """At the CPA."""
     closest: float
     nees: float
     """Per axis."""
@@ -73,7 +73,7 @@ def outcome(name, *faults, network=NETWORK_FILE, settings=None):
 
 
 def findings(name, *faults):
-    """[str] that the doctor says of the bundled recording `name` with `faults`."""
+    """[str] findings of the doctor for the bundled recording `name` with `faults`."""
     network = mt.read_network(ROADS[name][1] if name in ROADS else NETWORK_FILE)
     settings = settings_for('vehicle')
     readings = apply(recorded(name).readings, *faults)

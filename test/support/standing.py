@@ -1,4 +1,4 @@
-"""Vehicles that stand: their tracks in the worlds of `support.situations`, and the backgrounds."""
+"""Stopped vehicles: their tracks in the worlds of `support.situations`, and the backgrounds."""
 
 import numpy as np
 
@@ -10,15 +10,15 @@ from support.situations import made, wrong_of
 
 STOPS = ('stops for 5 s', 'stops for 20 s', 'stops for 60 s')
 STANDING = 0.05
-"""[m/s] Slower is standing."""
+"""[m/s] Slower vehicles are stopped."""
 RIGHT = 2.0
-"""Standard deviations of one reading: a background that is off by more is not right."""
+"""A background is wrong if its error exceeds this number of standard deviations of a reading."""
 SOON_S = 3.0
-"""[s] The background shall be right so soon after a vehicle that stood there has left."""
+"""[s] Time after the departure of a parked vehicle by which the background must be right."""
 TRACKED_M = 2.0
-"""[m] A vehicle is tracked where the median error is less."""
+"""[m] A vehicle is tracked if the median error is smaller."""
 PART = 50
-"""Readings that are fed at once."""
+"""Number of readings fed at once."""
 
 
 def poses_of(records):
@@ -26,14 +26,14 @@ def poses_of(records):
 
 
 def stands(a_world, body=0):
-    """(begin, end) [s] of when a body of a `World` stands."""
+    """(begin, end) [s] of the stop of a body of a `World`."""
     velocity = np.gradient(a_world.positions[body], a_world.t, axis=0)
     still = a_world.t[np.linalg.norm(velocity, axis=1) < STANDING]
     return still.min(), still.max()
 
 
 def goes_on(name, run):
-    """Whether one track has a vehicle before it stops, and still two seconds after it started."""
+    """Whether one track contains a vehicle before it stops and 2 s after it continues."""
     a_world = made(name, SIMULATORS[run % 2], run // 2)
     pipeline = Pipeline(a_world.network, settings_for('vehicle'))
     poses = poses_of(pipeline.feed(a_world.readings) + pipeline.flush())
@@ -45,11 +45,9 @@ def goes_on(name, run):
 
 
 def right_after(run):
-    """[s] from when a vehicle that stood there at the start is gone to when all backgrounds are
-    right for good; infinite where they never are.
-
-    It is gone where no sensor is off its last level by `RIGHT` any more. Live: no first pass.
-    """
+    """[s] from the departure of a parked vehicle until all backgrounds stay right; inf if never."""
+    # It has left when no sensor differs from its final level by more than `RIGHT`. The stage runs
+    # live, without a first pass.
     a_world = made('there at the start, leaves', SIMULATORS[run % 2], run // 2)
     stage = Pipeline(a_world.network, settings_for('vehicle')).calibrate
     readings, names = a_world.readings, a_world.network.names
@@ -74,15 +72,7 @@ def right_after(run):
 
 
 def first_after(run):
-    """Track of the first vehicle after one that stood there at the start has left, offline.
-
-    Returns
-    -------
-    error : float [m]
-        Median over the poses of the track that is nearest to it; infinite without a track.
-    n_sure, n_wrong : int
-        Poses of that track without a flag, and wrong ones among them.
-    """
+    """(median error [m] or inf, n_sure, n_wrong) of the vehicle after a parked one, offline."""
     a_world = made('there at the start, then cars', SIMULATORS[run % 2], run // 2)
     pipeline = Pipeline(a_world.network, settings_for('vehicle'))
     prescan([a_world.readings], a_world.network,

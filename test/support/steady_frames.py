@@ -16,11 +16,9 @@ MOMENTS = np.array([[150.0, 40.0, -120.0], [90.0, -60.0, -160.0], [110.0, 70.0, 
 
 def steady_frames(rng, network=ROAD, path=STRAIGHT, clocks=(), change=None, period_s=0.08,
                   until_s=1.2):
-    """Frames from 1.6 s before to `until_s` after the closest point.
-
-    `clocks` [s] ahead, of all sensors but the first; `change` takes and gives fields
-    (n_frames, n_sensors, 3).
-    """
+    """Frames from 1.6 s before to `until_s` after the CPA."""
+    # `clocks` [s] are the offsets of all sensors but the first; `change` is a function of the
+    # fields (n_frames, n_sensors, 3).
     t = np.arange(-1.6, until_s, period_s)
     n = len(network)
     theta = np.concatenate([path, np.zeros(n - 1)])

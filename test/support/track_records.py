@@ -1,4 +1,4 @@
-"""Records of made-up tracks, as a tracker publishes them."""
+"""Records of synthetic tracks, as published by a tracker."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ NS = 1_000_000_000
 
 
 def _common(t, x, y, v, **changes):
-    """What both kinds of pose have."""
+    """Fields common to both kinds of pose."""
     return {'stamp_ns': round(t * NS), 'id': 1, 'position': np.array([x, y, 0.5]),
             'velocity': np.array([v, 0.0, 0.0]), 'covariance': 0.01 * np.eye(6),
             'orientation': np.array([0.0, 0.0, 0.0, 1.0]),
@@ -19,7 +19,7 @@ def _common(t, x, y, v, **changes):
 
 
 def track_pose(t, x, y=-1.5, v=10.0, ended=False, **changes):
-    """`Track` at a time [s] and a place [m], with a speed [m/s] along x."""
+    """`Track` at a time [s] and a position [m], with a speed [m/s] along x."""
     return Track(**{
         'ended': ended, 'existence': 1.0, 'weight': 1.0, 'nis': 1.0,
         'nis_by_sensor': np.ones(2), 'degrees_of_freedom': 6, 'arrival': 'left',
@@ -29,7 +29,7 @@ def track_pose(t, x, y=-1.5, v=10.0, ended=False, **changes):
 
 
 def smoothed_pose(t, x, y=-1.5, v=10.0, **changes):
-    """`SmoothedPose`, of a complete track."""
+    """`SmoothedPose` of a complete track."""
     return SmoothedPose(**{'complete': True, **_common(t, x, y, v), **changes})
 
 

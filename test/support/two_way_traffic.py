@@ -1,7 +1,7 @@
-"""The traffic of PHD15 Paper B, simulated: 511 vehicles between two sensors with two axes.
+"""Simulation of the traffic of PHD15 Paper B: 511 vehicles between two sensors with two axes.
 
-Both lanes, the counts of both directions, the distances and the speed are the paper's; vehicles
-are those of either simulator, sensors have errors, and some vehicles meet or follow closely.
+Lanes, counts of both directions, distances and speed are those of the paper. The vehicles are those
+of either simulator, the sensors have errors, and some vehicles meet or follow closely.
 """
 
 from dataclasses import dataclass
@@ -22,66 +22,66 @@ from support.situation_worlds import car, truck
 
 SENSORS = np.array([[0.0, -5.0, 0.0], [0.0, 5.0, 0.0]])
 LANE_M = 1.5
-"""[m] Lanes at y = -1.5 (northbound, along x) and y = 1.5: 3.5 m and 6.5 m from the sensors."""
+"""[m] Lanes at y = -1.5 (northbound, along x) and y = 1.5, 3.5 m and 6.5 m from the sensors."""
 N_NORTH, N_SOUTH = 291, 220
 SPEED, SPEED_STD = 25.0, 2.5
 MINUTES = 120.0
 RATE = 100.0
 WINDOW_S, PAD_S = 0.7, 0.4
-"""[s] The paper has 1.5 s, in which more of the others are seen, too."""
+"""[s] The paper uses 1.5 s, which includes more of the other vehicles."""
 SATURATION = 200e-6
 NOISE = 3e-8
-"""[T] On each axis."""
+"""[T] Noise on each axis."""
 OFFSET_STD = 5e-9
-"""[T] Error of the background."""
+"""[T] Standard deviation of the background error."""
 TRUCKS = 0.1
 MIN_HEADWAY_S = 1.0
-"""[s] In one lane."""
+"""[s] Minimum headway in one lane."""
 
 
 @dataclass(frozen=True)
 class Passing:
-    """A vehicle, what both sensors measured around it, and the truth."""
+    """Vehicle with the measurements of both sensors and the truth."""
 
     t: np.ndarray
-    """(n,) [s] from the closest approach."""
+    """(n,) [s] from the CPA."""
     field: np.ndarray
-    """(2, n, 2) [T] of each sensor, world axes."""
+    """(2, n, 2) [T] Field at each sensor, world axes."""
     is_north: bool
     headway: float
     """[s] to the nearest other vehicle at the sensors."""
 
     @property
     def near(self):
-        """Row of the sensor beside the vehicle's own lane."""
+        """Index of the sensor beside the vehicle's own lane."""
         return 0 if self.is_north else 1
 
     def rotations(self):
-        """`FieldRotation` of each sensor; none where the field tells nothing."""
+        """`FieldRotation` of each sensor; a neutral one if the direction is not observable."""
         pad = int(PAD_S * RATE)
         return [rotation_of_pass(field, NOISE, pad) or FieldRotation(0.0, 1.0)
                 for field in self.field]
 
     def likelihood_ratio_of_north(self):
-        """(log likelihood ratio of each sensor, their sum) of a vehicle along x."""
+        """([log-likelihood ratio of each sensor], their sum) for a northbound vehicle."""
         near, far = 5.0 - LANE_M, 5.0 + LANE_M
         one = direction_likelihood_ratio(self.t, self.field[0], NOISE,
                                          LaneHypothesis(SPEED, near), LaneHypothesis(-SPEED, far))
-        # From the second sensor, which looks along -y, the axes are turned.
+        # The second sensor faces -y, so its axes are rotated.
         other = direction_likelihood_ratio(self.t, -self.field[1], NOISE,
                                            LaneHypothesis(SPEED, near),
                                            LaneHypothesis(-SPEED, far))
         return [one, -other], one - other
 
     def log_odds_of_north(self):
-        """([log odds of each sensor], fused ones) of a vehicle along x."""
-        # From the first sensor a northbound vehicle moves from left to right.
+        """([log odds of each sensor], fused log odds) for a northbound vehicle."""
+        # Seen from the first sensor, a northbound vehicle moves from left to right.
         one, other = (r.log_odds for r in self.rotations())
         return [one, -other], fused_log_odds([one, other], [True, False])
 
 
 def arrivals(rng):
-    """[(time [s], is it northbound, speed [m/s])] in order of time."""
+    """[(time [s], whether northbound, speed [m/s])] in order of time."""
     out = []
     for n, is_north in ((N_NORTH, True), (N_SOUTH, False)):
         while True:
@@ -95,7 +95,7 @@ def arrivals(rng):
 
 
 def passings(simulator, seed):
-    """[`Passing`] of all vehicles of one replica."""
+    """[`Passing`] of all vehicles of one realisation."""
     rng = np.random.default_rng([seed, len(simulator)])
     plan = arrivals(rng)
     bodies = [(truck if rng.random() < TRUCKS else car)(rng, simulator) for _ in plan]
@@ -115,7 +115,7 @@ def passings(simulator, seed):
 
 
 def field_of(body, arrival, lateral, t):
-    """(2, n, 2) [T] field of a vehicle at both sensors at times (n,) [s]."""
+    """Field (2, n, 2) [T] of a vehicle at both sensors at times (n,) [s]."""
     at, is_north, speed = arrival
     way = 1.0 if is_north else -1.0
     position = np.stack([way * speed * (t - at), np.full(len(t), -way * lateral)], axis=1)
@@ -125,7 +125,7 @@ def field_of(body, arrival, lateral, t):
 
 @dataclass(frozen=True)
 class Shares:
-    """Shares of right directions."""
+    """Shares of correct directions."""
 
     near: float
     far: float
@@ -133,7 +133,7 @@ class Shares:
 
 
 def shares(vehicles, log_odds):
-    """`Shares` of `Passing`s, of ([log odds of each sensor], fused ones) of each."""
+    """`Shares` of `Passing`s with ([log odds of each sensor], fused log odds) each."""
     north = np.array([v.is_north for v in vehicles])
     near = np.array([v.near for v in vehicles])
     single = (np.array([each for each, _ in log_odds]) > 0.0) == north[:, None]
@@ -144,7 +144,7 @@ def shares(vehicles, log_odds):
 
 
 def calibration(vehicles):
-    """(stated, measured) error probability in the far lane, of vehicles that are alone."""
+    """(stated, measured) error probability in the far lane, for vehicles without others nearby."""
     alone = [v for v in vehicles if v.headway > 2.0]
     far = [(v.log_odds_of_north()[0][1 - v.near], v.is_north) for v in alone]
     stated = [1.0 / (1.0 + np.exp(min(abs(odds), 500.0))) for odds, _ in far]

@@ -1,4 +1,4 @@
-"""Worlds: any number of bodies and disturbances around a network, with the truth of all bodies."""
+"""Worlds with several bodies and disturbances around a network, and the truth of all bodies."""
 
 from dataclasses import dataclass
 
@@ -11,18 +11,18 @@ from support.box_vehicles import BOUGHT, magnetised
 from support.samples import scenario
 
 GRID_S = 0.01
-"""[s] Steps in which a `Ride` adds its speed up."""
+"""[s] Step of the integration of a `Ride`'s speed."""
 
 
 @dataclass(frozen=True)
 class Ride:
-    """A course along a `Path` at any speed: it stops, reverses, and goes on."""
+    """Course along a `Path` at any speed, with stops and reversals."""
 
     path: Path
     times: tuple
     """(k,) [s]."""
     speeds: tuple
-    """(k,) [m/s] at those times, linear between them; negative = backwards."""
+    """(k,) [m/s] at those times, linear in between; negative = backwards."""
 
     def at(self, t):
         """See `mag_tracking.simulation.scenario.Course`."""
@@ -30,7 +30,7 @@ class Ride:
         grid = np.arange(0.0, max(self.times[-1], t.max()) + 2 * GRID_S, GRID_S)
         speed = np.interp(grid, self.times, self.speeds)
         way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * GRID_S)])
-        # The clock of a sensor may begin before the ride does.
+        # The clock of a sensor may be ahead of the start of the ride.
         before = np.minimum(t, 0.0) * self.speeds[0]
         return self.path.at((np.interp(t, grid, way) + before) / self.path.speed)
 
@@ -41,7 +41,7 @@ class Convoy:
 
     bodies: tuple
     behind: tuple
-    """[m] of each body's middle behind that of the convoy."""
+    """[m] Distance of each body's centre behind that of the convoy."""
 
     def field(self, earth_field, position, heading, points):
         """See `mag_tracking.simulation.scenario.Body`."""
@@ -52,18 +52,18 @@ class Convoy:
 
 @dataclass(frozen=True)
 class World:
-    """What happens around a network."""
+    """Scenario around a network."""
 
     network: SensorNetwork
     readings: Readings
     t: np.ndarray
-    """(n,) [s]"""
+    """(n,) [s]."""
     positions: np.ndarray
-    """(n_bodies, n, 2) [m]"""
+    """(n_bodies, n, 2) [m]."""
 
 
 def box_two_wheeler(rng, length, moment, iron=1.0):
-    """A motorcycle, a bicycle or a trolley of boxes: a frame, an engine (`iron`), two wheels."""
+    """Motorcycle, bicycle or trolley of boxes: a frame, an engine (`iron`), two wheels."""
     parts = [((0.0, 0.0, 0.5), (0.5 * length, 0.06, 0.5), 1.0),
              ((0.05 * length, 0.0, 0.4), (0.35, 0.3, 0.3), iron)]
     parts += [((0.35 * end * length, 0.0, 0.3), (0.05, 0.15, 0.5), 0.4) for end in (-1, 1)]
@@ -71,16 +71,13 @@ def box_two_wheeler(rng, length, moment, iron=1.0):
 
 
 def world(network, movers, duration, rng, flaws=None, rate=100.0, ambient=None):
-    """`World` of movers [(body, course)] for a `duration` [s].
-
-    `ambient` takes times (n,) [s] and gives a field (n, n_sensors, 3) [T] in the world frame, which
-    is added; `flaws` are the `Imperfections` of the sensors.
-    """
+    """`World` of movers [(body, course)] for a `duration` [s], with sensors that have `flaws`."""
+    # `ambient` is a function from times (n,) [s] to a field (n, n_sensors, 3) [T], world frame.
     flaws = flaws or Imperfections()
     t = np.arange(0.0, duration, 1.0 / rate)
     parts = []
     for body, course in movers:
-        # Each body in a world of its own with perfect sensors; fields add up.
+        # Each body is simulated separately with perfect sensors; the fields are added.
         readings, *_ = scenario.simulate(network, body, course, rate, duration, rng,
                                          Imperfections(noise_std=0.0))
         parts.append(readings.field.reshape(len(t), len(network), 3) - _earth(network))
@@ -101,7 +98,7 @@ def _earth(network):
 
 
 def _flawed(B, flaws, t, rng):
-    """Fields (n, n_sensors, 3) [T] as sensors with `Imperfections` measure them."""
+    """Fields (n, n_sensors, 3) [T] as measured by sensors with `Imperfections`."""
     out = np.empty_like(B)
     for j in range(B.shape[1]):
         a, b, c = flaws.tilt_std * rng.standard_normal(3)

@@ -1,6 +1,6 @@
-"""An Xsens device for tests: its messages, written from the protocol and not from the parser.
+"""Simulated Xsens device: its messages, written from the protocol and not from the parser.
 
-`encode_random_frame` and `garbage` make endless streams; the long run is
+`encode_random_frame` and `garbage` generate endless streams; the long run is
 `PYTHONPATH=test python -m support.xsens_messages --frames 1000000`.
 """
 
@@ -12,14 +12,14 @@ import time
 from mag_tracking.drivers.reading import Reading
 
 LAYOUT = ('temp', 'acc', 'gyr', 'mag', 'counter')
-"""Of the MTData messages of `encode_random_frame`; their numbers are floats."""
+"""Blocks of the MTData messages of `encode_random_frame`, with float numbers."""
 FLOAT, FP1220, FP1632, DOUBLE = range(4)
 MARKS = (0xFA, 0xFA, 0xFF, 0xFF, 0x36, 0x32, 0x3E)
-"""Bytes of which garbage has more than its share."""
+"""Bytes that are frequent in garbage."""
 
 
 def message(mid, data, extended=None):
-    """A whole message; `extended` = whether its length takes two bytes more."""
+    """Complete message; `extended` = its length takes two more bytes."""
     if extended is None:
         extended = len(data) > 254
     length = b'\xff' + struct.pack('>H', len(data)) if extended else bytes([len(data)])
@@ -28,12 +28,12 @@ def message(mid, data, extended=None):
 
 
 def packet(identifier, data):
-    """A packet of MTData2."""
+    """Packet of MTData2."""
     return struct.pack('>HB', identifier, len(data)) + data
 
 
 def reals(numbers, precision):
-    """Bytes of real numbers that can be written so."""
+    """Bytes of real numbers in a given precision."""
     if precision == FLOAT:
         return struct.pack(f'>{len(numbers)}f', *numbers)
     if precision == DOUBLE:
@@ -48,7 +48,7 @@ def reals(numbers, precision):
 
 
 def mtdata2(reading, precision=FLOAT, before=b'', behind=b''):
-    """An MTData2 message of a reading, with other packets before and behind."""
+    """MTData2 message of a reading, with other packets before and after it."""
     data = before
     if reading.sequence is not None:
         data += packet(0x1020, struct.pack('>H', reading.sequence))
@@ -66,14 +66,14 @@ FRAME = mtdata2(READING)
 
 
 def random_reals(rng, precision, n=3):
-    """Numbers that `precision` can write, of all sizes."""
+    """Numbers of all magnitudes that `precision` represents exactly."""
     bits, fraction = {FLOAT: (25, 20), FP1220: (32, 20), FP1632: (48, 32), DOUBLE: (53, 40)}[
         precision]
     return tuple((rng.getrandbits(bits) - 2**(bits - 1)) / 2**fraction for _ in range(n))
 
 
 def random_reading(rng, precision):
-    """A reading of field, acceleration or both."""
+    """Reading with field, acceleration or both."""
     what = rng.randrange(4)
     return Reading(
         field=None if what == 0 else random_reals(rng, precision),
@@ -83,7 +83,7 @@ def random_reading(rng, precision):
 
 
 def other_packet(rng):
-    """A packet that no reading is made of, known or unknown."""
+    """Packet that is not part of a reading, known or unknown."""
     kind, size = rng.choice(((0x0810, 4), (0x1010, 12), (0x1070, 4), (0x2010, 16), (0x2034, 12),
                              (0x4010, 12), (0x4030, 12), (0x8020, 12), (0xE020, 4),
                              (0x5A5F, rng.randrange(40)), (0xFAFF, rng.randrange(40))))
@@ -91,7 +91,7 @@ def other_packet(rng):
 
 
 def encode_random_frame(rng):
-    """(bytes, [Reading]) of some message that a device may send; `rng` is a random.Random."""
+    """(bytes, [Reading]) of a message that a device may send; `rng` is a random.Random."""
     kind = rng.random()
     if kind < 0.08:
         mid, size = rng.choice(((0x3E, 0), (0x42, 1), (0x31, 0), (0x0D, 118), (0xC1, 32),
@@ -110,7 +110,7 @@ def encode_random_frame(rng):
 
 
 def garbage(rng, n):
-    """`n` bytes that look like the beginnings of messages."""
+    """`n` bytes that resemble beginnings of messages."""
     out = bytearray()
     while len(out) < n:
         kind = rng.random()
@@ -126,7 +126,7 @@ def garbage(rng, n):
 
 
 def stream(rng, frames):
-    """(bytes, [Reading], lengths of the frames) of frames with garbage between."""
+    """(bytes, [Reading], lengths of the frames) of frames with garbage in between."""
     parts, readings, lengths = [], [], []
     for _ in range(frames):
         if rng.random() < 0.5:
@@ -139,7 +139,7 @@ def stream(rng, frames):
 
 
 def lost_and_false(sent, found):
-    """(how many of `sent` are not in `found`, how many of `found` were not sent), in order."""
+    """(number of `sent` not in `found`, number of `found` not sent), in order."""
     lost = position = false = 0
     at = {}
     for index, reading in enumerate(sent):
@@ -155,7 +155,7 @@ def lost_and_false(sent, found):
 
 
 def main():
-    """A long run, in pieces of the size that a serial port gives."""
+    """Run many frames in pieces of the size that a serial port returns."""
     from mag_tracking.drivers.framings.xsens import XsensFraming, XsensSettings
 
     parser = argparse.ArgumentParser(description=__doc__)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mag_tracking.records import FieldFrame
-from mag_tracking.web.live_scene import KEPT_S, MAX_POSES, LiveScene
+from mag_tracking.web.live_scene import HISTORY_S, MAX_POSES, LiveScene
 from support.live_records import NS, feed, later, poses
 
 
@@ -110,7 +110,7 @@ def test_old_tracks_are_forgotten_and_their_number_is_bounded(scene, records):
     assert kept <= MAX_POSES
     first = min(times[-1] for times in late.tracks.values())
     last = max(times[-1] for times in late.tracks.values())
-    assert last - first <= KEPT_S
+    assert last - first <= HISTORY_S
     # Nobody looked: what was smoothed of forgotten tracks is forgotten, too.
     assert sum(len(json.loads(m).get('smoothed', ())) for m in rows) == len(late.tracks)
 

@@ -142,7 +142,7 @@ def test_the_doctor_of_a_single_reading_writes_its_report(chromium, tmp_path):
                      1_790_000_000_000_000_000)
     assert run('doctor', recording, '--report', path) == 2
     page = opened(chromium, path)
-    assert 'Wrong' in page.value('getComputedStyle(document.querySelector("#notes .error"), '
+    assert 'Error' in page.value('getComputedStyle(document.querySelector("#notes .error"), '
                                  '"::before").content')
     closed(page, path)
 

@@ -49,9 +49,9 @@ def test_ten_viewers_hear_the_same_and_one_that_goes_away_disturbs_none(scene, s
 def test_a_viewer_that_cannot_follow_gets_the_whole_later(scene, server, records, monkeypatch):
     """Its buffer is bounded, the others are served, and finally it has all poses."""
     # On a busy machine it takes longer until this test reads.
-    monkeypatch.setattr('mag_tracking.web.page_server.GIVE_UP_S', 600.0)
+    monkeypatch.setattr('mag_tracking.web.page_server.LAG_TIMEOUT_S', 600.0)
     with viewer_of(server) as quick, unread(server) as slow:
-        stamp = publish_until(scene, records, lambda: server.n_behind, quick)
+        stamp = publish_until(scene, records, lambda: server.n_lagged, quick)
         assert read_until(slow, b'"type": "scene"', 2) == 2
         # The scene with all poses is followed by what is new.
         assert read_until(slow, f'"latest_ns": "{more(scene, records, stamp)}"'.encode()) == 1
@@ -109,9 +109,9 @@ def unread(server):
 
 
 def test_a_viewer_that_never_reads_is_disconnected(scene, records, monkeypatch):
-    monkeypatch.setattr('mag_tracking.web.page_server.GIVE_UP_S', 0.5)
+    monkeypatch.setattr('mag_tracking.web.page_server.LAG_TIMEOUT_S', 0.5)
     with PageServer(scene, port=0) as server, viewer_of(server) as quick, unread(server):
-        stamp = publish_until(scene, records, lambda: server.n_behind, quick)
+        stamp = publish_until(scene, records, lambda: server.n_lagged, quick)
         end = time.monotonic() + 60.0
         while server.n_viewers > 1:
             stamp = more(scene, records, stamp)
@@ -137,7 +137,7 @@ def test_a_scene_larger_than_the_buffer_is_followed_by_rows(scene, server, recor
             received += part
             stamp = more(scene, records, stamp)
         assert received.count(b'"type": "scene"') == 1
-        assert server.n_behind == 0 and len(received) > 1_500_000
+        assert server.n_lagged == 0 and len(received) > 1_500_000
 
 
 def test_the_number_of_viewers_is_limited(scene, monkeypatch):
@@ -168,7 +168,7 @@ def test_a_fault_of_the_source_is_said_and_ends_nothing(caplog):
         assert messages[-1]['text'] == 'ValueError: broken'
         received(server.url, lambda m: m['type'] == 'fault')
         assert server.is_serving
-    assert len([r for r in caplog.records if 'fault of the live page' in r.message]) == 1
+    assert len([r for r in caplog.records if 'error in the live page' in r.message]) == 1
     assert not server.is_serving
 
 

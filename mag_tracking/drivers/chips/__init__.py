@@ -1,1 +1,1 @@
-"""Magnetometers on I2C, one file for each maker or chip; `chip.py` says what a chip has to do."""
+"""Magnetometers on I2C, one file for each manufacturer or chip."""

@@ -1,8 +1,7 @@
-"""What a chip is to the polling, and how it reaches its registers.
+"""Protocol of a magnetometer chip, and access to its registers.
 
-A new sensor is one file with a frozen dataclass of settings and a class with the
-methods of `Chip`, and one line each in `CHIPS` and `I2cSettings` of
-`transports/i2c.py`.
+A new chip is one file with a frozen dataclass of settings and a class with the methods of `Chip`,
+plus one line each in `CHIPS` and `I2cSettings` of `transports/i2c.py`.
 """
 
 import errno
@@ -15,64 +14,111 @@ from smbus2 import i2c_msg
 from mag_tracking.drivers.reading import Axes
 from mag_tracking.errors import DeviceError, SettingsError
 
-MARGIN = 1.1
-"""By how much longer than the data sheet's typical value a conversion is waited for."""
+CONVERSION_MARGIN = 1.1
+"""Ratio of the waiting time to the data sheet's typical conversion time."""
 Identity: TypeAlias = tuple[tuple[int, int], ...]
-"""((register, value), ...) by which a chip is known."""
+"""((register, value), ...) that identify a chip."""
 Value = TypeVar('Value', int, float)
 Choice = TypeVar('Choice')
 
 
 class SmBus(Protocol):
-    """What is used of `smbus2.SMBus`; all methods raise OSError."""
+    """Part of the interface of `smbus2.SMBus` that is used. All methods raise OSError."""
 
     def write_byte(self, i2c_addr: int, value: int, /) -> object:
-        """Send one byte without a register's number."""
+        """Write one byte without a register number.
+
+        Parameters
+        ----------
+        i2c_addr : int
+        value : int
+        """
 
     def read_byte_data(self, i2c_addr: int, register: int, /) -> int:
-        """One register."""
+        """Read one register.
+
+        Parameters
+        ----------
+        i2c_addr : int
+        register : int
+
+        Returns
+        -------
+        int
+        """
 
     def write_byte_data(self, i2c_addr: int, register: int, value: int, /) -> object:
-        """Write one register."""
+        """Write one register.
+
+        Parameters
+        ----------
+        i2c_addr : int
+        register : int
+        value : int
+        """
 
     def read_i2c_block_data(self, i2c_addr: int, register: int, length: int, /) -> Sequence[int]:
-        """Successive registers."""
+        """Read successive registers.
+
+        Parameters
+        ----------
+        i2c_addr : int
+        register : int
+        length : int
+
+        Returns
+        -------
+        sequence of int
+        """
 
     def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> object:
-        """Several messages as one transaction."""
+        """Transfer several messages in one transaction.
+
+        Parameters
+        ----------
+        *i2c_msgs : i2c_msg
+        """
 
     def close(self) -> object:
         """Close the bus."""
 
 
 class Place(NamedTuple):
-    """Where on a bus a chip is."""
+    """Location of a chip on a bus."""
 
     address: int
+    """Address of the chip."""
     multiplexer: int | None = None
-    """Address of a TCA9548A; None = the chip is on the bus itself."""
+    """Address of a TCA9548A; None = the chip is directly on the bus."""
     channel: int | None = None
+    """Channel of the multiplexer."""
 
     def __str__(self) -> str:
         behind = ('' if self.multiplexer is None else
-                  f', behind channel {self.channel} of the multiplexer at {self.multiplexer:#04x}')
+                  f', on channel {self.channel} of the multiplexer at {self.multiplexer:#04x}')
         return f'address {self.address:#04x}{behind}'
 
 
 class Bus:
-    """An open bus, its multiplexers, and the time.
+    """Open bus with its multiplexers.
+
+    Source: TCA9548A data sheet (SCPS207), section 8.5. The only register of a multiplexer has one
+    bit for each channel and is written without a register number.
 
     Parameters
     ----------
-    smbus : smbus2.SMBus, or what has its methods
-        None where nothing is said to the chips.
-    monotonic_ns, sleep : functions
-    multiplexers : set of int
-        Addresses of every TCA9548A. One channel of one of them is open at a time, and
-        none while a chip on the bus itself is spoken to.
+    smbus : smbus2.SMBus or None
+        None if no transfers are made.
+    monotonic_ns : callable
+    sleep : callable
+    multiplexers : collection of int, optional
+        Addresses of all TCA9548A. One channel of one of them is open at a time, and none during
+        transfers to a chip directly on the bus.
 
-    Source: TCA9548A data sheet (SCPS207), section 8.5: its only register takes one
-    bit for each channel, without a register's number before it.
+    Attributes
+    ----------
+    monotonic_ns : callable
+    sleep : callable
     """
 
     def __init__(self, smbus: SmBus | None, monotonic_ns: Callable[[], int],
@@ -84,18 +130,29 @@ class Bus:
 
     @property
     def smbus(self) -> SmBus:
-        """What it was made with; raises OSError where that was None."""
+        """Open bus.
+
+        Raises
+        ------
+        OSError
+            If there is none.
+        """
         if self._smbus is None:
-            raise OSError(errno.ENODEV, 'there is no bus')
+            raise OSError(errno.ENODEV, 'the bus is not open')
         return self._smbus
 
     def select(self, place: Place) -> None:
-        """Open the way to a place and close all others; raises OSError."""
+        """Open the path to a chip and close all others.
+
+        Parameters
+        ----------
+        place : Place
+        """
         wanted = (place.multiplexer, place.channel)
         if not self._multiplexers or wanted == self._selected:
             return
         open_now = None if self._selected is None else self._selected[0]
-        # What is not known to be shut may be open.
+        # Multiplexers in an unknown state may have an open channel.
         others = self._multiplexers if self._selected is None else [open_now]
         for address in others:
             if address is not None and address != place.multiplexer:
@@ -105,93 +162,177 @@ class Bus:
         self._selected = wanted
 
     def forget(self) -> None:
-        """After a failure: what is open is not known any more."""
+        """Discard the known state of the multiplexers, after a failure."""
         self._selected = None
 
 
 class Registers:
-    """The registers of one chip; all methods raise OSError where it does not answer."""
+    """Registers of one chip. All methods raise OSError if the chip does not answer.
+
+    Parameters
+    ----------
+    bus : Bus
+    place : Place
+
+    Attributes
+    ----------
+    monotonic_ns : callable
+    sleep : callable
+    """
 
     def __init__(self, bus: Bus, place: Place) -> None:
         self._bus, self._place = bus, place
         self.monotonic_ns, self.sleep = bus.monotonic_ns, bus.sleep
 
     def read(self, register: int) -> int:
-        """One register, as an int."""
+        """Read one register.
+
+        Parameters
+        ----------
+        register : int
+
+        Returns
+        -------
+        int
+        """
         self._bus.select(self._place)
         return self._bus.smbus.read_byte_data(self._place.address, register)
 
     def read_block(self, register: int, length: int) -> bytes:
-        """(length,) bytes of successive registers, 32 at most."""
+        """Read successive registers.
+
+        Parameters
+        ----------
+        register : int
+            First register.
+        length : int
+            Number of registers, up to 32.
+
+        Returns
+        -------
+        (length,) bytes
+
+        Raises
+        ------
+        OSError
+            If the chip does not answer, or the block is shorter than requested.
+        """
         self._bus.select(self._place)
         block = bytes(self._bus.smbus.read_i2c_block_data(self._place.address, register, length))
         if len(block) != length:
-            raise OSError(errno.EIO, f'{len(block)} of {length} bytes came')
+            raise OSError(errno.EIO, f'received {len(block)} of {length} bytes')
         return block
 
     def write(self, register: int, value: int) -> None:
-        """Write one register."""
+        """Write one register.
+
+        Parameters
+        ----------
+        register : int
+        value : int
+        """
         self._bus.select(self._place)
         self._bus.smbus.write_byte_data(self._place.address, register, value)
 
     def transfer(self, *messages: i2c_msg) -> None:
-        """`smbus2.i2c_msg`s as one transaction."""
+        """Transfer messages in one transaction.
+
+        Parameters
+        ----------
+        *messages : i2c_msg
+        """
         self._bus.select(self._place)
         self._bus.smbus.i2c_rdwr(*messages)
 
 
 class Conversion(NamedTuple):
-    """What a chip measured."""
+    """Measured value."""
 
     middle_ns: int
-    """`time.monotonic_ns()` at the middle of its conversion, as nearly as is known."""
+    """`time.monotonic_ns()` at the middle of the conversion, as accurately as it is known."""
     field: Axes
-    """[T] in the right-handed axes that its class describes; NaN where over the range."""
+    """[T] Field in the right-handed axes described by the chip's module; NaN for an axis over
+    its range."""
 
 
 Measurement: TypeAlias = Generator[float, None, Conversion | None]
-"""Of `Chip.measure`."""
+"""Return type of `Chip.measure`."""
 
 
 class Identified(Protocol):
-    """A chip, or the class of one."""
+    """Chip, or class of a chip, with an identity."""
 
     @property
     def IDENTITY(self) -> Identity:
-        """By which it is known."""
+        """Registers and values that identify the chip."""
 
 
 class Chip(Identified, Protocol):
-    """A magnetometer."""
+    """Magnetometer chip."""
 
     def set_up(self) -> None:
-        """Make it ready, whatever its state; raises OSError, or DeviceError that says why."""
+        """Configure the chip from any state.
+
+        Raises
+        ------
+        OSError
+            If the chip does not answer.
+        DeviceError
+            If it cannot be configured, with the reason.
+        """
 
     def measure(self) -> Measurement:
-        """A generator of one measurement: yields seconds to wait, returns a `Conversion`.
+        """Make one measurement.
 
-        Returns None where there is no conversion that was not returned before. Raises
-        OSError where the chip fails. The chips of a bus measure at the same time, so it
-        may be asked to go on later than that, when another keeps the bus.
+        The chips of a bus measure concurrently, so the generator may be resumed later than it
+        requested while another chip uses the bus.
+
+        Returns
+        -------
+        Conversion or None
+            None if there is no conversion that has not been returned before.
+
+        Yields
+        ------
+        float, s
+            Time to wait before the generator is resumed.
+
+        Raises
+        ------
+        OSError
+            If the chip fails.
         """
 
 
 class ChipClass(Identified, Protocol):
-    """A class of `Chip`s. Making one must not touch the bus.
+    """Class of a `Chip`. Creating an instance must not access the bus.
 
-    `count` takes the cause of what is lost, in the plural.
+    `count` is called with the cause of a loss, a plural.
     """
 
     NAME: str
-    """In the settings; theirs are under the same name."""
+    """Name of the chip in the settings, and of the group of its own settings."""
 
     def __call__(self, registers: Registers, settings: Any,
                  count: Callable[[str], None]) -> Chip:
-        """A chip with these registers."""
+        """Create a chip with these registers."""
 
 
 def check_identity(chip: Identified, registers: Registers) -> None:
-    """Raises DeviceError where another chip answers, OSError where none does."""
+    """Check that the expected chip answers.
+
+    Parameters
+    ----------
+    chip : Identified
+    registers : Registers
+
+    Raises
+    ------
+    DeviceError
+        If another chip answers.
+    OSError
+        If no chip answers.
+    """
     for register, expected in chip.IDENTITY:
         found = registers.read(register)
         if found != expected:
@@ -200,13 +341,45 @@ def check_identity(chip: Identified, registers: Registers) -> None:
 
 
 def one_of(name: str, value: Value, choices: Mapping[Value, Choice]) -> Choice:
-    """`choices[value]` of a setting that has but a few values; raises SettingsError."""
+    """Value that belongs to one of a few permitted settings.
+
+    Parameters
+    ----------
+    name : str
+        Name of the setting, for the error message.
+    value : int or float
+        Value of the setting.
+    choices : dict
+        By permitted value.
+
+    Returns
+    -------
+    object
+        `choices[value]`.
+
+    Raises
+    ------
+    SettingsError
+        If `value` is not permitted.
+    """
     if value not in choices:
         raise SettingsError(f'{name}: expected one of {", ".join(map(str, choices))}, got {value}')
     return choices[value]
 
 
-def in_range(values: Iterable[float], largest: float) -> Axes:
-    """Three `values`, with NaN for those whose size is above `largest`."""
+def mask_overrange(values: Iterable[float], largest: float) -> Axes:
+    """Replace values beyond the range by NaN.
+
+    Parameters
+    ----------
+    values : iterable of float
+        Three values.
+    largest : float
+        Largest permitted magnitude.
+
+    Returns
+    -------
+    tuple of three float
+    """
     x, y, z = (v if abs(v) <= largest else math.nan for v in values)
     return x, y, z

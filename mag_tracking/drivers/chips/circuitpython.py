@@ -1,17 +1,17 @@
-"""Drivers written for CircuitPython, of which there is one for nearly every magnetometer.
+"""Adapter for drivers written for CircuitPython, which exist for nearly every magnetometer.
 
-A chip `adafruit_lis3mdl.LIS3MDL` is that class of that module, which has to be
-installed (`pip install adafruit-circuitpython-lis3mdl`). It is made with a bus and an
-address and its own defaults, and its property `magnetic` is read.
+A chip named `adafruit_lis3mdl.LIS3MDL` is that class of that module, which must be installed (`pip
+install adafruit-circuitpython-lis3mdl`). It is created with a bus, an address and its own defaults,
+and its property `magnetic` is read.
 
-It is not so good as a chip of `chips/`: the property does not tell an old conversion
-from a new one, some drivers wait inside of it, NaN for an axis over its range is not
-known, and the axes and the scale are the driver's (that of the MMC5603, 1.0.16, is 2.4 %
-above its data sheet's 16384 counts per gauss). The reading's time is the middle of the call, so
-a chip that measures by itself is late by half to one and a half of its periods.
+This is inferior to a chip of `chips/`: the property does not distinguish an old conversion from a
+new one, some drivers wait inside it, an axis over its range is not detected, and axes and scale are
+those of the driver (the scale of the MMC5603 driver 1.0.16 is 2.4 % above the data sheet's 16384
+counts per gauss). The time of a reading is the middle of the call, so a chip that measures
+continuously is late by 0.5 to 1.5 of its periods.
 
-Source: the CircuitPython API reference, `busio.I2C`, and "CircuitPython design guide,
-sensor properties and units": `magnetic` is in microtesla.
+Source: the CircuitPython API reference, `busio.I2C`, and "CircuitPython design guide, sensor
+properties and units": `magnetic` is in microtesla.
 """
 
 import errno
@@ -23,47 +23,79 @@ from smbus2 import i2c_msg
 from mag_tracking.drivers.chips.chip import Conversion, Measurement, Registers
 from mag_tracking.errors import DeviceError
 
-MAX_NS = 250_000_000
-"""A driver that goes on asking its chip for longer is stopped."""
+TIMEOUT_NS = 250_000_000
+"""[ns] Time after which a driver that waits for its chip is stopped."""
 
 
 class BusioI2c:
-    """What such a driver needs of `busio.I2C`.
+    """Part of the interface of `busio.I2C` that CircuitPython drivers use.
 
-    Once `until_ns` has passed every transaction raises OSError: drivers wait for their
-    chip in loops without an end.
+    After the deadline every transaction raises OSError, because drivers wait for their chip in
+    unbounded loops.
+
+    Parameters
+    ----------
+    registers : Registers
     """
 
     def __init__(self, registers: Registers) -> None:
         self._registers = registers
         self._locked = False
-        self._until_ns = 0
+        self._deadline_ns = 0
 
     def begin(self, longest_ns: int) -> None:
-        """Unlocked, and good for so long."""
+        """Unlock the bus and set the deadline.
+
+        Parameters
+        ----------
+        longest_ns : int, ns
+            Time until the deadline.
+        """
         self._locked = False
-        self._until_ns = self._registers.monotonic_ns() + longest_ns
+        self._deadline_ns = self._registers.monotonic_ns() + longest_ns
 
     def try_lock(self) -> bool:
-        """Whether it was free, and is locked now."""
+        """Lock the bus if it is free.
+
+        Returns
+        -------
+        bool
+            Whether it was free.
+        """
         self._check_time()
         free, self._locked = not self._locked, True
         return free
 
     def unlock(self) -> None:
-        """Free it."""
+        """Unlock the bus."""
         self._locked = False
 
     def writeto(self, address: int, buffer: bytes | bytearray, *, start: int = 0,
                 end: int | None = None) -> None:
-        """Write `buffer[start:end]`; nothing to write asks whether the chip is there."""
+        """Write `buffer[start:end]`; an empty write checks whether the chip answers.
+
+        Parameters
+        ----------
+        address : int
+        buffer : bytes or bytearray
+        start : int, optional
+        end : int, optional
+        """
         data = bytes(buffer[start:end])
-        # Many adapters refuse a message without bytes.
+        # Many adapters refuse a message of zero length.
         self._transfer(i2c_msg.write(address, data) if data else i2c_msg.read(address, 1))
 
     def readfrom_into(self, address: int, buffer: bytearray, *, start: int = 0,
                       end: int | None = None) -> None:
-        """Read as many bytes as `buffer[start:end]` has, into it."""
+        """Read into `buffer[start:end]`.
+
+        Parameters
+        ----------
+        address : int
+        buffer : bytearray
+        start : int, optional
+        end : int, optional
+        """
         message = i2c_msg.read(address, len(buffer[start:end]))
         self._transfer(message)
         buffer[start:end] = bytes(message)
@@ -72,30 +104,41 @@ class BusioI2c:
                               in_buffer: bytearray, *, out_start: int = 0,
                               out_end: int | None = None, in_start: int = 0,
                               in_end: int | None = None) -> None:
-        """Both, as one transaction."""
+        """Write and read in one transaction.
+
+        Parameters
+        ----------
+        address : int
+        out_buffer : bytes or bytearray
+        in_buffer : bytearray
+        out_start : int, optional
+        out_end : int, optional
+        in_start : int, optional
+        in_end : int, optional
+        """
         message = i2c_msg.read(address, len(in_buffer[in_start:in_end]))
         self._transfer(i2c_msg.write(address, bytes(out_buffer[out_start:out_end])), message)
         in_buffer[in_start:in_end] = bytes(message)
 
     def _transfer(self, *messages: i2c_msg) -> None:
-        """One transaction, while there is time."""
+        """Make one transaction, if the deadline has not passed."""
         self._check_time()
         self._registers.transfer(*messages)
 
     def _check_time(self) -> None:
-        """Raises OSError where the driver has taken too long."""
-        if self._registers.monotonic_ns() > self._until_ns:
-            raise OSError(errno.EIO, 'the driver waited too long for its chip')
+        """Raise OSError if the deadline has passed."""
+        if self._registers.monotonic_ns() > self._deadline_ns:
+            raise OSError(errno.EIO, 'timeout while the driver waited for its chip')
 
 
 class CircuitpythonChip:
-    """See `Chip`.
+    """Chip read through a CircuitPython driver. Implements `Chip`.
 
     Parameters
     ----------
     registers : Registers
     name : str
-        `module.Class`.
+        `module.Class` of the driver.
     address : int
     """
 
@@ -104,22 +147,43 @@ class CircuitpythonChip:
     def __init__(self, registers: Registers, name: str, address: int) -> None:
         self._registers, self._name, self._address = registers, name, address
         self._i2c = BusioI2c(registers)
-        # Of somebody else's class.
+        # Instance of a third-party class.
         self._driver: Any = None
 
     def set_up(self) -> None:
-        """See `Chip`; loads the module."""
+        """Load the driver and create its instance.
+
+        Raises
+        ------
+        DeviceError
+            If the driver is not installed or does not find the chip.
+        """
         cls = load(self._name)
-        self._i2c.begin(10 * MAX_NS)
+        self._i2c.begin(10 * TIMEOUT_NS)
         try:
             self._driver = cls(self._i2c, self._address)
         except (RuntimeError, ValueError) as error:
             raise DeviceError(f'{self._name}: {error}') from error
 
     def measure(self) -> Measurement:
-        """See `Chip`."""
+        """Read the property `magnetic` of the driver.
+
+        Returns
+        -------
+        Conversion
+
+        Yields
+        ------
+        float, s
+            Never: the driver itself waits for the chip.
+
+        Raises
+        ------
+        OSError
+            If the driver fails.
+        """
         yield from ()
-        self._i2c.begin(MAX_NS)
+        self._i2c.begin(TIMEOUT_NS)
         start_ns = self._registers.monotonic_ns()
         try:
             x, y, z = self._driver.magnetic
@@ -130,11 +194,26 @@ class CircuitpythonChip:
 
 
 def load(name: str) -> Any:
-    """The class `module.Class`; raises DeviceError that says what to install."""
+    """Load a driver class.
+
+    Parameters
+    ----------
+    name : str
+        `module.Class`.
+
+    Returns
+    -------
+    type
+
+    Raises
+    ------
+    DeviceError
+        If it cannot be imported. The message names the package to install.
+    """
     module_name, _, class_name = name.rpartition('.')
     try:
         module = importlib.import_module(module_name)
-    # Blinka, which such drivers import, knows only some boards and says so in its own ways.
+    # Blinka, which such drivers import, raises various errors on boards that it does not support.
     except (ImportError, NotImplementedError, RuntimeError, OSError) as error:
         package = module_name.partition('.')[0].replace('adafruit_', 'adafruit-circuitpython-')
         raise DeviceError(f'{name}: cannot be loaded ({error}); is {package} installed?') from error

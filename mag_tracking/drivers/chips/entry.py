@@ -1,4 +1,4 @@
-"""Which chip is where, as it stands in the settings: name:chip:address@multiplexer.channel."""
+"""Sensors of an I2C bus as listed in the settings: name:chip:address@multiplexer.channel."""
 
 import re
 from collections.abc import Collection, Sequence
@@ -12,55 +12,78 @@ ENTRY = re.compile(r'(?P<name>[^:]+):(?P<chip>[^:]+):0x(?P<address>[0-9a-fA-F]{2
 
 
 class Sensor(NamedTuple):
-    """One entry."""
+    """Sensor on a bus."""
 
     name: str
     chip: str
     place: Place
 
 
-def sensors_of(entries: Sequence[str], known: Collection[str]) -> list[Sensor]:
-    """The `Sensor`s of all entries.
+def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor]:
+    """Parse all entries.
 
     Parameters
     ----------
     entries : sequence of str
     known : collection of str
-        Names of chips; every other has to be a module.Class.
+        Names of the supported chips; any other chip must be a module.Class.
 
-    Raises SettingsError for an entry that is none, and for two that exclude each other.
+    Returns
+    -------
+    list of Sensor
+
+    Raises
+    ------
+    SettingsError
+        If an entry is not valid, or two entries exclude each other.
     """
-    sensors = [sensor_of(entry, known) for entry in entries]
+    sensors = [parse_sensor(entry, known) for entry in entries]
     multiplexers = {s.place.multiplexer for s in sensors} - {None}
     for i, sensor in enumerate(sensors):
         if sensor.place.address in multiplexers:
             raise SettingsError(f'sensors: {sensor.name}: address {sensor.place.address:#04x} is '
-                                'that of a multiplexer')
+                                'used by a multiplexer')
         for other in sensors[:i]:
             if other.name == sensor.name:
-                raise SettingsError(f'sensors: {sensor.name} is there twice')
-            if _both_answer(sensor.place, other.place):
+                raise SettingsError(f'sensors: {sensor.name} appears twice')
+            if _conflict(sensor.place, other.place):
                 raise SettingsError(f'sensors: {other.name} and {sensor.name} both answer at '
                                     f'{sensor.place}')
     return sensors
 
 
-def _both_answer(one: Place, other: Place) -> bool:
-    """What is on the bus itself also hears what goes through a multiplexer."""
+def _conflict(one: Place, other: Place) -> bool:
+    """Whether two chips answer at once; one directly on the bus is reached with every channel."""
     return one.address == other.address and (
         one == other or None in (one.multiplexer, other.multiplexer))
 
 
-def sensor_of(entry: str, known: Collection[str]) -> Sensor:
-    """The `Sensor` of one entry; raises SettingsError."""
+def parse_sensor(entry: str, known: Collection[str]) -> Sensor:
+    """Parse one entry.
+
+    Parameters
+    ----------
+    entry : str
+    known : collection of str
+        Names of the supported chips.
+
+    Returns
+    -------
+    Sensor
+
+    Raises
+    ------
+    SettingsError
+        If the entry is not valid.
+    """
     match = ENTRY.fullmatch(entry)
     if match is None:
         raise SettingsError('sensors: expected name:chip:0xNN or name:chip:0xNN@0xNN.channel, '
                             f'got {entry!r}')
     name, chip = match['name'], match['chip']
     if chip not in known and '.' not in chip:
-        raise SettingsError(f'sensors: {name}: chip {chip} is none of {", ".join(known)}, nor a '
-                            'module.Class')
+        raise SettingsError(f'sensors: {name}: chip {chip} is neither one of '
+                            f'{", ".join(known)} nor a module.Class')
     address = _address(name, 'address', match['address'], 0x08)
     if match['multiplexer'] is None:
         return Sensor(name, chip, Place(address))
@@ -69,9 +92,9 @@ def sensor_of(entry: str, known: Collection[str]) -> Sensor:
 
 
 def _address(name: str, what: str, digits: str, lowest: int) -> int:
-    """An address from `lowest` on; raises SettingsError."""
+    """Parse an address and check its range."""
     address = int(digits, 16)
     if not lowest <= address <= 0x77:
-        raise SettingsError(f'sensors: {name}: {what} {address:#04x} is outside {lowest:#04x} .. '
-                            '0x77')
+        raise SettingsError(f'sensors: {name}: {what} {address:#04x} is outside '
+                            f'{lowest:#04x} .. 0x77')
     return address

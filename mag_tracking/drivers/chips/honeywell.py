@@ -1,19 +1,19 @@
 """Honeywell HMC5883L and HMC5983: anisotropic magnetoresistive bridges, 12 bits.
 
-Each reading starts a conversion of its own. Its time is the middle of that
-conversion, 3 ms after it was started, uncertain by about 1 ms.
+Each reading starts a conversion. Its time is the middle of the conversion, 3 ms after the start,
+with an uncertainty of about 1 ms.
 
-Axes: as drawn in the data sheets, right-handed. The registers come in the order X,
-Z, Y. An axis over its range is NaN.
+Axes: as drawn in the data sheets, right-handed. The order of the registers is X, Z, Y. An axis over
+its range is NaN.
 
-Scale: 73, 92, 122, 152, 227, 256, 303, 435 nT a count for ranges of +-88, 130, 190,
-250, 400, 470, 560, 810 uT. Noise about 200 nT. The offset may be tens of microtesla,
-and drifts with temperature (the HMC5983 corrects its scale for that, as set up here).
+Scale: 73, 92, 122, 152, 227, 256, 303, 435 nT per count for ranges of ±88, 130, 190, 250, 400, 470,
+560, 810 µT. The noise is about 200 nT. The offset may be tens of microtesla and drifts with
+temperature. The HMC5983, as configured here, corrects its scale for temperature.
 
-Chips sold as HMC5883L are often QMC5883L, which answer at 0x0d and are not this chip.
+Chips sold as HMC5883L are often QMC5883L, which answer at 0x0d and are not supported.
 
-Sources: HMC5883L data sheet 900405 Rev E (2013), tables 2 to 21; HMC5983 data sheet
-900425 (2012), whose registers differ in bit 7 of configuration register A.
+Sources: HMC5883L data sheet 900405 Rev E (2013), tables 2 to 21; HMC5983 data sheet 900425 (2012),
+whose registers differ in bit 7 of configuration register A.
 """
 
 import errno
@@ -23,7 +23,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from mag_tracking.drivers.chips.chip import (
-    MARGIN,
+    CONVERSION_MARGIN,
     Conversion,
     Measurement,
     Registers,
@@ -37,25 +37,33 @@ CONVERSION_S = 6e-3
 OVERFLOW = -4096
 GAINS = {88.0: 1370, 130.0: 1090, 190.0: 820, 250.0: 660,
          400.0: 440, 470.0: 390, 560.0: 330, 810.0: 230}
-"""{range [uT]: counts per gauss}, in the order of their numbers in configuration register B."""
+"""{range [µT]: counts per gauss}, in the order of the gain codes of configuration register B."""
 
 
 @dataclass(frozen=True)
 class Hmc5883lSettings:
-    """Settings of the HMC5883L or HMC5983 on a bus."""
+    """Settings of an HMC5883L or HMC5983 on I2C."""
 
     range_ut: float = param(
-        190.0, 'Largest field of an axis: 88, 130, 190, 250, 400, 470, 560 or 810.', 'uT',
+        190.0, 'Measurement range of an axis: 88, 130, 190, 250, 400, 470, 560 or 810.', 'uT',
         (88.0, 810.0))
 
 
 class Hmc5883l:
-    """HMC5883L; see the module."""
+    """HMC5883L; see the module.
+
+    Parameters
+    ----------
+    registers : Registers
+    settings : Hmc5883lSettings
+    count : callable
+        Not used.
+    """
 
     IDENTITY = ((0x0A, ord('H')), (0x0B, ord('4')), (0x0C, ord('3')))
     NAME = 'hmc5883l'
     CONFIGURATION = 0x10
-    """One conversion for each reading, 15 Hz (which counts for nothing here), no bias."""
+    """One sample per measurement, no bias. The rate, 15 Hz, does not affect single measurements."""
 
     def __init__(self, registers: Registers, settings: Hmc5883lSettings,
                  count: Callable[[str], None]) -> None:
@@ -64,24 +72,40 @@ class Hmc5883l:
         self._gain_bits = list(GAINS).index(settings.range_ut) << 5
 
     def set_up(self) -> None:
-        """See `Chip`."""
+        """Configure the chip."""
         self._registers.write(CONFIGURATION_A, self.CONFIGURATION)
         self._registers.write(CONFIGURATION_B, self._gain_bits)
-        # The first measurement after a change of the gain still has the old one.
+        # The first measurement after a change of the gain still uses the old gain.
         self._registers.write(MODE, SINGLE_MEASUREMENT)
-        self._registers.sleep(CONVERSION_S * MARGIN)
+        self._registers.sleep(CONVERSION_S * CONVERSION_MARGIN)
 
     def measure(self) -> Measurement:
-        """See `Chip`."""
+        """Make one single measurement.
+
+        Returns
+        -------
+        Conversion or None
+            None if the conversion is not done in time.
+
+        Yields
+        ------
+        float, s
+            Time to wait for the conversion.
+
+        Raises
+        ------
+        OSError
+            If the chip has lost its configuration.
+        """
         self._registers.write(MODE, SINGLE_MEASUREMENT)
         start_ns = self._registers.monotonic_ns()
-        yield CONVERSION_S * MARGIN
+        yield CONVERSION_S * CONVERSION_MARGIN
         configuration, gain_bits, mode, x, z, y = struct.unpack(
             '>BBBhhh', self._registers.read_block(CONFIGURATION_A, 9))
         if configuration != self.CONFIGURATION or gain_bits != self._gain_bits:
-            raise OSError(errno.EIO, 'its settings are gone, perhaps its supply was')
-        # The chip goes idle by itself when it is done; its RDY bit stays set from one
-        # conversion to the next, and tells nothing of a new one.
+            raise OSError(errno.EIO, 'the chip lost its settings; check its supply')
+        # The chip becomes idle when the conversion is done. Its RDY bit remains set from one
+        # conversion to the next, and does not indicate a new one.
         if mode & 0x03 == SINGLE_MEASUREMENT:
             return None
         x, y, z = (math.nan if c == OVERFLOW else c / self._gain * 1e-4 for c in (x, y, z))
@@ -89,7 +113,7 @@ class Hmc5883l:
 
 
 class Hmc5983(Hmc5883l):
-    """HMC5983, with compensation of the temperature; see the module."""
+    """HMC5983, with temperature compensation; see the module."""
 
     NAME = 'hmc5983'
     CONFIGURATION = 0x90

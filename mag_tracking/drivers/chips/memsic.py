@@ -1,30 +1,29 @@
 """MEMSIC MMC5983MA and MMC5603NJ: anisotropic magnetoresistive bridges, 18 and 20 bits.
 
-A bridge's offset drifts with temperature by far more than the noise. A pulse of
-current (SET, or RESET with the opposite sign) turns the sensing direction of all
-three axes around, but not the offset; so half the difference of a measurement after each
-has no offset, and half their sum is the offset. The pulse also undoes what a strong
-magnet left in the chip. A reading is such a pair, whose halves are `1 ms + 1.1
-conversion` apart. With `set_reset_s` above 0 a pair is made only so often, and its
-offset is subtracted in between. That is faster, but has 1.4 times the noise, and half
-of what the field changed by within a pair stays in the offset until the next one.
+The offset of a bridge drifts with temperature by much more than the noise. A current pulse (SET, or
+RESET with the opposite sign) reverses the sensing direction of all three axes, but not the offset.
+Half the difference of the measurements after a SET and a RESET therefore has no offset, and half
+their sum is the offset. The pulses also remove the effect of a strong magnet on the chip. A
+reading is such a pair, whose halves are `1 ms + 1.1 conversion` apart. With `set_reset_s` above 0,
+pairs are made only at that interval, and their offset is subtracted from the single measurements in
+between. This is faster, but has 1.4 times the noise, and half the change of the field within a pair
+remains in the offset until the next pair.
 
-A reading's time is the middle of its conversions, which it starts itself; it is
-uncertain by the tolerance of the chip's oscillator, below half a millisecond. A
-pair takes twice `1 ms + 1.1 conversion`, and some 1 ms on a bus of 400 kHz.
+The time of a reading is the middle of its conversions, which the reading itself starts; the
+uncertainty due to the chip's oscillator is below 0.5 ms. A pair takes twice
+`1 ms + 1.1 conversion`, plus about 1 ms on a bus of 400 kHz.
 
-Axes: the direction after RESET is taken as positive. It is the one in which the
-axes are right-handed; those after SET are their opposites, though the data sheet of
-the MMC5983MA calls what is measured after SET positive. Linux says of the MMC5603 and
-its kin that they are "naturally aligned after RESET" (mmc5633.c). Turn the board once
-in the Earth's field to be sure.
+Axes: the direction after RESET is positive, because the axes are right-handed in it. The axes after
+SET are opposite, although the data sheet of the MMC5983MA calls the value after SET positive. Linux
+describes the MMC5603 and its relatives as "naturally aligned after RESET" (mmc5633.c). Rotate the
+board once in the Earth's field to verify the signs.
 
-MMC5983MA: +-800 uT, 6.10 nT a count. Noise 40, 60, 80, 120 nT rms for conversions
-of 8, 4, 2, 0.5 ms; a pair has 0.7 of it.
-MMC5603NJ: +-3 mT, 6.10 nT a count. Noise 200 nT rms for the conversion of 6.6 ms.
+MMC5983MA: ±800 µT, 6.10 nT per count. Noise of 40, 60, 80, 120 nT rms for conversions of 8, 4, 2,
+0.5 ms; 0.7 of it for a pair.
+MMC5603NJ: ±3 mT, 6.10 nT per count. Noise of 200 nT rms for the conversion of 6.6 ms.
 
-Sources: MMC5983MA data sheet Rev A (2019), "Register Map" and "Using SET and RESET
-to remove bridge offset"; MMC5603NJ data sheet Rev B (2018).
+Sources: MMC5983MA data sheet Rev A (2019), "Register Map" and "Using SET and RESET to remove bridge
+offset"; MMC5603NJ data sheet Rev B (2018).
 """
 
 import math
@@ -32,11 +31,11 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
 from mag_tracking.drivers.chips.chip import (
-    MARGIN,
+    CONVERSION_MARGIN,
     Conversion,
     Measurement,
     Registers,
-    in_range,
+    mask_overrange,
     one_of,
 )
 from mag_tracking.drivers.reading import Axes
@@ -45,40 +44,48 @@ from mag_tracking.settings import param
 COUNTS_PER_TESLA = 16384e4
 TAKE_MEASUREMENT, SET, RESET, SOFT_RESET = 0x01, 0x08, 0x10, 0x80
 SETTLE_S = 1e-3
-"""From a pulse to the next measurement, at least."""
+"""[s] Minimum time from a pulse to the next measurement."""
 
 
 @dataclass(frozen=True)
 class Mmc5983maSettings:
-    """Settings of the MMC5983MA on a bus."""
+    """Settings of an MMC5983MA on I2C."""
 
     conversion_ms: float = param(
-        4.0, 'Length of a conversion; the longer, the less noise: 8, 4, 2 or 0.5.', 'ms',
+        4.0, 'Duration of a conversion: 8, 4, 2 or 0.5. Longer conversions have less noise.', 'ms',
         (0.5, 8.0))
     set_reset_s: float = param(
-        0.0, 'The offset is measured anew after so long; 0 = with every reading.', 's',
+        0.0, 'Interval between measurements of the offset; 0 = with every reading.', 's',
         (0.0, 3600.0))
 
 
 @dataclass(frozen=True)
 class Mmc5603Settings(Mmc5983maSettings):
-    """Settings of the MMC5603NJ on a bus."""
+    """Settings of an MMC5603NJ on I2C."""
 
     conversion_ms: float = param(
-        3.5, 'Length of a conversion; the longer, the less noise: 6.6, 3.5, 2 or 1.2.', 'ms',
-        (1.2, 6.6))
+        3.5, 'Duration of a conversion: 6.6, 3.5, 2 or 1.2. Longer conversions have less noise.',
+        'ms', (1.2, 6.6))
 
 
 class Mmc5983ma:
-    """MMC5983MA; see the module."""
+    """MMC5983MA; see the module.
+
+    Parameters
+    ----------
+    registers : Registers
+    settings : Mmc5983maSettings
+    count : callable
+        Not used.
+    """
 
     IDENTITY = ((0x2F, 0x30),)
     NAME = 'mmc5983ma'
     STATUS, DONE, CONTROL_0, CONTROL_1 = 0x08, 0x01, 0x09, 0x0A
     BANDWIDTHS = {8.0: 0, 4.0: 1, 2.0: 2, 0.5: 3}
     SOFT_RESET_S = 0.015
-    LARGEST = 131070
-    """Counts; beyond is the end of the converter's range."""
+    FULL_SCALE = 131070
+    """Largest valid number of counts; larger numbers are at the end of the converter's range."""
     N_BYTES = 7
 
     def __init__(self, registers: Registers, settings: Mmc5983maSettings,
@@ -87,20 +94,31 @@ class Mmc5983ma:
         self._bandwidth = one_of(f'{self.NAME}.conversion_ms', settings.conversion_ms,
                                  self.BANDWIDTHS)
         self._conversion_ns = round(settings.conversion_ms * 1e6)
-        self._renew_ns = round(settings.set_reset_s * 1e9)
+        self._set_reset_ns = round(settings.set_reset_s * 1e9)
         self._offset: Axes | None = None
         self._offset_ns = 0
 
     def set_up(self) -> None:
-        """See `Chip`."""
+        """Reset and configure the chip."""
         self._registers.write(self.CONTROL_1, SOFT_RESET)
         self._registers.sleep(self.SOFT_RESET_S)
         self._registers.write(self.CONTROL_1, self._bandwidth)
 
     def measure(self) -> Measurement:
-        """See `Chip`."""
+        """Make a pair of measurements, or a single one with the stored offset.
+
+        Returns
+        -------
+        Conversion or None
+            None if a conversion is not done in time.
+
+        Yields
+        ------
+        float, s
+            Time to wait for a pulse or a conversion.
+        """
         if self._offset is None or (
-                self._registers.monotonic_ns() - self._offset_ns >= self._renew_ns):
+                self._registers.monotonic_ns() - self._offset_ns >= self._set_reset_ns):
             return (yield from self._pair())
         conversion = yield from self._convert()
         if conversion is None:
@@ -110,7 +128,7 @@ class Mmc5983ma:
         return _conversion(middle_ns, (x, y, z))
 
     def _pair(self) -> Measurement:
-        """A measurement in both directions, and the offset."""
+        """Measure after SET and after RESET; store the offset."""
         halves = []
         for pulse in (SET, RESET):
             self._registers.write(self.CONTROL_0, pulse)
@@ -121,25 +139,25 @@ class Mmc5983ma:
             halves.append(conversion)
         (set_ns, after_set), (reset_ns, after_reset) = halves
         x, y, z = ((r + s) / 2 for r, s in zip(after_reset, after_set, strict=True))
-        # An axis over its range has no offset: the next measurement is a pair again.
+        # An axis over its range has no offset, so the next measurement is a pair again.
         self._offset = None if any(map(math.isnan, (x, y, z))) else (x, y, z)
         self._offset_ns = reset_ns
         x, y, z = ((r - s) / 2 for r, s in zip(after_reset, after_set, strict=True))
         return _conversion((set_ns + reset_ns) // 2, (x, y, z))
 
     def _convert(self) -> Generator[float, None, tuple[int, Axes] | None]:
-        """(middle [ns], counts of the three axes) of one conversion; None = not done in time."""
+        """(middle [ns], counts of the three axes) of one conversion; None if it is late."""
         self._registers.write(self.CONTROL_0, TAKE_MEASUREMENT)
         start_ns = self._registers.monotonic_ns()
-        yield self._conversion_ns * 1e-9 * MARGIN
+        yield self._conversion_ns * 1e-9 * CONVERSION_MARGIN
         if not self._registers.read(self.STATUS) & self.DONE:
             return None
         counts = self._counts(self._registers.read_block(0x00, self.N_BYTES))
-        return start_ns + self._conversion_ns // 2, in_range(counts, self.LARGEST)
+        return start_ns + self._conversion_ns // 2, mask_overrange(counts, self.FULL_SCALE)
 
     @staticmethod
     def _counts(block: bytes) -> list[int]:
-        """Signed counts: 16 bits of each axis, then the last two of all in one byte."""
+        """Signed counts: 16 bits of each axis, then the last two of all axes in one byte."""
         return [(block[2 * i] << 10 | block[2 * i + 1] << 2 | block[6] >> (6 - 2 * i) & 3)
                 - (1 << 17) for i in range(3)]
 
@@ -152,7 +170,7 @@ class Mmc5603(Mmc5983ma):
     STATUS, DONE, CONTROL_0, CONTROL_1 = 0x18, 0x40, 0x1B, 0x1C
     BANDWIDTHS = {6.6: 0, 3.5: 1, 2.0: 2, 1.2: 3}
     SOFT_RESET_S = 0.025
-    LARGEST = 30 * 16384
+    FULL_SCALE = 30 * 16384
     N_BYTES = 9
 
     @staticmethod
@@ -163,6 +181,6 @@ class Mmc5603(Mmc5983ma):
 
 
 def _conversion(middle_ns: int, counts: Axes) -> Conversion:
-    """The `Conversion` of counts."""
+    """Conversion of counts to tesla."""
     x, y, z = (c / COUNTS_PER_TESLA for c in counts)
     return Conversion(middle_ns, (x, y, z))

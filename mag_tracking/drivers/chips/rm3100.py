@@ -1,54 +1,63 @@
 """PNI RM3100: three magneto-inductive coils and a counter, 24 bits.
 
-It measures continuously, X, Y and Z one after the other, as fast as its cycle count
-lets it. A reading's time is that of reading less one period: half a period for the
-conversion, half for how long it has lain there, which is uncertain by half a period.
-The period is 1.9, 3.5, 6.8 ms for 50, 100, 200 cycles.
+It measures continuously, X, Y and Z in sequence, as fast as its cycle count permits. The time of a
+reading is the time at which it is read minus one period: half a period for the conversion and half
+for its mean age, with an uncertainty of half a period. The period is 1.9, 3.5, 6.8 ms for 50, 100,
+200 cycles.
 
-Axes: those of the board on which the coils are; with coils placed and connected as in
-the manual, right-handed (north, east, down).
+Axes: those of the board on which the coils are mounted; with coils placed and connected as in the
+manual, right-handed (north, east, down).
 
-Scale: 50, 26, 13 nT a count; range +-800 uT, beyond which an axis is NaN; noise 30, 20,
-15 nT rms.
+Scale: 50, 26, 13 nT per count; range ±800 µT, beyond which an axis is NaN; noise of 30, 20, 15 nT
+rms.
 
-Source: RM3100 & RM2100 Sensor Suite User Manual, PNI doc 1017252, table 3-1 (scale,
-rate, noise), tables 5-1 to 5-4 and 5-8.
+Source: RM3100 & RM2100 Sensor Suite User Manual, PNI doc 1017252, table 3-1 (scale, rate, noise),
+tables 5-1 to 5-4 and 5-8.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from mag_tracking.drivers.chips.chip import (
-    MARGIN,
+    CONVERSION_MARGIN,
     Conversion,
     Measurement,
     Registers,
-    in_range,
+    mask_overrange,
     one_of,
 )
 from mag_tracking.settings import param
 
 CONTINUOUS, CYCLE_COUNTS, RATE, RESULTS, STATUS = 0x01, 0x04, 0x0B, 0x24, 0x34
 ALL_AXES_READY = 0x79
-"""START, the three axes, and data are ready when all three are."""
+"""START, all three axes, and data ready when all three are measured."""
 FASTEST = 0x92
 READY = 0x80
-LARGEST = 800e-6
+FULL_SCALE = 800e-6
+"""[T] Measurement range of an axis."""
 CYCLES = {50: (20.0, 534.0), 100: (38.0, 283.0), 200: (75.0, 147.0)}
-"""{cycle count: (counts per microtesla, triples a second)}."""
+"""{cycle count: (counts per microtesla, measurements of all axes per second)}."""
 
 
 @dataclass(frozen=True)
 class Rm3100Settings:
-    """Settings of the RM3100 on a bus."""
+    """Settings of an RM3100 on I2C."""
 
     cycle_count: int = param(
-        200, 'Oscillations counted for each axis: 50, 100 or 200; the more, the finer and the '
-        'slower.', '', (50, 200))
+        200, 'Number of oscillations counted for each axis: 50, 100 or 200. Higher counts give '
+        'finer resolution at a lower rate.', '', (50, 200))
 
 
 class Rm3100:
-    """RM3100; see the module."""
+    """RM3100; see the module.
+
+    Parameters
+    ----------
+    registers : Registers
+    settings : Rm3100Settings
+    count : callable
+        Not used.
+    """
 
     IDENTITY = ((0x36, 0x22),)
     NAME = 'rm3100'
@@ -60,18 +69,29 @@ class Rm3100:
         self._delay_ns = round(1e9 / rate_hz)
 
     def set_up(self) -> None:
-        """See `Chip`."""
-        # It takes new cycle counts and rates only while it does not measure.
+        """Configure the chip for continuous measurement."""
+        # Cycle counts and rate are accepted only while the chip does not measure.
         self._registers.write(CONTINUOUS, 0)
         for axis in range(3):
             self._registers.write(CYCLE_COUNTS + 2 * axis, self._cycles >> 8)
             self._registers.write(CYCLE_COUNTS + 2 * axis + 1, self._cycles & 0xFF)
         self._registers.write(RATE, FASTEST)
         self._registers.write(CONTINUOUS, ALL_AXES_READY)
-        self._registers.sleep(self._delay_ns * 1e-9 * MARGIN)
+        self._registers.sleep(self._delay_ns * 1e-9 * CONVERSION_MARGIN)
 
     def measure(self) -> Measurement:
-        """See `Chip`; it measures by itself, so there is nothing to wait for."""
+        """Read the latest conversion.
+
+        Returns
+        -------
+        Conversion or None
+            None if there is no new conversion.
+
+        Yields
+        ------
+        float, s
+            Never: the chip measures continuously.
+        """
         yield from ()
         now_ns = self._registers.monotonic_ns()
         if not self._registers.read(STATUS) & READY:
@@ -79,4 +99,4 @@ class Rm3100:
         block = self._registers.read_block(RESULTS, 9)
         counts = (int.from_bytes(block[i:i + 3], 'big', signed=True) for i in (0, 3, 6))
         return Conversion(now_ns - self._delay_ns,
-                          in_range([c / self._gain * 1e-6 for c in counts], LARGEST))
+                          mask_overrange([c / self._gain * 1e-6 for c in counts], FULL_SCALE))

@@ -1,1 +1,1 @@
-"""Framings: from bytes to readings, one file a format; each is pure."""
+"""Framings: readings from bytes, one file per format. All are pure functions."""

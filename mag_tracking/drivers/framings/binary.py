@@ -1,4 +1,4 @@
-"""Framing of binary frames of a fixed length: sync, payload, checksum, tail."""
+"""Framing of binary frames of fixed length: sync, payload, checksum, tail."""
 
 import struct
 from collections import Counter
@@ -31,49 +31,60 @@ _Converter: TypeAlias = Callable[[Any], object]
 class BinarySettings:
     """Settings of the framing of binary frames."""
 
-    sync: str = param('', 'What a frame begins with, hexadecimal: A5 5A.')
+    sync: str = param('', 'Bytes at the beginning of a frame, hexadecimal, such as A5 5A.')
     fields: tuple[str, ...] = param(
-        (), 'What stands in a frame, in order, each with its type: sensor, ticks, sequence, x, y, '
-        'z, ax, ay, az, or - to be skipped, as in x:i16; x.A:i16 is the axis of a sensor A, where '
-        'there are several. Types: ' + ' '.join(_CODES) + '.')
+        (), 'Values of the payload in order, each with its type, such as x:i16: sensor, ticks, '
+        'sequence, x, y, z, ax, ay, az, or - to skip one. x.A:i16 is an axis of sensor A, for '
+        'frames with several sensors. Types: ' + ' '.join(_CODES) + '.')
     each: tuple[str, ...] = param(
-        (), 'Axes of one sensor with their types, which follow count times behind the fields.')
-    count: int = param(0, 'How many sensors follow in the order of each.', '', (0, 4096))
-    byte_order: str = param('little', 'little or big, of all numbers and of the checksum.')
+        (), 'Axes of one sensor with their types, repeated count times after the fields.')
+    count: int = param(0, 'Number of sensors described by each.', '', (0, 4096))
+    byte_order: str = param(
+        'little', 'Byte order of all numbers and of the checksum: little or big.')
     checksum: str = param(
-        'none', 'What stands behind the payload: none, ' + ', '.join(CHECKSUMS) + '.')
-    checksum_from: str = param('payload', 'Where it begins to count: sync or payload.')
-    tail: str = param('', 'What a frame ends with, hexadecimal; empty = nothing.')
+        'none', 'Checksum after the payload: none, ' + ', '.join(CHECKSUMS) + '.')
+    checksum_from: str = param(
+        'payload', 'First part of the frame that the checksum covers: sync or payload.')
+    tail: str = param('', 'Bytes at the end of a frame, hexadecimal; empty = none.')
 
 
 class BinaryFraming:
     """Readings from binary frames.
 
-    Where a frame fails, the search goes on one byte behind the beginning of its sync.
-    With a checksum of n bits every true frame is found wherever it stands, save that a
-    sync that stands in garbage or in a payload passes for a frame with a chance of
-    2^-n, and then hides the true frames that begin within its length. Without a checksum (a
-    tail is a weak one) every sync passes: true frames are found as long as they follow
-    each other without a gap, or with a gap that holds no sync; behind another gap
-    there may be invented readings and lost ones until a frame happens to be in step
-    again.
+    If a frame is not valid, the search continues one byte after the beginning of its sync. With an
+    n-bit checksum, every true frame is found at any position, except that a sync in garbage or in a
+    payload passes for a frame with probability 2^-n and then hides the true frames that begin
+    within its length. Without a checksum (a tail is a weak one) every sync passes: true frames are
+    found as long as they follow each other without a gap, or with a gap that contains no sync.
+    After any other gap, readings may be false or lost until a frame happens to be aligned again.
+
+    No standard defines this format; it is the frame commonly chosen by makers of sensor boards.
+
+    Parameters
+    ----------
+    settings : BinarySettings
 
     Attributes
     ----------
-    CLOCK, DRIVER : dict
-        The settings of the clock and of the driver that follow from the types: a
-        counter goes back to 0 where its type ends.
+    size : int
+        Length of a frame in bytes.
+    CLOCK : dict of str to float
+        Clock settings that follow from the types: a counter wraps at the end of its type.
+    DRIVER : dict of str to int
+        Driver settings that follow from the types.
 
-    Source: no standard; the frame that makers of sensor boards commonly choose.
+    Raises
+    ------
+    SettingsError
+        If the settings do not describe a frame.
     """
 
     SETTINGS = BinarySettings
 
     def __init__(self, settings: BinarySettings) -> None:
-        """Raises SettingsError."""
         self._sync = _hexadecimal('sync', settings.sync)
         if not self._sync:
-            raise SettingsError('sync: a frame must begin with one byte at least')
+            raise SettingsError('sync: at least one byte is required, such as A5')
         self._tail = _hexadecimal('tail', settings.tail)
         self._order: _ByteOrder = chosen('byte_order', settings.byte_order, ('little', 'big'))
         name = chosen('checksum', settings.checksum, ('none', *CHECKSUMS))
@@ -98,7 +109,18 @@ class BinaryFraming:
             {'sequence_wrap': _wrap(kinds['sequence'])} if 'sequence' in kinds else {})
 
     def parse(self, data: bytes, final: bool = False) -> Parsed:
-        """All readings in `data`; see `Framing.parse`."""
+        """Find all readings; see `Framing.parse`.
+
+        Parameters
+        ----------
+        data : bytes
+        final : bool, optional
+            Whether no bytes follow.
+
+        Returns
+        -------
+        Parsed
+        """
         readings: list[Reading] = []
         rejected: Counter[str] = Counter()
         at = frames = 0
@@ -128,15 +150,15 @@ class BinaryFraming:
         return Parsed(tuple(readings), consumed, rejected)
 
     def _begun(self, data: bytes, at: int) -> int:
-        """How many bytes at the end of `data`, from `at` on, may be the beginning of a sync."""
+        """Length of a possible beginning of a sync at the end of `data`, after position `at`."""
         for n in range(min(len(self._sync) - 1, len(data) - at), 0, -1):
             if data.endswith(self._sync[:n]):
                 return n
         return 0
 
     def _fault(self, data: bytes, start: int) -> str:
-        """Why there is no frame at `start`; empty = there is one."""
-        # No exception: among bytes like the sync this is asked for each of them.
+        """Why there is no frame at `start`; empty if there is one."""
+        # An exception would be too slow, as this is called for every byte that looks like a sync.
         if not data.startswith(self._tail, start + self._checksum_end):
             return 'with a wrong tail'
         end = start + self._payload_end
@@ -146,19 +168,19 @@ class BinaryFraming:
         return ''
 
     def _read(self, data: bytes, start: int) -> list[Reading]:
-        """The readings of the frame at `start`, or Rejected."""
+        """Readings of the frame at `start`; raises Rejected."""
         values = self._struct.unpack_from(data, start + self._payload)
         return self._layout.readings(
             [convert(value) for convert, value in zip(self._converters, values, strict=True)])
 
 
 def _zero(data: bytes) -> int:
-    """The checksum of no bytes."""
+    """Checksum without any bytes."""
     return 0
 
 
 def _hexadecimal(setting: str, text: str) -> bytes:
-    """The bytes of a hexadecimal text."""
+    """Bytes of a hexadecimal text."""
     try:
         return bytes.fromhex(text)
     except ValueError:
@@ -171,8 +193,8 @@ def _typed(setting: str, fields: Sequence[str]) -> list[tuple[str, str]]:
     for text in fields:
         name, _, kind = text.rpartition(':')
         if kind not in _CODES:
-            raise SettingsError(f'{setting}: {text!r} has none of the types {" ".join(_CODES)}, '
-                                'as in x:i16')
+            raise SettingsError(f'{setting}: {text!r}: expected a name with one of the types '
+                                f'{" ".join(_CODES)}, such as x:i16')
         if kind[0] == 'f' and name in ('sensor', 'sequence'):
             raise SettingsError(f'{setting}: {name} must be an integer, got {kind}')
         out.append((name, kind))
@@ -180,13 +202,13 @@ def _typed(setting: str, fields: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def _wrap(kind: str) -> int:
-    """Where a counter of this type goes back to 0; 0 = it will not live to see it."""
+    """Number at which a counter of this type wraps; 0 if it never does in practice."""
     bits = int(kind[1:])
     return 0 if kind[0] == 'f' or bits == 64 else 1 << bits
 
 
 def _converter(quantity: str, kind: str, order: _ByteOrder) -> _Converter:
-    """From what `struct` gives to the value that `FieldLayout` takes."""
+    """Function from a value of `struct` to that expected by `FieldLayout`."""
     if quantity == SKIP:
         return skipped
     convert: _Converter

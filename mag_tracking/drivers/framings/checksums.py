@@ -1,7 +1,7 @@
-"""Checksums of the frames that devices send.
+"""Checksums of the frames sent by devices.
 
-Source: names, polynomials and check values of the "Catalogue of parametrised CRC
-algorithms" (G. Cook); the check value is that of the ASCII text '123456789'.
+Source: names, polynomials and check values of the "Catalogue of parametrised CRC algorithms" (G.
+Cook). The check value is that of the ASCII text '123456789'.
 """
 
 import binascii
@@ -13,26 +13,44 @@ from typing import NamedTuple
 
 
 class Checksum(NamedTuple):
-    """One checksum: how many bytes it takes in a frame, and how it is reckoned."""
+    """Size and function of a checksum."""
 
     size: int
-    """Bytes."""
+    """Size in bytes."""
     value: Callable[[bytes], int]
-    """From the bytes that it covers to the number that stands in the frame."""
+    """Function from the bytes covered to the checksum."""
 
 
 def sum8(data: bytes) -> int:
-    """Sum of the bytes modulo 256; check value 0xDD."""
+    """Sum of the bytes modulo 256; check value 0xDD.
+
+    Parameters
+    ----------
+    data : bytes
+
+    Returns
+    -------
+    int
+    """
     return sum(data) & 0xFF
 
 
 def xor8(data: bytes) -> int:
-    """All bytes joined by exclusive or, as NMEA 0183 has it; check value 0x31."""
+    """Exclusive or of the bytes, as in NMEA 0183; check value 0x31.
+
+    Parameters
+    ----------
+    data : bytes
+
+    Returns
+    -------
+    int
+    """
     return reduce(xor, data, 0)
 
 
 def _forward_table(polynomial: int) -> tuple[int, ...]:
-    """The 256 remainders of an 8-bit CRC, highest bit first."""
+    """The 256 remainders of an 8-bit CRC, most significant bit first."""
     table = []
     for byte in range(256):
         for _ in range(8):
@@ -42,7 +60,7 @@ def _forward_table(polynomial: int) -> tuple[int, ...]:
 
 
 def _reflected_table(polynomial: int) -> tuple[int, ...]:
-    """The 256 remainders of a CRC, lowest bit first; `polynomial` reflected too."""
+    """The 256 remainders of a CRC, least significant bit first; `polynomial` is reflected too."""
     table = []
     for byte in range(256):
         for _ in range(8):
@@ -56,7 +74,16 @@ _MODBUS = _reflected_table(0xA001)
 
 
 def crc8(data: bytes) -> int:
-    """CRC-8/SMBUS: polynomial 0x07, start 0; check value 0xF4."""
+    """CRC-8/SMBUS: polynomial 0x07, initial value 0; check value 0xF4.
+
+    Parameters
+    ----------
+    data : bytes
+
+    Returns
+    -------
+    int
+    """
     crc, table = 0, _CRC8
     for byte in data:
         crc = table[crc ^ byte]
@@ -64,12 +91,30 @@ def crc8(data: bytes) -> int:
 
 
 def crc16_ccitt(data: bytes) -> int:
-    """CRC-16/CCITT-FALSE (IBM-3740): polynomial 0x1021, start 0xFFFF; check value 0x29B1."""
+    """CRC-16/CCITT-FALSE (IBM-3740): polynomial 0x1021, initial value 0xFFFF; check value 0x29B1.
+
+    Parameters
+    ----------
+    data : bytes
+
+    Returns
+    -------
+    int
+    """
     return binascii.crc_hqx(data, 0xFFFF)
 
 
 def crc16_modbus(data: bytes) -> int:
-    """CRC-16/MODBUS: polynomial 0x8005 reflected, start 0xFFFF; check value 0x4B37."""
+    """CRC-16/MODBUS: polynomial 0x8005 reflected, initial value 0xFFFF; check value 0x4B37.
+
+    Parameters
+    ----------
+    data : bytes
+
+    Returns
+    -------
+    int
+    """
     crc, table = 0xFFFF, _MODBUS
     for byte in data:
         crc = crc >> 8 ^ table[(crc ^ byte) & 0xFF]
@@ -77,7 +122,16 @@ def crc16_modbus(data: bytes) -> int:
 
 
 def crc32(data: bytes) -> int:
-    """CRC-32 (ISO-HDLC), as in Ethernet and zip; check value 0xCBF43926."""
+    """CRC-32 (ISO-HDLC), as in Ethernet and zip; check value 0xCBF43926.
+
+    Parameters
+    ----------
+    data : bytes
+
+    Returns
+    -------
+    int
+    """
     return zlib.crc32(data)
 
 
@@ -89,4 +143,4 @@ CHECKSUMS = {
     'crc16_modbus': Checksum(2, crc16_modbus),
     'crc32': Checksum(4, crc32),
 }
-"""By the name that the settings use."""
+"""Checksums by their names in the settings."""

@@ -1,9 +1,8 @@
-"""What the values of one frame mean: names in the settings to readings.
+"""Meaning of the values of a frame, as named in the settings.
 
-A field is one of `sensor`, `ticks`, `sequence`, the axes `x y z` of the magnetic
-field, the axes `ax ay az` of the acceleration, or `-` for a value to be skipped.
-Where a frame holds several sensors, an axis carries the sensor's name behind the
-first dot (`x.A`).
+A field is one of `sensor`, `ticks`, `sequence`, the axes `x y z` of the magnetic field, the axes
+`ax ay az` of the acceleration, or `-` for a value to be skipped. If a frame contains several
+sensors, an axis has the sensor's name after the first dot (`x.A`).
 """
 
 import math
@@ -17,44 +16,46 @@ from mag_tracking.errors import SettingsError
 
 FIELD, ACCELERATION = ('x', 'y', 'z'), ('ax', 'ay', 'az')
 AXES = FIELD + ACCELERATION
-OF_THE_FRAME = ('sensor', 'ticks', 'sequence')
+FRAME_QUANTITIES = ('sensor', 'ticks', 'sequence')
+"""Fields that belong to the frame, not to one sensor."""
 SKIP = '-'
 Values: TypeAlias = Sequence[Any]
-"""Of one frame; the type of each follows from its field."""
+"""Values of one frame; the type of each follows from its field."""
 MAX_NAME = 64
-"""Characters of a sensor's name at most."""
+"""Maximum length of a sensor's name in characters."""
 _ESCAPE = re.compile(r'\\(x[0-9A-Fa-f]{2}|.?)', re.DOTALL)
 _ESCAPED = {'n': '\n', 'r': '\r', 't': '\t', '0': '\0', '\\': '\\'}
 _Choice = TypeVar('_Choice', bound=str)
 
 
 class Rejected(ValueError):
-    """A line or frame gives no reading; the text is the cause, behind 'lines' or 'frames'."""
+    """A line or frame has no reading. The text is the cause, to follow 'lines' or 'frames'."""
 
 
 class FieldLayout:
-    """Turns the values of one frame into one reading per sensor.
+    """Converts the values of one frame to one reading per sensor.
+
+    Parameters
+    ----------
+    fields : sequence of str
+        Fields in the order in which they are sent.
+    each : sequence of str, optional
+        Axes and skipped values of one of several identical sensors, without a sensor's name. They
+        are repeated `count` times after `fields`, for the sensors '0', '1', ...
+    count : int, optional
 
     Attributes
     ----------
     quantities : tuple of str
-        What each value of a frame is, in the order sent: a field's name without the
-        sensor. So many values has a frame.
+        Field of each value of a frame, without the sensor.
+
+    Raises
+    ------
+    SettingsError
+        If a field is unknown or appears twice, or there is no axis.
     """
 
     def __init__(self, fields: Sequence[str], each: Sequence[str] = (), count: int = 0) -> None:
-        """
-        Parameters
-        ----------
-        fields : sequence of str
-            In the order sent.
-        each : sequence of str
-            Axes and skips of one of many like sensors, without a sensor's name;
-            repeated `count` times behind `fields`, the sensors being '0', '1', ...
-        count : int
-
-        Raises SettingsError for an unknown field, a field twice, or no axis at all.
-        """
         names = _expanded(tuple(fields), tuple(each), count)
         index: dict[str, int] = {}
         sensors: dict[str, dict[str, int]] = {}
@@ -62,37 +63,38 @@ class FieldLayout:
             if name == SKIP:
                 continue
             if name in index:
-                raise SettingsError(f'fields: {name} is there twice')
+                raise SettingsError(f'fields: {name} appears twice')
             index[name] = i
             quantity, sensor = _parts(name)
             if quantity in AXES:
                 sensors.setdefault(sensor, {})[quantity] = i
         if not sensors:
-            raise SettingsError(f'fields: none of {" ".join(AXES)} is there, in {list(names)}')
+            raise SettingsError(f'fields: expected at least one of {" ".join(AXES)}, got '
+                                f'{list(names)}')
         if '' in sensors and len(sensors) > 1:
-            raise SettingsError('fields: either every axis belongs to a named sensor (x.A), or '
-                                f'none; got {list(names)}')
+            raise SettingsError('fields: either all axes or none must name a sensor (x.A), got '
+                                f'{list(names)}')
         self.quantities = tuple(_parts(name)[0] for name in names)
-        # Behind the values stand a NaN and a None for what the frame does not hold.
+        # `readings` appends a NaN and a None to the values, for fields that the frame lacks.
         self._device = index.get('sensor')
         self._ticks, self._sequence = index.get('ticks', -1), index.get('sequence', -1)
         self._sensors = [(sensor, _triple(axes, FIELD), _triple(axes, ACCELERATION))
                          for sensor, axes in sensors.items()]
 
     def readings(self, values: Values) -> list[Reading]:
-        """The readings of one frame, in the order in which the sensors first appear.
+        """Readings of one frame, in the order in which the sensors first appear.
 
         Parameters
         ----------
-        values : sequence, as long as `quantities`
-            float for an axis (NaN = missing), str for `sensor`, float for `ticks`, int
-            for `sequence`, anything for a skip.
+        values : sequence
+            One value for each of `quantities`: float for an axis (NaN = missing), str for `sensor`,
+            float for `ticks`, int for `sequence`, anything for a skipped value.
 
         Returns
         -------
         list of Reading
-            The same ticks and sequence in all. A frame with `sensor` and named sensors
-            gives the names joined by a dot ('board.A').
+            All with the same ticks and sequence. In a frame with `sensor` and named sensors, the
+            names are joined by a dot ('board.A').
         """
         v = [*values, math.nan, None]
         ticks, sequence = v[self._ticks], v[self._sequence]
@@ -106,44 +108,60 @@ class FieldLayout:
 
 
 def _parts(name: str) -> tuple[str, str]:
-    """(quantity, sensor) of a field's name."""
+    """(quantity, sensor) of a field."""
     quantity, _, sensor = name.partition('.')
     return quantity, sensor
 
 
 def _triple(axes: Mapping[str, int], names: Sequence[str]) -> Callable[[Values], Any]:
-    """From the values of a frame to three axes, or to None where it holds none of them."""
+    """Function from the values of a frame to three axes, or to None if it has none of them."""
     if not any(name in axes for name in names):
         return itemgetter(-1)
     return itemgetter(*(axes.get(name, -2) for name in names))
 
 
 def _expanded(fields: tuple[str, ...], each: tuple[str, ...], count: int) -> tuple[str, ...]:
-    """All names of a frame, checked one by one."""
+    """All fields of a frame, each of them checked."""
     for name in fields:
         quantity, sensor = _parts(name)
-        if quantity not in (AXES if '.' in name else (*OF_THE_FRAME, *AXES, SKIP)):
-            raise SettingsError(f'fields: {name!r} is none of {" ".join((*OF_THE_FRAME, *AXES))} '
-                                'or - (and only an axis may have a sensor, as in x.A)')
-        if '.' in name and not _usable(sensor):
-            raise SettingsError(f'fields: {name!r}: the name of a sensor has 1 to {MAX_NAME} '
+        if quantity not in (AXES if '.' in name else (*FRAME_QUANTITIES, *AXES, SKIP)):
+            raise SettingsError(f'fields: {name!r}: expected one of '
+                                f'{" ".join((*FRAME_QUANTITIES, *AXES))} or - (only an axis may '
+                                'name a sensor, such as x.A)')
+        if '.' in name and not _is_valid_name(sensor):
+            raise SettingsError(f'fields: {name!r}: expected a sensor name of 1 to {MAX_NAME} '
                                 'printable characters')
     for name in each:
         if name not in (*AXES, SKIP):
-            raise SettingsError(f'each: {name!r} is none of {" ".join(AXES)} or -')
+            raise SettingsError(f'each: expected {" ".join(AXES)} or -, got {name!r}')
     if bool(each) != (count > 0):
-        raise SettingsError(f'each and count go together, got {list(each)} and {count}')
+        raise SettingsError(f'each and count must be set together, got {list(each)} and {count}')
     return fields + tuple(name if name == SKIP else f'{name}.{i}'
                           for i in range(count) for name in each)
 
 
-def _usable(name: str) -> bool:
+def _is_valid_name(name: str) -> bool:
     """Whether a sensor may have this name."""
     return 0 < len(name) <= MAX_NAME and name.isprintable()
 
 
 def axis_value(value: float | bytes) -> float:
-    """`value` as a float; NaN = missing. Raises Rejected where it is infinite."""
+    """Convert an axis to float.
+
+    Parameters
+    ----------
+    value : float or bytes
+        NaN = missing.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    Rejected
+        If `value` is infinite.
+    """
     try:
         value = float(value)
     except OverflowError:
@@ -154,7 +172,21 @@ def axis_value(value: float | bytes) -> float:
 
 
 def ticks_value(value: float) -> float:
-    """`value` as a float [ticks]. Raises Rejected where it is not finite."""
+    """Convert a device time to float.
+
+    Parameters
+    ----------
+    value : float
+
+    Returns
+    -------
+    float, ticks
+
+    Raises
+    ------
+    Rejected
+        If `value` is not finite.
+    """
     value = axis_value(value)
     if math.isnan(value):
         raise Rejected('without ticks')
@@ -162,28 +194,77 @@ def ticks_value(value: float) -> float:
 
 
 def sequence_value(value: int) -> int:
-    """`value`, an int. Raises Rejected where no counter of 64 bits holds it."""
+    """Check a sequence number.
+
+    Parameters
+    ----------
+    value : int
+
+    Returns
+    -------
+    int
+
+    Raises
+    ------
+    Rejected
+        If `value` exceeds 64 bits.
+    """
     if not -2**63 <= value < 2**64:
         raise Rejected('with a sequence of more than 64 bits')
     return value
 
 
 def sensor_name(text: str) -> str:
-    """`text` if a sensor may have this name. Raises Rejected."""
-    if not _usable(text):
-        raise Rejected('with an unusable sensor name')
+    """Check the name of a sensor.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    Rejected
+        If the name is empty, too long, or contains unprintable characters.
+    """
+    if not _is_valid_name(text):
+        raise Rejected('with an invalid sensor name')
     return text
 
 
 def skipped(value: object) -> None:
-    """Nothing, in the place of a value that is not asked for."""
+    """Ignore a value.
+
+    Parameters
+    ----------
+    value : object
+    """
     return None
 
 
 def unescaped(setting: str, text: str) -> bytes:
-    r"""The bytes (UTF-8) of a text in which \n \r \t \0 \\ and \xhh may stand for characters.
+    r"""Bytes (UTF-8) of a text with escape sequences.
 
-    So both quotes of YAML mean the same. Raises SettingsError that names `setting`.
+    The sequences \n, \r, \t, \0, \\ and \xhh are recognised, so that both kinds of YAML quotes
+    have the same effect.
+
+    Parameters
+    ----------
+    setting : str
+        Name of the setting, for the error message.
+    text : str
+
+    Returns
+    -------
+    bytes
+
+    Raises
+    ------
+    SettingsError
+        If an escape sequence is unknown, or the text cannot be encoded.
     """
     def character(match: re.Match[str]) -> str:
         code = match[1]
@@ -191,17 +272,35 @@ def unescaped(setting: str, text: str) -> bytes:
             return _ESCAPED[code]
         if len(code) == 3 and int(code[1:], 16) < 0x80:
             return chr(int(code[1:], 16))
-        raise SettingsError(f'{setting}: {match[0]!r} is none of \\n \\r \\t \\0 \\\\ '
-                            '\\x00 .. \\x7f')
+        raise SettingsError(f'{setting}: unknown escape sequence {match[0]!r}; expected \\n \\r '
+                            '\\t \\0 \\\\ or \\x00 .. \\x7f')
 
     try:
         return _ESCAPE.sub(character, text).encode()
     except UnicodeEncodeError:
-        raise SettingsError(f'{setting}: {text!r} has no UTF-8') from None
+        raise SettingsError(f'{setting}: {text!r} cannot be encoded as UTF-8') from None
 
 
 def chosen(setting: str, value: str, choices: Sequence[_Choice]) -> _Choice:
-    """`value`, if it is one of `choices`. Raises SettingsError that names `setting`."""
+    """Check that a setting is one of the permitted values.
+
+    Parameters
+    ----------
+    setting : str
+        Name of the setting, for the error message.
+    value : str
+    choices : sequence of str
+
+    Returns
+    -------
+    str
+        `value`.
+
+    Raises
+    ------
+    SettingsError
+        If it is not permitted.
+    """
     if value not in choices:
-        raise SettingsError(f'{setting}: {value!r} is none of {", ".join(choices)}')
+        raise SettingsError(f'{setting}: expected one of {", ".join(choices)}, got {value!r}')
     return choices[choices.index(value)]

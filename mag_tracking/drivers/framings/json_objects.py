@@ -1,4 +1,4 @@
-"""Framing of JSON objects, one a line or one a message."""
+"""Framing of JSON objects, one per line or one per message."""
 
 import json
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 from mag_tracking.drivers.framings.fields import (
     ACCELERATION,
     FIELD,
-    OF_THE_FRAME,
+    FRAME_QUANTITIES,
     FieldLayout,
     Rejected,
     axis_value,
@@ -26,41 +26,49 @@ _Converter: TypeAlias = Callable[[object, str], object]
 
 @dataclass(frozen=True)
 class JsonSettings:
-    """Settings of the framing of JSON objects; a path is keys with dots between, `a.b.0`."""
+    """Settings of the framing of JSON objects. A path is keys separated by dots, as in `a.b.0`."""
 
-    sensor: str = param('', "Path of the sensor's name (a text or an integer); empty = none.")
-    ticks: str = param('', "Path of the device's clock; empty = none.")
-    sequence: str = param('', "Path of the device's count of readings; empty = none.")
+    sensor: str = param('', "Path of the sensor's name (a string or an integer); empty = none.")
+    ticks: str = param('', 'Path of the device clock; empty = none.')
+    sequence: str = param('', 'Path of the sequence number; empty = none.')
     field: tuple[str, ...] = param(
-        (), 'Paths of the three axes of the field (empty = that axis is not there), or the path '
-        'of a list of three.')
-    acceleration: tuple[str, ...] = param((), 'As field, of the acceleration.')
-    end: str = param('\\n', 'Ends a line; a carriage return before it is dropped.')
+        (), 'Paths of the three axes of the field (empty = the axis is missing), or the path of a '
+        'list of three.')
+    acceleration: tuple[str, ...] = param((), 'Paths of the acceleration, like those of the field.')
+    end: str = param('\\n', 'End of a line. A carriage return before it is removed.')
     max_length: int = param(
-        4096, 'Longest line or message, without its end.', 'bytes', (2, 1 << 20))
+        4096, 'Maximum length of a line or message without its end.', 'bytes', (2, 1 << 20))
 
 
 class JsonFraming:
-    """Readings from JSON objects, one reading an object.
+    """Readings from JSON objects, one reading per object.
 
-    An axis is null or NaN where it is missing; a path that leads nowhere is a
-    rejection. An object of several lines is only read where the data are `final`
-    and hold nothing else; otherwise its lines are read one by one.
+    An axis is missing if it is null or NaN; an object that lacks a configured path is rejected. An
+    object that spans several lines is read only if the data are `final` and contain nothing
+    else; otherwise its lines are read one by one.
 
-    Source: RFC 8259; NaN and Infinity, which it does not have, are read as Python,
+    Source: RFC 8259. NaN and Infinity, which it does not define, are accepted, because Python,
     JavaScript libraries and many devices write them.
+
+    Parameters
+    ----------
+    settings : JsonSettings
+
+    Raises
+    ------
+    SettingsError
+        If a path is not valid, or neither the field nor the acceleration has one.
     """
 
     SETTINGS = JsonSettings
 
     def __init__(self, settings: JsonSettings) -> None:
-        """Raises SettingsError."""
         self._lines = Lines(settings.end, settings.max_length)
         self._decode = json.JSONDecoder(object_pairs_hook=_object).decode
         self._lists: list[tuple[str, _Keys]] = []
         self._values: list[tuple[str, _Keys, _Converter]] = []
         names: list[str] = []
-        for name in OF_THE_FRAME:
+        for name in FRAME_QUANTITIES:
             if path := getattr(settings, name):
                 names.append(name)
                 self._values.append((path, _keys(name, path), _CONVERTERS[name]))
@@ -69,28 +77,39 @@ class JsonFraming:
                 if path:
                     names.append(axis)
                     self._values.append((path, _keys(name, path), _axis))
-        if not self._values or names[-1] in OF_THE_FRAME:
-            raise SettingsError('field: neither the field nor the acceleration has a path')
+        if not self._values or names[-1] in FRAME_QUANTITIES:
+            raise SettingsError('field: a path of the field or of the acceleration is required')
         self._layout = FieldLayout(names)
 
     def _axes(self, name: str, paths: tuple[str, ...]) -> tuple[str, ...]:
-        """The paths of three axes."""
+        """Paths of three axes."""
         if len(paths) == 1 and paths[0]:
             self._lists.append((paths[0], _keys(name, paths[0])))
             return tuple(f'{paths[0]}.{i}' for i in range(3))
         if any(paths) and len(paths) != 3:
-            raise SettingsError(f'{name}: expected the paths of three axes, or of one list, got '
-                                f'{list(paths)}')
+            raise SettingsError(f'{name}: expected the paths of three axes, or the path of a list, '
+                                f'got {list(paths)}')
         return paths if any(paths) else ('', '', '')
 
     def parse(self, data: bytes, final: bool = False) -> Parsed:
-        """All readings in `data`; see `Framing.parse`."""
-        if final and self._is_one(data):
+        """Find all readings; see `Framing.parse`.
+
+        Parameters
+        ----------
+        data : bytes
+        final : bool, optional
+            Whether no bytes follow.
+
+        Returns
+        -------
+        Parsed
+        """
+        if final and self._is_single_document(data):
             return self._lines.read([data], len(data), self._read)
         return self._lines.parse(data, final, self._read)
 
-    def _is_one(self, data: bytes) -> bool:
-        """Whether all of a message is one piece of JSON, of several lines perhaps."""
+    def _is_single_document(self, data: bytes) -> bool:
+        """Whether a whole message is one JSON document that spans several lines."""
         if self._lines.end not in data.strip() or len(data) > self._lines.max_length:
             return False
         try:
@@ -100,7 +119,7 @@ class JsonFraming:
         return True
 
     def _json(self, line: bytes) -> Any:
-        """What a line says, or Rejected."""
+        """Content of a line; raises Rejected."""
         try:
             return self._decode(line.decode())
         except RecursionError:
@@ -108,40 +127,40 @@ class JsonFraming:
         except Rejected:
             raise
         except ValueError:
-            # Also an integer of more digits than Python cares to read.
-            raise Rejected('that are no JSON') from None
+            # Also an integer with more digits than Python converts.
+            raise Rejected('that are not JSON') from None
 
     def _read(self, line: bytes) -> list[Reading]:
-        """The reading of one object, or Rejected."""
+        """Readings of one object; raises Rejected."""
         content = self._json(line)
         if not isinstance(content, dict):
-            raise Rejected('that are no JSON object')
+            raise Rejected('that are not a JSON object')
         for path, keys in self._lists:
-            value = _at(content, path, keys)
+            value = _lookup(content, path, keys)
             if not isinstance(value, list) or len(value) != 3:
-                raise Rejected(f'whose {path} is no list of three')
-        return self._layout.readings([convert(_at(content, path, keys), path)
+                raise Rejected(f'whose {path} is not a list of three')
+        return self._layout.readings([convert(_lookup(content, path, keys), path)
                                       for path, keys, convert in self._values])
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object as a dict."""
+    """JSON object as a dict; raises Rejected for duplicate keys."""
     content = dict(pairs)
     if len(content) != len(pairs):
-        raise Rejected('with a key twice')
+        raise Rejected('with a duplicate key')
     return content
 
 
 def _keys(name: str, path: str) -> _Keys:
-    """The steps of a path: (key, index or None)."""
+    """Steps of a path: (key, index or None)."""
     keys = path.split('.')
     if not all(keys):
         raise SettingsError(f'{name}: {path!r} has an empty key')
     return tuple((key, int(key) if key.isascii() and key.isdecimal() else None) for key in keys)
 
 
-def _at(value: Any, path: str, keys: _Keys) -> Any:
-    """What stands at a path, or Rejected."""
+def _lookup(value: Any, path: str, keys: _Keys) -> Any:
+    """Value at a path; raises Rejected."""
     for key, index in keys:
         if isinstance(value, dict) and key in value:
             value = value[key]
@@ -153,38 +172,38 @@ def _at(value: Any, path: str, keys: _Keys) -> Any:
 
 
 def _number(value: object, path: str) -> int | float:
-    """A number, which a bool is not in JSON."""
+    """Check that a value is a number; a bool is not a number in JSON."""
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise Rejected(f'whose {path} is no number')
+        raise Rejected(f'whose {path} is not a number')
     return value
 
 
 def _axis(value: object, path: str) -> float:
-    """An axis, NaN where it is null."""
+    """Value of an axis; NaN for null."""
     return float('nan') if value is None else axis_value(_number(value, path))
 
 
 def _ticks(value: object, path: str) -> float:
-    """The device's clock, which must be there."""
+    """Device time, which is required."""
     return ticks_value(_number(value, path))
 
 
 def _sequence(value: object, path: str) -> int:
-    """The device's count; JSON does not tell 12 from 12.0."""
+    """Sequence number; JSON does not distinguish 12 from 12.0."""
     value = _number(value, path)
     if isinstance(value, float):
         if not value.is_integer():
-            raise Rejected(f'whose {path} is no integer')
+            raise Rejected(f'whose {path} is not an integer')
         value = int(value)
     return sequence_value(value)
 
 
 def _sensor(value: object, path: str) -> str:
-    """The name of the sensor, which may be a number."""
+    """Name of the sensor, which may be a number."""
     if isinstance(value, int) and not isinstance(value, bool):
         value = str(value)
     if not isinstance(value, str):
-        raise Rejected(f'whose {path} is no name')
+        raise Rejected(f'whose {path} is not a name')
     return sensor_name(value)
 
 

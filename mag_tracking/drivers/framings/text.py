@@ -1,4 +1,4 @@
-"""Framing of lines of text: numbers between separators, with or without a checksum."""
+"""Framing of lines of text: separated numbers, with or without a checksum."""
 
 import re
 from collections import Counter
@@ -23,7 +23,7 @@ from mag_tracking.drivers.reading import Parsed, Reading
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
 
-# Each character has one place in these, or a long line would take quadratic time.
+# Each character can match in one way only; otherwise a long line would take quadratic time.
 _NUMBER = re.compile(rb'[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?').fullmatch
 _MISSING = re.compile(rb'(?:[+-]?nan)?', re.IGNORECASE).fullmatch
 _INFINITE = re.compile(rb'[+-]?inf(?:inity)?', re.IGNORECASE).fullmatch
@@ -35,60 +35,87 @@ class TextSettings:
     """Settings of the framing of lines of text."""
 
     fields: tuple[str, ...] = param(
-        (), 'What stands in a line, in order: sensor, ticks, sequence, x, y, z, ax, ay, az, or - '
-        'for a value to be skipped; x.A is the axis of a sensor A, where there are several.')
-    each: tuple[str, ...] = param(
-        (), 'Axes of one sensor, which follow count times behind the fields.')
-    count: int = param(0, 'How many sensors follow in the order of each.', '', (0, 4096))
-    separator: str = param(',', 'Stands between two values; a blank is any white space.')
-    end: str = param('\\n', 'Ends a line; a carriage return before it is dropped.')
-    prefix: str = param('', 'How a line of readings begins; other lines are rejected.')
-    comment: str = param('', 'How a line begins that is to be passed over; empty = none is.')
+        (), 'Values of a line in order: sensor, ticks, sequence, x, y, z, ax, ay, az, or - to skip '
+        'one. x.A is an axis of sensor A, for lines with several sensors.')
+    each: tuple[str, ...] = param((), 'Axes of one sensor, repeated count times after the fields.')
+    count: int = param(0, 'Number of sensors described by each.', '', (0, 4096))
+    separator: str = param(',', 'Separator of two values; a blank stands for any white space.')
+    end: str = param('\\n', 'End of a line. A carriage return before it is removed.')
+    prefix: str = param('', 'Beginning of the lines with readings; other lines are rejected.')
+    comment: str = param('', 'Beginning of the lines to ignore; empty = none.')
     checksum: str = param(
-        'none', "none, or nmea: a line ends in * and two hexadecimal digits, the exclusive or of "
-        'what stands before it, without a $ at the beginning.')
-    max_length: int = param(512, 'Longest line, without its end.', 'bytes', (1, 65536))
+        'none', 'Checksum: none, or nmea (a line ends in * and two hexadecimal digits, the '
+        'exclusive or of the preceding characters without a leading $).')
+    max_length: int = param(512, 'Maximum length of a line without its end.', 'bytes', (1, 65536))
 
 
 class Lines:
-    """Cuts bytes into lines and counts what cannot be read; as pure as a framing."""
+    """Splits bytes into lines and counts those that cannot be read. It holds no state.
+
+    Parameters
+    ----------
+    end : str
+        End of a line, as in `TextSettings`.
+    max_length : int, bytes
+        Maximum length of a line.
+
+    Attributes
+    ----------
+    end : bytes
+    max_length : int, bytes
+
+    Raises
+    ------
+    SettingsError
+        If `end` is empty.
+    """
 
     def __init__(self, end: str, max_length: int) -> None:
-        """
-        Parameters
-        ----------
-        end : str
-            As in `TextSettings`; raises SettingsError where it is empty.
-        max_length : int [bytes]
-        """
         self.end = unescaped('end', end)
         if not self.end:
-            raise SettingsError('end: the end of a line is empty')
+            raise SettingsError('end: at least one character is required, such as \\n')
         self.max_length = max_length
 
     def parse(self, data: bytes, final: bool, read: Callable[[bytes], list[Reading]]) -> Parsed:
-        """All lines of `data`, as `Framing.parse`.
+        """Parse all lines; see `Framing.parse`.
 
         Parameters
         ----------
         data : bytes
         final : bool
-            What stands behind the last end is a line too.
-        read : function
-            From a line of valid UTF-8 (bytes, neither empty nor too long) to readings;
-            raises Rejected.
+            Whether the bytes after the last end are a line too.
+        read : callable
+            Function from a line of valid UTF-8 (bytes, neither empty nor too long) to readings; may
+            raise Rejected.
+
+        Returns
+        -------
+        Parsed
         """
         *lines, rest = data.split(self.end)
         if final:
             lines += [rest] if rest else []
             return self.read(lines, len(data), read)
-        # So much of a line that is too long stays that it is still too long in the next call.
+        # Of a line that is too long, enough is kept for it to be too long in the next call too.
         kept = min(len(rest), self.max_length + len(self.end))
         return self.read(lines, len(data) - kept, read)
 
     def read(self, lines: Iterable[bytes], consumed: int,
              read: Callable[[bytes], list[Reading]]) -> Parsed:
-        """The `Parsed` of these lines; the other parameters as in `parse`."""
+        """Parse lines that have been split already.
+
+        Parameters
+        ----------
+        lines : iterable of bytes
+        consumed : int
+            Number of bytes consumed.
+        read : callable
+            As in `parse`.
+
+        Returns
+        -------
+        Parsed
+        """
         readings: list[Reading] = []
         rejected: Counter[str] = Counter()
         for line in lines:
@@ -99,14 +126,14 @@ class Lines:
         return Parsed(tuple(readings), consumed, rejected)
 
     def _checked(self, line: bytes) -> bytes:
-        """The line without its carriage return, or Rejected."""
+        """Line without its carriage return; raises Rejected."""
         if len(line) > self.max_length:
-            raise Rejected('that are too long')
+            raise Rejected('longer than max_length')
         if not line.isascii():
             try:
                 line.decode()
             except UnicodeDecodeError:
-                raise Rejected('that are no UTF-8') from None
+                raise Rejected('that are not UTF-8') from None
         line = line.removesuffix(b'\r')
         if not line or line.isspace():
             raise Rejected('that are empty')
@@ -114,21 +141,28 @@ class Lines:
 
 
 class TextFraming:
-    """Readings from lines of text, one frame a line.
+    """Readings from lines of text, one frame per line.
 
-    An axis is `nan` or nothing where it is missing; other numbers are decimal. A
-    line that is not as the settings say is rejected as a whole. Without a prefix or a
-    checksum, the second half of a line may look like a line: nothing tells '12.5,3,4'
-    from the end of '-12.5,3,4', nor, where `final` is given for a line that is cut off,
-    '1,2,3' from the beginning of '1,2,34'.
+    An axis is missing if it is `nan` or empty; all other numbers are decimal. A line that does not
+    match the settings is rejected as a whole. Without a prefix or a checksum, part of a line may
+    look like a complete line: '12.5,3,4' is also the end of '-12.5,3,4', and '1,2,3', if `final`
+    is set for a truncated line, is also the beginning of '1,2,34'.
 
-    Source: the checksum is that of NMEA 0183, section "Checksum field".
+    Source: NMEA 0183, section "Checksum field".
+
+    Parameters
+    ----------
+    settings : TextSettings
+
+    Raises
+    ------
+    SettingsError
+        If the settings do not describe a line.
     """
 
     SETTINGS = TextSettings
 
     def __init__(self, settings: TextSettings) -> None:
-        """Raises SettingsError."""
         self._lines = Lines(settings.end, settings.max_length)
         self._layout = FieldLayout(settings.fields, settings.each, settings.count)
         self._prefix = unescaped('prefix', settings.prefix)
@@ -140,24 +174,35 @@ class TextFraming:
         self._check(separator)
 
     def _check(self, separator: bytes) -> None:
-        """Raises SettingsError where no line could be read."""
+        """Raise SettingsError if no line can be read with these settings."""
         if not separator or re.search(rb'[0-9A-Za-z+.-]', separator):
-            raise SettingsError(f'separator: {separator!r} is empty or may be part of a number')
+            raise SettingsError(f'separator: {separator!r} is empty or can be part of a number')
         if self._lines.end in separator:
-            raise SettingsError(f'separator: {separator!r} holds the end of the line')
+            raise SettingsError(f'separator: {separator!r} contains the end of the line')
         for name, text in (('prefix', self._prefix), ('comment', self._comment)):
             if self._lines.end in text:
-                raise SettingsError(f'{name}: {text!r} holds the end of the line')
+                raise SettingsError(f'{name}: {text!r} contains the end of the line')
         if self._comment and self._prefix.startswith(self._comment):
             raise SettingsError(f'comment: every line with the prefix {self._prefix!r} begins '
-                                f'with {self._comment!r} and would be passed over')
+                                f'with {self._comment!r} and would be ignored')
 
     def parse(self, data: bytes, final: bool = False) -> Parsed:
-        """All readings in `data`; see `Framing.parse`."""
+        """Find all readings; see `Framing.parse`.
+
+        Parameters
+        ----------
+        data : bytes
+        final : bool, optional
+            Whether no bytes follow.
+
+        Returns
+        -------
+        Parsed
+        """
         return self._lines.parse(data, final, self._read)
 
     def _read(self, line: bytes) -> list[Reading]:
-        """The readings of one line, or Rejected."""
+        """Readings of one line; raises Rejected."""
         if self._comment and line.startswith(self._comment):
             raise Rejected('that are comments')
         if not line.startswith(self._prefix):
@@ -166,13 +211,13 @@ class TextFraming:
             line = _without_checksum(line)
         values = line[len(self._prefix):].split(self._separator)
         if len(values) != len(self._converters):
-            raise Rejected('with another number of fields')
+            raise Rejected('with an unexpected number of fields')
         return self._layout.readings(
             [convert(text) for convert, text in zip(self._converters, values, strict=True)])
 
 
 def _without_checksum(line: bytes) -> bytes:
-    """What stands before `*hh`, or Rejected."""
+    """Line without `*hh`; raises Rejected."""
     if line[-3:-2] != b'*':
         raise Rejected('without a checksum')
     line, digits = line[:-3], line[-2:]
@@ -182,7 +227,7 @@ def _without_checksum(line: bytes) -> bytes:
 
 
 def _converter(quantity: str) -> Callable[[bytes], object]:
-    """From the bytes between two separators to the value that `FieldLayout` takes."""
+    """Function from the bytes between two separators to the value expected by `FieldLayout`."""
     if quantity in AXES:
         return _axis
     others: dict[str, Callable[[bytes], object]] = {
@@ -191,29 +236,29 @@ def _converter(quantity: str) -> Callable[[bytes], object]:
 
 
 def _axis(text: bytes) -> float:
-    """An axis, NaN where there is nothing."""
+    """Value of an axis; NaN if empty."""
     text = text.strip(b' \t')
     if _NUMBER(text):
         return axis_value(text)
     if _MISSING(text):
         return float('nan')
     raise Rejected('with an infinite number' if _INFINITE(text)
-                   else 'with something that is no number')
+                   else 'with a value that is not a number')
 
 
 def _ticks(text: bytes) -> float:
-    """The device's clock, which must be there."""
+    """Device time, which is required."""
     return ticks_value(_axis(text))
 
 
 def _sequence(text: bytes) -> int:
-    """The device's count, which must be there."""
+    """Sequence number, which is required."""
     text = text.strip(b' \t')
     if not _INTEGER(text):
-        raise Rejected('with a sequence that is no integer')
+        raise Rejected('with a sequence that is not an integer')
     return sequence_value(int(text))
 
 
 def _sensor(text: bytes) -> str:
-    """The name of the sensor."""
+    """Name of the sensor."""
     return sensor_name(text.strip(b' \t').decode())

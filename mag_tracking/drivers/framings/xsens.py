@@ -1,25 +1,24 @@
-"""The binary protocol of Xsens' MTi and MTx, as a framing.
+"""Framing of the binary protocol of the Xsens MTi and MTx.
 
-A message is the preamble 0xFA, the address 0xFF, its kind (MID), the length of DATA
-(one byte, or 0xFF and two bytes), DATA, and a byte that makes the sum of all but the
-preamble a multiple of 256. One wrong message of 256 passes such a sum, so:
+A message consists of the preamble 0xFA, the address 0xFF, its type (MID), the length of DATA (one
+byte, or 0xFF and two bytes), DATA, and a byte that makes the sum of all bytes but the preamble a
+multiple of 256. One of 256 false messages has a valid checksum. Therefore:
 
-- A message must be one that a device sends: MTData2, MTData, WakeUp, Error, or an answer,
-  whose MID is that of the question plus one and so odd; and not longer than the settings
-  allow.
-- The packets in MTData2 must fill it, and MTData must be as long as the settings say.
-- Where a right data message begins inside another message, that other one is none: it was
-  garbage, or it lost some of its bytes and took in those of its successor.
+- A message must be one that a device sends: MTData2, MTData, WakeUp, Error, or a reply, whose MID
+  is that of the request plus one and therefore odd. It must not be longer than the settings permit.
+- The packets of MTData2 must fill it, and MTData must have the configured length.
+- A message that contains the start of a valid data message is rejected: it was garbage, or it lost
+  some of its bytes and includes those of its successor.
 
-So no true data message is lost to a false one that begins before it, with two exceptions: both
-together are longer than the longest frame, and the false one is a data message too; or a data
-message that lost one single byte ends, and is right, with the preamble of the next.
-A false one that meets no true one can still pass. What is not taken is searched again from the
-byte behind its preamble.
+No true data message is lost to a false one that begins before it, with two exceptions: the two
+together are longer than the longest frame and the false one is a data message too; or a data
+message that lost a single byte is completed, and becomes valid, with the preamble of the next one.
+A false message that overlaps no true one can still pass. The search continues at the byte after the
+preamble of a rejected message.
 
-Sources: Xsens, "MT Low Level Communication Protocol Documentation", MT0101P, revision
-2019.A: message structure and message listing; Xsens, "MTi User Manual", MT0605P, section
-5.3.2: acknowledgements.
+Sources: Xsens, "MT Low Level Communication Protocol Documentation", MT0101P, revision 2019.A:
+message structure and message listing; Xsens, "MTi User Manual", MT0605P, section 5.3.2:
+acknowledgements.
 """
 
 from collections import Counter
@@ -42,7 +41,7 @@ _MTDATA, _MTDATA2, _WAKE_UP, _ERROR = 0x32, 0x36, 0x3E, 0x42
 _DATA_MESSAGES = (_MTDATA, _MTDATA2)
 _EXTENDED = 0xFF
 _MAX_OVERHEAD = 7
-"""Bytes of a message with extended length that are not DATA."""
+"""Number of bytes of a message with extended length besides DATA."""
 
 
 @dataclass(frozen=True)
@@ -50,31 +49,32 @@ class XsensSettings:
     """Settings of the Xsens protocol."""
 
     max_message: int = param(
-        512, 'Bytes of data in the longest message; a longer one is taken for garbage.',
+        512, 'Maximum length of the data of a message. A longer message is treated as garbage.',
         'bytes', (254, 4096))
     mtdata: tuple[str, ...] = param(
-        ('none',), 'Blocks in the messages MTData of an MTi or MTx of the first generation, as its '
-        'output mode and output settings say, in this order: temp, acc, gyr, mag, quaternion or '
-        'euler or matrix, analog_1, analog_2, status, counter; none = it does not send MTData.')
+        ('none',), 'Blocks in the MTData messages of a first-generation MTi or MTx, according to '
+        'its output mode and output settings, in this order: temp, acc, gyr, mag, quaternion or '
+        'euler or matrix, analog_1, analog_2, status, counter. none = the device sends no MTData.')
     mtdata_format: str = param('float', 'Format of the numbers in MTData: float or fp12.20.')
 
 
 class _Message(NamedTuple):
-    """A message in a window of bytes; it may end behind what has come."""
+    """Message in a window of bytes; it may end after the last byte received."""
 
     mid: int
     begin: int
-    """Of DATA."""
+    """Beginning of DATA."""
     end: int
-    """Behind the checksum."""
+    """End of the checksum."""
 
 
 class _Step(NamedTuple):
-    """What became of the message that may begin at a place."""
+    """Result for the message that may begin at a position."""
 
     length: int
-    """Bytes that are done with; 0 = more are needed to tell."""
+    """Number of bytes consumed; 0 = more bytes are needed."""
     taken: bool
+    """Whether the message is accepted."""
     causes: tuple[str, ...] = ()
     reading: Reading | None = None
 
@@ -84,15 +84,13 @@ _REFUSE = _Step(1, False)
 
 
 def _is_from_device(mid: int) -> bool:
-    """Whether a device sends such messages."""
+    """Whether devices send messages of this type."""
     return mid % 2 == 1 or mid in (_MTDATA, _MTDATA2, _WAKE_UP, _ERROR)
 
 
 def _message_at(window: bytes, place: int, longest: int) -> _Message | None:
-    """The message that may begin there, or None where none can.
-
-    While its head is not whole, MID is -1 and the end is one byte behind the window.
-    """
+    """Message that may begin at `place`; None if none can."""
+    # While the head is incomplete, MID is -1 and the end is one byte after the window.
     head = window[place:place + 6]
     if not head.startswith(_START[:len(head)]):
         return None
@@ -108,20 +106,27 @@ def _message_at(window: bytes, place: int, longest: int) -> _Message | None:
     return _Message(head[2], begin, begin + size + 1)
 
 
-def _sum_is_right(window: bytes, place: int, message: _Message) -> bool:
-    """Whether all but the preamble adds up to a multiple of 256."""
+def _is_checksum_valid(window: bytes, place: int, message: _Message) -> bool:
+    """Whether the sum of all bytes but the preamble is a multiple of 256."""
     return sum(window[place + 1:message.end]) % 256 == 0
 
 
 class XsensFraming:
-    """Finds readings in what an MTi or MTx sends; see `Framing`.
+    """Readings from the messages of an MTi or MTx. Implements `Framing`.
 
-    A reading has the field in arbitrary units (1 = the field's size where Xsens calibrated
-    the sensor), the acceleration in m/s^2, the packet counter as sequence (modulo 2^16), and
-    SampleTimeFine as ticks (10 kHz); each if the device sends it. A message with neither field
-    nor acceleration gives none, and is counted; its number will seem to be lost.
+    A reading has the field in arbitrary units (1 = the magnitude of the field where Xsens
+    calibrated the sensor), the acceleration in m/s², the packet counter as sequence (modulo 2^16),
+    and SampleTimeFine as ticks (10 kHz), each if the device sends it. A message with neither field
+    nor acceleration has no reading; it is counted, and its sequence number appears to be lost.
 
-    Raises SettingsError where `mtdata` or `mtdata_format` describe no message.
+    Parameters
+    ----------
+    settings : XsensSettings
+
+    Raises
+    ------
+    SettingsError
+        If `mtdata` or `mtdata_format` do not describe a message.
     """
 
     SETTINGS = XsensSettings
@@ -134,11 +139,22 @@ class XsensFraming:
         if tuple(settings.mtdata) != ('none',):
             self._layout = MTDataLayout(settings.mtdata, settings.mtdata_format)
         elif settings.mtdata_format != 'float':
-            raise SettingsError(f'mtdata_format is {settings.mtdata_format!r}, but mtdata says '
-                                'that there is no MTData')
+            raise SettingsError(f'mtdata_format is {settings.mtdata_format!r}, but mtdata is none; '
+                                'set mtdata to the blocks of the messages')
 
     def parse(self, data: bytes, final: bool = False) -> Parsed:
-        """All readings in `data`, bytes; see `Framing.parse`."""
+        """Find all readings; see `Framing.parse`.
+
+        Parameters
+        ----------
+        data : bytes
+        final : bool, optional
+            Whether no bytes follow.
+
+        Returns
+        -------
+        Parsed
+        """
         readings: list[Reading] = []
         rejected: Counter[str] = Counter()
         position = 0
@@ -164,17 +180,17 @@ class XsensFraming:
         return Parsed(tuple(readings), position, {c: n for c, n in rejected.items() if n})
 
     def _step(self, window: bytes, more: bool) -> _Step:
-        """What becomes of the message at the beginning of `window`; `more` = more may come."""
+        """Result for the message at the beginning of `window`; `more` = more bytes may follow."""
         message = _message_at(window, 0, self._longest)
         if message is None:
             return _REFUSE
         if message.end > len(window):
             return _WAIT if more else _REFUSE
-        if not _sum_is_right(window, 0, message):
+        if not _is_checksum_valid(window, 0, message):
             return _REFUSE._replace(causes=('frames with a wrong checksum',))
         content = self._data_content(window, message)
         if content is None and message.mid == _MTDATA2:
-            return _REFUSE._replace(causes=('MTData2 messages whose packets do not fit',))
+            return _REFUSE._replace(causes=('MTData2 messages with invalid packet lengths',))
         inside = self._step_inside(window, message, content is not None, more)
         if inside is not None:
             return inside
@@ -184,12 +200,12 @@ class XsensFraming:
 
     def _step_inside(self, window: bytes, outer: _Message, outer_is_data: bool,
                      more: bool) -> _Step | None:
-        """The step if `outer` is not to be taken, or not yet, for what begins in it; else None."""
-        refused = _REFUSE._replace(causes=('messages in which another begins',))
+        """Result if another message that begins inside rejects or delays `outer`; else None."""
+        refused = _REFUSE._replace(causes=('messages that contain the start of another',))
         place = 0
         while True:
-            # A data message is not kept waiting for the byte behind it, though its checksum might
-            # be a preamble; it would come late once in 256 times.
+            # A data message does not wait for the byte after it, although its checksum may be a
+            # preamble; otherwise one in 256 messages would be late.
             place = self._next_inside(window, place + 1, outer.end, outer_is_data)
             if place < 0:
                 return None
@@ -201,20 +217,20 @@ class XsensFraming:
                     return _WAIT
                 if len(window) == self._longest + _MAX_OVERHEAD and not outer_is_data:
                     return refused
-            elif (_sum_is_right(window, place, inner)
+            elif (_is_checksum_valid(window, place, inner)
                   and self._data_content(window, inner) is not None):
                 return refused
 
     @staticmethod
     def _next_inside(window: bytes, place: int, end: int, whole: bool) -> int:
-        """Where the next start begins before `end`, -1 = nowhere; `whole` = both its bytes."""
+        """Position of the next start before `end`, -1 if none; `whole` = both of its bytes."""
         found = window.find(_START, place, end if whole else end + 1)
         if found < 0 and not whole and end == len(window) and window.endswith(_PREAMBLE, place):
             return end - 1
         return found
 
     def _data_content(self, window: bytes, message: _Message) -> Content | None:
-        """The `Content` of a data message that is made as it should be, else None."""
+        """Content of a well-formed data message, else None."""
         data = window[message.begin:message.end - 1]
         if message.mid == _MTDATA2:
             return read_mtdata2(data)
@@ -223,11 +239,11 @@ class XsensFraming:
         return None
 
     def _cause(self, window: bytes, message: _Message) -> str:
-        """How a message that gives nothing is counted."""
+        """Cause by which a message without a reading is counted."""
         if message.mid == _MTDATA:
             if self._layout is None:
-                return 'MTData messages, of which the settings say that there are none'
-            return 'MTData messages of another length than the settings say'
+                return 'MTData messages, although mtdata is none'
+            return 'MTData messages whose length does not match mtdata'
         if message.mid == _ERROR:
             if message.end - message.begin < 2:
                 return 'error messages without a code'

@@ -1,14 +1,13 @@
-"""What the DATA of Xsens' two data messages, MTData2 and MTData, says of the field.
+"""Content of DATA of the Xsens data messages MTData2 and MTData.
 
-The magnetic field is in arbitrary units, 1 = the size of the field where Xsens
-calibrated the sensor; the acceleration is in m/s^2. Both are in the sensor's frame:
-the coordinate bits of a data identifier (0x4 NED, 0x8 NWU) belong to the orientation
-only (MT0101P, note to revision W) and are not looked at.
+The magnetic field is in arbitrary units (1 = the magnitude of the field where Xsens calibrated the
+sensor), the acceleration in m/s². Both are in the sensor frame: the coordinate bits of a data
+identifier (0x4 NED, 0x8 NWU) apply to the orientation only (MT0101P, note to revision W) and are
+ignored.
 
-Sources: Xsens, "MT Low Level Communication Protocol Documentation", MT0101P, revision
-2019.A: MTData2, the table of its data identifiers, and the fixed point formats; Xsens,
-"MTi and MTx User Manual and Technical Documentation", MT0100P.N, section 5.3:
-SetOutputSettings and MTData.
+Sources: Xsens, "MT Low Level Communication Protocol Documentation", MT0101P, revision 2019.A:
+MTData2, the table of its data identifiers, and the fixed point formats; Xsens, "MTi and MTx User
+Manual and Technical Documentation", MT0100P.N, section 5.3: SetOutputSettings and MTData.
 """
 
 import struct
@@ -19,15 +18,15 @@ from mag_tracking.drivers.reading import Reading
 from mag_tracking.errors import SettingsError
 
 TICK_S = 1e-4
-"""[s] Of SampleTimeFine. It goes back to 0 at 2^32 (MTi 1 and 600 series), or at 864 000 000
-ticks, which is a day (MTi 10 and 100 series)."""
+"""[s] Tick of SampleTimeFine. It wraps at 2^32 (MTi 1 and 600 series), or at 864 000 000 ticks,
+which is one day (MTi 10 and 100 series)."""
 
 _PACKET_COUNTER = 0x1020
 _SAMPLE_TIME_FINE = 0x1060
 _ACCELERATION = 0x4020
 _MAGNETIC_FIELD = 0xC020
 _COMPONENT_READOUT = 0xA000
-"""The group of raw values."""
+"""Group of the raw values."""
 _MAGNETIC = 0xC000
 _KIND = 0xFFF0
 _GROUP = 0xFE00
@@ -35,12 +34,12 @@ _GROUP = 0xFE00
 _FLOAT, _FIXED_12_20, _FIXED_16_32 = 0, 1, 2
 _THREE = (struct.Struct('>3f'), struct.Struct('>3i'), struct.Struct('>IhIhIh'),
           struct.Struct('>3d'))
-"""Three reals, by the two bits of the precision."""
+"""Three real numbers, by the two precision bits of the identifier."""
 
 _BLOCKS = {
     'temp': 4, 'acc': 12, 'gyr': 12, 'mag': 12, 'quaternion': 16, 'euler': 12, 'matrix': 36,
     'analog_1': 2, 'analog_2': 2, 'status': 1, 'counter': 2}
-"""Bytes of the blocks of MTData, in the order of the protocol."""
+"""Size in bytes of the blocks of MTData, in the order of the protocol."""
 _ORIENTATIONS = {'quaternion', 'euler', 'matrix'}
 _FORMATS = {'float': _FLOAT, 'fp12.20': _FIXED_12_20}
 
@@ -49,16 +48,16 @@ _Triple: TypeAlias = tuple[float, float, float]
 
 
 class Content(NamedTuple):
-    """What a data message says."""
+    """Content of a data message."""
 
     reading: Reading | None
-    """None = nothing of field or acceleration."""
+    """None = neither field nor acceleration."""
     causes: tuple[str, ...]
-    """Of what is not in the reading, one for each time."""
+    """Causes by which ignored content is counted, one for each occurrence."""
 
 
 def _three_reals(data: bytes, precision: int) -> _Triple | None:
-    """Three reals, or None where `data` is not as long as they are."""
+    """Three real numbers; None if `data` has another length."""
     layout = _THREE[precision]
     if len(data) != layout.size:
         return None
@@ -66,17 +65,15 @@ def _three_reals(data: bytes, precision: int) -> _Triple | None:
     if precision == _FIXED_12_20:
         return tuple(v / 2**20 for v in values)
     if precision == _FIXED_16_32:
-        # The fraction is sent first, then the whole part with the sign.
+        # The fraction is sent first, then the signed integer part.
         return tuple(whole + fraction / 2**32
                      for fraction, whole in zip(values[::2], values[1::2], strict=True))
     return values
 
 
 def _value(identifier: int, data: bytes) -> tuple[str, float | _Triple | None] | None:
-    """(what of a reading it is, the value), or None for any other packet.
-
-    The value is None where `data` is not as long as such a packet.
-    """
+    """(field of a reading, value) of a packet; None for any other packet."""
+    # The value is None if the length of the packet is wrong.
     if identifier == _PACKET_COUNTER:
         return 'sequence', int.from_bytes(data, 'big') if len(data) == 2 else None
     if identifier == _SAMPLE_TIME_FINE:
@@ -90,11 +87,11 @@ def _value(identifier: int, data: bytes) -> tuple[str, float | _Triple | None] |
 
 
 def read_mtdata2(data: bytes) -> Content | None:
-    """The content of the DATA of an MTData2 message.
+    """Read DATA of an MTData2 message.
 
-    A packet is an identifier (u16), the size of its data (u8), and the data. From
-    packets of no interest only the raw ones (0xA0..) and other kinds of magnetic ones
-    (0xC0..) get a cause; SampleTimeCoarse (0x1070) is too coarse to be a clock.
+    A packet is an identifier (u16), the size of its data (u8), and the data. Of the packets that
+    are not used, only raw values (0xA0..) and other magnetic packets (0xC0..) are counted.
+    SampleTimeCoarse (0x1070) is too coarse for a clock.
 
     Parameters
     ----------
@@ -103,8 +100,7 @@ def read_mtdata2(data: bytes) -> Content | None:
     Returns
     -------
     Content or None
-        None where the packets do not fill `data`, or one of those that a reading is
-        made of has another size than its kind.
+        None if the packets do not fill `data`, or if a packet that is used has an invalid size.
     """
     found: dict[str, Any] = {}
     causes: list[str] = []
@@ -126,54 +122,56 @@ def read_mtdata2(data: bytes) -> Content | None:
         if value is None:
             return None
         if name in found:
-            causes.append(f'packets that the message had already: 0x{identifier:04X}')
+            causes.append(f'duplicate packets in a message: 0x{identifier:04X}')
             continue
         found[name] = value
     return _content(found, causes)
 
 
 def _content(found: Mapping[str, Any], causes: Sequence[str]) -> Content:
-    """The content, with a reading where there is something to read."""
+    """Content with a reading, if there is a field or an acceleration."""
     if 'field' in found or 'acceleration' in found:
         return Content(Reading(**found), tuple(causes))
     return Content(None, (*causes, 'messages without field or acceleration'))
 
 
 class MTDataLayout:
-    """What is where in an MTData message; the message itself does not say.
+    """Layout of an MTData message, which the message itself does not describe.
+
+    Parameters
+    ----------
+    blocks : sequence of str
+        'temp', 'acc', 'gyr', 'mag', then one of 'quaternion', 'euler' and 'matrix', 'analog_1',
+        'analog_2', 'status', 'counter'; only those that are enabled.
+    number_format : str
+        Format of all real numbers: 'float' or 'fp12.20'.
 
     Attributes
     ----------
     size : int
-        Bytes of DATA.
+        Length of DATA in bytes.
+
+    Raises
+    ------
+    SettingsError
+        If a block is unknown or out of order, if there is a second orientation, or if there is
+        neither 'acc' nor 'mag'.
     """
 
     def __init__(self, blocks: Sequence[str], number_format: str) -> None:
-        """
-        Parameters
-        ----------
-        blocks : sequence of str
-            'temp', 'acc', 'gyr', 'mag', then one of 'quaternion', 'euler' and 'matrix',
-            'analog_1', 'analog_2', 'status', 'counter'; each only if it is switched on.
-        number_format : str
-            Of all reals: 'float' or 'fp12.20'.
-
-        Raises SettingsError for an unknown name, another order than this, a second
-        orientation, or nothing that a reading could be made of.
-        """
         for name in blocks:
             if name not in _BLOCKS:
                 raise SettingsError(f'mtdata: unknown block {name!r}; known: {", ".join(_BLOCKS)}')
         if list(blocks) != [name for name in _BLOCKS if name in blocks]:
-            raise SettingsError(f'mtdata: {", ".join(blocks)} is not in the order of the protocol, '
-                                f'which is {", ".join(_BLOCKS)}, each at most once')
+            raise SettingsError(f'mtdata: {", ".join(blocks)} is not in the order of the protocol: '
+                                f'{", ".join(_BLOCKS)}, each at most once')
         if len(_ORIENTATIONS.intersection(blocks)) > 1:
             raise SettingsError('mtdata: more than one of ' + ', '.join(sorted(_ORIENTATIONS)))
         if not {'acc', 'mag'}.intersection(blocks):
-            raise SettingsError(f'mtdata: neither acc nor mag in {", ".join(blocks)}')
+            raise SettingsError(f'mtdata: acc or mag is required, got {", ".join(blocks)}')
         if number_format not in _FORMATS:
-            raise SettingsError(f'mtdata_format: {number_format!r} is none of '
-                                f'{", ".join(_FORMATS)}')
+            raise SettingsError(f'mtdata_format: expected one of {", ".join(_FORMATS)}, got '
+                                f'{number_format!r}')
         self._precision = _FORMATS[number_format]
         self._begin: dict[str, int] = {}
         self.size = 0
@@ -182,7 +180,16 @@ class MTDataLayout:
             self.size += _BLOCKS[name]
 
     def read(self, data: bytes) -> Content:
-        """The `Content` of DATA of just this size, bytes."""
+        """Read DATA of length `size`.
+
+        Parameters
+        ----------
+        data : bytes
+
+        Returns
+        -------
+        Content
+        """
         found: dict[str, Any] = {}
         for block, name in (('mag', 'field'), ('acc', 'acceleration')):
             if block in self._begin:

@@ -1,1 +1,1 @@
-"""Transports: how bytes reach this machine, one file each."""
+"""Transports: moving bytes to this machine, one file each."""

@@ -1,14 +1,14 @@
-"""Magnetometer chips on an I2C bus of this machine, read in turns.
+"""Magnetometer chips on an I2C bus of this machine, polled cyclically.
 
-A turn begins every 1 / rate_hz, by absolute deadlines, so its errors do not add up. In it every
-chip is asked once, and those that can be told when to measure do so at the same time. An arrival is
-the middle of the chip's conversion as nearly as is known; the modules of `chips/` say
-how nearly. The field is in tesla.
+A polling cycle begins every 1 / rate_hz at absolute deadlines, so timing errors do not accumulate.
+Every chip is read once per cycle, and chips that measure on request do so at the same time. The
+arrival time of a reading is the middle of the chip's conversion, as accurately as it is known; the
+modules of `chips/` give the accuracy. The field is in tesla.
 
-A bus that hangs keeps a `read` for as long as the bus adapter's driver waits, mostly a second; a
-turn ends with the first such failure.
+If the bus hangs, `read` blocks for the timeout of the bus adapter's driver, usually one second. A
+cycle ends at the first such failure.
 
-Sources: i2c-dev of Linux (Documentation/i2c/dev-interface.rst), and its error codes
+Sources: i2c-dev of Linux (Documentation/i2c/dev-interface.rst) and its error codes
 (Documentation/i2c/fault-codes.rst).
 """
 
@@ -32,7 +32,7 @@ from mag_tracking.drivers.chips.chip import (
     check_identity,
 )
 from mag_tracking.drivers.chips.circuitpython import CircuitpythonChip
-from mag_tracking.drivers.chips.entry import sensors_of
+from mag_tracking.drivers.chips.entry import parse_sensors
 from mag_tracking.drivers.chips.honeywell import Hmc5883l, Hmc5883lSettings, Hmc5983
 from mag_tracking.drivers.chips.lis3mdl import Lis3mdl, Lis3mdlSettings
 from mag_tracking.drivers.chips.memsic import (
@@ -48,9 +48,10 @@ from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.settings import param
 
 CLOSE_WAIT_S = 0.1
-"""How long `close` may have to wait for a `read` in another thread, besides a turn."""
+"""[s] Maximum time that `close` waits for a `read` in another thread, in addition to one cycle."""
 _CLASSES: tuple[ChipClass, ...] = (Mmc5983ma, Mmc5603, Hmc5883l, Hmc5983, Rm3100, Lis3mdl)
 CHIPS = {cls.NAME: cls for cls in _CLASSES}
+"""Supported chips by name."""
 NO_ANSWER = (errno.EREMOTEIO, errno.ENXIO)
 
 
@@ -60,17 +61,18 @@ class I2cSettings:
 
     bus: int = param(1, 'Number N of the bus /dev/i2c-N.', '', (0, 255))
     sensors: tuple[str, ...] = param(
-        ('',), 'Each sensor as name:chip:address, such as A:lis3mdl:0x1c, or '
-        'A:lis3mdl:0x1c@0x70.3 behind channel 3 of a TCA9548A at 0x70. A chip is one of '
-        'mmc5983ma, mmc5603, hmc5883l, hmc5983, rm3100, lis3mdl, or the module.Class of a driver '
-        'for CircuitPython.')
-    rate_hz: float = param(50.0, 'Turns a second; each sensor is read once in a turn.', 'Hz',
-                           (0.01, 1000.0))
+        ('',), 'Sensors as name:chip:address, such as A:lis3mdl:0x1c, or A:lis3mdl:0x1c@0x70.3 on '
+        'channel 3 of a TCA9548A at 0x70. Chips: mmc5983ma, mmc5603, hmc5883l, hmc5983, rm3100, '
+        'lis3mdl, or the module.Class of a CircuitPython driver.')
+    rate_hz: float = param(
+        50.0, 'Polling rate. Each sensor is read once per polling cycle.', 'Hz', (0.01, 1000.0))
     max_failures: int = param(
-        10, 'A chip that cannot be read so many turns in a row is lost.', '', (1, 1_000_000))
+        10, 'Number of consecutive polling cycles in which a chip cannot be read before the device '
+        'is reopened.', '', (1, 1_000_000))
     silence_timeout_s: float = param(
-        2.0, 'A chip that gives no new conversion for so long, and for three turns, is lost: after '
-        'a cut of its supply it does not measure until it is set up again.', 's', (0.0, 3600.0))
+        2.0, 'Interval without a new conversion of a chip, at least three polling cycles, after '
+        'which the device is reopened. A chip whose supply was interrupted does not measure until '
+        'it is configured again.', 's', (0.0, 3600.0))
     mmc5983ma: Mmc5983maSettings = Mmc5983maSettings()
     mmc5603: Mmc5603Settings = Mmc5603Settings()
     hmc5883l: Hmc5883lSettings = Hmc5883lSettings()
@@ -80,18 +82,27 @@ class I2cSettings:
 
 
 class I2cDevice(Closable):
-    """The chips of one bus; see `reading.Device`. The field is in tesla.
+    """Chips of one bus, with the field in tesla. Implements `reading.Device`.
 
     Parameters
     ----------
     settings : I2cSettings
-    open_bus : function
-        From the number of a bus to what has the methods of `smbus2.SMBus`.
-    monotonic_ns, sleep : functions
+    open_bus : callable, optional
+        Function from the number of a bus to an `smbus2.SMBus` or equivalent.
+    monotonic_ns : callable, optional
+        Monotonic clock; tests replace it.
+    sleep : callable, optional
 
-    Raises SettingsError where no sensor is named, or one wrongly.
-    `counts` has, each with the name of the sensor: readings that failed, turns without a new
-    conversion, conversions overwritten before they were read; and turns missed.
+    Attributes
+    ----------
+    counts : Counter
+        Number of missed polling cycles, and for each sensor of failed readings, of cycles without
+        a new conversion and of overwritten conversions.
+
+    Raises
+    ------
+    SettingsError
+        If no sensor is given, or a sensor or a chip setting is not valid.
     """
 
     SETTINGS = I2cSettings
@@ -100,8 +111,8 @@ class I2cDevice(Closable):
                  monotonic_ns: Callable[[], int] = time.monotonic_ns,
                  sleep: Callable[[float], object] = time.sleep) -> None:
         if settings.sensors == ('',):
-            raise SettingsError('sensors: at least one, such as A:lis3mdl:0x1c, is needed')
-        self._sensors = {s.name: s for s in sensors_of(settings.sensors, CHIPS)}
+            raise SettingsError('sensors: at least one is required, such as A:lis3mdl:0x1c')
+        self._sensors = {s.name: s for s in parse_sensors(settings.sensors, CHIPS)}
         self.counts: Counter[str] = Counter()
         self._settings, self._open_bus = settings, open_bus
         self._monotonic_ns, self._sleep = monotonic_ns, sleep
@@ -111,23 +122,29 @@ class I2cDevice(Closable):
         self._lost, self._due_ns = '', 0
         self._failed: Counter[str] = Counter()
         self._silent: Counter[str] = Counter()
-        self._most_silent = max(3, math.ceil(settings.silence_timeout_s * settings.rate_hz))
-        # To make the chips tells what is wrong with their settings.
-        self._chips = self._made_on(Bus(None, monotonic_ns, sleep))
+        self._max_silent = max(3, math.ceil(settings.silence_timeout_s * settings.rate_hz))
+        # Creating the chips checks their settings.
+        self._chips = self._create_chips(Bus(None, monotonic_ns, sleep))
 
     def open(self) -> None:
-        """Open the bus, find the chips and set them up; raises DeviceError."""
+        """Open the bus, identify the chips and configure them.
+
+        Raises
+        ------
+        DeviceError
+            If the bus cannot be opened, or a chip is missing or of another type.
+        """
         with self._lock:
             self._release()
             try:
                 opened = self._open_bus(self._settings.bus)
             except OSError as error:
-                raise DeviceError(f'{self._name}: {_obstacle(error)}') from error
+                raise DeviceError(f'{self._name}: {_open_error(error)}') from error
             multiplexers = {s.place.multiplexer for s in self._sensors.values()
                             if s.place.multiplexer is not None}
             self._bus = bus = Bus(opened, self._monotonic_ns, self._sleep, multiplexers)
             try:
-                self._chips = self._made_on(bus)
+                self._chips = self._create_chips(bus)
                 for name, chip in self._chips.items():
                     self._set_up(name, chip, bus)
             except DeviceError:
@@ -139,11 +156,11 @@ class I2cDevice(Closable):
 
     @property
     def _name(self) -> str:
-        """Of the bus, for messages."""
+        """Path of the bus, for messages."""
         return f'/dev/i2c-{self._settings.bus}'
 
-    def _made_on(self, bus: Bus) -> dict[str, Chip]:
-        """{name of the sensor: its chip}; nothing is said to the chips yet."""
+    def _create_chips(self, bus: Bus) -> dict[str, Chip]:
+        """{name of the sensor: chip}, without access to the bus."""
         chips: dict[str, Chip] = {}
         for name, sensor in self._sensors.items():
             registers = Registers(bus, sensor.place)
@@ -155,11 +172,11 @@ class I2cDevice(Closable):
         return chips
 
     def _count(self, cause: str, name: str) -> None:
-        """Count what is lost of a sensor."""
+        """Count a loss of a sensor."""
         self.counts[f'{cause}: {name}'] += 1
 
     def _set_up(self, name: str, chip: Chip, bus: Bus) -> None:
-        """Make sure it is the right chip, and set it up; raises DeviceError."""
+        """Identify and configure a chip; raises DeviceError."""
         sensor = self._sensors[name]
         where = f'{self._name}: {name} ({sensor.chip}, {sensor.place})'
         registers = Registers(bus, sensor.place)
@@ -167,14 +184,14 @@ class I2cDevice(Closable):
             check_identity(chip, registers)
             chip.set_up()
         except DeviceError as error:
-            known = [] if sensor.chip not in CHIPS else self._answers_as(registers)
-            hint = f'; it answers as {known[0]}' if known else ''
+            known = [] if sensor.chip not in CHIPS else self._matching_chips(registers)
+            hint = f'; it is identified as {known[0]}' if known else ''
             raise DeviceError(f'{where}: {error}{hint}') from error
         except OSError as error:
             raise DeviceError(f'{where}: {self._fault(error)}') from error
 
-    def _answers_as(self, registers: Registers) -> list[str]:
-        """Names of the chips whose identity a place has."""
+    def _matching_chips(self, registers: Registers) -> list[str]:
+        """Names of the supported chips with the identity found at a place."""
         found = []
         for name, cls in CHIPS.items():
             try:
@@ -185,43 +202,55 @@ class I2cDevice(Closable):
         return found
 
     def _fault(self, error: OSError) -> str:
-        """What an error of the bus means, and what to do."""
+        """Meaning of a bus error, and the remedy."""
         if error.errno in NO_ANSWER:
-            return ('nothing answers; check its wiring, supply and address with i2cdetect -y '
+            return ('no answer; check wiring and supply, and the address with i2cdetect -y '
                     f'{self._settings.bus}')
         if isinstance(error, TimeoutError):
-            return 'the bus hangs; a chip or a wire holds a line low'
+            return 'the bus hangs; check for a chip or wire that holds a line low'
         if error.errno == errno.EBUSY:
-            return 'a driver of the kernel has taken the address; unload it'
+            return 'the address is in use by a kernel driver; unload it'
         return f'cannot be read: {error.strerror or error}'
 
     def read(self, timeout_s: float) -> list[Arrival]:
-        """What the next turn gives, as soon as a turn gives something.
+        """Return the readings of the next polling cycle that has any.
 
-        Returns [] where no turn in time does, or where `close` is called meanwhile.
-        Raises DeviceError where it is not open, or a chip is lost.
+        Parameters
+        ----------
+        timeout_s : float, s
+            Maximum time to wait.
+
+        Returns
+        -------
+        list of Arrival
+            Empty if there is no reading in time, or if `close` was called.
+
+        Raises
+        ------
+        DeviceError
+            If the bus is not open, or a chip is lost.
         """
         with self._lock:
             end_ns = self._monotonic_ns() + round(timeout_s * 1e9)
             while True:
                 if self._bus is None:
-                    raise DeviceError(f'{self._name}: is not open')
+                    raise DeviceError(f'{self._name}: not open')
                 if self._lost:
                     raise DeviceError(self._lost)
                 if not self._wait(end_ns):
                     return []
-                arrivals = self._turn(self._bus)
-                # A turn may take longer than there is time.
+                arrivals = self._run_cycle(self._bus)
+                # A cycle may last longer than the timeout.
                 if arrivals or self._monotonic_ns() >= end_ns:
                     return sorted(arrivals, key=lambda a: a.arrival_ns)
 
     def _wait(self, end_ns: int) -> bool:
-        """Whether the next turn is due before `end_ns`; waits for the one or the other."""
+        """Wait until the next cycle is due or `end_ns`; return whether a cycle is due."""
         while not self._closing:
             now_ns = self._monotonic_ns()
             late = (now_ns - self._due_ns) // self._period_ns
             if late > 0:
-                self.counts['turns missed'] += late
+                self.counts['polling cycles missed'] += late
                 self._due_ns += late * self._period_ns
             if now_ns >= self._due_ns:
                 self._due_ns += self._period_ns
@@ -232,8 +261,8 @@ class I2cDevice(Closable):
             self._sleep(min((until_ns - now_ns) * 1e-9, CLOSE_WAIT_S))
         return False
 
-    def _turn(self, bus: Bus) -> list[Arrival]:
-        """Let every chip measure once, all at the same time; a list of `Arrival`."""
+    def _run_cycle(self, bus: Bus) -> list[Arrival]:
+        """Let every chip measure once, all at the same time."""
         arrivals: list[Arrival] = []
         running = {name: chip.measure() for name, chip in self._chips.items()}
         wake_ns = dict.fromkeys(running, self._monotonic_ns())
@@ -249,7 +278,7 @@ class I2cDevice(Closable):
             except StopIteration as done:
                 arrivals += self._arrivals(name, done.value)
             except TimeoutError as error:
-                # Each further try would wait as long.
+                # Every further attempt would block for as long.
                 for other in wake_ns:
                     self._fail(bus, other, error)
                 return arrivals
@@ -259,41 +288,41 @@ class I2cDevice(Closable):
         return arrivals
 
     def _arrivals(self, name: str, conversion: Conversion | None) -> list[Arrival]:
-        """A list of one `Arrival`, or of none."""
+        """List with the reading of a conversion, or an empty one."""
         self._failed[name] = 0
         if conversion is None:
-            self._count('turns without a new conversion', name)
+            self._count('polling cycles without a new conversion', name)
             self._silent[name] += 1
-            if self._silent[name] >= self._most_silent:
-                self._lost = (f'{self._name}: {name} has given no new conversion in '
-                              f'{self._silent[name]} turns; perhaps its supply was cut')
+            if self._silent[name] >= self._max_silent:
+                self._lost = (f'{self._name}: {name}: no new conversion in {self._silent[name]} '
+                              'polling cycles; check its supply')
             return []
         self._silent[name] = 0
         return [Arrival(conversion.middle_ns, Reading(name, conversion.field))]
 
     def _fail(self, bus: Bus, name: str, error: OSError) -> None:
-        """Count a failure; too many in a row and the device is lost."""
+        """Count a failure; too many consecutive ones mark the device as lost."""
         bus.forget()
-        self._count('readings that failed', name)
+        self._count('failed readings', name)
         self._failed[name] += 1
         if self._failed[name] >= self._settings.max_failures:
             self._lost = (f'{self._name}: {name} failed {self._failed[name]} times in a row: '
                           f'{self._fault(error)}')
 
     def _release(self) -> None:
-        """Let go of the bus, if it is held."""
+        """Close the bus if it is open."""
         self._lost = ''
         if self._bus is not None:
             self._bus.smbus.close()
             self._bus = None
 
 
-def _obstacle(error: OSError) -> str:
-    """Why a bus cannot be opened, and what to do."""
+def _open_error(error: OSError) -> str:
+    """Why a bus cannot be opened, and the remedy."""
     if error.errno == errno.ENOENT:
-        return ('is not there; enable I2C (on a Raspberry Pi: raspi-config), load the module with '
-                'sudo modprobe i2c-dev, and see i2cdetect -l')
+        return ('not found; enable I2C (on a Raspberry Pi: raspi-config), load the module with '
+                'sudo modprobe i2c-dev, and list the buses with i2cdetect -l')
     if error.errno in (errno.EACCES, errno.EPERM):
-        return ('no permission; buses belong to the group i2c: sudo usermod -aG i2c $USER, and '
+        return ('no permission; add your user to the group i2c (sudo usermod -aG i2c $USER) and '
                 'log in again')
     return f'cannot be opened: {error.strerror or error}'

@@ -1,12 +1,12 @@
-"""A serial line: USB adapters, USB boards, RS-232 and RS-485 ports.
+"""Serial line: USB adapters, USB boards, RS-232 and RS-485 ports.
 
-Bytes come without borders; where a reading begins is the framing's business. What
-the port held before it was opened is thrown away, so the first bytes may be the
-rest of a frame, and every byte is younger than `open`.
+The stream of bytes has no boundaries; finding readings is the task of the framing. Data received
+before `open` are discarded, so the first bytes may be the rest of a frame, and all bytes are
+received after `open`.
 
-Sources: the termios of pyserial 3.5; TIOCGICOUNT of Linux (ioctl_tty(2), and
-`struct serial_icounter_struct` in linux/serial.h) for what the line and the driver
-lost. A pseudo-terminal does not count, and loses nothing.
+Sources: the termios of pyserial 3.5; TIOCGICOUNT of Linux (ioctl_tty(2), and `struct
+serial_icounter_struct` in linux/serial.h) for losses on the line and in the driver. A
+pseudo-terminal has no such counters, and no losses.
 """
 
 import errno
@@ -27,35 +27,44 @@ from mag_tracking.settings import param
 TIOCGICOUNT = 0x545D
 ICOUNTER = struct.Struct('20i')
 LINE_ERRORS = {
-    6: 'framing errors on the line (is the baud rate right?)',
-    7: 'bytes lost, overrun of the receiver',
+    6: 'framing errors on the line (check the baud rate)',
+    7: 'bytes lost to receiver overruns',
     8: 'parity errors on the line',
-    9: 'breaks on the line',
-    10: 'bytes lost, overrun of the driver\'s buffer',
+    9: 'break conditions on the line',
+    10: 'bytes lost to driver buffer overruns',
 }
 """{index in `struct serial_icounter_struct`: cause}."""
 
 
 @dataclass(frozen=True)
 class SerialSettings:
-    """Settings of a serial line; 8 data bits, no flow control."""
+    """Settings of a serial line with 8 data bits and no flow control."""
 
     port: str = param(
-        '', 'Path of the port, such as /dev/ttyUSB0; the links below /dev/serial/by-id keep their '
-        'names when plugs change places.')
-    baud: int = param(115200, 'Speed of the line.', 'bit/s', (50, 20_000_000))
-    parity: str = param('N', 'N = none, E = even, O = odd.')
-    stop_bits: int = param(1, 'Stop bits.', '', (1, 2))
-    exclusive: bool = param(
-        True, 'No other program that asks for the port alone gets it at the same time.')
+        '', 'Path of the port, such as /dev/ttyUSB0. The links in /dev/serial/by-id keep their '
+        'names when adapters are plugged in elsewhere.')
+    baud: int = param(115200, 'Baud rate.', 'bit/s', (50, 20_000_000))
+    parity: str = param('N', 'Parity: N = none, E = even, O = odd.')
+    stop_bits: int = param(1, 'Number of stop bits.', '', (1, 2))
+    exclusive: bool = param(True, 'Whether to open the port for exclusive use.')
 
 
 class SerialPort(Polled[serial.Serial]):
-    """Transport over a serial line; see `reading.Transport`.
+    """Transport over a serial line. Implements `reading.Transport`.
 
-    Raises SettingsError where no port is named, or where the parity is none of the three.
-    `counts` has the errors of the line as the kernel counts them, where the driver of the port
-    does.
+    Parameters
+    ----------
+    settings : SerialSettings
+
+    Attributes
+    ----------
+    counts : Counter
+        Number of errors on the line, if the driver of the port counts them.
+
+    Raises
+    ------
+    SettingsError
+        If no port is given, or the parity is not valid.
     """
 
     SETTINGS = SerialSettings
@@ -64,7 +73,7 @@ class SerialPort(Polled[serial.Serial]):
     def __init__(self, settings: SerialSettings) -> None:
         super().__init__()
         if not settings.port:
-            raise SettingsError('port: the path of a serial port is needed')
+            raise SettingsError('port: the path of a serial port is required, such as /dev/ttyUSB0')
         if settings.parity not in ('N', 'E', 'O'):
             raise SettingsError(f'parity: expected N, E or O, got {settings.parity!r}')
         self.counts: Counter[str] = Counter()
@@ -72,48 +81,67 @@ class SerialPort(Polled[serial.Serial]):
         self._line_errors: tuple[int, ...] | None = None
 
     def open(self) -> None:
-        """Open the port; raises DeviceError where it is not there, busy or not allowed."""
+        """Open the port.
+
+        Raises
+        ------
+        DeviceError
+            If the port does not exist, is in use, or access is not permitted.
+        """
         s = self._settings
         with self._lock:
             self._release()
             try:
-                # Opening flushes what the port has received so far.
+                # Opening discards the data received so far.
                 opened = serial.Serial(
                     s.port, s.baud, parity=s.parity, stopbits=s.stop_bits, timeout=0,
                     exclusive=s.exclusive or None)
             except (OSError, ValueError, termios.error) as error:
-                raise DeviceError(f'serial port {s.port}: {self._obstacle(error)}') from error
-            self._hold(opened)
+                raise DeviceError(f'serial port {s.port}: {self._open_error(error)}') from error
+            self._attach(opened)
             try:
                 self._line_errors = _line_errors_of(opened)
             except OSError:
-                # Many drivers, and all pseudo-terminals, do not count.
+                # Many drivers, and all pseudo-terminals, have no error counters.
                 self._line_errors = None
 
-    def _obstacle(self, error: Exception) -> str:
-        """What stands in the way, and what to do."""
+    def _open_error(self, error: Exception) -> str:
+        """Why the port cannot be opened, and the remedy."""
         code = getattr(error, 'errno', None)
         if code in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
             there = ', '.join(f'{p.device} ({p.description})' for p in list_ports.comports())
-            return f'is not there; {f"there are {there}" if there else "there is no other either"}'
+            return f'not found; {f"available ports: {there}" if there else "no ports available"}'
         if code in (errno.EACCES, errno.EPERM):
-            return ('no permission; ports belong to the group dialout: sudo usermod -aG dialout '
-                    '$USER, and log in again')
+            return ('no permission; add your user to the group dialout (sudo usermod -aG dialout '
+                    '$USER) and log in again')
         if code in (errno.EBUSY, errno.EAGAIN):
-            return 'is in use by another program'
+            return 'in use by another program'
         if isinstance(error.__context__, termios.error) or code == errno.EISDIR:
-            return f'is not a serial port, or there is no device behind it ({error})'
-        return f'cannot be opened with {self._settings.baud} bit/s: {error}'
+            return f'not a serial port, or no device is connected to it ({error})'
+        return f'cannot be opened at {self._settings.baud} bit/s: {error}'
 
     def read(self, timeout_s: float) -> list[Chunk]:
-        """At most one chunk: what is there as soon as something is; its time is the wake-up's.
+        """Return the available bytes, or wait for the first ones.
 
-        Returns [] where nothing comes in time, or where `close` is called meanwhile.
-        Raises DeviceError where the port is not open or is gone.
+        Parameters
+        ----------
+        timeout_s : float, s
+            Maximum time to wait.
+
+        Returns
+        -------
+        list of Chunk
+            One chunk, whose arrival is the time of the wake-up. Empty if nothing arrived in time,
+            or if `close` was called.
+
+        Raises
+        ------
+        DeviceError
+            If the port is not open, or the connection is lost.
         """
         with self._lock:
             if self._handle is None:
-                raise DeviceError(f'serial port {self._settings.port}: is not open')
+                raise DeviceError(f'serial port {self._settings.port}: not open')
             try:
                 arrival_ns = self._wait(timeout_s)
                 if self._line_errors is not None:
@@ -123,17 +151,17 @@ class SerialPort(Polled[serial.Serial]):
                     return []
                 data = self._handle.read(max(1, self._handle.in_waiting))
             except OSError as error:
-                raise DeviceError(f'serial port {self._settings.port}: is gone, perhaps unplugged '
-                                  f'({error})') from error
+                raise DeviceError(f'serial port {self._settings.port}: connection lost, check '
+                                  f'whether it is plugged in ({error})') from error
         return [Chunk(arrival_ns, data)] if data else []
 
     def _count_line_errors(self, before: tuple[int, ...], now: tuple[int, ...]) -> None:
-        """Add what the line and the driver lost between two looks at the kernel's counters."""
+        """Add the losses between two readings of the kernel's counters."""
         for i, cause in LINE_ERRORS.items():
             if now[i] != before[i]:
                 self.counts[cause] += (now[i] - before[i]) % 2**32
 
 
 def _line_errors_of(port: serial.Serial) -> tuple[int, ...]:
-    """The kernel's counters; raises OSError where the driver of the port has none."""
+    """The kernel's counters; raises OSError if the driver of the port has none."""
     return ICOUNTER.unpack(fcntl.ioctl(port.fileno(), TIOCGICOUNT, bytes(ICOUNTER.size)))

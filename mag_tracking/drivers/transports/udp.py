@@ -1,17 +1,17 @@
-"""UDP over IPv4: each datagram is a message of its own.
+"""UDP over IPv4; each datagram is a message.
 
-A datagram's time is the kernel's own (SO_TIMESTAMPNS), which does not depend on when this
-process gets to run. It is of the wall clock, and is moved to the monotonic clock by their
-difference, which is constant unless the wall clock is set: the system's fine tuning turns
-both. So where the difference has changed since the queue was last empty, the time of the
-wake-up is taken instead, and that is counted. In the first milliseconds after the first
-socket of the machine asks for its times, the kernel gives that of the reading instead.
+The arrival time of a datagram is that of the kernel (SO_TIMESTAMPNS), which does not depend on when
+this process runs. It is taken from the wall clock and converted to the monotonic clock by their
+difference, which is constant unless the wall clock is set: fine adjustments by the system change
+the rate of both. If the difference has changed since the queue was last empty, the time of the
+wake-up is used instead, and counted. In the first milliseconds after the first socket of the
+machine requests timestamps, the kernel returns the time of the reading instead.
 
-What the kernel dropped because the buffer was full is read from the socket's own counter
-(SO_MEMINFO). Unlike SO_RXQ_OVFL, which comes with the next datagram, it is right also where no
-further one comes.
+Datagrams that the kernel dropped because the buffer was full are read from the socket's own counter
+(SO_MEMINFO). Unlike SO_RXQ_OVFL, which is delivered with the next datagram, it is also correct if
+no further datagram arrives.
 
-Sources: socket(7), ip(7) and udp(7) of Linux; the order of the counters: SK_MEMINFO_* of
+Sources: socket(7), ip(7) and udp(7) of Linux; order of the counters: SK_MEMINFO_* of
 linux/sock_diag.h, described in sock_diag(7).
 """
 
@@ -31,16 +31,16 @@ from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.settings import param
 
 AT_ONCE = 1000
-"""Datagrams that one `read` gives at most."""
+"""Maximum number of datagrams per `read`."""
 CLOCK_SET_NS = 1_000_000
-"""A change of the clocks' difference by more is no error of measuring it."""
+"""[ns] Larger changes of the difference between the clocks are not measurement errors."""
 SO_TIMESTAMPNS = getattr(socket, 'SO_TIMESTAMPNS', 35)
 SO_MEMINFO = 55
 MEMINFO = struct.Struct('9I')
 DROPS = 8
 TIMESPEC = struct.Struct('ll')
 Ancillary: TypeAlias = tuple[int, int, bytes]
-"""Level, type and data of what comes beside a datagram."""
+"""Level, type and data of a control message received with a datagram."""
 
 
 @dataclass(frozen=True)
@@ -48,26 +48,30 @@ class UdpSettings:
     """Settings of a UDP socket."""
 
     address: str = param(
-        '0.0.0.0', 'Address of this machine to listen at; 0.0.0.0 = all. With a group: that of '
-        'the interface to join it on, 0.0.0.0 = as the routes say.')
-    port: int = param(0, 'Port to listen at; it must be set.', '', (1, 65535))
-    group: str = param('', 'Multicast group to join, such as 239.1.2.3; nothing that is not sent '
-                       'to it is received then.')
+        '0.0.0.0', 'Local address to listen on; 0.0.0.0 = all. With a group: address of the '
+        'interface on which to join it; 0.0.0.0 = according to the routing table.')
+    port: int = param(0, 'Local port to listen on; required.', '', (1, 65535))
+    group: str = param(
+        '', 'Multicast group to join, such as 239.1.2.3. Only datagrams sent to it are then '
+        'received.')
     sources: tuple[str, ...] = param(
-        ('',), 'Addresses whose datagrams are taken; an empty one stands for all.')
+        ('',), 'Addresses from which datagrams are accepted; an empty address stands for all.')
     source_port: bool = param(
-        False, 'The source of a datagram is address:port instead of the address.')
+        False, 'Whether the source of a datagram is address:port instead of the address.')
     receive_buffer: int = param(
-        212992, 'What the kernel holds for this program while it does not get to run, overhead of '
-        'each datagram (about 0.5 KiB) included; more than net.core.rmem_max is not given.',
-        'bytes', (2048, 1 << 30))
-    max_length: int = param(65507, 'A longer datagram is dropped.', 'bytes', (1, 65507))
+        212992, "Size of the kernel's receive buffer, including an overhead of about 0.5 KiB per "
+        'datagram. The kernel limits it to net.core.rmem_max.', 'bytes', (2048, 1 << 30))
+    max_length: int = param(
+        65507, 'Maximum length of a datagram; longer ones are dropped.', 'bytes', (1, 65507))
 
 
 def clock_difference() -> int | None:
-    """Wall clock less monotonic clock [ns], of three tries the one that took least.
+    """Wall clock minus monotonic clock, from the fastest of three measurements.
 
-    None where even that one took too long to tell anything.
+    Returns
+    -------
+    int or None, ns
+        None if even the fastest measurement took too long to be accurate.
     """
     tries = []
     for _ in range(3):
@@ -78,15 +82,25 @@ def clock_difference() -> int | None:
 
 
 class UdpSocket(Polled[socket.socket]):
-    """Transport over UDP; see `reading.Transport`. One chunk per datagram, its source an address.
+    """Transport over UDP with one chunk per datagram. Implements `reading.Transport`.
+
+    The source of a chunk is the address of its sender.
 
     Parameters
     ----------
     settings : UdpSettings
-    report : function
-        Takes a line of text for the user: that the kernel gave less buffer than asked for.
+    report : callable, optional
+        Receives a line of text for the user if the kernel reduced the receive buffer.
 
-    Raises SettingsError where an address or the port is none.
+    Attributes
+    ----------
+    counts : Counter
+        Number of dropped datagrams and of replaced timestamps, by cause.
+
+    Raises
+    ------
+    SettingsError
+        If an address or the port is not valid.
     """
 
     SETTINGS = UdpSettings
@@ -95,7 +109,7 @@ class UdpSocket(Polled[socket.socket]):
     def __init__(self, settings: UdpSettings, report: Callable[[str], object] = print) -> None:
         super().__init__()
         if settings.port == 0:
-            raise SettingsError('port: the number of a UDP port is needed')
+            raise SettingsError('port: the number of a UDP port is required, such as 5005')
         self._sources = frozenset(settings.sources) - {''}
         for name, address in [('address', settings.address), ('group', settings.group or '0.0.0.0'),
                               *(('sources', source) for source in sorted(self._sources))]:
@@ -112,11 +126,17 @@ class UdpSocket(Polled[socket.socket]):
 
     @property
     def settings(self) -> UdpSettings:
-        """As they were given."""
+        """Settings of the socket."""
         return self._settings
 
     def open(self) -> None:
-        """Bind, and join the group; raises DeviceError where the system refuses."""
+        """Bind the socket, and join the group.
+
+        Raises
+        ------
+        DeviceError
+            If the system refuses.
+        """
         with self._lock:
             self._release()
             opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -124,56 +144,68 @@ class UdpSocket(Polled[socket.socket]):
                 self._set_up(opened)
             except OSError as error:
                 opened.close()
-                raise DeviceError(f'UDP {self._where()}: {self._obstacle(error)}') from error
+                raise DeviceError(f'UDP {self._where()}: {self._open_error(error)}') from error
             self._drops, self._difference = 0, clock_difference()
-            self._hold(opened)
+            self._attach(opened)
 
     def _set_up(self, opened: socket.socket) -> None:
-        """Options first: from `bind` on datagrams come."""
+        """Set the options, then bind: datagrams arrive as soon as the socket is bound."""
         s = self._settings
         opened.setblocking(False)
         opened.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, s.receive_buffer)
-        # The kernel doubles what it is asked for, for its overhead, and says the double.
+        # The kernel doubles the requested size for its overhead, and returns the doubled size.
         given = opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
         if given < s.receive_buffer:
-            self._report(f'UDP {self._where()}: the kernel gave a receive buffer of {given} bytes '
-                         f'instead of {s.receive_buffer}; raise net.core.rmem_max')
+            self._report(f'UDP {self._where()}: the kernel limits the receive buffer to {given} '
+                         f'bytes instead of {s.receive_buffer}; increase net.core.rmem_max')
         if s.group:
-            # Several programs may listen to a group; to be bound to it keeps all else out.
+            # Several programs may listen to a group. Binding to it excludes all other datagrams.
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             opened.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP,
                               socket.inet_aton(s.group) + socket.inet_aton(s.address))
         opened.bind((s.group or s.address, s.port))
 
     def _where(self) -> str:
-        """The end of the line, for messages."""
+        """Local end of the connection, for messages."""
         s = self._settings
         return f'{s.address}:{s.port}' + (f', group {s.group}' if s.group else '')
 
-    def _obstacle(self, error: OSError) -> str:
-        """What stands in the way, and what to do."""
+    def _open_error(self, error: OSError) -> str:
+        """Why the socket cannot be opened, and the remedy."""
         s = self._settings
         if error.errno == errno.EADDRINUSE:
-            return 'the port is in use by another program'
+            return 'the port is in use by another program; choose another port'
         if error.errno == errno.EACCES:
-            return 'no permission; ports below 1024 are the system\'s'
+            return 'no permission; ports below 1024 are reserved, choose another one'
         if s.group and not ipaddress.IPv4Address(s.group).is_multicast:
-            return f'{s.group} is no multicast group; those are 224.0.0.0 to 239.255.255.255'
+            return f'{s.group} is not a multicast group (224.0.0.0 to 239.255.255.255)'
         if error.errno in (errno.EADDRNOTAVAIL, errno.ENODEV):
-            return (f'no interface of this machine has the address {s.address}, or none leads to '
-                    f'the group; see `ip address`')
+            return (f'no interface has the address {s.address}, or none has a route to the group; '
+                    f'check with `ip address`')
         return f'cannot be opened: {error.strerror}'
 
     def read(self, timeout_s: float) -> list[Chunk]:
-        """The datagrams that are there, `AT_ONCE` at most, as soon as there is one.
+        """Return the available datagrams, or wait for the first one.
 
-        Returns [] where nothing comes in time, or where `close` is called meanwhile.
-        Raises DeviceError where the socket is not open or fails.
+        Parameters
+        ----------
+        timeout_s : float, s
+            Maximum time to wait.
+
+        Returns
+        -------
+        list of Chunk
+            Up to `AT_ONCE` datagrams. Empty if none arrived in time, or if `close` was called.
+
+        Raises
+        ------
+        DeviceError
+            If the socket is not open or fails.
         """
         with self._lock:
             if self._handle is None:
-                raise DeviceError(f'UDP {self._where()}: is not open')
+                raise DeviceError(f'UDP {self._where()}: not open')
             try:
                 woken_ns = self._wait(timeout_s)
                 chunks = [] if woken_ns is None else self._drain(self._handle, woken_ns)
@@ -183,7 +215,7 @@ class UdpSocket(Polled[socket.socket]):
         return chunks
 
     def _drain(self, opened: socket.socket, woken_ns: int) -> list[Chunk]:
-        """Chunks of what is in the queue."""
+        """Chunks of the queued datagrams."""
         came: list[tuple[bytes, list[Ancillary], int, tuple[str, int]]] = []
         empty = False
         room = socket.CMSG_SPACE(TIMESPEC.size)
@@ -196,18 +228,18 @@ class UdpSocket(Polled[socket.socket]):
         usable = (difference is not None and self._difference is not None
                   and abs(difference - self._difference) < CLOCK_SET_NS)
         if empty:
-            # Whatever is still in the queue is measured against the time before it came.
+            # Only an empty queue updates it: queued datagrams arrived under the old difference.
             self._difference = difference
         return [Chunk(self._arrival(ancillary, difference if usable else None, woken_ns), data,
                       f'{ip}:{port}' if self._settings.source_port else ip)
                 for data, ancillary, flags, (ip, port) in came if self._accept(data, flags, ip)]
 
     def _accept(self, data: bytes, flags: int, ip: str) -> bool:
-        """Whether a datagram is handed on; one that is not is counted."""
+        """Whether a datagram is accepted; a rejected one is counted."""
         if not self._any_source and ip not in self._sources:
             self.counts['datagrams from other sources'] += 1
         elif flags & socket.MSG_TRUNC:
-            self.counts['datagrams that were too long'] += 1
+            self.counts['datagrams longer than max_length'] += 1
         elif not data:
             self.counts['empty datagrams'] += 1
         else:
@@ -215,18 +247,18 @@ class UdpSocket(Polled[socket.socket]):
         return False
 
     def _arrival(self, ancillary: list[Ancillary], difference: int | None, woken_ns: int) -> int:
-        """When a datagram came, by the monotonic clock [ns]."""
+        """Arrival time of a datagram on the monotonic clock [ns]."""
         if difference is not None:
             for level, kind, data in ancillary:
                 if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS):
                     seconds, ns = TIMESPEC.unpack(data)
                     arrival_ns: int = seconds * 1_000_000_000 + ns - difference
                     return arrival_ns
-        self.counts['datagrams with the time of the wake-up instead of the kernel\'s'] += 1
+        self.counts['datagrams timestamped at wake-up instead of by the kernel'] += 1
         return woken_ns
 
     def _count_drops(self, opened: socket.socket) -> None:
-        """Add what the kernel has dropped since last time."""
+        """Add the number of datagrams that the kernel has dropped since the last call."""
         drops = MEMINFO.unpack(
             opened.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size))[DROPS]
         if drops != self._drops:

@@ -1,11 +1,12 @@
-// Curves over time (fields, weights, innovation, speed) with a line at the current time.
+// Plots over time (fields, weights, innovation, speed) with a line at the current time.
 'use strict';
 
 const STRONGEST = 'strongest';
-const MOST_PANELS = 4;
+const MAX_PANELS = 4;
 // Length of the time axis of a live page [s].
 const WINDOW_S = 20;
-const MANY_DOTS = 250;
+// Number of readings above which the markers are small.
+const DENSE_READINGS = 250;
 
 const AXES = [[VERMILLION, 'solid'], [SERIES[2], 'dash'], [SERIES[0], 'dot']];
 
@@ -23,19 +24,19 @@ function unitOf(strongest) {
 }
 
 function largest(axes) {
-  let most = 0;
-  for (const axis of axes) for (const v of axis) if (Math.abs(v) > most) most = Math.abs(v);
-  return most;
+  let max = 0;
+  for (const axis of axes) for (const v of axis) if (Math.abs(v) > max) max = Math.abs(v);
+  return max;
 }
 
-// [{name, t, measured, predicted or null}] of a track; of recent frames if there is no track.
+// [{name, t, measured, predicted or null}] of a track, or of the recent frames without a track.
 function fieldsOf(scene, track) {
   if (track) {
     return track.fields.map(field => ({name: scene.sensors.names[field.sensor],
       t: field.t || track.columns.t, measured: field.measured, predicted: field.predicted}));
   }
-  return scene.heard ? scene.sensors.names.map((name, j) => ({name: name, t: scene.heard.t,
-    measured: scene.heard.fields.map(axis => axis[j]), predicted: null})) : [];
+  return scene.recent ? scene.sensors.names.map((name, j) => ({name: name, t: scene.recent.t,
+    measured: scene.recent.fields.map(axis => axis[j]), predicted: null})) : [];
 }
 
 function chosenFields(scene, track, choice, range) {
@@ -46,7 +47,7 @@ function chosenFields(scene, track, choice, range) {
     return [field, largest(field.measured.map(axis => axis.slice(first, end)))];
   }));
   const strongest = [...fields].sort((a, b) => strength.get(b) - strength.get(a));
-  return fields.filter(field => strongest.slice(0, MOST_PANELS).includes(field));
+  return fields.filter(field => strongest.slice(0, MAX_PANELS).includes(field));
 }
 
 function drawFields(scene, track, choice, t, range) {
@@ -65,8 +66,8 @@ function drawFields(scene, track, choice, t, range) {
   holder.style.setProperty('--panels', fields.length);
   const [f, unit] = unitOf(Math.max(0, ...fields.map(field => largest(field.measured))));
   fields.forEach((field, i) => {
-    const traces = [], many = field.t.length > MANY_DOTS;
-    // Dense dots would hide the lines.
+    const traces = [], many = field.t.length > DENSE_READINGS;
+    // Large dense markers would hide the lines.
     const dots = many ? {size: 3, opacity: 0.45} : {size: 5};
     AXES.forEach(([colour, dash], a) => {
       const name = 'xyz'[a];
@@ -86,7 +87,7 @@ function drawFields(scene, track, choice, t, range) {
 }
 
 function drawWeights(track, t, range) {
-  const traces = !track ? [] : Object.entries(looksOf(track)).map(([name, [colour, dash]]) => ({
+  const traces = !track ? [] : Object.entries(stylesOf(track)).map(([name, [colour, dash]]) => ({
     type: 'scatter', mode: 'lines', x: track.columns.t, y: track.arrivals[name].weight,
     name: plain(name) || 'all hypotheses', showlegend: true,
     line: {color: colour, dash: dash, width: 2}}));
@@ -123,7 +124,7 @@ function drawSpeed(track, t, range) {
   Plotly.react('speed', traces, curveLayout('m/s', t, range, {rangemode: 'tozero'}), CONFIG);
 }
 
-// Move the time line without redrawing the curves.
+// Move the time line without redrawing the plots.
 function moveLines(t) {
   for (const plot of [...document.querySelectorAll('#field .plot'),
     ...['weights', 'innovation', 'speed'].map(id => document.getElementById(id))]) {

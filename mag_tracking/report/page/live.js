@@ -2,8 +2,8 @@
 'use strict';
 
 const RETRY_MS = 1000;
-// History [s].
-const KEPT_S = 600;
+// Tracks that ended earlier than this are removed [s].
+const HISTORY_S = 600;
 
 function connect() {
   page.live = true;
@@ -13,15 +13,15 @@ function connect() {
     location.href);
   address.protocol = location.protocol === 'https:' ? 'wss:' : 'ws:';
   const socket = new WebSocket(address);
-  socket.addEventListener('message', event => take(JSON.parse(event.data)));
-  socket.addEventListener('open', () => say('Connected', false));
+  socket.addEventListener('message', event => receive(JSON.parse(event.data)));
+  socket.addEventListener('open', () => showConnection('Connected', false));
   socket.addEventListener('close', () => {
-    say('Connection lost. Reconnecting…', true);
+    showConnection('Connection lost. Reconnecting…', true);
     setTimeout(connect, RETRY_MS);
   });
 }
 
-function say(text, lost) {
+function showConnection(text, lost) {
   const line = at('connection');
   line.hidden = false;
   line.textContent = text;
@@ -29,50 +29,51 @@ function say(text, lost) {
   page.connected = !lost;
 }
 
-function take(message) {
+function receive(message) {
   if (message.type === 'scene') {
     at('title').textContent = message.title;
     at('subtitle').textContent = message.subtitle;
     setScene(message.scene);
-    page.scene.heard = {t: [], fields: [0, 1, 2].map(
+    page.scene.recent = {t: [], fields: [0, 1, 2].map(
       () => page.scene.sensors.names.map(() => []))};
   } else if (message.type === 'rows' && page.scene) {
-    takeRows(decodedAll(message));
+    addRows(decodedAll(message));
   } else if (message.type === 'fault') {
-    say(`Fault of the page: ${message.text}`, true);
+    showConnection(`Page error: ${message.text}`, true);
   } else if (message.type === 'health') {
     showNotes(message.notes);
     showTables(message.tables);
   }
 }
 
-function takeRows(message) {
+function addRows(message) {
   const scene = page.scene;
   for (const rows of message.tracks) {
     const track = scene.tracks.find(other => other.key === rows.key);
     if (track) append(track, rows); else scene.tracks.push(rows);
-    grownReach(scene, track || rows);
+    extendReach(scene, track || rows);
     if (!track || rows.ended) page.tableDue = 0;
   }
   for (const one of message.smoothed) {
     const track = scene.tracks.find(other => other.key === one.key);
     if (track) track.smoothed = one;
   }
-  if (message.frame) hear(scene.heard, message.frame);
+  if (message.frame) addFrame(scene.recent, message.frame);
   scene.end = Math.max(scene.end, message.end);
   scene.latestNs = message.latest_ns;
-  scene.tracks = scene.tracks.filter(track => endOf(track) > scene.end - KEPT_S);
-  scene.begin = Math.max(scene.begin, scene.end - KEPT_S);
+  scene.tracks = scene.tracks.filter(track => endOf(track) > scene.end - HISTORY_S);
+  scene.begin = Math.max(scene.begin, scene.end - HISTORY_S);
   boundSlider();
   moveTo(page.follows ? scene.end : page.t);
 }
 
-function hear(heard, frame) {
-  heard.t.push(frame.t);
-  const gone = indexAt(heard.t, frame.t - WINDOW_S) + 1;
-  heard.t.splice(0, gone);
-  heard.fields.forEach((axis, a) => axis.forEach((values, j) => {
+// Append a frame, and remove those before the time axis.
+function addFrame(recent, frame) {
+  recent.t.push(frame.t);
+  const old = indexAt(recent.t, frame.t - WINDOW_S) + 1;
+  recent.t.splice(0, old);
+  recent.fields.forEach((axis, a) => axis.forEach((values, j) => {
     values.push(frame.field[3 * j + a]);
-    values.splice(0, gone);
+    values.splice(0, old);
   }));
 }

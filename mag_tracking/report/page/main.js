@@ -3,7 +3,7 @@
 
 const page = {scene: null, t: 0, follows: false, choice: STRONGEST, current: undefined,
   plays: false, drawn: 0, tableDue: 0};
-// The table of a live page is updated this often [ms].
+// Interval between updates of the track table of a live page [ms].
 const TABLE_MS = 1000;
 // Public for debugging and tests.
 window.magTracking = page;
@@ -22,27 +22,27 @@ function begin(data) {
 
 function setScene(packed) {
   const scene = page.scene = decodedAll(packed);
-  scene.tracks.forEach(track => grownReach(scene, track));
+  scene.tracks.forEach(track => extendReach(scene, track));
   at('scene').hidden = at('time').hidden = false;
   at('sensors').replaceChildren(
-    element('option', `strongest ${MOST_PANELS}`, {value: STRONGEST}),
+    element('option', `${MAX_PANELS} strongest`, {value: STRONGEST}),
     ...scene.sensors.names.map(name => element('option', name, {value: name})));
   if (!scene.sensors.names.includes(page.choice)) page.choice = STRONGEST;
   at('sensors').value = page.choice;
   page.current = undefined;
   page.tableDue = 0;
-  // Fitted passes have neither.
+  // Fitted passes have neither weights nor innovations.
   at('weights-card').hidden = !page.live && scene.tracks.every(
     track => !Object.keys(track.arrivals).length);
   at('innovation-card').hidden = !page.live && scene.tracks.every(
     track => track.columns.nis.every(Number.isNaN));
   boundSlider();
   const first = scene.tracks[0];
-  moveTo(page.follows ? scene.end : first ? best(first) : 0);
+  moveTo(page.follows ? scene.end : first ? mostAccurateTime(first) : 0);
 }
 
 // Time of the most accurate pose of a track.
-function best(track) {
+function mostAccurateTime(track) {
   const c = track.columns;
   let k = 0;
   for (let i = 1; i < c.t.length; i++) {
@@ -57,6 +57,7 @@ function boundSlider() {
   at('slider').max = Math.max(scene.end, scene.begin + 1e-3);
 }
 
+// Set the current time; the page is redrawn once per animation frame at most.
 let waiting = false;
 function moveTo(t) {
   page.t = t;
@@ -71,15 +72,15 @@ function moveTo(t) {
 function rangeOf(track, t) {
   if (page.follows) return [Math.max(page.scene.begin, t - WINDOW_S), t];
   if (!track) return [t - WINDOW_S, t];
-  const spare = 0.03 * (endOf(track) - beginOf(track)) + 0.01;
-  return [beginOf(track) - spare, endOf(track) + spare];
+  const margin = 0.03 * (endOf(track) - beginOf(track)) + 0.01;
+  return [beginOf(track) - margin, endOf(track) + margin];
 }
 
 let curvesDue = 0;
 function draw() {
   const scene = page.scene, t = page.t;
   const nearest = currentTrack(scene, t);
-  // Without a target a live page shows the current fields.
+  // While there is no target, a live page shows the current fields.
   const track = page.follows && !tracksAt(scene, t).length ? null : nearest;
   at('slider').value = t;
   at('clock').textContent = `${t.toFixed(2)} s`;
@@ -114,7 +115,7 @@ function drawCurves(track, t) {
 function jump(track) {
   page.follows = false;
   page.current = undefined;
-  moveTo(best(track));
+  moveTo(mostAccurateTime(track));
   at('map-card').scrollIntoView({block: 'nearest'});
 }
 

@@ -1,19 +1,20 @@
 // Map of sensors, tracks, 90 % regions and hypotheses at the current time.
 'use strict';
 
-// Okabe and Ito 2008; each colour has its own dash style.
+// Colours of Okabe and Ito (2008); each has its own dash style.
 const SERIES = ['#0072B2', '#E69F00', '#009E73', '#CC79A7', '#56B4E9'];
 const DASHES = ['solid', 'dash', 'dot', 'dashdot', 'longdash'];
 const VERMILLION = '#D55E00', BLACK = '#000000';
 const SYMBOLS = ['circle', 'square', 'diamond'];
 // Standard deviations to the edge of a 90 % ellipse and of a 90 % interval.
 const SCALE_2D = Math.sqrt(-2 * Math.log(0.1)), SCALE_1D = 1.645;
-const MIN_DRAWN = 0.01, MOST_LABELS = 24;
+// Minimum weight of a hypothesis that is drawn, and maximum number of sensors with labels.
+const MIN_DRAWN = 0.01, MAX_LABELS = 24;
 const FONT = {size: 13, color: '#1b1b1b'};
 const CONFIG = {responsive: true, displaylogo: false,
   modeBarButtonsToRemove: ['select2d', 'lasso2d', 'sendDataToCloud']};
 
-// [xs, ys] on the edge of the 90 % region of a position.
+// Outline [xs, ys] of the 90 % region of a position.
 function ellipse(x, y, xx, xy, yy) {
   const middle = 0.5 * (xx + yy), half = Math.hypot(0.5 * (xx - yy), xy);
   const long = SCALE_2D * Math.sqrt(Math.max(middle + half, 0));
@@ -28,17 +29,17 @@ function ellipse(x, y, xx, xy, yy) {
 }
 
 // {arrival: [colour, dash]} in a fixed order.
-function looksOf(track) {
+function stylesOf(track) {
   return Object.fromEntries(Object.keys(track.arrivals).sort().map(
     (name, i) => [name, [SERIES[i % SERIES.length], DASHES[i % DASHES.length]]]));
 }
 
-function line(xs, ys, name, look, more) {
-  return {type: 'scatter', mode: 'lines', x: xs, y: ys, name: name, line: look,
+function line(xs, ys, name, style, more) {
+  return {type: 'scatter', mode: 'lines', x: xs, y: ys, name: name, line: style,
     hoverinfo: name ? 'name' : 'skip', showlegend: Boolean(name), ...more};
 }
 
-// Labels of the sensors; those one above the other share a label.
+// Labels of the sensors; sensors one above the other share a label.
 function labelsOf(sensors, factor) {
   const groups = new Map();
   sensors.names.forEach((name, j) => {
@@ -67,7 +68,7 @@ function mapTraces(scene, t) {
       traces.push(line(scaled(track.smoothed.x), scaled(track.smoothed.y), named('smoothed'),
         {color: VERMILLION, width: 1.5}));
     }
-    // Ambiguous poses may jump, so no line connects them.
+    // Ambiguous poses may jump, so they are not connected by a line.
     const sure = axis => Array.from(axis, (v, i) => c.ambiguous[i] ? null : f * v);
     const doubtful = axis => scaled(axis.slice(0, k + 1).filter((_, i) => c.ambiguous[i]));
     traces.push(line(sure(c.x), sure(c.y), '', {color: '#a8a8a8', width: 1.5}));
@@ -78,7 +79,7 @@ function mapTraces(scene, t) {
       marker: {size: 5, color: '#ffffff', line: {color: '#707070', width: 1.2}}});
     if (tracksAt(scene, t).includes(track)) traces.push(...nowTraces(track, k, f, named));
   }
-  traces.push({type: 'scatter', mode: scene.sensors.names.length > MOST_LABELS ? 'markers'
+  traces.push({type: 'scatter', mode: scene.sensors.names.length > MAX_LABELS ? 'markers'
     : 'markers+text', x: scaled(scene.sensors.x), y: scaled(scene.sensors.y),
   text: labelsOf(scene.sensors, f), hovertext: scene.sensors.names.map(plain),
   textposition: 'top center', hoverinfo: 'text', name: 'magnetometers', cliponaxis: false,
@@ -88,11 +89,11 @@ function mapTraces(scene, t) {
 
 // Hypotheses, 90 % region, pose and velocity of a track.
 function nowTraces(track, k, f, named) {
-  const c = track.columns, traces = [], looks = looksOf(track);
+  const c = track.columns, traces = [], styles = stylesOf(track);
   const arrivals = Object.entries(track.arrivals).filter(
     ([name, a]) => name !== '' && a.weight[k] > MIN_DRAWN);
   for (const [name, a] of arrivals) {
-    const [colour, dash] = looks[name];
+    const [colour, dash] = styles[name];
     const [xs, ys] = ellipse(f * a.x[k], f * a.y[k], f * f * a.xx[k], f * f * a.xy[k],
       f * f * a.yy[k]);
     traces.push(line(xs, ys, named(`from ${plain(name)}, ${Math.round(100 * a.weight[k])} %`),
@@ -125,7 +126,7 @@ function mapLayout(scene) {
 }
 
 // Extend the map to the unambiguous poses of a track, up to a limit.
-function grownReach(scene, track) {
+function extendReach(scene, track) {
   const c = track.columns, r = scene.reach, edge = scene.most_reach;
   for (let k = 0; k < c.t.length; k++) {
     if (c.ambiguous[k]) continue;
@@ -145,7 +146,7 @@ function readout(scene, t) {
     return `Track ${track.id}: x ${(f * c.x[k]).toFixed(digits)}, y ` +
       `${(f * c.y[k]).toFixed(digits)}, z ${(f * c.z[k]).toFixed(digits)} ${u}; standard deviation ` +
       `${sd.toFixed(digits)} ${u}; ${(f * Math.hypot(c.vx[k], c.vy[k])).toFixed(digits)} ${u}/s` +
-      (c.ambiguous[k] ? `; ambiguous (${track.doubts[k].replaceAll('_', ' ') || 'no cause given'})`
+      (c.ambiguous[k] ? `; ambiguous (${track.doubts[k].replaceAll('_', ' ') || 'no reason given'})`
         : '');
   }).join('\n');
 }

@@ -1,12 +1,12 @@
-// Data of a page: decoding, appending of live rows, and lookup by time.
+// Data of a page: decoding, appending live rows, and lookup by time.
 'use strict';
 
 const ARRAYS = {f8: Float64Array, f4: Float32Array, u1: Uint8Array};
 
-// Maximum number of poses of a live track, and how many are removed when it is exceeded.
-const MAX_OF_TRACK = 8000, FORGOTTEN = 1000;
+// Maximum number of poses of a live track, and number removed when it is exceeded.
+const MAX_TRACK_POSES = 8000, N_REMOVED = 1000;
 
-// A typed array of {f8: base64}, {f4: base64} or {u1: base64}.
+// Typed array from {f8: base64}, {f4: base64} or {u1: base64}.
 function decoded(packed) {
   const [kind] = Object.keys(packed);
   const text = atob(packed[kind]);
@@ -15,7 +15,7 @@ function decoded(packed) {
   return new ARRAYS[kind](bytes.buffer);
 }
 
-// Decode every packed array in nested objects and lists.
+// Decode all packed arrays in nested objects and lists.
 function decodedAll(value) {
   if (Array.isArray(value)) return value.map(decodedAll);
   if (value === null || typeof value !== 'object') return value;
@@ -33,7 +33,7 @@ function joined(one, other) {
   return out;
 }
 
-// Append the columns of `rows` to those of `track`; a new arrival had no weight before.
+// Append the columns of `rows` to `track`; a new direction of arrival had weight 0 before.
 function append(track, rows) {
   const before = track.columns.t.length, added = rows.columns.t.length;
   for (const name of Object.keys(track.columns)) {
@@ -48,13 +48,13 @@ function append(track, rows) {
   }
   track.fields = joinedFields(track.fields, before, rows.fields, added);
   track.doubts = track.doubts.concat(rows.doubts);
-  const spare = track.columns.t.length - MAX_OF_TRACK;
-  if (spare > 0) forget(track, spare + FORGOTTEN);
+  const excess = track.columns.t.length - MAX_TRACK_POSES;
+  if (excess > 0) forget(track, excess + N_REMOVED);
   track.ended = rows.ended;
   track.facts = rows.facts;
 }
 
-// Fields of the sensors in either list, by sensor; NaN where one list lacks a sensor.
+// Concatenate the fields of two lists by sensor; NaN if one list lacks a sensor.
 function joinedFields(fields, before, more, added) {
   const bySensor = list => new Map(list.map(field => [field.sensor, field]));
   const old = bySensor(fields), news = bySensor(more);
@@ -81,12 +81,13 @@ function forget(track, n) {
   track.doubts = track.doubts.slice(n);
 }
 
+// Columns of `n` poses without a hypothesis from this direction.
 function absent(like, n) {
   return Object.fromEntries(Object.keys(like).map(
     key => [key, new like[key].constructor(n).fill(key === 'weight' ? 0 : NaN)]));
 }
 
-// Index of the last time up to `t`; -1 before the first.
+// Index of the last time not after `t`; -1 if all are later.
 function indexAt(times, t) {
   let low = 0, high = times.length;
   while (low < high) {
@@ -99,7 +100,7 @@ function indexAt(times, t) {
 const beginOf = track => track.columns.t[0];
 const endOf = track => track.columns.t[track.columns.t.length - 1];
 
-// How long the last pose of a track stays on the map [s].
+// Time for which the last pose of a track remains on the map [s].
 const SHOWN_AFTER_S = 0.6;
 
 // Tracks with a pose at `t`.
@@ -108,7 +109,7 @@ function tracksAt(scene, t) {
     track => beginOf(track) <= t + 1e-9 && t <= endOf(track) + SHOWN_AFTER_S);
 }
 
-// Track whose curves are drawn at `t`: the newest one, otherwise the nearest in time.
+// Track shown in the plots at `t`: the newest one, otherwise the nearest in time.
 function currentTrack(scene, t) {
   const there = tracksAt(scene, t);
   if (there.length) return there[there.length - 1];

@@ -28,7 +28,7 @@ function table(columns, rows, classes) {
 function shown(cell) {
   if (cell === null || cell === undefined) return '–';
   if (typeof cell !== 'number' || Number.isInteger(cell)) return String(cell);
-  // Coordinates may be large.
+  // Large numbers, such as coordinates, keep two decimals.
   return String(Number(Math.abs(cell) < 1000 ? cell.toPrecision(4) : cell.toFixed(2)));
 }
 
@@ -68,22 +68,22 @@ function showCharts(charts) {
 }
 
 function showTrackTable(scene, jump) {
-  const columns = ['track', 'begins [s]', 'ends [s]', 'from', 'kind', 'speed [m/s]',
+  const columns = ['track', 'start [s]', 'end [s]', 'from', 'kind', 'speed [m/s]',
     'moment [A m²]', 'verdict', 'error [m]', 'doubts (poses)'];
   const rows = scene.tracks.map(track => {
     const facts = track.facts || {};
     const go = element('button', `${facts.label || track.id}`,
-      {type: 'button', title: 'show this track'});
+      {type: 'button', title: 'Show this track'});
     go.addEventListener('click', () => jump(track));
     return [go, Number(beginOf(track).toFixed(2)), Number(endOf(track).toFixed(2)), facts.arrival, facts.kind, facts.speed,
-      facts.moment, facts.verdict || (track.ended ? '' : 'running'), facts.error,
+      facts.moment, facts.verdict || (track.ended ? '' : 'active'), facts.error,
       facts.doubts];
   });
-  // A column without any value says nothing.
+  // Columns without any value are omitted.
   const used = columns.map((_, i) => i === 0 || rows.some(
     row => row[i] !== null && row[i] !== undefined && row[i] !== ''));
   const only = row => row.filter((_, i) => used[i]);
-  const found = rows.length ? table(only(columns), rows.map(only)) : element('p', 'No track yet.');
+  const found = rows.length ? table(only(columns), rows.map(only)) : element('p', 'No tracks yet.');
   scene.tracks.forEach((track, i) => {
     found.tBodies[0].rows[i].dataset.key = track.key;
   });

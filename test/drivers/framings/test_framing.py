@@ -64,24 +64,24 @@ def test_what_the_values_of_a_frame_mean(fields, each, count, values, expected):
 
 
 @pytest.mark.parametrize('fields, each, count, message', [
-    ((), (), 0, 'none of x y z ax ay az is there'),
-    (('ticks', '-'), (), 0, 'none of x y z ax ay az is there'),
-    (('x', 'w'), (), 0, "'w' is none of"),
-    (('x', 'y', 'x'), (), 0, 'x is there twice'),
-    (('x.A', 'x.A'), (), 0, 'x.A is there twice'),
-    (('ticks', 'ticks', 'x'), (), 0, 'ticks is there twice'),
-    (('x.0',), ('x',), 1, 'x.0 is there twice'),
-    (('x', 'y.A'), (), 0, 'either every axis'),
-    (('x',), ('y',), 1, 'either every axis'),
-    (('x', 'ticks.A'), (), 0, "'ticks.A' is none of"),
-    (('x', '-.A'), (), 0, "'-.A' is none of"),
+    ((), (), 0, 'expected at least one of x y z ax ay az'),
+    (('ticks', '-'), (), 0, 'expected at least one of x y z ax ay az'),
+    (('x', 'w'), (), 0, "fields: 'w': expected one of"),
+    (('x', 'y', 'x'), (), 0, 'x appears twice'),
+    (('x.A', 'x.A'), (), 0, 'x.A appears twice'),
+    (('ticks', 'ticks', 'x'), (), 0, 'ticks appears twice'),
+    (('x.0',), ('x',), 1, 'x.0 appears twice'),
+    (('x', 'y.A'), (), 0, 'either all axes or none'),
+    (('x',), ('y',), 1, 'either all axes or none'),
+    (('x', 'ticks.A'), (), 0, "fields: 'ticks.A': expected one of"),
+    (('x', '-.A'), (), 0, "fields: '-.A': expected one of"),
     (('x.',), (), 0, '1 to 64 printable'),
     (('x.' + 65 * 'a',), (), 0, '1 to 64 printable'),
     (('x.\n',), (), 0, '1 to 64 printable'),
-    ((), ('x', 'ticks'), 2, "each: 'ticks' is none of"),
-    ((), ('x.A',), 2, "each: 'x.A' is none of"),
-    ((), ('x',), 0, 'go together'),
-    (XYZ, (), 3, 'go together')])
+    ((), ('x', 'ticks'), 2, "each: expected x y z ax ay az or -, got 'ticks'"),
+    ((), ('x.A',), 2, "each: expected x y z ax ay az or -, got 'x.A'"),
+    ((), ('x',), 0, 'must be set together'),
+    (XYZ, (), 3, 'must be set together')])
 def test_fields_that_mean_nothing_are_refused(fields, each, count, message):
     with pytest.raises(SettingsError, match=message):
         FieldLayout(fields, each, count)
@@ -187,12 +187,12 @@ def test_what_follows_from_the_types():
 
 
 @pytest.mark.parametrize('changes, message', [
-    ({'sync': ''}, 'sync: a frame must begin'), ({'sync': 'A5 5'}, "sync: 'A5 5' is not hexa"),
+    ({'sync': ''}, 'sync: at least one byte'), ({'sync': 'A5 5'}, "sync: 'A5 5' is not hexa"),
     ({'sync': 'xy'}, 'sync'), ({'tail': '0'}, "tail: '0' is not hexadecimal"),
-    ({'fields': ['x']}, "fields: 'x' has none of the types"),
-    ({'fields': ['x:u12']}, "fields: 'x:u12' has none of the types"),
-    ({'each': ['x.A'], 'count': 1}, "each: 'x.A' has none of the types"),
-    ({'fields': ['w:u8']}, "'w' is none of"), ({'fields': []}, 'fields'),
+    ({'fields': ['x']}, "fields: 'x': expected a name with one of the types"),
+    ({'fields': ['x:u12']}, "fields: 'x:u12': expected a name with one of the types"),
+    ({'each': ['x.A'], 'count': 1}, "each: 'x.A': expected a name with one of the types"),
+    ({'fields': ['w:u8']}, "fields: 'w': expected one of"), ({'fields': []}, 'fields'),
     ({'fields': ['sequence:f32', 'x:u8']}, 'sequence must be an integer'),
     ({'fields': ['sensor:f64', 'x:u8']}, 'sensor must be an integer'),
     ({'byte_order': 'middle'}, 'byte_order'), ({'checksum': 'md5'}, 'checksum'),
@@ -332,5 +332,5 @@ def test_a_long_value_takes_no_time(value):
     framing = TextFraming(TextSettings(fields=('x',), max_length=65536))
     start = time.process_time()
     assert framing.parse(value, final=True).rejected == {
-        'lines with something that is no number': 1}
+        'lines with a value that is not a number': 1}
     assert time.process_time() - start < 1.0

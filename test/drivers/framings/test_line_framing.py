@@ -39,21 +39,21 @@ def test_a_line_of_text(line, expected):
 
 
 @pytest.mark.parametrize('line, cause', [
-    (b'1,2', 'with another number of fields'),
-    (b'1,2,3,', 'with another number of fields'),
-    (b'1_0,2,3', 'with something that is no number'),
-    ('１,2,3'.encode(), 'with something that is no number'),
-    (b'0x1,2,3', 'with something that is no number'),
-    (b'1e,2,3', 'with something that is no number'),
-    (b'.,2,3', 'with something that is no number'),
-    (b'1 2,2,3', 'with something that is no number'),
-    (b'1,2,3\r\r', 'with something that is no number'),
-    (b'1,2,\xa03', 'that are no UTF-8'),
+    (b'1,2', 'with an unexpected number of fields'),
+    (b'1,2,3,', 'with an unexpected number of fields'),
+    (b'1_0,2,3', 'with a value that is not a number'),
+    ('１,2,3'.encode(), 'with a value that is not a number'),
+    (b'0x1,2,3', 'with a value that is not a number'),
+    (b'1e,2,3', 'with a value that is not a number'),
+    (b'.,2,3', 'with a value that is not a number'),
+    (b'1 2,2,3', 'with a value that is not a number'),
+    (b'1,2,3\r\r', 'with a value that is not a number'),
+    (b'1,2,\xa03', 'that are not UTF-8'),
     (b'1,2,inf', 'with an infinite number'),
     (b'1,2,-Infinity', 'with an infinite number'),
     (b'1,2,1e999', 'with an infinite number'),
     (b'1,2,' + b'9' * 400, 'with an infinite number'),
-    (b'1,2,' + b'0' * 509, 'that are too long'),
+    (b'1,2,' + b'0' * 509, 'longer than max_length'),
     (b'', 'that are empty'),
     (b' \t\r', 'that are empty')])
 def test_a_line_that_is_rejected(line, cause):
@@ -63,16 +63,16 @@ def test_a_line_that_is_rejected(line, cause):
 
 
 @pytest.mark.parametrize('line, cause', [
-    (b',1,7,?,1,2,3', 'with an unusable sensor name'),
-    (b'a' * 65 + b',1,7,?,1,2,3', 'with an unusable sensor name'),
-    (b'a\x07,1,7,?,1,2,3', 'with an unusable sensor name'),
+    (b',1,7,?,1,2,3', 'with an invalid sensor name'),
+    (b'a' * 65 + b',1,7,?,1,2,3', 'with an invalid sensor name'),
+    (b'a\x07,1,7,?,1,2,3', 'with an invalid sensor name'),
     (b'A,,7,?,1,2,3', 'without ticks'),
     (b'A,nan,7,?,1,2,3', 'without ticks'),
     (b'A,inf,7,?,1,2,3', 'with an infinite number'),
-    (b'A,1,,?,1,2,3', 'with a sequence that is no integer'),
-    (b'A,1,7.0,?,1,2,3', 'with a sequence that is no integer'),
-    (b'A,1,1_0,?,1,2,3', 'with a sequence that is no integer'),
-    (b'A,1,' + b'1' * 5000 + b',?,1,2,3', 'with a sequence that is no integer'),
+    (b'A,1,,?,1,2,3', 'with a sequence that is not an integer'),
+    (b'A,1,7.0,?,1,2,3', 'with a sequence that is not an integer'),
+    (b'A,1,1_0,?,1,2,3', 'with a sequence that is not an integer'),
+    (b'A,1,' + b'1' * 5000 + b',?,1,2,3', 'with a sequence that is not an integer'),
     (b'A,1,18446744073709551616,?,1,2,3', 'with a sequence of more than 64 bits'),
     (b'A,1,-9223372036854775809,?,1,2,3', 'with a sequence of more than 64 bits')])
 def test_a_value_that_must_be_there(line, cause):
@@ -90,7 +90,7 @@ def test_separators_ends_prefixes_and_comments():
         b'$MAG,1,2,3\n# $MAG,1,2,3\n1,2,3\n $MAG,1,2,3\n')
     assert parsed.readings == (ONE,)
     assert parsed.rejected == {'lines without the prefix': 2, 'lines that are comments': 1}
-    assert text().parse(b'#1,2,3\n').rejected == {'lines with something that is no number': 1}
+    assert text().parse(b'#1,2,3\n').rejected == {'lines with a value that is not a number': 1}
 
 
 @pytest.mark.parametrize('line, cause', [
@@ -112,11 +112,12 @@ def test_the_checksum_of_nmea(line, cause):
 
 @pytest.mark.parametrize('changes, message', [
     ({'end': ''}, 'end'), ({'separator': ''}, 'separator'), ({'separator': '.'}, 'separator'),
-    ({'separator': 'e'}, 'separator'), ({'separator': '\\n'}, 'holds the end'),
-    ({'prefix': 'a\n'}, 'prefix: .* holds the end'), ({'comment': '\\n'}, 'comment: .* holds'),
-    ({'prefix': '$M', 'comment': '$'}, 'would be passed over'),
-    ({'checksum': 'crc8'}, "checksum: 'crc8' is none of none, nmea"),
-    ({'max_length': 0}, 'max_length'), ({'fields': ['B']}, "'B' is none of")])
+    ({'separator': 'e'}, 'separator'), ({'separator': '\\n'}, 'contains the end'),
+    ({'prefix': 'a\n'}, 'prefix: .* contains the end'),
+    ({'comment': '\\n'}, 'comment: .* contains the end'),
+    ({'prefix': '$M', 'comment': '$'}, 'would be ignored'),
+    ({'checksum': 'crc8'}, "checksum: expected one of none, nmea, got 'crc8'"),
+    ({'max_length': 0}, 'max_length'), ({'fields': ['B']}, "fields: 'B': expected one of")])
 def test_text_settings_that_mean_nothing_are_refused(changes, message):
     with pytest.raises(SettingsError, match=message):
         text(**changes)
@@ -141,32 +142,32 @@ def test_an_object_with_everything():
 
 
 @pytest.mark.parametrize('line, cause', [
-    (b'{"m": [1, 2]}', 'whose m is no list of three'),
-    (b'{"m": [1, 2, 3, 4]}', 'whose m is no list of three'),
-    (b'{"m": {"0": 1, "1": 2, "2": 3}}', 'whose m is no list of three'),
-    (b'{"m": null}', 'whose m is no list of three'),
+    (b'{"m": [1, 2]}', 'whose m is not a list of three'),
+    (b'{"m": [1, 2, 3, 4]}', 'whose m is not a list of three'),
+    (b'{"m": {"0": 1, "1": 2, "2": 3}}', 'whose m is not a list of three'),
+    (b'{"m": null}', 'whose m is not a list of three'),
     (b'{"x": [1, 2, 3]}', 'without m'),
-    (b'{"m": [1, 2, true]}', 'whose m.2 is no number'),
-    (b'{"m": [1, 2, "3"]}', 'whose m.2 is no number'),
+    (b'{"m": [1, 2, true]}', 'whose m.2 is not a number'),
+    (b'{"m": [1, 2, "3"]}', 'whose m.2 is not a number'),
     (b'{"m": [1, 2, Infinity]}', 'with an infinite number'),
     (b'{"m": [1, 2, 1e999]}', 'with an infinite number'),
     (b'{"m": [1, 2, 1' + b'0' * 400 + b']}', 'with an infinite number'),
-    (b'{"m": [1, 2, 1' + b'0' * 5000 + b']}', 'that are no JSON'),
-    (b'{"m": [1, 2, 3], "m": [1, 2, 3]}', 'with a key twice'),
-    (b'{"m": [1, 2, 3], "d": [{"a": 0, "a": 0}]}', 'with a key twice'),
+    (b'{"m": [1, 2, 1' + b'0' * 5000 + b']}', 'that are not JSON'),
+    (b'{"m": [1, 2, 3], "m": [1, 2, 3]}', 'with a duplicate key'),
+    (b'{"m": [1, 2, 3], "d": [{"a": 0, "a": 0}]}', 'with a duplicate key'),
     (b'{"m": [1, 2, 3], "d": ' + b'[' * 60_000 + b']' * 60_000 + b'}',
      'that are nested too deeply'),
     (b'{"m":' * 30_000, 'that are nested too deeply'),
-    (b'{"m": [1, 2, 3]', 'that are no JSON'),
-    (b'{"m": [1, 2, 3]} {}', 'that are no JSON'),
-    (b'{"m": [1, 2, 3,]}', 'that are no JSON'),
-    (b'\xef\xbb\xbf{"m": [1, 2, 3]}', 'that are no JSON'),
-    (b'[1, 2, 3]', 'that are no JSON object'),
-    (b'"m"', 'that are no JSON object'),
-    (b'{"m": [1, 2, 3], "\xff": 1}', 'that are no UTF-8'),
-    ('{"m": [1, 2, 3]}'.encode('utf-16'), 'that are no UTF-8'),
+    (b'{"m": [1, 2, 3]', 'that are not JSON'),
+    (b'{"m": [1, 2, 3]} {}', 'that are not JSON'),
+    (b'{"m": [1, 2, 3,]}', 'that are not JSON'),
+    (b'\xef\xbb\xbf{"m": [1, 2, 3]}', 'that are not JSON'),
+    (b'[1, 2, 3]', 'that are not a JSON object'),
+    (b'"m"', 'that are not a JSON object'),
+    (b'{"m": [1, 2, 3], "\xff": 1}', 'that are not UTF-8'),
+    ('{"m": [1, 2, 3]}'.encode('utf-16'), 'that are not UTF-8'),
     (b' ', 'that are empty'),
-    (b'{"m": [1, 2, 3]' + b' ' * 200_000 + b'}', 'that are too long')])
+    (b'{"m": [1, 2, 3]' + b' ' * 200_000 + b'}', 'longer than max_length')])
 def test_an_object_that_is_rejected(line, cause):
     framing = objects(max_length=200_000)
     parsed = framing.parse(line + b'\n{"m":[1,2,3]}\n')
@@ -175,17 +176,17 @@ def test_an_object_that_is_rejected(line, cause):
 
 
 @pytest.mark.parametrize('old, new, cause', [
-    (b'"A"', b'true', 'whose id is no name'), (b'"A"', b'1.5', 'whose id is no name'),
-    (b'"A"', b'null', 'whose id is no name'), (b'"A"', b'""', 'with an unusable sensor name'),
-    (b'"A"', b'"\\ud800"', 'with an unusable sensor name'),
-    (b'"A"', b'9' * 4000, 'with an unusable sensor name'),
-    (b'"t": 5', b'"t": null', 'whose clock.t is no number'),
+    (b'"A"', b'true', 'whose id is not a name'), (b'"A"', b'1.5', 'whose id is not a name'),
+    (b'"A"', b'null', 'whose id is not a name'), (b'"A"', b'""', 'with an invalid sensor name'),
+    (b'"A"', b'"\\ud800"', 'with an invalid sensor name'),
+    (b'"A"', b'9' * 4000, 'with an invalid sensor name'),
+    (b'"t": 5', b'"t": null', 'whose clock.t is not a number'),
     (b'"t": 5', b'"t": NaN', 'without ticks'), (b'"t": 5', b'"u": 5', 'without clock.t'),
-    (b'"n": 7', b'"n": 7.5', 'whose n is no integer'),
-    (b'"n": 7', b'"n": NaN', 'whose n is no integer'),
-    (b'"n": 7', b'"n": -Infinity', 'whose n is no integer'),
+    (b'"n": 7', b'"n": 7.5', 'whose n is not an integer'),
+    (b'"n": 7', b'"n": NaN', 'whose n is not an integer'),
+    (b'"n": 7', b'"n": -Infinity', 'whose n is not an integer'),
     (b'"n": 7', b'"n": 1e30', 'with a sequence of more than 64 bits'),
-    (b'"n": 7', b'"n": false', 'whose n is no number'),
+    (b'"n": 7', b'"n": false', 'whose n is not a number'),
     (b'[1, 2]', b'[1]', 'without m.y.1'), (b'[1, 2]', b'{"0": 1}', 'without m.y.1'),
     (b'{"x"', b'{"q"', 'without m.x'), (b'{"x": 1, "y": [1, 2]}', b'"xy"', 'without m.x'),
     (b'{"x": 1, "y": [1, 2]}', b'[1]', 'without m.x')])
@@ -200,23 +201,24 @@ def test_a_path_that_must_lead_somewhere(old, new, cause):
 
 def test_an_object_of_several_lines_is_only_read_from_a_whole_message():
     pretty = b'{\n "m": [1,\n 2, 3]\n}\n'
-    assert objects().parse(pretty).rejected == {'lines that are no JSON': 4}
+    assert objects().parse(pretty).rejected == {'lines that are not JSON': 4}
     parsed = objects().parse(pretty, final=True)
     assert parsed.readings == (ONE,) and parsed.consumed == len(pretty) and not parsed.rejected
     assert objects(max_length=len(pretty) - 1).parse(pretty, final=True).rejected == {
-        'lines that are no JSON': 4}
+        'lines that are not JSON': 4}
     # Several objects in a message are lines, whatever one of them is like.
     for bad in (b'{"m": 1, "m": 1}', b'\xff', b'['):
         parsed = objects().parse(bad + b'\n{"m":[1,2,3]}\n{"m":[1,2,3]}', final=True)
         assert parsed.readings == (ONE, ONE) and sum(parsed.rejected.values()) == 1
-    assert objects().parse(b'[1,\n2]', final=True).rejected == {'lines that are no JSON object': 1}
+    assert objects().parse(b'[1,\n2]', final=True).rejected == {
+        'lines that are not a JSON object': 1}
 
 
 @pytest.mark.parametrize('changes, message', [
     ({'field': ['a', 'b']}, 'field: expected the paths of three axes'),
-    ({'field': ['']}, 'neither the field nor the acceleration'),
-    ({'field': [''], 'ticks': 't'}, 'neither the field nor the acceleration'),
-    ({'field': ['', '', '']}, 'neither the field nor the acceleration'),
+    ({'field': ['']}, 'field: a path of the field or of the acceleration'),
+    ({'field': [''], 'ticks': 't'}, 'field: a path of the field or of the acceleration'),
+    ({'field': ['', '', '']}, 'field: a path of the field or of the acceleration'),
     ({'acceleration': ['a', 'b', 'c', 'd']}, 'acceleration: expected'),
     ({'ticks': 'a..b'}, "ticks: 'a..b' has an empty key"), ({'field': ['.a']}, 'empty key'),
     ({'end': ''}, 'end')])

@@ -26,7 +26,7 @@ from support.xsens_messages import (
 )
 
 BETWEEN = 'bytes between frames'
-UNFIT = 'MTData2 messages whose packets do not fit'
+UNFIT = 'MTData2 messages with invalid packet lengths'
 NOTHING = 'messages without field or acceleration'
 LEGACY = XsensFraming(XsensSettings(mtdata=LAYOUT))
 FRAMING = XsensFraming(XsensSettings())
@@ -129,8 +129,8 @@ def test_packets_that_might_have_been_used_are_counted():
     assert parsed.readings == (READING,)
     assert parsed.rejected == {
         'packets not used: 0xA010': 1, 'packets not used: 0xC010': 1, 'packets not used: 0xC034': 1,
-        'packets that the message had already: 0xC020': 1,
-        'packets that the message had already: 0x1020': 1}
+        'duplicate packets in a message: 0xC020': 1,
+        'duplicate packets in a message: 0x1020': 1}
 
 
 @pytest.mark.parametrize('data', [b'', packet(0x2010, bytes(16)), packet(0x1020, b'\x00\x01')])
@@ -186,11 +186,11 @@ def test_mtdata_that_the_settings_do_not_describe_is_counted():
     sent = message(0x32, bytes(41)) + message(0x32, bytes(43)) + message(0x32, b'') + FRAME
     parsed = LEGACY.parse(sent)
     assert parsed.readings == (READING,)
-    assert parsed.rejected == {'MTData messages of another length than the settings say': 3}
+    assert parsed.rejected == {'MTData messages whose length does not match mtdata': 3}
     parsed = FRAMING.parse(sent)
     assert parsed.readings == (READING,)
     assert parsed.rejected == {
-        'MTData messages, of which the settings say that there are none': 3}
+        'MTData messages, although mtdata is none': 3}
 
 
 @pytest.mark.parametrize('changes, text', [
@@ -199,9 +199,10 @@ def test_mtdata_that_the_settings_do_not_describe_is_counted():
     ({'mtdata': ['mag', 'acc']}, 'mag, acc is not in the order'),
     ({'mtdata': ['mag', 'mag']}, 'mag, mag is not in the order'),
     ({'mtdata': ['mag', 'quaternion', 'euler']}, 'more than one of euler, matrix, quaternion'),
-    ({'mtdata': ['temp', 'gyr', 'counter']}, 'neither acc nor mag in temp, gyr, counter'),
-    ({'mtdata': ['mag'], 'mtdata_format': 'double'}, "'double' is none of float, fp12.20"),
-    ({'mtdata_format': 'fp12.20'}, "mtdata_format is 'fp12.20', but mtdata says that there is no"),
+    ({'mtdata': ['temp', 'gyr', 'counter']}, 'acc or mag is required, got temp, gyr, counter'),
+    ({'mtdata': ['mag'], 'mtdata_format': 'double'},
+     "mtdata_format: expected one of float, fp12.20, got 'double'"),
+    ({'mtdata_format': 'fp12.20'}, "mtdata_format is 'fp12.20', but mtdata is none"),
     ({'max_message': 253}, 'max_message: 253 is outside'),
     ({'max_message': 4097}, 'max_message: 4097 is outside')])
 def test_settings_that_describe_no_message_are_refused(changes, text):

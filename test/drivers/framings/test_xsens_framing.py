@@ -24,7 +24,7 @@ from support.xsens_messages import (
 
 BETWEEN = 'bytes between frames'
 WRONG_SUM = 'frames with a wrong checksum'
-SPLICED = 'messages in which another begins'
+SPLICED = 'messages that contain the start of another'
 LEGACY = XsensFraming(XsensSettings(mtdata=LAYOUT))
 FRAMING = XsensFraming(XsensSettings())
 LONGEST = 512 + 7

@@ -104,18 +104,18 @@ def test_turns_that_were_missed_are_counted_and_the_grid_stays():
     after = device.read(1.0)[0].arrival_ns
     again = device.read(1.0)[0].arrival_ns
     # 20, 40, 60, 80 ms are gone; 100 ms is late, and the next one is not.
-    assert device.counts == {'turns missed': 4}
+    assert device.counts == {'polling cycles missed': 4}
     assert (again - before) * 1e-9 == pytest.approx(0.120, abs=5e-3)
     assert (after - before) * 1e-9 == pytest.approx(0.110, abs=1e-2)
     clock.sleep(0.03)
     device.read(1.0)
-    assert device.counts == {'turns missed': 5}
+    assert device.counts == {'polling cycles missed': 5}
 
 
 def test_a_turn_that_takes_longer_than_the_period_misses_others():
     clock, _, device, _ = one('mmc5983ma', rate_hz=100.0, mmc5983ma={'conversion_ms': 8.0})
     arrivals = read_for(device, clock, 2.0)
-    assert len(arrivals) + device.counts['turns missed'] == pytest.approx(200, abs=3)
+    assert len(arrivals) + device.counts['polling cycles missed'] == pytest.approx(200, abs=3)
     assert 60 < len(arrivals) < 105
 
 
@@ -153,7 +153,7 @@ def test_no_conversion_is_read_twice(chip):
     assert len(arrivals) == pytest.approx(rate, abs=2)
     assert np.diff([a.reading.field[0] for a in arrivals]) == pytest.approx(1e-7, abs=2e-8)
     assert device.counts == {
-        'turns without a new conversion: A': pytest.approx(400 - rate, abs=3)}
+        'polling cycles without a new conversion: A': pytest.approx(400 - rate, abs=3)}
 
 
 def test_conversions_that_nobody_read_are_counted():
@@ -177,7 +177,7 @@ def test_a_conversion_that_is_not_done_is_no_reading(chip, changes):
         fake.finish = lambda: None
     assert device.read(0.0199) == []
     device.read(0.0199)
-    assert device.counts['turns without a new conversion: A'] >= 1
+    assert device.counts['polling cycles without a new conversion: A'] >= 1
     if slow:
         fake.CONVERSION_MS = slow
     else:
@@ -220,7 +220,7 @@ def test_a_failure_is_counted_and_tried_again(chip):
         assert device.read(0.02) == []
         fake.answers = True
         assert len(device.read(1.0)) == 1
-        assert device.counts['readings that failed: A'] == n
+        assert device.counts['failed readings: A'] == n
 
 
 @pytest.mark.parametrize('chip', FAKES)
@@ -228,14 +228,14 @@ def test_a_chip_that_goes_on_failing_is_lost_and_set_up_again(chip):
     clock, bus, device, fake = one(chip, max_failures=5)
     device.read(1.0)
     fake.answers = False
-    with pytest.raises(DeviceError, match=r'A failed 5 times in a row: nothing answers'):
+    with pytest.raises(DeviceError, match=r'A failed 5 times in a row: no answer'):
         device.read(10.0)
     with pytest.raises(DeviceError, match='A failed 5 times'):
         device.read(10.0)
-    assert device.counts['readings that failed: A'] == 5
+    assert device.counts['failed readings: A'] == 5
     device.close()
     assert not bus.open
-    with pytest.raises(DeviceError, match='nothing answers'):
+    with pytest.raises(DeviceError, match='no answer'):
         device.open()
     assert not bus.open
     fake.answers = True
@@ -263,7 +263,7 @@ def test_a_chip_whose_supply_was_cut_is_lost(chip):
     device.read(1.0)
     fake.power_up()
     start = clock.ns
-    with pytest.raises(DeviceError, match='A has given no new conversion in 25 turns'):
+    with pytest.raises(DeviceError, match='A: no new conversion in 25 polling cycles'):
         device.read(10.0)
     assert (clock.ns - start) * 1e-9 == pytest.approx(0.5, abs=0.03)
     device.open()
@@ -287,13 +287,13 @@ def test_a_scale_that_went_with_the_supply_is_no_reading(chip):
     clock, _, device, fake = one(chip, **{chip: {'range_ut': 810.0}})
     device.read(1.0)
     fake.power_up()
-    with pytest.raises(DeviceError, match='its settings are gone'):
+    with pytest.raises(DeviceError, match='the chip lost its settings'):
         device.read(10.0)
     # The same gain, and yet not as it was set up.
     fake.memory[:] = bytes([0x70, 7 << 5]) + fake.memory[2:]
     device.open()
     fake.memory[0] = 0x70
-    with pytest.raises(DeviceError, match='its settings are gone'):
+    with pytest.raises(DeviceError, match='the chip lost its settings'):
         device.read(10.0)
 
 
@@ -307,6 +307,6 @@ def test_a_bus_that_hangs_costs_one_wait_a_turn():
     assert device.read(0.5) == []
     assert (clock.ns - start) * 1e-9 < 1.2
     assert {k: n for k, n in device.counts.items() if 'failed' in k} == {
-        f'readings that failed: {name}': 1 for name in 'ABC'}
+        f'failed readings: {name}': 1 for name in 'ABC'}
     with pytest.raises(DeviceError, match='in a row: the bus hangs'):
         device.read(5.0)

@@ -21,19 +21,19 @@ from support.i2c_chips import Clock, FakeHmc5883l, FakeLis3mdl, FakeMmc5603
     (['A:lis3mdl:28'], "got 'A:lis3mdl:28'"),
     (['A:lis3mdl:0x1c@0x70'], 'channel'),
     (['A:lis3mdl:0x1c@0x70.8'], 'channel'),
-    (['A:lis3dml:0x1c'], 'chip lis3dml is none of mmc5983ma, mmc5603, hmc5883l, hmc5983, rm3100, '
-                         'lis3mdl'),
+    (['A:lis3dml:0x1c'], 'chip lis3dml is neither one of mmc5983ma, mmc5603, hmc5883l, hmc5983, '
+                         'rm3100, lis3mdl nor a module.Class'),
     (['A:lis3mdl:0x78'], r'A: address 0x78 is outside 0x08 \.\. 0x77'),
     (['A:lis3mdl:0x07'], r'A: address 0x07 is outside'),
     (['A:lis3mdl:0x1c@0x6f.1'], r'A: multiplexer 0x6f is outside 0x70 \.\. 0x77'),
     (['A:lis3mdl:0x1c@0x78.1'], r'A: multiplexer 0x78 is outside'),
-    (['A:lis3mdl:0x1c', 'A:lis3mdl:0x1e'], 'A is there twice'),
+    (['A:lis3mdl:0x1c', 'A:lis3mdl:0x1e'], 'A appears twice'),
     (['A:lis3mdl:0x1c', 'B:rm3100:0x1c'], 'A and B both answer at address 0x1c$'),
     (['A:lis3mdl:0x1c@0x70.1', 'B:lis3mdl:0x1c'], 'A and B both answer'),
     (['A:lis3mdl:0x1c', 'B:lis3mdl:0x1c@0x70.1'],
-     'A and B both answer at address 0x1c, behind channel 1 of the multiplexer at 0x70'),
+     'A and B both answer at address 0x1c, on channel 1 of the multiplexer at 0x70'),
     (['A:lis3mdl:0x1c@0x70.1', 'B:lis3mdl:0x1c@0x70.1'], 'A and B both answer'),
-    (['A:lis3mdl:0x70', 'B:lis3mdl:0x1c@0x70.1'], 'A: address 0x70 is that of a multiplexer'),
+    (['A:lis3mdl:0x70', 'B:lis3mdl:0x1c@0x70.1'], 'A: address 0x70 is used by a multiplexer'),
 ])
 def test_entries_that_cannot_be(entries, message):
     with pytest.raises(SettingsError, match=message):
@@ -62,7 +62,7 @@ def test_the_usual_settings_are_usable(chip):
 
 
 @pytest.mark.parametrize('code, message', [
-    (errno.ENOENT, '/dev/i2c-7: is not there; enable I2C.*modprobe i2c-dev'),
+    (errno.ENOENT, '/dev/i2c-7: not found; enable I2C.*modprobe i2c-dev'),
     (errno.EACCES, '/dev/i2c-7: no permission; .*usermod -aG i2c'),
     (errno.EIO, '/dev/i2c-7: cannot be opened: Input/output error'),
 ])
@@ -78,7 +78,7 @@ def test_a_bus_that_cannot_be_opened(code, message):
 
 def test_the_real_smbus_says_that_there_is_no_bus():
     settings = replace(I2cSettings(), {'sensors': ['A:lis3mdl:0x1c'], 'bus': 254})
-    with pytest.raises(DeviceError, match='/dev/i2c-254: is not there'):
+    with pytest.raises(DeviceError, match='/dev/i2c-254: not found'):
         I2cDevice(settings).open()
 
 
@@ -109,7 +109,7 @@ def test_a_chip_is_set_up_whatever_state_it_was_left_in(chip):
 def test_nothing_at_the_address():
     _, bus, device = rig(['A:lis3mdl:0x1e'], {})
     with pytest.raises(DeviceError, match=re.escape(
-            '/dev/i2c-1: A (lis3mdl, address 0x1e): nothing answers; check its wiring, supply and '
+            '/dev/i2c-1: A (lis3mdl, address 0x1e): no answer; check wiring and supply, and the '
             'address with i2cdetect -y 1')):
         device.open()
     assert bus.opened == 1 and not bus.open
@@ -120,7 +120,7 @@ def test_another_chip_at_the_address():
     _, bus, device = rig(['A:lis3mdl:0x1e'], {0x1E: FakeHmc5883l(clock)}, clock)
     with pytest.raises(DeviceError, match=re.escape(
             'A (lis3mdl, address 0x1e): identity register 0x0f reads 0x00 instead of 0x3d; it '
-            'answers as hmc5883l')):
+            'is identified as hmc5883l')):
         device.open()
     assert not bus.open
     assert bus.chips[0x1E].written == []
@@ -142,8 +142,8 @@ def test_every_register_of_the_identity_counts(chip, register):
 
 @pytest.mark.parametrize('error, message', [
     (OSError(errno.ETIMEDOUT, 'Connection timed out'), 'the bus hangs'),
-    (OSError(errno.EBUSY, 'Device or resource busy'), 'a driver of the kernel has taken'),
-    (OSError(errno.ENXIO, 'No such device or address'), 'nothing answers'),
+    (OSError(errno.EBUSY, 'Device or resource busy'), 'the address is in use by a kernel driver'),
+    (OSError(errno.ENXIO, 'No such device or address'), 'no answer'),
     (OSError(errno.EIO, 'Input/output error'), 'cannot be read: Input/output error'),
 ])
 @pytest.mark.parametrize('when', range(6))
@@ -163,7 +163,7 @@ def test_a_block_that_is_cut_off_is_a_failure():
     whole = bus.read_i2c_block_data
     bus.read_i2c_block_data = lambda *arguments: whole(*arguments)[:5]
     assert device.read(0.02) == []
-    assert device.counts['readings that failed: A'] == 1
+    assert device.counts['failed readings: A'] == 1
 
 
 def test_closing():
@@ -171,7 +171,7 @@ def test_closing():
     device.close()
     device.close()
     assert not bus.open
-    with pytest.raises(DeviceError, match='/dev/i2c-1: is not open'):
+    with pytest.raises(DeviceError, match='/dev/i2c-1: not open'):
         device.read(0.1)
     device.open()
     assert device.read(1.0)
@@ -280,10 +280,10 @@ def test_a_channel_that_was_shut_behind_our_back_is_opened_again():
     bus.chips[0x70].mask = 0
     assert device.read(0.019) == []
     assert device.read(1.0)
-    assert device.counts['readings that failed: A'] == 1
+    assert device.counts['failed readings: A'] == 1
 
 
 def test_a_missing_multiplexer_is_named():
     clock, bus, device = rig(['A:lis3mdl:0x1c@0x72.4'], {})
-    with pytest.raises(DeviceError, match='behind channel 4 of the multiplexer at 0x72.*answers'):
+    with pytest.raises(DeviceError, match='on channel 4 of the multiplexer at 0x72.*no answer'):
         device.open()

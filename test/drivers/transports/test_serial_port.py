@@ -167,7 +167,7 @@ def test_a_device_that_is_pulled_out_is_told(device, port):
     device.unplug()
     start = time.monotonic()
     for _ in range(2):
-        with pytest.raises(DeviceError, match=f'serial port {device.link}: is gone'):
+        with pytest.raises(DeviceError, match=f'serial port {device.link}: connection lost'):
             port.read(20.0)
     assert time.monotonic() - start < 1.0
 
@@ -175,7 +175,7 @@ def test_a_device_that_is_pulled_out_is_told(device, port):
 def test_a_read_that_waits_is_told_at_once(device, port):
     threading.Timer(0.2, device.unplug).start()
     start = time.monotonic()
-    with pytest.raises(DeviceError, match='is gone'):
+    with pytest.raises(DeviceError, match='connection lost'):
         port.read(20.0)
     assert time.monotonic() - start < 1.0
 
@@ -187,7 +187,7 @@ def test_the_same_device_after_it_was_plugged_in_again(device, port):
         with pytest.raises(DeviceError):
             port.read(1.0)
         port.close()
-        assert 'is not there' in failure(port)
+        assert 'not found' in failure(port)
         device.plug()
         port.open()
         device.write(text)
@@ -197,13 +197,13 @@ def test_the_same_device_after_it_was_plugged_in_again(device, port):
 def test_a_port_that_is_not_there_names_those_that_are(monkeypatch):
     port = SerialPort(SerialSettings(port='/dev/ttyNONE0'))
     monkeypatch.setattr(serial_port.list_ports, 'comports', lambda: [])
-    assert failure(port) == ('serial port /dev/ttyNONE0: is not there; there is no other either')
+    assert failure(port) == ('serial port /dev/ttyNONE0: not found; no ports available')
 
     class Known:
         device, description = '/dev/ttyUSB7', 'FT232R'
 
     monkeypatch.setattr(serial_port.list_ports, 'comports', lambda: [Known, Known])
-    assert failure(port).endswith('there are /dev/ttyUSB7 (FT232R), /dev/ttyUSB7 (FT232R)')
+    assert failure(port).endswith('available ports: /dev/ttyUSB7 (FT232R), /dev/ttyUSB7 (FT232R)')
 
 
 def test_no_permission(device):
@@ -227,7 +227,7 @@ def test_no_permission(device):
 
 def test_two_at_one_port(device, port):
     other = SerialPort(SerialSettings(port=device.path))
-    assert failure(other) == f'serial port {device.path}: is in use by another program'
+    assert failure(other) == f'serial port {device.path}: in use by another program'
     # The refused one leaves the port as it was, and gets it as soon as it is free.
     device.write(b'x')
     assert gather(port, 1) == b'x'
@@ -248,7 +248,7 @@ def test_what_is_no_serial_port(tmp_path):
     (tmp_path / 'file').write_text('text')
     for path in (tmp_path / 'file', tmp_path, Path('/dev/null')):
         said = failure(SerialPort(SerialSettings(port=str(path))))
-        assert said.startswith(f'serial port {path}: is not a serial port, or there is no device')
+        assert said.startswith(f'serial port {path}: not a serial port, or no device is connected')
 
 
 def test_a_refused_open_leaves_nothing_open(device, port, tmp_path):
@@ -292,7 +292,7 @@ def test_a_speed_that_the_port_cannot(device, monkeypatch):
 
     monkeypatch.setattr('serial.Serial._set_special_baudrate', refused)
     port = SerialPort(SerialSettings(port=device.path, baud=12345))
-    assert 'cannot be opened with 12345 bit/s: Failed' in failure(port)
+    assert 'cannot be opened at 12345 bit/s: Failed' in failure(port)
 
 
 def test_what_the_line_loses_is_counted_from_opening_on(device, monkeypatch):
@@ -315,15 +315,15 @@ def test_what_the_line_loses_is_counted_from_opening_on(device, monkeypatch):
     now[7] = -2**31 + 20
     device.write(b'x')
     assert [c.data for c in port.read(1.0)] == [b'x']
-    lost = {'framing errors on the line (is the baud rate right?)': 99,
-            'bytes lost, overrun of the receiver': 2**31 + 13, 'parity errors on the line': 101,
-            'breaks on the line': 2, 'bytes lost, overrun of the driver\'s buffer': 103}
+    lost = {'framing errors on the line (check the baud rate)': 99,
+            'bytes lost to receiver overruns': 2**31 + 13, 'parity errors on the line': 101,
+            'break conditions on the line': 2, 'bytes lost to driver buffer overruns': 103}
     assert port.counts == lost
     assert port.read(0.0) == [] and port.counts == lost
     # Also where nothing arrives.
     now[6] += 1
     assert port.read(0.0) == []
-    assert port.counts['framing errors on the line (is the baud rate right?)'] == 100
+    assert port.counts['framing errors on the line (check the baud rate)'] == 100
     # A port that was plugged in again counts from the beginning.
     now[:] = [0] * 20
     port.open()
@@ -340,7 +340,7 @@ def test_what_the_line_loses_is_counted_from_opening_on(device, monkeypatch):
 def test_closing(device, handles):
     port = SerialPort(SerialSettings(port=device.path))
     port.close()
-    with pytest.raises(DeviceError, match=f'{device.path}: is not open'):
+    with pytest.raises(DeviceError, match=f'{device.path}: not open'):
         port.read(0.0)
     for _ in range(2):
         port.open()
@@ -353,7 +353,7 @@ def test_closing(device, handles):
         assert not handles[-1].is_open
         port.close()
         port.close()
-        with pytest.raises(DeviceError, match='is not open'):
+        with pytest.raises(DeviceError, match='not open'):
             port.read(0.0)
 
 

@@ -140,7 +140,7 @@ def test_the_time_is_that_of_the_coming_not_of_the_reading(listen, sender):
     assert not udp.counts
 
 
-TIMED = 'datagrams with the time of the wake-up instead of the kernel\'s'
+TIMED = 'datagrams timestamped at wake-up instead of by the kernel'
 
 
 @pytest.mark.parametrize('step_s', [-3600.0, -0.02, 0.02, 3600.0])
@@ -274,7 +274,7 @@ def test_what_is_too_long_or_empty_is_counted(listen, sender):
     udp = listen(max_length=100)
     sender(udp, b'x' * 101, b'y' * 100, b'', b'z' * 5000, b'a')
     assert [c.data for c in udp.read(1.0)] == [b'y' * 100, b'a']
-    assert udp.counts == {'datagrams that were too long': 2, 'empty datagrams': 1}
+    assert udp.counts == {'datagrams longer than max_length': 2, 'empty datagrams': 1}
 
 
 def test_only_the_sources_that_were_named(listen, sender):
@@ -319,25 +319,26 @@ def test_a_port_that_is_in_use(listen):
     udp = listen()
     other = UdpSocket(udp.settings)
     assert failure(other) == (
-        f'UDP 127.0.0.1:{udp.settings.port}: the port is in use by another program')
+        f'UDP 127.0.0.1:{udp.settings.port}: the port is in use by another program; '
+        'choose another port')
     udp.close()
     other.open()
     other.close()
 
 
 @pytest.mark.parametrize('changes, text', [
-    ({'address': '192.0.2.1'}, 'UDP 192.0.2.1:{port}: no interface of this machine has the '
+    ({'address': '192.0.2.1'}, 'UDP 192.0.2.1:{port}: no interface has the '
                                'address 192.0.2.1'),
     ({'address': '192.0.2.1', 'group': '239.1.2.3'}, 'group 239.1.2.3: no interface'),
-    ({'group': '192.0.2.9'}, '192.0.2.9 is no multicast group'),
-    ({'group': '127.0.0.1'}, '127.0.0.1 is no multicast group')])
+    ({'group': '192.0.2.9'}, '192.0.2.9 is not a multicast group'),
+    ({'group': '127.0.0.1'}, '127.0.0.1 is not a multicast group')])
 def test_an_address_that_cannot_be_listened_at(changes, text):
     port = free_port(socket.SOCK_DGRAM)
     udp = UdpSocket(replace(SETTINGS, port=port, **changes))
     before = len(os.listdir('/proc/self/fd'))
     assert text.format(port=port) in failure(udp)
     assert len(os.listdir('/proc/self/fd')) == before
-    with pytest.raises(DeviceError, match='is not open'):
+    with pytest.raises(DeviceError, match='not open'):
         udp.read(0.0)
 
 
@@ -348,15 +349,15 @@ def test_a_port_of_the_system(monkeypatch):
 
     monkeypatch.setattr(udp_socket.socket, 'socket', type('Socket', (socket.socket,),
                                                           {'bind': bind}))
-    assert 'ports below 1024 are the system' in failure(UdpSocket(replace(SETTINGS, port=514)))
+    assert 'ports below 1024 are reserved' in failure(UdpSocket(replace(SETTINGS, port=514)))
 
 
 def test_a_buffer_that_the_kernel_does_not_give(sockets, listen):
     said = []
     udp = listen(said.append, receive_buffer=1 << 30)
     given = sockets[-1].getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
-    assert said == [f'UDP 127.0.0.1:{udp.settings.port}: the kernel gave a receive buffer of '
-                    f'{given} bytes instead of {1 << 30}; raise net.core.rmem_max']
+    assert said == [f'UDP 127.0.0.1:{udp.settings.port}: the kernel limits the receive buffer to '
+                    f'{given} bytes instead of {1 << 30}; increase net.core.rmem_max']
     said.clear()
     listen(said.append, receive_buffer=100_000)
     assert sockets[-1].getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == 200_000
@@ -373,7 +374,7 @@ def test_a_socket_that_fails(sockets, listen):
 def test_closing(sockets):
     udp = UdpSocket(replace(SETTINGS, port=free_port(socket.SOCK_DGRAM)))
     udp.close()
-    with pytest.raises(DeviceError, match=f'UDP 127.0.0.1:{udp.settings.port}: is not open'):
+    with pytest.raises(DeviceError, match=f'UDP 127.0.0.1:{udp.settings.port}: not open'):
         udp.read(0.0)
     before = len(os.listdir('/proc/self/fd'))
     for _ in range(2):
@@ -388,7 +389,7 @@ def test_closing(sockets):
         assert [s.fileno() for s in sockets] == [-1] * len(sockets)
         udp.close()
         udp.close()
-        with pytest.raises(DeviceError, match='is not open'):
+        with pytest.raises(DeviceError, match='not open'):
             udp.read(0.0)
     assert len(os.listdir('/proc/self/fd')) == before
 
