@@ -1,6 +1,6 @@
 """Tracks and poses of magnetic targets from a network of stationary magnetometers.
 
-The names below are the public Python interface; docs/api.md has examples:
+The names below are the public Python interface. The gallery of the documentation has examples:
 
     import mag_tracking as mt
 
@@ -14,6 +14,7 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    __version__: str
     from mag_tracking.analysis.placement import PlannedTarget, Sampling
     from mag_tracking.apps.events import EventsResult, events
     from mag_tracking.apps.fit import FitResult, fit
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
     from mag_tracking.network.file import read_network
     from mag_tracking.records import Readings
     from mag_tracking.settings import read_parameter_file
-
-__version__ = '0.1.0'
 
 __all__ = [
     'EventsResult', 'FitResult', 'FittedPass', 'MagTrackingError', 'MissingDependencyError',
@@ -70,6 +69,9 @@ _MODULE_OF = {name: module for module, names in _MODULES.items() for name in nam
 if not TYPE_CHECKING:  # A type checker uses the imports above and reports all other names.
     def __getattr__(name: str) -> object:
         """Import a public name on first use (PEP 562)."""
+        if name == '__version__':
+            # As installed: the version stands in package.xml only.
+            return importlib.import_module('importlib.metadata').version(__name__)
         if name not in _MODULE_OF:
             raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
         module = importlib.import_module(f'{__name__}.{_MODULE_OF[name]}')
