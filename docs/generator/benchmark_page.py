@@ -43,12 +43,16 @@ def benchmark_page():
     n = sum(len(run['figures']) for run in latest.values())
     aims = [f for run in latest.values() for f in run['figures'].values() if f['aim'] is not None]
     lines = ['# Benchmarks', '',
-             f'`make bench` measures these {n} figures and writes them to `benchmarks/latest.json`, from '
-             f'which this page is generated. {sum(map(is_met, aims))} of {len(aims)} figures with an aim '
+             f'`make bench` measures these {n} figures and writes them to '
+             f'`benchmarks/latest.json`, from '
+             f'which this page is generated. {sum(map(is_met, aims))} of {len(aims)} figures with '
+             f'an aim '
              'meet it. An aim is what theory or a user asks for, not what was once reached. '
              '`benchmarks/history.jsonl` has all earlier runs.', '',
-             'Simulators: *clouds* are clouds of magnetised points, *boxes* are magnetised sheets with '
-             'imperfect sensors. *Wrong* poses carry no flag, and are more than 2 m and more than three '
+             'Simulators: *clouds* are clouds of magnetised points, *boxes* are magnetised sheets '
+             'with '
+             'imperfect sensors. *Wrong* poses carry no flag, and are more than 2 m and more than '
+             'three '
              'standard deviations from every vehicle.', '']
     for name, run in sorted(latest.items()):
         module, text = description_of(name)

@@ -39,8 +39,10 @@ def actions_of(command):
 
 def command_page():
     """Markdown: the help of every command and sub-command."""
-    lines = ['# Command line', '', 'The help of each command, as `mag-tracking COMMAND --help` prints '
-             'it. Commands that need ROS 2 say so. The exit status is 0 on success, 1 for an error that '
+    lines = ['# Command line', '', 'The help of each command, as `mag-tracking COMMAND --help` '
+                                   'prints '
+             'it. Commands that need ROS 2 say so. The exit status is 0 on success, 1 for an '
+             'error that '
              'a message explains, 2 for a wrong command line, 130 after Ctrl-C.', '',
              '```text', help_of(), '```', '']
     for name in COMMANDS:

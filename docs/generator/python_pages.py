@@ -26,7 +26,8 @@ PRIVATE = ('core', '__main__')
 def python_pages():
     """{file name: Markdown}: an overview, the public interface, the base modules, a page a folder."""
     pages = {'python/index.md': overview(), 'python/interface.md': interface(),
-             'python/base.md': page('Base modules', 'Records, settings, geometry and errors, for all '
+             'python/base.md': page('Base modules', 'Records, settings, geometry and errors, for '
+                                                    'all '
                                     'other modules.', [f'mag_tracking.{m}' for m in BASE])}
     for room, text in ROOMS.items():
         for folder, modules in folders_of(room).items():
@@ -65,10 +66,14 @@ def page(title, text, modules):
 
 def interface():
     """The names that `import mag_tracking` exports."""
-    lines = ['# Public interface', '', '`import mag_tracking as mt` needs no ROS and imports nothing until '
-             'a name is used. Units are SI, timestamps are integer nanoseconds, positions are in the frame '
-             'of the network, fields in the frame of the sensor. All errors that the package raises on '
-             'purpose are subclasses of `MagTrackingError`. {doc}`/gallery/index` shows the interface at '
+    lines = ['# Public interface', '', '`import mag_tracking as mt` needs no ROS and imports '
+                                       'nothing until '
+             'a name is used. Units are SI, timestamps are integer nanoseconds, positions are in '
+             'the frame '
+             'of the network, fields in the frame of the sensor. All errors that the package '
+             'raises on '
+             'purpose are subclasses of `MagTrackingError`. {doc}`/gallery/index` shows the '
+             'interface at '
              'work.', '']
     for name in sorted(mag_tracking.__all__, key=lambda n: (n[0].isupper(), n)):
         value = getattr(mag_tracking, name)
@@ -89,9 +94,11 @@ def overview():
             names.append(folder.replace('/', '_'))
             rows.append((names[-1], ROOMS[room] if folder == room else ''))
     return '\n'.join([
-        '# Python API', '', 'The [public interface](interface.md) is stable. The other pages document the '
+        '# Python API', '', 'The [public interface](interface.md) is stable. The other pages '
+                            'document the '
         'modules behind it, for extensions and for research; they may change with any release.', '',
         '| page | content |', '|---|---|',
-        *(f'| [{name.replace("_", ".", 1) if name not in ("interface", "base") else name}]({name}.md) | {text} |'
+        *(f'| '
+          f'[{name.replace("_", ".", 1) if name not in ("interface", "base") else name}]({name}.md) | {text} |'
           for name, text in rows),
         '', '```{toctree}', ':hidden:', ':maxdepth: 1', '', *names, '```', ''])

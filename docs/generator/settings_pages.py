@@ -16,8 +16,10 @@ def settings_pages():
 def parameters():
     """All settings of the pipeline, one table per stage."""
     lines = ['# Parameters', '',
-             'Every setting of the pipeline, for parameter files (`--params`), `settings=` in Python and '
-             'ROS parameters. {doc}`/guides/own_recording` shows how to set them. Nodes read them once, '
+             'Every setting of the pipeline, for parameter files (`--params`), `settings=` in '
+             'Python and '
+             'ROS parameters. {doc}`/guides/own_recording` shows how to set them. Nodes read them '
+             'once, '
              'when they start; those marked *live* may change while a node runs.', '']
     rows = to_reference(Settings()).splitlines()
     head, body = rows[:2], rows[2:]
@@ -38,7 +40,8 @@ def parameters():
 
 def drivers():
     """All settings of a drivers file, one table per transport, framing and device."""
-    lines = ['# Drivers file', '', 'Every setting of a drivers file. {doc}`/guides/connect_sensors` '
+    lines = ['# Drivers file', '', 'Every setting of a drivers file. '
+                                   '{doc}`/guides/connect_sensors` '
              'explains what they are for.', '']
     for group, settings in settings_by_kind().items():
         lines += [f'## {group or "Every device"}', '', to_reference(settings, live=False)]
@@ -49,7 +52,8 @@ def doubts():
     """The reasons of an ambiguous pose."""
     return '\n'.join(
         ['# Reasons for an ambiguous pose', '', 'A pose is `ambiguous` while at least one of these '
-         'reasons applies. They are listed in the field `doubts` of a `Track` message, in the column '
+         'reasons applies. They are listed in the field `doubts` of a `Track` message, in the '
+         'column '
          '`doubts` of `poses.csv`, and with the number of poses in `summary.json`. '
          '{doc}`/concepts/uncertainty` explains what the flag promises.', '',
          '| reason | meaning |', '|---|---|',
@@ -58,8 +62,10 @@ def doubts():
 
 def archive_tables():
     """The columns of an archive."""
-    lines = ['# Tables of an archive', '', 'Columns of the Parquet tables that `mag-tracking archive` '
-             'writes ({doc}`/guides/archive`). Unknown values are null. The unit and the meaning of each '
+    lines = ['# Tables of an archive', '', 'Columns of the Parquet tables that `mag-tracking '
+                                           'archive` '
+             'writes ({doc}`/guides/archive`). Unknown values are null. The unit and the meaning '
+             'of each '
              'column are also stored in the metadata of the files.', '']
     for table, columns in TABLES.items():
         lines += [f'## {table}', '', '| column | unit | meaning |', '|---|---|---|',

@@ -18,7 +18,8 @@ RATES = {
     'field_readings_calibrated': ('one per batch', 'Calibrated readings of many sensors.'),
     'calibration_state': ('1 Hz and on change',
                           'Background, noise, orientation and clock offset of each sensor.'),
-    'network_frame': (FRAMES, 'Samples of all sensors within one period, with the detection state.'),
+    'network_frame': (FRAMES, 'Samples of all sensors within one period, with the detection '
+    'state.'),
     'detection_node/detections': (EVENT, 'Onset and release of each detection.'),
     'detection_node/events': (EVENT, 'A pass as described by a single sensor.'),
     'tracker_node/pose': (FRAMES + ' and track', 'Published pose of each track.'),
@@ -54,9 +55,11 @@ def topic_page():
     """Markdown."""
     lines = ['# Topics, services and messages', '',
              'Relative names resolve in the namespace of the node; every name can be remapped. '
-             '`~/pose` of the tracker is `tracker_node/pose` below. Inputs are subscribed best-effort '
+             '`~/pose` of the tracker is `tracker_node/pose` below. Inputs are subscribed '
+             'best-effort '
              '(matches both kinds), or reliable with the parameter `reliable_input`.', '',
-             'RELIABLE, BEST_EFFORT, VOLATILE and TRANSIENT_LOCAL are the QoS policies of DDS; *depth* is '
+             'RELIABLE, BEST_EFFORT, VOLATILE and TRANSIENT_LOCAL are the QoS policies of DDS; '
+             '*depth* is '
              'the length of the queue.', '']
     for name, publishers, services in graph():
         lines += [f'## {name}', '', '| publishes | type | QoS | rate | content |', '|---|---|---|---|---|']
