@@ -24,15 +24,15 @@ PRIVATE = ('core', '__main__')
 
 
 def python_pages():
-    """{file name: Markdown}: an overview, the public interface, the base modules, a page a folder."""
+    """{file name: Markdown}: overview, public interface, base modules, one page per folder."""
     pages = {'python/index.md': overview(), 'python/interface.md': interface(),
              'python/base.md': page('Base modules', 'Records, settings, geometry and errors, for '
                                                     'all '
                                     'other modules.', [f'mag_tracking.{m}' for m in BASE])}
-    for room, text in ROOMS.items():
+    for room in ROOMS:
         for folder, modules in folders_of(room).items():
             pages[f'python/{folder.replace("/", "_")}.md'] = page(
-                folder.replace('/', '.'), text if folder == room else '', modules)
+                folder.replace('/', '.'), description_of(folder), modules)
     return pages
 
 
@@ -47,6 +47,14 @@ def folders_of(room):
         folder = str(path.parent.relative_to(PACKAGE))
         found.setdefault(folder, []).append('.'.join(('mag_tracking', *parts)))
     return found
+
+
+def description_of(folder):
+    """What is in a folder, in one sentence."""
+    if folder in ROOMS:
+        return ROOMS[folder]
+    tree = ast.parse((PACKAGE / folder / '__init__.py').read_text(encoding='utf-8'))
+    return ast.get_docstring(tree).splitlines()[0]
 
 
 def is_documented(path):
@@ -92,13 +100,12 @@ def overview():
     for room in ROOMS:
         for folder in folders_of(room):
             names.append(folder.replace('/', '_'))
-            rows.append((names[-1], ROOMS[room] if folder == room else ''))
+            rows.append((names[-1], description_of(folder)))
     return '\n'.join([
-        '# Python API', '', 'The [public interface](interface.md) is stable. The other pages '
-                            'document the '
-        'modules behind it, for extensions and for research; they may change with any release.', '',
+        '# Python API', '',
+        'The [public interface](interface.md) is stable. The other pages document the modules '
+        'behind it, for extensions and for research; they may change with any release.', '',
         '| page | content |', '|---|---|',
-        *(f'| '
-          f'[{name.replace("_", ".", 1) if name not in ("interface", "base") else name}]({name}.md) | {text} |'
+        *(f'| [{name.replace("_", ".", 1)}]({name}.md) | {text} |'
           for name, text in rows),
         '', '```{toctree}', ':hidden:', ':maxdepth: 1', '', *names, '```', ''])

@@ -47,7 +47,8 @@ SERVICES = {
     'survey': 'Estimate orientations and clock offsets; optionally save the network file.',
     'pause': 'Pause the replay.', 'resume': 'Resume the replay.',
     'seek': 'Continue the replay at an offset from its beginning.'}
-STANDARD = re.compile('describe_parameters|get_parameter|list_parameters|set_parameters|change_state|'
+STANDARD = re.compile('describe_parameters|get_parameter|list_parameters|set_parameters|'
+                      'change_state|'
                       'get_state|get_available|get_transition|type_description')
 
 
@@ -62,7 +63,8 @@ def topic_page():
              '*depth* is '
              'the length of the queue.', '']
     for name, publishers, services in graph():
-        lines += [f'## {name}', '', '| publishes | type | QoS | rate | content |', '|---|---|---|---|---|']
+        lines += [f'## {name}', '', '| publishes | type | QoS | rate | content |',
+                  '|---|---|---|---|---|']
         lines += [f'| `{topic}` | `{kind}` | {qos} | {" | ".join(RATES[topic])} |'
                   for topic, kind, qos in publishers]
         if services:
@@ -71,7 +73,8 @@ def topic_page():
         lines.append('')
     lines += ['## Messages of mag_tracking_msgs', '']
     for path in sorted((MESSAGES / 'msg').glob('*.msg')) + sorted((MESSAGES / 'srv').glob('*.srv')):
-        lines += [f'### {path.stem}', '', '```text', path.read_text(encoding='utf-8').rstrip(), '```', '']
+        lines += [f'### {path.stem}', '', '```text', path.read_text(encoding='utf-8').rstrip(),
+                  '```', '']
     return '\n'.join(lines)
 
 

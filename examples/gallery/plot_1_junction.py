@@ -2,8 +2,8 @@
 A car turns at a junction
 =========================
 
-Two magnetometers stand on both sides of a road. A car arrives from the left and turns into the side
-street between them. This is the recording that ``make demo`` plays over ROS topics.
+Two magnetometers stand on both sides of a road. A car arrives from the left and turns into the
+side street between them. This is the recording that ``make demo`` plays over ROS topics.
 """
 
 # %%
@@ -19,13 +19,13 @@ result = mt.track(DATA / 'vehicles' / 'junction_left_turns_to_rear.mcap', NETWOR
 print(result)
 
 # %%
-# Map of the track: the published poses with 90 % ellipses (circles are ambiguous poses), the smoothed
-# track, the ground truth, and the best hypothesis of each arrival direction.
+# Map of the track: the published poses with 90 % ellipses (circles are ambiguous poses), the
+# smoothed track, the ground truth, and the best hypothesis of each arrival direction.
 figure = result.map_figure()
 
 # %%
-# At first, several arrival directions explain the field. The weight of each one shows when the evidence
-# decides between them.
+# At first, several arrival directions explain the field. The weight of each one shows when the
+# evidence decides between them.
 figure = result.weights_figure()
 
 # %%

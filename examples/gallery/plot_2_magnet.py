@@ -2,8 +2,8 @@
 A magnet moves past sixteen sensors
 ===================================
 
-A cylinder magnet of 10 mm is moved past sixteen real three-axis sensors. An optical system measured the
-true poses. The measurements come as a table, not as a recording.
+A cylinder magnet of 10 mm is moved past sixteen real three-axis sensors. An optical system
+measured the true poses. The measurements come as a table, not as a recording.
 """
 
 # %%
@@ -24,8 +24,8 @@ recording, network, n_readings = import_pose_table(
 print(n_readings, 'readings of', len(mt.read_network(network)), 'sensors')
 
 # %%
-# ``target='magnet'`` selects six degrees of freedom: position and direction of the moment. The rotation
-# about the moment is not observable; it is flagged and gets the variance π².
+# ``target='magnet'`` selects six degrees of freedom: position and direction of the moment. The
+# rotation about the moment is not observable; it is flagged and gets the variance π².
 result = mt.track(recording, network, target='magnet')
 errors = result.errors()
 print(f'position: {1e3 * errors["position_mean"]:.2f} mm on average')

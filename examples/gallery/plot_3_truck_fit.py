@@ -2,8 +2,9 @@
 Fit of a truck
 ==============
 
-On a straight road, a batch fit of the whole pass is the most accurate estimate. A vehicle is a row of
-one to four dipoles at constant velocity; the number of dipoles is selected by an information criterion.
+On a straight road, a batch fit of the whole pass is the most accurate estimate. A vehicle is a row
+of one to four dipoles at constant velocity; the number of dipoles is selected by an information
+criterion.
 """
 
 # %%
@@ -23,8 +24,8 @@ print(f'speed {chosen.speed[0]:.2f} ± {chosen.speed[1]:.2f} m/s, '
       f'length {chosen.length[0]:.1f} ± {chosen.length[1]:.1f} m')
 
 # %%
-# Measured (dots) and fitted field (lines). 90 % of the measurements should lie within the bands, which
-# include what the model does not describe.
+# Measured (dots) and fitted field (lines). 90 % of the measurements should lie within the bands,
+# which include what the model does not describe.
 figure = pass_figure(chosen, 'truck')
 
 # %%

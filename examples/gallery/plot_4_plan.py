@@ -2,8 +2,8 @@
 Plan a network
 ==============
 
-How accurately can a network locate a vehicle, where does it detect one, and where would one more sensor
-help most? Cramér-Rao bounds answer this before the first hole is drilled.
+How accurately can a network locate a vehicle, where does it detect one, and where would one more
+sensor help most? Cramér-Rao bounds answer this before the first hole is drilled.
 """
 
 # %%
@@ -20,8 +20,8 @@ for lane in plan.lanes:
           f'{lane.pass_std[:, 0].min():.3f} m')
 
 # %%
-# Position bound of a car that passes, by the whole pass. No unbiased estimator is more accurate; real
-# vehicles are not point dipoles and are tracked several times less accurately.
+# Position bound of a car that passes, by the whole pass. No unbiased estimator is more accurate;
+# real vehicles are not point dipoles and are tracked several times less accurately.
 figure = position_figure(plan)
 
 # %%

@@ -2,8 +2,8 @@
 Published figures: detection and bounds (MITRE12)
 =================================================
 
-Detection probability of one and five sensors and Cramér-Rao bounds, after Slater and Jacyna. The script
-``examples/mitre12.py`` prints which published numbers are reproduced and which are not.
+Detection probability of one and five sensors and Cramér-Rao bounds, after Slater and Jacyna. The
+script ``examples/mitre12.py`` prints which published numbers are reproduced and which are not.
 """
 
 # %%

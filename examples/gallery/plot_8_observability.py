@@ -2,8 +2,9 @@
 Published figures: observability (T10)
 ======================================
 
-What one and two magnetometers can observe of a target that passes at constant velocity, after Wahlström
-(2010), chapter 5. ``examples/t10_observability.py`` prints the comparison with the published numbers.
+What one and two magnetometers can observe of a target that passes at constant velocity, after
+Wahlström (2010), chapter 5. ``examples/t10_observability.py`` prints the comparison with the
+published numbers.
 """
 
 # %%

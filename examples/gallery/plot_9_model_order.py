@@ -2,8 +2,8 @@
 Published figures: number of dipoles (TSP14)
 ============================================
 
-Normalised cost of the fit over the number of dipoles for the bundled passes, as in Figure 7 of Wahlström
-and Gustafsson (2014).
+Normalised cost of the fit over the number of dipoles for the bundled passes, as in Figure 7 of
+Wahlström and Gustafsson (2014).
 """
 
 # %%
