@@ -24,7 +24,6 @@ extensions = [
     'numpydoc',
     'sphinx.ext.autodoc',
     'sphinx.ext.doctest',
-    'sphinx.ext.mathjax',
     'sphinx_copybutton',
     'sphinx_design',
     'sphinx_gallery.gen_gallery',
@@ -35,7 +34,7 @@ source_suffix = {'.rst': 'restructuredtext', '.md': 'markdown'}
 nitpicky = False
 
 write_pages()
-myst_enable_extensions = ['colon_fence', 'deflist', 'dollarmath', 'substitution']
+myst_enable_extensions = ['colon_fence', 'deflist', 'substitution']
 myst_heading_anchors = 3
 # Every number in the text is one of `benchmarks/latest.json`: {{ bench['replay']['...'] }}.
 myst_substitutions = {'bench': benchmark_figures()}
@@ -71,8 +70,6 @@ html_static_path = ['_static']
 html_css_files = ['site.css']
 html_show_sourcelink = False
 html_copy_source = False
-# MathJax comes from the network; the pages read without it.
-mathjax_path = 'https://cdn.jsdelivr.net/npm/mathjax@3/es5/tex-mml-chtml.js'
 copybutton_prompt_text = r'\$ |>>> |\.\.\. '
 copybutton_prompt_is_regexp = True
 linkcheck_anchors = False

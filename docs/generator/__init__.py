@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from generator.benchmark_page import benchmark_figures, benchmark_page
+from generator.benchmark_page import benchmark_figures, benchmark_page, draw_situations
 from generator.command_page import command_page
 from generator.python_pages import python_pages
 from generator.settings_pages import settings_pages
@@ -26,3 +26,4 @@ def write_pages():
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.exists() or path.read_text(encoding='utf-8') != text:
             path.write_text(text, encoding='utf-8')
+    draw_situations(DOCS / 'images' / 'situations.png')

@@ -4,6 +4,8 @@ import ast
 import json
 from pathlib import Path
 
+from matplotlib.figure import Figure
+
 ROOT = Path(__file__).resolve().parents[2]
 LATEST = ROOT / 'benchmarks' / 'latest.json'
 
@@ -37,6 +39,27 @@ def description_of(name):
     return module, '\n\n'.join(paragraphs).removeprefix('`make bench`: ')
 
 
+def draw_situations(path):
+    """Bar chart: share of wrong poses in each situation, with its aim."""
+    figures = json.loads(LATEST.read_text(encoding='utf-8'))['situations']['figures']
+    rows = [(name.removesuffix(': wrong'), f) for name, f in figures.items()
+            if name.endswith(': wrong') and not name.startswith('all ')
+            and ' of 0;' not in f['note']]
+    rows.sort(key=lambda row: row[1]['value'])
+    figure = Figure(figsize=(8.0, 0.22 * len(rows) + 1.0), layout='constrained')
+    axes = figure.add_subplot(
+        xlabel='share of unflagged poses that are wrong [%]', xlim=(0.0, 101.0), xscale='symlog',
+        xticks=(0, 1, 2, 5, 10, 20, 50, 100), xticklabels=(0, 1, 2, 5, 10, 20, 50, 100))
+    colours = ['#0072b2' if is_met(f) else '#d55e00' for _, f in rows]
+    axes.barh(range(len(rows)), [f['value'] for _, f in rows], color=colours)
+    axes.plot([f['aim'] for _, f in rows], range(len(rows)), 'k|', ms=8, label='aim')
+    axes.set_yticks(range(len(rows)), [name for name, _ in rows], fontsize=8)
+    axes.set_ylim(-0.6, len(rows) - 0.4)
+    axes.grid(axis='x', alpha=0.3)
+    axes.legend(loc='lower right')
+    figure.savefig(path, dpi=110)
+
+
 def benchmark_page():
     """Markdown: one section per benchmark."""
     latest = json.loads(LATEST.read_text(encoding='utf-8'))
@@ -54,6 +77,11 @@ def benchmark_page():
              'imperfect sensors. *Wrong* poses carry no flag, and are more than 2 m and more than '
              'three '
              'standard deviations from every vehicle.', '']
+    lines += ['![Wrong poses in each situation](images/situations.png)', '',
+              '*Situations that no model assumes (`bench.situations`): share of the unflagged '
+              'poses '
+              'that are wrong. Blue: the aim is met. Situations without an unflagged pose are not '
+              'shown.*', '']
     for name, run in sorted(latest.items()):
         module, text = description_of(name)
         text = text[:1].upper() + text[1:]

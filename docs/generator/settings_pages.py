@@ -3,7 +3,7 @@
 from mag_tracking.drivers.configuration import settings_by_kind
 from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.recording.archive_tables import TABLES
-from mag_tracking.settings import flatten, to_reference
+from mag_tracking.settings import flatten
 from mag_tracking.stages.track.doubts import MEANINGS
 
 
@@ -14,22 +14,18 @@ def settings_pages():
 
 
 def parameters():
-    """All settings of the pipeline, one table per stage."""
+    """All settings of the pipeline, by stage."""
     lines = ['# Parameters', '',
              'Every setting of the pipeline, for parameter files (`--params`), `settings=` in '
              'Python and '
              'ROS parameters. {doc}`/guides/own_recording` shows how to set them. Nodes read them '
              'once, '
              'when they start; those marked *live* may change while a node runs.', '']
-    rows = to_reference(Settings()).splitlines()
-    head, body = rows[:2], rows[2:]
     groups = {}
-    for row in body:
-        name = row.split('`')[1]
-        group = '.'.join(name.split('.')[:-1])
-        groups.setdefault(group, []).append(row)
+    for parameter in flatten(Settings()):
+        groups.setdefault(parameter.name.rpartition('.')[0], []).append(parameter)
     for group, some in groups.items():
-        lines += [f'## {group}', '', *head, *some, '']
+        lines += [f'## {group}', '', *(line for p in some for line in entry(p))]
     default = {p.name: p.value for p in flatten(Settings())}
     lines += ['## Defaults for a magnet', '', '`target: magnet` (`--target magnet`) changes these '
               'defaults.', '', '| parameter | vehicle | magnet |', '|---|---|---|']
@@ -39,13 +35,23 @@ def parameters():
 
 
 def drivers():
-    """All settings of a drivers file, one table per transport, framing and device."""
+    """All settings of a drivers file, by transport, framing and device."""
     lines = ['# Drivers file', '', 'Every setting of a drivers file. '
                                    '{doc}`/guides/connect_sensors` '
              'explains what they are for.', '']
     for group, settings in settings_by_kind().items():
-        lines += [f'## {group or "Every device"}', '', to_reference(settings, live=False)]
+        lines += [f'## {group or "Every device"}', '',
+                  *(line for p in flatten(settings) for line in entry(p))]
     return '\n'.join(lines)
+
+
+def entry(p):
+    """Definition list entry of a parameter."""
+    facts = [f'default `{p.value!r}`', p.unit, *(
+        [f'{p.range[0]:g} to {p.range[1]:g}'] if p.range else
+        [f'one of {", ".join(f"`{c}`" for c in p.choices)}'] if p.choices else []),
+        'live' if p.live else '']
+    return [f'`{p.name}`', f': {"; ".join(f for f in facts if f)}', '', f'  {p.doc}', '']
 
 
 def doubts():

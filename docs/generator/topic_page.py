@@ -41,7 +41,7 @@ RATES = {
     '/tf': (FRAMES + ' and track, with `publish_tf`', 'Transform to each unambiguous target.'),
     '/tf_static': ('on change', 'Transforms to the sensors.'),
     '/diagnostics': ('1 Hz', 'Rates, losses, rejections, latency and faults, with advice.'),
-    '/clock': ('100 Hz', 'Time of a replay.')}
+    '/clock': ('50 to 200 Hz', 'Time of a replay.')}
 SERVICES = {
     'calibrate': 'Learn the backgrounds of the named sensors again (empty: of all).',
     'survey': 'Estimate orientations and clock offsets; optionally save the network file.',
@@ -59,13 +59,11 @@ def topic_page():
              '`~/pose` of the tracker is `tracker_node/pose` below. Inputs are subscribed '
              'best-effort '
              '(matches both kinds), or reliable with the parameter `reliable_input`.', '',
-             'RELIABLE, BEST_EFFORT, VOLATILE and TRANSIENT_LOCAL are the QoS policies of DDS; '
-             '*depth* is '
-             'the length of the queue.', '']
+             'Publishers are reliable; *latched* is the durability `TRANSIENT_LOCAL`, *depth* the '
+             'length of the queue.', '']
     for name, publishers, services in graph():
-        lines += [f'## {name}', '', '| publishes | type | QoS | rate | content |',
-                  '|---|---|---|---|---|']
-        lines += [f'| `{topic}` | `{kind}` | {qos} | {" | ".join(RATES[topic])} |'
+        lines += [f'## {name}', '', '| publishes | content | rate | QoS |', '|---|---|---|---|']
+        lines += [f'| `{topic}`<br>`{kind}` | {RATES[topic][1]} | {RATES[topic][0]} | {qos} |'
                   for topic, kind, qos in publishers]
         if services:
             lines += ['', '| service | type | effect |', '|---|---|---|',
@@ -109,8 +107,9 @@ def publishers_of(node, sensors):
                 or node.get_name() == 'replay_node' and topic not in ('/clock', '/diagnostics'):
             continue
         qos = publisher.qos_profile
-        rows[topic] = (topic, type_of(publisher.msg_type), f'{qos.reliability.name}, '
-                       f'{qos.durability.name}, depth {qos.depth}')
+        assert qos.reliability.name == 'RELIABLE'
+        latched = 'latched, ' if qos.durability.name == 'TRANSIENT_LOCAL' else ''
+        rows[topic] = (topic, type_of(publisher.msg_type), f'{latched}depth {qos.depth}')
     return sorted(rows.values())
 
 
@@ -122,5 +121,5 @@ def services_of(node):
 
 def type_of(message):
     """The ROS name of a message or service class."""
-    package, kind, *_ = message.__module__.split('.')
-    return f'{package}/{kind}/{message.__name__}'
+    package, *_ = message.__module__.split('.')
+    return f'{package}/{message.__name__}'

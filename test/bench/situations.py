@@ -53,10 +53,8 @@ def row(name, found):
 def keep(figures, name, found):
     """Record the share of wrong poses of a situation; whether its aim is missed."""
     sure, wrong = sum(v.n_sure for v in found), sum(v.n_wrong for v in found)
-    if not sure:
-        return False
     n = sum(len(v.wrong) for v in found)
-    return figures.keep(f'{name}: wrong', 100.0 * wrong / sure, '%',
+    return figures.keep(f'{name}: wrong', 100.0 * wrong / max(sure, 1), '%',
                         100.0 * SITUATIONS[name].aim, note=f'{wrong} of {sure}; {n} poses in all')
 
 
