@@ -28,7 +28,7 @@ from scipy.optimize import brentq
 
 from mag_tracking.inference.crlb import bound, information, observability
 from mag_tracking.inference.matched_filter import (
-    any_detects,
+    any_detection_probability,
     deflection,
     detection_probability,
     noise_spectrum,
@@ -105,13 +105,13 @@ def detection(m, cpa, starts, sensors, scale=AS_PUBLISHED):
 def at_least_once(m, cpa, sensors=ONE, phase=0.0, scale=AS_PUBLISHED):
     """Probability (6) over a whole drive; `phase` shifts where the periods begin, in periods."""
     starts = SPEED * PERIOD * (np.arange(-20, 20) + phase)
-    return any_detects(detection(m, cpa, starts, sensors, scale))
+    return any_detection_probability(detection(m, cpa, starts, sensors, scale))
 
 
 def most_in_a_period(m, cpa, sensors=ONE, scale=AS_PUBLISHED):
     """The largest P_D of one period (5), wherever it begins."""
     starts = np.linspace(-60.0, 60.0, 961)
-    return any_detects(detection(m, cpa, starts, sensors, scale), axis=-1).max()
+    return any_detection_probability(detection(m, cpa, starts, sensors, scale), axis=-1).max()
 
 
 def cpa_where(probability, wanted):
@@ -155,7 +155,7 @@ def pass_figure(sensors, title):
     for axes, (vehicle, cpas) in zip(figure.subplots(1, 2, sharey=True), CPAS.items(),
                                      strict=True):
         for cpa in cpas:
-            p = any_detects(detection(moment(vehicle), cpa, starts, sensors), axis=-1)
+            p = any_detection_probability(detection(moment(vehicle), cpa, starts, sensors), axis=-1)
             axes.plot(starts, p, label=f'{cpa} m')
         axes.plot(sensors, np.full(len(sensors), -0.045), 'k^', ms=7, label='sensor')
         axes.set(title=vehicle, xlabel=FROM_WHERE, ylim=(-0.08, 1.03), xlim=(-80.0, 80.0))

@@ -160,7 +160,7 @@ def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, flo
     return float(np.arctan2(vy, vx)), float(np.sqrt(g @ covariance[:2, :2] @ g))
 
 
-def moved_along(path: FloatArray, seconds: float) -> FloatArray:
+def propagated_path(path: FloatArray, seconds: float) -> FloatArray:
     """Paths (..., 6 or more) of position, velocity and constants, starting `seconds` later."""
     moved: FloatArray = path.copy()
     moved[..., :3] += seconds * path[..., 3:6]

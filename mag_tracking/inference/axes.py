@@ -50,7 +50,7 @@ def smallest_pivots(y: FloatArray, C: FloatArray) -> FloatArray:
     return out
 
 
-def are_covariances(y: FloatArray, C: FloatArray) -> BoolArray:
+def are_valid_covariances(y: FloatArray, C: FloatArray) -> BoolArray:
     """Whether covariances are finite, symmetric and positive definite, over the axes present.
 
     The arrays are as for `whitened_energy`. Returns (n,).

@@ -12,7 +12,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 
 
-def widened_to_cover(P: FloatArray, difference: FloatArray) -> FloatArray:
+def inflated_to_cover(P: FloatArray, difference: FloatArray) -> FloatArray:
     """Covariance `P` (n, n) of a state, widened until its horizontal position covers another.
 
     The state begins with x and y [m]. Along their `difference` (k,), k <= n, from the other

@@ -26,7 +26,7 @@ from mag_tracking.inference.matrices import (
 RANK_TOLERANCE = 1e-12
 """An eigenvalue below this share of the largest one counts as zero."""
 
-_SHARE = 1e-6
+_KERNEL_TOLERANCE = 1e-6
 """A state takes part in a kernel that reaches further than this along its axis."""
 
 _K_DIPOLE = 1e-7
@@ -98,7 +98,7 @@ def observability(information: ArrayLike, names: Sequence[str],
     w, V = np.linalg.eigh(scale[:, None] * J * scale)
     zero = w <= RANK_TOLERANCE * w[-1]
     return Observability(w, np.inf if zero.any() else w[-1] / w[0], scale[:, None] * V[:, zero],
-                         tuple(names[i] for i in np.flatnonzero(_takes_part(V[:, zero]))))
+                         tuple(names[i] for i in np.flatnonzero(_is_in_kernel(V[:, zero]))))
 
 
 def bound(information: ArrayLike, prior: ArrayLike | None = None) -> FloatArray:
@@ -130,7 +130,7 @@ def bound(information: ArrayLike, prior: ArrayLike | None = None) -> FloatArray:
     unit_diagonal('prior', prior[free])
     scale, root, kernel = _inverse_root(J[free] + prior[free])
     P = root @ root.T / (scale[:, None] * scale)
-    lost = _takes_part(kernel)
+    lost = _is_in_kernel(kernel)
     P[lost] = P[:, lost] = np.nan
     P[lost, lost] = np.inf
     covariance = np.zeros(J.shape)
@@ -168,8 +168,8 @@ def marginal(information: ArrayLike, keep: ArrayLike) -> FloatArray:
     # Not by subtraction: others that are hardly observable would leave rounding that looks
     # like information. First the directions (columns of U) that the kernel does not reach ...
     U, reach, _ = np.linalg.svd(kernel[kept])
-    U = U[:, np.count_nonzero(reach > _SHARE):]
-    U = np.where(np.linalg.norm(U, axis=1, keepdims=True) > _SHARE, U, 0.0)
+    U = U[:, np.count_nonzero(reach > _KERNEL_TOLERANCE):]
+    U = np.where(np.linalg.norm(U, axis=1, keepdims=True) > _KERNEL_TOLERANCE, U, 0.0)
     # ... then the inverse of the bound in them, U (U'PU)^-1 U'.
     R = triangular_factor((U.T @ root[kept]).T)
     W = scale[kept, None] * np.linalg.solve(R.T, U.T).T
@@ -308,7 +308,7 @@ def _inverse_root(J: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return scale, V[:, ~zero] / np.sqrt(w[~zero]), V[:, zero]
 
 
-def _takes_part(kernel: FloatArray) -> BoolArray:
+def _is_in_kernel(kernel: FloatArray) -> BoolArray:
     """Which states (n,) an orthonormal kernel basis (n, k) reaches."""
-    reached: BoolArray = np.linalg.norm(kernel, axis=1) > _SHARE
+    reached: BoolArray = np.linalg.norm(kernel, axis=1) > _KERNEL_TOLERANCE
     return reached

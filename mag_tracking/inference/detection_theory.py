@@ -30,7 +30,7 @@ def detection_probability(snr: float | FloatArray, threshold: float | FloatArray
     return cast(FloatArray, 1.0 - chndtr(threshold, degrees_of_freedom, snr))
 
 
-def missed_probability(probability: ArrayLike, run: int) -> FloatArray:
+def missed_detection_probability(probability: ArrayLike, run: int) -> FloatArray:
     """Probability that no `run` frames in a row detect.
 
     Parameters

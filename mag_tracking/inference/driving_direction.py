@@ -24,7 +24,7 @@ MAX_CONFIDENCE = 0.98
 """The sign of the correlation is exact for a target at the height of the sensor only. Half its
 lateral distance above it 0.6 % of random moments turn the other way, the whole distance 2.2 %."""
 
-UPRIGHT = 0.2
+MAX_VERTICAL_SHARE = 0.2
 """Share of the vertical field that a tilted horizontal axis may miss."""
 
 
@@ -215,7 +215,8 @@ def horizontal_field(field: FloatArray, R_ws: FloatArray) -> FloatArray:
         missing = np.isnan(field[:, a])
         for b in range(2):
             part = R_ws[b, a] * field[:, a]
-            out[:, b] += np.where(missing, 0.0 if abs(R_ws[b, a]) < UPRIGHT else np.nan, part)
+            out[:, b] += np.where(
+                missing, 0.0 if abs(R_ws[b, a]) < MAX_VERTICAL_SHARE else np.nan, part)
     return out
 
 

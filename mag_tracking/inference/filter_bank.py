@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference import core
 
-_NEGLIGIBLE = np.log(100.0)
+_NEGLIGIBLE_LOG_RATIO = np.log(100.0)
 """Hypotheses lighter than the heaviest by more than this have no say in which is published."""
-_SINGULAR = 1e-15
+_SINGULAR_TOLERANCE = 1e-15
 """A variance that is less than this share of the largest is none, as in `numpy.linalg.pinv`."""
 
 
@@ -51,7 +51,7 @@ class FilterBank:
     and of a sensor that is missing."""
 
     @classmethod
-    def of_targets(cls, x: FloatArray, P: FloatArray, label: IntArray, n_sensors: int,
+    def from_targets(cls, x: FloatArray, P: FloatArray, label: IntArray, n_sensors: int,
                    background_std: float, own_covariance: FloatArray | None = None,
                    kind: IntArray | None = None) -> 'FilterBank':
         """A bank with equal weights from target states alone.
@@ -87,9 +87,9 @@ class FilterBank:
         would be a lottery where many neighbours share the weight.
         """
         return core.best(self.x, self.P, self.log_w, _classes(self.label), _classes(self.kind),
-                         _NEGLIGIBLE)
+                         _NEGLIGIBLE_LOG_RATIO)
 
-    def of_target(self, i: int, n_one: int) -> 'FilterBank':
+    def extract_target(self, i: int, n_one: int) -> 'FilterBank':
         """The same hypotheses with the states of target `i` of several alone, each of which has
         `n_one` states; of a single target it is the bank itself.
         """
@@ -128,7 +128,7 @@ class FilterBank:
         """Total weight of the hypotheses of the mask `rows` (n_hyp,)."""
         return float(np.exp(log_sum_exp(self.log_w[rows]))) if rows.any() else 0.0
 
-    def outweigh(self, n: int, share: float) -> bool:
+    def is_concentrated_in(self, n: int, share: float) -> bool:
         """Whether the `n` heaviest hypotheses have at least this share of the weight."""
         return bool(np.exp(np.sort(self.log_w)[-n:]).sum() >= share)
 
@@ -148,7 +148,7 @@ class FilterBank:
             variance, axes = np.linalg.eigh(C)
             along = np.einsum('ni,nij->nj', difference, axes)
             # Where nothing varies there is nothing to be apart by.
-            varies = variance > _SINGULAR * variance[:, -1:]
+            varies = variance > _SINGULAR_TOLERANCE * variance[:, -1:]
             z = (along**2 / np.where(varies, variance, np.inf)).sum(axis=1)
         apart: BoolArray = z > distance**2
         return apart
@@ -174,7 +174,7 @@ class FilterBank:
         rows = np.flatnonzero(mask)
         gone = len(mask) - len(rows)
         if gone:
-            self.x, self.P = (_moved_up(a, rows) for a in (self.x, self.P))
+            self.x, self.P = (_compacted(a, rows) for a in (self.x, self.P))
             self.log_w = self.log_w[mask] - log_sum_exp(self.log_w[mask])
             for name in ('label', 'kind', 'origin', 'nis'):
                 setattr(self, name, getattr(self, name)[mask])
@@ -204,7 +204,7 @@ def _classes(labels: IntArray) -> IntArray:
     return classes
 
 
-def _moved_up(a: FloatArray, rows: IntArray) -> FloatArray:
+def _compacted(a: FloatArray, rows: IntArray) -> FloatArray:
     """The `rows` (n,), ascending, of an array, at its beginning: what is new takes longer.
 
     A new array, though, where the rest would hold more memory than they do.

@@ -10,17 +10,17 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.iron import Iron, hard_and_soft_iron
 from mag_tracking.inference.log_normal_classes import UNKNOWN
 
-BETWEEN_STD = 20.0
+PASS_TO_PASS_STD = 20.0
 """[A m^2] Moments of one vehicle differ by this between passes, on top of what their fits state
 (T10 Table 6.9: 14, 18 and 21 on the three axes)."""
 
-MIN_SEPARATION = np.deg2rad(45.0)
+MIN_HEADING_SEPARATION = np.deg2rad(45.0)
 """[rad] Headings that are this far apart tell hard iron from soft iron."""
 
-SAME_HEADING = np.deg2rad(10.0)
+HEADING_TOLERANCE = np.deg2rad(10.0)
 """[rad] A vehicle that is enrolled at one heading is compared at that heading only."""
 
-LEVEL = 0.01
+SIGNIFICANCE_LEVEL = 0.01
 """A moment that is less probable than this for every vehicle is of an unknown one."""
 
 
@@ -58,9 +58,9 @@ class EnrolledVehicle:
         ----------
         [T10]_ eq. (6.16); [TSP14]_ eq. (15), (16).
         """
-        between = BETWEEN_STD**2 * np.eye(3)
+        between = PASS_TO_PASS_STD**2 * np.eye(3)
         if self.iron is None:
-            if abs(_turn(heading - self.heading)) > SAME_HEADING:
+            if abs(_wrapped(heading - self.heading)) > HEADING_TOLERANCE:
                 return None
             return self.moment, self.covariance + between
         c, s = np.cos(heading), np.sin(heading)
@@ -111,14 +111,14 @@ def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: Flo
     moments, headings = np.asarray(moments, dtype=float), np.asarray(headings, dtype=float)
     if not len(moments):
         raise ValueError(f'{name}: a vehicle is enrolled by at least one pass')
-    spread = np.asarray(covariances, dtype=float) + BETWEEN_STD**2 * np.eye(3)
-    apart = np.abs(_turn(headings[:, None] - headings)).max()
-    if apart >= MIN_SEPARATION:
+    spread = np.asarray(covariances, dtype=float) + PASS_TO_PASS_STD**2 * np.eye(3)
+    apart = np.abs(_wrapped(headings[:, None] - headings)).max()
+    if apart >= MIN_HEADING_SEPARATION:
         iron = hard_and_soft_iron(moments, headings, induction, spread)
         return EnrolledVehicle(name, iron, np.nan, np.full(3, np.nan), np.full((3, 3), np.nan))
-    if not np.isfinite(moments).all() or apart > SAME_HEADING:
+    if not np.isfinite(moments).all() or apart > HEADING_TOLERANCE:
         raise ValueError(f'{name}: expected finite moments at one heading, or at headings that '
-                         f'are {np.rad2deg(MIN_SEPARATION):.0f} degrees apart; these are '
+                         f'are {np.rad2deg(MIN_HEADING_SEPARATION):.0f} degrees apart; these are '
                          f'{np.rad2deg(apart):.0f} degrees apart')
     information = np.linalg.inv(spread)
     covariance = np.linalg.inv(information.sum(axis=0))
@@ -158,11 +158,11 @@ def identify(vehicles: Sequence[EnrolledVehicle], moment: FloatArray, covariance
     p = np.exp(np.array(list(log_p.values())) - max(log_p.values()))
     best = max(log_p, key=lambda name: log_p[name])
     return Identification(
-        best if min(distances.values()) <= chdtri(3, LEVEL) else UNKNOWN,
+        best if min(distances.values()) <= chdtri(3, SIGNIFICANCE_LEVEL) else UNKNOWN,
         dict(zip(log_p, (p / p.sum()).tolist(), strict=True)), distances, tuple(others))
 
 
-def _turn(angle: FloatArray | float) -> FloatArray:
+def _wrapped(angle: FloatArray | float) -> FloatArray:
     """The same angle, between -pi and pi."""
     turned: FloatArray = np.angle(np.exp(1j * np.asarray(angle)))
     return turned

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.inference.latest_frames import LatestFrames
+from mag_tracking.inference.sliding_sum import SlidingSum
 
 WINDOW_S = 0.5
 """[s] Latest frames that are tested together."""
@@ -29,7 +29,7 @@ class InnovationConsistency:
         # (2, n_sensors + 1): normalised innovations squared and degrees of freedom, of each sensor
         # and of all.
         self._total = np.zeros((2, n_sensors + 1))
-        self._latest = LatestFrames(WINDOW_S)
+        self._latest = SlidingSum(WINDOW_S)
 
     def add(self, nis: FloatArray, n_axes: FloatArray, stamp_ns: int) -> None:
         """Count a frame.

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import BoolArray, FloatArray
-from mag_tracking.inference.matrices import pseudo_inverse, running_away
+from mag_tracking.inference.matrices import ignoring_overflow, pseudo_inverse
 
 ResidualAndJacobian: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Takes points (n, n_x), returns residuals (n, n_y) and Jacobians (n, n_y, n_x)."""
 
-CORRELATED_S = 0.2
+CORRELATION_TIME_S = 0.2
 """[s] What a model leaves out of a vehicle is alike for so long: a car's length at 20 m/s."""
 
 
@@ -89,7 +89,7 @@ def _damped_step(J: FloatArray, residual: FloatArray, damping: FloatArray) -> Fl
 def _evaluate(residual_and_jacobian: ResidualAndJacobian, x: FloatArray
               ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Residuals, Jacobians and costs; an unusable point costs infinity."""
-    with running_away():
+    with ignoring_overflow():
         residual, J = residual_and_jacobian(x)
         cost = np.einsum('ni,ni->n', residual, residual)
     bad = ~(np.isfinite(cost) & np.isfinite(J).all(axis=(1, 2)))
@@ -116,16 +116,16 @@ def project_out_linear(A: FloatArray, y: FloatArray
         Pseudo-inverse of A'A.
     """
     At = np.swapaxes(A, 1, 2)
-    inverse = pseudo_inverse(At @ A, LINEAR_RANK)
+    inverse = pseudo_inverse(At @ A, LINEAR_RANK_TOLERANCE)
     p = np.einsum('nij,nj->ni', inverse, At @ y)
     return p, y - np.einsum('nyi,ni->ny', A, p), inverse
 
 
-LINEAR_RANK = 1e-11
+LINEAR_RANK_TOLERANCE = 1e-11
 """Dipoles that are almost at one place would cancel each other with moments without bounds."""
 
 
-def correlated_scores(scores: FloatArray, lag: int) -> FloatArray:
+def score_sum_covariance(scores: FloatArray, lag: int) -> FloatArray:
     """Covariance of the sum of scores that are correlated over some neighbours.
 
     Parameters
@@ -149,7 +149,7 @@ def correlated_scores(scores: FloatArray, lag: int) -> FloatArray:
     return S
 
 
-def left_out_covariance(t: Sequence[FloatArray], derivatives: Sequence[FloatArray],
+def model_error_covariance(t: Sequence[FloatArray], derivatives: Sequence[FloatArray],
                         left: Sequence[FloatArray], covariance: FloatArray) -> FloatArray:
     """What must be added to a covariance for what a model leaves out.
 
@@ -172,9 +172,9 @@ def left_out_covariance(t: Sequence[FloatArray], derivatives: Sequence[FloatArra
     excess = np.zeros_like(covariance)
     for times, H, r in zip(t, derivatives, left, strict=True):
         columns = H * scale
-        step = np.median(np.diff(times)) if len(times) > 1 else CORRELATED_S
-        excess += correlated_scores(np.einsum('nai,na->ni', columns, r),
-                                    int(CORRELATED_S / max(step, 1e-9)))
+        step = np.median(np.diff(times)) if len(times) > 1 else CORRELATION_TIME_S
+        excess += score_sum_covariance(np.einsum('nai,na->ni', columns, r),
+                                    int(CORRELATION_TIME_S / max(step, 1e-9)))
         excess -= np.einsum('nai,naj->ij', columns, columns)
     if not np.isfinite(excess).all():
         return np.full_like(covariance, np.nan)

@@ -9,7 +9,7 @@ from scipy.special import chdtri
 from mag_tracking.arrays import FloatArray
 
 UNKNOWN = 'unknown'
-LEVEL = 0.01
+SIGNIFICANCE_LEVEL = 0.01
 """Something that is less probable than this under every class is of an unknown one."""
 
 
@@ -56,5 +56,5 @@ def class_posterior(names: Sequence[str], shares: Sequence[float],
     log_p = np.log(np.array(shares)) - 0.5 * distance - 0.5 * np.log(variance).sum(axis=0)
     p = np.exp(log_p - log_p.max())
     best = int(np.argmax(p))
-    is_known = distance.min() <= chdtri(len(features), LEVEL)
+    is_known = distance.min() <= chdtri(len(features), SIGNIFICANCE_LEVEL)
     return ClassPosterior(names[best] if is_known else UNKNOWN, p / p.sum())

@@ -17,7 +17,7 @@ from scipy.special import ndtr, ndtri
 
 from mag_tracking.arrays import BoolArray, FloatArray
 
-_EDGE = 1e-9
+_BAND_EDGE_TOLERANCE = 1e-9
 """A frequency on the edge of a band belongs to it; it may be off by this share."""
 
 
@@ -46,10 +46,10 @@ def noise_spectrum(frequency: ArrayLike, background: float, resolution: float,
     number, in Hz.
     """
     f = np.abs(np.asarray(frequency, dtype=float))
-    _refuse('frequency', 'numbers', f, np.isnan(f))
+    _raise_for_invalid('frequency', 'numbers', f, np.isnan(f))
     for name, value in (('background', background), ('resolution', resolution)):
-        _refuse(name, 'at least 0 and finite', value, not 0.0 <= value < np.inf)
-    _refuse('bandwidth', 'above 0 and finite', bandwidth, not 0.0 < bandwidth < np.inf)
+        _raise_for_invalid(name, 'at least 0 and finite', value, not 0.0 <= value < np.inf)
+    _raise_for_invalid('bandwidth', 'above 0 and finite', bandwidth, not 0.0 < bandwidth < np.inf)
     steps = resolution**2 / (24.0 * bandwidth)
     if background == 0.0:
         return np.full(f.shape, steps)
@@ -94,21 +94,21 @@ def deflection(B: ArrayLike, sampling_rate: float, spectrum: Callable[[FloatArra
     if B.ndim < 2 or 0 in B.shape[-2:]:
         raise ValueError(f'B needs shape (..., n, n_axes), got {B.shape}')
     missing = np.isnan(B).all(axis=-2)
-    _refuse('B', 'finite, or NaN on a whole axis', B,
+    _raise_for_invalid('B', 'finite, or NaN on a whole axis', B,
             ~np.isfinite(B) & ~missing[..., None, :])
-    _refuse('sampling_rate', 'above 0 and finite', sampling_rate,
+    _raise_for_invalid('sampling_rate', 'above 0 and finite', sampling_rate,
             not 0.0 < sampling_rate < np.inf)
     low, high = band
-    _refuse('band', 'two ascending frequencies, the first at least 0', list(band),
+    _raise_for_invalid('band', 'two ascending frequencies, the first at least 0', list(band),
             not 0.0 <= low < high)
     n = B.shape[-2]
     f = np.arange(n // 2 + 1) * sampling_rate / n
-    kept = (f >= low * (1.0 - _EDGE)) & (f <= high * (1.0 + _EDGE))
+    kept = (f >= low * (1.0 - _BAND_EDGE_TOLERANCE)) & (f <= high * (1.0 + _BAND_EDGE_TOLERANCE))
     if not kept.any():
         raise ValueError(f'{n} samples at {sampling_rate} Hz have no frequency in the band '
                          f'{list(band)} Hz: they are {sampling_rate / n} Hz apart')
     S = np.broadcast_to(np.asarray(spectrum(f[kept]), dtype=float), f[kept].shape)
-    _refuse('spectrum', 'above 0', S, ~(S > 0.0))
+    _raise_for_invalid('spectrum', 'above 0', S, ~(S > 0.0))
     # Negative frequencies are the mirror image; zero and half the rate have none.
     signs = np.where((f == 0.0) | (2 * np.arange(len(f)) == n), 1.0, 2.0)[kept]
     F = np.fft.rfft(np.where(missing[..., None, :], 0.0, B), axis=-2)[..., kept, :]
@@ -133,12 +133,14 @@ def detection_probability(deflection: ArrayLike, false_alarm_probability: ArrayL
     """
     deflection = np.asarray(deflection, dtype=float)
     p_fa = np.asarray(false_alarm_probability, dtype=float)
-    _refuse('deflection', 'at least 0', deflection, deflection < 0.0)
-    _refuse('false_alarm_probability', 'above 0 and below 1', p_fa, ~((p_fa > 0.0) & (p_fa < 1.0)))
+    _raise_for_invalid('deflection', 'at least 0', deflection, deflection < 0.0)
+    _raise_for_invalid('false_alarm_probability', 'above 0 and below 1', p_fa,
+                       ~((p_fa > 0.0) & (p_fa < 1.0)))
     return ndtr(deflection + ndtri(p_fa))
 
 
-def any_detects(probability: ArrayLike, axis: int | tuple[int, ...] | None = None) -> FloatArray:
+def any_detection_probability(probability: ArrayLike,
+                              axis: int | tuple[int, ...] | None = None) -> FloatArray:
     """Probability that at least one of several independent detectors detects.
 
     Parameters
@@ -155,14 +157,14 @@ def any_detects(probability: ArrayLike, axis: int | tuple[int, ...] | None = Non
     lasts longer than a period, or reaches several sensors, is not independent.
     """
     p = np.asarray(probability, dtype=float)
-    _refuse('probability', 'from 0 to 1', p, (p < 0.0) | (p > 1.0))
+    _raise_for_invalid('probability', 'from 0 to 1', p, (p < 0.0) | (p > 1.0))
     with np.errstate(divide='ignore'):
         silent = np.sum(np.log1p(-np.where(np.isnan(p), 0.0, p)), axis=axis)
     any_of_them: FloatArray = -np.expm1(silent)
     return any_of_them
 
 
-def _refuse(name: str, needed: str, value: ArrayLike, bad: bool | BoolArray) -> None:
+def _raise_for_invalid(name: str, needed: str, value: ArrayLike, bad: bool | BoolArray) -> None:
     """Raise ValueError for the first entry of `value` that is `bad`, one flag or its shape."""
     if np.any(bad):
         at = np.argwhere(bad)[0].tolist() if np.ndim(bad) else []

@@ -11,7 +11,7 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.least_squares import project_out_linear, refine
-from mag_tracking.inference.matrices import running_away
+from mag_tracking.inference.matrices import ignoring_overflow
 
 
 class SeparableModel(Protocol):
@@ -56,7 +56,7 @@ class SeparableProblem:
 
     def cost(self, theta: FloatArray) -> FloatArray:
         """(n,) least sum of squares for theta (n, n_theta); infinite where it is no number."""
-        with running_away():
+        with ignoring_overflow():
             A = self._without_nuisance(self._model.basis(theta))
             p, _, _ = project_out_linear(A, self._y)
             # Not from the residuals: a grid of starts has many, and digits enough.

@@ -59,7 +59,7 @@ def closest_approach(r0: ArrayLike, v0: ArrayLike) -> tuple[float, float, FloatA
 
     Source: TSP14 eq. (24).
     """
-    r0, v0 = _vector('r0', r0), _vector('v0', v0)
+    r0, v0 = _checked_vector('r0', r0), _checked_vector('v0', v0)
     speed = np.linalg.norm(v0)
     if not 0.0 < speed < np.inf:
         raise ValueError(f'v0 has to be finite and not zero, got {v0.tolist()}')
@@ -96,7 +96,8 @@ def anderson_coefficients(r_cpa: ArrayLike, v0: ArrayLike, m: ArrayLike) -> Floa
 
     Source: TSP14 eq. (25)-(26), corrected: (25c) has a plus between its terms.
     """
-    r_cpa, v0, m = _vector('r_cpa', r_cpa), _vector('v0', v0), _vector('m', m)
+    r_cpa, v0, m = (_checked_vector('r_cpa', r_cpa), _checked_vector('v0', v0),
+                    _checked_vector('m', m))
     distance, speed = np.linalg.norm(r_cpa), np.linalg.norm(v0)
     if not 0.0 < speed < np.inf:
         raise ValueError(f'v0 has to be finite and not zero, got {v0.tolist()}')
@@ -167,7 +168,7 @@ def anderson_residual(t: FloatArray, y: FloatArray, time: float, scale: float) -
     return core.anderson_residual(t, y, time, scale)
 
 
-def _vector(name: str, value: ArrayLike) -> FloatArray:
+def _checked_vector(name: str, value: ArrayLike) -> FloatArray:
     """The value as a vector of three."""
     value = np.asarray(value, dtype=float)
     if value.shape != (3,):

@@ -43,7 +43,7 @@ def sensor_fields(positions: FloatArray, R_sw: FloatArray, r: FloatArray, m: Flo
     return core.sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx)
 
 
-def _alike(r: ArrayLike, m: ArrayLike) -> tuple[FloatArray, FloatArray]:
+def _broadcast_pair(r: ArrayLike, m: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Both in the shape that they broadcast to."""
     r, m = np.broadcast_arrays(np.asarray(r, dtype=float), np.asarray(m, dtype=float))
     if r.shape[-1:] != (3,):
@@ -68,7 +68,7 @@ def dipole_field(r: ArrayLike, m: ArrayLike) -> FloatArray:
 
     Source: TSP14 eq. (2).
     """
-    return core.dipole_field(*_alike(r, m))
+    return core.dipole_field(*_broadcast_pair(r, m))
 
 
 def dipole_jacobians(r: ArrayLike, m: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -90,4 +90,4 @@ def dipole_jacobians(r: ArrayLike, m: ArrayLike) -> tuple[FloatArray, FloatArray
 
     Source: TSP14 eq. (30a), (30b), with the factor mu0/4pi.
     """
-    return core.dipole_jacobians(*_alike(r, m))
+    return core.dipole_jacobians(*_broadcast_pair(r, m))

@@ -35,19 +35,20 @@ class MultipolePass:
 
     names = ('x', 'y', 'z', 'vx', 'vy', 'vz')
 
-    def _from_target(self, theta: FloatArray) -> FloatArray:
+    def _relative_positions(self, theta: FloatArray) -> FloatArray:
         """(n_paths, n, 3) [m] sensor minus target."""
         return (self.positions - theta[:, None, :3]
                 - self.t[:, None] * theta[:, None, 3:])
 
     def basis(self, theta: FloatArray) -> FloatArray:
         """Fields of unit moments, (n_paths, 3 n, 3 | 8 | 15), for paths theta (n_paths, 6)."""
-        _, A = multipole_jacobians(self._from_target(theta), np.zeros(_N_MOMENTS[self.order]))
+        _, A = multipole_jacobians(self._relative_positions(theta),
+                                   np.zeros(_N_MOMENTS[self.order]))
         return (self.M @ A).reshape(len(theta), 3 * len(self.t), -1)
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
         """d(basis(theta) p)/d(theta), (n_paths, 3 n, 6); `p` (n_paths, 3 | 8 | 15)."""
-        gradient, _ = multipole_jacobians(self._from_target(theta), p[:, None])
+        gradient, _ = multipole_jacobians(self._relative_positions(theta), p[:, None])
         D = -(self.M @ gradient)
         return np.concatenate([D, self.t[:, None, None] * D], axis=-1).reshape(
             len(theta), 3 * len(self.t), 6)

@@ -109,11 +109,11 @@ class Magnet:
             # What is not known of the moment itself is turned exactly: the turn's share counts.
             before = R @ P[:, 6:9, 6:9] @ np.swapaxes(R, 1, 2)
             after = F[:, 6:9] @ P @ np.swapaxes(F[:, 6:9], 1, 2) + Q[:, 6:9, 6:9]
-            Q[:, 6:9, 6:9] += _shortening(moved[:, 6:9], before, after)
+            Q[:, 6:9, 6:9] += _second_order_noise(moved[:, 6:9], before, after)
         return moved, F, Q
 
 
-def _shortening(m: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
+def _second_order_noise(m: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
     """Second moment (n, 3, 3), along m, of what a turn by an uncertain angle takes from m.
 
     A moment `m` (n, 3) that is turned by a small (a, b) across itself ends

@@ -60,7 +60,7 @@ class SteadyPass:
                            np.linalg.qr(np.vander(places, increasing=True))[0])
 
     @cached_property
-    def _mixing(self) -> FloatArray:
+    def _moment_transform(self) -> FloatArray:
         """(3 d, 3 d): moments of the row = mixing @ linear parameters."""
         return np.kron(self.combinations, np.eye(3)).astype(np.float64)
 
@@ -74,12 +74,12 @@ class SteadyPass:
         """Fields of unit combinations, (n_paths, 3 n, 3 d), for theta (n_paths, n_free)."""
         A = core.steady_bases(self.whole(theta), self.places, self.t, self.positions, self.M,
                               self.clock)
-        return A @ self._mixing
+        return A @ self._moment_transform
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
         """d(basis(theta) p)/d(theta), (n_paths, 3 n, n_free); `p` (n_paths, 3 d)."""
         D = core.steady_derivatives(
-            self.whole(theta), p @ self._mixing.T, self.places, self.t,
+            self.whole(theta), p @ self._moment_transform.T, self.places, self.t,
             self.positions, self.M, self.clock)
         free: FloatArray = D[:, :, self.free]
         return free

@@ -51,7 +51,7 @@ struct Induced {
 struct RowVehicle {
     int n_states, n_dipoles;
     double density[3], induction[3];  // Of the acceleration [m^2/s^3]; B0/mu0 [A/m].
-    double moment_drift, difference_drift, turn_acceleration, turn_time, fastest_turn;
+    double moment_drift, difference_drift, turn_acceleration, turn_time, max_turn_rate;
 
     INLINE int n() const { return n_states; }
 
@@ -99,7 +99,7 @@ struct RowVehicle {
         const int w = n - 1;
         const double fading = std::exp(-dt / turn_time);
         const double speed = std::max(std::sqrt(x[3] * x[3] + x[4] * x[4]),
-                                      turn_acceleration / fastest_turn);
+                                      turn_acceleration / max_turn_rate);
         const double rate = turn_acceleration / speed;
         Q[w * wide + w] = P[w * wide + w] > 0.0 ? (1.0 - fading * fading) * rate * rate : 0.0;
     }

@@ -12,7 +12,7 @@ from mag_tracking.physics.dipole import MU0
 from mag_tracking.physics.motion import constant_velocity, fading_turn, integrator_noise
 from mag_tracking.physics.sources import Dipoles
 
-FASTEST_TURN = 1.0
+MAX_TURN_RATE = 1.0
 """[rad/s] Deviation of the turn rate of a vehicle that is slow; no car turns much faster."""
 
 
@@ -115,6 +115,6 @@ class RowVehicle:
 
     def turn_variance(self, speed: FloatArray) -> FloatArray:
         """(...) [rad^2/s^2] of the turn rate at a horizontal `speed` (...) [m/s]."""
-        slowest = self.turn_acceleration / FASTEST_TURN
+        slowest = self.turn_acceleration / MAX_TURN_RATE
         variance: FloatArray = np.square(self.turn_acceleration / np.maximum(speed, slowest))
         return variance

@@ -38,7 +38,7 @@ class Body(Protocol):
         ...
 
 
-class Course(Protocol):
+class Trajectory(Protocol):
     """Where a body is at any time."""
 
     def at(self, t: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -46,7 +46,7 @@ class Course(Protocol):
         ...
 
 
-def body_axes(position: FloatArray, heading: FloatArray) -> tuple[FloatArray, FloatArray]:
+def body_poses(position: FloatArray, heading: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Rotations (n, 3, 3), body to world, and origins (n, 3) [m] of a body on the ground.
 
     `position` (n, 2) [m] and `heading` (n,) [rad].
@@ -72,7 +72,7 @@ class MagneticBody:
     def field(self, earth_field: FloatArray, position: FloatArray, heading: FloatArray,
               points: FloatArray) -> FloatArray:
         """See `Body.field`."""
-        R, origin = body_axes(position, heading)
+        R, origin = body_poses(position, heading)
         r = origin[:, None] + np.einsum('nij,pj->npi', R, self.parts)
         B_body = np.einsum('nji,j->ni', R, earth_field)
         induced = np.einsum('pij,nj->npi', self.susceptibility, B_body) / MU0
@@ -147,7 +147,7 @@ class Path:
 
 
 @dataclass(frozen=True)
-class Imperfections:
+class SensorErrorModel:
     """What real sensors add; zeros are perfect sensors."""
 
     noise_std: float = 1.2e-8
@@ -164,8 +164,8 @@ class Imperfections:
     """Of each axis, as a share of 1."""
 
 
-def simulate(network: SensorNetwork, body: Body, path: Course, rate: float, duration: float,
-             rng: np.random.Generator, imperfections: Imperfections | None = None,
+def simulate(network: SensorNetwork, body: Body, path: Trajectory, rate: float, duration: float,
+             rng: np.random.Generator, sensor_errors: SensorErrorModel | None = None,
              start_s: float = 0.0) -> tuple[Readings, FloatArray, FloatArray, FloatArray]:
     """Raw readings of every sensor and the truth, for one vehicle.
 
@@ -190,7 +190,7 @@ def simulate(network: SensorNetwork, body: Body, path: Course, rate: float, dura
 
     Raises ValueError for a network without an earth field.
     """
-    flaws, earth_field = imperfections or Imperfections(), network.earth_field
+    flaws, earth_field = sensor_errors or SensorErrorModel(), network.earth_field
     if earth_field is None:
         raise ValueError('the network has no earth field to simulate in')
     t = np.arange(0.0, duration, 1.0 / rate, dtype=float)

@@ -198,7 +198,7 @@ class TrackEvidence:
         a target has to explain the frames better.
         """
         found = set()
-        if self.bayes_factor.fell_behind(ratio):
+        if self.bayes_factor.is_recently_disfavoured(ratio):
             found.add(doubts.SOMETHING_ELSE)
         if self.contradicts(nis, degrees_of_freedom):
             found.add(doubts.CONTRADICTION)
@@ -259,7 +259,7 @@ class TrackEvidence:
         several explain the field, what they differ by says nothing about how far away it is. A
         target that `is_coming` nearer to the sensors is not out of reach, however uncertain.
         """
-        if self.bayes_factor.unexplained_s(track.stamp_ns) > UNEXPLAINED_S:
+        if self.bayes_factor.disfavoured_s(track.stamp_ns) > UNEXPLAINED_S:
             return UNEXPLAINED
         misfit = track.nis > settings.end_nis * track.degrees_of_freedom
         self._n_misfits = self._n_misfits + 1 if misfit else 0

@@ -159,7 +159,7 @@ class Member:
     def is_doubted(self, settings: TrackSettings) -> bool:
         """Whether all of the track, as it stands, may be wrong."""
         return self.evidence.doubted or self.opinion.is_doubtful \
-            or not self.evidence.bayes_factor.leads(settings.min_bayes_factor) \
+            or not self.evidence.bayes_factor.is_favoured(settings.min_bayes_factor) \
             or not self._target.starts_anywhere and self.evidence.is_felt_by_one
 
     def _doubts(self, update: Update, view: View, alone: bool) -> set[str]:
@@ -168,7 +168,7 @@ class Member:
         found = evidence.doubts | ({doubts.ONE_SENSOR} if alone else set())
         if update.bank_filter.is_implausible(bank, best, update.frame):
             found.add(doubts.MISFIT)
-        if not evidence.bayes_factor.leads(settings.min_bayes_factor):
+        if not evidence.bayes_factor.is_favoured(settings.min_bayes_factor):
             found.add(doubts.SOMETHING_ELSE)
         # A magnet may rest: it is then as smooth as anything, and is where it was.
         if self._target.starts_anywhere:
@@ -206,7 +206,7 @@ class Member:
         `uniform` is the probability that it was one field over the network.
         """
         if self._was_sure or self.last is None \
-                or self.evidence.bayes_factor.unexplained_s(self.last.stamp_ns) <= 0.0:
+                or self.evidence.bayes_factor.disfavoured_s(self.last.stamp_ns) <= 0.0:
             return None
         return Unexplained(self.id, self.begin_ns, self.evidence.largest, self.evidence.felt,
                            uniform)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mag_tracking.inference.least_squares import LINEAR_RANK, refine
-from mag_tracking.inference.matrices import RANK, pseudo_inverse
+from mag_tracking.inference.least_squares import LINEAR_RANK_TOLERANCE, refine
+from mag_tracking.inference.matrices import PSEUDO_INVERSE_TOLERANCE, pseudo_inverse
 from mag_tracking.inference.separable_fit import SeparableProblem
 from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, PATH, SteadyPass
 from mag_tracking.stages.track import core
@@ -99,8 +99,8 @@ def test_dipoles_that_are_almost_at_one_place_are_fitted_as_by_numpy(length):
         theta=theta.copy(), cost=cost, covariance=P, free=free, fixed=fixed, places=model.places,
         combinations=model.combinations, t=data.t, positions=data.positions, M=data.M,
         clock=data.clock, y=data.y - nuisance @ (nuisance.T @ data.y), nuisance=nuisance,
-        n_steps=0, tolerance=0.0, most_damping=1e12, full_rank=1e-3, linear_rank=LINEAR_RANK,
-        rank=RANK)
+        n_steps=0, tolerance=0.0, most_damping=1e12, full_rank=1e-3,
+        linear_rank=LINEAR_RANK_TOLERANCE, rank=PSEUDO_INVERSE_TOLERANCE)
     residual, J = problem.residual_and_jacobian(theta)
     assert cost[0] == pytest.approx(float(residual[0] @ residual[0]), rel=1e-6)
     # Eigenvalues near the limit are known to a few digits only.

@@ -13,7 +13,7 @@ from mag_tracking.inference.filter_bank import FilterBank
 
 
 @dataclass
-class StartingBank:
+class InitialBank:
     """The hypotheses of a `FilterBank` at its start; every array has the hypothesis as first axis.
     """
 
@@ -29,7 +29,7 @@ class StartingBank:
     n_sensors: int
 
     @classmethod
-    def of(cls, bank: FilterBank, n_target: int) -> 'StartingBank':
+    def of(cls, bank: FilterBank, n_target: int) -> 'InitialBank':
         """A copy of a bank whose first `n_target` states are of the target."""
         return cls(bank.x.copy(), bank.P[:, :n_target, :n_target].copy(),
                    bank.P[0, n_target:, n_target:].copy(), bank.label, bank.kind, bank.origin,

@@ -9,7 +9,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.units import NS
 
 
-class LatestFrames:
+class SlidingSum:
     """Values added within a time before the latest frame."""
 
     def __init__(self, window_s: float) -> None:

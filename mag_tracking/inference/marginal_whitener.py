@@ -9,7 +9,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 
 
-class Marginalised:
+class MarginalWhitener:
     """The inverse root of I + C C'."""
 
     def __init__(self, columns: FloatArray) -> None:
