@@ -194,7 +194,8 @@ def test_standing_vehicle_has_a_finite_model(name):
 
 
 def test_states_of_another_model_are_refused():
-    with pytest.raises(ValueError, match=r'3 dipoles need 19 states, got an array \(2, 10\)'):
+    with pytest.raises(ValueError,
+                       match=r'3 dipoles need 19 states, got an array of shape \(2, 10\)'):
         EXAMPLES['RowVehicle'].dipoles(np.zeros((2, 10)))
 
 
