@@ -174,8 +174,8 @@ struct Vehicles {
     }
 };
 
-// Field and derivative, as Target::field. Returns the magnitude of the model error [T], the gradient
-// times the length scale in `lengths` [m], one per target.
+// Field and derivative, as Target::field. Returns the magnitude of the model error [T]: the
+// gradient times the length scale in `lengths` [m], one per target.
 template <class Target>
 INLINE double field_and_error(const Target& target, const double* x, const double* position,
                               const double* R, const double* lengths, double* field, double* H,

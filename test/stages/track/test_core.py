@@ -164,9 +164,9 @@ def test_a_noise_that_is_not_positive_definite_is_refused(bad):
 
 
 @pytest.mark.parametrize('spoil, error', [
-    (lambda b: setattr(b, 'x', b.x[:, :-1].copy()), 'x: not of the shape'),
-    (lambda b: setattr(b, 'P', b.P[:, :-1].copy()), 'P: not of the shape'),
-    (lambda b: setattr(b, 'P', b.P[:-1].copy()), 'P: not of the shape')])
+    (lambda b: setattr(b, 'x', b.x[:, :-1].copy()), 'x: shape does not match'),
+    (lambda b: setattr(b, 'P', b.P[:, :-1].copy()), 'P: shape does not match'),
+    (lambda b: setattr(b, 'P', b.P[:-1].copy()), 'P: shape does not match')])
 def test_arrays_of_other_sizes_are_refused(spoil, error):
     compiled, _, bank, frames, _ = case('point')
     spoil(bank)

@@ -113,11 +113,11 @@ def test_dipoles_that_are_almost_at_one_place_are_fitted_as_by_numpy(length):
     ('fixed', np.zeros(N_PATH - 1), 'fixed: not path and clocks'),
     ('free', np.array([0, 11]), 'free: no such column'),
     ('free', np.array([-1, 3]), 'free: no such column'),
-    ('y', np.zeros(11), 'y: not of the shape'),
-    ('nuisance', np.zeros((11, 2)), 'nuisance: not of the shape'),
-    ('M', np.zeros((3, 3, 3)), 'M: not of the shape'),
-    ('combinations', np.eye(2), 'combinations: not of the shape'),
-    ('covariance', np.zeros((1, 3, 3)), 'covariance: not of the shape')])
+    ('y', np.zeros(11), 'y: shape does not match'),
+    ('nuisance', np.zeros((11, 2)), 'nuisance: shape does not match'),
+    ('M', np.zeros((3, 3, 3)), 'M: shape does not match'),
+    ('combinations', np.eye(2), 'combinations: shape does not match'),
+    ('covariance', np.zeros((1, 3, 3)), 'covariance: shape does not match')])
 def test_arrays_of_other_sizes_are_refused(name, value, error):
     arguments = {
         'theta': np.zeros((1, 2)), 'cost': np.zeros(1), 'covariance': np.zeros((1, 2, 2)),
