@@ -1,7 +1,7 @@
-"""A bank as it starts: what is known of the target and of the sensors has nothing in common yet.
+"""Compact copy of a filter bank at its start, before target and sensor states are correlated.
 
-Smoothing and relinearising begin where a track began. To keep the covariances of all its
-hypotheses would take as much memory as the bank.
+Smoothing and relinearisation restart at the beginning of a track. Storing the full covariances of
+all hypotheses would need as much memory as the bank.
 """
 
 from dataclasses import dataclass
@@ -14,32 +14,62 @@ from mag_tracking.inference.filter_bank import FilterBank
 
 @dataclass
 class InitialBank:
-    """The hypotheses of a `FilterBank` at its start; every array has the hypothesis as first axis.
+    """Hypotheses of a `FilterBank` at its start.
+
+    The hypothesis is the first axis of every array.
     """
 
     x: FloatArray
-    """(n_hyp, n_x) states: of the target, then of the sensors."""
+    """States, (n_hyp, n_x): of the target, then of the sensors."""
     P: FloatArray
-    """(n_hyp, n_t, n_t) covariances of the target's."""
+    """Covariances of the target states, (n_hyp, n_t, n_t)."""
     P_sensors: FloatArray
-    """(n_x - n_t, n_x - n_t) covariance of the sensors', of any hypothesis."""
+    """Covariance of the sensor states, common to all hypotheses, (n_x - n_t, n_x - n_t)."""
     label: IntArray
+    """As `FilterBank.label`."""
     kind: IntArray
+    """As `FilterBank.kind`."""
     origin: IntArray
+    """As `FilterBank.origin`."""
     n_sensors: int
+    """Number of sensors."""
 
     @classmethod
     def of(cls, bank: FilterBank, n_target: int) -> 'InitialBank':
-        """A copy of a bank whose first `n_target` states are of the target."""
+        """Copy the start of a bank.
+
+        Parameters
+        ----------
+        bank : FilterBank
+            Bank before its first update.
+        n_target : int
+            Number of target states, which come first.
+
+        Returns
+        -------
+        InitialBank
+        """
         return cls(bank.x.copy(), bank.P[:, :n_target, :n_target].copy(),
                    bank.P[0, n_target:, n_target:].copy(), bank.label, bank.kind, bank.origin,
                    bank.nis.shape[1])
 
     def __len__(self) -> int:
+        """Number of hypotheses."""
         return len(self.x)
 
     def rows(self, rows: IntArray) -> FilterBank:
-        """A bank of the hypotheses `rows` (n,) int, weighted alike; its arrays are its own."""
+        """Restore some hypotheses with equal weights.
+
+        Parameters
+        ----------
+        rows : (n,) int array
+            Rows to restore.
+
+        Returns
+        -------
+        FilterBank
+            Its arrays are copies.
+        """
         n, n_t = len(rows), self.P.shape[1]
         P = np.zeros((n, self.x.shape[1], self.x.shape[1]))
         P[:, :n_t, :n_t], P[:, n_t:, n_t:] = self.P[rows], self.P_sensors
@@ -47,6 +77,12 @@ class InitialBank:
                           self.kind[rows], self.origin[rows], np.full((n, self.n_sensors), np.nan))
 
     def keep(self, mask: BoolArray) -> None:
-        """Keep the hypotheses of the `mask` (n_hyp,)."""
+        """Keep some hypotheses.
+
+        Parameters
+        ----------
+        mask : (n_hyp,) bool array
+            Hypotheses to keep.
+        """
         for name in ('x', 'P', 'label', 'kind', 'origin'):
             setattr(self, name, getattr(self, name)[mask])

@@ -1,7 +1,7 @@
-"""Linear terms with a Gaussian prior, taken out of whitened measurements.
+"""Whitening of measurements with linear nuisance terms that have a Gaussian prior.
 
-With y = C c + e, c and e standard normal, the covariance of y is I + C C'. Its inverse root is I on
-all directions but the few that C spans, so that a large problem stays cheap.
+With y = C c + e and c, e standard normal, the covariance of y is I + C C'. Its inverse root is I in
+all directions outside the few that C spans, so that whitening a large problem is cheap.
 """
 
 import numpy as np
@@ -10,20 +10,34 @@ from mag_tracking.arrays import FloatArray
 
 
 class MarginalWhitener:
-    """The inverse root of I + C C'."""
+    """Inverse root of the covariance I + C C'.
+
+    Parameters
+    ----------
+    columns : (n_y, q) array
+        C: columns of the nuisance terms, each times the standard deviation of its coefficient.
+    """
 
     def __init__(self, columns: FloatArray) -> None:
-        """`columns` C (n_y, q), each times the standard deviation of its coefficient."""
         self._U, size, _ = np.linalg.svd(columns, full_matrices=False)
         self._size = size
         self._taken: FloatArray = 1.0 - 1.0 / np.sqrt(1.0 + size**2)
 
     def __call__(self, A: FloatArray) -> FloatArray:
-        """The inverse root times A (..., n_y, k), or (n_y,)."""
+        """Whiten `A` (..., n_y, k), or (n_y,)."""
         whitened: FloatArray = A - (self._U * self._taken) @ (self._U.T @ A)
         return whitened
 
     def correction_factor(self, A: FloatArray) -> FloatArray:
-        """F(A) (q, k) for A (n_y, k): A' inv(I + C C') B = A'B - F(A)' F(B)."""
+        """Factor F(A) of the low-rank correction: A' inv(I + C C') B = A'B - F(A)' F(B).
+
+        Parameters
+        ----------
+        A : (n_y, k) array
+
+        Returns
+        -------
+        (q, k) array
+        """
         share: FloatArray = self._size / np.sqrt(1.0 + self._size**2)
         return share[:, None] * (self._U.T @ A)

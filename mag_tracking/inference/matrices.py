@@ -1,4 +1,4 @@
-"""Matrices that are checked, brought to unit diagonal, whitened, and inverted."""
+"""Matrix validation, scaling to unit diagonal, whitening and pseudo-inverses."""
 
 from contextlib import AbstractContextManager
 from typing import cast
@@ -11,10 +11,29 @@ from mag_tracking.inference import core
 
 
 def whitened(H: ArrayLike, C: ArrayLike | None) -> FloatArray:
-    """Rows of H in units of their noise (..., n_y, n_x); missing rows are zero."""
+    """Whiten the rows of measurement matrices.
+
+    Parameters
+    ----------
+    H : (..., n_y, n_x) array
+        Measurement matrices; a row of NaN is not measured.
+    C : (..., n_y, n_y) array or None
+        Noise covariances; leading axes broadcast against `H`. None if `H` is whitened.
+
+    Returns
+    -------
+    (..., n_y, n_x) array
+        Rows of unit noise; zero for missing rows.
+
+    Raises
+    ------
+    ValueError
+        If a shape does not match, or a matrix is not finite, not symmetric or not positive
+        definite.
+    """
     H = np.asarray(H, dtype=float)
     if H.ndim < 2:
-        raise ValueError(f'H needs shape (..., n_y, n_x), got {H.shape}')
+        raise ValueError(f'H must have shape (..., n_y, n_x), got {H.shape}')
     missing = np.isnan(H).all(axis=-1)
     raise_for_invalid('row of H ', 'finite or wholly NaN', H,
                       ~np.isfinite(H).all(axis=-1) & ~missing)
@@ -31,26 +50,85 @@ def whitened(H: ArrayLike, C: ArrayLike | None) -> FloatArray:
 
 
 def leading_broadcast(name: str, A: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    """A as a float array of `shape`; only leading axes may be left out."""
+    """Broadcast a matrix over leading axes.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for the error message.
+    A : (..., m, n) array
+        Matrix.
+    shape : tuple of int
+        Required shape; its last two lengths must be m and n.
+
+    Returns
+    -------
+    array of shape `shape`
+        Read-only.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not match.
+    """
     A = np.asarray(A, dtype=float)
     try:
         if A.shape[-2:] == shape[-2:]:
             return np.broadcast_to(A, shape)
     except ValueError:
         pass
-    raise ValueError(f'{name} has shape {A.shape}, needed is {shape}')
+    raise ValueError(f'{name} has shape {A.shape}, expected {shape}')
 
 
 def raise_for_invalid(name: str, fault: str, A: FloatArray, bad: BoolArray | np.bool_) -> None:
-    """Raise ValueError for the first matrix of A (..., n, n) that is `bad` (...)."""
+    """Raise ValueError for the first invalid matrix.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for the error message.
+    fault : str
+        Property that is violated, such as 'symmetric'.
+    A : (..., n, n) array
+        Matrices.
+    bad : (...) bool array
+        Flags of the invalid matrices.
+
+    Raises
+    ------
+    ValueError
+        If any flag is set.
+    """
     for at in np.argwhere(bad).tolist():
         raise ValueError(f'{name}{at or ""} is not {fault}: {A[tuple(at)].tolist()}')
 
 
 def unit_diagonal(name: str, A: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Scale, eigenvalues and vectors of A / (scale scale'), once A is fit for it."""
+    """Scale symmetric matrices to unit diagonal and decompose them.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for the error message.
+    A : (..., n, n) array
+        Symmetric positive semidefinite matrices.
+
+    Returns
+    -------
+    scale : (..., n) array
+        Roots of the diagonal; 1 where the diagonal is not positive.
+    w : (..., n) array
+        Eigenvalues of A / (scale scale'), ascending.
+    V : (..., n, n) array
+        Eigenvectors in columns.
+
+    Raises
+    ------
+    ValueError
+        If a matrix is not square, finite, symmetric and positive semidefinite.
+    """
     if A.ndim < 2 or A.shape[-1] != A.shape[-2]:
-        raise ValueError(f'{name} has to be square, got {A.shape}')
+        raise ValueError(f'{name} must be square, got shape {A.shape}')
     raise_for_invalid(name, 'finite', A, ~np.isfinite(A).all(axis=(-2, -1)))
     diagonal = np.einsum('...ii->...i', A)
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
@@ -64,32 +142,56 @@ def unit_diagonal(name: str, A: FloatArray) -> tuple[FloatArray, FloatArray, Flo
 
 
 def triangular_factor(A: FloatArray) -> FloatArray:
-    """R of A = Q R."""
-    # The stub of numpy knows only of the pair.
+    """R of the QR decomposition A = Q R.
+
+    Parameters
+    ----------
+    A : (m, n) array
+
+    Returns
+    -------
+    (min(m, n), n) array
+        Upper triangular.
+    """
+    # The type stub of NumPy lists only the pair (Q, R).
     return cast(FloatArray, np.linalg.qr(A, mode='r'))
 
 
 def ignoring_overflow() -> AbstractContextManager[None]:
-    """Start of a block in which numbers may grow beyond all bounds: a search that does so costs
-    infinity.
+    """Context in which overflow is not reported: a diverging search has infinite cost.
+
+    Returns
+    -------
+    context manager
     """
     return np.errstate(over='ignore', invalid='ignore')
 
 
 PSEUDO_INVERSE_TOLERANCE = 1e-15
-"""Directions whose eigenvalue is below this share of the largest are those of rounding errors."""
+"""Relative eigenvalue below which a direction consists of rounding errors."""
 
 
 def pseudo_inverse(A: FloatArray, rank: float = PSEUDO_INVERSE_TOLERANCE) -> FloatArray:
-    """Pseudo-inverses (n, k, k), scaled to unit diagonal first: units differ by decades.
+    """Pseudo-inverses of symmetric matrices, scaled to unit diagonal.
 
-    Directions whose eigenvalue is then below the share `rank` of the largest are left out. A
-    matrix that is not finite, of a search that ran away, has an inverse of NaN. Of full rank the
-    lower triangles count.
+    The matrices are scaled because the units of the parameters differ by decades.
+
+    Parameters
+    ----------
+    A : (n, k, k) array
+        Symmetric positive semidefinite matrices.
+    rank : float
+        Directions with an eigenvalue below this fraction of the largest are left out.
+
+    Returns
+    -------
+    (n, k, k) array
+        NaN for a matrix that is not finite, as in a diverging search. For matrices of full rank
+        only the lower triangles are read.
     """
     A = np.ascontiguousarray(A, dtype=float)
     inverse: FloatArray = np.empty_like(A)
-    # It takes a hundredth of the time of the eigenvalues.
+    # Cholesky factors take a hundredth of the time of eigenvalues.
     if core.inverses(A, MIN_PIVOT_ROOT, inverse):
         return inverse
     finite: BoolArray = np.all(np.isfinite(A), axis=(1, 2))
@@ -107,4 +209,4 @@ def pseudo_inverse(A: FloatArray, rank: float = PSEUDO_INVERSE_TOLERANCE) -> Flo
 
 
 MIN_PIVOT_ROOT = 1e-3
-"""The least root of a pivot that is left to a matrix whose inverse needs no care."""
+"""Root of a pivot, at unit diagonal, above which a matrix is inverted by its Cholesky factor."""

@@ -208,12 +208,12 @@ GOOD = np.ones((11, 2))
 
 
 @pytest.mark.parametrize('call, message', [
-    (lambda: noise_spectrum([1.0, np.nan], 1e-10, 0.0, 11.0), r'frequency\[1\].*numbers, got nan'),
+    (lambda: noise_spectrum([1.0, np.nan], 1e-10, 0.0, 11.0), r'frequency\[1\].*a number, got nan'),
     (lambda: noise_spectrum(1.0, -1e-10, 0.0, 11.0), 'background.*at least 0.*got -1e-10'),
     (lambda: noise_spectrum(1.0, 1e-10, np.inf, 11.0), 'resolution.*got inf'),
     (lambda: noise_spectrum(1.0, 1e-10, 0.0, 0.0), 'bandwidth.*above 0.*got 0.0'),
-    (lambda: deflection(GOOD[:, 0], 22.0, mitre, ALL), r'B needs shape.*got \(11,\)'),
-    (lambda: deflection(GOOD[:0], 22.0, mitre, ALL), r'B needs shape.*got \(0, 2\)'),
+    (lambda: deflection(GOOD[:, 0], 22.0, mitre, ALL), r'B must have shape.*got \(11,\)'),
+    (lambda: deflection(GOOD[:0], 22.0, mitre, ALL), r'B must have shape.*got \(0, 2\)'),
     (lambda: deflection(np.where(np.arange(11)[:, None] == 3, np.nan, GOOD), 22.0, mitre, ALL),
      r'B\[3, 0\].*NaN on a whole axis, got nan'),
     (lambda: deflection(GOOD * np.inf, 22.0, mitre, ALL), r'B\[0, 0\].*got inf'),
