@@ -113,7 +113,7 @@ def observability(information: ArrayLike, names: Sequence[str],
     unit_diagonal('information', J)
     scale = np.ones(len(J)) if scale is None else np.asarray(scale, dtype=float)
     if len(names) != len(J) or scale.shape != (len(J),) or not np.all(scale > 0.0):
-        raise ValueError(f'expected {len(J)} names and {len(J)} positive scales, '
+        raise ValueError(f'expected names and positive scales of {len(J)} states, '
                          f'got {list(names)} and {scale.tolist()}')
     w, V = np.linalg.eigh(scale[:, None] * J * scale)
     zero = w <= RANK_TOLERANCE * w[-1]

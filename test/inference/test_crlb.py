@@ -331,7 +331,7 @@ H9, I9, SKEW = np.ones((4, 3, 9)), np.eye(9), np.eye(3) + 0.5 * np.eye(3, k=1)
     (lambda: information(H9, 1e-16 * SKEW), r'C\[0\] is not symmetric'),
     (lambda: information(np.where(np.arange(9) == 4, np.nan, H9)), r'row of H \[0, 0\] is not fin'),
     (lambda: observability(np.ones((9, 8)), NAMES), r'information must be square.*\(9, 8\)'),
-    (lambda: observability(I9, NAMES[:8]), 'expected 9 names'),
+    (lambda: observability(I9, NAMES[:8]), 'names and positive scales of 9 states'),
     (lambda: observability(I9, NAMES, np.zeros(9)), 'positive scales.*0.0'),
     (lambda: bound(I9, -2.0 * I9), 'prior is not positive semidefinite.*-2.0'),
     (lambda: marginal(I9, [9]), 'keep is not valid for 9 states.*9'),
