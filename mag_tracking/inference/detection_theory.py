@@ -1,4 +1,4 @@
-"""Thresholds and probabilities of the chi-square energy test (T10 section 5.4)."""
+"""Thresholds and probabilities of the chi-square energy test."""
 
 from typing import cast
 
@@ -73,7 +73,7 @@ def detection_probability(snr: float | FloatArray, threshold: float | FloatArray
 
 
 def missed_detection_probability(probability: ArrayLike, run: int) -> FloatArray:
-    """Probability that a target is never detected in `run` consecutive frames.
+    """Probability that a target is missed: no `run` consecutive frames all detect it.
 
     Parameters
     ----------

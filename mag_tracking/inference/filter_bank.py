@@ -1,7 +1,7 @@
 """Bank of filters: hypotheses as arrays, with logarithmic weights.
 
-T10 section 2.6 and Alg. 3. Weights are kept as logarithms because two hypotheses may differ by
-thousands of nats.
+The bank follows T10 section 2.6 and Alg. 3. Weights are kept as logarithms because two hypotheses
+may differ by thousands of nats.
 """
 
 from dataclasses import dataclass, fields

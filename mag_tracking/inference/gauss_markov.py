@@ -2,10 +2,8 @@
 
 Each component is an integrated random walk: its rate of change is a Wiener process. The strength of
 the process is unknown and may change: a bank of strengths is weighted by the data, and each
-strength switches to another one at a constant rate.
-
-The process is that of Bar-Shalom, Li and Kirubarajan 2001, section 6.2.2, and the weights are those
-of section 11.6. The states are not mixed, because all of them follow the same data.
+strength switches to another one at a constant rate. The states of different strengths are not
+mixed, because all of them follow the same data.
 """
 
 import numpy as np

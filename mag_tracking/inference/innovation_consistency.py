@@ -1,10 +1,8 @@
 """Innovation consistency: whether the innovations of a track match their covariance, over time.
 
 The normalised innovations squared (NIS) of a consistent filter are chi-square distributed; those of
-a filter that allows for model errors are smaller. A single frame is not conclusive. Tested are the
-frames of a short window and the whole track, for the network as a whole and for each sensor.
-
-Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2.
+a filter that allows for model errors are smaller. A single frame is not conclusive. The test covers
+the frames of a short window and the whole track, for the network as a whole and for each sensor.
 """
 
 import numpy as np

@@ -1,11 +1,10 @@
 """Matched filter: detection of a known signal in coloured noise, by one or several sensors.
 
 It bounds the detectability of a pass whose signature is known; the energy test (`detection_theory`)
-needs no signature and detects less. Spectral densities are two-sided: the noise power is their
-integral over negative and positive frequencies. NaN means not measured: an axis, or a detector
-without any axis. Invalid values raise ValueError with the value.
-
-MITRE12 section 3 and appendix B.
+needs no signature and detects less. The equations are those of MITRE12 section 3 and appendix B.
+Spectral densities are two-sided: the noise power is their integral over negative and positive
+frequencies. NaN means not measured: an axis, or a detector without any axis. Invalid values raise
+ValueError with the value.
 """
 
 from collections.abc import Callable, Sequence

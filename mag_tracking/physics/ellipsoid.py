@@ -34,11 +34,11 @@ def demagnetisation_factors(aspect: ArrayLike) -> tuple[FloatArray, FloatArray]:
 
     Notes
     -----
-    The factors are evaluated as the integral from which the closed form is derived, a b c/2 int
-    ds/((s + a^2) sqrt(...)), which is Carlson's R_D. It holds for oblate ellipsoids as well and
-    loses no digits near the sphere, where the closed form is 0/0. The closed form printed in the
-    paper needs a correction: t2 = m - (t1 + 1)/m; the printed t2 = m - t1 - 1 gives L1 + 2 L2 =
-    0.49 at m = 2.
+    The factors are evaluated as the integral from which the closed form is derived, a b c/2 times
+    the integral of ds/((s + a^2) sqrt(...)), which is Carlson's R_D. It holds for oblate ellipsoids
+    as well and loses no digits near the sphere, where the closed form is 0/0. The closed form
+    printed in the paper needs a correction: t2 = m - (t1 + 1)/m; the printed t2 = m - t1 - 1 gives
+    L1 + 2 L2 = 0.49 at m = 2.
 
     References
     ----------

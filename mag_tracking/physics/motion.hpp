@@ -33,7 +33,7 @@ INLINE void turn(const double* x, int w, double dt, double mean, double fading, 
     double chord = 1.0 - half * half / 6.0, slope = -half / 3.0;
     if (std::abs(half) > SMALL_ANGLE) chord = s / half, slope = (c - chord) / half;
     const double along_x = c * x[3] - s * x[4], along_y = s * x[3] + c * x[4];
-    const double turned_x = c * along_x - s * along_y, turned_y = s * along_x + c * along_y;
+    const double rotated_x = c * along_x - s * along_y, rotated_y = s * along_x + c * along_y;
     const double by_rate = 0.5 * dt * dt * mean;
     const double cc = c * c - s * s, ss = 2.0 * s * c;
     out = Motion{
@@ -42,11 +42,11 @@ INLINE void turn(const double* x, int w, double dt, double mean, double fading, 
         {{1.0, dt * chord * c, -dt * chord * s, by_rate * (slope * along_x - chord * along_y)},
          {1.0, dt * chord * s, dt * chord * c, by_rate * (slope * along_y + chord * along_x)},
          {1.0, dt},
-         {cc, -ss, -dt * mean * turned_y},
-         {ss, cc, dt * mean * turned_x},
+         {cc, -ss, -dt * mean * rotated_y},
+         {ss, cc, dt * mean * rotated_x},
          {fading}},
-        {x[0] + dt * chord * along_x, x[1] + dt * chord * along_y, x[2] + dt * x[5], turned_x,
-         turned_y, fading * x[w]}};
+        {x[0] + dt * chord * along_x, x[1] + dt * chord * along_y, x[2] + dt * x[5], rotated_x,
+         rotated_y, fading * x[w]}};
 }
 
 }  // namespace mag_tracking

@@ -29,8 +29,8 @@ def rotated_fields(h: FloatArray, H: FloatArray, angles: FloatArray
 
     Notes
     -----
-    First order in the angle: the field magnitude is 1.5 % too large at 10 degrees and 3.4 % at 15
-    degrees.
+    First order in the angle: the field magnitude is too large by up to 1.5 % at 10 degrees and
+    3.4 % at 15 degrees.
 
     References
     ----------

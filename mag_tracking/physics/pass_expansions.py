@@ -34,8 +34,7 @@ class MultipolePass:
     positions: FloatArray
     """Position of the sensor of each sample, (n, 3) m, world frame."""
     M: FloatArray
-    """Whitening matrix times the rotation from the world to the sensor frame, of each sample, (n,
-    3, 3)."""
+    """Whitening matrix times world-to-sensor rotation of each sample, (n, 3, 3)."""
     order: int = 2
     """Highest multipole order: 1, 2 or 3."""
 

@@ -20,8 +20,8 @@ class RowPass:
 
     Path parameters (6, or 7 for two or more dipoles): position r0 of the centre of the row at time
     zero [m], velocity v0 [m/s], length L from the first to the last dipole [m]. Linear parameters
-    (3 n_dipoles): orthogonal combinations of the moments [A m², world frame], which are ordered
-    from tail to head.
+    (3 n_dipoles): coefficients of orthogonal combinations of the moments [A m², world frame]. The
+    dipoles are ordered from tail to head.
 
     The row is parallel to v0, as in TSP14; that of `vehicles.RowVehicle` stays horizontal. If v0 is
     zero, a row of two or more dipoles has no direction and the field is NaN.
@@ -36,8 +36,7 @@ class RowPass:
     positions: FloatArray
     """Position of the sensor of each sample, (n, 3) m, world frame."""
     M: FloatArray
-    """Whitening matrix times the rotation from the world to the sensor frame, of each sample, (n,
-    3, 3)."""
+    """Whitening matrix times world-to-sensor rotation of each sample, (n, 3, 3)."""
     n_dipoles: int = 1
     """Number of dipoles of the row."""
 

@@ -29,7 +29,7 @@ constexpr double WEIGHTS[N_NODES] = {
 // Centre of the row at one time.
 struct Middle {
     double position[3], heading;  // [m], [rad]
-    double time;                  // [s] of the reference clock; a clock that is ahead stamps too late.
+    double time;                  // [s] of the reference clock; stamps of a clock ahead are late.
 
     // `clock` is the clock of the sample; -1: reference clock.
     INLINE Middle(const double* theta, double t, long clock) {
@@ -60,7 +60,7 @@ struct Middle {
         const double rate = theta[TURN_RATE], more = theta[TURN_ACCELERATION];
         const bool bends = rate != 0.0 || more != 0.0;
         const double cos_0 = std::cos(theta[HEADING]), sin_0 = std::sin(theta[HEADING]);
-        double *x = by, *y = by + n, *z = by + 2 * n, *turned = by + 3 * n;
+        double *x = by, *y = by + n, *z = by + 2 * n, *heading_by = by + 3 * n;
         for (int k = 0; k < 4 * n; ++k) by[k] = 0.0;
         x[X] = y[Y] = z[Z] = 1.0, z[CLIMB] = time;
         for (int g = 0; g < N_NODES; ++g) {
@@ -76,13 +76,13 @@ struct Middle {
             x[TURN_ACCELERATION] -= 0.5 * at * at * way * s;
             y[TURN_ACCELERATION] += 0.5 * at * at * way * c;
         }
-        turned[HEADING] = 1.0, turned[TURN_RATE] = time;
-        turned[TURN_ACCELERATION] = 0.5 * time * time;
+        heading_by[HEADING] = 1.0, heading_by[TURN_RATE] = time;
+        heading_by[TURN_ACCELERATION] = 0.5 * time * time;
         if (clock < 0) return;
         const double now = v + gain * time;
         const int k = N_PATH + int(clock);
         x[k] = -now * std::cos(heading), y[k] = -now * std::sin(heading), z[k] = -theta[CLIMB];
-        turned[k] = -rate - more * time;
+        heading_by[k] = -rate - more * time;
     }
 };
 

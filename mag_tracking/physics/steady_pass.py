@@ -29,9 +29,10 @@ class SteadyPass:
     """A row of `n_dipoles` dipoles along a path with constant acceleration and turn acceleration.
 
     Non-linear parameters theta: those of `PATH` and of the clock offsets that are listed in `free`,
-    in that order; the others stay as in `fixed`. Linear parameters (3 n_dipoles): combinations of
-    the moments. The tracker fits this model in compiled code (`stages/track/steady_fit.hpp`);
-    `basis` and `derivative` serve searches with a prior, and simulations.
+    in that order; the others stay as in `fixed`. Linear parameters (3 n_dipoles): coefficients of
+    orthogonal combinations of the moments. The tracker fits this model in compiled code
+    (`stages/track/steady_fit.hpp`); `basis` and `derivative` serve searches with a prior, and
+    simulations.
     """
 
     t: FloatArray
@@ -39,8 +40,7 @@ class SteadyPass:
     positions: FloatArray
     """Position of the sensor of each sample, (n, 3) m, world frame."""
     M: FloatArray
-    """Whitening matrix times the rotation from the world to the sensor frame, of each sample, (n,
-    3, 3)."""
+    """Whitening matrix times world-to-sensor rotation of each sample, (n, 3, 3)."""
     clock: IntArray
     """Index of the clock of each sample, (n,); -1 is the reference clock."""
     free: IntArray

@@ -121,9 +121,9 @@ struct RowVehicle {
             dm[n + k] = s, dm[n + k + 1] = c;
             dm[2 * n + k + 2] = 1.0;
             // d(hard)/d(heading) = z x hard
-            const double turned_x = iron.by_x - hard_y, turned_y = iron.by_y + hard_x;
-            dm[3] = turned_x * turn_x, dm[4] = turned_x * turn_y;
-            dm[n + 3] = turned_y * turn_x, dm[n + 4] = turned_y * turn_y;
+            const double slope_x = iron.by_x - hard_y, slope_y = iron.by_y + hard_x;
+            dm[3] = slope_x * turn_x, dm[4] = slope_x * turn_y;
+            dm[n + 3] = slope_y * turn_x, dm[n + 4] = slope_y * turn_y;
             dm[soft] = c * iron.ahead, dm[soft + 1] = -s * iron.left;
             dm[n + soft] = s * iron.ahead, dm[n + soft + 1] = c * iron.left;
             dm[2 * n + soft + 2] = iron.up;
@@ -161,7 +161,7 @@ struct RowVehicle {
             dipole.add_field(field);
             gradient += dipole.gradient();
             // d(hard)/d(heading) = z x hard; d(position)/d(heading) = along z x heading.
-            const double turned_x = iron.by_x - hard_y, turned_y = iron.by_y + hard_x;
+            const double slope_x = iron.by_x - hard_y, slope_y = iron.by_y + hard_x;
             for (int a = 0; a < 3; ++a) {
                 double g[3], q[3], *row = H + a * stride;
                 dipole.rows(R + 3 * a, g, q);
@@ -171,7 +171,7 @@ struct RowVehicle {
                 row[soft] += iron.ahead * q_ahead;
                 row[soft + 1] += iron.left * q_left;
                 row[soft + 2] += iron.up * q[2];
-                by_heading[a] += q[0] * turned_x + q[1] * turned_y + along * (g[0] * s - g[1] * c);
+                by_heading[a] += q[0] * slope_x + q[1] * slope_y + along * (g[0] * s - g[1] * c);
                 if (d > 1) row[length] -= place * (g[0] * c + g[1] * s);
             }
         }
